@@ -1,0 +1,1 @@
+"""The vehicle agent: plan execution, trajectory planning and tracking."""

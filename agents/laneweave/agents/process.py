@@ -1,0 +1,28 @@
+"""The agent process: one vehicle, or several, over Zenoh."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+
+from laneweave.agents.core import AgentCore
+from laneweave.agents.host import AgentHost, Shard
+from laneweave.protocol.messages import Name
+from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.zenoh_transport import run_core
+
+
+def run_agents(scenario: Scenario, vehicles: Iterable[str], shard: Shard | None = None) -> None:
+    """Run agents until their vehicles have left the road, or until SIGINT or SIGTERM.
+
+    Raises:
+        BadInputError: nobody answers at the scenario's endpoint.
+    """
+    incarnation = time.time_ns()
+    host = AgentHost(
+        lambda vehicle: AgentCore(vehicle, incarnation, scenario),
+        [Name(vehicle) for vehicle in vehicles],
+        shard,
+    )
+    network = scenario.network
+    run_core(host, network.endpoint, network.realm, network.lease_s)

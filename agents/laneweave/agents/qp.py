@@ -1,0 +1,211 @@
+"""Quadratic programs: the one place that knows OSQP, and that does not trust it.
+
+    minimise    1/2 x' P x + q' x
+    subject to  lower <= A x <= upper
+
+P and A are set up once, the vectors change between solutions. What OSQP 1.1 leaves to its caller
+is done here: it accepts vectors of the wrong length, prints and goes on with stale data when
+lower > upper, keeps a NaN for ever in its warm start, and returns a finite x for an infeasible
+problem.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from attrs import frozen
+from numpy.typing import NDArray
+from osqp import ext_builtin
+
+Vector = NDArray[np.float64]
+
+SOLVED = 1
+SOLVED_INACCURATE = 2
+MAX_ITERATIONS = 7
+
+_INFINITY = float(ext_builtin.OSQP_INFTY)
+
+
+@frozen
+class QPSettings:
+    """How hard OSQP tries. There is no time limit: equal inputs must give equal results."""
+
+    eps_abs: float = 1e-3
+    """Largest residual, primal (in the rows' units) and dual, at which an iterate is accepted."""
+    max_iter: int = 400
+    check_termination: int = 5
+    """Iterations between two tests for termination."""
+    rho: float = 0.1
+    """First step size of the iteration (ADMM)."""
+    adaptive_rho_interval: int = 50
+    """Iterations between two changes of rho; 0 keeps it."""
+    alpha: float = 1.6
+    """Over-relaxation of the iteration, in (0, 2)."""
+    eps_infeasible: float = 1e-4
+    """Accuracy of the certificate by which a program is given up as infeasible."""
+    check_duality_gap: bool = False
+    """Whether the duality gap, an absolute cost, must also be below eps_abs."""
+    polishing: bool = False
+    """Whether a solution is refined on its active rows (to machine accuracy when it works)."""
+    row_tolerance: float = 2e-3
+    """A result that violates a row by more is not usable, whatever OSQP says about it."""
+
+
+@frozen
+class QPResult:
+    """What came out of one solution."""
+
+    x: Vector
+    """The solution, shape (n,); meaningless unless `usable`."""
+    usable: bool
+    """Whether OSQP came to an end and x keeps all rows within the tolerance."""
+    status: int
+    """OSQP's status: 1 solved, 2 inaccurate, 7 out of iterations, others: no solution."""
+    iterations: int
+    row_violation: float
+    """Largest violation of a row by x, in the row's unit; infinite without a solution."""
+
+
+class QuadraticProgram:
+    """One quadratic program, set up once and solved again and again with changing vectors.
+
+    Use one object per thread. Equal sequences of calls give bit-identical results.
+    """
+
+    def __init__(
+        self,
+        cost: Any,  # noqa: ANN401 - scipy.sparse has no types
+        rows: Any,  # noqa: ANN401
+        lower: Vector,
+        upper: Vector,
+        linear: Vector | None = None,
+        settings: QPSettings | None = None,
+    ) -> None:
+        """Set up the solver: scaling and factorisation happen here.
+
+        Args:
+            cost: P, sparse (n, n), symmetric and positive semidefinite; both triangles.
+            rows: A, sparse (m, n).
+            lower: lower bounds (m,); -inf for none.
+            upper: upper bounds (m,); +inf for none.
+            linear: q (n,); None for zero.
+            settings: None for the defaults.
+
+        Raises:
+            ValueError: the matrices or vectors do not fit, are not finite, or lower > upper.
+        """
+        m, n = rows.shape
+        if cost.shape != (n, n):
+            raise ValueError(f"cost has shape {cost.shape}, rows have {n} columns")
+        self._n = n
+        self._settings = settings or QPSettings()
+        self._rows = rows.tocsr()
+        cost_csc, rows_csc = cost.tocsc(), rows.tocsc()
+        for name, matrix in (("cost", cost_csc), ("rows", rows_csc)):
+            if not np.isfinite(matrix.data).all():
+                raise ValueError(f"{name} has entries that are not finite")
+        self._lower, self._upper = np.zeros(m), np.zeros(m)
+        self._new_lower, self._new_upper = np.zeros(m), np.zeros(m)
+        self._above, self._below = np.zeros(m), np.zeros(m)
+        self._zero_x, self._zero_y = np.zeros(n), np.zeros(m)
+        self._check_bounds(lower, upper)
+        first = np.zeros(n) if linear is None else self._checked_linear(linear)
+        # OSQP reads the upper triangle, sorted by row within each column.
+        triangle = cost_csc.copy()
+        columns = np.repeat(np.arange(n), np.diff(triangle.indptr))
+        triangle.data[triangle.indices > columns] = 0.0
+        triangle.eliminate_zeros()
+        triangle.sort_indices()
+        rows_csc.sort_indices()
+        self._solver = ext_builtin.OSQPSolver(
+            ext_builtin.CSC(triangle),
+            first,
+            ext_builtin.CSC(rows_csc),
+            self._lower,
+            self._upper,
+            m,
+            n,
+            _osqp_settings(self._settings),
+        )
+
+    def update(self, lower: Vector, upper: Vector, linear: Vector | None = None) -> None:
+        """Replace the bounds (m,) and, unless None, the linear cost (n,).
+
+        Raises:
+            ValueError: a shape is wrong, a number is NaN, the linear cost is not finite, a lower
+                bound is +inf, an upper bound -inf, or lower > upper. The program is unchanged.
+        """
+        checked = None if linear is None else self._checked_linear(linear)
+        self._check_bounds(lower, upper)
+        if self._solver.update_data_vec(q=checked, l=self._lower, u=self._upper):
+            raise ValueError("OSQP refused the vectors")
+
+    def solve(self) -> QPResult:
+        """Solve, starting from the previous solution."""
+        solver = self._solver
+        solver.solve()
+        info = solver.info
+        status = int(info.status_val)
+        x: Vector = solver.solution.x
+        violation = math.inf
+        if status in (SOLVED, SOLVED_INACCURATE, MAX_ITERATIONS):
+            violation = self._row_violation(x)
+        usable = violation <= self._settings.row_tolerance
+        result = QPResult(x, usable, status, int(info.iter), violation)
+        if not usable:
+            self.reset()
+        return result
+
+    def reset(self) -> None:
+        """Forget the previous solution: the next one starts from zero."""
+        self._solver.warm_start(self._zero_x, self._zero_y)
+        if self._settings.adaptive_rho_interval:
+            self._solver.update_rho(self._settings.rho)
+
+    def _row_violation(self, x: Vector) -> float:
+        values = self._rows @ x
+        np.subtract(values, self._upper, out=self._above)
+        np.subtract(self._lower, values, out=self._below)
+        np.maximum(self._above, self._below, out=self._above)
+        # A NaN anywhere stays NaN and fails every comparison.
+        return max(float(self._above.max()), 0.0) if self._above.size else 0.0
+
+    def _checked_linear(self, linear: Vector) -> Vector:
+        if linear.shape != (self._n,):
+            raise ValueError(f"linear has shape {linear.shape}, expected {(self._n,)}")
+        if not np.isfinite(linear).all():
+            raise ValueError("linear cost is not finite")
+        return linear
+
+    def _check_bounds(self, lower: Vector, upper: Vector) -> None:
+        """Copy checked bounds, clipped to OSQP's infinity, or raise and change nothing."""
+        shape = self._lower.shape
+        if lower.shape != shape or upper.shape != shape:
+            raise ValueError(f"bounds have shapes {lower.shape}, {upper.shape}, expected {shape}")
+        np.maximum(lower, -_INFINITY, out=self._new_lower)
+        np.minimum(upper, _INFINITY, out=self._new_upper)
+        if not (self._new_lower <= self._new_upper).all():
+            row = int(np.argmin(self._new_lower <= self._new_upper))
+            raise ValueError(f"row {row}: bounds [{lower[row]}, {upper[row]}] admit nothing")
+        self._lower, self._new_lower = self._new_lower, self._lower
+        self._upper, self._new_upper = self._new_upper, self._upper
+
+
+def _osqp_settings(settings: QPSettings) -> Any:  # noqa: ANN401 - OSQP's own type has no stub
+    osqp = ext_builtin.OSQPSettings()
+    ext_builtin.osqp_set_default_settings(osqp)
+    osqp.verbose = 0
+    osqp.eps_abs = settings.eps_abs
+    osqp.eps_rel = 0.0
+    osqp.max_iter = settings.max_iter
+    osqp.check_termination = settings.check_termination
+    osqp.rho = settings.rho
+    osqp.alpha = settings.alpha
+    osqp.adaptive_rho = 1 if settings.adaptive_rho_interval else 0
+    osqp.adaptive_rho_interval = settings.adaptive_rho_interval
+    osqp.check_dualgap = int(settings.check_duality_gap)
+    osqp.polishing = int(settings.polishing)
+    osqp.eps_prim_inf = settings.eps_infeasible
+    return osqp

@@ -1,0 +1,367 @@
+"""The tracker: a quadratic program per tick that keeps the vehicle on its reference.
+
+Model predictive control over N ticks of h seconds, in error coordinates z = z_ref + e,
+u = u_ref + w, with z = (s, v, a, y, v_y, a_y) and u = (j_s, j_y):
+
+    minimise    sum_k 1/2 (e_k' Q e_k + w_k' R w_k) + 1/2 e_N' S e_N + 1/2 G sum_k g_k^2
+    subject to  e_{k+1} = A e_k + B w_k + c_k                  exact: jerks are constant per tick
+                0 <= v_k <= v_max,  a_min <= a_k <= a_max,  |a_y,k| <= a_y,max
+                |v_y,k| <= slip v_k                            no sliding sideways
+                |j_s,k| <= j_max,  |j_y,k| <= j_y,max
+                s_k <= ahead_k - min_gap + g_k                 ahead_k: predicted rear bumper
+
+c is zero for a reference that obeys the dynamics. S is the cost to go of the unlimited problem,
+so without active rows this is the infinite-horizon linear-quadratic regulator. On the reference
+the solution is zero, which the solver's tolerance cannot spoil; in absolute coordinates it leaves
+1.6 m/s3 of noise on the jerk. The slack g is quadratic: an exact (linear) penalty takes four
+times as long. All matrices are set up once; a tick changes bounds only.
+
+Three things keep the program small in its numbers, and with them the solver quick. A reference
+that runs into the vehicle ahead yields (see `yielding`). Near standstill the prediction has some
+play in speed and slip. And far from the reference (after an emergency brake, say) or when the
+program has no usable answer, the hold law's way back is the reference: zero is then a solution
+whatever the state, even one from which no jerk keeps a limit, since bounds are widened to admit it.
+
+The solver's answer is not the last word: the jerks that are returned have been integrated exactly
+and held within the limits by `limited_jerk`, tick by tick where that is needed.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import numpy as np
+from attrs import frozen
+from numpy.typing import NDArray
+from scipy import sparse
+
+from laneweave.agents.qp import QPResult, QPSettings, QuadraticProgram
+from laneweave.agents.trajectory import Window, axis_matrices
+from laneweave.agents.yielding import yield_behind
+from laneweave.protocol.motion import State, hold_law, integrate, limited_jerk
+from laneweave.protocol.scenario import Scenario
+
+Array = NDArray[np.float64]
+
+_WEIGHTS = (1.0, 0.4, 0.1)
+"""Of (s, v, a) errors [1/m2, s2/m2, s4/m2]."""
+_LATERAL_WEIGHTS = (2.0, 0.8, 0.2)
+_JERK_WEIGHT = 0.02
+_GAP_WEIGHT = 10.0
+
+# A fixed rho leaves nothing behind but the warm start, so a reset is complete.
+_SETTINGS = QPSettings(
+    eps_abs=1e-3,
+    max_iter=400,
+    check_termination=5,
+    rho=0.3,
+    adaptive_rho_interval=0,
+    row_tolerance=2e-2,
+)
+_FAR_M = 1e4
+"""Stands for no vehicle ahead: finite, so that the row keeps its kind and OSQP its factors."""
+_NEAR = (8.0, 4.0, 6.0, 3.0, 2.5, 6.0)
+"""Largest errors of (s, v, a, y, v_y, a_y) at which the reference is tracked as it is."""
+_SPEED_PLAY_MPS = 0.3
+_SLIP_PLAY_MPS = 0.1
+"""Play of the prediction near standstill."""
+_LIMIT_TOLERANCE = 1e-3
+"""Jerks whose states exceed a limit by more are held within it tick by tick [m/s, m/s2]."""
+
+
+@frozen(eq=False)
+class TrackResult:
+    """The plan of one tick."""
+
+    jerk: Array
+    """Jerks (N, 2) from now on [m/s3], within the vehicle's limits; zero unless `usable`."""
+    usable: bool
+    """Whether to drive by `jerk`; otherwise play the rest of the last good one."""
+    iterations: int
+    solve_ms: float
+    """CPU time of the calling thread [ms]."""
+    row_violation: float
+    """Largest violation of a row by the solver's answer, before limits were applied."""
+
+
+def remaining_jerk(jerk: Array, elapsed_ticks: int) -> Array:
+    """Return what is left of a plan's jerks (N, 2) after some ticks: (N - elapsed, 2), a view.
+
+    The fallback when no new plan is usable; when nothing is left, drive by `hold_law`.
+    """
+    return jerk[max(elapsed_ticks, 0) :]
+
+
+@frozen(eq=False)
+class _Path:
+    """What is tracked in this tick."""
+
+    states: Array
+    """(N + 1, 6)."""
+    jerks: Array
+    """(N, 2)."""
+    defect: Array | None
+    """c (N, 3) of the axis along the road; None for zero."""
+
+
+class Tracker:
+    """Tracks a reference; one object per vehicle, not to be shared between threads.
+
+    Equal sequences of calls give bit-identical jerks.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Set up matrices and solver for a scenario's limits, tick and horizon."""
+        n = scenario.tracking.horizon_ticks
+        self._n = n
+        self._tick_s = scenario.runtime.tick_s
+        self._times_s = np.arange(n + 1, dtype=np.float64)
+        self._times_s *= self._tick_s
+        self._axis = axis_matrices(self._tick_s)
+        self._limits = scenario.vehicle
+        self._min_gap_m = scenario.tracking.min_gap_m
+        self._jerk_limits = np.array(
+            [self._limits.max_jerk_mps3, self._limits.max_lateral_jerk_mps3]
+        )
+        self._low, self._high = _Bounds(n), _Bounds(n)
+        self._low.slip_left[:] = self._low.gap[:] = -np.inf
+        self._high.slip_right[:] = np.inf
+        self._high.gap[:] = _FAR_M
+        self._no_gap = True
+        self._qp = QuadraticProgram(
+            _cost(n, self._tick_s),
+            _rows(n, self._tick_s, self._limits.max_slip_ratio),
+            self._low.all,
+            self._high.all,
+            settings=_SETTINGS,
+        )
+
+    def solve(self, state: State, window: Window, ahead: Array | None = None) -> TrackResult:
+        """Return the jerks that bring the vehicle to its reference.
+
+        Args:
+            state: (s, v, a, y, v_y, a_y) now.
+            window: the reference from now on, N + 1 states and N jerks.
+            ahead: predicted rear bumper of the vehicle ahead now and at the next N ticks,
+                (N + 1,) [m]; +inf where there is none. None: no vehicle ahead.
+
+        Raises:
+            ValueError: a shape is wrong, a number is NaN or the state not finite.
+        """
+        start = time.thread_time()
+        states, jerks = window.states, window.jerks
+        if states.shape != (self._n + 1, 6) or jerks.shape != (self._n, 2):
+            raise ValueError(
+                f"window has shapes {states.shape}, {jerks.shape}, not {self._n} ticks"
+            )
+        if not all(map(math.isfinite, state)):
+            raise ValueError(f"state is not finite: {state}")
+        latest = self._latest(ahead)
+        iterations = 0
+        path = self._give_way(state, states, jerks, latest)
+        usable = _is_near(state, path.states[0].tolist())
+        if usable:
+            self._set_bounds(state, path, latest)
+            result = self._solve_program()
+            usable, iterations = result.usable, result.iterations
+        if not usable:
+            path = self._give_way(state, *self._way_back(state, states), latest)
+            self._set_bounds(state, path, latest)
+            np.minimum(self._low.limits, 0.0, out=self._low.limits)
+            np.maximum(self._high.limits, 0.0, out=self._high.limits)
+            result = self._solve_program()
+            usable, iterations = result.usable, iterations + result.iterations
+        if usable:
+            answer = result.x[6 * self._n : 8 * self._n].reshape(-1, 2)
+            jerk = self._limited(state, path.jerks + answer)
+        else:
+            jerk = np.zeros((self._n, 2))
+        elapsed_ms = (time.thread_time() - start) * 1e3
+        return TrackResult(jerk, usable, iterations, elapsed_ms, result.row_violation)
+
+    def _solve_program(self) -> QPResult:
+        self._qp.update(self._low.all, self._high.all)
+        return self._qp.solve()
+
+    def _latest(self, ahead: Array | None) -> Array | None:
+        """Return the furthest that the front bumper may be, (N + 1,) [m]."""
+        if ahead is None:
+            return None
+        if ahead.shape != (self._n + 1,):
+            raise ValueError(f"ahead has shape {ahead.shape}, expected {(self._n + 1,)}")
+        latest: Array = ahead - self._min_gap_m
+        return latest
+
+    def _give_way(self, state: State, states: Array, jerks: Array, latest: Array | None) -> _Path:
+        """Return the reference as it is, or yielding if it violates a gap."""
+        if latest is None or not (states[:, 0] > latest).any():
+            return _Path(states, jerks, None)
+        states, jerks = states.copy(), jerks.copy()
+        yield_behind(state, states, jerks, latest, self._times_s, self._limits)
+        transition, effect = self._axis
+        along = states[:, :3]
+        defect = along[:-1] @ transition.T + jerks[:, :1] * effect[:, 0] - along[1:]
+        return _Path(states, jerks, defect)
+
+    def _set_bounds(self, state: State, path: _Path, latest: Array | None) -> None:
+        """Write all bounds."""
+        states, jerks = path.states, path.jerks
+        low, high, limits = self._low, self._high, self._limits
+        low.dynamics[:] = 0.0
+        if path.defect is not None:
+            low.dynamics[:, :3] -= path.defect
+        if latest is not None:
+            np.subtract(latest[1:], states[1:, 0], out=high.gap)
+            # A gap that even the yielding path cannot keep asks for no more than the path.
+            np.clip(high.gap, 0.0, _FAR_M, out=high.gap)
+            self._no_gap = False
+        elif not self._no_gap:
+            high.gap[:] = _FAR_M
+            self._no_gap = True
+        s, v, a, y, v_y, a_y = states[0].tolist()
+        error = (
+            state[0] - s,
+            state[1] - v,
+            state[2] - a,
+            state[3] - y,
+            state[4] - v_y,
+            state[5] - a_y,
+        )
+        low.dynamics[0] -= integrate(error, (0.0, 0.0), self._tick_s)
+        high.dynamics[:] = low.dynamics
+
+        _, speed, accel, _, slip, lateral_accel = states[1:].T
+        np.subtract(-_SPEED_PLAY_MPS, speed, out=low.speed)
+        np.subtract(limits.max_speed_mps, speed, out=high.speed)
+        np.subtract(limits.min_accel_mps2, accel, out=low.accel)
+        np.subtract(limits.max_accel_mps2, accel, out=high.accel)
+        np.subtract(-limits.max_lateral_accel_mps2, lateral_accel, out=low.lateral_accel)
+        np.subtract(limits.max_lateral_accel_mps2, lateral_accel, out=high.lateral_accel)
+        room = limits.max_slip_ratio * speed
+        room += _SLIP_PLAY_MPS
+        np.subtract(room, slip, out=high.slip_left)
+        np.add(room, slip, out=low.slip_right)
+        np.negative(low.slip_right, out=low.slip_right)
+        np.subtract(self._jerk_limits, jerks, out=high.jerk)
+        np.add(self._jerk_limits, jerks, out=low.jerk)
+        np.negative(low.jerk, out=low.jerk)
+
+    def _way_back(self, state: State, states: Array) -> tuple[Array, Array]:
+        """Return the hold law's way from a state to a reference: states (N + 1, 6), jerks."""
+        way, inputs = [state], []
+        for row in states[:-1].tolist():
+            jerk = hold_law(way[-1], tuple(row), self._limits, self._tick_s)
+            way.append(integrate(way[-1], jerk, self._tick_s))
+            inputs.append(jerk)
+        return np.array(way), np.array(inputs)
+
+    def _limited(self, state: State, jerk: Array) -> Array:
+        """Return jerks (N, 2) that keep the limits exactly, as far as the state allows."""
+        clipped = np.clip(jerk, -self._jerk_limits, self._jerk_limits)
+        if self._excess(state, clipped) <= _LIMIT_TOLERANCE:
+            return clipped
+        now = state
+        for k, (along, across) in enumerate(jerk.tolist()):
+            allowed = limited_jerk(now, (along, across), self._limits, self._tick_s)
+            jerk[k] = allowed
+            now = integrate(now, allowed, self._tick_s)
+        return jerk
+
+    def _excess(self, state: State, jerk: Array) -> float:
+        """Return by how much the states that follow from jerks (N, 2) exceed a limit, at most."""
+        limits, h = self._limits, self._tick_s
+        rate = np.cumsum(jerk, axis=0)
+        rate *= h
+        rate += (state[2], state[5])
+        change = rate - jerk * (h / 2.0)
+        speed = np.cumsum(change, axis=0)
+        speed *= h
+        speed += (state[1], state[4])
+        v, a, a_y = speed[:, 0], rate[:, 0], rate[:, 1]
+        return max(
+            float(a.max()) - limits.max_accel_mps2,
+            limits.min_accel_mps2 - float(a.min()),
+            float(np.abs(a_y).max()) - limits.max_lateral_accel_mps2,
+            float(v.max()) - limits.max_speed_mps,
+            -float(v.min()),
+            float((np.abs(speed[:, 1]) - limits.max_slip_ratio * v).max()),
+        )
+
+
+def _is_near(state: State, reference: list[float]) -> bool:
+    return all(
+        abs(now - wanted) <= most for now, wanted, most in zip(state, reference, _NEAR, strict=True)
+    )
+
+
+class _Bounds:
+    """One bound vector (14 N,) and its blocks, as views."""
+
+    def __init__(self, n: int) -> None:
+        self.all = np.zeros(14 * n)
+        self.dynamics = self.all[: 6 * n].reshape(n, 6)
+        self.speed = self.all[6 * n : 7 * n]
+        self.accel = self.all[7 * n : 8 * n]
+        self.lateral_accel = self.all[8 * n : 9 * n]
+        self.slip_left = self.all[9 * n : 10 * n]
+        self.slip_right = self.all[10 * n : 11 * n]
+        self.jerk = self.all[11 * n : 13 * n].reshape(n, 2)
+        self.limits = self.all[6 * n : 13 * n]
+        self.gap = self.all[13 * n :]
+
+
+def _rows(n: int, h: float, slip: float) -> Any:  # noqa: ANN401 - scipy.sparse has no types
+    """Return A over x = (e_1 .. e_N, w_0 .. w_N-1, g_1 .. g_N), rows in the order of `_Bounds`."""
+    transition, effect = axis_matrices(h)
+    eye = sparse.eye(n)
+    shift = sparse.diags([np.ones(n - 1)], [-1], shape=(n, n))
+    step = sparse.kron(shift, np.kron(np.eye(2), transition)) - sparse.eye(6 * n)
+    drive = sparse.kron(eye, np.kron(np.eye(2), effect))
+
+    def pick(*row: float) -> Any:  # noqa: ANN401
+        return sparse.kron(eye, np.array([row]))
+
+    return sparse.bmat(
+        [
+            [step, drive, None],
+            [pick(0, 1, 0, 0, 0, 0), None, None],
+            [pick(0, 0, 1, 0, 0, 0), None, None],
+            [pick(0, 0, 0, 0, 0, 1), None, None],
+            [pick(0, -slip, 0, 0, 1, 0), None, None],
+            [pick(0, slip, 0, 0, 1, 0), None, None],
+            [None, sparse.eye(2 * n), None],
+            [pick(1, 0, 0, 0, 0, 0), None, -eye],
+        ],
+        format="csc",
+    )
+
+
+def _cost(n: int, h: float) -> Any:  # noqa: ANN401
+    """Return P over the same x."""
+    along, across = np.diag(_WEIGHTS), np.diag(_LATERAL_WEIGHTS)
+    stage = sparse.block_diag([along, across])
+    last = sparse.block_diag([_cost_to_go(along, h), _cost_to_go(across, h)])
+    return sparse.block_diag(
+        [
+            sparse.kron(sparse.eye(n - 1), stage),
+            last,
+            _JERK_WEIGHT * sparse.eye(2 * n),
+            _GAP_WEIGHT * sparse.eye(n),
+        ],
+        format="csc",
+    )
+
+
+def _cost_to_go(weights: Array, h: float) -> Array:
+    """Return the fixed point (3, 3) of the Riccati recursion of one axis."""
+    transition, effect = axis_matrices(h)
+    cost = weights
+    for _ in range(1000):
+        gain = effect.T @ cost @ transition / (_JERK_WEIGHT + effect.T @ cost @ effect)
+        following = weights + transition.T @ cost @ (transition - effect @ gain)
+        if np.abs(following - cost).max() < 1e-9 * np.abs(following).max():
+            break
+        cost = (following + following.T) / 2.0
+    return cost

@@ -1,0 +1,1 @@
+"""Election, formation building, planning, and the coordinator process."""

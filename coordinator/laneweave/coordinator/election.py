@@ -1,0 +1,111 @@
+"""Leader election among coordinator candidates (rule L1).
+
+A candidate leads when it has heard no better-ranked one for the election time and is itself at
+least that old. Candidates are ranked by name. Election gives progress, never safety: two leaders
+at once are harmless, because vehicles promise one ballot at a time.
+"""
+
+from __future__ import annotations
+
+import math
+
+from attrs import define, field
+
+from laneweave.protocol.messages import Heartbeat, Name
+
+
+@define
+class _Peer:
+    incarnation: int
+    heard_s: float
+
+
+@define
+class Election:
+    """What one candidate knows of the others."""
+
+    name: Name
+    incarnation: int
+    election_s: float
+    started_s: float
+    term: int = 0
+    """Highest term seen; the own term while leading."""
+    leading: bool = False
+    link_up: bool = True
+    _peers: dict[str, _Peer] = field(factory=dict)
+    _dead: set[tuple[str, int]] = field(factory=set)
+
+    def on_heartbeat(self, heartbeat: Heartbeat, now_s: float) -> None:
+        """Note that a candidate lives, unless its process is known to be gone.
+
+        A heartbeat that was still in flight when its sender's connection closed must not revive it.
+        """
+        self.see_term(heartbeat.term)
+        if heartbeat.coordinator == self.name:
+            return
+        if (heartbeat.coordinator, heartbeat.incarnation) in self._dead:
+            return
+        known = self._peers.get(heartbeat.coordinator)
+        if known is not None and known.incarnation > heartbeat.incarnation:
+            return
+        self._peers[heartbeat.coordinator] = _Peer(heartbeat.incarnation, now_s)
+
+    def on_token_up(self, coordinator: str, incarnation: int, now_s: float) -> None:
+        """A process is connected (again, if it had only been paused)."""
+        if coordinator == self.name:
+            return
+        self._dead.discard((coordinator, incarnation))
+        known = self._peers.get(coordinator)
+        if known is None or known.incarnation <= incarnation:
+            self._peers[coordinator] = _Peer(incarnation, now_s)
+
+    def on_token_down(self, coordinator: str, incarnation: int) -> None:
+        """A process is gone; forget it at once.
+
+        Losing the own connection makes every token vanish: nothing is concluded from that.
+        """
+        if not self.link_up or coordinator == self.name:
+            return
+        self._dead.add((coordinator, incarnation))
+        known = self._peers.get(coordinator)
+        if known is not None and known.incarnation <= incarnation:
+            del self._peers[coordinator]
+
+    def on_link(self, *, up: bool, now_s: float) -> None:
+        """The own connection was lost or came back: count the own age from here."""
+        self.link_up = up
+        self.started_s = now_s
+
+    def see_term(self, term: int) -> None:
+        """Remember the highest term that anybody showed."""
+        if not self.leading:
+            self.term = max(self.term, term)
+
+    def update(self, now_s: float) -> bool:
+        """Decide whether to lead now; true when this has changed."""
+        rival = any(
+            name < self.name and now_s - peer.heard_s < self.election_s
+            for name, peer in self._peers.items()
+        )
+        lead = self.link_up and not rival and now_s - self.started_s >= self.election_s
+        if lead == self.leading:
+            return False
+        self.leading = lead
+        if lead:
+            self.term += 1
+        return True
+
+    def raise_term(self, above: int) -> None:
+        """Take a term above one that was seen on a vehicle (L3)."""
+        self.term = max(self.term, above + 1)
+
+    def next_change_s(self) -> float:
+        """Return when the next decision may be due without any message."""
+        return min(
+            (
+                peer.heard_s + self.election_s
+                for name, peer in self._peers.items()
+                if name < self.name
+            ),
+            default=math.inf,
+        )

@@ -1,0 +1,34 @@
+"""Target assignment and path planning in the relative coordinate system.
+
+`plan` answers one `PlanRequest`. Where the paper's parts are:
+
+| paper | module |
+|---|---|
+| relative motion modes 1 and 2 | `grid` |
+| conflict model | `conflicts` |
+| formation relative distance, cost matrix C | `frd` |
+| preference matrix P | `preference` |
+| assignments in non-decreasing order of cost | `assignments` |
+| TAPPA, Algorithm 1 | `tappa` |
+| CBSA, Algorithm 2 | `cbs`; as drawn in the case study: `conflict_tree` |
+| SPPA | `diagram` (all shortest paths), `sppa` (the choice among them) |
+| relative path map | `path_map` |
+
+The package is pure: no I/O, no state between calls, and time only through the clock it is given.
+"""
+
+from laneweave.coordinator.planning.facade import plan
+from laneweave.coordinator.planning.frd import Weights
+from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
+from laneweave.coordinator.planning.response import PlanResponse
+from laneweave.coordinator.planning.validate import problems_of_paths, problems_of_response
+
+__all__ = [
+    "PlanRequest",
+    "PlanResponse",
+    "VehicleRequest",
+    "Weights",
+    "plan",
+    "problems_of_paths",
+    "problems_of_response",
+]

@@ -1,0 +1,170 @@
+"""Assignments of vehicles to targets in non-decreasing order of cost (paper, section `candi`).
+
+Murty's method: the set of all assignments is split into parts that are described by a prefix of
+fixed pairs and by forbidden targets for the row after it. Taking the best assignment out of its
+part splits the part again. Each new part differs from its parent in one freed vehicle, so its best
+assignment is found by one shortest augmenting path from the parent's dual variables.
+
+Costs are whole numbers. Among assignments of equal cost the lexicographically smallest vector
+comes first: the cost is extended by the vector read as a number with one digit per vehicle, which
+makes all costs distinct and the order independent of the algorithm.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator, Sequence
+
+import attrs
+
+from laneweave.coordinator.planning.budget import Budget
+from laneweave.coordinator.planning.frd import IntMatrix
+from laneweave.coordinator.planning.preference import BoolMatrix
+
+Row = dict[int, int]
+"""One vehicle's allowed targets and their extended costs."""
+
+
+@attrs.frozen
+class Assignment:
+    """The assignment vector a (0-based targets) and its cost C."""
+
+    targets: tuple[int, ...]
+    cost: int
+
+
+class _Matching:
+    """A minimum-cost matching with the dual variables that prove it to be one.
+
+    The matrix is made square by idle rows that stand for targets left over, at cost 0.
+    """
+
+    def __init__(self, rows: list[int], columns: list[int], u: list[int], v: list[int]) -> None:
+        """Take the target of each row, the row of each target, and both potentials."""
+        self.rows = rows
+        self.columns = columns
+        self.u = u
+        self.v = v
+
+    def copy(self) -> _Matching:
+        """Return an independent copy."""
+        return _Matching(self.rows[:], self.columns[:], self.u[:], self.v[:])
+
+    def augment(self, costs: Sequence[Row], row: int, fixed: int, banned: frozenset[int]) -> bool:
+        """Match the free `row` along a shortest augmenting path; return whether there is one.
+
+        Rows before `fixed` keep their targets; `row` itself must not take a `banned` one.
+        """
+        distance: dict[int, int] = {}
+        reached_from: dict[int, int] = {}
+        done: dict[int, int] = {}
+        heap: list[tuple[int, int]] = []
+        at, travelled = row, 0
+        while True:
+            base = travelled - self.u[at]
+            for j, cost in costs[at].items():
+                if j in done or self._is_fixed(j, fixed) or (at == row and j in banned):
+                    continue
+                length = base + cost - self.v[j]
+                if j not in distance or length < distance[j]:
+                    distance[j] = length
+                    reached_from[j] = at
+                    heapq.heappush(heap, (length, j))
+            while heap and heap[0][1] in done:
+                heapq.heappop(heap)
+            if not heap:
+                return False
+            travelled, column = heapq.heappop(heap)
+            if self.columns[column] < 0:
+                break
+            done[column] = travelled
+            at = self.columns[column]
+        self.u[row] += travelled
+        for j, length in done.items():
+            self.u[self.columns[j]] += travelled - length
+            self.v[j] -= travelled - length
+        while True:
+            at = reached_from[column]
+            self.columns[column] = at
+            self.rows[at], column = column, self.rows[at]
+            if at == row:
+                return True
+
+    def _is_fixed(self, column: int, fixed: int) -> bool:
+        return 0 <= self.columns[column] < fixed
+
+
+@attrs.define(order=True)
+class _Part:
+    """A part of the set of all assignments, ordered by the cost of its best one."""
+
+    key: int
+    matching: _Matching = attrs.field(order=False)
+    fixed: int = attrs.field(order=False)
+    banned: frozenset[int] = attrs.field(order=False)
+
+
+def assignments(
+    costs: IntMatrix, allowed: BoolMatrix, budget: Budget | None = None
+) -> Iterator[Assignment]:
+    """Yield all assignments of allowed pairs, cheapest first, ties in lexicographic order.
+
+    There may be more targets than vehicles. Nothing is computed before it is asked for.
+    """
+    budget = budget or Budget()
+    vehicle_count, target_count = costs.shape
+    if vehicle_count > target_count:
+        return
+    scale = max(target_count, 1) ** vehicle_count
+    rows = _extended_costs(costs, allowed, scale)
+    first = _best(rows, vehicle_count, target_count, budget)
+    heap = [] if first is None else [_Part(_key(rows, first, vehicle_count), first, 0, frozenset())]
+    while heap:
+        part = heapq.heappop(heap)
+        chosen = tuple(part.matching.rows[:vehicle_count])
+        yield Assignment(chosen, part.key // scale)
+        for row in range(part.fixed, vehicle_count):
+            budget.check_time()
+            banned = {chosen[row]} | (part.banned if row == part.fixed else frozenset())
+            child = part.matching.copy()
+            child.columns[chosen[row]] = -1
+            child.rows[row] = -1
+            if child.augment(rows, row, row, frozenset(banned)):
+                key = _key(rows, child, vehicle_count)
+                heapq.heappush(heap, _Part(key, child, row, frozenset(banned)))
+
+
+def _extended_costs(costs: IntMatrix, allowed: BoolMatrix, scale: int) -> list[Row]:
+    """Return the costs with the tie-breaking digits, then a row of zeros per idle target."""
+    vehicle_count, target_count = costs.shape
+    rows = []
+    digit = scale
+    for i in range(vehicle_count):
+        digit //= target_count
+        rows.append(
+            {j: int(costs[i, j]) * scale + j * digit for j in range(target_count) if allowed[i, j]}
+        )
+    idle: Row = dict.fromkeys(range(target_count), 0)
+    return rows + [idle] * (target_count - vehicle_count)
+
+
+def _best(
+    rows: list[Row], vehicle_count: int, target_count: int, budget: Budget
+) -> _Matching | None:
+    """Return the cheapest matching of all rows, or None if some vehicle cannot be served."""
+    none = [-1] * target_count
+    matching = _Matching(none[:], none[:], [0] * target_count, [0] * target_count)
+    for row in range(vehicle_count):
+        budget.check_time()
+        if not matching.augment(rows, row, 0, frozenset()):
+            return None
+    # A target that no vehicle has taken still has potential 0, so an idle row fits it exactly.
+    left_over = (j for j, row in enumerate(matching.columns) if row < 0)
+    for row, j in enumerate(left_over, start=vehicle_count):
+        matching.rows[row] = j
+        matching.columns[j] = row
+    return matching
+
+
+def _key(rows: list[Row], matching: _Matching, vehicle_count: int) -> int:
+    return sum(rows[i][matching.rows[i]] for i in range(vehicle_count))

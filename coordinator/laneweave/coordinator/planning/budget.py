@@ -1,0 +1,41 @@
+"""How long a search may go on."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+Clock = Callable[[], float]
+
+
+class BudgetSpentError(Exception):
+    """The deadline has passed or the node limit is reached; results so far stay valid."""
+
+
+class Budget:
+    """A deadline and a limit on the nodes taken from conflict trees."""
+
+    def __init__(
+        self,
+        *,
+        deadline: float | None = None,
+        max_nodes: int | None = None,
+        clock: Clock = time.monotonic,
+    ) -> None:
+        """Set the limits; `deadline` is a time of `clock`."""
+        self._deadline = deadline
+        self._max_nodes = max_nodes
+        self._clock = clock
+        self.nodes = 0
+
+    def check_time(self) -> None:
+        """Raise `BudgetSpentError` once the deadline has passed."""
+        if self._deadline is not None and self._clock() >= self._deadline:
+            raise BudgetSpentError
+
+    def take_node(self) -> None:
+        """Count one node, or raise `BudgetSpentError` if none is left."""
+        self.check_time()
+        if self._max_nodes is not None and self.nodes >= self._max_nodes:
+            raise BudgetSpentError
+        self.nodes += 1

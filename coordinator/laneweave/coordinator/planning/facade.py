@@ -1,0 +1,108 @@
+"""One call that plans one request."""
+
+from __future__ import annotations
+
+import math
+import time
+from contextlib import suppress
+
+import numpy as np
+
+from laneweave.coordinator.planning.assignments import assignments
+from laneweave.coordinator.planning.budget import Budget, BudgetSpentError, Clock
+from laneweave.coordinator.planning.conflicts import ConflictModel
+from laneweave.coordinator.planning.frd import IntMatrix, Weights, cost_matrix
+from laneweave.coordinator.planning.grid import Cell
+from laneweave.coordinator.planning.incumbent import Solution, tidied
+from laneweave.coordinator.planning.path_map import RelativePathMap
+from laneweave.coordinator.planning.preference import BoolMatrix, preference_matrix
+from laneweave.coordinator.planning.problem import Problem
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.response import PlanResponse, Status
+from laneweave.coordinator.planning.tappa import Tappa
+
+
+def plan(
+    request: PlanRequest,
+    *,
+    max_nodes: int | None = None,
+    weights: Weights | None = None,
+    clock: Clock = time.monotonic,
+) -> PlanResponse:
+    """Plan one request.
+
+    Equal requests get equal plans unless the deadline passes first; `max_nodes` limits the search
+    in a repeatable way. `weights` of the formation relative distance must give a lower bound.
+    """
+    started = clock()
+    weights = (weights or Weights.for_mode(request.mode)).checked(request.mode)
+    budget = Budget(deadline=started + request.deadline_s, max_nodes=max_nodes, clock=clock)
+    problem = Problem(
+        request.grid,
+        request.mode,
+        ConflictModel(request.conflicts),
+        [vehicle.cell for vehicle in request.vehicles],
+        request.targets,
+    )
+    choices = request.choices()
+    tappa: Tappa | None = None
+    best: Solution | None = None
+    with suppress(BudgetSpentError):
+        costs, allowed = matrices(request, weights, choices, budget)
+        tappa = Tappa(problem, assignments(costs, allowed, budget), choices, budget)
+        tappa.run()
+        best = None if tappa.best is None else tidied(problem, tappa.best, budget)
+    finished = tappa is not None and tappa.finished
+    cells = [] if best is None else _cells_of(problem, best)
+    path_map = RelativePathMap.padded([v.id for v in request.vehicles][: len(cells)], cells)
+    bound = 0 if tappa is None else tappa.lower_bound
+    cost = None if best is None else best.cost
+    return PlanResponse(
+        status=_status(found=best is not None, finished=finished),
+        cost=cost,
+        lower_bound=None if math.isinf(bound) else int(bound if cost is None else min(bound, cost)),
+        steps=None if best is None else path_map.steps,
+        assignment=() if best is None else best.assignment,
+        paths=path_map.rows,
+        solve_ms=round(1e3 * (clock() - started), 3),
+        assignments_tried=0 if tappa is None else tappa.tried,
+        nodes_expanded=budget.nodes,
+    )
+
+
+def _status(*, found: bool, finished: bool) -> Status:
+    if found:
+        return "optimal" if finished else "feasible"
+    return "infeasible" if finished else "timeout"
+
+
+def _cells_of(problem: Problem, solution: Solution) -> list[list[Cell]]:
+    """Return the paths as cells, each beginning at the vehicle's start."""
+    table = problem.table
+    return [
+        [table.cell(start), *(table.cell(table.landing(move)) for move in path)]
+        for start, path in zip(problem.starts, solution.paths, strict=True)
+    ]
+
+
+def matrices(
+    request: PlanRequest, weights: Weights, choices: list[frozenset[int]], budget: Budget
+) -> tuple[IntMatrix, BoolMatrix]:
+    """Return the cost matrix C and the preference matrix P of a request.
+
+    Blocked cells may make the way longer than the formation relative distance, or cut it off.
+    Both only sharpen the lower bound: C takes the larger number, P drops unreachable targets.
+    """
+    starts = [vehicle.cell for vehicle in request.vehicles]
+    costs = cost_matrix(starts, request.targets, weights)
+    allowed = preference_matrix(choices, len(request.targets))
+    if request.grid.blocked:
+        for i, start in enumerate(starts):
+            budget.check_time()
+            distances = request.grid.distances(start, request.mode, request.targets)
+            for j, target in enumerate(request.targets):
+                if target in distances:
+                    costs[i, j] = max(costs[i, j], distances[target])
+                else:
+                    allowed[i, j] = np.False_
+    return costs, allowed

@@ -1,0 +1,151 @@
+"""Good path sets early: prioritized planning, improved by large-neighbourhood search.
+
+The conflict trees prove how cheap a plan can be, but may take long to reach their first solution.
+Here vehicles are planned one after the other, each avoiding the paths of those before it; then a
+few vehicles at a time are taken out, perhaps exchange targets, and are planned again. That gives
+an answer when the deadline comes early, and a bound C'* that lets the trees stop early.
+
+All choices are drawn from a fixed seed, so equal problems give equal path sets.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterable, Sequence
+
+import attrs
+
+from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
+from laneweave.coordinator.planning.diagram import Bans, shortest_paths
+from laneweave.coordinator.planning.problem import Problem
+from laneweave.coordinator.planning.sppa import Path, choose_path
+
+_TAKE_OUT_AT_MOST = 4
+
+
+@attrs.frozen
+class Solution:
+    """A conflict-free path set for an assignment."""
+
+    assignment: tuple[int, ...]
+    paths: tuple[Path, ...]
+
+    @property
+    def cost(self) -> int:
+        """Return the cost of the path set."""
+        return sum(len(path) for path in self.paths)
+
+
+class Incumbent:
+    """The best path set found without a proof."""
+
+    def __init__(self, problem: Problem, choices: Sequence[frozenset[int]], budget: Budget) -> None:
+        """Start without a path set; `choices` are the eligible targets of each vehicle."""
+        self.best: Solution | None = None
+        self._problem = problem
+        self._choices = choices
+        self._budget = budget
+        self._random = random.Random(0)  # noqa: S311
+        self._order = list(range(len(choices)))
+
+    def build(self, assignment: Sequence[int]) -> None:
+        """Plan all vehicles one after the other; one that is stuck goes first next time."""
+        stuck, paths = self._plan(self._order, list(assignment), {})
+        if stuck is None:
+            self._keep(assignment, paths)
+            self._random.shuffle(self._order)
+        else:
+            self._order.remove(stuck)
+            self._order.insert(0, stuck)
+
+    def improve(self) -> None:
+        """Take some vehicles out of the best path set and plan them again."""
+        if self.best is None or len(self.best.paths) < 2:
+            return
+        count = len(self.best.paths)
+        size = self._random.randint(2, min(count, _TAKE_OUT_AT_MOST))
+        removed = self._random.sample(range(count), size)
+        assignment = list(self.best.assignment)
+        if self._random.random() < 0.5:
+            self._exchange(assignment, removed)
+        kept = {v: path for v, path in enumerate(self.best.paths) if v not in removed}
+        stuck, paths = self._plan(removed, assignment, kept)
+        if stuck is None:
+            self._keep(assignment, paths)
+
+    def offer(self, solution: Solution) -> None:
+        """Keep a path set found elsewhere if it is better."""
+        if self.best is None or solution.cost < self.best.cost:
+            self.best = solution
+
+    def _keep(self, assignment: Sequence[int], paths: dict[int, Path]) -> None:
+        found = Solution(tuple(assignment), tuple(paths[v] for v in range(len(paths))))
+        if self.best is None or found.cost <= self.best.cost:
+            self.best = found
+
+    def _exchange(self, assignment: list[int], removed: Sequence[int]) -> None:
+        """Exchange the targets of the removed vehicles, if all remain eligible."""
+        targets = [assignment[v] for v in removed]
+        self._random.shuffle(targets)
+        if all(t in self._choices[v] for v, t in zip(removed, targets, strict=True)):
+            for vehicle, target in zip(removed, targets, strict=True):
+                assignment[vehicle] = target
+
+    def _plan(
+        self, order: Iterable[int], assignment: Sequence[int], kept: dict[int, Path]
+    ) -> tuple[int | None, dict[int, Path]]:
+        """Plan the vehicles in this order around the kept paths; return who is stuck, if any."""
+        problem = self._problem
+        table, targets = problem.table, problem.targets
+        paths = dict(kept)
+        for vehicle in order:
+            self._budget.check_time()
+            bans = Bans()
+            for other, path in paths.items():
+                avoid(problem, bans, path, targets[assignment[other]])
+            start, target = problem.starts[vehicle], targets[assignment[vehicle]]
+            diagram = shortest_paths(table, start, target, bans)
+            if diagram is None:
+                return vehicle, paths
+            paths[vehicle] = choose_path(table, diagram, [0] * diagram.cost)
+        return None, paths
+
+
+def avoid(problem: Problem, bans: Bans, path: Path, target: int) -> None:
+    """Add all moves that conflict with a path, and with waiting at its target ever after."""
+    conflicts = problem.table.conflicts
+    for step, move in enumerate(path):
+        bans.at[step] = bans.at.get(step, 0) | conflicts[move]
+    bans.since[len(path)] = bans.since.get(len(path), 0) | conflicts[target]
+
+
+def tidied(problem: Problem, solution: Solution, budget: Budget) -> Solution:
+    """Return the path set without needless moves.
+
+    Each vehicle in turn takes, among its cheapest paths around all others, the one with the
+    fewest moves. Stops when nothing changes any more, or when time is up.
+    """
+    while True:
+        before = solution
+        for vehicle in range(len(solution.paths)):
+            try:
+                budget.check_time()
+            except BudgetSpentError:
+                return solution
+            solution = _tidied_for(problem, solution, vehicle)
+        if solution == before:
+            return solution
+
+
+def _tidied_for(problem: Problem, solution: Solution, vehicle: int) -> Solution:
+    bans = Bans()
+    for other, path in enumerate(solution.paths):
+        if other != vehicle:
+            avoid(problem, bans, path, problem.targets[solution.assignment[other]])
+    target = problem.targets[solution.assignment[vehicle]]
+    diagram = shortest_paths(problem.table, problem.starts[vehicle], target, bans)
+    if diagram is None:
+        return solution
+    path = choose_path(problem.table, diagram, [0] * diagram.cost)
+    paths = (*solution.paths[:vehicle], path, *solution.paths[vehicle + 1 :])
+    return Solution(solution.assignment, paths)

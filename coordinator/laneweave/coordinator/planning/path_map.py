@@ -1,0 +1,81 @@
+"""The relative path map (paper, section `rpp`, table `rpm`).
+
+One row per vehicle, one column per fixed time point: the cells in a column are occupied at the
+same time, so conflicts can be read off two neighbouring columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import combinations
+
+import attrs
+
+from laneweave.coordinator.planning.conflicts import ConflictModel
+from laneweave.coordinator.planning.grid import Cell, Move
+
+
+@attrs.frozen(order=True)
+class FoundConflict:
+    """Two vehicles (rows, from 0) whose moves in a step (from 0) conflict."""
+
+    step: int
+    first: int
+    second: int
+    kind: str
+
+
+@attrs.frozen
+class RelativePathMap:
+    """The cells of all vehicles at all fixed time points."""
+
+    ids: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+
+    @classmethod
+    def padded(cls, ids: Sequence[str], paths: Sequence[Sequence[Cell]]) -> RelativePathMap:
+        """Make a map of paths of different lengths; a vehicle that has arrived stays."""
+        length = max((len(path) for path in paths), default=1)
+        rows = (tuple(path) + (path[-1],) * (length - len(path)) for path in paths)
+        return cls(tuple(ids), tuple(rows))
+
+    @property
+    def steps(self) -> int:
+        """Return the number of steps between the first and the last time point."""
+        return len(self.rows[0]) - 1 if self.rows else 0
+
+    def move(self, row: int, step: int) -> Move:
+        """Return what a vehicle does in a step."""
+        return self.rows[row][step], self.rows[row][step + 1]
+
+    def cost(self) -> int:
+        """Return the sum over vehicles of the number of steps until their final arrival."""
+        return sum(final_arrival(row) for row in self.rows)
+
+    def conflicts(self, model: ConflictModel) -> Iterator[FoundConflict]:
+        """Yield all conflicts, step by step."""
+        for step in range(self.steps):
+            moves = [self.move(row, step) for row in range(len(self.rows))]
+            for i, j in combinations(range(len(moves)), 2):
+                kind = model.kind(moves[i], moves[j])
+                if kind is not None:
+                    yield FoundConflict(step, i, j, kind)
+
+    def __str__(self) -> str:
+        """Return the table as text; columns are headed by the time point, from 1."""
+        cells = [[f"({c},{lane})" for c, lane in row] for row in self.rows]
+        header = ["Vehicle ID", *(f"step {k + 1}" for k in range(self.steps + 1))]
+        table = [header, *([name, *row] for name, row in zip(self.ids, cells, strict=True))]
+        widths = [max(len(line[k]) for line in table) for k in range(len(header))]
+        return "\n".join(
+            "  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip()
+            for line in table
+        )
+
+
+def final_arrival(path: Sequence[Cell]) -> int:
+    """Return the number of steps after which a vehicle never leaves the path's last cell."""
+    steps = len(path) - 1
+    while steps > 0 and path[steps - 1] == path[-1]:
+        steps -= 1
+    return steps

@@ -1,0 +1,234 @@
+"""What is asked of the planner, checked before anything is planned.
+
+The JSON form is fixed (`laneweave.plan.request/1`). Whatever is wrong with a request is reported
+as `BadInputError`, which names the field, the value and what is allowed. Unknown keys are errors,
+too: a misspelt preference must not silently become "any target".
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final
+
+import attrs
+
+from laneweave.coordinator.planning.conflicts import DEFAULT_KINDS, KINDS
+from laneweave.coordinator.planning.fields import (
+    as_cell,
+    as_int,
+    as_list,
+    as_mapping,
+    as_text,
+    require,
+)
+from laneweave.coordinator.planning.grid import Cell, Grid, Mode
+from laneweave.coordinator.planning.preference import eligible_targets
+from laneweave.protocol.errors import BadInputError
+
+REQUEST_SCHEMA: Final = "laneweave.plan.request/1"
+DEFAULT_DEADLINE_S: Final = 4.0
+
+MAX_COLUMNS: Final = 1000
+MAX_LANES: Final = 16
+MAX_VEHICLES: Final = 200
+MAX_TARGETS: Final = 400
+MAX_ID_LENGTH: Final = 100
+MAX_DEADLINE_S: Final = 3600.0
+
+
+@attrs.frozen
+class VehicleRequest:
+    """One vehicle: its start cell, and the lane or the targets (indices) it may be assigned to."""
+
+    id: str
+    cell: Cell
+    lane: int | None = None
+    eligible: tuple[int, ...] | None = None
+
+
+@attrs.frozen
+class PlanRequest:
+    """Vehicles, targets and rules of one planning problem; checked when it is made."""
+
+    grid: Grid
+    mode: Mode
+    conflicts: tuple[str, ...]
+    vehicles: tuple[VehicleRequest, ...]
+    targets: tuple[Cell, ...]
+    deadline_s: float = DEFAULT_DEADLINE_S
+
+    def __attrs_post_init__(self) -> None:
+        """Reject what is inconsistent, however the request was made."""
+        _check_grid(self.grid)
+        if self.mode not in (1, 2):
+            raise BadInputError("mode", self.mode, "1 or 2")
+        _check_conflicts(self.conflicts)
+        _check_targets(self)
+        _check_vehicles(self)
+        if not (math.isfinite(self.deadline_s) and 0 < self.deadline_s <= MAX_DEADLINE_S):
+            allowed = f"a number above 0, at most {MAX_DEADLINE_S:g}"
+            raise BadInputError("deadline_s", self.deadline_s, allowed)
+
+    def choices(self) -> list[frozenset[int]]:
+        """Return, per vehicle, the indices of the targets it may be assigned to."""
+        return [eligible_targets(self.targets, v.lane, v.eligible) for v in self.vehicles]
+
+    @classmethod
+    def from_dict(cls, data: object) -> PlanRequest:
+        """Read the JSON form."""
+        known = ("schema", "grid", "mode", "conflicts", "vehicles", "targets", "deadline_s")
+        fields = as_mapping("request", data, known)
+        require(fields, "", ("schema", "grid", "vehicles", "targets"))
+        if fields["schema"] != REQUEST_SCHEMA:
+            raise BadInputError("schema", fields["schema"], repr(REQUEST_SCHEMA))
+        mode = _read_mode(fields.get("mode", 1))
+        conflicts = DEFAULT_KINDS[mode]
+        if "conflicts" in fields:
+            names = as_list("conflicts", fields["conflicts"], len(KINDS))
+            conflicts = tuple(as_text(f"conflicts[{i}]", name) for i, name in enumerate(names))
+        vehicles = as_list("vehicles", fields["vehicles"], MAX_VEHICLES)
+        targets = as_list("targets", fields["targets"], MAX_TARGETS)
+        return cls(
+            grid=_read_grid(fields["grid"]),
+            mode=mode,
+            conflicts=conflicts,
+            vehicles=tuple(_read_vehicle(f"vehicles[{i}]", v) for i, v in enumerate(vehicles)),
+            targets=tuple(as_cell(f"targets[{i}]", t) for i, t in enumerate(targets)),
+            deadline_s=_read_deadline(fields.get("deadline_s", DEFAULT_DEADLINE_S)),
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON form."""
+        return {
+            "schema": REQUEST_SCHEMA,
+            "grid": {
+                "columns": self.grid.columns,
+                "lanes": self.grid.lanes,
+                "blocked": [list(cell) for cell in sorted(self.grid.blocked)],
+            },
+            "mode": self.mode,
+            "conflicts": list(self.conflicts),
+            "vehicles": [_write_vehicle(vehicle) for vehicle in self.vehicles],
+            "targets": [list(target) for target in self.targets],
+            "deadline_s": self.deadline_s,
+        }
+
+
+def _read_mode(value: object) -> Mode:
+    mode = as_int("mode", value, 1, 2)
+    return 1 if mode == 1 else 2
+
+
+def _read_deadline(value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise BadInputError("deadline_s", value, f"a number above 0, at most {MAX_DEADLINE_S:g}")
+    if isinstance(value, int) and abs(value) > MAX_DEADLINE_S:
+        raise BadInputError("deadline_s", value, f"a number above 0, at most {MAX_DEADLINE_S:g}")
+    return float(value)
+
+
+def _read_grid(value: object) -> Grid:
+    fields = as_mapping("grid", value, ("columns", "lanes", "blocked"))
+    require(fields, "grid", ("columns", "lanes"))
+    columns = as_int("grid.columns", fields["columns"], 1, MAX_COLUMNS)
+    lanes = as_int("grid.lanes", fields["lanes"], 1, MAX_LANES)
+    blocked = as_list("grid.blocked", fields.get("blocked", ()), columns * lanes)
+    cells = [as_cell(f"grid.blocked[{i}]", cell) for i, cell in enumerate(blocked)]
+    for i, cell in enumerate(cells):
+        if not Grid(columns, lanes).contains(cell):
+            raise BadInputError(f"grid.blocked[{i}]", cell, "a cell in the grid")
+        if cell in cells[:i]:
+            raise BadInputError(f"grid.blocked[{i}]", cell, "each cell once")
+    return Grid(columns, lanes, cells)
+
+
+def _read_vehicle(field: str, value: object) -> VehicleRequest:
+    fields = as_mapping(field, value, ("id", "cell", "lane", "eligible"))
+    require(fields, field, ("id", "cell"))
+    lane = as_int(f"{field}.lane", fields["lane"], 0, MAX_LANES - 1) if "lane" in fields else None
+    eligible: tuple[int, ...] | None = None
+    if "eligible" in fields:
+        items = as_list(f"{field}.eligible", fields["eligible"], MAX_TARGETS)
+        eligible = tuple(
+            as_int(f"{field}.eligible[{k}]", item, 0, MAX_TARGETS - 1)
+            for k, item in enumerate(items)
+        )
+    cell = as_cell(f"{field}.cell", fields["cell"])
+    return VehicleRequest(as_text(f"{field}.id", fields["id"]), cell, lane, eligible)
+
+
+def _write_vehicle(vehicle: VehicleRequest) -> dict[str, Any]:
+    written: dict[str, Any] = {"id": vehicle.id, "cell": list(vehicle.cell)}
+    if vehicle.lane is not None:
+        written["lane"] = vehicle.lane
+    if vehicle.eligible is not None:
+        written["eligible"] = list(vehicle.eligible)
+    return written
+
+
+def _check_grid(grid: Grid) -> None:
+    as_int("grid.columns", grid.columns, 1, MAX_COLUMNS)
+    as_int("grid.lanes", grid.lanes, 1, MAX_LANES)
+    for cell in sorted(grid.blocked):
+        if not grid.contains(cell):
+            raise BadInputError("grid.blocked", cell, "cells in the grid")
+
+
+def _check_conflicts(conflicts: Sequence[str]) -> None:
+    for i, kind in enumerate(conflicts):
+        if kind not in KINDS:
+            raise BadInputError(f"conflicts[{i}]", kind, "any of " + ", ".join(KINDS))
+        if kind in conflicts[:i]:
+            raise BadInputError(f"conflicts[{i}]", kind, "each kind once")
+
+
+def _check_cell(field: str, cell: Cell, grid: Grid) -> None:
+    if not grid.contains(cell):
+        allowed = f"column 0 to {grid.columns - 1}, lane 0 to {grid.lanes - 1}"
+        raise BadInputError(field, cell, allowed)
+    if not grid.is_free(cell):
+        raise BadInputError(field, cell, "a cell that is not blocked")
+
+
+def _check_targets(request: PlanRequest) -> None:
+    if not 1 <= len(request.targets) <= MAX_TARGETS:
+        raise BadInputError("targets", len(request.targets), f"1 to {MAX_TARGETS} targets")
+    seen: dict[Cell, int] = {}
+    for i, target in enumerate(request.targets):
+        _check_cell(f"targets[{i}]", target, request.grid)
+        if target in seen:
+            allowed = f"each cell once; it is targets[{seen[target]}], too"
+            raise BadInputError(f"targets[{i}]", target, allowed)
+        seen[target] = i
+
+
+def _check_vehicles(request: PlanRequest) -> None:
+    if not 1 <= len(request.vehicles) <= MAX_VEHICLES:
+        raise BadInputError("vehicles", len(request.vehicles), f"1 to {MAX_VEHICLES} vehicles")
+    ids: dict[str, int] = {}
+    cells: dict[Cell, int] = {}
+    for i, vehicle in enumerate(request.vehicles):
+        field = f"vehicles[{i}]"
+        if not 1 <= len(vehicle.id) <= MAX_ID_LENGTH:
+            raise BadInputError(f"{field}.id", vehicle.id, f"1 to {MAX_ID_LENGTH} characters")
+        if vehicle.id in ids:
+            allowed = f"unique ids; vehicles[{ids[vehicle.id]}] has it, too"
+            raise BadInputError(f"{field}.id", vehicle.id, allowed)
+        _check_cell(f"{field}.cell", vehicle.cell, request.grid)
+        if vehicle.cell in cells:
+            allowed = f"a cell of its own; vehicles[{cells[vehicle.cell]}] is there, too"
+            raise BadInputError(f"{field}.cell", vehicle.cell, allowed)
+        ids[vehicle.id] = cells[vehicle.cell] = i
+        _check_preference(field, vehicle, request)
+
+
+def _check_preference(field: str, vehicle: VehicleRequest, request: PlanRequest) -> None:
+    if vehicle.lane is not None:
+        if vehicle.eligible is not None:
+            raise BadInputError(f"{field}.eligible", vehicle.eligible, "lane or eligible, not both")
+        as_int(f"{field}.lane", vehicle.lane, 0, request.grid.lanes - 1)
+    for k, target in enumerate(vehicle.eligible or ()):
+        as_int(f"{field}.eligible[{k}]", target, 0, len(request.targets) - 1)
+        if target in (vehicle.eligible or ())[:k]:
+            raise BadInputError(f"{field}.eligible[{k}]", target, "each target once")

@@ -1,0 +1,130 @@
+"""TAPPA, the target assignment and path planning algorithm (paper, Algorithm 1).
+
+The paper applies CBSA to one assignment after the other and stops when the next assignment costs
+no less than the best path set. Here the conflict trees of all assignments stay open side by side,
+so that an assignment without a solution cannot hold up the others, and a tree is left alone once
+its lower bound exceeds that of another tree or the cost of the next assignment. "Optimal" is
+claimed when no open tree and no later assignment can be cheaper.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+from laneweave.coordinator.planning.assignments import Assignment
+from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
+from laneweave.coordinator.planning.cbs import ConflictTree
+from laneweave.coordinator.planning.incumbent import Incumbent, Solution
+from laneweave.coordinator.planning.problem import Problem
+from laneweave.coordinator.planning.reachability import explore
+
+_SLICE = 4
+"""Nodes expanded in one tree before the order of trees is looked at again."""
+
+_EXPLORE_AFTER = 128
+_EXPLORE_MOVES = 20_000
+_EXPLORE_GROWTH = 8
+_EXPLORE_TIMES = 3
+"""After so many nodes without a path set, so many joint moves are tried; then more of both."""
+
+_NODES_PER_BUILD = 2
+_NODES_PER_IMPROVEMENT = 4
+
+
+class Tappa:
+    """The state of Algorithm 1.
+
+    best: the best path set P* so far; its cost is C'*.
+    lower_bound: no path set costs less.
+    finished: the search is complete; `best` is optimal, or nothing exists.
+    tried: the assignments A_1 ... A_k whose trees were opened.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        candidates: Iterator[Assignment],
+        choices: Sequence[frozenset[int]],
+        budget: Budget,
+    ) -> None:
+        """Prepare the search; `candidates` are the assignments in order of cost."""
+        self.lower_bound: float = 0
+        self.finished = False
+        self.tried = 0
+        self._problem = problem
+        self._candidates = candidates
+        self._budget = budget
+        self._trees: list[ConflictTree] = []
+        self._incumbent = Incumbent(problem, choices, budget)
+        self._choices = choices
+        self._effort = 0
+        self._explored = 0
+
+    @property
+    def best(self) -> Solution | None:
+        """Return the best path set so far."""
+        return self._incumbent.best
+
+    @property
+    def best_cost(self) -> float:
+        """Return C'*, which is infinite until a path set is found."""
+        return math.inf if self.best is None else self.best.cost
+
+    def run(self) -> None:
+        """Search until the optimum is proven or the budget is spent."""
+        try:
+            self._search()
+        except BudgetSpentError:
+            self.lower_bound = min(self.lower_bound, self.best_cost)
+
+    def _search(self) -> None:
+        upcoming = next(self._candidates, None)
+        while True:
+            next_cost = math.inf if upcoming is None else upcoming.cost
+            self._trees = [t for t in self._trees if t.lower_bound < self.best_cost]
+            tree = min(self._trees, key=lambda t: (t.lower_bound, t.expanded), default=None)
+            tree_bound = math.inf if tree is None else tree.lower_bound
+            self.lower_bound = min(next_cost, tree_bound, self.best_cost)
+            if self.best_cost <= self.lower_bound:
+                self.finished = True
+                return
+            turn = (tree_bound, 0 if tree is None else tree.expanded)
+            if upcoming is not None and (next_cost, _SLICE * len(self._trees)) <= turn:
+                self.tried += 1
+                self._trees.append(ConflictTree(self._problem, upcoming.targets, self._budget))
+                upcoming = next(self._candidates, None)
+            elif tree is not None:
+                node = tree.search(below=self.best_cost, nodes=_SLICE)
+                if node is not None:
+                    self._incumbent.offer(Solution(tree.assignment, node.paths))
+                self._look_for_incumbent()
+                if self.best is None and self._is_impossible():
+                    self.lower_bound = math.inf
+                    self.finished = True
+                    return
+
+    def _look_for_incumbent(self) -> None:
+        """Spend a fixed share of the effort on finding path sets without a proof."""
+        incumbent = self._incumbent
+        while True:
+            step = _NODES_PER_BUILD if incumbent.best is None else _NODES_PER_IMPROVEMENT
+            if self._effort + step > self._budget.nodes or not self._trees:
+                return
+            self._effort += step
+            if incumbent.best is None:
+                tree = self._trees[self._effort // step % len(self._trees)]
+                incumbent.build(tree.assignment)
+            else:
+                incumbent.improve()
+
+    def _is_impossible(self) -> bool:
+        """Now and then, look whether the vehicles can reach their targets at all."""
+        growth = _EXPLORE_GROWTH**self._explored
+        if self._explored == _EXPLORE_TIMES or self._budget.nodes < _EXPLORE_AFTER * growth:
+            return False
+        self._explored += 1
+        verdict = explore(self._problem, self._choices, self._budget, _EXPLORE_MOVES * growth)
+        if verdict.solution is not None:
+            self._incumbent.offer(verdict.solution)
+        return verdict.impossible

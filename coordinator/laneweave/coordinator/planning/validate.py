@@ -1,0 +1,110 @@
+"""Checks a plan against its request, sharing no code with the search.
+
+Only the definition of a conflict is shared, because it is what a plan is checked against. The
+coordinator calls this before a plan is issued, whoever made the plan.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import combinations
+
+from laneweave.coordinator.planning.conflicts import ConflictModel
+from laneweave.coordinator.planning.grid import Cell
+from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
+from laneweave.coordinator.planning.response import PlanResponse
+
+_FAR_APART = 3
+"""Vehicles this many columns or lanes apart cannot touch within one step."""
+
+
+def problems_of_response(request: PlanRequest, response: PlanResponse) -> list[str]:
+    """Return what is wrong with a response; nothing is wrong with one that holds no plan."""
+    if response.status in ("infeasible", "timeout"):
+        empty = not response.paths and not response.assignment and response.cost is None
+        return [] if empty else [f"a plan although the status is {response.status}"]
+    problems = problems_of_paths(request, response.assignment, response.paths)
+    if problems:
+        return problems
+    cost = sum(_steps_until_final_arrival(path) for path in response.paths)
+    if response.cost != cost:
+        problems.append(f"cost {response.cost}, but the paths cost {cost}")
+    if response.steps != len(response.paths[0]) - 1:
+        problems.append(f"steps {response.steps}, but paths of {len(response.paths[0])} cells")
+    if response.lower_bound is None or response.lower_bound > cost:
+        problems.append(f"lower bound {response.lower_bound} above the cost {cost}")
+    if response.status == "optimal" and response.lower_bound != cost:
+        problems.append(f"optimal, but lower bound {response.lower_bound} is not the cost {cost}")
+    return problems
+
+
+def problems_of_paths(
+    request: PlanRequest, assignment: Sequence[int], paths: Sequence[Sequence[Cell]]
+) -> list[str]:
+    """Return what is wrong with a path set; an empty list means that it may be issued."""
+    problems = list(_problems_of_shape(request, assignment, paths))
+    if problems:
+        return problems
+    for i, vehicle in enumerate(request.vehicles):
+        problems += _problems_of_vehicle(request, vehicle, assignment[i], paths[i])
+    for i, j in combinations(range(len(assignment)), 2):
+        if assignment[i] == assignment[j]:
+            ids = f"{request.vehicles[i].id} and {request.vehicles[j].id}"
+            problems.append(f"{ids} are both assigned to target {assignment[i]}")
+    return problems + list(_conflicts(request, paths))
+
+
+def _problems_of_shape(
+    request: PlanRequest, assignment: Sequence[int], paths: Sequence[Sequence[Cell]]
+) -> Iterator[str]:
+    count = len(request.vehicles)
+    if len(assignment) != count or len(paths) != count:
+        yield f"{count} vehicles, but {len(assignment)} targets and {len(paths)} paths"
+    elif len({len(path) for path in paths}) != 1 or not paths[0]:
+        yield f"paths of different lengths: {sorted({len(path) for path in paths})}"
+
+
+def _problems_of_vehicle(
+    request: PlanRequest, vehicle: VehicleRequest, target: int, path: Sequence[Cell]
+) -> Iterator[str]:
+    name, grid = vehicle.id, request.grid
+    if tuple(path[0]) != vehicle.cell:
+        yield f"{name} starts at {path[0]} instead of {vehicle.cell}"
+    for cell in path:
+        inside = 0 <= cell[0] < grid.columns and 0 <= cell[1] < grid.lanes
+        if not inside or tuple(cell) in grid.blocked:
+            yield f"{name} is in {cell}, which is blocked or outside the grid"
+    for step in range(len(path) - 1):
+        columns = abs(path[step][0] - path[step + 1][0])
+        lanes = abs(path[step][1] - path[step + 1][1])
+        if (columns + lanes if request.mode == 1 else max(columns, lanes)) > 1:
+            yield f"{name} jumps from {path[step]} to {path[step + 1]} in step {step}"
+    if not 0 <= target < len(request.targets):
+        yield f"{name} is assigned to target {target}, which does not exist"
+        return
+    cell = request.targets[target]
+    if tuple(path[-1]) != cell:
+        yield f"{name} ends at {path[-1]} instead of {cell}"
+    if vehicle.lane is not None and cell[1] != vehicle.lane:
+        yield f"{name} prefers lane {vehicle.lane} but is assigned to {cell}"
+    if vehicle.eligible is not None and target not in vehicle.eligible:
+        yield f"{name} is assigned to target {target}, which is not eligible"
+
+
+def _conflicts(request: PlanRequest, paths: Sequence[Sequence[Cell]]) -> Iterator[str]:
+    model = ConflictModel(request.conflicts)
+    for (i, a), (j, b) in combinations(enumerate(paths), 2):
+        for step in range(len(a) - 1):
+            if abs(a[step][0] - b[step][0]) >= _FAR_APART:
+                continue
+            if abs(a[step][1] - b[step][1]) >= _FAR_APART:
+                continue
+            kind = model.kind((a[step], a[step + 1]), (b[step], b[step + 1]))
+            if kind is not None:
+                ids = f"{request.vehicles[i].id} and {request.vehicles[j].id}"
+                yield f"{kind} conflict of {ids} in step {step}"
+
+
+def _steps_until_final_arrival(path: Sequence[Cell]) -> int:
+    moves = [k for k in range(1, len(path)) if path[k] != path[k - 1]]
+    return moves[-1] if moves else 0

@@ -1,0 +1,21 @@
+"""The coordinator process over Zenoh."""
+
+from __future__ import annotations
+
+import time
+
+from laneweave.coordinator.core import CoordinatorCore
+from laneweave.protocol.messages import Name
+from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.zenoh_transport import run_core
+
+
+def run_coordinator(scenario: Scenario, name: str) -> None:
+    """Run a coordinator candidate until SIGINT or SIGTERM.
+
+    Raises:
+        BadInputError: nobody answers at the scenario's endpoint.
+    """
+    core = CoordinatorCore(Name(name), time.time_ns(), scenario)
+    network = scenario.network
+    run_core(core, network.endpoint, network.realm, network.lease_s)

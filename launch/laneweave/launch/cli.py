@@ -1,0 +1,304 @@
+"""The command line `laneweave`.
+
+Exit status: 0 done; 1 the run failed or a promise was broken; 2 bad input, with one line on stderr
+that names the field, the value and what is allowed.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from laneweave.launch.logs import log_to_terminal
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario import Scenario, load_scenario
+
+app = typer.Typer(
+    name="laneweave",
+    help="Formation control with lane preference for connected and automated vehicles.",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+MISSING_SIM = "the simulation packages: install laneweave[sim]"
+
+
+class TransportChoice(StrEnum):
+    """How the roles of a run talk to each other."""
+
+    zenoh = "zenoh"
+    simulated = "simulated"
+
+
+class Method(StrEnum):
+    """How vehicles are controlled."""
+
+    formation = "formation"
+
+
+class OutputFormat(StrEnum):
+    """How a plan is printed."""
+
+    json = "json"
+    table = "table"
+
+
+ConfigOption = Annotated[
+    Path | None, typer.Option("--config", metavar="DEPLOYMENT.toml", help="Scenario and network.")
+]
+RealmEndpoint = Annotated[
+    str | None, typer.Option("--endpoint", help="Zenoh endpoint; overrides the configuration.")
+]
+
+
+@app.command()
+def run(
+    scenario: Annotated[
+        Path | None, typer.Argument(metavar="[SCENARIO.toml]", help="Default: the paper's road.")
+    ] = None,
+    volume: Annotated[
+        float | None, typer.Option("--volume", help="Vehicles per lane and hour.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Seed of everything random.")] = None,
+    duration: Annotated[
+        float | None, typer.Option("--duration", help="Seconds during which vehicles arrive.")
+    ] = None,
+    method: Annotated[Method, typer.Option("--method")] = Method.formation,
+    vehicles_per_process: Annotated[
+        int | None, typer.Option("--vehicles-per-process", help="Agents that share a process.")
+    ] = None,
+    coordinators: Annotated[
+        int | None, typer.Option("--coordinators", help="Coordinator candidates.")
+    ] = None,
+    transport: Annotated[TransportChoice, typer.Option("--transport")] = TransportChoice.zenoh,
+    faults: Annotated[
+        Path | None, typer.Option("--faults", metavar="FILE", help="Faults to inject.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Default: a new folder in runs/.")
+    ] = None,
+    pace: Annotated[
+        float | None,
+        typer.Option("--pace", help="Road seconds per second; default: as fast as possible."),
+    ] = None,
+    no_progress: Annotated[bool, typer.Option("--no-progress")] = False,
+) -> None:
+    """Run a scenario on this machine and write its folder."""
+    from laneweave.launch.faults import load_faults
+    from laneweave.launch.local_run import LocalRun, coordinator_names
+    from laneweave.launch.outcome import print_outcome
+    from laneweave.launch.simulated_run import SimulatedRun
+
+    settings = load_scenario(
+        scenario,
+        seed=seed,
+        demand__volume_veh_per_lane_h=volume,
+        demand__duration_s=duration,
+        runtime__vehicles_per_process=vehicles_per_process,
+        runtime__coordinators=coordinators,
+    )
+    if pace is not None and not 0.01 <= pace <= 1000:
+        raise BadInputError("--pace", pace, "[0.01, 1000]")
+    plan_of_faults = load_faults(faults, coordinator_names(settings))
+    folder = _new_folder(out, settings, method.value)
+    show = not no_progress and sys.stderr.isatty()
+    if transport is TransportChoice.simulated:
+        outcome = SimulatedRun(
+            settings, folder, method.value, plan_of_faults, show_progress=show
+        ).run()
+    else:
+        outcome = LocalRun(settings, folder, method.value, plan_of_faults, show, pace).run()
+    if outcome.summary is not None:
+        _draw(folder)
+    print_outcome(outcome, Console())
+    raise typer.Exit(outcome.exit_status)
+
+
+@app.command()
+def plan(
+    request: Annotated[Path, typer.Argument(metavar="REQUEST.json", help="- reads stdin.")],
+    deadline: Annotated[
+        float | None, typer.Option("--deadline", help="Seconds; overrides the request's.")
+    ] = None,
+    connect: Annotated[
+        str | None, typer.Option("--connect", metavar="ENDPOINT", help="Ask a coordinator there.")
+    ] = None,
+    realm: Annotated[str, typer.Option("--realm", help="Realm of that coordinator.")] = "default",
+    output: Annotated[OutputFormat, typer.Option("--format")] = OutputFormat.json,
+) -> None:
+    """Plan one request here, or ask a running coordinator."""
+    from laneweave.launch.plan_command import answer_request
+
+    answer_request(request, deadline, connect, realm, as_table=output is OutputFormat.table)
+
+
+@app.command()
+def router(config: ConfigOption = None, endpoint: RealmEndpoint = None) -> None:
+    """Run the Zenoh router of a deployment."""
+    from laneweave.protocol.zenoh_transport import run_router
+
+    settings = _deployment(config, endpoint)
+    run_router(settings.network.endpoint, settings.network.lease_s)
+
+
+@app.command()
+def ping(config: ConfigOption = None, endpoint: RealmEndpoint = None) -> None:
+    """Open a session at a router and close it: the health check of a deployment."""
+    from laneweave.protocol.zenoh_transport import ZenohTransport
+
+    network = _deployment(config, endpoint).network
+    ZenohTransport(network.endpoint, lambda _: None, network.lease_s).close()
+
+
+@app.command()
+def coordinator(
+    config: ConfigOption = None,
+    endpoint: RealmEndpoint = None,
+    name: Annotated[str, typer.Option("--name", help="Rank: the lowest name leads.")] = "c1",
+) -> None:
+    """Run a coordinator candidate; it also answers plan requests."""
+    from laneweave.coordinator.process import run_coordinator
+    from laneweave.protocol.topics import NAME_PATTERN
+
+    if not NAME_PATTERN.fullmatch(name):
+        raise BadInputError("--name", name, "letters, digits, `_`, `-`, `.`; at most 64")
+    run_coordinator(_deployment(config, endpoint), name)
+
+
+@app.command()
+def agent(
+    vehicles: Annotated[
+        list[str] | None, typer.Argument(metavar="[VEHICLE]...", help="Default: all announced.")
+    ] = None,
+    config: ConfigOption = None,
+    endpoint: RealmEndpoint = None,
+    shard: Annotated[
+        str, typer.Option("--shard", metavar="I/N", help="Take every N-th announced vehicle.")
+    ] = "0/1",
+) -> None:
+    """Run the agents of named vehicles, or of all that are announced."""
+    from laneweave.agents.host import Shard
+    from laneweave.agents.process import run_agents
+
+    settings = _deployment(config, endpoint)
+    if vehicles:
+        run_agents(settings, vehicles)
+        return
+    index, _, count = shard.partition("/")
+    if not (index.isdecimal() and count.isdecimal() and int(index) < int(count)):
+        raise BadInputError("--shard", shard, "I/N with 0 <= I < N")
+    run_agents(settings, (), Shard(int(index), int(count)))
+
+
+@app.command()
+def bridge(
+    config: ConfigOption = None,
+    endpoint: RealmEndpoint = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR")] = None,
+    pace: Annotated[
+        float | None, typer.Option("--pace", help="Road seconds per second; default 1.")
+    ] = 1.0,
+) -> None:
+    """Run the simulated world of a deployment."""
+    from laneweave.sim_bridge.process import run_bridge
+
+    settings = _deployment(config, endpoint)
+    folder = _new_folder(out, settings, Method.formation.value)
+    run_bridge(settings, folder, Method.formation.value, pace)
+    _draw(folder)
+
+
+@app.command()
+def report(
+    folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Folders of runs.")],
+) -> None:
+    """Draw the pictures of finished runs again."""
+    for folder in folders:
+        if not (folder / "trajectories.parquet").is_file():
+            raise BadInputError(
+                "DIR", str(folder), "the folder of a run, with trajectories.parquet"
+            )
+    for folder in folders:
+        _draw(folder)
+        Console().print(f"{folder}: drawn", highlight=False)
+
+
+def _deployment(config: Path | None, endpoint: str | None) -> Scenario:
+    settings = load_scenario(config, network__endpoint=endpoint)
+    if not settings.network.endpoint:
+        raise BadInputError(
+            "network.endpoint", "", "an endpoint, in the configuration or with --endpoint"
+        )
+    return settings
+
+
+def _new_folder(out: Path | None, settings: Scenario, method: str) -> Path:
+    """Return a folder that holds no other run.
+
+    Raises:
+        BadInputError: it does, or it cannot be made.
+    """
+    if out is None:
+        stamp = time.strftime("%Y%m%d-%H%M%S")
+        volume = f"{settings.demand.volume_veh_per_lane_h:g}"
+        base = Path("runs") / f"{method}-{volume}-seed{settings.seed}-{stamp}"
+        out = base
+        copies = 1
+        while out.exists():
+            copies += 1
+            out = base.with_name(f"{base.name}-{copies}")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        if any(out.iterdir()):
+            raise BadInputError("--out", str(out), "a new or empty folder")
+    except OSError as error:
+        raise BadInputError("--out", str(out), f"a folder ({error.strerror})") from error
+    return out
+
+
+def _draw(folder: Path) -> None:
+    from laneweave.launch.figures import road_snapshots, speed_heatmap, travel_time_boxplot
+
+    travel_time_boxplot([folder], folder / "travel_time.png")
+    speed_heatmap(folder, folder / "speed.png")
+    road_snapshots(folder, folder / "road.png")
+
+
+def main() -> None:
+    """Run the command line (entry point of the package)."""
+    sys.exit(_status(sys.argv[1:]))
+
+
+def _status(arguments: list[str]) -> int:
+    log_to_terminal()
+    command = typer.main.get_command(app)
+    try:
+        result: Any = command.main(
+            arguments or ["--help"], prog_name="laneweave", standalone_mode=False
+        )
+    except BadInputError as error:
+        return _refuse(str(error))
+    except (typer.Abort, KeyboardInterrupt):
+        sys.stderr.write("interrupted\n")
+        return 1
+    except typer.TyperException as error:
+        # Unknown options and arguments; the library's own report takes several lines.
+        return _refuse(getattr(error, "format_message", error.__str__)())
+    except BrokenPipeError:
+        return 1
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("laneweave"):
+            raise
+        return _refuse(f"{error.name}: not installed; allowed: {MISSING_SIM}")
+    return result if isinstance(result, int) else 0
+
+
+def _refuse(line: str) -> int:
+    sys.stderr.write(" ".join(line.split()) + "\n")
+    return 2

@@ -1,0 +1,247 @@
+"""A run on this machine: router, coordinators, bridge and agents as processes over Zenoh.
+
+The supervisor starts them, starts an agent for every vehicle that is announced, watches them,
+injects faults, and always cleans up: on success, on failure, on Ctrl-C, and when a process dies.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import tempfile
+import time
+from collections.abc import Iterator
+from multiprocessing.connection import wait as wait_for_sentinels
+from multiprocessing.context import ForkServerProcess
+from pathlib import Path
+
+import attrs
+import structlog
+from attrs import define, field
+
+from laneweave.launch.faults import LEADER, Faults, Kill
+from laneweave.launch.observer import Observer
+from laneweave.launch.outcome import Outcome, complete_summary
+from laneweave.launch.progress import RunProgress
+from laneweave.launch.roles import fork_server, start_role
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario import Scenario, to_tables
+from laneweave.protocol.topics import Keys
+from laneweave.protocol.zenoh_transport import ZenohTransport
+
+log = structlog.get_logger(__name__)
+
+ROUTER_START_S = 20.0
+STALL_S = 90.0
+"""A run whose road clock stands still for this long has failed."""
+FIRST_TICK_S = 60.0
+STOP_S = 5.0
+"""How long processes get to end by themselves."""
+POLL_S = 0.1
+
+
+@define
+class _Failover:
+    killed: str
+    at: float
+
+
+@define
+class LocalRun:
+    """One run under supervision; `run` does it all."""
+
+    scenario: Scenario
+    folder: Path
+    method: str = "formation"
+    faults: Faults = field(factory=Faults)
+    show_progress: bool = True
+    pace: float | None = None
+    _processes: dict[str, ForkServerProcess] = field(factory=dict)
+    _started_agents: set[str] = field(factory=set)
+    _killed: set[str] = field(factory=set)
+    _problems: list[str] = field(factory=list)
+    _recovery_s: list[float] = field(factory=list)
+    _failover: _Failover | None = None
+    _peak: int = 0
+    _stop: bool = False
+
+    def run(self) -> Outcome:
+        """Run the scenario and return what came of it.
+
+        Raises:
+            BadInputError: the environment does not allow the run.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with (
+            tempfile.TemporaryDirectory(prefix="laneweave-") as sockets,
+            self._signals(),
+            RunProgress(self.scenario, show=self.show_progress) as progress,
+        ):
+            network = attrs.evolve(
+                self.scenario.network, endpoint=f"unixsock-stream/{sockets}/router.sock"
+            )
+            self.scenario = attrs.evolve(self.scenario, network=network)
+            try:
+                self._supervise(progress)
+            finally:
+                self._clean_up()
+        return complete_summary(
+            self.folder,
+            problems=self._problems,
+            processes=self._peak,
+            recovery_s=self._recovery_s,
+        )
+
+    # --- supervision --------------------------------------------------------------------------
+
+    def _supervise(self, progress: RunProgress) -> None:
+        context = fork_server()
+        tables = to_tables(self.scenario)
+        options = {"folder": str(self.folder), "method": self.method, "pace": self.pace}
+
+        def start(role: str, name: str, **more: object) -> None:
+            self._processes[name] = start_role(context, role, name, tables, options | more)
+            self._peak = max(self._peak, len(self._processes))
+
+        start("router", "router")
+        observer = Observer(Keys(self.scenario.network.realm))
+        with contextlib.closing(self._connect(observer)) as transport:
+            observer.subscribe(transport)
+            for name in coordinator_names(self.scenario):
+                start("coordinator", name)
+            start("bridge", "bridge")
+            began = advanced = time.monotonic()
+            last_tick = -1
+            while not self._stop and self._processes_fine():
+                observer.wait(POLL_S)
+                view, now = observer.view, time.monotonic()
+                progress.update(view)
+                for group in self._agents_to_start(observer):
+                    start("agent", f"agent-{group[0]}", vehicles=group)
+                self._inject(observer)
+                self._note_recovery(observer, now)
+                if view.clock is not None and view.clock.tick != last_tick:
+                    last_tick, advanced = view.clock.tick, now
+                if now - advanced > (STALL_S if last_tick >= 0 else FIRST_TICK_S):
+                    self._problems.append(
+                        f"the road clock stands still at tick {last_tick} since {now - began:.0f} s"
+                    )
+                    return
+            if self._stop:
+                self._problems.append("interrupted")
+
+    def _connect(self, observer: Observer) -> ZenohTransport:
+        network = self.scenario.network
+        give_up = time.monotonic() + ROUTER_START_S
+        while True:
+            try:
+                return ZenohTransport(network.endpoint, observer.inbox.put, network.lease_s)
+            except BadInputError:
+                router = self._processes["router"]
+                if self._stop or time.monotonic() > give_up or not router.is_alive():
+                    raise
+                time.sleep(0.02)
+
+    def _processes_fine(self) -> bool:
+        """Take note of processes that ended; false when the run is over."""
+        names = {process.sentinel: name for name, process in self._processes.items()}
+        for sentinel in wait_for_sentinels(list(names), timeout=0):
+            assert isinstance(sentinel, int)  # noqa: S101 (narrows the type)
+            name = names[sentinel]
+            process = self._processes.pop(name)
+            process.join()
+            if name == "bridge":
+                if process.exitcode != 0:
+                    self._problems.append(f"the bridge ended with status {process.exitcode}")
+                return False
+            if process.exitcode != 0 and name not in self._killed:
+                self._problems.append(f"{name} ended with status {process.exitcode}")
+                if name == "router":
+                    return False
+        return True
+
+    def _agents_to_start(self, observer: Observer) -> Iterator[list[str]]:
+        """Group announced vehicles whose agents are not started yet."""
+        census, scenario = observer.view.census, self.scenario
+        if census is None:
+            return
+        waiting = [
+            (announced.arrival_s, announced.vehicle)
+            for announced in census.announced
+            if announced.vehicle not in self._started_agents
+        ]
+        per_process = scenario.runtime.vehicles_per_process
+        urgent_s = observer.view.t_s + scenario.runtime.announce_s / 2
+        while waiting and (len(waiting) >= per_process or waiting[0][0] <= urgent_s):
+            group = [str(vehicle) for _, vehicle in waiting[:per_process]]
+            del waiting[:per_process]
+            self._started_agents.update(group)
+            yield group
+
+    # --- faults -------------------------------------------------------------------------------
+
+    def _inject(self, observer: Observer) -> None:
+        due, self.faults = self.faults.due(observer.view.t_s)
+        for kill in due:
+            self._kill(kill, observer)
+
+    def _kill(self, kill: Kill, observer: Observer) -> None:
+        leader = observer.view.leader
+        name = leader if kill.target == LEADER else kill.target
+        process = self._processes.get(name) if name is not None else None
+        if name is None or process is None or process.pid is None:
+            self._problems.append(f"no process to kill for target {kill.target}")
+            return
+        log.warning("killing", target=name, t_s=observer.view.t_s)
+        self._killed.add(name)
+        os.kill(process.pid, signal.SIGKILL)
+        if name == leader:
+            self._failover = _Failover(name, time.monotonic())
+            observer.view.leader = None
+
+    def _note_recovery(self, observer: Observer, now: float) -> None:
+        failover = self._failover
+        if failover is not None and observer.view.leader not in (None, failover.killed):
+            self._recovery_s.append(round(now - failover.at, 4))
+            self._failover = None
+
+    # --- the end ------------------------------------------------------------------------------
+
+    @contextlib.contextmanager
+    def _signals(self) -> Iterator[None]:
+        def stop(_number: int, _frame: object) -> None:
+            self._stop = True
+
+        before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def _clean_up(self) -> None:
+        """End every process: asked first, then killed. The router goes last."""
+        router = self._processes.pop("router", None)
+        _end_all(list(self._processes.values()))
+        self._processes.clear()
+        if router is not None:
+            _end_all([router])
+
+
+def coordinator_names(scenario: Scenario) -> tuple[str, ...]:
+    """Return the names of a scenario's coordinator candidates, best-ranked first."""
+    return tuple(f"c{index + 1}" for index in range(scenario.runtime.coordinators))
+
+
+def _end_all(processes: list[ForkServerProcess]) -> None:
+    for process in processes:
+        process.terminate()
+    deadline = time.monotonic() + STOP_S
+    for process in processes:
+        process.join(max(0.0, deadline - time.monotonic()))
+        if process.is_alive():
+            log.warning("killing a process that did not end", process=process.name)
+            process.kill()
+            process.join(STOP_S)
+        process.close()

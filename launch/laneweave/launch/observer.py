@@ -1,0 +1,79 @@
+"""A node that watches a run: clock, census, leader. It says nothing."""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+from collections.abc import Iterator
+
+from attrs import define, field
+
+from laneweave.protocol.codec import decode
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.messages import Census, Heartbeat, Name, RoadClock
+from laneweave.protocol.topics import CENSUS, CLOCK, HEARTBEAT, Keys
+from laneweave.protocol.transport import Delivery, Received, Transport
+
+TOPICS = (CLOCK, CENSUS, HEARTBEAT)
+
+
+@define
+class View:
+    """What is known of a run."""
+
+    clock: RoadClock | None = None
+    census: Census | None = None
+    leader: Name | None = None
+    term: int = 0
+
+    def take(self, message: object) -> None:
+        """Take a message in; older news than what is known is ignored."""
+        match message:
+            case RoadClock() if self.clock is None or message.tick >= self.clock.tick:
+                self.clock = message
+            case Census() if self.census is None or message.t_s >= self.census.t_s:
+                self.census = message
+            case Heartbeat() if message.leading and message.term >= self.term:
+                self.leader, self.term = message.coordinator, message.term
+            case _:
+                pass
+
+    @property
+    def t_s(self) -> float:
+        """Road time."""
+        return self.clock.t_s if self.clock is not None else 0.0
+
+
+@define
+class Observer:
+    """Fills a view from a transport's deliveries."""
+
+    keys: Keys
+    inbox: queue.SimpleQueue[Delivery] = field(factory=queue.SimpleQueue)
+    view: View = field(factory=View)
+
+    def subscribe(self, transport: Transport) -> None:
+        """Ask for what the view needs."""
+        for topic in TOPICS:
+            transport.subscribe(self.keys.all_of(topic))
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait for news at most this long, then take in all there are."""
+        for message in self._messages(timeout_s):
+            self.view.take(message)
+
+    def _messages(self, timeout_s: float) -> Iterator[object]:
+        try:
+            delivery = self.inbox.get(timeout=timeout_s)
+            while True:
+                with contextlib.suppress(BadInputError):
+                    yield from self._decoded(delivery)
+                delivery = self.inbox.get_nowait()
+        except queue.Empty:
+            return
+
+    def _decoded(self, delivery: Delivery) -> Iterator[object]:
+        if isinstance(delivery, Received):
+            known = self.keys.read(delivery.key)
+            if known is not None and known[0] in TOPICS:
+                yield decode(delivery.payload, known[0].kind)

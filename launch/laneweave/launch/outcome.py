@@ -1,0 +1,145 @@
+"""What came of a run: its summary, completed by what only the launcher knows, and its verdict."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from attrs import frozen
+from rich.console import Console
+from rich.table import Table
+
+
+@frozen
+class Outcome:
+    """A finished run."""
+
+    folder: Path
+    summary: dict[str, Any] | None
+    """As in `summary.json`; None when the run ended before there was one."""
+    problems: tuple[str, ...]
+    """Why it failed; empty: it did not."""
+
+    @property
+    def exit_status(self) -> int:
+        """0: done; 1: the run failed or a promise was broken."""
+        return 1 if self.problems else 0
+
+
+def complete_summary(
+    folder: Path,
+    *,
+    problems: Sequence[str],
+    processes: int,
+    recovery_s: Sequence[float] = (),
+    dropped: int = 0,
+) -> Outcome:
+    """Add the launcher's knowledge to a run's summary and judge the run.
+
+    Args:
+        folder: the run's folder.
+        problems: what went wrong already.
+        processes: most role processes at one time.
+        recovery_s: for each killed leader, wall-clock seconds until another one led.
+        dropped: messages that faults took away.
+    """
+    path = folder / "summary.json"
+    if not path.exists():
+        return Outcome(folder, None, (*problems, "the run left no summary"))
+    summary: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    summary["runtime"]["processes"] = processes
+    summary["messages"]["dropped_by_faults"] = dropped
+    if recovery_s:
+        summary["failover"]["recovery_s"] = list(recovery_s)
+    path.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    return Outcome(folder, summary, (*problems, *_broken_promises(summary)))
+
+
+def _broken_promises(summary: dict[str, Any]) -> list[str]:
+    vehicles, safety = summary["vehicles"], summary["safety"]
+    broken = []
+    if safety["overlaps"]:
+        broken.append(f"{safety['overlaps']} pairs of vehicles overlapped")
+    if vehicles["left"] < vehicles["demanded"]:
+        missing = vehicles["demanded"] - vehicles["left"]
+        broken.append(f"{missing} of {vehicles['demanded']} vehicles did not leave the road")
+    return broken
+
+
+def print_outcome(outcome: Outcome, console: Console) -> None:
+    """Print the table at the end of a run."""
+    summary = outcome.summary
+    if summary is not None:
+        table = Table(title=f"laneweave run: {outcome.folder}", show_header=False)
+        table.add_column()
+        table.add_column(justify="right")
+        for label, value in _rows(summary):
+            table.add_row(label, value)
+        console.print(table)
+    for problem in outcome.problems:
+        console.print(f"FAILED: {problem}", style="bold red", highlight=False)
+
+
+def _rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
+    return [*_traffic_rows(summary), *_control_rows(summary)]
+
+
+def _traffic_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
+    vehicles, safety = summary["vehicles"], summary["safety"]
+    share = vehicles["on_preferred_lane"] / vehicles["left"] if vehicles["left"] else 0.0
+    volume, seed = summary["volume_veh_per_lane_h"], summary["seed"]
+    gap, headway = _text(safety["min_gap_m"]), _text(safety["min_headway_s"])
+    low, high = _text(safety["min_accel_mps2"]), _text(safety["max_accel_mps2"])
+    return [
+        ("demand", f"{volume:g} vehicles/(lane h), seed {seed}"),
+        ("simulated time", f"{summary['simulated_s']:.1f} s"),
+        ("vehicles left / entered", f"{vehicles['left']} / {vehicles['entered']}"),
+        ("most at one time", f"{vehicles['peak']}"),
+        ("on their preferred lane", f"{vehicles['on_preferred_lane']} ({share:.2%})"),
+        (
+            "travel time mean / p95 / max",
+            _join(summary["travel_time_s"], "mean", "p95", "max", unit=" s"),
+        ),
+        ("overlaps", f"{safety['overlaps']} (SUMO reports {safety['sumo_collisions']})"),
+        ("least gap, least headway", f"{gap} m, {headway} s"),
+        ("acceleration", f"{low} to {high} m/s2"),
+    ]
+
+
+def _control_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
+    planning, runtime = summary["planning"], summary["runtime"]
+    failover, largest = summary["failover"], planning["largest_formation"]
+    recoveries = ", ".join(f"{seconds:.3f} s" for seconds in failover["recovery_s"])
+    return [
+        (
+            "plans, proven optimal",
+            f"{planning['plans']}, {planning['optimal']}, up to {largest} vehicles",
+        ),
+        (
+            "planning time p50 / p95 / max",
+            _join(planning["solve_ms"], "p50", "p95", "max", unit=" ms"),
+        ),
+        (
+            "tracking CPU p50 / p99",
+            _join(summary["tracking"]["solve_ms"], "p50", "p99", unit=" ms"),
+        ),
+        ("tick p50 / p99", _join(runtime["tick_ms"], "p50", "p99", unit=" ms")),
+        (
+            "real-time factor",
+            f"{runtime['real_time_factor']:.2f} ({runtime['processes']} processes)",
+        ),
+        (
+            "leader changes",
+            f"{failover['leader_changes']}" + (f" ({recoveries})" if recoveries else ""),
+        ),
+    ]
+
+
+def _join(values: dict[str, Any], *names: str, unit: str) -> str:
+    return " / ".join(_text(values[name]) for name in names) + unit
+
+
+def _text(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"

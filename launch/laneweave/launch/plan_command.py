@@ -1,0 +1,75 @@
+"""`laneweave plan`: one request, planned here or by a running coordinator."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+
+from laneweave.coordinator.planning import PlanRequest, PlanResponse, plan
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.topics import SERVICE, Keys
+from laneweave.protocol.zenoh_transport import ask
+
+ANSWER_MARGIN_S = 5.0
+"""A coordinator gets this much longer than the request's deadline."""
+
+
+def answer_request(
+    path: Path, deadline_s: float | None, endpoint: str | None, realm: str, *, as_table: bool
+) -> None:
+    """Read a request, have it planned, and print the answer.
+
+    Raises:
+        BadInputError: the request cannot be read or is not valid, or nobody answers.
+    """
+    data = _read(path)
+    if deadline_s is not None:
+        data["deadline_s"] = deadline_s
+    request = PlanRequest.from_dict(data)
+    if endpoint is None:
+        response = plan(request)
+    else:
+        response = _ask(endpoint, realm, data, request.deadline_s + ANSWER_MARGIN_S)
+    if as_table:
+        sys.stdout.write(_table(request, response))
+    else:
+        sys.stdout.write(json.dumps(response.to_dict(), indent=2) + "\n")
+
+
+def _table(request: PlanRequest, response: PlanResponse) -> str:
+    verdict = f"{response.status}, cost {response.cost}, lower bound {response.lower_bound}"
+    if not response.paths:
+        return f"{response.status}, lower bound {response.lower_bound}\n"
+    return f"{verdict}, {response.steps} steps\n\n{response.path_map(request)}\n"
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        text = sys.stdin.read() if str(path) == "-" else path.read_text(encoding="utf-8")
+        data = json.loads(text)
+    except OSError as error:
+        raise BadInputError(
+            "REQUEST.json", str(path), f"a readable file ({error.strerror})"
+        ) from error
+    except (ValueError, RecursionError) as error:
+        raise BadInputError("REQUEST.json", str(path), f"valid JSON ({error})") from error
+    if not isinstance(data, dict):
+        raise BadInputError("REQUEST.json", type(data).__name__, "a JSON object")
+    return data
+
+
+def _ask(endpoint: str, realm: str, data: dict[str, Any], timeout_s: float) -> PlanResponse:
+    key = Keys(realm).key(SERVICE)
+    try:
+        payload, ok = ask(endpoint, key, json.dumps(data).encode(), timeout_s)
+    except TimeoutError as error:
+        raise BadInputError(
+            "--connect", endpoint, f"a coordinator that answers ({error})"
+        ) from error
+    answer = json.loads(payload)
+    if not ok:
+        raise BadInputError(answer.get("field") or "request", "refused", answer.get("message", ""))
+    return PlanResponse.from_dict(answer)

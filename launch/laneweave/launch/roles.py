@@ -1,0 +1,120 @@
+"""Starting a role in a process of its own.
+
+Processes come from a fork server that has imported what agents need and opened nothing, so that
+one more vehicle costs a fork and not the start of an interpreter.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import multiprocessing
+import os
+import signal
+import sys
+from collections.abc import Callable
+from multiprocessing.context import ForkServerContext, ForkServerProcess
+from pathlib import Path
+from typing import Any
+
+import structlog
+
+from laneweave.launch.logs import log_to_file
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario import parse_scenario
+
+log = structlog.get_logger(__name__)
+
+PRELOADED = [
+    "laneweave.launch.roles",
+    "laneweave.agents.process",
+    "laneweave.coordinator.process",
+]
+_PR_SET_PDEATHSIG = 1
+
+
+def fork_server() -> ForkServerContext:
+    """Return the context whose processes are forked from a server that is ready to drive.
+
+    Linear algebra in every process stays on one thread: many processes share few cores.
+    """
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(PRELOADED)
+    return context
+
+
+def start_role(
+    context: ForkServerContext,
+    role: str,
+    name: str,
+    tables: dict[str, Any],
+    options: dict[str, Any],
+) -> ForkServerProcess:
+    """Start a role.
+
+    Args:
+        context: of `fork_server`.
+        role: `router`, `coordinator`, `bridge` or `agent`.
+        name: for logs and process lists.
+        tables: the scenario, as `to_tables` gives it.
+        options: what the role needs beside the scenario; `folder` is where its log goes.
+    """
+    process = context.Process(target=run_role, args=(role, name, tables, options), name=name)
+    process.start()
+    return process
+
+
+def run_role(role: str, name: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
+    """Run a role in this process until it ends (the target of `start_role`)."""
+    die_with_parent()
+    log_to_file(Path(options["folder"]) / "log.jsonl", role, name)
+    try:
+        _ROLES[role](name, tables, options)
+    except BadInputError as error:
+        log.error("cannot start", reason=str(error))  # noqa: TRY400 (the line says it all)
+        sys.exit(2)
+    except Exception:
+        log.exception("role failed")
+        sys.exit(1)
+
+
+def die_with_parent() -> None:
+    """Have the kernel end this process when its parent dies, however that dies."""
+    parent = os.getppid()
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+    if os.getppid() != parent:
+        sys.exit(1)
+
+
+def _router(_: str, tables: dict[str, Any], __: dict[str, Any]) -> None:
+    from laneweave.protocol.zenoh_transport import run_router
+
+    network = parse_scenario(tables).network
+    run_router(network.endpoint, network.lease_s)
+
+
+def _coordinator(name: str, tables: dict[str, Any], _: dict[str, Any]) -> None:
+    from laneweave.coordinator.process import run_coordinator
+
+    run_coordinator(parse_scenario(tables), name)
+
+
+def _bridge(_: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
+    from laneweave.sim_bridge.process import run_bridge
+
+    run_bridge(parse_scenario(tables), Path(options["folder"]), options["method"], options["pace"])
+
+
+def _agent(_: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
+    from laneweave.agents.process import run_agents
+
+    run_agents(parse_scenario(tables), options["vehicles"])
+
+
+_ROLES: dict[str, Callable[[str, dict[str, Any], dict[str, Any]], None]] = {
+    "router": _router,
+    "coordinator": _coordinator,
+    "bridge": _bridge,
+    "agent": _agent,
+}

@@ -1,0 +1,1 @@
+"""What every laneweave process shares: lattice, scenario, messages, keys, transport."""

@@ -1,0 +1,92 @@
+"""The lattice: relative coordinate system (RCS) of the paper, Section 2.2.
+
+One endless lattice moves at the formation speed v_F along the road. A cell is (column, lane):
+columns grow forwards, lanes to the left, both may be any integer. Its pitch is d_F along the road
+and the lane width across. All vehicles know it from the shared road clock:
+
+    s(cell, t) = v_F t + column d_F         (front bumper, road start at s = 0)
+    y(cell)    = (lane + 1/2) lane width    (body centre, right road edge at y = 0)
+
+So column c passes the start of the road at t = -c d_F / v_F, and vehicles that enter later have
+smaller columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from attrs import frozen
+
+Cell = tuple[int, int]
+"""(column, lane)."""
+
+Move = tuple[int, Cell, Cell]
+"""(step, from, to): in this step of its plan the vehicle moves to a neighbouring cell."""
+
+
+def footprint(origin: Cell, target: Cell) -> frozenset[Cell]:
+    """Return the cells that a move occupies while it is under way.
+
+    Both end cells and, for an oblique move, both corner cells. A hold (origin equal to target)
+    occupies its own cell.
+    """
+    (column, lane), (to_column, to_lane) = origin, target
+    return frozenset({origin, target, (column, to_lane), (to_column, lane)})
+
+
+def territory(start_cells: Iterable[Cell], moves: Iterable[Move]) -> frozenset[Cell]:
+    """Return every cell that a plan may occupy: its start cells and all footprints of its moves."""
+    cells = set(start_cells)
+    for _, origin, target in moves:
+        cells |= footprint(origin, target)
+    return frozenset(cells)
+
+
+@frozen
+class Lattice:
+    """Geometry of the moving lattice and of the column blocks that formations own.
+
+    Formation number b owns the columns -(b + 1) W + 1 .. -b W for block width W. The number is a
+    pure function of the column and columns are never used twice, so formations never meet.
+    """
+
+    pitch_m: float
+    """Column pitch d_F."""
+    speed_mps: float
+    """Lattice speed v_F."""
+    lane_width_m: float
+    lanes: int
+    block_columns: int
+    """Block width W in columns."""
+
+    def cell_s_m(self, column: int, t_s: float) -> float:
+        """Return the road position of a column at road time `t_s`."""
+        return self.speed_mps * t_s + column * self.pitch_m
+
+    def cell_y_m(self, lane: int) -> float:
+        """Return the lateral position of a lane's centre line."""
+        return (lane + 0.5) * self.lane_width_m
+
+    def passing_time_s(self, column: int, s_m: float = 0.0) -> float:
+        """Return the road time at which a column passes position `s_m`."""
+        return (s_m - column * self.pitch_m) / self.speed_mps
+
+    def block_of(self, column: int) -> int:
+        """Return the number of the formation that owns a column."""
+        return -column // self.block_columns
+
+    def block_range(self, block: int) -> range:
+        """Return the columns of a block in ascending order (rear first)."""
+        return range(-(block + 1) * self.block_columns + 1, -block * self.block_columns + 1)
+
+    def block_cells(self, block: int) -> frozenset[Cell]:
+        """Return all cells of a block: the territory that its formation may use."""
+        return frozenset(
+            (column, lane) for column in self.block_range(block) for lane in range(self.lanes)
+        )
+
+    @staticmethod
+    def interlaced(cell: Cell) -> bool:
+        """Tell whether a cell belongs to the interlaced structure (paper, Fig. on structures)."""
+        column, lane = cell
+        return (column + lane) % 2 == 0

@@ -1,0 +1,252 @@
+"""Every message that travels, with units, sender, rate, and what its loss means.
+
+All are frozen attrs classes; `codec` turns them into MessagePack and back. `t_s` is road time, the
+clock that all vehicles share and that the lattice moves with. A *ballot* names one attempt of one
+leader process to have one plan executed. Field types are checked on receipt, so a core never sees
+a malformed message.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, NewType
+
+from attrs import field, frozen
+
+from laneweave.protocol.lattice import Cell, Move
+
+Name = NewType("Name", str)
+"""Name of a vehicle, coordinator or role: letters, digits, `_`, `-`, `.`; at most 64."""
+
+
+class Ballot(NamedTuple):
+    """(term, coordinator, incarnation, seq), compared in this order.
+
+    Unique for ever: an incarnation is the start time of a coordinator process in ns, and `seq`
+    counts the ballots of that process. It is never used for two plans.
+    """
+
+    term: int
+    coordinator: Name
+    incarnation: int
+    seq: int
+
+
+@frozen
+class Heartbeat:
+    """Coordinator to coordinators and observers, every `network.heartbeat_s`.
+
+    Missing for `network.election_s`: its sender is not a candidate any more. Late or duplicated:
+    harmless, leading twice is safe. From a process whose liveliness token is gone: ignored.
+    """
+
+    coordinator: Name
+    incarnation: int
+    term: int
+    leading: bool
+    formations: int
+    """Plans in force, for observers."""
+
+
+@frozen
+class Prepare:
+    """Leader to each vehicle of the roster that has not promised, every `network.resend_s`.
+
+    Missing: sent again. Duplicated or late: a vehicle that promised this ballot answers with its
+    state again; one that promised a higher ballot ignores it.
+    """
+
+    ballot: Ballot
+    formation: int
+    roster: tuple[Name, ...]
+
+
+@frozen
+class Plan:
+    """Leader to each vehicle of the roster that has not accepted, every `network.resend_s`.
+
+    One and only one per ballot. Missing: sent again; nobody moves before all have it (start gate).
+    Duplicated, late, or from a ballot that is not the promised one: ignored. Dependencies between
+    moves are not sent, they are a pure function of this message (`dependencies`).
+    """
+
+    ballot: Ballot
+    formation: int
+    roster: tuple[Name, ...]
+    incarnations: dict[Name, int]
+    """Incarnation of each vehicle's agent when it promised."""
+    start_cells: dict[Name, Cell]
+    moves: dict[Name, tuple[Move, ...]]
+    """(step, from, to) of each vehicle, steps ascending."""
+    t0_s: float
+    """Road time at which step 0 may begin."""
+    slot_s: float
+    """T_F: step n may begin at t0 + n slot."""
+    territory: tuple[Cell, ...]
+
+
+@frozen
+class VehicleState:
+    """Vehicle to its formation and the coordinators, every tick and at once on every change.
+
+    It is promise, acknowledgement and progress report in one. Missing: whoever waits for it holds
+    its cell. Late or duplicated: harmless, since all it says ("completed k moves of ballot b")
+    stays true. Of another ballot than the receiver's plan: says nothing about this plan.
+    """
+
+    vehicle: Name
+    incarnation: int
+    formation: int
+    promised: Ballot | None
+    accepted: bool
+    """It has the plan of the promised ballot."""
+    ready: bool
+    """Accepted, and not moving or moving in a move of this plan."""
+    completed: int
+    """k: completed moves of the accepted plan."""
+    hold_cell: Cell
+    """Where it holds: its cell, or the target while it moves."""
+    moving: bool
+    go: bool
+    """Its start gate is open."""
+    done: bool
+    """It has completed all moves of the accepted plan."""
+    overdue: bool
+    """Its next move has been due for longer than the leader should accept."""
+    s_m: float
+    y_m: float
+    speed_mps: float
+    t_s: float
+
+
+@frozen
+class Neighbour:
+    """The nearest vehicle ahead in a lane, as local sensing sees it."""
+
+    lane: int
+    gap_m: float
+    """Net bumper-to-bumper distance along the road; negative: side by side."""
+    speed_mps: float
+
+
+@frozen
+class Sense:
+    """Bridge to one vehicle at each tick: what its own sensors and motion controller know.
+
+    Missing: sent again every `network.resend_s` until the tick's deadline; after it the vehicle's
+    last trajectory is continued. Duplicated: answered again, the same way. Older than the newest
+    tick seen: ignored.
+    """
+
+    vehicle: Name
+    tick: int
+    t_s: float
+    state: tuple[float, float, float, float, float, float]
+    """(s m, v m/s, a m/s2, y m, v_y m/s, a_y m/s2); s is the front bumper, y the body centre."""
+    hold_cell: Cell
+    """The cell in which the motion controller will hold when nothing new comes."""
+    motion_end_tick: int
+    """The tick at which the move under way ends; not after `tick`: the vehicle holds."""
+    motion_origin: Cell
+    """Where the move under way began; `hold_cell` when it holds."""
+    preferred_lane: int
+    ahead: tuple[Neighbour, ...]
+    """One for each lane that the body touches or that is next to it, where there is somebody."""
+    left: bool = False
+    """The vehicle has left the road: its agent reports and ends."""
+
+
+@frozen
+class Command:
+    """Vehicle agent to its motion controller (in the bridge), the answer to each `Sense`.
+
+    It holds the whole remaining trajectory: jerks per tick from `tick` on. Missing: the controller
+    plays the trajectory it has and then holds `hold_cell`. Duplicated: no effect. For an older
+    tick than the newest command: ignored.
+    """
+
+    vehicle: Name
+    tick: int
+    hold_cell: Cell
+    motion_end_tick: int
+    motion_origin: Cell
+    jerks: bytes
+    """Little-endian float32 pairs (j_s, j_y) in m/s3, one for each tick of the horizon."""
+
+
+@frozen
+class CensusEntry:
+    """One vehicle on the road, as counted at its start."""
+
+    vehicle: Name
+    cell: Cell
+    """The cell in which it entered; its column tells its formation."""
+    preferred_lane: int
+    entered_s: float
+
+
+@frozen
+class Announcement:
+    """A vehicle that will arrive soon."""
+
+    vehicle: Name
+    lane: int
+    preferred_lane: int
+    arrival_s: float
+
+
+@frozen
+class Census:
+    """Roadside to coordinators and the launcher, on every change and every second of road time.
+
+    It is complete: a vehicle is on the road if and only if it is listed. Missing: the receiver
+    works with the older one, which lacks only the newest vehicles. Older than the newest: ignored.
+    """
+
+    t_s: float
+    on_road: tuple[CensusEntry, ...]
+    announced: tuple[Announcement, ...]
+
+
+@frozen
+class RoadClock:
+    """Bridge to everyone who needs road time and progress, each tick.
+
+    Missing: the receiver's clock stands still, so that nothing new begins. Late: ignored.
+    """
+
+    tick: int
+    t_s: float
+    demanded: int
+    entered: int
+    on_road: int
+    left: int
+    ended: bool
+
+
+@frozen
+class Report:
+    """Any role to the recorder when it ends, and coordinators every few seconds.
+
+    Missing: the summary counts less. Duplicated: the newest of a sender counts.
+    """
+
+    role: Name
+    name: Name
+    published: int
+    rejected: int
+    """Messages that were not well formed."""
+    solves: int = 0
+    unusable: int = 0
+    solve_ms: bytes = b""
+    """Little-endian float32 CPU milliseconds, one for each tracking solve."""
+
+
+@frozen
+class LogEvent:
+    """Any role to the recorder: something worth a line in `events.jsonl`. Missing: not recorded."""
+
+    role: Name
+    name: Name
+    t_s: float
+    kind: Name
+    data: dict[str, Any] = field(factory=dict)

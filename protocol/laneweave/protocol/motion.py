@@ -1,0 +1,154 @@
+"""Motion of one vehicle: exact integration, limits, and the law that brings it to rest in a cell.
+
+State and input of the road model, both axes triple integrators (front bumper s along the road,
+body centre y across it):
+
+    state z = (s, v, a, y, v_y, a_y)        input u = (j_s, j_y), constant during a tick
+
+Everything here is a pure function of plain floats. The agent plans with it, the vehicle's own
+motion controller runs on it when the agent's commands run out, and the plant integrates with it,
+so the three agree to the last bit.
+"""
+
+from __future__ import annotations
+
+import math
+
+from laneweave.protocol.lattice import Cell, Lattice
+from laneweave.protocol.scenario import Vehicle
+
+State = tuple[float, float, float, float, float, float]
+"""(s [m], v [m/s], a [m/s2], y [m], v_y [m/s], a_y [m/s2])."""
+
+Jerk = tuple[float, float]
+"""(j_s, j_y) [m/s3]."""
+
+# Poles of the hold law near -0.6 and -1.2 +- 0.8i 1/s: no overshoot worth mentioning, and slow
+# enough for ticks of 0.1 s.
+_POSITION_GAIN = 0.35
+"""Wanted speed per position error [1/s]."""
+_SPEED_GAIN = 1.2
+"""Wanted acceleration per speed error [1/s]."""
+_ACCEL_GAIN = 3.0
+"""Jerk per acceleration error [1/s]."""
+_BRAKE_SHARE = 0.6
+"""Share of the braking limit that the hold law asks for."""
+_ACCEL_SHARE = 0.8
+"""Share of the other limits that the hold law asks for."""
+_CATCH_UP_SHARE = 0.25
+"""Largest speed towards the cell along the road, as a share of the cell's speed."""
+
+
+def integrate(state: State, jerk: Jerk, tick_s: float) -> State:
+    """Return the state after one tick of constant jerk: the exact solution, no approximation.
+
+    Args:
+        state: (s, v, a, y, v_y, a_y) in m and s.
+        jerk: (j_s, j_y) [m/s3].
+        tick_s: length of the tick [s].
+    """
+    s, v, a, y, v_y, a_y = state
+    j_s, j_y = jerk
+    half = tick_s * tick_s / 2.0
+    sixth = half * tick_s / 3.0
+    return (
+        s + v * tick_s + a * half + j_s * sixth,
+        v + a * tick_s + j_s * half,
+        a + j_s * tick_s,
+        y + v_y * tick_s + a_y * half + j_y * sixth,
+        v_y + a_y * tick_s + j_y * half,
+        a_y + j_y * tick_s,
+    )
+
+
+def cell_state(lattice: Lattice, cell: Cell, t_s: float) -> State:
+    """Return the state of a vehicle that holds `cell` at road time `t_s` [s]."""
+    column, lane = cell
+    return (lattice.cell_s_m(column, t_s), lattice.speed_mps, 0.0, lattice.cell_y_m(lane), 0.0, 0.0)
+
+
+def limited_jerk(state: State, jerk: Jerk, limits: Vehicle, tick_s: float) -> Jerk:
+    """Return the jerk nearest to `jerk` that keeps the vehicle within its limits.
+
+    After the tick the accelerations are within their limits, the speed within [0, max_speed_mps]
+    and |v_y| <= max_slip_ratio v, and all of them can be kept ever after: the speed looks ahead,
+    so braking ends early enough for the acceleration to return to zero before the vehicle would
+    roll backwards. From a state that was reached within the limits this needs no more than the
+    jerk limits. From any other (an emergency brake that was released late) the jerk limit gives
+    way to the speed, and the speed to the acceleration limit.
+
+    Args:
+        state: (s, v, a, y, v_y, a_y) in m and s, finite.
+        jerk: wanted (j_s, j_y) [m/s3]; NaN counts as zero.
+        limits: the vehicle's limits.
+        tick_s: length of the tick [s].
+    """
+    _, v, a, _, v_y, a_y = state
+    ratio, j_max = limits.max_slip_ratio, limits.max_jerk_mps3
+    a_next = a + tick_s * _clamp(jerk[0], -j_max, j_max)
+    a_next = max(a_next, _least_accel(v, a, j_max, tick_s))
+    a_next = min(a_next, -_least_accel(limits.max_speed_mps - v, -a, j_max, tick_s))
+    a_next = _clamp(a_next, limits.min_accel_mps2, limits.max_accel_mps2)
+
+    j_max, a_max = limits.max_lateral_jerk_mps3, limits.max_lateral_accel_mps2
+    ay_next = a_y + tick_s * _clamp(jerk[1], -j_max, j_max)
+    # Room to either side of the slip limit is a speed too: ratio v -+ v_y >= 0.
+    left = _least_accel(ratio * v - v_y, ratio * a - a_y, j_max, tick_s)
+    right = _least_accel(ratio * v + v_y, ratio * a + a_y, j_max, tick_s)
+    ay_next = min(max(ay_next, right - ratio * a_next), ratio * a_next - left)
+    ay_next = _clamp(ay_next, -a_max, a_max)
+    return ((a_next - a) / tick_s, (ay_next - a_y) / tick_s)
+
+
+def hold_law(state: State, reference: State, limits: Vehicle, tick_s: float) -> Jerk:
+    """Return the jerk that brings the vehicle to rest in a cell: a saturated linear feedback.
+
+    Position error asks for a speed, speed error for an acceleration, acceleration error for a
+    jerk; each is saturated before it is passed on. It looks neither ahead nor behind: gaps are
+    the emergency brake's business.
+
+    Args:
+        state: (s, v, a, y, v_y, a_y) in m and s, finite.
+        reference: the cell now, `cell_state(lattice, cell, t_s)`.
+        limits: the vehicle's limits; the result respects them as `limited_jerk` does.
+        tick_s: length of the tick [s].
+    """
+    s, v, a, y, v_y, a_y = state
+    cell_s, cell_v, _, cell_y, _, _ = reference
+    catch_up = _CATCH_UP_SHARE * cell_v
+    headroom = _ACCEL_SHARE * (limits.max_speed_mps - cell_v)
+    wanted_v = cell_v + _clamp(_POSITION_GAIN * (cell_s - s), -catch_up, min(catch_up, headroom))
+    wanted_a = _clamp(
+        _SPEED_GAIN * (wanted_v - v),
+        _BRAKE_SHARE * limits.min_accel_mps2,
+        _ACCEL_SHARE * limits.max_accel_mps2,
+    )
+    slip = _ACCEL_SHARE * limits.max_slip_ratio * max(v, 0.0)
+    wanted_vy = _clamp(_POSITION_GAIN * (cell_y - y), -slip, slip)
+    a_max = _ACCEL_SHARE * limits.max_lateral_accel_mps2
+    wanted_ay = _clamp(_SPEED_GAIN * (wanted_vy - v_y), -a_max, a_max)
+    jerk = (_ACCEL_GAIN * (wanted_a - a), _ACCEL_GAIN * (wanted_ay - a_y))
+    return limited_jerk(state, jerk, limits, tick_s)
+
+
+def _clamp(value: float, low: float, high: float) -> float:
+    """Return `value` within [low, high]; NaN becomes 0."""
+    return 0.0 if math.isnan(value) else min(max(value, low), high)
+
+
+def _least_accel(room: float, rate: float, jerk: float, tick_s: float) -> float:
+    """Return the least rate after this tick from which `room` can be kept >= 0.
+
+    `room` is a speed above its lower bound [m/s] and `rate` its derivative [m/s2]. Raising the
+    rate to zero from -x jerk tick_s, whole ticks at full jerk and a last part tick, costs
+    jerk tick_s^2 / 2 times the linear interpolation of m^2 at x, and this tick costs the mean of
+    both rates. The bound is where both together use up the room:
+
+        x + interp(m^2)(x) = 2 (room + rate tick_s / 2) / (jerk tick_s^2)
+    """
+    step = jerk * tick_s
+    share = (2.0 * room / tick_s + rate) / step
+    if share <= 0.0:
+        return -share * step
+    whole = math.floor((math.sqrt(1.0 + 4.0 * share) - 1.0) / 2.0)
+    return -step * (whole + (share - whole * (whole + 1.0)) / (2.0 * (whole + 1.0)))

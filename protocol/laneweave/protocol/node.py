@@ -1,0 +1,308 @@
+"""Pure cores and the node that drives one over a transport.
+
+A *core* is a state machine without I/O, clock, thread or randomness of its own: `handle` takes an
+event and the time and returns effects; `wakeup_s` says when it wants to be called again. A `Node`
+translates: payloads into typed events, effects into calls of the transport. Malformed input is
+counted and dropped here, so no core ever sees it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any, Protocol
+
+import attrs
+import structlog
+from attrs import field, frozen
+
+from laneweave.protocol.codec import decode, encode
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.messages import Report
+from laneweave.protocol.topics import Keys, Topic
+from laneweave.protocol.transport import (
+    Delivery,
+    LinkDown,
+    LinkUp,
+    Question,
+    Received,
+    TokenDown,
+    TokenUp,
+    Transport,
+)
+
+log = structlog.get_logger(__name__)
+
+
+@frozen
+class Started:
+    """The node is up; the first event of every core."""
+
+
+@frozen
+class Arrived:
+    """A well-formed message."""
+
+    topic: Topic
+    parameters: dict[str, str]
+    message: Any
+
+
+@frozen
+class PeerUp:
+    """A peer's liveliness token appeared."""
+
+    topic: Topic
+    parameters: dict[str, str]
+
+
+@frozen
+class PeerDown:
+    """A peer's liveliness token vanished."""
+
+    topic: Topic
+    parameters: dict[str, str]
+
+
+@frozen
+class Wakeup:
+    """The time that the core asked for has come."""
+
+
+@frozen
+class Computed:
+    """A computation that the core ordered has ended; `error` is set when it raised."""
+
+    job: int
+    result: Any
+    error: str = ""
+
+
+@frozen
+class Asked:
+    """Somebody asks this node's service; answer with `Reply`."""
+
+    token: int
+    payload: bytes
+
+
+@frozen
+class Stopping:
+    """The process was asked to end; the last event of a core."""
+
+
+Event = (
+    Started | Arrived | PeerUp | PeerDown | LinkUp | LinkDown | Wakeup | Computed | Asked | Stopping
+)
+
+
+@frozen
+class Send:
+    """Publish a message."""
+
+    topic: Topic
+    message: Any
+    parameters: dict[str, Any] = field(factory=dict)
+
+
+@frozen
+class Listen:
+    """Subscribe to a topic; parameters that are not given match anything."""
+
+    topic: Topic
+    parameters: dict[str, Any] = field(factory=dict)
+
+
+@frozen
+class Unlisten:
+    """Undo `Listen`."""
+
+    topic: Topic
+    parameters: dict[str, Any] = field(factory=dict)
+
+
+@frozen
+class Announce:
+    """Show a liveliness token."""
+
+    topic: Topic
+    parameters: dict[str, Any] = field(factory=dict)
+
+
+@frozen
+class Withdraw:
+    """Take a liveliness token back."""
+
+    topic: Topic
+    parameters: dict[str, Any] = field(factory=dict)
+
+
+@frozen
+class Watch:
+    """Be told of tokens that appear and vanish."""
+
+    topic: Topic
+    parameters: dict[str, Any] = field(factory=dict)
+
+
+@frozen
+class Serve:
+    """Answer questions on a topic."""
+
+    topic: Topic
+
+
+@frozen
+class Reply:
+    """Answer a question; `ok` false marks an error reply."""
+
+    token: int
+    payload: bytes
+    ok: bool = True
+
+
+@frozen
+class Compute:
+    """Run `work` beside the core; `Computed` brings its result."""
+
+    job: int
+    work: Callable[[], Any]
+
+
+@frozen
+class End:
+    """The core has nothing more to do; the node leaves the network."""
+
+
+Effect = Send | Listen | Unlisten | Announce | Withdraw | Watch | Serve | Reply | Compute | End
+
+
+class Core(Protocol):
+    """A state machine that a node drives."""
+
+    def handle(self, event: Event, now_s: float) -> Iterable[Effect]:
+        """Take one event at a time and return what to do."""
+
+    @property
+    def wakeup_s(self) -> float | None:
+        """When to be called with `Wakeup`, on the clock of `now_s`; None: not by itself."""
+
+
+class Node:
+    """Drives one core over one transport.
+
+    `order_work` takes computations off the node's hands and calls `dispatch(Computed(...))` when
+    one is done.
+    """
+
+    def __init__(
+        self,
+        core: Core,
+        transport: Transport,
+        keys: Keys,
+        order_work: Callable[[Compute], None],
+    ) -> None:
+        """Join a core to its transport; nothing is sent before the first `dispatch`."""
+        self.core = core
+        self.ended = False
+        self.published = 0
+        self.rejected = 0
+        self._transport = transport
+        self._keys = keys
+        self._order_work = order_work
+
+    def deliver(self, delivery: Delivery, now_s: float) -> None:
+        """Translate what the transport hands over and let the core handle it."""
+        event = self._event(delivery)
+        if event is not None:
+            self.dispatch(event, now_s)
+
+    def dispatch(self, event: Event, now_s: float) -> None:
+        """Let the core handle an event and carry out the effects."""
+        if self.ended:
+            return
+        for effect in self.core.handle(event, now_s):
+            self._carry_out(effect)
+
+    def _event(self, delivery: Delivery) -> Event | None:
+        if isinstance(delivery, (LinkUp, LinkDown)):
+            return delivery
+        if isinstance(delivery, Question):
+            return Asked(delivery.token, delivery.payload)
+        known = self._keys.read(delivery.key)
+        if known is None:
+            self._reject(delivery.key, "no such topic")
+            return None
+        topic, parameters = known
+        if isinstance(delivery, TokenUp):
+            return PeerUp(topic, parameters)
+        if isinstance(delivery, TokenDown):
+            return PeerDown(topic, parameters)
+        return self._arrived(topic, parameters, delivery)
+
+    def _arrived(
+        self, topic: Topic, parameters: dict[str, str], received: Received
+    ) -> Arrived | None:
+        if topic.kind is None:
+            self._reject(received.key, "carries no messages")
+            return None
+        try:
+            return Arrived(topic, parameters, decode(received.payload, topic.kind))
+        except BadInputError as error:
+            self._reject(received.key, str(error))
+            return None
+
+    def _reject(self, key: str, reason: str) -> None:
+        self.rejected += 1
+        # One line for the 1st, 10th, 100th, ...: a flood must not fill the log.
+        if self.rejected == 10 ** (len(str(self.rejected)) - 1):
+            log.warning("message ignored", key=key, reason=reason, ignored=self.rejected)
+
+    def _carry_out(self, effect: Effect) -> None:
+        transport = self._transport
+        match effect:
+            case Send(topic, message, parameters):
+                if isinstance(message, Report):
+                    message = attrs.evolve(
+                        message, published=self.published, rejected=self.rejected
+                    )
+                self.published += 1
+                transport.publish(
+                    self._keys.key(topic, **parameters), encode(message), topic.quality
+                )
+            case Compute():
+                self._order_work(effect)
+            case Reply(token, payload, ok):
+                transport.answer(token, payload, ok=ok)
+            case End():
+                self.ended = True
+                transport.close()
+            case _:
+                self._declare(effect)
+
+    def _declare(self, effect: Effect) -> None:
+        transport = self._transport
+        match effect:
+            case Listen(topic, parameters):
+                transport.subscribe(self._expression(topic, parameters))
+            case Unlisten(topic, parameters):
+                transport.unsubscribe(self._expression(topic, parameters))
+            case Announce(topic, parameters):
+                transport.announce(self._keys.key(topic, **parameters))
+            case Withdraw(topic, parameters):
+                transport.withdraw(self._keys.key(topic, **parameters))
+            case Watch(topic, parameters):
+                transport.watch(self._expression(topic, parameters))
+            case Serve(topic):
+                transport.serve(self._keys.key(topic))
+
+    def _expression(self, topic: Topic, parameters: dict[str, Any]) -> str:
+        return self._keys.key(topic, **(dict.fromkeys(topic.parameters, "*") | parameters))
+
+
+def run_job(job: Compute) -> Computed:
+    """Run a computation and wrap its result or its failure."""
+    try:
+        return Computed(job.job, job.work())
+    except Exception as error:
+        log.exception("computation failed", job=job.job)
+        return Computed(job.job, None, f"{type(error).__name__}: {error}")

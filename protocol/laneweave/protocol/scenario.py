@@ -1,0 +1,420 @@
+"""The scenario: one TOML file for world and deployment, read by every role.
+
+Every field has a unit in its name, a default (the paper's value, Table "Simulation parameters",
+where the paper gives one) and a checked range. `load_scenario` checks the fields, then how they
+fit together, and raises `BadInputError` with the field, the value and what is allowed.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import attrs
+from attrs import field, frozen
+
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.lattice import Lattice
+from laneweave.protocol.structuring import structure
+
+SCHEMA = "laneweave.scenario/1"
+
+BASE_CONFLICTS = ("node", "edge", "special-1")
+CONFLICT_KINDS = (
+    "node",
+    "edge",
+    "special-1",
+    "special-2",
+    "special-3",
+    "special-4",
+    "geometric",
+)
+
+Validator = Callable[[Any, "attrs.Attribute[Any]", Any], None]
+
+
+def within(low: float, high: float, *, open_low: bool = False) -> Validator:
+    """Return a validator for a finite number in [low, high], or (low, high] if `open_low`."""
+
+    def check(_: object, attribute: attrs.Attribute[Any], value: float) -> None:
+        if not math.isfinite(value) or value > high or value < low or (open_low and value == low):
+            bracket = "(" if open_low else "["
+            raise BadInputError(attribute.name, value, f"{bracket}{low:g}, {high:g}]")
+
+    return check
+
+
+def one_of(*choices: object) -> Validator:
+    """Return a validator for a fixed set of values."""
+
+    def check(_: object, attribute: attrs.Attribute[Any], value: object) -> None:
+        if value not in choices:
+            raise BadInputError(attribute.name, value, ", ".join(map(str, choices)))
+
+    return check
+
+
+def _conflict_kinds(_: object, attribute: attrs.Attribute[Any], value: Sequence[str]) -> None:
+    for kind in value:
+        if kind not in CONFLICT_KINDS:
+            raise BadInputError(attribute.name, kind, "any of " + ", ".join(CONFLICT_KINDS))
+
+
+@frozen
+class Road:
+    """The road: segments S1 (entry), S2 (driving), S3 (lane sorting); paper, Section 5.2.1."""
+
+    lanes: int = field(default=3, validator=within(1, 8))
+    lane_width_m: float = field(default=3.5, validator=within(2.0, 10.0))
+    s1_m: float = field(default=50.0, validator=within(0.0, 20_000.0))
+    s2_m: float = field(default=350.0, validator=within(0.0, 20_000.0))
+    s3_m: float = field(default=600.0, validator=within(0.0, 20_000.0, open_low=True))
+
+    @property
+    def length_m(self) -> float:
+        """Whole length of the road."""
+        return self.s1_m + self.s2_m + self.s3_m
+
+    @property
+    def sorting_start_m(self) -> float:
+        """Where S3 begins: no lane change before it."""
+        return self.s1_m + self.s2_m
+
+
+@frozen
+class Demand:
+    """Random arrivals: per lane, headway = minimum + exponential, mean 3600 / volume."""
+
+    volume_veh_per_lane_h: float = field(default=1000.0, validator=within(0, 3600, open_low=True))
+    duration_s: float = field(default=300.0, validator=within(0, 86_400, open_low=True))
+    min_headway_s: float = field(default=1.0, validator=within(0.0, 60.0))
+    lane_shares: tuple[float, ...] = ()
+    """Share of vehicles that prefer each lane; empty: all lanes alike."""
+
+
+@frozen
+class FormationSettings:
+    """Formation control parameters d_F, T_F, v_F and the planner's choices."""
+
+    gap_m: float = field(default=15.0, validator=within(1.0, 200.0))
+    """d_F, the column pitch."""
+    cycle_s: float = field(default=4.0, validator=within(0.5, 60.0))
+    """T_F, the time slot of a step."""
+    move_s: float = field(default=3.8, validator=within(0.5, 60.0))
+    """Time that a move takes within its slot; the rest is slack for lost messages."""
+    speed_mps: float = field(default=15.0, validator=within(1.0, 60.0))
+    """v_F, the speed of the lattice."""
+    block_columns: int = field(default=4, validator=within(1, 24))
+    """Width of a formation's block; the interlaced structure puts half of its cells to use."""
+    max_vehicles: int = field(default=6, validator=within(1, 36))
+    """Largest formation (the paper: six)."""
+    mode: int = field(default=1, validator=one_of(1, 2))
+    """Relative motion mode."""
+    conflicts: tuple[str, ...] = field(default=(), validator=_conflict_kinds)
+    """Conflict kinds the planner avoids; empty: the mode's default."""
+    weight_straight: int = field(default=1, validator=one_of(0, 1))
+    """l_s of the formation relative distance."""
+    weight_oblique: int | None = field(default=None, validator=one_of(None, 0, 1, 2))
+    """l_o of the formation relative distance; none: the number of steps of an oblique edge."""
+    planning_deadline_s: float = field(default=4.0, validator=within(0.01, 3600.0))
+    max_nodes: int = field(default=20_000, validator=within(1, 100_000_000))
+    """Bound on search nodes per plan: keeps equal seeds equal whatever the machine's speed."""
+
+    @property
+    def oblique_steps(self) -> int:
+        """Steps that an oblique edge takes: the largest l_o that still is a lower bound."""
+        return 2 if self.mode == 1 else 1
+
+    @property
+    def conflict_kinds(self) -> tuple[str, ...]:
+        """The conflict kinds in force."""
+        if self.conflicts:
+            return self.conflicts
+        return BASE_CONFLICTS if self.mode == 1 else ("geometric",)
+
+
+@frozen
+class Vehicle:
+    """Size and limits of every vehicle."""
+
+    length_m: float = field(default=5.0, validator=within(1.0, 30.0))
+    width_m: float = field(default=1.8, validator=within(0.5, 4.0))
+    max_speed_mps: float = field(default=25.0, validator=within(1.0, 80.0))
+    min_accel_mps2: float = field(default=-10.0, validator=within(-20.0, -0.1))
+    max_accel_mps2: float = field(default=5.0, validator=within(0.1, 20.0))
+    max_jerk_mps3: float = field(default=15.0, validator=within(0.1, 100.0))
+    max_lateral_accel_mps2: float = field(default=3.0, validator=within(0.1, 20.0))
+    max_lateral_jerk_mps3: float = field(default=8.0, validator=within(0.1, 100.0))
+    max_slip_ratio: float = field(default=0.25, validator=within(0.01, 1.0))
+    """Lateral speed is at most this share of the forward speed: no sliding sideways."""
+
+
+@frozen
+class Tracking:
+    """The tracking controller of the lower level."""
+
+    horizon_ticks: int = field(default=40, validator=within(10, 100))
+    min_gap_m: float = field(default=3.0, validator=within(0.0, 100.0))
+    """Net gap to the vehicle ahead that the tracker gives up its reference for."""
+
+
+@frozen
+class Network:
+    """How roles find each other and when they give each other up; wall-clock seconds."""
+
+    realm: str = "default"
+    """First part of every key: deployments with different realms do not see each other."""
+    endpoint: str = ""
+    """Zenoh endpoint of the router; empty: a socket in a temporary folder (`laneweave run`)."""
+    lease_s: float = field(default=0.5, validator=within(0.1, 60.0))
+    """A silent session is given up after this time (Zenoh's transport lease)."""
+    heartbeat_s: float = field(default=0.1, validator=within(0.01, 10.0))
+    election_s: float = field(default=0.4, validator=within(0.05, 60.0))
+    """A candidate leads when it has been the best-ranked one for this long."""
+    resend_s: float = field(default=0.2, validator=within(0.01, 10.0))
+    """PREPARE, PLAN and ticks are sent again after this time without an answer."""
+    stale_s: float = field(default=1.0, validator=within(0.1, 60.0))
+    """A vehicle state older than this is not used for decisions (road seconds)."""
+
+
+@frozen
+class Runtime:
+    """How a run is executed."""
+
+    tick_s: float = field(default=0.1, validator=within(0.01, 1.0))
+    tick_deadline_s: float = field(default=2.0, validator=within(0.02, 60.0))
+    """An agent that has not answered a tick by then is passed over (wall-clock seconds)."""
+    agent_start_s: float = field(default=15.0, validator=within(0.1, 120.0))
+    """How long the entrance waits for a vehicle's agent to come up (wall-clock seconds)."""
+    announce_s: float = field(default=6.0, validator=within(0.0, 600.0))
+    """Arrivals are announced this long ahead, so that their agents are up in time (road s)."""
+    coordinators: int = field(default=3, validator=within(1, 9))
+    vehicles_per_process: int = field(default=1, validator=within(1, 1000))
+    max_road_s: float = field(default=100_000.0, validator=within(1.0, 1e6))
+    """A run that has not ended by this road time is ended and counted as failed."""
+
+
+@frozen
+class Scenario:
+    """Everything a role needs to know."""
+
+    schema: str = field(default=SCHEMA, validator=one_of(SCHEMA))
+    seed: int = field(default=1, validator=within(0, 2**63 - 1))
+    road: Road = Road()
+    demand: Demand = Demand()
+    formation: FormationSettings = FormationSettings()
+    vehicle: Vehicle = Vehicle()
+    tracking: Tracking = Tracking()
+    network: Network = Network()
+    runtime: Runtime = Runtime()
+
+    @property
+    def lattice(self) -> Lattice:
+        """The moving lattice of this scenario."""
+        return Lattice(
+            pitch_m=self.formation.gap_m,
+            speed_mps=self.formation.speed_mps,
+            lane_width_m=self.road.lane_width_m,
+            lanes=self.road.lanes,
+            block_columns=self.formation.block_columns,
+        )
+
+    @property
+    def lane_shares(self) -> tuple[float, ...]:
+        """Share of vehicles that prefer each lane, one number per lane, summing to one."""
+        shares = self.demand.lane_shares or (1.0,) * self.road.lanes
+        total = sum(shares)
+        return tuple(share / total for share in shares)
+
+
+def load_scenario(path: Path | None, **overrides: object) -> Scenario:
+    """Read a scenario and apply overrides such as `seed=3` or `demand__volume_veh_per_lane_h=1600`.
+
+    Args:
+        path: a TOML file; None takes the defaults, which are the paper's scenario.
+        **overrides: values that replace those of the file; `None` leaves the file's value.
+            `table__field` names a field of a table.
+
+    Raises:
+        BadInputError: the file cannot be read, is not TOML, or a value is not acceptable.
+    """
+    data: dict[str, Any] = {}
+    if path is not None:
+        data = read_toml(path)
+    for name, value in overrides.items():
+        if value is None:
+            continue
+        *tables, key = name.split("__")
+        target = data
+        for table in tables:
+            target = target.setdefault(table, {})
+            if not isinstance(target, dict):
+                raise BadInputError(table, target, "a table")
+        target[key] = value
+    return parse_scenario(data)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Raises:
+        BadInputError: the file cannot be read or is not TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise BadInputError("file", str(path), f"a readable file ({error.strerror})") from error
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise BadInputError("file", str(path), f"valid TOML ({error})") from error
+
+
+def parse_scenario(data: Mapping[str, Any]) -> Scenario:
+    """Build a scenario from nested tables and cross-check it.
+
+    Raises:
+        BadInputError: a field is unknown, of the wrong type, out of range, or does not fit others.
+    """
+    scenario = structure(data, Scenario)
+    check_scenario(scenario)
+    return scenario
+
+
+def to_tables(scenario: Scenario) -> dict[str, Any]:
+    """Return nested tables from which `parse_scenario` builds the same scenario."""
+    return attrs.asdict(scenario)
+
+
+def check_scenario(scenario: Scenario) -> None:
+    """Check how the fields fit together.
+
+    Raises:
+        BadInputError: names the first field that does not fit.
+    """
+    _check_lanes(scenario)
+    _check_motion(scenario)
+    _check_conflicts(scenario)
+    _check_timing(scenario)
+
+
+def _require(ok: bool, name: str, value: object, allowed: str) -> None:
+    if not ok:
+        raise BadInputError(name, value, allowed)
+
+
+def _check_lanes(scenario: Scenario) -> None:
+    road, demand, vehicle = scenario.road, scenario.demand, scenario.vehicle
+    shares = demand.lane_shares
+    _require(
+        len(shares) in (0, road.lanes),
+        "demand.lane_shares",
+        list(shares),
+        f"one share for each of the {road.lanes} lanes of road.lanes, or none",
+    )
+    _require(
+        all(math.isfinite(share) and share >= 0 for share in shares)
+        and (not shares or sum(shares) > 0),
+        "demand.lane_shares",
+        list(shares),
+        "finite numbers >= 0, not all 0",
+    )
+    _require(
+        road.lane_width_m > vehicle.width_m,
+        "road.lane_width_m",
+        road.lane_width_m,
+        f"wider than vehicle.width_m = {vehicle.width_m:g}",
+    )
+    _require(
+        3600.0 / demand.volume_veh_per_lane_h >= demand.min_headway_s,
+        "demand.volume_veh_per_lane_h",
+        demand.volume_veh_per_lane_h,
+        f"at most 3600 / demand.min_headway_s = {3600.0 / max(demand.min_headway_s, 1e-9):g}",
+    )
+
+
+def _check_motion(scenario: Scenario) -> None:
+    formation, vehicle, road = scenario.formation, scenario.vehicle, scenario.road
+    _require(
+        formation.gap_m > vehicle.length_m,
+        "formation.gap_m",
+        formation.gap_m,
+        f"longer than vehicle.length_m = {vehicle.length_m:g}",
+    )
+    _require(
+        formation.move_s <= formation.cycle_s,
+        "formation.move_s",
+        formation.move_s,
+        f"at most formation.cycle_s = {formation.cycle_s:g}",
+    )
+    _require(
+        formation.speed_mps < vehicle.max_speed_mps,
+        "formation.speed_mps",
+        formation.speed_mps,
+        f"below vehicle.max_speed_mps = {vehicle.max_speed_mps:g}",
+    )
+    _require(
+        (formation.weight_oblique or 0) <= formation.oblique_steps,
+        "formation.weight_oblique",
+        formation.weight_oblique,
+        "at most 1 in mode 2 (an oblique edge is one step), at most 2 in mode 1",
+    )
+    block_m = (formation.block_columns - 1) * formation.gap_m
+    needed_m = block_m + vehicle.length_m + formation.speed_mps * formation.cycle_s
+    _require(
+        road.s3_m >= needed_m,
+        "road.s3_m",
+        road.s3_m,
+        f"at least {needed_m:g}: a whole formation and one step fit in",
+    )
+
+
+def _check_conflicts(scenario: Scenario) -> None:
+    kinds = set(scenario.formation.conflict_kinds)
+    executable = "geometric" in kinds or (
+        scenario.formation.mode == 1 and set(BASE_CONFLICTS) <= kinds
+    )
+    _require(
+        executable,
+        "formation.conflicts",
+        sorted(kinds),
+        "geometric, or in mode 1 node, edge and special-1: moves of one step must have disjoint "
+        "footprints to be executed without a timetable",
+    )
+
+
+def _check_timing(scenario: Scenario) -> None:
+    network, runtime, formation = scenario.network, scenario.runtime, scenario.formation
+    _require(
+        network.election_s > 2 * network.heartbeat_s,
+        "network.election_s",
+        network.election_s,
+        f"more than twice network.heartbeat_s = {network.heartbeat_s:g}",
+    )
+    _require(
+        network.lease_s > network.heartbeat_s,
+        "network.lease_s",
+        network.lease_s,
+        f"more than network.heartbeat_s = {network.heartbeat_s:g}",
+    )
+    for name, value in (("cycle_s", formation.cycle_s), ("move_s", formation.move_s)):
+        ticks = value / runtime.tick_s
+        _require(
+            ticks >= 2 and abs(ticks - round(ticks)) < 1e-6,
+            f"formation.{name}",
+            value,
+            f"a multiple of runtime.tick_s = {runtime.tick_s:g}, at least twice it",
+        )
+    _require(
+        scenario.tracking.horizon_ticks * runtime.tick_s >= formation.move_s,
+        "tracking.horizon_ticks",
+        scenario.tracking.horizon_ticks,
+        f"long enough to hold a whole move of {formation.move_s:g} s",
+    )
+    _require(
+        runtime.tick_deadline_s > network.resend_s,
+        "runtime.tick_deadline_s",
+        runtime.tick_deadline_s,
+        f"more than network.resend_s = {network.resend_s:g}",
+    )

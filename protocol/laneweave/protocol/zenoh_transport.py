@@ -1,0 +1,332 @@
+"""The transport over Zenoh: the only module that imports zenoh.
+
+Shape: every process is a client of one router, which is a Python process itself. Scouting and
+gossip are off; nothing listens but the router. Callbacks only enqueue. See docs/PROTOCOL.md for
+the settings of each topic and why they are so.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import queue
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import structlog
+import zenoh
+
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.node import (
+    Compute,
+    Computed,
+    Core,
+    Node,
+    Started,
+    Stopping,
+    Wakeup,
+    run_job,
+)
+from laneweave.protocol.topics import Keys, Quality
+from laneweave.protocol.transport import (
+    Deliver,
+    Delivery,
+    LinkDown,
+    LinkUp,
+    Question,
+    Received,
+    TokenDown,
+    TokenUp,
+)
+
+log = structlog.get_logger(__name__)
+
+# Express would send each sample in a packet of its own; with DROP it loses most of a synchronised
+# burst, so it is off everywhere.
+_QUALITY: dict[Quality, dict[str, Any]] = {
+    Quality.LATEST: {
+        "congestion_control": zenoh.CongestionControl.DROP,
+        "priority": zenoh.Priority.DATA,
+        "express": False,
+    },
+    Quality.ASSURED: {
+        "congestion_control": zenoh.CongestionControl.BLOCK,
+        "priority": zenoh.Priority.DATA,
+        "express": False,
+    },
+    Quality.LOCKSTEP: {
+        "congestion_control": zenoh.CongestionControl.BLOCK,
+        "priority": zenoh.Priority.REAL_TIME,
+        "express": False,
+    },
+}
+
+
+def _config(mode: str, lease_s: float) -> zenoh.Config:
+    config = zenoh.Config()
+    for path, value in (
+        ("mode", mode),
+        ("scouting/multicast/enabled", False),
+        ("scouting/gossip/enabled", False),
+        ("transport/link/tx/lease", int(lease_s * 1000)),
+        ("transport/shared_memory/enabled", False),
+    ):
+        config.insert_json5(path, json.dumps(value))
+    return config
+
+
+def check_endpoint(endpoint: str) -> str:
+    """Return the endpoint.
+
+    Raises:
+        BadInputError: it is not of a kind that the Zenoh wheel carries.
+    """
+    if not endpoint.startswith(("unixsock-stream/", "tcp/", "tls/")):
+        raise BadInputError(
+            "network.endpoint", endpoint, "unixsock-stream/PATH, tcp/HOST:PORT or tls/HOST:PORT"
+        )
+    return endpoint
+
+
+class ZenohTransport:
+    """One client session."""
+
+    def __init__(self, endpoint: str, deliver: Deliver, lease_s: float) -> None:
+        """Connect to a router.
+
+        Args:
+            endpoint: Zenoh endpoint of the router.
+            deliver: called from Zenoh's threads with each delivery; must return at once.
+            lease_s: after this time of silence the others give this session up.
+
+        Raises:
+            BadInputError: the endpoint is malformed or nobody answers there.
+        """
+        config = _config("client", lease_s)
+        config.insert_json5("connect/endpoints", json.dumps([check_endpoint(endpoint)]))
+        config.insert_json5(
+            "connect/retry",
+            json.dumps({"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 1.5}),
+        )
+        try:
+            self._session = zenoh.open(config)
+        except zenoh.ZError as error:
+            raise BadInputError(
+                "network.endpoint", endpoint, "the endpoint of a running router"
+            ) from error
+        self._deliver = deliver
+        self._subscriptions: dict[str, Any] = {}
+        self._tokens: dict[str, Any] = {}
+        self._keep: list[Any] = []
+        self._questions: dict[int, zenoh.Query] = {}
+        self._question_lock = threading.Lock()
+        self._question_count = 0
+        self._closed = False
+        self._keep.append(
+            self._session.info.declare_transport_events_listener(self._on_link, history=False)
+        )
+
+    def publish(self, key: str, payload: bytes, quality: Quality) -> None:
+        """Send; silently lost while there is no connection."""
+        with contextlib.suppress(zenoh.ZError):
+            self._session.put(key, payload, **_QUALITY[quality])
+
+    def subscribe(self, key_expression: str) -> None:
+        """Subscribe once; a second call for the same expression does nothing."""
+        if key_expression not in self._subscriptions and not self._closed:
+            self._subscriptions[key_expression] = self._session.declare_subscriber(
+                key_expression, self._on_sample
+            )
+
+    def unsubscribe(self, key_expression: str) -> None:
+        """Undo `subscribe`."""
+        subscription = self._subscriptions.pop(key_expression, None)
+        if subscription is not None:
+            subscription.undeclare()
+
+    def announce(self, key: str) -> None:
+        """Show a liveliness token."""
+        if key not in self._tokens and not self._closed:
+            self._tokens[key] = self._session.liveliness().declare_token(key)
+
+    def withdraw(self, key: str) -> None:
+        """Take a liveliness token back."""
+        token = self._tokens.pop(key, None)
+        if token is not None:
+            token.undeclare()
+
+    def watch(self, key_expression: str) -> None:
+        """Watch liveliness tokens."""
+        self._keep.append(
+            self._session.liveliness().declare_subscriber(
+                key_expression, self._on_token, history=True
+            )
+        )
+
+    def serve(self, key: str) -> None:
+        """Answer queries on a key."""
+        self._keep.append(self._session.declare_queryable(key, self._on_query))
+
+    def answer(self, token: int, payload: bytes, *, ok: bool) -> None:
+        """Answer a query once."""
+        with self._question_lock:
+            query = self._questions.pop(token, None)
+        if query is None:
+            return
+        with contextlib.suppress(zenoh.ZError):
+            if ok:
+                query.reply(query.key_expr, payload)
+            else:
+                query.reply_err(payload)
+            query.drop()  # type: ignore[no-untyped-call]
+
+    def close(self) -> None:
+        """Close the session; without it a callback subscriber hangs the interpreter at exit."""
+        if not self._closed:
+            self._closed = True
+            self._session.close()  # type: ignore[no-untyped-call]
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        self._deliver(Received(str(sample.key_expr), sample.payload.to_bytes()))
+
+    def _on_token(self, sample: zenoh.Sample) -> None:
+        kind = TokenUp if sample.kind == zenoh.SampleKind.PUT else TokenDown
+        self._deliver(kind(str(sample.key_expr)))
+
+    def _on_link(self, event: zenoh.TransportEvent) -> None:
+        self._deliver(LinkUp() if event.kind == zenoh.SampleKind.PUT else LinkDown())
+
+    def _on_query(self, query: zenoh.Query) -> None:
+        with self._question_lock:
+            self._question_count += 1
+            token = self._question_count
+            self._questions[token] = query
+        payload = query.payload.to_bytes() if query.payload is not None else b""
+        self._deliver(Question(str(query.key_expr), payload, token))
+
+
+def run_core(core: Core, endpoint: str, realm: str, lease_s: float) -> None:
+    """Drive a core over Zenoh until it ends or the process gets SIGINT or SIGTERM.
+
+    To be called from the main thread. Computations run one at a time in a thread.
+
+    Raises:
+        BadInputError: nobody answers at the endpoint.
+    """
+    # Enqueuing from callbacks and signal handlers alike: SimpleQueue.put is reentrant.
+    inbox: queue.SimpleQueue[Delivery | Computed | Stopping] = queue.SimpleQueue()
+    transport = ZenohTransport(endpoint, inbox.put, lease_s)
+    worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="compute")
+    node = Node(core, transport, Keys(realm), lambda job: _order(worker, job, inbox.put))
+    with _stop_signals(lambda: inbox.put(Stopping())):
+        try:
+            node.dispatch(Started(), time.monotonic())
+            while not node.ended:
+                _step(node, inbox)
+        finally:
+            transport.close()
+            worker.shutdown(wait=False, cancel_futures=True)
+
+
+def _step(node: Node, inbox: queue.SimpleQueue[Delivery | Computed | Stopping]) -> None:
+    wakeup_s = node.core.wakeup_s
+    timeout_s = 1.0 if wakeup_s is None else min(1.0, max(0.0, wakeup_s - time.monotonic()))
+    try:
+        item = inbox.get(timeout=timeout_s)
+    except queue.Empty:
+        item = None
+    now_s = time.monotonic()
+    if isinstance(item, Stopping):
+        node.dispatch(item, now_s)
+        node.ended = True
+    elif isinstance(item, Computed):
+        node.dispatch(item, now_s)
+    elif item is not None:
+        node.deliver(item, now_s)
+    wakeup_s = node.core.wakeup_s
+    if wakeup_s is not None and wakeup_s <= now_s:
+        node.dispatch(Wakeup(), now_s)
+
+
+def _order(worker: ThreadPoolExecutor, job: Compute, done: Callable[[Computed], None]) -> None:
+    worker.submit(lambda: done(run_job(job)))
+
+
+@contextlib.contextmanager
+def _stop_signals(stop: Callable[[], None]) -> Iterator[None]:
+    def on_signal(number: int, _frame: object) -> None:
+        log.info("stopping", signal=signal.Signals(number).name)
+        stop()
+
+    before = {
+        number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def run_router(endpoint: str, lease_s: float, ready: Callable[[], None] | None = None) -> None:
+    """Run a Zenoh router until SIGINT or SIGTERM.
+
+    Raises:
+        BadInputError: it cannot listen at the endpoint.
+    """
+    config = _config("router", lease_s)
+    config.insert_json5("listen/endpoints", json.dumps([check_endpoint(endpoint)]))
+    stop = threading.Event()
+    with _stop_signals(stop.set):
+        try:
+            session = zenoh.open(config)
+        except zenoh.ZError as error:
+            raise BadInputError(
+                "network.endpoint", endpoint, "an endpoint that is free to listen at"
+            ) from error
+        try:
+            if ready is not None:
+                ready()
+            while not stop.wait(1.0):
+                pass
+        finally:
+            session.close()  # type: ignore[no-untyped-call]
+
+
+def ask(endpoint: str, key: str, payload: bytes, timeout_s: float) -> tuple[bytes, bool]:
+    """Ask a service and wait for one answer.
+
+    Returns:
+        The answer and whether it is a result (true) or an error reply (false).
+
+    Raises:
+        BadInputError: nobody answers at the endpoint, or no service is there.
+        TimeoutError: there is a service but it did not answer in time.
+    """
+    transport = ZenohTransport(endpoint, lambda _: None, lease_s=1.0)
+    try:
+        return transport_ask(transport, key, payload, timeout_s)
+    finally:
+        transport.close()
+
+
+def transport_ask(
+    transport: ZenohTransport, key: str, payload: bytes, timeout_s: float
+) -> tuple[bytes, bool]:
+    """Ask over an open transport; see `ask`."""
+    session = transport._session  # noqa: SLF001 (same module)
+    replies = list(session.get(key, payload=payload, timeout=timeout_s))
+    if not replies:
+        raise BadInputError("connect", key, "a network with a running coordinator")
+    reply = replies[0]
+    if reply.ok is not None:
+        return reply.ok.payload.to_bytes(), True
+    error = reply.err
+    text = error.payload.to_bytes() if error is not None else b""
+    if text == b"Timeout":
+        raise TimeoutError(f"no answer within {timeout_s:g} s")
+    return text, False

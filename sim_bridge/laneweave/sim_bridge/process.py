@@ -1,0 +1,42 @@
+"""The bridge process: SUMO on one side, Zenoh on the other."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from pathlib import Path
+
+from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.zenoh_transport import run_core
+from laneweave.sim_bridge.core import BridgeCore
+from laneweave.sim_bridge.run_record import RunRecord
+from laneweave.sim_bridge.sumo_world import SumoWorld
+
+
+def run_bridge(
+    scenario: Scenario, folder: Path, method: str = "formation", pace: float | None = None
+) -> None:
+    """Run the simulated world until all vehicles have left, or until SIGINT or SIGTERM.
+
+    Args:
+        scenario: road, demand, vehicles, endpoint.
+        folder: where the run's files go.
+        method: how vehicles are controlled, for the summary.
+        pace: road seconds per second; None: as fast as agents answer.
+
+    Raises:
+        BadInputError: nobody answers at the scenario's endpoint.
+        SumoUnavailableError: libsumo cannot be loaded.
+    """
+    record = RunRecord(folder, scenario, method, time.perf_counter)
+    network = scenario.network
+    with (
+        tempfile.TemporaryDirectory(prefix="laneweave-sumo-") as sumo_folder,
+        SumoWorld(scenario, Path(sumo_folder)) as world,
+    ):
+        core = BridgeCore(scenario, world, record, pace=pace)
+        try:
+            run_core(core, network.endpoint, network.realm, network.lease_s)
+        finally:
+            # After an error, too: what was recorded is kept.
+            record.close(core.t_s, interrupted=True)

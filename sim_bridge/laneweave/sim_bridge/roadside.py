@@ -1,0 +1,128 @@
+"""The roadside at the entrance: it meters vehicles in, counts them, and tells who is there.
+
+Its census is complete, which is what lets a coordinator know a roster for certain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from attrs import frozen
+
+from laneweave.protocol.messages import Announcement, Census, CensusEntry, Name, RoadClock
+from laneweave.protocol.scenario import Scenario
+from laneweave.sim_bridge.demand import Arrival, arrivals
+from laneweave.sim_bridge.entry import Admission, EntryMeter
+from laneweave.sim_bridge.traffic import RoadVehicle
+
+
+@frozen
+class Counts:
+    """How many vehicles were demanded (up to now), entered, are on the road, have left."""
+
+    demanded: int
+    entered: int
+    on_road: int
+    left: int
+
+    def clock(self, tick: int, t_s: float, *, ended: bool) -> RoadClock:
+        """Return the clock message of a tick."""
+        return RoadClock(
+            tick=tick,
+            t_s=t_s,
+            demanded=self.demanded,
+            entered=self.entered,
+            on_road=self.on_road,
+            left=self.left,
+            ended=ended,
+        )
+
+
+class Roadside:
+    """Demand, entry metering and census."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Draw the demand of a scenario."""
+        self._announce_s = scenario.runtime.announce_s
+        self._tick_s = scenario.runtime.tick_s
+        self._meter = EntryMeter(scenario.lattice, scenario.formation.max_vehicles)
+        self._arrivals = arrivals(scenario)
+        self._demanded = 0
+        self._queued = 0
+        self._entered = 0
+        self._left = 0
+        self._announced: tuple[Announcement, ...] = ()
+
+    def newly_demanded(self, t_s: float) -> tuple[Arrival, ...]:
+        """Return the vehicles that arrived since the last call."""
+        first = self._demanded
+        while self._demanded < len(self._arrivals) and self._arrivals[self._demanded].t_s <= t_s:
+            self._demanded += 1
+        return self._arrivals[first : self._demanded]
+
+    def admit(self, t_s: float) -> list[Admission]:
+        """Return the vehicles whose cells pass the start of the road up to now."""
+        # Queue those who arrive until the next tick: their cell may pass between two ticks.
+        while (
+            self._queued < len(self._arrivals)
+            and self._arrivals[self._queued].t_s <= t_s + self._tick_s
+        ):
+            self._meter.demand(self._arrivals[self._queued])
+            self._queued += 1
+        admissions = self._meter.admit(t_s)
+        self._entered += len(admissions)
+        return admissions
+
+    def count_left(self) -> None:
+        """Count a vehicle that passed the end of the road."""
+        self._left += 1
+
+    def counts(self, on_road: int) -> Counts:
+        """Return the counts."""
+        return Counts(self._demanded, self._entered, on_road, self._left)
+
+    def exhausted(self, t_s: float) -> bool:
+        """Tell whether nobody waits and nobody will arrive any more."""
+        return (
+            self._queued == len(self._arrivals)
+            and not self._meter.waiting
+            and (not self._arrivals or self._arrivals[-1].t_s <= t_s)
+        )
+
+    def announcements_changed(self, t_s: float) -> bool:
+        """Look who is about to arrive; tell whether that has changed."""
+        before = self._announced
+        self._announced = self._announcements(t_s)
+        return self._announced != before
+
+    def census(self, t_s: float, on_road: Iterable[RoadVehicle]) -> Census:
+        """Return who is on the road and who was announced last."""
+        return Census(
+            t_s=t_s,
+            on_road=tuple(
+                CensusEntry(
+                    vehicle=vehicle.name,
+                    cell=vehicle.admission.cell,
+                    preferred_lane=vehicle.admission.arrival.preferred_lane,
+                    entered_s=vehicle.admission.t_s,
+                )
+                for vehicle in on_road
+            ),
+            announced=self._announced,
+        )
+
+    def _announcements(self, t_s: float) -> tuple[Announcement, ...]:
+        coming = list(self._meter.waiting)
+        for arrival in self._arrivals[self._queued :]:
+            if arrival.t_s > t_s + self._announce_s:
+                break
+            coming.append(arrival)
+        return tuple(
+            Announcement(
+                vehicle=Name(arrival.vehicle),
+                lane=arrival.lane,
+                preferred_lane=arrival.preferred_lane,
+                arrival_s=arrival.t_s,
+            )
+            for arrival in sorted(coming, key=lambda arrival: (arrival.t_s, arrival.vehicle))
+        )

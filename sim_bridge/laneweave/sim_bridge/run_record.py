@@ -1,0 +1,221 @@
+"""What a run leaves behind: the recorder's files plus what all roles reported, in summary.json."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from attrs import define, field
+from numpy.typing import NDArray
+
+from laneweave.protocol.messages import Heartbeat, LogEvent, Name, Report
+from laneweave.protocol.scenario import Scenario
+from laneweave.sim_bridge.demand import Arrival
+from laneweave.sim_bridge.overlap import LeastGaps
+from laneweave.sim_bridge.recorder import Recorder
+from laneweave.sim_bridge.traffic import RoadVehicle
+
+
+@define
+class _Leadership:
+    """Who leads, as heard in heartbeats."""
+
+    leader: tuple[Name, int] | None = None
+    heard_s: float = 0.0
+    changes: int = 0
+    recovery_s: list[float] = field(factory=list)
+
+
+class RunRecord:
+    """Collects a run's measurements and writes its folder."""
+
+    def __init__(
+        self, folder: Path, scenario: Scenario, method: str, stopwatch: Callable[[], float]
+    ) -> None:
+        """Open a run's folder; see `Recorder` for its files."""
+        self.departed: dict[Name, RoadVehicle] = {}
+        self._folder = folder
+        self._scenario = scenario
+        self._method = method
+        self._stopwatch = stopwatch
+        self._began = stopwatch()
+        self._recorder = Recorder(folder, scenario)
+        self._leadership = _Leadership()
+        self._reports: dict[tuple[Name, Name], Report] = {}
+        self._plans: list[dict[str, Any]] = []
+        self._tick_ms: list[float] = []
+        self._agentless_ticks = 0
+        self._closed = False
+
+    # --- what the bridge sees -----------------------------------------------------------------
+
+    def note(self, t_s: float, kind: str, **data: object) -> None:
+        """Write an event of the bridge's own."""
+        if not self._closed:
+            self._recorder.event(t_s, kind, role="bridge", **data)
+
+    def on_demanded(self, arrival: Arrival) -> None:
+        """A vehicle wants to enter."""
+        self._recorder.demanded(arrival)
+
+    def on_entered(self, vehicle: RoadVehicle) -> None:
+        """A vehicle entered the road."""
+        admission = vehicle.admission
+        number = self._scenario.lattice.block_of(admission.cell[0])
+        self._recorder.entered(vehicle.name, admission.t_s, number)
+        self.note(
+            admission.t_s,
+            "entered",
+            vehicle=vehicle.name,
+            lane=admission.arrival.lane,
+            preferred_lane=admission.arrival.preferred_lane,
+            formation=number,
+        )
+
+    def on_left(self, vehicle: RoadVehicle, t_s: float) -> None:
+        """A vehicle passed the end of the road since the last tick."""
+        s_m, v_mps, _, y_m, _, _ = vehicle.state
+        beyond_m = s_m - self._scenario.road.length_m
+        left_s = t_s - beyond_m / v_mps if v_mps > 0 else t_s
+        lane = int(y_m // self._scenario.road.lane_width_m)
+        self._recorder.left(vehicle.name, left_s, lane)
+        self.departed[vehicle.name] = vehicle
+        self._agentless_ticks += vehicle.controller.played_from_hold
+        self.note(
+            left_s,
+            "left",
+            vehicle=vehicle.name,
+            lane=lane,
+            on_preferred_lane=lane == vehicle.admission.arrival.preferred_lane,
+        )
+
+    def on_still_on_road(self, vehicle: RoadVehicle) -> None:
+        """The run ends while a vehicle is on the road."""
+        self._agentless_ticks += vehicle.controller.played_from_hold
+
+    def on_shown(
+        self,
+        t_s: float,
+        vehicles: Iterable[RoadVehicle],
+        *,
+        overlaps: Iterable[tuple[str, str]],
+        collisions: Iterable[tuple[str, str]],
+        gaps: LeastGaps,
+    ) -> None:
+        """All bodies were shown at a tick."""
+        overlaps = list(overlaps)
+        for pair in overlaps:
+            self.note(t_s, "overlap", vehicles=pair)
+        self._recorder.safety(overlaps, collisions, gaps)
+        self._recorder.tick(t_s, (_sample(vehicle) for vehicle in vehicles))
+
+    def on_tick(self, duration_s: float) -> None:
+        """A tick took this long."""
+        self._tick_ms.append(duration_s * 1e3)
+
+    # --- what others say ----------------------------------------------------------------------
+
+    def on_event(self, event: LogEvent) -> None:
+        """A role had something to say."""
+        if self._closed:
+            return
+        self._recorder.event(event.t_s, event.kind, role=event.role, name=event.name, **event.data)
+        if event.kind == "plan-made":
+            self._plans.append(event.data)
+
+    def on_report(self, report: Report) -> None:
+        """A role reported its counters; the newest of a sender counts."""
+        self._reports[report.role, report.name] = report
+
+    def on_heartbeat(self, heartbeat: Heartbeat, t_s: float, wall_s: float) -> None:
+        """Follow the leadership: how often it changes, and for how long nobody leads."""
+        leadership = self._leadership
+        sender = (heartbeat.coordinator, heartbeat.incarnation)
+        if not heartbeat.leading:
+            return
+        if sender != leadership.leader:
+            if leadership.leader is not None:
+                leadership.changes += 1
+                leadership.recovery_s.append(round(wall_s - leadership.heard_s, 4))
+            leadership.leader = sender
+            self.note(t_s, "leader", coordinator=heartbeat.coordinator, term=heartbeat.term)
+        leadership.heard_s = wall_s
+
+    # --- the end ------------------------------------------------------------------------------
+
+    def close(self, t_s: float, *, interrupted: bool) -> None:
+        """Write everything down. Idempotent."""
+        if self._closed:
+            return
+        self.note(t_s, "run-interrupted" if interrupted else "run-ended")
+        self._closed = True
+        self._recorder.close()
+        summary = self._recorder.summarise(self._method, t_s) | self._rest(t_s)
+        text = json.dumps(summary, indent=2) + "\n"
+        (self._folder / "summary.json").write_text(text, encoding="utf-8")
+
+    def _rest(self, t_s: float) -> dict[str, Any]:
+        wall_s = self._stopwatch() - self._began
+        reports = self._reports.values()
+        solve_ms = np.frombuffer(b"".join(r.solve_ms for r in reports if len(r.solve_ms) % 4 == 0),
+                                 dtype="<f4")  # fmt: skip
+        plan_ms = np.array([_number(plan.get("solve_ms")) for plan in self._plans])
+        return {
+            "planning": {
+                "plans": len(self._plans),
+                "optimal": sum(plan.get("status") == "optimal" for plan in self._plans),
+                "largest_formation": max(
+                    (int(_number(plan.get("vehicles"))) for plan in self._plans), default=0
+                ),
+                "solve_ms": _spread(plan_ms, 50, 95, largest=True),
+            },
+            "tracking": {
+                "solves": sum(report.solves for report in reports),
+                "unusable": sum(report.unusable for report in reports),
+                "hold_law_ticks": self._agentless_ticks,
+                "solve_ms": _spread(solve_ms, 50, 99),
+            },
+            "runtime": {
+                "real_time_factor": round(t_s / wall_s, 3) if wall_s > 0 else 0.0,
+                "wall_s": round(wall_s, 3),
+                "processes": 1,
+                "vehicles_per_process": self._scenario.runtime.vehicles_per_process,
+                "tick_ms": _spread(np.array(self._tick_ms), 50, 99),
+            },
+            "messages": {
+                "published": sum(report.published for report in reports),
+                "dropped_by_faults": 0,
+                "rejected": sum(report.rejected for report in reports),
+            },
+            "failover": {
+                "leader_changes": self._leadership.changes,
+                "recovery_s": self._leadership.recovery_s,
+            },
+        }
+
+
+def _sample(vehicle: RoadVehicle) -> tuple[str, float, float, float, float, int | None, int]:
+    s_m, v_mps, a_mps2, y_m, _, _ = vehicle.state
+    column, lane = vehicle.controller.hold_cell
+    return (vehicle.name, s_m, y_m, v_mps, a_mps2, column, lane)
+
+
+def _number(value: object) -> float:
+    return float(value) if isinstance(value, (int, float)) else 0.0
+
+
+def _spread(
+    values: NDArray[Any], *percentiles: int, largest: bool = False
+) -> dict[str, float | None]:
+    found: dict[str, float | None] = {
+        f"p{percentile}": round(float(np.percentile(values, percentile)), 3)
+        if len(values)
+        else None
+        for percentile in percentiles
+    }
+    if largest:
+        found["max"] = round(float(values.max()), 3) if len(values) else None
+    return found

@@ -1,0 +1,249 @@
+"""The road in SUMO; the only module that imports libsumo.
+
+SUMO shows every vehicle exactly where the plant says it is: position, lateral position, heading
+and speed, between lanes as well. It drives none of them. Each tick goes
+
+    place() every vehicle  ->  step()  ->  positions(), collisions()
+
+`place` gives SUMO the middle of the front bumper and the angle (moveToXY with keepRoute=2, which
+takes both as they are). During its step SUMO derives a speed of its own from the displacement;
+`step` replaces it by the vehicle's (setPreviousSpeed), so the speed read back is exact, too.
+
+libsumo holds its simulation in global variables: there is one `SumoWorld` per process at a time.
+It is imported when the first world opens, so that everything else works without it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import os
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from laneweave.protocol.motion import State
+from laneweave.protocol.scenario import Scenario
+from laneweave.sim_bridge.network_file import EDGE, MARGIN_M, ROUTE, VEHICLE_TYPE, write_network
+from laneweave.sim_bridge.overlap import Pose, pose_of
+
+DEBIAN_PACKAGES = {
+    "libX11.so.6": "libx11-6",
+    "libXext.so.6": "libxext6",
+    "libXrender.so.1": "libxrender1",
+    "libGL.so.1": "libgl1",
+    "libatomic.so.1": "libatomic1",
+}
+"""System libraries that libsumo loads and a slim container lacks, and what brings them."""
+
+_IMPORT_SWITCH = "LIBSUMO_AS_TRACI"
+
+
+class SumoUnavailableError(RuntimeError):
+    """libsumo or a system library that it needs cannot be loaded; the message says what to do."""
+
+
+class SumoWorld:
+    """One road with vehicles in SUMO. Close it, or use it as a context manager."""
+
+    _open: SumoWorld | None = None
+
+    def __init__(self, scenario: Scenario, folder: Path) -> None:
+        """Write the network into a folder and start SUMO on it.
+
+        Args:
+            scenario: road, vehicle size and tick.
+            folder: where to write SUMO's input files.
+
+        Raises:
+            SumoUnavailableError: libsumo cannot be loaded.
+            RuntimeError: another world is open in this process.
+        """
+        if SumoWorld._open is not None:
+            raise RuntimeError("libsumo holds one simulation per process, and one is open")
+        self._sumo: Any = _load_libsumo()
+        self._length_m = scenario.road.length_m
+        self._lane_width_m = scenario.road.lane_width_m
+        self._lanes = scenario.road.lanes
+        self._half_body_m = 0.5 * scenario.vehicle.length_m
+        self._states: dict[str, State] = {}
+        self._placed: set[str] = set()
+        self._shown: list[str] = []
+        self._sumo.start([*write_network(scenario, folder).options])
+        SumoWorld._open = self
+
+    def add(self, vehicle: str, state: State) -> None:
+        """Put a new vehicle on the road; SUMO shows it from the next step on.
+
+        Args:
+            vehicle: its name.
+            state: (s, v, a, y, v_y, a_y) in m and s.
+
+        Raises:
+            ValueError: it is on the road already, or `state` is not on the edge.
+        """
+        if vehicle in self._states:
+            raise ValueError(f"{vehicle} is on the road already")
+        self._check(vehicle, state)
+        api = self._sumo.vehicle
+        api.add(vehicle, ROUTE, typeID=VEHICLE_TYPE, depart="now", departPos="0", departSpeed="0")
+        api.setSpeedMode(vehicle, 0)
+        api.setLaneChangeMode(vehicle, 0)
+        self._states[vehicle] = state
+        self._move(vehicle, state)
+
+    def place(self, vehicle: str, state: State) -> None:
+        """Say where a vehicle is at the end of the next step.
+
+        Args:
+            vehicle: a vehicle that was added.
+            state: (s, v, a, y, v_y, a_y) in m and s.
+
+        Raises:
+            ValueError: the vehicle is not on the road, or `state` is not on the edge.
+        """
+        if vehicle not in self._states:
+            raise ValueError(f"{vehicle} is not on the road")
+        self._check(vehicle, state)
+        self._states[vehicle] = state
+        self._move(vehicle, state)
+
+    def step(self) -> None:
+        """Advance SUMO by one tick.
+
+        A vehicle that was not placed since the last step stays where it is: SUMO drives nobody.
+
+        Raises:
+            RuntimeError: SUMO shows other vehicles than those that were added (it never should).
+        """
+        for vehicle, state in self._states.items():
+            if vehicle not in self._placed:
+                self._move(vehicle, state)
+        self._placed.clear()
+        self._sumo.simulationStep()
+        api = self._sumo.vehicle
+        if api.getIDCount() != len(self._states):
+            raise RuntimeError(f"SUMO shows {api.getIDCount()} of {len(self._states)} vehicles")
+        for vehicle, state in self._states.items():
+            api.setPreviousSpeed(vehicle, state[1], state[2])
+        self._shown = list(self._states)
+
+    def positions(self) -> dict[str, Pose]:
+        """Read back where SUMO shows each vehicle after the last step.
+
+        Returns:
+            (s m, y m, heading rad, speed m/s) of each vehicle, in the order of addition.
+        """
+        api = self._sumo.vehicle
+        position, angle, speed = api.getPosition, api.getAngle, api.getSpeed
+        poses = {}
+        for vehicle in self._shown:
+            s_m, front_y_m = position(vehicle)
+            heading = math.radians(90.0 - angle(vehicle))
+            y_m = front_y_m - self._half_body_m * math.sin(heading)
+            poses[vehicle] = (s_m, y_m, heading, speed(vehicle))
+        return poses
+
+    def collisions(self) -> list[tuple[str, str]]:
+        """Return the pairs that SUMO reports as colliding in the last step, sorted, each once.
+
+        SUMO misses pairs that overlap between lanes: `overlap.overlapping_pairs` is the truth.
+        """
+        return sorted(
+            {
+                (min(found.collider, found.victim), max(found.collider, found.victim))
+                for found in self._sumo.simulation.getCollisions()
+            }
+        )
+
+    def remove(self, vehicle: str) -> None:
+        """Take a vehicle off the road.
+
+        Raises:
+            ValueError: it is not on the road.
+        """
+        if self._states.pop(vehicle, None) is None:
+            raise ValueError(f"{vehicle} is not on the road")
+        self._placed.discard(vehicle)
+        self._shown = [other for other in self._shown if other != vehicle]
+        self._sumo.vehicle.remove(vehicle)
+
+    def close(self) -> None:
+        """End SUMO; a second call does nothing."""
+        if SumoWorld._open is self:
+            SumoWorld._open = None
+            self._states.clear()
+            self._shown.clear()
+            self._sumo.close()
+
+    def __enter__(self) -> Self:
+        """Return this world."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close this world."""
+        self.close()
+
+    def _check(self, vehicle: str, state: State) -> None:
+        """Refuse a state that SUMO would map to some other place."""
+        if not math.isfinite(sum(state)):
+            raise ValueError(f"{vehicle} must be at a finite state, not {state}")
+        if not -MARGIN_M <= state[0] <= self._length_m + MARGIN_M:
+            raise ValueError(
+                f"{vehicle} must be at s in [{-MARGIN_M:g}, {self._length_m + MARGIN_M:g}] m, "
+                f"not at {state[0]:g} m"
+            )
+
+    def _move(self, vehicle: str, state: State) -> None:
+        """Give SUMO the middle of the front bumper, its lane, and the angle."""
+        s_m, front_y_m, heading, _ = pose_of(state)
+        front_y_m += self._half_body_m * math.sin(heading)
+        lane = min(max(int(front_y_m // self._lane_width_m), 0), self._lanes - 1)
+        degrees = 90.0 - math.degrees(heading)
+        self._sumo.vehicle.moveToXY(vehicle, EDGE, lane, s_m, front_y_m, degrees, 2)
+        self._placed.add(vehicle)
+
+
+def _load_libsumo() -> Any:  # noqa: ANN401 - libsumo has no types
+    """Import libsumo.
+
+    Its complaint about another version of pyarrow is switched off: it concerns SUMO's own Parquet
+    output, which is not used; both were tried together, imported in either order.
+    """
+    previous = os.environ.get(_IMPORT_SWITCH)
+    os.environ[_IMPORT_SWITCH] = "quiet"
+    try:
+        import libsumo  # noqa: PLC0415 - lazily, see above
+    except (ImportError, OSError) as error:
+        raise SumoUnavailableError(_advice(error)) from error
+    else:
+        return libsumo
+    finally:
+        if previous is None:
+            del os.environ[_IMPORT_SWITCH]
+        else:
+            os.environ[_IMPORT_SWITCH] = previous
+
+
+def _advice(error: Exception) -> str:
+    """Return what to install so that libsumo loads."""
+    if isinstance(error, ModuleNotFoundError):
+        return "libsumo is not installed: pip install 'laneweave[sim]'"
+    missing = [package for library, package in DEBIAN_PACKAGES.items() if not _loads(library)]
+    if missing:
+        return f"libsumo lacks system libraries: apt-get install {' '.join(missing)} ({error})"
+    return f"libsumo cannot be loaded: {error}; it needs {' '.join(DEBIAN_PACKAGES.values())}"
+
+
+def _loads(library: str) -> bool:
+    """Tell whether the dynamic loader finds a shared library."""
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True

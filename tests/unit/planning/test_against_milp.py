@@ -1,0 +1,87 @@
+"""The planner must answer with exactly the cost that the oracle proves, and with legal paths."""
+
+import json
+from collections import Counter
+from itertools import product
+from typing import Any
+
+import pytest
+
+from laneweave.coordinator.planning import PlanRequest, plan
+from oracles import joint_search, milp_oracle
+from oracles.instances import VARIANTS, random_request, small_request, variant
+from oracles.path_rules import check_paths
+
+INSTANCES = 200
+CHUNK = 10
+
+# Costs that the oracle needs 4 to 20 seconds each to prove, written down once.
+RECORDED_COSTS = {11: 22, 40: 34, 63: 20, 112: 25, 133: 29}
+
+
+def _plan(request: dict[str, Any]) -> dict[str, Any]:
+    response: dict[str, Any] = plan(PlanRequest.from_dict(request)).to_dict()
+    return response
+
+
+def _faults(request: dict[str, Any], cost: int) -> list[str]:
+    response = _plan(request)
+    claims = {key: response[key] for key in ("status", "cost", "lower_bound")}
+    expected = {"status": "optimal", "cost": cost, "lower_bound": cost}
+    if claims != expected:
+        return [f"answers {claims}, the oracle {expected}"]
+    return check_paths(request, response)
+
+
+@pytest.mark.parametrize("first", range(0, INSTANCES, CHUNK))
+def test_planner_agrees_with_the_oracle(first: int) -> None:
+    wrong = []
+    for seed in range(first, first + CHUNK):
+        request = random_request(seed)
+        cost = RECORDED_COSTS.get(seed) or milp_oracle.optimal_cost(request)
+        assert cost is not None, f"seed {seed} is infeasible"
+        wrong += [
+            f"seed {seed}: {fault}: {json.dumps(request)}" for fault in _faults(request, cost)
+        ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_all_sets_of_conflicts_and_all_sizes_occur() -> None:
+    requests = [random_request(seed) for seed in range(INSTANCES)]
+    variants = Counter(str(variant(seed)) for seed in range(INSTANCES))
+    sizes = Counter(len(request["vehicles"]) for request in requests)
+    assert set(variants) == {str(one) for one in VARIANTS}
+    assert min(variants.values()) >= 8
+    assert set(sizes) == {2, 3, 4, 5, 6}
+    assert min(sizes.values()) >= 20
+    assert sum(bool(request["grid"]["blocked"]) for request in requests) >= 50
+    assert sum(len(request["targets"]) > len(request["vehicles"]) for request in requests) >= 50
+    for key in ("lane", "eligible"):
+        assert sum(any(key in v for v in request["vehicles"]) for request in requests) >= 50
+
+
+CROWDED = list(product(range(8), ((3, 2, 2), (4, 1, 2), (3, 2, 3))))
+
+
+@pytest.mark.parametrize("code", range(len(VARIANTS)))
+def test_planner_agrees_with_joint_search_where_space_is_scarce(code: int) -> None:
+    """Many of these have no solution, which the planner must prove."""
+    mode, conflicts = VARIANTS[code]
+    wrong = []
+    for seed, (columns, lanes, count) in CROWDED:
+        request = small_request(
+            1000 * code + seed,
+            columns=columns,
+            lanes=lanes,
+            count=count,
+            mode=mode,
+            conflicts=conflicts,
+        )
+        cost = joint_search.optimal_cost(request)
+        if cost is not None:
+            found = _faults(request, cost)
+        else:
+            status = _plan(request)["status"]
+            found = [] if status == "infeasible" else [f"{status}, but there is no solution"]
+        wrong += [f"seed {seed}: {fault}: {json.dumps(request)}" for fault in found]
+    assert not wrong, "\n".join(wrong)
