@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, plan
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.topics import SERVICE, Keys

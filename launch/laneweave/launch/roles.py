@@ -29,6 +29,7 @@ PRELOADED = [
     "laneweave.agents.process",
     "laneweave.coordinator.process",
 ]
+AGENT_NICENESS = 5
 _PR_SET_PDEATHSIG = 1
 
 
@@ -109,6 +110,8 @@ def _bridge(_: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
 def _agent(_: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
     from laneweave.agents.process import run_agents
 
+    # Everybody waits for bridge, router and coordinators: they go first.
+    os.nice(AGENT_NICENESS)
     run_agents(parse_scenario(tables), options["vehicles"])
 
 
