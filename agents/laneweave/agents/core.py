@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from laneweave.agents.execution import PlanExecution
-from laneweave.agents.tracker import Tracker
+from laneweave.agents.tracker import Tracker, remaining_jerk
 from laneweave.agents.trajectory import Reference
 from laneweave.protocol.messages import (
     Command,
@@ -90,6 +90,16 @@ class AgentCore:
         """Ticks drive the agent; it has no clock of its own."""
         return None
 
+    @property
+    def needs_states(self) -> bool:
+        """Whether the states of this vehicle's formation matter to it now."""
+        return (
+            not self.ended
+            and self._execution is not None
+            and self._sense is not None
+            and self._execution.needs_states(self._sense.t_s)
+        )
+
     def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
         """Take an event; see `Core`."""
         del now_s
@@ -129,13 +139,13 @@ class AgentCore:
             return
         self._sense = sense
         if self._execution is None:
-            yield from self._meet_vehicle(sense)
+            self._meet_vehicle(sense)
         self._decide(sense)
         self._command = self._drive(sense)
         yield Send(COMMAND, self._command, self._own)
         yield self._show()
 
-    def _meet_vehicle(self, sense: Sense) -> Iterator[Effect]:
+    def _meet_vehicle(self, sense: Sense) -> None:
         """V1: take over what the motion controller is doing."""
         self.formation = self._scenario.lattice.block_of(sense.hold_cell[0])
         self._execution = PlanExecution(
@@ -145,14 +155,14 @@ class AgentCore:
             OVERDUE_SLOTS * self._scenario.formation.cycle_s,
         )
         if sense.motion_end_tick > sense.tick:
-            self._execution.moving = True
             ticks = round(self._scenario.formation.move_s / self._scenario.runtime.tick_s)
             self._reference = Reference.move(
                 self._scenario, sense.motion_origin, sense.hold_cell, sense.motion_end_tick - ticks
             )
         else:
             self._reference = Reference.hold(self._scenario, sense.hold_cell)
-        yield Listen(STATE, {"formation": self.formation})
+        # A body that is late still moves, though the time of its motion is over.
+        self._execution.moving = not self._arrived(sense)
 
     def _decide(self, sense: Sense) -> None:
         """V5 to V7."""
@@ -202,7 +212,7 @@ class AgentCore:
 
     def _fall_back(self, sense: Sense) -> None:
         """Continue the last good trajectory; when it has run out, go to rest in the hold cell."""
-        rest = self._jerks[sense.tick - self._jerks_tick :]
+        rest = remaining_jerk(self._jerks, sense.tick - self._jerks_tick)
         execution = self._execution
         assert execution is not None  # noqa: S101 (met the vehicle)
         if len(rest) == 0:

@@ -118,10 +118,22 @@ class PlanExecution:
         """All moves of the accepted plan are completed."""
         return self.plan is not None and self.completed == len(self.plan.moves[self.vehicle])
 
-    @property
-    def waits_for_others(self) -> bool:
-        """What other vehicles show still matters to this one."""
-        return self.plan is not None and not (self.done and self.go)
+    def needs_states(self, t_s: float) -> bool:
+        """Tell whether what other vehicles show matters now.
+
+        It does until the gate is open, and from shortly before the plan's start on as long as a
+        move waits for somebody. What is missed in between is shown again: it stays true.
+        """
+        plan = self.plan
+        if plan is None:
+            return False
+        if not self.go:
+            return True
+        return t_s >= plan.t0_s - plan.slot_s and any(
+            self.heard.get(other, -1) < count
+            for needs in self._needs[self.completed :]
+            for other, count in needs.items()
+        )
 
     @property
     def ready(self) -> bool:

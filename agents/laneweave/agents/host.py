@@ -9,8 +9,18 @@ from attrs import frozen
 
 from laneweave.agents.core import AgentCore
 from laneweave.protocol.messages import Census, Name, VehicleState
-from laneweave.protocol.node import Arrived, Effect, End, Event, Listen, Started, Stopping, Wakeup
-from laneweave.protocol.topics import CENSUS
+from laneweave.protocol.node import (
+    Arrived,
+    Effect,
+    End,
+    Event,
+    Listen,
+    Started,
+    Stopping,
+    Unlisten,
+    Wakeup,
+)
+from laneweave.protocol.topics import CENSUS, STATE
 
 IDLE_S = 60.0
 """An agent whose vehicle says nothing for this long (node clock) ends."""
@@ -42,6 +52,7 @@ class AgentHost:
         self._shard = shard
         self._agents: dict[Name, AgentCore] = {name: make_agent(name) for name in vehicles}
         self._seen: set[Name] = set(self._agents)
+        self._formations: set[int] = set()
         self._heard_s = 0.0
 
     @property
@@ -51,6 +62,10 @@ class AgentHost:
 
     def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
         """Take an event; see `Core`."""
+        yield from self._on_event(event, now_s)
+        yield from self._listen_to_formations()
+
+    def _on_event(self, event: Event, now_s: float) -> Iterator[Effect]:
         match event:
             case Started():
                 self._heard_s = now_s
@@ -87,6 +102,22 @@ class AgentHost:
                 self._seen.add(name)
                 self._agents[name] = self._make_agent(name)
                 yield from self._agents[name].handle(Started(), now_s)
+
+    def _listen_to_formations(self) -> Iterator[Effect]:
+        """Subscribe to the states that matter now, and only to those.
+
+        They are most of the traffic, and most of the time nobody waits for anybody.
+        """
+        wanted = {
+            agent.formation
+            for agent in self._agents.values()
+            if agent.formation is not None and agent.needs_states
+        }
+        for number in sorted(self._formations - wanted):
+            yield Unlisten(STATE, {"formation": number})
+        for number in sorted(wanted - self._formations):
+            yield Listen(STATE, {"formation": number})
+        self._formations = wanted
 
     def _forget_ended(self, name: Name) -> Iterator[Effect]:
         if self._agents[name].ended:

@@ -117,8 +117,6 @@ class Tracker:
         n = scenario.tracking.horizon_ticks
         self._n = n
         self._tick_s = scenario.runtime.tick_s
-        self._times_s = np.arange(n + 1, dtype=np.float64)
-        self._times_s *= self._tick_s
         self._axis = axis_matrices(self._tick_s)
         self._limits = scenario.vehicle
         self._min_gap_m = scenario.tracking.min_gap_m
@@ -199,7 +197,7 @@ class Tracker:
         if latest is None or not (states[:, 0] > latest).any():
             return _Path(states, jerks, None)
         states, jerks = states.copy(), jerks.copy()
-        yield_behind(state, states, jerks, latest, self._times_s, self._limits)
+        yield_behind(state, states, jerks, latest, self._tick_s, self._limits)
         transition, effect = self._axis
         along = states[:, :3]
         defect = along[:-1] @ transition.T + jerks[:, :1] * effect[:, 0] - along[1:]

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from laneweave.agents.qp import QPSettings, QuadraticProgram
+from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario import Scenario, Vehicle
 
@@ -147,6 +148,26 @@ def move_profile(scenario: Scenario, dx: int, dy: int) -> Trajectory:
         dx * scenario.formation.gap_m,
         dy * scenario.road.lane_width_m,
     )
+
+
+def check_moves(scenario: Scenario) -> None:
+    """Check that every move of the scenario's mode can be driven within the vehicle's limits.
+
+    Raises:
+        BadInputError: one cannot.
+    """
+    for dx, dy in ((1, 0), (-1, 0), (0, 1), (1, 1), (-1, 1)):
+        if dx and dy and scenario.formation.mode == 1:
+            continue
+        try:
+            move_profile(scenario, dx, dy)
+        except InfeasibleTrajectoryError as error:
+            raise BadInputError(
+                "formation.move_s",
+                scenario.formation.move_s,
+                f"long enough for a move by {dx} columns and {dy} lanes within the limits of the "
+                f"vehicle ({error})",
+            ) from error
 
 
 class Reference:

@@ -6,6 +6,8 @@ that names the field, the value and what is allowed.
 
 from __future__ import annotations
 
+import json
+import signal
 import sys
 import time
 from enum import StrEnum
@@ -40,6 +42,13 @@ class Method(StrEnum):
     """How vehicles are controlled."""
 
     formation = "formation"
+
+
+class Benchmark(StrEnum):
+    """What `laneweave bench` measures."""
+
+    runtime = "runtime"
+    planner = "planner"
 
 
 class OutputFormat(StrEnum):
@@ -90,11 +99,14 @@ def run(
     no_progress: Annotated[bool, typer.Option("--no-progress")] = False,
 ) -> None:
     """Run a scenario on this machine and write its folder."""
+    from laneweave.agents.trajectory import check_moves
     from laneweave.launch.faults import load_faults
     from laneweave.launch.local_run import LocalRun, coordinator_names
     from laneweave.launch.outcome import print_outcome
     from laneweave.launch.simulated_run import SimulatedRun
 
+    # As Ctrl-C: files are completed and temporary folders removed.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     settings = load_scenario(
         scenario,
         seed=seed,
@@ -103,8 +115,8 @@ def run(
         runtime__vehicles_per_process=vehicles_per_process,
         runtime__coordinators=coordinators,
     )
-    if pace is not None and not 0.01 <= pace <= 1000:
-        raise BadInputError("--pace", pace, "[0.01, 1000]")
+    _check_pace(pace)
+    check_moves(settings)
     plan_of_faults = load_faults(faults, coordinator_names(settings))
     folder = _new_folder(out, settings, method.value)
     show = not no_progress and sys.stderr.isatty()
@@ -164,10 +176,10 @@ def coordinator(
 ) -> None:
     """Run a coordinator candidate; it also answers plan requests."""
     from laneweave.coordinator.process import run_coordinator
-    from laneweave.protocol.topics import NAME_PATTERN
+    from laneweave.protocol.topics import NAME_PATTERN, NAME_RULE
 
     if not NAME_PATTERN.fullmatch(name):
-        raise BadInputError("--name", name, "letters, digits, `_`, `-`, `.`; at most 64")
+        raise BadInputError("--name", name, NAME_RULE)
     run_coordinator(_deployment(config, endpoint), name)
 
 
@@ -185,8 +197,14 @@ def agent(
     """Run the agents of named vehicles, or of all that are announced."""
     from laneweave.agents.host import Shard
     from laneweave.agents.process import run_agents
+    from laneweave.agents.trajectory import check_moves
+    from laneweave.protocol.topics import NAME_PATTERN, NAME_RULE
 
+    for vehicle in vehicles or ():
+        if not NAME_PATTERN.fullmatch(vehicle):
+            raise BadInputError("VEHICLE", vehicle, NAME_RULE)
     settings = _deployment(config, endpoint)
+    check_moves(settings)
     if vehicles:
         run_agents(settings, vehicles)
         return
@@ -208,6 +226,7 @@ def bridge(
     """Run the simulated world of a deployment."""
     from laneweave.sim_bridge.process import run_bridge
 
+    _check_pace(pace)
     settings = _deployment(config, endpoint)
     folder = _new_folder(out, settings, Method.formation.value)
     run_bridge(settings, folder, Method.formation.value, pace)
@@ -225,8 +244,55 @@ def report(
                 "DIR", str(folder), "the folder of a run, with trajectories.parquet"
             )
     for folder in folders:
-        _draw(folder)
+        try:
+            _draw(folder)
+        except (OSError, ValueError, KeyError) as error:
+            raise BadInputError(
+                "DIR", str(folder), f"the folder of a finished run ({error})"
+            ) from error
         Console().print(f"{folder}: drawn", highlight=False)
+
+
+@app.command()
+def bench(
+    what: Annotated[Benchmark, typer.Argument(help="runtime or planner.")],
+    vehicles: Annotated[
+        str, typer.Option("--vehicles", help="runtime: vehicles on the road, e.g. 30,60,90.")
+    ] = "30,60,90",
+    per_process: Annotated[
+        int, typer.Option("--vehicles-per-process", min=1, help="runtime: agents per process.")
+    ] = 1,
+    seconds: Annotated[
+        float, typer.Option("--seconds", min=5.0, max=3600.0, help="runtime: road time measured.")
+    ] = 60.0,
+    instances: Annotated[
+        int, typer.Option("--instances", min=1, max=10_000, help="planner: per formation size.")
+    ] = 100,
+    seed: Annotated[int, typer.Option("--seed", min=0)] = 1,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Measure this machine."""
+    from laneweave.launch import bench as benchmarks
+
+    if what is Benchmark.planner:
+        rows = benchmarks.bench_planner(instances, seed=seed)
+        table = benchmarks.planner_table(rows)
+    else:
+        counts = vehicles.split(",")
+        if not all(count.isdecimal() and 1 <= int(count) <= 200 for count in counts):
+            raise BadInputError("--vehicles", vehicles, "numbers from 1 to 200 with commas between")
+        rows = [
+            benchmarks.bench_runtime(
+                int(count), seconds=seconds, per_process=per_process, seed=seed
+            )
+            for count in counts
+        ]
+        table = benchmarks.runtime_table(rows)
+    if as_json:
+        result = {"benchmark": what.value, "machine": benchmarks.machine(), "results": rows}
+        sys.stdout.write(json.dumps(result, indent=2) + "\n")
+    else:
+        Console().print(table)
 
 
 def _deployment(config: Path | None, endpoint: str | None) -> Scenario:
@@ -236,6 +302,11 @@ def _deployment(config: Path | None, endpoint: str | None) -> Scenario:
             "network.endpoint", "", "an endpoint, in the configuration or with --endpoint"
         )
     return settings
+
+
+def _check_pace(pace: float | None) -> None:
+    if pace is not None and not 0.01 <= pace <= 1000:
+        raise BadInputError("--pace", pace, "[0.01, 1000]")
 
 
 def _new_folder(out: Path | None, settings: Scenario, method: str) -> Path:

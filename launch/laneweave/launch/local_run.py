@@ -11,7 +11,7 @@ import os
 import signal
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from multiprocessing.connection import wait as wait_for_sentinels
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
@@ -21,7 +21,8 @@ import structlog
 from attrs import define, field
 
 from laneweave.launch.faults import LEADER, Faults, Kill
-from laneweave.launch.observer import Observer
+from laneweave.launch.logs import last_error
+from laneweave.launch.observer import Observer, View
 from laneweave.launch.outcome import Outcome, complete_summary
 from laneweave.launch.progress import RunProgress
 from laneweave.launch.roles import fork_server, start_role
@@ -32,6 +33,8 @@ from laneweave.protocol.zenoh_transport import ZenohTransport
 
 log = structlog.get_logger(__name__)
 
+MAX_TEMPORARY_BYTES = 70
+"""Sockets lie up to 37 characters below TMPDIR, and their paths have at most 107 bytes."""
 ROUTER_START_S = 20.0
 STALL_S = 90.0
 """A run whose road clock stands still for this long has failed."""
@@ -57,6 +60,8 @@ class LocalRun:
     faults: Faults = field(factory=Faults)
     show_progress: bool = True
     pace: float | None = None
+    watch: Callable[[View, Mapping[str, int]], None] | None = None
+    """Called ten times a second with what is known and the process id of each role."""
     _processes: dict[str, ForkServerProcess] = field(factory=dict)
     _started_agents: set[str] = field(factory=set)
     _killed: set[str] = field(factory=set)
@@ -72,6 +77,7 @@ class LocalRun:
         Raises:
             BadInputError: the environment does not allow the run.
         """
+        check_temporary_folder()
         self.folder.mkdir(parents=True, exist_ok=True)
         with (
             tempfile.TemporaryDirectory(prefix="laneweave-") as sockets,
@@ -120,6 +126,8 @@ class LocalRun:
                 for group in self._agents_to_start(observer):
                     start("agent", f"agent-{group[0]}", vehicles=group)
                 self._inject(observer)
+                if self.watch is not None:
+                    self.watch(view, self._process_ids())
                 self._note_recovery(observer, now)
                 if view.clock is not None and view.clock.tick != last_tick:
                     last_tick, advanced = view.clock.tick, now
@@ -153,13 +161,22 @@ class LocalRun:
             process.join()
             if name == "bridge":
                 if process.exitcode != 0:
-                    self._problems.append(f"the bridge ended with status {process.exitcode}")
+                    self._note_end("the bridge", name, process.exitcode)
+                return False
+            if name == "router":
+                self._note_end("the router", name, process.exitcode)
                 return False
             if process.exitcode != 0 and name not in self._killed:
-                self._problems.append(f"{name} ended with status {process.exitcode}")
-                if name == "router":
-                    return False
+                self._note_end(name, name, process.exitcode)
         return True
+
+    def _note_end(self, who: str, name: str, status: int | None) -> None:
+        words = last_error(self.folder / "log.jsonl", name)
+        reason = f": {words}" if words else ""
+        self._problems.append(f"{who} ended with status {status}{reason}")
+
+    def _process_ids(self) -> dict[str, int]:
+        return {name: process.pid or 0 for name, process in self._processes.items()}
 
     def _agents_to_start(self, observer: Observer) -> Iterator[list[str]]:
         """Group announced vehicles whose agents are not started yet."""
@@ -227,6 +244,17 @@ class LocalRun:
         self._processes.clear()
         if router is not None:
             _end_all([router])
+
+
+def check_temporary_folder() -> None:
+    """Check that sockets can be made in the temporary folder.
+
+    Raises:
+        BadInputError: its path is too long.
+    """
+    folder = tempfile.gettempdir()
+    if len(os.fsencode(folder)) > MAX_TEMPORARY_BYTES:
+        raise BadInputError("TMPDIR", folder, f"a path of at most {MAX_TEMPORARY_BYTES} bytes")
 
 
 def coordinator_names(scenario: Scenario) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import sys
 from pathlib import Path
@@ -22,6 +23,21 @@ def log_to_terminal() -> None:
         logger_factory=structlog.PrintLoggerFactory(sys.stderr),
         cache_logger_on_first_use=True,
     )
+
+
+def last_error(path: Path, name: str) -> str:
+    """Return the last error that a process of a run logged, as one line; empty: none."""
+    found = ""
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    for line in lines:
+        try:
+            entry = json.loads(line)
+        except ValueError:  # cut off when its process was killed
+            continue
+        if entry.get("level") == "error" and entry.get("name") == name:
+            text = entry.get("reason") or entry.get("exception") or entry.get("event") or ""
+            found = str(text).strip().rpartition("\n")[2]
+    return found
 
 
 def log_to_file(path: Path, role: str, name: str) -> None:

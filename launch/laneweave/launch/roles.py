@@ -69,6 +69,8 @@ def start_role(
 def run_role(role: str, name: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
     """Run a role in this process until it ends (the target of `start_role`)."""
     die_with_parent()
+    # Ctrl-C reaches the whole process group: the supervisor ends its processes, in order.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     log_to_file(Path(options["folder"]) / "log.jsonl", role, name)
     try:
         _ROLES[role](name, tables, options)

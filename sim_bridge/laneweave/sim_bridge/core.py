@@ -220,7 +220,8 @@ class BridgeCore:
 
     def _on_command(self, command: Command) -> None:
         vehicle = self.vehicles.get(command.vehicle)
-        if vehicle is None:
+        if vehicle is None or command.tick > self.tick:
+            # Nobody can answer a tick that has not been: it would shut out the true answers.
             return
         try:
             vehicle.controller.take(command)
@@ -337,7 +338,8 @@ class BridgeCore:
         self.tick += 1
         self._show()
         self._let_leave()
-        self._record.on_tick(self._stopwatch() - self._tick_began)
+        duration_s = self._stopwatch() - self._tick_began
+        self._record.on_tick(self.t_s, len(self.vehicles), duration_s)
         if self._over():
             yield from self._wind_up(now_s)
             return

@@ -18,6 +18,9 @@ from laneweave.protocol.motion import Jerk, cell_state, hold_law
 from laneweave.protocol.scenario import Vehicle
 from laneweave.sim_bridge.plant import Plant
 
+MAX_COLUMN = 2**31 - 1
+"""Columns are recorded with 32 bits; no vehicle gets this far."""
+
 
 @define
 class MotionController:
@@ -45,10 +48,13 @@ class MotionController:
         """Take a command unless a newer one has been taken; false when it was ignored.
 
         Raises:
-            BadInputError: the jerks are not pairs of finite numbers.
+            BadInputError: the jerks are not pairs of finite numbers, or a cell is on no lane.
         """
         if command.tick <= self.command_tick:
             return False
+        for cell in (command.hold_cell, command.motion_origin):
+            if not (0 <= cell[1] < self.lattice.lanes and abs(cell[0]) <= MAX_COLUMN):
+                raise BadInputError("Command", cell, f"cells on {self.lattice.lanes} lanes")
         if len(command.jerks) % 8:
             raise BadInputError("Command.jerks", f"{len(command.jerks)} bytes", "float32 pairs")
         jerks = np.frombuffer(command.jerks, dtype="<f4").reshape(-1, 2)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 from attrs import define, field
 from numpy.typing import NDArray
 
@@ -46,7 +49,7 @@ class RunRecord:
         self._leadership = _Leadership()
         self._reports: dict[tuple[Name, Name], Report] = {}
         self._plans: list[dict[str, Any]] = []
-        self._tick_ms: list[float] = []
+        self._ticks: list[tuple[float, int, float]] = []
         self._agentless_ticks = 0
         self._closed = False
 
@@ -112,9 +115,9 @@ class RunRecord:
         self._recorder.safety(overlaps, collisions, gaps)
         self._recorder.tick(t_s, (_sample(vehicle) for vehicle in vehicles))
 
-    def on_tick(self, duration_s: float) -> None:
+    def on_tick(self, t_s: float, on_road: int, duration_s: float) -> None:
         """A tick took this long."""
-        self._tick_ms.append(duration_s * 1e3)
+        self._ticks.append((t_s, on_road, duration_s * 1e3))
 
     # --- what others say ----------------------------------------------------------------------
 
@@ -122,7 +125,9 @@ class RunRecord:
         """A role had something to say."""
         if self._closed:
             return
-        self._recorder.event(event.t_s, event.kind, role=event.role, name=event.name, **event.data)
+        # The sender's own words about who it is do not count.
+        data = event.data | {"role": event.role, "name": event.name}
+        self._recorder.event(event.t_s, event.kind, **data)
         if event.kind == "plan-made":
             self._plans.append(event.data)
 
@@ -153,15 +158,30 @@ class RunRecord:
         self.note(t_s, "run-interrupted" if interrupted else "run-ended")
         self._closed = True
         self._recorder.close()
+        self._write_ticks()
         summary = self._recorder.summarise(self._method, t_s) | self._rest(t_s)
-        text = json.dumps(summary, indent=2) + "\n"
-        (self._folder / "summary.json").write_text(text, encoding="utf-8")
+        text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
+        # Whole or not at all: a process that is killed here must not leave half a summary.
+        unfinished = self._folder / "summary.json.part"
+        unfinished.write_text(text, encoding="utf-8")
+        unfinished.replace(self._folder / "summary.json")
+
+    def _write_ticks(self) -> None:
+        """Write ticks.parquet: how long each tick took, with how many vehicles on the road."""
+        times, counts, durations = zip(*self._ticks, strict=True) if self._ticks else ((), (), ())
+        table = pa.table(
+            {
+                "t_s": pa.array(times, pa.float64()),
+                "on_road": pa.array(counts, pa.int32()),
+                "tick_ms": pa.array(durations, pa.float32()),
+            }
+        )
+        pq.write_table(table, self._folder / "ticks.parquet", compression="zstd")
 
     def _rest(self, t_s: float) -> dict[str, Any]:
         wall_s = self._stopwatch() - self._began
         reports = self._reports.values()
-        solve_ms = np.frombuffer(b"".join(r.solve_ms for r in reports if len(r.solve_ms) % 4 == 0),
-                                 dtype="<f4")  # fmt: skip
+        solve_ms = _milliseconds(report.solve_ms for report in reports)
         plan_ms = np.array([_number(plan.get("solve_ms")) for plan in self._plans])
         return {
             "planning": {
@@ -183,7 +203,7 @@ class RunRecord:
                 "wall_s": round(wall_s, 3),
                 "processes": 1,
                 "vehicles_per_process": self._scenario.runtime.vehicles_per_process,
-                "tick_ms": _spread(np.array(self._tick_ms), 50, 99),
+                "tick_ms": _spread(np.array([tick[2] for tick in self._ticks]), 50, 99),
             },
             "messages": {
                 "published": sum(report.published for report in reports),
@@ -204,18 +224,27 @@ def _sample(vehicle: RoadVehicle) -> tuple[str, float, float, float, float, int 
 
 
 def _number(value: object) -> float:
-    return float(value) if isinstance(value, (int, float)) else 0.0
+    usable = isinstance(value, (int, float)) and math.isfinite(value)
+    return float(value) if usable else 0.0
+
+
+def _milliseconds(packed: Iterable[bytes]) -> NDArray[np.float64]:
+    """Return the durations that can be durations: what comes from others may be anything."""
+    whole = b"".join(each for each in packed if len(each) % 4 == 0)
+    values = np.frombuffer(whole, dtype="<f4").astype(np.float64)
+    return values[np.isfinite(values) & (values >= 0.0)]
 
 
 def _spread(
     values: NDArray[Any], *percentiles: int, largest: bool = False
 ) -> dict[str, float | None]:
-    found: dict[str, float | None] = {
-        f"p{percentile}": round(float(np.percentile(values, percentile)), 3)
-        if len(values)
-        else None
-        for percentile in percentiles
-    }
+    ranks = {f"p{percentile}": percentile for percentile in percentiles}
     if largest:
-        found["max"] = round(float(values.max()), 3) if len(values) else None
-    return found
+        ranks["max"] = 100
+    return {name: _percentile(values, rank) for name, rank in ranks.items()}
+
+
+def _percentile(values: NDArray[Any], rank: int) -> float | None:
+    with np.errstate(all="ignore"):
+        value = float(np.percentile(values, rank)) if len(values) else math.nan
+    return round(value, 3) if math.isfinite(value) else None

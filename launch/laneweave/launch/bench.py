@@ -1,0 +1,217 @@
+"""Benchmarks: `laneweave bench runtime` and `laneweave bench planner`.
+
+Machines differ and are noisy: medians, and CPU time where it is the solver that counts.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pyarrow.parquet as pq
+from attrs import define, field
+from numpy.typing import NDArray
+from rich.table import Table
+
+from laneweave.coordinator.planning import plan
+from laneweave.coordinator.planning.instances import block_request
+from laneweave.launch.local_run import LocalRun
+from laneweave.launch.observer import View
+from laneweave.protocol.scenario import Scenario, load_scenario
+
+ROLES = ("router", "coordinator", "bridge", "agent")
+SETTLE_S = 10.0
+"""Road seconds after the road has filled before anything is measured."""
+
+
+@define
+class _Window:
+    """Processes seen at the beginning and the end of the measured part of a run."""
+
+    begin_s: float
+    end_s: float
+    first: dict[str, tuple[psutil.Process, float]] = field(factory=dict)
+    began: tuple[float, float] | None = None
+    ended: tuple[float, float] | None = None
+    cpu_s: dict[str, float] = field(factory=dict)
+    memory: dict[str, list[tuple[float, float]]] = field(factory=dict)
+
+    def watch(self, view: View, process_ids: Mapping[str, int]) -> None:
+        """Take measurements when the window begins and ends."""
+        now = time.perf_counter()
+        if self.began is None and view.t_s >= self.begin_s:
+            self.began = (view.t_s, now)
+            self.first = {
+                name: (process, _cpu_s(process))
+                for name, process in _processes(process_ids).items()
+            }
+        elif self.began is not None and self.ended is None and view.t_s >= self.end_s:
+            self.ended = (view.t_s, now)
+            self._measure(process_ids)
+
+    def _measure(self, process_ids: Mapping[str, int]) -> None:
+        for name, process in _processes(process_ids).items():
+            role = _role(name)
+            before = self.first.get(name, (process, 0.0))[1]
+            self.cpu_s[role] = self.cpu_s.get(role, 0.0) + _cpu_s(process) - before
+            info = process.memory_full_info()
+            self.memory.setdefault(role, []).append((info.pss / 2**20, info.uss / 2**20))
+
+
+def bench_runtime(vehicles: int, *, seconds: float, per_process: int, seed: int) -> dict[str, Any]:
+    """Measure a run with about `vehicles` on the road, one process for `per_process` of them.
+
+    Returns:
+        Real-time factor, tick time, CPU and memory per role, over `seconds` of road time.
+    """
+    base = load_scenario(None)
+    travel_s = base.road.length_m / base.formation.speed_mps
+    volume = vehicles / (travel_s * base.road.lanes) * 3600.0
+    begin_s = travel_s + SETTLE_S
+    scenario = load_scenario(
+        None,
+        seed=seed,
+        demand__volume_veh_per_lane_h=volume,
+        demand__duration_s=begin_s + seconds,
+        runtime__vehicles_per_process=per_process,
+    )
+    window = _Window(begin_s, begin_s + seconds)
+    with tempfile.TemporaryDirectory(prefix="laneweave-bench-") as folder:
+        run = LocalRun(scenario, Path(folder) / "run", show_progress=False, watch=window.watch)
+        outcome = run.run()
+        ticks = pq.read_table(Path(folder) / "run" / "ticks.parquet")
+    times_s = ticks.column("t_s").to_numpy()
+    measured = (times_s > window.begin_s) & (times_s <= window.end_s)
+    return {
+        "vehicles_wanted": vehicles,
+        "volume_veh_per_lane_h": round(volume, 1),
+        "vehicles_per_process": per_process,
+        "vehicles_on_road": round(float(ticks.column("on_road").to_numpy()[measured].mean()), 1),
+        "real_time_factor": _rate(window),
+        "tick_ms": _spread(ticks.column("tick_ms").to_numpy()[measured], 50, 99),
+        "cpu_ms_per_tick": _per_tick(window, scenario),
+        "memory_mib": _memory(window),
+        "problems": list(outcome.problems),
+    }
+
+
+def bench_planner(instances: int, *, seed: int) -> list[dict[str, Any]]:
+    """Measure the planner on the formations that the paper's operation brings about.
+
+    Returns:
+        One row per formation size: CPU milliseconds, median, 95th percentile, maximum.
+    """
+    rows = []
+    for size in (2, 3, 4, 5, 6):
+        times_ms = []
+        optimal = 0
+        for index in range(instances):
+            request = block_request(seed + index, vehicles=size)
+            began = time.process_time()
+            response = plan(request)
+            times_ms.append((time.process_time() - began) * 1e3)
+            optimal += response.status == "optimal"
+        rows.append(
+            {
+                "vehicles": size,
+                "instances": instances,
+                "optimal": optimal,
+                "cpu_ms": _spread(np.array(times_ms), 50, 95) | {"max": round(max(times_ms), 3)},
+            }
+        )
+    return rows
+
+
+def machine() -> dict[str, Any]:
+    """Return what the figures depend on."""
+    return {
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+    }
+
+
+def runtime_table(rows: list[dict[str, Any]]) -> Table:
+    """Return the results of `bench_runtime` as a table."""
+    table = Table("vehicles", "per process", "real-time factor", "tick p50 / p99 ms")
+    for role in ROLES:
+        table.add_column(f"{role} CPU ms/tick")
+    table.add_column("agents' memory MiB (each)")
+    for row in rows:
+        cpu, memory = row["cpu_ms_per_tick"], row["memory_mib"].get("agent", {})
+        table.add_row(
+            f"{row['vehicles_on_road']:.0f}",
+            str(row["vehicles_per_process"]),
+            f"{row['real_time_factor']:.2f}",
+            f"{row['tick_ms']['p50']:.1f} / {row['tick_ms']['p99']:.1f}",
+            *(f"{cpu.get(role, 0.0):.2f}" for role in ROLES),
+            f"{memory.get('total', 0.0):.0f} ({memory.get('each', 0.0):.1f})",
+        )
+    return table
+
+
+def planner_table(rows: list[dict[str, Any]]) -> Table:
+    """Return the results of `bench_planner` as a table."""
+    table = Table("vehicles", "optimal", "CPU ms p50", "p95", "max")
+    for row in rows:
+        cpu = row["cpu_ms"]
+        table.add_row(
+            str(row["vehicles"]),
+            f"{row['optimal']} of {row['instances']}",
+            *(f"{cpu[name]:.2f}" for name in ("p50", "p95", "max")),
+        )
+    return table
+
+
+def _processes(process_ids: Mapping[str, int]) -> dict[str, psutil.Process]:
+    found = {}
+    for name, process_id in process_ids.items():
+        try:
+            found[name] = psutil.Process(process_id)
+        except psutil.NoSuchProcess:
+            continue
+    return found
+
+
+def _role(name: str) -> str:
+    return "coordinator" if name.startswith("c") else name.partition("-")[0]
+
+
+def _cpu_s(process: psutil.Process) -> float:
+    times = process.cpu_times()
+    return float(times.user + times.system)
+
+
+def _rate(window: _Window) -> float:
+    if window.began is None or window.ended is None:
+        return 0.0
+    road_s, wall_s = (end - begin for begin, end in zip(window.began, window.ended, strict=True))
+    return round(road_s / wall_s, 3)
+
+
+def _per_tick(window: _Window, scenario: Scenario) -> dict[str, float]:
+    ticks = (window.end_s - window.begin_s) / scenario.runtime.tick_s
+    return {role: round(cpu * 1e3 / ticks, 3) for role, cpu in sorted(window.cpu_s.items())}
+
+
+def _memory(window: _Window) -> dict[str, dict[str, float]]:
+    return {
+        role: {
+            "processes": len(pairs),
+            "total": round(sum(pss for pss, _ in pairs), 1),
+            "each": round(float(np.median([pss for pss, _ in pairs])), 2),
+            "own_each": round(float(np.median([uss for _, uss in pairs])), 2),
+        }
+        for role, pairs in sorted(window.memory.items())
+    }
+
+
+def _spread(values: NDArray[Any], *percentiles: int) -> dict[str, float]:
+    return {f"p{each}": round(float(np.percentile(values, each)), 3) for each in percentiles}
