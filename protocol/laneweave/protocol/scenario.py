@@ -19,6 +19,7 @@ from attrs import field, frozen
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Lattice
 from laneweave.protocol.structuring import structure
+from laneweave.protocol.topics import NAME_PATTERN, NAME_RULE
 
 SCHEMA = "laneweave.scenario/1"
 
@@ -40,7 +41,8 @@ def within(low: float, high: float, *, open_low: bool = False) -> Validator:
     """Return a validator for a finite number in [low, high], or (low, high] if `open_low`."""
 
     def check(_: object, attribute: attrs.Attribute[Any], value: float) -> None:
-        if not math.isfinite(value) or value > high or value < low or (open_low and value == low):
+        # NaN fails both comparisons.
+        if not low <= value <= high or (open_low and value == low):
             bracket = "(" if open_low else "["
             raise BadInputError(attribute.name, value, f"{bracket}{low:g}, {high:g}]")
 
@@ -55,6 +57,11 @@ def one_of(*choices: object) -> Validator:
             raise BadInputError(attribute.name, value, ", ".join(map(str, choices)))
 
     return check
+
+
+def _key_part(_: object, attribute: attrs.Attribute[Any], value: str) -> None:
+    if not NAME_PATTERN.fullmatch(value):
+        raise BadInputError(attribute.name, value, NAME_RULE)
 
 
 def _conflict_kinds(_: object, attribute: attrs.Attribute[Any], value: Sequence[str]) -> None:
@@ -165,11 +172,11 @@ class Tracking:
 class Network:
     """How roles find each other and when they give each other up; wall-clock seconds."""
 
-    realm: str = "default"
+    realm: str = field(default="default", validator=_key_part)
     """First part of every key: deployments with different realms do not see each other."""
     endpoint: str = ""
     """Zenoh endpoint of the router; empty: a socket in a temporary folder (`laneweave run`)."""
-    lease_s: float = field(default=0.5, validator=within(0.1, 60.0))
+    lease_s: float = field(default=1.0, validator=within(0.1, 60.0))
     """A silent session is given up after this time (Zenoh's transport lease)."""
     heartbeat_s: float = field(default=0.1, validator=within(0.01, 10.0))
     election_s: float = field(default=1.0, validator=within(0.05, 60.0))
@@ -268,7 +275,8 @@ def read_toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise BadInputError("file", str(path), f"a readable file ({error.strerror})") from error
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (ValueError, RecursionError) as error:
+        # Not UTF-8, not TOML, a NUL in the path, too many digits, too deep.
         raise BadInputError("file", str(path), f"valid TOML ({error})") from error
 
 
@@ -315,11 +323,10 @@ def _check_lanes(scenario: Scenario) -> None:
         f"one share for each of the {road.lanes} lanes of road.lanes, or none",
     )
     _require(
-        all(math.isfinite(share) and share >= 0 for share in shares)
-        and (not shares or sum(shares) > 0),
+        all(share >= 0 for share in shares) and (not shares or 0 < sum(shares) < math.inf),
         "demand.lane_shares",
         list(shares),
-        "finite numbers >= 0, not all 0",
+        "numbers >= 0, not all 0, with a finite sum",
     )
     _require(
         road.lane_width_m > vehicle.width_m,
