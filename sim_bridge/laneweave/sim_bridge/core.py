@@ -402,6 +402,12 @@ class BridgeCore:
         counts = self._roadside.counts(on_road=len(self.vehicles))
         yield Send(CLOCK, counts.clock(self.tick, self.t_s, ended=True))
         yield Send(CENSUS, self._roadside.census(self.t_s, self.vehicles.values()))
+        # Through the network, like everybody's: the node fills in what it has counted.
+        yield Send(
+            REPORT,
+            Report(role=Name("bridge"), name=Name("bridge"), published=0, rejected=0),
+            {"role": "bridge", "name": "bridge"},
+        )
         yield from self._tell_leaving()
         for vehicle in self.vehicles.values():
             yield Send(SENSE, self._sense(vehicle, left=True), {"vehicle": vehicle.name})
