@@ -228,11 +228,14 @@ class CoordinatorCore:
         control.begin(now_s)
         return control
 
-    def _new_ballot(self, highest_term: int) -> Ballot:
-        if highest_term > self.election.term:
-            self.election.raise_term(highest_term)
+    def _new_ballot(self, above: Ballot | None) -> Ballot:
         self._seq += 1
-        return Ballot(self.election.term, self.name, self._incarnation, self._seq)
+        ballot = Ballot(self.election.term, self.name, self._incarnation, self._seq)
+        if above is not None and ballot < above:
+            # Equal terms happen, too: two candidates that did not hear each other take the same.
+            self.election.raise_term(above.term)
+            ballot = ballot._replace(term=self.election.term)
+        return ballot
 
     def _order_plan(self, number: int, control: FormationControl) -> Iterator[Effect]:
         if steps_left(number, self._start_s(number), self.scenario) == 0 or control.ballot is None:

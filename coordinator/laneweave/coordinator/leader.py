@@ -53,8 +53,8 @@ class FormationControl:
     """The leader's state for one formation."""
 
     formation: Formation
-    new_ballot: Callable[[int], Ballot]
-    """Returns a ballot never used before, with a term above the given one if that is higher."""
+    new_ballot: Callable[[Ballot | None], Ballot]
+    """Returns a ballot never used before and above the given one, if one is given."""
     rng: random.Random
     resend_s: float
     phase: Phase = Phase.OBSERVING
@@ -67,25 +67,29 @@ class FormationControl:
     _due_s: float = 0.0
     """When the phase's timer fires (node clock)."""
     _observe_until_s: float = 0.0
-    _highest_term: int = 0
+    _highest: Ballot | None = None
+    """Highest ballot that a member has shown; a new one must be above it to be promised."""
 
     def begin(self, now_s: float) -> None:
         """Take the formation over (L2)."""
         self.phase = Phase.OBSERVING
         self._states.clear()
+        self._promises = {}
         self._observe_until_s = self._due_s = now_s + OBSERVE_S
 
     # --- inputs -------------------------------------------------------------------------------
 
     def on_members(self, formation: Formation, now_s: float) -> None:
-        """The census changed: a vehicle that left can neither promise nor accept."""
-        left = set(self.formation.roster) - set(formation.roster)
-        if not left and formation == self.formation:
+        """The census changed: who left can neither promise nor accept; targets may be new (L8)."""
+        if formation == self.formation:
             return
+        left = set(self.formation.roster) - set(formation.roster)
+        new_targets = not set(formation.members) <= set(self.formation.members)
         self.formation = formation
         for vehicle in left:
             self._states.pop(vehicle, None)
-        if self.phase in (Phase.PREPARING, Phase.PLANNING, Phase.ISSUING):
+        unfinished = self.phase in (Phase.PREPARING, Phase.PLANNING, Phase.ISSUING)
+        if unfinished or (self.phase is Phase.WATCHING and new_targets):
             self._prepare(now_s)
 
     def on_state(self, state: VehicleState, now_s: float) -> None:
@@ -93,7 +97,7 @@ class FormationControl:
         if state.vehicle not in self.formation.roster or not self._take(state):
             return
         if state.promised is not None:
-            self._highest_term = max(self._highest_term, state.promised.term)
+            self._highest = max(self._highest or state.promised, state.promised)
         if self.phase is Phase.OBSERVING:
             self._observe(now_s)
         elif self.phase in (Phase.PREPARING, Phase.PLANNING, Phase.ISSUING, Phase.WATCHING):
@@ -176,7 +180,7 @@ class FormationControl:
 
     def _take(self, state: VehicleState) -> bool:
         known = self._states.get(state.vehicle)
-        if known is not None and (state.incarnation, state.t_s) < (known.incarnation, known.t_s):
+        if known is not None and _age(state) < _age(known):
             return False
         self._states[state.vehicle] = state
         return True
@@ -192,12 +196,14 @@ class FormationControl:
         if in_force and len(shown) == 1:
             # Adoption: send nothing, watch. The plan is executed without any leader.
             self.ballot = shown.pop()
+            # The promises were given to another leader; whoever has accepted has promised.
+            self._promises = dict(self._states)
             self.phase = Phase.WATCHING
         else:
             self._prepare(now_s)
 
     def _prepare(self, now_s: float) -> None:
-        self.ballot = self.new_ballot(self._highest_term)
+        self.ballot = self.new_ballot(self._highest)
         self.plan = None
         self._promises = {}
         self._accepted = set()
@@ -218,7 +224,7 @@ class FormationControl:
             self._prepare(now_s)
         elif self.phase is Phase.ISSUING:
             self._count_acceptance(state, ballot)
-        elif self.phase is Phase.WATCHING and state.overdue:
+        elif self.phase is Phase.WATCHING and (state.overdue or self._astray(state)):
             self._prepare(now_s)
 
     def _count_promise(self, state: VehicleState, ballot: Ballot) -> None:
@@ -237,7 +243,23 @@ class FormationControl:
     def _restarted(self, state: VehicleState) -> bool:
         """Tell whether a vehicle's agent is another process than the one that promised (L8)."""
         promise = self._promises.get(state.vehicle)
-        if promise is not None:
-            return promise.incarnation != state.incarnation
-        # Adopted plans: the promise was given to another leader.
-        return state.promised != self.ballot
+        return promise is None or promise.incarnation != state.incarnation
+
+    def _astray(self, state: VehicleState) -> bool:
+        """Tell whether the plan has ended for a vehicle that now prefers another lane (L8).
+
+        An adopted plan may have been made for targets that this leader never saw.
+        """
+        return state.done and any(
+            member.vehicle == state.vehicle and member.preferred_lane != state.hold_cell[1]
+            for member in self.formation.members
+        )
+
+
+def _age(state: VehicleState) -> tuple[object, ...]:
+    """Return what orders the states of one vehicle, older ones first.
+
+    Between two ticks it shows states with equal times; it never promises less or takes back an
+    acceptance, so a late state cannot pass for a newer one.
+    """
+    return (state.incarnation, state.t_s, state.promised or (), state.accepted)

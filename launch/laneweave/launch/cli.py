@@ -28,6 +28,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+TYPER_INTERRUPTED = 130
+"""What typer makes of Ctrl-C."""
 MISSING_SIM = "the simulation packages: install laneweave[sim]"
 
 
@@ -367,6 +369,9 @@ def _status(arguments: list[str]) -> int:
         if (error.name or "").startswith("laneweave"):
             raise
         return _refuse(f"{error.name}: not installed; allowed: {MISSING_SIM}")
+    if result == TYPER_INTERRUPTED:
+        sys.stderr.write("interrupted\n")
+        return 1
     return result if isinstance(result, int) else 0
 
 

@@ -89,7 +89,7 @@ class LocalRun:
             )
             self.scenario = attrs.evolve(self.scenario, network=network)
             try:
-                self._supervise(progress)
+                self._supervise(progress, sockets)
             finally:
                 self._clean_up()
         return complete_summary(
@@ -101,10 +101,15 @@ class LocalRun:
 
     # --- supervision --------------------------------------------------------------------------
 
-    def _supervise(self, progress: RunProgress) -> None:
+    def _supervise(self, progress: RunProgress, temporary: str) -> None:
         context = fork_server()
         tables = to_tables(self.scenario)
-        options = {"folder": str(self.folder), "method": self.method, "pace": self.pace}
+        options = {
+            "folder": str(self.folder),
+            "temporary": temporary,
+            "method": self.method,
+            "pace": self.pace,
+        }
 
         def start(role: str, name: str, **more: object) -> None:
             self._processes[name] = start_role(context, role, name, tables, options | more)

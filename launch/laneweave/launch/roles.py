@@ -11,7 +11,11 @@ import multiprocessing
 import os
 import signal
 import sys
+import tempfile
+import threading
+import time
 from collections.abc import Callable
+from multiprocessing import forkserver
 from multiprocessing.context import ForkServerContext, ForkServerProcess
 from pathlib import Path
 from typing import Any
@@ -30,7 +34,10 @@ PRELOADED = [
     "laneweave.coordinator.process",
 ]
 AGENT_NICENESS = 5
+ORPHAN_S = 5.0
+"""How long a process whose supervisor died gets to end in good order."""
 _PR_SET_PDEATHSIG = 1
+_PR_SET_NAME = 15
 
 
 def fork_server() -> ForkServerContext:
@@ -42,6 +49,13 @@ def fork_server() -> ForkServerContext:
         os.environ.setdefault(name, "1")
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(PRELOADED)
+    # Ctrl-C reaches the whole process group: the supervisor ends its processes, in order. They
+    # inherit that they ignore it, so none is caught unprepared.
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        forkserver.ensure_running()
+    finally:
+        signal.signal(signal.SIGINT, before)
     return context
 
 
@@ -59,7 +73,8 @@ def start_role(
         role: `router`, `coordinator`, `bridge` or `agent`.
         name: for logs and process lists.
         tables: the scenario, as `to_tables` gives it.
-        options: what the role needs beside the scenario; `folder` is where its log goes.
+        options: what the role needs beside the scenario; `folder` is where its log goes,
+            `temporary` where its temporary files go.
     """
     process = context.Process(target=run_role, args=(role, name, tables, options), name=name)
     process.start()
@@ -69,8 +84,9 @@ def start_role(
 def run_role(role: str, name: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
     """Run a role in this process until it ends (the target of `start_role`)."""
     die_with_parent()
-    # Ctrl-C reaches the whole process group: the supervisor ends its processes, in order.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    die_with_supervisor()
+    ctypes.CDLL(None).prctl(_PR_SET_NAME, name.encode()[:15], 0, 0, 0)
+    tempfile.tempdir = options["temporary"]
     log_to_file(Path(options["folder"]) / "log.jsonl", role, name)
     try:
         _ROLES[role](name, tables, options)
@@ -88,6 +104,24 @@ def die_with_parent() -> None:
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
     if os.getppid() != parent:
         sys.exit(1)
+
+
+def die_with_supervisor() -> None:
+    """End this process when the one that ordered it dies, however that dies.
+
+    The fork server, which is the parent, lives on as long as one of its processes does.
+    """
+    supervisor = multiprocessing.parent_process()
+    if supervisor is None:
+        return
+
+    def watch() -> None:
+        supervisor.join()
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(ORPHAN_S)
+        os._exit(1)
+
+    threading.Thread(target=watch, name="supervisor", daemon=True).start()
 
 
 def _router(_: str, tables: dict[str, Any], __: dict[str, Any]) -> None:

@@ -6,17 +6,17 @@ becomes one `BadInputError`. It never raises anything else, whatever the bytes.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import msgpack
 from attrs import fields
-from cattrs.gen import make_dict_structure_fn, make_dict_unstructure_fn
 
 from laneweave.protocol import messages
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.messages import Ballot, Name
 from laneweave.protocol.structuring import first_problem, strict_converter
-from laneweave.protocol.topics import NAME_PATTERN
+from laneweave.protocol.topics import NAME_PATTERN, NAME_RULE
 
 VERSION = 1
 MAX_BYTES = 1 << 20
@@ -36,11 +36,12 @@ KINDS: dict[str, type] = {
     )
 }
 _MAX_INT = 2**63
+_MAX_DEPTH = 8
 
 
 def _name(value: object, _: type) -> str:
     if type(value) is not str or not NAME_PATTERN.fullmatch(value):
-        raise BadInputError("", value, "a name of letters, digits, `_`, `-`, `.`; at most 64")
+        raise BadInputError("", value, "a name of " + NAME_RULE)
     return value
 
 
@@ -63,9 +64,27 @@ def _ballot(value: object, _: type) -> Ballot:
 
 
 def _plain_data(value: object, _: type) -> dict[str, Any]:
-    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
-        raise BadInputError("", value, "a map with text keys")
+    if not isinstance(value, dict) or not _is_plain(value, _MAX_DEPTH):
+        allowed = "a map with text keys of what JSON knows: finite, 64-bit, not deep"
+        raise BadInputError("", value, allowed)
     return value
+
+
+def _is_plain(value: object, depth: int) -> bool:
+    match value:
+        case None | bool() | str():
+            return True
+        case int():
+            return -_MAX_INT <= value < _MAX_INT
+        case float():
+            return math.isfinite(value)
+        case list():
+            return depth > 0 and all(_is_plain(item, depth - 1) for item in value)
+        case dict():
+            return depth > 0 and all(
+                type(key) is str and _is_plain(item, depth - 1) for key, item in value.items()
+            )
+    return False
 
 
 def _make_converter(*, detailed: bool) -> Any:  # noqa: ANN401 (cattrs converters are generic)
@@ -74,18 +93,6 @@ def _make_converter(*, detailed: bool) -> Any:  # noqa: ANN401 (cattrs converter
     converter.register_structure_hook(Name, _name)
     converter.register_structure_hook(Ballot, _ballot)
     converter.register_structure_hook_func(lambda kind: kind == dict[str, Any], _plain_data)
-    # Parts before wholes: the generated code of a whole looks its parts up once.
-    for kind in (messages.Neighbour, messages.CensusEntry, messages.Announcement, *KINDS.values()):
-        converter.register_structure_hook(
-            kind,
-            make_dict_structure_fn(
-                kind,
-                converter,
-                _cattrs_forbid_extra_keys=True,
-                _cattrs_detailed_validation=detailed,
-            ),
-        )
-        converter.register_unstructure_hook(kind, make_dict_unstructure_fn(kind, converter))
     return converter
 
 

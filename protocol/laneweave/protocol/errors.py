@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
+import reprlib
+
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel = 4
+_SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = 12
+_SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 80
+
 
 class BadInputError(ValueError):
     """Something a user or a peer supplied is not acceptable.
@@ -18,13 +25,21 @@ class BadInputError(ValueError):
         super().__init__(field, value, allowed)
 
     def __str__(self) -> str:
-        """Return the one line."""
-        shown = " ".join(repr(self.value).split())
-        if len(shown) > 80:
-            shown = shown[:77] + "..."
-        return f"{self.field}: got {shown}; allowed: {self.allowed}"
+        """Return the one line, whatever the value and the name are."""
+        try:
+            shown = _SHORT.repr(self.value)
+        except ValueError:  # an integer of thousands of digits
+            shown = f"a huge {type(self.value).__name__}"
+        return f"{_line(self.field, 120)}: got {_line(shown, 80)}; allowed: {_line(self.allowed)}"
 
     def within(self, parent: str) -> BadInputError:
         """Return the same error with `parent` put before the field's name."""
-        separator = "" if self.field.startswith("[") or not self.field else "."
+        separator = "." if parent and self.field and not self.field.startswith("[") else ""
         return BadInputError(f"{parent}{separator}{self.field}", self.value, self.allowed)
+
+
+def _line(text: str, length: int = 500) -> str:
+    """Return text as part of one readable line."""
+    words = "".join(char if char.isprintable() else " " for char in text).split()
+    line = " ".join(words)
+    return line if len(line) <= length else line[: length - 3] + "..."

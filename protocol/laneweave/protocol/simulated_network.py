@@ -39,6 +39,8 @@ from laneweave.protocol.transport import (
 
 KILL_SEEN_S = 0.005
 """A killed process is noticed within this time (measured on Zenoh: 2 to 9 ms)."""
+WAKE_AGAIN_S = 0.001
+"""A core that asks for a time that has passed is woken this much later: time goes on for it too."""
 
 
 @frozen
@@ -53,7 +55,7 @@ class Conditions:
     duplication: float = 0.0
     """Probability that a receiver gets a message twice."""
     lease_s: float = 0.5
-    """A paused node or one cut off is given up after this time."""
+    """A paused node is given up after this time."""
     compute_s: float = 0.05
     """Virtual time that a computation takes."""
 
@@ -69,11 +71,13 @@ class SimulatedTransport:
         self.watched: dict[str, None] = {}
         self.tokens: dict[str, None] = {}
         self.served: set[str] = set()
+        self.closed = False
 
     def publish(self, key: str, payload: bytes, quality: Quality) -> None:
         """Send to all subscribers, each with its own fate."""
         del quality
-        self._network.carry(self.name, key, payload)
+        if not self.closed:
+            self._network.carry(self.name, key, payload)
 
     def subscribe(self, key_expression: str) -> None:
         """Subscribe."""
@@ -87,20 +91,21 @@ class SimulatedTransport:
 
     def announce(self, key: str) -> None:
         """Show a token."""
-        if key not in self.tokens:
+        if key not in self.tokens and not self.closed:
             self.tokens[key] = None
-            self._network.tell_token(self.name, key, up=True)
+            self._network.show_token(self.name, key)
 
     def withdraw(self, key: str) -> None:
         """Take a token back."""
-        if key in self.tokens:
+        if key in self.tokens and not self.closed:
             del self.tokens[key]
-            self._network.tell_token(self.name, key, up=False)
+            self._network.hide_token(self.name, key)
 
     def watch(self, key_expression: str) -> None:
-        """Watch tokens, beginning with those that are there."""
-        self.watched[key_expression] = None
-        self._network.show_tokens(self.name, key_expression)
+        """Watch tokens once, beginning with those that are there."""
+        if key_expression not in self.watched and not self.closed:
+            self.watched[key_expression] = None
+            self._network.show_all_tokens(self.name, key_expression)
 
     def serve(self, key: str) -> None:
         """Answer questions on a key."""
@@ -108,23 +113,52 @@ class SimulatedTransport:
 
     def answer(self, token: int, payload: bytes, *, ok: bool) -> None:
         """Answer a question once."""
-        self._network.take_answer(token, payload, ok=ok)
+        if not self.closed:
+            self._network.take_answer(self.name, token, payload, ok=ok)
 
     def close(self) -> None:
         """Leave the network."""
-        self._network.remove(self.name)
+        if not self.closed:
+            self._network.remove(self.name)
+
+
+_Item = Delivery | Computed | Started | Stopping
 
 
 class _Member:
     """A node with its place in the network."""
 
-    def __init__(self, node: Node, transport: SimulatedTransport) -> None:
-        self.node = node
+    node: Node
+
+    def __init__(self, transport: SimulatedTransport) -> None:
         self.transport = transport
         self.connected = True
+        self.connection = 0
+        """What was under way when a connection ended does not arrive in the next one."""
         self.paused = False
-        self.backlog: list[Delivery | Computed] = []
+        self.pauses = 0
+        self.lapsed = False
+        """Paused for longer than its lease."""
+        self.backlog: list[_Item] = []
         self.wakeup_s: float | None = None
+        self.news_s = 0.0
+        """When the newest news of a token arrives: they do not overtake each other."""
+        self.seen: dict[str, None] = {}
+        """Tokens that have been shown to it."""
+
+    @property
+    def visible(self) -> bool:
+        """Whether others see its tokens."""
+        return self.connected and not self.lapsed
+
+    def learn(self, news: TokenUp | TokenDown) -> bool:
+        """Remember what it is shown; false when that is nothing new."""
+        known = news.key in self.seen
+        if isinstance(news, TokenUp):
+            self.seen[news.key] = None
+            return not known
+        self.seen.pop(news.key, None)
+        return known
 
 
 class SimulatedNetwork:
@@ -142,7 +176,8 @@ class SimulatedNetwork:
         self._members: dict[str, _Member] = {}
         self._routes: dict[str, tuple[str, ...]] = {}
         self._cut: Callable[[str, str], bool] | None = None
-        self._answers: dict[int, Callable[[bytes, bool], None]] = {}
+        self._answers: dict[int, tuple[Callable[[bytes, bool], None], tuple[int, ...]]] = {}
+        """For each open question who asked, and all tokens under which it was asked."""
         self._token_count = count(1)
 
     # --- building and driving ---------------------------------------------------------------
@@ -155,11 +190,13 @@ class SimulatedNetwork:
         """
         if name in self._members:
             raise ValueError(f"node {name} is already in the network")
-        transport = SimulatedTransport(self, name)
-        node = Node(core, transport, Keys(realm), lambda job: self._compute(name, job))
-        self._members[name] = _Member(node, transport)
-        self._in(0.0, lambda: self._dispatch(name, Started()))
-        return node
+        member = _Member(SimulatedTransport(self, name))
+        member.node = Node(
+            core, member.transport, Keys(realm), lambda job: self._compute(member, job)
+        )
+        self._members[name] = member
+        self._in(0.0, lambda: self._hand_over(member, Started()))
+        return member.node
 
     def __contains__(self, name: str) -> bool:
         """Tell whether a node is in the network."""
@@ -188,7 +225,8 @@ class SimulatedNetwork:
             if stop is not None and stop():
                 return
             self.step()
-        self.now_s = max(self.now_s, until_s)
+        if stop is None or not stop():
+            self.now_s = max(self.now_s, until_s)
 
     def at(self, time_s: float, action: Callable[[], None]) -> None:
         """Do something at a virtual time, e.g. inject a fault."""
@@ -201,45 +239,56 @@ class SimulatedNetwork:
         self._vanish(name, KILL_SEEN_S)
 
     def stop(self, name: str) -> None:
-        """Ask a node to end, as SIGTERM does."""
-        self._dispatch(name, Stopping())
-        self.remove(name)
+        """Ask a node to end, as SIGTERM does; a paused one does so when it is resumed."""
+        member = self._members.get(name)
+        if member is not None:
+            self._hand_over(member, Stopping())
 
     def pause(self, name: str) -> None:
         """Stop a node's clock and hands; its tokens vanish after the lease."""
         member = self._members[name]
+        if member.paused:
+            return
         member.paused = True
-        self._in(self.conditions.lease_s, lambda: self._lapse(name))
+        member.pauses += 1
+        pause = member.pauses
+        self._in(self.conditions.lease_s, lambda: self._lapse(member, pause))
 
     def resume(self, name: str) -> None:
         """Wake a paused node: it finds everything that queued up, as a zombie does."""
         member = self._members[name]
+        if not member.paused:
+            return
         member.paused = False
         member.wakeup_s = None
-        for key in member.transport.tokens:
-            self.tell_token(name, key, up=True)
+        if member.lapsed:
+            member.lapsed = False
+            self._show_own(member)
         backlog, member.backlog = member.backlog, []
         for item in backlog:
-            self._hand_over(name, item)
-        self._plan_wakeup(name)
+            self._hand_over(member, item)
+        self._plan_wakeup(member)
 
     def cut(self, blocked: Callable[[str, str], bool] | None) -> None:
         """Partition: messages from a to b are lost where `blocked(a, b)`; None heals."""
         self._cut = blocked
 
     def disconnect(self, name: str) -> None:
-        """Take a node off the network: it and the others see each other's tokens vanish."""
+        """Take a node off the network: it and the others see each other's tokens vanish, at once.
+
+        The node sees its own vanish too, and its `LinkDown` anywhere among them.
+        """
         member = self._members[name]
         if not member.connected:
             return
+        self._hide_own(member)
         member.connected = False
-        self._hand_over(name, LinkDown())
-        for other in self._members.values():
-            for key in other.transport.tokens:
-                if _matches_any(member.transport.watched, key):
-                    self._hand_over(name, TokenDown(key))
-        for key in member.transport.tokens:
-            self._tell_others(name, TokenDown(key), key)
+        member.connection += 1
+        news: list[Delivery] = [TokenDown(key) for key in member.seen]
+        member.seen.clear()
+        news.insert(self._random.randint(0, len(news)), LinkDown())
+        for item in news:
+            self._hand_over(member, item)
 
     def reconnect(self, name: str) -> None:
         """Bring a node back."""
@@ -247,11 +296,10 @@ class SimulatedNetwork:
         if member.connected:
             return
         member.connected = True
-        self._hand_over(name, LinkUp())
-        for key in member.transport.tokens:
-            self.tell_token(name, key, up=True)
-        for expression in member.transport.watched:
-            self.show_tokens(name, expression)
+        self._show_own(member, but=member)
+        for key in self._seen_tokens(member.transport.watched):
+            self._tell(member, TokenUp(key))
+        self._hand_over(member, LinkUp())
 
     # --- what transports call ---------------------------------------------------------------
 
@@ -267,36 +315,48 @@ class SimulatedNetwork:
     def inject(self, key: str, payload: bytes) -> None:
         """Deliver any bytes on any key, as a stranger on the network could."""
         for receiver in self._route(key):
-            self._send(receiver, Received(key, payload))
+            self._send(self._members[receiver], Received(key, payload))
 
     def ask(self, key: str, payload: bytes, answer: Callable[[bytes, bool], None]) -> bool:
-        """Ask a service; false when nobody serves the key."""
-        for name, member in self._members.items():
-            if key in member.transport.served:
-                token = next(self._token_count)
-                self._answers[token] = answer
-                self._send(name, Question(key, payload, token))
-                return True
-        return False
+        """Ask all who serve the key and take the first answer; false when nobody serves it."""
+        servers = [
+            member
+            for member in self._members.values()
+            if member.connected and key in member.transport.served
+        ]
+        tokens = tuple(next(self._token_count) for _ in servers)
+        for server, token in zip(servers, tokens, strict=True):
+            self._answers[token] = answer, tokens
+            self._send(server, Question(key, payload, token))
+        return bool(servers)
 
-    def take_answer(self, token: int, payload: bytes, *, ok: bool) -> None:
-        """Hand an answer to whoever asked."""
-        waiting = self._answers.pop(token, None)
-        if waiting is not None:
-            self._in(self._delay(), lambda: waiting(payload, ok))
+    def take_answer(self, server: str, token: int, payload: bytes, *, ok: bool) -> None:
+        """Hand the first answer to whoever asked."""
+        if token not in self._answers or not self._members[server].connected:
+            return
+        answer, tokens = self._answers[token]
+        for other in tokens:
+            del self._answers[other]
+        self._in(self._delay(), lambda: answer(payload, ok))
 
-    def tell_token(self, owner: str, key: str, *, up: bool) -> None:
-        """Tell all watchers that a token appeared or vanished."""
-        if self._members[owner].connected:
-            self._tell_others(owner, TokenUp(key) if up else TokenDown(key), key)
+    def show_token(self, owner: str, key: str) -> None:
+        """Tell all watchers of a new token."""
+        member = self._members[owner]
+        if member.visible and not self._shown(key, member):
+            self._tell_watchers(TokenUp(key))
 
-    def show_tokens(self, watcher: str, expression: str) -> None:
+    def hide_token(self, owner: str, key: str) -> None:
+        """Tell all watchers that a token is gone."""
+        member = self._members[owner]
+        if member.visible and not self._shown(key, member):
+            self._tell_watchers(TokenDown(key))
+
+    def show_all_tokens(self, watcher: str, expression: str) -> None:
         """Tell a new watcher of the tokens that are there."""
-        for member in self._members.values():
-            if member.connected and not member.paused:
-                for key in member.transport.tokens:
-                    if matches(expression, key):
-                        self._send(watcher, TokenUp(key))
+        member = self._members[watcher]
+        if member.connected:
+            for key in self._seen_tokens({expression: None}):
+                self._tell(member, TokenUp(key))
 
     def forget_routes(self) -> None:
         """Subscriptions changed: look receivers up again."""
@@ -312,23 +372,58 @@ class SimulatedNetwork:
         member = self._members.pop(name, None)
         if member is None:
             return
+        member.transport.closed = True
         self.forget_routes()
-        keys = tuple(member.transport.tokens)
-        self._in(seen_after_s, lambda: self._tell_tokens_down(name, keys))
+        if member.visible:
+            self._in(seen_after_s, lambda: self._hide_own(member))
 
-    def _lapse(self, name: str) -> None:
-        member = self._members.get(name)
-        if member is not None and member.paused:
-            self._tell_tokens_down(name, tuple(member.transport.tokens))
+    def _lapse(self, member: _Member, pause: int) -> None:
+        if member.paused and member.pauses == pause and not member.transport.closed:
+            self._hide_own(member)
+            member.lapsed = True
 
-    def _tell_tokens_down(self, owner: str, keys: tuple[str, ...]) -> None:
-        for key in keys:
-            self._tell_others(owner, TokenDown(key), key)
+    def _shown(self, key: str, owner: _Member) -> bool:
+        """Tell whether somebody else shows a token on this key."""
+        return any(
+            member is not owner and member.visible and key in member.transport.tokens
+            for member in self._members.values()
+        )
 
-    def _tell_others(self, owner: str, news: TokenUp | TokenDown, key: str) -> None:
-        for name, member in self._members.items():
-            if name != owner and member.connected and _matches_any(member.transport.watched, key):
-                self._send(name, news)
+    def _seen_tokens(self, watched: dict[str, None]) -> list[str]:
+        keys = (
+            key
+            for member in self._members.values()
+            if member.visible
+            for key in member.transport.tokens
+            if _matches_any(watched, key)
+        )
+        return list(dict.fromkeys(keys))
+
+    def _show_own(self, owner: _Member, but: _Member | None = None) -> None:
+        if owner.visible:
+            for key in owner.transport.tokens:
+                if not self._shown(key, owner):
+                    self._tell_watchers(TokenUp(key), but)
+
+    def _hide_own(self, owner: _Member) -> None:
+        if owner.visible:
+            for key in owner.transport.tokens:
+                if not self._shown(key, owner):
+                    self._tell_watchers(TokenDown(key), owner)
+
+    def _tell_watchers(self, news: TokenUp | TokenDown, but: _Member | None = None) -> None:
+        for member in self._members.values():
+            if (
+                member is not but
+                and member.connected
+                and _matches_any(member.transport.watched, news.key)
+            ):
+                self._tell(member, news)
+
+    def _tell(self, watcher: _Member, news: TokenUp | TokenDown) -> None:
+        """Send news of a token, which stay in order as Zenoh's declarations do."""
+        watcher.news_s = max(watcher.news_s, self.now_s + self._delay())
+        self._arrive_at(watcher.news_s, watcher, news)
 
     def _route(self, key: str) -> tuple[str, ...]:
         route = self._routes.get(key)
@@ -350,12 +445,24 @@ class SimulatedNetwork:
         if conditions.loss and self._random.random() < conditions.loss:
             self.dropped += 1
             return
-        self._send(receiver, Received(key, payload))
+        member = self._members[receiver]
+        self._send(member, Received(key, payload))
         if conditions.duplication and self._random.random() < conditions.duplication:
-            self._send(receiver, Received(key, payload))
+            self._send(member, Received(key, payload))
 
-    def _send(self, receiver: str, delivery: Delivery) -> None:
-        self._in(self._delay(), lambda: self._hand_over(receiver, delivery))
+    def _send(self, receiver: _Member, delivery: Delivery) -> None:
+        self._arrive_at(self.now_s + self._delay(), receiver, delivery)
+
+    def _arrive_at(self, time_s: float, receiver: _Member, delivery: Delivery) -> None:
+        connection = receiver.connection
+
+        def arrive() -> None:
+            if not receiver.connected or receiver.connection != connection:
+                return
+            if not isinstance(delivery, (TokenUp, TokenDown)) or receiver.learn(delivery):
+                self._hand_over(receiver, delivery)
+
+        self.at(time_s, arrive)
 
     def _delay(self) -> float:
         return self.conditions.delay_s + self.conditions.jitter_s * self._random.random()
@@ -363,48 +470,41 @@ class SimulatedNetwork:
     def _in(self, delay_s: float, action: Callable[[], None]) -> None:
         self.at(self.now_s + delay_s, action)
 
-    def _hand_over(self, name: str, item: Delivery | Computed) -> None:
-        member = self._members.get(name)
-        if member is None:
+    def _hand_over(self, member: _Member, item: _Item) -> None:
+        if member.transport.closed:
             return
         if member.paused:
             member.backlog.append(item)
             return
-        self.delivered += 1
-        if isinstance(item, Computed):
+        if isinstance(item, (Computed, Started, Stopping)):
             member.node.dispatch(item, self.now_s)
         else:
+            self.delivered += 1
             member.node.deliver(item, self.now_s)
-        self._plan_wakeup(name)
+        if isinstance(item, Stopping):
+            member.transport.close()
+        self._plan_wakeup(member)
 
-    def _dispatch(self, name: str, event: Started | Stopping) -> None:
-        member = self._members.get(name)
-        if member is not None:
-            member.node.dispatch(event, self.now_s)
-            self._plan_wakeup(name)
-
-    def _plan_wakeup(self, name: str) -> None:
-        member = self._members.get(name)
-        if member is None or member.paused:
+    def _plan_wakeup(self, member: _Member, earliest_s: float = 0.0) -> None:
+        if member.transport.closed or member.paused:
             return
         wakeup_s = member.node.core.wakeup_s
         if wakeup_s is not None and wakeup_s != member.wakeup_s:
             member.wakeup_s = wakeup_s
-            self.at(wakeup_s, lambda: self._wake(name, wakeup_s))
+            self.at(max(wakeup_s, earliest_s), lambda: self._wake(member, wakeup_s))
 
-    def _wake(self, name: str, wakeup_s: float) -> None:
-        member = self._members.get(name)
-        if member is None or member.paused or member.wakeup_s != wakeup_s:
+    def _wake(self, member: _Member, wakeup_s: float) -> None:
+        if member.transport.closed or member.paused or member.wakeup_s != wakeup_s:
             return
         member.wakeup_s = None
         due_s = member.node.core.wakeup_s
         if due_s is not None and due_s <= self.now_s:
             member.node.dispatch(Wakeup(), self.now_s)
-        self._plan_wakeup(name)
+        self._plan_wakeup(member, self.now_s + WAKE_AGAIN_S)
 
-    def _compute(self, name: str, job: Compute) -> None:
+    def _compute(self, member: _Member, job: Compute) -> None:
         computed = run_job(job)
-        self._in(self.conditions.compute_s, lambda: self._hand_over(name, computed))
+        self._in(self.conditions.compute_s, lambda: self._hand_over(member, computed))
 
 
 def matches(expression: str, key: str) -> bool:

@@ -1,15 +1,15 @@
 """Strict conversion of untyped maps (TOML, MessagePack, JSON) into attrs classes, with cattrs.
 
-Nothing is coerced: a string is not a number, a bool is not an int, an int is accepted where a
-float is meant. Unknown keys are errors. Every failure becomes one `BadInputError` that names the
-field by its path.
+Nothing is coerced: a string is not a number, a bool is not an int, text is not a list; an int is
+accepted where a float is meant. Unknown keys are errors. Every failure becomes one `BadInputError`
+that names the field by its path.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, TypeVar, get_args, get_origin
 
 import attrs
 from cattrs import Converter
@@ -19,13 +19,15 @@ from cattrs.errors import (
     ForbiddenExtraKeysError,
     IterableValidationNote,
 )
+from cattrs.gen import make_dict_structure_fn
 
 from laneweave.protocol.errors import BadInputError
 
 T = TypeVar("T")
+Hook = Callable[[Any, Any], Any]
 
 
-def _exactly(kind: type, name: str) -> Callable[[object, type], object]:
+def _exactly(kind: type, name: str) -> Hook:
     def hook(value: object, _: type) -> object:
         if type(value) is not kind:
             raise BadInputError("", value, name)
@@ -35,11 +37,12 @@ def _exactly(kind: type, name: str) -> Callable[[object, type], object]:
 
 
 def _number(value: object, _: type) -> float:
-    if type(value) is int:
-        return float(value)
-    if type(value) is not float or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise BadInputError("", value, "a number")
+    # NaN fails the comparison; so does an int that no float can hold.
+    if not abs(value) <= sys.float_info.max:
         raise BadInputError("", value, "a finite number")
-    return value
+    return float(value)
 
 
 def strict_converter(*, detailed: bool) -> Converter:
@@ -50,7 +53,84 @@ def strict_converter(*, detailed: bool) -> Converter:
     converter.register_structure_hook(bool, _exactly(bool, "true or false"))
     converter.register_structure_hook(bytes, _exactly(bytes, "bytes"))
     converter.register_structure_hook(float, _number)
+    converter.register_structure_hook_factory(
+        lambda kind: _origin(kind) is tuple, lambda kind: _tuple_hook(kind, converter)
+    )
+    converter.register_structure_hook_factory(
+        lambda kind: _origin(kind) is dict, lambda kind: _dict_hook(kind, converter)
+    )
+    converter.register_structure_hook_factory(attrs.has, lambda kind: _class_hook(kind, converter))
     return converter
+
+
+def _origin(kind: Any) -> object:  # noqa: ANN401 (whatever annotates a field)
+    return get_origin(kind)
+
+
+def _tuple_hook(kind: Any, converter: Converter) -> Hook:  # noqa: ANN401 (a generic alias)
+    kinds = get_args(kind)
+    endless = kinds[-1] is Ellipsis
+    hooks = [(converter.get_structure_hook(part), part) for part in kinds if part is not Ellipsis]
+
+    def parts(value: object) -> Iterator[tuple[Any, tuple[Hook, Any]]]:
+        if not isinstance(value, (list, tuple)):
+            raise BadInputError("", value, "a list")
+        if not endless and len(value) != len(hooks):
+            raise BadInputError("", value, f"a list of {len(hooks)}")
+        return zip(value, hooks * len(value) if endless else hooks, strict=True)
+
+    def fast(value: object, _: type) -> tuple[Any, ...]:
+        return tuple([hook(item, part) for item, (hook, part) in parts(value)])
+
+    def detailed(value: object, _: type) -> tuple[Any, ...]:
+        done: list[Any] = []
+        for item, (hook, part) in parts(value):
+            try:
+                done.append(hook(item, part))
+            except Exception as error:
+                raise first_problem(error).within(f"[{len(done)}]") from error
+        return tuple(done)
+
+    return detailed if converter.detailed_validation else fast
+
+
+def _dict_hook(kind: Any, converter: Converter) -> Hook:  # noqa: ANN401 (a generic alias)
+    key_kind, value_kind = get_args(kind)
+    key_hook = converter.get_structure_hook(key_kind)
+    value_hook = converter.get_structure_hook(value_kind)
+
+    def hook(value: object, _: type) -> dict[Any, Any]:
+        if not isinstance(value, Mapping):
+            raise BadInputError("", value, "a table")
+        done = {}
+        for key, item in value.items():
+            try:
+                done[key_hook(key, key_kind)] = value_hook(item, value_kind)
+            except Exception as error:
+                raise first_problem(error).within(f"[{key}]") from error
+        return done
+
+    return hook
+
+
+def _class_hook(kind: type, converter: Converter) -> Hook:
+    fields_hook: Hook = make_dict_structure_fn(
+        kind,
+        converter,
+        _cattrs_forbid_extra_keys=True,
+        _cattrs_detailed_validation=converter.detailed_validation,
+    )
+
+    def detailed(value: object, _: type) -> object:
+        if not isinstance(value, Mapping):
+            raise BadInputError("", value, "a table")
+        for key in value:
+            if type(key) is not str:
+                raise BadInputError("", key, "text as the key of each field")
+        return fields_hook(value, kind)
+
+    # The fast one refuses the same, it only cannot say why.
+    return detailed if converter.detailed_validation else fields_hook
 
 
 _CONVERTER = strict_converter(detailed=True)
@@ -62,16 +142,10 @@ def structure(data: Mapping[str, Any], kind: type[T]) -> T:
     Raises:
         BadInputError: the first thing that is wrong, named by its path.
     """
-    if not isinstance(data, Mapping):
-        raise BadInputError("", data, "a table")
     try:
         return _CONVERTER.structure(data, kind)
-    except BaseValidationError as group:
-        raise first_problem(group) from None
-    except BadInputError:
-        raise
-    except (TypeError, ValueError, KeyError, AttributeError) as error:
-        raise BadInputError("", data, str(error)) from error
+    except Exception as error:  # noqa: BLE001 (cattrs raises what the hooks and validators raise)
+        raise first_problem(error) from None
 
 
 def first_problem(error: Exception, path: str = "") -> BadInputError:
@@ -80,14 +154,13 @@ def first_problem(error: Exception, path: str = "") -> BadInputError:
         for inner in error.exceptions:
             return first_problem(inner, path + _step(inner, bool(path)))
     if isinstance(error, ForbiddenExtraKeysError):
-        unknown = min(error.extra_fields)
         allowed = sorted(attribute.alias for attribute in attrs.fields(error.cl))
-        name = f"{path}.{unknown}" if path else unknown
-        return BadInputError(name, "an unknown key", "one of " + ", ".join(allowed))
-    if isinstance(error, BadInputError):
-        return (
-            error.within(path) if error.field else BadInputError(path, error.value, error.allowed)
+        problem = BadInputError(
+            min(error.extra_fields), "an unknown key", "one of " + ", ".join(allowed)
         )
+        return problem.within(path)
+    if isinstance(error, BadInputError):
+        return error.within(path)
     if isinstance(error, KeyError):
         return BadInputError(path, "nothing", "a value; this field is required")
     return BadInputError(path, "a value of another kind", str(error) or type(error).__name__)

@@ -19,6 +19,7 @@ from laneweave.protocol.errors import BadInputError
 
 PREFIX = "laneweave"
 NAME_PATTERN = re.compile(r"[A-Za-z0-9_.-]{1,64}")
+NAME_RULE = "letters, digits, `_`, `-`, `.`; at least 1, at most 64"
 
 
 class Quality(Enum):
@@ -103,10 +104,14 @@ class Keys:
             BadInputError: the realm cannot be one part of a key.
         """
         if not NAME_PATTERN.fullmatch(self.realm):
-            raise BadInputError("network.realm", self.realm, "letters, digits, `_`, `-`, `.`")
+            raise BadInputError("network.realm", self.realm, NAME_RULE)
 
     def key(self, topic: Topic, **parameters: object) -> str:
-        """Return a concrete key, or a key expression when a parameter is `*`."""
+        """Return a concrete key, or a key expression when a parameter is `*`.
+
+        Raises:
+            BadInputError: a parameter cannot be one part of a key.
+        """
         return f"{PREFIX}/{self.realm}/{topic.pattern.format_map(_Text(parameters))}"
 
     def all_of(self, topic: Topic) -> str:
@@ -130,12 +135,17 @@ class Keys:
 class _Text(dict[str, str]):
     def __init__(self, parameters: Mapping[str, object]) -> None:
         super().__init__({name: str(value) for name, value in parameters.items()})
+        for name, text in self.items():
+            if text != "*" and not NAME_PATTERN.fullmatch(text):
+                raise BadInputError(name, text, NAME_RULE)
 
 
 def _match(pattern: list[str], parts: list[str]) -> dict[str, str] | None:
     found = {}
     for expected, part in zip(pattern, parts, strict=True):
         if expected.startswith("{"):
+            if not NAME_PATTERN.fullmatch(part):
+                return None
             found[expected[1:-1]] = part
         elif expected != part:
             return None

@@ -34,7 +34,7 @@ class TokenUp:
 class TokenDown:
     """A liveliness token vanished: its process ended, fell silent, or *we* lost the network.
 
-    A `LinkDown` that comes with it tells the last case from the others.
+    In the last case a `LinkDown` comes with it, at the same time, before it or after it.
     """
 
     key: str
@@ -82,7 +82,11 @@ class Transport(Protocol):
         """Take a liveliness token back; unknown ones are ignored."""
 
     def watch(self, key_expression: str) -> None:
-        """Deliver tokens that appear or vanish, beginning with those that are there."""
+        """Deliver tokens that appear or vanish, beginning with those that are there.
+
+        This node's own are among them. Several nodes may show a token on one key: it has vanished
+        when the last of them has taken it back.
+        """
 
     def serve(self, key: str) -> None:
         """Deliver questions that are asked on this key."""
@@ -91,4 +95,4 @@ class Transport(Protocol):
         """Answer a question once; unknown tokens are ignored."""
 
     def close(self) -> None:
-        """Leave the network. Idempotent."""
+        """Leave the network. Idempotent; whatever is called after it does nothing."""

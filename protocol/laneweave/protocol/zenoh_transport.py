@@ -14,7 +14,6 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import structlog
@@ -85,7 +84,8 @@ def check_endpoint(endpoint: str) -> str:
     Raises:
         BadInputError: it is not of a kind that the Zenoh wheel carries.
     """
-    if not endpoint.startswith(("unixsock-stream/", "tcp/", "tls/")):
+    kind, _, address = endpoint.partition("/")
+    if kind not in ("unixsock-stream", "tcp", "tls") or not address:
         raise BadInputError(
             "network.endpoint", endpoint, "unixsock-stream/PATH, tcp/HOST:PORT or tls/HOST:PORT"
         )
@@ -106,13 +106,14 @@ class ZenohTransport:
         Raises:
             BadInputError: the endpoint is malformed or nobody answers there.
         """
+        check_endpoint(endpoint)
         config = _config("client", lease_s)
-        config.insert_json5("connect/endpoints", json.dumps([check_endpoint(endpoint)]))
         config.insert_json5(
             "connect/retry",
             json.dumps({"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 1.5}),
         )
         try:
+            config.insert_json5("connect/endpoints", json.dumps([endpoint]))
             self._session = zenoh.open(config)
         except zenoh.ZError as error:
             raise BadInputError(
@@ -121,13 +122,14 @@ class ZenohTransport:
         self._deliver = deliver
         self._subscriptions: dict[str, Any] = {}
         self._tokens: dict[str, Any] = {}
-        self._keep: list[Any] = []
+        self._watched: dict[str, Any] = {}
+        self._served: dict[str, Any] = {}
         self._questions: dict[int, zenoh.Query] = {}
         self._question_lock = threading.Lock()
         self._question_count = 0
         self._closed = False
-        self._keep.append(
-            self._session.info.declare_transport_events_listener(self._on_link, history=False)
+        self._link_listener = self._session.info.declare_transport_events_listener(
+            self._on_link, history=False
         )
 
     def publish(self, key: str, payload: bytes, quality: Quality) -> None:
@@ -160,16 +162,16 @@ class ZenohTransport:
             token.undeclare()
 
     def watch(self, key_expression: str) -> None:
-        """Watch liveliness tokens."""
-        self._keep.append(
-            self._session.liveliness().declare_subscriber(
+        """Watch liveliness tokens once; a second call for the same expression does nothing."""
+        if key_expression not in self._watched and not self._closed:
+            self._watched[key_expression] = self._session.liveliness().declare_subscriber(
                 key_expression, self._on_token, history=True
             )
-        )
 
     def serve(self, key: str) -> None:
         """Answer queries on a key."""
-        self._keep.append(self._session.declare_queryable(key, self._on_query))
+        if key not in self._served and not self._closed:
+            self._served[key] = self._session.declare_queryable(key, self._on_query)
 
     def answer(self, token: int, payload: bytes, *, ok: bool) -> None:
         """Answer a query once."""
@@ -215,13 +217,13 @@ def run_core(core: Core, endpoint: str, realm: str, lease_s: float) -> None:
     To be called from the main thread. Computations run one at a time in a thread.
 
     Raises:
-        BadInputError: nobody answers at the endpoint.
+        BadInputError: the realm is malformed or nobody answers at the endpoint.
     """
+    keys = Keys(realm)
     # Enqueuing from callbacks and signal handlers alike: SimpleQueue.put is reentrant.
     inbox: queue.SimpleQueue[Delivery | Computed | Stopping] = queue.SimpleQueue()
     transport = ZenohTransport(endpoint, inbox.put, lease_s)
-    worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="compute")
-    node = Node(core, transport, Keys(realm), lambda job: _order(worker, job, inbox.put))
+    node = Node(core, transport, keys, _worker(inbox.put))
     with _stop_signals(lambda: inbox.put(Stopping())):
         try:
             node.dispatch(Started(), time.monotonic())
@@ -229,7 +231,6 @@ def run_core(core: Core, endpoint: str, realm: str, lease_s: float) -> None:
                 _step(node, inbox)
         finally:
             transport.close()
-            worker.shutdown(wait=False, cancel_futures=True)
 
 
 def _step(node: Node, inbox: queue.SimpleQueue[Delivery | Computed | Stopping]) -> None:
@@ -241,6 +242,7 @@ def _step(node: Node, inbox: queue.SimpleQueue[Delivery | Computed | Stopping]) 
         item = None
     now_s = time.monotonic()
     if isinstance(item, Stopping):
+        log.info("stopping")
         node.dispatch(item, now_s)
         node.ended = True
     elif isinstance(item, Computed):
@@ -252,18 +254,33 @@ def _step(node: Node, inbox: queue.SimpleQueue[Delivery | Computed | Stopping]) 
         node.dispatch(Wakeup(), now_s)
 
 
-def _order(worker: ThreadPoolExecutor, job: Compute, done: Callable[[Computed], None]) -> None:
-    worker.submit(lambda: done(run_job(job)))
+def _worker(done: Callable[[Computed], None]) -> Callable[[Compute], None]:
+    """Start a thread that computes one job after the other, and return how to order one.
+
+    A daemon: a process that is asked to end does not wait for a computation.
+    """
+    jobs: queue.SimpleQueue[Compute] = queue.SimpleQueue()
+
+    def work() -> None:
+        while True:
+            done(run_job(jobs.get()))
+
+    threading.Thread(target=work, name="compute", daemon=True).start()
+    return jobs.put
 
 
 @contextlib.contextmanager
 def _stop_signals(stop: Callable[[], None]) -> Iterator[None]:
-    def on_signal(number: int, _frame: object) -> None:
-        log.info("stopping", signal=signal.Signals(number).name)
+    # A handler may interrupt anything, a thread that holds a lock too: `stop` takes none, and
+    # whoever it wakes writes the log.
+    def on_signal(_number: int, _frame: object) -> None:
         stop()
 
     before = {
-        number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)
+        number: signal.signal(number, on_signal)
+        for number in (signal.SIGINT, signal.SIGTERM)
+        # What is ignored stays ignored: a supervisor takes Ctrl-C for all its processes.
+        if signal.getsignal(number) is not signal.SIG_IGN
     }
     try:
         yield
@@ -278,11 +295,12 @@ def run_router(endpoint: str, lease_s: float, ready: Callable[[], None] | None =
     Raises:
         BadInputError: it cannot listen at the endpoint.
     """
+    check_endpoint(endpoint)
     config = _config("router", lease_s)
-    config.insert_json5("listen/endpoints", json.dumps([check_endpoint(endpoint)]))
-    stop = threading.Event()
-    with _stop_signals(stop.set):
+    stop: queue.SimpleQueue[bool] = queue.SimpleQueue()
+    with _stop_signals(lambda: stop.put(True)):
         try:
+            config.insert_json5("listen/endpoints", json.dumps([endpoint]))
             session = zenoh.open(config)
         except zenoh.ZError as error:
             raise BadInputError(
@@ -291,14 +309,17 @@ def run_router(endpoint: str, lease_s: float, ready: Callable[[], None] | None =
         try:
             if ready is not None:
                 ready()
-            while not stop.wait(1.0):
-                pass
+            stopping = False
+            while not stopping:
+                with contextlib.suppress(queue.Empty):
+                    stopping = stop.get(timeout=1.0)
+            log.info("stopping")
         finally:
             session.close()  # type: ignore[no-untyped-call]
 
 
 def ask(endpoint: str, key: str, payload: bytes, timeout_s: float) -> tuple[bytes, bool]:
-    """Ask a service and wait for one answer.
+    """Ask a service and wait for the first answer, whoever serves it.
 
     Returns:
         The answer and whether it is a result (true) or an error reply (false).
@@ -319,10 +340,14 @@ def transport_ask(
 ) -> tuple[bytes, bool]:
     """Ask over an open transport; see `ask`."""
     session = transport._session  # noqa: SLF001 (same module)
-    replies = list(session.get(key, payload=payload, timeout=timeout_s))
-    if not replies:
+    # Without consolidation each reply is handed over as it comes: one server that hangs must not
+    # hold back the answers of the others.
+    replies = session.get(
+        key, payload=payload, timeout=timeout_s, consolidation=zenoh.ConsolidationMode.NONE
+    )
+    reply = next(iter(replies), None)
+    if reply is None:
         raise BadInputError("connect", key, "a network with a running coordinator")
-    reply = replies[0]
     if reply.ok is not None:
         return reply.ok.payload.to_bytes(), True
     error = reply.err

@@ -224,8 +224,7 @@ def _sample(vehicle: RoadVehicle) -> tuple[str, float, float, float, float, int 
 
 
 def _number(value: object) -> float:
-    usable = isinstance(value, (int, float)) and math.isfinite(value)
-    return float(value) if usable else 0.0
+    return float(value) if isinstance(value, (int, float)) and math.isfinite(value) else 0.0
 
 
 def _milliseconds(packed: Iterable[bytes]) -> NDArray[np.float64]:

@@ -25,28 +25,34 @@ from laneweave.coordinator.planning.constraints import (
     Conflict,
     Constraint,
     Split,
+    bans_for,
+    rises,
     split_by_cost,
     split_by_moves,
 )
-from laneweave.coordinator.planning.diagram import Bans, Diagram, shortest_paths
+from laneweave.coordinator.planning.diagram import Diagram, shortest_paths
 from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.sppa import Path, choose_path, conflicting_moves
 
+_EXACT_COVER_EDGES = 16
+
 UNBOUNDED = math.inf
+BOTH = 2
+"""Both children of a split cost more."""
 
 
 @attrs.define(eq=False)
 class Node:
     """A node of the conflict tree.
 
-    bans: the constraints, as one map from step to banned moves per vehicle.
+    constraints: of this node and all nodes above it.
     diagrams: all shortest paths of each vehicle under its constraints.
     paths: the path set, chosen from the diagrams.
     conflicts: of the path set.
     bound: a lower bound on the cost of every solution below this node.
     """
 
-    bans: tuple[Bans, ...]
+    constraints: tuple[Constraint, ...]
     diagrams: tuple[Diagram, ...]
     paths: tuple[Path, ...]
     conflicts: tuple[Conflict, ...]
@@ -83,7 +89,8 @@ class ConflictTree:
     def search(self, *, below: float, nodes: int) -> Node | None:
         """Expand up to `nodes` nodes; return a solution that costs less than `below`, if found.
 
-        The first solution found is the best one of this assignment, and ends the tree.
+        `below` must not grow between calls: nodes that cost as much are dropped. The first
+        solution found is the best one of this assignment, and ends the tree.
         """
         last = self.expanded + nodes
         while self._open and self._open[0][0] < below and self.expanded < last:
@@ -103,7 +110,8 @@ class ConflictTree:
             children = self._children(node)
             heapq.heappop(self._open)
             for child in children:
-                self._push(child)
+                if child.bound < below:
+                    self._push(child)
         return None
 
     def _push(self, node: Node) -> None:
@@ -125,7 +133,7 @@ class ConflictTree:
             diagrams.append(diagram)
         cost = sum(len(path) for path in paths)
         conflicts = self._all_conflicts(diagrams, paths)
-        return Node(tuple(Bans() for _ in paths), tuple(diagrams), tuple(paths), conflicts, cost)
+        return Node((), tuple(diagrams), tuple(paths), conflicts, cost)
 
     def _children(self, node: Node) -> list[Node]:
         """Return the children of a node, after bypassing conflicts that cost nothing."""
@@ -146,22 +154,22 @@ class ConflictTree:
             if not node.conflicts:
                 return [node]
 
-    def _child(self, node: Node, constraints: Sequence[Constraint]) -> Node | None:
+    def _child(self, node: Node, added: Sequence[Constraint]) -> Node | None:
         """Return the node with these constraints added, or None if some vehicle has no path."""
-        table = self.problem.table
-        bans, diagrams = list(node.bans), list(node.diagrams)
+        problem, table = self.problem, self.problem.table
+        constraints = (*node.constraints, *added)
+        diagrams = list(node.diagrams)
         changed = []
-        for constraint in constraints:
-            vehicle = constraint.vehicle
-            bans[vehicle] = constraint.added_to(bans[vehicle])
-            if vehicle in changed or not constraint.spares(diagrams[vehicle]):
-                diagram = shortest_paths(
-                    table, self.problem.starts[vehicle], diagrams[vehicle].target, bans[vehicle]
-                )
-                if diagram is None:
-                    return None
-                diagrams[vehicle] = diagram
-                changed.append(vehicle)
+        for vehicle, diagram in enumerate(node.diagrams):
+            if all(constraint.spares(vehicle, diagram) for constraint in added):
+                continue
+            self._budget.check_time()
+            bans = bans_for(vehicle, constraints)
+            narrowed = shortest_paths(table, problem.starts[vehicle], diagram.target, bans)
+            if narrowed is None:
+                return None
+            diagrams[vehicle] = narrowed
+            changed.append(vehicle)
         paths = list(node.paths)
         rerouted = [v for v in changed if not respects(paths[v], diagrams[v])]
         for vehicle in rerouted:
@@ -171,14 +179,15 @@ class ConflictTree:
                 for i, (path, other) in enumerate(zip(paths, diagrams, strict=True))
                 if i != vehicle
             ]
+            self._budget.check_time()
             taken = conflicting_moves(table, others, diagram.cost)
             paths[vehicle] = choose_path(table, diagram, taken)
-        conflicts = node.conflicts
+        conflicts = set(node.conflicts)
         for vehicle in rerouted:
-            kept = [c for c in conflicts if vehicle not in (c.first, c.second)]
-            conflicts = (*kept, *self._conflicts_of(vehicle, diagrams, paths))
+            conflicts = {c for c in conflicts if vehicle not in (c.first, c.second)}
+            conflicts.update(self._conflicts_of(vehicle, diagrams, paths))
         bound = max(sum(len(path) for path in paths), node.bound)
-        return Node(tuple(bans), tuple(diagrams), tuple(paths), conflicts, bound)
+        return Node(constraints, tuple(diagrams), tuple(paths), tuple(sorted(conflicts)), bound)
 
     def _all_conflicts(
         self, diagrams: Sequence[Diagram], paths: Sequence[Path]
@@ -211,26 +220,18 @@ class ConflictTree:
 
     def _choose_split(self, node: Node) -> Split:
         """Return the split whose children cost most; among equal ones the earliest."""
-        best: Split | None = None
-        for conflict in sorted(node.conflicts):
-            split = self._split(node, conflict)
-            if best is None or split.rises > best.rises:
-                best = split
-            if best.rises == 2:
-                return best
-        assert best is not None  # noqa: S101
-        for conflict in sorted(node.conflicts):
-            pair = node.diagrams[conflict.first], node.diagrams[conflict.second]
-            if not self.problem.compatible(*pair):
-                return split_by_cost(self.problem.table, conflict, node.diagrams)
-        return best
-
-    def _split(self, node: Node, conflict: Conflict) -> Split:
-        moves = (
-            _move(node, conflict.first, conflict.step),
-            _move(node, conflict.second, conflict.step),
-        )
-        return split_by_moves(self.problem.table, conflict, moves, node.diagrams)
+        table, diagrams = self.problem.table, node.diagrams
+        best, most = node.conflicts[0], -1
+        for conflict in node.conflicts:
+            rising = rises(table, conflict, _moves(node, conflict), diagrams)
+            if rising > most:
+                best, most = conflict, rising
+            if most == BOTH:
+                return split_by_moves(table, best, _moves(node, best), diagrams)
+        for conflict in node.conflicts:
+            if not self.problem.compatible(diagrams[conflict.first], diagrams[conflict.second]):
+                return split_by_cost(table, conflict, diagrams)
+        return split_by_moves(table, best, _moves(node, best), diagrams)
 
     def _raise_bound(self, node: Node) -> None:
         """Add what pairs of vehicles that cannot both keep their cost must pay at least."""
@@ -251,7 +252,7 @@ def least_cover(edges: Sequence[tuple[int, int]]) -> int:
     a, b = edges[0]
     without_a = [e for e in edges if a not in e]
     without_b = [e for e in edges if b not in e]
-    if len(edges) > 24:
+    if len(edges) > _EXACT_COVER_EDGES:
         return 1 + least_cover([e for e in without_a if b not in e])
     return 1 + min(least_cover(without_a), least_cover(without_b))
 
@@ -263,6 +264,11 @@ def respects(path: Path, diagram: Diagram) -> bool:
     )
 
 
-def _move(node: Node, vehicle: int, step: int) -> int:
-    path = node.paths[vehicle]
-    return path[step] if step < len(path) else node.diagrams[vehicle].target
+def _moves(node: Node, conflict: Conflict) -> tuple[int, int]:
+    """Return the conflicting moves of both vehicles."""
+    step = conflict.step
+    first, second = (
+        node.paths[v][step] if step < len(node.paths[v]) else node.diagrams[v].target
+        for v in (conflict.first, conflict.second)
+    )
+    return first, second

@@ -13,7 +13,8 @@ improvements keep every solution in the tree:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import attrs
 
@@ -21,43 +22,57 @@ from laneweave.coordinator.planning.diagram import Bans, Diagram
 from laneweave.coordinator.planning.moves import MoveTable, bits
 
 
-@attrs.frozen
-class Constraint:
-    """A restriction of one vehicle.
+class Constraint(NamedTuple):
+    """What one child of a split adds.
 
-    It must not make any of the `banned` moves in this step, nor later if `lasting`. If `arrived`
-    is set, it must have reached its target for good before this step.
+    arrived is None: in this step `vehicle` must not make a move of `own`, and no other vehicle one
+        of `others`.
+    arrived is True: before this step, `vehicle` has reached its target for good, and from this
+        step on, no other vehicle makes a move of `others`.
+    arrived is False: before this step, `vehicle` has not reached its target for good. It may wait
+        there in this step and leave it later.
     """
 
     vehicle: int
     step: int
-    banned: int
-    lasting: bool = False
-    arrived: bool = False
+    own: int = 0
+    others: int = 0
+    arrived: bool | None = None
 
-    def spares(self, diagram: Diagram) -> bool:
-        """Tell whether all paths of a diagram satisfy this constraint."""
-        if self.arrived:
-            return diagram.cost <= self.step
-        if not self.lasting:
-            return not diagram.layer(self.step) & self.banned
+    def spares(self, vehicle: int, diagram: Diagram) -> bool:
+        """Tell whether all paths of a vehicle's diagram satisfy this constraint."""
+        if vehicle == self.vehicle:
+            if self.arrived is not None:
+                return (diagram.cost <= self.step) == self.arrived
+            return not diagram.layer(self.step) & self.own
+        if not self.arrived:
+            return not diagram.layer(self.step) & self.others
         later = range(self.step, max(diagram.cost, self.step) + 1)
-        return not any(diagram.layer(step) & self.banned for step in later)
+        return not any(diagram.layer(step) & self.others for step in later)
 
-    def added_to(self, bans: Bans) -> Bans:
-        """Return the bans of the vehicle with this constraint."""
-        at, since, latest = bans.at, bans.since, bans.latest
-        if self.arrived:
-            latest = self.step if latest is None else min(latest, self.step)
-        elif self.lasting:
-            since = {**since, self.step: since.get(self.step, 0) | self.banned}
+
+def bans_for(vehicle: int, constraints: Iterable[Constraint]) -> Bans:
+    """Return all that is forbidden to one vehicle."""
+    at: dict[int, int] = {}
+    since: dict[int, int] = {}
+    earliest = 0
+    latest: int | None = None
+    for constraint in constraints:
+        step = constraint.step
+        if vehicle != constraint.vehicle:
+            if constraint.others:
+                bans = since if constraint.arrived else at
+                bans[step] = bans.get(step, 0) | constraint.others
+        elif constraint.arrived:
+            latest = step if latest is None else min(latest, step)
+        elif constraint.arrived is not None:
+            earliest = max(earliest, step + 1)
         else:
-            at = {**at, self.step: at.get(self.step, 0) | self.banned}
-        return Bans(at, since, latest)
+            at[step] = at.get(step, 0) | constraint.own
+    return Bans(at, since, earliest, latest)
 
 
-@attrs.frozen(order=True)
-class Conflict:
+class Conflict(NamedTuple):
     """Two vehicles whose moves in this step conflict; `first` < `second`."""
 
     step: int
@@ -70,12 +85,26 @@ class Split:
     """The constraints of two children such that every solution survives in exactly one of them.
 
     without, using: the vehicle that the split is about avoids the set S_A, or uses it.
-    rises: how many of the two children surely cost more than their parent (2: cardinal).
     """
 
     without: tuple[Constraint, ...]
     using: tuple[Constraint, ...]
-    rises: int
+
+
+def rises(
+    table: MoveTable, conflict: Conflict, moves: tuple[int, int], diagrams: Sequence[Diagram]
+) -> int:
+    """Return how many of the children of a split must cost more than their parent.
+
+    2: cardinal, all shortest paths of both conflict in this step. 1: semi-cardinal, all shortest
+    paths of one conflict with the move of the other.
+    """
+    first = diagrams[conflict.first].layer(conflict.step)
+    second = diagrams[conflict.second].layer(conflict.step)
+    against_first = table.common_conflicts(first)
+    if against_first >> moves[1] & 1:
+        return 1 if second & ~against_first else 2
+    return table.common_conflicts(second) >> moves[0] & 1
 
 
 def split_by_moves(
@@ -84,46 +113,37 @@ def split_by_moves(
     """Return the split that a conflict between two moves leads to."""
     step = conflict.step
     pair = conflict.first, conflict.second
+    for vehicle in pair:
+        if step >= diagrams[vehicle].cost:
+            return _split_by_arrival(table, vehicle, step, diagrams, ())
     layers = diagrams[pair[0]].layer(step), diagrams[pair[1]].layer(step)
     sets = _exclusive_sets(table, moves, layers)
-    raises = not layers[0] & ~sets[0], not layers[1] & ~sets[1]
-    if step >= diagrams[pair[0]].cost:
-        return _split_by_arrival(table, pair[0], step, diagrams, (), sum(raises))
-    if step >= diagrams[pair[1]].cost:
-        return _split_by_arrival(table, pair[1], step, diagrams, (), sum(raises))
-    side = _side_to_decide(raises, sets, layers)
+    side = _side_to_decide(sets, layers)
     vehicle, chosen = pair[side], sets[side]
     others = table.common_conflicts(chosen)
     return Split(
-        (Constraint(vehicle, step, chosen),),
-        (
-            Constraint(vehicle, step, table.valid & ~chosen),
-            *(Constraint(i, step, others) for i in range(len(diagrams)) if i != vehicle),
-        ),
-        sum(raises),
+        without=(Constraint(vehicle, step, chosen),),
+        using=(Constraint(vehicle, step, table.valid & ~chosen, others),),
     )
 
 
-def _side_to_decide(
-    raises: tuple[bool, bool], sets: tuple[int, int], layers: tuple[int, int]
-) -> int:
-    """Return which vehicle the split is about: one that must pay, else the more restricted one."""
-    if raises[0] != raises[1]:
-        return 0 if raises[0] else 1
-    share = [
-        (s & layer).bit_count() / layer.bit_count() for s, layer in zip(sets, layers, strict=True)
-    ]
-    return 0 if share[0] >= share[1] else 1
+def _side_to_decide(sets: tuple[int, int], layers: tuple[int, int]) -> int:
+    """Return whose set covers the larger share of its shortest paths; 1 means it must pay."""
+    first, second = (
+        (chosen & layer).bit_count() / layer.bit_count()
+        for chosen, layer in zip(sets, layers, strict=True)
+    )
+    return 0 if first >= second else 1
 
 
 def split_by_cost(table: MoveTable, conflict: Conflict, diagrams: Sequence[Diagram]) -> Split:
     """Return the split that follows when no two shortest paths of the vehicles are compatible.
 
-    Then one of the two must arrive later, that is, must not yet wait at its target.
+    Then one of the two must arrive later.
     """
     a, b = diagrams[conflict.first], diagrams[conflict.second]
-    later = Constraint(conflict.second, b.cost, 1 << b.target)
-    return _split_by_arrival(table, conflict.first, a.cost, diagrams, (later,), 2)
+    later = Constraint(conflict.second, b.cost, arrived=False)
+    return _split_by_arrival(table, conflict.first, a.cost, diagrams, (later,))
 
 
 def _split_by_arrival(
@@ -132,23 +152,12 @@ def _split_by_arrival(
     step: int,
     diagrams: Sequence[Diagram],
     more: tuple[Constraint, ...],
-    rises: int,
 ) -> Split:
     """Split by whether a vehicle has arrived for good before a step."""
-    target = diagrams[vehicle].target
-    passing = table.conflicts[target]
+    passing = table.conflicts[diagrams[vehicle].target]
     return Split(
-        (Constraint(vehicle, step, 1 << target),),
-        (
-            Constraint(vehicle, step, 0, arrived=True),
-            *(
-                Constraint(i, step, passing, lasting=True)
-                for i in range(len(diagrams))
-                if i != vehicle
-            ),
-            *more,
-        ),
-        rises,
+        without=(Constraint(vehicle, step, arrived=False),),
+        using=(Constraint(vehicle, step, others=passing, arrived=True), *more),
     )
 
 

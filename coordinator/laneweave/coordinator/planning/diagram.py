@@ -20,11 +20,12 @@ class Bans:
 
     at: sets of moves for single steps.
     since: sets of moves that are banned in a step and all later ones.
-    latest: the vehicle must have arrived for good after this many steps.
+    earliest, latest: the least and the largest number of steps until the final arrival.
     """
 
     at: dict[int, int] = attrs.field(factory=dict)
     since: dict[int, int] = attrs.field(factory=dict)
+    earliest: int = 0
     latest: int | None = None
 
 
@@ -51,19 +52,19 @@ class Diagram:
 
 def shortest_paths(table: MoveTable, start: int, target: int, bans: Bans) -> Diagram | None:
     """Return all paths of least cost that respect the bans, or None if there is no path at all."""
-    last_ban = max(*bans.at, *bans.since, -1, -1) + 1
-    limit = last_ban + table.cell_count if bans.latest is None else bans.latest
-    arrival = 0
+    last_ban = max(*bans.at, *bans.since, bans.earliest, -1)
+    limit = last_ban + table.cell_count + 2 if bans.latest is None else bans.latest
+    arrival = bans.earliest
     for step, banned in bans.at.items():
         if banned >> target & 1:
             arrival = max(arrival, step + 1)
     for banned in bans.since.values():
         if banned >> target & 1:
             return None
-    cells = 1 << start
+    cells = arriving = 1 << start
     layers: list[int] = []
     lasting = 0
-    while len(layers) < arrival or not cells >> target & 1:
+    while len(layers) < arrival or not arriving >> target & 1:
         step = len(layers)
         if not cells or step >= limit:
             return None
@@ -71,6 +72,10 @@ def shortest_paths(table: MoveTable, start: int, target: int, bans: Bans) -> Dia
         moves = table.starting_in(cells) & ~(bans.at.get(step, 0) | lasting)
         layers.append(moves)
         cells = table.ends(moves)
+        # Who has waited at the target arrived earlier, unless waiting there was forbidden later.
+        arriving = cells if not moves >> target & 1 else table.ends(moves & ~(1 << target))
+    if layers:
+        layers[-1] &= ~(1 << target)
     cells = 1 << target
     for step in range(len(layers) - 1, -1, -1):
         layers[step] &= table.leading_to(cells)

@@ -53,7 +53,7 @@ def plan(
         tappa.run()
         best = None if tappa.best is None else tidied(problem, tappa.best, budget)
     finished = tappa is not None and tappa.finished
-    cells = [] if best is None else _cells_of(problem, best)
+    cells = [] if best is None else cells_of(problem, best)
     path_map = RelativePathMap.padded([v.id for v in request.vehicles][: len(cells)], cells)
     bound = 0 if tappa is None else tappa.lower_bound
     cost = None if best is None else best.cost
@@ -76,7 +76,7 @@ def _status(*, found: bool, finished: bool) -> Status:
     return "infeasible" if finished else "timeout"
 
 
-def _cells_of(problem: Problem, solution: Solution) -> list[list[Cell]]:
+def cells_of(problem: Problem, solution: Solution) -> list[list[Cell]]:
     """Return the paths as cells, each beginning at the vehicle's start."""
     table = problem.table
     return [

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Sequence
 import attrs
 
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
-from laneweave.coordinator.planning.diagram import Bans, shortest_paths
+from laneweave.coordinator.planning.diagram import Bans, Diagram, shortest_paths
 from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.sppa import Path, choose_path
 
@@ -62,9 +62,7 @@ class Incumbent:
         """Take some vehicles out of the best path set and plan them again."""
         if self.best is None or len(self.best.paths) < 2:
             return
-        count = len(self.best.paths)
-        size = self._random.randint(2, min(count, _TAKE_OUT_AT_MOST))
-        removed = self._random.sample(range(count), size)
+        removed = self._neighbourhood(self.best)
         assignment = list(self.best.assignment)
         if self._random.random() < 0.5:
             self._exchange(assignment, removed)
@@ -82,6 +80,37 @@ class Incumbent:
         found = Solution(tuple(assignment), tuple(paths[v] for v in range(len(paths))))
         if self.best is None or found.cost <= self.best.cost:
             self.best = found
+
+    def _neighbourhood(self, best: Solution) -> list[int]:
+        """Choose a vehicle that is late, and some of those that are in its way."""
+        problem, count = self._problem, len(best.paths)
+        size = self._random.randint(2, min(count, _TAKE_OUT_AT_MOST))
+        free = [problem.free_paths(v, best.assignment[v]) for v in range(count)]
+        late = [len(best.paths[v]) - (d.cost if d else 0) for v, d in enumerate(free)]
+        if not any(late):
+            return self._random.sample(range(count), size)
+        (seed,) = self._random.choices(range(count), late)
+        wish = free[seed]
+        blockers = [
+            v
+            for v in range(count)
+            if v != seed and wish is not None and self._is_in_the_way(best, v, wish)
+        ]
+        self._random.shuffle(blockers)
+        others = [v for v in range(count) if v != seed and v not in blockers]
+        self._random.shuffle(others)
+        removed = [seed, *(blockers + others)[: size - 1]]
+        self._random.shuffle(removed)
+        return removed
+
+    def _is_in_the_way(self, best: Solution, vehicle: int, wish: Diagram) -> bool:
+        """Tell whether a vehicle's path conflicts with some shortest path of another one."""
+        conflicts = self._problem.table.conflicts
+        path, target = best.paths[vehicle], self._problem.targets[best.assignment[vehicle]]
+        return any(
+            layer & conflicts[path[step] if step < len(path) else target]
+            for step, layer in enumerate(wish.layers)
+        )
 
     def _exchange(self, assignment: list[int], removed: Sequence[int]) -> None:
         """Exchange the targets of the removed vehicles, if all remain eligible."""

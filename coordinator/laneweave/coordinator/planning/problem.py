@@ -9,6 +9,8 @@ from laneweave.coordinator.planning.diagram import Bans, Diagram, compatible, sh
 from laneweave.coordinator.planning.grid import Cell, Grid, Mode
 from laneweave.coordinator.planning.moves import MoveTable
 
+_REMEMBERED_PAIRS = 50_000
+
 
 class Problem:
     """Vehicles and targets on a grid, and results that many conflict trees ask for again.
@@ -46,6 +48,8 @@ class Problem:
         key = id(a), id(b)
         known = self._compatible.get(key)
         if known is None:
+            if len(self._compatible) >= _REMEMBERED_PAIRS:
+                self._compatible.clear()
             known = compatible(self.table, a, b), a, b
             self._compatible[key] = known
         return known[0]

@@ -30,6 +30,8 @@ _EXPLORE_TIMES = 3
 
 _NODES_PER_BUILD = 2
 _NODES_PER_IMPROVEMENT = 4
+_CREDIT_PER_VEHICLE = 12
+"""Nodes that are granted to the search for path sets each time it has found a better one."""
 
 
 class Tappa:
@@ -59,6 +61,8 @@ class Tappa:
         self._incumbent = Incumbent(problem, choices, budget)
         self._choices = choices
         self._effort = 0
+        self._credit = 0
+        self._builds = 0
         self._explored = 0
 
     @property
@@ -105,18 +109,23 @@ class Tappa:
                     return
 
     def _look_for_incumbent(self) -> None:
-        """Spend a fixed share of the effort on finding path sets without a proof."""
+        """Spend a share of the effort on finding path sets without a proof, more while it pays."""
         incumbent = self._incumbent
-        while True:
-            step = _NODES_PER_BUILD if incumbent.best is None else _NODES_PER_IMPROVEMENT
-            if self._effort + step > self._budget.nodes or not self._trees:
-                return
-            self._effort += step
+        while self._trees:
+            before = self.best_cost
             if incumbent.best is None:
-                tree = self._trees[self._effort // step % len(self._trees)]
-                incumbent.build(tree.assignment)
+                if self._effort + _NODES_PER_BUILD > self._budget.nodes:
+                    return
+                self._effort += _NODES_PER_BUILD
+                self._builds += 1
+                incumbent.build(self._trees[self._builds % len(self._trees)].assignment)
             else:
+                if self._effort + _NODES_PER_IMPROVEMENT > self._budget.nodes + self._credit:
+                    return
+                self._effort += _NODES_PER_IMPROVEMENT
                 incumbent.improve()
+            if self.best_cost < before:
+                self._credit += _CREDIT_PER_VEHICLE * len(self._choices)
 
     def _is_impossible(self) -> bool:
         """Now and then, look whether the vehicles can reach their targets at all."""

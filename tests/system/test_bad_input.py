@@ -1,0 +1,266 @@
+"""Bad input: one line on stderr that says what is wrong, status 2, and nothing is left running."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from system.harness import END_S, Ended, Lab
+
+NOBODY = "unixsock-stream/nobody.sock"
+
+REQUEST: dict[str, Any] = {
+    "schema": "laneweave.plan.request/1",
+    "grid": {"columns": 4, "lanes": 2},
+    "vehicles": [{"id": "a", "cell": [0, 0], "lane": 1}],
+    "targets": [[1, 0], [1, 1]],
+}
+
+
+def refused(lab: Lab, *arguments: object, **environment: str) -> str:
+    """Run a command that must be refused, and return its one line."""
+    ended: Ended = lab.run(*arguments, within_s=END_S, **environment)
+    assert ended.status == 2, ended
+    assert ended.out == ""
+    lines = ended.err.splitlines()
+    assert len(lines) == 1, ended.err
+    return lines[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["fly"], "fly"),
+        (["run", "--wings", "2"], "--wings"),
+        (["run", "a.toml", "b.toml"], "b.toml"),
+        (["run", "--volume", "-5"], "demand.volume_veh_per_lane_h: got -5.0; allowed: (0, 3600]"),
+        (["run", "--volume", "5000"], "demand.volume_veh_per_lane_h: got 5000.0"),
+        (["run", "--volume", "nan"], "demand.volume_veh_per_lane_h: got nan"),
+        (["run", "--volume", "much"], "--volume"),
+        (["run", "--duration", "0"], "demand.duration_s: got 0.0"),
+        (["run", "--duration", "inf"], "demand.duration_s: got inf"),
+        (["run", "--seed", "-1"], "seed: got -1"),
+        (["run", "--seed", "1.5"], "--seed"),
+        (["run", "--vehicles-per-process", "0"], "runtime.vehicles_per_process: got 0"),
+        (["run", "--coordinators", "0"], "runtime.coordinators: got 0"),
+        (["run", "--method", "magic"], "magic"),
+        (["run", "--transport", "pigeon"], "pigeon"),
+        (["run", "--pace", "0"], "--pace: got 0.0"),
+        (["run", "--pace", "nan"], "--pace: got nan"),
+        (["run", "missing.toml"], "missing.toml"),
+        (["run", "."], "a readable file"),
+        (["run", "--faults", "missing.toml"], "missing.toml"),
+        (["run", "--out", "/dev/null/out"], "--out: got '/dev/null/out'"),
+        (["plan"], "REQUEST.json"),
+        (["plan", "missing.json"], "missing.json"),
+        (["plan", "."], "a readable file"),
+        (["plan", "missing.json", "--format", "poem"], "poem"),
+        (["router"], "network.endpoint"),
+        (["coordinator"], "network.endpoint"),
+        (["agent"], "network.endpoint"),
+        (["bridge", "--out", "out"], "network.endpoint"),
+        (["ping"], "network.endpoint"),
+        (["bridge", "--endpoint", NOBODY, "--pace", "0"], "--pace: got 0.0"),
+        (["bridge", "--endpoint", NOBODY, "--out", "."], "--out: got '.'"),
+        (["agent", "--endpoint", NOBODY, "--shard", "2/2"], "--shard: got '2/2'"),
+        (["agent", "--endpoint", NOBODY, "--shard", "0/0"], "--shard: got '0/0'"),
+        (["agent", "--endpoint", NOBODY, "--shard", "-1/2"], "-1/2"),
+        (["agent", "--endpoint", NOBODY, "--shard", "half"], "--shard: got 'half'"),
+        (["agent", "--endpoint", NOBODY, "v/1"], "VEHICLE: got 'v/1'"),
+        (["agent", "--endpoint", NOBODY, "*"], "VEHICLE: got '*'"),
+        (["coordinator", "--endpoint", NOBODY, "--name", "c/1"], "--name: got 'c/1'"),
+        (["coordinator", "--endpoint", NOBODY, "--name", ""], "--name: got ''"),
+        (["coordinator", "--endpoint", NOBODY, "--name", "c" * 65], "--name: got 'ccc"),
+        (["report"], "DIR"),
+        (["report", "missing"], "DIR: got 'missing'"),
+    ],
+    ids=lambda value: " ".join(value)[:40] if isinstance(value, list) else "",
+)
+def test_command_lines(lab: Lab, arguments: list[str], named: str) -> None:
+    lab.path("something.txt", "")  # so that the folder is not empty
+    assert named in refused(lab, *arguments)
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("sped = 1", "sped: got 'an unknown key'"),
+        ("[road]\nlane = 3", "road.lane: got 'an unknown key'"),
+        ("seed = true", "seed: got True"),
+        ("seed = '1'", "seed: got '1'"),
+        ("seed = 99999999999999999999", "seed: got 99999999999999999999"),
+        ("road = 3", "road: got 3"),
+        ("[road]\nlanes = 0", "road.lanes: got 0"),
+        ("[road]\nlane_width_m = nan", "road.lane_width_m: got nan"),
+        ("[road]\nlane_width_m = 2.0\n[vehicle]\nwidth_m = 2.5", "road.lane_width_m: got 2.0"),
+        ("[demand]\nlane_shares = [1.0, 1.0]", "demand.lane_shares: got [1.0, 1.0]"),
+        ("[demand]\nlane_shares = [0.0, 0.0, 0.0]", "demand.lane_shares"),
+        ("[demand]\nlane_shares = 'all'", "demand.lane_shares"),
+        ("[network]\nrealm = 'a/b'", "network.realm: got 'a/b'"),
+        ("[network]\nlease_s = 0.1", "network.lease_s"),
+        ("[formation]\nmove_s = 4.5", "formation.move_s: got 4.5"),
+        ("schema = 'laneweave.scenario/9'", "schema"),
+        ("not TOML", "valid TOML"),
+        ("a = " + "[" * 5000, "valid TOML"),
+        ("\x00", "valid TOML"),
+    ],
+    ids=range(19),
+)
+def test_scenarios(lab: Lab, text: str, named: str) -> None:
+    line = refused(lab, "run", lab.path("scenario.toml", text), "--out", "out")
+
+    assert named in line
+    assert not (lab.folder / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("[[kill]]\ntarget = 'c9'\nat_s = 1.0", "kill[0].target: got 'c9'"),
+        ("[[kill]]\ntarget = 'v1'\nat_s = 1.0", "leader, c1, c2, c3"),
+        ("[[kill]]\nat_s = 1.0\n[[kill]]\nat_s = -1.0", "kill[1].at_s: got -1.0"),
+        ("[[kill]]\nat_s = nan", "kill[0].at_s: got nan"),
+        ("[[kill]]\ntarget = 'c1'", "kill[0].at_s"),
+        ("[[kill]]\nat_s = 1.0\nhow = 'softly'", "kill[0].how: got 'an unknown key'"),
+        ("[[pause]]\nat_s = 1.0", "pause: got 'an unknown key'"),
+        ("kill = 'c1'", "kill"),
+    ],
+    ids=range(8),
+)
+def test_faults(lab: Lab, text: str, named: str) -> None:
+    faults = lab.path("faults.toml", text)
+    assert named in refused(lab, "run", "--faults", faults, "--out", "out")
+
+
+def _change(**changes: object) -> str:
+    return json.dumps(REQUEST | changes)
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("", "valid JSON"),
+        ("{", "valid JSON"),
+        ("[" * 100_000, "valid JSON"),
+        ("[]", "a JSON object"),
+        ("{}", "schema"),
+        (_change(schema="other"), "schema"),
+        (_change(hurry=True), "hurry"),
+        (_change(mode=3), "mode"),
+        (_change(mode=float("nan")), "mode"),
+        (_change(conflicts=["vertex"]), "conflicts"),
+        (_change(grid={"columns": 0, "lanes": 2}), "grid.columns"),
+        (_change(grid={"columns": 10**9, "lanes": 2}), "grid.columns"),
+        (_change(targets=[[9, 9]]), "targets[0]"),
+        (_change(targets=[[0.5, 0]]), "targets[0]"),
+        (_change(vehicles=[{"id": "a", "cell": [4, 0]}]), "vehicles[0].cell"),
+        (_change(vehicles=[{"id": "a", "cell": [0, 0], "lane": 7}]), "vehicles[0].lane"),
+        (_change(vehicles=[{"id": "a", "cell": [0, 0], "eligible": [2]}]), "vehicles[0].eligible"),
+        (_change(vehicles=[{"id": "a", "cell": [0, 0]}] * 2), "vehicles[1]"),
+        (_change(deadline_s=float("nan")), "deadline_s"),
+        (_change(deadline_s=-1), "deadline_s"),
+        (_change(deadline_s=1e9), "deadline_s"),
+    ],
+    ids=range(21),
+)
+def test_plan_requests(lab: Lab, text: str, named: str) -> None:
+    assert named in refused(lab, "plan", lab.path("request.json", text))
+
+
+def test_deadlines_on_the_command_line(lab: Lab) -> None:
+    request = lab.path("request.json", json.dumps(REQUEST))
+    for deadline in ("-1", "0", "nan", "inf"):
+        assert "deadline_s" in refused(lab, "plan", request, "--deadline", deadline)
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    [
+        "nonsense",
+        "udp/127.0.0.1:7447",
+        "tcp/",
+        "tcp/127.0.0.1",
+        "tcp/127.0.0.1:port",
+        "tcp/127.0.0.1:99999",
+        "tcp/no-such-host.invalid:7447",
+        "unixsock-stream/",
+        "unixsock-stream/missing/folder/router.sock",
+    ],
+)
+def test_endpoints_that_cannot_be(lab: Lab, endpoint: str) -> None:
+    for role in ("router", "ping"):
+        assert "network.endpoint" in refused(lab, role, "--endpoint", endpoint)
+
+
+@pytest.mark.parametrize("role", ["coordinator", "agent", "bridge", "ping", "plan"])
+def test_nobody_is_there(lab: Lab, role: str) -> None:
+    request = lab.path("request.json", json.dumps(REQUEST))
+    options = {
+        "plan": [request, "--connect", NOBODY],
+        "bridge": ["--endpoint", NOBODY, "--out", "out"],
+    }
+    line = refused(lab, role, *options.get(role, ["--endpoint", NOBODY]))
+    assert NOBODY in line
+
+
+@pytest.fixture
+def silent_server() -> Iterator[str]:
+    """Return the endpoint of somebody who accepts connections and says nothing."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        kept: list[socket.socket] = []
+
+        def accept() -> None:
+            while True:
+                try:
+                    kept.append(server.accept()[0])
+                except OSError:
+                    return
+
+        thread = threading.Thread(target=accept, daemon=True)
+        thread.start()
+        yield f"tcp/127.0.0.1:{server.getsockname()[1]}"
+        server.shutdown(socket.SHUT_RDWR)
+        thread.join()
+        for connection in kept:
+            connection.close()
+
+
+def test_somebody_else_is_there(lab: Lab, silent_server: str) -> None:
+    assert silent_server in refused(lab, "ping", "--endpoint", silent_server)
+    assert silent_server in refused(lab, "router", "--endpoint", silent_server)
+
+
+def _full(folder: Path) -> None:
+    folder.mkdir()
+    (folder / "summary.json").write_text("{}")
+
+
+def _file(path: Path) -> None:
+    path.write_text("")
+
+
+@pytest.mark.parametrize(("make", "out"), [(_full, "out"), (_file, "out"), (_file, "out/below")])
+def test_folders_that_cannot_be_written(lab: Lab, make: Callable[[Path], None], out: str) -> None:
+    make(lab.folder / "out")
+    for transport in ("zenoh", "simulated"):
+        line = refused(lab, "run", "--duration", "1", "--transport", transport, "--out", out)
+        assert f"--out: got '{out}'" in line
+
+
+def test_the_temporary_folder_is_too_deep_for_sockets(lab: Lab) -> None:
+    deep = lab.folder / ("d" * 100)
+    deep.mkdir()
+    assert "TMPDIR" in refused(lab, "run", "--duration", "1", "--out", "out", TMPDIR=str(deep))
+
+
+def test_a_folder_that_is_no_run(lab: Lab) -> None:
+    folder = lab.folder / "torn"
+    folder.mkdir()
+    (folder / "trajectories.parquet").write_bytes(b"PAR1 torn")
+    assert "DIR: got 'torn'" in refused(lab, "report", "torn")

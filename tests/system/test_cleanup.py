@@ -1,0 +1,148 @@
+"""However a run ends, it ends soon, says why, keeps what it wrote, and leaves no process."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+from pathlib import Path
+
+import psutil
+import pyarrow.parquet as pq
+import pytest
+
+from system.harness import DEMAND, END_S, Lab, check_safe_and_complete, events, interrupt, summary
+
+FEW_PROCESSES = ("--vehicles-per-process", "4", "--coordinators", "2")
+
+
+def start_and_wait(lab: Lab, road: Path, *options: str, entered: int = 4) -> subprocess.Popen[str]:
+    """Start a run into `out` and wait until it is under way."""
+    process = lab.start("run", road, *DEMAND, *options, "--out", "out")
+    folder = lab.folder / "out"
+
+    def is_under_way() -> bool:
+        assert process.poll() is None, process.communicate()
+        return len(events(folder, "entered")) >= entered
+
+    lab.wait_until(is_under_way)
+    return process
+
+
+def check_files(folder: Path) -> None:
+    """Check that a run's files are complete though the run is not."""
+    assert summary(folder)["vehicles"]["entered"] > 0
+    assert pq.read_table(folder / "trajectories.parquet").num_rows > 0
+    assert pq.read_table(folder / "trips.parquet").num_rows > 0
+    assert events(folder)[-1]["kind"] == "run-interrupted"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_run(lab: Lab, road: Path, number: signal.Signals) -> None:
+    process = start_and_wait(lab, road, *FEW_PROCESSES, "--pace", "5")
+
+    if number is signal.SIGINT:
+        interrupt(process, number)
+    else:
+        process.send_signal(number)
+
+    ended = lab.finish(process, END_S)
+    assert ended.status == 1
+    assert "FAILED: interrupted" in ended.out
+    assert ended.err == ""
+    lab.check_nothing_left()
+    check_files(lab.folder / "out")
+
+
+@pytest.mark.parametrize("role", ["router", "c1", "bridge"])
+def test_ctrl_c_ends_a_run_that_is_starting(lab: Lab, road: Path, role: str) -> None:
+    process = lab.start("run", road, *DEMAND, "--coordinators", "1", "--out", "out")
+    lab.wait_until(lambda: role in lab.roles())
+
+    interrupt(process, signal.SIGINT)
+    interrupt(process, signal.SIGINT)
+
+    ended = lab.finish(process, END_S)
+    assert ended.status == 1
+    assert "Traceback" not in ended.err
+    lab.check_nothing_left()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_simulated_run(lab: Lab, road: Path, number: signal.Signals) -> None:
+    process = start_and_wait(lab, road, "--transport", "simulated")
+
+    interrupt(process, number)
+
+    ended = lab.finish(process, END_S)
+    assert ended.status == 1
+    assert ended.err == "interrupted\n"
+    lab.check_nothing_left()
+    check_files(lab.folder / "out")
+
+
+def test_roles_end_when_the_supervisor_is_killed(lab: Lab, road: Path) -> None:
+    process = start_and_wait(lab, road, *FEW_PROCESSES, "--pace", "5")
+
+    process.kill()
+
+    lab.wait_until(lambda: not lab.processes(), END_S)
+    check_files(lab.folder / "out")
+
+
+def test_a_run_ends_when_the_fork_server_is_killed(lab: Lab, road: Path) -> None:
+    process = start_and_wait(lab, road, *FEW_PROCESSES, "--pace", "5")
+    server = psutil.Process(lab.roles()["bridge"]).parent()
+    assert server is not None
+
+    server.kill()
+
+    ended = lab.finish(process, END_S)
+    assert ended.status == 1
+    assert "FAILED: the " in ended.out
+    lab.wait_until(lambda: not lab.processes(), END_S)
+
+
+@pytest.mark.parametrize("role", ["bridge", "router"])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_a_run_ends_with_its_bridge_and_its_router(
+    lab: Lab, road: Path, role: str, number: signal.Signals
+) -> None:
+    process = start_and_wait(lab, road, *FEW_PROCESSES, "--pace", "5", entered=2)
+
+    os.kill(lab.roles()[role], number)
+
+    ended = lab.finish(process, END_S)
+    assert ended.status == 1
+    assert "FAILED: " in ended.out
+    if number is signal.SIGKILL:
+        assert f"FAILED: the {role} ended with status -9" in ended.out
+    lab.check_nothing_left()
+    if (role, number) != ("bridge", signal.SIGKILL):
+        check_files(lab.folder / "out")
+
+
+def test_vehicles_arrive_though_an_agent_is_killed(lab: Lab, road: Path) -> None:
+    process = start_and_wait(lab, road)
+    agent = next(name for name in sorted(lab.roles()) if name.startswith("agent-"))
+
+    os.kill(lab.roles()[agent], signal.SIGKILL)
+
+    ended = lab.finish(process)
+    lab.check_nothing_left()
+    check_safe_and_complete(lab.folder / "out")
+    # A lost process is a failure, though nobody came to harm.
+    assert ended.status == 1
+    assert f"FAILED: {agent} ended with status -9" in ended.out
+
+
+def test_the_reason_of_a_failure_is_told(lab: Lab, road: Path) -> None:
+    broken = lab.folder / "broken" / "libsumo"
+    broken.mkdir(parents=True)
+    (broken / "__init__.py").write_text("raise ImportError('libX11.so.6: cannot open')\n")
+
+    ended = lab.run("run", road, *DEMAND, "--out", "out", PYTHONPATH=str(broken.parent))
+
+    assert ended.status == 1
+    assert "FAILED: the bridge ended with status 1: " in ended.out
+    assert "libX11.so.6" in ended.out

@@ -1,0 +1,320 @@
+"""Somebody on the network talks nonsense, on every key there is. Nobody listens."""
+
+from __future__ import annotations
+
+import os
+import random
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import attrs
+import msgpack
+import pytest
+
+from laneweave.protocol.codec import MAX_BYTES, VERSION, encode
+from laneweave.protocol.messages import (
+    Announcement,
+    Ballot,
+    Census,
+    CensusEntry,
+    Command,
+    Heartbeat,
+    LogEvent,
+    Name,
+    Neighbour,
+    Plan,
+    Prepare,
+    Report,
+    RoadClock,
+    Sense,
+    VehicleState,
+)
+from laneweave.protocol.topics import (
+    BRIDGE_ALIVE,
+    COORDINATOR_ALIVE,
+    SERVICE,
+    STATE,
+    TOPICS,
+    VEHICLE_ALIVE,
+    Keys,
+    Quality,
+    Topic,
+)
+from laneweave.protocol.zenoh_transport import ZenohTransport, transport_ask
+from system.conftest import FinishedRun
+from system.harness import (
+    DEMAND,
+    END_S,
+    Lab,
+    check_safe_and_complete,
+    events,
+    final_lanes,
+    log_lines,
+    summary,
+)
+
+KEYS = Keys("default")
+GHOST = Name("ghost")
+HUGE = 2**63 - 1
+
+
+def messages(vehicle: Name, *, number: int, real: float) -> dict[type, Any]:
+    """Return a well-formed message of each kind, with this number and this real in every place."""
+    cell = (number, number)
+    ballot = Ballot(number, GHOST, number, number)
+    made = (
+        Heartbeat(Name("zz"), number, number, leading=False, formations=number),
+        Prepare(ballot, number, (vehicle,)),
+        Plan(
+            ballot,
+            number,
+            (vehicle,),
+            {vehicle: number},
+            {vehicle: cell},
+            {vehicle: ((number, cell, (number, 0)),)},
+            real,
+            real,
+            (cell,),
+        ),
+        VehicleState(
+            vehicle,
+            number,
+            number,
+            ballot,
+            accepted=True,
+            ready=True,
+            completed=number,
+            hold_cell=cell,
+            moving=True,
+            go=True,
+            done=True,
+            overdue=True,
+            s_m=real,
+            y_m=real,
+            speed_mps=real,
+            t_s=real,
+        ),
+        Sense(
+            vehicle,
+            number,
+            real,
+            (real,) * 6,
+            cell,
+            number,
+            cell,
+            number,
+            (Neighbour(number, real, real),),
+        ),
+        Command(vehicle, number, cell, number, cell, b"\xff\xff\x7f\x7f" * 80),
+        Census(
+            real,
+            (CensusEntry(vehicle, cell, number, real),),
+            (Announcement(vehicle, number, number, real),),
+        ),
+        RoadClock(number, real, number, number, number, number, ended=True),
+        Report(Name("agent"), vehicle, number, number, number, number, b"\x00\x00\xc0\x7f" * 9),
+        LogEvent(
+            Name("agent"),
+            vehicle,
+            real,
+            Name("plan-made"),
+            {
+                "role": "r",
+                "name": "n",
+                "self": 1,
+                "t_s": "soon",
+                "kind": [],
+                "data": {},
+                "solve_ms": real,
+                "vehicles": number,
+                "status": {},
+                "formation": "\n\x00",
+            },
+        ),
+    )
+    return {type(message): message for message in made}
+
+
+def keys_of(topic: Topic, vehicle: str) -> Iterator[str]:
+    """Return keys of a topic: of somebody who is there and of somebody who is not."""
+    there = {"vehicle": vehicle, "formation": 0, "coordinator": "c1", "role": "agent"}
+    there |= {"name": vehicle, "incarnation": 1}
+    nobody = dict.fromkeys(topic.parameters, "ghost") | {"formation": 99}
+    yield KEYS.key(topic, **there)
+    yield KEYS.key(topic, **nobody)
+
+
+def nonsense(topic: Topic, rng: random.Random) -> Iterator[bytes]:
+    """Return payloads that are no message of a topic."""
+    good = messages(GHOST, number=1, real=1.0)
+    yield b""
+    yield b"\xc1"
+    yield rng.randbytes(200)
+    yield b"\x91" * 400  # lists in lists
+    yield msgpack.packb([VERSION, "Nonsense", {}])
+    for kind, message in good.items():
+        whole = encode(message)
+        if kind is not topic.kind:
+            yield whole
+            continue
+        yield whole[: len(whole) // 2]
+        yield whole[:-1]
+        yield whole + b"\x00"
+        body = attrs.asdict(message)
+        yield msgpack.packb([VERSION + 1, kind.__name__, body])
+        yield msgpack.packb([VERSION, kind.__name__, body | {"more": 1}])
+        yield msgpack.packb([VERSION, kind.__name__, {}])
+        yield msgpack.packb([VERSION, kind.__name__, dict.fromkeys(body, float("nan"))])
+        yield msgpack.packb([VERSION, kind.__name__, dict.fromkeys(body, 2**64 - 1)])
+
+
+def huge_payloads() -> Iterator[bytes]:
+    yield bytes(MAX_BYTES + 1)
+    yield encode(Report(Name("agent"), GHOST, 0, 0, solve_ms=bytes(MAX_BYTES)))
+
+
+@pytest.fixture
+def talk(lab: Lab) -> Iterator[Callable[[Callable[[ZenohTransport], None]], None]]:
+    """Return what repeats something on the run's network, beside the test, until its end."""
+    stop = threading.Event()
+    threads: list[threading.Thread] = []
+
+    def start(say: Callable[[ZenohTransport], None]) -> None:
+        transport = ZenohTransport(lab.router_endpoint, lambda _: None, lease_s=1.0)
+
+        def work() -> None:
+            try:
+                while not stop.is_set():
+                    say(transport)
+                    stop.wait(0.3)
+            finally:
+                transport.close()
+
+        threads.append(threading.Thread(target=work, daemon=True))
+        threads[-1].start()
+
+    yield start
+    stop.set()
+    for thread in threads:
+        thread.join(END_S)
+        assert not thread.is_alive()
+
+
+def say_nonsense(transport: ZenohTransport) -> None:
+    """Publish nonsense on all keys, and what is well formed in the name of nobody."""
+    rng = random.Random(1)  # noqa: S311 (nothing secret)
+    for topic in TOPICS:
+        for key in keys_of(topic, "v0001"):
+            for payload in nonsense(topic, rng):
+                transport.publish(key, payload, Quality.ASSURED)
+    for topic in TOPICS:
+        for number, real in ((-1, -1e9), (HUGE, -1e308)):
+            forged = messages(GHOST, number=number, real=real)
+            # Who leads and what time it is can be forged: that is for access control to stop.
+            harmless = messages(GHOST, number=-1, real=-1e9)
+            if topic.kind in (Heartbeat, RoadClock, Census):
+                forged = harmless
+            if topic.kind is not None:
+                for key in keys_of(topic, "v0001"):
+                    transport.publish(key, encode(forged[topic.kind]), Quality.ASSURED)
+    transport.publish("laneweave/default/nothing", b"", Quality.ASSURED)
+    transport.publish("laneweave/default/sense/v0001/more", b"", Quality.ASSURED)
+    transport.publish("laneweave/default/command/" + "v" * 1000, b"", Quality.ASSURED)
+
+
+def show_tokens(transport: ZenohTransport) -> None:
+    """Show tokens of processes that are none, and take them back."""
+    alive = "laneweave/default/alive"
+    keys = [
+        f"{alive}/coordinator/zz/{incarnation}"
+        for incarnation in ("x", "-1", "1.5", "٣", "9" * 60, "9" * 5000, "0x10", "%00")
+    ]
+    keys += [f"{alive}/coordinator/c0/not-a-number", f"{alive}/vehicle/{'v' * 500}"]
+    keys += [KEYS.key(VEHICLE_ALIVE, vehicle=GHOST), KEYS.key(BRIDGE_ALIVE, name=GHOST)]
+    keys += [KEYS.key(COORDINATOR_ALIVE, coordinator=GHOST, incarnation=7)]
+    keys += [KEYS.key(STATE, formation=0, vehicle=GHOST), f"{alive}/x", KEYS.key(SERVICE)]
+    for key in keys:
+        transport.announce(key)
+    for key in keys:
+        transport.withdraw(key)
+
+
+def test_nonsense_changes_nothing(
+    finished_run: FinishedRun,
+    lab: Lab,
+    road: Path,
+    talk: Callable[[Callable[[ZenohTransport], None]], None],
+) -> None:
+    folder = lab.folder / "out"
+    process = lab.start(
+        *("run", road, *DEMAND, "--vehicles-per-process", "8"),
+        *("--pace", "8", "--out", folder),
+    )
+    lab.wait_until(lambda: len(events(folder, "entered")) > 0)
+    large = huge_payloads()
+
+    def say(transport: ZenohTransport) -> None:
+        say_nonsense(transport)
+        show_tokens(transport)
+        for payload in large:  # once
+            for topic in TOPICS:
+                for key in keys_of(topic, "v0001"):
+                    transport.publish(key, payload, Quality.ASSURED)
+        for question in (b"", b"{", b"\xc1", b"{}", b"[" * 5000, bytes(MAX_BYTES + 1)):
+            _, ok = transport_ask(transport, KEYS.key(SERVICE), question, END_S)
+            assert not ok
+
+    talk(say)
+    ended = lab.finish(process)
+
+    lab.check_nothing_left()
+    assert ended.status == 0, ended
+    check_safe_and_complete(folder)
+    assert final_lanes(folder) == final_lanes(finished_run("simulated"))
+    assert summary(folder)["messages"]["rejected"] > 0
+    assert [line for line in log_lines(folder) if line["level"] == "error"] == []
+    # What was recorded in other names than those of the run's own processes is still readable.
+    assert any(event.get("name") == GHOST for event in events(folder, "plan-made"))
+
+
+@pytest.mark.parametrize(("number", "real"), [(HUGE, 1.7e308), (-(2**63), -1.7e308), (0, 0.0)])
+def test_forged_messages_crash_nobody(
+    lab: Lab,
+    road: Path,
+    talk: Callable[[Callable[[ZenohTransport], None]], None],
+    number: int,
+    real: float,
+) -> None:
+    folder = lab.folder / "out"
+    process = lab.start(
+        *("run", road, *DEMAND, "--vehicles-per-process", "4"),
+        *("--pace", "5", "--out", folder),
+    )
+    lab.wait_until(lambda: len(events(folder, "plan-made")) > 0)
+    known = [Name(event["vehicle"]) for event in events(folder, "entered")]
+    said = threading.Event()
+
+    def say(transport: ZenohTransport) -> None:
+        for vehicle in known:
+            forged = messages(vehicle, number=number, real=real)
+            for topic in TOPICS:
+                if topic.kind is not None:
+                    for key in keys_of(topic, vehicle):
+                        transport.publish(key, encode(forged[topic.kind]), Quality.ASSURED)
+        said.set()
+
+    talk(say)
+    assert said.wait(END_S)
+    before = len(events(folder))
+    lab.wait_until(lambda: process.poll() is not None or len(events(folder)) > before + 5, 20.0)
+    if process.poll() is None:
+        os.kill(process.pid, 15)
+    ended = lab.finish(process, END_S)
+
+    # The run may fail: whoever may forge messages can end it. No process may fail for it.
+    assert [line for line in log_lines(folder) if line["level"] == "error"] == []
+    assert "ended with status" not in ended.out
+    assert summary(folder)["vehicles"]["entered"] > 0
+    lab.wait_until(lambda: not lab.processes(), END_S)

@@ -1,0 +1,159 @@
+"""Whole runs: what they leave behind, and that all ways of running agree."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+
+from system.conftest import FinishedRun
+from system.harness import (
+    DEMAND,
+    Lab,
+    check_safe_and_complete,
+    events,
+    final_lanes,
+    log_lines,
+    mean_travel_time_s,
+    summary,
+    trips,
+)
+
+NUMBER, TEXT, COUNT = (int, float), (str,), (int,)
+MAYBE = (int, float, type(None))
+"""Null where nothing was measured: no vehicle of a short run counts."""
+
+SUMMARY: dict[str, Any] = {
+    "schema": TEXT,
+    "method": TEXT,
+    "seed": COUNT,
+    "volume_veh_per_lane_h": NUMBER,
+    "lanes": COUNT,
+    "road_m": NUMBER,
+    "simulated_s": NUMBER,
+    "vehicles": dict.fromkeys(("demanded", "entered", "left", "on_preferred_lane", "peak"), COUNT),
+    "travel_time_s": dict.fromkeys(("mean", "p50", "p95", "max"), MAYBE),
+    "throughput_veh_per_lane_h": MAYBE,
+    "safety": {
+        "overlaps": COUNT,
+        "sumo_collisions": COUNT,
+        "min_gap_m": NUMBER,
+        "min_headway_s": NUMBER,
+        "emergency_brakes": COUNT,
+        "max_accel_mps2": NUMBER,
+        "min_accel_mps2": NUMBER,
+        "max_jerk_mps3": NUMBER,
+    },
+    "planning": {
+        "plans": COUNT,
+        "optimal": COUNT,
+        "largest_formation": COUNT,
+        "solve_ms": dict.fromkeys(("p50", "p95", "max"), NUMBER),
+    },
+    "tracking": {
+        "solves": COUNT,
+        "unusable": COUNT,
+        "solve_ms": dict.fromkeys(("p50", "p99"), NUMBER),
+    },
+    "runtime": {
+        "real_time_factor": NUMBER,
+        "wall_s": NUMBER,
+        "processes": COUNT,
+        "vehicles_per_process": COUNT,
+        "tick_ms": dict.fromkeys(("p50", "p99"), NUMBER),
+    },
+    "messages": {"published": COUNT, "dropped_by_faults": COUNT},
+    "failover": {"leader_changes": COUNT, "recovery_s": (list,)},
+}
+
+
+def differences(found: Any, expected: Any, path: str = "") -> list[str]:  # noqa: ANN401 (JSON)
+    """Return what is missing in a summary or of another type; there may be more in it."""
+    if isinstance(expected, tuple):
+        # A bool is an int for Python only.
+        fits = isinstance(found, expected) and not isinstance(found, bool)
+        return [] if fits else [f"{path}: {found!r}"]
+    missing = [f"{path}.{key}: missing" for key in expected if key not in found]
+    return missing + [
+        difference
+        for key in expected
+        if key in found
+        for difference in differences(found[key], expected[key], f"{path}.{key}")
+    ]
+
+
+@pytest.mark.parametrize("name", ["zenoh", "packed", "simulated"])
+def test_a_run_keeps_its_promises(finished_run: FinishedRun, name: str) -> None:
+    folder = finished_run(name)
+
+    check_safe_and_complete(folder)
+    found = summary(folder)
+    assert found["vehicles"]["on_preferred_lane"] == found["vehicles"]["left"]
+    assert found["safety"]["min_accel_mps2"] >= -10
+    assert found["safety"]["max_accel_mps2"] <= 5
+    assert found["safety"]["min_gap_m"] > 0
+    assert found["planning"]["plans"] > 1
+    assert found["tracking"]["unusable"] == 0
+    assert found["messages"]["rejected"] == 0
+    assert [line for line in log_lines(folder) if line["level"] == "error"] == []
+
+
+@pytest.mark.parametrize("name", ["zenoh", "simulated"])
+def test_a_run_leaves_all_its_files(finished_run: FinishedRun, name: str) -> None:
+    folder = finished_run(name)
+
+    assert differences(summary(folder), SUMMARY) == []
+    assert summary(folder)["schema"] == "laneweave.summary/1"
+    vehicles = trips(folder)
+    assert len(vehicles) == summary(folder)["vehicles"]["demanded"]
+    assert all(trip["on_preferred_lane"] for trip in vehicles.values())
+    rows = pq.read_table(folder / "trajectories.parquet")
+    assert set(rows.column_names) >= {
+        *("t_s", "vehicle", "s_m", "y_m", "speed_mps", "accel_mps2", "column", "lane")
+    }
+    assert set(rows["vehicle"].unique().to_pylist()) == set(vehicles)
+    assert {event["vehicle"] for event in events(folder, "left")} == set(vehicles)
+    assert all({"t_s", "kind", "role"} <= event.keys() for event in events(folder))
+    assert len(events(folder, "plan-made")) == summary(folder)["planning"]["plans"]
+    for picture in ("travel_time", "speed", "road"):
+        assert (folder / f"{picture}.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def test_a_run_prints_a_table_and_nothing_else(finished_run: FinishedRun) -> None:
+    folder = finished_run("zenoh")
+
+    out = (folder / "stdout.txt").read_text(encoding="utf-8")
+    assert "on their preferred lane" in out
+    assert "(100.00%)" in out
+    assert "FAILED" not in out
+    assert (folder / "stderr.txt").read_text(encoding="utf-8") == ""
+
+
+def test_the_number_of_processes_is_as_asked(finished_run: FinishedRun) -> None:
+    single, packed = summary(finished_run("zenoh")), summary(finished_run("packed"))
+
+    # Router, bridge and three coordinators, and at least as many agents as were on the road.
+    assert single["runtime"]["processes"] >= 5 + single["vehicles"]["peak"]
+    assert single["runtime"]["vehicles_per_process"] == 1
+    assert packed["runtime"]["processes"] <= 5 + packed["vehicles"]["demanded"] // 2
+    assert packed["runtime"]["vehicles_per_process"] == 8
+
+
+@pytest.mark.parametrize("name", ["zenoh", "packed"])
+def test_processes_and_simulation_agree(finished_run: FinishedRun, name: str) -> None:
+    real, simulated = finished_run(name), finished_run("simulated")
+
+    assert final_lanes(real) == final_lanes(simulated)
+    assert mean_travel_time_s(real) == pytest.approx(mean_travel_time_s(simulated), rel=0.01)
+
+
+def test_a_simulated_run_repeats_itself(finished_run: FinishedRun, lab: Lab, road: Path) -> None:
+    first, second = finished_run("simulated"), lab.folder / "second"
+
+    ended = lab.run("run", road, *DEMAND, "--transport", "simulated", "--out", second)
+
+    assert ended.status == 0
+    for file in ("trajectories.parquet", "trips.parquet"):
+        assert pq.read_table(first / file).equals(pq.read_table(second / file))

@@ -1,0 +1,58 @@
+"""The formation relative distance, its weights, and the preference matrix."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from laneweave.coordinator.planning.frd import Weights, cost_matrix, frd
+from laneweave.coordinator.planning.grid import Cell, Grid, Mode
+from laneweave.coordinator.planning.preference import eligible_targets, preference_matrix
+from laneweave.protocol.errors import BadInputError
+
+CELLS = st.tuples(st.integers(0, 4), st.integers(0, 2))
+
+
+def test_the_equation_of_the_paper() -> None:
+    # Five columns and two lanes apart: two oblique edges and three straight ones.
+    assert frd((0, 0), (5, 2), Weights(straight=1, oblique=1)) == 5
+    assert frd((0, 0), (5, 2), Weights(straight=1, oblique=2)) == 7
+    assert frd((0, 0), (5, 2), Weights(straight=0, oblique=1)) == 2
+
+
+@given(CELLS, CELLS, st.sampled_from([1, 2]))
+def test_default_weights_give_the_number_of_steps_on_a_free_grid(
+    a: Cell, b: Cell, mode: Mode
+) -> None:
+    assert frd(a, b, Weights.for_mode(mode)) == Grid(5, 3).distances(a, mode, [b])[b]
+
+
+@pytest.mark.parametrize(
+    ("mode", "weights", "field"),
+    [
+        (1, Weights(2, 2), "l_s"),
+        (1, Weights(1, 3), "l_o"),
+        (2, Weights(1, 2), "l_o"),
+        (2, Weights(-1, 1), "l_s"),
+    ],
+)
+def test_weights_that_are_no_lower_bound_are_rejected(
+    mode: Mode, weights: Weights, field: str
+) -> None:
+    with pytest.raises(BadInputError) as caught:
+        weights.checked(mode)
+    assert caught.value.field == field
+
+
+def test_cost_matrix() -> None:
+    costs = cost_matrix([(0, 0), (2, 1)], [(0, 0), (1, 1), (2, 2)], Weights(1, 1))
+    assert costs.tolist() == [[0, 1, 2], [2, 1, 1]]
+
+
+def test_preferences() -> None:
+    targets = [(0, 0), (1, 1), (2, 1)]
+    assert eligible_targets(targets, 1, None) == {1, 2}
+    assert eligible_targets(targets, 2, None) == frozenset()
+    assert eligible_targets(targets, None, (0, 2)) == {0, 2}
+    assert eligible_targets(targets, None, None) == {0, 1, 2}
+    matrix = preference_matrix([frozenset({1}), frozenset()], 3)
+    assert matrix.tolist() == [[False, True, False], [False, False, False]]

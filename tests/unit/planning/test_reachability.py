@@ -1,0 +1,62 @@
+"""The breadth-first search over joint states."""
+
+import pytest
+from hypothesis import given, settings
+
+from laneweave.coordinator.planning import PlanRequest, VehicleRequest, problems_of_paths
+from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
+from laneweave.coordinator.planning.conflicts import ConflictModel
+from laneweave.coordinator.planning.facade import cells_of
+from laneweave.coordinator.planning.grid import Grid
+from laneweave.coordinator.planning.path_map import RelativePathMap
+from laneweave.coordinator.planning.problem import Problem
+from laneweave.coordinator.planning.reachability import Verdict, explore
+from unit.planning.planning_oracles import cheapest_plan, requests
+
+
+def _explore(request: PlanRequest, max_moves: int = 10**6) -> tuple[Problem, Verdict]:
+    cells = [vehicle.cell for vehicle in request.vehicles]
+    model = ConflictModel(request.conflicts)
+    problem = Problem(request.grid, request.mode, model, cells, request.targets)
+    return problem, explore(problem, request.choices(), Budget(), max_moves)
+
+
+@settings(max_examples=80, deadline=None)
+@given(requests())
+def test_verdict_agrees_with_the_joint_search(request: PlanRequest) -> None:
+    problem, verdict = _explore(request)
+    solvable = cheapest_plan(request) is not None
+    assert verdict.impossible != solvable
+    assert (verdict.solution is not None) == solvable
+    if verdict.solution is not None:
+        cells = cells_of(problem, verdict.solution)
+        rows = RelativePathMap.padded(["" for _ in cells], cells).rows
+        assert problems_of_paths(request, verdict.solution.assignment, rows) == []
+
+
+PUZZLE = PlanRequest(
+    Grid(3, 3),
+    1,
+    ("node", "edge", "special-1"),
+    tuple(
+        VehicleRequest(f"v{i}", cell, eligible=(i,))
+        for i, cell in enumerate([(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (2, 0), (2, 1)])
+    ),
+    ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (2, 1), (2, 0)),
+)
+"""The eight puzzle with two tiles exchanged, which has no solution."""
+
+
+def test_a_search_that_is_cut_off_shows_nothing() -> None:
+    _, verdict = _explore(PUZZLE, max_moves=500)
+    assert verdict == Verdict(solution=None, impossible=False)
+
+
+def test_time_is_checked() -> None:
+    cells = [vehicle.cell for vehicle in PUZZLE.vehicles]
+    model = ConflictModel(PUZZLE.conflicts)
+    problem = Problem(PUZZLE.grid, 1, model, cells, PUZZLE.targets)
+    ticks = iter(range(1000))
+    budget = Budget(deadline=3.0, clock=lambda: float(next(ticks)))
+    with pytest.raises(BudgetSpentError):
+        explore(problem, PUZZLE.choices(), budget, max_moves=10**9)

@@ -1,0 +1,431 @@
+"""The scenario: the paper's defaults, and one readable line for everything that is wrong."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import attrs
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario import (
+    Scenario,
+    load_scenario,
+    parse_scenario,
+    read_toml,
+    to_tables,
+)
+
+FOLDER = Path(__file__).parents[3] / "scenarios"
+TABLES = [
+    attribute.name for attribute in attrs.fields(Scenario) if attrs.has(type(attribute.default))
+]
+
+
+def refusal(data: dict[str, Any]) -> BadInputError:
+    with pytest.raises(BadInputError) as caught:
+        parse_scenario(data)
+    assert_readable(caught.value)
+    return caught.value
+
+
+def assert_readable(error: BadInputError) -> None:
+    line = str(error)
+    assert len(line.splitlines()) == 1
+    assert line.isprintable()
+    assert line.startswith(re.split(r"[\n\x1b]", error.field)[0])
+    assert "; allowed: " in line
+    for jargon in ("object has no", "not iterable", "argument of type", "unhashable"):
+        assert jargon not in line
+
+
+def nested(dotted: str, value: object) -> dict[str, Any]:
+    *tables, key = dotted.split(".")
+    data: dict[str, Any] = {key: value}
+    for table in reversed(tables):
+        data = {table: data}
+    return data
+
+
+# --- defaults ---------------------------------------------------------------------------------
+
+
+def test_defaults_are_the_table_of_the_paper() -> None:
+    scenario = load_scenario(None)
+    formation, vehicle, road = scenario.formation, scenario.vehicle, scenario.road
+    assert formation.gap_m == 15.0
+    assert formation.cycle_s == 4.0
+    assert formation.speed_mps == 15.0
+    assert vehicle.max_speed_mps == 25.0
+    assert vehicle.min_accel_mps2 == -10.0
+    assert vehicle.max_accel_mps2 == 5.0
+    assert (road.s1_m, road.s2_m, road.s3_m) == (50.0, 350.0, 600.0)
+    assert road.lanes == 3
+    assert formation.max_vehicles == 6
+    assert formation.mode == 1
+    assert formation.conflict_kinds == ("node", "edge", "special-1")
+    assert scenario.demand.volume_veh_per_lane_h == 1000.0
+    assert road.length_m == 1000.0
+    assert road.sorting_start_m == 400.0
+    assert scenario.lane_shares == pytest.approx((1 / 3,) * 3)
+
+
+def test_the_file_of_the_paper_holds_the_defaults() -> None:
+    explicit = ("node", "edge", "special-1")
+    default = Scenario()
+    formation = attrs.evolve(default.formation, conflicts=explicit)
+    assert load_scenario(FOLDER / "paper.toml") == attrs.evolve(default, formation=formation)
+
+
+@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.toml")), ids=lambda path: path.stem)
+def test_every_scenario_of_the_repository_loads(path: Path) -> None:
+    assert load_scenario(path).schema == "laneweave.scenario/1"
+
+
+def test_the_lattice_is_that_of_the_tables() -> None:
+    lattice = parse_scenario({"road": {"lanes": 2}, "formation": {"block_columns": 6}}).lattice
+    assert (lattice.lanes, lattice.block_columns) == (2, 6)
+    assert (lattice.pitch_m, lattice.speed_mps, lattice.lane_width_m) == (15.0, 15.0, 3.5)
+
+
+# --- one field that is wrong ------------------------------------------------------------------
+
+LEAVES = [
+    (f"{table}.{attribute.name}", attribute.default)
+    for table in TABLES
+    for attribute in attrs.fields(type(getattr(Scenario(), table)))
+]
+NOT_NUMBERS: tuple[Any, ...] = ("1", True, None, [], [1], {}, math.nan, math.inf, -math.inf)
+
+
+@pytest.mark.parametrize("table", ["", *(f"{table}." for table in TABLES)])
+def test_an_unknown_key_is_refused_by_name(table: str) -> None:
+    error = refusal(nested(f"{table}speling", 1))
+    assert error.field == f"{table}speling"
+    assert "one of" in error.allowed
+
+
+@pytest.mark.parametrize("table", TABLES)
+@pytest.mark.parametrize("value", [5, "x", True, None, [], [{}], 1.5])
+def test_a_table_that_is_none_is_refused(table: str, value: object) -> None:
+    assert refusal({table: value}).field == table
+
+
+@pytest.mark.parametrize(("field", "default"), LEAVES, ids=[field for field, _ in LEAVES])
+def test_every_wrong_type_of_every_field_is_refused_by_name(field: str, default: object) -> None:
+    if isinstance(default, str):
+        wrongs: tuple[Any, ...] = (1, True, None, [], {}, 1.5)
+    elif isinstance(default, tuple):
+        wrongs = (1, True, None, "node", {}, {"a": 1}, [True], [[]], [None], [math.nan], [{}])
+    elif default is None:
+        wrongs = ("1", True, 1.0, [], {}, math.nan)
+    elif isinstance(default, int):
+        wrongs = (*NOT_NUMBERS, 1.0, 16**5000)
+    else:
+        wrongs = (*NOT_NUMBERS, 10**400, -(10**400), 16**5000)
+    for wrong in wrongs:
+        assert refusal(nested(field, wrong)).field.split("[")[0] == field, wrong
+
+
+OUT_OF_RANGE: list[tuple[str, Any]] = [
+    ("schema", "laneweave.scenario/2"),
+    ("schema", 1),
+    ("seed", -1),
+    ("seed", 2**63),
+    ("seed", 1.0),
+    ("seed", 10**400),
+    ("road.lanes", 0),
+    ("road.lanes", 9),
+    ("road.lanes", -3),
+    ("road.lane_width_m", 1.9),
+    ("road.lane_width_m", 10.1),
+    ("road.s1_m", -0.1),
+    ("road.s2_m", 20_001),
+    ("road.s3_m", 0),
+    ("demand.volume_veh_per_lane_h", -5),
+    ("demand.volume_veh_per_lane_h", 0),
+    ("demand.volume_veh_per_lane_h", 5000),
+    ("demand.volume_veh_per_lane_h", math.nan),
+    ("demand.duration_s", 0),
+    ("demand.duration_s", 86_401),
+    ("demand.min_headway_s", -1),
+    ("demand.min_headway_s", 61),
+    ("formation.gap_m", 0.5),
+    ("formation.cycle_s", 0.4),
+    ("formation.move_s", 61),
+    ("formation.speed_mps", 0),
+    ("formation.block_columns", 0),
+    ("formation.block_columns", 25),
+    ("formation.max_vehicles", 0),
+    ("formation.max_vehicles", 37),
+    ("formation.mode", 0),
+    ("formation.mode", 3),
+    ("formation.conflicts", ["nod"]),
+    ("formation.conflicts", ["node", ""]),
+    ("formation.weight_straight", 2),
+    ("formation.weight_oblique", 3),
+    ("formation.weight_oblique", -1),
+    ("formation.planning_deadline_s", 0),
+    ("formation.max_nodes", 0),
+    ("vehicle.length_m", 0.9),
+    ("vehicle.width_m", 4.5),
+    ("vehicle.max_speed_mps", 81),
+    ("vehicle.min_accel_mps2", 0),
+    ("vehicle.min_accel_mps2", 10),
+    ("vehicle.max_accel_mps2", 0),
+    ("vehicle.max_jerk_mps3", 0),
+    ("vehicle.max_lateral_accel_mps2", -1),
+    ("vehicle.max_lateral_jerk_mps3", 101),
+    ("vehicle.max_slip_ratio", 0),
+    ("vehicle.max_slip_ratio", 1.01),
+    ("tracking.horizon_ticks", 9),
+    ("tracking.horizon_ticks", 101),
+    ("tracking.min_gap_m", -1),
+    ("network.realm", ""),
+    ("network.realm", "a/b"),
+    ("network.realm", "*"),
+    ("network.realm", "a b"),
+    ("network.realm", "x" * 65),
+    ("network.realm", "é"),
+    ("network.realm", "a\n"),
+    ("network.lease_s", 0),
+    ("network.heartbeat_s", 0),
+    ("network.election_s", 61),
+    ("network.resend_s", 0),
+    ("runtime.tick_s", 0),
+    ("runtime.tick_s", 1.1),
+    ("runtime.tick_deadline_s", 0),
+    ("runtime.agent_start_s", 121),
+    ("runtime.announce_s", -1),
+    ("runtime.coordinators", 0),
+    ("runtime.coordinators", 10),
+    ("runtime.vehicles_per_process", 0),
+    ("runtime.max_road_s", 0),
+]
+
+
+@pytest.mark.parametrize(("field", "value"), OUT_OF_RANGE)
+def test_a_value_out_of_range_is_refused_by_name(field: str, value: object) -> None:
+    assert refusal(nested(field, value)).field == field
+
+
+# --- fields that do not fit together ----------------------------------------------------------
+
+MISFITS: list[tuple[str, dict[str, Any]]] = [
+    ("demand.lane_shares", {"demand": {"lane_shares": [0.5, 0.5]}}),
+    ("demand.lane_shares", {"demand": {"lane_shares": [1, 1, 1, 1]}}),
+    ("demand.lane_shares", {"road": {"lanes": 2}, "demand": {"lane_shares": [1, 1, 1]}}),
+    ("demand.lane_shares", {"demand": {"lane_shares": [0, 0, 0]}}),
+    ("demand.lane_shares", {"demand": {"lane_shares": [1, -1, 1]}}),
+    ("demand.lane_shares", {"demand": {"lane_shares": [1e308, 1e308, 1e308]}}),
+    ("road.lane_width_m", {"road": {"lane_width_m": 2.0}, "vehicle": {"width_m": 2.0}}),
+    ("road.lane_width_m", {"road": {"lane_width_m": 2.0}, "vehicle": {"width_m": 3.0}}),
+    (
+        "demand.volume_veh_per_lane_h",
+        {"demand": {"volume_veh_per_lane_h": 3600, "min_headway_s": 1.01}},
+    ),
+    ("demand.volume_veh_per_lane_h", {"demand": {"min_headway_s": 60}}),
+    ("formation.gap_m", {"formation": {"gap_m": 5.0}}),
+    ("formation.gap_m", {"vehicle": {"length_m": 30.0}}),
+    ("formation.move_s", {"formation": {"move_s": 4.1}}),
+    ("formation.move_s", {"formation": {"cycle_s": 3.0}}),
+    ("formation.speed_mps", {"formation": {"speed_mps": 25.0}}),
+    ("formation.speed_mps", {"vehicle": {"max_speed_mps": 10.0}}),
+    (
+        "formation.weight_oblique",
+        {"formation": {"mode": 2, "weight_oblique": 2}},
+    ),
+    ("road.s3_m", {"road": {"s3_m": 100.0}}),
+    ("road.s3_m", {"formation": {"block_columns": 24, "gap_m": 100.0}}),
+    ("formation.conflicts", {"formation": {"conflicts": ["node"]}}),
+    ("formation.conflicts", {"formation": {"conflicts": ["node", "edge"]}}),
+    (
+        "formation.conflicts",
+        {"formation": {"mode": 2, "conflicts": ["node", "edge", "special-1"]}},
+    ),
+    ("network.election_s", {"network": {"election_s": 0.2, "heartbeat_s": 0.1}}),
+    ("network.election_s", {"network": {"heartbeat_s": 5.0}}),
+    (
+        "network.lease_s",
+        {"network": {"lease_s": 0.5, "heartbeat_s": 0.5, "election_s": 2.0}},
+    ),
+    ("formation.cycle_s", {"formation": {"cycle_s": 4.05}}),
+    ("formation.move_s", {"formation": {"move_s": 3.85}}),
+    ("formation.cycle_s", {"runtime": {"tick_s": 0.3}}),
+    ("formation.move_s", {"runtime": {"tick_s": 1.0}}),
+    ("formation.cycle_s", {"formation": {"cycle_s": 1.0, "move_s": 1.0}, "runtime": {"tick_s": 1}}),
+    ("tracking.horizon_ticks", {"tracking": {"horizon_ticks": 37}}),
+    ("runtime.tick_deadline_s", {"runtime": {"tick_deadline_s": 0.2}}),
+    ("runtime.tick_deadline_s", {"network": {"resend_s": 2.0}}),
+]
+
+
+@pytest.mark.parametrize(("field", "data"), MISFITS)
+def test_fields_that_do_not_fit_are_refused_by_name(field: str, data: dict[str, Any]) -> None:
+    assert refusal(data).field == field
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        {"demand": {"lane_shares": [1, 0, 0]}},
+        {"demand": {"volume_veh_per_lane_h": 3600, "min_headway_s": 1.0}},
+        {"formation": {"move_s": 4.0}},
+        {"formation": {"mode": 2}},
+        {"formation": {"mode": 2, "weight_oblique": 1}},
+        {"formation": {"conflicts": ["geometric"]}},
+        {"road": {"lanes": 1}},
+        {"tracking": {"horizon_ticks": 38}},
+        {"runtime": {"tick_s": 0.05}, "tracking": {"horizon_ticks": 76}},
+        {"seed": 2**63 - 1},
+        {"road": {}},
+    ],
+)
+def test_what_just_fits_is_taken(data: dict[str, Any]) -> None:
+    parse_scenario(data)
+
+
+def test_lane_shares_sum_to_one() -> None:
+    scenario = parse_scenario({"demand": {"lane_shares": [2, 1, 1]}})
+    assert scenario.lane_shares == (0.5, 0.25, 0.25)
+
+
+# --- files ------------------------------------------------------------------------------------
+
+
+def file_refusal(path: Path) -> BadInputError:
+    with pytest.raises(BadInputError) as caught:
+        load_scenario(path)
+    assert_readable(caught.value)
+    return caught.value
+
+
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
+    assert file_refusal(tmp_path / "none.toml").field == "file"
+    assert file_refusal(Path("a\0b")).field == "file"
+
+
+def test_a_folder_is_refused(tmp_path: Path) -> None:
+    assert file_refusal(tmp_path).field == "file"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"seed = ",
+        b"seed 1",
+        b"\xff\xfe",
+        b"seed = 1\nseed = 2",
+        b"[road\nlanes = 3",
+        b"\x00",
+        b"{}",
+        b"seed = " + b"9" * 5000,
+        b"seed = " + b"[" * 5000,
+        b"road.lanes = 3\nroad = 1",
+    ],
+    ids=range(10),
+)
+def test_what_is_no_toml_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "x.toml"
+    path.write_bytes(content)
+    assert file_refusal(path).field == "file"
+
+
+def test_values_that_toml_allows_are_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "x.toml"
+    for line, field in (
+        ("seed = 0x" + "f" * 5000, "seed"),
+        ("seed = 1979-05-27", "seed"),
+        ("[road]\nlanes = nan", "road.lanes"),
+        ("[demand]\nvolume_veh_per_lane_h = inf", "demand.volume_veh_per_lane_h"),
+        ("[[road]]\nlanes = 3", "road"),
+        ('"a\\nb" = 1', "a\nb"),
+        ('[road]\n"a\\u001b[2J" = 1', "road.a\x1b[2J"),
+    ):
+        path.write_text(line, encoding="utf-8")
+        assert file_refusal(path).field == field
+
+
+def test_an_empty_file_is_the_default(tmp_path: Path) -> None:
+    path = tmp_path / "x.toml"
+    path.write_text("", encoding="utf-8")
+    assert load_scenario(path) == Scenario()
+
+
+# --- round trip and overrides -----------------------------------------------------------------
+
+SCENARIOS = st.builds(
+    lambda lanes, volume, seed, mode, oblique, realm: attrs.evolve(
+        Scenario(),
+        seed=seed,
+        road=attrs.evolve(Scenario().road, lanes=lanes),
+        demand=attrs.evolve(
+            Scenario().demand,
+            volume_veh_per_lane_h=volume,
+            lane_shares=tuple(float(lane + 1) for lane in range(lanes)),
+        ),
+        formation=attrs.evolve(Scenario().formation, mode=mode, weight_oblique=oblique),
+        network=attrs.evolve(Scenario().network, realm=realm),
+    ),
+    st.integers(1, 8),
+    st.floats(1, 3600),
+    st.integers(0, 2**63 - 1),
+    st.sampled_from((1, 2)),
+    st.sampled_from((None, 0, 1)),
+    st.text("abcXYZ019_.-", min_size=1, max_size=64),
+)
+
+
+@settings(max_examples=50, deadline=None)
+@given(SCENARIOS)
+def test_tables_give_the_same_scenario_back(scenario: Scenario) -> None:
+    tables = to_tables(scenario)
+    assert parse_scenario(tables) == scenario
+    assert parse_scenario(json.loads(json.dumps(tables))) == scenario
+
+
+def test_overrides_replace_the_values_of_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "x.toml"
+    path.write_text("seed = 5\n[demand]\nduration_s = 10.0\n", encoding="utf-8")
+    scenario = load_scenario(
+        path, seed=7, demand__volume_veh_per_lane_h=1600, runtime__coordinators=None
+    )
+    assert scenario.seed == 7
+    assert scenario.demand.duration_s == 10.0
+    assert scenario.demand.volume_veh_per_lane_h == 1600.0
+    assert scenario.runtime.coordinators == Scenario().runtime.coordinators
+    assert load_scenario(path, seed=None).seed == 5
+
+
+@pytest.mark.parametrize(
+    ("overrides", "field"),
+    [
+        ({"seed": -1}, "seed"),
+        ({"demand__volume_veh_per_lane_h": math.nan}, "demand.volume_veh_per_lane_h"),
+        ({"demand__speling": 1}, "demand.speling"),
+        ({"speling__x": 1}, "speling"),
+        ({"runtime__coordinators": "3"}, "runtime.coordinators"),
+    ],
+)
+def test_a_wrong_override_is_refused_by_name(overrides: dict[str, object], field: str) -> None:
+    with pytest.raises(BadInputError) as caught:
+        load_scenario(None, **overrides)
+    assert caught.value.field == field
+
+
+def test_an_override_of_a_table_that_is_none_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x.toml"
+    path.write_text("demand = 5", encoding="utf-8")
+    with pytest.raises(BadInputError) as caught:
+        load_scenario(path, demand__duration_s=1.0)
+    assert caught.value.field == "demand"
+
+
+def test_read_toml_returns_plain_tables() -> None:
+    assert read_toml(FOLDER / "demo.toml")["demand"]["duration_s"] == 90.0

@@ -1,0 +1,116 @@
+"""Strict structuring: nothing is coerced, and the path leads to what is wrong."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from attrs import field, frozen
+
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario import within
+from laneweave.protocol.structuring import structure
+
+
+@frozen
+class Part:
+    """A nested table."""
+
+    size: float = field(validator=within(0.0, 10.0))
+    name: str = "none"
+
+
+@frozen
+class Whole:
+    """Everything that structuring knows."""
+
+    count: int
+    flag: bool = False
+    raw: bytes = b""
+    part: Part = Part(1.0)
+    parts: tuple[Part, ...] = ()
+    pair: tuple[int, str] = (1, "a")
+    table: dict[str, tuple[int, ...]] = field(factory=dict)
+    maybe: int | None = None
+
+
+def test_good_data_becomes_the_class() -> None:
+    data = {
+        "count": 1,
+        "flag": True,
+        "raw": b"x",
+        "part": {"size": 2},
+        "parts": [{"size": 3.0, "name": "p"}, {"size": 4}],
+        "pair": [2, "b"],
+        "table": {"k": [1, 2]},
+        "maybe": 5,
+    }
+    whole = structure(data, Whole)
+    assert whole == Whole(
+        1, True, b"x", Part(2.0), (Part(3.0, "p"), Part(4.0)), (2, "b"), {"k": (1, 2)}, 5
+    )
+    assert type(whole.part.size) is float
+
+
+@pytest.mark.parametrize(
+    ("change", "path"),
+    [
+        ({"count": True}, "count"),
+        ({"count": "1"}, "count"),
+        ({"count": 1.0}, "count"),
+        ({"flag": 1}, "flag"),
+        ({"raw": "x"}, "raw"),
+        ({"raw": [1]}, "raw"),
+        ({"part": None}, "part"),
+        ({"part": []}, "part"),
+        ({"part": {}}, "part.size"),
+        ({"part": {"size": True}}, "part.size"),
+        ({"part": {"size": "1"}}, "part.size"),
+        ({"part": {"size": math.nan}}, "part.size"),
+        ({"part": {"size": 10**400}}, "part.size"),
+        ({"part": {"size": 11}}, "part.size"),
+        ({"part": {"size": 1, "name": 1}}, "part.name"),
+        ({"part": {"size": 1, "more": 1}}, "part.more"),
+        ({"part": {"size": 1, 2: 3}}, "part"),
+        ({"parts": {}}, "parts"),
+        ({"parts": "ab"}, "parts"),
+        ({"parts": {"size": 1}}, "parts"),
+        ({"parts": [{"size": 1}, {"size": -1}]}, "parts[1].size"),
+        ({"parts": [{"size": 1}, 5]}, "parts[1]"),
+        ({"pair": "1a"}, "pair"),
+        ({"pair": [1]}, "pair"),
+        ({"pair": [1, "a", 2]}, "pair"),
+        ({"pair": [1, 2]}, "pair[1]"),
+        ({"pair": {1: 1, 2: "a"}}, "pair"),
+        ({"table": []}, "table"),
+        ({"table": {1: []}}, "table[1]"),
+        ({"table": {"k": 1}}, "table[k]"),
+        ({"table": {"k": [1, "2"]}}, "table[k][1]"),
+        ({"maybe": "x"}, "maybe"),
+        ({"maybe": False}, "maybe"),
+        ({"more": 1}, "more"),
+    ],
+)
+def test_what_is_wrong_is_named_by_its_path(change: dict[str, Any], path: str) -> None:
+    with pytest.raises(BadInputError) as caught:
+        structure({"count": 1} | change, Whole)
+    assert caught.value.field == path
+    assert str(caught.value).startswith(f"{path}: got ")
+
+
+@pytest.mark.parametrize("data", [None, 5, "x", [], [("count", 1)], {1: 2}])
+def test_what_is_no_table_is_refused(data: Any) -> None:  # noqa: ANN401
+    with pytest.raises(BadInputError):
+        structure(data, Whole)
+
+
+def test_a_missing_field_says_so() -> None:
+    with pytest.raises(BadInputError, match=r"^count: got 'nothing'; allowed: .*required$"):
+        structure({}, Whole)
+
+
+def test_the_value_is_not_changed() -> None:
+    data = {"count": 1, "table": {"k": [1]}}
+    structure(data, Whole)
+    assert data == {"count": 1, "table": {"k": [1]}}

@@ -1,0 +1,346 @@
+"""The documents agree with the code: tables, links, commands, examples."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import math
+import re
+import shlex
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import attrs
+import pytest
+import typer
+
+from laneweave.coordinator.planning import PlanRequest
+from laneweave.launch.cli import app
+from laneweave.launch.faults import load_faults
+from laneweave.launch.plan_command import answer_request
+from laneweave.protocol import messages
+from laneweave.protocol.codec import KINDS, field_names
+from laneweave.protocol.scenario import (
+    CONFLICT_KINDS,
+    Scenario,
+    load_scenario,
+    parse_scenario,
+)
+from laneweave.protocol.topics import NAME_RULE, TOPICS
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
+COORDINATORS = tuple(f"c{number}" for number in range(1, 10))
+NOT_OURS = {"runs", "build", "dist", "node_modules"}
+
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+HEADING = re.compile(r"^#+ +(.+)$", re.MULTILINE)
+
+
+def markdown_files() -> list[Path]:
+    folders = [
+        path
+        for path in ROOT.iterdir()
+        if path.is_dir() and not path.name.startswith(".") and path.name not in NOT_OURS
+    ]
+    return sorted([*ROOT.glob("*.md"), *(file for folder in folders for file in _below(folder))])
+
+
+def _below(folder: Path) -> Iterator[Path]:
+    return folder.rglob("*.md")
+
+
+MARKDOWN = markdown_files()
+IDS = [str(path.relative_to(ROOT)) for path in MARKDOWN]
+each_document = pytest.mark.parametrize("path", MARKDOWN, ids=IDS)
+
+
+def read(name: str) -> str:
+    return (DOCS / name).read_text(encoding="utf-8")
+
+
+def fences(text: str, *languages: str) -> list[str]:
+    return [body for language, body in FENCE.findall(text) if language in languages]
+
+
+def section(text: str, heading: str) -> str:
+    """Return what follows a heading, up to the next heading of the same or a higher level."""
+    level = len(heading) - len(heading.lstrip("#"))
+    begin = re.search(rf"^{re.escape(heading)}$", text, re.MULTILINE)
+    assert begin is not None, f"no heading {heading!r}"
+    rest = text[begin.end() :]
+    end = re.search(rf"^#{{1,{level}}} ", rest, re.MULTILINE)
+    return rest[: end.start()] if end else rest
+
+
+def rows(text: str) -> list[list[str]]:
+    """Return the body rows of the first table in a text."""
+    lines: list[str] = []
+    for line in text.splitlines():
+        if line.startswith("|"):
+            lines.append(line)
+        elif lines:
+            break
+    return [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines[2:]]
+
+
+def line(cells: list[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def code(text: str) -> str:
+    return text.strip("`")
+
+
+# --- docs/ARCHITECTURE.md: every field of a scenario ---------------------------------------------
+
+UNITS = {
+    "veh_per_lane_h": "vehicles/(lane h)",
+    "mps3": "m/s3",
+    "mps2": "m/s2",
+    "mps": "m/s",
+    "m": "m",
+    "s": "s",
+    "ticks": "ticks",
+}
+
+
+def scenario_table(meanings: Mapping[str, str]) -> str:
+    """Return the table of all scenario fields; the meanings come from the document itself."""
+    table = [line(["Field", "Default", "Unit", "Allowed", "Meaning"]), "|---|---|---|---|---|"]
+    for name, attribute in _scenario_fields():
+        cells = [_default(attribute), _unit(name), _allowed(attribute), meanings.get(name, "?")]
+        table.append(line([f"`{name}`", *cells]))
+    return "\n".join(table)
+
+
+def _scenario_fields() -> Iterator[tuple[str, attrs.Attribute[Any]]]:
+    for outer in attrs.fields(Scenario):
+        if outer.type is not None and attrs.has(type(outer.default)):
+            for inner in attrs.fields(type(outer.default)):
+                yield f"{outer.name}.{inner.name}", inner
+        else:
+            yield outer.name, outer
+
+
+def _default(attribute: attrs.Attribute[Any]) -> str:
+    value = attribute.default
+    if value is None:
+        return "not set"
+    if isinstance(value, tuple):
+        return f"`{list(value)}`"
+    return f"`{json.dumps(value)}`"
+
+
+def _unit(name: str) -> str:
+    return next((unit for end, unit in UNITS.items() if name.endswith(f"_{end}")), "")
+
+
+def _allowed(attribute: attrs.Attribute[Any]) -> str:
+    if attribute.validator is None:
+        return {"str": "text", "tuple[float, ...]": "list of numbers"}[str(attribute.type)]
+    found = inspect.getclosurevars(attribute.validator).nonlocals
+    if "choices" in found:
+        return ", ".join(f"`{json.dumps(one)}`" for one in found["choices"] if one is not None)
+    if "low" in found:
+        bracket = "(" if found["open_low"] else "["
+        return f"{bracket}{_number(found['low'])}, {_number(found['high'])}]"
+    rules = {
+        "_key_part": NAME_RULE,
+        "_conflict_kinds": "any of " + ", ".join(f"`{kind}`" for kind in CONFLICT_KINDS),
+    }
+    return rules[getattr(attribute.validator, "__name__", "")]
+
+
+def _number(value: float) -> str:
+    if isinstance(value, int) and value > 2**53:
+        return f"2^{math.ceil(math.log2(value))} - 1"
+    return f"{value:.10g}"
+
+
+def test_table_of_scenario_fields() -> None:
+    part = section(read("ARCHITECTURE.md"), "### All fields")
+    found = rows(part)
+    meanings = {code(cells[0]): cells[-1] for cells in found}
+    expected = scenario_table(meanings)
+    shown = "\n".join(text for text in part.splitlines() if text.startswith("|"))
+    assert shown == expected, f"the table in ARCHITECTURE.md should be\n\n{expected}\n"
+    lacking = [name for name, _ in _scenario_fields() if meanings[name] in ("", "?")]
+    assert not lacking, f"fields without a meaning: {lacking}"
+
+
+def test_rows_that_cross_check_fields_name_fields_that_exist() -> None:
+    part = section(read("ARCHITECTURE.md"), "### Rules between fields")
+    known = {name for name, _ in _scenario_fields()}
+    named = set(re.findall(r"`([a-z]+\.[a-z_0-9]+)`", part))
+    assert named
+    assert named <= known
+
+
+# --- docs/PROTOCOL.md: keys and messages ---------------------------------------------------------
+
+
+def test_table_of_topics() -> None:
+    shown = [
+        [code(cell) for cell in cells[:5]]
+        for cells in rows(section(read("PROTOCOL.md"), "## Keys"))
+    ]
+    expected = [
+        [
+            topic.name,
+            topic.pattern,
+            "none" if topic.kind is None else topic.kind.__name__,
+            topic.sender,
+            topic.quality.name,
+        ]
+        for topic in TOPICS
+    ]
+    table = "\n".join(line([f"`{cell}`" for cell in cells]) for cells in expected)
+    assert shown == expected, f"the table in PROTOCOL.md should begin with\n\n{table}\n"
+
+
+PARTS = (messages.Neighbour, messages.CensusEntry, messages.Announcement)
+
+
+@pytest.mark.parametrize("kind", [*KINDS.values(), *PARTS], ids=lambda kind: kind.__name__)
+def test_fields_of_messages(kind: type) -> None:
+    part = section(read("PROTOCOL.md"), f"### {kind.__name__}")
+    shown = tuple(code(cells[0]) for cells in rows(part))
+    assert shown == field_names(kind)
+
+
+def test_fields_of_ballots() -> None:
+    shown = tuple(code(cells[0]) for cells in rows(section(read("PROTOCOL.md"), "### Ballot")))
+    assert shown == messages.Ballot._fields
+
+
+def test_places_in_the_code_exist() -> None:
+    """Rule tables name `module.py: Class.method` or `module.py: function`."""
+    sources = {path.name: path.read_text() for path in ROOT.glob("*/laneweave/*/*.py")}
+    places = re.findall(r"`(\w+\.py): ([\w.]+)`", read("PROTOCOL.md") + read("SAFETY.md"))
+    assert places
+    for module, name in places:
+        last = name.rpartition(".")[2]
+        assert re.search(rf"\b(def|class) {last}\b|^{last}\b", sources[module], re.MULTILINE), (
+            f"{module} has no {name}"
+        )
+
+
+# --- everywhere ----------------------------------------------------------------------------------
+
+
+def anchors(text: str) -> set[str]:
+    """Return the anchors of a document's headings, as GitHub makes them."""
+    found: set[str] = set()
+    for heading in HEADING.findall(FENCE.sub("", text)):
+        plain = re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-")
+        number = 0
+        while (anchor := plain if number == 0 else f"{plain}-{number}") in found:
+            number += 1
+        found.add(anchor)
+    return found
+
+
+@each_document
+def test_links_resolve(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    broken = []
+    for link in LINK.findall(FENCE.sub("", text)):
+        if re.match(r"[a-z]+:", link):
+            continue
+        name, _, anchor = link.partition("#")
+        target = (path.parent / name).resolve() if name else path
+        if not target.exists():
+            broken.append(link)
+        elif anchor and anchor not in anchors(target.read_text(encoding="utf-8")):
+            broken.append(link)
+    assert not broken
+
+
+def commands(text: str) -> Iterator[str]:
+    """Yield the `laneweave` command lines of a document."""
+    for body in fences(text, "", "sh", "bash", "console"):
+        for entry in body.replace("\\\n", " ").splitlines():
+            command = entry.strip().removeprefix("$ ")
+            if command.startswith("laneweave "):
+                yield command
+    for inline in re.findall(r"`(laneweave [^`\n]+)`", FENCE.sub("", text)):
+        yield inline
+
+
+@each_document
+def test_commands_exist(path: Path) -> None:
+    program = typer.main.get_command(app)
+    subcommands: dict[str, Any] = getattr(program, "commands", {})
+    for command in commands(path.read_text(encoding="utf-8")):
+        words = shlex.split(command, comments=True)[1:]
+        if not words or words[0].isupper() or words[0] == "--help":
+            continue
+        assert words[0] in subcommands, command
+        subcommand = subcommands[words[0]]
+        known = {option for parameter in subcommand.params for option in parameter.opts}
+        options = {word.partition("=")[0] for word in words if word.startswith("--")}
+        assert options <= known | {"--help"}, command
+        if len(words) > 1 and not re.search(r"[\[\]|>&]|\.\.\.|--help", command):
+            # A whole command: the parser takes it, with placeholders as file names.
+            subcommand.make_context(words[0], words[1:])
+
+
+@each_document
+def test_toml_in_documents_loads(path: Path, tmp_path: Path) -> None:
+    for body in fences(path.read_text(encoding="utf-8"), "toml"):
+        data = tomllib.loads(body)
+        if "kill" in data:
+            file = tmp_path / "faults.toml"
+            file.write_text(body)
+            load_faults(file, COORDINATORS)
+        else:
+            parse_scenario(data)
+
+
+@each_document
+def test_scenario_files_that_documents_name_exist(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    for name in re.findall(r"(?<![\w/])scenarios/[\w./-]+\.toml", text):
+        assert (ROOT / name).is_file(), name
+
+
+@pytest.mark.parametrize(
+    "path", sorted([*(ROOT / "scenarios").rglob("*.toml"), *DOCS.rglob("*.toml")]), ids=str
+)
+def test_scenario_files_load(path: Path) -> None:
+    if path.parent.name == "faults":
+        assert load_faults(path, COORDINATORS).kill
+    else:
+        load_scenario(path)
+
+
+@each_document
+def test_json_in_documents_is_a_request_or_an_answer(path: Path) -> None:
+    for body in fences(path.read_text(encoding="utf-8"), "json"):
+        data = json.loads(body)
+        if data.get("schema") == "laneweave.plan.request/1":
+            PlanRequest.from_dict(data)
+
+
+@pytest.mark.parametrize("path", sorted(DOCS.rglob("*.json")), ids=str)
+def test_example_requests_are_valid(path: Path) -> None:
+    PlanRequest.from_dict(json.loads(path.read_text(encoding="utf-8")))
+
+
+def test_the_answer_to_the_case_study_is_the_one_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    answer_request(DOCS / "examples/case-study.json", None, None, "default", as_table=True)
+    assert capsys.readouterr().out in fences(read("PLANNING.md"), "text")
+
+
+def test_decisions_are_listed_and_have_three_parts() -> None:
+    decisions = sorted((DOCS / "adr").glob("[0-9]*.md"))
+    numbers = [int(path.name[:4]) for path in decisions]
+    assert numbers == list(range(1, len(numbers) + 1))
+    for path in decisions:
+        headings = HEADING.findall(path.read_text(encoding="utf-8"))
+        assert headings[1:] == ["Context", "Decision", "Consequences"], path.name
+        assert f"adr/{path.name}" in read("ARCHITECTURE.md"), f"{path.name} is not listed"
