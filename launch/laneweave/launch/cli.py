@@ -96,7 +96,7 @@ def run(
     ] = None,
     pace: Annotated[
         float | None,
-        typer.Option("--pace", help="Road seconds per second; default: as fast as possible."),
+        typer.Option("--pace", help="Most road seconds per second; default: runtime.max_pace."),
     ] = None,
     no_progress: Annotated[bool, typer.Option("--no-progress")] = False,
 ) -> None:
@@ -228,6 +228,8 @@ def bridge(
     """Run the simulated world of a deployment."""
     from laneweave.sim_bridge.process import run_bridge
 
+    # Until the bridge is up; then it ends in good order.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     _check_pace(pace)
     settings = _deployment(config, endpoint)
     folder = _new_folder(out, settings, Method.formation.value)

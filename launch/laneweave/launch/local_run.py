@@ -39,6 +39,8 @@ ROUTER_START_S = 20.0
 STALL_S = 90.0
 """A run whose road clock stands still for this long has failed."""
 FIRST_TICK_S = 60.0
+LEADER_S = 5.0
+"""How long a run waits for a leader beyond the election time before it begins without one."""
 STOP_S = 5.0
 """How long processes get to end by themselves."""
 POLL_S = 0.1
@@ -121,6 +123,8 @@ class LocalRun:
             observer.subscribe(transport)
             for name in coordinator_names(self.scenario):
                 start("coordinator", name)
+            # Road time must not begin before somebody can plan.
+            self._await_leader(observer)
             start("bridge", "bridge")
             began = advanced = time.monotonic()
             last_tick = -1
@@ -155,6 +159,11 @@ class LocalRun:
                 if self._stop or time.monotonic() > give_up or not router.is_alive():
                     raise
                 time.sleep(0.02)
+
+    def _await_leader(self, observer: Observer) -> None:
+        give_up = time.monotonic() + LEADER_S + 2 * self.scenario.network.election_s
+        while observer.view.leader is None and not self._stop and time.monotonic() < give_up:
+            observer.wait(POLL_S)
 
     def _processes_fine(self) -> bool:
         """Take note of processes that ended; false when the run is over."""

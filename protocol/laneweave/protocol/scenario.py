@@ -199,6 +199,9 @@ class Runtime:
     """How long the entrance waits for a vehicle's agent to come up (wall-clock seconds)."""
     announce_s: float = field(default=6.0, validator=within(0.0, 600.0))
     """Arrivals are announced this long ahead, so that their agents are up in time (road s)."""
+    max_pace: float = field(default=10.0, validator=within(0.01, 1000.0))
+    """Most road seconds per second: network and planning take wall-clock time, and must stay short
+    against the lead that a plan has before its start."""
     coordinators: int = field(default=3, validator=within(1, 9))
     vehicles_per_process: int = field(default=1, validator=within(1, 1000))
     max_road_s: float = field(default=100_000.0, validator=within(1.0, 1e6))

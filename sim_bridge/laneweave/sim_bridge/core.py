@@ -121,7 +121,7 @@ class BridgeCore:
             scenario: road, demand, vehicles.
             world: an empty world.
             record: where measurements go.
-            pace: road seconds per second of the node's clock; None: as fast as answers come.
+            pace: most road seconds per second of the node's clock; None: the scenario's maximum.
             stopwatch: measures the duration of ticks, in s; decides nothing.
         """
         self.scenario = scenario
@@ -131,7 +131,7 @@ class BridgeCore:
         self._world = world
         self._record = record
         self._roadside = Roadside(scenario)
-        self._pace = pace
+        self._tick_lasts_s = scenario.runtime.tick_s / (pace or scenario.runtime.max_pace)
         self._stopwatch = stopwatch
         self._agents_up: set[str] = set()
         self._silent: set[str] = set()
@@ -142,7 +142,7 @@ class BridgeCore:
         self._census_sent_tick = -CENSUS_EVERY_TICKS
         self._census_changed = True
         self._tick_began = 0.0
-        self._began_s = 0.0
+        self._opened_s = 0.0
         self._due_s = 0.0
         self._resend_s = 0.0
         self._deadline_s = 0.0
@@ -202,7 +202,6 @@ class BridgeCore:
         yield Listen(HEARTBEAT)
         yield Watch(VEHICLE_ALIVE)
         yield Announce(BRIDGE_ALIVE, {"name": "bridge"})
-        self._began_s = now_s
         self._open_tick(now_s)
 
     def _on_message(self, message: object) -> None:
@@ -253,6 +252,7 @@ class BridgeCore:
 
     def _open_tick(self, now_s: float) -> None:
         """Admit vehicles at the entrance; wait for their agents."""
+        self._opened_s = now_s
         self._tick_began = self._stopwatch()
         for arrival in self._roadside.newly_demanded(self.t_s):
             self._record.on_demanded(arrival)
@@ -343,12 +343,10 @@ class BridgeCore:
         if self._over():
             yield from self._wind_up(now_s)
             return
-        self._due_s = now_s
-        if self._pace is not None:
-            self._due_s = self._began_s + self.t_s / self._pace
-        elif not self._link_up:
+        self._due_s = max(now_s, self._opened_s + self._tick_lasts_s)
+        if not self._link_up:
             # Nobody can answer: do not race ahead of the vehicles while the network is away.
-            self._due_s = now_s + self.scenario.runtime.tick_s
+            self._due_s = max(self._due_s, now_s + self.scenario.runtime.tick_s)
         self.phase = Phase.PACE
 
     def _show(self) -> None:

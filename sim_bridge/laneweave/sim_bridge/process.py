@@ -22,7 +22,7 @@ def run_bridge(
         scenario: road, demand, vehicles, endpoint.
         folder: where the run's files go.
         method: how vehicles are controlled, for the summary.
-        pace: road seconds per second; None: as fast as agents answer.
+        pace: most road seconds per second; None: the scenario's maximum.
 
     Raises:
         BadInputError: nobody answers at the scenario's endpoint.
