@@ -338,7 +338,8 @@ def _new_folder(out: Path | None, settings: Scenario, method: str) -> Path:
 
 
 def _draw(folder: Path) -> None:
-    from laneweave.launch.figures import road_snapshots, speed_heatmap, travel_time_boxplot
+    from laneweave.launch.figures import speed_heatmap, travel_time_boxplot
+    from laneweave.launch.snapshots import road_snapshots
 
     travel_time_boxplot([folder], folder / "travel_time.png")
     speed_heatmap(folder, folder / "speed.png")

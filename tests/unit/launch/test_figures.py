@@ -8,12 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from laneweave.launch.figures import (
-    lane_colours,
-    road_snapshots,
-    speed_heatmap,
-    travel_time_boxplot,
-)
+from laneweave.launch.figures import speed_heatmap, travel_time_boxplot
+from laneweave.launch.snapshots import lane_colours, road_snapshots
 from laneweave.protocol.scenario import parse_scenario
 from laneweave.sim_bridge.demand import Arrival
 from laneweave.sim_bridge.recorder import Recorder
@@ -86,7 +82,7 @@ def test_lanes_are_coloured_as_in_the_paper() -> None:
 
 
 def test_matplotlib_is_imported_only_to_draw() -> None:
-    code = "import sys; import laneweave.launch.figures; sys.exit('matplotlib' in sys.modules)"
+    code = "import sys; import laneweave.launch.figures, laneweave.launch.snapshots; sys.exit('matplotlib' in sys.modules)"
     path = [entry for entry in sys.path if entry]
     finished = subprocess.run(  # noqa: S603 - our own interpreter and code
         [sys.executable, "-c", f"import sys; sys.path[:0] = {path!r}; {code}"], check=False
