@@ -184,8 +184,6 @@ class Network:
     noticed at once by its liveliness token; this is for one that hangs."""
     resend_s: float = field(default=0.2, validator=within(0.01, 10.0))
     """PREPARE, PLAN and ticks are sent again after this time without an answer."""
-    stale_s: float = field(default=1.0, validator=within(0.1, 60.0))
-    """A vehicle state older than this is not used for decisions (road seconds)."""
 
 
 @frozen

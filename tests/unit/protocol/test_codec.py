@@ -315,8 +315,10 @@ def wrong_values(hint: Any) -> list[Any]:  # noqa: ANN401
         keys: list[Any] = [{1: 1}, {"a": {1: 1}}, {b"a": 1}]
         return [*NOT_MAPS, *keys, *({"a": item} for item in foreign)]
     if get_origin(hint) is dict:
-        keys = [{name: right_value(parts[1])} for name in (*NAMES_NOT_ALLOWED, 1, None, b"v1")]
-        return [*NOT_MAPS, *keys] + [{"v1": wrong} for wrong in wrong_values(parts[1])]
+        named: list[Any] = [
+            {name: right_value(parts[1])} for name in (*NAMES_NOT_ALLOWED, 1, None, b"v1")
+        ]
+        return [*NOT_MAPS, *named, *({"v1": wrong} for wrong in wrong_values(parts[1]))]
     if get_origin(hint) is tuple and parts[-1] is Ellipsis:
         return [*NOT_LISTS] + [[wrong] for wrong in wrong_values(parts[0])]
     if get_origin(hint) is tuple:
@@ -330,12 +332,12 @@ def wrong_values(hint: Any) -> list[Any]:  # noqa: ANN401
     if attrs.has(hint):
         body = {name: right_value(part) for name, part in HINTS[hint].items()}
         lacking: list[Any] = [{k: v for k, v in body.items() if k != name} for name in body]
-        nested = [
+        parts_wrong: list[Any] = [
             body | {name: wrong}
             for name, part in HINTS[hint].items()
             for wrong in wrong_values(part)
         ]
-        return [*NOT_MAPS, body | {"more": 1}, body | {1: 1}, *lacking, *nested]
+        return [*NOT_MAPS, body | {"more": 1}, body | {1: 1}, *lacking, *parts_wrong]
     simple: dict[Any, list[Any]] = {
         int: [*NOT_INTS],
         float: [*NUMBERS_NOT_ALLOWED, True, "1.0", None, [], {}, b"1"],
