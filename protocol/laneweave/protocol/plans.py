@@ -43,9 +43,9 @@ def _needs(plan: Plan, vehicle: Name, step: int, cells: frozenset[Cell]) -> Need
 def plan_problems(plan: Plan) -> list[str]:
     """Return what is wrong with a plan; empty when it can be executed safely.
 
-    Checked: the maps cover the roster; slots last; moves are chains of neighbouring cells from the start cell
-    with ascending steps; what vehicles occupy during a step (footprint of a move, or the cell of a
-    hold) is disjoint; the territory covers everything.
+    Checked: the maps cover the roster; slots last; moves are chains of neighbouring cells from the
+    start cell with ascending steps; what vehicles occupy during a step (footprint of a move, or the
+    cell of a hold) is disjoint; the territory covers everything.
     """
     problems = list(_roster_problems(plan))
     if plan.slot_s <= 0:

@@ -7,7 +7,6 @@ fit together, and raises `BadInputError` with the field, the value and what is a
 
 from __future__ import annotations
 
-import math
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -18,6 +17,7 @@ from attrs import field, frozen
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Lattice
+from laneweave.protocol.scenario_checks import check_scenario
 from laneweave.protocol.structuring import structure
 from laneweave.protocol.topics import NAME_PATTERN, NAME_RULE
 
@@ -141,6 +141,12 @@ class FormationSettings:
         if self.conflicts:
             return self.conflicts
         return BASE_CONFLICTS if self.mode == 1 else ("geometric",)
+
+    @property
+    def executable(self) -> bool:
+        """Whether moves of one step have disjoint footprints, as plans without timetable need."""
+        kinds = set(self.conflict_kinds)
+        return "geometric" in kinds or (self.mode == 1 and set(BASE_CONFLICTS) <= kinds)
 
 
 @frozen
@@ -295,135 +301,3 @@ def parse_scenario(data: Mapping[str, Any]) -> Scenario:
 def to_tables(scenario: Scenario) -> dict[str, Any]:
     """Return nested tables from which `parse_scenario` builds the same scenario."""
     return attrs.asdict(scenario)
-
-
-def check_scenario(scenario: Scenario) -> None:
-    """Check how the fields fit together.
-
-    Raises:
-        BadInputError: names the first field that does not fit.
-    """
-    _check_lanes(scenario)
-    _check_motion(scenario)
-    _check_conflicts(scenario)
-    _check_timing(scenario)
-
-
-def _require(ok: bool, name: str, value: object, allowed: str) -> None:
-    if not ok:
-        raise BadInputError(name, value, allowed)
-
-
-def _check_lanes(scenario: Scenario) -> None:
-    road, demand, vehicle = scenario.road, scenario.demand, scenario.vehicle
-    shares = demand.lane_shares
-    _require(
-        len(shares) in (0, road.lanes),
-        "demand.lane_shares",
-        list(shares),
-        f"one share for each of the {road.lanes} lanes of road.lanes, or none",
-    )
-    _require(
-        all(share >= 0 for share in shares) and (not shares or 0 < sum(shares) < math.inf),
-        "demand.lane_shares",
-        list(shares),
-        "numbers >= 0, not all 0, with a finite sum",
-    )
-    _require(
-        road.lane_width_m > vehicle.width_m,
-        "road.lane_width_m",
-        road.lane_width_m,
-        f"wider than vehicle.width_m = {vehicle.width_m:g}",
-    )
-    _require(
-        3600.0 / demand.volume_veh_per_lane_h >= demand.min_headway_s,
-        "demand.volume_veh_per_lane_h",
-        demand.volume_veh_per_lane_h,
-        f"at most 3600 / demand.min_headway_s = {3600.0 / max(demand.min_headway_s, 1e-9):g}",
-    )
-
-
-def _check_motion(scenario: Scenario) -> None:
-    formation, vehicle, road = scenario.formation, scenario.vehicle, scenario.road
-    _require(
-        formation.gap_m > vehicle.length_m,
-        "formation.gap_m",
-        formation.gap_m,
-        f"longer than vehicle.length_m = {vehicle.length_m:g}",
-    )
-    _require(
-        formation.move_s <= formation.cycle_s,
-        "formation.move_s",
-        formation.move_s,
-        f"at most formation.cycle_s = {formation.cycle_s:g}",
-    )
-    _require(
-        formation.speed_mps < vehicle.max_speed_mps,
-        "formation.speed_mps",
-        formation.speed_mps,
-        f"below vehicle.max_speed_mps = {vehicle.max_speed_mps:g}",
-    )
-    _require(
-        (formation.weight_oblique or 0) <= formation.oblique_steps,
-        "formation.weight_oblique",
-        formation.weight_oblique,
-        "at most 1 in mode 2 (an oblique edge is one step), at most 2 in mode 1",
-    )
-    block_m = (formation.block_columns - 1) * formation.gap_m
-    needed_m = block_m + vehicle.length_m + formation.speed_mps * formation.cycle_s
-    _require(
-        road.s3_m >= needed_m,
-        "road.s3_m",
-        road.s3_m,
-        f"at least {needed_m:g}: a whole formation and one step fit in",
-    )
-
-
-def _check_conflicts(scenario: Scenario) -> None:
-    kinds = set(scenario.formation.conflict_kinds)
-    executable = "geometric" in kinds or (
-        scenario.formation.mode == 1 and set(BASE_CONFLICTS) <= kinds
-    )
-    _require(
-        executable,
-        "formation.conflicts",
-        sorted(kinds),
-        "geometric, or in mode 1 node, edge and special-1: moves of one step must have disjoint "
-        "footprints to be executed without a timetable",
-    )
-
-
-def _check_timing(scenario: Scenario) -> None:
-    network, runtime, formation = scenario.network, scenario.runtime, scenario.formation
-    _require(
-        network.election_s > 2 * network.heartbeat_s,
-        "network.election_s",
-        network.election_s,
-        f"more than twice network.heartbeat_s = {network.heartbeat_s:g}",
-    )
-    _require(
-        network.lease_s > network.heartbeat_s,
-        "network.lease_s",
-        network.lease_s,
-        f"more than network.heartbeat_s = {network.heartbeat_s:g}",
-    )
-    for name, value in (("cycle_s", formation.cycle_s), ("move_s", formation.move_s)):
-        ticks = value / runtime.tick_s
-        _require(
-            ticks >= 2 and abs(ticks - round(ticks)) < 1e-6,
-            f"formation.{name}",
-            value,
-            f"a multiple of runtime.tick_s = {runtime.tick_s:g}, at least twice it",
-        )
-    _require(
-        scenario.tracking.horizon_ticks * runtime.tick_s >= formation.move_s,
-        "tracking.horizon_ticks",
-        scenario.tracking.horizon_ticks,
-        f"long enough to hold a whole move of {formation.move_s:g} s",
-    )
-    _require(
-        runtime.tick_deadline_s > network.resend_s,
-        "runtime.tick_deadline_s",
-        runtime.tick_deadline_s,
-        f"more than network.resend_s = {network.resend_s:g}",
-    )

@@ -26,7 +26,8 @@ from laneweave.protocol.node import (
     Wakeup,
     run_job,
 )
-from laneweave.protocol.topics import Keys, Quality
+from laneweave.protocol.simulated_transport import SimulatedTransport
+from laneweave.protocol.topics import Keys, matches_any
 from laneweave.protocol.transport import (
     Delivery,
     LinkDown,
@@ -58,68 +59,6 @@ class Conditions:
     """A paused node is given up after this time."""
     compute_s: float = 0.05
     """Virtual time that a computation takes."""
-
-
-class SimulatedTransport:
-    """One node's view of the simulated network; made by `SimulatedNetwork.add`."""
-
-    def __init__(self, network: SimulatedNetwork, name: str) -> None:
-        """Attach a named node to a network."""
-        self._network = network
-        self.name = name
-        self.subscriptions: dict[str, None] = {}
-        self.watched: dict[str, None] = {}
-        self.tokens: dict[str, None] = {}
-        self.served: set[str] = set()
-        self.closed = False
-
-    def publish(self, key: str, payload: bytes, quality: Quality) -> None:
-        """Send to all subscribers, each with its own fate."""
-        del quality
-        if not self.closed:
-            self._network.carry(self.name, key, payload)
-
-    def subscribe(self, key_expression: str) -> None:
-        """Subscribe."""
-        self.subscriptions[key_expression] = None
-        self._network.forget_routes()
-
-    def unsubscribe(self, key_expression: str) -> None:
-        """Undo `subscribe`."""
-        self.subscriptions.pop(key_expression, None)
-        self._network.forget_routes()
-
-    def announce(self, key: str) -> None:
-        """Show a token."""
-        if key not in self.tokens and not self.closed:
-            self.tokens[key] = None
-            self._network.show_token(self.name, key)
-
-    def withdraw(self, key: str) -> None:
-        """Take a token back."""
-        if key in self.tokens and not self.closed:
-            del self.tokens[key]
-            self._network.hide_token(self.name, key)
-
-    def watch(self, key_expression: str) -> None:
-        """Watch tokens once, beginning with those that are there."""
-        if key_expression not in self.watched and not self.closed:
-            self.watched[key_expression] = None
-            self._network.show_all_tokens(self.name, key_expression)
-
-    def serve(self, key: str) -> None:
-        """Answer questions on a key."""
-        self.served.add(key)
-
-    def answer(self, token: int, payload: bytes, *, ok: bool) -> None:
-        """Answer a question once."""
-        if not self.closed:
-            self._network.take_answer(self.name, token, payload, ok=ok)
-
-    def close(self) -> None:
-        """Leave the network."""
-        if not self.closed:
-            self._network.remove(self.name)
 
 
 _Item = Delivery | Computed | Started | Stopping
@@ -395,7 +334,7 @@ class SimulatedNetwork:
             for member in self._members.values()
             if member.visible
             for key in member.transport.tokens
-            if _matches_any(watched, key)
+            if matches_any(watched, key)
         )
         return list(dict.fromkeys(keys))
 
@@ -416,7 +355,7 @@ class SimulatedNetwork:
             if (
                 member is not but
                 and member.connected
-                and _matches_any(member.transport.watched, news.key)
+                and matches_any(member.transport.watched, news.key)
             ):
                 self._tell(member, news)
 
@@ -431,7 +370,7 @@ class SimulatedNetwork:
             route = self._routes[key] = tuple(
                 name
                 for name, member in self._members.items()
-                if _matches_any(member.transport.subscriptions, key)
+                if matches_any(member.transport.subscriptions, key)
             )
         return route
 
@@ -505,21 +444,3 @@ class SimulatedNetwork:
     def _compute(self, member: _Member, job: Compute) -> None:
         computed = run_job(job)
         self._in(self.conditions.compute_s, lambda: self._hand_over(member, computed))
-
-
-def matches(expression: str, key: str) -> bool:
-    """Tell whether a key expression matches a key: `*` is one part, `**` any number of parts."""
-    return _match_parts(expression.split("/"), key.split("/"))
-
-
-def _match_parts(expression: list[str], key: list[str]) -> bool:
-    if not expression:
-        return not key
-    head, rest = expression[0], expression[1:]
-    if head == "**":
-        return any(_match_parts(rest, key[start:]) for start in range(len(key) + 1))
-    return bool(key) and head in ("*", key[0]) and _match_parts(rest, key[1:])
-
-
-def _matches_any(expressions: dict[str, None], key: str) -> bool:
-    return any(matches(expression, key) for expression in expressions)

@@ -9,7 +9,7 @@ docs/PROTOCOL.md is checked.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from enum import Enum
 
 from attrs import frozen
@@ -150,3 +150,22 @@ def _match(pattern: list[str], parts: list[str]) -> dict[str, str] | None:
         elif expected != part:
             return None
     return found
+
+
+def matches(expression: str, key: str) -> bool:
+    """Tell whether a key expression matches a key: `*` is one part, `**` any number of parts."""
+    return _match_parts(expression.split("/"), key.split("/"))
+
+
+def _match_parts(expression: list[str], key: list[str]) -> bool:
+    if not expression:
+        return not key
+    head, rest = expression[0], expression[1:]
+    if head == "**":
+        return any(_match_parts(rest, key[start:]) for start in range(len(key) + 1))
+    return bool(key) and head in ("*", key[0]) and _match_parts(rest, key[1:])
+
+
+def matches_any(expressions: Iterable[str], key: str) -> bool:
+    """Tell whether one of several key expressions matches a key."""
+    return any(matches(expression, key) for expression in expressions)

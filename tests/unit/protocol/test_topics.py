@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from laneweave.protocol.codec import KINDS
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.simulated_network import matches
 from laneweave.protocol.topics import (
     CLOCK,
     COMMAND,
@@ -20,6 +19,7 @@ from laneweave.protocol.topics import (
     VEHICLE_ALIVE,
     Keys,
     Topic,
+    matches,
 )
 
 KEYS = Keys("r-1")

@@ -1,0 +1,140 @@
+"""How the fields of a scenario fit together."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from laneweave.protocol.errors import BadInputError
+
+if TYPE_CHECKING:
+    from laneweave.protocol.scenario import Scenario
+
+
+def check_scenario(scenario: Scenario) -> None:
+    """Check how the fields fit together.
+
+    Raises:
+        BadInputError: names the first field that does not fit.
+    """
+    _check_lanes(scenario)
+    _check_motion(scenario)
+    _check_conflicts(scenario)
+    _check_timing(scenario)
+
+
+def _require(ok: bool, name: str, value: object, allowed: str) -> None:
+    if not ok:
+        raise BadInputError(name, value, allowed)
+
+
+def _check_lanes(scenario: Scenario) -> None:
+    road, demand, vehicle = scenario.road, scenario.demand, scenario.vehicle
+    shares = demand.lane_shares
+    _require(
+        len(shares) in (0, road.lanes),
+        "demand.lane_shares",
+        list(shares),
+        f"one share for each of the {road.lanes} lanes of road.lanes, or none",
+    )
+    _require(
+        all(share >= 0 for share in shares) and (not shares or 0 < sum(shares) < math.inf),
+        "demand.lane_shares",
+        list(shares),
+        "numbers >= 0, not all 0, with a finite sum",
+    )
+    _require(
+        road.lane_width_m > vehicle.width_m,
+        "road.lane_width_m",
+        road.lane_width_m,
+        f"wider than vehicle.width_m = {vehicle.width_m:g}",
+    )
+    _require(
+        3600.0 / demand.volume_veh_per_lane_h >= demand.min_headway_s,
+        "demand.volume_veh_per_lane_h",
+        demand.volume_veh_per_lane_h,
+        f"at most 3600 / demand.min_headway_s = {3600.0 / max(demand.min_headway_s, 1e-9):g}",
+    )
+
+
+def _check_motion(scenario: Scenario) -> None:
+    formation, vehicle, road = scenario.formation, scenario.vehicle, scenario.road
+    _require(
+        formation.gap_m > vehicle.length_m,
+        "formation.gap_m",
+        formation.gap_m,
+        f"longer than vehicle.length_m = {vehicle.length_m:g}",
+    )
+    _require(
+        formation.move_s <= formation.cycle_s,
+        "formation.move_s",
+        formation.move_s,
+        f"at most formation.cycle_s = {formation.cycle_s:g}",
+    )
+    _require(
+        formation.speed_mps < vehicle.max_speed_mps,
+        "formation.speed_mps",
+        formation.speed_mps,
+        f"below vehicle.max_speed_mps = {vehicle.max_speed_mps:g}",
+    )
+    _require(
+        (formation.weight_oblique or 0) <= formation.oblique_steps,
+        "formation.weight_oblique",
+        formation.weight_oblique,
+        "at most 1 in mode 2 (an oblique edge is one step), at most 2 in mode 1",
+    )
+    block_m = (formation.block_columns - 1) * formation.gap_m
+    needed_m = block_m + vehicle.length_m + formation.speed_mps * formation.cycle_s
+    _require(
+        road.s3_m >= needed_m,
+        "road.s3_m",
+        road.s3_m,
+        f"at least {needed_m:g}: a whole formation and one step fit in",
+    )
+
+
+def _check_conflicts(scenario: Scenario) -> None:
+    formation = scenario.formation
+    _require(
+        formation.executable,
+        "formation.conflicts",
+        sorted(formation.conflict_kinds),
+        "geometric, or in mode 1 node, edge and special-1: moves of one step must have disjoint "
+        "footprints to be executed without a timetable",
+    )
+
+
+def _check_timing(scenario: Scenario) -> None:
+    network, runtime, formation = scenario.network, scenario.runtime, scenario.formation
+    _require(
+        network.election_s > 2 * network.heartbeat_s,
+        "network.election_s",
+        network.election_s,
+        f"more than twice network.heartbeat_s = {network.heartbeat_s:g}",
+    )
+    _require(
+        network.lease_s > network.heartbeat_s,
+        "network.lease_s",
+        network.lease_s,
+        f"more than network.heartbeat_s = {network.heartbeat_s:g}",
+    )
+    for name, value in (("cycle_s", formation.cycle_s), ("move_s", formation.move_s)):
+        ticks = value / runtime.tick_s
+        _require(
+            ticks >= 2 and abs(ticks - round(ticks)) < 1e-6,
+            f"formation.{name}",
+            value,
+            f"a multiple of runtime.tick_s = {runtime.tick_s:g}, at least twice it",
+        )
+    _require(
+        scenario.tracking.horizon_ticks * runtime.tick_s >= formation.move_s,
+        "tracking.horizon_ticks",
+        scenario.tracking.horizon_ticks,
+        f"long enough to hold a whole move of {formation.move_s:g} s",
+    )
+    _require(
+        runtime.tick_deadline_s > network.resend_s,
+        "runtime.tick_deadline_s",
+        runtime.tick_deadline_s,
+        f"more than network.resend_s = {network.resend_s:g}",
+    )
