@@ -144,6 +144,7 @@ class Player:
     """The world of one story."""
 
     def __init__(self) -> None:
+        """Begin with an empty road at time 0."""
         self.t_s = 0.0
         self.vehicles: dict[str, Vehicle] = {}
         self.leaders: dict[str, Leader] = {}

@@ -54,8 +54,8 @@ def test_equal_seeds_give_equal_runs() -> None:
     assert World(7, ROUGH).run() == World(7, ROUGH).run()
 
 
-# Taking every plan (`mutants.no_promise_check`) is not in this list: it takes a plan and a state that
-# are both older than a whole later plan. The story `late_duplicate_plan` shows the collision.
+# `mutants.no_promise_check` is not in this list: its collision needs a plan and a state that are
+# both older than a whole later plan. The story `late_duplicate_plan` has it.
 MUTANTS: tuple[Mutant, ...] = (
     mutants.no_gate,
     mutants.timetable_only,

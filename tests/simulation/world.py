@@ -95,6 +95,7 @@ class Watchdog:
     """Compares what all bodies occupy whenever one of them begins a motion."""
 
     def __init__(self, bodies: Mapping[Name, Body]) -> None:
+        """Watch all bodies of a world."""
         self._bodies = bodies
         self.overlaps: list[Overlap] = []
         self.motions = 0
@@ -123,6 +124,7 @@ class LightAgent:
     """An agent process without dynamics."""
 
     def __init__(self, body: Body, incarnation: int, world: World) -> None:
+        """Take over whatever the body is doing (V1)."""
         self.body = body
         self._world = world
         self._own = {"vehicle": body.name}
@@ -146,7 +148,8 @@ class LightAgent:
                 yield Announce(VEHICLE_ALIVE, self._own)
                 self._wakeup_s = now_s + TICK_S
             case Arrived(_, _, VehicleState() as state):
-                execution.on_state(state)
+                if execution.needs_states(now_s):  # a real one does not even subscribe otherwise
+                    execution.on_state(state)
             case Arrived(_, _, Prepare() as prepare):
                 if execution.on_prepare(prepare):
                     yield self._show(now_s)
@@ -196,6 +199,7 @@ class Roadside:
     """Sends clock and census; whoever is in the census stays there, preferences may change."""
 
     def __init__(self, bodies: Mapping[Name, Body]) -> None:
+        """Remember where everybody is at the start."""
         self._entered = {body: body.cell for body in bodies.values()}
         self._sent = 0
         self._wakeup_s = 0.0
@@ -258,7 +262,8 @@ class World:
     """One run; equal seeds give equal runs."""
 
     def __init__(self, seed: int, faults: Faults | None = None) -> None:
-        self._rng = random.Random(f"world/{seed}")
+        """Draw the vehicles and, unless given, the faults."""
+        self._rng = random.Random(f"world/{seed}")  # noqa: S311 (simulation, not secrets)
         self.faults = faults or Faults.drawn(self._rng)
         faults = self.faults
         self.network = SimulatedNetwork(

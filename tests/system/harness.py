@@ -10,6 +10,7 @@ import contextlib
 import json
 import os
 import signal
+import statistics
 import subprocess
 import sys
 import time
@@ -34,6 +35,7 @@ schema = "laneweave.scenario/1"
 
 [road]
 s2_m = 100.0
+s3_m = 450.0
 """
 DEMAND = ("--volume", "1300", "--duration", "14", "--seed", "1")
 """With `ROAD`: lane sorting begins while vehicles still arrive."""
@@ -85,7 +87,7 @@ class Lab:
         except subprocess.TimeoutExpired:
             self.kill_rest()
             out, err = process.communicate()
-            message = f"still running after {within_s:g} s: {process.args}\n{out}\n{err}"
+            message = f"still running after {within_s:g} s: {process.args!r}\n{out}\n{err}"
             raise AssertionError(message) from None
         return Ended(process.returncode, out, err)
 
@@ -206,8 +208,7 @@ def final_lanes(folder: Path) -> dict[str, int]:
 
 def mean_travel_time_s(folder: Path) -> float:
     """Return the mean travel time of all vehicles, counted or not."""
-    times = [trip["travel_time_s"] for trip in trips(folder).values()]
-    return sum(times) / len(times)
+    return statistics.fmean(trip["travel_time_s"] for trip in trips(folder).values())
 
 
 def check_safe_and_complete(folder: Path) -> None:

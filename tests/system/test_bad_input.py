@@ -201,7 +201,7 @@ def test_endpoints_that_cannot_be(lab: Lab, endpoint: str) -> None:
 @pytest.mark.parametrize("role", ["coordinator", "agent", "bridge", "ping", "plan"])
 def test_nobody_is_there(lab: Lab, role: str) -> None:
     request = lab.path("request.json", json.dumps(REQUEST))
-    options = {
+    options: dict[str, list[object]] = {
         "plan": [request, "--connect", NOBODY],
         "bridge": ["--endpoint", NOBODY, "--out", "out"],
     }

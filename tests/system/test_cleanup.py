@@ -16,7 +16,7 @@ from system.harness import DEMAND, END_S, Lab, check_safe_and_complete, events, 
 FEW_PROCESSES = ("--vehicles-per-process", "4", "--coordinators", "2")
 
 
-def start_and_wait(lab: Lab, road: Path, *options: str, entered: int = 4) -> subprocess.Popen[str]:
+def start_and_wait(lab: Lab, road: Path, *options: str, entered: int = 2) -> subprocess.Popen[str]:
     """Start a run into `out` and wait until it is under way."""
     process = lab.start("run", road, *DEMAND, *options, "--out", "out")
     folder = lab.folder / "out"
@@ -39,7 +39,7 @@ def check_files(folder: Path) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_a_run(lab: Lab, road: Path, number: signal.Signals) -> None:
-    process = start_and_wait(lab, road, *FEW_PROCESSES, "--pace", "5")
+    process = start_and_wait(lab, road, *FEW_PROCESSES, "--pace", "10")
 
     if number is signal.SIGINT:
         interrupt(process, number)
@@ -64,7 +64,7 @@ def test_ctrl_c_ends_a_run_that_is_starting(lab: Lab, road: Path, role: str) -> 
 
     ended = lab.finish(process, END_S)
     assert ended.status == 1
-    assert "Traceback" not in ended.err
+    assert ended.err in ("", "interrupted\n")
     lab.check_nothing_left()
 
 
@@ -82,7 +82,7 @@ def test_a_signal_ends_a_simulated_run(lab: Lab, road: Path, number: signal.Sign
 
 
 def test_roles_end_when_the_supervisor_is_killed(lab: Lab, road: Path) -> None:
-    process = start_and_wait(lab, road, *FEW_PROCESSES, "--pace", "5")
+    process = start_and_wait(lab, road, *FEW_PROCESSES, "--pace", "10")
 
     process.kill()
 
@@ -91,7 +91,7 @@ def test_roles_end_when_the_supervisor_is_killed(lab: Lab, road: Path) -> None:
 
 
 def test_a_run_ends_when_the_fork_server_is_killed(lab: Lab, road: Path) -> None:
-    process = start_and_wait(lab, road, *FEW_PROCESSES, "--pace", "5")
+    process = start_and_wait(lab, road, *FEW_PROCESSES, "--pace", "10")
     server = psutil.Process(lab.roles()["bridge"]).parent()
     assert server is not None
 
@@ -108,7 +108,7 @@ def test_a_run_ends_when_the_fork_server_is_killed(lab: Lab, road: Path) -> None
 def test_a_run_ends_with_its_bridge_and_its_router(
     lab: Lab, road: Path, role: str, number: signal.Signals
 ) -> None:
-    process = start_and_wait(lab, road, *FEW_PROCESSES, "--pace", "5", entered=2)
+    process = start_and_wait(lab, road, *FEW_PROCESSES, "--pace", "10")
 
     os.kill(lab.roles()[role], number)
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import queue
 import signal
 import socket
 import subprocess
@@ -12,6 +14,9 @@ from typing import Any
 
 import pytest
 
+from laneweave.protocol.topics import BRIDGE_ALIVE, Keys
+from laneweave.protocol.transport import Delivery, TokenUp
+from laneweave.protocol.zenoh_transport import ZenohTransport
 from system.conftest import FinishedRun
 from system.harness import (
     END_S,
@@ -97,7 +102,7 @@ def test_roles_by_hand(
     # Somebody must lead before vehicles come: the answer to a question shows it.
     lab.wait_until(lambda: _ask(lab, config, REQUEST).status == 0, END_S)
 
-    bridge = lab.start("bridge", "--config", config, "--pace", "10", "--out", "out")
+    bridge = lab.start("bridge", "--config", config, "--pace", "20", "--out", "out")
     ended = lab.finish(bridge, RUN_S)
 
     assert (ended.status, ended.err) == (0, "")
@@ -164,11 +169,15 @@ def test_an_end_does_not_wait_for_a_long_computation(lab: Lab) -> None:
     stop(lab, router)
 
 
-def test_the_bridge_waits_for_nobody_for_ever(lab: Lab) -> None:
-    config = deployment(lab, free_tcp())
+def test_the_bridge_ends_while_it_waits_for_agents(lab: Lab) -> None:
+    endpoint = free_tcp()
+    config = deployment(lab, endpoint)
+    tokens: queue.SimpleQueue[Delivery] = queue.SimpleQueue()
     router = start_router(lab, config)
     bridge = lab.start("bridge", "--config", config, "--pace", "100", "--out", "out")
-    lab.wait_until(lambda: (lab.folder / "out" / "events.jsonl").exists(), END_S)
+    with contextlib.closing(ZenohTransport(endpoint, tokens.put, lease_s=1.0)) as transport:
+        transport.watch(Keys("test").all_of(BRIDGE_ALIVE))
+        assert isinstance(tokens.get(timeout=END_S), TokenUp)
 
     stop(lab, bridge)
 

@@ -8,27 +8,30 @@ import math
 import re
 import shlex
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import attrs
+import numpy as np
 import pytest
 import typer
+from numpy.typing import NDArray
 
+from laneweave.agents.trajectory import move_profile
 from laneweave.coordinator.planning import PlanRequest
 from laneweave.launch.cli import app
 from laneweave.launch.faults import load_faults
 from laneweave.launch.plan_command import answer_request
 from laneweave.protocol import messages
 from laneweave.protocol.codec import KINDS, field_names
-from laneweave.protocol.scenario import (
-    CONFLICT_KINDS,
-    Scenario,
-    load_scenario,
-    parse_scenario,
-)
+from laneweave.protocol.lattice import Cell, footprint
+from laneweave.protocol.motion import cell_state
+from laneweave.protocol.scenario import CONFLICT_KINDS, Scenario, load_scenario, parse_scenario
 from laneweave.protocol.topics import NAME_RULE, TOPICS
+from laneweave.sim_bridge.overlap import least_gaps, pose_of
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -41,16 +44,11 @@ HEADING = re.compile(r"^#+ +(.+)$", re.MULTILINE)
 
 
 def markdown_files() -> list[Path]:
-    folders = [
-        path
-        for path in ROOT.iterdir()
-        if path.is_dir() and not path.name.startswith(".") and path.name not in NOT_OURS
-    ]
-    return sorted([*ROOT.glob("*.md"), *(file for folder in folders for file in _below(folder))])
-
-
-def _below(folder: Path) -> Iterator[Path]:
-    return folder.rglob("*.md")
+    found = list(ROOT.glob("*.md"))
+    for folder in ROOT.iterdir():
+        if folder.is_dir() and folder.name[0] != "." and folder.name not in NOT_OURS:
+            found += folder.rglob("*.md")
+    return sorted(found)
 
 
 MARKDOWN = markdown_files()
@@ -119,8 +117,9 @@ def scenario_table(meanings: Mapping[str, str]) -> str:
 
 def _scenario_fields() -> Iterator[tuple[str, attrs.Attribute[Any]]]:
     for outer in attrs.fields(Scenario):
-        if outer.type is not None and attrs.has(type(outer.default)):
-            for inner in attrs.fields(type(outer.default)):
+        kind: type = type(outer.default)
+        if attrs.has(kind):
+            for inner in attrs.fields(kind):
                 yield f"{outer.name}.{inner.name}", inner
         else:
             yield outer.name, outer
@@ -141,7 +140,9 @@ def _unit(name: str) -> str:
 
 def _allowed(attribute: attrs.Attribute[Any]) -> str:
     if attribute.validator is None:
-        return {"str": "text", "tuple[float, ...]": "list of numbers"}[str(attribute.type)]
+        # Parsing any scenario resolves the annotations from text to types.
+        kind = attribute.type.__name__ if attribute.type is str else str(attribute.type)
+        return {"str": "text", "tuple[float, ...]": "list of numbers"}[kind]
     found = inspect.getclosurevars(attribute.validator).nonlocals
     if "choices" in found:
         return ", ".join(f"`{json.dumps(one)}`" for one in found["choices"] if one is not None)
@@ -219,7 +220,9 @@ def test_fields_of_ballots() -> None:
 
 def test_places_in_the_code_exist() -> None:
     """Rule tables name `module.py: Class.method` or `module.py: function`."""
-    sources = {path.name: path.read_text() for path in ROOT.glob("*/laneweave/*/*.py")}
+    sources: dict[str, str] = {}
+    for path in ROOT.glob("*/laneweave/*/*.py"):
+        sources[path.name] = sources.get(path.name, "") + path.read_text(encoding="utf-8")
     places = re.findall(r"`(\w+\.py): ([\w.]+)`", read("PROTOCOL.md") + read("SAFETY.md"))
     assert places
     for module, name in places:
@@ -227,6 +230,39 @@ def test_places_in_the_code_exist() -> None:
         assert re.search(rf"\b(def|class) {last}\b|^{last}\b", sources[module], re.MULTILINE), (
             f"{module} has no {name}"
         )
+
+
+# --- docs/SAFETY.md: the least gap ---------------------------------------------------------------
+
+
+def test_least_gap_of_mode_1() -> None:
+    """Vehicles with disjoint footprints, one up to 2 s late, from the profiles in use."""
+    least_m = min(_gaps_of_pairs(Scenario(), late_ticks=(0, 10, 20)))
+    assert f"**{least_m:.2f} m**" in read("SAFETY.md")
+
+
+def _gaps_of_pairs(scenario: Scenario, late_ticks: Sequence[int]) -> Iterator[float]:
+    body = scenario.vehicle.length_m, scenario.vehicle.width_m
+    steps = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))
+    origin = (0, 0)
+    around = [(c, lane) for c in (-2, -1, 0, 1, 2) for lane in (-1, 0, 1) if (c, lane) != origin]
+    for a, b, cell, late in product(steps, steps, around, late_ticks):
+        if footprint(origin, a) & footprint(cell, (cell[0] + b[0], cell[1] + b[1])):
+            continue
+        first, second = _motion(scenario, origin, a, 0), _motion(scenario, cell, b, late)
+        near = np.abs(first[:, 3] - second[:, 3]) < 3.0  # no turned body is wider
+        for one, other in zip(first[near][::2], second[near][::2], strict=True):
+            if abs(one[0] - other[0]) < 16.0:
+                yield least_gaps({"a": pose_of(one), "b": pose_of(other)}, *body).gap_m
+
+
+@lru_cache(maxsize=1024)
+def _motion(scenario: Scenario, cell: Cell, step: Cell, late: int) -> NDArray[np.float64]:
+    """Return states (60, 6) of a move that begins late, relative to the lattice."""
+    states = move_profile(scenario, *step).states
+    at = np.clip(np.arange(60) - late, 0, len(states) - 1)
+    moved: NDArray[np.float64] = states[at] + np.array(cell_state(scenario.lattice, cell, 0.0))
+    return moved
 
 
 # --- everywhere ----------------------------------------------------------------------------------
@@ -253,9 +289,7 @@ def test_links_resolve(path: Path) -> None:
             continue
         name, _, anchor = link.partition("#")
         target = (path.parent / name).resolve() if name else path
-        if not target.exists():
-            broken.append(link)
-        elif anchor and anchor not in anchors(target.read_text(encoding="utf-8")):
+        if not target.exists() or (anchor and anchor not in anchors(target.read_text("utf-8"))):
             broken.append(link)
     assert not broken
 
@@ -267,8 +301,7 @@ def commands(text: str) -> Iterator[str]:
             command = entry.strip().removeprefix("$ ")
             if command.startswith("laneweave "):
                 yield command
-    for inline in re.findall(r"`(laneweave [^`\n]+)`", FENCE.sub("", text)):
-        yield inline
+    yield from re.findall(r"`(laneweave [^`\n]+)`", FENCE.sub("", text))
 
 
 @each_document

@@ -118,12 +118,22 @@ class AgentCore:
                 if self._execution is not None and self._execution.on_prepare(prepare):
                     yield self._show()
             case Arrived(_, _, Plan() as plan):
-                if self._execution is not None and self._execution.on_plan(plan):
+                execution = self._execution
+                if execution is not None and self._in_block(plan) and execution.on_plan(plan):
                     yield self._show()
             case Stopping():
                 yield self._report()
             case _:
                 pass
+
+    def _in_block(self, plan: Plan) -> bool:
+        """Tell whether a plan keeps to the block that this vehicle's formation owns.
+
+        Plans of different formations run at the same time because their blocks are disjoint.
+        """
+        if self.formation is None:
+            return False
+        return set(plan.territory) <= self._scenario.lattice.block_cells(self.formation)
 
     # --- the tick -----------------------------------------------------------------------------
 

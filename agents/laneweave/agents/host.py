@@ -62,8 +62,11 @@ class AgentHost:
 
     def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
         """Take an event; see `Core`."""
+        hosted = bool(self._agents)
         yield from self._on_event(event, now_s)
         yield from self._listen_to_formations()
+        if hosted and not self._agents and self._shard is None:
+            yield End()  # last: nothing can be undone on a network that the node has left
 
     def _on_event(self, event: Event, now_s: float) -> Iterator[Effect]:
         match event:
@@ -81,9 +84,7 @@ class AgentHost:
                         yield from agent.handle(event, now_s)
             case Arrived(_, parameters, _) if parameters.get("vehicle") in self._agents:
                 self._heard_s = now_s
-                name = Name(parameters["vehicle"])
-                yield from self._agents[name].handle(event, now_s)
-                yield from self._forget_ended(name)
+                yield from self._hand_on(event, Name(parameters["vehicle"]), now_s)
             case Wakeup() if self._shard is None and now_s >= self._heard_s + IDLE_S:
                 yield End()
             case Stopping():
@@ -91,6 +92,11 @@ class AgentHost:
                     yield from agent.handle(event, now_s)
             case _:
                 pass
+
+    def _hand_on(self, event: Event, name: Name, now_s: float) -> Iterator[Effect]:
+        yield from self._agents[name].handle(event, now_s)
+        if self._agents[name].ended:
+            del self._agents[name]
 
     def _on_census(self, census: Census, now_s: float) -> Iterator[Effect]:
         shard = self._shard
@@ -118,9 +124,3 @@ class AgentHost:
         for number in sorted(wanted - self._formations):
             yield Listen(STATE, {"formation": number})
         self._formations = wanted
-
-    def _forget_ended(self, name: Name) -> Iterator[Effect]:
-        if self._agents[name].ended:
-            del self._agents[name]
-            if not self._agents and self._shard is None:
-                yield End()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import structlog
@@ -17,7 +17,7 @@ from laneweave.coordinator.formation import (
     steps_left,
 )
 from laneweave.coordinator.leader import FormationControl, Phase
-from laneweave.coordinator.planning import PlanResponse, Weights, plan
+from laneweave.coordinator.planning import PlanRequest, PlanResponse, Weights, checked_plan
 from laneweave.coordinator.service import PlanningService
 from laneweave.protocol.lattice import Move, territory
 from laneweave.protocol.messages import (
@@ -242,7 +242,9 @@ class CoordinatorCore:
             control.settle()
             yield self._log("formation-too-late", formation=number)
             return
-        request = plan_request(
+        # In the job: promises that cannot be planned from fail there, as any failed planning does.
+        make_request = partial(
+            plan_request,
             number,
             control.hold_cells,
             {member.vehicle: member.preferred_lane for member in control.formation.members},
@@ -251,7 +253,7 @@ class CoordinatorCore:
         job = self._job()
         self._planning[job] = (number, control.ballot)
         nodes = self.scenario.formation.max_nodes * 2**control.failures
-        yield Compute(job, partial(plan, request, max_nodes=nodes, weights=self._weights))
+        yield Compute(job, partial(_plan, make_request, nodes, self._weights))
 
     def _on_computed(self, job: int, result: object, error: str, now_s: float) -> Iterator[Effect]:
         if self._service.owns(job):
@@ -341,6 +343,10 @@ class CoordinatorCore:
             ]
         # Never ask for a moment that has passed: the same timer would fire for ever.
         self._wakeup_s = max(min(time for time in times if time > now_s), now_s + 1e-3)
+
+
+def _plan(make_request: Callable[[], PlanRequest], nodes: int, weights: Weights) -> PlanResponse:
+    return checked_plan(make_request(), max_nodes=nodes, weights=weights)
 
 
 def _identity(parameters: dict[str, str]) -> tuple[str, int]:

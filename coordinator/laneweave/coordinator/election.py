@@ -62,7 +62,8 @@ class Election:
     def on_token_down(self, coordinator: str, incarnation: int) -> None:
         """A process is gone; forget it at once.
 
-        Losing the own connection makes every token vanish: nothing is concluded from that.
+        Losing the own connection makes every token vanish, before or after the news of it. Known to
+        be disconnected, nothing is concluded; for the moment before, leading twice is harmless.
         """
         if not self.link_up or coordinator == self.name:
             return
@@ -84,10 +85,10 @@ class Election:
     def update(self, now_s: float) -> bool:
         """Decide whether to lead now; true when this has changed."""
         rival = any(
-            name < self.name and now_s - peer.heard_s < self.election_s
+            name < self.name and now_s < peer.heard_s + self.election_s
             for name, peer in self._peers.items()
         )
-        lead = self.link_up and not rival and now_s - self.started_s >= self.election_s
+        lead = self.link_up and not rival and now_s >= self.started_s + self.election_s
         if lead == self.leading:
             return False
         self.leading = lead

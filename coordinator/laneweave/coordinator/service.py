@@ -10,7 +10,7 @@ from typing import Any
 import msgpack
 from attrs import define, field
 
-from laneweave.coordinator.planning import PlanRequest, PlanResponse, plan
+from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan
 from laneweave.protocol.codec import MAX_BYTES
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.node import Compute, Effect, Reply
@@ -39,7 +39,7 @@ class PlanningService:
             yield Reply(token, _error(error.field, str(error), is_json=is_json), ok=False)
             return
         self._waiting[job] = (token, is_json)
-        yield Compute(job, partial(plan, request))
+        yield Compute(job, partial(checked_plan, request), background=True)
 
     def _check_load(self) -> None:
         if len(self._waiting) >= MAX_WAITING:

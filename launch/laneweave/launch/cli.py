@@ -101,12 +101,6 @@ def run(
     no_progress: Annotated[bool, typer.Option("--no-progress")] = False,
 ) -> None:
     """Run a scenario on this machine and write its folder."""
-    from laneweave.agents.trajectory import check_moves
-    from laneweave.launch.faults import load_faults
-    from laneweave.launch.local_run import LocalRun, coordinator_names
-    from laneweave.launch.outcome import print_outcome
-    from laneweave.launch.simulated_run import SimulatedRun
-
     # As Ctrl-C: files are completed and temporary folders removed.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     settings = load_scenario(
@@ -118,11 +112,19 @@ def run(
         runtime__coordinators=coordinators,
     )
     _check_pace(pace)
+
+    from laneweave.agents.trajectory import check_moves
+    from laneweave.launch.faults import load_faults
+    from laneweave.launch.local_run import LocalRun, coordinator_names
+    from laneweave.launch.outcome import print_outcome
+
     check_moves(settings)
     plan_of_faults = load_faults(faults, coordinator_names(settings))
     folder = _new_folder(out, settings, method.value)
     show = not no_progress and sys.stderr.isatty()
     if transport is TransportChoice.simulated:
+        from laneweave.launch.simulated_run import SimulatedRun
+
         outcome = SimulatedRun(
             settings, folder, method.value, plan_of_faults, show_progress=show
         ).run()

@@ -155,8 +155,10 @@ class LocalRun:
             try:
                 return ZenohTransport(network.endpoint, observer.inbox.put, network.lease_s)
             except BadInputError:
+                if self._stop:
+                    raise KeyboardInterrupt from None
                 router = self._processes["router"]
-                if self._stop or time.monotonic() > give_up or not router.is_alive():
+                if time.monotonic() > give_up or not router.is_alive():
                     raise
                 time.sleep(0.02)
 

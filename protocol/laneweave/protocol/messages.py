@@ -52,7 +52,7 @@ class Prepare:
     """Leader to each vehicle of the roster that has not promised, every `network.resend_s`.
 
     Missing: sent again. Duplicated or late: a vehicle that promised this ballot answers with its
-    state again; one that promised a higher ballot ignores it.
+    state again; one that promised a higher ballot changes nothing and shows that ballot.
     """
 
     ballot: Ballot
@@ -225,7 +225,7 @@ class RoadClock:
 
 @frozen
 class Report:
-    """Any role to the recorder when it ends, and coordinators every few seconds.
+    """Agents, bridge and coordinators to the recorder at the end; coordinators now and then, too.
 
     Missing: the summary counts less. Duplicated: the newest of a sender counts.
     """

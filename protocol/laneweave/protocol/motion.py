@@ -104,8 +104,7 @@ def hold_law(state: State, reference: State, limits: Vehicle, tick_s: float) -> 
     """Return the jerk that brings the vehicle to rest in a cell: a saturated linear feedback.
 
     Position error asks for a speed, speed error for an acceleration, acceleration error for a
-    jerk; each is saturated before it is passed on. It looks neither ahead nor behind: gaps are
-    the emergency brake's business.
+    jerk; each is saturated before it is passed on. It looks neither ahead nor behind.
 
     Args:
         state: (s, v, a, y, v_y, a_y) in m and s, finite.

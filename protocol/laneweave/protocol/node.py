@@ -162,10 +162,14 @@ class Reply:
 
 @frozen
 class Compute:
-    """Run `work` beside the core; `Computed` brings its result."""
+    """Run `work` beside the core; `Computed` brings its result.
+
+    Jobs run one after the other; those in the background do not delay the others.
+    """
 
     job: int
     work: Callable[[], Any]
+    background: bool = False
 
 
 @frozen

@@ -26,7 +26,7 @@ class Quality(Enum):
     """Quality of service of a topic; `zenoh_transport` maps it to Zenoh's settings."""
 
     LATEST = "latest"
-    """Periodic; a newer one replaces it. Dropped when the network is congested."""
+    """Periodic, so that a lost one hardly matters. Dropped when the network is congested."""
     ASSURED = "assured"
     """Waits when the network is congested; acknowledged and sent again by the protocol."""
     LOCKSTEP = "lockstep"

@@ -214,7 +214,7 @@ class ZenohTransport:
 def run_core(core: Core, endpoint: str, realm: str, lease_s: float) -> None:
     """Drive a core over Zenoh until it ends or the process gets SIGINT or SIGTERM.
 
-    To be called from the main thread. Computations run one at a time in a thread.
+    To be called from the main thread. Computations run in threads of their own.
 
     Raises:
         BadInputError: the realm is malformed or nobody answers at the endpoint.
@@ -223,7 +223,7 @@ def run_core(core: Core, endpoint: str, realm: str, lease_s: float) -> None:
     # Enqueuing from callbacks and signal handlers alike: SimpleQueue.put is reentrant.
     inbox: queue.SimpleQueue[Delivery | Computed | Stopping] = queue.SimpleQueue()
     transport = ZenohTransport(endpoint, inbox.put, lease_s)
-    node = Node(core, transport, keys, _worker(inbox.put))
+    node = Node(core, transport, keys, _Workers(inbox.put).order)
     with _stop_signals(lambda: inbox.put(Stopping())):
         try:
             node.dispatch(Started(), time.monotonic())
@@ -254,19 +254,28 @@ def _step(node: Node, inbox: queue.SimpleQueue[Delivery | Computed | Stopping]) 
         node.dispatch(Wakeup(), now_s)
 
 
-def _worker(done: Callable[[Computed], None]) -> Callable[[Compute], None]:
-    """Start a thread that computes one job after the other, and return how to order one.
+class _Workers:
+    """Threads that compute, one for the core's own jobs and one for those in the background.
 
-    A daemon: a process that is asked to end does not wait for a computation.
+    Started when first needed, and daemons: a process that is asked to end does not wait for them.
     """
-    jobs: queue.SimpleQueue[Compute] = queue.SimpleQueue()
 
-    def work() -> None:
+    def __init__(self, done: Callable[[Computed], None]) -> None:
+        """Prepare; `done` is called from the threads."""
+        self._done = done
+        self._jobs: dict[bool, queue.SimpleQueue[Compute]] = {}
+
+    def order(self, job: Compute) -> None:
+        """Have a job computed after those that were ordered before it."""
+        jobs = self._jobs.get(job.background)
+        if jobs is None:
+            jobs = self._jobs[job.background] = queue.SimpleQueue()
+            threading.Thread(target=self._work, args=(jobs,), daemon=True).start()
+        jobs.put(job)
+
+    def _work(self, jobs: queue.SimpleQueue[Compute]) -> None:
         while True:
-            done(run_job(jobs.get()))
-
-    threading.Thread(target=work, name="compute", daemon=True).start()
-    return jobs.put
+            self._done(run_job(jobs.get()))
 
 
 @contextlib.contextmanager

@@ -292,7 +292,8 @@ class BridgeCore:
         counts = self._roadside.counts(on_road=len(self.vehicles))
         yield Send(CLOCK, counts.clock(self.tick, self.t_s, ended=False))
         due = self.tick >= self._census_sent_tick + CENSUS_EVERY_TICKS
-        if self._census_changed or due or self._roadside.announcements_changed(self.t_s):
+        announced = self._roadside.announcements_changed(self.t_s)
+        if announced or due or self._census_changed:
             self._census_changed = False
             self._census_sent_tick = self.tick
             yield Send(CENSUS, self._roadside.census(self.t_s, self.vehicles.values()))

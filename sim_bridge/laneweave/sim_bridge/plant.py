@@ -2,19 +2,14 @@
 
 A vehicle is a triple integrator along and across the road (`protocol.motion`). The plant takes a
 jerk for each tick, keeps it within the vehicle's limits, integrates exactly, and remembers the
-extremes. The emergency brake is the one thing that bypasses the jerk limit: braking that builds up
-over most of a second comes too late.
+extremes.
 """
 
 from __future__ import annotations
 
-import math
-
 from laneweave.protocol.motion import State, integrate, limited_jerk
 from laneweave.protocol.scenario import Vehicle
 from laneweave.sim_bridge.overlap import Pose, pose_of
-
-_ROUNDING_MPS = 1e-9
 
 
 class Plant:
@@ -31,7 +26,6 @@ class Plant:
         self._state = state
         self._limits = limits
         self._tick_s = tick_s
-        self._braked = False
         self._max_jerk = 0.0
         self._min_accel = self._max_accel = state[2]
 
@@ -47,7 +41,7 @@ class Plant:
 
     @property
     def max_jerk_mps3(self) -> float:
-        """Largest change of longitudinal acceleration in a tick, per second; braking included."""
+        """Largest change of longitudinal acceleration in a tick, per second."""
         return self._max_jerk
 
     @property
@@ -60,50 +54,22 @@ class Plant:
         """Greatest longitudinal acceleration so far."""
         return self._max_accel
 
-    def step(self, jerk_s: float, jerk_y: float, *, brake: bool = False) -> State:
+    def step(self, jerk_s: float, jerk_y: float) -> State:
         """Move on by one tick.
 
         Args:
             jerk_s: wanted longitudinal jerk [m/s3]; limited as `limited_jerk` does, NaN is 0.
             jerk_y: wanted lateral jerk [m/s3]; limited likewise.
-            brake: emergency brake: full braking throughout the tick instead of `jerk_s`, down to
-                standstill; the jerk limit does not hold.
 
         Returns:
             The new state.
         """
         before = self._state
-        s, v, a, y, v_y, a_y = before
-        limits, tick_s = self._limits, self._tick_s
-        if brake:
-            a = max(limits.min_accel_mps2, -v / tick_s)
-        elif self._braked:
-            # Released: from here the jerk limit is enough to come to rest without rolling back.
-            a = max(a, -math.sqrt(2.0 * limits.max_jerk_mps3 * max(v, 0.0)))
-        state = (s, v, a, y, v_y, a_y)
-        j_s, j_y = limited_jerk(state, (jerk_s, jerk_y), limits, tick_s)
-        self._state = self._rolling(state, integrate(state, (0.0 if brake else j_s, j_y), tick_s))
-        self._braked = brake
-        accel = self._state[2]
-        self._max_jerk = max(self._max_jerk, abs(accel - before[2]) / self._tick_s)
-        self._min_accel = min(self._min_accel, accel)
-        self._max_accel = max(self._max_accel, accel)
+        jerk = limited_jerk(before, (jerk_s, jerk_y), self._limits, self._tick_s)
+        s, v, a, y, v_y, a_y = integrate(before, jerk, self._tick_s)
+        # Rounding may leave a stopped vehicle rolling back by a hair.
+        self._state = (s, max(v, 0.0), a, y, v_y, a_y)
+        self._max_jerk = max(self._max_jerk, abs(a - before[2]) / self._tick_s)
+        self._min_accel = min(self._min_accel, a)
+        self._max_accel = max(self._max_accel, a)
         return self._state
-
-    def _rolling(self, before: State, after: State) -> State:
-        """Return the state after a tick with the wheels rolling: neither backwards nor sideways.
-
-        `limited_jerk` sees to that but for rounding, except after an emergency brake, when lateral
-        limits can be too tight to follow the forward speed; the lateral acceleration jumps then.
-        A body that slid sideways at standstill would point across the road.
-        """
-        s, v, a, y, v_y, a_y = after
-        v = max(v, 0.0)
-        most = self._limits.max_slip_ratio * v
-        if abs(v_y) <= most:
-            return (s, v, a, y, v_y, a_y)
-        wanted = math.copysign(most, v_y)
-        if abs(v_y) - most > _ROUNDING_MPS:
-            a_y = (wanted - before[4]) / self._tick_s
-            y = before[3] + 0.5 * (before[4] + wanted) * self._tick_s
-        return (s, v, a, y, wanted, a_y)

@@ -79,7 +79,7 @@ def shown(
 def accepted(plan: Plan | None = None, name: Name = A) -> PlanExecution:
     plan = plan or make_plan()
     execution = vehicle(name, plan.start_cells[name])
-    assert execution.on_prepare(prepare(plan.ballot, *plan.roster))
+    execution.on_prepare(prepare(plan.ballot, *plan.roster))
     assert execution.on_plan(plan)
     return execution
 
@@ -90,7 +90,7 @@ def accepted(plan: Plan | None = None, name: Name = A) -> PlanExecution:
 def test_v1_starts_with_nothing() -> None:
     execution = vehicle()
     assert (execution.promised, execution.plan, execution.completed) == (None, None, 0)
-    assert not (execution.go or execution.ready or execution.done or execution.moving)
+    assert not any((execution.go, execution.ready, execution.done, execution.moving))
     assert execution.next_move(1e9) is None
     assert not execution.overdue(1e9)
 
@@ -379,6 +379,21 @@ def test_without_moves_it_is_done_at_once() -> None:
     execution = accepted(name=B)
     assert execution.done
     assert not execution.overdue(T0_S + 1000.0)
+
+
+def test_states_matter_until_the_gate_is_open_and_while_a_move_waits() -> None:
+    assert not vehicle().needs_states(T0_S)
+    moves: dict[Name, tuple[Move, ...]] = {
+        A: ((0, (1, 0), (2, 0)),),
+        B: ((1, (0, 0), (1, 0)),),
+    }
+    execution = accepted(make_plan(moves=moves, cells={A: (1, 0), B: (0, 0)}), B)
+    assert execution.needs_states(0.0)
+    execution.on_state(shown(A, go=True))
+    assert not execution.needs_states(T0_S - SLOT_S - 0.1)
+    assert execution.needs_states(T0_S - SLOT_S)
+    execution.on_state(shown(A, completed=1))
+    assert not execution.needs_states(T0_S)
 
 
 def test_overdue_runs_from_the_moment_the_next_move_is_due() -> None:

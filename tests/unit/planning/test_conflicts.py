@@ -3,7 +3,7 @@
 import itertools
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.conflicts import KINDS, ConflictModel, footprint
@@ -66,18 +66,21 @@ def test_side_by_side_and_apart_is_no_conflict() -> None:
     assert everything.kind(((0, 0), (0, 0)), ((0, 1), (0, 1))) is None
 
 
+@settings(deadline=None)
 @given(moves(), moves(), st.sampled_from(KINDS))
 def test_every_kind_is_symmetric(a: Move, b: Move, kind: str) -> None:
     model = ConflictModel([kind])
     assert model.kind(a, b) == model.kind(b, a)
 
 
+@settings(deadline=None)
 @given(moves(), moves())
 def test_geometric_contains_all_other_kinds(a: Move, b: Move) -> None:
     if ConflictModel(KINDS[:-1]).kind(a, b) is not None:
         assert ConflictModel(["geometric"]).kind(a, b) == "geometric"
 
 
+@settings(deadline=None)
 @given(moves(), moves(), st.tuples(st.integers(-5, 5), st.integers(-5, 5)))
 def test_conflicts_do_not_depend_on_the_place(a: Move, b: Move, shift: Cell) -> None:
     def moved(move: Move) -> Move:

@@ -7,7 +7,7 @@ from typing import Any
 
 import attrs
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, VehicleRequest, plan
 from laneweave.coordinator.planning.grid import Grid
@@ -173,6 +173,7 @@ def test_requests_made_in_code_are_checked_too() -> None:
         attrs.evolve(request, conflicts=("nodes",))
 
 
+@settings(deadline=None)
 @given(requests())
 def test_json_round_trip(request: PlanRequest) -> None:
     assert PlanRequest.from_dict(json.loads(json.dumps(request.to_dict()))) == request

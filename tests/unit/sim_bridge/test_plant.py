@@ -1,4 +1,4 @@
-"""The plant keeps its limits, integrates exactly, and brakes at once when it must."""
+"""The plant keeps its limits and integrates exactly."""
 
 from __future__ import annotations
 
@@ -46,44 +46,11 @@ def test_limits_hold_whatever_is_commanded(commands: list[tuple[float, float]]) 
     assert 0.0 <= plant.max_accel_mps2 <= LIMITS.max_accel_mps2 + 1e-9
 
 
-def test_the_emergency_brake_stops_within_the_braking_distance() -> None:
+def test_it_brakes_to_a_standstill_and_stays() -> None:
     plant = Plant(CRUISE, LIMITS, TICK_S)
-    for _ in range(30):
-        plant.step(15.0, 0.0, brake=True)
+    for _ in range(60):
+        plant.step(-LIMITS.max_jerk_mps3, 0.0)
     s, v, a, *_ = plant.state
-    assert s == pytest.approx(15.0**2 / (2.0 * 10.0))
-    assert v == pytest.approx(0.0, abs=1e-9)
-    assert a == pytest.approx(0.0, abs=1e-9)
-    assert plant.min_accel_mps2 == -10.0
-    assert plant.max_jerk_mps3 == pytest.approx(100.0)
-
-
-@given(
-    st.lists(st.tuples(JERKS, JERKS, st.booleans()), min_size=1, max_size=120),
-)
-@settings(max_examples=100, deadline=None)
-def test_braking_at_any_time_keeps_the_vehicle_sound(
-    commands: list[tuple[float, float, bool]],
-) -> None:
-    plant = Plant(CRUISE, LIMITS, TICK_S)
-    for jerk_s, jerk_y, brake in commands:
-        before = plant.state
-        s, v, a, y, v_y, _ = plant.step(jerk_s, jerk_y, brake=brake)
-        assert s >= before[0] - 1e-3  # a release just above standstill may roll back by less
-        assert 0.0 <= v <= LIMITS.max_speed_mps + 1e-6
-        assert a >= LIMITS.min_accel_mps2 - 1e-9
-        assert abs(v_y) <= LIMITS.max_slip_ratio * v
-        assert abs(y - before[3]) <= 0.1 * max(abs(v_y), abs(before[4])) + 0.02
-        assert abs(plant.pose[2]) <= math.atan(LIMITS.max_slip_ratio) + 1e-9
-        if brake:
-            assert a == pytest.approx(max(-10.0, -before[1] / TICK_S), abs=1e-9)
-
-
-def test_standstill_is_reached_from_the_middle_of_a_lane_change() -> None:
-    plant = Plant((0.0, 15.0, 0.0, 1.75, 1.6, 2.0), LIMITS, TICK_S)
-    for _ in range(40):
-        plant.step(0.0, 8.0, brake=True)
-    _, v, a, _, v_y, a_y = plant.state
-    assert (v, v_y) == pytest.approx((0.0, 0.0), abs=1e-9)
-    assert (a, a_y) == pytest.approx((0.0, 0.0), abs=1e-9)
-    assert plant.pose[2] == pytest.approx(0.0, abs=1e-9)
+    assert v == pytest.approx(0.0, abs=1e-6)
+    assert a == pytest.approx(0.0, abs=1e-6)
+    assert 15.0**2 / (2.0 * 10.0) < s < 30.0

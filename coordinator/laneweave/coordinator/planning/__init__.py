@@ -17,7 +17,7 @@
 The package is pure: no I/O, no state between calls, and time only through the clock it is given.
 """
 
-from laneweave.coordinator.planning.facade import plan
+from laneweave.coordinator.planning.facade import checked_plan, plan
 from laneweave.coordinator.planning.frd import Weights
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanResponse
@@ -28,6 +28,7 @@ __all__ = [
     "PlanResponse",
     "VehicleRequest",
     "Weights",
+    "checked_plan",
     "plan",
     "problems_of_paths",
     "problems_of_response",

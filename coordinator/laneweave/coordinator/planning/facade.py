@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from contextlib import suppress
+from typing import Final
 
 import numpy as np
 
@@ -20,6 +21,10 @@ from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse, Status
 from laneweave.coordinator.planning.tappa import Tappa
+from laneweave.coordinator.planning.validate import problems_of_response
+
+MAX_NODES: Final = 500_000
+"""Bounds the memory to about 1 GB; it takes minutes to get there."""
 
 
 def plan(
@@ -32,11 +37,13 @@ def plan(
     """Plan one request.
 
     Equal requests get equal plans unless the deadline passes first; `max_nodes` limits the search
-    in a repeatable way. `weights` of the formation relative distance must give a lower bound.
+    in a repeatable way, and is never above `MAX_NODES`. `weights` of the formation relative
+    distance must give a lower bound.
     """
     started = clock()
     weights = (weights or Weights.for_mode(request.mode)).checked(request.mode)
-    budget = Budget(deadline=started + request.deadline_s, max_nodes=max_nodes, clock=clock)
+    nodes = MAX_NODES if max_nodes is None else min(max_nodes, MAX_NODES)
+    budget = Budget(deadline=started + request.deadline_s, max_nodes=nodes, clock=clock)
     problem = Problem(
         request.grid,
         request.mode,
@@ -52,11 +59,11 @@ def plan(
         tappa = Tappa(problem, assignments(costs, allowed, budget), choices, budget)
         tappa.run()
         best = None if tappa.best is None else tidied(problem, tappa.best, budget)
-    finished = tappa is not None and tappa.finished
     cells = [] if best is None else cells_of(problem, best)
     path_map = RelativePathMap.padded([v.id for v in request.vehicles][: len(cells)], cells)
     bound = 0 if tappa is None else tappa.lower_bound
     cost = None if best is None else best.cost
+    finished = tappa is not None and (tappa.finished or cost == bound)
     return PlanResponse(
         status=_status(found=best is not None, finished=finished),
         cost=cost,
@@ -83,6 +90,21 @@ def cells_of(problem: Problem, solution: Solution) -> list[list[Cell]]:
         [table.cell(start), *(table.cell(table.landing(move)) for move in path)]
         for start, path in zip(problem.starts, solution.paths, strict=True)
     ]
+
+
+def checked_plan(
+    request: PlanRequest, *, max_nodes: int | None = None, weights: Weights | None = None
+) -> PlanResponse:
+    """Plan one request and check the answer against it; see `plan`.
+
+    Raises:
+        RuntimeError: the answer is wrong, which would be an error in the planner.
+    """
+    response = plan(request, max_nodes=max_nodes, weights=weights)
+    problems = problems_of_response(request, response)
+    if problems:
+        raise RuntimeError("the planner made a wrong plan: " + "; ".join(problems))
+    return response
 
 
 def matrices(

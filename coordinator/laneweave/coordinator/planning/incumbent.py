@@ -20,7 +20,18 @@ from laneweave.coordinator.planning.diagram import Bans, Diagram, shortest_paths
 from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.sppa import Path, choose_path
 
-_TAKE_OUT_AT_MOST = 4
+_NODES_PER_BUILD = 2
+_NODES_PER_IMPROVEMENT = 24
+"""One step per two nodes until there is a path set; then one step per four nodes with 6 vehicles,
+and one per node from 24 vehicles on, where a proof is out of reach."""
+
+_CREDIT_PER_VEHICLE = 4
+"""Nodes' worth of steps that are granted each time a better path set is found."""
+
+_TAKE_OUT_AT_MOST = 6
+_BUILDS_PER_ROUND = 16
+_IDLE_STEPS_PER_ROUND = 600
+"""After so many vain attempts to improve a path set the search starts again from new ones."""
 
 
 @attrs.frozen
@@ -47,10 +58,44 @@ class Incumbent:
         self._budget = budget
         self._random = random.Random(0)  # noqa: S311
         self._order = list(range(len(choices)))
+        self._effort = 0
+        self._credit = 0
+        self._steps = 0
+        self._round: Solution | None = None
+        self._builds = 0
+        self._idle = 0
 
-    def build(self, assignment: Sequence[int]) -> None:
+    def work(self, nodes: int, assignments: Sequence[Sequence[int]]) -> None:
+        """Do as many small steps as the number of expanded nodes allows, more while it pays."""
+        vehicles = len(self._choices)
+        while self._effort < nodes + self._credit:
+            before = self.best
+            self._steps += 1
+            self._effort += (
+                _NODES_PER_BUILD if before is None else max(1, _NODES_PER_IMPROVEMENT // vehicles)
+            )
+            self._step(assignments[self._steps % len(assignments)])
+            if self.best is not before:
+                self._credit += _CREDIT_PER_VEHICLE * vehicles
+
+    def _step(self, assignment: Sequence[int]) -> None:
+        """Do one small piece of work; new rounds plan for `assignment`."""
+        if self._round is None or self._builds < _BUILDS_PER_ROUND:
+            self._build(assignment)
+        elif len(assignment) > 1:
+            self._improve(self._round)
+        if self._idle > _IDLE_STEPS_PER_ROUND:
+            self._round, self._builds, self._idle = None, 0, 0
+
+    def offer(self, solution: Solution) -> None:
+        """Keep a path set if it is the best so far."""
+        if self.best is None or solution.cost < self.best.cost:
+            self.best = solution
+
+    def _build(self, assignment: Sequence[int]) -> None:
         """Plan all vehicles one after the other; one that is stuck goes first next time."""
-        stuck, paths = self._plan(self._order, list(assignment), {})
+        self._builds += 1
+        stuck, paths = self._plan(self._order, assignment, {})
         if stuck is None:
             self._keep(assignment, paths)
             self._random.shuffle(self._order)
@@ -58,28 +103,25 @@ class Incumbent:
             self._order.remove(stuck)
             self._order.insert(0, stuck)
 
-    def improve(self) -> None:
-        """Take some vehicles out of the best path set and plan them again."""
-        if self.best is None or len(self.best.paths) < 2:
-            return
-        removed = self._neighbourhood(self.best)
-        assignment = list(self.best.assignment)
+    def _improve(self, best: Solution) -> None:
+        """Take some vehicles out of the round's path set and plan them again."""
+        removed = self._neighbourhood(best)
+        assignment = list(best.assignment)
         if self._random.random() < 0.5:
             self._exchange(assignment, removed)
-        kept = {v: path for v, path in enumerate(self.best.paths) if v not in removed}
+        kept = {v: path for v, path in enumerate(best.paths) if v not in removed}
+        self._idle += 1
         stuck, paths = self._plan(removed, assignment, kept)
         if stuck is None:
             self._keep(assignment, paths)
 
-    def offer(self, solution: Solution) -> None:
-        """Keep a path set found elsewhere if it is better."""
-        if self.best is None or solution.cost < self.best.cost:
-            self.best = solution
-
     def _keep(self, assignment: Sequence[int], paths: dict[int, Path]) -> None:
         found = Solution(tuple(assignment), tuple(paths[v] for v in range(len(paths))))
-        if self.best is None or found.cost <= self.best.cost:
-            self.best = found
+        if self._round is None or found.cost < self._round.cost:
+            self._idle = 0
+        if self._round is None or found.cost <= self._round.cost:
+            self._round = found
+        self.offer(found)
 
     def _neighbourhood(self, best: Solution) -> list[int]:
         """Choose a vehicle that is late, and some of those that are in its way."""

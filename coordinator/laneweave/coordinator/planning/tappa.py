@@ -28,11 +28,6 @@ _EXPLORE_GROWTH = 8
 _EXPLORE_TIMES = 3
 """After so many nodes without a path set, so many joint moves are tried; then more of both."""
 
-_NODES_PER_BUILD = 2
-_NODES_PER_IMPROVEMENT = 4
-_CREDIT_PER_VEHICLE = 12
-"""Nodes that are granted to the search for path sets each time it has found a better one."""
-
 
 class Tappa:
     """The state of Algorithm 1.
@@ -60,9 +55,6 @@ class Tappa:
         self._trees: list[ConflictTree] = []
         self._incumbent = Incumbent(problem, choices, budget)
         self._choices = choices
-        self._effort = 0
-        self._credit = 0
-        self._builds = 0
         self._explored = 0
 
     @property
@@ -85,47 +77,44 @@ class Tappa:
     def _search(self) -> None:
         upcoming = next(self._candidates, None)
         while True:
-            next_cost = math.inf if upcoming is None else upcoming.cost
-            self._trees = [t for t in self._trees if t.lower_bound < self.best_cost]
-            tree = min(self._trees, key=lambda t: (t.lower_bound, t.expanded), default=None)
+            tree = self._most_promising_tree()
             tree_bound = math.inf if tree is None else tree.lower_bound
+            next_cost = math.inf if upcoming is None else upcoming.cost
             self.lower_bound = min(next_cost, tree_bound, self.best_cost)
             if self.best_cost <= self.lower_bound:
                 self.finished = True
                 return
-            turn = (tree_bound, 0 if tree is None else tree.expanded)
-            if upcoming is not None and (next_cost, _SLICE * len(self._trees)) <= turn:
+            if upcoming is not None and self._is_turn_of_assignment(next_cost, tree):
                 self.tried += 1
                 self._trees.append(ConflictTree(self._problem, upcoming.targets, self._budget))
                 upcoming = next(self._candidates, None)
             elif tree is not None:
-                node = tree.search(below=self.best_cost, nodes=_SLICE)
-                if node is not None:
-                    self._incumbent.offer(Solution(tree.assignment, node.paths))
-                self._look_for_incumbent()
-                if self.best is None and self._is_impossible():
-                    self.lower_bound = math.inf
-                    self.finished = True
-                    return
+                self._apply_cbsa(tree)
+            if self.best is None and self._is_impossible():
+                self.lower_bound = math.inf
+                self.finished = True
+                return
 
-    def _look_for_incumbent(self) -> None:
-        """Spend a share of the effort on finding path sets without a proof, more while it pays."""
-        incumbent = self._incumbent
-        while self._trees:
-            before = self.best_cost
-            if incumbent.best is None:
-                if self._effort + _NODES_PER_BUILD > self._budget.nodes:
-                    return
-                self._effort += _NODES_PER_BUILD
-                self._builds += 1
-                incumbent.build(self._trees[self._builds % len(self._trees)].assignment)
-            else:
-                if self._effort + _NODES_PER_IMPROVEMENT > self._budget.nodes + self._credit:
-                    return
-                self._effort += _NODES_PER_IMPROVEMENT
-                incumbent.improve()
-            if self.best_cost < before:
-                self._credit += _CREDIT_PER_VEHICLE * len(self._choices)
+    def _most_promising_tree(self) -> ConflictTree | None:
+        """Close the trees that cannot improve C'*; return the one with the least lower bound."""
+        self._trees = [tree for tree in self._trees if tree.lower_bound < self.best_cost]
+        return min(self._trees, key=lambda tree: (tree.lower_bound, tree.expanded), default=None)
+
+    def _is_turn_of_assignment(self, next_cost: float, tree: ConflictTree | None) -> bool:
+        """Tell whether to open the tree of A_{k+1} before going on with an open tree.
+
+        At equal cost, the more trees are open the more nodes each of them gets first.
+        """
+        if tree is None:
+            return True
+        return (next_cost, _SLICE * len(self._trees)) <= (tree.lower_bound, tree.expanded)
+
+    def _apply_cbsa(self, tree: ConflictTree) -> None:
+        """Continue one tree for a while; then look for path sets elsewhere, too."""
+        node = tree.search(below=self.best_cost, nodes=_SLICE)
+        if node is not None:
+            self._incumbent.offer(Solution(tree.assignment, node.paths))
+        self._incumbent.work(self._budget.nodes, [tree.assignment for tree in self._trees])
 
     def _is_impossible(self) -> bool:
         """Now and then, look whether the vehicles can reach their targets at all."""

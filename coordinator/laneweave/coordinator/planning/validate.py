@@ -1,7 +1,7 @@
 """Checks a plan against its request, sharing no code with the search.
 
-Only the definition of a conflict is shared, because it is what a plan is checked against. The
-coordinator calls this before a plan is issued, whoever made the plan.
+Only the definition of a conflict is shared, because it is what a plan is checked against.
+`checked_plan` calls this before a coordinator issues or answers a plan.
 """
 
 from __future__ import annotations

@@ -1,0 +1,232 @@
+"""Several agents in one process: who gets which event, shards, and when the process ends."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import pytest
+from attrs import evolve
+
+from laneweave.agents.core import AgentCore
+from laneweave.agents.host import IDLE_S, AgentHost, Shard
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.messages import (
+    Announcement,
+    Ballot,
+    Census,
+    CensusEntry,
+    Command,
+    Name,
+    Plan,
+    Prepare,
+    Report,
+    Sense,
+    VehicleState,
+)
+from laneweave.protocol.motion import cell_state
+from laneweave.protocol.node import (
+    Announce,
+    Arrived,
+    Effect,
+    End,
+    Event,
+    Listen,
+    Send,
+    Started,
+    Stopping,
+    Unlisten,
+    Wakeup,
+)
+from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.topics import CENSUS, PLAN, PREPARE, SENSE, STATE, VEHICLE_ALIVE, Topic
+
+SCENARIO = Scenario()
+A, B, C = Name("A"), Name("B"), Name("C")
+BALLOT = Ballot(1, Name("c1"), 1, 1)
+FRONT: Cell = (0, 0)
+"""In formation 0; the next block begins at column -4."""
+
+
+def make_host(*vehicles: Name, shard: Shard | None = None) -> AgentHost:
+    return AgentHost(lambda name: AgentCore(name, 1, SCENARIO), vehicles, shard)
+
+
+def give(host: AgentHost, event: Event, now_s: float = 0.0) -> list[Effect]:
+    return list(host.handle(event, now_s))
+
+
+def hand(host: AgentHost, topic: Topic, vehicle: Name, message: object) -> list[Effect]:
+    return give(host, Arrived(topic, {"vehicle": vehicle}, message))
+
+
+def sense(vehicle: Name, cell: Cell, tick: int = 1, *, left: bool = False) -> Sense:
+    t_s = tick * SCENARIO.runtime.tick_s
+    state = cell_state(SCENARIO.lattice, cell, t_s)
+    return Sense(vehicle, tick, t_s, state, cell, 0, cell, 0, (), left)
+
+
+def senders(effects: Iterable[Effect], kind: type[Command] | type[VehicleState]) -> list[str]:
+    return [
+        effect.message.vehicle
+        for effect in effects
+        if isinstance(effect, Send) and isinstance(effect.message, kind)
+    ]
+
+
+def shown_by(effects: Iterable[Effect]) -> list[VehicleState]:
+    return [
+        effect.message
+        for effect in effects
+        if isinstance(effect, Send) and isinstance(effect.message, VehicleState)
+    ]
+
+
+def census(*on_road: Name, announced: Iterable[Name] = ()) -> Census:
+    return Census(
+        0.0,
+        tuple(CensusEntry(name, FRONT, 0, 0.0) for name in on_road),
+        tuple(Announcement(name, 0, 0, 5.0) for name in announced),
+    )
+
+
+def accept(host: AgentHost, cells: dict[Name, Cell]) -> list[Effect]:
+    """Let all vehicles of a roster promise and accept a plan without moves."""
+    effects: list[Effect] = []
+    for name in cells:
+        effects += hand(host, PREPARE, name, Prepare(BALLOT, 0, tuple(cells)))
+    plan = Plan(
+        BALLOT, 0, tuple(cells), dict.fromkeys(cells, 1), cells, dict.fromkeys(cells, ()),
+        0.0, 4.0, tuple(cells.values()),
+    )  # fmt: skip
+    for name in cells:
+        effects += hand(host, PLAN, name, plan)
+    return effects
+
+
+def test_events_go_to_the_vehicle_that_they_concern() -> None:
+    host = make_host(A, B)
+    started = give(host, Started())
+    assert [e.parameters["vehicle"] for e in started if isinstance(e, Announce)] == [A, B]
+    effects = hand(host, SENSE, B, sense(B, (-1, 1)))
+    assert senders(effects, Command) == senders(effects, VehicleState) == [B]
+    hand(host, SENSE, A, sense(A, FRONT))
+    effects = hand(host, PREPARE, A, Prepare(BALLOT, 0, (A, B)))
+    assert [(s.vehicle, s.promised) for s in shown_by(effects)] == [(A, BALLOT)]
+    assert hand(host, SENSE, C, sense(C, FRONT)) == []
+
+
+def test_states_go_to_the_members_of_the_formation() -> None:
+    host = make_host(A, B, C)
+    cells: dict[Name, Cell] = {A: FRONT, B: (-1, 1)}
+    for name, cell in (*cells.items(), (C, (-4, 0))):
+        hand(host, SENSE, name, sense(name, cell))
+    *_, last = shown_by(accept(host, cells))
+    assert (last.vehicle, last.ready) == (B, True)
+    give(host, Arrived(STATE, {"formation": "0", "vehicle": B}, last))
+    (state,) = shown_by(hand(host, SENSE, A, sense(A, FRONT, 2)))
+    assert state.go  # A has heard B
+    (state,) = shown_by(hand(host, SENSE, B, sense(B, (-1, 1), 2)))
+    assert not state.go  # B has not heard A
+
+
+def test_states_of_other_formations_are_not_handed_on() -> None:
+    host = make_host(A, B)
+    cells: dict[Name, Cell] = {A: FRONT, B: (-1, 1)}
+    for name, cell in cells.items():
+        hand(host, SENSE, name, sense(name, cell))
+    *_, last = shown_by(accept(host, cells))
+    elsewhere = evolve(last, formation=1)
+    give(host, Arrived(STATE, {"formation": "1", "vehicle": B}, elsewhere))
+    (state,) = shown_by(hand(host, SENSE, A, sense(A, FRONT, 2)))
+    assert not state.go
+
+
+def test_listens_to_a_formation_only_while_somebody_waits() -> None:
+    host = make_host(A, B)
+    cells: dict[Name, Cell] = {A: FRONT, B: (-1, 1)}
+    for name, cell in cells.items():
+        assert Listen(STATE, {"formation": 0}) not in hand(host, SENSE, name, sense(name, cell))
+    effects = accept(host, cells)
+    assert effects.count(Listen(STATE, {"formation": 0})) == 1
+    first, second = (s for s in shown_by(effects) if s.accepted)
+    key = {"formation": "0", "vehicle": first.vehicle}
+    give(host, Arrived(STATE, key, first))
+    assert give(host, Arrived(STATE, {**key, "vehicle": second.vehicle}, second)) == []
+    hand(host, SENSE, A, sense(A, FRONT, 2))
+    assert Unlisten(STATE, {"formation": 0}) in hand(host, SENSE, B, sense(B, (-1, 1), 2))
+
+
+def test_ends_when_the_last_vehicle_has_left() -> None:
+    host = make_host(A, B)
+    for name in (A, B):
+        hand(host, SENSE, name, sense(name, FRONT))
+    effects = hand(host, SENSE, A, sense(A, FRONT, 2, left=True))
+    assert End() not in effects
+    assert hand(host, SENSE, A, sense(A, FRONT, 3)) == []
+    effects = hand(host, SENSE, B, sense(B, FRONT, 2, left=True))
+    assert effects.count(End()) == 1
+
+
+def test_nothing_follows_the_end() -> None:
+    """Not even the end of a subscription: the node has left the network by then."""
+    host = make_host(A)
+    hand(host, SENSE, A, sense(A, FRONT))
+    accept(host, {A: FRONT, B: (-1, 1)})  # A waits for B's state
+    effects = hand(host, SENSE, A, sense(A, FRONT, 2, left=True))
+    assert effects[-2:] == [Unlisten(STATE, {"formation": 0}), End()]
+
+
+def test_ends_for_want_of_news() -> None:
+    host = make_host(A)
+    give(host, Started(), 10.0)
+    assert host.wakeup_s == 10.0 + IDLE_S
+    give(host, Arrived(SENSE, {"vehicle": A}, sense(A, FRONT)), 30.0)
+    assert give(host, Wakeup(), 10.0 + IDLE_S) == []
+    assert host.wakeup_s == 30.0 + IDLE_S
+    assert give(host, Wakeup(), 30.0 + IDLE_S) == [End()]
+
+
+def test_stopping_reports_for_every_vehicle() -> None:
+    reports = [
+        effect.message.name
+        for effect in give(make_host(A, B), Stopping())
+        if isinstance(effect, Send) and isinstance(effect.message, Report)
+    ]
+    assert reports == [A, B]
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_every_vehicle_belongs_to_exactly_one_shard(count: int) -> None:
+    for number in range(50):
+        takers = [Shard(index, count).takes(f"v{number}") for index in range(count)]
+        assert takers.count(True) == 1
+
+
+def test_a_shard_takes_announced_vehicles_and_those_on_the_road_once() -> None:
+    shards = [make_host(shard=Shard(index, 2)) for index in range(2)]
+    names = [Name(f"v{number}") for number in range(20)]
+    up: list[str] = []
+    for host in shards:
+        assert give(host, Started())[0] == Listen(CENSUS)
+        assert host.wakeup_s is None
+        for _ in range(2):
+            message = census(*names[:5], announced=names[3:])
+            up += [
+                effect.parameters["vehicle"]
+                for effect in give(host, Arrived(CENSUS, {}, message))
+                if isinstance(effect, Announce) and effect.topic is VEHICLE_ALIVE
+            ]
+    assert sorted(up) == sorted(names)
+
+
+def test_a_shard_goes_on_without_vehicles_and_takes_nobody_twice() -> None:
+    host = make_host(shard=Shard(0, 1))
+    give(host, Arrived(CENSUS, {}, census(A)))
+    hand(host, SENSE, A, sense(A, FRONT))
+    assert End() not in hand(host, SENSE, A, sense(A, FRONT, 2, left=True))
+    assert give(host, Arrived(CENSUS, {}, census(A))) == []
+    assert give(host, Wakeup(), 1e6) == []
+
+
+def test_without_a_shard_the_census_is_nothing_to_it() -> None:
+    assert give(make_host(A), Arrived(CENSUS, {}, census(B))) == []

@@ -1,0 +1,153 @@
+"""Rule L1: who leads, and what a candidate concludes from heartbeats, tokens and its own link."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from laneweave.coordinator.election import Election
+from laneweave.protocol.messages import Heartbeat, Name
+
+ELECTION_S = 0.4
+
+
+def candidate(name: str = "b", started_s: float = 0.0) -> Election:
+    return Election(Name(name), 1, ELECTION_S, started_s)
+
+
+def beat(name: str, incarnation: int = 1, term: int = 0) -> Heartbeat:
+    return Heartbeat(Name(name), incarnation, term, leading=False, formations=0)
+
+
+@pytest.mark.parametrize("heard_s", [0.1, 0.3, 1.1, 7.7, 1e6 + 0.3])
+def test_it_can_decide_exactly_when_it_asks_to_be_woken(heard_s: float) -> None:
+    """Rounding must not make a candidate sleep on until the next heartbeat."""
+    election = candidate()
+    election.on_heartbeat(beat("a"), heard_s)
+    assert election.update(election.next_change_s())
+
+
+def test_alone_it_leads_when_it_is_old_enough() -> None:
+    election = candidate(started_s=10.0)
+    assert not election.update(10.0 + ELECTION_S - 0.01)
+    assert election.update(10.0 + ELECTION_S)
+    assert (election.leading, election.term) == (True, 1)
+    assert not election.update(10.0 + 2 * ELECTION_S)  # no change
+
+
+def test_a_better_ranked_candidate_keeps_it_from_leading() -> None:
+    election = candidate()
+    election.on_heartbeat(beat("a"), 0.3)
+    assert not election.update(0.3 + ELECTION_S - 0.01)
+    assert election.next_change_s() == 0.3 + ELECTION_S
+    assert election.update(0.3 + ELECTION_S)
+
+
+def test_a_worse_ranked_candidate_does_not() -> None:
+    election = candidate()
+    election.on_heartbeat(beat("c"), 0.3)
+    assert election.next_change_s() == math.inf
+    assert election.update(ELECTION_S)
+
+
+def test_its_own_heartbeat_is_not_a_rival() -> None:
+    election = candidate()
+    election.on_heartbeat(beat("b", incarnation=2), 0.3)
+    election.on_token_up("b", 2, 0.3)
+    election.on_token_down("b", 2)
+    assert election.update(ELECTION_S)
+
+
+def test_steps_down_for_a_better_ranked_one_and_leads_again_with_a_higher_term() -> None:
+    election = candidate()
+    election.update(ELECTION_S)
+    election.on_heartbeat(beat("a", term=7), 1.0)
+    assert election.update(1.0)
+    assert not election.leading
+    election.on_heartbeat(beat("a", term=7), 1.1)  # terms are noted while not leading
+    assert election.update(1.1 + ELECTION_S)
+    assert (election.leading, election.term) == (True, 8)
+
+
+def test_a_dead_process_is_forgotten_at_once() -> None:
+    election = candidate()
+    election.on_heartbeat(beat("a"), 0.5)
+    assert not election.update(0.6)
+    election.on_token_down("a", 1)
+    assert election.update(0.6)
+
+
+def test_a_heartbeat_in_flight_does_not_revive_a_dead_process() -> None:
+    election = candidate()
+    election.on_heartbeat(beat("a"), 0.5)
+    election.on_token_down("a", 1)
+    election.on_heartbeat(beat("a"), 0.6)
+    assert election.update(0.6)
+    assert election.leading
+
+
+def test_the_next_process_of_that_name_counts() -> None:
+    election = candidate()
+    election.on_token_down("a", 1)
+    election.on_heartbeat(beat("a", incarnation=2), 0.6)
+    assert not election.update(0.6)
+    election.on_token_down("a", 1)  # late news of the old one
+    assert not election.update(0.6)
+    election.on_heartbeat(beat("a", incarnation=1), 0.9)  # late itself, and not to be counted
+    assert election.update(0.6 + ELECTION_S)
+
+
+def test_late_tokens_of_an_old_process_do_not_replace_the_new_one() -> None:
+    election = candidate()
+    election.on_token_up("a", 2, 0.1)
+    election.on_token_up("a", 1, 0.2)
+    election.on_token_down("a", 2)
+    assert election.update(ELECTION_S)
+
+
+def test_a_zombie_that_comes_back_counts_again() -> None:
+    election = candidate()
+    election.on_heartbeat(beat("a"), 0.1)
+    election.on_token_down("a", 1)  # stopped for longer than its lease
+    assert election.update(0.6)
+    assert election.leading
+    election.on_token_up("a", 1, 2.0)
+    assert election.update(2.0)
+    assert not election.leading
+    election.on_heartbeat(beat("a"), 2.3)
+    assert not election.update(2.3 + ELECTION_S - 0.01)
+
+
+def test_losing_the_own_link_concludes_nothing_about_others() -> None:
+    election = candidate()
+    election.on_heartbeat(beat("a"), 0.5)
+    election.on_link(up=False, now_s=0.6)
+    election.on_token_down("a", 1)
+    election.on_heartbeat(beat("a"), 0.61)  # not dead
+    assert not election.update(5.0)  # and without a link it never leads
+    election.on_link(up=True, now_s=6.0)
+    assert not election.update(6.0 + ELECTION_S - 0.01)  # its age counts from here
+    election.on_heartbeat(beat("a"), 6.2)
+    assert not election.update(6.0 + ELECTION_S)
+
+
+def test_losing_the_own_link_ends_the_lead() -> None:
+    election = candidate()
+    election.update(ELECTION_S)
+    election.on_link(up=False, now_s=1.0)
+    assert election.update(1.0)
+    assert not election.leading
+
+
+def test_terms_only_rise() -> None:
+    election = candidate()
+    election.raise_term(4)
+    assert election.term == 5
+    election.raise_term(2)
+    election.see_term(3)
+    assert election.term == 5
+    election.update(ELECTION_S)
+    assert election.term == 6
+    election.see_term(50)  # a leader keeps its own; vehicles tell it of higher ones
+    assert election.term == 6

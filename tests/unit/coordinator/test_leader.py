@@ -1,0 +1,440 @@
+"""Rules L2 to L8 for one formation, transition by transition."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Iterable
+
+import pytest
+
+from laneweave.coordinator.formation import Formation
+from laneweave.coordinator.leader import BACK_OFF_S, OBSERVE_S, RETRY_S, FormationControl, Phase
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.messages import Ballot, CensusEntry, Name, Plan, Prepare, VehicleState
+
+A, B, C = Name("A"), Name("B"), Name("C")
+OTHERS = Ballot(1, Name("other"), 1, 1)
+RESEND_S = 0.2
+RNG = random.Random(1)  # noqa: S311 (a test, not secrets)
+Reach = Callable[..., tuple[FormationControl, Ballot]]
+
+
+def formation(*names: Name, lane: int = 1) -> Formation:
+    return Formation(0, tuple(CensusEntry(name, (0, 0), lane, 0.0) for name in names))
+
+
+class Ballots:
+    """A source of ballots like a coordinator's."""
+
+    def __init__(self) -> None:
+        """Begin with term 1."""
+        self.term, self.given = 1, 0
+
+    def __call__(self, above: Ballot | None) -> Ballot:
+        if above is not None:
+            self.term = max(self.term, above.term + 1)
+        self.given += 1
+        return Ballot(self.term, Name("me"), 1, self.given)
+
+
+def control(*names: Name) -> FormationControl:
+    made = FormationControl(formation(*names), Ballots(), RNG, RESEND_S)
+    made.begin(0.0)
+    return made
+
+
+def state(
+    name: Name,
+    promised: Ballot | None = None,
+    *,
+    accepted: bool = False,
+    incarnation: int = 1,
+    t_s: float = 0.0,
+    cell: Cell = (0, 0),
+    done: bool = False,
+    overdue: bool = False,
+) -> VehicleState:
+    return VehicleState(
+        vehicle=name,
+        incarnation=incarnation,
+        formation=0,
+        promised=promised,
+        accepted=accepted,
+        ready=accepted,
+        completed=0,
+        hold_cell=cell,
+        moving=False,
+        go=False,
+        done=done,
+        overdue=overdue,
+        s_m=0.0,
+        y_m=0.0,
+        speed_mps=0.0,
+        t_s=t_s,
+    )
+
+
+def phase(leader: FormationControl) -> Phase:
+    return leader.phase
+
+
+def hear(leader: FormationControl, *states: VehicleState, now_s: float = 0.0) -> None:
+    for each in states:
+        leader.on_state(each, now_s)
+
+
+def to(sent: Iterable[tuple[Name, Prepare | Plan]]) -> list[Name]:
+    return [name for name, _ in sent]
+
+
+def preparing(*names: Name) -> tuple[FormationControl, Ballot]:
+    leader = control(*names)
+    hear(leader, *(state(name) for name in names))
+    assert phase(leader) is Phase.PREPARING
+    assert leader.ballot is not None
+    return leader, leader.ballot
+
+
+def planning(*names: Name) -> tuple[FormationControl, Ballot]:
+    leader, ballot = preparing(*names)
+    hear(leader, *(state(name, ballot) for name in names))
+    assert leader.take_planning_order(0.0)
+    return leader, ballot
+
+
+def plan_of(leader: FormationControl) -> Plan:
+    assert leader.ballot is not None
+    cells = leader.hold_cells
+    return Plan(
+        leader.ballot, 0, tuple(cells), leader.incarnations, cells, dict.fromkeys(cells, ()),
+        0.0, 4.0, (),
+    )  # fmt: skip
+
+
+def issuing(*names: Name) -> tuple[FormationControl, Ballot]:
+    leader, ballot = planning(*names)
+    leader.on_plan(plan_of(leader), 0.0)
+    return leader, ballot
+
+
+def watching(*names: Name) -> tuple[FormationControl, Ballot]:
+    leader, ballot = issuing(*names)
+    hear(leader, *(state(name, ballot, accepted=True) for name in names))
+    assert phase(leader) is Phase.WATCHING
+    return leader, ballot
+
+
+# --- L2 ---------------------------------------------------------------------------------------
+
+
+def test_l2_adopts_a_plan_that_all_have_accepted_and_sends_nothing() -> None:
+    leader = control(A, B)
+    hear(leader, state(A, OTHERS, accepted=True), state(B, OTHERS, accepted=True))
+    assert (leader.phase, leader.ballot, leader.plan) == (Phase.WATCHING, OTHERS, None)
+    leader.on_time(100.0)
+    assert list(leader.outgoing(100.0)) == []
+    assert not leader.take_planning_order(100.0)
+    assert leader.wakeup_s is None
+
+
+@pytest.mark.parametrize(
+    "last",
+    [
+        state(B),
+        state(B, OTHERS),
+        state(B, OTHERS._replace(seq=2), accepted=True),
+        state(B, OTHERS, accepted=True, overdue=True),
+    ],
+    ids=["nothing promised", "promised only", "another plan", "overdue"],
+)
+def test_l2_mixed_states_lead_to_a_new_ballot(last: VehicleState) -> None:
+    leader = control(A, B)
+    hear(leader, state(A, OTHERS, accepted=True))
+    assert phase(leader) is Phase.OBSERVING
+    hear(leader, last)
+    assert phase(leader) is Phase.PREPARING
+    assert leader.ballot is not None
+    assert leader.ballot > OTHERS
+
+
+def test_l2_waits_for_the_states_of_the_roster_but_not_for_ever() -> None:
+    leader = control(A, B)
+    hear(leader, state(A, OTHERS, accepted=True))
+    leader.on_time(OBSERVE_S - 0.01)
+    assert phase(leader) is Phase.OBSERVING
+    assert leader.wakeup_s == OBSERVE_S
+    leader.on_time(OBSERVE_S)
+    assert phase(leader) is Phase.PREPARING
+
+
+def test_strangers_say_nothing() -> None:
+    leader = control(A)
+    hear(leader, state(C, OTHERS._replace(term=9)))
+    assert phase(leader) is Phase.OBSERVING
+    hear(leader, state(A))
+    assert leader.ballot == Ballot(1, Name("me"), 1, 1)
+
+
+# --- L3 and L4 --------------------------------------------------------------------------------
+
+
+def test_l3_a_new_ballot_is_above_everything_seen() -> None:
+    leader = control(A, B)
+    hear(leader, state(A, OTHERS), state(B, OTHERS._replace(term=5)))
+    assert leader.ballot == Ballot(6, Name("me"), 1, 1)
+
+
+def test_prepare_goes_to_those_who_have_not_promised_until_they_have() -> None:
+    leader, ballot = preparing(A, B)
+    sent = dict(leader.outgoing(0.0))
+    assert sent == dict.fromkeys((A, B), Prepare(ballot, 0, (A, B)))
+    assert list(leader.outgoing(RESEND_S / 2)) == []
+    hear(leader, state(A, ballot))
+    assert to(leader.outgoing(RESEND_S)) == [B]
+    assert leader.wakeup_s == 2 * RESEND_S
+
+
+def test_l4_only_this_ballot_is_a_promise_and_not_once_accepted() -> None:
+    leader, ballot = preparing(A)
+    for each in (state(A), state(A, ballot._replace(seq=0)), state(A, ballot, accepted=True)):
+        hear(leader, each)
+        assert not leader.take_planning_order(0.0)
+
+
+def test_a_promise_that_was_forgotten_is_void() -> None:
+    leader, ballot = preparing(A, B)
+    hear(leader, state(A, ballot), state(A, incarnation=2), state(B, ballot))
+    assert not leader.take_planning_order(0.0)
+    assert to(leader.outgoing(0.0)) == [A]
+    hear(leader, state(A, ballot, incarnation=2, cell=(3, 1)))
+    assert leader.take_planning_order(0.0)
+    assert leader.incarnations == {A: 2, B: 1}
+    assert leader.hold_cells == {A: (3, 1), B: (0, 0)}
+
+
+@pytest.mark.parametrize(
+    ("newer", "older"),
+    [
+        (state(A, Ballot(1, Name("me"), 1, 1), t_s=2.0), state(A, t_s=1.0)),
+        (state(A, Ballot(1, Name("me"), 1, 1)), state(A)),
+        (state(A, Ballot(1, Name("me"), 1, 1)), state(A, Ballot(0, Name("x"), 1, 1))),
+        (state(A, Ballot(1, Name("me"), 1, 1), incarnation=2), state(A, t_s=9.0)),
+    ],
+    ids=["older time", "no promise yet", "lower promise", "older process"],
+)
+def test_a_late_state_takes_no_promise_back(newer: VehicleState, older: VehicleState) -> None:
+    leader, _ = preparing(A)
+    hear(leader, newer, older)
+    assert leader.take_planning_order(0.0)
+
+
+# --- L5 ---------------------------------------------------------------------------------------
+
+
+def test_l5_needs_the_whole_roster_and_orders_once() -> None:
+    leader, ballot = preparing(A, B, C)
+    hear(leader, state(A, ballot), state(B, ballot))
+    assert not leader.take_planning_order(0.0)
+    hear(leader, state(C, ballot))
+    assert leader.take_planning_order(0.0)
+    assert not leader.take_planning_order(0.0)
+    assert (leader.phase, leader.wakeup_s) == (Phase.PLANNING, None)
+    assert list(leader.outgoing(9.0)) == []
+
+
+def test_l5_failed_planning_keeps_the_ballot_and_tries_again_later_and_later() -> None:
+    leader, ballot = planning(A)
+    now_s = 0.0
+    for pause_s in (RETRY_S, 2 * RETRY_S, 4 * RETRY_S):
+        leader.on_planning_failed(now_s)
+        assert leader.wakeup_s == now_s + pause_s
+        assert not leader.take_planning_order(now_s + pause_s - 0.01)
+        now_s += pause_s
+        leader.on_time(now_s)
+        assert list(leader.outgoing(now_s)) == []
+        assert leader.take_planning_order(now_s)
+        assert leader.ballot == ballot
+    leader.on_plan(plan_of(leader), now_s)
+    assert leader.failures == 0
+
+
+def test_restart_during_the_pause_after_failed_planning() -> None:
+    leader, ballot = planning(A)
+    leader.on_planning_failed(0.0)
+    hear(leader, state(A, incarnation=2))
+    assert not leader.take_planning_order(RETRY_S)
+    assert to(leader.outgoing(RETRY_S)) == [A]
+    hear(leader, state(A, ballot, incarnation=2))
+    assert leader.take_planning_order(RETRY_S + RESEND_S)
+
+
+# --- L6 ---------------------------------------------------------------------------------------
+
+
+def test_l6_the_plan_goes_to_those_who_have_not_accepted() -> None:
+    leader, ballot = issuing(A, B)
+    plan = plan_of(leader)
+    assert list(leader.outgoing(0.0)) == [(A, plan), (B, plan)]
+    hear(leader, state(A, ballot, accepted=True))
+    assert list(leader.outgoing(RESEND_S - 0.01)) == []
+    assert list(leader.outgoing(RESEND_S)) == [(B, plan)]
+    hear(leader, state(B, ballot))  # still only promised
+    assert phase(leader) is Phase.ISSUING
+    hear(leader, state(B, ballot, accepted=True))
+    assert (leader.phase, leader.ballot) == (Phase.WATCHING, ballot)
+    assert list(leader.outgoing(99.0)) == []
+
+
+# --- L7 ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("reach", [preparing, planning, issuing, watching])
+@pytest.mark.parametrize("higher", [Ballot(2, Name("a"), 1, 1), Ballot(1, Name("z"), 1, 1)])
+def test_l7_outbid_backs_off_then_looks_and_takes_a_higher_term(
+    reach: Reach, higher: Ballot
+) -> None:
+    leader, ballot = reach(A, B)
+    hear(leader, state(A, higher, t_s=1.0), now_s=5.0)
+    assert phase(leader) is Phase.BACKING_OFF
+    pause_s = (leader.wakeup_s or 0.0) - 5.0
+    assert BACK_OFF_S[0] <= pause_s <= BACK_OFF_S[1]
+    assert list(leader.outgoing(9.0)) == []
+    assert not leader.take_planning_order(9.0)
+    leader.on_time(5.0 + pause_s)
+    assert phase(leader) is Phase.OBSERVING
+    hear(leader, state(A, higher, t_s=2.0), state(B, ballot, t_s=2.0), now_s=6.0)
+    assert phase(leader) is Phase.PREPARING
+    assert leader.ballot is not None
+    assert leader.ballot.term > higher.term
+
+
+def test_l7_adopts_the_others_plan_if_it_is_in_force_after_the_pause() -> None:
+    leader, _ = issuing(A, B)
+    higher = Ballot(2, Name("z"), 1, 1)
+    hear(leader, state(A, higher, t_s=1.0))
+    leader.on_time(1.0)
+    for name in (A, B):
+        hear(leader, state(name, higher, accepted=True, incarnation=2, t_s=2.0))
+    assert (leader.phase, leader.ballot) == (Phase.WATCHING, higher)
+    # The incarnations that promised this leader's own ballot are history.
+    hear(leader, state(A, higher, accepted=True, incarnation=2, t_s=3.0))
+    assert phase(leader) is Phase.WATCHING
+
+
+# --- L8 ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("reach", [planning, issuing, watching])
+def test_l8_a_restarted_agent_leads_to_a_new_ballot(reach: Reach) -> None:
+    leader, ballot = reach(A, B)
+    hear(leader, state(A, incarnation=2))
+    assert phase(leader) is Phase.PREPARING
+    assert leader.ballot is not None
+    assert leader.ballot > ballot
+
+
+@pytest.mark.parametrize("promised", [None, OTHERS])
+def test_l8_a_restarted_agent_in_an_adopted_plan(promised: Ballot | None) -> None:
+    """A duplicate of the old PREPARE may make it promise the adopted ballot once more."""
+    leader = control(A, B)
+    hear(leader, state(A, OTHERS, accepted=True), state(B, OTHERS, accepted=True))
+    hear(leader, state(A, promised, incarnation=2))
+    assert phase(leader) is Phase.PREPARING
+
+
+def test_l8_overdue_leads_to_a_new_ballot() -> None:
+    leader, ballot = watching(A, B)
+    hear(leader, state(A, ballot, accepted=True, overdue=True))
+    assert phase(leader) is Phase.PREPARING
+
+
+def test_l8_new_targets_lead_to_a_new_ballot() -> None:
+    leader, _ = watching(A, B)
+    leader.on_members(formation(A, B), 1.0)
+    assert phase(leader) is Phase.WATCHING
+    leader.on_members(formation(A, B, lane=2), 1.0)
+    assert phase(leader) is Phase.PREPARING
+
+
+def test_l8_an_adopted_plan_that_ended_on_the_wrong_lane_was_for_other_targets() -> None:
+    leader = control(A)
+    hear(leader, state(A, OTHERS, accepted=True, cell=(0, 2)))
+    assert phase(leader) is Phase.WATCHING
+    hear(leader, state(A, OTHERS, accepted=True, cell=(0, 1), done=True, t_s=1.0))
+    assert phase(leader) is Phase.WATCHING
+    hear(leader, state(A, OTHERS, accepted=True, cell=(0, 2), done=True, t_s=2.0))
+    assert phase(leader) is Phase.PREPARING
+
+
+# --- the roster -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("reach", [preparing, planning, issuing])
+def test_who_leaves_takes_the_ballot_along(reach: Reach) -> None:
+    leader, ballot = reach(A, B)
+    leader.on_members(formation(A), 1.0)
+    assert phase(leader) is Phase.PREPARING
+    assert leader.ballot is not None
+    assert leader.ballot > ballot
+    assert list(leader.outgoing(1.0)) == [(A, Prepare(leader.ballot, 0, (A,)))]
+    hear(leader, state(B, leader.ballot), state(A, leader.ballot))
+    assert leader.take_planning_order(1.0)
+    assert set(leader.hold_cells) == {A}
+
+
+def test_who_leaves_a_plan_in_force_stops_nobody() -> None:
+    leader, ballot = watching(A, B)
+    leader.on_members(formation(A), 1.0)
+    assert (leader.phase, leader.ballot) == (Phase.WATCHING, ballot)
+
+
+def test_who_leaves_while_observing_is_not_waited_for() -> None:
+    leader = control(A, B)
+    leader.on_members(formation(A), 0.1)
+    hear(leader, state(A, OTHERS, accepted=True))
+    assert phase(leader) is Phase.WATCHING
+
+
+def test_settled_is_the_end() -> None:
+    leader, ballot = planning(A)
+    leader.settle()
+    hear(leader, state(A, ballot, incarnation=2, overdue=True))
+    leader.on_time(1e6)
+    leader.on_members(formation(A, lane=2), 1e6)
+    assert (leader.phase, leader.wakeup_s) == (Phase.SETTLED, None)
+    assert list(leader.outgoing(1e6)) == []
+
+
+# --- ballots ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_under_random_states_ballots_only_rise_and_plans_need_all_promises(seed: int) -> None:
+    rng = random.Random(seed)  # noqa: S311 (a test, not secrets)
+    leader, now_s, ballots = control(A, B), 0.0, [Ballot(0, Name(""), 0, 0)]
+    for _ in range(300):
+        now_s += rng.choice((0.0, 0.05, 0.3))
+        known = leader.ballot or OTHERS
+        promised = rng.choice((None, OTHERS, known, known, known._replace(term=known.term + 1)))
+        each = state(
+            rng.choice((A, B)),
+            promised,
+            accepted=promised is not None and rng.random() < 0.4,
+            incarnation=rng.choice((1, 1, 1, 2)),
+            t_s=now_s + rng.uniform(-0.3, 0.0),
+            overdue=rng.random() < 0.1,
+        )
+        leader.on_state(each, now_s)
+        leader.on_time(now_s)
+        if leader.take_planning_order(now_s):
+            assert set(leader.hold_cells) == {A, B}
+            if rng.random() < 0.7:
+                leader.on_plan(plan_of(leader), now_s)
+            else:
+                leader.on_planning_failed(now_s)
+        for _, message in leader.outgoing(now_s):
+            assert message.ballot == leader.ballot
+            if message.ballot != ballots[-1]:
+                assert message.ballot > ballots[-1]
+                ballots.append(message.ballot)
+    assert len(ballots) > 3
