@@ -38,7 +38,7 @@ def random_request(seed: int) -> dict[str, Any]:
 
     Each has a target that it may take and can reach alone; nothing more is promised.
     """
-    rng = Random(seed)  # noqa: S311  (not for secrets)
+    rng = Random(seed)
     mode, conflicts = variant(seed)
     count = rng.choice((2, 3, 3, 4, 4, 5, 5, 6))
     while True:
@@ -59,7 +59,7 @@ def small_request(
     seed: int, *, columns: int, lanes: int, count: int, mode: int, conflicts: list[str] | None
 ) -> dict[str, Any]:
     """A request of the size asked for, with or without a solution."""
-    request = _draw(Random(seed), columns, lanes, count, mode)  # noqa: S311  (not for secrets)
+    request = _draw(Random(seed), columns, lanes, count, mode)
     if conflicts is not None:
         request["conflicts"] = conflicts
     return request

@@ -204,7 +204,7 @@ class Player:
     ) -> Iterator[str]:
         core = CoordinatorCore(Name(name), incarnation, Scenario())
         core.election.term = term
-        rng = random.Random(0)  # noqa: S311 (a story, not secrets)
+        rng = random.Random(0)
         control = FormationControl(formation, core._new_ballot, rng, RESEND_S)
         self.leaders[name] = Leader(core, incarnation, control)
         control.begin(self.t_s)

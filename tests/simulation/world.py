@@ -263,7 +263,7 @@ class World:
 
     def __init__(self, seed: int, faults: Faults | None = None) -> None:
         """Draw the vehicles and, unless given, the faults."""
-        self._rng = random.Random(f"world/{seed}")  # noqa: S311 (simulation, not secrets)
+        self._rng = random.Random(f"world/{seed}")
         self.faults = faults or Faults.drawn(self._rng)
         faults = self.faults
         self.network = SimulatedNetwork(

@@ -62,7 +62,7 @@ class Lab:
 
     def start(self, *arguments: object, **environment: str) -> subprocess.Popen[str]:
         """Start `laneweave ARGUMENTS` as the leader of a new process group."""
-        process = subprocess.Popen(  # noqa: S603 (our own program)
+        process = subprocess.Popen(
             [LANEWEAVE, *map(str, arguments)],
             cwd=self.folder,
             env=self.environment | environment,

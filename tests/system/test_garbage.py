@@ -206,7 +206,7 @@ def talk(lab: Lab) -> Iterator[Callable[[Callable[[ZenohTransport], None]], None
 
 def say_nonsense(transport: ZenohTransport) -> None:
     """Publish nonsense on all keys, and what is well formed in the name of nobody."""
-    rng = random.Random(1)  # noqa: S311 (nothing secret)
+    rng = random.Random(1)
     for topic in TOPICS:
         for key in keys_of(topic, "v0001"):
             for payload in nonsense(topic, rng):

@@ -261,6 +261,16 @@ def test_promise_and_acceptance_are_shown_at_once() -> None:
     assert rig.hand(PREPARE, Prepare(BALLOT, 0, (OTHER,))) == []
 
 
+@pytest.mark.parametrize("beyond", [(-4, 1), (1, 1), (-1, 3)])
+def test_a_plan_beyond_its_own_block_is_not_accepted(beyond: Cell) -> None:
+    """Plans of other formations run at the same time; only the blocks keep them apart."""
+    rig = up_and_running()
+    rig.hand(PREPARE, Prepare(BALLOT, 0, (ME,)))
+    plan = make_plan({ME: ()}, {ME: HOME}, {ME: 1})
+    assert rig.hand(PLAN, attrs.evolve(plan, territory=(HOME, beyond))) == []
+    assert rig.hand(PLAN, plan) != []
+
+
 # --- moves ------------------------------------------------------------------------------------
 
 

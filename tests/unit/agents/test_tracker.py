@@ -311,7 +311,7 @@ def test_gap_rows_leave_nothing_behind() -> None:
 
 def script(tracker: Tracker) -> bytes:
     """Drive through moves, noise and a braking vehicle; return all jerks, bit by bit."""
-    rng = random.Random(7)  # noqa: S311
+    rng = random.Random(7)
     predict = braking(14.0, 2.0, 60, end_speed=9.0)
     state, jerks = cell_state(LATTICE, (0, 1), 0.0), b""
     reference = Reference.moves(SCENARIO, (0, 1), [(10, (-1, 2)), (50, (-1, 1))])

@@ -15,7 +15,7 @@ from laneweave.protocol.messages import Ballot, CensusEntry, Name, Plan, Prepare
 A, B, C = Name("A"), Name("B"), Name("C")
 OTHERS = Ballot(1, Name("other"), 1, 1)
 RESEND_S = 0.2
-RNG = random.Random(1)  # noqa: S311 (a test, not secrets)
+RNG = random.Random(1)
 Reach = Callable[..., tuple[FormationControl, Ballot]]
 
 
@@ -410,7 +410,7 @@ def test_settled_is_the_end() -> None:
 
 @pytest.mark.parametrize("seed", range(20))
 def test_under_random_states_ballots_only_rise_and_plans_need_all_promises(seed: int) -> None:
-    rng = random.Random(seed)  # noqa: S311 (a test, not secrets)
+    rng = random.Random(seed)
     leader, now_s, ballots = control(A, B), 0.0, [Ballot(0, Name(""), 0, 0)]
     for _ in range(300):
         now_s += rng.choice((0.0, 0.05, 0.3))

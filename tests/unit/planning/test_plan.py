@@ -256,7 +256,7 @@ class TestRepeatable:
                 "PYTHONPATH": os.pathsep.join(roots),
             }
             command = [sys.executable, "-c", SCRIPT]
-            return subprocess.run(  # noqa: S603
+            return subprocess.run(
                 command, env=environment, check=True, capture_output=True, text=True
             ).stdout
 

@@ -89,7 +89,7 @@ def is_executable_in_words(plan: Plan) -> bool:
 
 def draw_plan(seed: int, *, careful: bool) -> Plan:
     """Draw a plan on a small grid; a careful one keeps the bodies of each step apart."""
-    rng = random.Random(seed)  # noqa: S311
+    rng = random.Random(seed)
     grid = [(column, lane) for column in range(4) for lane in range(3)]
     names = [Name(f"v{index}") for index in range(rng.randint(1, 6))]
     starts = dict(zip(names, rng.sample(grid, len(names)), strict=True))
@@ -144,7 +144,7 @@ def test_every_wait_points_to_an_earlier_step(plan: Plan) -> None:
 @settings(max_examples=100, deadline=None)
 @given(VALID_PLANS, st.integers(0, 2**32))
 def test_any_order_that_keeps_the_waits_is_safe_and_ends(plan: Plan, seed: int) -> None:
-    rng = random.Random(seed)  # noqa: S311
+    rng = random.Random(seed)
     needs = {vehicle: dependencies(plan, vehicle) for vehicle in plan.roster}
     done = dict.fromkeys(plan.roster, 0)
     bodies = {vehicle: {cell} for vehicle, cell in plan.start_cells.items()}

@@ -229,7 +229,7 @@ time.sleep(60)
 
 def start_process(code: str, *arguments: str) -> subprocess.Popen[bytes]:
     """Start a Python process and wait until it says that it is ready."""
-    process = subprocess.Popen([sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE)  # noqa: S603
+    process = subprocess.Popen([sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE)
     assert process.stdout is not None
     if process.stdout.readline() != b"ready\n":
         process.kill()

@@ -209,7 +209,7 @@ def test_missing_system_libraries_are_named_by_their_debian_packages(
 def test_nothing_but_a_world_imports_libsumo() -> None:
     code = "import sys; import laneweave.sim_bridge.sumo_world; sys.exit('libsumo' in sys.modules)"
     path = [entry for entry in sys.path if entry]
-    finished = subprocess.run(  # noqa: S603 - our own interpreter and code
+    finished = subprocess.run(
         [sys.executable, "-c", f"import sys; sys.path[:0] = {path!r}; {code}"], check=False
     )
     assert finished.returncode == 0

@@ -20,10 +20,10 @@ from laneweave.coordinator.planning.diagram import Bans, Diagram, shortest_paths
 from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.sppa import Path, choose_path
 
-_NODES_PER_BUILD = 2
+_NODES_PER_BUILD = 12
 _NODES_PER_IMPROVEMENT = 24
-"""One step per two nodes until there is a path set; then one step per four nodes with 6 vehicles,
-and one per node from 24 vehicles on, where a proof is out of reach."""
+"""Divided by the number of vehicles: with 6 vehicles one step per two nodes until there is a path
+set, then one per four nodes; more steps with more vehicles, for which a proof is out of reach."""
 
 _CREDIT_PER_VEHICLE = 4
 """Nodes' worth of steps that are granted each time a better path set is found."""
@@ -58,7 +58,7 @@ class Incumbent:
         self._budget = budget
         self._random = random.Random(0)  # noqa: S311
         self._order = list(range(len(choices)))
-        self._effort = 0
+        self._effort = 0.0
         self._credit = 0
         self._steps = 0
         self._round: Solution | None = None
@@ -71,9 +71,8 @@ class Incumbent:
         while self._effort < nodes + self._credit:
             before = self.best
             self._steps += 1
-            self._effort += (
-                _NODES_PER_BUILD if before is None else max(1, _NODES_PER_IMPROVEMENT // vehicles)
-            )
+            share = _NODES_PER_BUILD if before is None else _NODES_PER_IMPROVEMENT
+            self._effort += share / vehicles
             self._step(assignments[self._steps % len(assignments)])
             if self.best is not before:
                 self._credit += _CREDIT_PER_VEHICLE * vehicles
