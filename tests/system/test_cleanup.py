@@ -54,7 +54,7 @@ def test_a_signal_ends_a_run(lab: Lab, road: Path, number: signal.Signals) -> No
     check_files(lab.folder / "out")
 
 
-@pytest.mark.parametrize("role", ["router", "c1", "bridge"])
+@pytest.mark.parametrize("role", ["router", "bridge"])
 def test_ctrl_c_ends_a_run_that_is_starting(lab: Lab, road: Path, role: str) -> None:
     process = lab.start("run", road, *DEMAND, "--coordinators", "1", "--out", "out")
     lab.wait_until(lambda: role in lab.roles())

@@ -8,7 +8,6 @@ import queue
 import signal
 import socket
 import subprocess
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -89,11 +88,9 @@ def stop(lab: Lab, *processes: subprocess.Popen[str]) -> None:
         assert lab.finish(process, END_S) == Ended(0, "", "")
 
 
-@pytest.mark.parametrize("make_endpoint", [free_tcp, lambda: "unixsock-stream/router.sock"])
-def test_roles_by_hand(
-    finished_run: FinishedRun, lab: Lab, make_endpoint: Callable[[], str]
-) -> None:
-    config = deployment(lab, make_endpoint())
+def test_roles_by_hand(finished_run: FinishedRun, lab: Lab) -> None:
+    # The other tests here use TCP.
+    config = deployment(lab, "unixsock-stream/router.sock")
     router = start_router(lab, config)
     coordinators = [
         lab.start("coordinator", "--config", config, "--name", name) for name in ("c1", "c2")

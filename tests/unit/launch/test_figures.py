@@ -82,7 +82,10 @@ def test_lanes_are_coloured_as_in_the_paper() -> None:
 
 
 def test_matplotlib_is_imported_only_to_draw() -> None:
-    code = "import sys; import laneweave.launch.figures, laneweave.launch.snapshots; sys.exit('matplotlib' in sys.modules)"
+    code = (
+        "import sys; import laneweave.launch.figures, laneweave.launch.snapshots; "
+        "sys.exit('matplotlib' in sys.modules)"
+    )
     path = [entry for entry in sys.path if entry]
     finished = subprocess.run(
         [sys.executable, "-c", f"import sys; sys.path[:0] = {path!r}; {code}"], check=False
