@@ -94,6 +94,7 @@ class CoordinatorCore:
         )
         self._planning: dict[int, tuple[int, Ballot]] = {}
         self._next_job = 0
+        self._road_changed = True
         self._heartbeat_s = 0.0
         self._report_s = 0.0
         self._wakeup_s: float | None = None
@@ -155,10 +156,12 @@ class CoordinatorCore:
                 self.election.on_heartbeat(message, now_s)
             case RoadClock():
                 self.t_s = max(self.t_s, message.t_s)
+                self._road_changed = True
             case Census():
                 if self.census is None or message.t_s >= self.census.t_s:
                     self.census = message
                     self.t_s = max(self.t_s, message.t_s)
+                    self._road_changed = True
             case VehicleState() if self.election.leading:
                 control = self.controls.get(message.formation)
                 if control is not None:
@@ -173,6 +176,7 @@ class CoordinatorCore:
             return
         self.controls = {}
         self._planning = {}
+        self._road_changed = True
         if self.election.leading:
             yield Listen(STATE)
         else:
@@ -201,7 +205,9 @@ class CoordinatorCore:
     def _lead(self, now_s: float) -> Iterator[Effect]:
         if not self.election.leading or self.census is None:
             return
-        self._update_members(self.census, now_s)
+        if self._road_changed:
+            self._road_changed = False
+            self._update_members(self.census, now_s)
         for number, control in self.controls.items():
             control.on_time(now_s)
             if control.take_planning_order(now_s):

@@ -5,6 +5,7 @@ Machines differ and are noisy: medians, and CPU time where it is the solver that
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
 import tempfile
@@ -48,21 +49,22 @@ class _Window:
         now = time.perf_counter()
         if self.began is None and view.t_s >= self.begin_s:
             self.began = (view.t_s, now)
-            self.first = {
-                name: (process, _cpu_s(process))
-                for name, process in _processes(process_ids).items()
-            }
+            for name, process in _processes(process_ids).items():
+                with contextlib.suppress(psutil.Error):
+                    self.first[name] = (process, _cpu_s(process))
         elif self.began is not None and self.ended is None and view.t_s >= self.end_s:
             self.ended = (view.t_s, now)
             self._measure(process_ids)
 
     def _measure(self, process_ids: Mapping[str, int]) -> None:
         for name, process in _processes(process_ids).items():
-            role = _role(name)
-            before = self.first.get(name, (process, 0.0))[1]
-            self.cpu_s[role] = self.cpu_s.get(role, 0.0) + _cpu_s(process) - before
-            info = process.memory_full_info()
-            self.memory.setdefault(role, []).append((info.pss / 2**20, info.uss / 2**20))
+            # Vehicles leave, and their agents with them.
+            with contextlib.suppress(psutil.Error):
+                role = _role(name)
+                before = self.first.get(name, (process, 0.0))[1]
+                info = process.memory_full_info()
+                self.memory.setdefault(role, []).append((info.pss / 2**20, info.uss / 2**20))
+                self.cpu_s[role] = self.cpu_s.get(role, 0.0) + _cpu_s(process) - before
 
 
 def bench_runtime(vehicles: int, *, seconds: float, per_process: int, seed: int) -> dict[str, Any]:

@@ -36,6 +36,8 @@ KINDS: dict[str, type] = {
     )
 }
 _MAX_INT = 2**63
+_MAX_FLOAT = 1e12
+"""Far beyond every position, speed and time, and small enough to calculate with."""
 _MAX_DEPTH = 8
 
 
@@ -49,6 +51,12 @@ def _integer(value: object, _: type) -> int:
     if type(value) is not int or not -_MAX_INT <= value < _MAX_INT:
         raise BadInputError("", value, "a 64-bit integer")
     return value
+
+
+def _measure(value: object, _: type) -> float:
+    if type(value) not in (int, float) or not -_MAX_FLOAT <= value <= _MAX_FLOAT:  # type: ignore[operator]
+        raise BadInputError("", value, f"a number in [{-_MAX_FLOAT:g}, {_MAX_FLOAT:g}]")
+    return float(value)  # type: ignore[arg-type]
 
 
 def _ballot(value: object, _: type) -> Ballot:
@@ -90,6 +98,7 @@ def _is_plain(value: object, depth: int) -> bool:
 def _make_converter(*, detailed: bool) -> Any:  # noqa: ANN401 (cattrs converters are generic)
     converter = strict_converter(detailed=detailed)
     converter.register_structure_hook(int, _integer)
+    converter.register_structure_hook(float, _measure)
     converter.register_structure_hook(Name, _name)
     converter.register_structure_hook(Ballot, _ballot)
     converter.register_structure_hook_func(lambda kind: kind == dict[str, Any], _plain_data)
