@@ -116,7 +116,9 @@ def messages(vehicle: Name, *, number: int, real: float) -> dict[type, Any]:
             (Announcement(vehicle, number, number, real),),
         ),
         RoadClock(number, real, number, number, number, number, ended=True),
-        Report(Name("agent"), vehicle, number, number, number, number, b"\x00\x00\xc0\x7f" * 9),
+        Report(
+            Name("agent"), vehicle, GHOST, number, number, number, number, b"\x00\x00\xc0\x7f" * 9
+        ),
         LogEvent(
             Name("agent"),
             vehicle,
@@ -174,7 +176,7 @@ def nonsense(topic: Topic, rng: random.Random) -> Iterator[bytes]:
 
 def huge_payloads() -> Iterator[bytes]:
     yield bytes(MAX_BYTES + 1)
-    yield encode(Report(Name("agent"), GHOST, 0, 0, solve_ms=bytes(MAX_BYTES)))
+    yield encode(Report(Name("agent"), GHOST, solve_ms=bytes(MAX_BYTES)))
 
 
 @pytest.fixture

@@ -141,7 +141,7 @@ class AgentCore:
         if sense.vehicle != self.vehicle:
             return
         if sense.left:
-            yield from self._end()
+            yield from self.leave()
             return
         if self._sense is not None and sense.tick <= self._sense.tick:
             if sense.tick == self._sense.tick and self._command is not None:
@@ -293,7 +293,8 @@ class AgentCore:
         )
         return Send(STATE, state, {"formation": self.formation, "vehicle": self.vehicle})
 
-    def _end(self) -> Iterator[Effect]:
+    def leave(self) -> Iterator[Effect]:
+        """End: the vehicle is not on the road any more."""
         if not self.ended:
             self.ended = True
             yield self._report()
@@ -305,8 +306,6 @@ class AgentCore:
         report = Report(
             role=Name("agent"),
             name=self.vehicle,
-            published=0,
-            rejected=0,
             solves=len(self._solve_ms),
             unusable=self._unusable,
             solve_ms=np.array(self._solve_ms, dtype="<f4").tobytes(),

@@ -15,15 +15,18 @@ from laneweave.protocol.node import (
     End,
     Event,
     Listen,
+    PeerDown,
+    PeerUp,
     Started,
     Stopping,
     Unlisten,
     Wakeup,
+    Watch,
 )
-from laneweave.protocol.topics import CENSUS, STATE
+from laneweave.protocol.topics import BRIDGE_ALIVE, CENSUS, STATE
 
-IDLE_S = 60.0
-"""An agent whose vehicle says nothing for this long (node clock) ends."""
+ALONE_S = 60.0
+"""Agents end when no bridge has been there for this long (node clock)."""
 
 
 @frozen
@@ -53,12 +56,17 @@ class AgentHost:
         self._agents: dict[Name, AgentCore] = {name: make_agent(name) for name in vehicles}
         self._seen: set[Name] = set(self._agents)
         self._formations: set[int] = set()
-        self._heard_s = 0.0
+        self._census_s = 0.0
+        self._bridge = ""
+        self._alone_since_s: float | None = 0.0
+        """Since when no bridge is there."""
 
     @property
     def wakeup_s(self) -> float | None:
-        """When to give up for want of news."""
-        return None if self._shard is not None else self._heard_s + IDLE_S
+        """When to give up waiting for a bridge; a shard waits for ever."""
+        if self._shard is not None or self._alone_since_s is None:
+            return None
+        return self._alone_since_s + ALONE_S
 
     def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
         """Take an event; see `Core`."""
@@ -71,27 +79,50 @@ class AgentHost:
     def _on_event(self, event: Event, now_s: float) -> Iterator[Effect]:
         match event:
             case Started():
-                self._heard_s = now_s
+                self._alone_since_s = now_s
+                yield Watch(BRIDGE_ALIVE)
                 if self._shard is not None:
                     yield Listen(CENSUS)
-                for agent in self._agents.values():
-                    yield from agent.handle(event, now_s)
-            case Arrived(_, _, Census() as census):
-                yield from self._on_census(census, now_s)
-            case Arrived(_, _, VehicleState() as state):
-                for agent in self._agents.values():
-                    if agent.formation == state.formation:
-                        yield from agent.handle(event, now_s)
-            case Arrived(_, parameters, _) if parameters.get("vehicle") in self._agents:
-                self._heard_s = now_s
-                yield from self._hand_on(event, Name(parameters["vehicle"]), now_s)
-            case Wakeup() if self._shard is None and now_s >= self._heard_s + IDLE_S:
+                yield from self._hand_to_all(event, now_s)
+            case Arrived():
+                yield from self._on_message(event, now_s)
+            case PeerUp(topic, parameters) if topic is BRIDGE_ALIVE:
+                yield from self._meet_bridge(parameters["incarnation"])
+            case PeerDown(topic, parameters) if topic is BRIDGE_ALIVE:
+                if parameters["incarnation"] == self._bridge:
+                    self._alone_since_s = now_s
+            case Wakeup() if self.wakeup_s is not None and now_s >= self.wakeup_s:
                 yield End()
             case Stopping():
-                for agent in self._agents.values():
-                    yield from agent.handle(event, now_s)
+                yield from self._hand_to_all(event, now_s)
             case _:
                 pass
+
+    def _on_message(self, event: Arrived, now_s: float) -> Iterator[Effect]:
+        message = event.message
+        if isinstance(message, Census):
+            yield from self._on_census(message, now_s)
+        elif isinstance(message, VehicleState):
+            for agent in self._agents.values():
+                if agent.formation == message.formation:
+                    yield from agent.handle(event, now_s)
+        elif event.parameters.get("vehicle") in self._agents:
+            yield from self._hand_on(event, Name(event.parameters["vehicle"]), now_s)
+
+    def _hand_to_all(self, event: Event, now_s: float) -> Iterator[Effect]:
+        for agent in self._agents.values():
+            yield from agent.handle(event, now_s)
+
+    def _meet_bridge(self, incarnation: str) -> Iterator[Effect]:
+        """Take note of a bridge: a new one has new vehicles, whatever their names."""
+        self._alone_since_s = None
+        if self._shard is not None and self._bridge not in ("", incarnation):
+            for agent in self._agents.values():
+                yield from agent.leave()
+            self._agents.clear()
+            self._seen.clear()
+            self._census_s = 0.0
+        self._bridge = incarnation
 
     def _hand_on(self, event: Event, name: Name, now_s: float) -> Iterator[Effect]:
         yield from self._agents[name].handle(event, now_s)
@@ -100,14 +131,19 @@ class AgentHost:
 
     def _on_census(self, census: Census, now_s: float) -> Iterator[Effect]:
         shard = self._shard
-        if shard is None:
+        if shard is None or census.t_s < self._census_s:
             return
-        announced = [entry.vehicle for entry in census.announced]
-        for name in announced + [entry.vehicle for entry in census.on_road]:
+        self._census_s = census.t_s
+        listed = dict.fromkeys(entry.vehicle for entry in census.announced)
+        listed |= dict.fromkeys(entry.vehicle for entry in census.on_road)
+        for name in listed:
             if name not in self._seen and shard.takes(name):
-                self._seen.add(name)
                 self._agents[name] = self._make_agent(name)
                 yield from self._agents[name].handle(Started(), now_s)
+        for name in sorted(set(self._agents) - set(listed)):
+            # It left, and the bridge's word of it was lost.
+            yield from self._agents.pop(name).leave()
+        self._seen = set(listed)
 
     def _listen_to_formations(self) -> Iterator[Effect]:
         """Subscribe to the states that matter now, and only to those.

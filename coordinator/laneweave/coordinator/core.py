@@ -52,6 +52,7 @@ from laneweave.protocol.node import (
 from laneweave.protocol.plans import plan_problems
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.topics import (
+    BRIDGE_ALIVE,
     CENSUS,
     CLOCK,
     COORDINATOR_ALIVE,
@@ -94,6 +95,7 @@ class CoordinatorCore:
         )
         self._planning: dict[int, tuple[int, Ballot]] = {}
         self._next_job = 0
+        self._bridge = ""
         self._road_changed = True
         self._heartbeat_s = 0.0
         self._report_s = 0.0
@@ -126,6 +128,8 @@ class CoordinatorCore:
                 self.election.on_token_up(*_identity(parameters), now_s)
             case PeerDown(topic, parameters) if topic is COORDINATOR_ALIVE:
                 self.election.on_token_down(*_identity(parameters))
+            case PeerUp(topic, parameters) if topic is BRIDGE_ALIVE:
+                self._meet_bridge(parameters["incarnation"])
             case LinkUp():
                 self.election.on_link(up=True, now_s=now_s)
             case LinkDown():
@@ -145,10 +149,20 @@ class CoordinatorCore:
         yield Listen(CLOCK)
         yield Listen(CENSUS)
         yield Watch(COORDINATOR_ALIVE)
+        yield Watch(BRIDGE_ALIVE)
         yield Announce(
             COORDINATOR_ALIVE, {"coordinator": self.name, "incarnation": self._incarnation}
         )
         yield Serve(SERVICE)
+
+    def _meet_bridge(self, incarnation: str) -> None:
+        """Forget the road of an earlier bridge: the clock of a new one begins at 0."""
+        if incarnation != self._bridge:
+            self._bridge = incarnation
+            self.census = None
+            self.t_s = 0.0
+            self.controls = {}
+            self._planning = {}
 
     def _on_message(self, message: object, now_s: float) -> None:
         match message:
@@ -265,7 +279,9 @@ class CoordinatorCore:
         if self._service.owns(job):
             yield from self._service.finish(job, result, error)
             return
-        number, ballot = self._planning.pop(job, (0, None))
+        if job not in self._planning:
+            return
+        number, ballot = self._planning.pop(job)
         control = self.controls.get(number)
         if control is None or control.ballot != ballot or control.phase is not Phase.PLANNING:
             return
@@ -334,7 +350,7 @@ class CoordinatorCore:
         )
 
     def _report(self) -> Effect:
-        message = Report(Name("coordinator"), self.name, published=0, rejected=0)
+        message = Report(Name("coordinator"), self.name)
         return Send(REPORT, message, {"role": "coordinator", "name": self.name})
 
     def _plan_wakeup(self, now_s: float) -> None:

@@ -40,9 +40,9 @@ class Election:
 
         A heartbeat that was still in flight when its sender's connection closed must not revive it.
         """
-        self.see_term(heartbeat.term)
         if heartbeat.coordinator == self.name:
             return
+        self.see_term(heartbeat.term)
         if (heartbeat.coordinator, heartbeat.incarnation) in self._dead:
             return
         known = self._peers.get(heartbeat.coordinator)
@@ -79,8 +79,9 @@ class Election:
 
     def see_term(self, term: int) -> None:
         """Remember the highest term that anybody showed."""
-        if not self.leading:
-            self.term = max(self.term, term)
+        if term > self.term:
+            # A leader that slept through another one's time must not go on below its term.
+            self.term = term + 1 if self.leading else term
 
     def update(self, now_s: float) -> bool:
         """Decide whether to lead now; true when this has changed."""

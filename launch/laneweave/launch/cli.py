@@ -18,7 +18,7 @@ import typer
 from rich.console import Console
 
 from laneweave.launch.logs import log_to_terminal
-from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.errors import BadInputError, EnvironmentUnfitError
 from laneweave.protocol.scenario import Scenario, load_scenario
 
 app = typer.Typer(
@@ -228,6 +228,7 @@ def bridge(
     ] = 1.0,
 ) -> None:
     """Run the simulated world of a deployment."""
+    from laneweave.launch.outcome import complete_summary, print_outcome
     from laneweave.sim_bridge.process import run_bridge
 
     # Until the bridge is up; then it ends in good order.
@@ -237,6 +238,12 @@ def bridge(
     folder = _new_folder(out, settings, Method.formation.value)
     run_bridge(settings, folder, Method.formation.value, pace)
     _draw(folder)
+    outcome = complete_summary(folder, problems=())
+    print_outcome(outcome, Console())
+    # A role that was asked to end did what it was asked, however far the run had come.
+    asked_to_end = outcome.summary is not None and outcome.summary["ending"] == "interrupted"
+    broken = outcome.summary is None or outcome.summary["safety"]["overlaps"]
+    raise typer.Exit(1 if broken else 0 if asked_to_end else outcome.exit_status)
 
 
 @app.command()
@@ -369,6 +376,9 @@ def _status(arguments: list[str]) -> int:
         # Unknown options and arguments; the library's own report takes several lines.
         return _refuse(getattr(error, "format_message", error.__str__)())
     except BrokenPipeError:
+        return 1
+    except EnvironmentUnfitError as error:
+        sys.stderr.write(" ".join(str(error).split()) + "\n")
         return 1
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("laneweave"):

@@ -39,6 +39,13 @@ class Faults:
         remaining = tuple(kill for kill in self.kill if kill.at_s > t_s)
         return due, attrs.evolve(self, kill=remaining)
 
+    def never_due(self) -> list[str]:
+        """Return a line for each fault that is left over when a run has ended."""
+        return [
+            f"the run ended before {kill.target} was killed at {kill.at_s:g} s"
+            for kill in self.kill
+        ]
+
 
 def load_faults(path: Path | None, coordinators: tuple[str, ...]) -> Faults:
     """Read a faults file; None means no faults.

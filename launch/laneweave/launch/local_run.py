@@ -38,7 +38,8 @@ MAX_TEMPORARY_BYTES = 70
 ROUTER_START_S = 20.0
 STALL_S = 90.0
 """A run whose road clock stands still for this long has failed."""
-FIRST_TICK_S = 60.0
+MOST_FAILED_AGENTS = 5
+"""A run in which more agents than that end by themselves with an error is given up."""
 LEADER_S = 5.0
 """How long a run waits for a leader beyond the election time before it begins without one."""
 STOP_S = 5.0
@@ -49,7 +50,24 @@ POLL_S = 0.1
 @define
 class _Failover:
     killed: str
-    at: float
+    at_s: float
+
+
+@define
+class _Stall:
+    """Notices a road clock that stands still."""
+
+    scenario: Scenario
+    advanced_s: float
+    tick: int = -1
+
+    def lasts(self, view: View, now_s: float) -> bool:
+        """Tell whether the clock has stood still for too long."""
+        if view.clock is not None and view.clock.tick != self.tick:
+            self.tick, self.advanced_s = view.clock.tick, now_s
+        # An entrance that waits for an agent stands still in good order.
+        patience_s = max(STALL_S, 2 * self.scenario.runtime.agent_start_s)
+        return now_s - self.advanced_s > patience_s
 
 
 @define
@@ -70,6 +88,7 @@ class LocalRun:
     _problems: list[str] = field(factory=list)
     _recovery_s: list[float] = field(factory=list)
     _failover: _Failover | None = None
+    _failed_agents: int = 0
     _peak: int = 0
     _stop: bool = False
 
@@ -126,8 +145,7 @@ class LocalRun:
             # Road time must not begin before somebody can plan.
             self._await_leader(observer)
             start("bridge", "bridge")
-            began = advanced = time.monotonic()
-            last_tick = -1
+            stall = _Stall(self.scenario, time.monotonic())
             while not self._stop and self._processes_fine():
                 observer.wait(POLL_S)
                 view, now = observer.view, time.monotonic()
@@ -138,15 +156,12 @@ class LocalRun:
                 if self.watch is not None:
                     self.watch(view, self._process_ids())
                 self._note_recovery(observer, now)
-                if view.clock is not None and view.clock.tick != last_tick:
-                    last_tick, advanced = view.clock.tick, now
-                if now - advanced > (STALL_S if last_tick >= 0 else FIRST_TICK_S):
-                    self._problems.append(
-                        f"the road clock stands still at tick {last_tick} since {now - began:.0f} s"
-                    )
+                if stall.lasts(view, now):
+                    self._problems.append(f"the road clock stands still at {view.t_s:.1f} s")
                     return
             if self._stop:
                 self._problems.append("interrupted")
+            self._problems += self.faults.never_due()
 
     def _connect(self, observer: Observer) -> ZenohTransport:
         network = self.scenario.network
@@ -184,6 +199,10 @@ class LocalRun:
                 return False
             if process.exitcode != 0 and name not in self._killed:
                 self._note_end(name, name, process.exitcode)
+                self._failed_agents += name.startswith("agent-")
+        if self._failed_agents > MOST_FAILED_AGENTS:
+            self._problems.append("agents cannot start or stay up")
+            return False
         return True
 
     def _note_end(self, who: str, name: str, status: int | None) -> None:
@@ -228,7 +247,7 @@ class LocalRun:
             return
         log.warning("killing", target=name, t_s=observer.view.t_s)
         self._killed.add(name)
-        os.kill(process.pid, signal.SIGKILL)
+        process.kill()
         if name == leader:
             self._failover = _Failover(name, time.monotonic())
             observer.view.leader = None
@@ -236,7 +255,7 @@ class LocalRun:
     def _note_recovery(self, observer: Observer, now: float) -> None:
         failover = self._failover
         if failover is not None and observer.view.leader not in (None, failover.killed):
-            self._recovery_s.append(round(now - failover.at, 4))
+            self._recovery_s.append(round(now - failover.at_s, 4))
             self._failover = None
 
     # --- the end ------------------------------------------------------------------------------

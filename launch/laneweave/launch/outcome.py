@@ -11,6 +11,8 @@ from attrs import frozen
 from rich.console import Console
 from rich.table import Table
 
+from laneweave.sim_bridge.run_record import write_summary
+
 
 @frozen
 class Outcome:
@@ -32,7 +34,7 @@ def complete_summary(
     folder: Path,
     *,
     problems: Sequence[str],
-    processes: int,
+    processes: int | None = None,
     recovery_s: Sequence[float] = (),
     dropped: int = 0,
 ) -> Outcome:
@@ -41,7 +43,7 @@ def complete_summary(
     Args:
         folder: the run's folder.
         problems: what went wrong already.
-        processes: most role processes at one time.
+        processes: most role processes at one time, where that is known.
         recovery_s: for each killed leader, wall-clock seconds until another one led.
         dropped: messages that faults took away.
     """
@@ -53,7 +55,7 @@ def complete_summary(
     summary["messages"]["dropped_by_faults"] = dropped
     if recovery_s:
         summary["failover"]["recovery_s"] = list(recovery_s)
-    path.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    write_summary(folder, summary)
     return Outcome(folder, summary, (*problems, *_broken_promises(summary)))
 
 
@@ -62,6 +64,8 @@ def _broken_promises(summary: dict[str, Any]) -> list[str]:
     broken = []
     if safety["overlaps"]:
         broken.append(f"{safety['overlaps']} pairs of vehicles overlapped")
+    if summary["ending"] != "complete":
+        broken.append(f"the run is not complete: {summary['ending']}")
     if vehicles["left"] < vehicles["demanded"]:
         missing = vehicles["demanded"] - vehicles["left"]
         broken.append(f"{missing} of {vehicles['demanded']} vehicles did not leave the road")
@@ -128,7 +132,7 @@ def _control_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
         ("tick p50 / p99", _join(runtime["tick_ms"], "p50", "p99", unit=" ms")),
         (
             "real-time factor",
-            f"{runtime['real_time_factor']:.2f} ({runtime['processes']} processes)",
+            f"{runtime['real_time_factor']:.2f} ({runtime['processes'] or '?'} processes)",
         ),
         (
             "leader changes",

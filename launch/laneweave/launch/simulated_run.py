@@ -22,7 +22,7 @@ from laneweave.protocol.node import Arrived, Effect, Event, Listen, Started
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.simulated_network import Conditions, SimulatedNetwork
 from laneweave.sim_bridge.core import BridgeCore, Phase
-from laneweave.sim_bridge.run_record import RunRecord
+from laneweave.sim_bridge.run_record import Ending, RunRecord
 from laneweave.sim_bridge.sumo_world import SumoWorld
 
 STALL_S = 600.0
@@ -63,7 +63,6 @@ class SimulatedRun:
     _started_agents: int = 0
     _known: set[Name] = field(factory=set)
     _problems: list[str] = field(factory=list)
-    _peak: int = 0
 
     def run(self) -> Outcome:
         """Run the scenario and return what came of it."""
@@ -80,7 +79,8 @@ class SimulatedRun:
             try:
                 self._drive(network, bridge, progress)
             finally:
-                record.close(bridge.t_s, interrupted=True)
+                record.close(bridge.t_s, Ending.INTERRUPTED)
+        self._problems += self.faults.never_due()
         return complete_summary(
             self.folder,
             problems=self._problems,

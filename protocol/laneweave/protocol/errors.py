@@ -43,3 +43,7 @@ def _line(text: str, length: int = 500) -> str:
     words = "".join(char if char.isprintable() else " " for char in text).split()
     line = " ".join(words)
     return line if len(line) <= length else line[: length - 3] + "..."
+
+
+class EnvironmentUnfitError(RuntimeError):
+    """This machine lacks something that the command needs; the message says what to install."""

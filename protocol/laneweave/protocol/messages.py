@@ -232,9 +232,12 @@ class Report:
 
     role: Name
     name: Name
-    published: int
-    rejected: int
-    """Messages that were not well formed."""
+    process: Name = Name("unknown")
+    """The process that counts; several vehicles may share one. The node fills in these three."""
+    published: int = 0
+    """Messages that the process has published so far."""
+    rejected: int = 0
+    """Messages so far that were not well formed."""
     solves: int = 0
     unusable: int = 0
     solve_ms: bytes = b""

@@ -17,7 +17,7 @@ from attrs import field, frozen
 
 from laneweave.protocol.codec import decode, encode
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.messages import Report
+from laneweave.protocol.messages import Name, Report
 from laneweave.protocol.topics import Keys, Topic
 from laneweave.protocol.transport import (
     Delivery,
@@ -204,8 +204,13 @@ class Node:
         transport: Transport,
         keys: Keys,
         order_work: Callable[[Compute], None],
+        label: Name,
     ) -> None:
-        """Join a core to its transport; nothing is sent before the first `dispatch`."""
+        """Join a core to its transport; nothing is sent before the first `dispatch`.
+
+        `label` tells this process from all others in reports.
+        """
+        self._label = label
         self.core = core
         self.ended = False
         self.published = 0
@@ -267,7 +272,10 @@ class Node:
             case Send(topic, message, parameters):
                 if isinstance(message, Report):
                     message = attrs.evolve(
-                        message, published=self.published, rejected=self.rejected
+                        message,
+                        process=self._label,
+                        published=self.published + 1,
+                        rejected=self.rejected,
                     )
                 self.published += 1
                 transport.publish(

@@ -133,6 +133,12 @@ def _check_timing(scenario: Scenario) -> None:
         f"long enough to hold a whole move of {formation.move_s:g} s",
     )
     _require(
+        network.lease_s <= runtime.tick_deadline_s,
+        "network.lease_s",
+        network.lease_s,
+        f"at most runtime.tick_deadline_s = {runtime.tick_deadline_s:g}: who hangs is given up",
+    )
+    _require(
         runtime.tick_deadline_s > network.resend_s,
         "runtime.tick_deadline_s",
         runtime.tick_deadline_s,

@@ -16,6 +16,7 @@ from itertools import count
 
 from attrs import frozen
 
+from laneweave.protocol.messages import Name
 from laneweave.protocol.node import (
     Compute,
     Computed,
@@ -118,6 +119,7 @@ class SimulatedNetwork:
         self._answers: dict[int, tuple[Callable[[bytes, bool], None], tuple[int, ...]]] = {}
         """For each open question who asked, and all tokens under which it was asked."""
         self._token_count = count(1)
+        self._label_count = count(1)
 
     # --- building and driving ---------------------------------------------------------------
 
@@ -131,7 +133,11 @@ class SimulatedNetwork:
             raise ValueError(f"node {name} is already in the network")
         member = _Member(SimulatedTransport(self, name))
         member.node = Node(
-            core, member.transport, Keys(realm), lambda job: self._compute(member, job)
+            core,
+            member.transport,
+            Keys(realm),
+            lambda job: self._compute(member, job),
+            Name(f"{next(self._label_count)}"),
         )
         self._members[name] = member
         self._in(0.0, lambda: self._hand_over(member, Started()))

@@ -70,7 +70,7 @@ COORDINATOR_ALIVE = Topic(
     Quality.ASSURED,
 )  # fmt: skip
 VEHICLE_ALIVE = Topic("vehicle-alive", "alive/vehicle/{vehicle}", None, "vehicle", Quality.ASSURED)
-BRIDGE_ALIVE = Topic("bridge-alive", "alive/bridge/{name}", None, "bridge", Quality.ASSURED)
+BRIDGE_ALIVE = Topic("bridge-alive", "alive/bridge/{incarnation}", None, "bridge", Quality.ASSURED)
 SERVICE = Topic("service", "service/plan", None, "client", Quality.ASSURED)
 
 TOPICS = (

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import queue
 import signal
 import threading
@@ -20,6 +21,7 @@ import structlog
 import zenoh
 
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.messages import Name
 from laneweave.protocol.node import (
     Compute,
     Computed,
@@ -223,7 +225,13 @@ def run_core(core: Core, endpoint: str, realm: str, lease_s: float) -> None:
     # Enqueuing from callbacks and signal handlers alike: SimpleQueue.put is reentrant.
     inbox: queue.SimpleQueue[Delivery | Computed | Stopping] = queue.SimpleQueue()
     transport = ZenohTransport(endpoint, inbox.put, lease_s)
-    node = Node(core, transport, keys, _Workers(inbox.put).order)
+    node = Node(
+        core,
+        transport,
+        keys,
+        _Workers(inbox.put).order,
+        Name(f"{os.getpid()}-{time.time_ns()}"),
+    )
     with _stop_signals(lambda: inbox.put(Stopping())):
         try:
             node.dispatch(Started(), time.monotonic())

@@ -56,7 +56,7 @@ from laneweave.protocol.topics import (
 from laneweave.protocol.transport import LinkDown, LinkUp
 from laneweave.sim_bridge.overlap import Pose, least_gaps, neighbours, overlapping_pairs
 from laneweave.sim_bridge.roadside import Roadside
-from laneweave.sim_bridge.run_record import RunRecord
+from laneweave.sim_bridge.run_record import Ending, RunRecord
 from laneweave.sim_bridge.traffic import RoadVehicle
 
 log = structlog.get_logger(__name__)
@@ -64,6 +64,7 @@ log = structlog.get_logger(__name__)
 CENSUS_EVERY_TICKS = 10
 LEFT_REPEATS = 20
 """Ticks for which the agent of a vehicle that left is told so."""
+BRIDGE = Name("bridge")
 WIND_UP_S = 2.0
 """How long the bridge waits for last reports at the end of a run."""
 
@@ -113,6 +114,7 @@ class BridgeCore:
         record: RunRecord,
         *,
         pace: float | None = None,
+        incarnation: int = 0,
         stopwatch: Callable[[], float] = time.perf_counter,
     ) -> None:
         """Set the world up before the first tick.
@@ -122,6 +124,7 @@ class BridgeCore:
             world: an empty world.
             record: where measurements go.
             pace: most road seconds per second of the node's clock; None: the scenario's maximum.
+            incarnation: tells this run of the road from earlier ones of the same deployment.
             stopwatch: measures the duration of ticks, in s; decides nothing.
         """
         self.scenario = scenario
@@ -132,12 +135,19 @@ class BridgeCore:
         self._record = record
         self._roadside = Roadside(scenario)
         self._tick_lasts_s = scenario.runtime.tick_s / (pace or scenario.runtime.max_pace)
+        self._incarnation = incarnation
         self._stopwatch = stopwatch
         self._agents_up: set[str] = set()
         self._silent: set[str] = set()
         self._awaited: set[Name] = set()
         self._at_entrance: list[RoadVehicle] = []
-        self._leaving: dict[Name, int] = {}
+        self._leaving: dict[Name, tuple[RoadVehicle, int]] = {}
+        """Vehicles that left, and how often their agents are still told so."""
+        self._unreported: set[str] = {BRIDGE}
+        """Whose last report is still to come."""
+        self._patience_s = scenario.runtime.agent_start_s
+        """How long to wait for the next agent that is not up."""
+        self._ending = Ending.COMPLETE
         self._link_up = True
         self._census_sent_tick = -CENSUS_EVERY_TICKS
         self._census_changed = True
@@ -178,10 +188,11 @@ class BridgeCore:
             case Started():
                 yield from self._start(now_s)
             case Arrived(_, _, message):
-                self._on_message(message)
+                self._on_message(message, now_s)
             case PeerUp(topic, parameters) if topic is VEHICLE_ALIVE:
                 self._agents_up.add(parameters["vehicle"])
                 self._silent.discard(parameters["vehicle"])
+                self._patience_s = self.scenario.runtime.agent_start_s
             case PeerDown(topic, parameters) if topic is VEHICLE_ALIVE:
                 self._on_agent_down(parameters["vehicle"])
             case LinkUp():
@@ -191,7 +202,7 @@ class BridgeCore:
             case Wakeup() if self.phase is Phase.ANSWERS:
                 yield from self._send_again(now_s)
             case Stopping():
-                self._finish(interrupted=True)
+                self._finish(Ending.INTERRUPTED)
             case _:
                 pass
 
@@ -201,10 +212,10 @@ class BridgeCore:
         yield Listen(REPORT)
         yield Listen(HEARTBEAT)
         yield Watch(VEHICLE_ALIVE)
-        yield Announce(BRIDGE_ALIVE, {"name": "bridge"})
+        yield Announce(BRIDGE_ALIVE, {"incarnation": self._incarnation})
         self._open_tick(now_s)
 
-    def _on_message(self, message: object) -> None:
+    def _on_message(self, message: object, now_s: float) -> None:
         match message:
             case Command():
                 self._on_command(message)
@@ -213,23 +224,26 @@ class BridgeCore:
             case LogEvent():
                 self._record.on_event(message)
             case Heartbeat():
-                self._record.on_heartbeat(message, self.t_s, self._stopwatch())
+                self._record.on_heartbeat(message, self.t_s, now_s)
             case _:
                 pass
 
     def _on_command(self, command: Command) -> None:
         vehicle = self.vehicles.get(command.vehicle)
-        if vehicle is None or command.tick > self.tick:
-            # Nobody can answer a tick that has not been: it would shut out the true answers.
+        if vehicle is None:
+            return
+        # Whoever answers late is there: the next tick waits for it, and it catches up.
+        self._silent.discard(command.vehicle)
+        if command.tick != self.tick or self.phase is not Phase.ANSWERS:
+            # A late answer was made for a state that is past: played now, from its middle, it
+            # would end somewhere else.
             return
         try:
             vehicle.controller.take(command)
         except BadInputError as error:
             log.warning("command ignored", vehicle=command.vehicle, reason=str(error))
             return
-        if command.tick == self.tick:
-            self._awaited.discard(command.vehicle)
-            self._silent.discard(command.vehicle)
+        self._awaited.discard(command.vehicle)
 
     def _on_agent_down(self, vehicle: str) -> None:
         if self._link_up:
@@ -246,8 +260,8 @@ class BridgeCore:
             yield from self._begin_tick(now_s)
         if self.phase is Phase.ANSWERS and (not self._awaited or now_s >= self._deadline_s):
             yield from self._end_tick(now_s)
-        if self.phase is Phase.WIND_UP and (not self._agents_up or now_s >= self._deadline_s):
-            self._finish(interrupted=False)
+        if self.phase is Phase.WIND_UP and (now_s >= self._deadline_s or self._all_reported()):
+            self._finish(self._ending)
             yield End()
 
     def _open_tick(self, now_s: float) -> None:
@@ -261,7 +275,7 @@ class BridgeCore:
             self._at_entrance.append(vehicle)
             self._census_changed = True
         self.phase = Phase.AGENTS
-        self._deadline_s = now_s + self.scenario.runtime.agent_start_s
+        self._deadline_s = now_s + self._patience_s
 
     def _entrance_clear(self, now_s: float) -> bool:
         return now_s >= self._deadline_s or all(
@@ -273,8 +287,12 @@ class BridgeCore:
             self.vehicles[vehicle.name] = vehicle
             self._world.add(vehicle.name, vehicle.state)
             self._record.on_entered(vehicle)
-            if vehicle.name not in self._agents_up:
+            if vehicle.name in self._agents_up:
+                self._unreported.add(vehicle.name)
+            else:
                 self._record.note(self.t_s, "agent-missing", vehicle=vehicle.name)
+                # Where one did not come, the next are not worth a long wait, until one does.
+                self._patience_s = self.scenario.network.resend_s
         self._at_entrance.clear()
         yield from self._tell_road_users()
         for vehicle in self.vehicles.values():
@@ -314,14 +332,12 @@ class BridgeCore:
         )
 
     def _tell_leaving(self) -> Iterator[Effect]:
-        for name in list(self._leaving):
-            self._leaving[name] -= 1
-            if name not in self._agents_up or self._leaving[name] < 0:
+        for name, (vehicle, repeats) in list(self._leaving.items()):
+            if name not in self._agents_up or repeats == 0:
                 del self._leaving[name]
                 continue
-            yield Send(
-                SENSE, self._sense(self._record.departed[name], left=True), {"vehicle": name}
-            )
+            self._leaving[name] = (vehicle, repeats - 1)
+            yield Send(SENSE, self._sense(vehicle, left=True), {"vehicle": name})
 
     def _send_again(self, now_s: float) -> Iterator[Effect]:
         if now_s >= self._resend_s:
@@ -386,12 +402,13 @@ class BridgeCore:
                 self._world.remove(name)
                 self._roadside.count_left()
                 self._record.on_left(vehicle, self.t_s)
-                self._leaving[name] = LEFT_REPEATS
+                self._leaving[name] = (vehicle, LEFT_REPEATS)
+                self._silent.discard(name)
                 self._census_changed = True
 
     def _over(self) -> bool:
         if self.t_s >= self.scenario.runtime.max_road_s:
-            self._record.note(self.t_s, "road-time-limit", on_road=len(self.vehicles))
+            self._ending = Ending.LIMIT
             return True
         return not self.vehicles and self._roadside.exhausted(self.t_s)
 
@@ -404,8 +421,8 @@ class BridgeCore:
         # Through the network, like everybody's: the node fills in what it has counted.
         yield Send(
             REPORT,
-            Report(role=Name("bridge"), name=Name("bridge"), published=0, rejected=0),
-            {"role": "bridge", "name": "bridge"},
+            Report(role=Name("bridge"), name=BRIDGE),
+            {"role": "bridge", "name": BRIDGE},
         )
         yield from self._tell_leaving()
         for vehicle in self.vehicles.values():
@@ -413,9 +430,13 @@ class BridgeCore:
         self.phase = Phase.WIND_UP
         self._deadline_s = now_s + WIND_UP_S
 
-    def _finish(self, *, interrupted: bool) -> None:
+    def _all_reported(self) -> bool:
+        self._unreported = {name for name in self._unreported if not self._record.has_report(name)}
+        return not self._unreported
+
+    def _finish(self, ending: Ending) -> None:
         if self.phase is not Phase.ENDED:
             self.phase = Phase.ENDED
             for vehicle in self.vehicles.values():
                 self._record.on_still_on_road(vehicle)
-            self._record.close(self.t_s, interrupted=interrupted)
+            self._record.close(self.t_s, ending)

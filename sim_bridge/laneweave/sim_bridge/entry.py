@@ -26,7 +26,7 @@ from attrs import frozen
 from laneweave.protocol.lattice import Cell, Lattice
 from laneweave.sim_bridge.demand import Arrival
 
-_TIME_TOLERANCE_S = 1e-9
+TIME_TOLERANCE_S = 1e-9
 """Ticks and passing times are the same instants computed in two ways."""
 
 
@@ -38,11 +38,6 @@ class Admission:
     cell: Cell
     t_s: float
     """Road time at which its cell passes s = 0."""
-
-    @property
-    def delay_s(self) -> float:
-        """Time that the vehicle waited for its cell."""
-        return self.t_s - self.arrival.t_s
 
 
 class EntryMeter:
@@ -58,6 +53,7 @@ class EntryMeter:
         self._lattice = lattice
         self._max_vehicles = max_vehicles
         self._queues: list[list[Arrival]] = [[] for _ in range(lattice.lanes)]
+        self._names: set[str] = set()
         self._column = 0  # the next column to pass s = 0
         self._block = 0  # the block of that column, how many it took, and their preferences
         self._taken = 0
@@ -65,7 +61,7 @@ class EntryMeter:
 
     @property
     def waiting(self) -> tuple[Arrival, ...]:
-        """Vehicles that were demanded and neither admitted nor withdrawn, lane by lane."""
+        """Vehicles that were demanded and not admitted yet, lane by lane."""
         return tuple(arrival for queue in self._queues for arrival in queue)
 
     def demand(self, arrival: Arrival) -> None:
@@ -80,18 +76,10 @@ class EntryMeter:
         lanes = range(self._lattice.lanes)
         if arrival.lane not in lanes or arrival.preferred_lane not in lanes:
             raise ValueError(f"{arrival} needs lanes 0 to {self._lattice.lanes - 1}")
-        if any(other.vehicle == arrival.vehicle for other in self.waiting):
+        if arrival.vehicle in self._names:
             raise ValueError(f"{arrival.vehicle} is waiting already")
+        self._names.add(arrival.vehicle)
         insort(self._queues[arrival.lane], arrival, key=lambda other: other.t_s)
-
-    def withdraw(self, vehicle: str) -> bool:
-        """Take a vehicle out of its queue; return whether it was waiting."""
-        for queue in self._queues:
-            for index, arrival in enumerate(queue):
-                if arrival.vehicle == vehicle:
-                    del queue[index]
-                    return True
-        return False
 
     def admit(self, until_s: float) -> list[Admission]:
         """Decide on all columns that pass s = 0 up to a road time and were not decided on before.
@@ -103,7 +91,7 @@ class EntryMeter:
             The vehicles that enter, by time, then lane.
         """
         admissions = []
-        while (t_s := self._lattice.passing_time_s(self._column)) <= until_s + _TIME_TOLERANCE_S:
+        while (t_s := self._lattice.passing_time_s(self._column)) <= until_s + TIME_TOLERANCE_S:
             for lane in range(self._lattice.lanes):
                 arrival = self._takes((self._column, lane), t_s)
                 if arrival is not None:
@@ -131,4 +119,5 @@ class EntryMeter:
             return None
         self._taken += 1
         self._preferring[preferred] += 1
+        self._names.discard(arrival.vehicle)
         return queue.pop(0)

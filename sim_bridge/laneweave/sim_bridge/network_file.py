@@ -1,7 +1,7 @@
 """The files that SUMO starts from: a hand-written network of one straight road, and its route.
 
 The road runs along x: s = x, and lane i has its centre line at y = (i + 1/2) lane width. SUMO's
-edge is longer than the road by `MARGIN_M` at both ends, so that the bodies of vehicles that have
+edge is longer than the road by `margin_m` at both ends, so that the bodies of vehicles that have
 just entered, and vehicles that are about to be removed behind the end, lie on it. Writing the
 network by hand spares `netconvert`, which comes with a much larger package than `libsumo`.
 """
@@ -17,8 +17,7 @@ from laneweave.protocol.scenario import Scenario
 EDGE = "road"
 ROUTE = "road"
 VEHICLE_TYPE = "vehicle"
-MARGIN_M = 30.0
-"""How much further than the road SUMO's edge reaches, at each end."""
+LEAST_MARGIN_M = 30.0
 
 
 @frozen
@@ -29,6 +28,16 @@ class NetworkFiles:
     routes: Path
     options: tuple[str, ...]
     """SUMO's whole argument list, program name first."""
+
+
+def margin_m(scenario: Scenario) -> float:
+    """Return how much further than the road SUMO's edge reaches, at each end.
+
+    A vehicle is removed at the first tick after the end: it may be a tick's way beyond it.
+    """
+    vehicle = scenario.vehicle
+    tick_way_m = vehicle.max_speed_mps * scenario.runtime.tick_s
+    return max(LEAST_MARGIN_M, tick_way_m + vehicle.length_m)
 
 
 def write_network(scenario: Scenario, folder: Path) -> NetworkFiles:
@@ -52,7 +61,7 @@ def _network_xml(scenario: Scenario) -> str:
     """Return the network: one edge between two dead ends."""
     road = scenario.road
     width_m = road.lanes * road.lane_width_m
-    west_m, east_m = -MARGIN_M, road.length_m + MARGIN_M
+    west_m, east_m = -margin_m(scenario), road.length_m + margin_m(scenario)
     bounds = f"{west_m:.6f},0,{east_m:.6f},{width_m:.6f}"
     lanes = "\n".join(
         f'    <lane id="{EDGE}_{lane}" index="{lane}" speed="{scenario.vehicle.max_speed_mps:.6f}"'

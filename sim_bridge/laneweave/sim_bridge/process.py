@@ -9,7 +9,7 @@ from pathlib import Path
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.zenoh_transport import run_core
 from laneweave.sim_bridge.core import BridgeCore
-from laneweave.sim_bridge.run_record import RunRecord
+from laneweave.sim_bridge.run_record import Ending, RunRecord
 from laneweave.sim_bridge.sumo_world import SumoWorld
 
 
@@ -34,9 +34,9 @@ def run_bridge(
         tempfile.TemporaryDirectory(prefix="laneweave-sumo-") as sumo_folder,
         SumoWorld(scenario, Path(sumo_folder)) as world,
     ):
-        core = BridgeCore(scenario, world, record, pace=pace)
+        core = BridgeCore(scenario, world, record, pace=pace, incarnation=time.time_ns())
         try:
             run_core(core, network.endpoint, network.realm, network.lease_s)
         finally:
             # After an error, too: what was recorded is kept.
-            record.close(core.t_s, interrupted=True)
+            record.close(core.t_s, Ending.INTERRUPTED)

@@ -5,14 +5,16 @@ Its census is complete, which is what lets a coordinator know a roster for certa
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Iterator
+from itertools import chain
 
 from attrs import frozen
 
 from laneweave.protocol.messages import Announcement, Census, CensusEntry, Name, RoadClock
 from laneweave.protocol.scenario import Scenario
 from laneweave.sim_bridge.demand import Arrival, arrivals
-from laneweave.sim_bridge.entry import Admission, EntryMeter
+from laneweave.sim_bridge.entry import TIME_TOLERANCE_S, Admission, EntryMeter
 from laneweave.sim_bridge.traffic import RoadVehicle
 
 
@@ -45,6 +47,11 @@ class Roadside:
         """Draw the demand of a scenario."""
         self._announce_s = scenario.runtime.announce_s
         self._tick_s = scenario.runtime.tick_s
+        self._lanes = scenario.road.lanes
+        # Every other cell of a lane is free to enter; one more, so that nobody comes unannounced.
+        lattice = scenario.lattice
+        between_entries_s = 2.0 * lattice.pitch_m / lattice.speed_mps
+        self._announced_per_lane = math.ceil(self._announce_s / between_entries_s) + 1
         self._meter = EntryMeter(scenario.lattice, scenario.formation.max_vehicles)
         self._arrivals = arrivals(scenario)
         self._demanded = 0
@@ -56,7 +63,10 @@ class Roadside:
     def newly_demanded(self, t_s: float) -> tuple[Arrival, ...]:
         """Return the vehicles that arrived since the last call."""
         first = self._demanded
-        while self._demanded < len(self._arrivals) and self._arrivals[self._demanded].t_s <= t_s:
+        while (
+            self._demanded < len(self._arrivals)
+            and self._arrivals[self._demanded].t_s <= t_s + TIME_TOLERANCE_S
+        ):
             self._demanded += 1
         return self._arrivals[first : self._demanded]
 
@@ -112,11 +122,13 @@ class Roadside:
         )
 
     def _announcements(self, t_s: float) -> tuple[Announcement, ...]:
-        coming = list(self._meter.waiting)
-        for arrival in self._arrivals[self._queued :]:
-            if arrival.t_s > t_s + self._announce_s:
-                break
-            coming.append(arrival)
+        """Return those who may enter within the announced time, however long the queue is."""
+        room = [self._announced_per_lane] * self._lanes
+        coming = []
+        for arrival in chain(self._meter.waiting, self._upcoming(t_s)):
+            if room[arrival.lane] > 0:
+                room[arrival.lane] -= 1
+                coming.append(arrival)
         return tuple(
             Announcement(
                 vehicle=Name(arrival.vehicle),
@@ -126,3 +138,9 @@ class Roadside:
             )
             for arrival in sorted(coming, key=lambda arrival: (arrival.t_s, arrival.vehicle))
         )
+
+    def _upcoming(self, t_s: float) -> Iterator[Arrival]:
+        for index in range(self._queued, len(self._arrivals)):
+            if self._arrivals[index].t_s > t_s + self._announce_s:
+                return
+            yield self._arrivals[index]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterable
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,25 @@ class _Leadership:
     recovery_s: list[float] = field(factory=list)
 
 
+class Ending(Enum):
+    """Why a run ended."""
+
+    COMPLETE = "complete"
+    """All demanded vehicles have left."""
+    INTERRUPTED = "interrupted"
+    """Somebody asked for it, or something failed."""
+    LIMIT = "limit"
+    """The road time limit was reached."""
+
+
+def write_summary(folder: Path, summary: dict[str, Any]) -> None:
+    """Write summary.json whole or not at all, whenever this process is killed."""
+    unfinished = folder / "summary.json.part"
+    text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
+    unfinished.write_text(text, encoding="utf-8")
+    unfinished.replace(folder / "summary.json")
+
+
 class RunRecord:
     """Collects a run's measurements and writes its folder."""
 
@@ -39,7 +59,6 @@ class RunRecord:
         self, folder: Path, scenario: Scenario, method: str, stopwatch: Callable[[], float]
     ) -> None:
         """Open a run's folder; see `Recorder` for its files."""
-        self.departed: dict[Name, RoadVehicle] = {}
         self._folder = folder
         self._scenario = scenario
         self._method = method
@@ -85,7 +104,6 @@ class RunRecord:
         left_s = t_s - beyond_m / v_mps if v_mps > 0 else t_s
         lane = int(y_m // self._scenario.road.lane_width_m)
         self._recorder.left(vehicle.name, left_s, lane)
-        self.departed[vehicle.name] = vehicle
         self._agentless_ticks += vehicle.controller.played_from_hold
         self.note(
             left_s,
@@ -135,8 +153,15 @@ class RunRecord:
         """A role reported its counters; the newest of a sender counts."""
         self._reports[report.role, report.name] = report
 
-    def on_heartbeat(self, heartbeat: Heartbeat, t_s: float, wall_s: float) -> None:
-        """Follow the leadership: how often it changes, and for how long nobody leads."""
+    def has_report(self, name: str) -> bool:
+        """Tell whether a vehicle's agent, or another role of that name, has reported."""
+        return any((Name(role), Name(name)) in self._reports for role in ("agent", "bridge"))
+
+    def on_heartbeat(self, heartbeat: Heartbeat, t_s: float, now_s: float) -> None:
+        """Follow the leadership: how often it changes, and for how long nobody leads.
+
+        `now_s` is the node's clock.
+        """
         leadership = self._leadership
         sender = (heartbeat.coordinator, heartbeat.incarnation)
         if not heartbeat.leading:
@@ -144,27 +169,23 @@ class RunRecord:
         if sender != leadership.leader:
             if leadership.leader is not None:
                 leadership.changes += 1
-                leadership.recovery_s.append(round(wall_s - leadership.heard_s, 4))
+                leadership.recovery_s.append(round(now_s - leadership.heard_s, 4))
             leadership.leader = sender
             self.note(t_s, "leader", coordinator=heartbeat.coordinator, term=heartbeat.term)
-        leadership.heard_s = wall_s
+        leadership.heard_s = now_s
 
     # --- the end ------------------------------------------------------------------------------
 
-    def close(self, t_s: float, *, interrupted: bool) -> None:
-        """Write everything down. Idempotent."""
+    def close(self, t_s: float, ending: Ending) -> None:
+        """Write everything down. Idempotent: the first ending counts."""
         if self._closed:
             return
-        self.note(t_s, "run-interrupted" if interrupted else "run-ended")
+        self.note(t_s, "run-ended", ending=ending.value)
         self._closed = True
         self._recorder.close()
         self._write_ticks()
-        summary = self._recorder.summarise(self._method, t_s) | self._rest(t_s)
-        text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
-        # Whole or not at all: a process that is killed here must not leave half a summary.
-        unfinished = self._folder / "summary.json.part"
-        unfinished.write_text(text, encoding="utf-8")
-        unfinished.replace(self._folder / "summary.json")
+        summary = self._recorder.summarise(self._method, t_s) | {"ending": ending.value}
+        write_summary(self._folder, summary | self._rest(t_s))
 
     def _write_ticks(self) -> None:
         """Write ticks.parquet: how long each tick took, with how many vehicles on the road."""
@@ -201,14 +222,14 @@ class RunRecord:
             "runtime": {
                 "real_time_factor": round(t_s / wall_s, 3) if wall_s > 0 else 0.0,
                 "wall_s": round(wall_s, 3),
-                "processes": 1,
+                "processes": None,
                 "vehicles_per_process": self._scenario.runtime.vehicles_per_process,
                 "tick_ms": _spread(np.array([tick[2] for tick in self._ticks]), 50, 99),
             },
             "messages": {
-                "published": sum(report.published for report in reports),
+                "published": _per_process(reports, "published"),
                 "dropped_by_faults": 0,
-                "rejected": sum(report.rejected for report in reports),
+                "rejected": _per_process(reports, "rejected"),
             },
             "failover": {
                 "leader_changes": self._leadership.changes,
@@ -221,6 +242,14 @@ def _sample(vehicle: RoadVehicle) -> tuple[str, float, float, float, float, int 
     s_m, v_mps, a_mps2, y_m, _, _ = vehicle.state
     column, lane = vehicle.controller.hold_cell
     return (vehicle.name, s_m, y_m, v_mps, a_mps2, column, lane)
+
+
+def _per_process(reports: Iterable[Report], counter: str) -> int:
+    """Add up a counter that processes report so far, each perhaps for several vehicles."""
+    newest: dict[Name, int] = {}
+    for report in reports:
+        newest[report.process] = max(newest.get(report.process, 0), getattr(report, counter))
+    return sum(newest.values())
 
 
 def _number(value: object) -> float:

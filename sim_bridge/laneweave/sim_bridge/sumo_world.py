@@ -22,9 +22,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from laneweave.protocol.errors import EnvironmentUnfitError
 from laneweave.protocol.motion import State
 from laneweave.protocol.scenario import Scenario
-from laneweave.sim_bridge.network_file import EDGE, MARGIN_M, ROUTE, VEHICLE_TYPE, write_network
+from laneweave.sim_bridge.network_file import EDGE, ROUTE, VEHICLE_TYPE, margin_m, write_network
 from laneweave.sim_bridge.overlap import Pose, pose_of
 
 DEBIAN_PACKAGES = {
@@ -39,7 +40,7 @@ DEBIAN_PACKAGES = {
 _IMPORT_SWITCH = "LIBSUMO_AS_TRACI"
 
 
-class SumoUnavailableError(RuntimeError):
+class SumoUnavailableError(EnvironmentUnfitError):
     """libsumo or a system library that it needs cannot be loaded; the message says what to do."""
 
 
@@ -63,6 +64,7 @@ class SumoWorld:
             raise RuntimeError("libsumo holds one simulation per process, and one is open")
         self._sumo: Any = _load_libsumo()
         self._length_m = scenario.road.length_m
+        self._margin_m = margin_m(scenario)
         self._lane_width_m = scenario.road.lane_width_m
         self._lanes = scenario.road.lanes
         self._half_body_m = 0.5 * scenario.vehicle.length_m
@@ -193,10 +195,10 @@ class SumoWorld:
         """Refuse a state that SUMO would map to some other place."""
         if not math.isfinite(sum(state)):
             raise ValueError(f"{vehicle} must be at a finite state, not {state}")
-        if not -MARGIN_M <= state[0] <= self._length_m + MARGIN_M:
+        low_m, high_m = -self._margin_m, self._length_m + self._margin_m
+        if not low_m <= state[0] <= high_m:
             raise ValueError(
-                f"{vehicle} must be at s in [{-MARGIN_M:g}, {self._length_m + MARGIN_M:g}] m, "
-                f"not at {state[0]:g} m"
+                f"{vehicle} must be at s in [{low_m:g}, {high_m:g}] m, not at {state[0]:g} m"
             )
 
     def _move(self, vehicle: str, state: State) -> None:

@@ -8,7 +8,7 @@ import pytest
 from attrs import evolve
 
 from laneweave.agents.core import AgentCore
-from laneweave.agents.host import IDLE_S, AgentHost, Shard
+from laneweave.agents.host import ALONE_S, AgentHost, Shard
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import (
     Announcement,
@@ -31,14 +31,26 @@ from laneweave.protocol.node import (
     End,
     Event,
     Listen,
+    PeerDown,
+    PeerUp,
     Send,
     Started,
     Stopping,
     Unlisten,
     Wakeup,
+    Withdraw,
 )
 from laneweave.protocol.scenario import Scenario
-from laneweave.protocol.topics import CENSUS, PLAN, PREPARE, SENSE, STATE, VEHICLE_ALIVE, Topic
+from laneweave.protocol.topics import (
+    BRIDGE_ALIVE,
+    CENSUS,
+    PLAN,
+    PREPARE,
+    SENSE,
+    STATE,
+    VEHICLE_ALIVE,
+    Topic,
+)
 
 SCENARIO = Scenario()
 A, B, C = Name("A"), Name("B"), Name("C")
@@ -176,14 +188,46 @@ def test_nothing_follows_the_end() -> None:
     assert effects[-2:] == [Unlisten(STATE, {"formation": 0}), End()]
 
 
-def test_ends_for_want_of_news() -> None:
+def test_ends_when_no_bridge_comes() -> None:
     host = make_host(A)
     give(host, Started(), 10.0)
-    assert host.wakeup_s == 10.0 + IDLE_S
-    give(host, Arrived(SENSE, {"vehicle": A}, sense(A, FRONT)), 30.0)
-    assert give(host, Wakeup(), 10.0 + IDLE_S) == []
-    assert host.wakeup_s == 30.0 + IDLE_S
-    assert give(host, Wakeup(), 30.0 + IDLE_S) == [End()]
+    assert host.wakeup_s == 10.0 + ALONE_S
+    assert give(host, Wakeup(), 10.0 + ALONE_S) == [End()]
+
+
+def test_waits_for_its_vehicle_as_long_as_the_bridge_is_there() -> None:
+    host = make_host(A)
+    give(host, Started(), 10.0)
+    give(host, PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}), 11.0)
+    assert host.wakeup_s is None
+    give(host, PeerDown(BRIDGE_ALIVE, {"incarnation": "6"}), 12.0)
+    assert host.wakeup_s is None
+    give(host, PeerDown(BRIDGE_ALIVE, {"incarnation": "7"}), 100.0)
+    assert give(host, Wakeup(), 99.0 + ALONE_S) == []
+    give(host, PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}), 99.5 + ALONE_S)
+    assert host.wakeup_s is None
+
+
+def test_a_new_bridge_has_new_vehicles_of_the_same_names() -> None:
+    host = make_host(shard=Shard(0, 1))
+    give(host, PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}))
+    first = census_of(A)
+    assert Announce(VEHICLE_ALIVE, {"vehicle": A}) in give(host, first)
+    assert give(host, first) == []
+    gone = give(host, PeerUp(BRIDGE_ALIVE, {"incarnation": "8"}))
+    assert Withdraw(VEHICLE_ALIVE, {"vehicle": A}) in gone
+    assert Announce(VEHICLE_ALIVE, {"vehicle": A}) in give(host, first)
+
+
+def test_a_shard_lets_go_of_vehicles_that_the_census_lacks() -> None:
+    host = make_host(shard=Shard(0, 1))
+    give(host, census_of(A, B))
+    assert Withdraw(VEHICLE_ALIVE, {"vehicle": B}) in give(host, census_of(A, t_s=2.0))
+    assert give(host, census_of(A, B, t_s=1.0)) == []  # an older one
+
+
+def census_of(*vehicles: Name, t_s: float = 1.0) -> Arrived:
+    return Arrived(CENSUS, {}, evolve(census(announced=vehicles), t_s=t_s))
 
 
 def test_stopping_reports_for_every_vehicle() -> None:

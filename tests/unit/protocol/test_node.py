@@ -120,7 +120,7 @@ class Bench:
 
     @node.default
     def _make_node(self) -> Node:
-        return Node(self.core, self.transport, KEYS, self.jobs.append)
+        return Node(self.core, self.transport, KEYS, self.jobs.append, Name("n1"))
 
     def carry_out(self, *effects: Effect) -> list[tuple[Any, ...]]:
         self.core.effects = list(effects)
@@ -251,13 +251,13 @@ def test_a_report_gets_the_counters_of_the_node(bench: Bench) -> None:
         bench.node.deliver(Received(BEAT_KEY, b"x"), 1.0)
     beat = Send(HEARTBEAT, BEAT, {"coordinator": "c1"})
     report = Report(
-        Name("coordinator"), Name("c1"), 99, 99, solves=5, unusable=1, solve_ms=b"\0" * 4
+        Name("coordinator"), Name("c1"), published=99, solves=5, unusable=1, solve_ms=b"\0" * 4
     )
     calls = bench.carry_out(
         beat, beat, beat, Send(REPORT, report, {"role": "coordinator", "name": "c1"})
     )
     sent = decode(calls[-1][2], Report)
-    assert sent == Report(Name("coordinator"), Name("c1"), 3, 4, 5, 1, b"\0" * 4)
+    assert sent == Report(Name("coordinator"), Name("c1"), Name("n1"), 4, 4, 5, 1, b"\0" * 4)
     assert bench.node.published == 4
 
 
