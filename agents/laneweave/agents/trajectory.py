@@ -128,9 +128,12 @@ def plan_trajectory(scenario: Scenario, waypoints: Sequence[Waypoint]) -> Trajec
         shifted = leg.states + np.array([start.position_m, 0.0, 0.0, start.lateral_m, 0.0, 0.0])
         states.append(shifted[:-1] if end is not waypoints[-1] else shifted)
         jerks.append(leg.jerks)
-    return Trajectory(np.concatenate(states), np.concatenate(jerks))
+    trajectory = Trajectory(np.concatenate(states), np.concatenate(jerks))
+    trajectory.states.flags.writeable = trajectory.jerks.flags.writeable = False
+    return trajectory
 
 
+@lru_cache(maxsize=64)
 def move_profile(scenario: Scenario, dx: int, dy: int) -> Trajectory:
     """Return the move by `dx` columns and `dy` lanes, from the origin; cached per process.
 
@@ -140,14 +143,9 @@ def move_profile(scenario: Scenario, dx: int, dy: int) -> Trajectory:
     """
     if abs(dx) > 1 or abs(dy) > 1:
         raise ValueError(f"({dx}, {dy}) does not lead to a neighbouring cell")
-    return _leg(
-        scenario.vehicle,
-        scenario.formation.speed_mps,
-        scenario.runtime.tick_s,
-        round(scenario.formation.move_s / scenario.runtime.tick_s),
-        dx * scenario.formation.gap_m,
-        dy * scenario.road.lane_width_m,
-    )
+    ticks = round(scenario.formation.move_s / scenario.runtime.tick_s)
+    along_m, across_m = dx * scenario.formation.gap_m, dy * scenario.road.lane_width_m
+    return plan_trajectory(scenario, (Waypoint(0, 0.0, 0.0), Waypoint(ticks, along_m, across_m)))
 
 
 def check_moves(scenario: Scenario) -> None:

@@ -223,6 +223,8 @@ class CoordinatorCore:
             self._road_changed = False
             self._update_members(self.census, now_s)
         for number, control in self.controls.items():
+            if control.wakeup_s is None or control.wakeup_s > now_s:
+                continue
             control.on_time(now_s)
             if control.take_planning_order(now_s):
                 yield from self._order_plan(number, control)

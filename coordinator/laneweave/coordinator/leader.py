@@ -152,12 +152,16 @@ class FormationControl:
         """Tell, once, that the whole roster has promised and planning should begin (L5)."""
         if (
             self.phase is not Phase.PREPARING
-            or set(self._promises) != set(self.formation.roster)
+            or not self._all_promised
             or (self.failures and now_s < self._due_s)
         ):
             return False
         self.phase = Phase.PLANNING
         return True
+
+    @property
+    def _all_promised(self) -> bool:
+        return set(self._promises) == set(self.formation.roster)
 
     @property
     def hold_cells(self) -> dict[Name, Cell]:
@@ -220,6 +224,8 @@ class FormationControl:
             self._due_s = now_s + self.rng.uniform(*BACK_OFF_S)
         elif self.phase is Phase.PREPARING:
             self._count_promise(state, ballot)
+            if self._all_promised and not self.failures:
+                self._due_s = now_s
         elif self._restarted(state):
             self._prepare(now_s)
         elif self.phase is Phase.ISSUING:

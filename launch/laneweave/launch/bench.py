@@ -28,6 +28,7 @@ from laneweave.launch.observer import View
 from laneweave.protocol.scenario import Scenario, load_scenario
 
 ROLES = ("router", "coordinator", "bridge", "agent")
+LOOK_EVERY_S = 0.3
 SETTLE_S = 10.0
 """Road seconds after the road has filled before anything is measured."""
 
@@ -38,33 +39,45 @@ class _Window:
 
     begin_s: float
     end_s: float
-    first: dict[str, tuple[psutil.Process, float]] = field(factory=dict)
+    seen: dict[str, tuple[psutil.Process, float]] = field(factory=dict)
+    """Each process, and its CPU time when it was last looked at."""
+    looked_s: float = 0.0
     began: tuple[float, float] | None = None
     ended: tuple[float, float] | None = None
     cpu_s: dict[str, float] = field(factory=dict)
     memory: dict[str, list[tuple[float, float]]] = field(factory=dict)
 
     def watch(self, view: View, process_ids: Mapping[str, int]) -> None:
-        """Take measurements when the window begins and ends."""
-        now = time.perf_counter()
+        """Take measurements while the window is open."""
+        now_s = time.perf_counter()
         if self.began is None and view.t_s >= self.begin_s:
-            self.began = (view.t_s, now)
-            for name, process in _processes(process_ids).items():
-                with contextlib.suppress(psutil.Error):
-                    self.first[name] = (process, _cpu_s(process))
-        elif self.began is not None and self.ended is None and view.t_s >= self.end_s:
-            self.ended = (view.t_s, now)
-            self._measure(process_ids)
+            self.began = (view.t_s, now_s)
+            self._look(process_ids, count=False)
+        elif self.began is not None and self.ended is None:
+            if view.t_s >= self.end_s:
+                self.ended = (view.t_s, now_s)
+                self._look(process_ids, count=True)
+                self._weigh(process_ids)
+            elif now_s >= self.looked_s + LOOK_EVERY_S:
+                # Vehicles leave, and their agents' accounts with them: look often.
+                self.looked_s = now_s
+                self._look(process_ids, count=True)
 
-    def _measure(self, process_ids: Mapping[str, int]) -> None:
-        for name, process in _processes(process_ids).items():
-            # Vehicles leave, and their agents with them.
+    def _look(self, process_ids: Mapping[str, int], *, count: bool) -> None:
+        for name, process_id in process_ids.items():
             with contextlib.suppress(psutil.Error):
-                role = _role(name)
-                before = self.first.get(name, (process, 0.0))[1]
-                info = process.memory_full_info()
-                self.memory.setdefault(role, []).append((info.pss / 2**20, info.uss / 2**20))
-                self.cpu_s[role] = self.cpu_s.get(role, 0.0) + _cpu_s(process) - before
+                process, before = self.seen.get(name) or (psutil.Process(process_id), 0.0)
+                cpu_s = _cpu_s(process)
+                self.seen[name] = (process, cpu_s)
+                if count:
+                    role = _role(name)
+                    self.cpu_s[role] = self.cpu_s.get(role, 0.0) + cpu_s - before
+
+    def _weigh(self, process_ids: Mapping[str, int]) -> None:
+        for name, process_id in process_ids.items():
+            with contextlib.suppress(psutil.Error):
+                info = psutil.Process(process_id).memory_full_info()
+                self.memory.setdefault(_role(name), []).append((info.pss / 2**20, info.uss / 2**20))
 
 
 def bench_runtime(vehicles: int, *, seconds: float, per_process: int, seed: int) -> dict[str, Any]:
@@ -170,16 +183,6 @@ def planner_table(rows: list[dict[str, Any]]) -> Table:
             *(f"{cpu[name]:.2f}" for name in ("p50", "p95", "max")),
         )
     return table
-
-
-def _processes(process_ids: Mapping[str, int]) -> dict[str, psutil.Process]:
-    found = {}
-    for name, process_id in process_ids.items():
-        try:
-            found[name] = psutil.Process(process_id)
-        except psutil.NoSuchProcess:
-            continue
-    return found
 
 
 def _role(name: str) -> str:

@@ -18,7 +18,7 @@ import typer
 from rich.console import Console
 
 from laneweave.launch.logs import log_to_terminal
-from laneweave.protocol.errors import BadInputError, EnvironmentUnfitError
+from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
 from laneweave.protocol.scenario import Scenario, load_scenario
 
 app = typer.Typer(
@@ -367,7 +367,7 @@ def _status(arguments: list[str]) -> int:
         result: Any = command.main(
             arguments or ["--help"], prog_name="laneweave", standalone_mode=False
         )
-    except BadInputError as error:
+    except (BadInputError, RefusedError) as error:
         return _refuse(str(error))
     except (typer.Abort, KeyboardInterrupt):
         sys.stderr.write("interrupted\n")
@@ -377,7 +377,7 @@ def _status(arguments: list[str]) -> int:
         return _refuse(getattr(error, "format_message", error.__str__)())
     except BrokenPipeError:
         return 1
-    except EnvironmentUnfitError as error:
+    except CommandFailedError as error:
         sys.stderr.write(" ".join(str(error).split()) + "\n")
         return 1
     except ModuleNotFoundError as error:

@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from laneweave.coordinator.planning import PlanRequest, PlanResponse, plan
-from laneweave.protocol.errors import BadInputError
+from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan
+from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
 from laneweave.protocol.topics import SERVICE, Keys
 from laneweave.protocol.zenoh_transport import ask
 
@@ -22,14 +22,16 @@ def answer_request(
     """Read a request, have it planned, and print the answer.
 
     Raises:
-        BadInputError: the request cannot be read or is not valid, or nobody answers.
+        BadInputError: the request cannot be read or is not valid, or nobody is at the endpoint.
+        RefusedError: the coordinator refused the request.
+        CommandFailedError: the coordinator failed or did not answer in time.
     """
     data = _read(path)
     if deadline_s is not None:
         data["deadline_s"] = deadline_s
     request = PlanRequest.from_dict(data)
     if endpoint is None:
-        response = plan(request)
+        response = checked_plan(request)
     else:
         response = _ask(endpoint, realm, data, request.deadline_s + ANSWER_MARGIN_S)
     if as_table:
@@ -65,10 +67,10 @@ def _ask(endpoint: str, realm: str, data: dict[str, Any], timeout_s: float) -> P
     try:
         payload, ok = ask(endpoint, key, json.dumps(data).encode(), timeout_s)
     except TimeoutError as error:
-        raise BadInputError(
-            "--connect", endpoint, f"a coordinator that answers ({error})"
-        ) from error
+        raise CommandFailedError(f"{endpoint}: {error}") from error
     answer = json.loads(payload)
-    if not ok:
-        raise BadInputError(answer.get("field") or "request", "refused", answer.get("message", ""))
-    return PlanResponse.from_dict(answer)
+    if ok:
+        return PlanResponse.from_dict(answer)
+    if answer["field"]:
+        raise RefusedError(answer["message"])
+    raise CommandFailedError(f"{endpoint}: {answer['message']}")

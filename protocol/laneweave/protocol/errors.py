@@ -45,5 +45,9 @@ def _line(text: str, length: int = 500) -> str:
     return line if len(line) <= length else line[: length - 3] + "..."
 
 
-class EnvironmentUnfitError(RuntimeError):
-    """This machine lacks something that the command needs; the message says what to install."""
+class RefusedError(Exception):
+    """Somebody else refused the input; the message is their line. Exit status 2."""
+
+
+class CommandFailedError(RuntimeError):
+    """The input is good and yet the command cannot be done; the message says why. Status 1."""

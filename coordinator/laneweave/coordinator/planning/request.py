@@ -134,13 +134,16 @@ def _read_grid(value: object) -> Grid:
     columns = as_int("grid.columns", fields["columns"], 1, MAX_COLUMNS)
     lanes = as_int("grid.lanes", fields["lanes"], 1, MAX_LANES)
     blocked = as_list("grid.blocked", fields.get("blocked", ()), columns * lanes)
-    cells = [as_cell(f"grid.blocked[{i}]", cell) for i, cell in enumerate(blocked)]
-    for i, cell in enumerate(cells):
-        if not Grid(columns, lanes).contains(cell):
+    whole = Grid(columns, lanes)
+    cells: dict[Cell, None] = {}
+    for i, item in enumerate(blocked):
+        cell = as_cell(f"grid.blocked[{i}]", item)
+        if not whole.contains(cell):
             raise BadInputError(f"grid.blocked[{i}]", cell, "a cell in the grid")
-        if cell in cells[:i]:
+        if cell in cells:
             raise BadInputError(f"grid.blocked[{i}]", cell, "each cell once")
-    return Grid(columns, lanes, cells)
+        cells[cell] = None
+    return Grid(columns, lanes, list(cells))
 
 
 def _read_vehicle(field: str, value: object) -> VehicleRequest:
@@ -228,7 +231,9 @@ def _check_preference(field: str, vehicle: VehicleRequest, request: PlanRequest)
         if vehicle.eligible is not None:
             raise BadInputError(f"{field}.eligible", vehicle.eligible, "lane or eligible, not both")
         as_int(f"{field}.lane", vehicle.lane, 0, request.grid.lanes - 1)
+    seen: set[int] = set()
     for k, target in enumerate(vehicle.eligible or ()):
         as_int(f"{field}.eligible[{k}]", target, 0, len(request.targets) - 1)
-        if target in (vehicle.eligible or ())[:k]:
+        if target in seen:
             raise BadInputError(f"{field}.eligible[{k}]", target, "each target once")
+        seen.add(target)
