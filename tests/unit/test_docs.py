@@ -21,6 +21,7 @@ import typer
 from numpy.typing import NDArray
 
 from laneweave.agents.trajectory import move_profile
+from laneweave.coordinator.leader import Phase
 from laneweave.coordinator.planning import PlanRequest
 from laneweave.launch.cli import app
 from laneweave.launch.faults import load_faults
@@ -32,6 +33,7 @@ from laneweave.protocol.motion import cell_state
 from laneweave.protocol.scenario import CONFLICT_KINDS, Scenario, load_scenario, parse_scenario
 from laneweave.protocol.topics import NAME_RULE, TOPICS
 from laneweave.sim_bridge.overlap import least_gaps, pose_of
+from laneweave.sim_bridge.run_record import Ending
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -181,6 +183,15 @@ def test_rows_that_cross_check_fields_name_fields_that_exist() -> None:
     assert named <= known
 
 
+def test_endings_of_runs() -> None:
+    (meaning,) = (
+        cells[1]
+        for cells in rows(section(read("ARCHITECTURE.md"), "## The end of a run"))
+        if code(cells[0]) == "ending"
+    )
+    assert set(re.findall(r"`(\w+)`:", meaning)) == {ending.value for ending in Ending}
+
+
 # --- docs/PROTOCOL.md: keys and messages ---------------------------------------------------------
 
 
@@ -216,6 +227,12 @@ def test_fields_of_messages(kind: type) -> None:
 def test_fields_of_ballots() -> None:
     shown = tuple(code(cells[0]) for cells in rows(section(read("PROTOCOL.md"), "### Ballot")))
     assert shown == messages.Ballot._fields
+
+
+def test_phases_of_a_formation() -> None:
+    (drawing,) = fences(section(read("PROTOCOL.md"), "## Leader"), "mermaid")
+    drawn = {*re.findall(r"(\w+) -->", drawing), *re.findall(r"--> (\w+)", drawing)}
+    assert drawn == {phase.value.replace(" ", "_") for phase in Phase}
 
 
 def test_places_in_the_code_exist() -> None:

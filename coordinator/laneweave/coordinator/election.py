@@ -13,6 +13,9 @@ from attrs import define, field
 
 from laneweave.protocol.messages import Heartbeat, Name
 
+MAX_TERM = 2**62
+"""A term beyond it is nonsense; following it would leave no room to count on."""
+
 
 @define
 class _Peer:
@@ -79,7 +82,7 @@ class Election:
 
     def see_term(self, term: int) -> None:
         """Remember the highest term that anybody showed."""
-        if term > self.term:
+        if self.term < term <= MAX_TERM:
             # A leader that slept through another one's time must not go on below its term.
             self.term = term + 1 if self.leading else term
 

@@ -30,6 +30,7 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario import Scenario, to_tables
 from laneweave.protocol.topics import Keys
 from laneweave.protocol.zenoh_transport import ZenohTransport
+from laneweave.sim_bridge.demand import arrivals
 
 log = structlog.get_logger(__name__)
 
@@ -83,7 +84,9 @@ class LocalRun:
     watch: Callable[[View, Mapping[str, int]], None] | None = None
     """Called ten times a second with what is known and the process id of each role."""
     _processes: dict[str, ForkServerProcess] = field(factory=dict)
-    _started_agents: set[str] = field(factory=set)
+    _group_of: dict[str, int] = field(init=False)
+    """Which vehicles share a process: neighbours in the order of their arrival."""
+    _started_groups: set[int] = field(factory=set)
     _killed: set[str] = field(factory=set)
     _problems: list[str] = field(factory=list)
     _recovery_s: list[float] = field(factory=list)
@@ -91,6 +94,14 @@ class LocalRun:
     _failed_agents: int = 0
     _peak: int = 0
     _stop: bool = False
+
+    def __attrs_post_init__(self) -> None:
+        """Group the vehicles of the demand."""
+        per_process = self.scenario.runtime.vehicles_per_process
+        self._group_of = {
+            arrival.vehicle: index // per_process
+            for index, arrival in enumerate(arrivals(self.scenario))
+        }
 
     def run(self) -> Outcome:
         """Run the scenario and return what came of it.
@@ -214,22 +225,13 @@ class LocalRun:
         return {name: process.pid or 0 for name, process in self._processes.items()}
 
     def _agents_to_start(self, observer: Observer) -> Iterator[list[str]]:
-        """Group announced vehicles whose agents are not started yet."""
-        census, scenario = observer.view.census, self.scenario
-        if census is None:
-            return
-        waiting = [
-            (announced.arrival_s, announced.vehicle)
-            for announced in census.announced
-            if announced.vehicle not in self._started_agents
-        ]
-        per_process = scenario.runtime.vehicles_per_process
-        urgent_s = observer.view.t_s + scenario.runtime.announce_s / 2
-        while waiting and (len(waiting) >= per_process or waiting[0][0] <= urgent_s):
-            group = [str(vehicle) for _, vehicle in waiting[:per_process]]
-            del waiting[:per_process]
-            self._started_agents.update(group)
-            yield group
+        """Return groups of vehicles that share a process, when its first one is announced."""
+        census = observer.view.census
+        for announced in census.announced if census is not None else ():
+            index = self._group_of.get(announced.vehicle)
+            if index is not None and index not in self._started_groups:
+                self._started_groups.add(index)
+                yield [name for name, group in self._group_of.items() if group == index]
 
     # --- faults -------------------------------------------------------------------------------
 

@@ -211,7 +211,8 @@ class Census:
 class RoadClock:
     """Bridge to everyone who needs road time and progress, each tick.
 
-    Missing: the receiver's clock stands still, so that nothing new begins. Late: ignored.
+    Missing: the receiver's clock stands still until the next one, or a census, so that nothing new
+    begins. Late: ignored.
     """
 
     tick: int
@@ -233,7 +234,8 @@ class Report:
     role: Name
     name: Name
     process: Name = Name("unknown")
-    """The process that counts; several vehicles may share one. The node fills in these three."""
+    """The process that counts; several vehicles may share one. The node fills it in, and both
+    counters."""
     published: int = 0
     """Messages that the process has published so far."""
     rejected: int = 0
