@@ -34,7 +34,9 @@ def check_files(folder: Path) -> None:
     assert summary(folder)["vehicles"]["entered"] > 0
     assert pq.read_table(folder / "trajectories.parquet").num_rows > 0
     assert pq.read_table(folder / "trips.parquet").num_rows > 0
-    assert events(folder)[-1]["kind"] == "run-interrupted"
+    last = events(folder)[-1]
+    assert (last["kind"], last["ending"]) == ("run-ended", "interrupted")
+    assert summary(folder)["ending"] == "interrupted"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

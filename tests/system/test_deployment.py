@@ -26,6 +26,7 @@ from system.harness import (
     check_safe_and_complete,
     events,
     final_lanes,
+    summary,
 )
 
 REQUEST: dict[str, Any] = {
@@ -176,9 +177,15 @@ def test_the_bridge_ends_while_it_waits_for_agents(lab: Lab) -> None:
         transport.watch(Keys("test").all_of(BRIDGE_ALIVE))
         assert isinstance(tokens.get(timeout=END_S), TokenUp)
 
-    stop(lab, bridge)
+    bridge.send_signal(signal.SIGTERM)
+    ended = lab.finish(bridge, END_S)
 
-    assert events(lab.folder / "out")[-1]["kind"] == "run-interrupted"
+    # It did what it was asked to do, and says what came of it.
+    assert (ended.status, ended.err) == (0, "")
+    assert "FAILED: the run is not complete: interrupted" in ended.out
+    last = events(lab.folder / "out")[-1]
+    assert (last["kind"], last["ending"]) == ("run-ended", "interrupted")
+    assert summary(lab.folder / "out")["ending"] == "interrupted"
     stop(lab, router)
     lab.check_nothing_left()
 

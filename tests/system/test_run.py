@@ -27,6 +27,7 @@ MAYBE = (int, float, type(None))
 
 SUMMARY: dict[str, Any] = {
     "schema": TEXT,
+    "ending": TEXT,
     "method": TEXT,
     "seed": COUNT,
     "volume_veh_per_lane_h": NUMBER,
@@ -64,7 +65,7 @@ SUMMARY: dict[str, Any] = {
         "vehicles_per_process": COUNT,
         "tick_ms": dict.fromkeys(("p50", "p99"), NUMBER),
     },
-    "messages": {"published": COUNT, "dropped_by_faults": COUNT},
+    "messages": {"published": COUNT, "dropped_by_faults": COUNT, "rejected": COUNT},
     "failover": {"leader_changes": COUNT, "recovery_s": (list,)},
 }
 
@@ -95,6 +96,7 @@ def test_a_run_keeps_its_promises(finished_run: FinishedRun, name: str) -> None:
     assert found["safety"]["max_accel_mps2"] <= 5
     assert found["safety"]["min_gap_m"] > 0
     assert found["planning"]["plans"] > 1
+    assert found["ending"] == "complete"
     assert found["tracking"]["unusable"] == 0
     assert found["messages"]["rejected"] == 0
     assert [line for line in log_lines(folder) if line["level"] == "error"] == []
@@ -139,6 +141,17 @@ def test_the_number_of_processes_is_as_asked(finished_run: FinishedRun) -> None:
     assert single["runtime"]["vehicles_per_process"] == 1
     assert packed["runtime"]["processes"] <= 5 + packed["vehicles"]["demanded"] // 2
     assert packed["runtime"]["vehicles_per_process"] == 8
+
+
+def test_messages_are_counted_once_however_vehicles_are_packed(finished_run: FinishedRun) -> None:
+    single, packed = summary(finished_run("zenoh")), summary(finished_run("packed"))
+
+    def per_vehicle(found: dict[str, Any]) -> float:
+        published: int = found["messages"]["published"]
+        entered: int = found["vehicles"]["entered"]
+        return published / entered
+
+    assert per_vehicle(packed) == pytest.approx(per_vehicle(single), rel=0.15)
 
 
 @pytest.mark.parametrize("name", ["zenoh", "packed"])

@@ -57,7 +57,8 @@ class AgentHost:
         self._seen: set[Name] = set(self._agents)
         self._formations: set[int] = set()
         self._census_s = 0.0
-        self._bridge = ""
+        self._bridge = -1
+        """Incarnation of the newest bridge."""
         self._alone_since_s: float | None = 0.0
         """Since when no bridge is there."""
 
@@ -87,9 +88,9 @@ class AgentHost:
             case Arrived():
                 yield from self._on_message(event, now_s)
             case PeerUp(topic, parameters) if topic is BRIDGE_ALIVE:
-                yield from self._meet_bridge(parameters["incarnation"])
+                yield from self._meet_bridge(_number(parameters["incarnation"]))
             case PeerDown(topic, parameters) if topic is BRIDGE_ALIVE:
-                if parameters["incarnation"] == self._bridge:
+                if _number(parameters["incarnation"]) == self._bridge:
                     self._alone_since_s = now_s
             case Wakeup() if self.wakeup_s is not None and now_s >= self.wakeup_s:
                 yield End()
@@ -113,10 +114,12 @@ class AgentHost:
         for agent in self._agents.values():
             yield from agent.handle(event, now_s)
 
-    def _meet_bridge(self, incarnation: str) -> Iterator[Effect]:
+    def _meet_bridge(self, incarnation: int) -> Iterator[Effect]:
         """Take note of a bridge: a new one has new vehicles, whatever their names."""
+        if incarnation < max(self._bridge, 0):
+            return  # left over from an earlier run, or no bridge at all
         self._alone_since_s = None
-        if self._shard is not None and self._bridge not in ("", incarnation):
+        if self._shard is not None and self._bridge not in (-1, incarnation):
             for agent in self._agents.values():
                 yield from agent.leave()
             self._agents.clear()
@@ -160,3 +163,7 @@ class AgentHost:
         for number in sorted(wanted - self._formations):
             yield Listen(STATE, {"formation": number})
         self._formations = wanted
+
+
+def _number(incarnation: str) -> int:
+    return int(incarnation) if incarnation.isdecimal() else -1

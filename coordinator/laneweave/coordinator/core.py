@@ -95,7 +95,8 @@ class CoordinatorCore:
         )
         self._planning: dict[int, tuple[int, Ballot]] = {}
         self._next_job = 0
-        self._bridge = ""
+        self._bridge = -1
+        """Incarnation of the newest bridge."""
         self._road_changed = True
         self._heartbeat_s = 0.0
         self._report_s = 0.0
@@ -129,7 +130,7 @@ class CoordinatorCore:
             case PeerDown(topic, parameters) if topic is COORDINATOR_ALIVE:
                 self.election.on_token_down(*_identity(parameters))
             case PeerUp(topic, parameters) if topic is BRIDGE_ALIVE:
-                self._meet_bridge(parameters["incarnation"])
+                self._meet_bridge(_number(parameters["incarnation"]))
             case LinkUp():
                 self.election.on_link(up=True, now_s=now_s)
             case LinkDown():
@@ -155,9 +156,9 @@ class CoordinatorCore:
         )
         yield Serve(SERVICE)
 
-    def _meet_bridge(self, incarnation: str) -> None:
+    def _meet_bridge(self, incarnation: int) -> None:
         """Forget the road of an earlier bridge: the clock of a new one begins at 0."""
-        if incarnation != self._bridge:
+        if incarnation > self._bridge:
             self._bridge = incarnation
             self.census = None
             self.t_s = 0.0
@@ -374,5 +375,8 @@ def _plan(make_request: Callable[[], PlanRequest], nodes: int, weights: Weights)
 
 
 def _identity(parameters: dict[str, str]) -> tuple[str, int]:
-    incarnation = parameters["incarnation"]
-    return parameters["coordinator"], int(incarnation) if incarnation.isdecimal() else -1
+    return parameters["coordinator"], _number(parameters["incarnation"])
+
+
+def _number(incarnation: str) -> int:
+    return int(incarnation) if incarnation.isdecimal() else -1

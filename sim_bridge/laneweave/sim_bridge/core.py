@@ -193,6 +193,8 @@ class BridgeCore:
                 self._agents_up.add(parameters["vehicle"])
                 self._silent.discard(parameters["vehicle"])
                 self._patience_s = self.scenario.runtime.agent_start_s
+                if parameters["vehicle"] in self.vehicles:
+                    self._unreported.add(parameters["vehicle"])
             case PeerDown(topic, parameters) if topic is VEHICLE_ALIVE:
                 self._on_agent_down(parameters["vehicle"])
             case LinkUp():
@@ -202,7 +204,9 @@ class BridgeCore:
             case Wakeup() if self.phase is Phase.ANSWERS:
                 yield from self._send_again(now_s)
             case Stopping():
-                self._finish(Ending.INTERRUPTED)
+                # Who is asked to end while the last reports come in has ended already.
+                winding_up = self.phase is Phase.WIND_UP
+                self._finish(self._ending if winding_up else Ending.INTERRUPTED)
             case _:
                 pass
 
@@ -220,7 +224,7 @@ class BridgeCore:
             case Command():
                 self._on_command(message)
             case Report():
-                self._record.on_report(message)
+                self._on_report(message)
             case LogEvent():
                 self._record.on_event(message)
             case Heartbeat():
@@ -245,10 +249,18 @@ class BridgeCore:
             return
         self._awaited.discard(command.vehicle)
 
+    def _on_report(self, report: Report) -> None:
+        if report.role in ("agent", "bridge"):
+            if report.name not in self._unreported:
+                return  # about a vehicle of an earlier run, or a duplicate
+            self._unreported.discard(report.name)
+        self._record.on_report(report)
+
     def _on_agent_down(self, vehicle: str) -> None:
         if self._link_up:
             self._agents_up.discard(vehicle)
             self._awaited.discard(Name(vehicle))
+            self._leaving.pop(Name(vehicle), None)
 
     # --- the tick -----------------------------------------------------------------------------
 
@@ -260,7 +272,7 @@ class BridgeCore:
             yield from self._begin_tick(now_s)
         if self.phase is Phase.ANSWERS and (not self._awaited or now_s >= self._deadline_s):
             yield from self._end_tick(now_s)
-        if self.phase is Phase.WIND_UP and (now_s >= self._deadline_s or self._all_reported()):
+        if self.phase is Phase.WIND_UP and (now_s >= self._deadline_s or not self._unreported):
             self._finish(self._ending)
             yield End()
 
@@ -407,10 +419,12 @@ class BridgeCore:
                 self._census_changed = True
 
     def _over(self) -> bool:
+        if not self.vehicles and self._roadside.exhausted(self.t_s):
+            return True
         if self.t_s >= self.scenario.runtime.max_road_s:
             self._ending = Ending.LIMIT
             return True
-        return not self.vehicles and self._roadside.exhausted(self.t_s)
+        return False
 
     # --- the end ------------------------------------------------------------------------------
 
@@ -418,21 +432,18 @@ class BridgeCore:
         counts = self._roadside.counts(on_road=len(self.vehicles))
         yield Send(CLOCK, counts.clock(self.tick, self.t_s, ended=True))
         yield Send(CENSUS, self._roadside.census(self.t_s, self.vehicles.values()))
-        # Through the network, like everybody's: the node fills in what it has counted.
+        yield from self._tell_leaving()
+        for vehicle in self.vehicles.values():
+            yield Send(SENSE, self._sense(vehicle, left=True), {"vehicle": vehicle.name})
+        # Last, so that it counts all, and through the network, like everybody's: the node fills in
+        # what it has counted.
         yield Send(
             REPORT,
             Report(role=Name("bridge"), name=BRIDGE),
             {"role": "bridge", "name": BRIDGE},
         )
-        yield from self._tell_leaving()
-        for vehicle in self.vehicles.values():
-            yield Send(SENSE, self._sense(vehicle, left=True), {"vehicle": vehicle.name})
         self.phase = Phase.WIND_UP
         self._deadline_s = now_s + WIND_UP_S
-
-    def _all_reported(self) -> bool:
-        self._unreported = {name for name in self._unreported if not self._record.has_report(name)}
-        return not self._unreported
 
     def _finish(self, ending: Ending) -> None:
         if self.phase is not Phase.ENDED:

@@ -48,10 +48,12 @@ class Roadside:
         self._announce_s = scenario.runtime.announce_s
         self._tick_s = scenario.runtime.tick_s
         self._lanes = scenario.road.lanes
-        # Every other cell of a lane is free to enter; one more, so that nobody comes unannounced.
+        # Every other cell of a lane is free to enter. A tick and one more, so that nobody comes
+        # unannounced.
         lattice = scenario.lattice
         between_entries_s = 2.0 * lattice.pitch_m / lattice.speed_mps
-        self._announced_per_lane = math.ceil(self._announce_s / between_entries_s) + 1
+        ahead_s = self._announce_s + self._tick_s
+        self._announced_per_lane = math.ceil(ahead_s / between_entries_s) + 1
         self._meter = EntryMeter(scenario.lattice, scenario.formation.max_vehicles)
         self._arrivals = arrivals(scenario)
         self._demanded = 0

@@ -153,10 +153,6 @@ class RunRecord:
         """A role reported its counters; the newest of a sender counts."""
         self._reports[report.role, report.name] = report
 
-    def has_report(self, name: str) -> bool:
-        """Tell whether a vehicle's agent, or another role of that name, has reported."""
-        return any((Name(role), Name(name)) in self._reports for role in ("agent", "bridge"))
-
     def on_heartbeat(self, heartbeat: Heartbeat, t_s: float, now_s: float) -> None:
         """Follow the leadership: how often it changes, and for how long nobody leads.
 

@@ -22,7 +22,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from laneweave.protocol.errors import EnvironmentUnfitError
+from laneweave.protocol.errors import CommandFailedError
 from laneweave.protocol.motion import State
 from laneweave.protocol.scenario import Scenario
 from laneweave.sim_bridge.network_file import EDGE, ROUTE, VEHICLE_TYPE, margin_m, write_network
@@ -40,7 +40,7 @@ DEBIAN_PACKAGES = {
 _IMPORT_SWITCH = "LIBSUMO_AS_TRACI"
 
 
-class SumoUnavailableError(EnvironmentUnfitError):
+class SumoUnavailableError(CommandFailedError):
     """libsumo or a system library that it needs cannot be loaded; the message says what to do."""
 
 

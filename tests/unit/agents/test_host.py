@@ -38,6 +38,7 @@ from laneweave.protocol.node import (
     Stopping,
     Unlisten,
     Wakeup,
+    Watch,
     Withdraw,
 )
 from laneweave.protocol.scenario import Scenario
@@ -219,6 +220,29 @@ def test_a_new_bridge_has_new_vehicles_of_the_same_names() -> None:
     assert Announce(VEHICLE_ALIVE, {"vehicle": A}) in give(host, first)
 
 
+@pytest.mark.parametrize("other", ["6", "ghost", "-1", "x"])
+def test_what_is_no_newer_bridge_changes_nothing(other: str) -> None:
+    """A bridge of an earlier run that was only asleep, or a stranger's token."""
+    named, shard = make_host(A), make_host(shard=Shard(0, 1))
+    for host in (named, shard):
+        give(host, Started(), 10.0)
+        give(host, PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}), 11.0)
+    give(shard, census_of(A))
+    for host in (named, shard):
+        assert give(host, PeerUp(BRIDGE_ALIVE, {"incarnation": other}), 12.0) == []
+        assert give(host, PeerDown(BRIDGE_ALIVE, {"incarnation": other}), 13.0) == []
+        assert host.wakeup_s is None
+        assert give(host, Wakeup(), 14.0 + ALONE_S) == []
+    assert give(shard, census_of(A)) == []  # it has the vehicle still
+
+
+def test_a_stranger_is_not_the_bridge_that_an_agent_waits_for() -> None:
+    host = make_host(A)
+    give(host, Started(), 10.0)
+    give(host, PeerUp(BRIDGE_ALIVE, {"incarnation": "ghost"}), 11.0)
+    assert give(host, Wakeup(), 10.0 + ALONE_S) == [End()]
+
+
 def test_a_shard_lets_go_of_vehicles_that_the_census_lacks() -> None:
     host = make_host(shard=Shard(0, 1))
     give(host, census_of(A, B))
@@ -251,7 +275,7 @@ def test_a_shard_takes_announced_vehicles_and_those_on_the_road_once() -> None:
     names = [Name(f"v{number}") for number in range(20)]
     up: list[str] = []
     for host in shards:
-        assert give(host, Started())[0] == Listen(CENSUS)
+        assert give(host, Started()) == [Watch(BRIDGE_ALIVE), Listen(CENSUS)]
         assert host.wakeup_s is None
         for _ in range(2):
             message = census(*names[:5], announced=names[3:])

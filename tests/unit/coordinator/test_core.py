@@ -50,6 +50,7 @@ from laneweave.protocol.node import (
 from laneweave.protocol.plans import plan_problems
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.topics import (
+    BRIDGE_ALIVE,
     CENSUS,
     CLOCK,
     COORDINATOR_ALIVE,
@@ -175,9 +176,35 @@ def test_start() -> None:
         Listen(CLOCK),
         Listen(CENSUS),
         Watch(COORDINATOR_ALIVE),
+        Watch(BRIDGE_ALIVE),
         Announce(COORDINATOR_ALIVE, {"coordinator": "c1", "incarnation": 1}),
         Serve(SERVICE),
     ]
+
+
+def test_a_new_bridge_has_a_new_road() -> None:
+    desk = Desk()
+    desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}))
+    (order,) = jobs(desk.collect_promises({A: (0, 0)}, {A: 1}))
+    assert desk.core.controls
+    desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "8"}))
+    assert (desk.core.controls, desk.core.census, desk.core.t_s) == ({}, None, 0.0)
+    assert desk.give(run_job(order)) == []  # a plan for the road that is no more
+    desk.tell(census({}, t_s=1.0))  # of an earlier road time than what it knew
+    assert desk.core.census is not None
+    assert desk.core.t_s == 1.0
+
+
+@pytest.mark.parametrize("other", ["7", "6", "ghost", "-1"])
+def test_what_is_no_newer_bridge_changes_nothing(other: str) -> None:
+    """The same one after a loss of the link, one of an earlier run, or a stranger's token."""
+    desk = Desk()
+    desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}))
+    desk.collect_promises({A: (0, 0)}, {A: 1})
+    for news in (PeerDown, PeerUp, PeerDown):
+        desk.give(news(BRIDGE_ALIVE, {"incarnation": other}))
+    assert list(desk.core.controls) == [0]
+    assert desk.core.t_s == T_S
 
 
 def test_heartbeats_are_periodic_and_say_who_leads() -> None:

@@ -65,9 +65,11 @@ def test_steps_down_for_a_better_ranked_one_and_leads_again_with_a_higher_term()
     election.on_heartbeat(beat("a", term=7), 1.0)
     assert election.update(1.0)
     assert not election.leading
-    election.on_heartbeat(beat("a", term=7), 1.1)  # terms are noted while not leading
+    assert election.term == 8  # it led when it saw the other term, and may yet again
+    election.on_heartbeat(beat("a", term=20), 1.1)  # terms are noted while not leading
+    assert election.term == 20
     assert election.update(1.1 + ELECTION_S)
-    assert (election.leading, election.term) == (True, 8)
+    assert (election.leading, election.term) == (True, 21)
 
 
 def test_a_dead_process_is_forgotten_at_once() -> None:
@@ -149,5 +151,41 @@ def test_terms_only_rise() -> None:
     assert election.term == 5
     election.update(ELECTION_S)
     assert election.term == 6
-    election.see_term(50)  # a leader keeps its own; vehicles tell it of higher ones
-    assert election.term == 6
+    for lower in (0, 5, 6):  # equal terms happen: ballots tell the coordinators apart
+        election.see_term(lower)
+        assert election.term == 6
+    election.see_term(50)  # what it does from now on is newer than that
+    assert (election.leading, election.term) == (True, 51)
+
+
+def test_a_leader_that_slept_does_not_go_on_below_the_term_of_the_one_in_between() -> None:
+    election = candidate("a")
+    election.update(ELECTION_S)
+    election.on_heartbeat(beat("b", term=2), 9.0)  # it led while this one slept
+    assert not election.update(9.0)
+    assert (election.leading, election.term) == (True, 3)
+    election.on_heartbeat(beat("b", term=3), 9.1)  # it has seen the new term by now
+    assert election.term == 3
+
+
+def test_the_own_heartbeat_says_nothing_about_terms() -> None:
+    """Of an earlier process of the same name, or its own that comes back: no race with itself."""
+    election = candidate("a")
+    election.update(ELECTION_S)
+    election.on_heartbeat(beat("a", term=9), 1.0)
+    assert election.term == 1
+
+
+def test_two_leaders_that_hear_each_other_do_not_outbid_each_other_for_ever() -> None:
+    first, second = candidate("a"), candidate("b")
+    for election in (first, second):
+        election.update(ELECTION_S)
+    second.raise_term(6)
+    now_s = 1.0
+    for _ in range(20):
+        for one, other in ((first, second), (second, first)):
+            one.on_heartbeat(beat(other.name, term=other.term), now_s)
+            one.update(now_s)
+        now_s += 0.1
+    assert (first.leading, second.leading) == (True, False)
+    assert (first.term, second.term) == (10, 10)

@@ -11,8 +11,11 @@ from rich.console import Console
 from laneweave.launch.outcome import Outcome, complete_summary, print_outcome
 
 
-def summary(*, overlaps: int = 0, left: int = 5, measured: float | None = 1.5) -> dict[str, Any]:
+def summary(
+    *, overlaps: int = 0, left: int = 5, measured: float | None = 1.5, ending: str = "complete"
+) -> dict[str, Any]:
     return {
+        "ending": ending,
         "volume_veh_per_lane_h": 1300.0,
         "seed": 1,
         "simulated_s": 80.0,
@@ -64,6 +67,13 @@ def test_a_run_that_kept_its_promises(tmp_path: Path) -> None:
     assert written["messages"] == {"published": 7, "dropped_by_faults": 3}
 
 
+def test_the_number_of_processes_is_unknown_where_nobody_says_it(tmp_path: Path) -> None:
+    outcome = judge(tmp_path, summary(), processes=None)
+    assert outcome.summary is not None
+    assert outcome.summary["runtime"]["processes"] is None
+    assert "(? processes)" in printed(outcome)
+
+
 def test_recoveries_seen_by_the_launcher_count(tmp_path: Path) -> None:
     outcome = judge(tmp_path, summary(), recovery_s=[0.25])
     assert outcome.summary is not None
@@ -75,6 +85,8 @@ def test_recoveries_seen_by_the_launcher_count(tmp_path: Path) -> None:
     [
         (summary(overlaps=2), "2 pairs of vehicles overlapped"),
         (summary(left=3), "2 of 5 vehicles did not leave the road"),
+        (summary(ending="interrupted"), "the run is not complete: interrupted"),
+        (summary(ending="limit"), "the run is not complete: limit"),
     ],
 )
 def test_a_broken_promise_fails_a_run(tmp_path: Path, found: dict[str, Any], problem: str) -> None:
@@ -108,9 +120,11 @@ def test_what_was_not_measured_is_a_dash(tmp_path: Path) -> None:
 
 
 def test_all_reasons_are_printed(tmp_path: Path) -> None:
-    text = printed(judge(tmp_path, summary(overlaps=1, left=4), problems=["the router [9] ended"]))
+    found = summary(overlaps=1, left=4, ending="limit")
+    text = printed(judge(tmp_path, found, problems=["the router [9] ended"]))
     assert [line for line in text.splitlines() if line.startswith("FAILED")] == [
         "FAILED: the router [9] ended",
         "FAILED: 1 pairs of vehicles overlapped",
+        "FAILED: the run is not complete: limit",
         "FAILED: 1 of 5 vehicles did not leave the road",
     ]

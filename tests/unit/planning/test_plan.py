@@ -4,7 +4,6 @@ import itertools
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -203,9 +202,10 @@ class TestDeadline:
         vehicles = tuple(VehicleRequest(f"v{i}", (i, 0), eligible=(i,)) for i in range(12))
         targets = tuple((11 - i, 0) for i in range(12))
         request = PlanRequest(Grid(40, 1), 1, ("node", "edge", "special-1"), vehicles, targets, 0.2)
-        response = plan(request, clock=time.process_time)
+        response = plan(request, clock=CountingClock())
         assert response.status == "timeout"
-        assert 200 - 5 <= response.solve_ms <= 200 + 50
+        # One look at the clock finds the deadline passed, and few more leave every loop.
+        assert 200 <= response.solve_ms <= 200 + 8
         assert response.lower_bound is not None
         assert response.lower_bound >= 72
 

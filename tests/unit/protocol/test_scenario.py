@@ -261,7 +261,9 @@ MISFITS: list[tuple[str, dict[str, Any]]] = [
     ("formation.move_s", {"runtime": {"tick_s": 1.0}}),
     ("formation.cycle_s", {"formation": {"cycle_s": 1.0, "move_s": 1.0}, "runtime": {"tick_s": 1}}),
     ("tracking.horizon_ticks", {"tracking": {"horizon_ticks": 37}}),
-    ("runtime.tick_deadline_s", {"runtime": {"tick_deadline_s": 0.2}}),
+    ("network.lease_s", {"runtime": {"tick_deadline_s": 0.99}}),
+    ("network.lease_s", {"network": {"lease_s": 2.1}}),
+    ("runtime.tick_deadline_s", {"network": {"lease_s": 0.2}, "runtime": {"tick_deadline_s": 0.2}}),
     ("runtime.tick_deadline_s", {"network": {"resend_s": 2.0}}),
 ]
 
@@ -282,6 +284,7 @@ def test_fields_that_do_not_fit_are_refused_by_name(field: str, data: dict[str, 
         {"formation": {"conflicts": ["geometric"]}},
         {"road": {"lanes": 1}},
         {"tracking": {"horizon_ticks": 38}},
+        {"network": {"lease_s": 2.0}},
         {"runtime": {"tick_s": 0.05}, "tracking": {"horizon_ticks": 76}},
         {"seed": 2**63 - 1},
         {"road": {}},

@@ -54,6 +54,8 @@ REALM = "r"
 KEYS = Keys(REALM)
 LEASE_S = 0.5
 WAIT_S = 10.0
+ASK_S = 3 * WAIT_S
+"""An answer that comes only when the question is given up comes too late for every test."""
 """Longest wait for what must come; what comes, comes in milliseconds."""
 QUIET_S = 0.15
 """How long to wait for what must not come (Zenoh, wall-clock)."""
@@ -303,7 +305,7 @@ class ZenohBed:
 
         def wait_for_answer() -> None:
             try:
-                answers.append(transport_ask(client, PLAN_SERVICE, payload, WAIT_S))
+                answers.append(transport_ask(client, PLAN_SERVICE, payload, ASK_S))
             except BadInputError:
                 answers.append(None)
 
@@ -608,11 +610,9 @@ def test_one_server_that_hangs_does_not_hold_back_the_others(bed: Bed) -> None:
         settle(bed, server)
     answers = bed.ask(b"?")
     bed.until(lambda: all(server.questions() for server in servers))
-    began_s = time.monotonic()
     servers[1].transport.answer(servers[1].questions()[0].token, b"!", ok=True)
-    bed.until(lambda: answers)
+    bed.until(lambda: answers)  # and the other one has not answered yet
     assert answers == [(b"!", True)]
-    assert time.monotonic() - began_s < WAIT_S / 2
     servers[0].transport.answer(servers[0].questions()[0].token, b"late", ok=True)
     bed.quiet()
     assert answers == [(b"!", True)]

@@ -1,0 +1,317 @@
+"""The bridge with real agents on the simulated network: faults, whole runs, the run after it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from laneweave.coordinator.core import CoordinatorCore
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.messages import Name
+from laneweave.protocol.simulated_network import Conditions
+from laneweave.sim_bridge.core import Phase
+from unit.sim_bridge.bench import (
+    Sleeper,
+    Street,
+    arrival,
+    make_scenario,
+    read_events,
+    read_summary,
+)
+
+LONG_ROAD = make_scenario(road={"lanes": 3, "s1_m": 20.0, "s2_m": 20.0, "s3_m": 400.0})
+SHORT_ROAD = make_scenario()
+TICK_S, LATTICE = LONG_ROAD.runtime.tick_s, LONG_ROAD.lattice
+BODY, LANE_M = LONG_ROAD.vehicle, LONG_ROAD.road.lane_width_m
+HOME: Cell = (-1, 1)
+"""Where vehicle A is: in the middle of its block, and of the road."""
+MOVE_TICK = 70
+MOVE_TICKS = round(LONG_ROAD.formation.move_s / TICK_S)
+PACE = 5.0
+"""A tick takes 20 ms, if everybody answers: hardly more than one that was missed."""
+PLAY_M = 0.5
+A, B = Name("A"), Name("B")
+
+MOVES: tuple[Cell, ...] = ((0, 1), (-2, 1), (-1, 2), (-1, 0), (0, 2), (-2, 0))
+
+
+@pytest.fixture
+def street(tmp_path: Path) -> Street:
+    """A and B will be on the road, of which A is about to move; B has a process."""
+    street = Street(LONG_ROAD, tmp_path, [arrival(A, 0.5, 1), arrival(B, 5.5, 0)], pace=PACE)
+    street.start_agents(B)
+    return street
+
+
+@pytest.fixture
+def agent(street: Street) -> Sleeper:
+    """The process of A, which is on the road."""
+    agent = street.start_agents(A)
+    street.run_to(40)
+    assert street.bridge.vehicles[A].controller.hold_cell == HOME
+    return agent
+
+
+def seen_in_cell(street: Street, first_tick: int = 1) -> list[tuple[float, float]]:
+    """Return where A was shown after each tick: m from its first cell along and across."""
+    column, lane = HOME
+    return [
+        (
+            poses[A][0] - LATTICE.cell_s_m(column, (index + 1) * TICK_S),
+            poses[A][1] - LATTICE.cell_y_m(lane),
+        )
+        for index, poses in enumerate(street.world.shown)
+        if A in poses and index + 1 >= first_tick
+    ]
+
+
+def way(target: Cell) -> tuple[float, float]:
+    return (target[0] - HOME[0]) * LATTICE.pitch_m, (target[1] - HOME[1]) * LANE_M
+
+
+def check_between_cells(street: Street, target: Cell) -> None:
+    """Check that A was always between its two cells, and its body in the lanes of both."""
+    along_m, across_m = way(target)
+    room_m = (LANE_M - BODY.width_m) / 2
+    for along, across in seen_in_cell(street):
+        assert min(along_m, 0.0) - PLAY_M <= along <= max(along_m, 0.0) + PLAY_M
+        play_m = min(PLAY_M, room_m)
+        assert min(across_m, 0.0) - play_m <= across <= max(across_m, 0.0) + play_m
+
+
+def check_arrived(street: Street, target: Cell) -> None:
+    assert seen_in_cell(street)[-1] == pytest.approx(way(target), abs=0.1)
+    assert street.bridge.vehicles[A].controller.hold_cell == target
+
+
+# --- an agent that sleeps ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("target", MOVES)
+@pytest.mark.parametrize("asleep_ticks", [25, 40, 60])
+def test_an_agent_that_slept_while_its_move_began_moves_from_where_the_body_is(
+    street: Street, agent: Sleeper, target: Cell, asleep_ticks: int
+) -> None:
+    """It answers all that it missed at once, as if it had moved at that time: nothing is played."""
+    street.order(A, target, MOVE_TICK * TICK_S)
+    street.run_to(MOVE_TICK - 10)
+    agent.asleep = True
+    street.run_to(MOVE_TICK - 10 + asleep_ticks)
+    assert seen_in_cell(street)[-1] == pytest.approx((0.0, 0.0), abs=1e-6)
+    agent.asleep = False
+    street.run_to(MOVE_TICK + 2 * asleep_ticks + 60)
+    check_between_cells(street, target)
+    check_arrived(street, target)
+    (silent,) = read_events(street.folder, "agent-silent")
+    assert silent["vehicle"] == A
+
+
+@pytest.mark.parametrize("target", [(0, 1), (-1, 2), (0, 2)])
+@pytest.mark.parametrize("asleep_ticks", [25, 40])
+def test_an_agent_that_slept_in_its_move_finds_the_body_further_on(
+    street: Street, agent: Sleeper, target: Cell, asleep_ticks: int
+) -> None:
+    street.order(A, target, MOVE_TICK * TICK_S)
+    street.run_to(MOVE_TICK + 10)
+    agent.asleep = True
+    street.run_to(MOVE_TICK + 10 + asleep_ticks)
+    agent.asleep = False
+    street.run_to(MOVE_TICK + 100)
+    check_between_cells(street, target)
+    check_arrived(street, target)
+    assert not street.agents[A]._execution.moving  # type: ignore[union-attr]
+
+
+def test_nobody_waits_long_for_an_agent_that_sleeps(street: Street, agent: Sleeper) -> None:
+    agent.asleep = True
+    began_s = street.network.now_s
+    street.run_to(140)
+    deadline_s = LONG_ROAD.runtime.tick_deadline_s
+    # It misses one deadline; for all the other ticks the pace of the run is kept.
+    assert street.network.now_s - began_s == pytest.approx(
+        100 * TICK_S / PACE + deadline_s, abs=0.3
+    )
+    agent.asleep = False
+    street.run_to(160)
+    assert street.bridge._silent == set()
+
+
+# --- an agent that dies -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("target", [(0, 1), (-1, 2), (-2, 0)])
+@pytest.mark.parametrize("restarts", [False, True])
+def test_the_move_of_an_agent_that_died_is_finished_and_held(
+    tmp_path: Path, street: Street, agent: Sleeper, target: Cell, *, restarts: bool
+) -> None:
+    assert not agent.asleep
+    undisturbed = Street(LONG_ROAD, tmp_path / "other", street.arrivals)
+    undisturbed.start_agents(A)
+    undisturbed.start_agents(B)
+    undisturbed.run_to(40)
+    for each in (undisturbed, street):
+        each.order(A, target, MOVE_TICK * TICK_S)
+        each.run_to(MOVE_TICK + 15)
+    street.network.kill("agent-A")
+    street.run_to(MOVE_TICK + 20)
+    if restarts:
+        street.start_agents(A)
+        street.run_to(MOVE_TICK + 25)
+        execution = street.agents[A]._execution
+        assert execution is not None
+        assert (execution.hold_cell, execution.moving, execution.plan) == (target, True, None)
+    for each in (undisturbed, street):
+        each.run_to(MOVE_TICK + MOVE_TICKS + 40)
+    for (along, across), expected in zip(
+        seen_in_cell(street), seen_in_cell(undisturbed), strict=False
+    ):
+        assert (along, across) == pytest.approx(expected, abs=0.1)
+    check_arrived(street, target)
+    assert (street.bridge.vehicles[A].controller.played_from_hold > 0) == (not restarts)
+    if restarts:
+        execution = street.agents[A]._execution
+        assert execution is not None
+        assert not execution.moving
+
+
+# --- whole runs -------------------------------------------------------------------------------
+
+MANY = tuple(
+    arrival(f"v{number:04d}", 1.3 * number + 0.2, number % 2, (number // 2) % 2)
+    for number in range(7)
+)
+"""Some of them want the other lane."""
+
+
+def check_complete(street: Street, folder: Path) -> None:
+    summary = read_summary(folder)
+    vehicles = summary["vehicles"]
+    assert summary["ending"] == "complete"
+    assert vehicles["left"] == vehicles["entered"] == vehicles["demanded"] == len(MANY)
+    assert summary["safety"]["overlaps"] == 0
+    bridge = street.bridge
+    for left_over in (bridge.vehicles, bridge._silent, bridge._awaited, bridge._at_entrance):
+        assert not left_over
+
+
+def check_all_gone(street: Street) -> None:
+    """Check that nothing is kept of vehicles that are no more."""
+    bridge = street.bridge
+    # The last one's token may vanish after its report, with which the run is over.
+    assert set(bridge._leaving) <= bridge._agents_up <= {MANY[-1].vehicle}
+    assert not bridge._unreported
+    for node in street.nodes:
+        assert not getattr(node.core, "_agents", None)
+
+
+@pytest.mark.parametrize("shards", [1, 2])
+def test_a_whole_run_counts_every_message_once(tmp_path: Path, shards: int) -> None:
+    """However many vehicles share a process, the summary says what all processes published."""
+    street = Street(SHORT_ROAD, tmp_path, MANY)
+    for index in range(shards):
+        street.start_shard(index, shards)
+    street.run()
+    check_complete(street, tmp_path)
+    summary = read_summary(tmp_path)
+    published = [node.published for node in street.nodes]
+    assert min(published) > 100
+    assert summary["messages"]["published"] == sum(published)
+    assert summary["messages"]["rejected"] == 0
+    assert summary["tracking"]["hold_law_ticks"] == 0
+    assert read_events(tmp_path, "agent-missing") == read_events(tmp_path, "agent-silent") == []
+
+
+def test_a_run_with_one_process_for_each_vehicle_counts_the_same(tmp_path: Path) -> None:
+    street = Street(SHORT_ROAD, tmp_path, MANY)
+    for vehicle in MANY:
+        street.start_agents(vehicle.vehicle)
+    street.run()
+    check_complete(street, tmp_path)
+    published = read_summary(tmp_path)["messages"]["published"]
+    assert published == sum(node.published for node in street.nodes)
+    assert all(node.ended for node in street.nodes)  # each when its vehicle had left
+
+
+def test_little_is_kept_of_vehicles_that_left(tmp_path: Path) -> None:
+    street = Street(SHORT_ROAD, tmp_path, MANY)
+    street.start_shard()
+    bridge, most = street.bridge, 0
+    ended_s: list[float] = []
+
+    def look() -> bool:
+        nonlocal most
+        most = max(most, len(bridge._leaving))
+        if bridge.phase is Phase.WIND_UP and not ended_s:
+            ended_s.append(street.network.now_s)
+        return bridge.phase is Phase.ENDED
+
+    street.run(look)
+    assert most == 1  # until its agent's token is gone, not for all the repeats
+    assert street.network.now_s - ended_s[0] < 0.1  # the reports were there: no waiting
+    check_all_gone(street)
+
+
+def test_a_bad_network_slows_a_run_down_and_nothing_else(tmp_path: Path) -> None:
+    conditions = Conditions(jitter_s=0.05, loss=0.1, duplication=0.1)
+    street = Street(SHORT_ROAD, tmp_path, MANY, conditions)
+    street.start_coordinators(2)
+    for index in range(2):
+        street.start_shard(index, 2)
+    street.run()
+    check_complete(street, tmp_path)
+    assert read_events(tmp_path, "agent-silent") == []
+
+
+def test_the_clock_does_not_race_while_the_bridge_is_off_the_network(tmp_path: Path) -> None:
+    street = Street(SHORT_ROAD, tmp_path, MANY)
+    street.bridge._tick_lasts_s = 1e-3  # as fast as everybody answers
+    street.start_shard()
+    street.run_to(60)
+    street.network.disconnect("bridge")
+    tick, began_s = street.bridge.tick, street.network.now_s
+    street.run(lambda: street.network.now_s >= began_s + 4.0)
+    assert street.bridge.tick - tick <= 4.0 / TICK_S + 1
+    street.network.reconnect("bridge")
+    street.run()
+    check_complete(street, tmp_path)
+
+
+# --- the next run -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("end_of_first", ["in good order", "killed"])
+def test_everybody_starts_afresh_with_the_next_bridge(tmp_path: Path, end_of_first: str) -> None:
+    """Its vehicles have the names of the last ones, and its road time begins at 0 again."""
+    street = Street(SHORT_ROAD, tmp_path / "first", MANY)
+    street.start_coordinators(2)
+    host = street.start_shard()
+    if end_of_first == "killed":
+        street.run_to(90)
+        assert len(street.bridge.vehicles) > 2
+        street.network.kill("bridge")
+    else:
+        street.run()
+        check_complete(street, tmp_path / "first")
+    street.network.run(street.network.now_s + 3.0)
+    old_agents = dict(street.agents)
+
+    street.start_bridge("next-bridge", tmp_path / "second")
+    street.run_to(20)
+    for node in street.nodes:
+        if isinstance(node.core, CoordinatorCore):
+            assert node.core.t_s <= street.bridge.t_s
+            assert node.core.census is not None
+            assert node.core.census.t_s <= street.bridge.t_s
+    assert host._agents
+    assert not set(map(id, host._agents.values())) & set(map(id, old_agents.values()))
+    street.run()
+
+    check_complete(street, tmp_path / "second")
+    check_all_gone(street)
+    summary = read_summary(tmp_path / "second")
+    assert summary["planning"]["plans"] > 0
+    assert summary["vehicles"]["on_preferred_lane"] == len(MANY)
+    assert summary["tracking"]["hold_law_ticks"] == 0
+    assert read_events(tmp_path / "second", "agent-missing") == []
+    assert read_events(tmp_path / "second", "agent-silent") == []

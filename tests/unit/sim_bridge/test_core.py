@@ -1,0 +1,527 @@
+"""The bridge's tick, step by step, and the beginning and end of a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from laneweave.protocol.messages import Census, Command, Name, Report, RoadClock, Sense
+from laneweave.protocol.node import (
+    Announce,
+    Arrived,
+    Event,
+    Listen,
+    PeerDown,
+    Send,
+    Stopping,
+    Wakeup,
+    Watch,
+)
+from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.topics import (
+    BRIDGE_ALIVE,
+    COMMAND,
+    COORDINATOR_ALIVE,
+    EVENT,
+    HEARTBEAT,
+    REPORT,
+    VEHICLE_ALIVE,
+)
+from laneweave.protocol.transport import LinkDown, LinkUp
+from laneweave.sim_bridge.core import LEFT_REPEATS, WIND_UP_S, Phase
+from laneweave.sim_bridge.overlap import pose_of
+from unit.sim_bridge.bench import (
+    Desk,
+    arrival,
+    asked,
+    ended,
+    jerks,
+    make_scenario,
+    read_events,
+    read_summary,
+    sent,
+)
+
+SCENARIO = make_scenario()
+TICK_S, RESEND_S = SCENARIO.runtime.tick_s, SCENARIO.network.resend_s
+DEADLINE_S, PATIENCE_S = SCENARIO.runtime.tick_deadline_s, SCENARIO.runtime.agent_start_s
+A, B = Name("A"), Name("B")
+TWO = (arrival(A, 0.5, lane=1), arrival(B, 0.6, lane=0))
+"""A enters at 1 s, B at 2 s: when the first free cells pass that are in the structure."""
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Desk:
+    """Two vehicles have just entered, and both agents have been asked."""
+    desk = Desk(SCENARIO, tmp_path, TWO)
+    desk.start(A, B)
+    desk.drive_to_entry(A, B)
+    desk.effects.clear()
+    return desk
+
+
+def record_of(desk: Desk, vehicle: Name) -> tuple[object, ...]:
+    """Return all that a motion controller knows."""
+    controller = desk.core.vehicles[vehicle].controller
+    return (
+        controller.command_tick,
+        controller.hold_cell,
+        controller.motion_origin,
+        controller.motion_end_tick,
+        controller._jerks.tobytes(),
+    )
+
+
+# --- the beginning ----------------------------------------------------------------------------
+
+
+def test_start(tmp_path: Path) -> None:
+    desk = Desk(SCENARIO, tmp_path, TWO)
+    effects = desk.start()
+    assert effects[:6] == [
+        Listen(COMMAND),
+        Listen(EVENT),
+        Listen(REPORT),
+        Listen(HEARTBEAT),
+        Watch(VEHICLE_ALIVE),
+        Announce(BRIDGE_ALIVE, {"incarnation": 0}),
+    ]
+    clock, census = (send.message for send in effects[6:] if isinstance(send, Send))
+    assert (clock.tick, clock.t_s, clock.on_road, clock.ended) == (0, 0.0, 0, False)
+    assert [one.vehicle for one in census.announced] == [A, B]
+    assert (desk.core.phase, desk.core.tick) == (Phase.PACE, 1)  # nobody had to be waited for
+
+
+def test_the_census_is_sent_on_changes_and_now_and_then(tmp_path: Path) -> None:
+    scenario = make_scenario(runtime={"announce_s": 1.0})
+    desk = Desk(scenario, tmp_path, [arrival(A, 4.05)])
+    desk.start(A)
+    desk.drive_to_entry(A)
+    sent_at = [round(census.t_s / TICK_S) for census in sent(desk.effects, Census)]
+    assert sent_at == [0, 10, 20, 30, 31, 41, 51, 60]  # announced at 3.1 s, entered at 6.0 s
+    assert [e.vehicle for e in sent(desk.effects, Census)[-1].on_road] == [A]
+
+
+# --- lockstep ---------------------------------------------------------------------------------
+
+
+def test_a_tick_ends_when_all_have_answered(desk: Desk) -> None:
+    tick = desk.core.tick
+    assert desk.answer(B) == []
+    assert desk.core.tick == tick
+    assert desk.answer(A) == []  # the next tick is not due yet
+    assert (desk.core.phase, desk.core.tick) == (Phase.PACE, tick + 1)
+    assert desk.world.positions() == {
+        name: pose_of(vehicle.state) for name, vehicle in desk.core.vehicles.items()
+    }
+    effects = desk.wake()
+    assert [type(effect.message) for effect in effects if isinstance(effect, Send)] == [
+        RoadClock,
+        Sense,
+        Sense,
+    ]
+    assert asked(effects) == [A, B]
+    for sense in sent(effects, Sense):
+        assert sense.tick == tick + 1
+        assert sense.state == desk.world.at[sense.vehicle]
+
+
+def test_the_answers_are_played_from_this_tick_on(desk: Desk) -> None:
+    before = {name: desk.core.vehicles[name].state for name in (A, B)}
+    desk.answer(A, jerks=jerks((2.0, 0.0), (-3.0, 1.0)))
+    desk.answer(B)
+    assert desk.core.vehicles[A].state[2] == pytest.approx(before[A][2] + 2.0 * TICK_S)
+    assert desk.core.vehicles[B].state[2] == before[B][2]
+
+
+def test_ticks_keep_the_pace_and_do_not_make_up_for_lost_time(desk: Desk) -> None:
+    opened_s = desk.now_s
+    desk.drive_to(desk.core.tick + 1)
+    assert desk.now_s == pytest.approx(opened_s + TICK_S)
+    desk.now_s += 3.3 * TICK_S
+    desk.answer(A)
+    desk.answer(B)
+    assert desk.core.wakeup_s == desk.now_s  # late: at once, but
+    desk.wake()
+    late_s = desk.now_s
+    desk.drive_to(desk.core.tick + 1)
+    assert desk.now_s == pytest.approx(late_s + TICK_S)  # only one
+
+
+def test_everybody_sees_who_is_ahead(tmp_path: Path) -> None:
+    desk = Desk(SCENARIO, tmp_path, [arrival(A, 0.1), arrival(B, 2.1)])
+    desk.start(A, B)
+    desk.drive_to_entry(B)
+    desk.answer(A)
+    desk.answer(B)
+    senses = {sense.vehicle: sense for sense in sent(desk.wake(), Sense)}
+    assert senses[A].ahead == ()
+    ((lane, gap_m, speed_mps),) = [(n.lane, n.gap_m, n.speed_mps) for n in senses[B].ahead]
+    assert (lane, speed_mps) == (0, 15.0)
+    assert gap_m == pytest.approx(30.0 - SCENARIO.vehicle.length_m)
+
+
+# --- who does not answer ----------------------------------------------------------------------
+
+
+def test_who_has_not_answered_is_asked_again_and_nobody_else(desk: Desk) -> None:
+    began_s, tick = desk.now_s, desk.core.tick
+    desk.answer(A)
+    for times in (1, 2, 3):
+        assert desk.core.wakeup_s == pytest.approx(began_s + times * RESEND_S)
+        effects = desk.wake()
+        assert asked(effects) == [B]
+        assert len(effects) == 1
+        assert sent(effects, Sense)[0].tick == tick
+    desk.answer(B)
+    assert desk.core.tick == tick + 1
+
+
+def test_nobody_is_asked_again_too_early(desk: Desk) -> None:
+    desk.now_s += 0.99 * RESEND_S
+    assert desk.give(Wakeup()) == []
+
+
+def test_after_the_deadline_the_bridge_goes_on_without(desk: Desk) -> None:
+    began_s, tick = desk.now_s, desk.core.tick
+    desk.answer(A)
+    desk.drive(lambda: desk.core.tick > tick, B)
+    assert desk.now_s == pytest.approx(began_s + DEADLINE_S)
+    (event,) = read_events(desk.folder, "agent-silent")
+    assert (event["vehicle"], event["t_s"]) == (B, pytest.approx(tick * TICK_S))
+    # Everybody is still asked, but nobody waits for the silent one any more.
+    began_s = desk.now_s
+    desk.effects.clear()
+    desk.drive_to(tick + 6, B)
+    assert desk.now_s <= began_s + 6 * TICK_S
+    assert asked(desk.effects).count(B) == asked(desk.effects).count(A) == 6
+    assert len(read_events(desk.folder, "agent-silent")) == 1
+
+
+def test_a_late_answer_ends_the_silence_and_does_nothing_else(desk: Desk) -> None:
+    tick = desk.core.tick
+    late = desk.command(B, hold_cell=(-1, 0), jerks=jerks((5.0, 5.0), ticks=40))
+    desk.answer(A)
+    desk.drive(lambda: desk.core.tick > tick, B)
+    desk.drive_to(tick + 3)
+    known = record_of(desk, B)
+    assert desk.give(Arrived(COMMAND, {"vehicle": B}, late)) == []
+    assert record_of(desk, B) == known
+    desk.answer(A)  # this tick had not asked it to be waited for
+    desk.wake()
+    assert desk.core._awaited == {A, B}
+
+
+@pytest.mark.parametrize("apart", [-5, -1, 1, 5, 2**62])
+def test_an_answer_to_another_tick_changes_nothing(desk: Desk, apart: int) -> None:
+    known, tick = record_of(desk, A), desk.core.tick
+    moving = {"hold_cell": (-1, 0), "motion_end_tick": tick + 9, "motion_origin": (-1, 0)}
+    desk.answer(A, tick=tick + apart, jerks=jerks((9.0, 9.0), ticks=9), **moving)
+    assert record_of(desk, A) == known
+    assert desk.core._awaited == {A, B}
+
+
+def test_an_answer_between_two_ticks_changes_nothing(desk: Desk) -> None:
+    desk.answer(A)
+    desk.answer(B)
+    assert desk.core.phase is Phase.PACE
+    known = record_of(desk, A)
+    early = desk.command(A, hold_cell=(-1, 0), jerks=jerks((9.0, 9.0), ticks=9))
+    assert early.tick == desk.core.tick  # nobody has been asked about it yet
+    desk.give(Arrived(COMMAND, {"vehicle": A}, early))
+    assert record_of(desk, A) == known
+    desk.wake()
+    assert desk.core._awaited == {A, B}
+
+
+def test_the_first_answer_to_a_tick_counts(desk: Desk) -> None:
+    desk.answer(A)
+    known = record_of(desk, A)
+    desk.answer(A, jerks=jerks((9.0, 0.0)))
+    assert record_of(desk, A) == known
+
+
+def test_an_answer_that_makes_no_sense_is_none(desk: Desk) -> None:
+    known = record_of(desk, A)
+    for name, nonsense in (
+        ("jerks", b"123"),
+        ("jerks", jerks((float("nan"), 0.0))),
+        ("hold_cell", (0, 7)),
+    ):
+        desk.answer(A, **{name: nonsense})
+        assert record_of(desk, A) == known
+        assert desk.core._awaited == {A, B}
+    desk.answer(A)
+    assert desk.core._awaited == {B}
+
+
+def test_answers_for_nobody_are_ignored(desk: Desk) -> None:
+    ghost = Command(Name("ghost"), desk.core.tick, (0, 0), 0, (0, 0), b"")
+    assert desk.give(Arrived(COMMAND, {"vehicle": "ghost"}, ghost)) == []
+
+
+def test_a_dead_agent_is_not_waited_for(desk: Desk) -> None:
+    tick = desk.core.tick
+    desk.answer(A)
+    desk.down(B)
+    assert desk.core.tick == tick + 1
+    desk.wake()
+    assert desk.core._awaited == {A}
+    desk.up(B)  # another one: from the next tick on
+    desk.answer(A)
+    desk.wake()
+    assert desk.core._awaited == {A, B}
+    assert read_events(desk.folder, "agent-silent") == []
+
+
+def test_a_new_agent_of_a_silent_one_is_waited_for(desk: Desk) -> None:
+    tick = desk.core.tick
+    desk.drive(lambda: desk.core.tick > tick, B)
+    desk.drive_to(tick + 1)
+    assert desk.core._awaited == {A}
+    desk.down(B)
+    desk.up(B)
+    desk.answer(A)
+    desk.wake()
+    assert desk.core._awaited == {A, B}
+
+
+# --- the entrance -----------------------------------------------------------------------------
+
+
+def test_the_entrance_waits_for_agents(tmp_path: Path) -> None:
+    desk = Desk(SCENARIO, tmp_path, TWO)
+    desk.start(A)
+    desk.drive(lambda: desk.core.phase is Phase.AGENTS)
+    tick, opened_s = desk.core.tick, desk.now_s
+    assert desk.core.wakeup_s == opened_s + PATIENCE_S
+    desk.now_s += 0.9 * PATIENCE_S
+    assert desk.give(Wakeup()) == []
+    assert asked(desk.up(B)) == [A, B]
+    assert desk.core.tick == tick
+    assert read_events(tmp_path, "agent-missing") == []
+
+
+def test_the_entrance_gives_up_once_and_has_little_patience_until_somebody_comes(
+    tmp_path: Path,
+) -> None:
+    """A deployment without agents must not take fifteen seconds for each vehicle."""
+    names = [f"v{number}" for number in range(5)]
+    desk = Desk(SCENARIO, tmp_path, [arrival(n, 2.0 * k + 0.1) for k, n in enumerate(names)])
+    desk.start()
+    waited = []
+    for name in names:
+        desk.drive(lambda: desk.core.phase is Phase.AGENTS)
+        opened_s = desk.now_s
+        if name == "v2":
+            desk.now_s += 0.5 * RESEND_S
+            desk.up("v2")
+        else:
+            desk.wake()
+        assert Name(name) in desk.core.vehicles
+        waited.append(desk.now_s - opened_s)
+        desk.drive(lambda: desk.core.phase is Phase.PACE)
+    assert waited == pytest.approx([PATIENCE_S, RESEND_S, 0.5 * RESEND_S, PATIENCE_S, RESEND_S])
+    missing = [event["vehicle"] for event in read_events(tmp_path, "agent-missing")]
+    assert missing == ["v0", "v1", "v3", "v4"]
+
+
+# --- leaving ----------------------------------------------------------------------------------
+
+
+def test_a_vehicle_that_left_is_told_so_until_its_agent_is_gone(tmp_path: Path) -> None:
+    desk = Desk(SCENARIO, tmp_path, [arrival(A, 0.5), arrival(B, 8.5)])
+    desk.start(A, B)
+    desk.drive(lambda: A in desk.core.vehicles)
+    desk.drive(lambda: A not in desk.core.vehicles)
+    assert B in desk.core.vehicles
+    desk.effects.clear()
+    desk.drive_to(desk.core.tick + 2)
+    assert [sense.vehicle for sense in sent(desk.effects, Sense) if sense.left] == [A] * 3
+    desk.down(A)
+    desk.effects.clear()
+    desk.drive_to(desk.core.tick + 2)
+    assert not any(sense.left for sense in sent(desk.effects, Sense))
+    assert desk.core._leaving == {}
+
+
+def test_a_vehicle_that_left_is_not_told_for_ever(tmp_path: Path) -> None:
+    desk = Desk(SCENARIO, tmp_path, [arrival(A, 0.5), arrival(B, 8.5)])
+    desk.start(A, B)
+    desk.drive(lambda: desk.core.phase is Phase.WIND_UP)
+    told = [sense.vehicle for sense in sent(desk.effects, Sense) if sense.left]
+    assert told.count(A) == LEFT_REPEATS
+    assert told.count(B) == 1  # it was the last one
+    assert A not in desk.core._leaving
+
+
+# --- the end ----------------------------------------------------------------------------------
+
+
+def wound_up(tmp_path: Path, scenario: Scenario = SCENARIO) -> Desk:
+    desk = Desk(scenario, tmp_path, TWO)
+    desk.start(A, B)
+    desk.drive(lambda: desk.core.phase is Phase.WIND_UP)
+    return desk
+
+
+def test_the_end_is_said_to_everybody(tmp_path: Path) -> None:
+    desk = wound_up(tmp_path)
+    clocks = sent(desk.effects, RoadClock)
+    assert [clock.ended for clock in clocks] == [False] * (len(clocks) - 1) + [True]
+    assert (clocks[-1].demanded, clocks[-1].entered, clocks[-1].left) == (2, 2, 2)
+    assert sent(desk.effects, Census)[-1].on_road == ()
+    assert isinstance(sent(desk.effects[-1:], Report)[0], Report)  # last: it counts all before
+
+
+def test_winds_up_until_all_have_reported(tmp_path: Path) -> None:
+    desk = wound_up(tmp_path)
+    ends_s = desk.now_s + WIND_UP_S
+    assert desk.core.wakeup_s == ends_s
+    assert desk.report("agent", A) == []
+    assert desk.report_own() == []
+    assert desk.report("coordinator", B) == []  # another role of that name
+    assert desk.core.wakeup_s == ends_s
+    assert ended(desk.report("agent", B))
+    assert desk.core.phase is Phase.ENDED
+    assert desk.now_s < ends_s
+    assert desk.core.wakeup_s is None
+    assert read_summary(tmp_path)["ending"] == "complete"
+
+
+def test_reports_about_vehicles_of_an_earlier_run_do_not_count(tmp_path: Path) -> None:
+    """A host that finds a new bridge lets its old vehicles go, whose names are used again."""
+    desk = Desk(SCENARIO, tmp_path, TWO)
+    desk.start(A, B)
+    for name in (A, B, "v0099"):
+        desk.report("agent", name, solves=1000)
+    desk.drive(lambda: desk.core.phase is Phase.WIND_UP)
+    desk.report_own()
+    desk.report("agent", A, solves=1)
+    assert desk.core.phase is Phase.WIND_UP
+    assert ended(desk.report("agent", B, solves=2))
+    assert read_summary(tmp_path)["tracking"]["solves"] == 3
+
+
+def test_does_not_wind_up_for_ever(tmp_path: Path) -> None:
+    desk = wound_up(tmp_path)
+    desk.report("agent", A)
+    began_s = desk.now_s
+    assert ended(desk.wake())
+    assert desk.now_s == began_s + WIND_UP_S
+    assert read_summary(tmp_path)["ending"] == "complete"
+
+
+def test_reports_are_awaited_of_agents_that_came_late_and_of_no_others(tmp_path: Path) -> None:
+    desk = Desk(SCENARIO, tmp_path, TWO)
+    desk.start()
+    desk.drive(lambda: desk.core.tick >= 40)
+    desk.up(B)
+    desk.drive(lambda: desk.core.phase is Phase.WIND_UP)
+    desk.report_own()
+    assert desk.core.phase is Phase.WIND_UP
+    assert ended(desk.report("agent", B))
+
+
+def test_a_run_that_is_stopped_was_interrupted(desk: Desk) -> None:
+    desk.give(Stopping())
+    assert desk.core.phase is Phase.ENDED
+    assert desk.core.wakeup_s is None
+    found = read_summary(desk.folder)
+    assert found["ending"] == "interrupted"
+    assert (found["vehicles"]["entered"], found["vehicles"]["left"]) == (2, 0)
+    (event,) = read_events(desk.folder, "run-ended")
+    assert event["ending"] == "interrupted"
+    assert desk.give(Wakeup()) == []
+
+
+def test_a_run_that_is_stopped_while_it_winds_up_is_complete_all_the_same(tmp_path: Path) -> None:
+    desk = wound_up(tmp_path)
+    desk.give(Stopping())
+    assert read_summary(tmp_path)["ending"] == "complete"
+
+
+def test_a_run_ends_at_the_limit(tmp_path: Path) -> None:
+    scenario = make_scenario(runtime={"max_road_s": 5.0})
+    desk = wound_up(tmp_path, scenario)
+    assert desk.core.t_s == 5.0
+    # Who is on the road will not be driven any further.
+    assert {sense.vehicle for sense in sent(desk.effects, Sense) if sense.left} == {A, B}
+    desk.wake()
+    assert read_summary(tmp_path)["ending"] == "limit"
+
+
+def test_a_run_that_is_over_at_the_limit_is_complete(tmp_path: Path) -> None:
+    over_s = wound_up(tmp_path / "first").core.t_s
+    scenario = make_scenario(runtime={"max_road_s": over_s})
+    wound_up(tmp_path / "second", scenario).wake()
+    assert read_summary(tmp_path / "second")["ending"] == "complete"
+
+
+def test_nothing_is_left_over_at_the_end(tmp_path: Path) -> None:
+    desk = Desk(SCENARIO, tmp_path, [*TWO, arrival("C", 3.0)])
+    desk.start(A, B, "C")
+    desk.drive(lambda: desk.core.tick > 60, B)
+    assert desk.core._silent == {B}
+    desk.drive(lambda: desk.core.phase is Phase.WIND_UP, B)
+    for name in (A, B, "C"):
+        desk.report("agent", name)
+        desk.down(name)
+    desk.report_own()
+    core = desk.core
+    assert core.phase is Phase.ENDED
+    for left_over in (
+        *(core.vehicles, core._leaving, core._silent, core._awaited, core._at_entrance),
+        *(core._agents_up, core._unreported, desk.world.at),
+    ):
+        assert not left_over
+
+
+def test_a_run_without_vehicles_ends(tmp_path: Path) -> None:
+    desk = Desk(SCENARIO, tmp_path, [])
+    desk.start()
+    assert desk.core.phase is Phase.WIND_UP
+    assert ended(desk.report_own())
+    assert read_summary(tmp_path)["vehicles"]["demanded"] == 0
+
+
+# --- the link ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("first", ["link", "tokens"])
+def test_the_clock_does_not_race_while_the_network_is_away(tmp_path: Path, first: str) -> None:
+    desk = Desk(SCENARIO, tmp_path, TWO, pace=1000.0)
+    desk.start(A, B)
+    desk.drive_to_entry(A, B)
+    news: list[Event] = [LinkDown()]
+    news += [PeerDown(VEHICLE_ALIVE, {"vehicle": name}) for name in (A, B)]
+    for event in news if first == "link" else reversed(news):
+        desk.give(event)
+    began_s, tick = desk.now_s, desk.core.tick
+    desk.drive(lambda: desk.now_s >= began_s + 3.0, A, B)
+    passed = desk.core.tick - tick
+    assert 5 <= passed <= 3.0 / TICK_S + 1
+    desk.give(LinkUp())
+    for name in (A, B):
+        desk.up(name)
+    tick = desk.core.tick
+    desk.drive_to(tick + 3)
+    assert desk.core._awaited == {A, B}
+    began_s = desk.now_s
+    desk.drive_to(tick + 10)
+    assert desk.now_s < began_s + 0.1  # as fast as it may
+
+
+def test_tokens_that_vanish_with_the_link_are_not_believed(desk: Desk) -> None:
+    desk.give(LinkDown())
+    desk.down(A)
+    assert desk.core._awaited == {A, B}
+    desk.give(LinkUp())
+    desk.down(A)
+    assert desk.core._awaited == {B}
+
+
+def test_other_tokens_are_nothing_to_it(desk: Desk) -> None:
+    desk.give(PeerDown(COORDINATOR_ALIVE, {"coordinator": A, "incarnation": "1"}))
+    assert desk.core._awaited == {A, B}
