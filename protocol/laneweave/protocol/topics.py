@@ -51,8 +51,8 @@ class Topic:
         return tuple(re.findall(r"{(\w+)}", self.pattern))
 
 
-CLOCK = Topic("clock", "clock", messages.RoadClock, "bridge", Quality.LOCKSTEP)
-CENSUS = Topic("census", "census", messages.Census, "bridge", Quality.ASSURED)
+CLOCK = Topic("clock", "clock", messages.RoadClock, "bridge", Quality.LATEST)
+CENSUS = Topic("census", "census", messages.Census, "bridge", Quality.LATEST)
 SENSE = Topic("sense", "sense/{vehicle}", messages.Sense, "bridge", Quality.LOCKSTEP)
 COMMAND = Topic("command", "command/{vehicle}", messages.Command, "vehicle", Quality.LOCKSTEP)
 STATE = Topic(

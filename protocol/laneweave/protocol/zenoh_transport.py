@@ -67,14 +67,22 @@ _QUALITY: dict[Quality, dict[str, Any]] = {
 }
 
 
+DROP_AFTER_US = 50
+
+
 def _config(mode: str, lease_s: float) -> zenoh.Config:
     config = zenoh.Config()
+    congestion = "transport/link/tx/queue/congestion_control"
     for path, value in (
         ("mode", mode),
         ("scouting/multicast/enabled", False),
         ("scouting/gossip/enabled", False),
         ("transport/link/tx/lease", int(lease_s * 1000)),
         ("transport/shared_memory/enabled", False),
+        # A client that hangs fills its buffers. Whoever waits for room in them waits for less than
+        # a lease, or everybody would give everybody up; who may drop, drops at once.
+        (f"{congestion}/block/wait_before_close", int(lease_s * 1e6 / 3)),
+        (f"{congestion}/drop/wait_before_drop", DROP_AFTER_US),
     ):
         config.insert_json5(path, json.dumps(value))
     return config
