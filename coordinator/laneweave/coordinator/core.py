@@ -126,7 +126,7 @@ class CoordinatorCore:
             case Arrived(_, _, message):
                 self._on_message(message, now_s)
             case PeerUp(topic, parameters) if topic is COORDINATOR_ALIVE:
-                self.election.on_token_up(*_identity(parameters), now_s)
+                self._meet_candidate(*_identity(parameters), now_s)
             case PeerDown(topic, parameters) if topic is COORDINATOR_ALIVE:
                 self.election.on_token_down(*_identity(parameters))
             case PeerUp(topic, parameters) if topic is BRIDGE_ALIVE:
@@ -155,6 +155,12 @@ class CoordinatorCore:
             COORDINATOR_ALIVE, {"coordinator": self.name, "incarnation": self._incarnation}
         )
         yield Serve(SERVICE)
+
+    def _meet_candidate(self, name: str, incarnation: int, now_s: float) -> None:
+        if name == self.name and incarnation != self._incarnation:
+            # Harmless for safety, but both would lead: nobody outranks the other.
+            log.warning("another coordinator has the same name", coordinator=name)
+        self.election.on_token_up(name, incarnation, now_s)
 
     def _meet_bridge(self, incarnation: int) -> None:
         """Forget the road of an earlier bridge: the clock of a new one begins at 0."""

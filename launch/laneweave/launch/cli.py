@@ -7,6 +7,7 @@ that names the field, the value and what is allowed.
 from __future__ import annotations
 
 import json
+import re
 import signal
 import sys
 import time
@@ -80,7 +81,9 @@ def run(
     duration: Annotated[
         float | None, typer.Option("--duration", help="Seconds during which vehicles arrive.")
     ] = None,
-    method: Annotated[Method, typer.Option("--method")] = Method.formation,
+    method: Annotated[
+        Method, typer.Option("--method", help="How vehicles are controlled.")
+    ] = Method.formation,
     vehicles_per_process: Annotated[
         int | None, typer.Option("--vehicles-per-process", help="Agents that share a process.")
     ] = None,
@@ -98,7 +101,7 @@ def run(
         float | None,
         typer.Option("--pace", help="Most road seconds per second; default: runtime.max_pace."),
     ] = None,
-    no_progress: Annotated[bool, typer.Option("--no-progress")] = False,
+    no_progress: Annotated[bool, typer.Option("--no-progress", help="Show no bar.")] = False,
 ) -> None:
     """Run a scenario on this machine and write its folder."""
     # As Ctrl-C: files are completed and temporary folders removed.
@@ -130,9 +133,9 @@ def run(
         ).run()
     else:
         outcome = LocalRun(settings, folder, method.value, plan_of_faults, show, pace).run()
+    print_outcome(outcome, Console())
     if outcome.summary is not None:
         _draw(folder)
-    print_outcome(outcome, Console())
     raise typer.Exit(outcome.exit_status)
 
 
@@ -213,7 +216,8 @@ def agent(
         run_agents(settings, vehicles)
         return
     index, _, count = shard.partition("/")
-    if not (index.isdecimal() and count.isdecimal() and int(index) < int(count)):
+    digits = index.isdecimal() and count.isdecimal() and len(shard) < 20
+    if not digits or int(index) >= int(count):
         raise BadInputError("--shard", shard, "I/N with 0 <= I < N")
     run_agents(settings, (), Shard(int(index), int(count)))
 
@@ -237,9 +241,9 @@ def bridge(
     settings = _deployment(config, endpoint)
     folder = _new_folder(out, settings, Method.formation.value)
     run_bridge(settings, folder, Method.formation.value, pace)
-    _draw(folder)
     outcome = complete_summary(folder, problems=())
     print_outcome(outcome, Console())
+    _draw(folder)
     # A role that was asked to end did what it was asked, however far the run had come.
     asked_to_end = outcome.summary is not None and outcome.summary["ending"] == "interrupted"
     broken = outcome.summary is None or outcome.summary["safety"]["overlaps"]
@@ -292,7 +296,7 @@ def bench(
         table = benchmarks.planner_table(rows)
     else:
         counts = vehicles.split(",")
-        if not all(count.isdecimal() and 1 <= int(count) <= 200 for count in counts):
+        if not all(re.fullmatch(r"[1-9][0-9]?|1[0-9][0-9]|200", count) for count in counts):
             raise BadInputError("--vehicles", vehicles, "numbers from 1 to 200 with commas between")
         rows = [
             benchmarks.bench_runtime(
@@ -341,6 +345,10 @@ def _new_folder(out: Path | None, settings: Scenario, method: str) -> Path:
         out.mkdir(parents=True, exist_ok=True)
         if any(out.iterdir()):
             raise BadInputError("--out", str(out), "a new or empty folder")
+        # Two runs that begin at the same time: the second one fails here.
+        (out / "log.jsonl").touch(exist_ok=False)
+    except FileExistsError as error:
+        raise BadInputError("--out", str(out), "a new or empty folder") from error
     except OSError as error:
         raise BadInputError("--out", str(out), f"a folder ({error.strerror})") from error
     return out
@@ -350,9 +358,12 @@ def _draw(folder: Path) -> None:
     from laneweave.launch.figures import speed_heatmap, travel_time_boxplot
     from laneweave.launch.snapshots import road_snapshots
 
-    travel_time_boxplot([folder], folder / "travel_time.png")
-    speed_heatmap(folder, folder / "speed.png")
-    road_snapshots(folder, folder / "road.png")
+    try:
+        travel_time_boxplot([folder], folder / "travel_time.png")
+        speed_heatmap(folder, folder / "speed.png")
+        road_snapshots(folder, folder / "road.png")
+    except OSError as error:
+        raise CommandFailedError(f"{folder}: pictures not drawn: {error}") from error
 
 
 def main() -> None:

@@ -11,6 +11,10 @@ if TYPE_CHECKING:
     from laneweave.protocol.scenario import Scenario
 
 
+LEAST_GAP_M = 1.0
+"""Between bumpers of neighbouring cells: bodies turn to change lanes, and track with some error."""
+
+
 def check_scenario(scenario: Scenario) -> None:
     """Check how the fields fit together.
 
@@ -59,11 +63,14 @@ def _check_lanes(scenario: Scenario) -> None:
 
 def _check_motion(scenario: Scenario) -> None:
     formation, vehicle, road = scenario.formation, scenario.vehicle, scenario.road
+    min_gap_m = scenario.tracking.min_gap_m
+    least_pitch_m = vehicle.length_m + max(min_gap_m, LEAST_GAP_M)
     _require(
-        formation.gap_m > vehicle.length_m,
+        formation.gap_m >= least_pitch_m,
         "formation.gap_m",
         formation.gap_m,
-        f"longer than vehicle.length_m = {vehicle.length_m:g}",
+        f"at least {least_pitch_m:g}: vehicle.length_m = {vehicle.length_m:g} and between two "
+        f"bumpers tracking.min_gap_m = {min_gap_m:g}, at least {LEAST_GAP_M:g}",
     )
     _require(
         formation.move_s <= formation.cycle_s,

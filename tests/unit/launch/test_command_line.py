@@ -34,9 +34,12 @@ def test_a_new_folder_tells_what_is_in_it(tmp_path: Path, monkeypatch: pytest.Mo
     assert all(folder.is_dir() for folder in folders)
 
 
-def test_an_empty_folder_will_do(tmp_path: Path) -> None:
-    assert cli._new_folder(tmp_path / "a" / "b", Scenario(), "formation").is_dir()
-    assert cli._new_folder(tmp_path / "a" / "b", Scenario(), "formation").is_dir()
+def test_an_empty_folder_will_do_once(tmp_path: Path) -> None:
+    out = tmp_path / "a" / "b"
+    out.mkdir(parents=True)
+    assert cli._new_folder(out, Scenario(), "formation").is_dir()
+    with pytest.raises(BadInputError, match="a new or empty folder"):
+        cli._new_folder(out, Scenario(), "formation")
 
 
 def test_a_folder_with_something_in_it_will_not(tmp_path: Path) -> None:

@@ -41,7 +41,7 @@ def summary(
             "largest_formation": 3,
             "solve_ms": dict.fromkeys(("p50", "p95", "max"), measured),
         },
-        "tracking": {"solve_ms": dict.fromkeys(("p50", "p99"), measured)},
+        "tracking": {"hold_law_ticks": 0, "solve_ms": dict.fromkeys(("p50", "p99"), measured)},
         "runtime": {
             "real_time_factor": 2.0,
             "processes": 1,

@@ -32,7 +32,8 @@ AWKWARD = {
 LONG_TICKS = {
     "demand": {"volume_veh_per_lane_h": 3600, "min_headway_s": 0.1, "duration_s": 120},
     "formation": {"gap_m": 5.5, "speed_mps": 50, "move_s": 4.0},
-    "vehicle": {"max_speed_mps": 60, "length_m": 5.0},
+    "vehicle": {"max_speed_mps": 60, "length_m": 4.0},
+    "tracking": {"min_gap_m": 1.0},
     "road": {"s3_m": 1000},
     "runtime": {"tick_s": 1.0},
 }

@@ -65,7 +65,9 @@ class RelativePathMap:
         """Return the table as text; columns are headed by the time point, from 1."""
         cells = [[f"({c},{lane})" for c, lane in row] for row in self.rows]
         header = ["Vehicle ID", *(f"step {k + 1}" for k in range(self.steps + 1))]
-        table = [header, *([name, *row] for name, row in zip(self.ids, cells, strict=True))]
+        # Ids come from anywhere; nothing in them may break the table or talk to the terminal.
+        ids = ["".join(c if c.isprintable() else "?" for c in name) for name in self.ids]
+        table = [header, *([name, *row] for name, row in zip(ids, cells, strict=True))]
         widths = [max(len(line[k]) for line in table) for k in range(len(header))]
         return "\n".join(
             "  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip()
