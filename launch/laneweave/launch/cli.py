@@ -135,7 +135,7 @@ def run(
         outcome = LocalRun(settings, folder, method.value, plan_of_faults, show, pace).run()
     print_outcome(outcome, Console())
     if outcome.summary is not None:
-        _draw(folder)
+        _draw_own(folder)
     raise typer.Exit(outcome.exit_status)
 
 
@@ -243,7 +243,7 @@ def bridge(
     run_bridge(settings, folder, Method.formation.value, pace)
     outcome = complete_summary(folder, problems=())
     print_outcome(outcome, Console())
-    _draw(folder)
+    _draw_own(folder)
     # A role that was asked to end did what it was asked, however far the run had come.
     asked_to_end = outcome.summary is not None and outcome.summary["ending"] == "interrupted"
     broken = outcome.summary is None or outcome.summary["safety"]["overlaps"]
@@ -358,10 +358,19 @@ def _draw(folder: Path) -> None:
     from laneweave.launch.figures import speed_heatmap, travel_time_boxplot
     from laneweave.launch.snapshots import road_snapshots
 
+    travel_time_boxplot([folder], folder / "travel_time.png")
+    speed_heatmap(folder, folder / "speed.png")
+    road_snapshots(folder, folder / "road.png")
+
+
+def _draw_own(folder: Path) -> None:
+    """Draw the pictures of the run that has just ended.
+
+    Raises:
+        CommandFailedError: they cannot be written.
+    """
     try:
-        travel_time_boxplot([folder], folder / "travel_time.png")
-        speed_heatmap(folder, folder / "speed.png")
-        road_snapshots(folder, folder / "road.png")
+        _draw(folder)
     except OSError as error:
         raise CommandFailedError(f"{folder}: pictures not drawn: {error}") from error
 
