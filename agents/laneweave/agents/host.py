@@ -23,7 +23,7 @@ from laneweave.protocol.node import (
     Wakeup,
     Watch,
 )
-from laneweave.protocol.topics import BRIDGE_ALIVE, CENSUS, STATE
+from laneweave.protocol.topics import BRIDGE_ALIVE, CENSUS, STATE, incarnation_of
 
 ALONE_S = 60.0
 """Agents end when no bridge has been there for this long (node clock)."""
@@ -88,9 +88,9 @@ class AgentHost:
             case Arrived():
                 yield from self._on_message(event, now_s)
             case PeerUp(topic, parameters) if topic is BRIDGE_ALIVE:
-                yield from self._meet_bridge(_number(parameters["incarnation"]))
+                yield from self._meet_bridge(incarnation_of(parameters))
             case PeerDown(topic, parameters) if topic is BRIDGE_ALIVE:
-                if _number(parameters["incarnation"]) == self._bridge:
+                if incarnation_of(parameters) == self._bridge:
                     self._alone_since_s = now_s
             case Wakeup() if self.wakeup_s is not None and now_s >= self.wakeup_s:
                 yield End()
@@ -163,7 +163,3 @@ class AgentHost:
         for number in sorted(wanted - self._formations):
             yield Listen(STATE, {"formation": number})
         self._formations = wanted
-
-
-def _number(incarnation: str) -> int:
-    return int(incarnation) if incarnation.isdecimal() else -1

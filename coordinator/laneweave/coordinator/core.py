@@ -63,6 +63,7 @@ from laneweave.protocol.topics import (
     REPORT,
     SERVICE,
     STATE,
+    incarnation_of,
 )
 from laneweave.protocol.transport import LinkDown, LinkUp
 
@@ -130,7 +131,7 @@ class CoordinatorCore:
             case PeerDown(topic, parameters) if topic is COORDINATOR_ALIVE:
                 self.election.on_token_down(*_identity(parameters))
             case PeerUp(topic, parameters) if topic is BRIDGE_ALIVE:
-                self._meet_bridge(_number(parameters["incarnation"]))
+                self._meet_bridge(incarnation_of(parameters))
             case LinkUp():
                 self.election.on_link(up=True, now_s=now_s)
             case LinkDown():
@@ -381,8 +382,4 @@ def _plan(make_request: Callable[[], PlanRequest], nodes: int, weights: Weights)
 
 
 def _identity(parameters: dict[str, str]) -> tuple[str, int]:
-    return parameters["coordinator"], _number(parameters["incarnation"])
-
-
-def _number(incarnation: str) -> int:
-    return int(incarnation) if incarnation.isdecimal() else -1
+    return parameters["coordinator"], incarnation_of(parameters)

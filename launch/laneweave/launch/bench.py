@@ -18,7 +18,6 @@ import numpy as np
 import psutil
 import pyarrow.parquet as pq
 from attrs import define, field
-from numpy.typing import NDArray
 from rich.table import Table
 
 from laneweave.coordinator.planning import plan
@@ -26,6 +25,7 @@ from laneweave.coordinator.planning.instances import block_request
 from laneweave.launch.local_run import LocalRun
 from laneweave.launch.observer import View
 from laneweave.protocol.scenario import Scenario, load_scenario
+from laneweave.sim_bridge.run_record import spread
 
 ROLES = ("router", "coordinator", "bridge", "agent")
 LOOK_EVERY_S = 0.3
@@ -110,7 +110,7 @@ def bench_runtime(vehicles: int, *, seconds: float, per_process: int, seed: int)
         "vehicles_per_process": per_process,
         "vehicles_on_road": round(float(ticks.column("on_road").to_numpy()[measured].mean()), 1),
         "real_time_factor": _rate(window),
-        "tick_ms": _spread(ticks.column("tick_ms").to_numpy()[measured], 50, 99),
+        "tick_ms": spread(ticks.column("tick_ms").to_numpy()[measured], 50, 99),
         "cpu_ms_per_tick": _per_tick(window, scenario),
         "memory_mib": _memory(window),
         "problems": list(outcome.problems),
@@ -138,7 +138,7 @@ def bench_planner(instances: int, *, seed: int) -> list[dict[str, Any]]:
                 "vehicles": size,
                 "instances": instances,
                 "optimal": optimal,
-                "cpu_ms": _spread(np.array(times_ms), 50, 95) | {"max": round(max(times_ms), 3)},
+                "cpu_ms": spread(np.array(times_ms), 50, 95, largest=True),
             }
         )
     return rows
@@ -216,7 +216,3 @@ def _memory(window: _Window) -> dict[str, dict[str, float]]:
         }
         for role, pairs in sorted(window.memory.items())
     }
-
-
-def _spread(values: NDArray[Any], *percentiles: int) -> dict[str, float]:
-    return {f"p{each}": round(float(np.percentile(values, each)), 3) for each in percentiles}

@@ -60,7 +60,6 @@ class SimulatedRun:
     conditions: Conditions = field(factory=Conditions)
     show_progress: bool = True
     _view: View = field(factory=View)
-    _started_agents: int = 0
     _known: set[Name] = field(factory=set)
     _problems: list[str] = field(factory=list)
 
@@ -127,8 +126,7 @@ class SimulatedRun:
             vehicle = announced.vehicle
             if vehicle not in self._known:
                 self._known.add(vehicle)
-                self._started_agents += 1
-                host = AgentHost(self._make_agent(1000 + self._started_agents), [vehicle])
+                host = AgentHost(self._make_agent(1000 + len(self._known)), [vehicle])
                 network.add(f"agent-{vehicle}", host, self.scenario.network.realm)
 
     def _make_agent(self, incarnation: int) -> Callable[[Name], AgentCore]:

@@ -295,20 +295,17 @@ class Node:
         transport = self._transport
         match effect:
             case Listen(topic, parameters):
-                transport.subscribe(self._expression(topic, parameters))
+                transport.subscribe(self._keys.all_of(topic, **parameters))
             case Unlisten(topic, parameters):
-                transport.unsubscribe(self._expression(topic, parameters))
+                transport.unsubscribe(self._keys.all_of(topic, **parameters))
             case Announce(topic, parameters):
                 transport.announce(self._keys.key(topic, **parameters))
             case Withdraw(topic, parameters):
                 transport.withdraw(self._keys.key(topic, **parameters))
             case Watch(topic, parameters):
-                transport.watch(self._expression(topic, parameters))
+                transport.watch(self._keys.all_of(topic, **parameters))
             case Serve(topic):
                 transport.serve(self._keys.key(topic))
-
-    def _expression(self, topic: Topic, parameters: dict[str, Any]) -> str:
-        return self._keys.key(topic, **(dict.fromkeys(topic.parameters, "*") | parameters))
 
 
 def run_job(job: Compute) -> Computed:

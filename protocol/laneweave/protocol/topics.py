@@ -114,9 +114,9 @@ class Keys:
         """
         return f"{PREFIX}/{self.realm}/{topic.pattern.format_map(_Text(parameters))}"
 
-    def all_of(self, topic: Topic) -> str:
-        """Return the key expression that matches all keys of a topic."""
-        return self.key(topic, **dict.fromkeys(topic.parameters, "*"))
+    def all_of(self, topic: Topic, **given: object) -> str:
+        """Return the key expression that matches all keys of a topic with the given parameters."""
+        return self.key(topic, **(dict.fromkeys(topic.parameters, "*") | given))
 
     def read(self, key: str) -> tuple[Topic, dict[str, str]] | None:
         """Return a key's topic and parameters, or None when it is not one of ours."""
@@ -150,6 +150,12 @@ def _match(pattern: list[str], parts: list[str]) -> dict[str, str] | None:
         elif expected != part:
             return None
     return found
+
+
+def incarnation_of(parameters: Mapping[str, str]) -> int:
+    """Return the incarnation in the parameters of a token's key, -1 where it is no number."""
+    incarnation = parameters["incarnation"]
+    return int(incarnation) if incarnation.isdecimal() else -1
 
 
 def matches(expression: str, key: str) -> bool:

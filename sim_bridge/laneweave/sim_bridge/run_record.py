@@ -207,20 +207,20 @@ class RunRecord:
                 "largest_formation": max(
                     (int(_number(plan.get("vehicles"))) for plan in self._plans), default=0
                 ),
-                "solve_ms": _spread(plan_ms, 50, 95, largest=True),
+                "solve_ms": spread(plan_ms, 50, 95, largest=True),
             },
             "tracking": {
                 "solves": sum(report.solves for report in reports),
                 "unusable": sum(report.unusable for report in reports),
                 "hold_law_ticks": self._agentless_ticks,
-                "solve_ms": _spread(solve_ms, 50, 99),
+                "solve_ms": spread(solve_ms, 50, 99),
             },
             "runtime": {
                 "real_time_factor": round(t_s / wall_s, 3) if wall_s > 0 else 0.0,
                 "wall_s": round(wall_s, 3),
                 "processes": None,
                 "vehicles_per_process": self._scenario.runtime.vehicles_per_process,
-                "tick_ms": _spread(np.array([tick[2] for tick in self._ticks]), 50, 99),
+                "tick_ms": spread(np.array([tick[2] for tick in self._ticks]), 50, 99),
             },
             "messages": {
                 "published": _per_process(reports, "published"),
@@ -259,9 +259,10 @@ def _milliseconds(packed: Iterable[bytes]) -> NDArray[np.float64]:
     return values[np.isfinite(values) & (values >= 0.0)]
 
 
-def _spread(
+def spread(
     values: NDArray[Any], *percentiles: int, largest: bool = False
 ) -> dict[str, float | None]:
+    """Return percentiles by name, `max` too if it is wanted; None where there are no values."""
     ranks = {f"p{percentile}": percentile for percentile in percentiles}
     if largest:
         ranks["max"] = 100
