@@ -26,7 +26,7 @@ from laneweave.launch.observer import Observer, View
 from laneweave.launch.outcome import Outcome, complete_summary
 from laneweave.launch.progress import RunProgress
 from laneweave.launch.roles import fork_server, start_role
-from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.scenario import Scenario, to_tables
 from laneweave.protocol.topics import Keys
 from laneweave.protocol.zenoh_transport import ZenohTransport
@@ -122,6 +122,8 @@ class LocalRun:
             self.scenario = attrs.evolve(self.scenario, network=network)
             try:
                 self._supervise(progress, sockets)
+            except CommandFailedError as error:
+                self._problems.append(str(error))
             finally:
                 self._clean_up()
         return complete_summary(

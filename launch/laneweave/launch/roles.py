@@ -23,7 +23,7 @@ from typing import Any
 import structlog
 
 from laneweave.launch.logs import log_to_file
-from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.scenario import parse_scenario
 
 log = structlog.get_logger(__name__)
@@ -75,9 +75,16 @@ def start_role(
         tables: the scenario, as `to_tables` gives it.
         options: what the role needs beside the scenario; `folder` is where its log goes,
             `temporary` where its temporary files go.
+
+    Raises:
+        CommandFailedError: the fork server is gone, or no process can be made.
     """
     process = context.Process(target=run_role, args=(role, name, tables, options), name=name)
-    process.start()
+    try:
+        process.start()
+    except (EOFError, OSError) as error:
+        reason = str(error) or "the fork server is gone"
+        raise CommandFailedError(f"cannot start {name}: {reason}") from error
     return process
 
 
