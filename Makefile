@@ -9,7 +9,7 @@ RUN    ?= runs/demo
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test test-full check format clean install help
+.PHONY: demo test test-full evaluation docs check format clean install help
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -42,6 +42,12 @@ test: $(STAMP) ## what CI runs
 
 test-full: $(STAMP) ## the long programmes too
 	$(BIN)/pytest -n 2
+
+evaluation: $(STAMP) ## measure what docs/EVALUATION.md reports under faults (hours)
+	$(BIN)/python benchmarks/resilience.py
+
+docs: $(STAMP) ## write the generated parts of the documents
+	$(BIN)/python docs/generate.py
 
 clean: ## remove everything that was made
 	rm -rf $(VENV) runs build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
-from scenarios.stories import StoryError, check_story
-from simulation import mutants
-from simulation.mutants import Mutant
+from scenarios.stories import check_story, ends_in_collision, read_story
+from scenarios.story_player import Player
+from scenarios.story_text import CollisionError, StoryError
 
 HERE = Path(__file__).parent
 STORIES = sorted(HERE.glob("*.txt"))
@@ -19,26 +20,28 @@ def test_story(path: Path) -> None:
     check_story(path)
 
 
-@pytest.mark.parametrize(
-    ("plant", "story"),
-    [
-        (mutants.no_gate, "start_gate"),
-        (mutants.no_gate, "plan_lost_for_one"),
-        (mutants.no_promise_check, "late_duplicate_plan"),
-        (mutants.no_promise_check, "zombie_leader"),
-        (mutants.timetable_only, "dependency"),
-        (mutants.needs_one_less, "dependency"),
-        (mutants.ready_while_moving, "prepare_while_moving"),
-        (mutants.foreign_motion_counts, "prepare_while_moving"),
-        (mutants.any_ballot_releases, "newer_ballot_releases_nothing"),
-    ],
-)
-def test_planted_bug_spoils_a_story(
-    plant: Mutant, story: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    plant(monkeypatch)
-    with pytest.raises(StoryError):
-        check_story(HERE / f"{story}.txt")
+@pytest.mark.parametrize("path", STORIES, ids=lambda path: path.stem)
+def test_story_says_first_what_it_shows(path: Path) -> None:
+    lines = path.read_text(encoding="utf-8").splitlines()
+    head = [line for line in lines[:5] if line.startswith("#")]
+    assert 1 <= len(head) <= 4
+    assert lines[: len(head)] == head
+    assert head[0].endswith("."), "the first line is a sentence of its own: README.md lists it"
+
+
+def test_readme_lists_all_stories() -> None:
+    listed = re.findall(
+        r"^\| \[(\w+)\]\((\w+)\.txt\) \| (.+) \|$",
+        (HERE / "README.md").read_text(encoding="utf-8"),
+        re.MULTILINE,
+    )
+    first_lines = {
+        path.stem: path.read_text(encoding="utf-8").splitlines()[0].removeprefix("# ")
+        for path in STORIES
+    }
+    assert all(name == link for name, link, _ in listed)
+    assert len(listed) == len(STORIES)
+    assert {name: text for name, _, text in listed} == first_lines
 
 
 @pytest.mark.parametrize(
@@ -46,9 +49,12 @@ def test_planted_bug_spoils_a_story(
     [
         ("=> A promises", "without a command"),
         ("A jumps", "no such command"),
+        ("A ticks", "there is no 'A'"),
         ("vehicle A at 0,0 wants 1\nvehicle B at 0,0 wants 1", "both occupy"),
         ("vehicle A at 0,0 wants 1\nA ticks\n=> A moves 0,0 > 0,1", "A holds 0,0"),
         ("vehicle A at 0,0 wants 1\nA gets PLAN 1/L1/1/1", "nobody has sent"),
+        ("clock 2.0\nclock 1.0", "it is 2 s already"),
+        ("vehicle A at 0,0 wants 1\nleader L1 term 1 leads A\nL1 hears A", "L1 preparing"),
     ],
 )
 def test_a_wrong_story_is_told_why(tmp_path: Path, text: str, complaint: str) -> None:
@@ -58,16 +64,24 @@ def test_a_wrong_story_is_told_why(tmp_path: Path, text: str, complaint: str) ->
         check_story(path)
 
 
-def test_taking_an_old_plan_ends_in_an_occupied_cell(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Without the promise the late duplicate is not only a wrong answer but a collision."""
-    mutants.no_promise_check(monkeypatch)
-    story = (HERE / "late_duplicate_plan.txt").read_text(encoding="utf-8")
+def test_a_moving_vehicle_occupies_both_cells(tmp_path: Path) -> None:
     path = tmp_path / "collision.txt"
     path.write_text(
-        story.replace("PLAN 1/L1/1/1\n  => A ignores it", "PLAN 1/L1/1/1\n  => A accepts"),
+        """
+        vehicle A at 0,0 wants 1
+        leader L1 term 1 leads A
+        L1 collects promises
+          => A promise 1/L1/1/1
+        L1 brings A@0>-1,1 into force
+          => A accept 1/L1/1/1
+        A ticks
+          => A's gate is open
+          => A moves 0,0 > -1,1
+        vehicle B at -1,0 wants 0   # a corner of A's way
+        """,
         encoding="utf-8",
     )
-    with pytest.raises(StoryError, match="both occupy"):
+    with pytest.raises(CollisionError, match="both occupy"):
         check_story(path)
+    assert ends_in_collision(path, Player())
+    assert len(read_story(path)) == 6

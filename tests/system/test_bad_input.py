@@ -56,6 +56,7 @@ def refused(lab: Lab, *arguments: object, **environment: str) -> str:
         (["run", "missing.toml"], "missing.toml"),
         (["run", "."], "a readable file"),
         (["run", "--faults", "missing.toml"], "missing.toml"),
+        (["run", "--faults", "lossy99"], "blackout, everything, leader-chaos, lossy10, lossy50"),
         (["run", "--out", "/dev/null/out"], "--out: got '/dev/null/out'"),
         (["plan"], "REQUEST.json"),
         (["plan", "missing.json"], "missing.json"),
@@ -128,10 +129,14 @@ def test_scenarios(lab: Lab, text: str, named: str) -> None:
         ("[[kill]]\nat_s = nan", "kill[0].at_s: got nan"),
         ("[[kill]]\ntarget = 'c1'", "kill[0].at_s"),
         ("[[kill]]\nat_s = 1.0\nhow = 'softly'", "kill[0].how: got 'an unknown key'"),
-        ("[[pause]]\nat_s = 1.0", "pause: got 'an unknown key'"),
+        ("[[pause]]\nat_s = 1.0", "pause[0].for_s: got 'nothing'"),
+        ("[[blame]]\nat_s = 1.0", "blame: got 'an unknown key'"),
+        ("[[kill]]\ntarget = 'v9999'\nat_s = 1.0", "or the name of a vehicle of the run"),
+        ("[[messages]]\nloss = 2.0", "messages[0].loss: got 2.0; allowed: [0, 1]"),
+        ("[[partition]]\nbetween = ['bridge']", "partition[0].between: got ['bridge']"),
         ("kill = 'c1'", "kill"),
     ],
-    ids=range(8),
+    ids=range(12),
 )
 def test_faults(lab: Lab, text: str, named: str) -> None:
     faults = lab.path("faults.toml", text)

@@ -17,8 +17,8 @@ FEW_PROCESSES = ("--vehicles-per-process", "4", "--coordinators", "2")
 
 
 def start_and_wait(lab: Lab, road: Path, *options: str, entered: int = 2) -> subprocess.Popen[str]:
-    """Start a run into `out` and wait until it is under way."""
-    process = lab.start("run", road, *DEMAND, *options, "--out", "out")
+    """Start a run into `out` that does not end by itself soon, and wait until it is under way."""
+    process = lab.start("run", road, *DEMAND, "--duration", "600", *options, "--out", "out")
     folder = lab.folder / "out"
 
     def is_under_way() -> bool:

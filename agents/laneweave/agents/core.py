@@ -1,31 +1,24 @@
-"""The vehicle agent's core: protocol, trajectory and tracking of one vehicle.
+"""The vehicle agent's core: charge, protocol and driving of one vehicle.
 
-At each tick it hears what its sensors and its motion controller know, decides whether a move may
-begin (`execution`), lays the reference through the lattice points (`trajectory`), and answers with
-the jerks that track it (`tracker`). Between ticks it promises, accepts, and listens to the others.
-When in doubt it holds its cell.
+At each tick it hears what its sensors and its motion controller know, makes sure that it is in
+charge of the vehicle, decides whether a move may begin (`execution`), and answers with what to
+drive (`driver`). Between ticks it promises, accepts, and listens to the others. When in doubt it
+holds its cell.
+
+**Charge.** One process at a time acts for a vehicle; its motion controller says which. An agent
+claims the vehicle with its first COMMAND and says nothing to others before a SENSE has shown that
+it is in charge. When another agent is, it falls silent. When the caretaker is - because this agent
+hung, or was not heard - it takes a new incarnation and claims the vehicle anew.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-import numpy as np
-from numpy.typing import NDArray
-
-from laneweave.agents.execution import PlanExecution
-from laneweave.agents.tracker import Tracker, remaining_jerk
-from laneweave.agents.trajectory import Reference
-from laneweave.protocol.messages import (
-    Command,
-    Name,
-    Plan,
-    Prepare,
-    Report,
-    Sense,
-    VehicleState,
-)
-from laneweave.protocol.motion import cell_state, hold_law, integrate
+from laneweave.agents.driver import Driver, TrackingDriver
+from laneweave.protocol.execution import VEHICLE_RULES, PlanExecution
+from laneweave.protocol.lattice import Move
+from laneweave.protocol.messages import Command, Name, Plan, Prepare, Report, Sense, VehicleState
 from laneweave.protocol.node import (
     Announce,
     Arrived,
@@ -48,14 +41,10 @@ from laneweave.protocol.topics import (
     STATE,
     VEHICLE_ALIVE,
 )
+from laneweave.protocol.transitions import RuleBook
 
 OVERDUE_SLOTS = 1.5
 """A move due for this many slots is reported as overdue."""
-ARRIVED_ALONG_M = 0.5
-ARRIVED_ACROSS_M = 0.3
-"""A motion has ended when its time is over and the body is this close to the target point."""
-SENSED_S = 1.0
-"""How far ahead local sensing is extrapolated; what others plan to do is not known here."""
 
 
 class AgentCore:
@@ -64,25 +53,35 @@ class AgentCore:
     def __init__(
         self,
         vehicle: Name,
-        incarnation: int,
+        new_incarnation: Callable[[], int],
         scenario: Scenario,
-        make_tracker: Callable[[Scenario], Tracker] = Tracker,
+        make_driver: Callable[[Scenario], Driver] = TrackingDriver,
+        rules: RuleBook = VEHICLE_RULES,
     ) -> None:
-        """Make an agent that knows nothing of its vehicle yet (V1)."""
+        """Make an agent that knows nothing of its vehicle yet (V1).
+
+        Args:
+            vehicle: its name.
+            new_incarnation: returns a number that no process has used before, greater than all
+                earlier ones.
+            scenario: lattice, limits, timing.
+            make_driver: makes what drives the vehicle.
+            rules: of plan execution; others than `VEHICLE_RULES` only in tests.
+        """
         self.vehicle = vehicle
-        self.formation: int | None = None
         self.ended = False
+        self.execution: PlanExecution | None = None
+        """None until it has met its vehicle."""
         self._scenario = scenario
-        self._incarnation = incarnation
-        self._tracker = make_tracker(scenario)
-        self._execution: PlanExecution | None = None
-        self._reference: Reference | None = None
+        self._new_incarnation = new_incarnation
+        self._incarnation = new_incarnation()
+        self._driver = make_driver(scenario)
+        self._rules = rules
+        self._formation: int | None = None
+        self._move: Move | None = None
+        """The newest move that it has begun."""
         self._sense: Sense | None = None
         self._command: Command | None = None
-        self._jerks: NDArray[np.float64] = np.zeros((0, 2))
-        self._jerks_tick = 0
-        self._solve_ms: list[float] = []
-        self._unusable = 0
         self._own = {"vehicle": vehicle}
 
     @property
@@ -91,14 +90,22 @@ class AgentCore:
         return None
 
     @property
-    def needs_states(self) -> bool:
-        """Whether the states of this vehicle's formation matter to it now."""
+    def in_charge(self) -> bool:
+        """Whether the last SENSE showed that this process acts for the vehicle."""
         return (
             not self.ended
-            and self._execution is not None
             and self._sense is not None
-            and self._execution.needs_states(self._sense.t_s)
+            and self._sense.attendant == self._incarnation
+            and not self._sense.caretaker
         )
+
+    @property
+    def wanted_states(self) -> tuple[int, ...]:
+        """Formations whose states matter to this vehicle now."""
+        execution, sense = self.execution, self._sense
+        if not self.in_charge or execution is None or sense is None or execution.plan is None:
+            return ()
+        return execution.plan.formations if execution.needs_states(sense.t_s) else ()
 
     def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
         """Take an event; see `Core`."""
@@ -111,29 +118,27 @@ class AgentCore:
                 yield Announce(VEHICLE_ALIVE, self._own)
             case Arrived(_, _, Sense() as sense):
                 yield from self._on_sense(sense)
-            case Arrived(_, _, VehicleState() as state):
-                if self._execution is not None:
-                    self._execution.on_state(state)
-            case Arrived(_, _, Prepare() as prepare):
-                if self._execution is not None and self._execution.on_prepare(prepare):
-                    yield self._show()
-            case Arrived(_, _, Plan() as plan):
-                execution = self._execution
-                if execution is not None and self._in_block(plan) and execution.on_plan(plan):
-                    yield self._show()
+            case Arrived(_, _, message) if self.in_charge:
+                yield from self._on_message(message)
             case Stopping():
                 yield self._report()
             case _:
                 pass
 
-    def _in_block(self, plan: Plan) -> bool:
-        """Tell whether a plan keeps to the block that this vehicle's formation owns.
-
-        Plans of different formations run at the same time because their blocks are disjoint.
-        """
-        if self.formation is None:
-            return False
-        return set(plan.territory) <= self._scenario.lattice.block_cells(self.formation)
+    def _on_message(self, message: object) -> Iterator[Effect]:
+        execution = self.execution
+        assert execution is not None  # noqa: S101 (in charge: it has met the vehicle)
+        match message:
+            case VehicleState():
+                execution.on_state(message)
+            case Prepare():
+                if execution.on_prepare(message):
+                    yield self._show()
+            case Plan():
+                if execution.on_plan(message):
+                    yield self._show()
+            case _:
+                pass
 
     # --- the tick -----------------------------------------------------------------------------
 
@@ -147,151 +152,76 @@ class AgentCore:
             if sense.tick == self._sense.tick and self._command is not None:
                 yield Send(COMMAND, self._command, self._own)
             return
+        was_in_charge = self.in_charge
         self._sense = sense
-        if self._execution is None:
+        if sense.attendant > self._incarnation:
+            self._command = None
+            if not sense.caretaker:
+                return  # another process is in charge, and well: it is not for this one to drive
+            # Above the attendant, even where the vehicle's clocks do not agree.
+            self._incarnation = max(self._new_incarnation(), sense.attendant + 1)
+        if not (was_in_charge and self.in_charge):
+            # Also while a claim is under way: until it is granted somebody else may have moved.
             self._meet_vehicle(sense)
-        self._decide(sense)
-        self._command = self._drive(sense)
+        yield from self._act(sense)
+
+    def _act(self, sense: Sense) -> Iterator[Effect]:
+        execution = self.execution
+        assert execution is not None  # noqa: S101 (met the vehicle)
+        execution.joined = sense.joined
+        if self.in_charge:
+            self._decide(sense, execution)
+        drive = self._driver.drive(sense, moving=execution.moving)
+        self._command = Command(
+            vehicle=self.vehicle,
+            incarnation=self._incarnation,
+            tick=sense.tick,
+            hold_cell=execution.hold_cell,
+            motion_end_tick=drive.motion_end_tick,
+            motion_origin=drive.motion_origin,
+            jerks=drive.jerks,
+            joined=execution.wanted_joined,
+        )
         yield Send(COMMAND, self._command, self._own)
-        yield self._show()
+        if self.in_charge:
+            yield self._show()
 
     def _meet_vehicle(self, sense: Sense) -> None:
         """V1: take over what the motion controller is doing."""
-        self.formation = self._scenario.lattice.block_of(sense.hold_cell[0])
-        self._execution = PlanExecution(
-            self.vehicle,
-            self._incarnation,
-            sense.hold_cell,
-            OVERDUE_SLOTS * self._scenario.formation.cycle_s,
-        )
-        if sense.motion_end_tick > sense.tick:
-            ticks = round(self._scenario.formation.move_s / self._scenario.runtime.tick_s)
-            self._reference = Reference.move(
-                self._scenario, sense.motion_origin, sense.hold_cell, sense.motion_end_tick - ticks
-            )
-        else:
-            self._reference = Reference.hold(self._scenario, sense.hold_cell)
-        # A body that is late still moves, though the time of its motion is over.
-        self._execution.moving = not self._arrived(sense)
-
-    def _decide(self, sense: Sense) -> None:
-        """V5 to V7."""
-        execution = self._execution
-        assert execution is not None  # noqa: S101 (met the vehicle)
-        if execution.moving and self._arrived(sense):
-            execution.end_motion()
-        move = execution.next_move(sense.t_s)
-        if move is not None:
-            execution.begin(move)
-            self._reference = Reference.move(self._scenario, move[1], move[2], sense.tick)
-
-    def _arrived(self, sense: Sense) -> bool:
-        execution, reference = self._execution, self._reference
-        assert execution is not None  # noqa: S101 (met the vehicle)
-        if reference is None or sense.tick < reference.end_tick:
-            return False
-        goal = cell_state(self._scenario.lattice, execution.hold_cell, sense.t_s)
-        return (
-            abs(sense.state[0] - goal[0]) <= ARRIVED_ALONG_M
-            and abs(sense.state[3] - goal[3]) <= ARRIVED_ACROSS_M
-        )
-
-    def _drive(self, sense: Sense) -> Command:
-        execution = self._execution
-        assert execution is not None  # noqa: S101 (met the vehicle)
-        reference = self._reference
-        assert reference is not None  # noqa: S101 (met the vehicle)
-        result = self._tracker.solve(
-            sense.state, reference.window(sense.tick), self._predict_ahead(sense)
-        )
-        self._solve_ms.append(result.solve_ms)
-        if result.usable:
-            self._jerks, self._jerks_tick = result.jerk, sense.tick
-        else:
-            self._unusable += 1
-            self._fall_back(sense)
-        return Command(
+        self._formation, self._move = sense.formation, None
+        self._driver.take_over(sense)
+        self.execution = PlanExecution(
             vehicle=self.vehicle,
-            tick=sense.tick,
-            hold_cell=execution.hold_cell,
-            # Past its time but not there yet: still moving, for whoever takes the vehicle over.
-            motion_end_tick=max(reference.end_tick, sense.tick + 1) if execution.moving else 0,
-            motion_origin=reference.origin,
-            jerks=self._jerks.astype("<f4").tobytes(),
+            incarnation=self._incarnation,
+            hold_cell=sense.hold_cell,
+            lattice=self._scenario.lattice,
+            overdue_s=OVERDUE_SLOTS * self._scenario.formation.cycle_s,
+            joined=sense.joined,
+            moving=not self._driver.at_rest(sense),
+            rules=self._rules,
         )
 
-    def _fall_back(self, sense: Sense) -> None:
-        """Continue the last good trajectory; when it has run out, go to rest in the hold cell."""
-        rest = remaining_jerk(self._jerks, sense.tick - self._jerks_tick)
-        execution = self._execution
-        assert execution is not None  # noqa: S101 (met the vehicle)
-        if len(rest) == 0:
-            rest = self._hold(sense, execution)
-        self._jerks, self._jerks_tick = rest, sense.tick
-
-    def _hold(self, sense: Sense, execution: PlanExecution) -> NDArray[np.float64]:
-        scenario = self._scenario
-        tick_s = scenario.runtime.tick_s
-        state, jerks = sense.state, []
-        for index in range(scenario.tracking.horizon_ticks):
-            goal = cell_state(scenario.lattice, execution.hold_cell, sense.t_s + index * tick_s)
-            jerk = hold_law(state, goal, scenario.vehicle, tick_s)
-            state = integrate(state, jerk, tick_s)
-            jerks.append(jerk)
-        return np.array(jerks)
-
-    def _predict_ahead(self, sense: Sense) -> NDArray[np.float64] | None:
-        """Return where the nearest vehicle ahead will end, at constant speed, as far as that holds.
-
-        It counts in the lanes that the body touches and in the lane that it enters.
-        """
-        if not sense.ahead:
-            return None
-        scenario = self._scenario
-        lane_width_m, half_m = scenario.road.lane_width_m, scenario.vehicle.width_m / 2
-        y_m = sense.state[3]
-        execution = self._execution
-        assert execution is not None  # noqa: S101 (met the vehicle)
-        lanes = {
-            int((y_m - half_m) // lane_width_m),
-            int((y_m + half_m) // lane_width_m),
-            execution.hold_cell[1],
-        }
-        near = [other for other in sense.ahead if other.lane in lanes]
-        if not near:
-            return None
-        ticks = scenario.tracking.horizon_ticks + 1
-        times_s = np.arange(ticks) * scenario.runtime.tick_s
-        rears = [sense.state[0] + other.gap_m + other.speed_mps * times_s for other in near]
-        rear: NDArray[np.float64] = np.min(rears, axis=0)
-        rear[times_s > SENSED_S + 1e-9] = np.inf
-        return rear
+    def _decide(self, sense: Sense, execution: PlanExecution) -> None:
+        """V5 to V7."""
+        if execution.moving and self._move is not None and sense.hold_cell != self._move[2]:
+            # The motion controller has not heard of the move, so the body is still at its origin:
+            # a trajectory that began earlier would have run away from it.
+            self._driver.begin(self._move, sense.tick)
+        if execution.moving and self._driver.at_rest(sense):
+            execution.end_motion()
+        move = execution.tick(sense.t_s)
+        if move is not None:
+            self._move = move
+            self._driver.begin(move, sense.tick)
 
     # --- what others see ----------------------------------------------------------------------
 
     def _show(self) -> Effect:
-        execution, sense = self._execution, self._sense
+        execution, sense = self.execution, self._sense
         assert execution is not None  # noqa: S101 (met the vehicle)
         assert sense is not None  # noqa: S101 (met the vehicle)
-        state = VehicleState(
-            vehicle=self.vehicle,
-            incarnation=self._incarnation,
-            formation=self.formation or 0,
-            promised=execution.promised,
-            accepted=execution.plan is not None,
-            ready=execution.ready,
-            completed=execution.completed,
-            hold_cell=execution.hold_cell,
-            moving=execution.moving,
-            go=execution.go,
-            done=execution.done,
-            overdue=execution.overdue(sense.t_s),
-            s_m=sense.state[0],
-            y_m=sense.state[3],
-            speed_mps=sense.state[1],
-            t_s=sense.t_s,
-        )
-        return Send(STATE, state, {"formation": self.formation, "vehicle": self.vehicle})
+        state = execution.state(sense, self._formation or 0, attended=True)
+        return Send(STATE, state, {"formation": self._formation, "vehicle": self.vehicle})
 
     def leave(self) -> Iterator[Effect]:
         """End: the vehicle is not on the road any more."""
@@ -303,11 +233,12 @@ class AgentCore:
             yield Withdraw(VEHICLE_ALIVE, self._own)
 
     def _report(self) -> Effect:
+        effort = self._driver.effort
         report = Report(
             role=Name("agent"),
             name=self.vehicle,
-            solves=len(self._solve_ms),
-            unusable=self._unusable,
-            solve_ms=np.array(self._solve_ms, dtype="<f4").tobytes(),
+            solves=effort.solves,
+            unusable=effort.unusable,
+            solve_ms=effort.solve_ms,
         )
         return Send(REPORT, report, {"role": "agent", "name": self.vehicle})

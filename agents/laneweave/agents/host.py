@@ -105,7 +105,7 @@ class AgentHost:
             yield from self._on_census(message, now_s)
         elif isinstance(message, VehicleState):
             for agent in self._agents.values():
-                if agent.formation == message.formation:
+                if message.formation in agent.wanted_states:
                     yield from agent.handle(event, now_s)
         elif event.parameters.get("vehicle") in self._agents:
             yield from self._hand_on(event, Name(event.parameters["vehicle"]), now_s)
@@ -153,11 +153,7 @@ class AgentHost:
 
         They are most of the traffic, and most of the time nobody waits for anybody.
         """
-        wanted = {
-            agent.formation
-            for agent in self._agents.values()
-            if agent.formation is not None and agent.needs_states
-        }
+        wanted = {number for agent in self._agents.values() for number in agent.wanted_states}
         for number in sorted(self._formations - wanted):
             yield Unlisten(STATE, {"formation": number})
         for number in sorted(wanted - self._formations):

@@ -7,22 +7,29 @@ from collections.abc import Iterable
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost, Shard
+from laneweave.protocol.faulty_core import Wrap, bare
 from laneweave.protocol.messages import Name
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.zenoh_transport import run_core
 
 
-def run_agents(scenario: Scenario, vehicles: Iterable[str], shard: Shard | None = None) -> None:
+def run_agents(
+    scenario: Scenario,
+    vehicles: Iterable[str],
+    shard: Shard | None = None,
+    wrap: Wrap = bare,
+) -> None:
     """Run agents until their vehicles have left the road, or until SIGINT or SIGTERM.
+
+    `wrap` may put faults before them.
 
     Raises:
         BadInputError: nobody answers at the scenario's endpoint.
     """
-    incarnation = time.time_ns()
     host = AgentHost(
-        lambda vehicle: AgentCore(vehicle, incarnation, scenario),
+        lambda vehicle: AgentCore(vehicle, time.time_ns, scenario),
         [Name(vehicle) for vehicle in vehicles],
         shard,
     )
     network = scenario.network
-    run_core(host, network.endpoint, network.realm, network.lease_s)
+    run_core(wrap(host), network.endpoint, network.realm, network.lease_s)

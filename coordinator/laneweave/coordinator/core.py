@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterable, Iterator, Mapping
 
 import structlog
 
@@ -12,14 +11,13 @@ from laneweave.coordinator.election import Election
 from laneweave.coordinator.formation import (
     Formation,
     closed_formations,
-    plan_request,
-    start_time_s,
-    steps_left,
+    closing_time_s,
 )
-from laneweave.coordinator.leader import FormationControl, Phase
-from laneweave.coordinator.planning import PlanRequest, PlanResponse, Weights, checked_plan
+from laneweave.coordinator.formation_planner import FormationPlanner, Note
+from laneweave.coordinator.groups import Groups
+from laneweave.coordinator.leader import FormationControl
+from laneweave.coordinator.leader_rules import LEADER_RULES, Phase
 from laneweave.coordinator.service import PlanningService
-from laneweave.protocol.lattice import Move, territory
 from laneweave.protocol.messages import (
     Ballot,
     Census,
@@ -49,7 +47,6 @@ from laneweave.protocol.node import (
     Unlisten,
     Watch,
 )
-from laneweave.protocol.plans import plan_problems
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.topics import (
     BRIDGE_ALIVE,
@@ -65,36 +62,50 @@ from laneweave.protocol.topics import (
     STATE,
     incarnation_of,
 )
+from laneweave.protocol.transitions import RuleBook
 from laneweave.protocol.transport import LinkDown, LinkUp
 
 log = structlog.get_logger(__name__)
 
 REPORT_S = 2.0
-START_MARGIN_S = 0.5
-"""A plan made late starts this much road time after it is ready."""
+JUST_CLOSED_S = 1.0
+"""A formation is new to everybody for this much road time."""
 
 
 class CoordinatorCore:
     """State machine of a coordinator; see `Core` for how it is driven."""
 
-    def __init__(self, name: Name, incarnation: int, scenario: Scenario) -> None:
-        """Make a candidate that has seen nothing yet."""
+    def __init__(
+        self,
+        name: Name,
+        incarnation: int,
+        scenario: Scenario,
+        rules: RuleBook = LEADER_RULES,
+    ) -> None:
+        """Make a candidate that has seen nothing yet.
+
+        Args:
+            name: by which candidates are ranked.
+            incarnation: a number that no process of this name has used before.
+            scenario: road, formations, timing.
+            rules: of a leader; others than `LEADER_RULES` only in tests.
+        """
         self.name = name
         self.scenario = scenario
         self.election = Election(name, incarnation, scenario.network.election_s, 0.0)
         self.controls: dict[int, FormationControl] = {}
+        """Each under the least number of its formations."""
         self.census: Census | None = None
         self.t_s = 0.0
+        self._rules = rules
+        self._groups = Groups()
+        self._planner = FormationPlanner(scenario, self._groups)
+        self._handled_s = self._awake_since_s = 0.0
+        """When the last event was, and since when this leader has missed nothing (node clock)."""
         self._incarnation = incarnation
         self._seq = 0
         self._rng = random.Random(f"{scenario.seed}/{name}/{incarnation}")  # noqa: S311
         self._service = PlanningService()
-        formation = scenario.formation
-        oblique = formation.weight_oblique
-        self._weights = Weights(
-            formation.weight_straight, formation.oblique_steps if oblique is None else oblique
-        )
-        self._planning: dict[int, tuple[int, Ballot]] = {}
         self._next_job = 0
         self._bridge = -1
         """Incarnation of the newest bridge."""
@@ -110,6 +121,10 @@ class CoordinatorCore:
 
     def handle(self, event: Event, now_s: float) -> list[Effect]:
         """Take an event; see `Core`."""
+        if now_s > self._handled_s + self.election.election_s / 2:
+            # Whoever wakes up from a pause leads no better than one who has just begun.
+            self._awake_since_s = now_s
+        self._handled_s = now_s
         effects = list(self._on_event(event, now_s))
         if not isinstance(event, Stopping):
             effects += self._on_election(now_s)
@@ -124,6 +139,8 @@ class CoordinatorCore:
         match event:
             case Started():
                 yield from self._start(now_s)
+            case Arrived(_, _, VehicleState() as state) if self.election.leading:
+                yield from self._on_state(state, now_s)
             case Arrived(_, _, message):
                 self._on_message(message, now_s)
             case PeerUp(topic, parameters) if topic is COORDINATOR_ALIVE:
@@ -132,14 +149,12 @@ class CoordinatorCore:
                 self.election.on_token_down(*_identity(parameters))
             case PeerUp(topic, parameters) if topic is BRIDGE_ALIVE:
                 self._meet_bridge(incarnation_of(parameters))
-            case LinkUp():
-                self.election.on_link(up=True, now_s=now_s)
-            case LinkDown():
-                self.election.on_link(up=False, now_s=now_s)
+            case LinkUp() | LinkDown():
+                self.election.on_link(up=isinstance(event, LinkUp), now_s=now_s)
             case Asked(token, payload):
                 yield from self._service.take(token, payload, self._job())
-            case Computed(job, result, error):
-                yield from self._on_computed(job, result, error, now_s)
+            case Computed():
+                yield from self._on_computed(event, now_s)
             case Stopping():
                 yield self._report()
             case _:
@@ -169,8 +184,12 @@ class CoordinatorCore:
             self._bridge = incarnation
             self.census = None
             self.t_s = 0.0
-            self.controls = {}
-            self._planning = {}
+            self._groups.forget()
+            self._forget_formations()
+
+    def _forget_formations(self) -> None:
+        self.controls = {}
+        self._planner.forget()
 
     def _on_message(self, message: object, now_s: float) -> None:
         match message:
@@ -184,21 +203,38 @@ class CoordinatorCore:
                     self.census = message
                     self.t_s = max(self.t_s, message.t_s)
                     self._road_changed = True
-            case VehicleState() if self.election.leading:
-                control = self.controls.get(message.formation)
-                if control is not None:
-                    control.on_state(message, now_s)
             case _:
                 pass
+
+    def _on_state(self, state: VehicleState, now_s: float) -> Iterator[Effect]:
+        # What a vehicle has joined stays joined, whoever had it joined.
+        if self._groups.join((state.formation, *state.joined)):
+            self._road_changed = True
+        group = self._groups.of(state.formation)
+        control = self.controls.get(group[0])
+        if control is None or control.formation.numbers != group:
+            return
+        issuing = control.phase is Phase.ISSUING
+        control.on_state(state, now_s)
+        if issuing and control.phase is Phase.WATCHING:
+            closed_s = closing_time_s(group, self.scenario)
+            yield self._log("plan-in-force", formation=group[0], closed_s=closed_s)
+
+    def _on_computed(self, computed: Computed, now_s: float) -> Iterator[Effect]:
+        if self._service.owns(computed.job):
+            yield from self._service.finish(computed.job, computed.result, computed.error)
+        else:
+            notes = self._planner.finish(computed, self.controls, self.t_s, now_s)
+            yield from self._carry_out(notes)
 
     # --- election -----------------------------------------------------------------------------
 
     def _on_election(self, now_s: float) -> Iterator[Effect]:
         if not self.election.update(now_s):
             return
-        self.controls = {}
-        self._planning = {}
+        self._forget_formations()
         self._road_changed = True
+        self._awake_since_s = now_s
         if self.election.leading:
             yield Listen(STATE)
         else:
@@ -230,32 +266,41 @@ class CoordinatorCore:
         if self._road_changed:
             self._road_changed = False
             self._update_members(self.census, now_s)
-        for number, control in self.controls.items():
+        for control in self.controls.values():
             if control.wakeup_s is None or control.wakeup_s > now_s:
                 continue
             control.on_time(now_s)
             if control.take_planning_order(now_s):
-                yield from self._order_plan(number, control)
+                yield from self._carry_out(
+                    self._planner.order(self._job(), control, self.t_s, now_s)
+                )
             for vehicle, message in control.outgoing(now_s):
                 topic = PLAN if isinstance(message, Plan) else PREPARE
                 yield Send(topic, message, {"vehicle": vehicle})
 
     def _update_members(self, census: Census, now_s: float) -> None:
-        formations = closed_formations(census, self.t_s, self.scenario)
+        formations = closed_formations(census, self.t_s, self.scenario, self._groups)
+        for number in set(self.controls) - set(formations):
+            del self.controls[number]
         for number, formation in formations.items():
             control = self.controls.get(number)
-            if control is None:
+            if control is None or control.formation.numbers != formation.numbers:
                 self.controls[number] = self._take_over(formation, now_s)
             else:
                 control.on_members(formation, now_s)
-        for number in set(self.controls) - set(formations):
-            del self.controls[number]
 
     def _take_over(self, formation: Formation, now_s: float) -> FormationControl:
         control = FormationControl(
-            formation, self._new_ballot, self._rng, self.scenario.network.resend_s
+            formation,
+            self._new_ballot,
+            self._rng,
+            self.scenario.network.resend_s,
+            self._rules,
         )
-        control.begin(now_s)
+        # A formation that has just closed before this leader's eyes has no plan to be adopted.
+        age_s = self.t_s - closing_time_s(formation.numbers, self.scenario)
+        watched = now_s >= self._awake_since_s + self.election.election_s
+        control.begin(now_s, observe=not watched or age_s > JUST_CLOSED_S)
         return control
 
     def _new_ballot(self, above: Ballot | None) -> Ballot:
@@ -267,73 +312,14 @@ class CoordinatorCore:
             ballot = ballot._replace(term=self.election.term)
         return ballot
 
-    def _order_plan(self, number: int, control: FormationControl) -> Iterator[Effect]:
-        if steps_left(number, self._start_s(number), self.scenario) == 0 or control.ballot is None:
-            control.settle()
-            yield self._log("formation-too-late", formation=number)
-            return
-        # In the job: promises that cannot be planned from fail there, as any failed planning does.
-        make_request = partial(
-            plan_request,
-            number,
-            control.hold_cells,
-            {member.vehicle: member.preferred_lane for member in control.formation.members},
-            self.scenario,
-        )
-        job = self._job()
-        self._planning[job] = (number, control.ballot)
-        nodes = self.scenario.formation.max_nodes * 2**control.failures
-        yield Compute(job, partial(_plan, make_request, nodes, self._weights))
-
-    def _on_computed(self, job: int, result: object, error: str, now_s: float) -> Iterator[Effect]:
-        if self._service.owns(job):
-            yield from self._service.finish(job, result, error)
-            return
-        if job not in self._planning:
-            return
-        number, ballot = self._planning.pop(job)
-        control = self.controls.get(number)
-        if control is None or control.ballot != ballot or control.phase is not Phase.PLANNING:
-            return
-        if isinstance(result, PlanResponse) and result.paths:
-            issued = self._plan_message(number, control, result)
-            problems = plan_problems(issued)
-            if not problems:
-                control.on_plan(issued, now_s)
-                yield self._log_plan(number, result)
-                return
-            error = "; ".join(problems)
-        status = result.status if isinstance(result, PlanResponse) else "error"
-        control.on_planning_failed(now_s)
-        yield self._log("planning-failed", formation=number, status=status, error=error)
-
-    def _plan_message(self, number: int, control: FormationControl, response: PlanResponse) -> Plan:
-        first = self.scenario.lattice.block_range(number)[0]
-        hold_cells = control.hold_cells
-        moves: dict[Name, tuple[Move, ...]] = {}
-        for vehicle, path in zip(hold_cells, response.paths, strict=True):
-            cells = [(column + first, lane) for column, lane in path]
-            moves[vehicle] = tuple(
-                (step, cells[step], cells[step + 1])
-                for step in range(len(cells) - 1)
-                if cells[step] != cells[step + 1]
-            )
-        assert control.ballot is not None  # noqa: S101 (set before planning begins)
-        all_moves = [move for each in moves.values() for move in each]
-        return Plan(
-            ballot=control.ballot,
-            formation=number,
-            roster=tuple(hold_cells),
-            incarnations=control.incarnations,
-            start_cells=hold_cells,
-            moves=moves,
-            t0_s=self._start_s(number),
-            slot_s=self.scenario.formation.cycle_s,
-            territory=tuple(sorted(territory(hold_cells.values(), all_moves))),
-        )
-
-    def _start_s(self, number: int) -> float:
-        return start_time_s(number, self.t_s + START_MARGIN_S, self.scenario)
+    def _carry_out(self, outcomes: Iterable[Compute | Note]) -> Iterator[Effect]:
+        """Pass computations on; write notes down; a new group changes who plans together."""
+        for outcome in outcomes:
+            if isinstance(outcome, Compute):
+                yield outcome
+                continue
+            self._road_changed |= outcome.kind == "formations-joined"
+            yield self._log(outcome.kind, **outcome.data)
 
     # --- small things -------------------------------------------------------------------------
 
@@ -345,26 +331,12 @@ class CoordinatorCore:
         message = LogEvent(Name("coordinator"), self.name, self.t_s, Name(kind), dict(data))
         return Send(EVENT, message, {"role": "coordinator", "name": self.name})
 
-    def _log_plan(self, number: int, response: PlanResponse) -> Effect:
-        return self._log(
-            "plan-made",
-            formation=number,
-            vehicles=len(response.paths),
-            status=response.status,
-            cost=response.cost,
-            lower_bound=response.lower_bound,
-            steps=response.steps,
-            solve_ms=response.solve_ms,
-            assignments_tried=response.assignments_tried,
-            nodes_expanded=response.nodes_expanded,
-        )
-
     def _report(self) -> Effect:
         message = Report(Name("coordinator"), self.name)
         return Send(REPORT, message, {"role": "coordinator", "name": self.name})
 
     def _plan_wakeup(self, now_s: float) -> None:
-        times = [self._heartbeat_s, self._report_s, self.election.next_change_s()]
+        times = [self._heartbeat_s, self._report_s, self.election.next_change_s(now_s)]
         if not self.election.leading:
             times.append(self.election.started_s + self.election.election_s)
         else:
@@ -377,9 +349,5 @@ class CoordinatorCore:
         self._wakeup_s = max(min(time for time in times if time > now_s), now_s + 1e-3)
 
 
-def _plan(make_request: Callable[[], PlanRequest], nodes: int, weights: Weights) -> PlanResponse:
-    return checked_plan(make_request(), max_nodes=nodes, weights=weights)
-
-
-def _identity(parameters: dict[str, str]) -> tuple[str, int]:
+def _identity(parameters: Mapping[str, str]) -> tuple[str, int]:
     return parameters["coordinator"], incarnation_of(parameters)

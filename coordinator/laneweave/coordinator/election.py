@@ -13,6 +13,8 @@ from attrs import define, field
 
 from laneweave.protocol.messages import Heartbeat, Name
 
+NEWCOMER_SHARE = 1.5
+"""A better-ranked newcomer is waited for by the leader for this many election times."""
 MAX_TERM = 2**62
 """A term beyond it is nonsense; following it would leave no room to count on."""
 
@@ -21,6 +23,9 @@ MAX_TERM = 2**62
 class _Peer:
     incarnation: int
     heard_s: float
+    since_s: float
+    """When this process was heard first."""
+    leading: bool = False
 
 
 @define
@@ -51,7 +56,7 @@ class Election:
         known = self._peers.get(heartbeat.coordinator)
         if known is not None and known.incarnation > heartbeat.incarnation:
             return
-        self._peers[heartbeat.coordinator] = _Peer(heartbeat.incarnation, now_s)
+        self._hear(heartbeat.coordinator, heartbeat.incarnation, now_s).leading = heartbeat.leading
 
     def on_token_up(self, coordinator: str, incarnation: int, now_s: float) -> None:
         """A process is connected (again, if it had only been paused)."""
@@ -60,7 +65,18 @@ class Election:
         self._dead.discard((coordinator, incarnation))
         known = self._peers.get(coordinator)
         if known is None or known.incarnation <= incarnation:
-            self._peers[coordinator] = _Peer(incarnation, now_s)
+            self._hear(coordinator, incarnation, now_s)
+
+    def _hear(self, coordinator: str, incarnation: int, now_s: float) -> _Peer:
+        peer = self._peers.get(coordinator)
+        if (
+            peer is None
+            or peer.incarnation != incarnation
+            or now_s >= peer.heard_s + self.election_s
+        ):
+            peer = self._peers[coordinator] = _Peer(incarnation, now_s, now_s)
+        peer.heard_s = now_s
+        return peer
 
     def on_token_down(self, coordinator: str, incarnation: int) -> None:
         """A process is gone; forget it at once.
@@ -89,7 +105,9 @@ class Election:
     def update(self, now_s: float) -> bool:
         """Decide whether to lead now; true when this has changed."""
         rival = any(
-            name < self.name and now_s < peer.heard_s + self.election_s
+            name < self.name
+            and now_s < peer.heard_s + self.election_s
+            and (not self.leading or peer.leading or now_s >= self._patience_s(peer))
             for name, peer in self._peers.items()
         )
         lead = self.link_up and not rival and now_s >= self.started_s + self.election_s
@@ -104,13 +122,20 @@ class Election:
         """Take a term above one that was seen on a vehicle (L3)."""
         self.term = max(self.term, above + 1)
 
-    def next_change_s(self) -> float:
-        """Return when the next decision may be due without any message."""
-        return min(
-            (
-                peer.heard_s + self.election_s
-                for name, peer in self._peers.items()
-                if name < self.name
-            ),
-            default=math.inf,
-        )
+    def _patience_s(self, peer: _Peer) -> float:
+        """Return until when a leader waits for a better-ranked newcomer to say that it leads.
+
+        A newcomer may not lead before it is old enough; stepping down at once would leave nobody.
+        """
+        return peer.since_s + NEWCOMER_SHARE * self.election_s
+
+    def next_change_s(self, now_s: float) -> float:
+        """Return when the next decision after `now_s` may be due without any message."""
+        times = [
+            time_s
+            for name, peer in self._peers.items()
+            if name < self.name
+            for time_s in (peer.heard_s + self.election_s, self._patience_s(peer))
+            if time_s > now_s
+        ]
+        return min(times, default=math.inf)

@@ -5,17 +5,18 @@ from __future__ import annotations
 import time
 
 from laneweave.coordinator.core import CoordinatorCore
+from laneweave.protocol.faulty_core import Wrap, bare
 from laneweave.protocol.messages import Name
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.zenoh_transport import run_core
 
 
-def run_coordinator(scenario: Scenario, name: str) -> None:
-    """Run a coordinator candidate until SIGINT or SIGTERM.
+def run_coordinator(scenario: Scenario, name: str, wrap: Wrap = bare) -> None:
+    """Run a coordinator candidate until SIGINT or SIGTERM; `wrap` may put faults before it.
 
     Raises:
         BadInputError: nobody answers at the scenario's endpoint.
     """
     core = CoordinatorCore(Name(name), time.time_ns(), scenario)
     network = scenario.network
-    run_core(core, network.endpoint, network.realm, network.lease_s)
+    run_core(wrap(core), network.endpoint, network.realm, network.lease_s)

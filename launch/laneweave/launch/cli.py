@@ -92,7 +92,8 @@ def run(
     ] = None,
     transport: Annotated[TransportChoice, typer.Option("--transport")] = TransportChoice.zenoh,
     faults: Annotated[
-        Path | None, typer.Option("--faults", metavar="FILE", help="Faults to inject.")
+        str | None,
+        typer.Option("--faults", metavar="FILE|PRESET", help="Faults to inject: docs/FAULTS.md."),
     ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="Default: a new folder in runs/.")
@@ -120,9 +121,11 @@ def run(
     from laneweave.launch.faults import load_faults
     from laneweave.launch.local_run import LocalRun, coordinator_names
     from laneweave.launch.outcome import print_outcome
+    from laneweave.sim_bridge.demand import arrivals
 
     check_moves(settings)
-    plan_of_faults = load_faults(faults, coordinator_names(settings))
+    vehicles = {arrival.vehicle for arrival in arrivals(settings)}
+    plan_of_faults = load_faults(faults, coordinator_names(settings), vehicles)
     folder = _new_folder(out, settings, method.value)
     show = not no_progress and sys.stderr.isatty()
     if transport is TransportChoice.simulated:
@@ -248,6 +251,44 @@ def bridge(
     asked_to_end = outcome.summary is not None and outcome.summary["ending"] == "interrupted"
     broken = outcome.summary is None or outcome.summary["safety"]["overlaps"]
     raise typer.Exit(1 if broken else 0 if asked_to_end else outcome.exit_status)
+
+
+@app.command()
+def simulate(
+    seeds: Annotated[
+        str, typer.Option("--seeds", metavar="A:B", help="Seeds to run; B is not included.")
+    ] = "0:100",
+    profile: Annotated[
+        str, typer.Option("--profile", metavar="NAME", help="What goes wrong: docs/SAFETY.md.")
+    ] = "mixed",
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", metavar="N", help="Processes; default: all cores.")
+    ] = None,
+    digest: Annotated[
+        bool, typer.Option("--digest", help="Print a digest of everything that was delivered.")
+    ] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="Tell the story of the first failed seed.")
+    ] = False,
+    no_progress: Annotated[bool, typer.Option("--no-progress", help="Show no bar.")] = False,
+) -> None:
+    """Simulate runs with far more faults than ever occur, and check each of them."""
+    from laneweave.launch.simulation import profiles, search
+
+    chosen = profiles.profile_named(profile)
+    numbers, count = search.parse_seeds(seeds), search.check_jobs(jobs)
+    search.quiet_logs()
+    show = not no_progress and sys.stderr.isatty()
+    result = search.search(numbers, chosen, count, digest=digest, show=show)
+    if verbose and (result.failed or len(numbers) == 1):
+        seed = result.failed[0].seed if result.failed else numbers[0]
+        for line in search.tell_story(seed, chosen):
+            typer.echo(line)
+    if digest:
+        typer.echo(f"digest {result.digest}")
+    for line in search.describe(result, chosen):
+        typer.echo(line)
+    raise typer.Exit(1 if result.failed else 0)
 
 
 @app.command()

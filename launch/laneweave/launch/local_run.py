@@ -12,27 +12,25 @@ import signal
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
-from multiprocessing.connection import wait as wait_for_sentinels
-from multiprocessing.context import ForkServerProcess
 from pathlib import Path
+from typing import Any
 
 import attrs
-import structlog
 from attrs import define, field
 
-from laneweave.launch.faults import LEADER, Faults, Kill
+from laneweave.launch.faults import Faults
 from laneweave.launch.logs import last_error
 from laneweave.launch.observer import Observer, View
 from laneweave.launch.outcome import Outcome, complete_summary
+from laneweave.launch.process_faults import ProcessFaults
 from laneweave.launch.progress import RunProgress
-from laneweave.launch.roles import fork_server, start_role
+from laneweave.launch.role_processes import ROUTER, Order, RoleEnd, RoleProcesses
+from laneweave.launch.roles import fork_server
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.scenario import Scenario, to_tables
 from laneweave.protocol.topics import Keys
 from laneweave.protocol.zenoh_transport import ZenohTransport
 from laneweave.sim_bridge.demand import arrivals
-
-log = structlog.get_logger(__name__)
 
 MAX_TEMPORARY_BYTES = 70
 """Sockets lie up to 37 characters below TMPDIR, and their paths have at most 107 bytes."""
@@ -43,15 +41,7 @@ MOST_FAILED_AGENTS = 5
 """A run in which more agents than that end by themselves with an error is given up."""
 LEADER_S = 5.0
 """How long a run waits for a leader beyond the election time before it begins without one."""
-STOP_S = 5.0
-"""How long processes get to end by themselves."""
 POLL_S = 0.1
-
-
-@define
-class _Failover:
-    killed: str
-    at_s: float
 
 
 @define
@@ -60,12 +50,12 @@ class _Stall:
 
     scenario: Scenario
     advanced_s: float
-    tick: int = -1
+    road_s: float = -1.0
 
-    def lasts(self, view: View, now_s: float) -> bool:
+    def lasts(self, road_s: float, now_s: float) -> bool:
         """Tell whether the clock has stood still for too long."""
-        if view.clock is not None and view.clock.tick != self.tick:
-            self.tick, self.advanced_s = view.clock.tick, now_s
+        if road_s != self.road_s:
+            self.road_s, self.advanced_s = road_s, now_s
         # An entrance that waits for an agent stands still in good order.
         patience_s = max(STALL_S, 2 * self.scenario.runtime.agent_start_s)
         return now_s - self.advanced_s > patience_s
@@ -83,16 +73,15 @@ class LocalRun:
     pace: float | None = None
     watch: Callable[[View, Mapping[str, int]], None] | None = None
     """Called ten times a second with what is known and the process id of each role."""
-    _processes: dict[str, ForkServerProcess] = field(factory=dict)
+    _processes: RoleProcesses = field(init=False)
+    _options: dict[str, Any] = field(init=False)
+    """What every role needs beside the scenario."""
+    _active_faults: ProcessFaults | None = None
     _group_of: dict[str, int] = field(init=False)
     """Which vehicles share a process: neighbours in the order of their arrival."""
     _started_groups: set[int] = field(factory=set)
-    _killed: set[str] = field(factory=set)
     _problems: list[str] = field(factory=list)
-    _recovery_s: list[float] = field(factory=list)
-    _failover: _Failover | None = None
     _failed_agents: int = 0
-    _peak: int = 0
     _stop: bool = False
 
     def __attrs_post_init__(self) -> None:
@@ -112,69 +101,94 @@ class LocalRun:
         check_temporary_folder()
         self.folder.mkdir(parents=True, exist_ok=True)
         with (
-            tempfile.TemporaryDirectory(prefix="laneweave-") as sockets,
+            tempfile.TemporaryDirectory(prefix="laneweave-") as temporary,
             self._signals(),
             RunProgress(self.scenario, show=self.show_progress) as progress,
         ):
             network = attrs.evolve(
-                self.scenario.network, endpoint=f"unixsock-stream/{sockets}/router.sock"
+                self.scenario.network, endpoint=f"unixsock-stream/{temporary}/router.sock"
             )
             self.scenario = attrs.evolve(self.scenario, network=network)
+            self._options = {
+                "folder": str(self.folder),
+                "temporary": temporary,
+                "method": self.method,
+                "pace": self.pace,
+            }
+            names = coordinator_names(self.scenario)
+            self._processes = RoleProcesses(fork_server(), self._prepare, names)
             try:
-                self._supervise(progress, sockets)
+                self._open_faults(Path(temporary))
+                self._supervise(progress)
             except CommandFailedError as error:
                 self._problems.append(str(error))
             finally:
-                self._clean_up()
+                self._processes.end_all()
+                if self._active_faults is not None:
+                    self._active_faults.close()
+            return self._outcome()
+
+    def _outcome(self) -> Outcome:
+        """Return what came of the run; its temporary folder is still there."""
+        faults = self._active_faults
         return complete_summary(
             self.folder,
             problems=self._problems,
-            processes=self._peak,
-            recovery_s=self._recovery_s,
+            processes=self._processes.peak,
+            failover=faults.injection.failover if faults is not None else None,
+            dropped=faults.board.dropped if faults is not None else 0,
+            faults=faults.summary() if faults is not None else None,
         )
+
+    def _prepare(self, order: Order) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Return the tables and options for the start of a role."""
+        tables, options = to_tables(self.scenario), self._options | dict(order.options)
+        if self._active_faults is None:
+            return tables, options
+        return self._active_faults.equip(order, tables, options)
+
+    def _open_faults(self, temporary: Path) -> None:
+        if self.faults:
+            self._active_faults = ProcessFaults.open(
+                self.faults, self.scenario, self._processes, temporary
+            )
 
     # --- supervision --------------------------------------------------------------------------
 
-    def _supervise(self, progress: RunProgress, temporary: str) -> None:
-        context = fork_server()
-        tables = to_tables(self.scenario)
-        options = {
-            "folder": str(self.folder),
-            "temporary": temporary,
-            "method": self.method,
-            "pace": self.pace,
-        }
-
-        def start(role: str, name: str, **more: object) -> None:
-            self._processes[name] = start_role(context, role, name, tables, options | more)
-            self._peak = max(self._peak, len(self._processes))
-
-        start("router", "router")
+    def _supervise(self, progress: RunProgress) -> None:
+        processes, faults = self._processes, self._active_faults
+        processes.start("router", ROUTER)
         observer = Observer(Keys(self.scenario.network.realm))
         with contextlib.closing(self._connect(observer)) as transport:
             observer.subscribe(transport)
-            for name in coordinator_names(self.scenario):
-                start("coordinator", name)
+            for name in processes.coordinators:
+                processes.start("coordinator", name)
             # Road time must not begin before somebody can plan.
             self._await_leader(observer)
-            start("bridge", "bridge")
+            processes.start("bridge", "bridge")
             stall = _Stall(self.scenario, time.monotonic())
             while not self._stop and self._processes_fine():
                 observer.wait(POLL_S)
                 view, now = observer.view, time.monotonic()
                 progress.update(view)
                 for group in self._agents_to_start(observer):
-                    start("agent", f"agent-{group[0]}", vehicles=group)
-                self._inject(observer)
+                    processes.start("agent", f"agent-{group[0]}", vehicles=group)
+                if faults is not None:
+                    faults.step(now, view)
                 if self.watch is not None:
-                    self.watch(view, self._process_ids())
-                self._note_recovery(observer, now)
-                if stall.lasts(view, now):
+                    self.watch(view, processes.ids)
+                if stall.lasts(self._road_s(view), now):
                     self._problems.append(f"the road clock stands still at {view.t_s:.1f} s")
                     return
             if self._stop:
                 self._problems.append("interrupted")
-            self._problems += self.faults.never_due()
+            if faults is not None:
+                self._problems += faults.injection.never_happened()
+
+    def _road_s(self, view: View) -> float:
+        """Return the road time, also where a fault keeps its news from the supervisor."""
+        faults = self._active_faults
+        return max(view.t_s, faults.board.road_s) if faults is not None else view.t_s
 
     def _connect(self, observer: Observer) -> ZenohTransport:
         network = self.scenario.network
@@ -185,8 +199,7 @@ class LocalRun:
             except BadInputError:
                 if self._stop:
                     raise KeyboardInterrupt from None
-                router = self._processes["router"]
-                if time.monotonic() > give_up or not router.is_alive():
+                if time.monotonic() > give_up or not self._processes.is_alive(ROUTER):
                     raise
                 time.sleep(0.02)
 
@@ -197,34 +210,23 @@ class LocalRun:
 
     def _processes_fine(self) -> bool:
         """Take note of processes that ended; false when the run is over."""
-        names = {process.sentinel: name for name, process in self._processes.items()}
-        for sentinel in wait_for_sentinels(list(names), timeout=0):
-            assert isinstance(sentinel, int)  # noqa: S101 (narrows the type)
-            name = names[sentinel]
-            process = self._processes.pop(name)
-            process.join()
-            if name == "bridge":
-                if process.exitcode != 0:
-                    self._note_end("the bridge", name, process.exitcode)
+        for end in self._processes.ended():
+            if end.name in ("bridge", ROUTER):
+                if end.status != 0 or end.name == ROUTER:
+                    self._note_end(f"the {end.name}", end)
                 return False
-            if name == "router":
-                self._note_end("the router", name, process.exitcode)
-                return False
-            if process.exitcode != 0 and name not in self._killed:
-                self._note_end(name, name, process.exitcode)
-                self._failed_agents += name.startswith("agent-")
+            if end.status != 0:
+                self._note_end(end.name, end)
+                self._failed_agents += end.name.startswith("agent-")
         if self._failed_agents > MOST_FAILED_AGENTS:
             self._problems.append("agents cannot start or stay up")
             return False
         return True
 
-    def _note_end(self, who: str, name: str, status: int | None) -> None:
-        words = last_error(self.folder / "log.jsonl", name)
+    def _note_end(self, who: str, end: RoleEnd) -> None:
+        words = last_error(self.folder / "log.jsonl", end.name)
         reason = f": {words}" if words else ""
-        self._problems.append(f"{who} ended with status {status}{reason}")
-
-    def _process_ids(self) -> dict[str, int]:
-        return {name: process.pid or 0 for name, process in self._processes.items()}
+        self._problems.append(f"{who} ended with status {end.status}{reason}")
 
     def _agents_to_start(self, observer: Observer) -> Iterator[list[str]]:
         """Return groups of vehicles that share a process, when its first one is announced."""
@@ -234,33 +236,6 @@ class LocalRun:
             if index is not None and index not in self._started_groups:
                 self._started_groups.add(index)
                 yield [name for name, group in self._group_of.items() if group == index]
-
-    # --- faults -------------------------------------------------------------------------------
-
-    def _inject(self, observer: Observer) -> None:
-        due, self.faults = self.faults.due(observer.view.t_s)
-        for kill in due:
-            self._kill(kill, observer)
-
-    def _kill(self, kill: Kill, observer: Observer) -> None:
-        leader = observer.view.leader
-        name = leader if kill.target == LEADER else kill.target
-        process = self._processes.get(name) if name is not None else None
-        if name is None or process is None or process.pid is None:
-            self._problems.append(f"no process to kill for target {kill.target}")
-            return
-        log.warning("killing", target=name, t_s=observer.view.t_s)
-        self._killed.add(name)
-        process.kill()
-        if name == leader:
-            self._failover = _Failover(name, time.monotonic())
-            observer.view.leader = None
-
-    def _note_recovery(self, observer: Observer, now: float) -> None:
-        failover = self._failover
-        if failover is not None and observer.view.leader not in (None, failover.killed):
-            self._recovery_s.append(round(now - failover.at_s, 4))
-            self._failover = None
 
     # --- the end ------------------------------------------------------------------------------
 
@@ -275,14 +250,6 @@ class LocalRun:
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
-
-    def _clean_up(self) -> None:
-        """End every process: asked first, then killed. The router goes last."""
-        router = self._processes.pop("router", None)
-        _end_all(list(self._processes.values()))
-        self._processes.clear()
-        if router is not None:
-            _end_all([router])
 
 
 def check_temporary_folder() -> None:
@@ -299,16 +266,3 @@ def check_temporary_folder() -> None:
 def coordinator_names(scenario: Scenario) -> tuple[str, ...]:
     """Return the names of a scenario's coordinator candidates, best-ranked first."""
     return tuple(f"c{index + 1}" for index in range(scenario.runtime.coordinators))
-
-
-def _end_all(processes: list[ForkServerProcess]) -> None:
-    for process in processes:
-        process.terminate()
-    deadline = time.monotonic() + STOP_S
-    for process in processes:
-        process.join(max(0.0, deadline - time.monotonic()))
-        if process.is_alive():
-            log.warning("killing a process that did not end", process=process.name)
-            process.kill()
-            process.join(STOP_S)
-        process.close()

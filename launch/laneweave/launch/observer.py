@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import queue
+from collections import deque
 from collections.abc import Iterator
 
 from attrs import define, field
 
 from laneweave.protocol.codec import decode
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.messages import Census, Heartbeat, Name, RoadClock
-from laneweave.protocol.topics import CENSUS, CLOCK, HEARTBEAT, Keys
+from laneweave.protocol.messages import Census, Heartbeat, LogEvent, Name, RoadClock
+from laneweave.protocol.topics import CENSUS, CLOCK, EVENT, HEARTBEAT, Keys
 from laneweave.protocol.transport import Delivery, Received, Transport
 
-TOPICS = (CLOCK, CENSUS, HEARTBEAT)
+TOPICS = (CLOCK, CENSUS, HEARTBEAT, EVENT)
+MOST_NEWS = 1000
+"""Events that are kept until somebody takes them."""
 
 
 @define
@@ -24,7 +27,10 @@ class View:
     clock: RoadClock | None = None
     census: Census | None = None
     leader: Name | None = None
+    incarnation: int = 0
+    """Of the leader."""
     term: int = 0
+    _news: deque[LogEvent] = field(factory=lambda: deque(maxlen=MOST_NEWS))
 
     def take(self, message: object) -> None:
         """Take a message in; older news than what is known is ignored."""
@@ -34,9 +40,17 @@ class View:
             case Census() if self.census is None or message.t_s >= self.census.t_s:
                 self.census = message
             case Heartbeat() if message.leading and message.term >= self.term:
-                self.leader, self.term = message.coordinator, message.term
+                self.leader, self.incarnation = message.coordinator, message.incarnation
+                self.term = message.term
+            case LogEvent():
+                self._news.append(message)
             case _:
                 pass
+
+    def take_news(self) -> Iterator[LogEvent]:
+        """Return what coordinators have said since the last call."""
+        while self._news:
+            yield self._news.popleft()
 
     @property
     def t_s(self) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from attrs import frozen
 from rich.console import Console
 from rich.table import Table
 
+from laneweave.launch.failover import Failover
 from laneweave.sim_bridge.run_record import write_summary
 
 
@@ -35,8 +37,9 @@ def complete_summary(
     *,
     problems: Sequence[str],
     processes: int | None = None,
-    recovery_s: Sequence[float] = (),
+    failover: Failover | None = None,
     dropped: int = 0,
+    faults: dict[str, Any] | None = None,
 ) -> Outcome:
     """Add the launcher's knowledge to a run's summary and judge the run.
 
@@ -44,8 +47,9 @@ def complete_summary(
         folder: the run's folder.
         problems: what went wrong already.
         processes: most role processes at one time, where that is known.
-        recovery_s: for each killed leader, wall-clock seconds until another one led.
+        failover: what faults of the leader have cost; None: there were none.
         dropped: messages that faults took away.
+        faults: what was done to the run; None: nothing.
     """
     path = folder / "summary.json"
     if not path.exists():
@@ -53,8 +57,12 @@ def complete_summary(
     summary: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     summary["runtime"]["processes"] = processes
     summary["messages"]["dropped_by_faults"] = dropped
-    if recovery_s:
-        summary["failover"]["recovery_s"] = list(recovery_s)
+    if faults is not None:
+        summary["faults"] = faults
+    if failover is not None and failover.recovery_s:
+        summary["failover"]["recovery_s"] = failover.recovery_s
+    if failover is not None and failover.plan_recovery_s:
+        summary["failover"]["plan_recovery_s"] = failover.plan_recovery_s
     write_summary(folder, summary)
     return Outcome(folder, summary, (*problems, *_broken_promises(summary)))
 
@@ -87,7 +95,7 @@ def print_outcome(outcome: Outcome, console: Console) -> None:
 
 
 def _rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
-    return [*_traffic_rows(summary), *_control_rows(summary)]
+    return [*_traffic_rows(summary), *_control_rows(summary), *_fault_rows(summary)]
 
 
 def _traffic_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
@@ -140,6 +148,25 @@ def _control_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
             f"{failover['leader_changes']}" + (f" ({recoveries})" if recoveries else ""),
         ),
     ]
+
+
+def _fault_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
+    faults = summary.get("faults")
+    if faults is None:
+        return []
+    verbs = Counter(
+        verb for one in faults["injected"] for verb in ("killed", "paused") if verb in one
+    )
+    rows = [
+        ("processes killed, paused", f"{verbs['killed']}, {verbs['paused']}"),
+        ("messages lost to faults", f"{summary['messages']['dropped_by_faults']}"),
+    ]
+    methods = faults["partition_methods"]
+    if methods:
+        how = ", ".join(dict.fromkeys(methods.values()))
+        why = faults.get("why_no_namespaces")
+        rows.append(("partitions made with", f"{how} ({why})" if why else how))
+    return rows
 
 
 def _join(values: dict[str, Any], *names: str, unit: str) -> str:

@@ -6,6 +6,7 @@ one more vehicle costs a fork and not the start of an interpreter.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import multiprocessing
 import os
@@ -21,9 +22,14 @@ from pathlib import Path
 from typing import Any
 
 import structlog
+from attrs import frozen
 
+from laneweave.launch.fault_board import BoardWord
 from laneweave.launch.logs import log_to_file
+from laneweave.launch.namespaces import join_namespace
 from laneweave.protocol.errors import BadInputError, CommandFailedError
+from laneweave.protocol.faulty_core import FaultyCore, MessageRule, Wrap, bare
+from laneweave.protocol.node import Core
 from laneweave.protocol.scenario import parse_scenario
 
 log = structlog.get_logger(__name__)
@@ -34,10 +40,30 @@ PRELOADED = [
     "laneweave.coordinator.process",
 ]
 AGENT_NICENESS = 5
+CONNECT_AGAIN_S = 0.1
+"""Where there are faults, a role that cannot connect tries again after this time."""
 ORPHAN_S = 5.0
 """How long a process whose supervisor died gets to end in good order."""
 _PR_SET_PDEATHSIG = 1
 _PR_SET_NAME = 15
+
+
+@frozen
+class MessageFaults:
+    """What a role process needs to have message faults; goes to it as an option."""
+
+    rules: tuple[MessageRule, ...]
+    board: Path
+    """File of the run's `SharedBoard`."""
+    word: int
+    """This process's word in it."""
+    receiver: str
+    seed: str
+
+    def wrap(self, core: Core) -> Core:
+        """Put the faults before a core."""
+        board = BoardWord(self.board, self.word)
+        return FaultyCore(core, self.rules, board, receiver=self.receiver, seed=self.seed)
 
 
 def fork_server() -> ForkServerContext:
@@ -74,7 +100,8 @@ def start_role(
         name: for logs and process lists.
         tables: the scenario, as `to_tables` gives it.
         options: what the role needs beside the scenario; `folder` is where its log goes,
-            `temporary` where its temporary files go.
+            `temporary` where its temporary files go, `namespace` a process whose network
+            namespace it joins, `faults` its `MessageFaults`; the last two may be missing.
 
     Raises:
         CommandFailedError: the fork server is gone, or no process can be made.
@@ -91,18 +118,34 @@ def start_role(
 def run_role(role: str, name: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
     """Run a role in this process until it ends (the target of `start_role`)."""
     die_with_parent()
+    if "namespace" in options:
+        # A thread belongs to a namespace, not a process: before there are more threads.
+        join_namespace(options["namespace"])
     die_with_supervisor()
     ctypes.CDLL(None).prctl(_PR_SET_NAME, name.encode()[:15], 0, 0, 0)
     tempfile.tempdir = options["temporary"]
     log_to_file(Path(options["folder"]) / "log.jsonl", role, name)
     try:
-        _ROLES[role](name, tables, options)
+        while not _run_once(role, name, tables, options):
+            time.sleep(CONNECT_AGAIN_S)
     except BadInputError as error:
         log.error("cannot start", reason=str(error))  # noqa: TRY400 (the line says it all)
         sys.exit(2)
     except Exception:
         log.exception("role failed")
         sys.exit(1)
+
+
+def _run_once(role: str, name: str, tables: dict[str, Any], options: dict[str, Any]) -> bool:
+    """Run a role; false when it could not connect because of a fault, and should try again."""
+    try:
+        _ROLES[role](name, tables, options)
+    except BadInputError as error:
+        # The router may be down, or the way to it cut. The bridge is never started then.
+        if "faults" not in options or role == "bridge" or error.field != "network.endpoint":
+            raise
+        return False
+    return True
 
 
 def die_with_parent() -> None:
@@ -122,8 +165,12 @@ def die_with_supervisor() -> None:
     if supervisor is None:
         return
 
+    parent = os.getppid()
+
     def watch() -> None:
         supervisor.join()
+        if os.getppid() == parent:
+            wake_children(parent)
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(ORPHAN_S)
         os._exit(1)
@@ -131,23 +178,43 @@ def die_with_supervisor() -> None:
     threading.Thread(target=watch, name="supervisor", daemon=True).start()
 
 
-def _router(_: str, tables: dict[str, Any], __: dict[str, Any]) -> None:
+def wake_children(parent: int) -> None:
+    """Let go on what a fault has paused: whoever sleeps does not see that its supervisor died."""
+    with contextlib.suppress(OSError):
+        children = Path(f"/proc/{parent}/task/{parent}/children").read_text(encoding="ascii")
+        for child in children.split():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(int(child), signal.SIGCONT)
+
+
+def _wrap(options: dict[str, Any]) -> Wrap:
+    faults = options.get("faults")
+    return bare if faults is None else faults.wrap
+
+
+def _router(_: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
     from laneweave.protocol.zenoh_transport import run_router
 
     network = parse_scenario(tables).network
-    run_router(network.endpoint, network.lease_s)
+    run_router(network.endpoint, network.lease_s, more_endpoints=options.get("listen", ()))
 
 
-def _coordinator(name: str, tables: dict[str, Any], _: dict[str, Any]) -> None:
+def _coordinator(name: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
     from laneweave.coordinator.process import run_coordinator
 
-    run_coordinator(parse_scenario(tables), name)
+    run_coordinator(parse_scenario(tables), name, _wrap(options))
 
 
 def _bridge(_: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
     from laneweave.sim_bridge.process import run_bridge
 
-    run_bridge(parse_scenario(tables), Path(options["folder"]), options["method"], options["pace"])
+    run_bridge(
+        parse_scenario(tables),
+        Path(options["folder"]),
+        options["method"],
+        options["pace"],
+        _wrap(options),
+    )
 
 
 def _agent(_: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
@@ -155,7 +222,7 @@ def _agent(_: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
 
     # Everybody waits for bridge, router and coordinators: they go first.
     os.nice(AGENT_NICENESS)
-    run_agents(parse_scenario(tables), options["vehicles"])
+    run_agents(parse_scenario(tables), options["vehicles"], wrap=_wrap(options))
 
 
 _ROLES: dict[str, Callable[[str, dict[str, Any], dict[str, Any]], None]] = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from itertools import count
 from pathlib import Path
 
 from attrs import define, field
@@ -12,13 +13,14 @@ from attrs import define, field
 from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost
 from laneweave.coordinator.core import CoordinatorCore
-from laneweave.launch.faults import LEADER, Faults
+from laneweave.launch.faults import Faults
 from laneweave.launch.local_run import coordinator_names
 from laneweave.launch.observer import TOPICS, View
 from laneweave.launch.outcome import Outcome, complete_summary
 from laneweave.launch.progress import RunProgress
+from laneweave.launch.simulated_faults import SimulatedFaults, SimulatedRoles, check_simulated
 from laneweave.protocol.messages import Name
-from laneweave.protocol.node import Arrived, Effect, Event, Listen, Started
+from laneweave.protocol.node import Arrived, Core, Effect, Event, Listen, Started
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.simulated_network import Conditions, SimulatedNetwork
 from laneweave.sim_bridge.core import BridgeCore, Phase
@@ -28,6 +30,7 @@ from laneweave.sim_bridge.sumo_world import SumoWorld
 STALL_S = 600.0
 """A road clock that stands still for this much virtual time has stopped for good."""
 PROGRESS_EVERY_TICKS = 20
+AGENT_PREFIX = "agent-"
 
 
 class _Watcher:
@@ -60,42 +63,71 @@ class SimulatedRun:
     conditions: Conditions = field(factory=Conditions)
     show_progress: bool = True
     _view: View = field(factory=View)
-    _known: set[Name] = field(factory=set)
+    _roles: SimulatedRoles = field(init=False)
+    _active_faults: SimulatedFaults | None = None
+    _incarnations: Iterator[int] = field(factory=lambda: count(1))
+    """Of agents and caretakers: each number once."""
+    _coordinator_incarnations: Iterator[int] = field(factory=lambda: count(1))
     _problems: list[str] = field(factory=list)
 
     def run(self) -> Outcome:
-        """Run the scenario and return what came of it."""
+        """Run the scenario and return what came of it.
+
+        Raises:
+            BadInputError: the faults are not for the simulated network.
+        """
         scenario = self.scenario
+        check_simulated(self.faults)
         self.folder.mkdir(parents=True, exist_ok=True)
         network = SimulatedNetwork(scenario.seed, self.conditions)
+        self._roles = SimulatedRoles(network, coordinator_names(scenario), self._start)
+        if self.faults:
+            self._active_faults = SimulatedFaults.open(self.faults, scenario, self._roles)
         record = RunRecord(self.folder, scenario, self.method, time.perf_counter)
         with (
             tempfile.TemporaryDirectory(prefix="laneweave-sumo-") as sumo_folder,
             SumoWorld(scenario, Path(sumo_folder)) as world,
             RunProgress(scenario, show=self.show_progress) as progress,
         ):
-            bridge = BridgeCore(scenario, world, record, pace=1.0)
+            bridge = BridgeCore(
+                scenario,
+                world,
+                record,
+                new_incarnation=self._incarnations.__next__,
+                pace=1.0,
+            )
             try:
                 self._drive(network, bridge, progress)
             finally:
                 record.close(bridge.t_s, Ending.INTERRUPTED)
-        self._problems += self.faults.never_due()
+        return self._outcome(network)
+
+    def _outcome(self, network: SimulatedNetwork) -> Outcome:
+        faults = self._active_faults
+        if faults is None:
+            return complete_summary(
+                self.folder, problems=self._problems, processes=1, dropped=network.dropped
+            )
         return complete_summary(
             self.folder,
-            problems=self._problems,
+            problems=[*self._problems, *faults.injection.never_happened()],
             processes=1,
-            dropped=network.dropped,
+            failover=faults.injection.failover,
+            dropped=network.dropped + faults.board.dropped,
+            faults=faults.summary(),
         )
 
     def _drive(self, network: SimulatedNetwork, bridge: BridgeCore, progress: RunProgress) -> None:
-        scenario, realm = self.scenario, self.scenario.network.realm
-        network.add("watcher", _Watcher(self._view, lambda: self._on_news(network)), realm)
-        for index, name in enumerate(coordinator_names(scenario)):
-            network.add(name, CoordinatorCore(Name(name), index + 1, scenario), realm)
-        network.add("bridge", bridge, realm)
+        realm, faults = self.scenario.network.realm, self._active_faults
+        network.add("watcher", _Watcher(self._view, self._start_agents), realm)
+        for name in self._roles.coordinators:
+            self._start(name)
+        self._add("bridge", bridge, "bridge")
         shown = advanced_tick = 0
         advanced_s = 0.0
         while bridge.phase is not Phase.ENDED and network.step():
+            if faults is not None:
+                faults.step(network.now_s, self._view)
             if bridge.tick != advanced_tick:
                 advanced_tick, advanced_s = bridge.tick, network.now_s
             elif network.now_s - advanced_s > STALL_S:
@@ -105,29 +137,27 @@ class SimulatedRun:
                 shown = bridge.tick
                 progress.update(self._view)
 
-    def _on_news(self, network: SimulatedNetwork) -> None:
-        self._start_agents(network)
-        due, self.faults = self.faults.due(self._view.t_s)
-        for kill in due:
-            leader = self._view.leader
-            name = leader if kill.target == LEADER else kill.target
-            if name is None or name not in network:
-                self._problems.append(f"no process to kill for target {kill.target}")
-                continue
-            network.kill(name)
-            if name == leader:
-                self._view.leader = None
+    def _start_agents(self) -> None:
+        agents, census = self._roles.agents, self._view.census
+        for announced in census.announced if census is not None else ():
+            if announced.vehicle not in agents:
+                agents[announced.vehicle] = f"{AGENT_PREFIX}{announced.vehicle}"
+                self._start(agents[announced.vehicle])
 
-    def _start_agents(self, network: SimulatedNetwork) -> None:
-        census = self._view.census
-        if census is None:
-            return
-        for announced in census.announced:
-            vehicle = announced.vehicle
-            if vehicle not in self._known:
-                self._known.add(vehicle)
-                host = AgentHost(self._make_agent(1000 + len(self._known)), [vehicle])
-                network.add(f"agent-{vehicle}", host, self.scenario.network.realm)
+    def _start(self, name: str) -> None:
+        """Start a coordinator or an agent, the first time or again."""
+        if name in self._roles.coordinators:
+            incarnation = next(self._coordinator_incarnations)
+            core = CoordinatorCore(Name(name), incarnation, self.scenario)
+            self._add(name, core, "coordinator")
+        else:
+            vehicle = Name(name.removeprefix(AGENT_PREFIX))
+            self._add(name, AgentHost(self._make_agent, [vehicle]), "vehicle")
 
-    def _make_agent(self, incarnation: int) -> Callable[[Name], AgentCore]:
-        return lambda vehicle: AgentCore(vehicle, incarnation, self.scenario)
+    def _add(self, name: str, core: Core, receiver: str) -> None:
+        faults = self._active_faults
+        faulty = core if faults is None else faults.wrap(core, name, receiver)
+        self._roles.network.add(name, faulty, self.scenario.network.realm)
+
+    def _make_agent(self, vehicle: Name) -> AgentCore:
+        return AgentCore(vehicle, self._incarnations.__next__, self.scenario)

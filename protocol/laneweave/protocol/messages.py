@@ -56,8 +56,10 @@ class Prepare:
     """
 
     ballot: Ballot
-    formation: int
+    formations: tuple[int, ...]
+    """Whose blocks the plan may use, ascending; more than one: a joint ballot."""
     roster: tuple[Name, ...]
+    """All vehicles on the road that entered in these blocks."""
 
 
 @frozen
@@ -70,7 +72,8 @@ class Plan:
     """
 
     ballot: Ballot
-    formation: int
+    formations: tuple[int, ...]
+    """Whose blocks the territory lies in; those of the ballot."""
     roster: tuple[Name, ...]
     incarnations: dict[Name, int]
     """Incarnation of each vehicle's agent when it promised."""
@@ -96,6 +99,9 @@ class VehicleState:
     vehicle: Name
     incarnation: int
     formation: int
+    """In whose block it entered."""
+    joined: tuple[int, ...]
+    """Formations whose blocks its plans may use, as its motion controller keeps them; ascending."""
     promised: Ballot | None
     accepted: bool
     """It has the plan of the promised ballot."""
@@ -112,6 +118,8 @@ class VehicleState:
     """It has completed all moves of the accepted plan."""
     overdue: bool
     """Its next move has been due for longer than the leader should accept."""
+    attended: bool
+    """An agent drives it; without one its caretaker speaks for it, and it only ever holds."""
     s_m: float
     y_m: float
     speed_mps: float
@@ -151,6 +159,14 @@ class Sense:
     preferred_lane: int
     ahead: tuple[Neighbour, ...]
     """One for each lane that the body touches or that is next to it, where there is somebody."""
+    formation: int = 0
+    """In whose block the vehicle entered."""
+    attendant: int = 0
+    """Incarnation of the process that is in charge of the vehicle; 0: none yet."""
+    caretaker: bool = False
+    """The one in charge is the vehicle's caretaker, because its agent died or fell silent."""
+    joined: tuple[int, ...] = ()
+    """Formations whose blocks the vehicle's plans may use, as the controller has confirmed."""
     left: bool = False
     """The vehicle has left the road: its agent reports and ends."""
 
@@ -161,16 +177,20 @@ class Command:
 
     It holds the whole remaining trajectory: jerks per tick from `tick` on. Missing: the controller
     plays the trajectory it has and then holds `hold_cell`. Duplicated: no effect. For an older
-    tick than the newest command: ignored.
+    tick than the newest command: ignored. From an older incarnation than the one in charge:
+    refused; from a newer one: that process is in charge from now on.
     """
 
     vehicle: Name
+    incarnation: int
     tick: int
     hold_cell: Cell
     motion_end_tick: int
     motion_origin: Cell
     jerks: bytes
     """Little-endian float32 pairs (j_s, j_y) in m/s3, one for each tick of the horizon."""
+    joined: tuple[int, ...] = ()
+    """Formations that the controller should remember as joined, beside those that it knows."""
 
 
 @frozen
@@ -234,12 +254,14 @@ class Report:
     role: Name
     name: Name
     process: Name = Name("unknown")
-    """The process that counts; several vehicles may share one. The node fills it in, and both
-    counters."""
+    """The process that counts; several vehicles may share one. The node fills it in, and the next
+    three counters."""
     published: int = 0
     """Messages that the process has published so far."""
     rejected: int = 0
     """Messages so far that were not well formed."""
+    dropped: int = 0
+    """Messages so far that injected faults kept from this process."""
     solves: int = 0
     unusable: int = 0
     solve_ms: bytes = b""

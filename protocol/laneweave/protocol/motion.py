@@ -13,6 +13,7 @@ so the three agree to the last bit.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 from laneweave.protocol.lattice import Cell, Lattice
 from laneweave.protocol.scenario import Vehicle
@@ -22,6 +23,10 @@ State = tuple[float, float, float, float, float, float]
 
 Jerk = tuple[float, float]
 """(j_s, j_y) [m/s3]."""
+
+ARRIVED_ALONG_M = 0.5
+ARRIVED_ACROSS_M = 0.3
+"""A motion has ended when its time is over and the body is this close to the target point."""
 
 # Poles of the hold law near -0.6 and -1.2 +- 0.8i 1/s: no overshoot worth mentioning, and slow
 # enough for ticks of 0.1 s.
@@ -37,6 +42,11 @@ _ACCEL_SHARE = 0.8
 """Share of the other limits that the hold law asks for."""
 _CATCH_UP_SHARE = 0.25
 """Largest speed towards the cell along the road, as a share of the cell's speed."""
+
+_OPEN_GAIN = 0.6
+"""Speed at which a gap that is too small is opened, per metre that it lacks [1/s]."""
+_SETTLE_TICKS = 2.0
+"""Ticks after which the speed is to be the safe one."""
 
 
 def integrate(state: State, jerk: Jerk, tick_s: float) -> State:
@@ -65,6 +75,21 @@ def cell_state(lattice: Lattice, cell: Cell, t_s: float) -> State:
     """Return the state of a vehicle that holds `cell` at road time `t_s` [s]."""
     column, lane = cell
     return (lattice.cell_s_m(column, t_s), lattice.speed_mps, 0.0, lattice.cell_y_m(lane), 0.0, 0.0)
+
+
+def at_rest_in_cell(state: State, lattice: Lattice, cell: Cell, t_s: float) -> bool:
+    """Tell whether a motion that led to `cell` has ended: the body is close to the target point.
+
+    Args:
+        state: of the body at road time `t_s` [s].
+        lattice: where the cell lies.
+        cell: (column, lane) of the target.
+        t_s: road time [s].
+    """
+    goal = cell_state(lattice, cell, t_s)
+    return (
+        abs(state[0] - goal[0]) <= ARRIVED_ALONG_M and abs(state[3] - goal[3]) <= ARRIVED_ACROSS_M
+    )
 
 
 def limited_jerk(state: State, jerk: Jerk, limits: Vehicle, tick_s: float) -> Jerk:
@@ -104,7 +129,8 @@ def hold_law(state: State, reference: State, limits: Vehicle, tick_s: float) -> 
     """Return the jerk that brings the vehicle to rest in a cell: a saturated linear feedback.
 
     Position error asks for a speed, speed error for an acceleration, acceleration error for a
-    jerk; each is saturated before it is passed on. It looks neither ahead nor behind.
+    jerk; each is saturated before it is passed on. It looks neither ahead nor behind; `keep_gap`
+    does.
 
     Args:
         state: (s, v, a, y, v_y, a_y) in m and s, finite.
@@ -128,6 +154,56 @@ def hold_law(state: State, reference: State, limits: Vehicle, tick_s: float) -> 
     wanted_ay = _clamp(_SPEED_GAIN * (wanted_vy - v_y), -a_max, a_max)
     jerk = (_ACCEL_GAIN * (wanted_a - a), _ACCEL_GAIN * (wanted_ay - a_y))
     return limited_jerk(state, jerk, limits, tick_s)
+
+
+def keep_gap(
+    state: State,
+    jerk: Jerk,
+    ahead: Iterable[tuple[float, float]],
+    limits: Vehicle,
+    min_gap_m: float,
+    tick_s: float,
+) -> Jerk:
+    """Return `jerk`, or one that brakes more where that is needed to stay behind somebody.
+
+    The safe speed after Gipps ("A behavioural car-following model for computer simulation",
+    Transportation Research B 15, 1981): should the other one brake with b to standstill, this one,
+    which brakes with b after the time T, comes to rest `min_gap_m` behind it,
+
+        v T + v^2 / (2 b)  <=  gap - min_gap + v_other^2 / (2 b).
+
+    b is the braking that the hold law asks for, too, so a row of vehicles that all drive by these
+    laws is safe as a whole. T is the time in which limited jerk builds b up; the time and the speed
+    that a vehicle gains until it has ended speeding up count, too.
+
+    Two exceptions. Who is at least `min_gap_m` behind may always be as fast as the other one: a row
+    at equal speed stays as it is, however tight, but closer than v T it relies on `min_gap_m` when
+    the first one brakes. And who is closer than `min_gap_m` falls back. Time is discrete: with
+    ticks of 0.1 s up to 0.1 m of the gap may lack, with ticks of 0.4 s up to 2 m (measured).
+
+    Args:
+        state: (s, v, a, y, v_y, a_y) in m and s, finite.
+        jerk: wanted (j_s, j_y) [m/s3].
+        ahead: (net gap [m], speed [m/s]) of each vehicle to stay behind.
+        limits: the vehicle's limits; the result respects them as `limited_jerk` does.
+        min_gap_m: net gap to keep [m].
+        tick_s: length of the tick [s].
+    """
+    _, v, a, _, _, _ = state
+    brake = -_BRAKE_SHARE * limits.min_accel_mps2
+    # Who is speeding up goes on to do so until the jerk limit has brought that to an end.
+    fade_s = max(a, 0.0) / limits.max_jerk_mps3
+    gained_v = max(a, 0.0) * (0.5 * fade_s + tick_s)
+    delay_s = brake / (2.0 * limits.max_jerk_mps3) + 2.0 * tick_s + fade_s
+    j_s = jerk[0]
+    for gap_m, speed_mps in ahead:
+        spare_m = gap_m - min_gap_m
+        room_m = max(spare_m + speed_mps * speed_mps / (2.0 * brake), 0.0)
+        stopping = brake * (math.sqrt(delay_s * delay_s + 2.0 * room_m / brake) - delay_s)
+        safe_v = max(stopping, speed_mps + _OPEN_GAIN * min(spare_m, 0.0))
+        wanted_a = max((safe_v - v - gained_v) / (_SETTLE_TICKS * tick_s), -brake)
+        j_s = min(j_s, (wanted_a - a) / tick_s)
+    return limited_jerk(state, (j_s, jerk[1]), limits, tick_s)
 
 
 def _clamp(value: float, low: float, high: float) -> float:

@@ -8,7 +8,8 @@ counted and dropped here, so no core ever sees it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any, Protocol
 
 import attrs
@@ -25,7 +26,6 @@ from laneweave.protocol.transport import (
     LinkUp,
     Question,
     Received,
-    TokenDown,
     TokenUp,
     Transport,
 )
@@ -43,7 +43,7 @@ class Arrived:
     """A well-formed message."""
 
     topic: Topic
-    parameters: dict[str, str]
+    parameters: Mapping[str, str]
     message: Any
 
 
@@ -52,7 +52,7 @@ class PeerUp:
     """A peer's liveliness token appeared."""
 
     topic: Topic
-    parameters: dict[str, str]
+    parameters: Mapping[str, str]
 
 
 @frozen
@@ -60,7 +60,7 @@ class PeerDown:
     """A peer's liveliness token vanished."""
 
     topic: Topic
-    parameters: dict[str, str]
+    parameters: Mapping[str, str]
 
 
 @frozen
@@ -184,7 +184,10 @@ class Core(Protocol):
     """A state machine that a node drives."""
 
     def handle(self, event: Event, now_s: float) -> Iterable[Effect]:
-        """Take one event at a time and return what to do."""
+        """Take one event at a time and return what to do.
+
+        What is in an event may be shared with other cores: it is not to be changed.
+        """
 
     @property
     def wakeup_s(self) -> float | None:
@@ -205,10 +208,12 @@ class Node:
         keys: Keys,
         order_work: Callable[[Compute], None],
         label: Name,
+        read: Callable[[str, bytes], Arrived] | None = None,
     ) -> None:
         """Join a core to its transport; nothing is sent before the first `dispatch`.
 
-        `label` tells this process from all others in reports.
+        `label` tells this process from all others in reports. `read` does what
+        `read_message` does with `keys`, which is also the default; it may remember.
         """
         self._label = label
         self.core = core
@@ -218,6 +223,9 @@ class Node:
         self._transport = transport
         self._keys = keys
         self._order_work = order_work
+        self._read = read or partial(read_message, keys)
+        self._encoded: tuple[object, bytes] = (None, b"")
+        """The newest message sent, and its bytes: a plan goes to one vehicle after the other."""
 
     def deliver(self, delivery: Delivery, now_s: float) -> None:
         """Translate what the transport hands over and let the core handle it."""
@@ -237,28 +245,14 @@ class Node:
             return delivery
         if isinstance(delivery, Question):
             return Asked(delivery.token, delivery.payload)
-        known = self._keys.read(delivery.key)
-        if known is None:
-            self._reject(delivery.key, "no such topic")
-            return None
-        topic, parameters = known
-        if isinstance(delivery, TokenUp):
-            return PeerUp(topic, parameters)
-        if isinstance(delivery, TokenDown):
-            return PeerDown(topic, parameters)
-        return self._arrived(topic, parameters, delivery)
-
-    def _arrived(
-        self, topic: Topic, parameters: dict[str, str], received: Received
-    ) -> Arrived | None:
-        if topic.kind is None:
-            self._reject(received.key, "carries no messages")
-            return None
         try:
-            return Arrived(topic, parameters, decode(received.payload, topic.kind))
+            if isinstance(delivery, Received):
+                return self._read(delivery.key, delivery.payload)
+            known = _known(self._keys, delivery.key)
         except BadInputError as error:
-            self._reject(received.key, str(error))
+            self._reject(delivery.key, str(error))
             return None
+        return PeerUp(*known) if isinstance(delivery, TokenUp) else PeerDown(*known)
 
     def _reject(self, key: str, reason: str) -> None:
         self.rejected += 1
@@ -278,9 +272,10 @@ class Node:
                         rejected=self.rejected,
                     )
                 self.published += 1
-                transport.publish(
-                    self._keys.key(topic, **parameters), encode(message), topic.quality
-                )
+                if message is not self._encoded[0]:
+                    self._encoded = message, encode(message)
+                key = self._keys.key(topic, **parameters)
+                transport.publish(key, self._encoded[1], topic.quality)
             case Compute():
                 self._order_work(effect)
             case Reply(token, payload, ok):
@@ -306,6 +301,30 @@ class Node:
                 transport.watch(self._keys.all_of(topic, **parameters))
             case Serve(topic):
                 transport.serve(self._keys.key(topic))
+
+
+def read_message(
+    keys: Keys,
+    key: str,
+    payload: bytes,
+    decode: Callable[[bytes, type], object] = decode,
+) -> Arrived:
+    """Return the message that arrived on a key; equal arguments give equal results.
+
+    Raises:
+        BadInputError: the key is none of `keys`, or the payload is no message of its topic.
+    """
+    topic, parameters = _known(keys, key)
+    if topic.kind is None:
+        raise BadInputError("key", key, "a topic that carries messages")
+    return Arrived(topic, parameters, decode(payload, topic.kind))
+
+
+def _known(keys: Keys, key: str) -> tuple[Topic, Mapping[str, str]]:
+    known = keys.read(key)
+    if known is None:
+        raise BadInputError("key", key, f"a topic of realm {keys.realm}")
+    return known
 
 
 def run_job(job: Compute) -> Computed:

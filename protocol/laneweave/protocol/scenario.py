@@ -118,6 +118,8 @@ class FormationSettings:
     """Width of a formation's block; the interlaced structure puts half of its cells to use."""
     max_vehicles: int = field(default=6, validator=within(1, 36))
     """Largest formation (the paper: six)."""
+    max_joined: int = field(default=1, validator=within(1, 4))
+    """Most neighbouring formations that one ballot may join, when one alone lacks room."""
     mode: int = field(default=1, validator=one_of(1, 2))
     """Relative motion mode."""
     conflicts: tuple[str, ...] = field(default=(), validator=_conflict_kinds)
@@ -189,7 +191,7 @@ class Network:
     """A candidate leads when it has been the best-ranked one for this long. A process that dies is
     noticed at once by its liveliness token; this is for one that hangs."""
     resend_s: float = field(default=0.2, validator=within(0.01, 10.0))
-    """PREPARE, PLAN and ticks are sent again after this time without an answer."""
+    """PREPARE and PLAN are sent again after this time without an answer."""
 
 
 @frozen
@@ -197,8 +199,13 @@ class Runtime:
     """How a run is executed."""
 
     tick_s: float = field(default=0.1, validator=within(0.01, 1.0))
-    tick_deadline_s: float = field(default=2.0, validator=within(0.02, 60.0))
-    """An agent that has not answered a tick by then is passed over (wall-clock seconds)."""
+    tick_resend_s: float = field(default=0.05, validator=within(0.005, 10.0))
+    """A tick is sent again after this time to those who have not answered (wall-clock seconds)."""
+    tick_deadline_s: float = field(default=0.3, validator=within(0.02, 60.0))
+    """Then the road goes on; who has not answered plays what it has (wall-clock seconds)."""
+    agent_silent_s: float = field(default=3.0, validator=within(0.1, 600.0))
+    """An agent that is asked for this long without any answer is not waited for any more, and its
+    vehicle's caretaker takes charge (wall-clock seconds)."""
     agent_start_s: float = field(default=15.0, validator=within(0.1, 120.0))
     """How long the entrance waits for a vehicle's agent to come up (wall-clock seconds)."""
     announce_s: float = field(default=6.0, validator=within(0.0, 600.0))

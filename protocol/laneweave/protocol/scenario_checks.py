@@ -140,14 +140,21 @@ def _check_timing(scenario: Scenario) -> None:
         f"long enough to hold a whole move of {formation.move_s:g} s",
     )
     _require(
-        network.lease_s <= runtime.tick_deadline_s,
-        "network.lease_s",
-        network.lease_s,
-        f"at most runtime.tick_deadline_s = {runtime.tick_deadline_s:g}: who hangs is given up",
+        runtime.tick_resend_s < runtime.tick_deadline_s,
+        "runtime.tick_resend_s",
+        runtime.tick_resend_s,
+        f"less than runtime.tick_deadline_s = {runtime.tick_deadline_s:g}",
     )
     _require(
-        runtime.tick_deadline_s > network.resend_s,
+        runtime.tick_deadline_s <= runtime.agent_silent_s,
         "runtime.tick_deadline_s",
         runtime.tick_deadline_s,
-        f"more than network.resend_s = {network.resend_s:g}",
+        f"at most runtime.agent_silent_s = {runtime.agent_silent_s:g}",
+    )
+    _require(
+        network.lease_s <= runtime.agent_silent_s,
+        "network.lease_s",
+        network.lease_s,
+        f"at most runtime.agent_silent_s = {runtime.agent_silent_s:g}: a session that is lost is "
+        "noticed before its agent counts as silent",
     )

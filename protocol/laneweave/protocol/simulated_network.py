@@ -2,31 +2,29 @@
 
 Nodes, messages and computations live on one event queue; time jumps from event to event. Each
 message to each receiver may be lost, duplicated, delayed and so overtaken, drawn from one seeded
-generator: equal seeds give equal runs. Nodes can be killed, paused, woken and cut off, with the
-liveliness behaviour that was measured on Zenoh (a killed process is seen at once, a silent one
-after its lease; a node that loses the network sees everybody else vanish).
+generator: equal seeds give equal runs. Nodes can be killed, paused, woken and cut off, the router
+can be lost and clocks can be wrong, with the liveliness behaviour that was measured on Zenoh (a
+killed process is seen at once, a silent one after its lease; a node that loses the network sees
+everybody else vanish).
+
+Every message travels as bytes and is checked on receipt, as on Zenoh. But all who receive the same
+bytes are handed one and the same message: no core may change what it is handed.
 """
 
 from __future__ import annotations
 
 import heapq
-import random
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from functools import lru_cache, partial
 from itertools import count
 
-from attrs import frozen
-
+from laneweave.protocol.codec import decode
 from laneweave.protocol.messages import Name
-from laneweave.protocol.node import (
-    Compute,
-    Computed,
-    Core,
-    Node,
-    Started,
-    Stopping,
-    Wakeup,
-    run_job,
-)
+from laneweave.protocol.node import Arrived, Core, Node, Started, Stopping, read_message
+from laneweave.protocol.simulated_conditions import Clock, Conditions
+from laneweave.protocol.simulated_members import Member
+from laneweave.protocol.simulated_time import Simulation
+from laneweave.protocol.simulated_tokens import Tokens
 from laneweave.protocol.simulated_transport import SimulatedTransport
 from laneweave.protocol.topics import Keys, matches_any
 from laneweave.protocol.transport import (
@@ -36,111 +34,65 @@ from laneweave.protocol.transport import (
     Question,
     Received,
     TokenDown,
-    TokenUp,
 )
+
+__all__ = ["KILL_SEEN_S", "REJOIN_S", "Clock", "Conditions", "SimulatedNetwork"]
 
 KILL_SEEN_S = 0.005
 """A killed process is noticed within this time (measured on Zenoh: 2 to 9 ms)."""
-WAKE_AGAIN_S = 0.001
-"""A core that asks for a time that has passed is woken this much later: time goes on for it too."""
+REJOIN_S = (0.2, 0.9)
+"""How long a node takes to find a router that has come back (measured on Zenoh)."""
+_REMEMBERED = 4096
+"""Messages that are remembered as they were read, once for all receivers."""
 
 
-@frozen
-class Conditions:
-    """How the network treats messages."""
-
-    delay_s: float = 0.002
-    jitter_s: float = 0.003
-    """Delay is drawn uniformly from [delay, delay + jitter]: messages overtake each other."""
-    loss: float = 0.0
-    """Probability that a message does not reach a receiver."""
-    duplication: float = 0.0
-    """Probability that a receiver gets a message twice."""
-    lease_s: float = 0.5
-    """A paused node is given up after this time."""
-    compute_s: float = 0.05
-    """Virtual time that a computation takes."""
-
-
-_Item = Delivery | Computed | Started | Stopping
-
-
-class _Member:
-    """A node with its place in the network."""
-
-    node: Node
-
-    def __init__(self, transport: SimulatedTransport) -> None:
-        self.transport = transport
-        self.connected = True
-        self.connection = 0
-        """What was under way when a connection ended does not arrive in the next one."""
-        self.paused = False
-        self.pauses = 0
-        self.lapsed = False
-        """Paused for longer than its lease."""
-        self.backlog: list[_Item] = []
-        self.wakeup_s: float | None = None
-        self.news_s = 0.0
-        """When the newest news of a token arrives: they do not overtake each other."""
-        self.seen: dict[str, None] = {}
-        """Tokens that have been shown to it."""
-
-    @property
-    def visible(self) -> bool:
-        """Whether others see its tokens."""
-        return self.connected and not self.lapsed
-
-    def learn(self, news: TokenUp | TokenDown) -> bool:
-        """Remember what it is shown; false when that is nothing new."""
-        known = news.key in self.seen
-        if isinstance(news, TokenUp):
-            self.seen[news.key] = None
-            return not known
-        self.seen.pop(news.key, None)
-        return known
-
-
-class SimulatedNetwork:
-    """The network, its nodes and the virtual clock."""
+class SimulatedNetwork(Simulation):
+    """The network and its nodes, in virtual time."""
 
     def __init__(self, seed: int, conditions: Conditions | None = None) -> None:
         """Make an empty network at time 0."""
-        self.now_s = 0.0
-        self.conditions = conditions or Conditions()
-        self.dropped = 0
-        self.delivered = 0
-        self._random = random.Random(seed)  # noqa: S311 (simulation, not secrets)
-        self._queue: list[tuple[float, int, Callable[[], None]]] = []
-        self._order = count()
-        self._members: dict[str, _Member] = {}
-        self._routes: dict[str, tuple[str, ...]] = {}
+        super().__init__(seed, conditions)
+        self._members: dict[str, Member] = {}
+        self._tokens = Tokens(self, self._members)
+        self._clocks: dict[str, Clock] = {}
+        self._routes: dict[str, tuple[Member, ...]] = {}
+        """For each key who receives what is published on it."""
         self._cut: Callable[[str, str], bool] | None = None
+        self._loss_on: Callable[[str], float] | None = None
+        self._router_up = True
+        self._outages = 0
         self._answers: dict[int, tuple[Callable[[bytes, bool], None], tuple[int, ...]]] = {}
         """For each open question who asked, and all tokens under which it was asked."""
         self._token_count = count(1)
         self._label_count = count(1)
+        self._readers: dict[str, Callable[[str, bytes], Arrived]] = {}
+        self._decode = lru_cache(maxsize=_REMEMBERED)(decode)
 
-    # --- building and driving ---------------------------------------------------------------
+    # --- nodes ------------------------------------------------------------------------------
 
     def add(self, name: str, core: Core, realm: str) -> Node:
-        """Start a node now.
+        """Start a node now; while the router is lost it starts without a connection.
 
         Raises:
             ValueError: a node of this name is there already.
         """
         if name in self._members:
             raise ValueError(f"node {name} is already in the network")
-        member = _Member(SimulatedTransport(self, name))
+        member = Member(self, SimulatedTransport(self, name))
+        member.clock = self._clocks.get(name)
         member.node = Node(
             core,
             member.transport,
             Keys(realm),
-            lambda job: self._compute(member, job),
+            member.compute,
             Name(f"{next(self._label_count)}"),
+            self._reader(realm),
         )
         self._members[name] = member
-        self._in(0.0, lambda: self._hand_over(member, Started()))
+        self.at(self.now_s, member.hand_over, Started())
+        if not self._router_up:
+            member.connected = False
+            self.at(self.now_s, member.hand_over, LinkDown())
         return member.node
 
     def __contains__(self, name: str) -> bool:
@@ -156,28 +108,7 @@ class SimulatedNetwork:
         """Return a node."""
         return self._members[name].node
 
-    def step(self) -> bool:
-        """Process the next event; false when there is none."""
-        if not self._queue:
-            return False
-        self.now_s, _, action = heapq.heappop(self._queue)
-        action()
-        return True
-
-    def run(self, until_s: float, stop: Callable[[], bool] | None = None) -> None:
-        """Process events up to a virtual time, or until `stop` says so."""
-        while self._queue and self._queue[0][0] <= until_s:
-            if stop is not None and stop():
-                return
-            self.step()
-        if stop is None or not stop():
-            self.now_s = max(self.now_s, until_s)
-
-    def at(self, time_s: float, action: Callable[[], None]) -> None:
-        """Do something at a virtual time, e.g. inject a fault."""
-        heapq.heappush(self._queue, (max(time_s, self.now_s), next(self._order), action))
-
-    # --- faults -----------------------------------------------------------------------------
+    # --- faults of nodes --------------------------------------------------------------------
 
     def kill(self, name: str) -> None:
         """Kill a node: it is gone without a word; its tokens vanish at once."""
@@ -187,7 +118,7 @@ class SimulatedNetwork:
         """Ask a node to end, as SIGTERM does; a paused one does so when it is resumed."""
         member = self._members.get(name)
         if member is not None:
-            self._hand_over(member, Stopping())
+            member.hand_over(Stopping())
 
     def pause(self, name: str) -> None:
         """Stop a node's clock and hands; its tokens vanish after the lease."""
@@ -196,27 +127,44 @@ class SimulatedNetwork:
             return
         member.paused = True
         member.pauses += 1
-        pause = member.pauses
-        self._in(self.conditions.lease_s, lambda: self._lapse(member, pause))
+        self.at(self.now_s + self.conditions.lease_s, self._lapse, member, member.pauses)
 
     def resume(self, name: str) -> None:
         """Wake a paused node: it finds everything that queued up, as a zombie does."""
         member = self._members[name]
         if not member.paused:
             return
-        member.paused = False
-        member.wakeup_s = None
         if member.lapsed:
             member.lapsed = False
-            self._show_own(member)
-        backlog, member.backlog = member.backlog, []
-        for item in backlog:
-            self._hand_over(member, item)
-        self._plan_wakeup(member)
+            self._tokens.show_all(member)
+        member.wake()
+        self._rejoin_later(member)
+
+    def set_clock(self, name: str, offset_s: float = 0.0, rate: float = 1.0) -> None:
+        """Let the clock of a node show `offset + rate * t` at virtual time t; default: exact.
+
+        The clock is its machine's: a node that starts under this name later finds it so. For a
+        node that runs already time jumps.
+
+        Raises:
+            ValueError: an argument is not finite, or the clock does not go forwards.
+        """
+        clock = self._clocks[name] = Clock(offset_s, rate)
+        if name in self._members:
+            self._members[name].set_clock(clock)
+
+    # --- faults of the network --------------------------------------------------------------
 
     def cut(self, blocked: Callable[[str, str], bool] | None) -> None:
         """Partition: messages from a to b are lost where `blocked(a, b)`; None heals."""
         self._cut = blocked
+
+    def lose(self, loss_on: Callable[[str], float] | None) -> None:
+        """Lose messages by their key: with probability `loss_on(key)` where that is the greater.
+
+        None: with `Conditions.loss` on every key.
+        """
+        self._loss_on = loss_on
 
     def disconnect(self, name: str) -> None:
         """Take a node off the network: it and the others see each other's tokens vanish, at once.
@@ -224,27 +172,34 @@ class SimulatedNetwork:
         The node sees its own vanish too, and its `LinkDown` anywhere among them.
         """
         member = self._members[name]
-        if not member.connected:
-            return
-        self._hide_own(member)
-        member.connected = False
-        member.connection += 1
-        news: list[Delivery] = [TokenDown(key) for key in member.seen]
-        member.seen.clear()
-        news.insert(self._random.randint(0, len(news)), LinkDown())
-        for item in news:
-            self._hand_over(member, item)
+        member.unplugged = True
+        self._break_links([member])
 
     def reconnect(self, name: str) -> None:
-        """Bring a node back."""
+        """Bring a node back at once; while the router is lost: when it finds that again."""
         member = self._members[name]
-        if member.connected:
-            return
-        member.connected = True
-        self._show_own(member, but=member)
-        for key in self._seen_tokens(member.transport.watched):
-            self._tell(member, TokenUp(key))
-        self._hand_over(member, LinkUp())
+        member.unplugged = False
+        if self._router_up:
+            self._join(member)
+
+    def lose_router(self) -> None:
+        """Take every node off the network: everybody sees everybody vanish, at once."""
+        if self._router_up:
+            self._router_up = False
+            self._outages += 1
+            self._break_links(list(self._members.values()))
+
+    def restore_router(self) -> None:
+        """Bring the router back; each node finds it in its own time, drawn from `REJOIN_S`."""
+        if not self._router_up:
+            self._router_up = True
+            for member in self._members.values():
+                self._rejoin_later(member)
+
+    def inject(self, key: str, payload: bytes) -> None:
+        """Deliver any bytes on any key, as a stranger on the network could."""
+        for receiver in self._route(key):
+            self._send(receiver, Received(key, payload))
 
     # --- what transports call ---------------------------------------------------------------
 
@@ -254,13 +209,25 @@ class SimulatedNetwork:
         if source is None or not source.connected:
             self.dropped += 1
             return
+        duplication, loss, draw = (
+            self.conditions.duplication,
+            self.conditions.loss,
+            self.random.random,
+        )
+        if self._loss_on is not None:
+            loss = max(loss, self._loss_on(key))
+        message = Received(key, payload)
         for receiver in self._route(key):
-            self._carry_to(sender, receiver, key, payload)
-
-    def inject(self, key: str, payload: bytes) -> None:
-        """Deliver any bytes on any key, as a stranger on the network could."""
-        for receiver in self._route(key):
-            self._send(self._members[receiver], Received(key, payload))
+            if (
+                not receiver.connected
+                or (self._cut is not None and self._cut(sender, receiver.transport.name))
+                or (loss and draw() < loss)
+            ):
+                self.dropped += 1
+                continue
+            self._send(receiver, message)
+            if duplication and draw() < duplication:
+                self._send(receiver, message)
 
     def ask(self, key: str, payload: bytes, answer: Callable[[bytes, bool], None]) -> bool:
         """Ask all who serve the key and take the first answer; false when nobody serves it."""
@@ -282,30 +249,26 @@ class SimulatedNetwork:
         answer, tokens = self._answers[token]
         for other in tokens:
             del self._answers[other]
-        self._in(self._delay(), lambda: answer(payload, ok))
+        self.at(self.now_s + self.delay_s(), answer, payload, ok)
 
     def show_token(self, owner: str, key: str) -> None:
         """Tell all watchers of a new token."""
-        member = self._members[owner]
-        if member.visible and not self._shown(key, member):
-            self._tell_watchers(TokenUp(key))
+        self._tokens.appeared(self._members[owner], key)
 
     def hide_token(self, owner: str, key: str) -> None:
         """Tell all watchers that a token is gone."""
-        member = self._members[owner]
-        if member.visible and not self._shown(key, member):
-            self._tell_watchers(TokenDown(key))
+        self._tokens.vanished(self._members[owner], key)
 
     def show_all_tokens(self, watcher: str, expression: str) -> None:
         """Tell a new watcher of the tokens that are there."""
         member = self._members[watcher]
         if member.connected:
-            for key in self._seen_tokens({expression: None}):
-                self._tell(member, TokenUp(key))
+            self._tokens.introduce(member, (expression,))
 
-    def forget_routes(self) -> None:
-        """Subscriptions changed: look receivers up again."""
-        self._routes.clear()
+    def forget_routes(self, expressions: Iterable[str]) -> None:
+        """Subscriptions changed: look the receivers on matching keys up again."""
+        for key in [key for key in self._routes if matches_any(expressions, key)]:
+            del self._routes[key]
 
     def remove(self, name: str) -> None:
         """Take a node out that left in good order."""
@@ -313,140 +276,73 @@ class SimulatedNetwork:
 
     # --- inside -----------------------------------------------------------------------------
 
+    def _reader(self, realm: str) -> Callable[[str, bytes], Arrived]:
+        """Return what reads messages for all nodes of a realm: each only once."""
+        if realm not in self._readers:
+            # Some go to many on keys of their own, like a plan: they are still decoded only once.
+            read = partial(read_message, Keys(realm), decode=self._decode)
+            self._readers[realm] = lru_cache(maxsize=_REMEMBERED)(read)
+        return self._readers[realm]
+
     def _vanish(self, name: str, seen_after_s: float) -> None:
         member = self._members.pop(name, None)
         if member is None:
             return
         member.transport.closed = True
-        self.forget_routes()
+        self.forget_routes(member.transport.subscriptions)
         if member.visible:
-            self._in(seen_after_s, lambda: self._hide_own(member))
+            self.at(self.now_s + seen_after_s, self._tokens.hide_all, member)
 
-    def _lapse(self, member: _Member, pause: int) -> None:
+    def _lapse(self, member: Member, pause: int) -> None:
         if member.paused and member.pauses == pause and not member.transport.closed:
-            self._hide_own(member)
+            self._tokens.hide_all(member)
             member.lapsed = True
 
-    def _shown(self, key: str, owner: _Member) -> bool:
-        """Tell whether somebody else shows a token on this key."""
-        return any(
-            member is not owner and member.visible and key in member.transport.tokens
-            for member in self._members.values()
-        )
+    def _break_links(self, members: Iterable[Member]) -> None:
+        broken = [member for member in members if member.connected]
+        for member in broken:
+            self._tokens.hide_all(member)
+            member.connected = False
+            member.connection += 1
+        for member in broken:
+            news: list[Delivery] = [TokenDown(key) for key in member.seen]
+            member.seen.clear()
+            news.insert(self.random.randint(0, len(news)), LinkDown())
+            for item in news:
+                member.hand_over(item)
 
-    def _seen_tokens(self, watched: dict[str, None]) -> list[str]:
-        keys = (
-            key
-            for member in self._members.values()
-            if member.visible
-            for key in member.transport.tokens
-            if matches_any(watched, key)
-        )
-        return list(dict.fromkeys(keys))
+    def _join(self, member: Member) -> None:
+        if member.connected:
+            return
+        member.connected = True
+        self._tokens.show_all(member, but=member)
+        self._tokens.introduce(member, member.transport.watched)
+        member.hand_over(LinkUp())
 
-    def _show_own(self, owner: _Member, but: _Member | None = None) -> None:
-        if owner.visible:
-            for key in owner.transport.tokens:
-                if not self._shown(key, owner):
-                    self._tell_watchers(TokenUp(key), but)
+    def _rejoin_later(self, member: Member) -> None:
+        if self._router_up and not member.connected and not member.unplugged:
+            join_s = self.now_s + self.random.uniform(*REJOIN_S)
+            self.at(join_s, self._rejoin, member, self._outages)
 
-    def _hide_own(self, owner: _Member) -> None:
-        if owner.visible:
-            for key in owner.transport.tokens:
-                if not self._shown(key, owner):
-                    self._tell_watchers(TokenDown(key), owner)
+    def _rejoin(self, member: Member, outage: int) -> None:
+        lost_again = self._outages != outage
+        # A paused node looks for the router when it wakes.
+        if not (lost_again or member.paused or member.unplugged or member.transport.closed):
+            self._join(member)
 
-    def _tell_watchers(self, news: TokenUp | TokenDown, but: _Member | None = None) -> None:
-        for member in self._members.values():
-            if (
-                member is not but
-                and member.connected
-                and matches_any(member.transport.watched, news.key)
-            ):
-                self._tell(member, news)
-
-    def _tell(self, watcher: _Member, news: TokenUp | TokenDown) -> None:
-        """Send news of a token, which stay in order as Zenoh's declarations do."""
-        watcher.news_s = max(watcher.news_s, self.now_s + self._delay())
-        self._arrive_at(watcher.news_s, watcher, news)
-
-    def _route(self, key: str) -> tuple[str, ...]:
+    def _route(self, key: str) -> tuple[Member, ...]:
         route = self._routes.get(key)
         if route is None:
             route = self._routes[key] = tuple(
-                name
-                for name, member in self._members.items()
+                member
+                for member in self._members.values()
                 if matches_any(member.transport.subscriptions, key)
             )
         return route
 
-    def _carry_to(self, sender: str, receiver: str, key: str, payload: bytes) -> None:
+    def _send(self, receiver: Member, delivery: Delivery) -> None:
+        # `at` and `delay_s` written out: most events of a simulation are made here.
         conditions = self.conditions
-        if not self._members[receiver].connected or (
-            self._cut is not None and self._cut(sender, receiver)
-        ):
-            self.dropped += 1
-            return
-        if conditions.loss and self._random.random() < conditions.loss:
-            self.dropped += 1
-            return
-        member = self._members[receiver]
-        self._send(member, Received(key, payload))
-        if conditions.duplication and self._random.random() < conditions.duplication:
-            self._send(member, Received(key, payload))
-
-    def _send(self, receiver: _Member, delivery: Delivery) -> None:
-        self._arrive_at(self.now_s + self._delay(), receiver, delivery)
-
-    def _arrive_at(self, time_s: float, receiver: _Member, delivery: Delivery) -> None:
-        connection = receiver.connection
-
-        def arrive() -> None:
-            if not receiver.connected or receiver.connection != connection:
-                return
-            if not isinstance(delivery, (TokenUp, TokenDown)) or receiver.learn(delivery):
-                self._hand_over(receiver, delivery)
-
-        self.at(time_s, arrive)
-
-    def _delay(self) -> float:
-        return self.conditions.delay_s + self.conditions.jitter_s * self._random.random()
-
-    def _in(self, delay_s: float, action: Callable[[], None]) -> None:
-        self.at(self.now_s + delay_s, action)
-
-    def _hand_over(self, member: _Member, item: _Item) -> None:
-        if member.transport.closed:
-            return
-        if member.paused:
-            member.backlog.append(item)
-            return
-        if isinstance(item, (Computed, Started, Stopping)):
-            member.node.dispatch(item, self.now_s)
-        else:
-            self.delivered += 1
-            member.node.deliver(item, self.now_s)
-        if isinstance(item, Stopping):
-            member.transport.close()
-        self._plan_wakeup(member)
-
-    def _plan_wakeup(self, member: _Member, earliest_s: float = 0.0) -> None:
-        if member.transport.closed or member.paused:
-            return
-        wakeup_s = member.node.core.wakeup_s
-        if wakeup_s is not None and wakeup_s != member.wakeup_s:
-            member.wakeup_s = wakeup_s
-            self.at(max(wakeup_s, earliest_s), lambda: self._wake(member, wakeup_s))
-
-    def _wake(self, member: _Member, wakeup_s: float) -> None:
-        if member.transport.closed or member.paused or member.wakeup_s != wakeup_s:
-            return
-        member.wakeup_s = None
-        due_s = member.node.core.wakeup_s
-        if due_s is not None and due_s <= self.now_s:
-            member.node.dispatch(Wakeup(), self.now_s)
-        self._plan_wakeup(member, self.now_s + WAKE_AGAIN_S)
-
-    def _compute(self, member: _Member, job: Compute) -> None:
-        computed = run_job(job)
-        self._in(self.conditions.compute_s, lambda: self._hand_over(member, computed))
+        arrival_s = self.now_s + conditions.delay_s + conditions.jitter_s * self.random.random()
+        arguments = (receiver.connection, delivery)
+        heapq.heappush(self.queue, (arrival_s, next(self.order), receiver.arrive, arguments))

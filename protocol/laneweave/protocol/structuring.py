@@ -8,7 +8,8 @@ that names the field by its path.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from itertools import cycle
 from typing import Any, TypeVar, get_args, get_origin
 
 import attrs
@@ -25,6 +26,8 @@ from laneweave.protocol.errors import BadInputError
 
 T = TypeVar("T")
 Hook = Callable[[Any, Any], Any]
+NumberOrRange = float | tuple[float, float]
+"""A number, or the range from which one is drawn."""
 
 
 def _exactly(kind: type, name: str) -> Hook:
@@ -45,6 +48,14 @@ def _number(value: object, _: type) -> float:
     return float(value)
 
 
+def _number_or_range(value: object, _: type) -> NumberOrRange:
+    if not isinstance(value, (list, tuple)):
+        return _number(value, float)
+    if len(value) != 2:
+        raise BadInputError("", value, "a number or a list of two")
+    return _number(value[0], float), _number(value[1], float)
+
+
 def strict_converter(*, detailed: bool) -> Converter:
     """Return a converter that coerces nothing; `detailed` collects paths for error messages."""
     converter = Converter(forbid_extra_keys=True, detailed_validation=detailed)
@@ -53,6 +64,7 @@ def strict_converter(*, detailed: bool) -> Converter:
     converter.register_structure_hook(bool, _exactly(bool, "true or false"))
     converter.register_structure_hook(bytes, _exactly(bytes, "bytes"))
     converter.register_structure_hook(float, _number)
+    converter.register_structure_hook(NumberOrRange, _number_or_range)
     converter.register_structure_hook_factory(
         lambda kind: _origin(kind) is tuple, lambda kind: _tuple_hook(kind, converter)
     )
@@ -71,20 +83,25 @@ def _tuple_hook(kind: Any, converter: Converter) -> Hook:  # noqa: ANN401 (a gen
     kinds = get_args(kind)
     endless = kinds[-1] is Ellipsis
     hooks = [(converter.get_structure_hook(part), part) for part in kinds if part is not Ellipsis]
+    first_hook, first_part = hooks[0]
 
-    def parts(value: object) -> Iterator[tuple[Any, tuple[Hook, Any]]]:
+    def parts(value: object) -> Sequence[Any]:
         if not isinstance(value, (list, tuple)):
             raise BadInputError("", value, "a list")
         if not endless and len(value) != len(hooks):
             raise BadInputError("", value, f"a list of {len(hooks)}")
-        return zip(value, hooks * len(value) if endless else hooks, strict=True)
+        return value
 
     def fast(value: object, _: type) -> tuple[Any, ...]:
-        return tuple([hook(item, part) for item, (hook, part) in parts(value)])
+        if endless:
+            return tuple([first_hook(item, first_part) for item in parts(value)])
+        return tuple(
+            [hook(item, part) for item, (hook, part) in zip(parts(value), hooks, strict=True)]
+        )
 
     def detailed(value: object, _: type) -> tuple[Any, ...]:
         done: list[Any] = []
-        for item, (hook, part) in parts(value):
+        for item, (hook, part) in zip(parts(value), cycle(hooks)):
             try:
                 done.append(hook(item, part))
             except Exception as error:

@@ -11,6 +11,8 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from enum import Enum
+from functools import lru_cache
+from types import MappingProxyType
 
 from attrs import frozen
 
@@ -112,35 +114,52 @@ class Keys:
         Raises:
             BadInputError: a parameter cannot be one part of a key.
         """
-        return f"{PREFIX}/{self.realm}/{topic.pattern.format_map(_Text(parameters))}"
+        return _key(self.realm, topic.pattern, **parameters)
 
     def all_of(self, topic: Topic, **given: object) -> str:
         """Return the key expression that matches all keys of a topic with the given parameters."""
         return self.key(topic, **(dict.fromkeys(topic.parameters, "*") | given))
 
-    def read(self, key: str) -> tuple[Topic, dict[str, str]] | None:
+    def read(self, key: str) -> tuple[Topic, Mapping[str, str]] | None:
         """Return a key's topic and parameters, or None when it is not one of ours."""
-        parts = key.split("/")
-        if parts[:2] != [PREFIX, self.realm]:
-            return None
-        for topic in TOPICS:
-            pattern = topic.pattern.split("/")
-            if len(pattern) == len(parts) - 2:
-                found = _match(pattern, parts[2:])
-                if found is not None:
-                    return topic, found
+        return _read(self.realm, key) if len(key) <= _MAX_KEY else None
+
+
+_MEMO = 1024
+"""Keys remembered, in each direction: a process uses few of them, many times a second."""
+_MAX_KEY = max(
+    len(re.sub(r"{\w+}", "x" * 64, f"{PREFIX}/{{realm}}/{topic.pattern}")) for topic in TOPICS
+)
+"""Characters of the longest key; no longer text is looked at or remembered."""
+_PATTERNS = tuple((topic, tuple(topic.pattern.split("/"))) for topic in TOPICS)
+
+
+# `typed`: 1, 1.0 and True are equal, but their texts differ.
+@lru_cache(maxsize=_MEMO, typed=True)
+def _key(realm: str, pattern: str, /, **parameters: object) -> str:
+    texts = {name: str(value) for name, value in parameters.items()}
+    for name, text in texts.items():
+        if text != "*" and not NAME_PATTERN.fullmatch(text):
+            raise BadInputError(name, text, NAME_RULE)
+    return f"{PREFIX}/{realm}/{pattern.format_map(texts)}"
+
+
+@lru_cache(maxsize=_MEMO)
+def _read(realm: str, key: str) -> tuple[Topic, Mapping[str, str]] | None:
+    prefix, *rest = key.split("/")
+    if prefix != PREFIX or not rest or rest[0] != realm:
         return None
+    parts = rest[1:]
+    for topic, pattern in _PATTERNS:
+        if len(pattern) == len(parts):
+            found = _match(pattern, parts)
+            if found is not None:
+                # All who read this key share the answer.
+                return topic, MappingProxyType(found)
+    return None
 
 
-class _Text(dict[str, str]):
-    def __init__(self, parameters: Mapping[str, object]) -> None:
-        super().__init__({name: str(value) for name, value in parameters.items()})
-        for name, text in self.items():
-            if text != "*" and not NAME_PATTERN.fullmatch(text):
-                raise BadInputError(name, text, NAME_RULE)
-
-
-def _match(pattern: list[str], parts: list[str]) -> dict[str, str] | None:
+def _match(pattern: Iterable[str], parts: Iterable[str]) -> dict[str, str] | None:
     found = {}
     for expected, part in zip(pattern, parts, strict=True):
         if expected.startswith("{"):
@@ -160,16 +179,16 @@ def incarnation_of(parameters: Mapping[str, str]) -> int:
 
 def matches(expression: str, key: str) -> bool:
     """Tell whether a key expression matches a key: `*` is one part, `**` any number of parts."""
-    return _match_parts(expression.split("/"), key.split("/"))
+    return _compiled(expression).fullmatch("/" + key) is not None
 
 
-def _match_parts(expression: list[str], key: list[str]) -> bool:
-    if not expression:
-        return not key
-    head, rest = expression[0], expression[1:]
-    if head == "**":
-        return any(_match_parts(rest, key[start:]) for start in range(len(key) + 1))
-    return bool(key) and head in ("*", key[0]) and _match_parts(rest, key[1:])
+@lru_cache(maxsize=_MEMO)
+def _compiled(expression: str) -> re.Pattern[str]:
+    """Return the pattern of the keys that match, each part with a slash before it."""
+    wild = {"*": "/[^/]*", "**": "(?:/[^/]*)*"}
+    return re.compile(
+        "".join(wild.get(part) or "/" + re.escape(part) for part in expression.split("/"))
+    )
 
 
 def matches_any(expressions: Iterable[str], key: str) -> bool:

@@ -14,7 +14,7 @@ import queue
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import structlog
@@ -314,18 +314,29 @@ def _stop_signals(stop: Callable[[], None]) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def run_router(endpoint: str, lease_s: float, ready: Callable[[], None] | None = None) -> None:
+def run_router(
+    endpoint: str,
+    lease_s: float,
+    ready: Callable[[], None] | None = None,
+    more_endpoints: Sequence[str] = (),
+) -> None:
     """Run a Zenoh router until SIGINT or SIGTERM.
 
+    Args:
+        endpoint: where it listens. The socket file that a killed router left there is replaced.
+        lease_s: after this time of silence the others give the router up.
+        ready: called when it listens.
+        more_endpoints: where else it listens.
+
     Raises:
-        BadInputError: it cannot listen at the endpoint.
+        BadInputError: it cannot listen at an endpoint.
     """
-    check_endpoint(endpoint)
+    endpoints = [check_endpoint(each) for each in (endpoint, *more_endpoints)]
     config = _config("router", lease_s)
     stop: queue.SimpleQueue[bool] = queue.SimpleQueue()
     with _stop_signals(lambda: stop.put(True)):
         try:
-            config.insert_json5("listen/endpoints", json.dumps([endpoint]))
+            config.insert_json5("listen/endpoints", json.dumps(endpoints))
             session = zenoh.open(config)
         except zenoh.ZError as error:
             raise BadInputError(

@@ -2,16 +2,17 @@
 
 A tick: the census admits vehicles, every vehicle on the road is told what its sensors see, its
 agent answers with a trajectory, all bodies move on by one tick, the world shows them, and what it
-shows is measured. A tick is sent again to those who have not answered; after the deadline their
-motion controllers go on with the trajectory that they have.
+shows is measured. A tick is sent again to those who have not answered (`answers`); after the
+deadline their motion controllers go on with the trajectory that they have. A vehicle without an
+agent, or with a silent one, gets a caretaker (`attendance`).
 """
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from enum import Enum
-from typing import Protocol
 
 import structlog
 
@@ -21,11 +22,10 @@ from laneweave.protocol.messages import (
     Heartbeat,
     LogEvent,
     Name,
-    Neighbour,
+    Plan,
+    Prepare,
     Report,
-    Sense,
 )
-from laneweave.protocol.motion import State
 from laneweave.protocol.node import (
     Announce,
     Arrived,
@@ -44,8 +44,6 @@ from laneweave.protocol.node import (
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.topics import (
     BRIDGE_ALIVE,
-    CENSUS,
-    CLOCK,
     COMMAND,
     EVENT,
     HEARTBEAT,
@@ -54,41 +52,19 @@ from laneweave.protocol.topics import (
     VEHICLE_ALIVE,
 )
 from laneweave.protocol.transport import LinkDown, LinkUp
-from laneweave.sim_bridge.overlap import Pose, least_gaps, neighbours, overlapping_pairs
+from laneweave.sim_bridge.answers import Answers
+from laneweave.sim_bridge.attendance import Attendance
+from laneweave.sim_bridge.leaving import Leaving, tell_left
 from laneweave.sim_bridge.roadside import Roadside
 from laneweave.sim_bridge.run_record import Ending, RunRecord
 from laneweave.sim_bridge.traffic import RoadVehicle
+from laneweave.sim_bridge.world import World, show_bodies
 
 log = structlog.get_logger(__name__)
 
-CENSUS_EVERY_TICKS = 10
-LEFT_REPEATS = 20
-"""Ticks for which the agent of a vehicle that left is told so."""
 BRIDGE = Name("bridge")
 WIND_UP_S = 2.0
 """How long the bridge waits for last reports at the end of a run."""
-
-
-class World(Protocol):
-    """Where the bodies are shown; `SumoWorld` in every real run."""
-
-    def add(self, vehicle: str, state: State) -> None:
-        """Put a vehicle on the road."""
-
-    def place(self, vehicle: str, state: State) -> None:
-        """Say where a vehicle is at the end of the next step."""
-
-    def step(self) -> None:
-        """Advance by one tick."""
-
-    def positions(self) -> dict[str, Pose]:
-        """Return where each vehicle is shown."""
-
-    def collisions(self) -> list[tuple[str, str]]:
-        """Return the pairs that the world itself takes for colliding."""
-
-    def remove(self, vehicle: str) -> None:
-        """Take a vehicle off the road."""
 
 
 class Phase(Enum):
@@ -113,6 +89,7 @@ class BridgeCore:
         world: World,
         record: RunRecord,
         *,
+        new_incarnation: Callable[[], int],
         pace: float | None = None,
         incarnation: int = 0,
         stopwatch: Callable[[], float] = time.perf_counter,
@@ -123,6 +100,7 @@ class BridgeCore:
             scenario: road, demand, vehicles.
             world: an empty world.
             record: where measurements go.
+            new_incarnation: returns a number that no process has used before, for caretakers.
             pace: most road seconds per second of the node's clock; None: the scenario's maximum.
             incarnation: tells this run of the road from earlier ones of the same deployment.
             stopwatch: measures the duration of ticks, in s; decides nothing.
@@ -137,25 +115,22 @@ class BridgeCore:
         self._tick_lasts_s = scenario.runtime.tick_s / (pace or scenario.runtime.max_pace)
         self._incarnation = incarnation
         self._stopwatch = stopwatch
-        self._agents_up: set[str] = set()
-        self._silent: set[str] = set()
-        self._awaited: set[Name] = set()
+        self._answers = Answers(scenario.runtime)
+        self._attendance = Attendance(new_incarnation)
         self._at_entrance: list[RoadVehicle] = []
-        self._leaving: dict[Name, tuple[RoadVehicle, int]] = {}
-        """Vehicles that left, and how often their agents are still told so."""
+        self._leaving = Leaving()
         self._unreported: set[str] = {BRIDGE}
         """Whose last report is still to come."""
         self._patience_s = scenario.runtime.agent_start_s
         """How long to wait for the next agent that is not up."""
         self._ending = Ending.COMPLETE
         self._link_up = True
-        self._census_sent_tick = -CENSUS_EVERY_TICKS
-        self._census_changed = True
+        self._absence_counts_s = -math.inf
+        """From when on a token that is not there means that its agent is not there."""
         self._tick_began = 0.0
         self._opened_s = 0.0
-        self._due_s = 0.0
-        self._resend_s = 0.0
-        self._deadline_s = 0.0
+        self._until_s = 0.0
+        """When to go on, whatever is waited for; answers have a deadline of their own."""
 
     # --- as a core ----------------------------------------------------------------------------
 
@@ -169,11 +144,9 @@ class BridgeCore:
         """Next resend, deadline, or tick."""
         match self.phase:
             case Phase.ANSWERS:
-                return min(self._resend_s, self._deadline_s)
-            case Phase.AGENTS | Phase.WIND_UP:
-                return self._deadline_s
-            case Phase.PACE:
-                return self._due_s
+                return min(self._answers.resend_s, self._answers.deadline_s)
+            case Phase.AGENTS | Phase.PACE | Phase.WIND_UP:
+                return self._until_s
             case _:
                 return None
 
@@ -187,20 +160,19 @@ class BridgeCore:
         match event:
             case Started():
                 yield from self._start(now_s)
-            case Arrived(_, _, message):
-                self._on_message(message, now_s)
+            case Arrived(_, parameters, message):
+                yield from self._on_message(message, parameters, now_s)
             case PeerUp(topic, parameters) if topic is VEHICLE_ALIVE:
-                self._agents_up.add(parameters["vehicle"])
-                self._silent.discard(parameters["vehicle"])
-                self._patience_s = self.scenario.runtime.agent_start_s
-                if parameters["vehicle"] in self.vehicles:
-                    self._unreported.add(parameters["vehicle"])
+                self._on_agent_up(Name(parameters["vehicle"]))
             case PeerDown(topic, parameters) if topic is VEHICLE_ALIVE:
-                self._on_agent_down(parameters["vehicle"])
+                self._on_agent_down(Name(parameters["vehicle"]))
             case LinkUp():
                 self._link_up = True
+                # The others come back to the network about now, too, and need a moment for it.
+                self._absence_counts_s = now_s + self.scenario.network.lease_s
             case LinkDown():
                 self._link_up = False
+                self._answers.link_down()
             case Wakeup() if self.phase is Phase.ANSWERS:
                 yield from self._send_again(now_s)
             case Stopping():
@@ -219,10 +191,15 @@ class BridgeCore:
         yield Announce(BRIDGE_ALIVE, {"incarnation": self._incarnation})
         self._open_tick(now_s)
 
-    def _on_message(self, message: object, now_s: float) -> None:
+    def _on_message(
+        self, message: object, parameters: Mapping[str, str], now_s: float
+    ) -> Iterator[Effect]:
         match message:
             case Command():
-                self._on_command(message)
+                yield from self._on_command(message)
+            case Prepare() | Plan():
+                vehicle = Name(parameters["vehicle"])
+                yield from self._attendance.on_message(vehicle, message, self.tick)
             case Report():
                 self._on_report(message)
             case LogEvent():
@@ -232,22 +209,34 @@ class BridgeCore:
             case _:
                 pass
 
-    def _on_command(self, command: Command) -> None:
-        vehicle = self.vehicles.get(command.vehicle)
+    def _on_command(self, command: Command) -> Iterator[Effect]:
+        name = command.vehicle
+        vehicle = self.vehicles.get(name)
         if vehicle is None:
             return
-        # Whoever answers late is there: the next tick waits for it, and it catches up.
-        self._silent.discard(command.vehicle)
+        controller = vehicle.controller
+        attendant = controller.attendant
+        # Whoever answers late is there: the next tick waits for it, and it catches up. But one that
+        # another agent has taken the vehicle from says nothing about that other one.
+        if command.incarnation >= attendant or name in self._attendance:
+            self._answers.heard(name)
         if command.tick != self.tick or self.phase is not Phase.ANSWERS:
             # A late answer was made for a state that is past: played now, from its middle, it
             # would end somewhere else.
             return
         try:
-            vehicle.controller.take(command)
+            taken = controller.take(command)
         except BadInputError as error:
-            log.warning("command ignored", vehicle=command.vehicle, reason=str(error))
+            log.warning("command ignored", vehicle=name, reason=str(error))
             return
-        self._awaited.discard(command.vehicle)
+        if not taken:
+            return
+        self._answers.awaited.discard(name)
+        if attendant not in (0, controller.attendant):
+            previous = "caretaker" if name in self._attendance else "agent"
+            self._record.on_agent_took_over(self.t_s, name, previous)
+        if attendant != controller.attendant:
+            yield from self._attendance.give_way(name)
 
     def _on_report(self, report: Report) -> None:
         if report.role in ("agent", "bridge"):
@@ -256,23 +245,28 @@ class BridgeCore:
             self._unreported.discard(report.name)
         self._record.on_report(report)
 
-    def _on_agent_down(self, vehicle: str) -> None:
+    def _on_agent_up(self, vehicle: Name) -> None:
+        self._answers.agent_up(vehicle)
+        self._patience_s = self.scenario.runtime.agent_start_s
+        if vehicle in self.vehicles:
+            self._unreported.add(vehicle)
+
+    def _on_agent_down(self, vehicle: Name) -> None:
         if self._link_up:
-            self._agents_up.discard(vehicle)
-            self._awaited.discard(Name(vehicle))
-            self._leaving.pop(Name(vehicle), None)
+            self._answers.agent_down(vehicle)
+            self._leaving.forget(vehicle)
 
     # --- the tick -----------------------------------------------------------------------------
 
     def _proceed(self, now_s: float) -> Iterator[Effect]:
         """Go on from phase to phase as far as nothing has to be waited for, one tick at most."""
-        if self.phase is Phase.PACE and now_s >= self._due_s:
+        if self.phase is Phase.PACE and now_s >= self._until_s:
             self._open_tick(now_s)
         if self.phase is Phase.AGENTS and self._entrance_clear(now_s):
             yield from self._begin_tick(now_s)
-        if self.phase is Phase.ANSWERS and (not self._awaited or now_s >= self._deadline_s):
+        if self.phase is Phase.ANSWERS and self._answers.complete(now_s):
             yield from self._end_tick(now_s)
-        if self.phase is Phase.WIND_UP and (now_s >= self._deadline_s or not self._unreported):
+        if self.phase is Phase.WIND_UP and (now_s >= self._until_s or not self._unreported):
             self._finish(self._ending)
             yield End()
 
@@ -283,140 +277,92 @@ class BridgeCore:
         for arrival in self._roadside.newly_demanded(self.t_s):
             self._record.on_demanded(arrival)
         for admission in self._roadside.admit(self.t_s):
-            vehicle = RoadVehicle.entering(admission, self.t_s, self.scenario)
-            self._at_entrance.append(vehicle)
-            self._census_changed = True
+            self._at_entrance.append(RoadVehicle.entering(admission, self.t_s, self.scenario))
         self.phase = Phase.AGENTS
-        self._deadline_s = now_s + self._patience_s
+        self._until_s = now_s + self._patience_s
 
     def _entrance_clear(self, now_s: float) -> bool:
-        return now_s >= self._deadline_s or all(
-            vehicle.name in self._agents_up for vehicle in self._at_entrance
+        return now_s >= self._until_s or all(
+            vehicle.name in self._answers.up for vehicle in self._at_entrance
         )
 
     def _begin_tick(self, now_s: float) -> Iterator[Effect]:
+        self._let_enter()
+        yield from self._roadside.news(self.tick, self.t_s, self.vehicles.values())
+        yield from self._take_care(now_s)
+        for vehicle in self.vehicles.values():
+            caretaker = vehicle.name in self._attendance
+            sense = vehicle.sense(self.tick, caretaker=caretaker)
+            yield Send(SENSE, sense, {"vehicle": vehicle.name})
+        yield from self._attendance.show(self.tick)
+        yield from self._leaving.tell(self.tick, self._answers.up)
+        self._answers.ask(self.vehicles, now_s, link_up=self._link_up)
+        self.phase = Phase.ANSWERS
+
+    def _let_enter(self) -> None:
         for vehicle in self._at_entrance:
             self.vehicles[vehicle.name] = vehicle
             self._world.add(vehicle.name, vehicle.state)
             self._record.on_entered(vehicle)
-            if vehicle.name in self._agents_up:
+            if vehicle.name in self._answers.up:
                 self._unreported.add(vehicle.name)
             else:
                 self._record.note(self.t_s, "agent-missing", vehicle=vehicle.name)
                 # Where one did not come, the next are not worth a long wait, until one does.
                 self._patience_s = self.scenario.network.resend_s
         self._at_entrance.clear()
-        yield from self._tell_road_users()
-        for vehicle in self.vehicles.values():
-            yield Send(SENSE, self._sense(vehicle), {"vehicle": vehicle.name})
-        yield from self._tell_leaving()
-        self._awaited = {
-            name for name in self.vehicles if name in self._agents_up and name not in self._silent
-        }
-        runtime, network = self.scenario.runtime, self.scenario.network
-        self._resend_s = now_s + network.resend_s
-        self._deadline_s = now_s + runtime.tick_deadline_s
-        self.phase = Phase.ANSWERS
 
-    def _tell_road_users(self) -> Iterator[Effect]:
-        counts = self._roadside.counts(on_road=len(self.vehicles))
-        yield Send(CLOCK, counts.clock(self.tick, self.t_s, ended=False))
-        due = self.tick >= self._census_sent_tick + CENSUS_EVERY_TICKS
-        announced = self._roadside.announcements_changed(self.t_s)
-        if announced or due or self._census_changed:
-            self._census_changed = False
-            self._census_sent_tick = self.tick
-            yield Send(CENSUS, self._roadside.census(self.t_s, self.vehicles.values()))
-
-    def _sense(self, vehicle: RoadVehicle, *, left: bool = False) -> Sense:
-        controller = vehicle.controller
-        return Sense(
-            vehicle=vehicle.name,
-            tick=self.tick,
-            t_s=self.t_s,
-            state=vehicle.state,
-            hold_cell=controller.hold_cell,
-            motion_end_tick=controller.motion_end_tick,
-            motion_origin=controller.motion_origin,
-            preferred_lane=vehicle.admission.arrival.preferred_lane,
-            ahead=vehicle.ahead,
-            left=left,
-        )
-
-    def _tell_leaving(self) -> Iterator[Effect]:
-        for name, (vehicle, repeats) in list(self._leaving.items()):
-            if name not in self._agents_up or repeats == 0:
-                del self._leaving[name]
-                continue
-            self._leaving[name] = (vehicle, repeats - 1)
-            yield Send(SENSE, self._sense(vehicle, left=True), {"vehicle": name})
+    def _take_care(self, now_s: float) -> Iterator[Effect]:
+        """Put caretakers in charge of vehicles whose agents are silent or not there."""
+        answers = self._answers
+        for name in answers.settle(now_s):
+            self._record.note(self.t_s, "agent-silent", vehicle=name)
+        if not self._link_up:
+            return  # nobody can be seen or heard: that says nothing about them
+        absence_counts = now_s >= self._absence_counts_s
+        for name, vehicle in self.vehicles.items():
+            absent = absence_counts and name not in answers.up
+            if (absent or name in answers.silent) and name not in self._attendance:
+                reason = "absent" if absent else "silent"
+                self._record.on_caretaker_took_over(self.t_s, name, reason)
+                yield from self._attendance.take_charge(vehicle, self.tick)
 
     def _send_again(self, now_s: float) -> Iterator[Effect]:
-        if now_s >= self._resend_s:
-            self._resend_s = now_s + self.scenario.network.resend_s
-            for name in sorted(self._awaited):
-                yield Send(SENSE, self._sense(self.vehicles[name]), {"vehicle": name})
+        for name in self._answers.ask_again(now_s):
+            vehicle = self.vehicles[name]
+            sense = vehicle.sense(self.tick, caretaker=name in self._attendance)
+            yield Send(SENSE, sense, {"vehicle": name})
 
     def _end_tick(self, now_s: float) -> Iterator[Effect]:
-        for name in sorted(self._awaited):
-            self._silent.add(name)
-            self._record.note(self.t_s, "agent-silent", vehicle=name)
-        self._awaited.clear()
+        self._record.on_missed(self._answers.close())
         for vehicle in self.vehicles.values():
-            vehicle.controller.step(self.tick)
+            vehicle.step(self.tick)
         self.tick += 1
-        self._show()
-        self._let_leave()
+        show_bodies(self._world, self.vehicles, self.scenario, self._record, self.t_s)
+        yield from self._let_leave()
         duration_s = self._stopwatch() - self._tick_began
         self._record.on_tick(self.t_s, len(self.vehicles), duration_s)
         if self._over():
             yield from self._wind_up(now_s)
             return
-        self._due_s = max(now_s, self._opened_s + self._tick_lasts_s)
-        if not self._link_up:
+        lasts_s = self._tick_lasts_s
+        if self._answers.deaf or not self._link_up:
             # Nobody can answer: do not race ahead of the vehicles while the network is away.
-            self._due_s = max(self._due_s, now_s + self.scenario.runtime.tick_s)
+            lasts_s = max(lasts_s, self.scenario.runtime.tick_s)
+        self._until_s = max(now_s, self._opened_s + lasts_s)
         self.phase = Phase.PACE
 
-    def _show(self) -> None:
-        """Let the world show the bodies, and measure what it shows."""
-        world, vehicle_size = self._world, self.scenario.vehicle
-        for vehicle in self.vehicles.values():
-            world.place(vehicle.name, vehicle.state)
-        world.step()
-        poses = world.positions()
-        size = (vehicle_size.length_m, vehicle_size.width_m)
-        seen = neighbours(
-            poses,
-            {},
-            lanes=self.scenario.road.lanes,
-            lane_width_m=self.scenario.road.lane_width_m,
-            length_m=size[0],
-            width_m=size[1],
-        )
-        for name, vehicle in self.vehicles.items():
-            vehicle.ahead = tuple(
-                Neighbour(lane, gap_m, speed_mps) for lane, gap_m, speed_mps, _ in seen[name].ahead
-            )
-        self._record.on_shown(
-            self.t_s,
-            self.vehicles.values(),
-            overlaps=overlapping_pairs(poses, *size),
-            collisions=world.collisions(),
-            gaps=least_gaps(poses, *size),
-        )
-
-    def _let_leave(self) -> None:
+    def _let_leave(self) -> Iterator[Effect]:
         length_m = self.scenario.road.length_m
         for name, vehicle in list(self.vehicles.items()):
             if vehicle.state[0] >= length_m:
                 del self.vehicles[name]
                 self._world.remove(name)
                 self._roadside.count_left()
-                self._record.on_left(vehicle, self.t_s)
-                self._leaving[name] = (vehicle, LEFT_REPEATS)
-                self._silent.discard(name)
-                self._census_changed = True
+                self._record.on_left(vehicle, self.t_s, attended=name not in self._attendance)
+                self._leaving.add(vehicle)
+                self._answers.forget(name)
+                yield from self._attendance.give_way(name)
 
     def _over(self) -> bool:
         if not self.vehicles and self._roadside.exhausted(self.t_s):
@@ -429,12 +375,11 @@ class BridgeCore:
     # --- the end ------------------------------------------------------------------------------
 
     def _wind_up(self, now_s: float) -> Iterator[Effect]:
-        counts = self._roadside.counts(on_road=len(self.vehicles))
-        yield Send(CLOCK, counts.clock(self.tick, self.t_s, ended=True))
-        yield Send(CENSUS, self._roadside.census(self.t_s, self.vehicles.values()))
-        yield from self._tell_leaving()
+        on_road = self.vehicles.values()
+        yield from self._roadside.news(self.tick, self.t_s, on_road, ended=True)
+        yield from self._leaving.tell(self.tick, self._answers.up)
         for vehicle in self.vehicles.values():
-            yield Send(SENSE, self._sense(vehicle, left=True), {"vehicle": vehicle.name})
+            yield tell_left(vehicle, self.tick)
         # Last, so that it counts all, and through the network, like everybody's: the node fills in
         # what it has counted.
         yield Send(
@@ -443,7 +388,7 @@ class BridgeCore:
             {"role": "bridge", "name": BRIDGE},
         )
         self.phase = Phase.WIND_UP
-        self._deadline_s = now_s + WIND_UP_S
+        self._until_s = now_s + WIND_UP_S
 
     def _finish(self, ending: Ending) -> None:
         if self.phase is not Phase.ENDED:

@@ -2,10 +2,16 @@
 
 It plays the trajectory of the newest command. When that runs out - the agent died, fell silent, or
 its commands were lost - it brings the vehicle to rest in the cell that the last command named and
-holds there: the vehicle goes on driving at v_F in a cell that is its own.
+holds there: the vehicle goes on driving at v_F in a cell that is its own, and keeps its distance
+to whoever its own sensors see ahead.
+
+It also keeps what must survive the agent: who is in charge of the vehicle, and which formations it
+has joined. Nobody but the process in charge changes where the vehicle holds or what it plays.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 import numpy as np
 from attrs import define, field
@@ -13,13 +19,13 @@ from numpy.typing import NDArray
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, Lattice
-from laneweave.protocol.messages import Command
-from laneweave.protocol.motion import Jerk, cell_state, hold_law
+from laneweave.protocol.messages import Command, Neighbour
+from laneweave.protocol.motion import Jerk, at_rest_in_cell, cell_state, hold_law, keep_gap
 from laneweave.protocol.scenario import Vehicle
 from laneweave.sim_bridge.plant import Plant
 
 MAX_COLUMN = 2**31 - 1
-"""Columns are recorded with 32 bits; no vehicle gets this far."""
+"""Columns are recorded with 32 bits; no vehicle gets this far. Formations have lesser numbers."""
 
 
 @define
@@ -31,6 +37,12 @@ class MotionController:
     lattice: Lattice
     tick_s: float
     hold_cell: Cell
+    min_gap_m: float = 0.0
+    """Net gap that the controller keeps by its own sensing while nobody drives."""
+    attendant: int = 0
+    """Incarnation of the process in charge; 0: none yet."""
+    joined: tuple[int, ...] = field(init=False)
+    """Formations whose blocks the vehicle's plans may use, ascending; it only ever grows."""
     motion_origin: Cell = field(init=False)
     motion_end_tick: int = 0
     command_tick: int = -1
@@ -38,44 +50,109 @@ class MotionController:
     played_from_hold: int = 0
     """Ticks that were driven by the hold law, for want of a command."""
     _jerks: NDArray[np.float32] = field(init=False)
+    _jerks_tick: int = 0
+    """Tick that the first of the jerks is for."""
 
     def __attrs_post_init__(self) -> None:
-        """Begin with nothing to play."""
+        """Begin with nothing to play, in the formation of the cell."""
+        self.joined = (self.lattice.block_of(self.hold_cell[0]),)
         self.motion_origin = self.hold_cell
         self._jerks = np.zeros((0, 2), dtype=np.float32)
 
     def take(self, command: Command) -> bool:
-        """Take a command unless a newer one has been taken; false when it was ignored.
+        """Take a command of the process in charge, or of one that takes charge with it.
+
+        A command is refused when its incarnation is less than the attendant's, or when one of this
+        tick or of a later one has been taken. A greater incarnation takes charge; it must name the
+        cell in which the vehicle holds already: it could not speak for the vehicle before, so it
+        cannot have got leave to move. Refused as well, it may try again with the next tick.
+
+        A command without jerks that names the cell in which the vehicle holds leaves the motion
+        under way as it is.
+
+        Returns:
+            Whether it was taken.
 
         Raises:
-            BadInputError: the jerks are not pairs of finite numbers, or a cell is on no lane.
+            BadInputError: the jerks are not pairs of finite numbers, a cell is on no lane, or a
+                number is out of range.
         """
-        if command.tick <= self.command_tick:
+        if command.incarnation < self.attendant or command.tick <= self.command_tick:
             return False
+        jerks = self._checked_jerks(command)
+        if command.incarnation > self.attendant and command.hold_cell != self.hold_cell:
+            return False
+        self.attendant = command.incarnation
+        self.command_tick = command.tick
+        self.join(command.joined)
+        if len(jerks) > 0 or command.hold_cell != self.hold_cell:
+            self._jerks, self._jerks_tick = jerks, command.tick
+            self.hold_cell = command.hold_cell
+            self.motion_origin = command.motion_origin
+            self.motion_end_tick = command.motion_end_tick
+        return True
+
+    def hand_over(self, incarnation: int) -> None:
+        """Put a process in charge that does not drive: what is under way goes on as it is.
+
+        Raises:
+            ValueError: the incarnation is not greater than the attendant's.
+        """
+        if incarnation <= self.attendant:
+            raise ValueError(f"incarnation {incarnation} is not above {self.attendant}")
+        self.attendant = incarnation
+
+    def join(self, formations: Iterable[int]) -> None:
+        """Remember formations as joined, for the process in charge."""
+        self.joined = tuple(sorted({*self.joined, *formations}))
+
+    def moving(self, tick: int) -> bool:
+        """Tell whether the motion under way has not ended at `tick`.
+
+        A body that is late still moves, though the time of its motion is over.
+        """
+        return tick < self.motion_end_tick or not at_rest_in_cell(
+            self.plant.state, self.lattice, self.hold_cell, tick * self.tick_s
+        )
+
+    def step(self, tick: int, ahead: Iterable[Neighbour] = ()) -> None:
+        """Drive from `tick` to the next one.
+
+        Args:
+            tick: number of the tick that begins.
+            ahead: whom the vehicle's sensors see.
+        """
+        self.plant.step(*self._jerk(tick, ahead))
+
+    def _checked_jerks(self, command: Command) -> NDArray[np.float32]:
         for cell in (command.hold_cell, command.motion_origin):
             if not (0 <= cell[1] < self.lattice.lanes and abs(cell[0]) <= MAX_COLUMN):
                 raise BadInputError("Command", cell, f"cells on {self.lattice.lanes} lanes")
+        for number in command.joined:
+            if abs(number) > MAX_COLUMN:
+                raise BadInputError("Command.joined", number, f"at most {MAX_COLUMN}")
         if len(command.jerks) % 8:
             raise BadInputError("Command.jerks", f"{len(command.jerks)} bytes", "float32 pairs")
         jerks = np.frombuffer(command.jerks, dtype="<f4").reshape(-1, 2)
         if not np.isfinite(jerks).all():
             raise BadInputError("Command.jerks", "NaN or infinity", "finite numbers")
-        self._jerks = jerks
-        self.command_tick = command.tick
-        self.hold_cell = command.hold_cell
-        self.motion_origin = command.motion_origin
-        self.motion_end_tick = command.motion_end_tick
-        return True
+        return jerks
 
-    def step(self, tick: int) -> None:
-        """Drive from `tick` to the next one."""
-        self.plant.step(*self._jerk(tick))
-
-    def _jerk(self, tick: int) -> Jerk:
-        index = tick - self.command_tick
-        if self.command_tick >= 0 and index < len(self._jerks):
+    def _jerk(self, tick: int, ahead: Iterable[Neighbour]) -> Jerk:
+        index = tick - self._jerks_tick
+        if 0 <= index < len(self._jerks):
             j_s, j_y = self._jerks[index].tolist()
             return j_s, j_y
         self.played_from_hold += 1
+        state = self.plant.state
         reference = cell_state(self.lattice, self.hold_cell, tick * self.tick_s)
-        return hold_law(self.plant.state, reference, self.limits, self.tick_s)
+        jerk = hold_law(state, reference, self.limits, self.tick_s)
+        near = [(other.gap_m, other.speed_mps) for other in ahead if self._is_in_the_way(other)]
+        return keep_gap(state, jerk, near, self.limits, self.min_gap_m, self.tick_s)
+
+    def _is_in_the_way(self, other: Neighbour) -> bool:
+        """Tell whether somebody is on a lane that the body touches or that it steers for."""
+        y_m, half_m = self.plant.state[3], 0.5 * self.limits.width_m
+        width_m = self.lattice.lane_width_m
+        first, last = int((y_m - half_m) // width_m), int((y_m + half_m) // width_m)
+        return first <= other.lane <= last or other.lane == self.hold_cell[1]

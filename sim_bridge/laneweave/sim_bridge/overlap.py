@@ -19,11 +19,10 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
+from laneweave.protocol.messages import Neighbour
+
 Pose = tuple[float, float, float, float]
 """(s m, y m, heading rad, speed m/s)."""
-
-Neighbour = tuple[int, float, float, float]
-"""(lane, gap m, speed m/s, acceleration m/s2) of a vehicle that local sensing sees."""
 
 _Point = tuple[float, float]
 
@@ -38,13 +37,6 @@ class LeastGaps(NamedTuple):
     """Bumper to bumper, along the road."""
     headway_s: float
     """Distance front to front divided by the speed of the follower."""
-
-
-class Surroundings(NamedTuple):
-    """What a vehicle sees: at most one neighbour in each lane and direction, by lane."""
-
-    ahead: tuple[Neighbour, ...]
-    behind: tuple[Neighbour, ...]
 
 
 def pose_of(state: Sequence[float]) -> Pose:
@@ -137,74 +129,46 @@ def least_gaps(poses: Mapping[str, Pose], length_m: float, width_m: float) -> Le
 
 def neighbours(
     poses: Mapping[str, Pose],
-    accels: Mapping[str, float],
     *,
     lanes: int,
     lane_width_m: float,
     length_m: float,
     width_m: float,
-) -> dict[str, Surroundings]:
-    """Return what each vehicle's local sensing sees.
+) -> dict[str, tuple[Neighbour, ...]]:
+    """Return whom each vehicle's local sensing sees ahead.
 
     In each lane that its body touches or that is adjacent to such a lane, a vehicle sees the
-    nearest vehicle ahead and the nearest behind that touches the lane. A vehicle that straddles
-    two lanes is seen in both. The gap is bumper to bumper, with bodies taken as unrotated; it is
-    negative for vehicles side by side, of which the one with the front ahead is ahead (at equal
-    positions: the one with the greater name).
+    nearest vehicle ahead that touches the lane. A vehicle that straddles two lanes is seen in both.
+    The gap is bumper to bumper, with bodies taken as unrotated; it is negative for vehicles side by
+    side, of which the one with the front ahead is ahead (at equal positions: the one with the
+    greater name).
 
     Args:
         poses: pose of each vehicle.
-        accels: acceleration of each vehicle in m/s2; 0 where it is missing.
         lanes: number of lanes.
         lane_width_m: width of a lane.
         length_m: length of every body.
         width_m: width of every body.
+
+    Returns:
+        For each vehicle at most one neighbour in each lane, by lane.
     """
-    order = [name for _, name in sorted((pose[0], name) for name, pose in poses.items())]
-    bodies = []
-    for name in order:
-        s_m, _, _, speed_mps = poses[name]
+    order = sorted(((pose[0], name) for name, pose in poses.items()), reverse=True)
+    # From the front: the last vehicle that was met in each lane is the nearest one.
+    nearest: list[tuple[float, float] | None] = [None] * lanes
+    seen = {}
+    for s_m, name in order:
         _, _, low, high = _extent(poses[name], length_m, width_m)
         first = min(max(int((low + _TOUCH_M) // lane_width_m), 0), lanes - 1)
         last = min(max(int((high - _TOUCH_M) // lane_width_m), first), lanes - 1)
-        touched = range(first, last + 1)
-        watched = range(max(first - 1, 0), min(last + 2, lanes))
-        bodies.append((s_m, speed_mps, accels.get(name, 0.0), touched, watched))
-    ahead = _sweep(bodies[::-1], lanes, 1.0, length_m)[::-1]
-    behind = _sweep(bodies, lanes, -1.0, length_m)
-    return dict(zip(order, map(Surroundings, ahead, behind), strict=True))
-
-
-_Body = tuple[float, float, float, range, range]
-"""(s m, speed m/s, acceleration m/s2, lanes that the body touches, lanes that it watches)."""
-
-
-def _sweep(
-    bodies: Sequence[_Body], lanes: int, direction: float, length_m: float
-) -> list[tuple[Neighbour, ...]]:
-    """Pass along the road; the last vehicle met in each lane is the nearest one.
-
-    Args:
-        bodies: in the order in which they are met.
-        lanes: number of lanes.
-        direction: 1 if they are met from the front, so that vehicles met before are ahead, or -1.
-        length_m: length of every body.
-
-    Returns:
-        For each body, what it sees among those met before.
-    """
-    nearest: list[_Body | None] = [None] * lanes
-    seen = []
-    for body in bodies:
-        s_m, _, _, touched, watched = body
         found = []
-        for lane in watched:
+        for lane in range(max(first - 1, 0), min(last + 2, lanes)):
             other = nearest[lane]
             if other is not None:
-                found.append((lane, direction * (other[0] - s_m) - length_m, other[1], other[2]))
-        seen.append(tuple(found))
-        for lane in touched:
-            nearest[lane] = body
+                found.append(Neighbour(lane, other[0] - s_m - length_m, other[1]))
+        seen[name] = tuple(found)
+        for lane in range(first, last + 1):
+            nearest[lane] = (s_m, poses[name][3])
     return seen
 
 

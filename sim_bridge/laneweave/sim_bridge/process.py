@@ -6,6 +6,7 @@ import tempfile
 import time
 from pathlib import Path
 
+from laneweave.protocol.faulty_core import Wrap, bare
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.zenoh_transport import run_core
 from laneweave.sim_bridge.core import BridgeCore
@@ -14,7 +15,11 @@ from laneweave.sim_bridge.sumo_world import SumoWorld
 
 
 def run_bridge(
-    scenario: Scenario, folder: Path, method: str = "formation", pace: float | None = None
+    scenario: Scenario,
+    folder: Path,
+    method: str = "formation",
+    pace: float | None = None,
+    wrap: Wrap = bare,
 ) -> None:
     """Run the simulated world until all vehicles have left, or until SIGINT or SIGTERM.
 
@@ -23,6 +28,7 @@ def run_bridge(
         folder: where the run's files go.
         method: how vehicles are controlled, for the summary.
         pace: most road seconds per second; None: the scenario's maximum.
+        wrap: may put faults before the core.
 
     Raises:
         BadInputError: nobody answers at the scenario's endpoint.
@@ -34,9 +40,16 @@ def run_bridge(
         tempfile.TemporaryDirectory(prefix="laneweave-sumo-") as sumo_folder,
         SumoWorld(scenario, Path(sumo_folder)) as world,
     ):
-        core = BridgeCore(scenario, world, record, pace=pace, incarnation=time.time_ns())
+        core = BridgeCore(
+            scenario,
+            world,
+            record,
+            new_incarnation=time.time_ns,
+            pace=pace,
+            incarnation=time.time_ns(),
+        )
         try:
-            run_core(core, network.endpoint, network.realm, network.lease_s)
+            run_core(wrap(core), network.endpoint, network.realm, network.lease_s)
         finally:
             # After an error, too: what was recorded is kept.
             record.close(core.t_s, Ending.INTERRUPTED)

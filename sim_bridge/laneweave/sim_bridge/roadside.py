@@ -6,16 +6,20 @@ Its census is complete, which is what lets a coordinator know a roster for certa
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from itertools import chain
 
 from attrs import frozen
 
 from laneweave.protocol.messages import Announcement, Census, CensusEntry, Name, RoadClock
+from laneweave.protocol.node import Effect, Send
 from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.topics import CENSUS, CLOCK
 from laneweave.sim_bridge.demand import Arrival, arrivals
 from laneweave.sim_bridge.entry import TIME_TOLERANCE_S, Admission, EntryMeter
 from laneweave.sim_bridge.traffic import RoadVehicle
+
+CENSUS_EVERY_TICKS = 10
 
 
 @frozen
@@ -61,6 +65,12 @@ class Roadside:
         self._entered = 0
         self._left = 0
         self._announced: tuple[Announcement, ...] = ()
+        self._census_sent_tick = -CENSUS_EVERY_TICKS
+        self._census_changed = True
+        """Somebody entered or left since the last census, or a block has closed."""
+        self._lattice = lattice
+        self._closing_block = 0
+        """The next block whose last column passes the start of the road."""
 
     def newly_demanded(self, t_s: float) -> tuple[Arrival, ...]:
         """Return the vehicles that arrived since the last call."""
@@ -83,11 +93,41 @@ class Roadside:
             self._queued += 1
         admissions = self._meter.admit(t_s)
         self._entered += len(admissions)
+        self._census_changed |= bool(admissions)
         return admissions
 
     def count_left(self) -> None:
         """Count a vehicle that passed the end of the road."""
         self._left += 1
+        self._census_changed = True
+
+    def news(
+        self, tick: int, t_s: float, on_road: Collection[RoadVehicle], *, ended: bool = False
+    ) -> Iterator[Effect]:
+        """Send the clock, and the census on every change, every 10 ticks, and at the end.
+
+        That a block has closed is a change, too: now its roster is known.
+
+        Args:
+            tick: number of the tick that begins.
+            t_s: its road time.
+            on_road: all vehicles on the road.
+            ended: whether it is the last one.
+        """
+        yield Send(CLOCK, self.counts(len(on_road)).clock(tick, t_s, ended=ended))
+        due = ended or tick >= self._census_sent_tick + CENSUS_EVERY_TICKS
+        announced = self.announcements_changed(t_s)
+        self._note_closed_blocks(t_s)
+        if announced or due or self._census_changed:
+            self._census_changed = False
+            self._census_sent_tick = tick
+            yield Send(CENSUS, self.census(t_s, on_road))
+
+    def _note_closed_blocks(self, t_s: float) -> None:
+        lattice = self._lattice
+        while lattice.passing_time_s(lattice.block_range(self._closing_block)[0]) < t_s:
+            self._closing_block += 1
+            self._census_changed = True
 
     def counts(self, on_road: int) -> Counts:
         """Return the counts."""

@@ -70,6 +70,11 @@ class RunRecord:
         self._plans: list[dict[str, Any]] = []
         self._ticks: list[tuple[float, int, float]] = []
         self._agentless_ticks = 0
+        self._missed_ticks = 0
+        self._caretaker_takeovers = 0
+        self._agent_takeovers = 0
+        self._left_off_lane = 0
+        self._left_unattended = 0
         self._closed = False
 
     # --- what the bridge sees -----------------------------------------------------------------
@@ -86,36 +91,64 @@ class RunRecord:
     def on_entered(self, vehicle: RoadVehicle) -> None:
         """A vehicle entered the road."""
         admission = vehicle.admission
-        number = self._scenario.lattice.block_of(admission.cell[0])
-        self._recorder.entered(vehicle.name, admission.t_s, number)
+        self._recorder.entered(vehicle.name, admission.t_s, vehicle.formation)
         self.note(
             admission.t_s,
             "entered",
             vehicle=vehicle.name,
             lane=admission.arrival.lane,
             preferred_lane=admission.arrival.preferred_lane,
-            formation=number,
+            formation=vehicle.formation,
         )
 
-    def on_left(self, vehicle: RoadVehicle, t_s: float) -> None:
-        """A vehicle passed the end of the road since the last tick."""
+    def on_left(self, vehicle: RoadVehicle, t_s: float, *, attended: bool) -> None:
+        """A vehicle passed the end of the road since the last tick.
+
+        `attended`: an agent was in charge of it, not its caretaker.
+        """
         s_m, v_mps, _, y_m, _, _ = vehicle.state
         beyond_m = s_m - self._scenario.road.length_m
         left_s = t_s - beyond_m / v_mps if v_mps > 0 else t_s
         lane = int(y_m // self._scenario.road.lane_width_m)
         self._recorder.left(vehicle.name, left_s, lane)
         self._agentless_ticks += vehicle.controller.played_from_hold
+        preferred_lane = vehicle.admission.arrival.preferred_lane
         self.note(
             left_s,
             "left",
             vehicle=vehicle.name,
             lane=lane,
-            on_preferred_lane=lane == vehicle.admission.arrival.preferred_lane,
+            on_preferred_lane=lane == preferred_lane,
         )
+        self._left_unattended += not attended
+        if lane != preferred_lane:
+            self._left_off_lane += 1
+            self.note(
+                left_s,
+                "left-off-lane",
+                vehicle=vehicle.name,
+                lane=lane,
+                preferred_lane=preferred_lane,
+                attended=attended,
+            )
 
     def on_still_on_road(self, vehicle: RoadVehicle) -> None:
         """The run ends while a vehicle is on the road."""
         self._agentless_ticks += vehicle.controller.played_from_hold
+
+    def on_missed(self, agents: int) -> None:
+        """So many agents have not answered a tick by its deadline."""
+        self._missed_ticks += agents
+
+    def on_caretaker_took_over(self, t_s: float, vehicle: Name, reason: str) -> None:
+        """A vehicle's caretaker is in charge, since its agent is `absent` or `silent`."""
+        self._caretaker_takeovers += 1
+        self.note(t_s, "caretaker-took-over", vehicle=vehicle, reason=reason)
+
+    def on_agent_took_over(self, t_s: float, vehicle: Name, previous: str) -> None:
+        """A vehicle's agent has taken charge from the `caretaker`, or from an earlier `agent`."""
+        self._agent_takeovers += 1
+        self.note(t_s, "agent-took-over", vehicle=vehicle, previous=previous)
 
     def on_shown(
         self,
@@ -181,6 +214,10 @@ class RunRecord:
         self._recorder.close()
         self._write_ticks()
         summary = self._recorder.summarise(self._method, t_s) | {"ending": ending.value}
+        summary["vehicles"] |= {
+            "left_off_lane": self._left_off_lane,
+            "left_unattended": self._left_unattended,
+        }
         write_summary(self._folder, summary | self._rest(t_s))
 
     def _write_ticks(self) -> None:
@@ -213,6 +250,9 @@ class RunRecord:
                 "solves": sum(report.solves for report in reports),
                 "unusable": sum(report.unusable for report in reports),
                 "hold_law_ticks": self._agentless_ticks,
+                "missed_ticks": self._missed_ticks,
+                "caretaker_takeovers": self._caretaker_takeovers,
+                "agent_takeovers": self._agent_takeovers,
                 "solve_ms": spread(solve_ms, 50, 99),
             },
             "runtime": {

@@ -61,7 +61,7 @@ FRONT: Cell = (0, 0)
 
 
 def make_host(*vehicles: Name, shard: Shard | None = None) -> AgentHost:
-    return AgentHost(lambda name: AgentCore(name, 1, SCENARIO), vehicles, shard)
+    return AgentHost(lambda name: AgentCore(name, lambda: 1, SCENARIO), vehicles, shard)
 
 
 def give(host: AgentHost, event: Event, now_s: float = 0.0) -> list[Effect]:
@@ -72,10 +72,23 @@ def hand(host: AgentHost, topic: Topic, vehicle: Name, message: object) -> list[
     return give(host, Arrived(topic, {"vehicle": vehicle}, message))
 
 
-def sense(vehicle: Name, cell: Cell, tick: int = 1, *, left: bool = False) -> Sense:
+def sense(
+    vehicle: Name,
+    cell: Cell,
+    tick: int = 1,
+    *,
+    attendant: int = 1,
+    joined: tuple[int, ...] | None = None,
+    left: bool = False,
+) -> Sense:
+    """Return what a vehicle senses whose agent is in charge, unless another attendant is given."""
     t_s = tick * SCENARIO.runtime.tick_s
     state = cell_state(SCENARIO.lattice, cell, t_s)
-    return Sense(vehicle, tick, t_s, state, cell, 0, cell, 0, (), left)
+    formation = SCENARIO.lattice.block_of(cell[0])
+    return Sense(
+        vehicle, tick, t_s, state, cell, 0, cell, 0, (), formation, attendant,
+        joined=(formation,) if joined is None else joined, left=left,
+    )  # fmt: skip
 
 
 def senders(effects: Iterable[Effect], kind: type[Command] | type[VehicleState]) -> list[str]:
@@ -102,13 +115,15 @@ def census(*on_road: Name, announced: Iterable[Name] = ()) -> Census:
     )
 
 
-def accept(host: AgentHost, cells: dict[Name, Cell]) -> list[Effect]:
+def accept(
+    host: AgentHost, cells: dict[Name, Cell], formations: tuple[int, ...] = (0,)
+) -> list[Effect]:
     """Let all vehicles of a roster promise and accept a plan without moves."""
     effects: list[Effect] = []
     for name in cells:
-        effects += hand(host, PREPARE, name, Prepare(BALLOT, 0, tuple(cells)))
+        effects += hand(host, PREPARE, name, Prepare(BALLOT, formations, tuple(cells)))
     plan = Plan(
-        BALLOT, 0, tuple(cells), dict.fromkeys(cells, 1), cells, dict.fromkeys(cells, ()),
+        BALLOT, formations, tuple(cells), dict.fromkeys(cells, 1), cells, dict.fromkeys(cells, ()),
         0.0, 4.0, tuple(cells.values()),
     )  # fmt: skip
     for name in cells:
@@ -123,7 +138,7 @@ def test_events_go_to_the_vehicle_that_they_concern() -> None:
     effects = hand(host, SENSE, B, sense(B, (-1, 1)))
     assert senders(effects, Command) == senders(effects, VehicleState) == [B]
     hand(host, SENSE, A, sense(A, FRONT))
-    effects = hand(host, PREPARE, A, Prepare(BALLOT, 0, (A, B)))
+    effects = hand(host, PREPARE, A, Prepare(BALLOT, (0,), (A, B)))
     assert [(s.vehicle, s.promised) for s in shown_by(effects)] == [(A, BALLOT)]
     assert hand(host, SENSE, C, sense(C, FRONT)) == []
 
@@ -167,6 +182,35 @@ def test_listens_to_a_formation_only_while_somebody_waits() -> None:
     assert give(host, Arrived(STATE, {**key, "vehicle": second.vehicle}, second)) == []
     hand(host, SENSE, A, sense(A, FRONT, 2))
     assert Unlisten(STATE, {"formation": 0}) in hand(host, SENSE, B, sense(B, (-1, 1), 2))
+
+
+def test_listens_to_all_formations_of_a_joint_plan_while_somebody_waits() -> None:
+    host = make_host(A, B)
+    cells: dict[Name, Cell] = {A: FRONT, B: (-4, 0)}
+    for name, cell in cells.items():
+        hand(host, SENSE, name, sense(name, cell, joined=(0, 1)))
+    effects = accept(host, cells, (0, 1))
+    topics = [effect for effect in effects if isinstance(effect, Listen)]
+    assert topics == [Listen(STATE, {"formation": 0}), Listen(STATE, {"formation": 1})]
+    first, second = (state for state in shown_by(effects) if state.accepted)
+    assert (first.formation, second.formation) == (0, 1)
+    give(host, Arrived(STATE, {"formation": "0", "vehicle": A}, first))
+    give(host, Arrived(STATE, {"formation": "1", "vehicle": B}, second))
+    (state,) = shown_by(hand(host, SENSE, A, sense(A, FRONT, 2, joined=(0, 1))))
+    assert state.go
+    effects = hand(host, SENSE, B, sense(B, (-4, 0), 2, joined=(0, 1)))
+    assert [effect for effect in effects if isinstance(effect, Unlisten)] == [
+        Unlisten(STATE, {"formation": 0}),
+        Unlisten(STATE, {"formation": 1}),
+    ]
+
+
+def test_who_is_not_in_charge_any_more_waits_for_nobody() -> None:
+    host = make_host(A)
+    hand(host, SENSE, A, sense(A, FRONT))
+    assert Listen(STATE, {"formation": 0}) in accept(host, {A: FRONT, B: (-1, 1)})
+    effects = hand(host, SENSE, A, sense(A, FRONT, 2, attendant=9))
+    assert effects == [Unlisten(STATE, {"formation": 0})]
 
 
 def test_ends_when_the_last_vehicle_has_left() -> None:

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import pytest
 from attrs import evolve
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from laneweave.coordinator.core import START_MARGIN_S, CoordinatorCore
 from laneweave.coordinator.formation import start_time_s
-from laneweave.coordinator.leader import Phase
-from laneweave.coordinator.planning import PlanResponse
-from laneweave.protocol.lattice import Cell
+from laneweave.coordinator.formation_planner import START_MARGIN_S
+from laneweave.coordinator.leader_rules import Phase
+from laneweave.coordinator.sorting import Sorting
+from laneweave.protocol.lattice import Cell, Move
 from laneweave.protocol.messages import (
     Ballot,
-    Census,
-    CensusEntry,
     Heartbeat,
     LogEvent,
     Name,
@@ -25,13 +21,10 @@ from laneweave.protocol.messages import (
     Prepare,
     Report,
     RoadClock,
-    VehicleState,
 )
 from laneweave.protocol.node import (
     Announce,
-    Arrived,
     Asked,
-    Compute,
     Computed,
     Effect,
     Listen,
@@ -40,7 +33,6 @@ from laneweave.protocol.node import (
     Reply,
     Send,
     Serve,
-    Started,
     Stopping,
     Unlisten,
     Wakeup,
@@ -48,7 +40,6 @@ from laneweave.protocol.node import (
     run_job,
 )
 from laneweave.protocol.plans import plan_problems
-from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.topics import (
     BRIDGE_ALIVE,
     CENSUS,
@@ -61,110 +52,25 @@ from laneweave.protocol.topics import (
     STATE,
 )
 from laneweave.protocol.transport import LinkDown, LinkUp
-
-SCENARIO = Scenario()
-LATTICE, ELECTION_S = SCENARIO.lattice, SCENARIO.network.election_s
-T_S = 20.0
-"""Road time: block 0 has closed and is on the way to S3."""
-A, B = Name("A"), Name("B")
-Cells = dict[Name, Cell]
-
-
-class Desk:
-    """A coordinator and what it has been told."""
-
-    def __init__(self, name: str = "c1", incarnation: int = 1) -> None:
-        """Start a coordinator."""
-        self.core = CoordinatorCore(Name(name), incarnation, SCENARIO)
-        self.now_s = 0.0
-        self.effects = list(self.core.handle(Started(), 0.0))
-
-    def give(self, *events: object) -> list[Effect]:
-        effects: list[Effect] = []
-        for event in events:
-            effects += self.core.handle(event, self.now_s)  # type: ignore[arg-type]
-            assert self.core.wakeup_s is not None
-            assert self.core.wakeup_s > self.now_s
-        self.effects += effects
-        return effects
-
-    def wait(self, seconds: float) -> list[Effect]:
-        self.now_s += seconds
-        return self.give(Wakeup())
-
-    def lead(self) -> list[Effect]:
-        return self.wait(ELECTION_S)
-
-    def tell(self, message: object) -> list[Effect]:
-        return self.give(Arrived(CENSUS, {}, message))
-
-    @property
-    def ballot(self) -> Ballot:
-        ballot = self.core.controls[0].ballot
-        assert ballot is not None
-        return ballot
-
-    def collect_promises(self, cells: Cells, lanes: dict[Name, int]) -> list[Effect]:
-        """Lead a formation up to the order of its plan."""
-        self.lead()
-        self.tell(census(cells, lanes))
-        for name, cell in cells.items():
-            self.tell(state(name, cell))
-        effects: list[Effect] = []
-        for name, cell in cells.items():
-            effects += self.tell(state(name, cell, self.ballot, t_s=1.0))
-        return effects
-
-
-def census(cells: Cells, lanes: dict[Name, int] | None = None, t_s: float = T_S) -> Census:
-    return Census(
-        t_s,
-        tuple(
-            CensusEntry(name, cell, (lanes or {}).get(name, 0), 0.0) for name, cell in cells.items()
-        ),
-        (),
-    )
-
-
-def state(
-    name: Name,
-    cell: Cell = (0, 0),
-    promised: Ballot | None = None,
-    *,
-    accepted: bool = False,
-    t_s: float = 0.0,
-) -> VehicleState:
-    return VehicleState(
-        vehicle=name,
-        incarnation=1,
-        formation=0,
-        promised=promised,
-        accepted=accepted,
-        ready=accepted,
-        completed=0,
-        hold_cell=cell,
-        moving=False,
-        go=False,
-        done=False,
-        overdue=False,
-        s_m=0.0,
-        y_m=0.0,
-        speed_mps=0.0,
-        t_s=t_s,
-    )
-
-
-def messages(effects: Iterable[Effect], kind: type) -> list[Send]:
-    return [e for e in effects if isinstance(e, Send) and isinstance(e.message, kind)]
-
-
-def jobs(effects: Iterable[Effect]) -> list[Compute]:
-    return [e for e in effects if isinstance(e, Compute)]
-
-
-def logged(effects: Iterable[Effect]) -> list[str]:
-    return [e.message.kind for e in messages(effects, LogEvent)]
-
+from unit.coordinator.desk import (
+    ELECTION_S,
+    LATTICE,
+    SCENARIO,
+    T_S,
+    A,
+    B,
+    C,
+    Cells,
+    D,
+    Desk,
+    E,
+    F,
+    census,
+    jobs,
+    logged,
+    messages,
+    state,
+)
 
 # --- being there ------------------------------------------------------------------------------
 
@@ -227,7 +133,8 @@ def test_leads_and_steps_down() -> None:
     desk.tell(census({A: (0, 0)}))
     assert set(desk.core.controls) == {0}
     better = Heartbeat(Name("c1"), 1, 1, leading=False, formations=0)
-    effects = desk.tell(better)
+    assert logged(desk.tell(better)) == []  # it waits until the newcomer leads
+    effects = desk.tell(evolve(better, leading=True))
     assert Unlisten(STATE) in effects
     assert logged(effects) == ["leader-stepped-down"]
     assert desk.core.controls == {}
@@ -307,9 +214,15 @@ def test_prepare_promise_plan_acceptance() -> None:
     plans = messages(effects, Plan)
     assert [(s.topic, s.parameters["vehicle"]) for s in plans] == [(PLAN, A), (PLAN, B)]
     assert plans[0].message == plans[1].message
+    assert plans[0].message.formations == (0,)
+    told: list[Effect] = []
     for name, cell in cells.items():
-        desk.tell(state(name, cell, desk.ballot, accepted=True, t_s=2.0))
+        told += desk.tell(state(name, cell, desk.ballot, accepted=True, t_s=2.0))
     assert desk.core.controls[0].phase is Phase.WATCHING
+    (note,) = messages(told, LogEvent)
+    assert (note.message.kind, note.message.data) == (
+        "plan-in-force", {"formation": 0, "closed_s": 3.0}
+    )  # fmt: skip
     desk.wait(1.0)
     assert messages(desk.wait(10.0), Plan) == []
 
@@ -341,6 +254,28 @@ def test_a_result_for_an_older_ballot_is_dropped() -> None:
     assert plan.message.roster == (A,)
 
 
+def test_a_result_for_an_older_ballot_is_dropped_while_the_newer_one_is_planned() -> None:
+    """It was made from promises that do not hold any more."""
+    desk = Desk()
+    cells: Cells = {A: (0, 0), B: (-1, 1)}
+    (old,) = jobs(desk.collect_promises(cells, {A: 1, B: 0}))
+    desk.tell(census(cells, {A: 2, B: 0}, t_s=T_S + 1.0))
+    (new,) = jobs(desk.promise(cells))
+    assert desk.core.controls[0].phase is Phase.PLANNING
+    assert messages(desk.give(run_job(old)), LogEvent) == []
+    plan: Plan = messages(desk.give(run_job(new)), Plan)[0].message
+    assert plan.moves[A][-1][2][1] == 2
+
+
+def test_a_result_that_comes_while_the_leader_backs_off_is_dropped() -> None:
+    desk = Desk()
+    (job,) = jobs(desk.collect_promises({A: (0, 0)}, {A: 1}))
+    desk.tell(state(A, promised=desk.ballot._replace(term=9), t_s=2.0))
+    assert desk.core.controls[0].phase is Phase.BACKING_OFF
+    effects = desk.give(run_job(job))
+    assert messages(effects, Plan) == messages(effects, LogEvent) == []
+
+
 def test_a_result_after_stepping_down_is_dropped() -> None:
     desk = Desk("c2")
     (job,) = jobs(desk.collect_promises({A: (0, 0)}, {}))
@@ -355,16 +290,21 @@ def test_failed_planning_is_logged_and_tried_again_under_the_same_ballot(spoil: 
     (job,) = jobs(desk.collect_promises(cells, {A: 1, B: 0}))
     ballot = desk.ballot
     result = run_job(job)
-    response = result.result
-    assert isinstance(response, PlanResponse)
+    sorting = result.result
+    assert isinstance(sorting, Sorting)
+    assert sorting.response is not None
     match spoil:
         case "error":
             result = evolve(result, result=None, error="ValueError: broken")
         case "nothing found":
-            result = evolve(result, result=evolve(response, status="timeout", paths=()))
+            nothing = evolve(sorting.response, status="timeout", paths=())
+            result = evolve(result, result=evolve(sorting, response=nothing))
         case _:
-            swapped = (((3, 0), (2, 1)), ((2, 1), (3, 0)))
-            result = evolve(result, result=evolve(response, paths=swapped))
+            swapped: dict[Name, tuple[Move, ...]] = {
+                A: ((0, (0, 0), (-1, 1)),),
+                B: ((0, (-1, 1), (0, 0)),),
+            }
+            result = evolve(result, result=evolve(sorting, moves=swapped))
     effects = desk.give(result)
     assert logged(effects) == ["planning-failed"]
     assert messages(effects, Plan) == []
@@ -382,7 +322,7 @@ def test_cells_that_cannot_be_planned_from_do_not_stop_the_coordinator(cell: Cel
     desk.tell(census({A: (0, 0), B: (-1, 1)}))
     desk.tell(state(A))
     desk.tell(state(B))
-    desk.tell(state(A, cell, desk.ballot, t_s=1.0))
+    desk.tell(evolve(state(A, promised=desk.ballot, t_s=1.0), hold_cell=cell))
     (job,) = jobs(desk.tell(state(B, (-1, 1), desk.ballot, t_s=1.0)))
     assert logged(desk.give(run_job(job))) == ["planning-failed"]
 
@@ -397,6 +337,21 @@ def test_too_late_for_any_step_settles() -> None:
     assert logged(effects) == ["formation-too-late"]
     assert desk.core.controls[0].phase is Phase.SETTLED
     assert logged(desk.wait(5.0)) == []
+
+
+def test_failed_planning_searches_further_each_time() -> None:
+    """The bound on nodes doubles, so that what is hard is solved in the end."""
+    few = evolve(SCENARIO, formation=evolve(SCENARIO.formation, max_nodes=1))
+    desk = Desk(scenario=few)
+    cells: Cells = {A: (0, 0), B: (-1, 1), C: (-2, 0), D: (-3, 1), E: (0, 2), F: (-2, 2)}
+    effects = desk.collect_promises(cells, dict(zip(cells, (2, 2, 1, 0, 0, 1), strict=True)))
+    outcomes: list[list[str]] = []
+    while not outcomes or "plan-made" not in outcomes[-1]:
+        (job,) = jobs(effects)
+        outcomes.append(logged(desk.give(run_job(job))))
+        assert len(outcomes) < 10
+        effects = desk.wait(8.0)
+    assert outcomes[0] == ["planning-failed"]
 
 
 @st.composite
@@ -425,7 +380,7 @@ def test_every_plan_is_executable_and_serves_all_preferences(
     assert set(plan.territory) <= LATTICE.block_cells(0)
     assert plan.slot_s == SCENARIO.formation.cycle_s
     now_s = max(t_s, T_S)
-    assert plan.t0_s == start_time_s(0, now_s + START_MARGIN_S, SCENARIO) > now_s
+    assert plan.t0_s == start_time_s((0,), now_s + START_MARGIN_S, SCENARIO) > now_s
     for name, moves in plan.moves.items():
         end = moves[-1][2] if moves else cells[name]
         assert end[1] == lanes[name]
@@ -444,7 +399,7 @@ def test_ballots_never_repeat() -> None:
             both: Cells = {A: (0, 0), B: (-5, 0)}
             desk.tell(census(both, t_s=T_S + round_))
             for number, name in ((0, A), (1, B)):
-                desk.tell(evolve(state(name), formation=number))
+                desk.tell(state(name, both[name]))
                 ballot = desk.core.controls[number].ballot
                 assert ballot is not None
                 seen.append(ballot)

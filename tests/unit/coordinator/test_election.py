@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from laneweave.coordinator.election import Election
+from laneweave.coordinator.election import NEWCOMER_SHARE, Election
 from laneweave.protocol.messages import Heartbeat, Name
 
 ELECTION_S = 0.4
@@ -16,8 +16,8 @@ def candidate(name: str = "b", started_s: float = 0.0) -> Election:
     return Election(Name(name), 1, ELECTION_S, started_s)
 
 
-def beat(name: str, incarnation: int = 1, term: int = 0) -> Heartbeat:
-    return Heartbeat(Name(name), incarnation, term, leading=False, formations=0)
+def beat(name: str, incarnation: int = 1, term: int = 0, *, leading: bool = False) -> Heartbeat:
+    return Heartbeat(Name(name), incarnation, term, leading=leading, formations=0)
 
 
 @pytest.mark.parametrize("heard_s", [0.1, 0.3, 1.1, 7.7, 1e6 + 0.3])
@@ -25,7 +25,7 @@ def test_it_can_decide_exactly_when_it_asks_to_be_woken(heard_s: float) -> None:
     """Rounding must not make a candidate sleep on until the next heartbeat."""
     election = candidate()
     election.on_heartbeat(beat("a"), heard_s)
-    assert election.update(election.next_change_s())
+    assert election.update(election.next_change_s(heard_s))
 
 
 def test_alone_it_leads_when_it_is_old_enough() -> None:
@@ -40,14 +40,14 @@ def test_a_better_ranked_candidate_keeps_it_from_leading() -> None:
     election = candidate()
     election.on_heartbeat(beat("a"), 0.3)
     assert not election.update(0.3 + ELECTION_S - 0.01)
-    assert election.next_change_s() == 0.3 + ELECTION_S
+    assert election.next_change_s(0.3) == 0.3 + ELECTION_S
     assert election.update(0.3 + ELECTION_S)
 
 
 def test_a_worse_ranked_candidate_does_not() -> None:
     election = candidate()
     election.on_heartbeat(beat("c"), 0.3)
-    assert election.next_change_s() == math.inf
+    assert election.next_change_s(0.3) == math.inf
     assert election.update(ELECTION_S)
 
 
@@ -62,7 +62,7 @@ def test_its_own_heartbeat_is_not_a_rival() -> None:
 def test_steps_down_for_a_better_ranked_one_and_leads_again_with_a_higher_term() -> None:
     election = candidate()
     election.update(ELECTION_S)
-    election.on_heartbeat(beat("a", term=7), 1.0)
+    election.on_heartbeat(beat("a", term=7, leading=True), 1.0)
     assert election.update(1.0)
     assert not election.leading
     assert election.term == 8  # it led when it saw the other term, and may yet again
@@ -115,7 +115,9 @@ def test_a_zombie_that_comes_back_counts_again() -> None:
     assert election.update(0.6)
     assert election.leading
     election.on_token_up("a", 1, 2.0)
-    assert election.update(2.0)
+    assert not election.update(2.0)  # it may be too young to lead
+    election.on_heartbeat(beat("a", leading=True), 2.1)
+    assert election.update(2.1)
     assert not election.leading
     election.on_heartbeat(beat("a"), 2.3)
     assert not election.update(2.3 + ELECTION_S - 0.01)
@@ -184,8 +186,38 @@ def test_two_leaders_that_hear_each_other_do_not_outbid_each_other_for_ever() ->
     now_s = 1.0
     for _ in range(20):
         for one, other in ((first, second), (second, first)):
-            one.on_heartbeat(beat(other.name, term=other.term), now_s)
+            one.on_heartbeat(beat(other.name, term=other.term, leading=other.leading), now_s)
             one.update(now_s)
         now_s += 0.1
     assert (first.leading, second.leading) == (True, False)
     assert (first.term, second.term) == (10, 10)
+
+
+def test_a_newcomer_is_waited_for_but_not_for_ever() -> None:
+    """Somebody leads all the time while a better-ranked candidate is too young to lead."""
+    election = candidate()
+    election.update(ELECTION_S)
+    patience_s = 1.0 + NEWCOMER_SHARE * ELECTION_S
+    for index in range(5):
+        election.on_heartbeat(beat("a"), 1.0 + 0.1 * index)
+        assert not election.update(1.0 + 0.1 * index)
+    assert election.next_change_s(1.4) == pytest.approx(patience_s)
+    election.on_heartbeat(beat("a"), patience_s - 0.01)
+    assert not election.update(patience_s - 0.01)
+    assert election.update(patience_s)
+    assert not election.leading
+
+
+def test_a_newcomer_keeps_those_who_do_not_lead_from_leading() -> None:
+    election = candidate()
+    election.on_token_up("a", 1, ELECTION_S - 0.01)
+    assert not election.update(ELECTION_S)
+
+
+def test_a_newcomer_that_falls_silent_is_new_again() -> None:
+    election = candidate()
+    election.on_heartbeat(beat("a"), 0.0)
+    assert election.update(ELECTION_S)
+    later_s = 5.0
+    election.on_heartbeat(beat("a"), later_s)
+    assert not election.update(later_s)

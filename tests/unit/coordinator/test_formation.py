@@ -1,26 +1,26 @@
-"""Which formations are closed, when they may start, and which cells they go to."""
+"""Which formations are closed, who belongs to them, and when they may start."""
 
 from __future__ import annotations
 
 import pytest
-from attrs import evolve
 from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.coordinator.formation import (
+    Formation,
     closed_formations,
-    parallel_targets,
-    plan_request,
+    closing_time_s,
     start_time_s,
     steps_left,
 )
+from laneweave.coordinator.groups import Groups
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import Census, CensusEntry, Name
 from laneweave.protocol.scenario import FormationSettings, Road, Scenario
 
 SCENARIO = Scenario()
 LATTICE = SCENARIO.lattice
-CLOSES_S = LATTICE.passing_time_s(LATTICE.block_range(0)[0])
+CLOSES_S = closing_time_s((0,), SCENARIO)
 """When the rear column of block 0 passes the start of the road: 3 s."""
 
 
@@ -29,35 +29,73 @@ def census(t_s: float, **cells: Cell) -> Census:
     return Census(t_s, entries, ())
 
 
+def closed(
+    seen: Census, t_s: float | None = None, groups: Groups | None = None
+) -> dict[int, Formation]:
+    return closed_formations(seen, seen.t_s if t_s is None else t_s, SCENARIO, groups or Groups())
+
+
+def joined(*numbers: int) -> Groups:
+    groups = Groups()
+    groups.join(numbers)
+    return groups
+
+
 def test_a_formation_closes_when_its_block_has_passed() -> None:
-    now = census(CLOSES_S, a=(0, 0))
-    assert closed_formations(now, CLOSES_S, SCENARIO) == {}
-    later = CLOSES_S + 0.1
-    assert closed_formations(census(later, a=(0, 0)), later, SCENARIO)[0].roster == ("a",)
+    assert CLOSES_S == 3.0
+    assert closed(census(CLOSES_S, a=(0, 0))) == {}
+    assert closed(census(CLOSES_S + 0.1, a=(0, 0)))[0].roster == ("a",)
 
 
 @pytest.mark.parametrize(("census_s", "clock_s"), [(3.0, 9.0), (9.0, 3.0)])
 def test_neither_an_old_census_nor_an_old_clock_closes_it(census_s: float, clock_s: float) -> None:
     """A census from before the block passed could lack a member."""
-    assert closed_formations(census(census_s, a=(0, 0)), clock_s, SCENARIO) == {}
+    assert closed(census(census_s, a=(0, 0)), clock_s) == {}
 
 
 def test_members_are_grouped_by_the_block_of_their_entry_and_sorted() -> None:
-    found = closed_formations(census(8.0, d=(-4, 0), b=(-3, 1), a=(-1, 1), c=(0, 2)), 8.0, SCENARIO)
-    assert {number: formation.roster for number, formation in found.items()} == {
-        0: ("a", "b", "c"),
-        1: ("d",),
+    found = closed(census(8.0, d=(-4, 0), b=(-3, 1), a=(-1, 1), c=(0, 2)))
+    assert {number: (each.numbers, each.roster) for number, each in found.items()} == {
+        0: ((0,), ("a", "b", "c")),
+        1: ((1,), ("d",)),
     }
-    assert 1 not in closed_formations(census(6.9, d=(-4, 0)), 6.9, SCENARIO)
+    assert 1 not in closed(census(6.9, d=(-4, 0)))
 
 
 def test_who_leaves_is_no_member_and_an_empty_formation_is_none() -> None:
-    assert closed_formations(census(50.0, a=(0, 0), b=(-1, 1)), 50.0, SCENARIO)[0].roster == (
-        "a",
-        "b",
-    )
-    assert closed_formations(census(60.0, b=(-1, 1)), 60.0, SCENARIO)[0].roster == ("b",)
-    assert closed_formations(census(70.0), 70.0, SCENARIO) == {}
+    assert closed(census(50.0, a=(0, 0), b=(-1, 1)))[0].roster == ("a", "b")
+    assert closed(census(60.0, b=(-1, 1)))[0].roster == ("b",)
+    assert closed(census(70.0)) == {}
+
+
+def test_joined_formations_are_one_under_the_least_number() -> None:
+    seen = census(16.0, a=(0, 0), b=(-5, 1), c=(-4, 0), d=(-9, 1))
+    found = closed(seen, groups=joined(0, 1))
+    assert {number: (each.numbers, each.roster) for number, each in found.items()} == {
+        0: ((0, 1), ("a", "b", "c")),
+        2: ((2,), ("d",)),
+    }
+
+
+def test_joined_formations_are_closed_when_the_last_block_has_passed() -> None:
+    both = census(7.0, a=(0, 0), b=(-5, 1))
+    assert closed(both, groups=joined(0, 1)) == {}
+    assert closed(both) != {}
+    later = census(7.1, a=(0, 0), b=(-5, 1))
+    assert closed(later, groups=joined(0, 1))[0].roster == ("a", "b")
+    # Also when nobody of the last block has entered yet, or its vehicles have left.
+    assert closed(census(7.0, a=(0, 0)), groups=joined(0, 1)) == {}
+    assert closed(census(7.1, a=(0, 0)), groups=joined(0, 1))[0].numbers == (0, 1)
+    assert closed(census(7.1, b=(-5, 1)), groups=joined(0, 1))[0].roster == ("b",)
+
+
+@given(st.lists(st.integers(0, 9), min_size=1, max_size=4, unique=True))
+def test_closing_is_when_the_rear_column_of_the_last_block_passes(numbers: list[int]) -> None:
+    several = tuple(sorted(numbers))
+    closes_s = closing_time_s(several, SCENARIO)
+    assert closes_s == max(closing_time_s((number,), SCENARIO) for number in several)
+    rear = min(column for number in several for column in LATTICE.block_range(number))
+    assert LATTICE.cell_s_m(rear, closes_s) == pytest.approx(0.0)
 
 
 @given(
@@ -73,7 +111,7 @@ def test_nobody_changes_lanes_before_the_rear_body_is_in_s3(
         road=Road(s1_m=0.0, s2_m=sorting_m), formation=FormationSettings(gap_m=gap_m)
     )
     lattice, tick_s = scenario.lattice, scenario.runtime.tick_s
-    start_s = start_time_s(number, not_before_s, scenario)
+    start_s = start_time_s((number,), not_before_s, scenario)
     assert start_s >= not_before_s - 1e-6
     rear_bumper_m = (
         lattice.cell_s_m(lattice.block_range(number)[0], start_s) - scenario.vehicle.length_m
@@ -84,57 +122,16 @@ def test_nobody_changes_lanes_before_the_rear_body_is_in_s3(
     assert start_s - tick_s < not_before_s or rear_bumper_m - 15.0 * tick_s < sorting_m + 1e-3
 
 
+def test_joined_formations_start_with_the_last_one() -> None:
+    assert start_time_s((2, 3), 0.0, SCENARIO) == start_time_s((3,), 0.0, SCENARIO)
+    assert start_time_s((2, 3), 0.0, SCENARIO) > start_time_s((2,), 0.0, SCENARIO)
+
+
 def test_steps_left() -> None:
     front_leaves_s = SCENARIO.road.length_m / SCENARIO.formation.speed_mps
-    assert steps_left(0, front_leaves_s, SCENARIO) == 0
-    assert steps_left(0, front_leaves_s + 100.0, SCENARIO) == 0
-    assert steps_left(0, front_leaves_s - 4.0, SCENARIO) == 1
-    assert steps_left(0, front_leaves_s - 11.9, SCENARIO) == 2
-    assert steps_left(1, front_leaves_s, SCENARIO) == 1  # the next block is a slot behind
-
-
-@given(
-    cells=st.lists(
-        st.tuples(st.integers(0, 7), st.integers(0, 2)), min_size=0, max_size=8, unique=True
-    ),
-    lane=st.integers(0, 2),
-)
-def test_targets_are_as_many_as_vehicles_contiguous_and_inside(
-    cells: list[Cell], lane: int
-) -> None:
-    targets = parallel_targets(lane, cells, 8)
-    assert len(targets) == len(cells)
-    assert {target[1] for target in targets} <= {lane}
-    columns = [target[0] for target in targets]
-    assert columns == list(range(columns[0], columns[0] + len(columns))) if columns else True
-    assert all(0 <= column < 8 for column in columns)
-
-
-def test_targets_are_where_the_ways_are_short() -> None:
-    assert parallel_targets(1, [(2, 1), (3, 1)], 8) == [(2, 1), (3, 1)]
-    assert parallel_targets(1, [(6, 0), (7, 2)], 8) == [(6, 1), (7, 1)]
-    assert parallel_targets(0, [], 8) == []
-
-
-def test_more_vehicles_than_cells_get_all_cells_of_the_lane() -> None:
-    cells = [(column, lane) for column in range(2) for lane in range(2)]
-    assert parallel_targets(0, cells, 2) == [(0, 0), (1, 0)]
-
-
-def test_the_request_is_in_the_blocks_own_columns() -> None:
-    cells: dict[Name, Cell] = {Name("b"): (-4, 0), Name("a"): (-7, 1)}
-    request = plan_request(1, cells, {Name("a"): 0, Name("b"): 2}, SCENARIO)
-    assert [(v.id, v.cell, v.lane) for v in request.vehicles] == [
-        ("b", (3, 0), 2),
-        ("a", (0, 1), 0),
-    ]
-    assert (request.grid.columns, request.grid.lanes) == (4, 3)
-    assert sorted(lane for _, lane in request.targets) == [0, 2]
-    assert request.mode == SCENARIO.formation.mode
-    assert request.conflicts == SCENARIO.formation.conflict_kinds
-
-
-def test_the_request_follows_the_scenario() -> None:
-    scenario = evolve(SCENARIO, formation=FormationSettings(mode=2, planning_deadline_s=1.5))
-    request = plan_request(0, {Name("a"): (0, 0)}, {Name("a"): 1}, scenario)
-    assert (request.mode, request.conflicts, request.deadline_s) == (2, ("geometric",), 1.5)
+    assert steps_left((0,), front_leaves_s, SCENARIO) == 0
+    assert steps_left((0,), front_leaves_s + 100.0, SCENARIO) == 0
+    assert steps_left((0,), front_leaves_s - 4.0, SCENARIO) == 1
+    assert steps_left((0,), front_leaves_s - 11.9, SCENARIO) == 2
+    assert steps_left((1,), front_leaves_s, SCENARIO) == 1  # the next block is a slot behind
+    assert steps_left((0, 1), front_leaves_s, SCENARIO) == 0  # the first of several counts

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from laneweave.launch.failover import Failover
 from laneweave.launch.outcome import Outcome, complete_summary, print_outcome
 
 
@@ -75,9 +76,10 @@ def test_the_number_of_processes_is_unknown_where_nobody_says_it(tmp_path: Path)
 
 
 def test_recoveries_seen_by_the_launcher_count(tmp_path: Path) -> None:
-    outcome = judge(tmp_path, summary(), recovery_s=[0.25])
+    outcome = judge(tmp_path, summary(), failover=Failover(1.0, [0.25], [0.5]))
     assert outcome.summary is not None
     assert outcome.summary["failover"]["recovery_s"] == [0.25]
+    assert outcome.summary["failover"]["plan_recovery_s"] == [0.5]
 
 
 @pytest.mark.parametrize(

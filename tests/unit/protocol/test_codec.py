@@ -38,10 +38,10 @@ V1, V2 = Name("v1"), Name("v2")
 BALLOT = Ballot(3, Name("c1"), 1_700_000_000_000_000_000, 2)
 SAMPLES: tuple[object, ...] = (
     Heartbeat(Name("c1"), 17, 3, leading=True, formations=2),
-    Prepare(BALLOT, -1, (V1, V2)),
+    Prepare(BALLOT, (-1, 0), (V1, V2)),
     Plan(
         BALLOT,
-        -1,
+        (-1, 0),
         (V1, V2),
         {V1: 11, V2: 12},
         {V1: (0, 0), V2: (2, 1)},
@@ -51,17 +51,19 @@ SAMPLES: tuple[object, ...] = (
         territory=((0, 0), (0, 1), (2, 1)),
     ),
     VehicleState(
-        V1, 11, -1, BALLOT, accepted=True, ready=True, completed=1, hold_cell=(0, 1), moving=False,
-        go=True, done=False, overdue=False, s_m=1.5, y_m=1.75, speed_mps=15.0, t_s=13.0,
+        V1, 11, -1, (-1, 0), BALLOT, accepted=True, ready=True, completed=1, hold_cell=(0, 1),
+        moving=False, go=True, done=False, overdue=False, attended=True, s_m=1.5, y_m=1.75,
+        speed_mps=15.0, t_s=13.0,
     ),
     Sense(
         V1, 130, 13.0, (1.5, 15.0, 0.0, 1.75, 0.0, 0.0), (0, 1), 120, (0, 0), 2,
-        (Neighbour(0, 10.0, 15.0), Neighbour(1, -0.5, 14.0)),
+        (Neighbour(0, 10.0, 15.0), Neighbour(1, -0.5, 14.0)), formation=-1, attendant=11,
+        caretaker=True, joined=(-1, 0),
     ),
-    Command(V1, 130, (0, 1), 140, (0, 0), b"\0" * 16),
+    Command(V1, 11, 130, (0, 1), 140, (0, 0), b"\0" * 16, (-1, 0)),
     Census(13.0, (CensusEntry(V1, (0, 1), 2, 5.0),), (Announcement(V2, 0, 1, 20.0),)),
     RoadClock(130, 13.0, demanded=5, entered=4, on_road=3, left=1, ended=False),
-    Report(Name("agent"), V1, Name("17-4"), 10, 0, 5, 1, b"\0\0\0\0"),
+    Report(Name("agent"), V1, Name("17-4"), 10, 0, 3, 5, 1, b"\0\0\0\0"),
     LogEvent(Name("bridge"), Name("b"), 13.0, Name("overlap"), {"n": 1, "pair": ["v1", "v2"]}),
 )  # fmt: skip
 NAMES_NOT_ALLOWED = ("a/b", "a*", "", "x" * 65, "a b", "a#", "$", "a?", "é", "a\n", "v1\n", "\0")

@@ -23,7 +23,7 @@ def make_plan(starts: dict[Name, Cell], moves: dict[Name, tuple[Move, ...]]) -> 
     cells = territory(starts.values(), [move for own in moves.values() for move in own])
     return Plan(
         BALLOT,
-        formation=0,
+        formations=(0,),
         roster=tuple(starts),
         incarnations=dict.fromkeys(starts, 1),
         start_cells=starts,

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from collections.abc import Iterable
 
 import pytest
-from attrs import define, field
 
 from laneweave.protocol.codec import encode
-from laneweave.protocol.messages import Heartbeat, Name
 from laneweave.protocol.node import (
-    Announce,
     Arrived,
     Compute,
     Computed,
@@ -20,10 +16,9 @@ from laneweave.protocol.node import (
     Event,
     Listen,
     PeerDown,
-    PeerUp,
-    Send,
     Started,
     Stopping,
+    Unlisten,
     Wakeup,
     Watch,
     Withdraw,
@@ -31,135 +26,22 @@ from laneweave.protocol.node import (
 from laneweave.protocol.simulated_network import KILL_SEEN_S, Conditions, SimulatedNetwork
 from laneweave.protocol.topics import HEARTBEAT, VEHICLE_ALIVE
 from laneweave.protocol.transport import LinkDown, LinkUp
-
-REALM = "r"
-CALM = Conditions(delay_s=0.002, jitter_s=0.0)
-STORM = Conditions(delay_s=0.002, jitter_s=0.05, loss=0.3, duplication=0.2)
-Handler = Callable[[Event, float], Iterable[Effect]]
-
-
-def no_effects(_: Event, __: float) -> Iterable[Effect]:
-    return ()
-
-
-@define
-class Recorder:
-    """A core that records every event and answers with what `on_event` says."""
-
-    on_event: Handler = no_effects
-    events: list[tuple[float, Event]] = field(factory=list)
-    wakeup_s: float | None = None
-
-    def handle(self, event: Event, now_s: float) -> Iterable[Effect]:
-        self.events.append((now_s, event))
-        return self.on_event(event, now_s)
-
-    def of(self, *kinds: type) -> list[Event]:
-        return [event for _, event in self.events if isinstance(event, kinds)]
-
-    def times(self, kind: type) -> list[float]:
-        return [now_s for now_s, event in self.events if isinstance(event, kind)]
-
-    @property
-    def numbers(self) -> list[int]:
-        """Which beats arrived, in order."""
-        return [event.message.term for _, event in self.events if isinstance(event, Arrived)]
-
-    @property
-    def tokens(self) -> list[str]:
-        """`+name` and `-name` of each token that appeared or vanished."""
-        signs = {PeerUp: "+", PeerDown: "-"}
-        return [
-            signs[type(event)] + event.parameters["vehicle"]
-            for _, event in self.events
-            if isinstance(event, (PeerUp, PeerDown))
-        ]
-
-
-def beat(number: int, sender: str = "a") -> Send:
-    message = Heartbeat(Name(sender), 1, number, leading=False, formations=0)
-    return Send(HEARTBEAT, message, {"coordinator": sender})
-
-
-def at_start(*effects: Effect) -> Handler:
-    return lambda event, _: effects if isinstance(event, Started) else ()
-
-
-def token(name: str) -> Announce:
-    return Announce(VEHICLE_ALIVE, {"vehicle": name})
-
-
-def listener() -> Recorder:
-    return Recorder(at_start(Listen(HEARTBEAT), Watch(VEHICLE_ALIVE)))
-
-
-def network_of(
-    conditions: Conditions = CALM,
-    seed: int = 1,
-    more: Mapping[str, Recorder] | None = None,
-    **cores: Recorder,
-) -> SimulatedNetwork:
-    """Return a network in which the cores have started."""
-    network = SimulatedNetwork(seed, conditions)
-    for name, core in (cores | dict(more or {})).items():
-        network.add(name, core, REALM)
-    network.run(0.1)
-    return network
-
-
-def send(network: SimulatedNetwork, name: str, *numbers: int) -> None:
-    """Have a node send beats now."""
-    core = network.node(name).core
-    assert isinstance(core, Recorder)
-    before, core.on_event = core.on_event, lambda *_: [beat(number, name) for number in numbers]
-    network.node(name).dispatch(Wakeup(), network.now_s)
-    core.on_event = before
-
-
-def perform(network: SimulatedNetwork, name: str, *effects: Effect) -> None:
-    """Have a node carry out effects now."""
-    core = network.node(name).core
-    assert isinstance(core, Recorder)
-    before, core.on_event = core.on_event, lambda *_: effects
-    network.node(name).dispatch(Wakeup(), network.now_s)
-    core.on_event = before
-
+from unit.protocol.recorder import (
+    CALM,
+    REALM,
+    STORM,
+    Recorder,
+    at_start,
+    beat,
+    chatter,
+    listener,
+    network_of,
+    perform,
+    send,
+    token,
+)
 
 # --- repeatable -------------------------------------------------------------------------------
-
-
-def chatter(seed: int, conditions: Conditions) -> tuple[list[list[tuple[float, Event]]], Any]:
-    """Run nodes that talk, with all faults, and return what each saw."""
-
-    def make(name: str) -> Recorder:
-        core = Recorder()
-        sent = 0
-
-        def talk(event: Event, now_s: float) -> Iterable[Effect]:
-            nonlocal sent
-            if isinstance(event, Started):
-                core.wakeup_s = now_s + 0.01
-                return [Listen(HEARTBEAT), Watch(VEHICLE_ALIVE), token(name)]
-            if isinstance(event, Wakeup):
-                core.wakeup_s = now_s + 0.01
-                sent += 1
-                return [beat(sent, name), *([Compute(sent, lambda: 1)] if sent % 10 == 0 else [])]
-            return ()
-
-        core.on_event = talk
-        return core
-
-    cores = {name: make(name) for name in ("a", "b", "c")}
-    network = SimulatedNetwork(seed, conditions)
-    for name, core in cores.items():
-        network.add(name, core, REALM)
-    network.at(0.2, lambda: network.pause("a"))
-    network.at(0.9, lambda: network.resume("a"))
-    network.at(0.5, lambda: network.disconnect("b"))
-    network.at(0.7, lambda: network.reconnect("b"))
-    network.at(1.0, lambda: network.kill("c"))
-    network.run(1.2)
-    return [core.events for core in cores.values()], (network.dropped, network.delivered)
 
 
 @pytest.mark.parametrize("conditions", [CALM, STORM], ids=["calm", "storm"])
@@ -244,6 +126,29 @@ def test_a_stranger_can_deliver_any_bytes() -> None:
     network.run(0.2)
     assert receiver.numbers == [4]
     assert network.node("a").rejected == 1
+
+
+def test_subscriptions_may_change_between_messages() -> None:
+    receivers = {name: listener() for name in ("b", "c")}
+    network = network_of(more=receivers, a=Recorder())
+    send(network, "a", 1)
+    perform(network, "b", Unlisten(HEARTBEAT))
+    send(network, "a", 2)
+    perform(network, "b", Listen(HEARTBEAT, {"coordinator": "a"}))
+    send(network, "a", 3)
+    send(network, "c", 4)
+    network.run(0.2)
+    assert receivers["b"].numbers == [1, 3]
+    assert receivers["c"].numbers == [1, 2, 3, 4]
+
+
+def test_nothing_is_sent_to_who_has_left() -> None:
+    network = network_of(a=Recorder(), b=listener(), c=listener())
+    send(network, "a", 1)
+    network.kill("b")
+    network.conditions = Conditions(loss=1.0)
+    send(network, "a", 2)
+    assert network.dropped == 1
 
 
 # --- who is there -----------------------------------------------------------------------------
@@ -610,9 +515,37 @@ def test_a_wakeup_that_moves_is_followed() -> None:
     core.on_event = move
     network = network_of(a=Recorder(), b=core)
     for number in range(1, 7):
-        network.at(0.1 + number * 0.02, lambda number=number: send(network, "a", number))  # type: ignore[misc]
+        network.at(0.1 + number * 0.02, send, network, "a", number)
     network.run(5.0)
     assert core.times(Wakeup) == [0.5]
+
+
+@pytest.mark.parametrize("shift_s", [0.01, -0.01], ids=["put off", "brought forward"])
+def test_a_wakeup_that_moves_again_and_again_does_not_fill_the_queue(shift_s: float) -> None:
+    core = Recorder(at_start(Listen(HEARTBEAT)))
+    core.wakeup_s = 3.0
+
+    def move(event: Event, now_s: float) -> Iterable[Effect]:
+        if isinstance(event, Arrived):
+            assert core.wakeup_s is not None
+            core.wakeup_s += shift_s
+        elif isinstance(event, Wakeup):
+            core.wakeup_s = 10.0 if now_s < 10.0 else None
+        return ()
+
+    network = network_of(a=Recorder(), b=core)
+    core.on_event = move
+    for number in range(100):
+        network.at(0.2 + number * 0.01, send, network, "a", number)
+    network.run(1.5)
+    assert core.wakeup_s == pytest.approx(3.0 + 100 * shift_s)
+    events = 0
+    while network.step():
+        events += 1
+    assert core.times(Wakeup) == [pytest.approx(3.0 + 100 * shift_s), 10.0]
+    # Put off: the first alarm sets the right one. Brought forward: each time one was set, and all
+    # but the last are stale, which set no others.
+    assert events == (3 if shift_s > 0 else 102)
 
 
 def test_a_wakeup_is_not_lost_in_a_pause() -> None:

@@ -10,7 +10,7 @@ from attrs import field, frozen
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario import within
-from laneweave.protocol.structuring import structure
+from laneweave.protocol.structuring import NumberOrRange, structure
 
 
 @frozen
@@ -33,6 +33,20 @@ class Whole:
     pair: tuple[int, str] = (1, "a")
     table: dict[str, tuple[int, ...]] = field(factory=dict)
     maybe: int | None = None
+    span: NumberOrRange = 1.0
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"), [(2, 2.0), (2.5, 2.5), ([1, 2.5], (1.0, 2.5)), ((1, 2), (1.0, 2.0))]
+)
+def test_a_number_or_a_range(given: object, expected: NumberOrRange) -> None:
+    assert structure({"count": 1, "span": given}, Whole).span == expected
+
+
+@pytest.mark.parametrize("given", ["1", True, [1], [1, 2, 3], [1, "2"], [1, math.inf], {"a": 1}])
+def test_neither_a_number_nor_a_range(given: object) -> None:
+    with pytest.raises(BadInputError, match=r"^span: got "):
+        structure({"count": 1, "span": given}, Whole)
 
 
 def test_good_data_becomes_the_class() -> None:

@@ -51,6 +51,27 @@ def test_numbers_become_text() -> None:
     assert KEYS.read(key) == (STATE, {"formation": "-3", "vehicle": "v1"})
 
 
+def test_equal_numbers_with_different_texts_stay_apart() -> None:
+    keys = [KEYS.key(COMMAND, vehicle=vehicle) for vehicle in (1, True, 1.0, "1")]
+    assert [key.rpartition("/")[2] for key in keys] == ["1", "True", "1.0", "1"]
+
+
+@pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
+def test_the_longest_key_is_read_back(topic: Topic) -> None:
+    keys = Keys("x" * 64)
+    parameters = dict.fromkeys(topic.parameters, "y" * 64)
+    assert keys.read(keys.key(topic, **parameters)) == (topic, parameters)
+
+
+def test_who_reads_a_key_cannot_change_what_others_read() -> None:
+    key = KEYS.key(COMMAND, vehicle="v1")
+    known = KEYS.read(key)
+    assert known is not None
+    with pytest.raises(TypeError):
+        known[1]["vehicle"] = "v2"  # type: ignore[index]
+    assert KEYS.read(key) == (COMMAND, {"vehicle": "v1"})
+
+
 def test_topics_are_distinct() -> None:
     assert len({topic.name for topic in TOPICS}) == len(TOPICS)
     shapes = {re.sub(r"{\w+}", "*", topic.pattern) for topic in TOPICS}

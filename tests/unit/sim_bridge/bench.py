@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import deque
 from collections.abc import Callable, Iterable
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -91,12 +92,19 @@ def make_bridge(
     *,
     pace: float | None = 1.0,
     incarnation: int = 0,
+    new_incarnation: Callable[[], int] | None = None,
 ) -> tuple[BridgeCore, PlainWorld]:
     """Return a bridge with the given demand, or with the scenario's."""
     world = PlainWorld()
     record = RunRecord(folder, scenario, "formation", lambda: 0.0)
     core = BridgeCore(
-        scenario, world, record, pace=pace, incarnation=incarnation, stopwatch=lambda: 0.0
+        scenario,
+        world,
+        record,
+        new_incarnation=new_incarnation or count(1).__next__,
+        pace=pace,
+        incarnation=incarnation,
+        stopwatch=lambda: 0.0,
     )
     if arrivals is not None:
         core._roadside._arrivals = tuple(arrivals)
@@ -144,7 +152,7 @@ class Desk:
     def start(self, *up: str) -> list[Effect]:
         """Start the bridge, with agents that are there already."""
         for vehicle in up:
-            self.core._agents_up.add(vehicle)
+            self.core._answers.up.add(Name(vehicle))
         return self.give(Started())
 
     def up(self, vehicle: str) -> list[Effect]:
@@ -163,11 +171,16 @@ class Desk:
         return self.give(Arrived(COMMAND, {"vehicle": vehicle}, self.command(vehicle, **changes)))
 
     def command(self, vehicle: str, **changes: Any) -> Command:  # noqa: ANN401 (fields)
-        """Return an answer to the current tick: go on as you are."""
+        """Return an answer to the current tick: go on as you are.
+
+        As agents do, it comes with a new incarnation when the caretaker is in charge.
+        """
         name = Name(vehicle)
         controller = self.core.vehicles[name].controller
+        cared_for = name in self.core._attendance
         known: dict[str, Any] = {
             "vehicle": name,
+            "incarnation": max(controller.attendant + cared_for, 1),
             "tick": self.core.tick,
             "hold_cell": controller.hold_cell,
             "motion_end_tick": 0,
@@ -189,7 +202,7 @@ class Desk:
         for _ in range(20_000):
             if until():
                 return
-            awaited = sorted(self.core._awaited - set(deaf))
+            awaited = sorted(self.core._answers.awaited - set(deaf))
             if self.core.phase is Phase.ANSWERS and awaited:
                 self.answer(awaited[0])
             else:
@@ -199,6 +212,13 @@ class Desk:
     def drive_to(self, tick: int, *deaf: str) -> None:
         """Go on until a tick has been opened and its vehicles have been asked."""
         self.drive(lambda: self.core.tick >= tick and self.core.phase is Phase.ANSWERS, *deaf)
+
+    def drive_to_silence(self, *silent: str) -> None:
+        """Go on without a word of some agents until they count as silent."""
+        answers = self.core._answers
+        self.drive(
+            lambda: answers.silent >= set(silent) and self.core.phase is Phase.ANSWERS, *silent
+        )
 
     def drive_to_entry(self, *vehicles: str) -> None:
         """Go on until vehicles are on the road and wait for their agents' answers."""
@@ -289,7 +309,12 @@ class Street:
         self._incarnations += 1
         folder.mkdir(parents=True, exist_ok=True)
         self.bridge, self.world = make_bridge(
-            self.scenario, folder, self.arrivals, pace=self.pace, incarnation=self._incarnations
+            self.scenario,
+            folder,
+            self.arrivals,
+            pace=self.pace,
+            incarnation=self._incarnations,
+            new_incarnation=self._new_incarnation,
         )
         self._add(name, self.bridge)
 
@@ -311,9 +336,12 @@ class Street:
         return host
 
     def _make_agent(self, vehicle: Name) -> AgentCore:
-        self._incarnations += 1
-        self.agents[vehicle] = AgentCore(vehicle, self._incarnations, self.scenario)
+        self.agents[vehicle] = AgentCore(vehicle, self._new_incarnation, self.scenario)
         return self.agents[vehicle]
+
+    def _new_incarnation(self) -> int:
+        self._incarnations += 1
+        return self._incarnations
 
     def _add(self, name: str, core: Core) -> None:
         self.nodes.append(self.network.add(name, core, REALM))
@@ -336,7 +364,7 @@ class Street:
         move: Move = (0, start, target)
         plan = Plan(
             ballot=ballot,
-            formation=block,
+            formations=(block,),
             roster=(name,),
             incarnations={name: agent._incarnation},
             start_cells={name: start},
@@ -345,9 +373,9 @@ class Street:
             slot_s=self.scenario.formation.cycle_s,
             territory=tuple(sorted(territory([start], [move]))),
         )
-        prepare = Prepare(ballot, block, (name,))
+        prepare = Prepare(ballot, (block,), (name,))
         for topic, message in ((PREPARE, prepare), (PLAN, plan)):
             self.network.inject(KEYS.key(topic, vehicle=vehicle), encode(message))
             self.network.run(self.network.now_s + 0.02)  # nothing overtakes it
-        assert agent._execution is not None
-        assert agent._execution.plan == plan
+        assert agent.execution is not None
+        assert agent.execution.plan == plan

@@ -29,7 +29,8 @@ from laneweave.protocol.topics import (
     VEHICLE_ALIVE,
 )
 from laneweave.protocol.transport import LinkDown, LinkUp
-from laneweave.sim_bridge.core import LEFT_REPEATS, WIND_UP_S, Phase
+from laneweave.sim_bridge.core import WIND_UP_S, Phase
+from laneweave.sim_bridge.leaving import LEFT_REPEATS
 from laneweave.sim_bridge.overlap import pose_of
 from unit.sim_bridge.bench import (
     Desk,
@@ -44,8 +45,11 @@ from unit.sim_bridge.bench import (
 )
 
 SCENARIO = make_scenario()
-TICK_S, RESEND_S = SCENARIO.runtime.tick_s, SCENARIO.network.resend_s
-DEADLINE_S, PATIENCE_S = SCENARIO.runtime.tick_deadline_s, SCENARIO.runtime.agent_start_s
+TICK_S, RESEND_S = SCENARIO.runtime.tick_s, SCENARIO.runtime.tick_resend_s
+DEADLINE_S, SILENT_S = SCENARIO.runtime.tick_deadline_s, SCENARIO.runtime.agent_silent_s
+PATIENCE_S, LITTLE_PATIENCE_S = SCENARIO.runtime.agent_start_s, SCENARIO.network.resend_s
+MISSES = round(SILENT_S / DEADLINE_S)
+"""Deadlines that an agent misses before it is silent."""
 A, B = Name("A"), Name("B")
 TWO = (arrival(A, 0.5, lane=1), arrival(B, 0.6, lane=0))
 """A enters at 1 s, B at 2 s: when the first free cells pass that are in the structure."""
@@ -66,6 +70,7 @@ def record_of(desk: Desk, vehicle: Name) -> tuple[object, ...]:
     controller = desk.core.vehicles[vehicle].controller
     return (
         controller.command_tick,
+        controller.attendant,
         controller.hold_cell,
         controller.motion_origin,
         controller.motion_end_tick,
@@ -139,7 +144,7 @@ def test_ticks_keep_the_pace_and_do_not_make_up_for_lost_time(desk: Desk) -> Non
     opened_s = desk.now_s
     desk.drive_to(desk.core.tick + 1)
     assert desk.now_s == pytest.approx(opened_s + TICK_S)
-    desk.now_s += 3.3 * TICK_S
+    desk.now_s += 2.3 * TICK_S
     desk.answer(A)
     desk.answer(B)
     assert desk.core.wakeup_s == desk.now_s  # late: at once, but
@@ -183,34 +188,61 @@ def test_nobody_is_asked_again_too_early(desk: Desk) -> None:
     assert desk.give(Wakeup()) == []
 
 
-def test_after_the_deadline_the_bridge_goes_on_without(desk: Desk) -> None:
-    began_s, tick = desk.now_s, desk.core.tick
+def test_at_the_deadline_the_road_goes_on_and_the_next_tick_waits_for_all(desk: Desk) -> None:
+    for _ in range(MISSES - 1):
+        began_s, tick = desk.now_s, desk.core.tick
+        assert desk.core._answers.awaited == {A, B}
+        desk.answer(A)
+        while desk.core.tick == tick:
+            desk.wake()
+        assert desk.now_s == pytest.approx(began_s + DEADLINE_S)
+        desk.drive_to(desk.core.tick)
+    assert read_events(desk.folder, "agent-silent") == []
+    assert B not in desk.core._attendance
+
+
+def test_who_misses_a_tick_plays_what_it_has(desk: Desk) -> None:
+    pairs = [(2.0, 0.0), (-1.0, 0.0), (0.0, 0.0)]
+    before = desk.core.vehicles[B].state
+    desk.answer(A)
+    desk.answer(B, jerks=jerks(*pairs))
+    desk.wake()
+    tick = desk.core.tick
     desk.answer(A)
     desk.drive(lambda: desk.core.tick > tick, B)
-    assert desk.now_s == pytest.approx(began_s + DEADLINE_S)
+    assert desk.core.vehicles[B].state[2] == pytest.approx(before[2] + 1.0 * TICK_S)
+    assert desk.core.vehicles[B].controller.played_from_hold == 0
+
+
+def test_who_has_not_answered_for_long_is_silent_and_not_waited_for(desk: Desk) -> None:
+    began_s, tick = desk.now_s, desk.core.tick
+    desk.drive_to_silence(B)
+    assert desk.now_s == pytest.approx(began_s + SILENT_S)
+    assert desk.core.tick == tick + MISSES
     (event,) = read_events(desk.folder, "agent-silent")
-    assert (event["vehicle"], event["t_s"]) == (B, pytest.approx(tick * TICK_S))
+    assert (event["vehicle"], event["t_s"]) == (B, pytest.approx(desk.core.t_s))
     # Everybody is still asked, but nobody waits for the silent one any more.
-    began_s = desk.now_s
+    began_s, tick = desk.now_s, desk.core.tick
     desk.effects.clear()
     desk.drive_to(tick + 6, B)
-    assert desk.now_s <= began_s + 6 * TICK_S
+    assert desk.now_s == pytest.approx(began_s + 6 * TICK_S)
     assert asked(desk.effects).count(B) == asked(desk.effects).count(A) == 6
     assert len(read_events(desk.folder, "agent-silent")) == 1
+    desk.give(Stopping())
+    assert read_summary(desk.folder)["tracking"]["missed_ticks"] == MISSES
 
 
 def test_a_late_answer_ends_the_silence_and_does_nothing_else(desk: Desk) -> None:
-    tick = desk.core.tick
-    late = desk.command(B, hold_cell=(-1, 0), jerks=jerks((5.0, 5.0), ticks=40))
-    desk.answer(A)
-    desk.drive(lambda: desk.core.tick > tick, B)
-    desk.drive_to(tick + 3)
+    late = desk.command(B, jerks=jerks((5.0, 5.0), ticks=40))
+    desk.drive_to_silence(B)
+    desk.drive_to(desk.core.tick + 3)
     known = record_of(desk, B)
     assert desk.give(Arrived(COMMAND, {"vehicle": B}, late)) == []
     assert record_of(desk, B) == known
+    assert B in desk.core._attendance  # until it claims its vehicle
     desk.answer(A)  # this tick had not asked it to be waited for
     desk.wake()
-    assert desk.core._awaited == {A, B}
+    assert desk.core._answers.awaited == {A, B}
 
 
 @pytest.mark.parametrize("apart", [-5, -1, 1, 5, 2**62])
@@ -219,7 +251,7 @@ def test_an_answer_to_another_tick_changes_nothing(desk: Desk, apart: int) -> No
     moving = {"hold_cell": (-1, 0), "motion_end_tick": tick + 9, "motion_origin": (-1, 0)}
     desk.answer(A, tick=tick + apart, jerks=jerks((9.0, 9.0), ticks=9), **moving)
     assert record_of(desk, A) == known
-    assert desk.core._awaited == {A, B}
+    assert desk.core._answers.awaited == {A, B}
 
 
 def test_an_answer_between_two_ticks_changes_nothing(desk: Desk) -> None:
@@ -232,7 +264,7 @@ def test_an_answer_between_two_ticks_changes_nothing(desk: Desk) -> None:
     desk.give(Arrived(COMMAND, {"vehicle": A}, early))
     assert record_of(desk, A) == known
     desk.wake()
-    assert desk.core._awaited == {A, B}
+    assert desk.core._answers.awaited == {A, B}
 
 
 def test_the_first_answer_to_a_tick_counts(desk: Desk) -> None:
@@ -251,13 +283,13 @@ def test_an_answer_that_makes_no_sense_is_none(desk: Desk) -> None:
     ):
         desk.answer(A, **{name: nonsense})
         assert record_of(desk, A) == known
-        assert desk.core._awaited == {A, B}
+        assert desk.core._answers.awaited == {A, B}
     desk.answer(A)
-    assert desk.core._awaited == {B}
+    assert desk.core._answers.awaited == {B}
 
 
 def test_answers_for_nobody_are_ignored(desk: Desk) -> None:
-    ghost = Command(Name("ghost"), desk.core.tick, (0, 0), 0, (0, 0), b"")
+    ghost = Command(Name("ghost"), 1, desk.core.tick, (0, 0), 0, (0, 0), b"")
     assert desk.give(Arrived(COMMAND, {"vehicle": "ghost"}, ghost)) == []
 
 
@@ -267,24 +299,53 @@ def test_a_dead_agent_is_not_waited_for(desk: Desk) -> None:
     desk.down(B)
     assert desk.core.tick == tick + 1
     desk.wake()
-    assert desk.core._awaited == {A}
+    assert desk.core._answers.awaited == {A}
     desk.up(B)  # another one: from the next tick on
     desk.answer(A)
     desk.wake()
-    assert desk.core._awaited == {A, B}
+    assert desk.core._answers.awaited == {A, B}
     assert read_events(desk.folder, "agent-silent") == []
 
 
 def test_a_new_agent_of_a_silent_one_is_waited_for(desk: Desk) -> None:
-    tick = desk.core.tick
-    desk.drive(lambda: desk.core.tick > tick, B)
-    desk.drive_to(tick + 1)
-    assert desk.core._awaited == {A}
+    desk.drive_to_silence(B)
+    assert desk.core._answers.awaited == {A}
     desk.down(B)
     desk.up(B)
     desk.answer(A)
     desk.wake()
-    assert desk.core._awaited == {A, B}
+    assert desk.core._answers.awaited == {A, B}
+
+
+def test_a_network_without_any_answers_does_not_stop_the_road(tmp_path: Path) -> None:
+    """All tokens are there and no message comes through: the first vehicles pay, once."""
+    names = [f"v{number:02d}" for number in range(12)]
+    desk = Desk(SCENARIO, tmp_path, [arrival(n, 2.0 * k + 0.1) for k, n in enumerate(names)], 100.0)
+    desk.start(*names)
+    desk.drive_to_entry(names[0])
+    began_s, tick = desk.now_s, desk.core.tick
+    desk.drive(lambda: desk.core.phase is Phase.WIND_UP, *names)
+    road_s = (desk.core.tick - tick) * TICK_S
+    # Real time, and not faster, though the pace would allow it.
+    paid_s = SILENT_S - MISSES * TICK_S
+    assert desk.now_s - began_s == pytest.approx(road_s + paid_s, abs=2 * TICK_S)
+    desk.give(Stopping())
+    summary = read_summary(tmp_path)
+    assert summary["vehicles"]["left"] == summary["vehicles"]["left_unattended"] == len(names)
+    assert summary["safety"]["overlaps"] == 0
+    silent = [event["vehicle"] for event in read_events(tmp_path, "agent-silent")]
+    assert sorted(silent) == names
+    assert {e["reason"] for e in read_events(tmp_path, "caretaker-took-over")} == {"silent"}
+
+
+def test_the_network_may_come_back(desk: Desk) -> None:
+    desk.drive(lambda: desk.core._answers.deaf and desk.core.phase is Phase.PACE, A, B)
+    desk.wake()
+    assert desk.core.phase is Phase.PACE  # nobody was waited for
+    for name in (A, B):
+        desk.answer(name, tick=desk.core.tick - 1)
+    desk.wake()
+    assert desk.core._answers.awaited == {A, B}
 
 
 # --- the entrance -----------------------------------------------------------------------------
@@ -315,14 +376,15 @@ def test_the_entrance_gives_up_once_and_has_little_patience_until_somebody_comes
         desk.drive(lambda: desk.core.phase is Phase.AGENTS)
         opened_s = desk.now_s
         if name == "v2":
-            desk.now_s += 0.5 * RESEND_S
+            desk.now_s += 0.5 * LITTLE_PATIENCE_S
             desk.up("v2")
         else:
             desk.wake()
         assert Name(name) in desk.core.vehicles
         waited.append(desk.now_s - opened_s)
         desk.drive(lambda: desk.core.phase is Phase.PACE)
-    assert waited == pytest.approx([PATIENCE_S, RESEND_S, 0.5 * RESEND_S, PATIENCE_S, RESEND_S])
+    little_s = LITTLE_PATIENCE_S
+    assert waited == pytest.approx([PATIENCE_S, little_s, 0.5 * little_s, PATIENCE_S, little_s])
     missing = [event["vehicle"] for event in read_events(tmp_path, "agent-missing")]
     assert missing == ["v0", "v1", "v3", "v4"]
 
@@ -343,7 +405,7 @@ def test_a_vehicle_that_left_is_told_so_until_its_agent_is_gone(tmp_path: Path) 
     desk.effects.clear()
     desk.drive_to(desk.core.tick + 2)
     assert not any(sense.left for sense in sent(desk.effects, Sense))
-    assert desk.core._leaving == {}
+    assert len(desk.core._leaving.repeats) == 0
 
 
 def test_a_vehicle_that_left_is_not_told_for_ever(tmp_path: Path) -> None:
@@ -353,7 +415,7 @@ def test_a_vehicle_that_left_is_not_told_for_ever(tmp_path: Path) -> None:
     told = [sense.vehicle for sense in sent(desk.effects, Sense) if sense.left]
     assert told.count(A) == LEFT_REPEATS
     assert told.count(B) == 1  # it was the last one
-    assert A not in desk.core._leaving
+    assert A not in desk.core._leaving.repeats
 
 
 # --- the end ----------------------------------------------------------------------------------
@@ -463,7 +525,7 @@ def test_nothing_is_left_over_at_the_end(tmp_path: Path) -> None:
     desk = Desk(SCENARIO, tmp_path, [*TWO, arrival("C", 3.0)])
     desk.start(A, B, "C")
     desk.drive(lambda: desk.core.tick > 60, B)
-    assert desk.core._silent == {B}
+    assert desk.core._answers.silent == {B}
     desk.drive(lambda: desk.core.phase is Phase.WIND_UP, B)
     for name in (A, B, "C"):
         desk.report("agent", name)
@@ -472,8 +534,17 @@ def test_nothing_is_left_over_at_the_end(tmp_path: Path) -> None:
     core = desk.core
     assert core.phase is Phase.ENDED
     for left_over in (
-        *(core.vehicles, core._leaving, core._silent, core._awaited, core._at_entrance),
-        *(core._agents_up, core._unreported, desk.world.at),
+        core._attendance._caretakers,
+        core._answers._unheard,
+        core._answers._unheard_s,
+        *(
+            core.vehicles,
+            core._leaving.repeats,
+            core._answers.silent,
+            core._answers.awaited,
+            core._at_entrance,
+        ),
+        *(core._answers.up, core._unreported, desk.world.at),
     ):
         assert not left_over
 
@@ -507,7 +578,7 @@ def test_the_clock_does_not_race_while_the_network_is_away(tmp_path: Path, first
         desk.up(name)
     tick = desk.core.tick
     desk.drive_to(tick + 3)
-    assert desk.core._awaited == {A, B}
+    assert desk.core._answers.awaited == {A, B}
     began_s = desk.now_s
     desk.drive_to(tick + 10)
     assert desk.now_s < began_s + 0.1  # as fast as it may
@@ -516,12 +587,12 @@ def test_the_clock_does_not_race_while_the_network_is_away(tmp_path: Path, first
 def test_tokens_that_vanish_with_the_link_are_not_believed(desk: Desk) -> None:
     desk.give(LinkDown())
     desk.down(A)
-    assert desk.core._awaited == {A, B}
+    assert desk.core._answers.awaited == {A, B}
     desk.give(LinkUp())
     desk.down(A)
-    assert desk.core._awaited == {B}
+    assert desk.core._answers.awaited == {B}
 
 
 def test_other_tokens_are_nothing_to_it(desk: Desk) -> None:
     desk.give(PeerDown(COORDINATOR_ALIVE, {"coordinator": A, "incarnation": "1"}))
-    assert desk.core._awaited == {A, B}
+    assert desk.core._answers.awaited == {A, B}

@@ -10,7 +10,7 @@ from attrs import evolve
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.messages import Command, Name
+from laneweave.protocol.messages import Command, Name, Neighbour
 from laneweave.protocol.motion import cell_state
 from laneweave.protocol.scenario import Scenario
 from laneweave.sim_bridge.motion_controller import MAX_COLUMN, MotionController
@@ -19,17 +19,23 @@ from laneweave.sim_bridge.plant import Plant
 SCENARIO = Scenario()
 LATTICE, TICK_S = SCENARIO.lattice, SCENARIO.runtime.tick_s
 HOME: Cell = (0, 1)
+AGENT = 5
+"""Incarnation of the process that drives."""
 
 
 @pytest.fixture
 def controller() -> MotionController:
     plant = Plant(cell_state(LATTICE, HOME, 0.0), SCENARIO.vehicle, TICK_S)
-    return MotionController(plant, SCENARIO.vehicle, LATTICE, TICK_S, HOME)
+    controller = MotionController(plant, SCENARIO.vehicle, LATTICE, TICK_S, HOME, min_gap_m=3.0)
+    controller.hand_over(AGENT)
+    return controller
 
 
-def command(tick: int, *pairs: tuple[float, float], hold_cell: Cell = HOME) -> Command:
+def command(
+    tick: int, *pairs: tuple[float, float], hold_cell: Cell = HOME, incarnation: int = AGENT
+) -> Command:
     played = np.array(pairs, dtype="<f4").tobytes()
-    return Command(Name("v"), tick, hold_cell, tick + len(pairs), HOME, played)
+    return Command(Name("v"), incarnation, tick, hold_cell, tick + len(pairs), HOME, played)
 
 
 def test_without_a_command_it_holds_its_cell(controller: MotionController) -> None:
@@ -73,10 +79,113 @@ def test_the_newest_command_counts(controller: MotionController) -> None:
     assert (controller.motion_origin, controller.motion_end_tick) == (HOME, 7)
 
 
-def test_a_command_without_jerks_is_a_hold(controller: MotionController) -> None:
-    assert controller.take(command(0))
-    controller.step(0)
-    assert controller.played_from_hold == 1
+def test_a_command_without_jerks_leaves_the_motion_under_way_as_it_is(
+    controller: MotionController,
+) -> None:
+    controller.take(command(5, (1.0, 0.0), (2.0, 0.0), hold_cell=(1, 1)))
+    controller.step(5)
+    assert controller.take(command(6, hold_cell=(1, 1)))
+    assert (controller.command_tick, controller.motion_end_tick) == (6, 7)
+    controller.step(6)
+    assert controller.plant.state[2] == pytest.approx(3.0 * TICK_S)
+    assert controller.played_from_hold == 0
+
+
+def test_a_command_without_jerks_that_names_another_cell_goes_there_by_the_hold_law(
+    controller: MotionController,
+) -> None:
+    controller.take(command(5, (1.0, 0.0), (2.0, 0.0)))
+    assert controller.take(command(6, hold_cell=(1, 1)))
+    controller.step(6)
+    assert (controller.hold_cell, controller.played_from_hold) == ((1, 1), 1)
+
+
+# --- who is in charge -------------------------------------------------------------------------
+
+
+def known(controller: MotionController) -> tuple[object, ...]:
+    return (
+        controller.attendant,
+        controller.joined,
+        controller.command_tick,
+        controller.hold_cell,
+        controller.motion_origin,
+        controller.motion_end_tick,
+        controller._jerk(3, ()),
+    )
+
+
+def test_nobody_is_in_charge_of_a_new_vehicle() -> None:
+    plant = Plant(cell_state(LATTICE, HOME, 0.0), SCENARIO.vehicle, TICK_S)
+    controller = MotionController(plant, SCENARIO.vehicle, LATTICE, TICK_S, (-9, 1))
+    assert (controller.attendant, controller.joined) == (0, (LATTICE.block_of(-9),))
+
+
+def test_an_older_process_is_refused_whatever_it_says(controller: MotionController) -> None:
+    controller.take(command(3, (1.0, 0.0)))
+    before = known(controller)
+    for cell in (HOME, (1, 1)):
+        late = evolve(command(4, (9.0, 0.0), hold_cell=cell, incarnation=AGENT - 1), joined=(7,))
+        assert not controller.take(late)
+        assert known(controller) == before
+    assert not controller.take(evolve(command(4, incarnation=AGENT - 1), jerks=b"nonsense"))
+
+
+def test_a_newer_process_takes_charge_with_its_command(controller: MotionController) -> None:
+    controller.take(command(3, (1.0, 0.0)))
+    assert controller.take(command(4, (2.0, 0.0), incarnation=AGENT + 1))
+    assert controller.attendant == AGENT + 1
+    assert controller._jerk(4, ()) == (2.0, 0.0)
+    assert not controller.take(command(5, (3.0, 0.0)))
+    assert controller._jerk(4, ()) == (2.0, 0.0)
+
+
+def test_who_takes_charge_cannot_move_with_the_same_command(controller: MotionController) -> None:
+    """It could not speak for the vehicle yet, so nobody has made room for its move."""
+    controller.take(command(3, (1.0, 0.0)))
+    before = known(controller)
+    assert not controller.take(command(4, (2.0, 0.0), hold_cell=(1, 1), incarnation=AGENT + 1))
+    assert known(controller) == before
+    assert controller.take(command(4, (2.0, 0.0), incarnation=AGENT + 1))
+    assert controller.take(command(5, (2.0, 0.0), hold_cell=(1, 1), incarnation=AGENT + 1))
+
+
+def test_a_claim_that_came_second_is_tried_again_with_the_next_tick(
+    controller: MotionController,
+) -> None:
+    """The one before has begun to move in this tick, of which the claim does not know."""
+    assert controller.take(command(3, (1.0, 0.0), hold_cell=(1, 1)))
+    assert not controller.take(command(3, (2.0, 0.0), incarnation=AGENT + 1))
+    assert (controller.attendant, controller.hold_cell) == (AGENT, (1, 1))
+    claim = command(4, (2.0, 0.0), hold_cell=(1, 1), incarnation=AGENT + 1)
+    assert controller.take(claim)
+    assert controller.attendant == AGENT + 1
+
+
+def test_handing_over_leaves_the_motion_as_it_is(controller: MotionController) -> None:
+    controller.take(command(3, *[(1.0, 0.0)] * 9, hold_cell=(1, 1)))
+    before = known(controller)
+    controller.hand_over(AGENT + 7)
+    assert known(controller) == (AGENT + 7, *before[1:])
+    for incarnation in (AGENT, AGENT + 7):
+        with pytest.raises(ValueError, match="not above"):
+            controller.hand_over(incarnation)
+
+
+def test_formations_are_joined_for_ever_and_only_by_who_is_in_charge(
+    controller: MotionController,
+) -> None:
+    own = LATTICE.block_of(HOME[0])
+    controller.take(evolve(command(3), joined=(own + 2,)))
+    assert [*controller.joined] == [own, own + 2]
+    controller.take(evolve(command(4), joined=()))
+    controller.take(evolve(command(5), joined=(own + 1, own + 2)))
+    controller.take(evolve(command(6, incarnation=AGENT - 1), joined=(own + 5,)))
+    controller.take(evolve(command(5), joined=(own + 6,)))
+    assert [*controller.joined] == [own, own + 1, own + 2]
+
+
+# --- what it refuses --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -91,17 +200,19 @@ def test_a_command_without_jerks_is_a_hold(controller: MotionController) -> None
         {"hold_cell": (MAX_COLUMN + 1, 0)},
         {"motion_origin": (-MAX_COLUMN - 1, 0)},
         {"motion_origin": (0, 2**62)},
+        {"joined": (0, MAX_COLUMN + 1)},
     ],
 )
 def test_a_bad_command_is_refused_whole(
     controller: MotionController, changes: dict[str, object]
 ) -> None:
     controller.take(command(3, (1.0, 0.0)))
-    bad = evolve(command(4, (2.0, 0.0), hold_cell=(1, 1)), **changes)  # type: ignore[arg-type]
-    with pytest.raises(BadInputError):
-        controller.take(bad)
-    assert (controller.command_tick, controller.hold_cell) == (3, HOME)
-    assert controller._jerk(3) == (1.0, 0.0)
+    before = known(controller)
+    for incarnation in (AGENT, AGENT + 1):
+        good = command(4, (2.0, 0.0), hold_cell=(1, 1), incarnation=incarnation)
+        with pytest.raises(BadInputError):
+            controller.take(evolve(good, **changes))  # type: ignore[arg-type]
+        assert known(controller) == before
 
 
 def test_the_body_has_its_own_limits(controller: MotionController) -> None:
@@ -113,3 +224,68 @@ def test_the_body_has_its_own_limits(controller: MotionController) -> None:
         assert a <= SCENARIO.vehicle.max_accel_mps2 + 1e-9
         assert abs(a_y) <= SCENARIO.vehicle.max_lateral_accel_mps2 + 1e-9
         assert abs(v_y) <= SCENARIO.vehicle.max_slip_ratio * v + 1e-9
+
+
+# --- when nobody drives -----------------------------------------------------------------------
+
+
+def test_a_motion_is_over_when_its_time_is_and_the_body_is_there(
+    controller: MotionController,
+) -> None:
+    assert not controller.moving(0)
+    controller.take(command(0, (0.0, 0.0), (0.0, 0.0)))
+    for tick, moving in ((0, True), (1, True), (2, False)):
+        assert controller.moving(tick) == moving
+        controller.step(tick)
+    controller.take(command(3, (0.0, 0.0), hold_cell=(1, 1)))
+    ends = [tick for tick in range(4, 200) if _moving_after(controller, tick)]
+    assert 30 < len(ends) < 120  # one column, by the hold law
+    assert ends == list(range(4, 4 + len(ends)))
+
+
+def _moving_after(controller: MotionController, tick: int) -> bool:
+    controller.step(tick - 1)
+    return controller.moving(tick)
+
+
+def drive_behind(
+    controller: MotionController, speed_mps: float, lane: int, *, ticks: int
+) -> list[float]:
+    """Let it hold its cell behind somebody who is 40 m ahead; return the gaps."""
+    gaps, rear_m = [], controller.plant.state[0] + 40.0
+    for tick in range(ticks):
+        gap_m = rear_m - controller.plant.state[0]
+        controller.step(tick, (Neighbour(lane, gap_m, speed_mps),))
+        rear_m += speed_mps * TICK_S
+        gaps.append(rear_m - controller.plant.state[0])
+    return gaps
+
+
+@pytest.mark.parametrize("speed_mps", [0.0, 7.0])
+def test_keeps_its_distance_while_nobody_drives(
+    controller: MotionController, speed_mps: float
+) -> None:
+    gaps = drive_behind(controller, speed_mps, HOME[1], ticks=300)
+    assert min(gaps) > 2.9
+    assert controller.plant.state[1] == pytest.approx(speed_mps, abs=0.1)
+    assert controller.plant.min_accel_mps2 >= 0.6 * SCENARIO.vehicle.min_accel_mps2 - 1e-9
+
+
+def test_nobody_on_another_lane_is_in_its_way(controller: MotionController) -> None:
+    for lane in (0, 2):
+        assert min(drive_behind(controller, 0.0, lane, ticks=60)) < -20.0
+
+
+def test_somebody_on_the_lane_that_it_steers_for_is_in_its_way(
+    controller: MotionController,
+) -> None:
+    controller.take(command(0, hold_cell=(0, 2)))
+    gaps = drive_behind(controller, 0.0, 2, ticks=200)
+    assert min(gaps) > 2.9
+
+
+def test_what_it_is_told_to_play_it_plays(controller: MotionController) -> None:
+    controller.take(command(0, *[(0.0, 0.0)] * 40))
+    for tick in range(40):
+        controller.step(tick, (Neighbour(HOME[1], 1.0, 0.0),))
+    assert controller.plant.state[1] == 15.0

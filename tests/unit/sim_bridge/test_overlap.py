@@ -14,11 +14,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from laneweave.protocol.messages import Neighbour
 from laneweave.sim_bridge import overlap
 from laneweave.sim_bridge.overlap import (
     LeastGaps,
     Pose,
-    Surroundings,
     corners,
     least_gaps,
     neighbours,
@@ -162,15 +162,8 @@ def test_nobody_in_line_is_infinitely_far() -> None:
     assert least_gaps({}, LENGTH_M, WIDTH_M) == LeastGaps(math.inf, math.inf)
 
 
-def sense(road: dict[str, Pose], accels: dict[str, float] | None = None) -> dict[str, Surroundings]:
-    return neighbours(
-        road,
-        accels or {},
-        lanes=3,
-        lane_width_m=LANE_M,
-        length_m=LENGTH_M,
-        width_m=WIDTH_M,
-    )
+def sense(road: dict[str, Pose]) -> dict[str, tuple[Neighbour, ...]]:
+    return neighbours(road, lanes=3, lane_width_m=LANE_M, length_m=LENGTH_M, width_m=WIDTH_M)
 
 
 def test_sensing_sees_the_nearest_in_its_own_and_adjacent_lanes() -> None:
@@ -181,11 +174,10 @@ def test_sensing_sees_the_nearest_in_its_own_and_adjacent_lanes() -> None:
         "left behind": (97.0, 5.25, 0.0, 16.0),
         "two lanes over": (110.0, 8.75, 0.0, 12.0),
     }
-    seen = sense(road, {"ahead": -2.0})
-    assert seen["ego"].ahead == ((0, 15.0, 14.0, -2.0),)
-    assert seen["ego"].behind == ((1, -2.0, 16.0, 0.0),)
-    assert seen["left behind"].ahead == ((0, -2.0, 15.0, 0.0), (2, 8.0, 12.0, 0.0))
-    assert seen["two lanes over"].behind == ((1, 8.0, 16.0, 0.0),)
+    seen = sense(road)
+    assert seen["ego"] == (Neighbour(0, 15.0, 14.0),)
+    assert seen["left behind"] == (Neighbour(0, -2.0, 15.0), Neighbour(2, 8.0, 12.0))
+    assert seen["far ahead"] == seen["two lanes over"] == ()
 
 
 def test_a_vehicle_between_lanes_is_seen_in_both_and_sees_further() -> None:
@@ -193,11 +185,12 @@ def test_a_vehicle_between_lanes_is_seen_in_both_and_sees_further() -> None:
         "changing": (100.0, 3.5, 0.1, 15.0),
         "right": (80.0, 1.75, 0.0, 15.0),
         "left": (80.0, 8.75, 0.0, 15.0),
+        "far ahead": (140.0, 8.75, 0.0, 15.0),
     }
     seen = sense(road)
-    assert [lane for lane, *_ in seen["right"].ahead] == [0, 1]
-    assert [lane for lane, *_ in seen["left"].ahead] == [1]
-    assert [lane for lane, *_ in seen["changing"].behind] == [0, 2]
+    assert [other.lane for other in seen["right"]] == [0, 1]
+    assert [other.lane for other in seen["left"]] == [1, 2]
+    assert [other.lane for other in seen["changing"]] == [2]
 
 
 @given(ROADS)
@@ -211,19 +204,22 @@ def test_sensing_agrees_with_brute_force(road: dict[str, Pose]) -> None:
         low = min(max(low, 0), 2)
         lanes_of[name] = range(low, min(max(high, low), 2) + 1)
     for name in road:
-        ahead, behind = {}, {}
+        ahead = {}
         for lane in range(max(lanes_of[name].start - 1, 0), min(lanes_of[name].stop + 1, 3)):
-            others = [other for other in road if other != name and lane in lanes_of[other]]
-            front = [other for other in others if (road[other][0], other) > (road[name][0], name)]
-            back = [other for other in others if other not in front]
+            front = [
+                (road[other][0], other)
+                for other in road
+                if lane in lanes_of[other] and (road[other][0], other) > (road[name][0], name)
+            ]
             if front:
-                nearest = min(road[other][0] for other in front)
-                ahead[lane] = nearest - LENGTH_M - road[name][0]
-            if back:
-                nearest = max(road[other][0] for other in back)
-                behind[lane] = road[name][0] - LENGTH_M - nearest
-        assert {lane: gap for lane, gap, _, _ in seen[name].ahead} == pytest.approx(ahead)
-        assert {lane: gap for lane, gap, _, _ in seen[name].behind} == pytest.approx(behind)
+                nearest_m, other = min(front)
+                ahead[lane] = (nearest_m - LENGTH_M - road[name][0], road[other][3])
+        assert {other.lane: other.gap_m for other in seen[name]} == pytest.approx(
+            {lane: gap_m for lane, (gap_m, _) in ahead.items()}
+        )
+        assert {other.lane: other.speed_mps for other in seen[name]} == {
+            lane: speed_mps for lane, (_, speed_mps) in ahead.items()
+        }
 
 
 def test_heading_points_where_the_body_goes() -> None:

@@ -7,7 +7,9 @@ from typing import Any
 
 import pytest
 
-from laneweave.protocol.scenario import Scenario, parse_scenario
+from laneweave.protocol.messages import Census
+from laneweave.protocol.node import Send
+from laneweave.protocol.scenario import Scenario, load_scenario, parse_scenario
 from laneweave.sim_bridge.entry import Admission
 from laneweave.sim_bridge.roadside import Counts, Roadside
 from laneweave.sim_bridge.traffic import RoadVehicle
@@ -170,3 +172,21 @@ def test_is_not_exhausted_while_somebody_is_still_to_come() -> None:
     roadside.admit(last_s + 60.0)
     assert not roadside.exhausted(last_s - 0.01)
     assert roadside.exhausted(last_s)
+
+
+def test_a_census_tells_at_once_that_a_block_has_closed() -> None:
+    """Who leads need not wait for the next second to know a roster for certain."""
+    scenario = load_scenario(None, seed=1, demand__duration_s=0.001)
+    roadside = Roadside(scenario)
+    tick_s = scenario.runtime.tick_s
+    censuses = [
+        tick
+        for tick in range(100)
+        for effect in roadside.news(tick, tick * tick_s, [])
+        if isinstance(effect, Send) and isinstance(effect.message, Census)
+    ]
+    lattice = scenario.lattice
+    closing = [lattice.passing_time_s(lattice.block_range(block)[0]) for block in range(2)]
+    first_later = [min(n for n in range(100) if n * tick_s > closes_s) for closes_s in closing]
+    assert set(first_later) <= set(censuses)
+    assert len(censuses) < 20

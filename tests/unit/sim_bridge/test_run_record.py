@@ -190,7 +190,7 @@ def test_a_trip_is_written_down(record: RunRecord, tmp_path: Path) -> None:
     record.on_demanded(stays.admission.arrival)
     record.on_entered(stays)
     stays.controller.played_from_hold = 3
-    record.on_left(traveller, 70.0)
+    record.on_left(traveller, 70.0, attended=True)
     record.on_still_on_road(stays)
     record.close(70.0, Ending.LIMIT)
     (left,) = read_events(tmp_path, "left")
@@ -208,7 +208,7 @@ def test_a_vehicle_that_stands_at_the_end_has_left(record: RunRecord, tmp_path: 
     record.on_demanded(traveller.admission.arrival)
     record.on_entered(traveller)
     traveller.controller.plant._state = (SCENARIO.road.length_m, 0.0, 0.0, 1.75, 0.0, 0.0)
-    record.on_left(traveller, 70.0)
+    record.on_left(traveller, 70.0, attended=True)
     assert read_events(tmp_path, "left")[0]["t_s"] == 70.0
 
 

@@ -1,0 +1,147 @@
+"""What faults on real processes cost: the table of docs/EVALUATION.md, "Under faults".
+
+    python benchmarks/resilience.py [--only NAME ...] [--out FOLDER]
+
+Each experiment is one `laneweave run` with a faults file. Its figures are read from the run's
+folder and written to FOLDER/resilience.json; experiments that are there already are kept, so that
+a part can be measured again. A run's own verdict (overlaps, who did not leave) is among them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+from attrs import frozen
+
+HERE = Path(__file__).resolve().parent
+TIMEOUT_S = 3600.0
+
+
+@frozen
+class Experiment:
+    """One run."""
+
+    name: str
+    faults: str | None
+    """A preset, or a file in `benchmarks/faults`."""
+    options: tuple[str, ...] = ()
+
+
+FULL_ROAD = ("--volume", "1600", "--seed", "1", "--duration", "300")
+REAL_TIME = ("--pace", "1")
+EXPERIMENTS = (
+    Experiment("undisturbed", None, FULL_ROAD),
+    Experiment("loss-10", "lossy10", FULL_ROAD),
+    Experiment("loss-30", "loss-30.toml", FULL_ROAD),
+    Experiment("loss-50", "lossy50", FULL_ROAD),
+    Experiment("blackout", "blackout", FULL_ROAD),
+    Experiment("blackout-from-start", "blackout-from-start.toml", FULL_ROAD),
+    Experiment("agents-killed", "agents-killed.toml", FULL_ROAD),
+    Experiment("router-killed", "router-killed-10-times.toml", (*FULL_ROAD, *REAL_TIME)),
+    Experiment(
+        "leader-killed",
+        "leader-killed-50-times.toml",
+        ("--volume", "1600", "--seed", "1", "--duration", "300", *REAL_TIME),
+    ),
+    Experiment(
+        "leader-stopped",
+        "leader-stopped-30-times.toml",
+        ("--volume", "1600", "--seed", "1", "--duration", "560", *REAL_TIME),
+    ),
+    Experiment("everything", "everything", FULL_ROAD),
+)
+
+
+def run(experiment: Experiment, folder: Path) -> dict[str, Any]:
+    """Run an experiment and return its figures."""
+    command = [str(Path(sys.executable).parent / "laneweave"), "run", "--no-progress"]
+    command += [*experiment.options, "--out", str(folder)]
+    if experiment.faults is not None:
+        path = HERE / "faults" / experiment.faults
+        command += ["--faults", str(path) if path.exists() else experiment.faults]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)  # noqa: S603
+    failures = [line for line in done.stdout.splitlines() if line.startswith("FAILED")]
+    return {"status": done.returncode, "failures": failures, "stderr": done.stderr} | figures(
+        folder
+    )
+
+
+def figures(folder: Path) -> dict[str, Any]:
+    """Return what a run's folder says about its promises."""
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    trips = pq.read_table(folder / "trips.parquet").to_pylist()
+    kinds: Counter[str] = Counter()
+    plans: Counter[int] = Counter()
+    killed: set[str] = set()
+    for line in (folder / "events.jsonl").read_text(encoding="utf-8").splitlines():
+        event = json.loads(line)
+        kinds[event["kind"]] += 1
+        if event["kind"] == "plan-made":
+            plans[event["formation"]] += 1
+        if event["kind"] == "caretaker-took-over":
+            killed.add(event["vehicle"])
+    others = [
+        trip for trip in trips if trip["vehicle"] not in killed and trip["left_s"] is not None
+    ]
+    vehicles, failover = summary["vehicles"], summary["failover"]
+    return {
+        "overlaps": summary["safety"]["overlaps"],
+        "demanded": vehicles["demanded"],
+        "left": vehicles["left"],
+        "on_lane_percent": _percent(vehicles["on_preferred_lane"], vehicles["left"]),
+        "others": len(others),
+        "others_on_lane_percent": _percent(
+            sum(trip["final_lane"] == trip["preferred_lane"] for trip in others), len(others)
+        ),
+        "travel_time_s": summary["travel_time_s"]["mean"],
+        "min_gap_m": summary["safety"]["min_gap_m"],
+        "dropped": summary["messages"]["dropped_by_faults"],
+        "real_time_factor": summary["runtime"]["real_time_factor"],
+        "formations_planned": len(plans),
+        "replanned": sum(plans.values()) - len(plans),
+        "leader_recovery_s": _spread(failover["recovery_s"]),
+        "plan_recovery_s": _spread(failover.get("plan_recovery_s", [])),
+        "events": dict(kinds),
+    }
+
+
+def _percent(part: int, whole: int) -> float | None:
+    return 100.0 * part / whole if whole else None
+
+
+def _spread(values: list[float]) -> dict[str, float | int]:
+    if not values:
+        return {"count": 0}
+    p50, p99 = np.percentile(values, [50, 99], method="higher")
+    return {"count": len(values), "p50": float(p50), "p99": float(p99), "max": max(values)}
+
+
+def main() -> None:
+    """Run what is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    names = [experiment.name for experiment in EXPERIMENTS]
+    parser.add_argument("--only", nargs="+", choices=names, default=names)
+    parser.add_argument("--out", type=Path, default=Path("runs/resilience"))
+    arguments = parser.parse_args()
+    folder: Path = arguments.out
+    folder.mkdir(parents=True, exist_ok=True)
+    record = folder / "resilience.json"
+    for experiment in EXPERIMENTS:
+        if experiment.name in arguments.only:
+            result = run(experiment, folder / experiment.name)
+            known = json.loads(record.read_text(encoding="utf-8")) if record.exists() else {}
+            known[experiment.name] = result
+            record.write_text(json.dumps(known, indent=1), encoding="utf-8")
+            print(experiment.name, json.dumps(result), flush=True)  # noqa: T201
+
+
+if __name__ == "__main__":
+    main()

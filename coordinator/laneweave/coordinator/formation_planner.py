@@ -1,0 +1,186 @@
+"""What a leader has planned for its formations, and what becomes of the results (rule L5).
+
+The planning itself runs beside the core (`Compute`); here its orders are written and its results
+turned into plans, into failures, or into formations that are joined because one alone lacks room.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import partial
+from typing import Any
+
+from attrs import field, frozen
+
+from laneweave.coordinator.formation import start_time_s, steps_left
+from laneweave.coordinator.groups import Groups, Numbers
+from laneweave.coordinator.leader import FormationControl
+from laneweave.coordinator.leader_rules import Phase
+from laneweave.coordinator.planning import PlanResponse, Weights
+from laneweave.coordinator.sorting import Sorting, SortingTask, sort_lanes
+from laneweave.protocol.lattice import territory
+from laneweave.protocol.messages import Ballot, Plan
+from laneweave.protocol.node import Compute, Computed
+from laneweave.protocol.plans import plan_problems
+from laneweave.protocol.scenario import Scenario
+
+START_MARGIN_S = 0.5
+"""A plan made late starts this much road time after it is ready."""
+MOST_DOUBLINGS = 4
+"""The bound on search nodes doubles with each failed planning, this often."""
+
+
+@frozen
+class Note:
+    """Something worth a line in `events.jsonl`."""
+
+    kind: str
+    data: dict[str, Any] = field(factory=dict)
+
+
+class FormationPlanner:
+    """Orders and results of planning."""
+
+    def __init__(self, scenario: Scenario, groups: Groups) -> None:
+        """Begin with nothing ordered; `groups` is the leader's, and grows here."""
+        self._scenario = scenario
+        self._groups = groups
+        self._ordered: dict[int, tuple[int, Ballot]] = {}
+        """For each job the formation and the ballot that it was ordered for."""
+        formation = scenario.formation
+        oblique = formation.weight_oblique
+        self._weights = Weights(
+            formation.weight_straight, formation.oblique_steps if oblique is None else oblique
+        )
+
+    def forget(self) -> None:
+        """Nobody waits for results any more."""
+        self._ordered.clear()
+
+    def order(
+        self, job: int, control: FormationControl, t_s: float, now_s: float
+    ) -> Iterator[Compute | Note]:
+        """Order a plan from the promises of a formation; too late for any step, settle it.
+
+        Args:
+            job: number of the computation.
+            control: in phase `PLANNING`.
+            t_s: road time.
+            now_s: node clock.
+        """
+        numbers, ballot = control.formation.numbers, control.ballot
+        assert ballot is not None  # noqa: S101 (set before planning begins)
+        if steps_left(numbers, self._start_s(numbers, t_s), self._scenario) == 0:
+            control.settle(now_s)
+            yield Note("formation-too-late", {"formation": numbers[0]})
+            return
+        task = SortingTask(
+            numbers,
+            control.hold_cells,
+            {member.vehicle: member.preferred_lane for member in control.formation.members},
+            control.unattended,
+            self._scenario,
+        )
+        self._ordered[job] = (numbers[0], ballot)
+        nodes = self._scenario.formation.max_nodes * 2 ** min(control.failures, MOST_DOUBLINGS)
+        # In the job: promises that cannot be planned from fail there, as any failed planning does.
+        yield Compute(job, partial(sort_lanes, task, nodes, self._weights))
+
+    def finish(
+        self,
+        computed: Computed,
+        controls: Mapping[int, FormationControl],
+        t_s: float,
+        now_s: float,
+    ) -> Iterator[Note]:
+        """Take a result; of a ballot that is not waited for any more it is dropped.
+
+        Args:
+            computed: the result of a job, a `Sorting`, or an error.
+            controls: all formations, each under its least number.
+            t_s: road time.
+            now_s: node clock.
+        """
+        if computed.job not in self._ordered:
+            return
+        number, ballot = self._ordered.pop(computed.job)
+        control = controls.get(number)
+        if control is None or control.ballot != ballot or control.phase is not Phase.PLANNING:
+            return
+        result, error, status = computed.result, computed.error, "error"
+        if isinstance(result, Sorting):
+            status = result.response.status if result.response is not None else "optimal"
+            if result.short_of_room and self._join_neighbour(control, controls, t_s):
+                yield Note("formations-joined", {"formations": list(self._groups.of(number))})
+                return
+            if result.solved:
+                plan = self._plan(control, result, t_s)
+                problems = plan_problems(plan)
+                if not problems:
+                    control.on_plan(plan, now_s, result.out_of_reach)
+                    yield from _notes(number, result)
+                    return
+                error = "; ".join(problems)
+        control.on_planning_failed(now_s)
+        data = {"formation": number, "status": status, "error": error}
+        yield Note("planning-failed", data)
+
+    def _join_neighbour(
+        self, control: FormationControl, controls: Mapping[int, FormationControl], t_s: float
+    ) -> bool:
+        """Join a formation that lacks room with a neighbour; false when none can help.
+
+        Both plan under one ballot from now on.
+        """
+        numbers, most = control.formation.numbers, self._scenario.formation.max_joined
+        for neighbour in (numbers[-1] + 1, numbers[0] - 1):
+            other = controls.get(self._groups.of(neighbour)[0])
+            if other is None or other.phase is Phase.SETTLED:
+                continue
+            union = tuple(sorted({*numbers, *other.formation.numbers}))
+            if len(union) > most:
+                continue
+            if steps_left(union, self._start_s(union, t_s), self._scenario) > 0:
+                return self._groups.join(union)
+        return False
+
+    def _plan(self, control: FormationControl, sorting: Sorting, t_s: float) -> Plan:
+        hold_cells, numbers, ballot = control.hold_cells, control.formation.numbers, control.ballot
+        assert ballot is not None  # noqa: S101 (set before planning begins)
+        all_moves = [move for each in sorting.moves.values() for move in each]
+        return Plan(
+            ballot=ballot,
+            formations=numbers,
+            roster=tuple(hold_cells),
+            incarnations=control.incarnations,
+            start_cells=hold_cells,
+            moves=sorting.moves,
+            t0_s=self._start_s(numbers, t_s),
+            slot_s=self._scenario.formation.cycle_s,
+            territory=tuple(sorted(territory(hold_cells.values(), all_moves))),
+        )
+
+    def _start_s(self, numbers: Numbers, t_s: float) -> float:
+        return start_time_s(numbers, t_s + START_MARGIN_S, self._scenario)
+
+
+def _notes(number: int, sorting: Sorting) -> Iterator[Note]:
+    if sorting.response is not None:
+        yield Note("plan-made", _facts(number, sorting.response))
+    if sorting.out_of_reach:
+        vehicles = [str(name) for name in sorting.out_of_reach]
+        yield Note("lane-out-of-reach", {"formation": number, "vehicles": vehicles})
+
+
+def _facts(number: int, response: PlanResponse) -> dict[str, Any]:
+    return {
+        "formation": number,
+        "vehicles": len(response.paths),
+        "status": response.status,
+        "cost": response.cost,
+        "lower_bound": response.lower_bound,
+        "steps": response.steps,
+        "solve_ms": response.solve_ms,
+        "assignments_tried": response.assignments_tried,
+        "nodes_expanded": response.nodes_expanded,
+    }

@@ -1,0 +1,174 @@
+"""Lane sorting of one formation, or of joined ones: from promises to moves.
+
+The grid is the blocks of the formations. Vehicles that no agent drives block their cells. When the
+whole sorting is impossible, it is tried with one vehicle less that gets its lane, each in turn, so
+that one vehicle in a corner does not keep all others from theirs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+
+from attrs import frozen
+
+from laneweave.coordinator.groups import Numbers
+from laneweave.coordinator.planning import PlanRequest, PlanResponse, Weights, checked_plan
+from laneweave.coordinator.targets import Targets, place
+from laneweave.protocol.lattice import Cell, Move
+from laneweave.protocol.messages import Name
+from laneweave.protocol.scenario import Scenario
+
+
+@frozen
+class SortingTask:
+    """What is to be sorted."""
+
+    numbers: Numbers
+    """The formations whose blocks may be used."""
+    hold_cells: Mapping[Name, Cell]
+    """Lattice cell of each member, in the order of the answer."""
+    preferred_lanes: Mapping[Name, int]
+    """Lane that each member needs."""
+    unattended: Collection[Name]
+    """Members that hold whatever is planned."""
+    scenario: Scenario
+    """Mode, conflict kinds, deadline, lattice."""
+
+    @property
+    def columns(self) -> range:
+        """Columns from the rear of the last block to the front of the first one."""
+        lattice = self.scenario.lattice
+        return range(
+            lattice.block_range(self.numbers[-1]).start, lattice.block_range(self.numbers[0]).stop
+        )
+
+    @property
+    def movers(self) -> dict[Name, Cell]:
+        """Grid cell of each member that can be moved."""
+        first = self.columns.start
+        return {
+            name: (column - first, lane)
+            for name, (column, lane) in self.hold_cells.items()
+            if name not in self.unattended
+        }
+
+    @property
+    def blocked(self) -> tuple[Cell, ...]:
+        """Grid cells that nobody may use: of members that hold, and between the blocks."""
+        first, lattice = self.columns.start, self.scenario.lattice
+        foreign = [
+            (column - first, lane)
+            for column in self.columns
+            if lattice.block_of(column) not in self.numbers
+            for lane in range(lattice.lanes)
+        ]
+        held = [
+            (self.hold_cells[name][0] - first, self.hold_cells[name][1]) for name in self.unattended
+        ]
+        return tuple(sorted({*foreign, *held}))
+
+
+@frozen
+class Sorting:
+    """What came of it."""
+
+    response: PlanResponse | None
+    """Of the planner; None: there is nobody to move."""
+    moves: dict[Name, tuple[Move, ...]]
+    """Moves of every member, on the lattice."""
+    out_of_reach: tuple[Name, ...]
+    """Members that do not get to their lanes."""
+    short_of_room: bool
+    """Somebody who could be moved does not get to its lane: more blocks could help."""
+
+    @property
+    def solved(self) -> bool:
+        """Whether there is a plan."""
+        return self.response is None or bool(self.response.paths)
+
+
+def plan_request(task: SortingTask, dropped: Name | None = None) -> tuple[PlanRequest, Targets]:
+    """Return the request for a sorting, and the targets that it contains.
+
+    Args:
+        task: with at least one vehicle that can be moved.
+        dropped: somebody who need not get to its lane.
+    """
+    scenario, columns = task.scenario, len(task.columns)
+    movers, blocked = task.movers, task.blocked
+    wanted = {
+        name: cell[1] if name == dropped else task.preferred_lanes[name]
+        for name, cell in movers.items()
+    }
+    targets = place(movers, wanted, columns, scenario.road.lanes, blocked)
+    index = {cell: number for number, cell in enumerate(targets.cells)}
+    vehicles = [
+        {"id": name, "cell": list(cell)}
+        | (
+            {"eligible": [index[targets.own[name]]]}
+            if name in targets.own
+            else {"lane": wanted[name]}
+        )
+        for name, cell in movers.items()
+    ]
+    formation = scenario.formation
+    request = PlanRequest.from_dict(
+        {
+            "schema": "laneweave.plan.request/1",
+            "grid": {
+                "columns": columns,
+                "lanes": scenario.road.lanes,
+                "blocked": [list(cell) for cell in blocked],
+            },
+            "mode": formation.mode,
+            "conflicts": list(formation.conflict_kinds),
+            "vehicles": vehicles,
+            "targets": [list(target) for target in targets.cells],
+            "deadline_s": formation.planning_deadline_s,
+        }
+    )
+    return request, targets
+
+
+def sort_lanes(task: SortingTask, max_nodes: int, weights: Weights) -> Sorting:
+    """Plan a sorting; with as many members on their lanes as can be had.
+
+    Args:
+        task: what is to be sorted.
+        max_nodes: bound on search nodes of each planning.
+        weights: l_s and l_o of the formation relative distance.
+    """
+    if not task.movers:
+        return _sorting(task, None)
+    response: PlanResponse | None = None
+    for dropped in _attempts(task):
+        request, _ = plan_request(task, dropped)
+        response = checked_plan(request, max_nodes=max_nodes, weights=weights)
+        if response.status != "infeasible":
+            break
+    return _sorting(task, response)
+
+
+def _attempts(task: SortingTask) -> Iterator[Name | None]:
+    yield None
+    yield from task.movers
+
+
+def _sorting(task: SortingTask, response: PlanResponse | None) -> Sorting:
+    first = task.columns.start
+    moves: dict[Name, tuple[Move, ...]] = dict.fromkeys(task.hold_cells, ())
+    ends = dict(task.hold_cells)
+    paths = response.paths if response is not None else ()
+    for name, path in zip(task.movers, paths, strict=False):
+        cells = [(column + first, lane) for column, lane in path]
+        moves[name] = tuple(
+            (step, cells[step], cells[step + 1])
+            for step in range(len(cells) - 1)
+            if cells[step] != cells[step + 1]
+        )
+        ends[name] = cells[-1]
+    missed = tuple(name for name, cell in ends.items() if cell[1] != task.preferred_lanes[name])
+    # Without a result in time nothing is known of the room; with more blocks it would take longer.
+    known = response is not None and response.status != "timeout"
+    short_of_room = known and any(name not in task.unattended for name in missed)
+    return Sorting(response, moves, missed, short_of_room)

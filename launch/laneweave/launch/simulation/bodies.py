@@ -1,0 +1,142 @@
+"""Bodies for the checker: rectangles in metres that move in straight lines; own geometry.
+
+Positions are those on the road less the way of the lattice, so that a vehicle which holds stands
+still: x = column * pitch, y = (lane + 1/2) * lane width.
+"""
+
+from __future__ import annotations
+
+import math
+
+from attrs import define, frozen
+
+Point = tuple[float, float]
+"""(x, y) in m."""
+Cells = frozenset[tuple[int, int]]
+
+DONE_ALONG_M = 1.0
+DONE_ACROSS_M = 0.5
+"""A motion is over for the checker when the body is this close to its end: sooner than for those
+who drive it, whose tolerances are half of it."""
+
+
+@frozen
+class Geometry:
+    """Sizes in m."""
+
+    pitch_m: float
+    lane_width_m: float
+    length_m: float
+    width_m: float
+
+    def point(self, cell: tuple[float, float]) -> Point:
+        """Return where a body is whose place in the lattice is (column, lane)."""
+        return cell[0] * self.pitch_m, (cell[1] + 0.5) * self.lane_width_m
+
+    def swept(self, origin: Point, target: Point) -> Cells:
+        """Return all cells of the bounding box of the way from one point to another one."""
+        low = [min(pair) for pair in zip(origin, target, strict=True)]
+        high = [max(pair) for pair in zip(origin, target, strict=True)]
+        # Who has nearly arrived is in that cell, and in no other one.
+        columns = range(
+            math.floor((low[0] + DONE_ALONG_M) / self.pitch_m),
+            math.ceil((high[0] - DONE_ALONG_M) / self.pitch_m) + 1,
+        )
+        lanes = range(
+            math.floor((low[1] + DONE_ACROSS_M) / self.lane_width_m - 0.5),
+            math.ceil((high[1] - DONE_ACROSS_M) / self.lane_width_m - 0.5) + 1,
+        )
+        return frozenset((column, lane) for column in columns for lane in lanes)
+
+
+@define(eq=False)
+class Body:
+    """One vehicle's body, and the motion that it is in."""
+
+    geometry: Geometry
+    origin: Point
+    target: Point
+    begin_s: float
+    end_s: float
+    """When it reaches the target; equal to `begin_s` when it only ever stood there."""
+    cells: Cells
+    """What it occupies."""
+
+    @classmethod
+    def standing(cls, geometry: Geometry, cell: tuple[int, int], t_s: float) -> Body:
+        """Return a body that holds a cell."""
+        point = geometry.point(cell)
+        return cls(geometry, point, point, t_s, t_s, frozenset({cell}))
+
+    def at(self, t_s: float) -> Point:
+        """Return where it is at a time."""
+        if t_s >= self.end_s:
+            return self.target
+        share = max(0.0, (t_s - self.begin_s) / (self.end_s - self.begin_s))
+        return (
+            self.origin[0] + share * (self.target[0] - self.origin[0]),
+            self.origin[1] + share * (self.target[1] - self.origin[1]),
+        )
+
+    def go(self, cell: tuple[int, int], t_s: float, duration_s: float) -> None:
+        """Begin a motion from where it is."""
+        self.origin, self.target = self.at(t_s), self.geometry.point(cell)
+        self.begin_s, self.end_s = t_s, t_s + duration_s
+        self.cells = self.geometry.swept(self.origin, self.target)
+
+    def rest(self, cell: tuple[int, int]) -> None:
+        """Occupy no more than the cell in which it has (nearly) arrived."""
+        self.cells = frozenset({cell})
+
+    @property
+    def done_s(self) -> float:
+        """When it is so close to the target that the motion is over."""
+        shares = [
+            tolerance_m / abs(way_m)
+            for tolerance_m, way_m in (
+                (DONE_ALONG_M, self.target[0] - self.origin[0]),
+                (DONE_ACROSS_M, self.target[1] - self.origin[1]),
+            )
+            if way_m
+        ]
+        share = min(1.0, *shares) if shares else 1.0
+        return self.end_s - share * (self.end_s - self.begin_s)
+
+
+def overlap_between(mine: Body, other: Body, from_s: float, to_s: float) -> float | None:
+    """Return when two bodies first overlap in a time in which neither begins a motion.
+
+    A motion may end in it. Exact: of two rectangles that move in straight lines, the time in which
+    they overlap along the road and that in which they overlap across it are intervals.
+
+    Returns:
+        A time in s; None: they do not.
+    """
+    ends = sorted({end for end in (mine.end_s, other.end_s) if from_s < end < to_s})
+    starts = [from_s, *ends]
+    for begin_s, end_s in zip(starts, [*ends, to_s], strict=True):
+        share = _first_share(mine, other, begin_s, end_s)
+        if share is not None:
+            return begin_s + share * (end_s - begin_s)
+    return None
+
+
+def _first_share(mine: Body, other: Body, begin_s: float, end_s: float) -> float | None:
+    geometry = mine.geometry
+    (x0, y0), (x1, y1) = mine.at(begin_s), mine.at(end_s)
+    (u0, w0), (u1, w1) = other.at(begin_s), other.at(end_s)
+    low, high = 0.0, 1.0
+    for first, last, size in (
+        (x0 - u0, x1 - u1, geometry.length_m),
+        (y0 - w0, y1 - w1, geometry.width_m),
+    ):
+        slope = last - first
+        if slope == 0.0:
+            if abs(first) >= size:
+                return None
+            continue
+        into, out = sorted(((-size - first) / slope, (size - first) / slope))
+        low, high = max(low, into), min(high, out)
+        if low >= high:
+            return None
+    return low

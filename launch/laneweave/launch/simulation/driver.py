@@ -1,0 +1,51 @@
+"""The light driver: the seam of `AgentCore` at which a simulated run leaves trajectories out."""
+
+from __future__ import annotations
+
+from laneweave.agents.driver import Drive, Effort
+from laneweave.protocol.lattice import Cell, Move
+from laneweave.protocol.messages import Sense
+from laneweave.protocol.motion import at_rest_in_cell
+from laneweave.protocol.scenario import Scenario
+
+
+class LightDriver:
+    """Names the cell to hold and the tick at which a move should be over; sends no jerks.
+
+    When a motion has ended it decides as `TrackingDriver` does: its time is over and the body is
+    there.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Make a driver that knows nothing of its vehicle yet."""
+        self._lattice = scenario.lattice
+        self._move_ticks = round(scenario.formation.move_s / scenario.runtime.tick_s)
+        self._origin: Cell = (0, 0)
+        self._goal: Cell = (0, 0)
+        self._end_tick = 0
+
+    @property
+    def effort(self) -> Effort:
+        """Nothing is solved here."""
+        return Effort()
+
+    def take_over(self, sense: Sense) -> None:
+        """Go on with what the motion controller is doing."""
+        self._origin, self._goal = sense.motion_origin, sense.hold_cell
+        self._end_tick = sense.motion_end_tick
+
+    def begin(self, move: Move, tick: int) -> None:
+        """Begin a move at this tick."""
+        _, self._origin, self._goal = move
+        self._end_tick = tick + self._move_ticks
+
+    def at_rest(self, sense: Sense) -> bool:
+        """Tell whether the motion's time is over and the body is at its target."""
+        return sense.tick >= self._end_tick and at_rest_in_cell(
+            sense.state, self._lattice, self._goal, sense.t_s
+        )
+
+    def drive(self, sense: Sense, *, moving: bool) -> Drive:
+        """Return when the motion under way ends, without jerks."""
+        end_tick = max(self._end_tick, sense.tick + 1) if moving else 0
+        return Drive(end_tick, self._origin, b"")

@@ -1,0 +1,147 @@
+"""What a seed draws before a run begins: the road, who visits it, the faults, and all wishes."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+
+from attrs import frozen
+
+from laneweave.launch.simulation.faults import CLOCK_DRIFT, CLOCK_OFFSET_S, LEASE_S, Mix
+from laneweave.launch.simulation.profiles import Profile
+from laneweave.launch.simulation.road import Visit
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.messages import Name
+from laneweave.protocol.scenario import FormationSettings, Network, Road, Runtime, Scenario
+
+SLOT_S, MOVE_S, TICK_S = 1.0, 0.8, 0.1
+LAST_BLOCKS = (-1, -1, 0, 1)
+"""Number of the rearmost formation. Those below 0 are on the road at the start; others enter cell
+by cell: formation 0 is closed after 3 s, formation 1 after 7 s."""
+LEAVES_S = (2.0, 9.0)
+LARGEST = 6
+"""Vehicles in a formation, as many as the paper's largest one has."""
+LARGEST_JOINED = 10
+"""In two formations that may be joined: more are too much work for the planner, often."""
+
+
+def make_scenario(lanes: int, max_joined: int) -> Scenario:
+    """Return the scenario of a run: a long road, and short times so that seeds are cheap."""
+    return Scenario(
+        road=Road(lanes=lanes, s1_m=0.0, s2_m=0.0, s3_m=20_000.0),
+        formation=FormationSettings(
+            cycle_s=SLOT_S,
+            move_s=MOVE_S,
+            max_joined=max_joined,
+            # The bound on nodes ends a search; the clock of a busy machine must not.
+            planning_deadline_s=3600.0,
+            max_nodes=500,
+        ),
+        network=Network(heartbeat_s=0.2, election_s=0.6, lease_s=LEASE_S),
+        runtime=Runtime(tick_s=TICK_S, agent_silent_s=1.5),
+    )
+
+
+@frozen
+class Setup:
+    """Everything that is fixed before a run begins."""
+
+    scenario: Scenario
+    mix: Mix
+    blocks: tuple[int, ...]
+    """Numbers of the formations, ascending."""
+    visits: tuple[Visit, ...]
+    crowded: bool
+    """Now and then more vehicles want a lane of a block than it has cells."""
+
+    @classmethod
+    def drawn(cls, profile: Profile, rng: random.Random) -> Setup:
+        """Draw from a profile."""
+        lanes = rng.randint(*profile.lanes)
+        scenario = make_scenario(lanes, rng.randint(*profile.max_joined))
+        last, number = rng.choice(LAST_BLOCKS), rng.randint(*profile.blocks)
+        blocks = tuple(range(last - number + 1, last + 1))
+        mix = Mix.drawn(profile, rng)
+        visits = tuple(_draw_visits(profile, scenario, blocks, mix, rng))
+        return cls(scenario, mix, blocks, visits, rng.random() < profile.crowding)
+
+    def wishes(self, rng: random.Random, *, last: bool) -> dict[Name, int]:
+        """Draw the lane that each vehicle prefers.
+
+        The last wishes can be fulfilled: in each block at most as many vehicles want a lane as it
+        has cells there. Where two formations may be joined, that holds for both together.
+        """
+        lanes, columns = self.scenario.road.lanes, self.scenario.formation.block_columns
+        may_join = len(self.blocks) == 2 and self.scenario.formation.max_joined >= 2
+        if self.crowded and (may_join or not last):
+            # One lane that everybody likes best.
+            room = [columns * len(self.blocks)] * lanes if last else [99] * lanes
+            favourite = rng.randrange(lanes)
+            weights = [6.0 if lane == favourite else 1.0 for lane in range(lanes)]
+            return _draw_lanes([visit.vehicle for visit in self.visits], room, weights, rng)
+        wishes: dict[Name, int] = {}
+        for block in self.blocks:
+            members = [visit.vehicle for visit in self.visits if self._block(visit) == block]
+            wishes |= _draw_lanes(members, [columns] * lanes, [1.0] * lanes, rng)
+        return wishes
+
+    def _block(self, visit: Visit) -> int:
+        return self.scenario.lattice.block_of(visit.cell[0])
+
+
+def _draw_lanes(
+    vehicles: list[Name], room: list[int], weights: list[float], rng: random.Random
+) -> dict[Name, int]:
+    left, lanes = list(room), range(len(room))
+    wishes: dict[Name, int] = {}
+    for vehicle in vehicles:
+        (lane,) = rng.choices(
+            lanes, [weight if left[lane] else 0.0 for lane, weight in enumerate(weights)]
+        )
+        left[lane] -= 1
+        wishes[vehicle] = lane
+    return wishes
+
+
+def _draw_visits(
+    profile: Profile,
+    scenario: Scenario,
+    blocks: tuple[int, ...],
+    mix: Mix,
+    rng: random.Random,
+) -> Iterator[Visit]:
+    """Draw who is in which cell: in each block at least one, in no block more than half full."""
+    lattice = scenario.lattice
+    half = min(scenario.formation.block_columns * lattice.lanes // 2, LARGEST)
+    room = dict.fromkeys(blocks, half)
+    if scenario.formation.max_joined > 1:
+        # Every other one is small.
+        room |= dict.fromkeys(blocks[rng.randrange(2) :: 2], min(half, LARGEST_JOINED - half))
+    least, most = profile.vehicles
+    wanted = min(max(rng.randint(least, most), len(blocks)), sum(room.values()))
+    counts = dict.fromkeys(blocks, 1)
+    while sum(counts.values()) < wanted:
+        counts[rng.choice([block for block in blocks if counts[block] < room[block]])] += 1
+    number = 0
+    for block in blocks:
+        cells = rng.sample(sorted(lattice.block_cells(block)), counts[block])
+        for index, cell in enumerate(cells):
+            number += 1
+            # The first one stays: without anybody a formation is gone, and so is its room.
+            leaves = index > 0 and rng.random() < profile.leavers
+            yield _visit(Name(f"v{number:02}"), cell, leaves, scenario, mix, rng)
+
+
+def _visit(
+    name: Name, cell: Cell, leaves: bool, scenario: Scenario, mix: Mix, rng: random.Random
+) -> Visit:
+    enters_s = max(0.0, scenario.lattice.passing_time_s(cell[0]))
+    wrong = 1.0 if mix.wrong_clocks else 0.0
+    return Visit(
+        vehicle=name,
+        cell=cell,
+        enters_s=enters_s,
+        leaves_s=enters_s + rng.uniform(*LEAVES_S) if leaves else None,
+        clock_offset_s=wrong * rng.uniform(-CLOCK_OFFSET_S, CLOCK_OFFSET_S),
+        clock_drift=wrong * rng.uniform(-CLOCK_DRIFT, CLOCK_DRIFT),
+    )

@@ -1,0 +1,75 @@
+"""Where the bodies are shown, and what is measured and sensed there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol
+
+from laneweave.protocol.messages import Name
+from laneweave.protocol.motion import State
+from laneweave.protocol.scenario import Scenario
+from laneweave.sim_bridge.overlap import Pose, least_gaps, neighbours, overlapping_pairs
+from laneweave.sim_bridge.run_record import RunRecord
+from laneweave.sim_bridge.traffic import RoadVehicle
+
+
+class World(Protocol):
+    """Where the bodies are shown; `SumoWorld` in every real run."""
+
+    def add(self, vehicle: str, state: State) -> None:
+        """Put a vehicle on the road."""
+
+    def place(self, vehicle: str, state: State) -> None:
+        """Say where a vehicle is at the end of the next step."""
+
+    def step(self) -> None:
+        """Advance by one tick."""
+
+    def positions(self) -> dict[str, Pose]:
+        """Return where each vehicle is shown."""
+
+    def collisions(self) -> list[tuple[str, str]]:
+        """Return the pairs that the world itself takes for colliding."""
+
+    def remove(self, vehicle: str) -> None:
+        """Take a vehicle off the road."""
+
+
+def show_bodies(
+    world: World,
+    vehicles: Mapping[Name, RoadVehicle],
+    scenario: Scenario,
+    record: RunRecord,
+    t_s: float,
+) -> None:
+    """Let the world show all bodies, record what it shows, and let each vehicle see who is ahead.
+
+    Args:
+        world: advanced by one tick.
+        vehicles: all on the road, moved on already.
+        scenario: size of vehicles and lanes.
+        record: takes overlaps, collisions, gaps and samples.
+        t_s: road time after the tick.
+    """
+    for vehicle in vehicles.values():
+        world.place(vehicle.name, vehicle.state)
+    world.step()
+    poses = world.positions()
+    size = (scenario.vehicle.length_m, scenario.vehicle.width_m)
+    road = scenario.road
+    ahead = neighbours(
+        poses,
+        lanes=road.lanes,
+        lane_width_m=road.lane_width_m,
+        length_m=size[0],
+        width_m=size[1],
+    )
+    for name, vehicle in vehicles.items():
+        vehicle.ahead = ahead[name]
+    record.on_shown(
+        t_s,
+        vehicles.values(),
+        overlaps=overlapping_pairs(poses, *size),
+        collisions=world.collisions(),
+        gaps=least_gaps(poses, *size),
+    )

@@ -1,0 +1,319 @@
+"""What planted bugs put in the place of rules; `planted_bugs` says what is broken by it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import pytest
+from attrs import evolve
+
+from laneweave.agents.core import AgentCore
+from laneweave.coordinator import core as coordinator_core
+from laneweave.coordinator import formation as formation_module
+from laneweave.coordinator.core import CoordinatorCore
+from laneweave.coordinator.election import Election
+from laneweave.coordinator.groups import Groups
+from laneweave.coordinator.leader import FormationControl
+from laneweave.coordinator.leader_rules import Phase
+from laneweave.protocol.execution import PLAN, PlanExecution, Stage
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.messages import (
+    Ballot,
+    Command,
+    Heartbeat,
+    Name,
+    Plan,
+    Prepare,
+    VehicleState,
+)
+from laneweave.protocol.plans import Needs, dependencies
+from laneweave.protocol.transitions import Transition
+from laneweave.sim_bridge.caretaker import Caretaker
+from laneweave.sim_bridge.motion_controller import MotionController
+
+LEASE_S = 2.0
+
+
+def always(*_: object) -> bool:
+    """Do not check."""
+    return True
+
+
+def never(*_: object) -> bool:
+    """Check and refuse."""
+    return False
+
+
+def skip(*_: object) -> None:
+    """Do not act."""
+
+
+# --- a vehicle --------------------------------------------------------------------------------
+
+
+def plan_in_any_phase(row: Transition) -> Transition:
+    return evolve(row, sources=tuple(Stage)) if row.event == PLAN else row
+
+
+def accept_anew(me: PlanExecution, plan: Plan) -> None:
+    me.promised, me.plan, me.completed = plan.ballot, plan, 0
+    me.needs = dependencies(plan, me.vehicle)
+
+
+def keep_count(me: PlanExecution, _: object) -> None:
+    me.plan, me.needs, me.moving_in_plan = None, (), False
+
+
+def promise_without_joining(me: PlanExecution, prepare: Prepare) -> None:
+    me.promised = prepare.ballot
+
+
+def is_member(me: PlanExecution, state: VehicleState) -> bool:
+    return me.plan is not None and state.vehicle in me.plan.moves and state.vehicle != me.vehicle
+
+
+def promised_my_ballot(me: PlanExecution, state: VehicleState) -> bool:
+    return is_member(me, state) and me.plan is not None and state.promised == me.plan.ballot
+
+
+def accepted_anything(me: PlanExecution, state: VehicleState) -> bool:
+    return is_member(me, state) and state.accepted
+
+
+def accepted_mine_or_goes(me: PlanExecution, state: VehicleState) -> bool:
+    return accepted_anything(me, state) and (promised_my_ballot(me, state) or state.go)
+
+
+def accepted_mine_or_newer(me: PlanExecution, state: VehicleState) -> bool:
+    plan = me.plan
+    return (
+        plan is not None
+        and accepted_anything(me, state)
+        and state.promised is not None
+        and state.promised >= plan.ballot
+    )
+
+
+def hear_whoever(me: PlanExecution, state: VehicleState) -> None:
+    me.heard[state.vehicle] = max(me.heard.get(state.vehicle, -1), state.completed)
+
+
+def hear_moves_under_way(me: PlanExecution, state: VehicleState) -> None:
+    if state.ready:
+        shown = state.completed + state.moving
+        me.heard[state.vehicle] = max(me.heard.get(state.vehicle, -1), shown)
+
+
+def has_plan(me: PlanExecution, _: object) -> bool:
+    return me.plan is not None
+
+
+def all_but_one_are_ready(me: PlanExecution, _: object) -> bool:
+    roster = me.plan.roster if me.plan is not None else ()
+    ready = sum(me.heard.get(other, -1) >= 0 for other in roster if other != me.vehicle)
+    return ready >= len(roster) - 2
+
+
+def is_released_after_a_while(me: PlanExecution, _: object) -> bool:
+    needs = me.needs[me.completed]
+    heard = all(me.heard.get(other, -1) >= count for other, count in needs.items())
+    return heard or me.is_due(me.t_s - LEASE_S)
+
+
+def one_less(plan: Plan, vehicle: Name) -> tuple[Needs, ...]:
+    return tuple(
+        {other: count - 1 for other, count in needs.items()}
+        for needs in dependencies(plan, vehicle)
+    )
+
+
+def without_corners(plan: Plan, vehicle: Name) -> tuple[Needs, ...]:
+    def needs_of(step: int, cells: set[Cell]) -> Needs:
+        return {
+            other: index + 1
+            for other, moves in plan.moves.items()
+            for index, (other_step, origin, target) in enumerate(moves)
+            if other != vehicle and other_step < step and cells & {origin, target}
+        }
+
+    return tuple(needs_of(step, {origin, target}) for step, origin, target in plan.moves[vehicle])
+
+
+def start_and_count(me: PlanExecution, _: object) -> None:
+    move = me.next_move
+    if move is not None:
+        me.hold_cell, me.moving, me.moving_in_plan = move[2], True, True
+        me.completed += 1
+
+
+# --- a leader ---------------------------------------------------------------------------------
+
+
+def whoever_is_heard(me: FormationControl) -> tuple[Name, ...]:
+    return tuple(name for name in me.formation.roster if name in me.states)
+
+
+def majority(me: FormationControl) -> tuple[Name, ...]:
+    roster = me.formation.roster
+    promised = tuple(name for name in roster if name in me.promises)
+    return promised if 2 * len(promised) > len(roster) else roster
+
+
+def anybody_has_promised(me: FormationControl, _: object) -> bool:
+    return bool(me.promises)
+
+
+def whoever_has_promised(me: FormationControl) -> tuple[Name, ...]:
+    return tuple(me.promises) or me.formation.roster
+
+
+def any_member(me: FormationControl, state: VehicleState) -> bool:
+    return state.vehicle in me.formation.roster
+
+
+def heard_have_accepted(me: FormationControl, _: object) -> bool:
+    return all(state.accepted for state in me.states.values())
+
+
+def all_have_accepted(me: FormationControl, _: object) -> bool:
+    return all(me.states[name].accepted for name in me.formation.roster)
+
+
+def one_ballot(me: FormationControl, _: object) -> bool:
+    ballots = {me.states[name].promised for name in me.formation.roster}
+    return len(ballots) == 1 and all_have_accepted(me, None)
+
+
+def adopt_the_ballot_only(me: FormationControl, _: object) -> None:
+    me.ballot = next(iter(me.states.values())).promised
+
+
+def prepare_the_same(me: FormationControl, _: object) -> None:
+    if me.ballot is None:
+        me.ballot = me.new_ballot(me.highest)
+    else:
+        # Who has restarted is asked again; the others have promised this ballot.
+        known = {name: each.incarnation for name, each in me.promises.items()}
+        me.promises = {
+            name: promise
+            for name, promise in me.promises.items()
+            if me.states[name].incarnation == known[name]
+        }
+    me.plan, me.accepted, me.failures, me.due_s = None, set(), 0, me.now_s
+
+
+def prepare_anew(me: FormationControl, _: object) -> None:
+    me.ballot = me.new_ballot(me.highest)
+    me.promises, me.due_s = {}, me.now_s
+
+
+def promised_something(_: FormationControl, state: VehicleState) -> bool:
+    return state.promised is not None and not state.accepted
+
+
+def count_entry_cell(me: FormationControl, state: VehicleState) -> None:
+    cells = {member.vehicle: member.cell for member in me.formation.members}
+    me.promises[state.vehicle] = evolve(state, hold_cell=cells[state.vehicle])
+
+
+def time_is_up_unless_issuing(me: FormationControl, _: object) -> bool:
+    return me.now_s >= me.until_s and me.phase is not Phase.ISSUING
+
+
+def shows_another_ballot(me: FormationControl, state: VehicleState) -> bool:
+    return state.promised != me.ballot
+
+
+def promised_b(me: FormationControl, state: VehicleState) -> bool:
+    return state.promised == me.ballot
+
+
+# --- outside the rule books -------------------------------------------------------------------
+
+
+def revive(patch: pytest.MonkeyPatch) -> None:
+    hear = Election.on_heartbeat
+
+    def mutant(self: Election, heartbeat: Heartbeat, now_s: float) -> None:
+        self._dead.clear()
+        hear(self, heartbeat, now_s)
+
+    patch.setattr(Election, "on_heartbeat", mutant)
+
+
+def believe_the_void(patch: pytest.MonkeyPatch) -> None:
+    def mutant(self: Election, *, up: bool, now_s: float) -> None:
+        del self, up, now_s
+
+    patch.setattr(Election, "on_link", mutant)
+
+
+def forget_incarnation(patch: pytest.MonkeyPatch) -> None:
+    new_ballot = CoordinatorCore._new_ballot
+
+    def mutant(self: CoordinatorCore, above: Ballot | None) -> Ballot:
+        return new_ballot(self, above)._replace(incarnation=1)
+
+    patch.setattr(CoordinatorCore, "_new_ballot", mutant)
+
+
+def close_at_once(patch: pytest.MonkeyPatch) -> None:
+    def mutant(*_: object) -> float:
+        return -1e9
+
+    for module in (coordinator_core, formation_module):
+        patch.setattr(module, "closing_time_s", mutant)
+
+
+def join_nothing(patch: pytest.MonkeyPatch) -> None:
+    def mutant(self: Groups, numbers: Iterable[int]) -> bool:
+        del self, numbers
+        return False
+
+    patch.setattr(Groups, "join", mutant)
+
+
+def play_everything(patch: pytest.MonkeyPatch) -> None:
+    take = MotionController.take
+
+    def mutant(self: MotionController, command: Command) -> bool:
+        return take(self, evolve(command, incarnation=max(command.incarnation, self.attendant)))
+
+    patch.setattr(MotionController, "take", mutant)
+
+
+def speak_at_once(patch: pytest.MonkeyPatch) -> None:
+    def mutant(self: AgentCore) -> bool:
+        return self.execution is not None and not self.ended
+
+    patch.setattr(AgentCore, "in_charge", property(mutant))
+
+
+def keep_incarnation(patch: pytest.MonkeyPatch) -> None:
+    sense = AgentCore._on_sense
+
+    def mutant(self: AgentCore, message: Any) -> Any:  # noqa: ANN401
+        # As if the caretaker had never been: what was promised before still counts.
+        return sense(self, evolve(message, attendant=self._incarnation))
+
+    patch.setattr(AgentCore, "_on_sense", mutant)
+
+
+def accept_moves(patch: pytest.MonkeyPatch) -> None:
+    on_message = Caretaker.on_message
+
+    def mutant(self: Caretaker, message: Prepare | Plan, tick: int) -> VehicleState | None:
+        if isinstance(message, Plan):
+            return self.show(tick) if self._execution.on_plan(message) else None
+        return on_message(self, message, tick)
+
+    patch.setattr(Caretaker, "on_message", mutant)
+
+
+def never_moving(patch: pytest.MonkeyPatch) -> None:
+    def mutant(self: MotionController, tick: int) -> bool:
+        del self, tick
+        return False
+
+    patch.setattr(MotionController, "moving", mutant)

@@ -1,0 +1,278 @@
+"""The coordinators of a story: leaders that have taken a formation over, and whole candidates."""
+
+from __future__ import annotations
+
+import random
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+
+from attrs import define, field
+
+from laneweave.coordinator.core import CoordinatorCore
+from laneweave.coordinator.formation import Formation
+from laneweave.coordinator.leader import FormationControl
+from laneweave.protocol.lattice import Move, territory
+from laneweave.protocol.messages import (
+    Ballot,
+    Census,
+    CensusEntry,
+    Heartbeat,
+    LogEvent,
+    Name,
+    Plan,
+    Prepare,
+    VehicleState,
+)
+from laneweave.protocol.node import Arrived, Compute, Effect, Event, Send, Started, Wakeup, run_job
+from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.topics import CENSUS, HEARTBEAT, STATE, Topic
+from laneweave.protocol.transitions import RuleBook
+from scenarios.story_road import SCENARIO, SLOT_S, Vehicle
+from scenarios.story_text import cell_of, shown, written
+
+Mail = dict[tuple[str, str, str], Prepare | Plan]
+"""What has been sent: (PREPARE or PLAN, ballot, vehicle) to message."""
+
+RESEND_S = 0.2
+
+
+@define(eq=False)
+class Leader:
+    """A coordinator that has taken a formation over; the story plans for it."""
+
+    name: str
+    control: FormationControl
+    incarnation: int
+
+    @classmethod
+    def taking_over(
+        cls,
+        name: str,
+        incarnation: int,
+        term: int,
+        formation: Formation,
+        now_s: float,
+        rules: RuleBook,
+    ) -> Leader:
+        """Return a leader that begins to observe."""
+        core = CoordinatorCore(Name(name), incarnation, Scenario())
+        core.election.term = term
+        rng = random.Random(0)
+        control = FormationControl(formation, core._new_ballot, rng, RESEND_S, rules)
+        control.begin(now_s)
+        return cls(name, control, incarnation)
+
+    @property
+    def controls(self) -> tuple[FormationControl, ...]:
+        return (self.control,)
+
+    def wake(self, mail: Mail, now_s: float) -> Iterator[str]:
+        """Let timers run; list what is sent."""
+        yield from self._watched(lambda: self.control.on_time(now_s))
+        for vehicle, message in self.control.outgoing(now_s):
+            yield post(mail, message, vehicle)
+
+    def hear(self, state: VehicleState, mail: Mail, now_s: float) -> Iterator[str]:
+        del mail
+        yield from self._watched(lambda: self.control.on_state(state, now_s))
+
+    def census(self, formation: Formation, now_s: float) -> Iterator[str]:
+        yield from self._watched(lambda: self.control.on_members(formation, now_s))
+
+    def plan(self, text: str, now_s: float) -> Iterator[str]:
+        """Issue a plan that the story gives."""
+        control = self.control
+        if not control.take_planning_order(now_s) or control.ballot is None:
+            yield f"{self.name} cannot plan"
+            return
+        plan = written_plan(text, control, control.ballot)
+        yield from self._watched(lambda: control.on_plan(plan, now_s))
+
+    def fail(self, now_s: float) -> Iterator[str]:
+        if not self.control.take_planning_order(now_s):
+            yield f"{self.name} cannot plan"
+            return
+        yield from self._watched(lambda: self.control.on_planning_failed(now_s))
+
+    def about(self) -> str:
+        return about(self.name, self.control)
+
+    def _watched(self, action: Callable[[], None]) -> Iterator[str]:
+        before = self.about()
+        action()
+        if self.about() != before:
+            yield self.about()
+
+
+@define(eq=False)
+class Candidate:
+    """A whole coordinator: election, census, blocks, joint ballots, and the real planner."""
+
+    name: str
+    core: CoordinatorCore
+    incarnation: int
+    heartbeat: Heartbeat | None = None
+    """The newest that it has sent."""
+    jobs: list[Compute] = field(factory=list)
+    """Plannings that it has ordered."""
+
+    @classmethod
+    def starting(
+        cls, name: str, incarnation: int, mail: Mail, now_s: float, rules: RuleBook
+    ) -> Candidate:
+        """Return a process that has just started."""
+        core = CoordinatorCore(Name(name), incarnation, SCENARIO, rules)
+        candidate = cls(name, core, incarnation)
+        list(candidate.handle(Started(), mail, now_s))
+        return candidate
+
+    @property
+    def controls(self) -> tuple[FormationControl, ...]:
+        return tuple(self.core.controls.values())
+
+    def wake(self, mail: Mail, now_s: float) -> Iterator[str]:
+        """Let timers run; list what is sent."""
+        yield from self.handle(Wakeup(), mail, now_s)
+
+    def hear(self, what: VehicleState | Heartbeat, mail: Mail, now_s: float) -> Iterator[str]:
+        topic = HEARTBEAT if isinstance(what, Heartbeat) else STATE
+        yield from self.get(topic, what, mail, now_s)
+
+    def census(self, on_road: Iterable[Vehicle], mail: Mail, now_s: float) -> Iterator[str]:
+        census = Census(now_s, tuple(map(entry_of, on_road)), ())
+        yield from self.get(CENSUS, census, mail, now_s)
+
+    def get(self, topic: Topic, message: object, mail: Mail, now_s: float) -> Iterator[str]:
+        yield from self.handle(Arrived(topic, {}, message), mail, now_s)
+
+    def plan(self, mail: Mail, now_s: float) -> Iterator[str]:
+        """Let the planner finish what was ordered first."""
+        if not self.jobs:
+            yield f"{self.name} cannot plan"
+            return
+        yield from self.handle(run_job(self.jobs.pop(0)), mail, now_s)
+
+    def handle(self, event: Event, mail: Mail, now_s: float) -> Iterator[str]:
+        """Hand an event to the core and tell what it did."""
+        before = self.about()
+        effects = self.core.handle(event, now_s)
+        told = [line for effect in effects if (line := self._effect(effect, mail))]
+        # Logged first, then what it is about, then what it sends.
+        yield from (line for line in told if not line.startswith(("PREPARE", "PLAN")))
+        yield from (line for line in self.about() if line not in before)
+        yield from (line for line in told if line.startswith(("PREPARE", "PLAN")))
+
+    def about(self) -> list[str]:
+        lines = []
+        for control in self.core.controls.values():
+            numbers = " ".join(map(str, control.formation.numbers))
+            line = f"{about(self.name, control)} for {numbers}"
+            if control.plan is not None:
+                line += f": {_moves_of(control.plan)}"
+            lines.append(line)
+        return lines
+
+    def rank(self) -> str:
+        """Tell whether it leads."""
+        election = self.core.election
+        return f"{self.name} {'leads' if election.leading else 'waits'}, term {election.term}"
+
+    def _effect(self, effect: Effect, mail: Mail) -> str:
+        match effect:
+            case Send(_, (Prepare() | Plan()) as message, parameters):
+                return post(mail, message, str(parameters["vehicle"]))
+            case Send(_, Heartbeat() as heartbeat):
+                self.heartbeat = heartbeat
+            case Send(_, LogEvent() as event):
+                return self._log(event)
+            case Compute():
+                self.jobs.append(effect)
+            case _:
+                pass
+        return ""
+
+    def _log(self, event: LogEvent) -> str:
+        match event.kind:
+            case "leader-elected":
+                return f"{self.name} leads, term {event.data['term']}"
+            case "leader-stepped-down":
+                return f"{self.name} leads no more"
+            case "formations-joined":
+                joined = " ".join(map(str, event.data["formations"]))
+                return f"{self.name} joins formations {joined}"
+            case "lane-out-of-reach":
+                return f"{self.name} cannot bring {' '.join(event.data['vehicles'])} to their lanes"
+            case "plan-made":
+                return ""
+            case kind:
+                return f"{self.name}: {kind}"
+
+
+def entry_of(vehicle: Vehicle) -> CensusEntry:
+    """Return how the census lists a vehicle."""
+    return CensusEntry(vehicle.name, vehicle.entry_cell, vehicle.preferred_lane, 0.0)
+
+
+def formation_of(vehicles: Mapping[str, Vehicle], roster: str) -> Formation:
+    """Return the formation of some vehicles: the blocks in which they entered."""
+    members = tuple(entry_of(vehicles[name]) for name in sorted(roster.split()))
+    lattice = SCENARIO.lattice
+    numbers = tuple(sorted({lattice.block_of(member.cell[0]) for member in members}))
+    return Formation(numbers, members)
+
+
+def written_plan(text: str, control: FormationControl, ballot: Ballot) -> Plan:
+    """Return the plan that a story gives, as the leader would issue it.
+
+    Args:
+        text: `A@0>0,2 B@1>0,1`; with `A:0,1@0>0,2` the leader takes A to be in (0, 1), with
+            `A@0>0,2 in blocks 0 1` it claims the blocks of these formations.
+        control: that has all promises.
+        ballot: of the control.
+    """
+    cells = control.hold_cells
+    moves: dict[Name, tuple[Move, ...]] = dict.fromkeys(cells, ())
+    at = dict(cells)
+    text, _, blocks = text.partition(" in blocks ")
+    for item in text.split():
+        who, step, target = re.split("[@>]", item)
+        name, _, believed = who.partition(":")
+        mover = Name(name)
+        if believed:
+            at[mover] = cells[mover] = cell_of(believed)
+        moves[mover] = (*moves[mover], (int(step), at[mover], cell_of(target)))
+        at[mover] = cell_of(target)
+    every_move = [move for each in moves.values() for move in each]
+    return Plan(
+        ballot=ballot,
+        formations=tuple(map(int, blocks.split())) or control.formation.numbers,
+        roster=tuple(cells),
+        incarnations=control.incarnations,
+        start_cells=cells,
+        moves=moves,
+        t0_s=0.0,
+        slot_s=SLOT_S,
+        territory=tuple(sorted(territory(cells.values(), every_move))),
+    )
+
+
+def post(mail: Mail, message: Prepare | Plan, vehicle: str) -> str:
+    """Put a message into the mail and tell so."""
+    kind = "PLAN" if isinstance(message, Plan) else "PREPARE"
+    mail[kind, written(message.ballot), vehicle] = message
+    return f"{kind} {written(message.ballot)} to {vehicle}"
+
+
+def about(name: str, control: FormationControl) -> str:
+    """Tell what a leader is about."""
+    ballot = f" {written(control.ballot)}" if control.ballot is not None else ""
+    return f"{name} {control.phase.value}{ballot}"
+
+
+def _moves_of(plan: Plan) -> str:
+    moves = [
+        f"{name}@{step}>{shown(target)}"
+        for name, moves in sorted(plan.moves.items())
+        for step, _, target in moves
+    ]
+    return " ".join(moves) or "nobody moves"

@@ -1,0 +1,216 @@
+"""The road of a story: bodies, their real motion controllers, and the processes that act for them.
+
+A body does not move by itself: it is in its cell, or between the cell that it left and the one that
+its controller makes for, until the story says that it arrives. Everything else is the real code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from itertools import count
+
+from attrs import define, field
+
+from laneweave.agents.core import AgentCore
+from laneweave.agents.driver import Drive, Effort
+from laneweave.protocol.execution import PlanExecution
+from laneweave.protocol.lattice import Cell, Lattice, Move
+from laneweave.protocol.messages import Command, Name, Plan, Prepare, Sense, VehicleState
+from laneweave.protocol.motion import at_rest_in_cell, cell_state
+from laneweave.protocol.node import Arrived, Effect, Send, Started
+from laneweave.protocol.scenario import FormationSettings, Road, Runtime, Scenario
+from laneweave.protocol.topics import PLAN, PREPARE, SENSE, STATE
+from laneweave.protocol.transitions import RuleBook
+from laneweave.sim_bridge.attendance import Attendance
+from laneweave.sim_bridge.demand import Arrival
+from laneweave.sim_bridge.entry import Admission
+from laneweave.sim_bridge.plant import Plant
+from laneweave.sim_bridge.traffic import RoadVehicle
+
+SLOT_S = 1.0
+TICK_S = 0.01
+SCENARIO = Scenario(
+    road=Road(s1_m=0.0, s2_m=0.0, s3_m=20_000.0),
+    # The bound on nodes ends a search; the clock of a busy machine must not.
+    formation=FormationSettings(
+        cycle_s=SLOT_S, move_s=0.8, max_joined=2, planning_deadline_s=3600.0
+    ),
+    runtime=Runtime(tick_s=TICK_S),
+)
+
+
+class StoryDriver:
+    """Drives without dynamics: a motion is over when the story has brought the body there."""
+
+    effort = Effort()
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Make a driver that knows nothing of its vehicle yet."""
+        self._lattice: Lattice = scenario.lattice
+        self._origin: Cell = (0, 0)
+        self._goal: Cell = (0, 0)
+
+    def take_over(self, sense: Sense) -> None:
+        self._origin, self._goal = sense.motion_origin, sense.hold_cell
+
+    def begin(self, move: Move, tick: int) -> None:
+        del tick
+        _, self._origin, self._goal = move
+
+    def at_rest(self, sense: Sense) -> bool:
+        return at_rest_in_cell(sense.state, self._lattice, self._goal, sense.t_s)
+
+    def drive(self, sense: Sense, *, moving: bool) -> Drive:
+        return Drive(sense.tick + 1 if moving else 0, self._origin, b"")
+
+
+@define(eq=False)
+class Vehicle:
+    """A body with its motion controller; both outlive every process that acts for it."""
+
+    road: RoadVehicle
+    at: Cell
+    """Where the body is, or where its motion began."""
+    caretakers: set[int] = field(factory=set)
+    """Incarnations that were caretakers."""
+    incarnations: Iterator[int] = field(factory=lambda: count(1))
+
+    @classmethod
+    def entering(cls, name: str, cell: Cell, preferred_lane: int, t_s: float) -> Vehicle:
+        """Return a vehicle that nobody is in charge of yet."""
+        arrival = Arrival(Name(name), cell[1], preferred_lane, t_s)
+        return cls(RoadVehicle.entering(Admission(arrival, cell, t_s), t_s, SCENARIO), cell)
+
+    @property
+    def name(self) -> Name:
+        return self.road.name
+
+    @property
+    def entry_cell(self) -> Cell:
+        return self.road.admission.cell
+
+    @property
+    def preferred_lane(self) -> int:
+        return self.road.admission.arrival.preferred_lane
+
+    @property
+    def occupied(self) -> set[Cell]:
+        """Every cell between where the body came from and where it will hold."""
+        columns, lanes = zip(self.at, self.road.controller.hold_cell, strict=True)
+        return {
+            (column, lane)
+            for column in range(min(columns), max(columns) + 1)
+            for lane in range(min(lanes), max(lanes) + 1)
+        }
+
+    def sense(self, tick: int) -> Sense:
+        """Return what the vehicle shows to whoever acts for it."""
+        controller = self.road.controller
+        self.place_body(tick)
+        return self.road.sense(tick, caretaker=controller.attendant in self.caretakers)
+
+    def place_body(self, tick: int) -> None:
+        """Put the body where the story has it: the lattice goes on moving."""
+        state = cell_state(SCENARIO.lattice, self.at, tick * TICK_S)
+        self.road.controller.plant = Plant(state, SCENARIO.vehicle, TICK_S)
+
+
+class Agent:
+    """An agent process of a vehicle."""
+
+    def __init__(self, name: str, vehicle: Vehicle, rules: RuleBook) -> None:
+        """Start a process; it has not met the vehicle yet."""
+        self.name = name
+        self.vehicle = vehicle
+        self.shown: VehicleState | None = None
+        self.command: Command | None = None
+        self.tick = -1
+        """The newest tick that it has sensed."""
+        self._core = AgentCore(
+            vehicle.name, lambda: next(vehicle.incarnations), SCENARIO, StoryDriver, rules
+        )
+        self._note(self._core.handle(Started(), 0.0))
+
+    @property
+    def execution(self) -> PlanExecution | None:
+        return self._core.execution
+
+    @property
+    def incarnation(self) -> int | None:
+        """The one that it acts under; None before it has met its vehicle."""
+        return self.execution.incarnation if self.execution is not None else None
+
+    @property
+    def in_charge(self) -> bool:
+        """Whether it has sensed that it is."""
+        return self._core.in_charge
+
+    def sense(self, tick: int) -> None:
+        """Get the SENSE of a tick; `command` is the answer, or none."""
+        self.tick, self.command = tick, None
+        self._note(self._core.handle(self._arrived(SENSE, self.vehicle.sense(tick)), 0.0))
+
+    def get(self, message: Prepare | Plan, tick: int) -> None:
+        del tick
+        topic = PLAN if isinstance(message, Plan) else PREPARE
+        self._note(self._core.handle(self._arrived(topic, message), 0.0))
+
+    def hear(self, state: VehicleState) -> None:
+        self._note(self._core.handle(self._arrived(STATE, state), 0.0))
+
+    def _arrived(self, topic: object, message: object) -> Arrived:
+        return Arrived(topic, {"vehicle": self.vehicle.name}, message)  # type: ignore[arg-type]
+
+    def _note(self, effects: Iterable[Effect]) -> None:
+        for effect in effects:
+            if isinstance(effect, Send) and isinstance(effect.message, VehicleState):
+                self.shown = effect.message
+            elif isinstance(effect, Send) and isinstance(effect.message, Command):
+                self.command = effect.message
+
+
+class CaretakerProcess:
+    """The caretaker of a vehicle, in charge from its first moment on."""
+
+    def __init__(self, name: str, vehicle: Vehicle, tick: int) -> None:
+        """Take charge."""
+        self.name = name
+        self.vehicle = vehicle
+        self.tick = tick
+        self.shown: VehicleState | None = None
+        self._attendance = Attendance(lambda: next(vehicle.incarnations))
+        vehicle.place_body(tick)
+        list(self._attendance.take_charge(vehicle.road, tick))
+        self.execution: PlanExecution = self._attendance._caretakers[vehicle.name]._execution
+        self.incarnation: int = self.execution.incarnation
+        vehicle.caretakers.add(self.incarnation)
+        self.sense(tick)
+
+    @property
+    def in_charge(self) -> bool:
+        """Whether no agent has taken charge since."""
+        return self.vehicle.name in self._attendance
+
+    def give_way(self) -> None:
+        """An agent has taken charge."""
+        list(self._attendance.give_way(self.vehicle.name))
+
+    def sense(self, tick: int) -> None:
+        self.tick = tick
+        self.vehicle.place_body(tick)
+        self._note(self._attendance.show(tick))
+
+    def get(self, message: Prepare | Plan, tick: int) -> None:
+        self.vehicle.place_body(tick)
+        self._note(self._attendance.on_message(self.vehicle.name, message, tick))
+
+    def hear(self, state: VehicleState) -> None:
+        """It never moves, so nothing that others show matters to it."""
+
+    def _note(self, effects: Iterable[Effect]) -> None:
+        for effect in effects:
+            if isinstance(effect, Send):
+                self.shown = effect.message
+
+
+Process = Agent | CaretakerProcess

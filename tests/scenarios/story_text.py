@@ -1,0 +1,52 @@
+"""How a story writes things, and what can be wrong with one."""
+
+from __future__ import annotations
+
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.messages import Ballot, VehicleState
+
+
+class StoryError(AssertionError):
+    """A story went otherwise, or cannot be read."""
+
+
+class CollisionError(StoryError):
+    """Two vehicles occupy one cell."""
+
+
+def cell_of(text: str) -> Cell:
+    """Read a cell: column,lane."""
+    column, lane = text.split(",")
+    return int(column), int(lane)
+
+
+def shown(cell: Cell) -> str:
+    """Write a cell."""
+    return f"{cell[0]},{cell[1]}"
+
+
+def written(ballot: Ballot) -> str:
+    """Write a ballot: term/coordinator/incarnation/seq."""
+    return "/".join(str(part) for part in ballot)
+
+
+def told(name: str, state: VehicleState) -> str:
+    """Tell what a state says."""
+    parts = [f"{name} {'moves to' if state.moving else 'holds'} {shown(state.hold_cell)}"]
+    if state.promised is not None:
+        has = "accepted" if state.accepted else "promised"
+        parts.append(f"{has} {written(state.promised)}")
+    if state.accepted:
+        parts.append(f"completed {state.completed}")
+    for word, holds in (
+        ("ready", state.ready),
+        ("gate open", state.go),
+        ("done", state.done),
+        ("overdue", state.overdue),
+        ("unattended", not state.attended),
+    ):
+        if holds:
+            parts.append(word)
+    if len(state.joined) > 1:
+        parts.append(f"joined {' '.join(map(str, state.joined))}")
+    return ", ".join(parts)

@@ -1,0 +1,46 @@
+"""Every planted bug spoils a story: the stories would notice if a rule were missing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from laneweave.coordinator.leader_rules import LEADER_RULES
+from laneweave.protocol.execution import VEHICLE_RULES
+from planted_bugs import BUGS, NOT_A_SAFETY_MATTER, ROWS_OF_OTHERS, PlantedBug
+from scenarios.stories import check_story, ends_in_collision
+from scenarios.story_player import Player
+from scenarios.story_text import StoryError
+
+HERE = Path(__file__).parent
+
+
+@pytest.mark.parametrize("bug", BUGS, ids=lambda bug: bug.name)
+def test_planted_bug_spoils_its_story(bug: PlantedBug, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = HERE / f"{bug.story}.txt"
+    bug.plant(monkeypatch)
+    with pytest.raises(StoryError):
+        check_story(path, Player(bug.vehicle_rules, bug.leader_rules))
+    collides = ends_in_collision(path, Player(bug.vehicle_rules, bug.leader_rules))
+    assert collides is bug.collides
+
+
+def test_names_tell_bugs_apart() -> None:
+    assert len({bug.name for bug in BUGS}) == len(BUGS)
+
+
+def test_every_bug_breaks_a_rule_that_exists() -> None:
+    rules = {row.rule for book in (VEHICLE_RULES, LEADER_RULES) for row in book.table}
+    assert {bug.rule for bug in BUGS} <= rules | set(ROWS_OF_OTHERS)
+    assert rules <= {bug.rule for bug in BUGS}, "each rule is broken at least once"
+    for bug in BUGS:
+        replaced = {*bug.vehicle, *bug.leader}
+        assert replaced or bug.vehicle_row is not None or bug.rule in ROWS_OF_OTHERS
+
+
+def test_every_guard_and_action_is_broken_or_excused() -> None:
+    names = {*VEHICLE_RULES.functions, *LEADER_RULES.functions}
+    broken = {name for bug in BUGS for name in (*bug.vehicle, *bug.leader)}
+    assert names == broken | set(NOT_A_SAFETY_MATTER)
+    assert not broken & set(NOT_A_SAFETY_MATTER)

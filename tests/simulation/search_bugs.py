@@ -1,0 +1,90 @@
+"""Which planted bugs does the random search find, and with which seed?
+
+    python tests/simulation/search_bugs.py [SEEDS] [PROFILE ...]
+
+prints a Markdown table: for each bug of `planted_bugs.BUGS` the first seed that catches it, and
+what was violated. Bugs without one need a scripted schedule: the stories of tests/scenarios.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from pathlib import Path
+
+import pytest
+from attrs import frozen
+
+if __name__ == "__main__":  # run as a program: as `pythonpath` in pyproject.toml
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from laneweave.launch.simulation.profiles import PROFILES
+from laneweave.launch.simulation.search import quiet_logs
+from laneweave.launch.simulation.world import World
+from planted_bugs import BUGS, PlantedBug
+
+SEEDS = 500
+SEARCHED = ("mixed", "joint")
+"""Profiles that are searched, one after the other."""
+
+
+@frozen
+class Catch:
+    """A seed that shows that a rule is broken."""
+
+    bug: str
+    profile: str
+    seed: int
+    kinds: tuple[str, ...]
+    """What was violated."""
+
+
+def first_catch(
+    bug: PlantedBug, seeds: Iterable[int], profiles: Sequence[str] = SEARCHED
+) -> Catch | None:
+    """Run seeds with a planted bug until a run is not as it must be."""
+    with pytest.MonkeyPatch.context() as patch:
+        bug.plant(patch)
+        for profile in profiles:
+            for seed in seeds:
+                world = World(seed, PROFILES[profile], bug.vehicle_rules, bug.leader_rules)
+                violations = world.run().violations
+                if violations:
+                    kinds = tuple(dict.fromkeys(violation.kind for violation in violations))
+                    return Catch(bug.name, profile, seed, kinds)
+    return None
+
+
+def _search(name: str, count: int, profiles: Sequence[str]) -> Catch | None:
+    quiet_logs()
+    return first_catch(bug_named(name), range(count), profiles)
+
+
+def bug_named(name: str) -> PlantedBug:
+    """Return a planted bug."""
+    return next(bug for bug in BUGS if bug.name == name)
+
+
+def table(catches: Iterable[Catch | None]) -> Iterator[str]:
+    """Return the lines of a Markdown table."""
+    yield "| planted bug | rule | what is broken | random search | story |"
+    yield "|---|---|---|---|---|"
+    for bug, catch in zip(BUGS, catches, strict=True):
+        found = "-" if catch is None else f"{catch.profile} {catch.seed}: {', '.join(catch.kinds)}"
+        yield f"| `{bug.name}` | {bug.rule} | {bug.text} | {found} | `{bug.story}` |"
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Print the table."""
+    count = int(arguments[0]) if arguments else SEEDS
+    search = partial(_search, count=count, profiles=arguments[1:] or SEARCHED)
+    with ProcessPoolExecutor() as pool:
+        for line in table(pool.map(search, [bug.name for bug in BUGS])):
+            sys.stdout.write(line + "\n")
+            sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,121 @@
+"""Random search: whatever happens to network and processes, no rule of the checker is broken.
+
+Each seed draws roads, vehicles, wishes and faults (`laneweave.launch.simulation`). A failure is
+replayed by the command that is printed with it. The whole programme is
+
+    laneweave simulate --seeds 0:20000
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from laneweave.launch.simulation.profiles import PROFILES
+from laneweave.launch.simulation.search import replay_command
+from laneweave.launch.simulation.setup import SLOT_S
+from laneweave.launch.simulation.world import Totals, World
+
+BATCH = 20
+DIGESTS = 100
+_PRINT_DIGESTS = f"""
+import json
+from laneweave.launch.simulation.profiles import PROFILES
+from laneweave.launch.simulation.search import quiet_logs, run_seeds
+quiet_logs()
+outcomes = run_seeds(range({DIGESTS}), PROFILES["mixed"], digest=True)
+print(json.dumps([outcome.digest for outcome in outcomes]))
+"""
+
+
+def search(profile: str, seeds: range) -> Totals:
+    """Run seeds and return what they consisted of."""
+    totals = Totals()
+    for seed in seeds:
+        outcome = World(seed, PROFILES[profile]).run()
+        told = "\n".join(map(str, outcome.violations))
+        assert not told, f"{told}\n{replay_command(seed, PROFILES[profile])}"
+        totals += outcome.totals
+    return totals
+
+
+@pytest.mark.parametrize("first", range(0, 300, BATCH))
+def test_no_rule_is_broken_and_everybody_arrives(first: int) -> None:
+    totals = search("mixed", range(first, first + BATCH))
+    assert totals.motions > 5 * BATCH  # the search is not idle
+    assert totals.plans > 3 * BATCH
+    assert totals.dropped > 1000
+
+
+@pytest.mark.full
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("first", range(100_000, 102_000, 100))
+def test_no_rule_is_broken_and_everybody_arrives_long(first: int) -> None:
+    search("mixed", range(first, first + 100))
+
+
+@pytest.mark.parametrize("profile", [name for name in PROFILES if name != "mixed"])
+def test_profile(profile: str) -> None:
+    search(profile, range(8))
+
+
+@pytest.mark.full
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("profile", [name for name in PROFILES if name != "mixed"])
+def test_profile_long(profile: str) -> None:
+    search(profile, range(1000, 1200))
+
+
+def test_formations_are_joined() -> None:
+    assert search("joint", range(100, 112)).joint_plans > 0
+
+
+def test_every_kind_of_fault_happens() -> None:
+    faults = search("mixed", range(300, 340)).faults
+    mixed = PROFILES["mixed"]
+    lasting = {
+        "loss",
+        "duplication",
+        "reordering",
+        "late-planning",
+        "failing-planning",
+        "lost-commands",
+        "slow-moves",
+        "wrong-clocks",
+    }
+    assert set(faults) == set(mixed.harm) | lasting
+    assert all(count > 0 for count in faults.values())
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_without_faults_the_last_plan_is_not_late(seed: int) -> None:
+    outcome = World(seed, PROFILES["calm"]).run()
+    assert not outcome.violations
+    # The last wishes come at most so long before the end of the phase; then one census, the margin
+    # of a plan, and the steps: of the plan under way one, of the last one at most eight.
+    assert outcome.totals.longest_healing_s < 1.0 + 0.5 + 9 * SLOT_S
+    assert outcome.totals.dropped == 0
+
+
+def test_equal_seeds_give_equal_runs_under_any_hash_seed() -> None:
+    first, second = (_digests(hash_seed) for hash_seed in ("0", "4711"))
+    assert len(first) == len(set(first)) == DIGESTS
+    equal = sum(one == other for one, other in zip(first, second, strict=True))
+    assert equal == DIGESTS
+
+
+def _digests(hash_seed: str) -> list[str]:
+    done = subprocess.run(
+        [sys.executable, "-c", _PRINT_DIGESTS],
+        env=os.environ | {"PYTHONHASHSEED": hash_seed},
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=True,
+    )
+    digests: list[str] = json.loads(done.stdout)
+    return digests

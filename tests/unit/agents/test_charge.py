@@ -1,0 +1,334 @@
+"""Who acts for a vehicle: an agent claims it, speaks once it is in charge, and gives way."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from attrs import evolve
+
+from laneweave.agents.core import AgentCore
+from laneweave.agents.driver import Drive, Effort
+from laneweave.protocol.lattice import Cell, Move
+from laneweave.protocol.messages import (
+    Ballot,
+    Command,
+    Name,
+    Prepare,
+    Report,
+    Sense,
+    VehicleState,
+)
+from laneweave.protocol.motion import cell_state
+from laneweave.protocol.node import Effect, Send, Wakeup
+from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.topics import PLAN, PREPARE, SENSE, STATE
+from unit.agents.agent_rig import (
+    BALLOT,
+    HOME,
+    LATTICE,
+    ME,
+    OTHER,
+    TICK_S,
+    Rig,
+    make_plan,
+    sent,
+)
+
+
+class Passenger:
+    """A driver that drives nothing and keeps a diary."""
+
+    effort = Effort()
+
+    def __init__(self, _: Scenario) -> None:
+        """Begin with an empty diary."""
+        self.taken_over: list[int] = []
+        self.begun: list[Move] = []
+        self.resting = True
+
+    def take_over(self, sense: Sense) -> None:
+        self.taken_over.append(sense.tick)
+
+    def begin(self, move: Move, tick: int) -> None:
+        del tick
+        self.begun.append(move)
+
+    def at_rest(self, sense: Sense) -> bool:
+        del sense
+        return self.resting
+
+    def drive(self, sense: Sense, *, moving: bool) -> Drive:
+        return Drive(sense.tick + 1 if moving else 0, HOME, b"")
+
+
+class Seat:
+    """An agent whose SENSEs the test writes; its incarnations are 1, 2, ..."""
+
+    def __init__(self) -> None:
+        """Start the agent."""
+        self.drivers: list[Passenger] = []
+        self.rig = Rig(self._make_driver)
+        self.tick = 0
+
+    def _make_driver(self, scenario: Scenario) -> Passenger:
+        self.drivers.append(Passenger(scenario))
+        return self.drivers[-1]
+
+    @property
+    def agent(self) -> AgentCore:
+        return self.rig.agent
+
+    @property
+    def driver(self) -> Passenger:
+        return self.drivers[-1]
+
+    @property
+    def shown(self) -> VehicleState:
+        return self.rig.shown[-1]
+
+    def feel(
+        self,
+        attendant: int,
+        *,
+        caretaker: bool = False,
+        joined: tuple[int, ...] = (0,),
+        cell: Cell = HOME,
+    ) -> list[Effect]:
+        """Show it the next tick, with somebody in charge."""
+        self.tick += 1
+        self.last = Sense(
+            ME, self.tick, self.tick * TICK_S, cell_state(LATTICE, cell, self.tick * TICK_S),
+            cell, 0, cell, 0, (), attendant=attendant, caretaker=caretaker, joined=joined,
+        )  # fmt: skip
+        return self.rig.hand(SENSE, self.last)
+
+    def repeat(self) -> list[Effect]:
+        """Show it the last tick once more."""
+        return self.rig.hand(SENSE, self.last)
+
+    def take_charge(self, joined: tuple[int, ...] = (0,)) -> None:
+        for _ in range(2):
+            self.feel(1, joined=joined)
+        assert self.shown.incarnation == 1
+
+    def prepare(self, *formations: int, ballot: Ballot = BALLOT) -> list[Effect]:
+        return self.rig.hand(PREPARE, Prepare(ballot, formations or (0,), (ME, OTHER)))
+
+    def plan(self, *formations: int, incarnation: int = 1) -> list[Effect]:
+        cells: dict[Name, Cell] = {ME: HOME, OTHER: (0, 0)}
+        incarnations = {ME: incarnation, OTHER: 1}
+        plan = make_plan({ME: (), OTHER: ()}, cells, incarnations, formations=formations or (0,))
+        return self.rig.hand(PLAN, plan)
+
+
+def kinds(effects: Iterable[Effect]) -> list[type]:
+    return [type(effect.message) for effect in effects if isinstance(effect, Send)]
+
+
+def wanted(seat: Seat) -> tuple[int, ...]:
+    return seat.agent.wanted_states
+
+
+def command_of(effects: Iterable[Effect]) -> Command:
+    (command,) = sent(effects, Command)
+    return command
+
+
+# --- claiming ---------------------------------------------------------------------------------
+
+
+def test_the_first_answer_claims_the_vehicle_and_says_nothing_to_others() -> None:
+    seat = Seat()
+    effects = seat.feel(0)
+    assert kinds(effects) == [Command]
+    command = command_of(effects)
+    assert (command.incarnation, command.tick, command.hold_cell) == (1, 1, HOME)
+    assert seat.repeat() == effects
+    assert not seat.agent.in_charge
+
+
+def test_it_promises_and_accepts_nothing_before_it_is_in_charge() -> None:
+    seat = Seat()
+    other = state_of(OTHER)
+    for effects in (
+        seat.prepare(),  # before it has met its vehicle at all
+        seat.plan(),
+        seat.rig.hand(STATE, other),
+        seat.rig.handle(Wakeup()),
+    ):
+        assert effects == []
+    seat.feel(0)
+    assert seat.prepare() == []
+    assert seat.plan() == []
+    assert seat.rig.hand(STATE, other) == []
+    assert wanted(seat) == ()
+    seat.feel(1)
+    assert (seat.shown.promised, seat.shown.accepted) == (None, False)
+
+
+def test_it_speaks_once_a_sense_has_shown_that_it_is_in_charge() -> None:
+    seat = Seat()
+    seat.feel(0)
+    effects = seat.feel(1)
+    assert seat.agent.in_charge
+    assert kinds(effects) == [Command, VehicleState]
+    assert (seat.shown.incarnation, seat.shown.attended) == (1, True)
+    assert kinds(seat.prepare()) == [VehicleState]
+    assert seat.shown.promised == BALLOT
+    assert kinds(seat.repeat()) == [Command]  # what others have been told once is enough
+
+
+def test_v1_is_repeated_while_a_claim_is_under_way() -> None:
+    """Until it is granted, somebody else may have moved the vehicle."""
+    seat = Seat()
+    cells: tuple[Cell, ...] = ((-1, 1), (-2, 1), (-2, 2), (-3, 2), (-3, 1))
+    for attendant, cell in zip((0, 0, 0, 1, 1), cells, strict=True):
+        command = command_of(seat.feel(attendant, cell=cell))
+        # From the moment it is in charge the hold cell is its own business.
+        assert command.hold_cell == (cell if seat.tick < 5 else cells[3])
+    assert seat.driver.taken_over == [1, 2, 3, 4]
+    assert seat.shown.hold_cell == cells[3]
+
+
+def test_what_moves_when_it_takes_charge_counts_as_moving() -> None:
+    seat = Seat()
+    seat.feel(0)
+    seat.driver.resting = False
+    seat.feel(1)
+    assert seat.shown.moving
+    seat.driver.resting = True
+    seat.feel(1)
+    assert (seat.shown.moving, seat.shown.completed) == (False, 0)
+
+
+# --- giving way -------------------------------------------------------------------------------
+
+
+def test_superseded_by_another_agent_it_is_silent() -> None:
+    seat = Seat()
+    seat.take_charge()
+    seat.prepare()
+    seat.plan()
+    assert wanted(seat) == (0,)
+    for _ in range(3):
+        assert seat.feel(2) == []
+        assert seat.repeat() == []
+    assert not seat.agent.in_charge
+    assert wanted(seat) == ()
+    higher = BALLOT._replace(seq=2)
+    assert seat.prepare(ballot=higher) == []
+    assert seat.plan() == []
+    assert seat.rig.hand(STATE, state_of(OTHER)) == []
+
+
+def test_superseded_by_the_caretaker_it_claims_with_a_new_incarnation_and_no_memory() -> None:
+    seat = Seat()
+    seat.take_charge()
+    seat.prepare()
+    seat.plan()
+    caretaker = seat.rig.new_incarnation()
+    effects = seat.feel(caretaker, caretaker=True)
+    assert kinds(effects) == [Command]
+    assert command_of(effects).incarnation == 3 > caretaker
+    assert seat.prepare(ballot=BALLOT._replace(seq=2)) == []
+    assert seat.plan(incarnation=3) == []
+    assert kinds(seat.feel(3)) == [Command, VehicleState]
+    assert (seat.shown.incarnation, seat.shown.promised, seat.shown.accepted) == (3, None, False)
+    seat.prepare()
+    seat.plan()  # for the incarnation that promised long ago
+    assert not seat.shown.accepted
+    seat.plan(incarnation=3)
+    assert seat.shown.accepted
+
+
+def test_a_claim_that_was_not_heard_is_made_again_with_the_same_incarnation() -> None:
+    seat = Seat()
+    seat.take_charge()
+    caretaker = seat.rig.new_incarnation()
+    claims = [command_of(seat.feel(caretaker, caretaker=True)) for _ in range(3)]
+    assert [claim.incarnation for claim in claims] == [3, 3, 3]
+    assert [claim.tick for claim in claims] == [3, 4, 5]
+
+
+def test_after_another_agent_has_died_it_claims_the_vehicle_from_its_caretaker() -> None:
+    seat = Seat()
+    seat.take_charge()
+    another, caretaker = seat.rig.new_incarnation(), seat.rig.new_incarnation()
+    assert seat.feel(another) == []
+    assert command_of(seat.feel(caretaker, caretaker=True)).incarnation == 4 > caretaker
+
+
+def test_who_finds_that_nobody_is_in_charge_begins_anew() -> None:
+    seat = Seat()
+    seat.take_charge()
+    seat.prepare()
+    assert kinds(seat.feel(0)) == [Command]
+    assert seat.prepare() == []
+    seat.feel(1)
+    assert seat.shown.promised is None
+
+
+def test_it_leaves_with_its_vehicle_whoever_is_in_charge() -> None:
+    seat = Seat()
+    seat.take_charge()
+    seat.feel(9)
+    seat.tick += 1
+    effects = seat.rig.hand(SENSE, evolve(seat.last, tick=seat.tick, left=True))
+    assert kinds(effects) == [Report]
+    assert seat.agent.ended
+
+
+# --- joined formations ------------------------------------------------------------------------
+
+
+def test_a_joint_plan_is_accepted_once_the_controller_has_confirmed_its_formations() -> None:
+    seat = Seat()
+    seat.take_charge()
+    seat.prepare(0, 1)
+    assert (seat.shown.promised, seat.shown.joined) == (BALLOT, (0,))
+    assert seat.plan(0, 1) == []
+    assert command_of(seat.feel(1)).joined == (0, 1)
+    assert seat.plan(0, 1) == []
+    assert command_of(seat.feel(1, joined=(0, 1))).joined == (0, 1)
+    assert (seat.shown.joined, seat.shown.accepted) == ((0, 1), False)
+    seat.plan(0, 1)
+    assert seat.shown.accepted
+    assert wanted(seat) == (0, 1)
+
+
+def test_what_the_controller_has_joined_outlives_the_agent() -> None:
+    seat = Seat()
+    for _ in range(2):
+        command = command_of(seat.feel(1, joined=(0, 3)))
+        assert command.joined == (0, 3)
+    assert seat.shown.joined == (0, 3)
+
+
+def test_what_was_promised_before_the_charge_was_lost_is_not_asked_for_any_more() -> None:
+    seat = Seat()
+    seat.take_charge()
+    seat.prepare(0, 1)
+    caretaker = seat.rig.new_incarnation()
+    assert command_of(seat.feel(caretaker, caretaker=True)).joined == (0,)
+
+
+def test_states_matter_only_while_a_plan_waits_for_them() -> None:
+    seat = Seat()
+    seat.take_charge()
+    seat.prepare()
+    assert wanted(seat) == ()
+    seat.plan()
+    assert wanted(seat) == (0,)
+    seat.rig.hand(STATE, state_of(OTHER))
+    seat.feel(1)
+    assert seat.shown.go
+    assert wanted(seat) == ()
+
+
+def state_of(name: Name) -> VehicleState:
+    """Return what a member shows that has accepted the plan and is ready."""
+    return VehicleState(
+        name, 1, 0, (0,), BALLOT, accepted=True, ready=True, completed=0, hold_cell=(0, 0),
+        moving=False, go=False, done=True, overdue=False, attended=True, s_m=0.0, y_m=0.0,
+        speed_mps=15.0, t_s=0.0,
+    )  # fmt: skip

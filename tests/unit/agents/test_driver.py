@@ -1,0 +1,333 @@
+"""The driver takes motions over, ends them when the body is there, and always has jerks to play."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import attrs
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from laneweave.agents.driver import SENSED_S, Drive, Effort, TrackingDriver
+from laneweave.agents.tracker import Tracker, TrackResult
+from laneweave.agents.trajectory import Window
+from laneweave.protocol.lattice import Cell, Move
+from laneweave.protocol.messages import Neighbour, Report, Sense
+from laneweave.protocol.motion import (
+    ARRIVED_ACROSS_M,
+    ARRIVED_ALONG_M,
+    State,
+    cell_state,
+    integrate,
+    limited_jerk,
+)
+from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.topics import SENSE
+from unit.agents.agent_rig import (
+    HOME,
+    LATTICE,
+    ME,
+    MOVE_TICKS,
+    SCENARIO,
+    TICK_S,
+    sent,
+    up_and_running,
+)
+
+N = SCENARIO.tracking.horizon_ticks
+MOVE: Move = (0, HOME, (-1, 2))
+
+
+class Probe(Tracker):
+    """A tracker that can be broken, and remembers what it was told of the vehicle ahead."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Begin unbroken."""
+        super().__init__(scenario)
+        self.broken = False
+        self.ahead: NDArray[np.float64] | None = None
+
+    def solve(
+        self, state: State, window: Window, ahead: NDArray[np.float64] | None = None
+    ) -> TrackResult:
+        self.ahead = ahead
+        result = super().solve(state, window, ahead)
+        if self.broken:
+            return attrs.evolve(result, usable=False, jerk=np.full_like(result.jerk, np.nan))
+        return result
+
+
+def sense(
+    tick: int = 10,
+    cell: Cell = HOME,
+    *,
+    end_tick: int = 0,
+    origin: Cell | None = None,
+    off: tuple[float, float] = (0.0, 0.0),
+    ahead: tuple[Neighbour, ...] = (),
+) -> Sense:
+    """Return what a vehicle senses that is `off` metres from its cell, along and across."""
+    t_s = tick * TICK_S
+    s, v, a, y, v_y, a_y = cell_state(LATTICE, cell, t_s)
+    state = (s + off[0], v, a, y + off[1], v_y, a_y)
+    return Sense(ME, tick, t_s, state, cell, end_tick, origin or cell, 0, ahead)
+
+
+def driver(make_tracker: Callable[[Scenario], Tracker] = Tracker) -> TrackingDriver:
+    """Return a driver that holds the home cell since tick 10."""
+    made = TrackingDriver(SCENARIO, make_tracker)
+    made.take_over(sense())
+    return made
+
+
+def probed() -> tuple[TrackingDriver, Probe]:
+    probes: list[Probe] = []
+
+    def make(scenario: Scenario) -> Tracker:
+        probes.append(Probe(scenario))
+        return probes[-1]
+
+    return driver(make), probes[0]
+
+
+def jerks(drive: Drive) -> NDArray[np.float64]:
+    return np.frombuffer(drive.jerks, "<f4").reshape(-1, 2).astype(float)
+
+
+def play(state: State, drive: Drive) -> State:
+    """Play all jerks of a drive, one for each tick."""
+    for along, across in jerks(drive).tolist():
+        state = integrate(
+            state, limited_jerk(state, (along, across), SCENARIO.vehicle, TICK_S), TICK_S
+        )
+    return state
+
+
+# --- references -------------------------------------------------------------------------------
+
+
+def test_holding_has_no_end_and_a_whole_horizon_to_play() -> None:
+    drive = driver().drive(sense(), moving=False)
+    assert (drive.motion_end_tick, drive.motion_origin) == (0, HOME)
+    assert jerks(drive) == pytest.approx(np.zeros((N, 2)), abs=1e-4)
+
+
+def test_a_move_ends_after_its_time_and_its_horizon_ends_in_the_target() -> None:
+    made = driver()
+    made.begin(MOVE, 10)
+    drive = made.drive(sense(), moving=True)
+    assert (drive.motion_end_tick, drive.motion_origin) == (10 + MOVE_TICKS, HOME)
+    end = play(sense().state, drive)
+    assert end == pytest.approx(cell_state(LATTICE, MOVE[2], (10 + N) * TICK_S), abs=0.02)
+
+
+def test_a_motion_under_way_is_taken_over_where_it_is() -> None:
+    made = driver()
+    made.begin(MOVE, 10)
+    state = sense().state
+    for tick in range(10, 25):
+        drive = made.drive(attrs.evolve(sense(tick), state=state), moving=True)
+        along, across = jerks(drive)[0].tolist()
+        state = integrate(state, (along, across), TICK_S)
+    felt = attrs.evolve(
+        sense(25, MOVE[2], end_tick=drive.motion_end_tick, origin=drive.motion_origin), state=state
+    )
+    heir = TrackingDriver(SCENARIO)
+    heir.take_over(felt)
+    assert not heir.at_rest(felt)
+    theirs, mine = made.drive(felt, moving=True), heir.drive(felt, moving=True)
+    assert (mine.motion_end_tick, mine.motion_origin) == (10 + MOVE_TICKS, HOME)
+    assert jerks(mine) == pytest.approx(jerks(theirs), abs=1e-3)
+
+
+@pytest.mark.parametrize("end_tick", [0, 9, 10])
+def test_a_motion_whose_time_is_over_is_taken_over_as_a_hold(end_tick: int) -> None:
+    made = TrackingDriver(SCENARIO)
+    made.take_over(sense(end_tick=end_tick, origin=(-2, 1)))
+    assert made.at_rest(sense())
+    assert made.drive(sense(), moving=False).motion_origin == HOME
+
+
+# --- the end of a motion ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("tick", "off", "rests"),
+    [
+        (10 + MOVE_TICKS, (0.0, 0.0), True),
+        (10 + MOVE_TICKS + 50, (0.0, 0.0), True),
+        (10 + MOVE_TICKS - 1, (0.0, 0.0), False),
+        (10 + MOVE_TICKS, (ARRIVED_ALONG_M - 0.01, ARRIVED_ACROSS_M - 0.01), True),
+        (10 + MOVE_TICKS, (-ARRIVED_ALONG_M + 0.01, -ARRIVED_ACROSS_M + 0.01), True),
+        (10 + MOVE_TICKS, (-ARRIVED_ALONG_M - 0.01, 0.0), False),
+        (10 + MOVE_TICKS, (0.0, ARRIVED_ACROSS_M + 0.01), False),
+    ],
+)
+def test_a_motion_ends_when_its_time_is_over_and_the_body_is_there(
+    tick: int, off: tuple[float, float], rests: bool
+) -> None:
+    made = driver()
+    made.begin(MOVE, 10)
+    assert made.at_rest(sense(tick, MOVE[2], off=off)) is rests
+
+
+def test_at_rest_is_meant_for_the_target_and_not_for_where_it_came_from() -> None:
+    made = driver()
+    made.begin(MOVE, 10)
+    assert not made.at_rest(sense(10 + MOVE_TICKS, HOME))
+
+
+def test_a_late_motion_says_that_it_goes_on() -> None:
+    """Whoever takes the vehicle over must not take the time's end for the motion's end."""
+    made = driver()
+    made.begin(MOVE, 10)
+    tick = 10 + MOVE_TICKS + 5
+    late = sense(tick, MOVE[2], off=(-2.0, 0.0))
+    assert made.drive(late, moving=True).motion_end_tick == tick + 1
+    assert made.drive(late, moving=False).motion_end_tick == 0
+
+
+# --- the vehicle ahead ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("ahead", "rear_m"),
+    [
+        ((), None),
+        ((Neighbour(1, 10.0, 15.0),), 10.0),
+        ((Neighbour(0, 5.0, 15.0), Neighbour(2, 6.0, 15.0)), None),
+        ((Neighbour(0, 5.0, 15.0), Neighbour(1, 9.0, 15.0), Neighbour(2, 6.0, 15.0)), 9.0),
+    ],
+    ids=["nobody", "own lane", "beside", "own lane counts only"],
+)
+def test_who_holds_minds_its_own_lane(ahead: tuple[Neighbour, ...], rear_m: float | None) -> None:
+    made, probe = probed()
+    felt = sense(ahead=ahead)
+    made.drive(felt, moving=False)
+    if rear_m is None:
+        assert probe.ahead is None
+    else:
+        assert probe.ahead is not None
+        assert probe.ahead[0] == felt.state[0] + rear_m
+
+
+def test_who_changes_lanes_minds_the_lane_that_it_enters_from_the_start() -> None:
+    made, probe = probed()
+    made.begin(MOVE, 10)
+    felt = sense(ahead=(Neighbour(0, 3.0, 15.0), Neighbour(1, 9.0, 15.0), Neighbour(2, 6.0, 15.0)))
+    made.drive(felt, moving=True)
+    assert probe.ahead is not None
+    assert probe.ahead[0] == felt.state[0] + 6.0
+
+
+@pytest.mark.parametrize(("across_m", "rear_m"), [(1.0, 4.0), (0.8, 9.0), (-1.0, 5.0)])
+def test_a_body_between_lanes_minds_all_that_it_touches(across_m: float, rear_m: float) -> None:
+    """Lanes are 3.5 m wide and bodies 1.8 m: more than 0.85 m off, it is in two lanes."""
+    made, probe = probed()
+    ahead = (Neighbour(0, 5.0, 15.0), Neighbour(1, 9.0, 15.0), Neighbour(2, 4.0, 15.0))
+    felt = sense(off=(0.0, across_m), ahead=ahead)
+    made.drive(felt, moving=False)
+    assert probe.ahead is not None
+    assert probe.ahead[0] == felt.state[0] + rear_m
+
+
+def test_what_is_sensed_is_extrapolated_at_constant_speed_for_a_while() -> None:
+    made, probe = probed()
+    felt = sense(ahead=(Neighbour(1, 20.0, 5.0),))
+    made.drive(felt, moving=False)
+    times_s = np.arange(N + 1) * TICK_S
+    assert probe.ahead is not None
+    known = times_s <= SENSED_S + 1e-9
+    assert probe.ahead[known] == pytest.approx(felt.state[0] + 20.0 + 5.0 * times_s[known])
+    assert np.isinf(probe.ahead[~known]).all()
+
+
+def test_of_two_ahead_the_nearer_one_counts_at_each_moment() -> None:
+    """While it changes lanes: the one behind is faster and passes the other's place."""
+    made, probe = probed()
+    made.begin(MOVE, 10)
+    felt = sense(ahead=(Neighbour(1, 10.0, 5.0), Neighbour(2, 6.0, 15.0)))
+    made.drive(felt, moving=True)
+    assert probe.ahead is not None
+    gaps = probe.ahead[:11] - felt.state[0]
+    assert (gaps[0], gaps[10]) == pytest.approx((6.0, 15.0))
+
+
+# --- when tracking fails ----------------------------------------------------------------------
+
+
+def test_unusable_answers_continue_the_last_good_trajectory() -> None:
+    made, probe = probed()
+    made.begin(MOVE, 10)
+    good = made.drive(sense(), moving=True)
+    probe.broken = True
+    for ticks in (3, 4, 20):
+        drive = made.drive(sense(10 + ticks), moving=True)
+        assert drive.jerks == good.jerks[8 * ticks :]
+        assert drive.motion_end_tick == 10 + MOVE_TICKS
+
+
+def test_when_that_has_run_out_it_goes_to_rest_in_the_target() -> None:
+    made, probe = probed()
+    made.begin(MOVE, 10)
+    made.drive(sense(), moving=True)
+    probe.broken = True
+    felt = sense(10 + N, MOVE[2], off=(-2.0, 0.4))
+    drive = made.drive(felt, moving=True)
+    assert jerks(drive).shape == (N, 2)
+    end = play(felt.state, drive)
+    goal = cell_state(LATTICE, MOVE[2], (10 + 2 * N) * TICK_S)
+    assert abs(end[0] - goal[0]) < 1.0
+    assert abs(end[3] - goal[3]) < 0.2
+
+
+def test_without_any_good_answer_it_keeps_its_cell() -> None:
+    made, probe = probed()
+    probe.broken = True
+    assert jerks(made.drive(sense(), moving=False)) == pytest.approx(np.zeros((N, 2)), abs=1e-6)
+
+
+def test_a_usable_answer_ends_the_fallback() -> None:
+    made, probe = probed()
+    probe.broken = True
+    made.drive(sense(11), moving=False)
+    probe.broken = False
+    felt = sense(12, off=(-1.0, 0.0))
+    drive = made.drive(felt, moving=False)
+    assert jerks(drive)[0, 0] > 1.0
+    assert drive == driver().drive(felt, moving=False)
+
+
+def test_the_effort_counts_solves_and_failures() -> None:
+    made, probe = probed()
+    assert made.effort == Effort()
+    for tick, broken in ((10, False), (11, True), (12, True), (13, False)):
+        probe.broken = broken
+        made.drive(sense(tick), moving=False)
+    effort = made.effort
+    assert (effort.solves, effort.unusable) == (4, 2)
+    solve_ms = np.frombuffer(effort.solve_ms, "<f4")
+    assert len(solve_ms) == 4
+    assert (solve_ms >= 0.0).all()
+
+
+def test_an_agent_with_a_broken_tracker_finishes_its_move_and_reports_the_failures() -> None:
+    probes: list[Probe] = []
+
+    def make(scenario: Scenario) -> TrackingDriver:
+        def make_tracker(of: Scenario) -> Tracker:
+            probes.append(Probe(of))
+            return probes[-1]
+
+        return TrackingDriver(scenario, make_tracker)
+
+    rig = up_and_running(make)
+    rig.accept(MOVE)
+    rig.run(5)
+    probes[-1].broken = True
+    state = rig.run(150)
+    assert (state.completed, state.moving) == (1, False)
+    assert rig.off(MOVE[2]) < 0.3
+    (report,) = sent(rig.hand(SENSE, rig.sense(left=True)), Report)
+    assert (report.solves, report.unusable) == (rig.tick, 150)

@@ -1,0 +1,388 @@
+"""Who is in charge of a vehicle at the bridge: its agent, or a caretaker that speaks for it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import pytest
+from attrs import evolve
+
+from laneweave.protocol.messages import Ballot, Name, Plan, Prepare, Sense, VehicleState
+from laneweave.protocol.node import Arrived, Effect, Listen, Send, Stopping, Unlisten
+from laneweave.protocol.topics import COMMAND, PLAN, PREPARE, STATE
+from laneweave.protocol.transport import LinkDown, LinkUp
+from laneweave.sim_bridge.core import Phase
+from unit.sim_bridge.bench import (
+    Desk,
+    arrival,
+    jerks,
+    make_scenario,
+    read_events,
+    read_summary,
+    sent,
+)
+
+SCENARIO = make_scenario()
+TICK_S = SCENARIO.runtime.tick_s
+SILENT_S = SCENARIO.runtime.agent_silent_s
+MISSES = round(SILENT_S / SCENARIO.runtime.tick_deadline_s)
+"""Deadlines that an agent misses before it is silent."""
+A, B = Name("A"), Name("B")
+TWO = (arrival(A, 0.5, lane=1), arrival(B, 0.6, lane=0))
+OF_B = {"vehicle": B}
+CARE_OF_B: list[Effect] = [Listen(PREPARE, OF_B), Listen(PLAN, OF_B)]
+CARE_OF_B_ENDS: list[Effect] = [Unlisten(PREPARE, OF_B), Unlisten(PLAN, OF_B)]
+AGENT = 17
+"""Incarnation of B's agent."""
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Desk:
+    """Two vehicles have just entered, and both agents have been asked."""
+    desk = Desk(SCENARIO, tmp_path, TWO)
+    desk.start(A, B)
+    desk.drive_to_entry(A, B)
+    desk.effects.clear()
+    return desk
+
+
+@pytest.fixture
+def attended(desk: Desk) -> Desk:
+    """B's agent is in charge, and the next tick has begun."""
+    desk.answer(B, incarnation=AGENT)
+    next_tick(desk, A)
+    return desk
+
+
+@pytest.fixture
+def cared_for(attended: Desk) -> Desk:
+    """B's agent has died, its caretaker is in charge."""
+    attended.down(B)
+    next_tick(attended, A)
+    return attended
+
+
+def next_tick(desk: Desk, *answering: Name) -> list[Effect]:
+    """Let some answer and the others not; return what is said from then to the next answers."""
+    tick = desk.core.tick
+    desk.effects.clear()
+    for name in answering:
+        desk.answer(name)
+    deaf = {A, B} - set(answering)
+    desk.drive(lambda: desk.core.tick > tick and desk.core.phase is Phase.ANSWERS, *deaf)
+    return desk.effects
+
+
+def sense_of(effects: Iterable[Effect], vehicle: Name, tick: int) -> Sense:
+    (sense,) = (s for s in sent(effects, Sense) if (s.vehicle, s.tick) == (vehicle, tick))
+    assert isinstance(sense, Sense)
+    return sense
+
+
+def sensed(desk: Desk, vehicle: Name) -> Sense:
+    """Return what a vehicle was told in this tick."""
+    return sense_of(desk.effects, vehicle, desk.core.tick)
+
+
+def listening(effects: Iterable[Effect]) -> list[Effect]:
+    return [effect for effect in effects if isinstance(effect, (Listen, Unlisten))]
+
+
+def known(desk: Desk, vehicle: Name) -> tuple[object, ...]:
+    """Return all that a motion controller knows."""
+    controller = desk.core.vehicles[vehicle].controller
+    return (
+        controller.command_tick,
+        controller.attendant,
+        controller.joined,
+        controller.hold_cell,
+        controller.motion_end_tick,
+        controller._jerks.tobytes(),
+    )
+
+
+# --- agents -----------------------------------------------------------------------------------
+
+
+def test_the_first_agent_is_in_charge_with_its_first_command(desk: Desk) -> None:
+    assert desk.core.vehicles[B].controller.attendant == 0
+    desk.answer(B, incarnation=AGENT)
+    next_tick(desk, A)
+    sense = sensed(desk, B)
+    block = SCENARIO.lattice.block_of(sense.hold_cell[0])
+    assert (sense.attendant, sense.caretaker) == (AGENT, False)
+    assert (sense.formation, sense.joined) == (block, (block,))
+    assert read_events(desk.folder, "agent-took-over") == []
+
+
+def test_what_the_controller_has_joined_is_confirmed(attended: Desk) -> None:
+    block = attended.core.vehicles[B].formation
+    attended.answer(B, incarnation=AGENT, joined=(block + 1,))
+    next_tick(attended, A)
+    assert sensed(attended, B).joined == (block, block + 1)
+
+
+def test_an_agent_that_restarts_takes_charge_and_its_zombie_does_not(attended: Desk) -> None:
+    attended.answer(B, incarnation=AGENT + 1)
+    before = known(attended, B)
+    attended.answer(B, incarnation=AGENT, jerks=jerks((9.0, 0.0)))
+    assert known(attended, B) == before
+    next_tick(attended, A)
+    attended.answer(B, incarnation=AGENT, jerks=jerks((9.0, 0.0)))
+    assert known(attended, B) == before
+    assert attended.core._answers.awaited == {A, B}  # it is not the zombie's answer that counts
+    (event,) = read_events(attended.folder, "agent-took-over")
+    assert (event["vehicle"], event["previous"]) == (B, "agent")
+
+
+def test_the_answers_of_a_zombie_are_no_sign_of_life(attended: Desk) -> None:
+    attended.answer(B, incarnation=AGENT + 1)
+    next_tick(attended, A)
+    for _ in range(MISSES):
+        attended.answer(B, incarnation=AGENT)
+        next_tick(attended, A)
+    assert attended.core._answers.silent == {B}
+    assert sensed(attended, B).caretaker
+
+
+def test_a_claim_that_fails_is_tried_again_with_the_next_tick(desk: Desk) -> None:
+    desk.answer(B, incarnation=AGENT)
+    desk.answer(B, incarnation=AGENT + 1)
+    next_tick(desk, A)
+    assert sensed(desk, B).attendant == AGENT
+    desk.answer(B, incarnation=AGENT + 1)
+    next_tick(desk, A)
+    assert sensed(desk, B).attendant == AGENT + 1
+
+
+# --- caretakers take charge -------------------------------------------------------------------
+
+
+def test_the_caretaker_takes_charge_when_the_agent_is_gone(attended: Desk) -> None:
+    attended.down(B)
+    effects = next_tick(attended, A)
+    attendant = sensed(attended, B).attendant
+    assert sensed(attended, B).caretaker
+    assert attendant > AGENT
+    assert listening(effects) == CARE_OF_B
+    (event,) = read_events(attended.folder, "caretaker-took-over")
+    assert (event["vehicle"], event["reason"]) == (B, "absent")
+    for _ in range(5):  # once
+        assert listening(next_tick(attended, A)) == []
+        assert sensed(attended, B).attendant == attendant
+
+
+def test_the_caretaker_takes_charge_when_the_agent_is_silent(attended: Desk) -> None:
+    for _ in range(MISSES - 1):
+        next_tick(attended, A)
+        assert not sensed(attended, B).caretaker
+    effects = next_tick(attended, A)
+    assert sensed(attended, B).caretaker
+    assert listening(effects) == CARE_OF_B
+    (event,) = read_events(attended.folder, "caretaker-took-over")
+    assert (event["vehicle"], event["reason"]) == (B, "silent")
+
+
+def test_the_caretaker_takes_charge_when_the_agent_never_came(tmp_path: Path) -> None:
+    desk = Desk(SCENARIO, tmp_path, TWO)
+    desk.start(A)
+    desk.drive_to_entry(A, B)
+    assert sensed(desk, B).caretaker
+    assert listening(desk.effects)[-2:] == CARE_OF_B
+    (event,) = read_events(tmp_path, "caretaker-took-over")
+    assert (event["vehicle"], event["reason"]) == (B, "absent")
+
+
+def test_an_agent_that_is_back_at_once_needs_no_caretaker(attended: Desk) -> None:
+    attended.down(B)
+    attended.up(B)
+    next_tick(attended, A)
+    assert not sensed(attended, B).caretaker
+
+
+def test_caretakers_have_greater_incarnations_than_all_before(desk: Desk) -> None:
+    desk.answer(B, incarnation=10**18)
+    desk.down(B)
+    next_tick(desk, A)
+    assert sensed(desk, B).attendant == 10**18 + 1
+
+
+def test_caretakers_take_incarnations_as_processes_do(tmp_path: Path) -> None:
+    desk = Desk(SCENARIO, tmp_path, TWO)
+    desk.core._attendance._new_incarnation = lambda: 10**9
+    desk.start(A)
+    desk.drive_to_entry(A, B)
+    assert sensed(desk, B).attendant == 10**9
+
+
+def test_there_are_no_caretakers_while_the_bridge_is_off_the_network(attended: Desk) -> None:
+    attended.down(B)  # a moment before the bridge hears that its own link is down
+    attended.give(LinkDown())
+    away_s = attended.now_s
+    attended.drive(lambda: attended.now_s >= away_s + 2 * SILENT_S, A, B)
+    assert attended.core.tick > SILENT_S / TICK_S
+    assert read_events(attended.folder, "caretaker-took-over") == []
+    attended.give(LinkUp())
+    came_s, lease_s = attended.now_s, SCENARIO.network.lease_s
+    attended.drive(lambda: B in attended.core._attendance, B)
+    # The others come back about now, too: only a little later it says something that B did not.
+    assert came_s + lease_s <= attended.now_s <= came_s + lease_s + 2 * TICK_S
+    assert A not in attended.core._attendance
+
+
+# --- what caretakers say ----------------------------------------------------------------------
+
+
+def ballot_for(desk: Desk) -> tuple[Prepare, Plan]:
+    """Return a ballot for B alone, which only holds."""
+    sense = desk.core.vehicles[B].sense(0, caretaker=True)
+    ballot = Ballot(1, Name("c1"), 7, 1)
+    prepare = Prepare(ballot, (sense.formation,), (B,))
+    plan = Plan(
+        ballot=ballot,
+        formations=prepare.formations,
+        roster=(B,),
+        incarnations={B: sense.attendant},
+        start_cells={B: sense.hold_cell},
+        moves={B: ()},
+        t0_s=0.0,
+        slot_s=4.0,
+        territory=(sense.hold_cell,),
+    )
+    return prepare, plan
+
+
+def test_a_caretaker_shows_its_vehicle_at_each_tick(cared_for: Desk) -> None:
+    for _ in range(3):
+        effects = next_tick(cared_for, A)
+        (send,) = (e for e in effects if isinstance(e, Send) and e.topic is STATE)
+        state, vehicle = send.message, cared_for.core.vehicles[B]
+        assert send.parameters == {"formation": vehicle.formation, "vehicle": B}
+        assert (state.vehicle, state.attended, state.t_s) == (B, False, cared_for.core.t_s)
+        assert (state.incarnation, state.s_m) == (vehicle.controller.attendant, vehicle.state[0])
+
+
+def test_a_caretaker_promises_and_accepts_at_once(cared_for: Desk) -> None:
+    prepare, plan = ballot_for(cared_for)
+    (state,) = sent(cared_for.give(Arrived(PREPARE, OF_B, prepare)), VehicleState)
+    assert (state.promised, state.accepted) == (prepare.ballot, False)
+    (state,) = sent(cared_for.give(Arrived(PLAN, OF_B, plan)), VehicleState)
+    assert (state.promised, state.accepted) == (prepare.ballot, True)
+
+
+def test_a_caretaker_accepts_no_plan_that_moves_its_vehicle(cared_for: Desk) -> None:
+    prepare, plan = ballot_for(cared_for)
+    column, lane = cell = plan.start_cells[B]
+    target = (column, 1 - lane)
+    moving = evolve(plan, moves={B: ((0, cell, target),)}, territory=(cell, target))
+    cared_for.give(Arrived(PREPARE, OF_B, prepare))
+    assert cared_for.give(Arrived(PLAN, OF_B, moving)) == []
+    (state,) = sent(next_tick(cared_for, A), VehicleState)
+    assert not state.accepted
+
+
+def test_nobody_at_the_bridge_speaks_for_a_vehicle_with_an_agent(attended: Desk) -> None:
+    prepare, plan = ballot_for(attended)
+    assert attended.give(Arrived(PREPARE, OF_B, prepare)) == []
+    assert attended.give(Arrived(PLAN, OF_B, plan)) == []
+    assert sent(next_tick(attended, A, B), VehicleState) == []
+
+
+# --- agents take their vehicles back ----------------------------------------------------------
+
+
+def test_an_agent_that_was_gone_takes_its_vehicle_back(cared_for: Desk) -> None:
+    cared_for.up(B)
+    next_tick(cared_for, A)
+    assert cared_for.core._answers.awaited == {A, B}
+    check_takes_back(cared_for)
+
+
+def test_an_agent_that_was_silent_takes_its_vehicle_back(attended: Desk) -> None:
+    attended.drive_to_silence(B)
+    late = attended.command(B, tick=attended.core.tick - 1, incarnation=AGENT)
+    attended.give(Arrived(COMMAND, OF_B, late))
+    next_tick(attended, A)
+    assert attended.core._answers.awaited == {A, B}
+    check_takes_back(attended)
+
+
+def check_takes_back(desk: Desk) -> None:
+    care = sensed(desk, B).attendant
+    before = known(desk, B)
+    assert desk.answer(B, incarnation=AGENT) == []  # it does not know yet
+    assert known(desk, B) == before
+    assert desk.answer(B, incarnation=care + 1) == CARE_OF_B_ENDS
+    next_tick(desk, A)
+    sense = sensed(desk, B)
+    assert (sense.attendant, sense.caretaker) == (care + 1, False)
+    (event,) = read_events(desk.folder, "agent-took-over")
+    assert (event["vehicle"], event["previous"]) == (B, "caretaker")
+    desk.give(Stopping())
+    tracking = read_summary(desk.folder)["tracking"]
+    assert (tracking["caretaker_takeovers"], tracking["agent_takeovers"]) == (1, 1)
+
+
+def test_an_agent_cannot_move_its_vehicle_with_the_claim(cared_for: Desk) -> None:
+    cared_for.up(B)
+    next_tick(cared_for, A)
+    before = known(cared_for, B)
+    assert cared_for.answer(B, hold_cell=(-1, 1)) == []
+    assert known(cared_for, B) == before
+    assert cared_for.core._answers.awaited == {A, B}
+
+
+def test_a_caretaker_that_has_given_way_says_nothing_more(cared_for: Desk) -> None:
+    prepare, _ = ballot_for(cared_for)
+    cared_for.up(B)
+    next_tick(cared_for, A)
+    cared_for.answer(B)
+    assert cared_for.give(Arrived(PREPARE, OF_B, prepare)) == []
+    assert sent(next_tick(cared_for, A), VehicleState) == []
+
+
+def test_the_next_caretaker_remembers_the_joined_formations_only(cared_for: Desk) -> None:
+    prepare, _ = ballot_for(cared_for)
+    both = (prepare.formations[0], prepare.formations[0] + 1)
+    cared_for.give(Arrived(PREPARE, OF_B, evolve(prepare, formations=both)))
+    first = cared_for.core.vehicles[B].controller.attendant
+    cared_for.up(B)
+    next_tick(cared_for, A)
+    cared_for.answer(B)
+    cared_for.down(B)
+    (state,) = sent(next_tick(cared_for, A), VehicleState)
+    assert (state.promised, state.joined) == (None, both)
+    assert state.incarnation > first
+
+
+# --- leaving ----------------------------------------------------------------------------------
+
+
+def test_caretakers_end_with_their_vehicles(tmp_path: Path) -> None:
+    desk = Desk(SCENARIO, tmp_path, [*TWO, arrival("C", 9.0)])
+    desk.start(A, "C")
+    desk.drive_to_entry(A, B)
+    desk.drive(lambda: B not in desk.core.vehicles)
+    assert listening(desk.effects)[-4:] == CARE_OF_B + CARE_OF_B_ENDS
+    assert B not in desk.core._attendance
+
+
+def test_vehicles_that_leave_off_their_lane_are_reported(tmp_path: Path) -> None:
+    arrivals = [
+        arrival(A, 0.5, lane=1, preferred_lane=0),
+        arrival(B, 0.6, lane=0, preferred_lane=1),
+        arrival("C", 5.0, lane=1, preferred_lane=1),
+    ]
+    desk = Desk(SCENARIO, tmp_path, arrivals)
+    desk.start(A, "C")
+    desk.drive(lambda: desk.core.phase is Phase.WIND_UP)
+    found = {
+        event["vehicle"]: (event["lane"], event["preferred_lane"], event["attended"])
+        for event in read_events(tmp_path, "left-off-lane")
+    }
+    assert found == {A: (1, 0, True), B: (0, 1, False)}
+    desk.give(Stopping())
+    vehicles = read_summary(tmp_path)["vehicles"]
+    assert (vehicles["left"], vehicles["on_preferred_lane"]) == (3, 1)
+    assert (vehicles["left_off_lane"], vehicles["left_unattended"]) == (2, 1)
