@@ -67,10 +67,10 @@ def messages(vehicle: Name, *, number: int, real: float) -> dict[type, Any]:
     ballot = Ballot(number, GHOST, number, number)
     made = (
         Heartbeat(Name("zz"), number, number, leading=False, formations=number),
-        Prepare(ballot, number, (vehicle,)),
+        Prepare(ballot, (number,), (vehicle,)),
         Plan(
             ballot,
-            number,
+            (number,),
             (vehicle,),
             {vehicle: number},
             {vehicle: cell},
@@ -83,6 +83,7 @@ def messages(vehicle: Name, *, number: int, real: float) -> dict[type, Any]:
             vehicle,
             number,
             number,
+            (number,),
             ballot,
             accepted=True,
             ready=True,
@@ -92,6 +93,7 @@ def messages(vehicle: Name, *, number: int, real: float) -> dict[type, Any]:
             go=True,
             done=True,
             overdue=True,
+            attended=True,
             s_m=real,
             y_m=real,
             speed_mps=real,
@@ -108,7 +110,9 @@ def messages(vehicle: Name, *, number: int, real: float) -> dict[type, Any]:
             number,
             (Neighbour(number, real, real),),
         ),
-        Command(vehicle, number, cell, number, cell, b"\xff\xff\x7f\x7f" * 80),
+        Command(
+            vehicle, number, number, cell, number, cell, b"\xff\xff\x7f\x7f" * 80, (number,) * 3
+        ),
         Census(
             real,
             (CensusEntry(vehicle, cell, number, real),),
@@ -116,7 +120,15 @@ def messages(vehicle: Name, *, number: int, real: float) -> dict[type, Any]:
         ),
         RoadClock(number, real, number, number, number, number, ended=True),
         Report(
-            Name("agent"), vehicle, GHOST, number, number, number, number, b"\x00\x00\xc0\x7f" * 9
+            Name("agent"),
+            vehicle,
+            GHOST,
+            number,
+            number,
+            number,
+            number,
+            number,
+            b"\x00\x00\xc0\x7f" * 9,
         ),
         LogEvent(
             Name("agent"),

@@ -97,6 +97,8 @@ class CoordinatorCore:
         """Each under the least number of its formations."""
         self.census: Census | None = None
         self.t_s = 0.0
+        self._formation_of: dict[Name, int] = {}
+        """In whose block each vehicle of the census entered."""
         self._rules = rules
         self._groups = Groups()
         self._planner = FormationPlanner(scenario, self._groups)
@@ -183,6 +185,7 @@ class CoordinatorCore:
         if incarnation > self._bridge:
             self._bridge = incarnation
             self.census = None
+            self._formation_of = {}
             self.t_s = 0.0
             self._groups.forget()
             self._forget_formations()
@@ -201,12 +204,18 @@ class CoordinatorCore:
             case Census():
                 if self.census is None or message.t_s >= self.census.t_s:
                     self.census = message
+                    block_of = self.scenario.lattice.block_of
+                    self._formation_of = {
+                        entry.vehicle: block_of(entry.cell[0]) for entry in message.on_road
+                    }
                     self.t_s = max(self.t_s, message.t_s)
                     self._road_changed = True
             case _:
                 pass
 
     def _on_state(self, state: VehicleState, now_s: float) -> Iterator[Effect]:
+        if self._formation_of.get(state.vehicle) != state.formation:
+            return  # of a vehicle that has left, or that the census does not know yet
         # What a vehicle has joined stays joined, whoever had it joined.
         if self._groups.join((state.formation, *state.joined)):
             self._road_changed = True
