@@ -33,28 +33,27 @@ class Experiment:
     faults: str | None
     """A preset, or a file in `benchmarks/faults`."""
     options: tuple[str, ...] = ()
+    scenario: str | None = None
+    """A file in `benchmarks`."""
 
 
 FULL_ROAD = ("--volume", "1600", "--seed", "1", "--duration", "300")
 REAL_TIME = ("--pace", "1")
+SHORT_TICKS = "short-ticks.toml"
 EXPERIMENTS = (
     Experiment("undisturbed", None, FULL_ROAD),
-    Experiment("loss-10", "lossy10", FULL_ROAD),
-    Experiment("loss-30", "loss-30.toml", FULL_ROAD),
-    Experiment("loss-50", "lossy50", FULL_ROAD),
+    Experiment("loss-10", "lossy10", FULL_ROAD, SHORT_TICKS),
+    Experiment("loss-30", "loss-30.toml", FULL_ROAD, SHORT_TICKS),
+    Experiment("loss-50", "lossy50", FULL_ROAD, SHORT_TICKS),
     Experiment("blackout", "blackout", FULL_ROAD),
     Experiment("blackout-from-start", "blackout-from-start.toml", FULL_ROAD),
     Experiment("agents-killed", "agents-killed.toml", FULL_ROAD),
     Experiment("router-killed", "router-killed-10-times.toml", (*FULL_ROAD, *REAL_TIME)),
-    Experiment(
-        "leader-killed",
-        "leader-killed-50-times.toml",
-        ("--volume", "1600", "--seed", "1", "--duration", "300", *REAL_TIME),
-    ),
+    Experiment("leader-killed", "leader-killed-50-times.toml", (*FULL_ROAD, *REAL_TIME)),
     Experiment(
         "leader-stopped",
         "leader-stopped-30-times.toml",
-        ("--volume", "1600", "--seed", "1", "--duration", "560", *REAL_TIME),
+        ("--volume", "600", "--seed", "1", "--duration", "560", *REAL_TIME),
     ),
     Experiment("everything", "everything", FULL_ROAD),
 )
@@ -63,6 +62,8 @@ EXPERIMENTS = (
 def run(experiment: Experiment, folder: Path) -> dict[str, Any]:
     """Run an experiment and return its figures."""
     command = [str(Path(sys.executable).parent / "laneweave"), "run", "--no-progress"]
+    if experiment.scenario is not None:
+        command.append(str(HERE / experiment.scenario))
     command += [*experiment.options, "--out", str(folder)]
     if experiment.faults is not None:
         path = HERE / "faults" / experiment.faults

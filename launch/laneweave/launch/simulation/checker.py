@@ -68,13 +68,16 @@ class _Run:
 class Checker:
     """Watches one run; `violations` says what it saw."""
 
-    def __init__(self, geometry: Geometry) -> None:
-        """Watch an empty road."""
+    def __init__(
+        self, geometry: Geometry, note: Callable[[float, str], None] | None = None
+    ) -> None:
+        """Watch an empty road; `note` is told of what happens on it."""
         self.violations: list[Violation] = []
         self.motions = 0
         self.plans: dict[Ballot, Plan] = {}
         """Every plan that was sent."""
         self._geometry = geometry
+        self._note = note
         self._bodies: dict[str, Body] = {}
         self._moving: dict[str, tuple[float, Cell, Ballot | None]] = {}
         """For each body in motion when it is over, where, and of which plan it is."""
@@ -98,12 +101,14 @@ class Checker:
 
     def enter(self, t_s: float, vehicle: str, cell: Cell) -> None:
         """A vehicle entered the road."""
+        self._tell_of(t_s, f"{vehicle} enters in {cell}")
         self.advance(t_s)
         self._bodies[vehicle] = Body.standing(self._geometry, cell, t_s)
         self._check_cells(t_s, vehicle)
 
     def leave(self, t_s: float, vehicle: str) -> None:
         """A vehicle left the road."""
+        self._tell_of(t_s, f"{vehicle} leaves the road")
         self.advance(t_s)
         self._end_motion(vehicle)
         del self._bodies[vehicle]
@@ -120,6 +125,7 @@ class Checker:
             way: the cell in which the vehicle held, and that in which it will.
             lasts_s: how long it takes.
         """
+        self._tell_of(t_s, f"{vehicle} moves from {way[0]} to {way[1]} in {lasts_s:.2f} s")
         self.advance(t_s)
         self.motions += 1
         body = self._bodies[vehicle]
@@ -240,6 +246,10 @@ class Checker:
         shown.hold_cell = state.hold_cell
         if len(shown.joined) != len(state.joined):
             shown.joined = frozenset(state.joined)
+
+    def _tell_of(self, t_s: float, event: str) -> None:
+        if self._note is not None:
+            self._note(t_s, f"*** {event}")
 
     def _tell(self, kind: str, t_s: float, vehicles: Iterable[str], text: str) -> None:
         if len(self.violations) < MOST_VIOLATIONS:

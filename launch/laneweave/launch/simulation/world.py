@@ -135,7 +135,8 @@ class World:
         self.checker = Checker(
             Geometry(
                 scenario.formation.gap_m, scenario.road.lane_width_m, size.length_m, size.width_m
-            )
+            ),
+            story.tell if story is not None else None,
         )
         self._rules = vehicle_rules, leader_rules
         self._story = story

@@ -35,7 +35,7 @@ def plan(seq: int, moves: dict[Name, tuple[Move, ...]]) -> Plan:
     )
 
 
-def state(vehicle: Name, seq: int | None, hold_cell: Cell = (0, 0), **more: Any) -> VehicleState:
+def state(vehicle: Name, seq: int | None, hold_cell: Cell = (0, 0), **more: object) -> VehicleState:
     values: dict[str, Any] = {
         "vehicle": vehicle,
         "incarnation": 1,
@@ -67,6 +67,7 @@ class Scene:
     """A road with vehicles whose agents do as plans say."""
 
     def __init__(self, **cells: Cell) -> None:
+        """Put vehicles in cells."""
         self.checker = Checker(GEOMETRY)
         self.cells = {Name(name): cell for name, cell in cells.items()}
         for name, cell in self.cells.items():

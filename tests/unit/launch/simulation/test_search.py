@@ -1,0 +1,150 @@
+"""`laneweave simulate`: seeds, processes, what is printed, and how it ends."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from attrs import evolve
+
+from laneweave.launch.simulation.checker import Violation
+from laneweave.launch.simulation.profiles import PROFILES
+from laneweave.launch.simulation.search import (
+    Result,
+    check_jobs,
+    describe,
+    parse_seeds,
+    run_seeds,
+    search,
+    tell_story,
+)
+from laneweave.launch.simulation.world import Outcome, Totals
+from laneweave.protocol.errors import BadInputError
+
+CALM = PROFILES["calm"]
+LANEWEAVE = Path(sys.executable).with_name("laneweave")
+
+
+def simulate(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [LANEWEAVE, "simulate", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize(("text", "seeds"), [("0:1", range(1)), ("5:20", range(5, 20))])
+def test_seeds(text: str, seeds: range) -> None:
+    assert parse_seeds(text) == seeds
+
+
+@pytest.mark.parametrize("text", ["", "5", "3:3", "4:3", "-1:3", "a:b", "0:1:2", "0:99999999999"])
+def test_bad_seeds(text: str) -> None:
+    with pytest.raises(BadInputError, match="A:B with A < B"):
+        parse_seeds(text)
+
+
+@pytest.mark.parametrize("jobs", [0, -1, 1000])
+def test_bad_jobs(jobs: int) -> None:
+    with pytest.raises(BadInputError, match="--jobs"):
+        check_jobs(jobs)
+
+
+def test_several_processes_come_to_the_same_as_one() -> None:
+    one = search(range(30), CALM, jobs=1, digest=True)
+    two = search(range(30), CALM, jobs=2, digest=True)
+    assert one.digests == two.digests
+    assert one.digest == two.digest
+    assert evolve(one.totals, cpu_s=0.0, virtual_s=0.0) == evolve(
+        two.totals, cpu_s=0.0, virtual_s=0.0
+    )
+    assert len(set(one.digests.values())) == one.passed == 30
+
+
+def test_profiles_and_seeds_make_different_runs() -> None:
+    digests = {
+        run_seeds([seed], PROFILES[name], digest=True)[0].digest
+        for seed in (1, 2)
+        for name in ("calm", "dense")
+    }
+    assert len(digests) == 4
+
+
+def test_failures_are_described_with_the_command_that_replays_them() -> None:
+    violation = Violation("cell", 3.25, ("v01", "v02"), "both occupy [(0, 0)]")
+    failed = (Outcome(17, (violation,), Totals(runs=1)),)
+    lines = list(describe(Result(Totals(runs=20), failed), CALM))
+    assert lines[:3] == [
+        "seed 17 failed:",
+        "     3.250 s  cell: v01, v02: both occupy [(0, 0)]",
+        "  again: laneweave simulate --seeds 17:18 --profile calm --verbose",
+    ]
+    assert lines[-1] == "19 passed, 1 failed"
+
+
+def test_the_story_of_a_run() -> None:
+    lines = list(tell_story(1, CALM))
+    assert lines[0] == "seed 1, profile calm:"
+    told = "\n".join(lines)
+    for word in (
+        "PREPARE",
+        "PLAN",
+        "STATE",
+        "COMMAND",
+        "moves",
+        "everything is made whole",
+        "*** v01",
+    ):
+        assert word in told
+
+
+def test_the_command() -> None:
+    done = simulate("--seeds", "0:4", "--profile", "calm", "--jobs", "2", "--digest")
+    assert done.returncode == 0
+    lines = done.stdout.splitlines()
+    assert lines[0].startswith("digest ")
+    assert "x real time on one core" in lines[1]
+    assert lines[-1] == "4 passed, 0 failed"
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["--seeds", "9:3"], "--seeds: got '9:3'; allowed: A:B with A < B"),
+        (["--profile", "mild"], "--profile: got 'mild'; allowed: mixed, calm"),
+        (["--jobs", "0"], "--jobs: got 0; allowed: [1, 256]"),
+    ],
+)
+def test_bad_input_is_one_line(arguments: list[str], line: str) -> None:
+    done = simulate(*arguments)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith(line)
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_interrupted(jobs: str) -> None:
+    process = subprocess.Popen(
+        [LANEWEAVE, "simulate", "--seeds", "0:100000", "--jobs", jobs],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        time.sleep(3.0)
+        assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 1
+    assert out == ""
+    assert err == "interrupted\n"

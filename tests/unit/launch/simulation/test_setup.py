@@ -1,0 +1,80 @@
+"""What a seed draws: roads, visits and wishes that make sense under every profile."""
+
+import random
+from collections import Counter
+
+import pytest
+
+from laneweave.launch.simulation.profiles import PROFILES, profile_named
+from laneweave.launch.simulation.setup import Setup
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario_checks import check_scenario
+
+EVERY = pytest.mark.parametrize("name", PROFILES)
+
+
+def draw(name: str, count: int = 60) -> list[tuple[Setup, random.Random]]:
+    rngs = [random.Random(seed) for seed in range(count)]
+    return [(Setup.drawn(PROFILES[name], rng), rng) for rng in rngs]
+
+
+@EVERY
+def test_every_road_is_a_valid_scenario_with_room_for_all(name: str) -> None:
+    for setup, _ in draw(name):
+        check_scenario(setup.scenario)
+        cells = [visit.cell for visit in setup.visits]
+        assert len(set(cells)) == len(cells)
+        lattice = setup.scenario.lattice
+        for visit in setup.visits:
+            assert lattice.block_of(visit.cell[0]) in setup.blocks
+            assert visit.enters_s >= lattice.passing_time_s(visit.cell[0])
+            assert visit.leaves_s is None or visit.leaves_s > visit.enters_s
+
+
+@EVERY
+def test_in_every_formation_somebody_stays(name: str) -> None:
+    for setup, _ in draw(name):
+        lattice = setup.scenario.lattice
+        stay = {lattice.block_of(visit.cell[0]) for visit in setup.visits if not visit.leaves_s}
+        assert stay == set(setup.blocks)
+
+
+@EVERY
+def test_the_last_wishes_can_be_fulfilled(name: str) -> None:
+    for setup, rng in draw(name):
+        columns, lattice = setup.scenario.formation.block_columns, setup.scenario.lattice
+        wishes = setup.wishes(rng, last=True)
+        lanes = Counter(
+            (lattice.block_of(visit.cell[0]), wishes[visit.vehicle]) for visit in setup.visits
+        )
+        if max(lanes.values()) > columns:
+            assert setup.scenario.formation.max_joined > 1
+            assert len(setup.blocks) == 2
+            together = Counter(wishes.values())
+            assert max(together.values()) <= 2 * columns
+
+
+def test_lanes_are_crowded_now_and_then() -> None:
+    crowded = 0
+    for setup, rng in draw("joint"):
+        lattice = setup.scenario.lattice
+        wishes = setup.wishes(rng, last=True)
+        lanes = Counter(
+            (lattice.block_of(visit.cell[0]), wishes[visit.vehicle]) for visit in setup.visits
+        )
+        crowded += max(lanes.values()) > setup.scenario.formation.block_columns
+    assert crowded > 5
+
+
+def test_profiles_draw_from_their_ranges() -> None:
+    for name, profile in PROFILES.items():
+        for setup, _ in draw(name):
+            assert setup.mix.conditions.loss in profile.loss
+            assert setup.scenario.road.lanes in range(profile.lanes[0], profile.lanes[1] + 1)
+            assert len(setup.blocks) in range(profile.blocks[0], profile.blocks[1] + 1)
+    assert all(len(setup.visits) == 12 for setup, _ in draw("dense"))
+
+
+def test_an_unknown_profile_is_refused() -> None:
+    with pytest.raises(BadInputError, match="mixed, calm, loss"):
+        profile_named("mild")
