@@ -139,10 +139,11 @@ def test_a_vehicle_without_agent_gets_a_caretaker_that_gives_way(bench: Bench) -
     sense = next(message for message in sent if isinstance(message, Sense))
     assert sense.caretaker
     assert sense.attendant == 100
-    prepare = Prepare(Ballot(1, Name("c1"), 1, 1), (-2,), (A,))
+    prepare = Prepare(Ballot(1, Name("c1"), 1, 1), (-1,), (A,))
     (state,) = messages(bench.road.handle(Arrived(PREPARE, OWN, prepare), bench.now_s))
     assert isinstance(state, VehicleState)
     assert state.promised == prepare.ballot
+    bench.agent(up=True)
     bench.command(101, (4, 1))
     assert not bench.sense().caretaker
     assert bench.road.takeovers == 1
