@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import pytest
@@ -27,6 +27,7 @@ from laneweave.protocol.messages import (
     Prepare,
     VehicleState,
 )
+from laneweave.protocol.node import Effect
 from laneweave.protocol.plans import Needs, dependencies
 from laneweave.protocol.transitions import Transition
 from laneweave.sim_bridge.caretaker import Caretaker
@@ -288,6 +289,17 @@ def speak_at_once(patch: pytest.MonkeyPatch) -> None:
         return self.execution is not None and not self.ended
 
     patch.setattr(AgentCore, "in_charge", property(mutant))
+
+
+def note_by_itself(patch: pytest.MonkeyPatch) -> None:
+    ask = AgentCore._ask_to_note
+
+    def mutant(self: AgentCore, execution: PlanExecution) -> Iterator[Effect]:
+        yield from ask(self, execution)
+        if execution.plan is not None and execution.on_noted(execution.plan.ballot):
+            yield self._show()
+
+    patch.setattr(AgentCore, "_ask_to_note", mutant)
 
 
 def keep_incarnation(patch: pytest.MonkeyPatch) -> None:

@@ -73,7 +73,7 @@ BUGS: tuple[PlantedBug, ...] = (
     # --- V2: promises
     PlantedBug(
         "lower-ballot-promised", "V2", "A lower ballot than the promised one is promised, too.",
-        "late_duplicate_plan", vehicle={"is_above_promise": broken.always},
+        "late_duplicate_plan", collides=False, vehicle={"is_above_promise": broken.always},
     ),
     PlantedBug(
         "promise-keeps-count", "V2", "A promise does not begin the count of moves anew.",
@@ -81,7 +81,7 @@ BUGS: tuple[PlantedBug, ...] = (
     ),
     PlantedBug(
         "promise-keeps-plan", "V2", "A promise does not end the part in the old plan.",
-        "prepare_while_moving", collides=False, vehicle={"drop_plan": broken.skip},
+        "prepare_while_moving", vehicle={"drop_plan": broken.skip},
     ),
     PlantedBug(
         "promise-keeps-heard", "V2", "What was heard of the old plan counts in the new one.",
@@ -94,9 +94,14 @@ BUGS: tuple[PlantedBug, ...] = (
     # --- V3: acceptance
     PlantedBug(
         "no-promise-check", "V3", "Any plan that names the vehicle is accepted at any time.",
-        "plan_of_a_zombie",
+        "plan_of_a_zombie", collides=False,
         vehicle={"is_promised_ballot": broken.always, "accept": broken.accept_anew},
         vehicle_row=broken.plan_in_any_phase,
+    ),
+    PlantedBug(
+        "acceptance-not-noted", "V3", "A plan is accepted without the motion controller's word.",
+        "zombie_takes_a_newer_plan",
+        vehicle={"is_noted": broken.always}, plant=broken.note_by_itself,
     ),
     PlantedBug(
         "zombie-plan-accepted", "V3", "A plan of a lower ballot than the promised one is accepted.",
@@ -326,7 +331,7 @@ BUGS: tuple[PlantedBug, ...] = (
     ),
     PlantedBug(
         "speaks-before-in-charge", "charge", "An agent promises before it is in charge.",
-        "agent_that_is_not_in_charge", plant=broken.speak_at_once,
+        "agent_that_is_not_in_charge", collides=False, plant=broken.speak_at_once,
     ),
     PlantedBug(
         "waking-agent-goes-on", "charge", "An agent that hung goes on as if nobody had taken over.",

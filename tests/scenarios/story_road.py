@@ -153,7 +153,17 @@ class Agent:
     def get(self, message: Prepare | Plan, tick: int) -> None:
         del tick
         topic = PLAN if isinstance(message, Plan) else PREPARE
+        before = self.command
         self._note(self._core.handle(self._arrived(topic, message), 0.0))
+        asked = self.command
+        # What is to be noted goes to the controller at once, and back: within one vehicle.
+        if (
+            asked is not None
+            and asked is not before
+            and self.vehicle.road.controller.note(asked)
+        ):
+            sense = self.vehicle.sense(self.tick)
+            self._note(self._core.handle(self._arrived(SENSE, sense), 0.0))
 
     def hear(self, state: VehicleState) -> None:
         self._note(self._core.handle(self._arrived(STATE, state), 0.0))

@@ -44,7 +44,18 @@ class Catch:
 def first_catch(
     bug: PlantedBug, seeds: Iterable[int], profiles: Sequence[str] = SEARCHED
 ) -> Catch | None:
-    """Run seeds with a planted bug until a run is not as it must be."""
+    """Run seeds with a planted bug until a run is not as it must be.
+
+    Raises:
+        RuntimeError: the same run fails without the bug, too, so it shows nothing about the bug.
+    """
+    catch = _first_failure(bug, seeds, profiles)
+    if catch is not None and World(catch.seed, PROFILES[catch.profile]).run().violations:
+        raise RuntimeError(f"{catch.profile} {catch.seed} fails without {bug.name}, too")
+    return catch
+
+
+def _first_failure(bug: PlantedBug, seeds: Iterable[int], profiles: Sequence[str]) -> Catch | None:
     with pytest.MonkeyPatch.context() as patch:
         bug.plant(patch)
         for profile in profiles:

@@ -15,8 +15,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
+from attrs import evolve
+
 from laneweave.agents.driver import Driver, TrackingDriver
 from laneweave.protocol.execution import VEHICLE_RULES, PlanExecution
+from laneweave.protocol.incarnations import above
 from laneweave.protocol.lattice import Move
 from laneweave.protocol.messages import Command, Name, Plan, Prepare, Report, Sense, VehicleState
 from laneweave.protocol.node import (
@@ -133,10 +136,11 @@ class AgentCore:
                 execution.on_state(message)
             case Prepare():
                 if execution.on_prepare(message):
+                    yield from self._ask_to_note(execution)
                     yield self._show()
             case Plan():
                 if execution.on_plan(message):
-                    yield self._show()
+                    yield from self._ask_to_note(execution)
             case _:
                 pass
 
@@ -150,6 +154,7 @@ class AgentCore:
             return
         if self._sense is not None and sense.tick <= self._sense.tick:
             if sense.tick == self._sense.tick and self._command is not None:
+                yield from self._take_note(sense)
                 yield Send(COMMAND, self._command, self._own)
             return
         was_in_charge = self.in_charge
@@ -158,8 +163,7 @@ class AgentCore:
             self._command = None
             if not sense.caretaker:
                 return  # another process is in charge, and well: it is not for this one to drive
-            # Above the attendant, even where the vehicle's clocks do not agree.
-            self._incarnation = max(self._new_incarnation(), sense.attendant + 1)
+            self._incarnation = above(self._new_incarnation(), sense.attendant)
         if not (was_in_charge and self.in_charge):
             # Also while a claim is under way: until it is granted somebody else may have moved.
             self._meet_vehicle(sense)
@@ -168,8 +172,9 @@ class AgentCore:
     def _act(self, sense: Sense) -> Iterator[Effect]:
         execution = self.execution
         assert execution is not None  # noqa: S101 (met the vehicle)
-        execution.joined = sense.joined
         if self.in_charge:
+            execution.on_joined(sense.joined)
+            execution.on_noted(sense.accepted)
             self._decide(sense, execution)
         drive = self._driver.drive(sense, moving=execution.moving)
         self._command = Command(
@@ -181,10 +186,29 @@ class AgentCore:
             motion_origin=drive.motion_origin,
             jerks=drive.jerks,
             joined=execution.wanted_joined,
+            accepted=execution.plan.ballot if execution.plan is not None else None,
         )
         yield Send(COMMAND, self._command, self._own)
         if self.in_charge:
             yield self._show()
+
+    def _take_note(self, sense: Sense) -> Iterator[Effect]:
+        """Hear within a tick what the controller has noted for the process in charge."""
+        execution = self.execution
+        if execution is None or not self.in_charge or sense.attendant != self._incarnation:
+            return
+        joined = execution.on_joined(sense.joined)
+        if execution.on_noted(sense.accepted) or joined:
+            yield self._show()
+
+    def _ask_to_note(self, execution: PlanExecution) -> Iterator[Effect]:
+        """Ask the controller at once, not only with the next tick's COMMAND."""
+        command, plan = self._command, execution.plan
+        assert command is not None  # noqa: S101 (in charge: it has commanded)
+        accepted = plan.ballot if plan is not None else None
+        if (command.joined, command.accepted) != (execution.wanted_joined, accepted):
+            self._command = evolve(command, joined=execution.wanted_joined, accepted=accepted)
+            yield Send(COMMAND, self._command, self._own)
 
     def _meet_vehicle(self, sense: Sense) -> None:
         """V1: take over what the motion controller is doing."""

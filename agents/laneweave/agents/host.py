@@ -134,7 +134,9 @@ class AgentHost:
 
     def _on_census(self, census: Census, now_s: float) -> Iterator[Effect]:
         shard = self._shard
-        if shard is None or census.t_s < self._census_s:
+        if shard is None or census.bridge not in (0, self._bridge):
+            return  # of an earlier road, or of one whose token has not been seen yet
+        if census.t_s < self._census_s:
             return
         self._census_s = census.t_s
         listed = dict.fromkeys(entry.vehicle for entry in census.announced)

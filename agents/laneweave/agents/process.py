@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost, Shard
 from laneweave.protocol.faulty_core import Wrap, bare
+from laneweave.protocol.incarnations import Incarnations
 from laneweave.protocol.messages import Name
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.zenoh_transport import run_core
@@ -26,8 +26,9 @@ def run_agents(
     Raises:
         BadInputError: nobody answers at the scenario's endpoint.
     """
+    incarnations = Incarnations()
     host = AgentHost(
-        lambda vehicle: AgentCore(vehicle, time.time_ns, scenario),
+        lambda vehicle: AgentCore(vehicle, incarnations, scenario),
         [Name(vehicle) for vehicle in vehicles],
         shard,
     )

@@ -190,6 +190,12 @@ class CoordinatorCore:
             self._groups.forget()
             self._forget_formations()
 
+    def _is_of_this_road(self, message: RoadClock | Census) -> bool:
+        """Tell whether news is of the newest bridge; a newer one is met with it."""
+        if message.bridge:
+            self._meet_bridge(message.bridge)
+        return message.bridge in (0, self._bridge)
+
     def _forget_formations(self) -> None:
         self.controls = {}
         self._planner.forget()
@@ -198,6 +204,8 @@ class CoordinatorCore:
         match message:
             case Heartbeat():
                 self.election.on_heartbeat(message, now_s)
+            case RoadClock() | Census() if not self._is_of_this_road(message):
+                pass
             case RoadClock():
                 self.t_s = max(self.t_s, message.t_s)
                 self._road_changed = True

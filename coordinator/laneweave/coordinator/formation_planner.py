@@ -81,10 +81,20 @@ class FormationPlanner:
             control.unattended,
             self._scenario,
         )
+        # What was ordered under an earlier ballot is not waited for any more.
+        for other, (number, _) in list(self._ordered.items()):
+            if number == numbers[0]:
+                del self._ordered[other]
         self._ordered[job] = (numbers[0], ballot)
         nodes = self._scenario.formation.max_nodes * 2 ** min(control.failures, MOST_DOUBLINGS)
         # In the job: promises that cannot be planned from fail there, as any failed planning does.
-        yield Compute(job, partial(sort_lanes, task, nodes, self._weights))
+        yield Compute(job, partial(self._sort, job, task, nodes))
+
+    def _sort(self, job: int, task: SortingTask, nodes: int) -> Sorting | None:
+        """Do the work, unless nobody waits for it any more when its turn comes."""
+        if job not in self._ordered:
+            return None
+        return sort_lanes(task, nodes, self._weights)
 
     def finish(
         self,

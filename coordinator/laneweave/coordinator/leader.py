@@ -45,6 +45,8 @@ class FormationControl:
     plan: Plan | None = None
     failures: int = 0
     """Plannings that failed under this ballot."""
+    back_offs: int = 0
+    """Pauses in a row without a plan in force between them."""
     out_of_reach: frozenset[Name] = frozenset()
     """Members that the plan in force does not bring to their lanes, because it cannot."""
     states: dict[Name, VehicleState] = field(factory=dict)

@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 OBSERVE_S = 1.0
 """How long a new leader waits for the states of a roster before it prepares (L2)."""
 BACK_OFF_S = (0.05, 0.3)
-"""Random pause before a leader outbids another one (L7)."""
+"""Random pause before a leader outbids another one (L7); twice as long each time in a row, so that
+one of two leaders gets the time to plan."""
+MOST_BACK_OFFS = 6
+"""The pause grows this often at most."""
 RETRY_S = 1.0
 """First pause after failed planning; doubles with each failure (L5)."""
 LONGEST_RETRY_S = 8.0
@@ -98,6 +101,7 @@ def _adopt(me: FormationControl, _: object) -> None:
     me.ballot = next(iter(me.states.values())).promised
     # The promises were given to another leader; whoever has accepted has promised.
     me.promises = dict(me.states)
+    me.back_offs = 0
     # Whom an earlier plan could not bring to its lane, this one may.
     me.out_of_reach = frozenset()
 
@@ -123,8 +127,10 @@ def _shows_higher_promise(me: FormationControl, state: VehicleState) -> bool:
 
 
 def _back_off(me: FormationControl, _: object) -> None:
-    """Pause for 0.05 to 0.3 s."""
-    me.until_s = me.due_s = me.now_s + me.rng.uniform(*BACK_OFF_S)
+    """Pause for 0.05 to 0.3 s, twice as long each time in a row."""
+    pause_s = me.rng.uniform(*BACK_OFF_S) * 2.0 ** min(me.back_offs, MOST_BACK_OFFS)
+    me.back_offs += 1
+    me.until_s = me.due_s = me.now_s + pause_s
 
 
 def _is_promise(me: FormationControl, state: VehicleState) -> bool:
@@ -202,6 +208,7 @@ def _is_the_last(me: FormationControl, state: VehicleState) -> bool:
 def _count_acceptance(me: FormationControl, state: VehicleState) -> None:
     """Count the acceptance."""
     me.accepted.add(state.vehicle)
+    me.back_offs = 0
 
 
 def _stalls(_: FormationControl, state: VehicleState) -> bool:

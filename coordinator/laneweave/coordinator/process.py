@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import time
-
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.protocol.faulty_core import Wrap, bare
+from laneweave.protocol.incarnations import Incarnations
 from laneweave.protocol.messages import Name
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.zenoh_transport import run_core
@@ -17,6 +16,6 @@ def run_coordinator(scenario: Scenario, name: str, wrap: Wrap = bare) -> None:
     Raises:
         BadInputError: nobody answers at the scenario's endpoint.
     """
-    core = CoordinatorCore(Name(name), time.time_ns(), scenario)
+    core = CoordinatorCore(Name(name), Incarnations()(), scenario)
     network = scenario.network
     run_core(wrap(core), network.endpoint, network.realm, network.lease_s)

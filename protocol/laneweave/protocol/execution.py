@@ -29,6 +29,8 @@ class Stage(Enum):
     FREE = "free"
     """Nothing promised, no plan."""
     PROMISED = "promised"
+    TAKEN = "taken"
+    """It has the plan, and waits for its motion controller to note that."""
     GATED = "gated"
     """It has accepted the plan and waits at the start gate."""
     GOING = "going"
@@ -76,11 +78,26 @@ class PlanExecution:
         return self.rules.take(self, PREPARE, prepare) is not None
 
     def on_plan(self, plan: Plan) -> bool:
-        """V3: accept the plan of the promised ballot, once; true when it was accepted now.
+        """V3: take the plan of the promised ballot, once; true when it was taken now.
 
-        A plan that cannot be executed safely is not accepted, whoever sent it.
+        A plan that cannot be executed safely is not taken, whoever sent it. It is accepted, and
+        that is shown, when the motion controller has noted it for this very process (`on_noted`).
         """
         return self.rules.take(self, PLAN, plan) is not None
+
+    def on_noted(self, ballot: Ballot | None) -> bool:
+        """V3: the controller notes a plan for the process in charge; true when it is mine now."""
+        return self.rules.take(self, NOTED, ballot) is not None
+
+    def on_joined(self, formations: tuple[int, ...]) -> bool:
+        """The controller has noted formations as joined; true when some were not known yet.
+
+        What it says may be older than what is known already: nothing that has been joined parts.
+        """
+        if set(formations) <= set(self.joined):
+            return False
+        self.joined = tuple(sorted({*self.joined, *formations}))
+        return True
 
     def on_state(self, state: VehicleState) -> None:
         """V4: remember what another member of the same plan has shown."""
@@ -106,6 +123,11 @@ class PlanExecution:
         return self.plan.moves[self.vehicle][self.completed]
 
     @property
+    def accepted(self) -> bool:
+        """It has a plan, and its motion controller has noted that."""
+        return self.phase in _ACCEPTED
+
+    @property
     def go(self) -> bool:
         """The start gate is open."""
         return self.phase is Stage.GOING
@@ -113,7 +135,7 @@ class PlanExecution:
     @property
     def done(self) -> bool:
         """All moves of the accepted plan are completed."""
-        return self.plan is not None and self.next_move is None
+        return self.accepted and self.next_move is None
 
     @property
     def ready(self) -> bool:
@@ -122,7 +144,7 @@ class PlanExecution:
 
     def overdue(self, t_s: float) -> bool:
         """Tell whether the next move has been due for too long."""
-        return not self.moving and self.is_due(t_s - self.overdue_s)
+        return self.accepted and not self.moving and self.is_due(t_s - self.overdue_s)
 
     def is_due(self, t_s: float) -> bool:
         """Tell whether the time of the next move has come."""
@@ -145,7 +167,7 @@ class PlanExecution:
             formation=formation,
             joined=self.joined,
             promised=self.promised,
-            accepted=self.plan is not None,
+            accepted=self.accepted,
             ready=self.ready,
             completed=self.completed,
             hold_cell=self.hold_cell,
@@ -178,7 +200,7 @@ class PlanExecution:
         )
 
 
-PREPARE, PLAN, STATE = "PREPARE", "PLAN", "STATE"
+PREPARE, PLAN, NOTED, STATE = "PREPARE", "PLAN", "SENSE", "STATE"
 GATE, TICK, REST = "tick (gate)", "tick (move)", "motion ends"
 
 
@@ -253,9 +275,14 @@ def _has_joined(me: PlanExecution, plan: Plan) -> bool:
 
 
 def _accept(me: PlanExecution, plan: Plan) -> None:
-    """Accept: the plan is mine, derive what my moves need."""
+    """Take the plan, derive what its moves need, ask the controller to note it."""
     me.plan = plan
     me.needs = me.rules.functions["dependencies"](plan, me.vehicle)
+
+
+def _is_noted(me: PlanExecution, ballot: Ballot | None) -> bool:
+    """My controller has noted for me that I accept it."""
+    return me.plan is not None and ballot == me.plan.ballot
 
 
 def _is_of_my_plan(me: PlanExecution, state: VehicleState) -> bool:
@@ -283,7 +310,7 @@ def _hear(me: PlanExecution, state: VehicleState) -> None:
 
 def _is_ready(me: PlanExecution, _: object) -> bool:
     """Accepted, and not moving or moving in a move of this plan."""
-    return me.plan is not None and (not me.moving or me.moving_in_plan)
+    return me.accepted and (not me.moving or me.moving_in_plan)
 
 
 def _is_holding(me: PlanExecution, _: object) -> bool:
@@ -342,7 +369,8 @@ def _rest(me: PlanExecution, _: object) -> None:
 
 
 _ANY = tuple(Stage)
-_WITH_PLAN = (Stage.GATED, Stage.GOING)
+_WITH_PLAN = (Stage.TAKEN, Stage.GATED, Stage.GOING)
+_ACCEPTED = (Stage.GATED, Stage.GOING)
 
 VEHICLE_RULES: RuleBook = RuleBook(
     (
@@ -367,9 +395,10 @@ VEHICLE_RULES: RuleBook = RuleBook(
                 "keeps_to_its_blocks",
                 "has_joined",
             ),
-            ("accept", "show"),
-            Stage.GATED,
+            ("accept",),
+            Stage.TAKEN,
         ),
+        Transition("V3", NOTED, (Stage.TAKEN,), ("is_noted",), ("show",), Stage.GATED),
         Transition(
             "V4",
             STATE,
@@ -404,6 +433,7 @@ VEHICLE_RULES: RuleBook = RuleBook(
         _keeps_to_its_blocks,
         _has_joined,
         _accept,
+        _is_noted,
         _is_of_my_plan,
         _shows_open_gate,
         _hear,

@@ -104,7 +104,7 @@ class VehicleState:
     """Formations whose blocks its plans may use, as its motion controller keeps them; ascending."""
     promised: Ballot | None
     accepted: bool
-    """It has the plan of the promised ballot."""
+    """It has the plan of the promised ballot, and its motion controller has noted that."""
     ready: bool
     """Accepted, and not moving or moving in a move of this plan."""
     completed: int
@@ -140,7 +140,7 @@ class Neighbour:
 class Sense:
     """Bridge to one vehicle at each tick: what its own sensors and motion controller know.
 
-    Missing: sent again every `network.resend_s` until the tick's deadline; after it the vehicle's
+    Missing: sent again every `runtime.tick_resend_s` until the deadline; after it the vehicle's
     last trajectory is continued. Duplicated: answered again, the same way. Older than the newest
     tick seen: ignored.
     """
@@ -166,7 +166,9 @@ class Sense:
     caretaker: bool = False
     """The one in charge is the vehicle's caretaker, because its agent died or fell silent."""
     joined: tuple[int, ...] = ()
-    """Formations whose blocks the vehicle's plans may use, as the controller has confirmed."""
+    """Formations whose blocks the vehicle's plans may use, as the controller has noted."""
+    accepted: Ballot | None = None
+    """Newest plan that the process in charge has accepted, as the controller has noted."""
     left: bool = False
     """The vehicle has left the road: its agent reports and ends."""
 
@@ -178,7 +180,8 @@ class Command:
     It holds the whole remaining trajectory: jerks per tick from `tick` on. Missing: the controller
     plays the trajectory it has and then holds `hold_cell`. Duplicated: no effect. For an older
     tick than the newest command: ignored. From an older incarnation than the one in charge:
-    refused; from a newer one: that process is in charge from now on.
+    refused; from a newer one: that process is in charge from now on. What it asks to be noted is
+    noted whatever its tick, and confirmed with a SENSE.
     """
 
     vehicle: Name
@@ -190,7 +193,9 @@ class Command:
     jerks: bytes
     """Little-endian float32 pairs (j_s, j_y) in m/s3, one for each tick of the horizon."""
     joined: tuple[int, ...] = ()
-    """Formations that the controller should remember as joined, beside those that it knows."""
+    """Formations that the controller should note as joined, beside those that it knows."""
+    accepted: Ballot | None = None
+    """The plan that the sender has accepted: the controller should note it."""
 
 
 @frozen
@@ -216,7 +221,7 @@ class Announcement:
 
 @frozen
 class Census:
-    """Roadside to coordinators and the launcher, on every change and every second of road time.
+    """Roadside to coordinators and the launcher, on every change and every ten ticks.
 
     It is complete: a vehicle is on the road if and only if it is listed. Missing: the receiver
     works with the older one, which lacks only the newest vehicles. Older than the newest: ignored.
@@ -225,6 +230,8 @@ class Census:
     t_s: float
     on_road: tuple[CensusEntry, ...]
     announced: tuple[Announcement, ...]
+    bridge: int = 0
+    """Incarnation of the bridge, which tells this road from an earlier one; 0: not told."""
 
 
 @frozen
@@ -242,6 +249,8 @@ class RoadClock:
     on_road: int
     left: int
     ended: bool
+    bridge: int = 0
+    """Incarnation of the bridge, which tells this road from an earlier one; 0: not told."""
 
 
 @frozen

@@ -21,6 +21,8 @@ from attrs import define, field
 from laneweave.protocol.messages import Name
 from laneweave.protocol.scenario import Runtime
 
+LATE_SHARE = 2.0
+"""An agent that answers, but always too late, is borne with for this many times as long."""
 _ROUNDING_S = 1e-6
 """Sums of deadlines are compared with a time of which they may be a divisor."""
 
@@ -44,6 +46,10 @@ class Answers:
     """Whose tokens were there when the current tick was sent, and who were not heard since."""
     _unheard_s: dict[Name, float] = field(factory=dict)
     """How long each has been asked since it was heard last."""
+    _idle_s: dict[Name, float] = field(factory=dict)
+    """How long each has been asked since an answer of it came in time."""
+    _asked: set[Name] = field(factory=set)
+    """Whose tokens were there when the current tick was sent, and who did not answer it in time."""
     _heard_any: bool = False
     _deaf_s: float = 0.0
     """How long agents have been asked since anybody was heard."""
@@ -56,17 +62,20 @@ class Answers:
     def agent_up(self, name: Name) -> None:
         """An agent's token appeared: it gets all the time that it may take."""
         self.up.add(name)
+        self._idle_s.pop(name, None)
         self._forgive(name)
 
     def agent_down(self, name: Name) -> None:
         """An agent's token vanished."""
         self.up.discard(name)
         self.awaited.discard(name)
+        self._idle_s.pop(name, None)
         self._forgive(name)
 
     def forget(self, name: Name) -> None:
         """Forget a vehicle that left the road; its agent may still be up."""
         self.awaited.discard(name)
+        self._idle_s.pop(name, None)
         self._forgive(name)
 
     def heard(self, name: Name) -> None:
@@ -75,13 +84,21 @@ class Answers:
         self._heard_any = True
         self._deaf_s = 0.0
 
+    def effective(self, name: Name) -> None:
+        """An answer came in time: the agent drives its vehicle."""
+        self._asked.discard(name)
+        self._idle_s.pop(name, None)
+
     def link_down(self) -> None:
         """The bridge lost its own connection: whoever does not answer now is not to blame."""
         self._unheard.clear()
+        self._asked.clear()
 
     def settle(self, now_s: float) -> list[Name]:
         """Account for the tick before; return who has become silent with it."""
         lasted_s = min(now_s - self._asked_s, self.runtime.tick_deadline_s)
+        for name in self._asked & self.up:
+            self._idle_s[name] = self._idle_s.get(name, 0.0) + lasted_s
         fallen_silent = []
         for name in sorted(self._unheard):
             self._unheard_s[name] = self._unheard_s.get(name, 0.0) + lasted_s
@@ -102,6 +119,7 @@ class Answers:
             link_up: whether the bridge is connected; nobody can answer while it is not.
         """
         self._unheard = {name for name in on_road if name in self.up} if link_up else set()
+        self._asked = set(self._unheard)
         self._heard_any = False
         self.awaited = set() if self.deaf else self._unheard - self.silent
         self._asked_s = now_s
@@ -124,6 +142,10 @@ class Answers:
         missed = len(self.awaited)
         self.awaited.clear()
         return missed
+
+    def ineffective(self, name: Name) -> bool:
+        """Tell whether no answer of an agent has come in time for too long, though it may live."""
+        return self._too_long(self._idle_s.get(name, 0.0) / LATE_SHARE)
 
     def _forgive(self, name: Name) -> None:
         self.silent.discard(name)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
+from laneweave.protocol.incarnations import above
 from laneweave.protocol.messages import Name, Plan, Prepare, VehicleState
 from laneweave.protocol.node import Effect, Listen, Send, Unlisten
 from laneweave.protocol.topics import PLAN, PREPARE, STATE
@@ -32,7 +33,7 @@ class Attendance:
 
     def take_charge(self, vehicle: RoadVehicle, tick: int) -> Iterator[Effect]:
         """Put a caretaker in charge of a vehicle that has none."""
-        incarnation = max(self._new_incarnation(), vehicle.controller.attendant + 1)
+        incarnation = above(self._new_incarnation(), vehicle.controller.attendant)
         self._caretakers[vehicle.name] = Caretaker(vehicle, incarnation, tick)
         yield Listen(PREPARE, {"vehicle": vehicle.name})
         yield Listen(PLAN, {"vehicle": vehicle.name})

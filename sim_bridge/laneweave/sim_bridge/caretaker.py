@@ -55,9 +55,12 @@ class Caretaker:
         if isinstance(message, Prepare):
             heeded = execution.on_prepare(message)
             self._vehicle.controller.join(execution.wanted_joined)
-            execution.joined = self._vehicle.controller.joined
+            execution.on_joined(self._vehicle.controller.joined)
         else:
             heeded = not message.moves.get(execution.vehicle) and execution.on_plan(message)
+            if heeded:
+                self._vehicle.controller.accept(message.ballot)
+                execution.on_noted(self._vehicle.controller.accepted)
         return self.show(tick) if heeded else None
 
     def show(self, tick: int) -> VehicleState:

@@ -111,7 +111,7 @@ class BridgeCore:
         self.vehicles: dict[Name, RoadVehicle] = {}
         self._world = world
         self._record = record
-        self._roadside = Roadside(scenario)
+        self._roadside = Roadside(scenario, incarnation)
         self._tick_lasts_s = scenario.runtime.tick_s / (pace or scenario.runtime.max_pace)
         self._incarnation = incarnation
         self._stopwatch = stopwatch
@@ -220,6 +220,8 @@ class BridgeCore:
         # another agent has taken the vehicle from says nothing about that other one.
         if command.incarnation >= attendant or name in self._attendance:
             self._answers.heard(name)
+        if controller.note(command):
+            yield self._sense_of(vehicle)
         if command.tick != self.tick or self.phase is not Phase.ANSWERS:
             # A late answer was made for a state that is past: played now, from its middle, it
             # would end somewhere else.
@@ -232,10 +234,13 @@ class BridgeCore:
         if not taken:
             return
         self._answers.awaited.discard(name)
+        self._answers.effective(name)
         if attendant not in (0, controller.attendant):
             previous = "caretaker" if name in self._attendance else "agent"
             self._record.on_agent_took_over(self.t_s, name, previous)
         if attendant != controller.attendant:
+            # Who claims a vehicle is there, whether or not its token has been seen.
+            self._answers.agent_up(name)
             yield from self._attendance.give_way(name)
 
     def _on_report(self, report: Report) -> None:
@@ -291,9 +296,7 @@ class BridgeCore:
         yield from self._roadside.news(self.tick, self.t_s, self.vehicles.values())
         yield from self._take_care(now_s)
         for vehicle in self.vehicles.values():
-            caretaker = vehicle.name in self._attendance
-            sense = vehicle.sense(self.tick, caretaker=caretaker)
-            yield Send(SENSE, sense, {"vehicle": vehicle.name})
+            yield self._sense_of(vehicle)
         yield from self._attendance.show(self.tick)
         yield from self._leaving.tell(self.tick, self._answers.up)
         self._answers.ask(self.vehicles, now_s, link_up=self._link_up)
@@ -322,16 +325,21 @@ class BridgeCore:
         absence_counts = now_s >= self._absence_counts_s
         for name, vehicle in self.vehicles.items():
             absent = absence_counts and name not in answers.up
-            if (absent or name in answers.silent) and name not in self._attendance:
-                reason = "absent" if absent else "silent"
+            if name in self._attendance:
+                continue
+            if absent or name in answers.silent or answers.ineffective(name):
+                reason = "absent" if absent else "silent" if name in answers.silent else "late"
                 self._record.on_caretaker_took_over(self.t_s, name, reason)
                 yield from self._attendance.take_charge(vehicle, self.tick)
 
     def _send_again(self, now_s: float) -> Iterator[Effect]:
         for name in self._answers.ask_again(now_s):
-            vehicle = self.vehicles[name]
-            sense = vehicle.sense(self.tick, caretaker=name in self._attendance)
-            yield Send(SENSE, sense, {"vehicle": name})
+            yield self._sense_of(self.vehicles[name])
+
+    def _sense_of(self, vehicle: RoadVehicle) -> Effect:
+        caretaker = vehicle.name in self._attendance
+        sense = vehicle.sense(self.tick, caretaker=caretaker)
+        return Send(SENSE, sense, {"vehicle": vehicle.name})
 
     def _end_tick(self, now_s: float) -> Iterator[Effect]:
         self._record.on_missed(self._answers.close())

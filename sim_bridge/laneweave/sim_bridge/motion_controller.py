@@ -5,8 +5,9 @@ its commands were lost - it brings the vehicle to rest in the cell that the last
 holds there: the vehicle goes on driving at v_F in a cell that is its own, and keeps its distance
 to whoever its own sensors see ahead.
 
-It also keeps what must survive the agent: who is in charge of the vehicle, and which formations it
-has joined. Nobody but the process in charge changes where the vehicle holds or what it plays.
+It also keeps what must survive the agent, or must not be believed of one that has been replaced:
+who is in charge of the vehicle, which formations it has joined, and which plan the process in
+charge has accepted. Nobody but that process changes where the vehicle holds or what it plays.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, Lattice
-from laneweave.protocol.messages import Command, Neighbour
+from laneweave.protocol.messages import Ballot, Command, Neighbour
 from laneweave.protocol.motion import Jerk, at_rest_in_cell, cell_state, hold_law, keep_gap
 from laneweave.protocol.scenario import Vehicle
 from laneweave.sim_bridge.plant import Plant
@@ -43,6 +44,8 @@ class MotionController:
     """Incarnation of the process in charge; 0: none yet."""
     joined: tuple[int, ...] = field(init=False)
     """Formations whose blocks the vehicle's plans may use, ascending; it only ever grows."""
+    accepted: Ballot | None = None
+    """Newest plan that the process in charge has accepted."""
     motion_origin: Cell = field(init=False)
     motion_end_tick: int = 0
     command_tick: int = -1
@@ -82,9 +85,10 @@ class MotionController:
         jerks = self._checked_jerks(command)
         if command.incarnation > self.attendant and command.hold_cell != self.hold_cell:
             return False
-        self.attendant = command.incarnation
+        if command.incarnation > self.attendant:
+            self.hand_over(command.incarnation)
         self.command_tick = command.tick
-        self.join(command.joined)
+        self.note(command)
         if len(jerks) > 0 or command.hold_cell != self.hold_cell:
             self._jerks, self._jerks_tick = jerks, command.tick
             self.hold_cell = command.hold_cell
@@ -101,6 +105,25 @@ class MotionController:
         if incarnation <= self.attendant:
             raise ValueError(f"incarnation {incarnation} is not above {self.attendant}")
         self.attendant = incarnation
+        self.accepted = None
+
+    def note(self, command: Command) -> bool:
+        """Note what the process in charge asks for, whatever the tick of its command.
+
+        Returns:
+            Whether anything was new.
+        """
+        if command.incarnation != self.attendant or not _in_range(command.joined):
+            return False
+        before = self.joined, self.accepted
+        self.join(command.joined)
+        if command.accepted is not None:
+            self.accept(command.accepted)
+        return (self.joined, self.accepted) != before
+
+    def accept(self, ballot: Ballot) -> None:
+        """Note a plan that the process in charge has accepted; an older one changes nothing."""
+        self.accepted = ballot if self.accepted is None else max(self.accepted, ballot)
 
     def join(self, formations: Iterable[int]) -> None:
         """Remember formations as joined, for the process in charge."""
@@ -128,9 +151,8 @@ class MotionController:
         for cell in (command.hold_cell, command.motion_origin):
             if not (0 <= cell[1] < self.lattice.lanes and abs(cell[0]) <= MAX_COLUMN):
                 raise BadInputError("Command", cell, f"cells on {self.lattice.lanes} lanes")
-        for number in command.joined:
-            if abs(number) > MAX_COLUMN:
-                raise BadInputError("Command.joined", number, f"at most {MAX_COLUMN}")
+        if not _in_range(command.joined):
+            raise BadInputError("Command.joined", command.joined, f"at most {MAX_COLUMN}")
         if len(command.jerks) % 8:
             raise BadInputError("Command.jerks", f"{len(command.jerks)} bytes", "float32 pairs")
         jerks = np.frombuffer(command.jerks, dtype="<f4").reshape(-1, 2)
@@ -156,3 +178,7 @@ class MotionController:
         width_m = self.lattice.lane_width_m
         first, last = int((y_m - half_m) // width_m), int((y_m + half_m) // width_m)
         return first <= other.lane <= last or other.lane == self.hold_cell[1]
+
+
+def _in_range(formations: Iterable[int]) -> bool:
+    return all(abs(number) <= MAX_COLUMN for number in formations)

@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 from laneweave.protocol.faulty_core import Wrap, bare
+from laneweave.protocol.incarnations import Incarnations
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.zenoh_transport import run_core
 from laneweave.sim_bridge.core import BridgeCore
@@ -40,13 +41,14 @@ def run_bridge(
         tempfile.TemporaryDirectory(prefix="laneweave-sumo-") as sumo_folder,
         SumoWorld(scenario, Path(sumo_folder)) as world,
     ):
+        incarnations = Incarnations()
         core = BridgeCore(
             scenario,
             world,
             record,
-            new_incarnation=time.time_ns,
+            new_incarnation=incarnations,
             pace=pace,
-            incarnation=time.time_ns(),
+            incarnation=incarnations(),
         )
         try:
             run_core(wrap(core), network.endpoint, network.realm, network.lease_s)

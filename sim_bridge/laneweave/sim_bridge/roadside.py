@@ -31,7 +31,7 @@ class Counts:
     on_road: int
     left: int
 
-    def clock(self, tick: int, t_s: float, *, ended: bool) -> RoadClock:
+    def clock(self, tick: int, t_s: float, *, ended: bool, bridge: int = 0) -> RoadClock:
         """Return the clock message of a tick."""
         return RoadClock(
             tick=tick,
@@ -41,14 +41,16 @@ class Counts:
             on_road=self.on_road,
             left=self.left,
             ended=ended,
+            bridge=bridge,
         )
 
 
 class Roadside:
     """Demand, entry metering and census."""
 
-    def __init__(self, scenario: Scenario) -> None:
-        """Draw the demand of a scenario."""
+    def __init__(self, scenario: Scenario, bridge: int = 0) -> None:
+        """Draw the demand of a scenario; `bridge` is the incarnation of whoever sends the news."""
+        self._bridge = bridge
         self._announce_s = scenario.runtime.announce_s
         self._tick_s = scenario.runtime.tick_s
         self._lanes = scenario.road.lanes
@@ -114,7 +116,8 @@ class Roadside:
             on_road: all vehicles on the road.
             ended: whether it is the last one.
         """
-        yield Send(CLOCK, self.counts(len(on_road)).clock(tick, t_s, ended=ended))
+        counts = self.counts(len(on_road))
+        yield Send(CLOCK, counts.clock(tick, t_s, ended=ended, bridge=self._bridge))
         due = ended or tick >= self._census_sent_tick + CENSUS_EVERY_TICKS
         announced = self.announcements_changed(t_s)
         self._note_closed_blocks(t_s)
@@ -161,6 +164,7 @@ class Roadside:
                 for vehicle in on_road
             ),
             announced=self._announced,
+            bridge=self._bridge,
         )
 
     def _announcements(self, t_s: float) -> tuple[Announcement, ...]:

@@ -69,6 +69,7 @@ class RoadVehicle:
             attendant=controller.attendant,
             caretaker=caretaker,
             joined=controller.joined,
+            accepted=controller.accepted,
             left=left,
         )
 

@@ -7,6 +7,7 @@ from itertools import count
 from typing import TypeVar
 
 import numpy as np
+from attrs import evolve
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.driver import Driver, TrackingDriver
@@ -47,11 +48,13 @@ class Rig:
         self.hold_cell, self.motion_origin, self.motion_end_tick = HOME, HOME, 0
         self.attendant, self.caretaker = 0, False
         self.formation, self.joined = 0, tuple[int, ...]((0,))
+        self.accepted: Ballot | None = None
         self.played: Command | None = None
         self.shown: list[VehicleState] = []
         self.ahead: tuple[Neighbour, ...] = ()
         self._incarnations = count(1)
         self._make_driver = make_driver
+        self._sensed: Sense | None = None
         self.restart()
 
     def restart(self) -> None:
@@ -62,7 +65,7 @@ class Rig:
         return next(self._incarnations)
 
     def sense(self, *, left: bool = False) -> Sense:
-        return Sense(
+        self._sensed = Sense(
             vehicle=ME,
             tick=self.tick,
             t_s=self.tick * TICK_S,
@@ -76,8 +79,10 @@ class Rig:
             attendant=self.attendant,
             caretaker=self.caretaker,
             joined=self.joined,
+            accepted=self.accepted,
             left=left,
         )
+        return self._sensed
 
     def hand(self, topic: Topic, message: object) -> list[Effect]:
         return self.handle(Arrived(topic, {"vehicle": ME}, message))
@@ -107,13 +112,29 @@ class Rig:
     def take(self, command: Command) -> None:
         """Let the motion controller take a command, from the one in charge or from a newer one."""
         assert command.incarnation >= self.attendant
-        self.caretaker = self.caretaker and command.incarnation == self.attendant
+        if command.incarnation > self.attendant:
+            self.caretaker, self.accepted = False, None
         self.attendant = command.incarnation
-        self.joined = tuple(sorted({*self.joined, *command.joined}))
+        self._note(command)
         self.played = command
         self.hold_cell = command.hold_cell
         self.motion_end_tick = command.motion_end_tick
         self.motion_origin = command.motion_origin
+
+    def _note(self, command: Command) -> None:
+        assert command.incarnation == self.attendant
+        self.joined = tuple(sorted({*self.joined, *command.joined}))
+        if command.accepted is not None:
+            self.accepted = command.accepted
+
+    def confirm(self, effects: Iterable[Effect]) -> list[Effect]:
+        """Note what the agent asks for between two ticks, and confirm it at once."""
+        (command,) = sent(effects, Command)
+        self._note(command)
+        assert self._sensed is not None
+        assert command.tick == self._sensed.tick
+        noted = evolve(self._sensed, joined=self.joined, accepted=self.accepted)
+        return self.hand(SENSE, noted)
 
     def coast(self, ticks: int) -> None:
         """Drive by the last command, and by the hold law when it runs out."""
@@ -140,7 +161,7 @@ class Rig:
         self.hand(PREPARE, Prepare(ballot, (0,), (ME,)))
         t0_s = (self.tick if t0_tick is None else t0_tick) * TICK_S
         plan = make_plan({ME: moves}, {ME: self.hold_cell}, {ME: incarnation}, ballot, t0_s)
-        self.hand(PLAN, plan)
+        self.confirm(self.hand(PLAN, plan))
         assert self.shown[-1].accepted
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+import pytest
 from attrs import evolve
 
 from laneweave.agents.core import AgentCore
@@ -92,6 +93,7 @@ class Seat:
         *,
         caretaker: bool = False,
         joined: tuple[int, ...] = (0,),
+        accepted: Ballot | None = None,
         cell: Cell = HOME,
     ) -> list[Effect]:
         """Show it the next tick, with somebody in charge."""
@@ -99,12 +101,26 @@ class Seat:
         self.last = Sense(
             ME, self.tick, self.tick * TICK_S, cell_state(LATTICE, cell, self.tick * TICK_S),
             cell, 0, cell, 0, (), attendant=attendant, caretaker=caretaker, joined=joined,
+            accepted=accepted,
         )  # fmt: skip
         return self.rig.hand(SENSE, self.last)
 
     def repeat(self) -> list[Effect]:
         """Show it the last tick once more."""
         return self.rig.hand(SENSE, self.last)
+
+    def note(
+        self,
+        accepted: Ballot | None = BALLOT,
+        *,
+        joined: tuple[int, ...] = (0,),
+        attendant: int | None = None,
+    ) -> list[Effect]:
+        """Show it within the tick what the controller has noted, for the one in charge."""
+        if attendant is None:
+            attendant = self.last.attendant
+        noted = evolve(self.last, accepted=accepted, joined=joined, attendant=attendant)
+        return self.rig.hand(SENSE, noted)
 
     def take_charge(self, joined: tuple[int, ...] = (0,)) -> None:
         for _ in range(2):
@@ -235,9 +251,9 @@ def test_superseded_by_the_caretaker_it_claims_with_a_new_incarnation_and_no_mem
     assert kinds(seat.feel(3)) == [Command, VehicleState]
     assert (seat.shown.incarnation, seat.shown.promised, seat.shown.accepted) == (3, None, False)
     seat.prepare()
-    seat.plan()  # for the incarnation that promised long ago
-    assert not seat.shown.accepted
-    seat.plan(incarnation=3)
+    assert seat.plan() == []  # for the incarnation that promised long ago
+    assert command_of(seat.plan(incarnation=3)).accepted == BALLOT
+    seat.note()
     assert seat.shown.accepted
 
 
@@ -278,21 +294,97 @@ def test_it_leaves_with_its_vehicle_whoever_is_in_charge() -> None:
     assert seat.agent.ended
 
 
+# --- acceptance -------------------------------------------------------------------------------
+
+
+def taken() -> Seat:
+    """Return a seat whose agent is in charge, and has a plan that is not noted yet."""
+    seat = Seat()
+    seat.take_charge()
+    seat.prepare()
+    assert kinds(seat.plan()) == [Command]
+    return seat
+
+
+def test_an_acceptance_is_asked_for_at_once_and_shown_when_it_has_been_noted() -> None:
+    seat = taken()
+    assert kinds(seat.repeat()) == [Command]  # a SENSE from before it was noted
+    assert kinds(seat.feel(1)) == [Command, VehicleState]
+    assert (seat.shown.promised, seat.shown.accepted) == (BALLOT, False)
+    assert kinds(seat.note()) == [VehicleState, Command]
+    assert (seat.shown.accepted, seat.shown.ready) == (True, True)
+    assert kinds(seat.note()) == [Command]  # once
+    assert kinds(seat.repeat()) == [Command]  # an older one that comes late takes nothing back
+    seat.feel(1)
+    assert seat.shown.accepted
+
+
+def test_a_note_may_come_with_the_next_tick() -> None:
+    seat = taken()
+    assert kinds(seat.feel(1, accepted=BALLOT)) == [Command, VehicleState]
+    assert seat.shown.accepted
+
+
+@pytest.mark.parametrize("noted", [None, BALLOT._replace(seq=0), BALLOT._replace(seq=2)])
+def test_what_was_noted_of_another_plan_is_no_acceptance(noted: Ballot | None) -> None:
+    seat = taken()
+    assert kinds(seat.note(noted)) == [Command]
+    seat.feel(1, accepted=noted)
+    assert not seat.shown.accepted
+
+
+@pytest.mark.parametrize("attendant", [0, 2])
+def test_what_was_noted_for_another_process_is_no_acceptance(attendant: int) -> None:
+    """A process that has been replaced without knowing it shows nothing that counts."""
+    seat = taken()
+    assert kinds(seat.note(attendant=attendant)) == [Command]
+    assert not seat.shown.accepted
+    shown = len(seat.rig.shown)
+    seat.feel(attendant, accepted=BALLOT)
+    assert len(seat.rig.shown) == shown
+    assert not seat.agent.in_charge
+
+
+def test_an_acceptance_of_the_process_before_is_not_its_own() -> None:
+    seat = Seat()
+    seat.feel(0)
+    seat.feel(1, accepted=BALLOT)
+    assert (seat.shown.promised, seat.shown.accepted) == (None, False)
+    seat.prepare()
+    seat.feel(1, accepted=BALLOT)
+    assert (seat.shown.promised, seat.shown.accepted) == (BALLOT, False)
+
+
+def test_a_higher_promise_ends_what_was_asked_for() -> None:
+    seat = taken()
+    effects = seat.prepare(ballot=BALLOT._replace(seq=2))
+    assert kinds(effects) == [Command, VehicleState]
+    assert command_of(effects).accepted is None
+    seat.note()
+    seat.feel(1, accepted=BALLOT)
+    assert not seat.shown.accepted
+
+
 # --- joined formations ------------------------------------------------------------------------
 
 
 def test_a_joint_plan_is_accepted_once_the_controller_has_confirmed_its_formations() -> None:
     seat = Seat()
     seat.take_charge()
-    seat.prepare(0, 1)
+    asked = seat.prepare(0, 1)
+    assert kinds(asked) == [Command, VehicleState]
+    assert command_of(asked).joined == (0, 1)
     assert (seat.shown.promised, seat.shown.joined) == (BALLOT, (0,))
+    assert kinds(seat.prepare(0, 1)) == [VehicleState]  # it has asked already
     assert seat.plan(0, 1) == []
     assert command_of(seat.feel(1)).joined == (0, 1)
     assert seat.plan(0, 1) == []
-    assert command_of(seat.feel(1, joined=(0, 1))).joined == (0, 1)
+    assert kinds(seat.note(None, joined=(0, 1))) == [VehicleState, Command]
     assert (seat.shown.joined, seat.shown.accepted) == ((0, 1), False)
+    assert kinds(seat.repeat()) == [Command]  # an older one that comes late takes nothing back
     seat.plan(0, 1)
-    assert seat.shown.accepted
+    seat.note(joined=(0, 1))
+    assert (seat.shown.joined, seat.shown.accepted) == ((0, 1), True)
     assert wanted(seat) == (0, 1)
 
 
@@ -318,8 +410,10 @@ def test_states_matter_only_while_a_plan_waits_for_them() -> None:
     seat.prepare()
     assert wanted(seat) == ()
     seat.plan()
-    assert wanted(seat) == (0,)
+    assert wanted(seat) == (0,)  # also while it is not noted yet: none is missed
     seat.rig.hand(STATE, state_of(OTHER))
+    seat.note()
+    assert wanted(seat) == (0,)
     seat.feel(1)
     assert seat.shown.go
     assert wanted(seat) == ()

@@ -127,16 +127,41 @@ def test_older_ticks_and_other_vehicles_are_ignored() -> None:
     assert rig.run().t_s == pytest.approx((rig.tick - 1) * TICK_S)
 
 
-def test_promise_and_acceptance_are_shown_at_once() -> None:
+def test_a_promise_is_shown_at_once_and_an_acceptance_as_soon_as_it_is_noted() -> None:
     rig = up_and_running()
+    tick = rig.tick
     rig.hand(PREPARE, Prepare(BALLOT, (0,), (ME, OTHER)))
     assert (rig.shown[-1].promised, rig.shown[-1].accepted) == (BALLOT, False)
     plan = make_plan({ME: (), OTHER: ()}, {ME: HOME, OTHER: (0, 0)}, {ME: 1, OTHER: 1})
-    rig.hand(PLAN, plan)
-    assert rig.shown[-1].accepted
+    shown = len(rig.shown)
+    asked = rig.hand(PLAN, plan)
+    assert len(rig.shown) == shown
+    assert rig.played is not None
+    assert sent(asked, Command) == [attrs.evolve(rig.played, accepted=BALLOT)]  # the same motion
     assert rig.agent.wanted_states == (0,)
+    effects = rig.confirm(asked)
+    assert [(s.accepted, s.ready) for s in sent(effects, VehicleState)] == [(True, True)]
+    assert sent(effects, Command) == sent(asked, Command)
+    assert rig.tick == tick
     assert rig.hand(PLAN, plan) == []
     assert rig.hand(PREPARE, Prepare(BALLOT, (0,), (OTHER,))) == []
+
+
+def test_an_acceptance_whose_note_was_lost_is_asked_for_with_each_tick() -> None:
+    rig = up_and_running()
+    rig.hand(PREPARE, Prepare(BALLOT, (0,), (ME,)))
+    plan = make_plan({ME: ((0, HOME, (-1, 2)),)}, {ME: HOME}, {ME: 1})
+    rig.hand(PLAN, plan)  # what it asks is lost
+    for _ in range(3):
+        effects = rig.hand(SENSE, rig.sense())
+        (command,) = sent(effects, Command)
+        assert (command.accepted, command.hold_cell) == (BALLOT, HOME)
+        assert not rig.shown[-1].accepted
+        assert rig.hand(PLAN, plan) == []  # it has asked already
+        rig.coast(1)
+    assert not rig.run().accepted  # now the controller hears of it
+    state = rig.run()
+    assert (state.accepted, state.moving) == (True, True)
 
 
 @pytest.mark.parametrize("beyond", [(-4, 1), (1, 1), (-1, 3)])
@@ -146,7 +171,8 @@ def test_a_plan_beyond_its_own_block_is_not_accepted(beyond: Cell) -> None:
     rig.hand(PREPARE, Prepare(BALLOT, (0,), (ME,)))
     plan = make_plan({ME: ()}, {ME: HOME}, {ME: 1})
     assert rig.hand(PLAN, attrs.evolve(plan, territory=(HOME, beyond))) == []
-    assert rig.hand(PLAN, plan) != []
+    rig.confirm(rig.hand(PLAN, plan))
+    assert rig.shown[-1].accepted
 
 
 # --- moves ------------------------------------------------------------------------------------
@@ -206,7 +232,7 @@ def test_overdue_is_shown() -> None:
     plan = make_plan(
         {ME: ((0, HOME, (-1, 2)),), OTHER: ()}, {ME: HOME, OTHER: (0, 0)}, {ME: 1, OTHER: 1}
     )
-    rig.hand(PLAN, plan)
+    rig.confirm(rig.hand(PLAN, plan))
     patience = round(OVERDUE_SLOTS * SCENARIO.formation.cycle_s / TICK_S)
     assert not rig.run(patience - rig.tick).overdue
     assert rig.run().overdue
@@ -265,7 +291,8 @@ def test_restart_of_a_vehicle_that_is_late_still_counts_as_moving() -> None:
     assert rig.off((0, 1)) > ARRIVED_ALONG_M
     assert state.moving
     rig.hand(PREPARE, Prepare(BALLOT._replace(seq=2), (0,), (ME,)))
-    rig.hand(PLAN, make_plan({ME: ()}, {ME: (0, 1)}, {ME: 2}, BALLOT._replace(seq=2)))
+    plan = make_plan({ME: ()}, {ME: (0, 1)}, {ME: 2}, BALLOT._replace(seq=2))
+    rig.confirm(rig.hand(PLAN, plan))
     assert rig.shown[-1].accepted
     assert not rig.shown[-1].ready
     rig.ahead = ()

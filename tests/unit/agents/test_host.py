@@ -79,6 +79,7 @@ def sense(
     *,
     attendant: int = 1,
     joined: tuple[int, ...] | None = None,
+    accepted: Ballot | None = None,
     left: bool = False,
 ) -> Sense:
     """Return what a vehicle senses whose agent is in charge, unless another attendant is given."""
@@ -87,7 +88,7 @@ def sense(
     formation = SCENARIO.lattice.block_of(cell[0])
     return Sense(
         vehicle, tick, t_s, state, cell, 0, cell, 0, (), formation, attendant,
-        joined=(formation,) if joined is None else joined, left=left,
+        joined=(formation,) if joined is None else joined, accepted=accepted, left=left,
     )  # fmt: skip
 
 
@@ -118,7 +119,7 @@ def census(*on_road: Name, announced: Iterable[Name] = ()) -> Census:
 def accept(
     host: AgentHost, cells: dict[Name, Cell], formations: tuple[int, ...] = (0,)
 ) -> list[Effect]:
-    """Let all vehicles of a roster promise and accept a plan without moves."""
+    """Let all vehicles of a roster promise and accept a plan without moves, in the first tick."""
     effects: list[Effect] = []
     for name in cells:
         effects += hand(host, PREPARE, name, Prepare(BALLOT, formations, tuple(cells)))
@@ -126,8 +127,10 @@ def accept(
         BALLOT, formations, tuple(cells), dict.fromkeys(cells, 1), cells, dict.fromkeys(cells, ()),
         0.0, 4.0, tuple(cells.values()),
     )  # fmt: skip
-    for name in cells:
+    for name, cell in cells.items():
         effects += hand(host, PLAN, name, plan)
+        noted = sense(name, cell, joined=formations, accepted=BALLOT)
+        effects += hand(host, SENSE, name, noted)
     return effects
 
 
@@ -294,8 +297,20 @@ def test_a_shard_lets_go_of_vehicles_that_the_census_lacks() -> None:
     assert give(host, census_of(A, B, t_s=1.0)) == []  # an older one
 
 
-def census_of(*vehicles: Name, t_s: float = 1.0) -> Arrived:
-    return Arrived(CENSUS, {}, evolve(census(announced=vehicles), t_s=t_s))
+def census_of(*vehicles: Name, t_s: float = 1.0, bridge: int = 0) -> Arrived:
+    return Arrived(CENSUS, {}, evolve(census(announced=vehicles), t_s=t_s, bridge=bridge))
+
+
+@pytest.mark.parametrize("other", [6, 8])
+def test_a_shard_hears_the_census_of_the_bridge_that_it_knows(other: int) -> None:
+    """That of an earlier road may come late, that of a newer one before its token."""
+    host = make_host(shard=Shard(0, 1))
+    assert give(host, census_of(A, bridge=7)) == []
+    give(host, PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}))
+    assert give(host, census_of(B, t_s=9.0, bridge=other)) == []
+    assert Announce(VEHICLE_ALIVE, {"vehicle": A}) in give(host, census_of(A, bridge=7))
+    # Neither does it make the next one of the right road look old.
+    assert Announce(VEHICLE_ALIVE, {"vehicle": C}) in give(host, census_of(A, C, bridge=7))
 
 
 def test_stopping_reports_for_every_vehicle() -> None:

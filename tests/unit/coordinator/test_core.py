@@ -14,6 +14,7 @@ from laneweave.coordinator.sorting import Sorting
 from laneweave.protocol.lattice import Cell, Move
 from laneweave.protocol.messages import (
     Ballot,
+    Census,
     Heartbeat,
     LogEvent,
     Name,
@@ -111,6 +112,63 @@ def test_what_is_no_newer_bridge_changes_nothing(other: str) -> None:
         desk.give(news(BRIDGE_ALIVE, {"incarnation": other}))
     assert list(desk.core.controls) == [0]
     assert desk.core.t_s == T_S
+
+
+def news_of(bridge: int, cells: Cells, t_s: float) -> tuple[Census, RoadClock]:
+    clock = RoadClock(round(10 * t_s), t_s, 1, 1, 1, 0, ended=False, bridge=bridge)
+    return evolve(census(cells, t_s=t_s), bridge=bridge), clock
+
+
+def road(desk: Desk) -> tuple[list[Name], float]:
+    """Return whom a coordinator knows on the road, and the road time."""
+    assert desk.core.census is not None
+    return [entry.vehicle for entry in desk.core.census.on_road], desk.core.t_s
+
+
+@pytest.mark.parametrize("index", [0, 1], ids=["census", "clock"])
+def test_news_of_an_earlier_road_are_ignored(index: int) -> None:
+    """They come late, and their road time is ahead of the new one's."""
+    desk = Desk()
+    desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}))
+    for message in news_of(7, {A: (0, 0)}, T_S):
+        desk.tell(message)
+    desk.tell(news_of(6, {B: (0, 0)}, 9 * T_S)[index])
+    assert road(desk) == ([A], T_S)
+
+
+def test_a_newer_bridge_is_met_by_its_news_before_its_token_is_seen() -> None:
+    for index in range(2):
+        desk = Desk()
+        desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}))
+        desk.collect_promises({A: (0, 0)}, {A: 1})
+        newer = news_of(8, {B: (0, 0)}, 1.0)
+        desk.tell(newer[index])
+        assert (desk.core.controls, desk.core.t_s) == ({}, 1.0)
+        desk.tell(newer[1 - index])
+        assert road(desk) == ([B], 1.0)
+        desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "8"}))  # nothing new
+        assert road(desk) == ([B], 1.0)
+        desk.tell(news_of(7, {A: (0, 0)}, 9 * T_S)[index])
+        assert road(desk) == ([B], 1.0)
+
+
+def test_states_of_vehicles_that_the_census_does_not_list_are_ignored() -> None:
+    """Or not in this formation: what they have joined is of another road."""
+    desk = Desk()
+    desk.lead()
+    desk.tell(census({A: (0, 0), B: (-5, 0)}))
+    theirs = Ballot(4, Name("c9"), 3, 2)
+    for stranger in (
+        state(C, (0, 0), theirs, joined=(0, 1)),
+        evolve(state(A, (0, 0), theirs, joined=(0, 1)), formation=1),
+        evolve(state(B, (-5, 0), theirs, joined=(0, 1)), formation=0),
+    ):
+        desk.tell(stranger)
+    assert set(desk.core.controls) == {0, 1}  # not joined
+    for control in desk.core.controls.values():
+        assert (control.states, control.highest) == ({}, None)
+    desk.tell(state(A, (0, 0), theirs))
+    assert desk.core.controls[0].highest == theirs
 
 
 def test_heartbeats_are_periodic_and_say_who_leads() -> None:
@@ -265,6 +323,35 @@ def test_a_result_for_an_older_ballot_is_dropped_while_the_newer_one_is_planned(
     assert messages(desk.give(run_job(old)), LogEvent) == []
     plan: Plan = messages(desk.give(run_job(new)), Plan)[0].message
     assert plan.moves[A][-1][2][1] == 2
+
+
+def test_an_order_that_is_replaced_before_its_turn_comes_is_not_worked_on() -> None:
+    """It may wait behind others; a hard one for nothing would keep the new one waiting."""
+    desk = Desk()
+    cells: Cells = {A: (0, 0), B: (-1, 1)}
+    (old,) = jobs(desk.collect_promises(cells, {A: 1, B: 0}))
+    assert isinstance(old.work(), Sorting)
+    desk.tell(census(cells, {A: 2, B: 0}, t_s=T_S + 1.0))
+    (new,) = jobs(desk.promise(cells))
+    assert old.work() is None
+    assert isinstance(new.work(), Sorting)
+    assert messages(desk.give(run_job(old)), LogEvent) == []
+    assert list(desk.core._planner._ordered) == [new.job]
+
+
+def test_orders_of_other_formations_stay() -> None:
+    desk = Desk()
+    cells: Cells = {A: (0, 0), B: (-5, 0)}
+    desk.lead()
+    desk.tell(census(cells, {A: 1, B: 1}))
+    orders = []
+    for number, (name, cell) in enumerate(cells.items()):
+        desk.tell(state(name, cell))
+        ballot = desk.core.controls[number].ballot
+        orders += jobs(desk.tell(state(name, cell, ballot, t_s=1.0)))
+    assert [isinstance(order.work(), Sorting) for order in orders] == [True, True]
+    desk.core._planner.forget()
+    assert [order.work() for order in orders] == [None, None]
 
 
 def test_a_result_that_comes_while_the_leader_backs_off_is_dropped() -> None:

@@ -15,6 +15,7 @@ from laneweave.coordinator.leader_rules import (
     ISSUE_S,
     LEADER_RULES,
     LONGEST_RETRY_S,
+    MOST_BACK_OFFS,
     OBSERVE_S,
     RETRY_S,
     Phase,
@@ -447,6 +448,69 @@ def test_l7_adopts_the_others_plan_if_it_is_in_force_after_the_pause() -> None:
     # The incarnations that promised this leader's own ballot are history.
     hear(leader, state(A, higher, accepted=True, incarnation=2, t_s=3.0))
     assert phase(leader) is Phase.WATCHING
+
+
+class Longest(random.Random):
+    """Every pause is as long as it may be."""
+
+    def uniform(self, a: float, b: float) -> float:
+        del a
+        return b
+
+
+def outbid(leader: FormationControl, now_s: float) -> tuple[float, Ballot]:
+    """Show a leader a higher ballot; return how long it pauses, and the new ballot after that."""
+    assert leader.ballot is not None
+    higher = leader.ballot._replace(term=leader.ballot.term + 1)
+    hear(leader, state(A, higher, t_s=now_s), now_s=now_s)
+    assert phase(leader) is Phase.BACKING_OFF
+    pause_s = (leader.wakeup_s or 0.0) - now_s
+    leader.on_time(now_s + pause_s - 1e-6)
+    assert phase(leader) is Phase.BACKING_OFF
+    leader.on_time(now_s + pause_s)
+    hear(leader, state(A, higher, t_s=now_s), state(B, t_s=now_s), now_s=now_s + pause_s)
+    assert phase(leader) is Phase.PREPARING
+    assert leader.ballot > higher
+    return pause_s, leader.ballot
+
+
+def promise_and_plan(leader: FormationControl, ballot: Ballot, now_s: float) -> None:
+    hear(leader, state(A, ballot, t_s=now_s), state(B, ballot, t_s=now_s), now_s=now_s)
+    assert leader.take_planning_order(now_s)
+    leader.on_plan(plan_of(leader), now_s)
+
+
+def test_l7_pauses_grow_so_that_one_of_two_leaders_gets_the_time_to_plan() -> None:
+    leader, _ = preparing(A, B)
+    leader.rng = Longest()
+    pauses = []
+    for now_s in range(0, 30 * (MOST_BACK_OFFS + 3), 30):
+        pause_s, ballot = outbid(leader, float(now_s))
+        pauses.append(pause_s / BACK_OFF_S[1])
+        promise_and_plan(leader, ballot, now_s + 25.0)  # promises and a plan are no success yet
+    growing = [2.0**number for number in range(MOST_BACK_OFFS)]
+    assert pauses == pytest.approx([*growing, *[2.0**MOST_BACK_OFFS] * 3])
+
+
+@pytest.mark.parametrize("success", ["accepted", "adopted"])
+def test_l7_after_a_success_the_pauses_are_short_again(success: str) -> None:
+    leader, _ = preparing(A, B)
+    leader.rng = Longest()
+    for now_s in (0.0, 30.0, 60.0):
+        pause_s, ballot = outbid(leader, now_s)
+    assert pause_s == pytest.approx(4.0 * BACK_OFF_S[1])
+    if success == "accepted":
+        promise_and_plan(leader, ballot, 80.0)
+        hear(leader, state(A, ballot, accepted=True, t_s=81.0), now_s=81.0)
+    else:
+        theirs = ballot._replace(term=ballot.term + 1)
+        hear(leader, state(A, theirs, accepted=True, t_s=80.0), now_s=80.0)
+        leader.on_time(100.0)
+        for name in (A, B):
+            hear(leader, state(name, theirs, accepted=True, t_s=101.0), now_s=101.0)
+        assert (phase(leader), leader.ballot) == (Phase.WATCHING, theirs)
+    pause_s, _ = outbid(leader, 120.0)
+    assert pause_s == pytest.approx(BACK_OFF_S[1])
 
 
 # --- L8 ---------------------------------------------------------------------------------------

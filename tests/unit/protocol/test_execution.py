@@ -90,11 +90,25 @@ def shown(
     )
 
 
-def accepted(plan: Plan | None = None, name: Name = A) -> PlanExecution:
+def taken(plan: Plan | None = None, name: Name = A) -> PlanExecution:
+    """Promise and take a plan, which the controller has not noted yet."""
     plan = plan or make_plan()
     execution = vehicle(name, plan.start_cells[name])
     execution.on_prepare(prepare(plan.ballot, *plan.roster))
     assert execution.on_plan(plan)
+    return execution
+
+
+def accept(execution: PlanExecution, plan: Plan) -> None:
+    """Take a plan, and let the controller note it."""
+    assert execution.on_plan(plan)
+    assert execution.on_noted(plan.ballot)
+
+
+def accepted(plan: Plan | None = None, name: Name = A) -> PlanExecution:
+    execution = taken(plan, name)
+    assert execution.promised is not None
+    assert execution.on_noted(execution.promised)
     return execution
 
 
@@ -180,7 +194,7 @@ def test_v2_forgets_plan_progress_gate_and_what_was_heard() -> None:
 
 
 @pytest.mark.parametrize("ballot", [LOW, MID])
-@pytest.mark.parametrize("reach", [accepted, going])
+@pytest.mark.parametrize("reach", [taken, accepted, going])
 def test_v2_a_repeat_or_a_lower_ballot_changes_nothing(
     ballot: Ballot, reach: Callable[[], PlanExecution]
 ) -> None:
@@ -200,7 +214,7 @@ def test_v2_while_moving_the_motion_ends_but_counts_for_no_plan() -> None:
     execution.on_prepare(prepare(HIGH))
     assert (execution.hold_cell, execution.moving, execution.ready) == ((-4, 1), True, False)
     newer = make_plan(HIGH, {A: ((0, (-4, 1), (-4, 2)),)}, {A: (-4, 1), B: (-3, 0)})
-    assert execution.on_plan(newer)
+    accept(execution, newer)
     assert not execution.ready  # it still occupies the footprint of the old move
     execution.on_state(shown(ballot=HIGH))
     assert execution.tick(T0_S) is None
@@ -222,6 +236,20 @@ def test_v2_asks_for_the_formations_of_the_ballot_and_never_for_fewer() -> None:
         execution.on_prepare(prepare(ballot, formations=formations))
         assert execution.wanted_joined == wanted
         assert execution.joined == (0, 2)  # that is for the motion controller to say
+
+
+def test_what_was_joined_stays_joined_whatever_comes_late() -> None:
+    execution = vehicle(joined=(0, 2))
+    for heard, news, known in (
+        ((0,), False, (0, 2)),
+        ((), False, (0, 2)),
+        ((0, 1, 2), True, (0, 1, 2)),
+        ((0, 1, 2), False, (0, 1, 2)),
+        ((5, 0), True, (0, 1, 2, 5)),
+        ((0, 2), False, (0, 1, 2, 5)),
+    ):
+        assert execution.on_joined(heard) == news
+        assert execution.joined == known
 
 
 # --- V3 ---------------------------------------------------------------------------------------
@@ -319,6 +347,62 @@ def test_v3_a_joint_plan_waits_until_the_controller_has_confirmed_its_formations
     assert execution.on_plan(joint)
 
 
+def waits(execution: PlanExecution) -> bool:
+    """Tell whether nothing of what a vehicle does or shows is that of one that has accepted."""
+    return (
+        execution.phase is Stage.TAKEN
+        and execution.tick(T0_S + 100.0) is None
+        and not any((execution.accepted, execution.ready, execution.go, execution.done))
+        and not execution.overdue(T0_S + 1000.0)
+    )
+
+
+@pytest.mark.parametrize("name", [A, B])  # B has no moves
+def test_v3_a_plan_is_accepted_when_the_controller_has_noted_it(name: Name) -> None:
+    execution = taken(name=name)
+    for heard in ((), (shown(A), shown(B)), (shown(A, go=True), shown(B, go=True))):
+        for state in heard:
+            execution.on_state(state)
+        assert waits(execution)  # whatever the others show
+    assert execution.needs_states(0.0)
+    assert execution.on_noted(MID)
+    assert (execution.phase, execution.accepted, execution.ready) == (Stage.GATED, True, True)
+    assert execution.done == (name == B)
+    execution.tick(T0_S)
+    assert execution.go  # what it has heard meanwhile counts
+
+
+@pytest.mark.parametrize("noted", [None, LOW, HIGH])
+def test_v3_what_the_controller_has_noted_of_another_ballot_says_nothing(
+    noted: Ballot | None,
+) -> None:
+    execution = taken()
+    assert not execution.on_noted(noted)
+    assert waits(execution)
+    assert execution.on_noted(MID)
+
+
+def test_v3_a_note_counts_once_and_only_for_a_plan_that_was_taken() -> None:
+    free, promised = vehicle(), vehicle()
+    promised.on_prepare(prepare(MID))
+    for execution in (free, promised, accepted(), going()):
+        before = repr(execution)
+        assert not execution.on_noted(MID)
+        assert not execution.on_noted(None)
+        assert repr(execution) == before
+
+
+def test_v3_a_plan_that_was_dropped_before_it_was_noted_is_not_accepted() -> None:
+    execution = taken()
+    execution.on_prepare(prepare(HIGH))
+    assert not execution.on_noted(MID)
+    newer = make_plan(HIGH)
+    assert execution.on_plan(newer)
+    assert not execution.on_noted(MID)  # that was the other one
+    assert waits(execution)
+    assert execution.on_noted(HIGH)
+
+
 # --- V4 and V5 --------------------------------------------------------------------------------
 
 
@@ -368,7 +452,7 @@ def test_v4_not_ready_counts_as_nothing_completed() -> None:
     assert execution.heard == {B: 0}
 
 
-@pytest.mark.parametrize("reach", [accepted, going])
+@pytest.mark.parametrize("reach", [taken, accepted, going])
 def test_v4_late_states_take_nothing_back(reach: Callable[[], PlanExecution]) -> None:
     execution = reach()
     for completed, ready, known in ((2, True, 2), (1, True, 2), (5, False, 2), (3, True, 3)):
@@ -467,7 +551,7 @@ def test_v7_counts_and_is_done() -> None:
     assert execution.tick(T0_S + 1000.0) is None
 
 
-@pytest.mark.parametrize("reach", [vehicle, accepted, going])
+@pytest.mark.parametrize("reach", [vehicle, taken, accepted, going])
 def test_v7_without_a_motion_nothing_ends(reach: Callable[[], PlanExecution]) -> None:
     execution = reach()
     before = repr(execution)
@@ -562,19 +646,21 @@ def test_a_history_takes_every_row_of_the_table() -> None:
         execution.on_prepare(prepare(MID))
     for _ in range(2):
         execution.on_plan(make_plan())
+    for _ in range(2):
+        execution.on_noted(MID)
     execution.on_state(shown())
     for _ in range(2):
         execution.tick(T0_S)
     for _ in range(2):
         execution.end_motion()
     execution.on_prepare(prepare(HIGH))
-    execution.on_plan(make_plan(HIGH, {A: ()}, {A: (-4, 1), B: (-3, 0)}))
+    accept(execution, make_plan(HIGH, {A: ()}, {A: (-4, 1), B: (-3, 0)}))
     for _ in range(2):
         execution.on_state(shown(ballot=HIGH, go=True))
     rules = [f"{book.table[row].rule} row {row}" for row in book.taken]
     assert rules == [
-        "V7 row 8", "V2 row 0", "V2 row 1", "V3 row 2", "V4 row 4", "V5 row 5", "V6 row 6",
-        "V7 row 7", "V2 row 0", "V3 row 2", "V4 row 3", "V4 row 4",
+        "V7 row 9", "V2 row 0", "V2 row 1", "V3 row 2", "V3 row 3", "V4 row 5", "V5 row 6",
+        "V6 row 7", "V7 row 8", "V2 row 0", "V3 row 2", "V3 row 3", "V4 row 4", "V4 row 5",
     ]  # fmt: skip
     assert {*book.taken} == {*range(len(VEHICLE_RULES.table))}
 
@@ -607,7 +693,7 @@ def test_dependencies_can_be_planted_too() -> None:
     sound, buggy = vehicle(), evolve(vehicle(), rules=book)
     for execution in (sound, buggy):
         execution.on_prepare(prepare(MID))
-        execution.on_plan(plan)
+        accept(execution, plan)
         execution.on_state(shown(go=True))
     assert buggy.tick(T0_S + 100.0) is not None
     assert sound.tick(T0_S + 100.0) is None

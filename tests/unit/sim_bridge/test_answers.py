@@ -7,7 +7,7 @@ from attrs import evolve
 
 from laneweave.protocol.messages import Name
 from laneweave.protocol.scenario import Runtime
-from laneweave.sim_bridge.answers import Answers
+from laneweave.sim_bridge.answers import LATE_SHARE, Answers
 
 RUNTIME = Runtime()
 DEADLINE_S, SILENT_S = RUNTIME.tick_deadline_s, RUNTIME.agent_silent_s
@@ -127,6 +127,66 @@ def test_without_a_connection_nobody_is_awaited_or_to_blame(answers: Answers) ->
         answers.ask((A, B), 50.0 + number * DEADLINE_S, link_up=True)
         answers.link_down()
         assert answers.settle(50.0 + (number + 1) * DEADLINE_S) == []
+
+
+# --- answers that come too late ---------------------------------------------------------------
+
+LATE_TICKS = round(LATE_SHARE * TICKS)
+"""Deadlines that an agent may miss with all its answers."""
+
+
+def late_tick(answers: Answers, number: int, *effective: Name) -> None:
+    """Let A and B be heard, but only some in time."""
+    answers.ask((A, B, C), number * DEADLINE_S, link_up=True)
+    for name in (A, B):
+        answers.heard(name)
+    for name in effective:
+        answers.effective(name)
+        answers.awaited.discard(name)
+    answers.close()
+    assert answers.settle((number + 1) * DEADLINE_S) == []
+
+
+def test_who_never_answers_in_time_is_ineffective_though_not_silent(answers: Answers) -> None:
+    for number in range(LATE_TICKS - 1):
+        late_tick(answers, number, A)
+        assert not answers.ineffective(B)
+    late_tick(answers, LATE_TICKS, A)
+    assert [answers.ineffective(name) for name in (A, B, C)] == [False, True, False]
+    assert answers.silent == set()
+    answers.ask((A, B), 100.0, link_up=True)
+    assert answers.awaited == {A, B}  # it may catch up
+
+
+def test_one_answer_in_time_in_a_while_is_enough_to_be_effective(answers: Answers) -> None:
+    for number in range(10 * LATE_TICKS):
+        late_tick(answers, number, *((A, B) if number % LATE_TICKS == 0 else (A,)))
+        assert not answers.ineffective(B)
+
+
+@pytest.mark.parametrize("sign", ["in time", "token", "no token", "left"])
+def test_what_ends_being_ineffective(answers: Answers, sign: str) -> None:
+    for number in range(LATE_TICKS):
+        late_tick(answers, number, A)
+    assert answers.ineffective(B)
+    match sign:
+        case "in time":
+            answers.effective(B)
+        case "token":
+            answers.agent_up(B)
+        case "no token":
+            answers.agent_down(B)
+        case _:
+            answers.forget(B)
+    assert not answers.ineffective(B)
+
+
+def test_time_off_the_network_makes_nobody_ineffective(answers: Answers) -> None:
+    for number in range(2 * LATE_TICKS):
+        answers.ask((A, B), number * DEADLINE_S, link_up=number % 2 == 0)
+        answers.link_down()
+        answers.settle((number + 1) * DEADLINE_S)
+    assert not answers.ineffective(A)
 
 
 # --- nobody answers at all --------------------------------------------------------------------

@@ -130,6 +130,28 @@ def test_accepts_a_plan_in_which_its_vehicle_holds(caretaker: Caretaker) -> None
     assert caretaker.show(1).accepted
 
 
+def test_what_it_accepts_is_noted_as_that_of_an_agent_is(
+    caretaker: Caretaker, vehicle: RoadVehicle
+) -> None:
+    told(caretaker, prepare())
+    caretaker.on_message(plan(own_moves=((1, HOME, NEXT),)), 0)
+    assert vehicle.controller.accepted is None
+    told(caretaker, plan())
+    assert vehicle.controller.accepted == FIRST
+    told(caretaker, prepare(SECOND))
+    told(caretaker, plan(SECOND))
+    assert vehicle.controller.accepted == SECOND
+
+
+def test_what_the_agent_before_it_accepted_is_not_its_own(vehicle: RoadVehicle) -> None:
+    vehicle.controller.accept(SECOND)
+    caretaker = Caretaker(vehicle, CARETAKER, 0)
+    told(caretaker, prepare())
+    assert not caretaker.show(0).accepted
+    assert told(caretaker, plan()).accepted
+    assert vehicle.controller.accepted == FIRST
+
+
 @pytest.mark.parametrize(
     "refused",
     [

@@ -8,10 +8,12 @@ from pathlib import Path
 import pytest
 from attrs import evolve
 
+from laneweave.protocol.incarnations import above
 from laneweave.protocol.messages import Ballot, Name, Plan, Prepare, Sense, VehicleState
 from laneweave.protocol.node import Arrived, Effect, Listen, Send, Stopping, Unlisten
 from laneweave.protocol.topics import COMMAND, PLAN, PREPARE, STATE
 from laneweave.protocol.transport import LinkDown, LinkUp
+from laneweave.sim_bridge.answers import LATE_SHARE
 from laneweave.sim_bridge.core import Phase
 from unit.sim_bridge.bench import (
     Desk,
@@ -96,6 +98,7 @@ def known(desk: Desk, vehicle: Name) -> tuple[object, ...]:
         controller.command_tick,
         controller.attendant,
         controller.joined,
+        controller.accepted,
         controller.hold_cell,
         controller.motion_end_tick,
         controller._jerks.tobytes(),
@@ -156,6 +159,57 @@ def test_a_claim_that_fails_is_tried_again_with_the_next_tick(desk: Desk) -> Non
     assert sensed(desk, B).attendant == AGENT + 1
 
 
+# --- what is noted within a tick --------------------------------------------------------------
+
+BALLOT = Ballot(1, Name("c1"), 7, 1)
+
+
+def test_what_is_new_to_the_controller_is_confirmed_at_once(attended: Desk) -> None:
+    block, tick = attended.core.vehicles[B].formation, attended.core.tick
+    effects = attended.answer(B, incarnation=AGENT, joined=(block + 1,), accepted=BALLOT)
+    sense = sense_of(effects, B, tick)
+    assert (sense.joined, sense.accepted) == ((block, block + 1), BALLOT)
+    assert (sense.attendant, sense.caretaker) == (AGENT, False)
+    again = attended.answer(B, incarnation=AGENT, joined=(block + 1,), accepted=BALLOT)
+    assert sent(again, Sense) == []  # it is told with the next tick, as ever
+    next_tick(attended, A)
+    assert sensed(attended, B).accepted == BALLOT
+
+
+def test_it_is_confirmed_at_once_whatever_the_tick_and_then_not_played(attended: Desk) -> None:
+    attended.answer(B, incarnation=AGENT)
+    attended.answer(A)
+    assert attended.core.phase is Phase.PACE  # the next tick is not due yet
+    before = known(attended, B)
+    for tick, ballot in ((-1, BALLOT), (0, BALLOT._replace(seq=2))):
+        late = {"incarnation": AGENT, "tick": attended.core.tick + tick, "accepted": ballot}
+        effects = attended.answer(B, **late, hold_cell=(-1, 1), jerks=jerks((9.0, 0.0)))
+        assert sense_of(effects, B, attended.core.tick).accepted == ballot
+        attended.core.vehicles[B].controller.accepted = None
+        assert known(attended, B) == before
+
+
+def test_nothing_is_noted_for_an_agent_that_has_been_replaced(attended: Desk) -> None:
+    """Its successor may be in an older plan already."""
+    attended.answer(B, incarnation=AGENT, accepted=BALLOT)
+    attended.drive_to(attended.core.tick + 1)
+    attended.answer(B, incarnation=AGENT + 1)
+    assert attended.core.vehicles[B].controller.accepted is None
+    before = known(attended, B)
+    assert attended.answer(B, incarnation=AGENT, accepted=BALLOT._replace(seq=2)) == []
+    assert known(attended, B) == before
+    next_tick(attended, A)
+    assert (sensed(attended, B).attendant, sensed(attended, B).accepted) == (AGENT + 1, None)
+
+
+def test_a_caretaker_takes_no_acceptance_over(attended: Desk) -> None:
+    attended.answer(B, incarnation=AGENT, accepted=BALLOT)
+    attended.down(B)
+    (state,) = sent(next_tick(attended, A), VehicleState)
+    assert (sensed(attended, B).accepted, state.accepted) == (None, False)
+    assert attended.answer(B, incarnation=AGENT, accepted=BALLOT) == []
+
+
 # --- caretakers take charge -------------------------------------------------------------------
 
 
@@ -184,6 +238,53 @@ def test_the_caretaker_takes_charge_when_the_agent_is_silent(attended: Desk) -> 
     assert (event["vehicle"], event["reason"]) == (B, "silent")
 
 
+def late_answer(desk: Desk) -> None:
+    """Let B's agent answer the tick before."""
+    late = desk.command(B, incarnation=AGENT, tick=desk.core.tick - 1)
+    desk.give(Arrived(COMMAND, OF_B, late))
+
+
+def test_the_caretaker_takes_charge_when_no_answer_comes_in_time(attended: Desk) -> None:
+    """It is alive, but it does not drive the vehicle: somebody has to say that it holds."""
+    patience = round(LATE_SHARE * MISSES)
+    for _ in range(patience - 1):
+        late_answer(attended)
+        next_tick(attended, A)
+        assert not sensed(attended, B).caretaker
+    late_answer(attended)
+    next_tick(attended, A)
+    assert sensed(attended, B).caretaker
+    assert attended.core._answers.silent == set()
+    (event,) = read_events(attended.folder, "caretaker-took-over")
+    assert (event["vehicle"], event["reason"]) == (B, "late")
+    for _ in range(3):  # as long as it is late it stays so
+        late_answer(attended)
+        next_tick(attended, A)
+        assert sensed(attended, B).caretaker
+    check_takes_back(attended)
+
+
+def test_an_agent_that_claims_its_vehicle_is_there_though_its_token_was_not_seen(
+    tmp_path: Path,
+) -> None:
+    desk = Desk(SCENARIO, tmp_path, TWO)
+    desk.start(A)
+    desk.drive_to_entry(A, B)
+    care = sensed(desk, B).attendant
+    assert desk.answer(B, incarnation=care + 1) == CARE_OF_B_ENDS
+    assert B in desk.core._answers.up
+    for _ in range(3):
+        next_tick(desk, A, B)
+        assert not sensed(desk, B).caretaker
+        assert desk.core._answers.awaited == {A, B}
+
+
+def test_who_does_not_get_the_vehicle_is_not_there(desk: Desk) -> None:
+    desk.down(B)
+    desk.answer(B, incarnation=AGENT, hold_cell=(-1, 1))  # a move is no claim
+    assert B not in desk.core._answers.up
+
+
 def test_the_caretaker_takes_charge_when_the_agent_never_came(tmp_path: Path) -> None:
     desk = Desk(SCENARIO, tmp_path, TWO)
     desk.start(A)
@@ -202,10 +303,12 @@ def test_an_agent_that_is_back_at_once_needs_no_caretaker(attended: Desk) -> Non
 
 
 def test_caretakers_have_greater_incarnations_than_all_before(desk: Desk) -> None:
+    desk.core._attendance._new_incarnation = lambda: 5
     desk.answer(B, incarnation=10**18)
     desk.down(B)
     next_tick(desk, A)
-    assert sensed(desk, B).attendant == 10**18 + 1
+    # Not just the next number: another process that steps above the agent may take that.
+    assert sensed(desk, B).attendant == above(5, 10**18) > 10**18
 
 
 def test_caretakers_take_incarnations_as_processes_do(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from attrs import evolve
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.messages import Command, Name, Neighbour
+from laneweave.protocol.messages import Ballot, Command, Name, Neighbour
 from laneweave.protocol.motion import cell_state
 from laneweave.protocol.scenario import Scenario
 from laneweave.sim_bridge.motion_controller import MAX_COLUMN, MotionController
@@ -107,6 +107,7 @@ def known(controller: MotionController) -> tuple[object, ...]:
     return (
         controller.attendant,
         controller.joined,
+        controller.accepted,
         controller.command_tick,
         controller.hold_cell,
         controller.motion_origin,
@@ -119,6 +120,7 @@ def test_nobody_is_in_charge_of_a_new_vehicle() -> None:
     plant = Plant(cell_state(LATTICE, HOME, 0.0), SCENARIO.vehicle, TICK_S)
     controller = MotionController(plant, SCENARIO.vehicle, LATTICE, TICK_S, (-9, 1))
     assert (controller.attendant, controller.joined) == (0, (LATTICE.block_of(-9),))
+    assert controller.accepted is None
 
 
 def test_an_older_process_is_refused_whatever_it_says(controller: MotionController) -> None:
@@ -183,6 +185,83 @@ def test_formations_are_joined_for_ever_and_only_by_who_is_in_charge(
     controller.take(evolve(command(6, incarnation=AGENT - 1), joined=(own + 5,)))
     controller.take(evolve(command(5), joined=(own + 6,)))
     assert [*controller.joined] == [own, own + 1, own + 2]
+
+
+# --- what it notes ----------------------------------------------------------------------------
+
+LOW, HIGH = Ballot(1, Name("c1"), 7, 1), Ballot(1, Name("c1"), 7, 2)
+
+
+def asking(
+    accepted: Ballot | None, *joined: int, tick: int = 3, incarnation: int = AGENT
+) -> Command:
+    return evolve(command(tick, incarnation=incarnation), accepted=accepted, joined=joined)
+
+
+def test_an_acceptance_is_noted_with_a_command(controller: MotionController) -> None:
+    assert controller.take(asking(LOW))
+    assert controller.accepted == LOW
+    controller.take(asking(None, tick=4))
+    assert controller.accepted == LOW
+
+
+def test_what_the_one_in_charge_asks_for_is_noted_whatever_the_tick(
+    controller: MotionController,
+) -> None:
+    controller.take(command(5, (1.0, 0.0)))
+    before = known(controller)
+    for tick, ballot in ((5, LOW), (4, HIGH)):
+        late = evolve(command(tick, (9.0, 0.0), hold_cell=(1, 1)), accepted=ballot, joined=(7,))
+        assert controller.note(late)
+        assert not controller.note(late)  # nothing new
+        assert (controller.accepted, controller.joined[-1]) == (ballot, 7)
+    assert known(controller)[3:] == before[3:]  # it is not played
+
+
+def test_the_newest_acceptance_counts(controller: MotionController) -> None:
+    assert controller.note(asking(HIGH))
+    for older in (LOW, None):
+        assert not controller.note(asking(older))
+        assert controller.accepted == HIGH
+
+
+@pytest.mark.parametrize("incarnation", [AGENT - 1, AGENT + 1])
+def test_nothing_is_noted_for_who_is_not_in_charge(
+    controller: MotionController, incarnation: int
+) -> None:
+    """Neither for one that has been replaced nor, before its claim, for its successor."""
+    before = known(controller)
+    assert not controller.note(asking(LOW, 7, incarnation=incarnation))
+    assert known(controller) == before
+
+
+def test_numbers_out_of_range_are_not_noted(controller: MotionController) -> None:
+    before = known(controller)
+    assert not controller.note(asking(LOW, 0, MAX_COLUMN + 1))
+    assert known(controller) == before
+
+
+@pytest.mark.parametrize("claim", ["command", "hand over"])
+def test_an_acceptance_is_forgotten_when_another_takes_charge(
+    controller: MotionController, claim: str
+) -> None:
+    controller.take(asking(LOW, 7))
+    joined = controller.joined
+    if claim == "command":
+        assert controller.take(asking(None, tick=4, incarnation=AGENT + 1))
+    else:
+        controller.hand_over(AGENT + 1)
+    assert (controller.accepted, controller.joined) == (None, joined)
+    assert not controller.note(asking(HIGH, tick=4))  # its time is over
+    assert controller.accepted is None
+    assert controller.note(asking(LOW, tick=4, incarnation=AGENT + 1))
+
+
+def test_a_claim_that_is_refused_makes_nothing_forgotten(controller: MotionController) -> None:
+    controller.take(asking(LOW))
+    claim = command(4, hold_cell=(1, 1), incarnation=AGENT + 1)
+    assert not controller.take(claim)
+    assert controller.accepted == LOW
 
 
 # --- what it refuses --------------------------------------------------------------------------

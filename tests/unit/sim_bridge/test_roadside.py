@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from laneweave.protocol.messages import Census
+from laneweave.protocol.messages import Census, RoadClock
 from laneweave.protocol.node import Send
 from laneweave.protocol.scenario import Scenario, load_scenario, parse_scenario
 from laneweave.sim_bridge.entry import Admission
@@ -160,6 +160,14 @@ def test_counts_make_the_clock() -> None:
     assert roadside.counts(on_road=7) == Counts(demanded=0, entered=0, on_road=7, left=1)
     clock = roadside.counts(on_road=7).clock(5, 0.5, ended=True)
     assert (clock.tick, clock.t_s, clock.on_road, clock.left, clock.ended) == (5, 0.5, 7, 1, True)
+
+
+@pytest.mark.parametrize("ended", [False, True])
+def test_all_news_name_the_bridge_that_they_come_from(*, ended: bool) -> None:
+    news = list(Roadside(Scenario(), 17).news(0, 0.0, (), ended=ended))
+    messages = [effect.message for effect in news if isinstance(effect, Send)]
+    assert [type(message) for message in messages] == [RoadClock, Census]
+    assert [message.bridge for message in messages] == [17, 17]
 
 
 def test_is_not_exhausted_while_somebody_is_still_to_come() -> None:

@@ -17,6 +17,8 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.simulated_network import Conditions, SimulatedNetwork
 from laneweave.protocol.topics import TOPICS
 
+ROAD = "road"
+"""Name of the road's node."""
 FIRST_S = 0.3
 """No single event before this time."""
 SHORT_S = (0.05, 2.5)
@@ -102,6 +104,9 @@ class Processes(Protocol):
     def start(self, name: str) -> None:
         """Start a process, unless it runs."""
 
+    def start_twin(self, name: str) -> str:
+        """Start a second process for an agent's vehicle, and return the name of its node."""
+
     def old_payload(self, rng: random.Random) -> tuple[str, bytes] | None:
         """Return a message that was sent some time ago, with its key."""
 
@@ -130,6 +135,7 @@ class Injector:
         self._note = note
         self._cuts: list[Callable[[str, str], bool]] = []
         self._blackouts = 0
+        self._twins: list[str] = []
 
     def plan(self, kinds: Sequence[str]) -> None:
         """Draw the single events of a run and when they happen."""
@@ -145,6 +151,8 @@ class Injector:
         network.conditions = WHOLE
         network.cut(None)
         network.restore_router()
+        for name in self._twins:
+            network.kill(name)
         for name in network.names:
             network.resume(name)
             network.reconnect(name)
@@ -157,6 +165,8 @@ class Injector:
         match kind:
             case "leader-kill" | "coordinator-kill" | "agent-kill":
                 done = self._kill(target, for_ever=kind == "agent-kill")
+            case "agent-twin":
+                done = self._double(target)
             case "leader-pause" | "coordinator-pause" | "agent-pause":
                 done = self._pause(target)
             case "cut":
@@ -210,6 +220,25 @@ class Injector:
             return False
         self._network.pause(name)
         self._later(SHORT_S, lambda: self._if_there(name, self._network.resume))
+        return True
+
+    def _double(self, name: str) -> bool:
+        """Start a second process for a vehicle; the first one goes on, and may not sense that."""
+        if name not in self._network:
+            return False
+        twin = self._processes.start_twin(name)
+        if twin in self._twins:
+            return False
+        self._twins.append(twin)
+
+        def blocked(sender: str, receiver: str) -> bool:
+            return sender == ROAD and receiver == name
+
+        self._cuts.append(blocked)
+        self._apply_cuts()
+        self._later(LONG_S, lambda: self._join(blocked))
+        victim = self._rng.choice((name, twin))
+        self._later(LONG_S, lambda: self._if_there(victim, self._network.kill))
         return True
 
     def _unplug(self, name: str) -> bool:

@@ -14,7 +14,7 @@ Span = tuple[int, int]
 """Least and greatest, both included."""
 
 COORDINATOR_HARM = ("leader-kill", "leader-pause", "coordinator-kill", "coordinator-pause")
-AGENT_HARM = ("agent-kill", "agent-kill", "agent-pause")
+AGENT_HARM = ("agent-kill", "agent-kill", "agent-pause", "agent-twin")
 NETWORK_HARM = ("cut", "partition", "partition", "blackout", "router-loss")
 NOISE = ("garbage", "replay")
 
@@ -141,7 +141,7 @@ _ALL = (
         text="twelve vehicles in few blocks, for the speed of the simulation, too",
         vehicles=(12, 12),
         blocks=(2, 2),
-        lanes=(3, 3),
+        lanes=(4, 4),
         max_joined=(1, 1),
     ),
 )

@@ -278,6 +278,8 @@ class LightRoad:
         held, attendant = controller.hold_cell, controller.attendant
         if command.incarnation >= attendant or command.vehicle in self._attendance:
             self._answers.heard(command.vehicle)
+        if controller.note(command) and not self._lost():
+            yield self._sense_of(command.vehicle, vehicle)
         try:
             if not controller.take(command):
                 self.refused += 1
@@ -285,7 +287,9 @@ class LightRoad:
         except BadInputError:
             self.refused += 1
             return
+        self._answers.effective(command.vehicle)
         if controller.attendant != attendant:
+            self._answers.agent_up(command.vehicle)
             yield from self._attendance.give_way(command.vehicle)
         if controller.hold_cell != held:
             lasts_s = self._move_lasts_s()
@@ -307,10 +311,13 @@ class LightRoad:
         self._answers.ask(self.vehicles, now_s, link_up=self._link_up)
         for name, vehicle in self.vehicles.items():
             if not self._lost():
-                sense = vehicle.sense(self.tick, caretaker=name in self._attendance)
-                yield Send(SENSE, sense, {"vehicle": name})
+                yield self._sense_of(name, vehicle)
         yield from self._attendance.show(self.tick)
         yield from self._tell_road(t_s)
+
+    def _sense_of(self, name: Name, vehicle: LightVehicle) -> Effect:
+        sense = vehicle.sense(self.tick, caretaker=name in self._attendance)
+        return Send(SENSE, sense, {"vehicle": name})
 
     def _let_enter(self, now_s: float) -> None:
         while self._visits and self._visits[0].enters_s <= now_s + 1e-6:
@@ -346,7 +353,8 @@ class LightRoad:
             absent = name not in answers.up and now_s >= max(
                 self._absence_counts_s, vehicle.admission.t_s + AGENT_START_S
             )
-            if (absent or name in answers.silent) and name not in self._attendance:
+            gone = absent or name in answers.silent or answers.ineffective(name)
+            if gone and name not in self._attendance:
                 self.takeovers += 1
                 yield from self._attendance.take_charge(vehicle, self.tick)
 

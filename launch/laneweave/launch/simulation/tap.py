@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 from laneweave.protocol.node import Core, Effect, Event, Send
 
@@ -24,9 +24,10 @@ class Tap:
         """When the core wants to be woken."""
         return self.core.wakeup_s
 
-    def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
+    def handle(self, event: Event, now_s: float) -> list[Effect]:
         """Let the core handle an event."""
-        for effect in self.core.handle(event, now_s):
+        effects = list(self.core.handle(event, now_s))
+        for effect in effects:
             if type(effect) is Send:
                 self._listener(self._name, effect)
-            yield effect
+        return effects

@@ -20,7 +20,7 @@ from laneweave.coordinator.leader_rules import LEADER_RULES
 from laneweave.launch.simulation.bodies import Geometry
 from laneweave.launch.simulation.checker import Checker, Violation
 from laneweave.launch.simulation.driver import LightDriver
-from laneweave.launch.simulation.faults import CLOCK_DRIFT, CLOCK_OFFSET_S, Injector
+from laneweave.launch.simulation.faults import CLOCK_DRIFT, CLOCK_OFFSET_S, ROAD, Injector
 from laneweave.launch.simulation.profiles import Profile
 from laneweave.launch.simulation.road import LightRoad
 from laneweave.launch.simulation.setup import SLOT_S, Setup
@@ -35,8 +35,9 @@ from laneweave.protocol.simulated_trace import TraceDigest
 from laneweave.protocol.topics import Keys
 from laneweave.protocol.transitions import RuleBook
 
+TWIN = ".2"
+"""Of the name of a second process of a vehicle."""
 COORDINATORS = ("c1", "c2", "c3")
-ROAD = "road"
 SLOWEST_SLOTS = 3.0
 """A slow motion takes at most this many slots."""
 NEW_WISHES_S = (0.8, 3.0)
@@ -200,10 +201,17 @@ class World:
         """Coordinators that take themselves for the leader."""
         return tuple(name for name in COORDINATORS if self._leads(name))
 
+    def start_twin(self, name: str) -> str:
+        """Start a second process for an agent's vehicle, and return the name of its node."""
+        twin = f"{name}{TWIN}"
+        self.start(twin)
+        return twin
+
     def start(self, name: str) -> None:
         """Start a process, unless it runs."""
         if name in self.network:
             return
+        vehicle = Name(name.removesuffix(TWIN))
         scenario, (vehicle_rules, leader_rules) = self.setup.scenario, self._rules
         core: Core
         if name in COORDINATORS:
@@ -211,9 +219,9 @@ class World:
             core = CoordinatorCore(Name(name), incarnation, scenario, leader_rules)
         else:
             agent = AgentCore(
-                Name(name), self._incarnations.__next__, scenario, LightDriver, vehicle_rules
+                vehicle, self._incarnations.__next__, scenario, LightDriver, vehicle_rules
             )
-            core = AgentHost(lambda _: agent, [Name(name)])
+            core = AgentHost(lambda _: agent, [vehicle])
         self.network.add(name, Tap(core, name, self._on_sent), scenario.network.realm)
 
     def old_payload(self, rng: random.Random) -> tuple[str, bytes] | None:
