@@ -6,7 +6,9 @@ compares it with what this script would write.
 
 from __future__ import annotations
 
+import json
 import re
+import sys
 from pathlib import Path
 
 from laneweave.coordinator.leader_rules import LEADER_RULES, Phase
@@ -14,10 +16,29 @@ from laneweave.protocol.execution import VEHICLE_RULES, Stage
 from laneweave.protocol.transitions import markdown_table, mermaid_diagram
 
 DOCS = Path(__file__).resolve().parent
+FOUND = DOCS / "evidence" / "planted-bugs-found.json"
+"""What the random search found, as `tests/simulation/search_bugs.py` prints it."""
 
 
 def _diagram(text: str) -> str:
     return f"```mermaid\n{text}\n```"
+
+
+def _planted_bugs() -> str:
+    """Return the table of planted bugs; the tests that use them are not a package."""
+    sys.path.insert(0, str(DOCS.parent / "tests"))
+    from planted_bugs import BUGS  # noqa: PLC0415
+
+    found = json.loads(FOUND.read_text(encoding="utf-8"))
+    lines = [
+        "| planted bug | rule | what is broken | spoils the story | it ends with | random search |",
+        "|---|---|---|---|---|---|",
+    ]
+    for bug in BUGS:
+        end = "two vehicles in one cell" if bug.collides else "disorder, or a wait"
+        seed = found.get(bug.name, "-")
+        lines.append(f"| `{bug.name}` | {bug.rule} | {bug.text} | `{bug.story}` | {end} | {seed} |")
+    return "\n".join(lines)
 
 
 def parts() -> dict[str, str]:
@@ -27,6 +48,7 @@ def parts() -> dict[str, str]:
         "vehicle phases": _diagram(mermaid_diagram(VEHICLE_RULES, Stage.FREE)),
         "leader rules": markdown_table(LEADER_RULES),
         "leader phases": _diagram(mermaid_diagram(LEADER_RULES, Phase.OBSERVING)),
+        "planted bugs": _planted_bugs(),
     }
 
 
