@@ -1,8 +1,8 @@
 """Incarnations: numbers that tell one process, or one claim of a process, from all others.
 
 A number is a time in ns whose low bits are the process's own: numbers grow from process to process
-as time does, and two processes that live at the same time never have the same one, also where one
-has to step above a number that is ahead of its clock.
+as time does, and two processes that live at the same time on one machine never have the same one,
+also where one has to step above a number that is ahead of its clock.
 """
 
 from __future__ import annotations

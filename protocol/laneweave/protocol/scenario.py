@@ -187,7 +187,7 @@ class Network:
     lease_s: float = field(default=1.0, validator=within(0.1, 60.0))
     """A silent session is given up after this time (Zenoh's transport lease)."""
     heartbeat_s: float = field(default=0.1, validator=within(0.01, 10.0))
-    election_s: float = field(default=1.0, validator=within(0.05, 60.0))
+    election_s: float = field(default=0.7, validator=within(0.05, 60.0))
     """A candidate leads when it has been the best-ranked one for this long. A process that dies is
     noticed at once by its liveliness token; this is for one that hangs."""
     resend_s: float = field(default=0.2, validator=within(0.01, 10.0))

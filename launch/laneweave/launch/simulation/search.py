@@ -17,6 +17,7 @@ from attrs import field, frozen
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from laneweave.launch.roles import die_with_supervisor
 from laneweave.launch.simulation.profiles import Profile
 from laneweave.launch.simulation.story import Story
 from laneweave.launch.simulation.world import Outcome, Totals, World
@@ -139,7 +140,11 @@ def _batches(seeds: range, profile: Profile, jobs: int, *, digest: bool) -> Iter
 
 
 def _quiet() -> None:
-    """In a worker: Ctrl-C is the parent's business, and expected warnings are nobody's."""
+    """In a worker: Ctrl-C is the parent's business, and expected warnings are nobody's.
+
+    A worker ends with its parent, however that ends.
+    """
+    die_with_supervisor()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     quiet_logs()
 
