@@ -157,11 +157,7 @@ class Agent:
         self._note(self._core.handle(self._arrived(topic, message), 0.0))
         asked = self.command
         # What is to be noted goes to the controller at once, and back: within one vehicle.
-        if (
-            asked is not None
-            and asked is not before
-            and self.vehicle.road.controller.note(asked)
-        ):
+        if asked is not None and asked is not before and self.vehicle.road.controller.note(asked):
             sense = self.vehicle.sense(self.tick)
             self._note(self._core.handle(self._arrived(SENSE, sense), 0.0))
 
