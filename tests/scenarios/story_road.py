@@ -18,7 +18,7 @@ from laneweave.protocol.lattice import Cell, Lattice, Move
 from laneweave.protocol.messages import Command, Name, Plan, Prepare, Sense, VehicleState
 from laneweave.protocol.motion import at_rest_in_cell, cell_state
 from laneweave.protocol.node import Arrived, Effect, Send, Started
-from laneweave.protocol.scenario import FormationSettings, Road, Runtime, Scenario
+from laneweave.protocol.scenario import FormationSettings, Network, Road, Runtime, Scenario
 from laneweave.protocol.topics import PLAN, PREPARE, SENSE, STATE
 from laneweave.protocol.transitions import RuleBook
 from laneweave.sim_bridge.attendance import Attendance
@@ -35,6 +35,7 @@ SCENARIO = Scenario(
     formation=FormationSettings(
         cycle_s=SLOT_S, move_s=0.8, max_joined=2, planning_deadline_s=3600.0
     ),
+    network=Network(election_s=1.0),
     runtime=Runtime(tick_s=TICK_S),
 )
 

@@ -7,6 +7,10 @@ asked for `agent_silent_s` without any answer is *silent* and not waited for any
 When nobody at all has answered for that long the network is *deaf*: no tick waits, so that
 vehicles which come then do not cost the same wait one after the other.
 
+Answers that come after their tick has been closed tell of a machine that is too slow rather than of
+lost messages. Then ticks get more time, and SENSE is sent again less often, so that the road slows
+down instead of leaving its vehicles behind; when none is late any more, that is taken back slowly.
+
 Times are those of the node's clock. Each tick counts for at most its deadline: what the road waits
 for otherwise (its pace, an agent that is to come up) is nobody's silence.
 """
@@ -21,6 +25,12 @@ from attrs import define, field
 from laneweave.protocol.messages import Name
 from laneweave.protocol.scenario import Runtime
 
+MOST_STRETCH = 8.0
+"""Ticks get at most this many times `tick_deadline_s`."""
+_STRETCH, _RELAX = 1.5, 0.98
+"""Factors of the time for a tick, after one with late answers and after one without."""
+_LATE_AGENTS = 0.05
+"""Share of the agents whose answers may be late without ticks getting more time."""
 LATE_SHARE = 2.0
 """An agent that answers, but always too late, is borne with for this many times as long."""
 _ROUNDING_S = 1e-6
@@ -50,6 +60,9 @@ class Answers:
     """How long each has been asked since an answer of it came in time."""
     _asked: set[Name] = field(factory=set)
     """Whose tokens were there when the current tick was sent, and who did not answer it in time."""
+    _late: set[Name] = field(factory=set)
+    """Who answered an earlier tick since the current one was sent."""
+    _stretch: float = 1.0
     _heard_any: bool = False
     _deaf_s: float = 0.0
     """How long agents have been asked since anybody was heard."""
@@ -84,6 +97,10 @@ class Answers:
         self._heard_any = True
         self._deaf_s = 0.0
 
+    def late(self, name: Name) -> None:
+        """An answer came after its tick had been closed."""
+        self._late.add(name)
+
     def effective(self, name: Name) -> None:
         """An answer came in time: the agent drives its vehicle."""
         self._asked.discard(name)
@@ -96,7 +113,7 @@ class Answers:
 
     def settle(self, now_s: float) -> list[Name]:
         """Account for the tick before; return who has become silent with it."""
-        lasted_s = min(now_s - self._asked_s, self.runtime.tick_deadline_s)
+        lasted_s = min(now_s - self._asked_s, self._stretch * self.runtime.tick_deadline_s)
         for name in self._asked & self.up:
             self._idle_s[name] = self._idle_s.get(name, 0.0) + lasted_s
         fallen_silent = []
@@ -122,15 +139,19 @@ class Answers:
         self._asked = set(self._unheard)
         self._heard_any = False
         self.awaited = set() if self.deaf else self._unheard - self.silent
+        slow = len(self._late) > _LATE_AGENTS * len(self.up)
+        self._stretch *= _STRETCH if slow else _RELAX
+        self._stretch = min(max(self._stretch, 1.0), MOST_STRETCH)
+        self._late.clear()
         self._asked_s = now_s
-        self.resend_s = now_s + self.runtime.tick_resend_s
-        self.deadline_s = now_s + self.runtime.tick_deadline_s
+        self.resend_s = now_s + self._stretch * self.runtime.tick_resend_s
+        self.deadline_s = now_s + self._stretch * self.runtime.tick_deadline_s
 
     def ask_again(self, now_s: float) -> list[Name]:
         """Return who is to be asked again now."""
         if now_s < self.resend_s:
             return []
-        self.resend_s = now_s + self.runtime.tick_resend_s
+        self.resend_s = now_s + self._stretch * self.runtime.tick_resend_s
         return sorted(self.awaited)
 
     def complete(self, now_s: float) -> bool:

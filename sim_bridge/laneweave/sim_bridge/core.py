@@ -225,6 +225,8 @@ class BridgeCore:
         if command.tick != self.tick or self.phase is not Phase.ANSWERS:
             # A late answer was made for a state that is past: played now, from its middle, it
             # would end somewhere else.
+            if command.tick < self.tick and command.incarnation == attendant:
+                self._answers.late(name)
             return
         try:
             taken = controller.take(command)

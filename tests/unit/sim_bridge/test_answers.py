@@ -7,7 +7,7 @@ from attrs import evolve
 
 from laneweave.protocol.messages import Name
 from laneweave.protocol.scenario import Runtime
-from laneweave.sim_bridge.answers import LATE_SHARE, Answers
+from laneweave.sim_bridge.answers import LATE_SHARE, MOST_STRETCH, Answers
 
 RUNTIME = Runtime()
 DEADLINE_S, SILENT_S = RUNTIME.tick_deadline_s, RUNTIME.agent_silent_s
@@ -241,3 +241,45 @@ def test_deadlines_may_be_as_long_as_silence() -> None:
     answers.agent_up(A)
     answers.agent_up(B)
     assert tick(answers, 0.0, B, lasts_s=SILENT_S) == [A]
+
+
+def slow_ticks(answers: Answers, names: list[Name], count: int, *, late: bool) -> float:
+    """Let ticks pass; return how long the next one may last."""
+    now_s = 100.0
+    for _ in range(count):
+        answers.ask(names, now_s, link_up=True)
+        for name in names:
+            answers.heard(name)
+            answers.effective(name)
+            if late:
+                answers.late(name)
+        now_s += 1.0
+    answers.ask(names, now_s, link_up=True)
+    return answers.deadline_s - now_s
+
+
+def test_ticks_get_more_time_while_answers_are_late_and_less_again() -> None:
+    answers = Answers(RUNTIME)
+    names = [Name(f"v{number}") for number in range(40)]
+    for name in names:
+        answers.agent_up(name)
+    assert slow_ticks(answers, names, 3, late=False) == pytest.approx(DEADLINE_S)
+    assert slow_ticks(answers, names, 1, late=True) == pytest.approx(1.5 * DEADLINE_S)
+    assert slow_ticks(answers, names, 30, late=True) == pytest.approx(MOST_STRETCH * DEADLINE_S)
+    assert answers.resend_s - (answers.deadline_s - MOST_STRETCH * DEADLINE_S) == pytest.approx(
+        MOST_STRETCH * RUNTIME.tick_resend_s
+    )
+    relaxed_s = slow_ticks(answers, names, 30, late=False)
+    assert DEADLINE_S < relaxed_s < MOST_STRETCH * DEADLINE_S
+    assert slow_ticks(answers, names, 200, late=False) == pytest.approx(DEADLINE_S)
+
+
+def test_one_late_agent_of_many_changes_nothing() -> None:
+    answers = Answers(RUNTIME)
+    names = [Name(f"v{number}") for number in range(40)]
+    for name in names:
+        answers.agent_up(name)
+    answers.ask(names, 0.0, link_up=True)
+    answers.late(names[0])
+    answers.ask(names, 1.0, link_up=True)
+    assert answers.deadline_s == pytest.approx(1.0 + DEADLINE_S)
