@@ -71,7 +71,7 @@ def test_profile_long(profile: str) -> None:
 
 
 def test_formations_are_joined() -> None:
-    assert search("joint", range(100, 112)).joint_plans > 0
+    assert search("joint", range(110, 122)).joint_plans > 0
 
 
 def test_every_kind_of_fault_happens() -> None:

@@ -126,7 +126,7 @@ def test_a_run_ends_with_its_bridge_and_its_router(
 
 
 def test_vehicles_arrive_though_an_agent_is_killed(lab: Lab, road: Path) -> None:
-    process = start_and_wait(lab, road)
+    process = start_and_wait(lab, road, "--duration", "14")
     agent = next(name for name in sorted(lab.roles()) if name.startswith("agent-"))
 
     os.kill(lab.roles()[agent], signal.SIGKILL)

@@ -259,7 +259,7 @@ def simulate(
         str, typer.Option("--seeds", metavar="A:B", help="Seeds to run; B is not included.")
     ] = "0:100",
     profile: Annotated[
-        str, typer.Option("--profile", metavar="NAME", help="What goes wrong: docs/SAFETY.md.")
+        str, typer.Option("--profile", metavar="NAME", help="What goes wrong; an unknown name lists them.")
     ] = "mixed",
     jobs: Annotated[
         int | None, typer.Option("--jobs", metavar="N", help="Processes; default: all cores.")
@@ -268,7 +268,7 @@ def simulate(
         bool, typer.Option("--digest", help="Print a digest of everything that was delivered.")
     ] = False,
     verbose: Annotated[
-        bool, typer.Option("--verbose", help="Tell the story of the first failed seed.")
+        bool, typer.Option("--verbose", help="Tell the story of the first failed seed, or of one.")
     ] = False,
     no_progress: Annotated[bool, typer.Option("--no-progress", help="Show no bar.")] = False,
 ) -> None:
@@ -278,6 +278,7 @@ def simulate(
     chosen = profiles.profile_named(profile)
     numbers, count = search.parse_seeds(seeds), search.check_jobs(jobs)
     search.quiet_logs()
+    search.end_on_sigterm()
     show = not no_progress and sys.stderr.isatty()
     result = search.search(numbers, chosen, count, digest=digest, show=show)
     if verbose and (result.failed or len(numbers) == 1):

@@ -30,7 +30,9 @@ GROUPS = tuple(SENDER_OF_GROUP)
 OTHERS = "others"
 AUTO, NAMESPACES, MESSAGES = "auto", "namespaces", "messages"
 MOST_S = 1e6
-MOST_TIMES = 1_000_000
+MOST_TIMES = 10_000
+LEAST_EVERY_S = 0.1
+"""Faults that repeat are looked for once in a tick."""
 
 
 def _range(_: object, attribute: attrs.Attribute[Any], value: tuple[float, float]) -> None:
@@ -64,9 +66,7 @@ class Strike:
     """Road time. Either this or `between_s`."""
     between_s: tuple[float, float] | None = field(default=None, validator=optional(_range))
     """Road times between which a time is drawn, for each target and each time."""
-    every_s: float | None = field(
-        default=None, validator=optional(within(0.0, MOST_S, open_low=True))
-    )
+    every_s: float | None = field(default=None, validator=optional(within(LEAST_EVERY_S, MOST_S)))
     """Again after so much road time; with `at_s`."""
     times: int | None = field(default=None, validator=optional(within(1, MOST_TIMES)))
     """How often in all; none: once, or with `every_s` to the end of the run."""
@@ -81,6 +81,8 @@ class Strike:
             raise BadInputError("every_s", self.every_s, "nothing without at_s")
         if self.times is not None and self.at_s is not None and self.every_s is None:
             raise BadInputError("times", self.times, "nothing without every_s or between_s")
+        if self.count * (self.times or 1) > MOST_TIMES:
+            raise BadInputError("times", self.times, f"count * times of at most {MOST_TIMES}")
         if self.count > 1 and self.target not in (AGENT, COORDINATOR):
             raise BadInputError("count", self.count, f"1 for any target but {AGENT}, {COORDINATOR}")
 

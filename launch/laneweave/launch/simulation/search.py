@@ -10,7 +10,9 @@ import re
 import signal
 import sys
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from itertools import islice
 
 import structlog
 from attrs import field, frozen
@@ -18,10 +20,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from laneweave.launch.roles import die_with_supervisor
+from laneweave.launch.simulation.checker import Violation
 from laneweave.launch.simulation.profiles import Profile
 from laneweave.launch.simulation.story import Story
 from laneweave.launch.simulation.world import Outcome, Totals, World
-from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.errors import BadInputError, CommandFailedError
 
 MOST_SEEDS = 10_000_000
 MOST_JOBS = 256
@@ -82,8 +85,16 @@ def check_jobs(jobs: int | None) -> int:
 
 
 def run_seeds(seeds: Sequence[int], profile: Profile, *, digest: bool = False) -> list[Outcome]:
-    """Run some seeds in this process."""
-    return [World(seed, profile, digest=digest).run() for seed in seeds]
+    """Run some seeds in this process; one that crashes is a failed one, too."""
+    return [_run_seed(seed, profile, digest=digest) for seed in seeds]
+
+
+def _run_seed(seed: int, profile: Profile, *, digest: bool) -> Outcome:
+    try:
+        return World(seed, profile, digest=digest).run()
+    except Exception as error:  # noqa: BLE001 (whatever a core does, the search goes on)
+        text = f"{type(error).__name__}: {error}"
+        return Outcome(seed, (Violation("crash", 0.0, (), text),), Totals(runs=1))
 
 
 def search(
@@ -126,12 +137,20 @@ def _batches(seeds: range, profile: Profile, jobs: int, *, digest: bool) -> Iter
     # Spawned: a fork would copy locks that the progress bar's thread holds.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(jobs, len(batches)), context, _quiet) as pool:
-        futures: list[Future[list[Outcome]]] = [
-            pool.submit(run_seeds, batch, profile, digest=digest) for batch in batches
-        ]
+        waiting = iter(batches)
+        running: set[Future[list[Outcome]]] = set()
         try:
-            for future in as_completed(futures):
-                yield future.result()
+            # Only a few batches at a time: a long search is soon under way, and soon ended.
+            for batch in islice(waiting, 2 * jobs):
+                running.add(pool.submit(run_seeds, batch, profile, digest=digest))
+            while running:
+                done, running = wait(running, return_when=FIRST_COMPLETED)
+                for batch in islice(waiting, len(done)):
+                    running.add(pool.submit(run_seeds, batch, profile, digest=digest))
+                for future in done:
+                    yield future.result()
+        except BrokenProcessPool as error:
+            raise CommandFailedError("a worker of the search was killed") from error
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             for process in multiprocessing.active_children():
@@ -144,9 +163,15 @@ def _quiet() -> None:
 
     A worker ends with its parent, however that ends.
     """
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     die_with_supervisor()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     quiet_logs()
+
+
+def end_on_sigterm() -> None:
+    """End as Ctrl-C does when the process is asked to end."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 def quiet_logs() -> None:
