@@ -259,7 +259,10 @@ def simulate(
         str, typer.Option("--seeds", metavar="A:B", help="Seeds to run; B is not included.")
     ] = "0:100",
     profile: Annotated[
-        str, typer.Option("--profile", metavar="NAME", help="What goes wrong; an unknown name lists them.")
+        str,
+        typer.Option(
+            "--profile", metavar="NAME", help="What goes wrong; an unknown name lists them."
+        ),
     ] = "mixed",
     jobs: Annotated[
         int | None, typer.Option("--jobs", metavar="N", help="Processes; default: all cores.")
