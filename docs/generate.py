@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+from functools import cache
 from pathlib import Path
 
 from laneweave.coordinator.leader_rules import LEADER_RULES, Phase
@@ -41,6 +42,7 @@ def _planted_bugs() -> str:
     return "\n".join(lines)
 
 
+@cache
 def parts() -> dict[str, str]:
     """Return each generated part by its name."""
     return {

@@ -186,7 +186,7 @@ class AgentCore:
             motion_origin=drive.motion_origin,
             jerks=drive.jerks,
             joined=execution.wanted_joined,
-            accepted=execution.plan.ballot if execution.plan is not None else None,
+            accepted=execution.wanted_accepted,
         )
         yield Send(COMMAND, self._command, self._own)
         if self.in_charge:
@@ -203,11 +203,12 @@ class AgentCore:
 
     def _ask_to_note(self, execution: PlanExecution) -> Iterator[Effect]:
         """Ask the controller at once, not only with the next tick's COMMAND."""
-        command, plan = self._command, execution.plan
+        command = self._command
         assert command is not None  # noqa: S101 (in charge: it has commanded)
-        accepted = plan.ballot if plan is not None else None
-        if (command.joined, command.accepted) != (execution.wanted_joined, accepted):
-            self._command = evolve(command, joined=execution.wanted_joined, accepted=accepted)
+        self._command = evolve(
+            command, joined=execution.wanted_joined, accepted=execution.wanted_accepted
+        )
+        if self._command != command:
             yield Send(COMMAND, self._command, self._own)
 
     def _meet_vehicle(self, sense: Sense) -> None:

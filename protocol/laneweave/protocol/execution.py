@@ -123,6 +123,11 @@ class PlanExecution:
         return self.plan.moves[self.vehicle][self.completed]
 
     @property
+    def wanted_accepted(self) -> Ballot | None:
+        """The plan that the motion controller should note as accepted."""
+        return self.plan.ballot if self.plan is not None else None
+
+    @property
     def accepted(self) -> bool:
         """It has a plan, and its motion controller has noted that."""
         return self.phase in _ACCEPTED
@@ -282,7 +287,7 @@ def _accept(me: PlanExecution, plan: Plan) -> None:
 
 def _is_noted(me: PlanExecution, ballot: Ballot | None) -> bool:
     """My controller has noted for me that I accept it."""
-    return me.plan is not None and ballot == me.plan.ballot
+    return me.plan is not None and ballot == me.wanted_accepted
 
 
 def _is_of_my_plan(me: PlanExecution, state: VehicleState) -> bool:

@@ -75,21 +75,18 @@ class Answers:
     def agent_up(self, name: Name) -> None:
         """An agent's token appeared: it gets all the time that it may take."""
         self.up.add(name)
-        self._idle_s.pop(name, None)
-        self._forgive(name)
+        self._begin_anew(name)
 
     def agent_down(self, name: Name) -> None:
         """An agent's token vanished."""
         self.up.discard(name)
         self.awaited.discard(name)
-        self._idle_s.pop(name, None)
-        self._forgive(name)
+        self._begin_anew(name)
 
     def forget(self, name: Name) -> None:
         """Forget a vehicle that left the road; its agent may still be up."""
         self.awaited.discard(name)
-        self._idle_s.pop(name, None)
-        self._forgive(name)
+        self._begin_anew(name)
 
     def heard(self, name: Name) -> None:
         """An agent gave a sign of life: an answer to any tick."""
@@ -103,6 +100,7 @@ class Answers:
 
     def effective(self, name: Name) -> None:
         """An answer came in time: the agent drives its vehicle."""
+        self.awaited.discard(name)
         self._asked.discard(name)
         self._idle_s.pop(name, None)
 
@@ -167,6 +165,12 @@ class Answers:
     def ineffective(self, name: Name) -> bool:
         """Tell whether no answer of an agent has come in time for too long, though it may live."""
         return self._too_long(self._idle_s.get(name, 0.0) / LATE_SHARE)
+
+    def _begin_anew(self, name: Name) -> None:
+        """Hold nothing against an agent that was so far."""
+        self._forgive(name)
+        self._asked.discard(name)
+        self._idle_s.pop(name, None)
 
     def _forgive(self, name: Name) -> None:
         self.silent.discard(name)

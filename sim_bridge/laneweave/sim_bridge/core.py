@@ -235,7 +235,6 @@ class BridgeCore:
             return
         if not taken:
             return
-        self._answers.awaited.discard(name)
         self._answers.effective(name)
         if attendant not in (0, controller.attendant):
             previous = "caretaker" if name in self._attendance else "agent"
