@@ -47,14 +47,13 @@ from laneweave.sim_bridge.answers import Answers
 from laneweave.sim_bridge.attendance import Attendance
 from laneweave.sim_bridge.demand import Arrival
 from laneweave.sim_bridge.entry import Admission
+from laneweave.sim_bridge.leaving import Leaving
 from laneweave.sim_bridge.motion_controller import MotionController
 from laneweave.sim_bridge.plant import Plant
+from laneweave.sim_bridge.roadside import CENSUS_EVERY_TICKS
 from laneweave.sim_bridge.traffic import RoadVehicle
 
 CLOCK_EVERY_TICKS = 2
-CENSUS_EVERY_TICKS = 10
-LEFT_REPEATS = 20
-"""Ticks for which the agent of a vehicle that left is told so."""
 AGENT_START_S = 1.0
 """How long after its entrance a vehicle waits for its agent before its caretaker takes charge."""
 SYNC_S = 1.0
@@ -225,8 +224,7 @@ class LightRoad:
         self._attendance = Attendance(new_incarnation)
         self._absence_counts_s = 0.0
         """Before this time nothing is concluded from a token that is not there."""
-        self._leaving: dict[Name, tuple[LightVehicle, int]] = {}
-        """Vehicles that left, and how often their agents are still told so."""
+        self._leaving = Leaving()
         self._link_up = True
         self._census_due_tick = 0
 
@@ -329,19 +327,12 @@ class LightRoad:
 
     def _let_leave(self, now_s: float) -> Iterator[Effect]:
         for name in [name for name, each in self.vehicles.items() if each.leaves_by(now_s)]:
-            self._leaving[name] = self.vehicles.pop(name), LEFT_REPEATS
+            self._leaving.add(self.vehicles.pop(name))
             self._answers.forget(name)
             yield from self._attendance.give_way(name)
             self._watcher.leave(now_s, name)
             self._census_due_tick = 0
-        for name, (vehicle, repeats) in list(self._leaving.items()):
-            yield Send(
-                SENSE, vehicle.sense(self.tick, caretaker=False, left=True), {"vehicle": name}
-            )
-            if repeats > 1 and name in self._answers.up:
-                self._leaving[name] = vehicle, repeats - 1
-            else:
-                del self._leaving[name]
+        yield from self._leaving.tell(self.tick, self._answers.up)
 
     def _look_after(self, now_s: float) -> Iterator[Effect]:
         """Let caretakers take charge of vehicles whose agents are gone or silent."""
