@@ -185,7 +185,7 @@ class CaretakerProcess:
         self.vehicle = vehicle
         self.tick = tick
         self.shown: VehicleState | None = None
-        self._attendance = Attendance(lambda: next(vehicle.incarnations))
+        self._attendance = Attendance(SCENARIO, lambda: next(vehicle.incarnations))
         vehicle.place_body(tick)
         list(self._attendance.take_charge(vehicle.road, tick))
         self.execution: PlanExecution = self._attendance._caretakers[vehicle.name]._execution
@@ -200,7 +200,7 @@ class CaretakerProcess:
 
     def give_way(self) -> None:
         """An agent has taken charge."""
-        list(self._attendance.give_way(self.vehicle.name))
+        list(self._attendance.forget(self.vehicle.name))
 
     def sense(self, tick: int) -> None:
         self.tick = tick

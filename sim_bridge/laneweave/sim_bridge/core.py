@@ -9,7 +9,6 @@ agent, or with a silent one, gets a caretaker (`attendance`).
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from enum import Enum
@@ -51,8 +50,6 @@ from laneweave.protocol.topics import (
     SENSE,
     VEHICLE_ALIVE,
 )
-from laneweave.protocol.transport import LinkDown, LinkUp
-from laneweave.sim_bridge.answers import Answers
 from laneweave.sim_bridge.attendance import Attendance
 from laneweave.sim_bridge.leaving import Leaving, tell_left
 from laneweave.sim_bridge.roadside import Roadside
@@ -115,8 +112,8 @@ class BridgeCore:
         self._tick_lasts_s = scenario.runtime.tick_s / (pace or scenario.runtime.max_pace)
         self._incarnation = incarnation
         self._stopwatch = stopwatch
-        self._answers = Answers(scenario.runtime)
-        self._attendance = Attendance(new_incarnation)
+        self._attendance = Attendance(scenario, new_incarnation)
+        self._answers = self._attendance.answers
         self._at_entrance: list[RoadVehicle] = []
         self._leaving = Leaving()
         self._unreported: set[str] = {BRIDGE}
@@ -124,9 +121,6 @@ class BridgeCore:
         self._patience_s = scenario.runtime.agent_start_s
         """How long to wait for the next agent that is not up."""
         self._ending = Ending.COMPLETE
-        self._link_up = True
-        self._absence_counts_s = -math.inf
-        """From when on a token that is not there means that its agent is not there."""
         self._tick_began = 0.0
         self._opened_s = 0.0
         self._until_s = 0.0
@@ -157,6 +151,7 @@ class BridgeCore:
         return effects
 
     def _on_event(self, event: Event, now_s: float) -> Iterator[Effect]:
+        self._attendance.on_network(event, now_s)
         match event:
             case Started():
                 yield from self._start(now_s)
@@ -165,14 +160,8 @@ class BridgeCore:
             case PeerUp(topic, parameters) if topic is VEHICLE_ALIVE:
                 self._on_agent_up(Name(parameters["vehicle"]))
             case PeerDown(topic, parameters) if topic is VEHICLE_ALIVE:
-                self._on_agent_down(Name(parameters["vehicle"]))
-            case LinkUp():
-                self._link_up = True
-                # The others come back to the network about now, too, and need a moment for it.
-                self._absence_counts_s = now_s + self.scenario.network.lease_s
-            case LinkDown():
-                self._link_up = False
-                self._answers.link_down()
+                if self._attendance.link_up:
+                    self._leaving.forget(Name(parameters["vehicle"]))
             case Wakeup() if self.phase is Phase.ANSWERS:
                 yield from self._send_again(now_s)
             case Stopping():
@@ -214,13 +203,9 @@ class BridgeCore:
         vehicle = self.vehicles.get(name)
         if vehicle is None:
             return
-        controller = vehicle.controller
-        attendant = controller.attendant
-        # Whoever answers late is there: the next tick waits for it, and it catches up. But one that
-        # another agent has taken the vehicle from says nothing about that other one.
-        if command.incarnation >= attendant or name in self._attendance:
-            self._answers.heard(name)
-        if controller.note(command):
+        attendant = vehicle.controller.attendant
+        cared_for = name in self._attendance
+        if self._attendance.hear(vehicle, command):
             yield self._sense_of(vehicle)
         if command.tick != self.tick or self.phase is not Phase.ANSWERS:
             # A late answer was made for a state that is past: played now, from its middle, it
@@ -229,20 +214,13 @@ class BridgeCore:
                 self._answers.late(name)
             return
         try:
-            taken = controller.take(command)
+            taken = yield from self._attendance.take(vehicle, command)
         except BadInputError as error:
             log.warning("command ignored", vehicle=name, reason=str(error))
             return
-        if not taken:
-            return
-        self._answers.effective(name)
-        if attendant not in (0, controller.attendant):
-            previous = "caretaker" if name in self._attendance else "agent"
+        if taken and attendant not in (0, vehicle.controller.attendant):
+            previous = "caretaker" if cared_for else "agent"
             self._record.on_agent_took_over(self.t_s, name, previous)
-        if attendant != controller.attendant:
-            # Who claims a vehicle is there, whether or not its token has been seen.
-            self._answers.agent_up(name)
-            yield from self._attendance.give_way(name)
 
     def _on_report(self, report: Report) -> None:
         if report.role in ("agent", "bridge"):
@@ -252,15 +230,9 @@ class BridgeCore:
         self._record.on_report(report)
 
     def _on_agent_up(self, vehicle: Name) -> None:
-        self._answers.agent_up(vehicle)
         self._patience_s = self.scenario.runtime.agent_start_s
         if vehicle in self.vehicles:
             self._unreported.add(vehicle)
-
-    def _on_agent_down(self, vehicle: Name) -> None:
-        if self._link_up:
-            self._answers.agent_down(vehicle)
-            self._leaving.forget(vehicle)
 
     # --- the tick -----------------------------------------------------------------------------
 
@@ -300,7 +272,7 @@ class BridgeCore:
             yield self._sense_of(vehicle)
         yield from self._attendance.show(self.tick)
         yield from self._leaving.tell(self.tick, self._answers.up)
-        self._answers.ask(self.vehicles, now_s, link_up=self._link_up)
+        self._attendance.ask(self.vehicles, now_s)
         self.phase = Phase.ANSWERS
 
     def _let_enter(self) -> None:
@@ -318,20 +290,11 @@ class BridgeCore:
 
     def _take_care(self, now_s: float) -> Iterator[Effect]:
         """Put caretakers in charge of vehicles whose agents are silent or not there."""
-        answers = self._answers
-        for name in answers.settle(now_s):
+        for name in self._answers.settle(now_s):
             self._record.note(self.t_s, "agent-silent", vehicle=name)
-        if not self._link_up:
-            return  # nobody can be seen or heard: that says nothing about them
-        absence_counts = now_s >= self._absence_counts_s
-        for name, vehicle in self.vehicles.items():
-            absent = absence_counts and name not in answers.up
-            if name in self._attendance:
-                continue
-            if absent or name in answers.silent or answers.ineffective(name):
-                reason = "absent" if absent else "silent" if name in answers.silent else "late"
-                self._record.on_caretaker_took_over(self.t_s, name, reason)
-                yield from self._attendance.take_charge(vehicle, self.tick)
+        for vehicle, absence in self._attendance.unattended(self.vehicles, now_s):
+            self._record.on_caretaker_took_over(self.t_s, vehicle.name, absence)
+            yield from self._attendance.take_charge(vehicle, self.tick)
 
     def _send_again(self, now_s: float) -> Iterator[Effect]:
         for name in self._answers.ask_again(now_s):
@@ -355,7 +318,7 @@ class BridgeCore:
             yield from self._wind_up(now_s)
             return
         lasts_s = self._tick_lasts_s
-        if self._answers.deaf or not self._link_up:
+        if self._answers.deaf or not self._attendance.link_up:
             # Nobody can answer: do not race ahead of the vehicles while the network is away.
             lasts_s = max(lasts_s, self.scenario.runtime.tick_s)
         self._until_s = max(now_s, self._opened_s + lasts_s)
@@ -370,8 +333,7 @@ class BridgeCore:
                 self._roadside.count_left()
                 self._record.on_left(vehicle, self.t_s, attended=name not in self._attendance)
                 self._leaving.add(vehicle)
-                self._answers.forget(name)
-                yield from self._attendance.give_way(name)
+                yield from self._attendance.forget(name)
 
     def _over(self) -> bool:
         if not self.vehicles and self._roadside.exhausted(self.t_s):

@@ -33,8 +33,6 @@ from laneweave.protocol.node import (
     Effect,
     Event,
     Listen,
-    PeerDown,
-    PeerUp,
     Send,
     Started,
     Wakeup,
@@ -42,9 +40,7 @@ from laneweave.protocol.node import (
 )
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.topics import BRIDGE_ALIVE, CENSUS, CLOCK, COMMAND, SENSE, VEHICLE_ALIVE
-from laneweave.protocol.transport import LinkDown, LinkUp
-from laneweave.sim_bridge.answers import Answers
-from laneweave.sim_bridge.attendance import Attendance
+from laneweave.sim_bridge.attendance import Absence, Attendance
 from laneweave.sim_bridge.demand import Arrival
 from laneweave.sim_bridge.entry import Admission
 from laneweave.sim_bridge.leaving import Leaving
@@ -220,12 +216,8 @@ class LightRoad:
         self._watcher = watcher
         self._move_lasts_s = move_lasts_s
         self._lost = lost
-        self._answers = Answers(scenario.runtime)
-        self._attendance = Attendance(new_incarnation)
-        self._absence_counts_s = 0.0
-        """Before this time nothing is concluded from a token that is not there."""
+        self._attendance = Attendance(scenario, new_incarnation)
         self._leaving = Leaving()
-        self._link_up = True
         self._census_due_tick = 0
 
     @property
@@ -235,6 +227,7 @@ class LightRoad:
 
     def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
         """Take an event; see `Core`."""
+        self._attendance.on_network(event, now_s)
         match event:
             case Arrived(_, _, Command() as command):
                 yield from self._on_command(command, now_s)
@@ -243,17 +236,6 @@ class LightRoad:
                 yield from self._attendance.on_message(vehicle, message, self.tick)
             case Wakeup() if now_s >= self.wakeup_s:
                 yield from self._on_tick(now_s)
-            case PeerUp(topic, parameters) if topic is VEHICLE_ALIVE:
-                self._answers.agent_up(Name(parameters["vehicle"]))
-            case PeerDown(topic, parameters) if topic is VEHICLE_ALIVE:
-                if self._link_up:
-                    self._answers.agent_down(Name(parameters["vehicle"]))
-            case LinkUp():
-                self._link_up = True
-                self._absence_counts_s = now_s + self._scenario.network.lease_s
-            case LinkDown():
-                self._link_up = False
-                self._answers.link_down()
             case Started():
                 yield Listen(COMMAND)
                 yield Watch(VEHICLE_ALIVE)
@@ -273,22 +255,14 @@ class LightRoad:
         if vehicle is None or self._lost():
             return
         controller = vehicle.controller
-        held, attendant = controller.hold_cell, controller.attendant
-        if command.incarnation >= attendant or command.vehicle in self._attendance:
-            self._answers.heard(command.vehicle)
-        if controller.note(command) and not self._lost():
+        held = controller.hold_cell
+        if self._attendance.hear(vehicle, command) and not self._lost():
             yield self._sense_of(command.vehicle, vehicle)
         try:
-            if not controller.take(command):
-                self.refused += 1
-                return
+            taken = yield from self._attendance.take(vehicle, command)
         except BadInputError:
-            self.refused += 1
-            return
-        self._answers.effective(command.vehicle)
-        if controller.attendant != attendant:
-            self._answers.agent_up(command.vehicle)
-            yield from self._attendance.give_way(command.vehicle)
+            taken = False
+        self.refused += not taken
         if controller.hold_cell != held:
             lasts_s = self._move_lasts_s()
             way = (held, controller.hold_cell)
@@ -306,7 +280,7 @@ class LightRoad:
         for vehicle in self.vehicles.values():
             vehicle.body.t_s = t_s
         yield from self._look_after(now_s)
-        self._answers.ask(self.vehicles, now_s, link_up=self._link_up)
+        self._attendance.ask(self.vehicles, now_s)
         for name, vehicle in self.vehicles.items():
             if not self._lost():
                 yield self._sense_of(name, vehicle)
@@ -328,26 +302,19 @@ class LightRoad:
     def _let_leave(self, now_s: float) -> Iterator[Effect]:
         for name in [name for name, each in self.vehicles.items() if each.leaves_by(now_s)]:
             self._leaving.add(self.vehicles.pop(name))
-            self._answers.forget(name)
-            yield from self._attendance.give_way(name)
+            yield from self._attendance.forget(name)
             self._watcher.leave(now_s, name)
             self._census_due_tick = 0
-        yield from self._leaving.tell(self.tick, self._answers.up)
+        yield from self._leaving.tell(self.tick, self._attendance.answers.up)
 
     def _look_after(self, now_s: float) -> Iterator[Effect]:
         """Let caretakers take charge of vehicles whose agents are gone or silent."""
-        answers = self._answers
-        answers.settle(now_s)
-        if not self._link_up:
-            return
-        for name, vehicle in self.vehicles.items():
-            absent = name not in answers.up and now_s >= max(
-                self._absence_counts_s, vehicle.admission.t_s + AGENT_START_S
-            )
-            gone = absent or name in answers.silent or answers.ineffective(name)
-            if gone and name not in self._attendance:
-                self.takeovers += 1
-                yield from self._attendance.take_charge(vehicle, self.tick)
+        self._attendance.answers.settle(now_s)
+        for vehicle, absence in self._attendance.unattended(self.vehicles, now_s):
+            if absence is Absence.ABSENT and now_s < vehicle.admission.t_s + AGENT_START_S:
+                continue
+            self.takeovers += 1
+            yield from self._attendance.take_charge(vehicle, self.tick)
 
     def _tell_road(self, t_s: float) -> Iterator[Effect]:
         count = len(self.vehicles)
