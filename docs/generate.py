@@ -13,8 +13,8 @@ from functools import cache
 from pathlib import Path
 
 from laneweave.coordinator.leader_rules import LEADER_RULES, Phase
-from laneweave.protocol.execution import VEHICLE_RULES, Stage
 from laneweave.protocol.transitions import markdown_table, mermaid_diagram
+from laneweave.protocol.vehicle_rules import VEHICLE_RULES, Stage
 
 DOCS = Path(__file__).resolve().parent
 FOUND = DOCS / "evidence" / "planted-bugs-found.json"

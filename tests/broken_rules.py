@@ -16,7 +16,7 @@ from laneweave.coordinator.election import Election
 from laneweave.coordinator.groups import Groups
 from laneweave.coordinator.leader import FormationControl
 from laneweave.coordinator.leader_rules import Phase
-from laneweave.protocol.execution import PLAN, PlanExecution, Stage
+from laneweave.protocol.execution import PlanExecution
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import (
     Ballot,
@@ -30,6 +30,7 @@ from laneweave.protocol.messages import (
 from laneweave.protocol.node import Effect
 from laneweave.protocol.plans import Needs, dependencies
 from laneweave.protocol.transitions import Transition
+from laneweave.protocol.vehicle_rules import PLAN, Stage
 from laneweave.sim_bridge.caretaker import Caretaker
 from laneweave.sim_bridge.motion_controller import MotionController
 

@@ -14,8 +14,8 @@ from attrs import field, frozen
 
 import broken_rules as broken
 from laneweave.coordinator.leader_rules import LEADER_RULES
-from laneweave.protocol.execution import VEHICLE_RULES
 from laneweave.protocol.transitions import Function, RuleBook, Transition
+from laneweave.protocol.vehicle_rules import VEHICLE_RULES
 
 ROWS_OF_OTHERS = {
     "L1": "election: coordinator.election",

@@ -9,13 +9,14 @@ from attrs import frozen
 
 from laneweave.coordinator.leader import FormationControl
 from laneweave.coordinator.leader_rules import LEADER_RULES
-from laneweave.protocol.execution import VEHICLE_RULES, PlanExecution
+from laneweave.protocol.execution import PlanExecution
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import Heartbeat, Plan, VehicleState
 from laneweave.protocol.node import PeerDown, PeerUp
 from laneweave.protocol.topics import COORDINATOR_ALIVE
 from laneweave.protocol.transitions import RuleBook
 from laneweave.protocol.transport import LinkDown, LinkUp
+from laneweave.protocol.vehicle_rules import VEHICLE_RULES
 from scenarios.story_leaders import Candidate, Leader, Mail, formation_of
 from scenarios.story_road import TICK_S, Agent, CaretakerProcess, Process, Vehicle
 from scenarios.story_text import CollisionError, StoryError, cell_of, shown, told, written

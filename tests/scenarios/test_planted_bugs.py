@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from laneweave.coordinator.leader_rules import LEADER_RULES
-from laneweave.protocol.execution import VEHICLE_RULES
+from laneweave.protocol.vehicle_rules import VEHICLE_RULES
 from planted_bugs import BUGS, NOT_A_SAFETY_MATTER, ROWS_OF_OTHERS, PlantedBug
 from scenarios.stories import check_story, ends_in_collision
 from scenarios.story_player import Player

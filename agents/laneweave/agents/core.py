@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from attrs import evolve
 
 from laneweave.agents.driver import Driver, TrackingDriver
-from laneweave.protocol.execution import VEHICLE_RULES, PlanExecution
+from laneweave.protocol.execution import PlanExecution
 from laneweave.protocol.incarnations import above
 from laneweave.protocol.lattice import Move
 from laneweave.protocol.messages import Command, Name, Plan, Prepare, Report, Sense, VehicleState
@@ -45,6 +45,7 @@ from laneweave.protocol.topics import (
     VEHICLE_ALIVE,
 )
 from laneweave.protocol.transitions import RuleBook
+from laneweave.protocol.vehicle_rules import VEHICLE_RULES
 
 OVERDUE_SLOTS = 1.5
 """A move due for this many slots is reported as overdue."""

@@ -7,9 +7,10 @@ from collections.abc import Callable
 import pytest
 from attrs import evolve
 
-from laneweave.protocol.execution import VEHICLE_RULES, PlanExecution, Stage
+from laneweave.protocol.execution import PlanExecution
 from laneweave.protocol.lattice import Cell, Lattice, Move, territory
 from laneweave.protocol.messages import Ballot, Name, Plan, Prepare, Sense, VehicleState
+from laneweave.protocol.vehicle_rules import VEHICLE_RULES, Stage
 from unit.rule_recorder import RuleRecorder
 
 A, B, C = Name("A"), Name("B"), Name("C")

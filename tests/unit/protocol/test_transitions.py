@@ -7,7 +7,6 @@ from enum import Enum
 import pytest
 from attrs import define, field
 
-from laneweave.protocol.execution import VEHICLE_RULES, Stage
 from laneweave.protocol.transitions import (
     RuleBook,
     Transition,
@@ -15,6 +14,7 @@ from laneweave.protocol.transitions import (
     mermaid_diagram,
     named,
 )
+from laneweave.protocol.vehicle_rules import VEHICLE_RULES, Stage
 
 
 class Lamp(Enum):

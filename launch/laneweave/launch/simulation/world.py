@@ -27,13 +27,13 @@ from laneweave.launch.simulation.setup import SLOT_S, Setup
 from laneweave.launch.simulation.story import Story
 from laneweave.launch.simulation.tap import Tap
 from laneweave.protocol.codec import encode
-from laneweave.protocol.execution import VEHICLE_RULES
 from laneweave.protocol.messages import Command, Name, Plan, Prepare, Sense, VehicleState
 from laneweave.protocol.node import Core, Send
 from laneweave.protocol.simulated_network import SimulatedNetwork
 from laneweave.protocol.simulated_trace import TraceDigest
 from laneweave.protocol.topics import Keys
 from laneweave.protocol.transitions import RuleBook
+from laneweave.protocol.vehicle_rules import VEHICLE_RULES
 
 TWIN = ".2"
 """Of the name of a second process of a vehicle."""
