@@ -179,6 +179,8 @@ def incarnation_of(parameters: Mapping[str, str]) -> int:
 
 def matches(expression: str, key: str) -> bool:
     """Tell whether a key expression matches a key: `*` is one part, `**` any number of parts."""
+    if "*" not in expression:
+        return expression == key
     return _compiled(expression).fullmatch("/" + key) is not None
 
 

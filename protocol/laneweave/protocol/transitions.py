@@ -63,7 +63,10 @@ class RuleBook:
     def take(self, machine: Any, event: str, message: Any) -> Transition | None:  # noqa: ANN401
         """Take the first transition that fits and return it; None: nothing changes."""
         for row in self._rows.get((event, machine.phase), ()):
-            if all(guard(machine, message) for guard in row.guards):
+            for guard in row.guards:
+                if not guard(machine, message):
+                    break
+            else:
                 for action in row.actions:
                     action(machine, message)
                 if row.transition.target is not None:

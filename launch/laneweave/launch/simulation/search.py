@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import logging
 import multiprocessing
@@ -131,6 +132,7 @@ def search(
 def _batches(seeds: range, profile: Profile, jobs: int, *, digest: bool) -> Iterator[list[Outcome]]:
     batches = [seeds[first : first + BATCH] for first in range(0, len(seeds), BATCH)]
     if jobs == 1 or len(batches) == 1:
+        _collect_seldom()
         for batch in batches:
             yield run_seeds(batch, profile, digest=digest)
         return
@@ -167,6 +169,13 @@ def _quiet() -> None:
     die_with_supervisor()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     quiet_logs()
+    _collect_seldom()
+
+
+def _collect_seldom() -> None:
+    """Look for cyclic garbage about once a run: what a run makes lives as long as the run."""
+    gc.freeze()
+    gc.set_threshold(50_000)
 
 
 def end_on_sigterm() -> None:
