@@ -13,6 +13,7 @@ from functools import cache
 from pathlib import Path
 
 from laneweave.coordinator.leader_rules import LEADER_RULES, Phase
+from laneweave.launch.simulation.profiles import PROFILES
 from laneweave.protocol.transitions import markdown_table, mermaid_diagram
 from laneweave.protocol.vehicle_rules import VEHICLE_RULES, Stage
 
@@ -42,6 +43,13 @@ def _planted_bugs() -> str:
     return "\n".join(lines)
 
 
+def _profiles() -> str:
+    """Return the table of what `laneweave simulate --profile` takes."""
+    lines = ["| `--profile` | what goes wrong |", "|---|---|"]
+    lines += [f"| `{profile.name}` | {profile.text} |" for profile in PROFILES.values()]
+    return "\n".join(lines)
+
+
 @cache
 def parts() -> dict[str, str]:
     """Return each generated part by its name."""
@@ -51,6 +59,7 @@ def parts() -> dict[str, str]:
         "leader rules": markdown_table(LEADER_RULES),
         "leader phases": _diagram(mermaid_diagram(LEADER_RULES, Phase.OBSERVING)),
         "planted bugs": _planted_bugs(),
+        "profiles": _profiles(),
     }
 
 
