@@ -33,6 +33,8 @@ GARBAGE = 20
 """Malformed payloads in one event."""
 REPLAYED = 20
 """Old messages in one event."""
+_CONCERNS_ONE = ("leader", "coordinator", "agent", "cut")
+"""How the kinds begin that strike one process."""
 CLOCK_OFFSET_S = 0.05
 CLOCK_DRIFT = 0.05
 
@@ -161,7 +163,8 @@ class Injector:
 
     def _harm(self, kind: str) -> None:
         target = self._target(kind)
-        self._note(f"--- fault: {kind} ({target})")
+        whom = f" of {target}" if kind.startswith(_CONCERNS_ONE) else ""
+        self._note(f"--- fault: {kind}{whom}")
         match kind:
             case "leader-kill" | "coordinator-kill" | "agent-kill":
                 done = self._kill(target, for_ever=kind == "agent-kill")
@@ -189,20 +192,20 @@ class Injector:
         rng, processes = self._rng, self._processes
         if kind.startswith("leader"):
             return rng.choice(processes.leaders or processes.coordinators)
-        if kind.startswith("agent") and processes.agents:
-            return rng.choice(processes.agents)
+        if kind.startswith("agent"):
+            return rng.choice(processes.agents or ("nobody",))
         if kind == "cut":
             return rng.choice(self._network.names)
         return rng.choice(processes.coordinators)
 
-    def _later(self, span_s: tuple[float, float], action: Callable[[], None]) -> None:
-        """Undo something after a while, unless everything has been made whole before."""
+    def _later(self, span_s: tuple[float, float], action: Callable[[], None], what: str) -> None:
+        """Do something more after a while, unless everything has been made whole before."""
         time_s = self._network.now_s + self._rng.uniform(*span_s)
-        self._network.at(time_s, self._undo, action)
+        self._network.at(time_s, self._undo, action, what)
 
-    def _undo(self, action: Callable[[], None]) -> None:
+    def _undo(self, action: Callable[[], None], what: str) -> None:
         if not self.healed:
-            self._note("--- the fault is over")
+            self._note(f"--- {what}")
             action()
 
     # --- processes ----------------------------------------------------------------------------
@@ -212,14 +215,15 @@ class Injector:
             return False
         self._network.kill(name)
         if not (for_ever and self._rng.random() < NEVER_AGAIN):
-            self._later(SHORT_S, partial(self._processes.start, name))
+            self._later(SHORT_S, partial(self._processes.start, name), f"{name} is restarted")
         return True
 
     def _pause(self, name: str) -> bool:
         if name not in self._network:
             return False
         self._network.pause(name)
-        self._later(SHORT_S, lambda: self._if_there(name, self._network.resume))
+        resume = partial(self._if_there, name, self._network.resume)
+        self._later(SHORT_S, resume, f"{name} wakes")
         return True
 
     def _double(self, name: str) -> bool:
@@ -236,14 +240,16 @@ class Injector:
 
         self._cuts.append(blocked)
         self._apply_cuts()
-        self._later(LONG_S, lambda: self._join(blocked))
+        self._later(LONG_S, partial(self._join, blocked), f"{name} senses its vehicle again")
         victim = self._rng.choice((name, twin))
-        self._later(LONG_S, lambda: self._if_there(victim, self._network.kill))
+        kill = partial(self._if_there, victim, self._network.kill)
+        self._later(LONG_S, kill, f"{victim} is killed")
         return True
 
     def _unplug(self, name: str) -> bool:
         self._network.disconnect(name)
-        self._later(SHORT_S, lambda: self._if_there(name, self._network.reconnect))
+        reconnect = partial(self._if_there, name, self._network.reconnect)
+        self._later(SHORT_S, reconnect, f"{name} is on the network again")
         return True
 
     def _if_there(self, name: str, action: Callable[[str], None]) -> None:
@@ -266,7 +272,9 @@ class Injector:
 
         self._cuts.append(blocked)
         self._apply_cuts()
-        self._later(LONG_S, lambda: self._join(blocked))
+        heard = "not heard by" if one_way else "apart from"
+        self._note(f"--- {heard} the others: {' '.join(sorted(inside))}")
+        self._later(LONG_S, partial(self._join, blocked), "a partition is over")
         return True
 
     def _join(self, blocked: Callable[[str, str], bool]) -> None:
@@ -283,7 +291,7 @@ class Injector:
         """Lose every message for a while."""
         self._blackouts += 1
         self._network.conditions = attrs.evolve(self._mix.conditions, loss=1.0)
-        self._later(LONG_S, self._end_blackout)
+        self._later(LONG_S, self._end_blackout, "a blackout is over")
         return True
 
     def _end_blackout(self) -> None:
@@ -293,7 +301,7 @@ class Injector:
 
     def _lose_router(self) -> bool:
         self._network.lose_router()
-        self._later(LONG_S, self._network.restore_router)
+        self._later(LONG_S, self._network.restore_router, "the router is back")
         return True
 
     def _garbage(self) -> bool:
