@@ -127,7 +127,6 @@ def messages(vehicle: Name, *, number: int, real: float) -> dict[type, Any]:
             number,
             number,
             number,
-            number,
             b"\x00\x00\xc0\x7f" * 9,
         ),
         LogEvent(

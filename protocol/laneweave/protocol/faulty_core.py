@@ -20,7 +20,7 @@ import attrs
 from attrs import field, frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.messages import Report, RoadClock
+from laneweave.protocol.messages import RoadClock
 from laneweave.protocol.node import Arrived, Core, Effect, Event, Send, Wakeup
 from laneweave.protocol.scenario import one_of, within
 from laneweave.protocol.topics import TOPICS
@@ -115,7 +115,6 @@ class FaultyCore:
             seed: of all draws; tells this process from the others of the run.
         """
         self.core = core
-        self.dropped = 0
         self._board = board
         self._rules = tuple(rule for rule in rules if rule.receiver in (None, receiver))
         self._rules_for: dict[str, tuple[MessageRule, ...]] = {}
@@ -135,7 +134,9 @@ class FaultyCore:
     def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
         """Take an event; see `Core`."""
         for effect in self._on_event(event, now_s):
-            yield self._passed_on(effect)
+            if isinstance(effect, Send) and isinstance(effect.message, RoadClock):
+                self._board.road_s = effect.message.t_s
+            yield effect
 
     def _on_event(self, event: Event, now_s: float) -> Iterator[Effect]:
         match event:
@@ -149,14 +150,14 @@ class FaultyCore:
     def _on_arrived(self, arrived: Arrived, now_s: float) -> Iterator[Effect]:
         delays_s = self._fate(arrived)
         if not delays_s:
-            self._count_dropped()
+            self._board.dropped += 1
         for delay_s in delays_s:
             if delay_s <= 0.0:
                 yield from self.core.handle(arrived, now_s)
             elif len(self._held) < MOST_HELD:
                 heapq.heappush(self._held, (now_s + delay_s, next(self._order), arrived))
             else:
-                self._count_dropped()
+                self._board.dropped += 1
 
     def _on_wakeup(self, wakeup: Wakeup, now_s: float) -> Iterator[Effect]:
         while self._held and self._held[0][0] <= now_s:
@@ -198,22 +199,6 @@ class FaultyCore:
             generator = random.Random(f"{self._seed}/{topic}")  # noqa: S311 (no secrets)
             self._generators[topic] = generator
         return generator
-
-    def _count_dropped(self) -> None:
-        self.dropped += 1
-        self._board.dropped += 1
-
-    def _passed_on(self, effect: Effect) -> Effect:
-        """Return an effect of the core, with what only the faults know."""
-        match effect:
-            case Send(message=RoadClock(t_s=t_s)):
-                self._board.road_s = t_s
-            case Send(message=Report()):
-                report = attrs.evolve(effect.message, dropped=self.dropped)
-                return attrs.evolve(effect, message=report)
-            case _:
-                pass
-        return effect
 
 
 def bare(core: Core) -> Core:

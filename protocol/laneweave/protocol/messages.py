@@ -264,13 +264,11 @@ class Report:
     name: Name
     process: Name = Name("unknown")
     """The process that counts; several vehicles may share one. The node fills it in, and the next
-    three counters."""
+    two counters."""
     published: int = 0
     """Messages that the process has published so far."""
     rejected: int = 0
     """Messages so far that were not well formed."""
-    dropped: int = 0
-    """Messages so far that injected faults kept from this process."""
     solves: int = 0
     unusable: int = 0
     solve_ms: bytes = b""
