@@ -18,18 +18,12 @@ from laneweave.launch.observer import View
 from laneweave.launch.role_processes import ROUTER, Order, RoleProcesses
 from laneweave.launch.roles import MessageFaults
 from laneweave.protocol.errors import BadInputError, CommandFailedError
-from laneweave.protocol.faulty_core import MessageRule
+from laneweave.protocol.faulty_core import SENDER_OF_ROLE, MessageRule
 from laneweave.protocol.scenario import Scenario
 
 log = structlog.get_logger(__name__)
 
-_SENDER_OF_ROLE = {"agent": "vehicle", "coordinator": "coordinator", "bridge": "bridge"}
-_GROUP_OF_ROLE = {
-    role: group
-    for role, sender in _SENDER_OF_ROLE.items()
-    for group, sender_of_group in SENDER_OF_GROUP.items()
-    if sender == sender_of_group
-}
+_GROUP_OF_SENDER = {sender: group for group, sender in SENDER_OF_GROUP.items()}
 
 
 @define
@@ -73,17 +67,18 @@ class ProcessFaults:
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return the scenario's tables and the options for a role that is to have the faults."""
         tables, options = dict(tables), dict(options)
-        network, group = self.network, _GROUP_OF_ROLE.get(order.role)
+        network, sender = self.network, SENDER_OF_ROLE.get(order.role)
         if network is not None and order.role == ROUTER:
             options |= {"namespace": network.process_id(HUB), "listen": (network.listen,)}
-        elif network is not None and group in network.groups:
-            options["namespace"] = network.process_id(group)
-            tables["network"] = tables["network"] | {"endpoint": network.endpoint(group)}
-        if order.role in _SENDER_OF_ROLE:
-            options["faults"] = self._message_faults(order)
+        if sender is not None:
+            group = _GROUP_OF_SENDER[sender]
+            if network is not None and group in network.groups:
+                options["namespace"] = network.process_id(group)
+                tables["network"] = tables["network"] | {"endpoint": network.endpoint(group)}
+            options["faults"] = self._message_faults(order, sender)
         return tables, options
 
-    def _message_faults(self, order: Order) -> MessageFaults:
+    def _message_faults(self, order: Order, sender: str) -> MessageFaults:
         start = self._starts[order.name] = self._starts.get(order.name, 0) + 1
         faults = self.faults
         seed = self.scenario.seed if faults.seed is None else faults.seed
@@ -91,7 +86,7 @@ class ProcessFaults:
             rules=self._rules(),
             board=self.board.path,
             word=self.board.new_word(),
-            receiver=_SENDER_OF_ROLE[order.role],
+            receiver=sender,
             seed=f"{seed}/{order.name}/{start}",
         )
 

@@ -25,16 +25,14 @@ from laneweave.protocol.node import Arrived, Core, Effect, Event, Send, Wakeup
 from laneweave.protocol.scenario import one_of, within
 from laneweave.protocol.topics import TOPICS
 
-SENDERS = ("vehicle", "coordinator", "bridge")
-"""Who sends and receives messages, as rules name them."""
+SENDER_OF_ROLE = {"agent": "vehicle", "coordinator": "coordinator", "bridge": "bridge"}
+"""Who a process of each role speaks for, as rules name them."""
+SENDERS = tuple(SENDER_OF_ROLE.values())
 MESSAGE_TOPICS = tuple(topic.name for topic in TOPICS if topic.kind is not None)
 Wrap = Callable[[Core], Core]
 """Puts something before a core, or nothing."""
 MOST_HELD = 10_000
 """Delayed messages that wait at one time; what comes beyond is lost."""
-
-_SENDER_OF_ROLE = {"agent": "vehicle"}
-"""Reports name the process's role, rules name who it speaks for."""
 
 
 def _message_topics(_: object, attribute: attrs.Attribute[Any], value: tuple[str, ...]) -> None:
@@ -211,4 +209,4 @@ def _sender(arrived: Arrived) -> str:
     if sender != "any":
         return sender
     role = arrived.parameters.get("role", "")
-    return _SENDER_OF_ROLE.get(role, role)
+    return SENDER_OF_ROLE.get(role, role)
