@@ -13,7 +13,7 @@ from attrs import frozen
 
 from laneweave.coordinator.groups import Numbers
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, Weights, checked_plan
-from laneweave.coordinator.targets import Targets, place
+from laneweave.coordinator.targets import place
 from laneweave.protocol.lattice import Cell, Move
 from laneweave.protocol.messages import Name
 from laneweave.protocol.scenario import Scenario
@@ -87,8 +87,8 @@ class Sorting:
         return self.response is None or bool(self.response.paths)
 
 
-def plan_request(task: SortingTask, dropped: Name | None = None) -> tuple[PlanRequest, Targets]:
-    """Return the request for a sorting, and the targets that it contains.
+def plan_request(task: SortingTask, dropped: Name | None = None) -> PlanRequest:
+    """Return the request for a sorting.
 
     Args:
         task: with at least one vehicle that can be moved.
@@ -112,7 +112,7 @@ def plan_request(task: SortingTask, dropped: Name | None = None) -> tuple[PlanRe
         for name, cell in movers.items()
     ]
     formation = scenario.formation
-    request = PlanRequest.from_dict(
+    return PlanRequest.from_dict(
         {
             "schema": "laneweave.plan.request/1",
             "grid": {
@@ -127,7 +127,6 @@ def plan_request(task: SortingTask, dropped: Name | None = None) -> tuple[PlanRe
             "deadline_s": formation.planning_deadline_s,
         }
     )
-    return request, targets
 
 
 def sort_lanes(task: SortingTask, max_nodes: int, weights: Weights) -> Sorting:
@@ -142,7 +141,7 @@ def sort_lanes(task: SortingTask, max_nodes: int, weights: Weights) -> Sorting:
         return _sorting(task, None)
     response: PlanResponse | None = None
     for dropped in _attempts(task):
-        request, _ = plan_request(task, dropped)
+        request = plan_request(task, dropped)
         response = checked_plan(request, max_nodes=max_nodes, weights=weights)
         if response.status != "infeasible":
             break
