@@ -421,7 +421,7 @@ def _draw_own(folder: Path) -> None:
 
 
 def main() -> None:
-    """Run the command line (entry point of the package)."""
+    """Run the command line with the arguments of this process."""
     sys.exit(_status(sys.argv[1:]))
 
 
