@@ -210,3 +210,38 @@ def test_at_rest_is_close_to_the_target(along_m: float, across_m: float, *, at_r
     s, v, a, y, v_y, a_y = cell_state(LATTICE, cell, t_s)
     state = (s + along_m, v, a, y + across_m, v_y, a_y)
     assert at_rest_in_cell(state, LATTICE, cell, t_s) == at_rest
+
+
+def moving_back(before_s: float) -> Motion:
+    """Hold the cell two columns ahead, then move into the next one, as a plan may ask for."""
+
+    def motion(t_s: float) -> tuple[float, float]:
+        move_s = SCENARIO.formation.move_s
+        share = min(max((t_s - before_s) / move_s, 0.0), 1.0)
+        way = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+        speed = 30.0 * share**2 * (1.0 - share) ** 2 / move_s
+        s_m = 200.0 + SPEED_MPS * t_s - LATTICE.pitch_m * way
+        return s_m, SPEED_MPS - LATTICE.pitch_m * speed
+
+    return motion
+
+
+def test_who_yields_to_a_planned_move_stays_in_its_cell() -> None:
+    """It sees somebody brake and cannot know that this ends a pitch ahead: it gives way for a time.
+
+    Its body stays in its cell all the same (assumption 3 of docs/SAFETY.md), and so do the bodies
+    of those behind it.
+    """
+    between_m = LATTICE.pitch_m - LIMITS.length_m
+    first_m, _ = (move := moving_back(2.0))(0.0)
+    history, states, _ = row(move, [LATTICE.pitch_m + between_m, between_m, between_m])
+    for tick, gaps in enumerate(history, start=1):
+        rear_m, _ = move(tick * TICK_S)
+        for column, gap_m in enumerate(gaps, start=2):
+            front_m = rear_m - gap_m
+            home_m = first_m + LIMITS.length_m - column * LATTICE.pitch_m
+            assert abs(home_m + SPEED_MPS * tick * TICK_S - front_m) < 0.5 * between_m
+            rear_m = front_m - LIMITS.length_m
+    assert min(gaps[0] for gaps in history) > 0.5 * between_m
+    assert history[-1] == pytest.approx([between_m] * 3, abs=0.2)
+    assert all(state[1] == pytest.approx(SPEED_MPS, abs=0.05) for state in states)
