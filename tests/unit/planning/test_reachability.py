@@ -1,4 +1,4 @@
-"""The breadth-first search over joint states."""
+"""The search over joint states."""
 
 import pytest
 from hypothesis import given, settings
@@ -6,11 +6,12 @@ from hypothesis import given, settings
 from laneweave.coordinator.planning import PlanRequest, VehicleRequest, problems_of_paths
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
 from laneweave.coordinator.planning.conflicts import ConflictModel
-from laneweave.coordinator.planning.facade import cells_of
+from laneweave.coordinator.planning.facade import cells_of, plan
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.reachability import Verdict, explore
+from laneweave.coordinator.planning.validate import problems_of_response
 from unit.planning.planning_oracles import cheapest_plan, requests
 
 
@@ -60,3 +61,23 @@ def test_time_is_checked() -> None:
     budget = Budget(deadline=3.0, clock=lambda: float(next(ticks)))
     with pytest.raises(BudgetSpentError):
         explore(problem, PUZZLE.choices(), budget, max_moves=10**9)
+
+
+def test_a_crowded_block_gets_an_answer_long_before_the_trees_find_one() -> None:
+    """The cheapest plan costs 25 (by the oracle); the trees find none in 10,000 nodes."""
+    wishes = {(1, 2): 1, (2, 1): 1, (3, 0): 2, (2, 0): 0, (3, 1): 1, (3, 2): 0}
+    request = PlanRequest(
+        Grid(4, 3),
+        1,
+        ("node", "edge", "special-1"),
+        tuple(
+            VehicleRequest(f"v{number}", cell, lane=lane)
+            for number, (cell, lane) in enumerate(wishes.items())
+        ),
+        ((2, 0), (3, 0), (1, 1), (2, 1), (3, 1), (3, 2)),
+    )
+    response = plan(request, max_nodes=200)
+    assert response.status == "feasible"
+    assert response.cost is not None
+    assert 25 <= response.cost <= 40
+    assert not problems_of_response(request, response)

@@ -91,6 +91,11 @@ class Incumbent:
         if self.best is None or solution.cost < self.best.cost:
             self.best = solution
 
+    def begin_with(self, solution: Solution) -> None:
+        """Improve a path set that was found elsewhere from now on."""
+        self.offer(solution)
+        self._round, self._builds, self._idle = solution, _BUILDS_PER_ROUND, 0
+
     def _build(self, assignment: Sequence[int]) -> None:
         """Plan all vehicles one after the other; one that is stuck goes first next time."""
         self._builds += 1

@@ -1,14 +1,15 @@
 """An exact answer for small joint state spaces: can the vehicles reach their targets at all?
 
-Conflict trees never end when no path set exists. A breadth-first search over the cells of all
-vehicles together does: vehicles with the same eligible targets form a team and are
-interchangeable, so a state is which cells each team occupies. The search is cut off after a given
-number of joint moves; then it has shown nothing.
+Conflict trees never end when no path set exists. A search over the cells of all vehicles together
+does: vehicles with the same eligible targets form a team and are interchangeable, so a state is
+which cells each team occupies. States whose vehicles are close to targets of theirs come first, so
+a path set is found soon where there is one, even if the trees take for ever to find it. The search
+is cut off after a given number of joint moves; then it has shown nothing.
 """
 
 from __future__ import annotations
 
-from collections import deque
+import heapq
 from collections.abc import Iterator, Sequence
 
 import attrs
@@ -57,11 +58,12 @@ def explore(
 
     start, order = _sorted_by_team([problem.starts[v] for v in vehicles], team)
     vehicles = [vehicles[i] for i in order]
+    away = [_steps_away(problem.table, goal) for goal in goals]
     found: dict[State, _Step | None] = {start: None}
-    frontier = deque([start])
+    frontier = [(0, 0, start)]
     made = 0
     while frontier:
-        state = frontier.popleft()
+        _, _, state = heapq.heappop(frontier)
         arrived = all(cell in goal for cell, goal in zip(state, goals, strict=True))
         if arrived and len(set(state)) == len(state):
             return Verdict(solution=_solution(problem, found, state, vehicles))
@@ -75,8 +77,22 @@ def explore(
             following, order = _sorted_by_team([problem.table.landing(m) for m in moves], team)
             if following not in found:
                 found[following] = _Step(state, moves, order)
-                frontier.append(following)
+                left = sum(steps.get(cell, 0) for steps, cell in zip(away, following, strict=True))
+                heapq.heappush(frontier, (left, len(found), following))
     return Verdict(impossible=True)
+
+
+def _steps_away(table: MoveTable, goals: frozenset[int]) -> dict[int, int]:
+    """Return the least number of steps from each cell to one of some others."""
+    steps: dict[int, int] = {}
+    reached = cells = sum(1 << goal for goal in goals)
+    count = 0
+    while cells:
+        steps.update(dict.fromkeys(bits(cells), count))
+        count += 1
+        cells = table.starts(table.leading_to(cells)) & ~reached
+        reached |= cells
+    return steps
 
 
 def _can_be_made_one_after_another(table: MoveTable) -> bool:

@@ -124,5 +124,5 @@ class Tappa:
         self._explored += 1
         verdict = explore(self._problem, self._choices, self._budget, _EXPLORE_MOVES * growth)
         if verdict.solution is not None:
-            self._incumbent.offer(verdict.solution)
+            self._incumbent.begin_with(verdict.solution)
         return verdict.impossible
