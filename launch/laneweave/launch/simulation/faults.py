@@ -156,8 +156,9 @@ class Injector:
         for name in self._twins:
             network.kill(name)
         for name in network.names:
+            # Who wakes handles what has come meanwhile, and may leave for good.
             network.resume(name)
-            network.reconnect(name)
+            self._if_there(name, network.reconnect)
         for name in (*self._processes.coordinators, *self._processes.agents):
             self._processes.start(name)
 
