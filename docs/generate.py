@@ -9,8 +9,10 @@ from __future__ import annotations
 import json
 import re
 import sys
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from laneweave.coordinator.leader_rules import LEADER_RULES, Phase
 from laneweave.launch.simulation.profiles import PROFILES
@@ -20,6 +22,8 @@ from laneweave.protocol.vehicle_rules import VEHICLE_RULES, Stage
 DOCS = Path(__file__).resolve().parent
 FOUND = DOCS / "evidence" / "planted-bugs-found.json"
 """What the random search found, as `tests/simulation/search_bugs.py` prints it."""
+MEASURED = DOCS / "evidence" / "resilience.json"
+"""What `benchmarks/resilience.py` wrote."""
 
 
 def _diagram(text: str) -> str:
@@ -50,6 +54,44 @@ def _profiles() -> str:
     return "\n".join(lines)
 
 
+def _resilience() -> str:
+    """Return the table of what faults on real processes cost."""
+    measured = json.loads(MEASURED.read_text(encoding="utf-8"))
+    undisturbed_s = measured["undisturbed"]["travel_time_s"]
+    lines = [
+        "| experiment | left | on their lane | overlaps | least gap | travel time | more |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, run in measured.items():
+        comparable = run["demanded"] == measured["undisturbed"]["demanded"]
+        times = f" ({run['travel_time_s'] / undisturbed_s:.3f}x)" if comparable else ""
+        lines.append(
+            f"| `{name}` | {run['left']} of {run['demanded']} | {run['on_lane_percent']:.1f} % "
+            f"| {run['overlaps']} | {run['min_gap_m']:.2f} m | {run['travel_time_s']:.2f} s{times} "
+            f"| {'; '.join(_more(run))} |"
+        )
+    return "\n".join(lines)
+
+
+def _more(run: dict[str, Any]) -> Iterator[str]:
+    """Yield what is worth saying of one experiment."""
+    if run["dropped"]:
+        yield f"{run['dropped']:,} messages lost"
+    taken_over = run["events"].get("caretaker-took-over", 0)
+    if taken_over:
+        yield f"caretakers took over {taken_over} times"
+    if taken_over and run["others"]:
+        share = run["others_on_lane_percent"]
+        yield f"of {run['others']} that never had one {share:.1f} % on their lane"
+    for key, words in (("leader_recovery_s", "another leader"), ("plan_recovery_s", "next plan")):
+        times = run[key]
+        if times["count"]:
+            yield f"{words} after {times['p50']:.2f} s (p50), {times['p99']:.2f} s (p99)"
+    if run["replanned"]:
+        yield f"{run['replanned']} plans made anew"
+    yield f"real-time factor {run['real_time_factor']:.2f}"
+
+
 @cache
 def parts() -> dict[str, str]:
     """Return each generated part by its name."""
@@ -60,6 +102,7 @@ def parts() -> dict[str, str]:
         "leader phases": _diagram(mermaid_diagram(LEADER_RULES, Phase.OBSERVING)),
         "planted bugs": _planted_bugs(),
         "profiles": _profiles(),
+        "resilience": _resilience(),
     }
 
 
