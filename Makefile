@@ -43,7 +43,7 @@ test: $(STAMP) ## what CI runs
 test-full: $(STAMP) ## the long programmes too
 	$(BIN)/pytest -n 2
 
-evaluation: $(STAMP) ## measure what docs/EVALUATION.md reports under faults (hours)
+evaluation: $(STAMP) ## measure what docs/EVALUATION.md reports under faults (over an hour)
 	$(BIN)/python benchmarks/resilience.py
 
 docs: $(STAMP) ## write the generated parts of the documents

@@ -54,6 +54,13 @@ class Benchmark(StrEnum):
     planner = "planner"
 
 
+class SolverChoice(StrEnum):
+    """How a request is planned here."""
+
+    tappa = "tappa"
+    sweep = "sweep"
+
+
 class OutputFormat(StrEnum):
     """How a plan is printed."""
 
@@ -153,11 +160,15 @@ def plan(
     ] = None,
     realm: Annotated[str, typer.Option("--realm", help="Realm of that coordinator.")] = "default",
     output: Annotated[OutputFormat, typer.Option("--format")] = OutputFormat.json,
+    solver: Annotated[
+        SolverChoice, typer.Option("--solver", help="How to plan here: see docs/PLANNING.md.")
+    ] = SolverChoice.tappa,
 ) -> None:
     """Plan one request here, or ask a running coordinator."""
     from laneweave.launch.plan_command import answer_request
 
-    answer_request(request, deadline, connect, realm, as_table=output is OutputFormat.table)
+    as_table = output is OutputFormat.table
+    answer_request(request, deadline, connect, realm, solver.value, as_table=as_table)
 
 
 @app.command()

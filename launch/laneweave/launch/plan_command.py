@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan
+from laneweave.coordinator.planning.facade import Solver
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
 from laneweave.protocol.topics import SERVICE, Keys
 from laneweave.protocol.zenoh_transport import ask
@@ -17,9 +18,15 @@ ANSWER_MARGIN_S = 5.0
 
 
 def answer_request(
-    path: Path, deadline_s: float | None, endpoint: str | None, realm: str, *, as_table: bool
+    path: Path,
+    deadline_s: float | None,
+    endpoint: str | None,
+    realm: str,
+    solver: Solver,
+    *,
+    as_table: bool,
 ) -> None:
-    """Read a request, have it planned, and print the answer.
+    """Read a request, have it planned, and print the answer; `solver` plans it here.
 
     Raises:
         BadInputError: the request cannot be read or is not valid, or nobody is at the endpoint.
@@ -31,7 +38,7 @@ def answer_request(
         data["deadline_s"] = deadline_s
     request = PlanRequest.from_dict(data)
     if endpoint is None:
-        response = checked_plan(request)
+        response = checked_plan(request, solver=solver)
     else:
         response = _ask(endpoint, realm, data, request.deadline_s + ANSWER_MARGIN_S)
     if as_table:

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from laneweave.coordinator.planning import PlanRequest, plan
+from laneweave.coordinator.planning.facade import Solver
 from oracles import joint_search, milp_oracle
 from oracles.instances import VARIANTS, random_request, small_request, variant
 from oracles.path_rules import check_paths
@@ -19,13 +20,16 @@ CHUNK = 10
 RECORDED_COSTS = {11: 22, 40: 34, 63: 20, 112: 25, 133: 29}
 
 
-def _plan(request: dict[str, Any]) -> dict[str, Any]:
-    response: dict[str, Any] = plan(PlanRequest.from_dict(request)).to_dict()
+SOLVERS: tuple[Solver, ...] = ("tappa", "sweep")
+
+
+def _plan(request: dict[str, Any], solver: Solver = "tappa") -> dict[str, Any]:
+    response: dict[str, Any] = plan(PlanRequest.from_dict(request), solver=solver).to_dict()
     return response
 
 
-def _faults(request: dict[str, Any], cost: int) -> list[str]:
-    response = _plan(request)
+def _faults(request: dict[str, Any], cost: int, solver: Solver) -> list[str]:
+    response = _plan(request, solver)
     claims = {key: response[key] for key in ("status", "cost", "lower_bound")}
     expected = {"status": "optimal", "cost": cost, "lower_bound": cost}
     if claims != expected:
@@ -41,7 +45,9 @@ def test_planner_agrees_with_the_oracle(first: int) -> None:
         cost = RECORDED_COSTS.get(seed) or milp_oracle.optimal_cost(request)
         assert cost is not None, f"seed {seed} is infeasible"
         wrong += [
-            f"seed {seed}: {fault}: {json.dumps(request)}" for fault in _faults(request, cost)
+            f"seed {seed}, {solver}: {fault}: {json.dumps(request)}"
+            for solver in SOLVERS
+            for fault in _faults(request, cost, solver)
         ]
     assert not wrong, "\n".join(wrong)
 
@@ -78,10 +84,11 @@ def test_planner_agrees_with_joint_search_where_space_is_scarce(code: int) -> No
             conflicts=conflicts,
         )
         cost = joint_search.optimal_cost(request)
-        if cost is not None:
-            found = _faults(request, cost)
-        else:
-            status = _plan(request)["status"]
-            found = [] if status == "infeasible" else [f"{status}, but there is no solution"]
-        wrong += [f"seed {seed}: {fault}: {json.dumps(request)}" for fault in found]
+        for solver in SOLVERS:
+            if cost is not None:
+                found = _faults(request, cost, solver)
+            else:
+                status = _plan(request, solver)["status"]
+                found = [] if status == "infeasible" else [f"{status}, but there is no solution"]
+            wrong += [f"seed {seed}, {solver}: {fault}: {json.dumps(request)}" for fault in found]
     assert not wrong, "\n".join(wrong)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 
@@ -9,6 +10,10 @@ Clock = Callable[[], float]
 
 _RELEASE_S_PER_NODE = 3e-6
 """What it takes to give the memory of a node back, after the answer is known."""
+
+
+_MOST_STATES = 20_000_000
+"""Partial solutions that fit into some 2 GB."""
 
 
 class BudgetSpentError(Exception):
@@ -44,3 +49,25 @@ class Budget:
         if self._max_nodes is not None and self.nodes >= self._max_nodes:
             raise BudgetSpentError
         self.nodes += 1
+
+    def take_states(self, states: int, per_node: int) -> None:
+        """Count partial solutions, so many of them as one node; raise as `take_node` does."""
+        self.nodes += -(-states // per_node)
+        self.check_time()
+        if self._max_nodes is not None and self.nodes >= self._max_nodes:
+            raise BudgetSpentError
+
+    def states_left(self, per_node: int, per_s: int) -> int:
+        """Return how many partial solutions may be made at one go, at a pace that is a safe guess.
+
+        Raises:
+            BudgetSpentError: none.
+        """
+        left = math.inf
+        if self._max_nodes is not None:
+            left = (self._max_nodes - self.nodes) * per_node
+        if self._deadline is not None:
+            left = min(left, (self._deadline - self._clock()) * per_s)
+        if left <= 0:
+            raise BudgetSpentError
+        return int(min(left, _MOST_STATES))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterator
 from contextlib import suppress
-from typing import Final
+from typing import Final, Literal, Protocol
 
 import numpy as np
 
@@ -23,8 +24,32 @@ from laneweave.coordinator.planning.response import PlanResponse, Status
 from laneweave.coordinator.planning.tappa import Tappa
 from laneweave.coordinator.planning.validate import problems_of_response
 
+Solver = Literal["tappa", "sweep"]
+"""`tappa`: the paper's algorithm. `sweep`: column by column, for large formations; what it cannot
+do, because vehicles may share a cell or differ too much, `tappa` does."""
+
 MAX_NODES: Final = 500_000
 """Bounds the memory to about 1 GB; it takes minutes to get there."""
+
+
+class Search(Protocol):
+    """A search for the best path set, by whatever solver."""
+
+    lower_bound: float
+    """No path set costs less; infinite: there is none."""
+    finished: bool
+    """The search is complete: `best` is optimal, or nothing exists."""
+    gave_up: bool
+    """Another solver is the better tool for this problem."""
+    tried: int
+    """Assignments that were looked at one by one."""
+
+    @property
+    def best(self) -> Solution | None:
+        """The cheapest path set so far."""
+
+    def run(self) -> None:
+        """Search until the optimum is proven or the budget is spent."""
 
 
 def plan(
@@ -32,6 +57,7 @@ def plan(
     *,
     max_nodes: int | None = None,
     weights: Weights | None = None,
+    solver: Solver = "tappa",
     clock: Clock = time.monotonic,
 ) -> PlanResponse:
     """Plan one request.
@@ -40,6 +66,11 @@ def plan(
     in a repeatable way, and is never above `MAX_NODES`. `weights` of the formation relative
     distance must give a lower bound.
     """
+    if solver == "sweep":
+        # Not on the request's time. Who uses the other solver need not wait for it at all.
+        from laneweave.coordinator.planning.exact import warm_up  # noqa: PLC0415
+
+        warm_up()
     started = clock()
     weights = (weights or Weights.for_mode(request.mode)).checked(request.mode)
     nodes = MAX_NODES if max_nodes is None else min(max_nodes, MAX_NODES)
@@ -52,18 +83,22 @@ def plan(
         request.targets,
     )
     choices = request.choices()
-    tappa: Tappa | None = None
-    best: Solution | None = None
+    searches: list[Search] = []
     with suppress(BudgetSpentError):
-        costs, allowed = matrices(request, weights, choices, budget)
-        tappa = Tappa(problem, assignments(costs, allowed, budget), choices, budget)
-        tappa.run()
-        best = None if tappa.best is None else tidied(problem, tappa.best, budget)
+        for search in _searches(solver, problem, request, weights, choices, budget):
+            searches.append(search)
+            search.run()
+            if not search.gave_up:
+                break
+    found = [search.best for search in searches if search.best is not None]
+    best = min(found, key=lambda solution: solution.cost, default=None)
+    if best is not None:
+        best = tidied(problem, best, budget)
     cells = [] if best is None else cells_of(problem, best)
     path_map = RelativePathMap.padded([v.id for v in request.vehicles][: len(cells)], cells)
-    bound = 0 if tappa is None else tappa.lower_bound
+    bound = max((search.lower_bound for search in searches), default=0)
     cost = None if best is None else best.cost
-    finished = tappa is not None and (tappa.finished or cost == bound)
+    finished = any(search.finished for search in searches) or cost == bound
     return PlanResponse(
         status=_status(found=best is not None, finished=finished),
         cost=cost,
@@ -72,9 +107,27 @@ def plan(
         assignment=() if best is None else best.assignment,
         paths=path_map.rows,
         solve_ms=round(1e3 * (clock() - started), 3),
-        assignments_tried=0 if tappa is None else tappa.tried,
+        assignments_tried=sum(search.tried for search in searches),
         nodes_expanded=budget.nodes,
     )
+
+
+def _searches(
+    solver: Solver,
+    problem: Problem,
+    request: PlanRequest,
+    weights: Weights,
+    choices: list[frozenset[int]],
+    budget: Budget,
+) -> Iterator[Search]:
+    """Yield what to search with; the next one where one gives up."""
+    if solver == "sweep":
+        from laneweave.coordinator.planning.exact import Exact, can_sweep  # noqa: PLC0415
+
+        if can_sweep(problem, choices):
+            yield Exact(problem, request, choices, budget)
+    costs, allowed = matrices(request, weights, choices, budget)
+    yield Tappa(problem, assignments(costs, allowed, budget), choices, budget)
 
 
 def _status(*, found: bool, finished: bool) -> Status:
@@ -93,14 +146,18 @@ def cells_of(problem: Problem, solution: Solution) -> list[list[Cell]]:
 
 
 def checked_plan(
-    request: PlanRequest, *, max_nodes: int | None = None, weights: Weights | None = None
+    request: PlanRequest,
+    *,
+    max_nodes: int | None = None,
+    weights: Weights | None = None,
+    solver: Solver = "tappa",
 ) -> PlanResponse:
     """Plan one request and check the answer against it; see `plan`.
 
     Raises:
         RuntimeError: the answer is wrong, which would be an error in the planner.
     """
-    response = plan(request, max_nodes=max_nodes, weights=weights)
+    response = plan(request, max_nodes=max_nodes, weights=weights, solver=solver)
     problems = problems_of_response(request, response)
     if problems:
         raise RuntimeError("the planner made a wrong plan: " + "; ".join(problems))

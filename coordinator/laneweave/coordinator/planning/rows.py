@@ -1,0 +1,146 @@
+"""Conflict rows: sets of moves of which one step admits at most one.
+
+Pairs of conflicting moves say what is forbidden; a linear relaxation that knows only pairs is weak.
+A *row* is a clique of the conflict relation: whatever the other vehicles do, at most one of its
+moves is made in a step. The rows here are maximal cliques that cover every conflicting pair. With
+footprints (mode 1 with node, edge and special-1; geometric) one kind of row is enough: all moves
+whose footprint contains a cell.
+
+Conflicts do not depend on where on the lattice they happen, so a kind of row is a pattern that is
+laid on every cell, its anchor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+from itertools import product
+
+import attrs
+
+from laneweave.coordinator.planning.conflicts import ConflictModel
+from laneweave.coordinator.planning.grid import Mode, Move, displacements
+
+_REACH = 2
+"""Two moves can only conflict when their from-cells are at most this far apart."""
+
+Member = tuple[int, int, int]
+"""Columns and lanes from the anchor to the from-cell of a move, and its displacement."""
+
+
+@attrs.frozen
+class RowKind:
+    """One pattern of conflicting moves.
+
+    members: its moves.
+    column: columns from the anchor to a column that every one of its moves touches.
+    """
+
+    members: tuple[Member, ...]
+    column: int
+
+
+@attrs.frozen
+class RowPatterns:
+    """All kinds of rows of a conflict model.
+
+    kinds: rows that cover all conflicting pairs.
+    local: whether two conflicting moves always touch a common column, and two vehicles never
+        share a cell; only then can a formation be swept column by column.
+    """
+
+    kinds: tuple[RowKind, ...]
+    local: bool
+
+
+@lru_cache(maxsize=64)
+def row_patterns(mode: Mode, model: ConflictModel) -> RowPatterns:
+    """Return the rows of a conflict model."""
+    relation = _Relation(mode, model)
+    uncovered = relation.pairs()
+    local = "node" in model.kinds or "geometric" in model.kinds
+    for a, b in uncovered:
+        local = local and bool(_columns(a, relation) & _columns(b, relation))
+    kinds = []
+    cliques = sorted(relation.maximal_cliques(), key=lambda clique: (-len(clique), clique))
+    for clique in cliques:
+        pairs = {_normal_pair(a, b) for a in clique for b in clique if a < b}
+        if pairs & uncovered:
+            uncovered -= pairs
+            common = frozenset.intersection(*(_columns(member, relation) for member in clique))
+            local = local and bool(common)
+            kinds.append(RowKind(clique, min(common, key=abs, default=0)))
+    return RowPatterns(tuple(kinds), local)
+
+
+class _Relation:
+    """Which moves around the origin conflict; a move is a `Member` of the anchor (0, 0)."""
+
+    def __init__(self, mode: Mode, model: ConflictModel) -> None:
+        self.steps = displacements(mode)
+        self._model = model
+        reach = range(-_REACH, _REACH + 1)
+        self._moves = list(product(reach, reach, range(len(self.steps))))
+
+    def move(self, member: Member) -> Move:
+        column, lane, d = member
+        step = self.steps[d]
+        return (column, lane), (column + step[0], lane + step[1])
+
+    def conflict(self, a: Member, b: Member) -> bool:
+        return self._model.kind(self.move(a), self.move(b)) is not None
+
+    def pairs(self) -> set[tuple[Member, Member]]:
+        """Return all conflicting pairs, each once wherever it may lie."""
+        origins = [(0, 0, d) for d in range(len(self.steps))]
+        return {
+            _normal_pair(a, b)
+            for a in origins
+            for b in self._moves
+            if a[:2] != b[:2] and self.conflict(a, b)
+        }
+
+    def maximal_cliques(self) -> set[tuple[Member, ...]]:
+        """Return the maximal cliques that contain a move from the origin, each once."""
+        found: set[tuple[Member, ...]] = set()
+        for d in range(len(self.steps)):
+            origin = (0, 0, d)
+            near = [b for b in self._moves if b != origin and self._exclude(origin, b)]
+            near_of = {a: {b for b in near if b != a and self._exclude(a, b)} for a in near}
+            for clique in _cliques(set(), set(near), set(), near_of):
+                found.add(_normal((origin, *clique)))
+        return found
+
+    def _exclude(self, a: Member, b: Member) -> bool:
+        """Tell whether no two vehicles make both moves; none share a cell."""
+        return a[:2] == b[:2] or self.conflict(a, b)
+
+
+def _cliques(
+    chosen: set[Member], open_: set[Member], closed: set[Member], near: dict[Member, set[Member]]
+) -> Iterator[tuple[Member, ...]]:
+    """Yield maximal cliques (Bron and Kerbosch, Communications of the ACM 16, 1973)."""
+    if not open_ and not closed:
+        yield tuple(chosen)
+        return
+    pivot = max(sorted(open_ | closed), key=lambda member: len(near[member] & open_))
+    for member in sorted(open_ - near[pivot]):
+        yield from _cliques(chosen | {member}, open_ & near[member], closed & near[member], near)
+        open_ = open_ - {member}
+        closed = closed | {member}
+
+
+def _columns(member: Member, relation: _Relation) -> frozenset[int]:
+    column, _, d = member
+    return frozenset({column, column + relation.steps[d][0]})
+
+
+def _normal(members: tuple[Member, ...]) -> tuple[Member, ...]:
+    """Return members with the anchor on the least of their from-cells."""
+    column, lane = min((member[0], member[1]) for member in members)
+    return tuple(sorted((c - column, left - lane, d) for c, left, d in members))
+
+
+def _normal_pair(a: Member, b: Member) -> tuple[Member, Member]:
+    first, second = _normal((a, b))
+    return first, second

@@ -1,0 +1,81 @@
+"""Conflict rows: cliques that cover every conflict."""
+
+from itertools import combinations
+
+import pytest
+
+from laneweave.coordinator.planning.conflicts import KINDS, ConflictModel
+from laneweave.coordinator.planning.grid import Mode, Move, displacements
+from laneweave.coordinator.planning.rows import RowKind, row_patterns
+from oracles.instances import VARIANTS
+
+MODELS: list[tuple[Mode, tuple[str, ...]]] = [
+    (1 if mode == 1 else 2, tuple(kinds)) for mode, kinds in VARIANTS if kinds is not None
+]
+NEAR = range(-2, 3)
+
+
+def moves_of(kind: RowKind, mode: Mode, column: int, lane: int) -> set[Move]:
+    """Return the moves of a row with its anchor in a cell."""
+    steps = displacements(mode)
+    moves = set()
+    for c, left, d in kind.members:
+        cell = column + c, lane + left
+        moves.add((cell, (cell[0] + steps[d][0], cell[1] + steps[d][1])))
+    return moves
+
+
+@pytest.mark.parametrize(("mode", "kinds"), MODELS)
+def test_every_conflict_is_in_a_row_and_every_row_excludes(
+    mode: Mode, kinds: tuple[str, ...]
+) -> None:
+    model = ConflictModel(kinds)
+    patterns = row_patterns(mode, model)
+    rows = [
+        moves_of(kind, mode, column, lane)
+        for kind in patterns.kinds
+        for column in range(-4, 5)
+        for lane in range(-4, 5)
+    ]
+    for kind in patterns.kinds:
+        for a, b in combinations(sorted(moves_of(kind, mode, 0, 0)), 2):
+            assert a[0] == b[0] or model.kind(a, b) is not None
+    steps = displacements(mode)
+    origin = [((0, 0), step) for step in steps]
+    others = [
+        ((column, lane), (column + along, lane + across))
+        for column in NEAR
+        for lane in NEAR
+        for along, across in steps
+        if (column, lane) != (0, 0)
+    ]
+    for a in origin:
+        for b in others:
+            if model.kind(a, b) is not None:
+                assert any(a in row and b in row for row in rows), (a, b)
+
+
+@pytest.mark.parametrize(("mode", "kinds"), MODELS)
+def test_all_moves_of_a_row_touch_its_column(mode: Mode, kinds: tuple[str, ...]) -> None:
+    patterns = row_patterns(mode, ConflictModel(kinds))
+    assert patterns.local
+    for kind in patterns.kinds:
+        for start, end in moves_of(kind, mode, 0, 0):
+            assert kind.column in (start[0], end[0])
+
+
+@pytest.mark.parametrize(
+    ("mode", "kinds", "moves"),
+    [(1, ("node", "edge", "special-1"), 9), (1, ("geometric",), 9), (2, ("geometric",), 25)],
+)
+def test_of_footprints_there_is_one_row_for_each_cell(
+    mode: Mode, kinds: tuple[str, ...], moves: int
+) -> None:
+    (kind,) = row_patterns(mode, ConflictModel(kinds)).kinds
+    assert len(kind.members) == moves
+
+
+def test_what_lets_vehicles_share_a_cell_cannot_be_swept() -> None:
+    for kind in KINDS:
+        local = row_patterns(2, ConflictModel((kind,))).local
+        assert local == (kind in ("node", "geometric"))
