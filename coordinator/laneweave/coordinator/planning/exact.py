@@ -8,7 +8,8 @@
    the next cost is looked at.
 
 The first cost that is possible is the least one, and the solution found has the fewest moves of all
-that cost as much.
+that cost as much. A path set that is found by other means (`reachability`, `incumbent`) is the
+answer when the deadline comes first, and ends the search when the bound reaches its cost.
 """
 
 from __future__ import annotations
@@ -21,12 +22,13 @@ from typing import Final
 
 import numpy as np
 from attrs import define
+from scipy.optimize import linear_sum_assignment
 
 from laneweave.coordinator.planning.arrays import UNREACHABLE, Teams, lattice, teams
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
 from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.grid import Grid
-from laneweave.coordinator.planning.incumbent import Solution
+from laneweave.coordinator.planning.incumbent import Incumbent, Solution, tidied
 from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.reachability import explore
 from laneweave.coordinator.planning.relaxation import Penalties, Subgradient, penalties
@@ -43,7 +45,7 @@ _SPARE_STEPS = 6
 _ITERATIONS = 300
 _PUZZLE_VEHICLES, _PUZZLE_STATES = 9, 1_000_000
 _AT_A_TIME = 10
-_QUICK = ((20, 500), (60, 5_000))
+_QUICK = ((20, 500), (60, 5_000), (120, 20_000))
 """Before that: so many iterations, then sweeps of so many partial solutions in all. They are enough
 for most small formations."""
 _SHARE = 0.25
@@ -52,7 +54,9 @@ _FIRST_STATES, _GROWTH = 20_000, 4
 """Most partial solutions of a sweep, before the other direction is tried; then more of both."""
 _STATES_PER_S = 1_000_000
 """No machine in question does less; so long a sweep may be when the deadline is near."""
-_EXPLORE_MOVES = 200_000
+_EXPLORE_MOVES = 20_000
+_INCUMBENT_NODES = 100
+"""How long the first path set is improved; see `Incumbent.work`."""
 _STEPS_GUESSED, _MOST_NUMBERS = 32, 50_000_000
 """Larger tables do not fit into memory."""
 _MOST_LANES, _MOST_OCCUPANTS = 16, 1 << 60
@@ -95,14 +99,14 @@ class Exact:
         budget: Budget,
     ) -> None:
         """Prepare the search."""
-        self.best: Solution | None = None
         self.lower_bound: float = 0
         self.finished = False
         self.tried = 0
         self.gave_up = False
         """Trees are the better tool: there is more to be told apart than a sweep can (`TOO_WIDE`),
         or the problem is a puzzle."""
-        self._explored = False
+        self._explore_moves = _EXPLORE_MOVES
+        self._incumbent = Incumbent(problem, choices, budget)
         self._problem = problem
         self._choices = choices
         self._budget = budget
@@ -110,6 +114,11 @@ class Exact:
         self._lattice = lattice(table.grid, table.mode, table.model)
         starts = [vehicle.cell for vehicle in request.vehicles]
         self._teams = teams(table.grid, table.mode, starts, request.targets, choices)
+
+    @property
+    def best(self) -> Solution | None:
+        """Return the cheapest path set so far."""
+        return self._incumbent.best
 
     def run(self) -> None:
         """Search until the optimum is proven or the budget is spent."""
@@ -129,6 +138,8 @@ class Exact:
         # Few vehicles on little room are a puzzle: much is possible, and trees are better at it.
         most = _PUZZLE_STATES if len(self._choices) <= _PUZZLE_VEHICLES else None
         for iterations, patience in chain(_QUICK, repeat((_ITERATIONS, most))):
+            if iterations == _ITERATIONS and self.best is None:
+                self._look_for_any()
             self._improve(search, iterations)
             if search.bound >= UNREACHABLE:
                 self.lower_bound, self.finished = math.inf, True
@@ -174,24 +185,36 @@ class Exact:
             contest = _Contest(both, budget, self._budget)
             done = contest.decide(patience)
             if done.ending == SOLVED:
-                self.best = self._solution(done, mirrored=contest.side == 1)
+                self._incumbent.offer(self._solution(done, mirrored=contest.side == 1))
             elif done.ending == DEAD:
                 self.lower_bound += 1
-                if self.best is None and not hurried:
-                    self._look_for_any()
             else:
                 self.gave_up = not hurried
                 return
 
     def _look_for_any(self) -> None:
-        """Find some path set, or that there is none, before costs are tried for ever."""
-        if self._explored:
+        """Find some path set, or show that there is none; more is tried each time."""
+        assignment = self._nearest_targets()
+        self._incumbent.work(_INCUMBENT_NODES, [assignment])
+        if self.best is not None:
             return
-        self._explored = True
-        verdict = explore(self._problem, self._choices, self._budget, _EXPLORE_MOVES)
-        self.best = verdict.solution
+        verdict = explore(self._problem, self._choices, self._budget, self._explore_moves)
+        self._explore_moves *= _GROWTH
         if verdict.impossible:
             self.lower_bound, self.finished = math.inf, True
+        elif verdict.solution is not None:
+            plain = tidied(self._problem, verdict.solution, self._budget)
+            self._incumbent.begin_with(plain)
+            self._incumbent.work(2 * _INCUMBENT_NODES, [plain.assignment])
+
+    def _nearest_targets(self) -> tuple[int, ...]:
+        """Return the assignment with the shortest ways, conflicts aside."""
+        ways = np.where(
+            self._teams.eligible[self._teams.team],
+            self._teams.distance[:, self._teams.start].T,
+            UNREACHABLE,
+        )
+        return tuple(int(target) for target in linear_sum_assignment(ways)[1])
 
     def _solution(self, done: Sweep, *, mirrored: bool) -> Solution:
         """Walk the vehicles through what a sweep decided."""
