@@ -12,6 +12,7 @@ problem.
 from __future__ import annotations
 
 import math
+import signal
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,8 @@ Vector = NDArray[np.float64]
 SOLVED = 1
 SOLVED_INACCURATE = 2
 MAX_ITERATIONS = 7
+INTERRUPTED = 10
+"""OSQP took a SIGINT for itself."""
 
 _INFINITY = float(ext_builtin.OSQP_INFTY)
 
@@ -146,6 +149,10 @@ class QuadraticProgram:
         """Solve, starting from the previous solution."""
         solver = self._solver
         solver.solve()
+        if int(solver.info.status_val) == INTERRUPTED:
+            # It was meant for the process, which would not learn of it otherwise.
+            signal.raise_signal(signal.SIGINT)
+            solver.solve()
         info = solver.info
         status = int(info.status_val)
         x: Vector = solver.solution.x

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import threading
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -187,3 +191,15 @@ def test_out_of_iterations_counts_only_within_the_row_tolerance() -> None:
     assert lax.usable == (lax.status in (2, 7))
     expected = np.max(np.maximum(lower - lax.x, lax.x - upper))
     assert lax.row_violation == pytest.approx(max(expected, 0.0))
+
+
+def test_an_interrupt_during_a_solve_is_not_lost() -> None:
+    """OSQP catches SIGINT while it works, and only stops; a long solve makes sure of that."""
+    endless = QPSettings(eps_abs=1e-300, max_iter=2_000_000_000, row_tolerance=1e-6)
+    program = box(200, settings=endless)
+    program.update(np.full(200, 5.0), np.full(200, 6.0), np.linspace(-1.0, 1.0, 200) / 3.0)
+    timer = threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        program.solve()
+    timer.join()
