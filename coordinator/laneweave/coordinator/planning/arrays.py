@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.grid import Cell, Grid, Mode, displacements
+from laneweave.coordinator.planning.moves import REACH, conflict_offsets
 from laneweave.coordinator.planning.rows import RowPatterns, row_patterns
 
 Ints = NDArray[np.int64]
@@ -24,7 +25,6 @@ Bools = NDArray[np.bool_]
 
 UNREACHABLE = 1e9
 """Stands for infinity, and can be added to."""
-_REACH = 2
 
 
 class Lattice(NamedTuple):
@@ -123,18 +123,12 @@ def _rows(
     return row, len(real), np.array(columns, dtype=np.int64)
 
 
-@lru_cache(maxsize=64)
 def _conflicts(mode: Mode, model: ConflictModel) -> Bools:
-    steps = displacements(mode)
-    side = 2 * _REACH + 1
-    table = np.zeros((len(steps), len(steps), side, side), dtype=np.bool_)
-    for d, step in enumerate(steps):
-        for e, (along, across) in enumerate(steps):
-            for i in range(side):
-                for j in range(side):
-                    at = (i - _REACH, j - _REACH)
-                    other = (at, (at[0] + along, at[1] + across))
-                    table[d, e, i, j] = model.kind(((0, 0), step), other) is not None
+    size, side = len(displacements(mode)), 2 * REACH + 1
+    table = np.zeros((size, size, side, side), dtype=np.bool_)
+    for d, offsets in enumerate(conflict_offsets(mode, model)):
+        for column, lane, e in offsets:
+            table[d, e, column + REACH, lane + REACH] = True
     return table
 
 

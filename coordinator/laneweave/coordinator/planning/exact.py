@@ -42,12 +42,15 @@ STATES_PER_NODE: Final = 100
 _TOLERANCE = 1e-6
 _SPARE_STEPS = 6
 """Steps with prices beyond the longest way; more when a solution may need more."""
-_ITERATIONS = 300
-_PUZZLE_VEHICLES, _PUZZLE_STATES = 9, 1_000_000
-_AT_A_TIME = 10
 _QUICK = ((20, 500), (60, 5_000), (120, 20_000))
-"""Before that: so many iterations, then sweeps of so many partial solutions in all. They are enough
+"""At first: so many iterations, then sweeps of so many partial solutions in all. They are enough
 for most small formations."""
+_ITERATIONS = 300
+"""Of a round after these."""
+_AT_A_TIME = 10
+"""Iterations between two looks at the clock."""
+_PUZZLE_VEHICLES, _PUZZLE_STATES = 9, 1_000_000
+"""So few vehicles with so many partial solutions are a puzzle, and left to trees."""
 _SHARE = 0.25
 """Part of a step by which the budget of one direction grows."""
 _FIRST_STATES, _GROWTH = 20_000, 4

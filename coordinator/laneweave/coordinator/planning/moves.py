@@ -18,7 +18,7 @@ from typing import Final
 from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.grid import Cell, Grid, Mode, Move, displacements
 
-_REACH: Final = 2
+REACH: Final = 2
 """Two moves can only conflict when their from-cells are at most this far apart."""
 
 Offsets = tuple[tuple[int, int, int], ...]
@@ -37,7 +37,7 @@ def bits(mask: int) -> Iterator[int]:
 
 
 @lru_cache(maxsize=64)
-def _conflict_offsets(
+def conflict_offsets(
     mode: Mode, model: ConflictModel
 ) -> tuple[tuple[tuple[int, int, int], ...], ...]:
     """Return, per displacement of A, the offsets and displacements of B that conflict with it.
@@ -45,7 +45,7 @@ def _conflict_offsets(
     Conflicts do not depend on where on the lattice they happen, so one table serves all grids.
     """
     steps = displacements(mode)
-    reach = range(-_REACH, _REACH + 1)
+    reach = range(-REACH, REACH + 1)
 
     def conflicting(d: int) -> Iterator[tuple[int, int, int]]:
         a: Move = ((0, 0), steps[d])
@@ -69,7 +69,7 @@ class MoveTable:
         self.model = model
         self.steps = displacements(mode)
         self.fan = len(self.steps)
-        self.width = grid.lanes + _REACH
+        self.width = grid.lanes + REACH
         self.every = (1 << self.fan) - 1
         self.shifts = tuple((c * self.width + lane) * self.fan for c, lane in self.steps)
         self.cells = self._free_cells()
@@ -158,7 +158,7 @@ class _ConflictSets(dict[int, int]):
 
     def __init__(self, table: MoveTable) -> None:
         super().__init__()
-        self._base = _REACH * (table.width + 1)
+        self._base = REACH * (table.width + 1)
         self._fan = table.fan
         self._valid = table.valid
         self._patterns = tuple(
@@ -166,7 +166,7 @@ class _ConflictSets(dict[int, int]):
                 1 << ((c * table.width + lane + self._base) * table.fan + e)
                 for c, lane, e in offsets
             )
-            for offsets in _conflict_offsets(table.mode, table.model)
+            for offsets in conflict_offsets(table.mode, table.model)
         )
         self._remember = table.valid.bit_length() <= _REMEMBER_BELOW_BITS
 

@@ -20,9 +20,7 @@ import attrs
 
 from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.grid import Mode, Move, displacements
-
-_REACH = 2
-"""Two moves can only conflict when their from-cells are at most this far apart."""
+from laneweave.coordinator.planning.moves import REACH, conflict_offsets
 
 Member = tuple[int, int, int]
 """Columns and lanes from the anchor to the from-cell of a move, and its displacement."""
@@ -78,8 +76,9 @@ class _Relation:
 
     def __init__(self, mode: Mode, model: ConflictModel) -> None:
         self.steps = displacements(mode)
+        self._mode = mode
         self._model = model
-        reach = range(-_REACH, _REACH + 1)
+        reach = range(-REACH, REACH + 1)
         self._moves = list(product(reach, reach, range(len(self.steps))))
 
     def move(self, member: Member) -> Move:
@@ -92,12 +91,11 @@ class _Relation:
 
     def pairs(self) -> set[tuple[Member, Member]]:
         """Return all conflicting pairs, each once wherever it may lie."""
-        origins = [(0, 0, d) for d in range(len(self.steps))]
         return {
-            _normal_pair(a, b)
-            for a in origins
-            for b in self._moves
-            if a[:2] != b[:2] and self.conflict(a, b)
+            _normal_pair((0, 0, d), other)
+            for d, offsets in enumerate(conflict_offsets(self._mode, self._model))
+            for other in offsets
+            if other[:2] != (0, 0)
         }
 
     def maximal_cliques(self) -> set[tuple[Member, ...]]:
