@@ -133,6 +133,9 @@ class ZenohTransport:
         self._subscriptions: dict[str, Any] = {}
         self._tokens: dict[str, Any] = {}
         self._watched: dict[str, Any] = {}
+        self._seen: set[str] = set()
+        """Keys of the tokens that were last delivered as being there."""
+        self._seen_lock = threading.Lock()
         self._served: dict[str, Any] = {}
         self._questions: dict[int, zenoh.Query] = {}
         self._question_lock = threading.Lock()
@@ -206,8 +209,17 @@ class ZenohTransport:
         self._deliver(Received(str(sample.key_expr), sample.payload.to_bytes()))
 
     def _on_token(self, sample: zenoh.Sample) -> None:
-        kind = TokenUp if sample.kind == zenoh.SampleKind.PUT else TokenDown
-        self._deliver(kind(str(sample.key_expr)))
+        # A session's own token comes from itself and, at times, again from the router.
+        key, is_there = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
+        with self._seen_lock:
+            if is_there == (key in self._seen):
+                return
+            if is_there:
+                self._seen.add(key)
+                self._deliver(TokenUp(key))
+            else:
+                self._seen.discard(key)
+                self._deliver(TokenDown(key))
 
     def _on_link(self, event: zenoh.TransportEvent) -> None:
         self._deliver(LinkUp() if event.kind == zenoh.SampleKind.PUT else LinkDown())

@@ -494,16 +494,40 @@ def test_a_watcher_sees_only_what_it_watches(bed: Bed) -> None:
     assert b.tokens() == ["+a1"]
 
 
+def news_of(party: Party, name: str) -> str:
+    return "".join(token[0] for token in party.tokens() if token[1:] == name)
+
+
 def test_own_tokens_are_seen_too(bed: Bed) -> None:
     a = bed.join("a")
     a.transport.announce(token_key("before"))
     a.transport.watch(TOKENS)
     a.transport.announce(token_key("after"))
-    bed.until(lambda: len(a.tokens()) == 2)
+    bed.until(lambda: sorted(a.tokens()) == ["+after", "+before"])
     a.transport.withdraw(token_key("before"))
-    bed.until(lambda: len(a.tokens()) == 3)
-    assert sorted(a.tokens()[:2]) == ["+after", "+before"]
-    assert a.tokens()[2] == "-before"
+    bed.until(lambda: "-before" in a.tokens())
+    bed.quiet()
+    bed.until(lambda: news_of(a, "before").endswith("-"))
+    assert news_of(a, "before") in {"+-", "+-+-"}
+    assert news_of(a, "after") == "+"
+
+
+def test_news_of_a_token_come_by_turns(bed: Bed) -> None:
+    a, b = bed.join("a"), bed.join("b")
+    names = [f"t{number}" for number in range(20)]
+    for name in names:
+        a.transport.announce(token_key(name))
+        a.transport.watch(token_key(name))
+        b.transport.watch(token_key(name))
+    bed.until(lambda: len(a.tokens()) >= len(names) and len(b.tokens()) >= len(names))
+    for name in names:
+        a.transport.withdraw(token_key(name))
+    gone = {f"-{name}" for name in names}
+    bed.until(lambda: gone <= set(a.tokens()) and gone <= set(b.tokens()))
+    bed.quiet()
+    bed.until(lambda: all(news_of(a, name).endswith("-") for name in names))
+    assert {news_of(b, name) for name in names} == {"+-"}
+    assert {news_of(a, name) for name in names} <= {"+-", "+-+-"}
 
 
 def test_repeated_calls_change_nothing(bed: Bed) -> None:
