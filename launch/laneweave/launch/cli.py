@@ -58,7 +58,7 @@ class SolverChoice(StrEnum):
     """How a request is planned here."""
 
     tappa = "tappa"
-    sweep = "sweep"
+    branching = "branching"
 
 
 class OutputFormat(StrEnum):

@@ -20,7 +20,7 @@ CHUNK = 10
 RECORDED_COSTS = {11: 22, 40: 34, 63: 20, 112: 25, 133: 29}
 
 
-SOLVERS: tuple[Solver, ...] = ("tappa", "sweep")
+SOLVERS: tuple[Solver, ...] = ("tappa", "branching")
 
 
 def _plan(request: dict[str, Any], solver: Solver = "tappa") -> dict[str, Any]:

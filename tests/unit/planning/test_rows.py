@@ -6,7 +6,7 @@ import pytest
 
 from laneweave.coordinator.planning.conflicts import KINDS, ConflictModel
 from laneweave.coordinator.planning.grid import Mode, Move, displacements
-from laneweave.coordinator.planning.rows import RowKind, row_patterns
+from laneweave.coordinator.planning.rows import Row, row_patterns
 from oracles.instances import VARIANTS
 
 MODELS: list[tuple[Mode, tuple[str, ...]]] = [
@@ -15,11 +15,11 @@ MODELS: list[tuple[Mode, tuple[str, ...]]] = [
 NEAR = range(-2, 3)
 
 
-def moves_of(kind: RowKind, mode: Mode, column: int, lane: int) -> set[Move]:
+def moves_of(pattern: Row, mode: Mode, column: int, lane: int) -> set[Move]:
     """Return the moves of a row with its anchor in a cell."""
     steps = displacements(mode)
     moves = set()
-    for c, left, d in kind.members:
+    for c, left, d in pattern:
         cell = column + c, lane + left
         moves.add((cell, (cell[0] + steps[d][0], cell[1] + steps[d][1])))
     return moves
@@ -32,13 +32,13 @@ def test_every_conflict_is_in_a_row_and_every_row_excludes(
     model = ConflictModel(kinds)
     patterns = row_patterns(mode, model)
     rows = [
-        moves_of(kind, mode, column, lane)
-        for kind in patterns.kinds
+        moves_of(pattern, mode, column, lane)
+        for pattern in patterns
         for column in range(-4, 5)
         for lane in range(-4, 5)
     ]
-    for kind in patterns.kinds:
-        for a, b in combinations(sorted(moves_of(kind, mode, 0, 0)), 2):
+    for pattern in patterns:
+        for a, b in combinations(sorted(moves_of(pattern, mode, 0, 0)), 2):
             assert a[0] == b[0] or model.kind(a, b) is not None
     steps = displacements(mode)
     origin = [((0, 0), step) for step in steps]
@@ -56,12 +56,13 @@ def test_every_conflict_is_in_a_row_and_every_row_excludes(
 
 
 @pytest.mark.parametrize(("mode", "kinds"), MODELS)
-def test_all_moves_of_a_row_touch_its_column(mode: Mode, kinds: tuple[str, ...]) -> None:
-    patterns = row_patterns(mode, ConflictModel(kinds))
-    assert patterns.local
-    for kind in patterns.kinds:
-        for start, end in moves_of(kind, mode, 0, 0):
-            assert kind.column in (start[0], end[0])
+def test_from_cells_of_a_row_can_be_told_apart_by_thirds(
+    mode: Mode, kinds: tuple[str, ...]
+) -> None:
+    """See `Lattice.near`."""
+    for pattern in row_patterns(mode, ConflictModel(kinds)):
+        for a, b in combinations({member[:2] for member in pattern}, 2):
+            assert max(abs(a[0] - b[0]), abs(a[1] - b[1])) <= 2
 
 
 @pytest.mark.parametrize(
@@ -71,11 +72,11 @@ def test_all_moves_of_a_row_touch_its_column(mode: Mode, kinds: tuple[str, ...])
 def test_of_footprints_there_is_one_row_for_each_cell(
     mode: Mode, kinds: tuple[str, ...], moves: int
 ) -> None:
-    (kind,) = row_patterns(mode, ConflictModel(kinds)).kinds
-    assert len(kind.members) == moves
+    (pattern,) = row_patterns(mode, ConflictModel(kinds))
+    assert len(pattern) == moves
 
 
-def test_what_lets_vehicles_share_a_cell_cannot_be_swept() -> None:
-    for kind in KINDS:
-        local = row_patterns(2, ConflictModel((kind,))).local
-        assert local == (kind in ("node", "geometric"))
+@pytest.mark.parametrize("kind", sorted(set(KINDS) - {"node", "geometric"}))
+def test_there_are_no_rows_where_vehicles_may_share_a_cell(kind: str) -> None:
+    with pytest.raises(ValueError, match="share a cell"):
+        row_patterns(2, ConflictModel((kind,)))

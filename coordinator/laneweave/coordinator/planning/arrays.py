@@ -2,7 +2,7 @@
 
 Cells are numbered column by column; `cell = column * lanes + lane`. A move is a displacement and a
 from-cell. Vehicles with equal eligibility are one *team*: they may swap their targets, so it does
-not matter which of them goes where.
+not matter which of them goes where. A *pair* is a team and a target that it may have.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.grid import Cell, Grid, Mode, displacements
-from laneweave.coordinator.planning.moves import REACH, conflict_offsets
-from laneweave.coordinator.planning.rows import RowPatterns, row_patterns
+from laneweave.coordinator.planning.rows import Row, row_patterns
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -33,38 +32,38 @@ class Lattice(NamedTuple):
     Shapes: D displacements, X cells, M most rows that a move is in.
     """
 
-    columns: int
     lanes: int
-    along: Ints
-    """(D,) columns that a displacement leads on."""
-    across: Ints
-    """(D,) lanes that it leads to the left."""
     step: Ints
-    """(D,) its difference of cell numbers."""
+    """(D,) difference of cell numbers."""
     valid: Bools
     """(D, X) whether the move stays on free cells."""
     row: Ints
     """(D, X, M) numbers of the rows that a move is in; -1: no more."""
     row_count: int
-    row_column: Ints
-    """(rows,) the column that each row belongs to: all its moves touch it."""
-    conflict: Bools
-    """(D, D, 5, 5) whether two moves conflict, by the way from one from-cell to the other, + 2."""
+    near: Ints
+    """(X,) a number from 0 to 8 that tells the from-cells of the moves in one row apart: they are
+    at most two columns and two lanes away from each other."""
 
 
 class Teams(NamedTuple):
-    """Vehicles and targets. Shapes: N vehicles, J targets, K teams."""
+    """Vehicles and targets. Shapes: N vehicles, J targets, K teams, P pairs, X cells."""
 
     start: Ints
     """(N,) cells."""
-    target: Ints
-    """(J,) cells."""
     team: Ints
     """(N,) numbers of the vehicles' teams."""
-    eligible: Bools
-    """(K, J)."""
+    target: Ints
+    """(J,) cells."""
+    pairs_from: Ints
+    """(K + 1,) team k has the pairs from `pairs_from[k]` to `pairs_from[k + 1]`."""
+    pair_target: Ints
+    """(P,) number of the target."""
+    pair_cell: Ints
+    """(P,) its cell."""
+    pair: Ints
+    """(K, J) number of a pair; -1: the team may not have the target."""
     distance: Floats
-    """(J, X) least steps from each cell to a target; `UNREACHABLE`: there is no way."""
+    """(X, P) least steps from each cell to a target; `UNREACHABLE`: there is no way."""
 
 
 @lru_cache(maxsize=16)
@@ -85,28 +84,19 @@ def lattice(grid: Grid, mode: Mode, model: ConflictModel) -> Lattice:
             for c, across in steps.tolist()
         ]
     )
-    row, row_count, row_column = _rows(grid, patterns, len(steps), valid)
-    return Lattice(
-        grid.columns,
-        grid.lanes,
-        steps[:, 0].copy(),
-        steps[:, 1].copy(),
-        steps[:, 0] * grid.lanes + steps[:, 1],
-        valid,
-        row,
-        row_count,
-        row_column,
-        _conflicts(mode, model),
-    )
+    row, row_count = _rows(grid, patterns, len(steps), valid)
+    cell = np.arange(grid.columns * grid.lanes)
+    near = cell // grid.lanes % 3 * 3 + cell % grid.lanes % 3
+    return Lattice(grid.lanes, steps[:, 0] * grid.lanes + steps[:, 1], valid, row, row_count, near)
 
 
 def _rows(
-    grid: Grid, patterns: RowPatterns, displacement_count: int, valid: Bools
-) -> tuple[Ints, int, Ints]:
+    grid: Grid, patterns: tuple[Row, ...], displacement_count: int, valid: Bools
+) -> tuple[Ints, int]:
     """Number the rows; those of a single move do not restrict anything."""
     members: dict[tuple[int, int, int], list[tuple[int, int]]] = {}
-    for number, kind in enumerate(patterns.kinds):
-        for c, across, d in kind.members:
+    for number, pattern in enumerate(patterns):
+        for c, across, d in pattern:
             for cell in np.flatnonzero(valid[d]).tolist():
                 column, lane = divmod(cell, grid.lanes)
                 members.setdefault((number, column - c, lane - across), []).append((d, cell))
@@ -119,22 +109,11 @@ def _rows(
     row = np.full((displacement_count, grid.columns * grid.lanes, most), -1, dtype=np.int64)
     for (d, cell), indices in of_move.items():
         row[d, cell, : len(indices)] = indices
-    columns = [key[1] + patterns.kinds[key[0]].column for key in real]
-    return row, len(real), np.array(columns, dtype=np.int64)
-
-
-def _conflicts(mode: Mode, model: ConflictModel) -> Bools:
-    size, side = len(displacements(mode)), 2 * REACH + 1
-    table = np.zeros((size, size, side, side), dtype=np.bool_)
-    for d, offsets in enumerate(conflict_offsets(mode, model)):
-        for column, lane, e in offsets:
-            table[d, e, column + REACH, lane + REACH] = True
-    return table
+    return row, len(real)
 
 
 def teams(
-    grid: Grid,
-    mode: Mode,
+    ways: Lattice,
     starts: Sequence[Cell],
     targets: Sequence[Cell],
     choices: Sequence[frozenset[int]],
@@ -142,24 +121,41 @@ def teams(
     """Return vehicles and targets as arrays, teams in the order of their first vehicles."""
     numbers: dict[frozenset[int], int] = {}
     team = [numbers.setdefault(choice, len(numbers)) for choice in choices]
-    eligible = np.zeros((len(numbers), len(targets)), dtype=np.bool_)
-    for choice, number in numbers.items():
-        eligible[number, sorted(choice)] = True
-    cells = [column * grid.lanes + lane for column, lane in targets]
+    pair_target = [j for choice in numbers for j in sorted(choice)]
+    pairs_from = np.cumsum([0, *map(len, numbers)])
+    pair = np.full((len(numbers), len(targets)), -1, dtype=np.int64)
+    for k in range(len(numbers)):
+        first, end = pairs_from[k : k + 2]
+        pair[k, pair_target[first:end]] = np.arange(first, end)
+    target = _cells(targets, ways)
+    numbered = np.array(pair_target, dtype=np.int64)
     return Teams(
-        np.array([column * grid.lanes + lane for column, lane in starts], dtype=np.int64),
-        np.array(cells, dtype=np.int64),
-        np.array(team, dtype=np.int64),
-        eligible,
-        _distances(grid, mode, targets),
+        start=_cells(starts, ways),
+        team=np.array(team, dtype=np.int64),
+        target=target,
+        pairs_from=pairs_from.astype(np.int64),
+        pair_target=numbered,
+        pair_cell=target[numbered],
+        pair=pair,
+        distance=np.ascontiguousarray(_distances(ways, target)[:, numbered]),
     )
 
 
-def _distances(grid: Grid, mode: Mode, targets: Sequence[Cell]) -> Floats:
-    """Return the least steps from every cell to each target, as if it were alone."""
-    free = list(grid.cells())
-    found = np.full((len(targets), grid.columns * grid.lanes), UNREACHABLE)
-    for j, target in enumerate(targets):
-        for (column, lane), steps in grid.distances(target, mode, free).items():
-            found[j, column * grid.lanes + lane] = steps
+def _cells(cells: Sequence[Cell], ways: Lattice) -> Ints:
+    return np.array([column * ways.lanes + lane for column, lane in cells], dtype=np.int64)
+
+
+def _distances(ways: Lattice, targets: Ints) -> Floats:
+    """Return (X, J) the least steps from every cell to each target, as if it were alone."""
+    cells = ways.valid.shape[1]
+    found = np.full((cells, len(targets)), UNREACHABLE)
+    found[targets, np.arange(len(targets))] = 0.0
+    moves = [(np.flatnonzero(ways.valid[d]), ways.step[d]) for d in range(len(ways.step))]
+    for _ in range(cells):
+        before = found.copy()
+        for from_, step in moves:
+            found[from_] = np.minimum(found[from_], before[from_ + step] + 1.0)
+        found = np.minimum(found, UNREACHABLE)
+        if np.array_equal(found, before):
+            break
     return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections.abc import Callable
 
@@ -10,10 +11,6 @@ Clock = Callable[[], float]
 
 _RELEASE_S_PER_NODE = 3e-6
 """What it takes to give the memory of a node back, after the answer is known."""
-
-
-_MOST_STATES = 20_000_000
-"""Partial solutions that fit into some 2 GB."""
 
 
 class BudgetSpentError(Exception):
@@ -50,24 +47,18 @@ class Budget:
             raise BudgetSpentError
         self.nodes += 1
 
-    def take_states(self, states: int, per_node: int) -> None:
-        """Count partial solutions, so many of them as one node; raise as `take_node` does."""
-        self.nodes += -(-states // per_node)
+    def take_nodes(self, nodes: int) -> None:
+        """Count nodes that were looked at; raise as `take_node` does."""
+        self.nodes += nodes
         self.check_time()
         if self._max_nodes is not None and self.nodes >= self._max_nodes:
             raise BudgetSpentError
 
-    def states_left(self, per_node: int, per_s: int) -> int:
-        """Return how many partial solutions may be made at one go, at a pace that is a safe guess.
-
-        Raises:
-            BudgetSpentError: none.
-        """
+    def nodes_left(self, s_per_node: float) -> int:
+        """Return how many nodes may be looked at before the deadline and within the limit."""
         left = math.inf
         if self._max_nodes is not None:
-            left = (self._max_nodes - self.nodes) * per_node
+            left = self._max_nodes - self.nodes
         if self._deadline is not None:
-            left = min(left, (self._deadline - self._clock()) * per_s)
-        if left <= 0:
-            raise BudgetSpentError
-        return int(min(left, _MOST_STATES))
+            left = min(left, (self._deadline - self._clock()) / max(s_per_node, 1e-6))
+        return max(0, int(min(left, sys.maxsize)))

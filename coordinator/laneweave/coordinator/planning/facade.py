@@ -24,9 +24,9 @@ from laneweave.coordinator.planning.response import PlanResponse, Status
 from laneweave.coordinator.planning.tappa import Tappa
 from laneweave.coordinator.planning.validate import problems_of_response
 
-Solver = Literal["tappa", "sweep"]
-"""`tappa`: the paper's algorithm. `sweep`: column by column, for large formations; what it cannot
-do, because vehicles may share a cell or differ too much, `tappa` does."""
+Solver = Literal["tappa", "branching"]
+"""`tappa`: the paper's algorithm. `branching`: branch and bound with prices, for large formations;
+what it cannot do, because vehicles may share a cell or tables get too large, `tappa` does."""
 
 MAX_NODES: Final = 500_000
 """Bounds the memory to about 1 GB; it takes minutes to get there."""
@@ -66,9 +66,9 @@ def plan(
     in a repeatable way, and is never above `MAX_NODES`. `weights` of the formation relative
     distance must give a lower bound.
     """
-    if solver == "sweep":
+    if solver == "branching":
         # Not on the request's time. Who uses the other solver need not wait for it at all.
-        from laneweave.coordinator.planning.exact import warm_up  # noqa: PLC0415
+        from laneweave.coordinator.planning.branching import warm_up  # noqa: PLC0415
 
         warm_up()
     started = clock()
@@ -121,11 +121,11 @@ def _searches(
     budget: Budget,
 ) -> Iterator[Search]:
     """Yield what to search with; the next one where one gives up."""
-    if solver == "sweep":
-        from laneweave.coordinator.planning.exact import Exact, can_sweep  # noqa: PLC0415
+    if solver == "branching":
+        from laneweave.coordinator.planning.branching import Branching, can_branch  # noqa: PLC0415
 
-        if can_sweep(problem, choices):
-            yield Exact(problem, request, choices, budget)
+        if can_branch(problem, choices):
+            yield Branching(problem, choices, budget)
     costs, allowed = matrices(request, weights, choices, budget)
     yield Tappa(problem, assignments(costs, allowed, budget), choices, budget)
 

@@ -1,4 +1,9 @@
-"""Compiled code of `relaxation`; see `sweep_kernel` for its style."""
+"""Compiled code of `relaxation`.
+
+Types are those of `arrays` and `relaxation`; numba compiles for what it is called with. Arrays are
+taken out of their tuples before loops, and inner loops are functions of their own: without that
+they take five times as long.
+"""
 
 from __future__ import annotations
 
@@ -7,124 +12,196 @@ from numba import njit
 
 from laneweave.coordinator.planning.arrays import UNREACHABLE
 
-ARRIVED = -1
-"""In a table of decisions: the vehicle has arrived for good."""
-_TOLERANCE = 1e-6
+PER_MOVE = 1e-5
+"""Added to the cost of each move that is not a wait: of equal costs the fewest moves win."""
+PARKED = -1
+"""In a way: the vehicle has arrived for good."""
+REFUTED, FOUND, OPEN = 0, 1, 2
+"""No solution below the ceiling; a solution below it; neither is known yet."""
+BOUND, PACE, STALE, WEIGHT, WEIGHTS, BEST = range(6)
+"""Places in the memory of `improve`: the best bound, the factor of the step length, iterations
+without a better bound, the weight of the next relaxed solution, the sum of all weights, the value
+of the best solution that happened to be free of conflicts."""
+_HALF = 0.5 * UNREACHABLE
+_TOLERANCE = 1e-7
 _MOMENTUM = 0.6
 _STEP = 0.6
 _PATIENCE = 12
 """After so many iterations without a better bound the steps become shorter."""
-_SHORTER = 0.6
-_SHORTEST = 0.0005
+_SHORTER, _SHORTEST = 0.6, 0.0005
+_FADING = 0.92
+"""Weight of a relaxed solution, relative to the next one."""
 
 
 @njit(cache=True)
-def improve_prices(lattice, teams, prices, best_prices, direction, memory, iterations):
-    """Go on with a subgradient method; see `relaxation.Subgradient` for what it changes.
+def list_moves(lattice, allowed, scratch):
+    """List the allowed moves of every step; return their number and the steps there are any in."""
+    teams, steps, displacements, cells = allowed.shape
+    move, move_from, step = scratch.move, scratch.move_from, lattice.step
+    count, span = 0, 0
+    for t in range(steps):
+        for k in range(teams):
+            move_from[t, k] = count
+            for cell in range(cells):
+                for d in range(displacements):
+                    if allowed[k, t, d, cell]:
+                        move[count, 0] = d
+                        move[count, 1] = cell
+                        move[count, 2] = cell + step[d]
+                        count += 1
+        move_from[t, teams] = count
+        if count > move_from[t, 0]:
+            span = t + 1
+    return count, span
 
-    memory: the best bound, the factor of the step length, iterations without a better bound.
+
+@njit(cache=True)
+def start_over(prices, span, scratch, memory):
+    """Begin to improve prices; there are none where nobody can move any more."""
+    prices[span:] = 0.0
+    scratch.present[:] = prices
+    scratch.direction[:] = 0.0
+    scratch.mass[:] = 0.0
+    memory[BOUND], memory[STALE], memory[WEIGHT], memory[WEIGHTS] = -UNREACHABLE, 0.0, 1.0, 0.0
+
+
+@njit(cache=True)
+def improve(lattice, teams, allowed, first, prices, span, scratch, memory, count, ceiling, goal):
+    """Go on with a subgradient method, until the ceiling is passed or a solution below it is found.
+
+    goal: the value that the steps aim at; negative: guess.
     """
-    steps, rows = prices.shape
-    goals = len(teams.target)
-    to_go = np.empty((steps + 1, goals, lattice.valid.shape[1]))
-    decision = np.empty((steps, goals, lattice.valid.shape[1]), np.int8)
-    matching = np.empty(goals, np.int64)
-    worth = np.empty(goals)
-    excess = np.empty((steps, rows))
-    for _ in range(iterations):
-        _look_back(lattice, teams, prices, to_go, decision)
-        bound = _match(teams, to_go[0], matching, worth) - prices.sum()
-        if bound > 0.5 * UNREACHABLE:
-            memory[0] = UNREACHABLE
-            return
-        _use_of_rows(lattice, teams, decision, matching, excess)
-        square = 0.0
-        for t in range(steps):
-            for row in range(rows):
-                over = excess[t, row] - 1.0
-                if over < 0.0 and prices[t, row] <= 0.0:
-                    over = 0.0
-                excess[t, row] = over
-                square += over * over
-        memory[2] = 0.0 if bound > memory[0] + 0.01 else memory[2] + 1.0
-        if bound > memory[0]:
-            memory[0] = bound
-            best_prices[:] = prices
+    rows = prices.shape[1]
+    present, direction, use = scratch.present, scratch.direction, scratch.use
+    for _ in range(count):
+        bound = evaluate(lattice, teams, first, present, span, scratch)
+        if bound > _HALF:
+            memory[BOUND] = UNREACHABLE
+            return REFUTED
+        memory[STALE] = 0.0 if bound > memory[BOUND] + 0.01 else memory[STALE] + 1.0
+        if bound > memory[BOUND]:
+            memory[BOUND] = bound
+            prices[:] = present
+            if bound > ceiling:
+                return REFUTED
+        value, arrived = _walk(lattice, teams, allowed, first, present, span, scratch, memory)
+        clash, square = _excess(present, use, span)
+        if not clash and arrived and value < memory[BEST] - _TOLERANCE:
+            memory[BEST] = value
+            scratch.best_way[:] = scratch.way
+        if memory[BEST] <= ceiling:
+            return FOUND
         if square == 0.0:
-            return
-        if memory[2] >= _PATIENCE:
-            memory[1] = max(_SHORTER * memory[1], _SHORTEST)
-            memory[2] = 0.0
-            prices[:] = best_prices
+            return OPEN
+        if memory[STALE] >= _PATIENCE:
+            memory[PACE] = max(_SHORTER * memory[PACE], _SHORTEST)
+            memory[STALE] = 0.0
+            present[:] = prices
             direction[:] = 0.0
             continue
-        # The method wants the best possible bound; a guess does, if it is a little too high.
-        goal = 1.12 * memory[0] + 2.0
-        factor = _STEP * memory[1] * (goal - bound) / square
-        for t in range(steps):
+        aim = goal if goal >= 0.0 else 1.12 * max(memory[BOUND], 0.0) + 2.0
+        factor = _STEP * memory[PACE] * (aim - bound) / square
+        for t in range(span):
             for row in range(rows):
-                change = _MOMENTUM * direction[t, row] + excess[t, row]
+                change = _MOMENTUM * direction[t, row] + use[t, row]
                 direction[t, row] = change
                 if change != 0.0:
-                    prices[t, row] = max(prices[t, row] + factor * change, 0.0)
+                    present[t, row] = max(present[t, row] + factor * change, 0.0)
+    return OPEN
 
 
 @njit(cache=True)
-def _price(rows, prices, t, d, cell):
-    """Return what a move pays in a step; `rows` are those of the lattice."""
+def evaluate(lattice, teams, first, prices, span, scratch):
+    """Return the bound at some prices; fills in costs to go and the assignment."""
+    _look_back(lattice, teams, first, prices, span, scratch)
     total = 0.0
-    for m in range(rows.shape[2]):
-        row = rows[d, cell, m]
-        if row < 0:
+    for t in range(span):
+        for row in range(prices.shape[1]):
+            total += prices[t, row]
+    return _match(teams, scratch) - total
+
+
+@njit(cache=True)
+def _look_back(lattice, teams, first, prices, span, scratch):
+    """Fill in the least priced cost from each cell before each step to the target of each pair.
+
+    Every step until the final arrival costs 1. Who has arrived waits, which pays for rows, too.
+    """
+    to_go, parked = scratch.to_go, scratch.parked
+    move, move_from, move_price = scratch.move, scratch.move_from, scratch.move_price
+    row, cell_of, pairs_from = lattice.row, teams.pair_cell, teams.pairs_from
+    parked[span] = 0.0
+    if span == len(prices):
+        to_go[span] = teams.distance
+    else:
+        to_go[span] = UNREACHABLE
+        for p in range(len(cell_of)):
+            if first[p] <= span:
+                to_go[span, cell_of[p], p] = 0.0
+    for t in range(span - 1, -1, -1):
+        to_go[t] = UNREACHABLE
+        for k in range(len(pairs_from) - 1):
+            _step_back(
+                move,
+                move_price,
+                move_from[t, k],
+                move_from[t, k + 1],
+                pairs_from[k],
+                pairs_from[k + 1],
+                row,
+                prices[t],
+                to_go[t],
+                to_go[t + 1],
+            )
+        for p in range(len(cell_of)):
+            cell = cell_of[p]
+            stay = parked[t + 1, p] + _price(row, prices[t], 0, cell)
+            parked[t, p] = stay
+            if t >= first[p] and stay <= to_go[t, cell, p]:
+                to_go[t, cell, p] = stay
+
+
+@njit(cache=True)
+def _step_back(move, move_price, begin, end, first_pair, end_pair, row, prices, here, then):
+    for m in range(begin, end):
+        d, cell, next_cell = move[m, 0], move[m, 1], move[m, 2]
+        price = 1.0 + _price(row, prices, d, cell)
+        if d != 0:
+            price += PER_MOVE
+        move_price[m] = price
+        for p in range(first_pair, end_pair):
+            total = price + then[next_cell, p]
+            if total < here[cell, p]:
+                here[cell, p] = total
+
+
+@njit(cache=True)
+def _price(row, prices, d, cell):
+    """Return what a move pays in a step with these prices."""
+    total = 0.0
+    for m in range(row.shape[2]):
+        r = row[d, cell, m]
+        if r < 0:
             break
-        total += prices[t, row]
+        total += prices[r]
     return total
 
 
 @njit(cache=True)
-def _look_back(lattice, teams, prices, to_go, decision):
-    """Fill in the least priced cost from each cell before each step to each target.
-
-    Every step until the final arrival costs 1. Who has arrived waits, which pays for rows, too.
-    """
-    steps = len(prices)
-    valid, step, rows, targets = lattice.valid, lattice.step, lattice.row, teams.target
-    displacements, cells = valid.shape
-    price = np.empty((displacements, cells))
-    to_go[steps] = teams.distance
-    stay = np.zeros(len(targets))
-    for t in range(steps - 1, -1, -1):
-        for d in range(displacements):
-            for cell in range(cells):
-                if valid[d, cell]:
-                    price[d, cell] = _price(rows, prices, t, d, cell)
-        for j in range(len(targets)):
-            for cell in range(cells):
-                least, choice = UNREACHABLE, 0
-                for d in range(displacements):
-                    if valid[d, cell]:
-                        total = price[d, cell] + to_go[t + 1, j, cell + step[d]]
-                        if total < least - 1e-12:
-                            least, choice = total, d
-                to_go[t, j, cell] = min(least + 1.0, UNREACHABLE)
-                decision[t, j, cell] = choice
-            target = targets[j]
-            stay[j] += price[0, target]
-            if stay[j] <= to_go[t, j, target]:
-                to_go[t, j, target] = stay[j]
-                decision[t, j, target] = ARRIVED
-
-
-@njit(cache=True)
-def _match(teams, cost_of_way, matching, worth):
+def _match(teams, scratch):
     """Assign targets at least cost; fill in each target's vehicle (or -1) and dual value.
 
     Successive shortest paths with potentials (Jonker and Volgenant, Computing 38, 1987).
     """
-    start, team, eligible = teams.start, teams.team, teams.eligible
-    vehicles, goals = len(start), len(matching)
+    to_go, start, pair = scratch.to_go, teams.start, teams.pair
+    cost, holder_of, worth_of = scratch.cost, scratch.holder, scratch.worth
+    vehicles, goals = cost.shape
+    for i in range(vehicles):
+        for j in range(goals):
+            p = pair[teams.team[i], j]
+            cost[i, j] = to_go[0, start[i], p] if p >= 0 else UNREACHABLE
     value = np.zeros(vehicles + 1)
-    worth_ = np.zeros(goals + 1)
+    worth = np.zeros(goals + 1)
     holder = np.full(goals + 1, -1)
     came_from = np.zeros(goals + 1, np.int64)
     slack = np.empty(goals + 1)
@@ -141,10 +218,7 @@ def _match(teams, cost_of_way, matching, worth):
             for j in range(goals):
                 if done[j]:
                     continue
-                cost = UNREACHABLE
-                if eligible[team[i], j]:
-                    cost = cost_of_way[j, start[i]]
-                length = cost - value[i] - worth_[j]
+                length = cost[i, j] - value[i] - worth[j]
                 if length < slack[j]:
                     slack[j] = length
                     came_from[j] = at
@@ -153,7 +227,7 @@ def _match(teams, cost_of_way, matching, worth):
             for j in range(goals + 1):
                 if done[j]:
                     value[holder[j]] += least
-                    worth_[j] -= least
+                    worth[j] -= least
                 else:
                     slack[j] -= least
             at = then
@@ -163,85 +237,137 @@ def _match(teams, cost_of_way, matching, worth):
             at = before
     total = 0.0
     for j in range(goals):
-        matching[j] = holder[j]
-        worth[j] = worth_[j]
+        holder_of[j], worth_of[j] = holder[j], worth[j]
         if holder[j] >= 0:
-            total += cost_of_way[j, start[holder[j]]]
-            if not eligible[team[holder[j]], j]:
-                total = UNREACHABLE
+            total += cost[holder[j], j]
     return min(total, UNREACHABLE)
 
 
 @njit(cache=True)
-def _use_of_rows(lattice, teams, decision, matching, use):
-    """Count the moves in each row when each vehicle takes its way."""
-    steps = len(decision)
-    rows, step = lattice.row, lattice.step
+def _walk(lattice, teams, allowed, first, prices, span, scratch, memory):
+    """Let each vehicle take its cheapest way; count the uses of rows and add up masses.
+
+    Returns the cost of all, and whether all have arrived in the end.
+    """
+    row, step, to_go, parked = lattice.row, lattice.step, scratch.to_go, scratch.parked
+    use, mass, way = scratch.use, scratch.mass, scratch.way
+    weight = memory[WEIGHT]
     use[:] = 0.0
-    for j in range(len(matching)):
-        if matching[j] < 0:
+    way[:] = PARKED
+    value, all_arrived = 0.0, True
+    for j in range(len(scratch.holder)):
+        i = scratch.holder[j]
+        if i < 0:
             continue
-        cell = teams.start[matching[j]]
+        k, cell = teams.team[i], teams.start[i]
+        p = teams.pair[k, j]
+        target = teams.pair_cell[p]
         arrived = False
-        for t in range(steps):
-            d = decision[t, j, cell]
-            arrived = arrived or d == ARRIVED
-            if arrived:
-                d = 0
-            for m in range(rows.shape[2]):
-                row = rows[d, cell, m]
-                if row < 0:
+        for t in range(span):
+            if cell == target and t >= first[p] and parked[t, p] <= to_go[t, cell, p]:
+                arrived = True
+            d = 0
+            if not arrived:
+                least = np.inf
+                for e in range(len(step)):
+                    if allowed[k, t, e, cell]:
+                        total = _price(row, prices[t], e, cell) + to_go[t + 1, cell + step[e], p]
+                        if e != 0:
+                            total += PER_MOVE
+                        if total < least - 1e-12:
+                            least, d = total, e
+                way[i, t] = d
+                value += 1.0
+                if d != 0:
+                    value += PER_MOVE
+            mass[k, t, d, cell] += weight
+            for m in range(row.shape[2]):
+                r = row[d, cell, m]
+                if r < 0:
                     break
-                use[t, row] += 1.0
+                use[t, r] += 1.0
             cell += step[d]
+        all_arrived = all_arrived and cell == target
+    memory[WEIGHTS] += weight
+    memory[WEIGHT] = weight / _FADING
+    return value, all_arrived
 
 
 @njit(cache=True)
-def penalties_of(lattice, teams, prices):
-    """Return bound, reduced costs and the targets' worth; see `relaxation.penalties`."""
-    steps = len(prices)
-    valid, step, rows, eligible = lattice.valid, lattice.step, lattice.row, teams.eligible
-    displacements, cells = valid.shape
-    groups, goals = eligible.shape
-    to_go = np.empty((steps + 1, goals, cells))
-    decision = np.empty((steps, goals, cells), np.int8)
-    matching = np.empty(goals, np.int64)
-    worth = np.empty(goals)
-    _look_back(lattice, teams, prices, to_go, decision)
-    bound = _match(teams, to_go[0], matching, worth) - prices.sum()
-    least = np.full((groups, steps + 1, cells), UNREACHABLE)
+def _excess(prices, use, span):
+    """Turn uses of rows into a subgradient; return whether one is used twice, and its square."""
+    clash, square = False, 0.0
+    for t in range(span):
+        for row in range(use.shape[1]):
+            over = use[t, row] - 1.0
+            if over > 0.0:
+                clash = True
+            elif prices[t, row] <= 0.0:
+                over = 0.0
+            use[t, row] = over
+            square += over * over
+    return clash, square
+
+
+@njit(cache=True)
+def forbid_dear(lattice, teams, allowed, first, prices, span, scratch, ceiling):
+    """Forbid what no solution below the ceiling contains.
+
+    Returns the bound and how many of the listed moves are still allowed. `scratch.reach` tells then
+    how much more than the bound it costs at least to be in a cell before a step.
+    """
+    groups, cells = len(allowed), allowed.shape[3]
+    bound = evaluate(lattice, teams, first, prices, span, scratch)
+    budget = ceiling - bound + _TOLERANCE
+    to_go, parked, least, reach = scratch.to_go, scratch.parked, scratch.least, scratch.reach
+    move, move_from, move_price = scratch.move, scratch.move_from, scratch.move_price
     for k in range(groups):
-        for t in range(steps + 1):
-            for j in range(goals):
-                if eligible[k, j]:
-                    for cell in range(cells):
-                        least[k, t, cell] = min(least[k, t, cell], to_go[t, j, cell] - worth[j])
-    move = np.full((groups, steps, displacements, cells), UNREACHABLE)
-    arrival = np.full((groups, goals, steps + 1), UNREACHABLE)
-    reach = np.full((groups, steps + 1, cells), UNREACHABLE)
+        for t in range(span + 1):
+            for cell in range(cells):
+                value = UNREACHABLE
+                for p in range(teams.pairs_from[k], teams.pairs_from[k + 1]):
+                    value = min(value, to_go[t, cell, p] - scratch.worth[teams.pair_target[p]])
+                least[k, t, cell] = value
+    reach[:] = UNREACHABLE
     for i in range(len(teams.start)):
         reach[teams.team[i], 0, teams.start[i]] = 0.0
+    kept = 0
+    for t in range(span):
+        for k in range(groups):
+            for m in range(move_from[t, k], move_from[t, k + 1]):
+                d, cell, next_cell = move[m, 0], move[m, 1], move[m, 2]
+                extra = move_price[m] + least[k, t + 1, next_cell] - least[k, t, cell]
+                total = reach[k, t, cell] + max(extra, 0.0)
+                if total > budget or least[k, t + 1, next_cell] > _HALF:
+                    allowed[k, t, d, cell] = False
+                    continue
+                kept += 1
+                if total < reach[k, t + 1, next_cell]:
+                    reach[k, t + 1, next_cell] = total
     for k in range(groups):
-        for t in range(steps):
-            for d in range(displacements):
-                for cell in range(cells):
-                    if not valid[d, cell]:
-                        continue
-                    then = cell + step[d]
-                    if least[k, t + 1, then] > 0.5 * UNREACHABLE:
-                        continue
-                    extra = 1.0 + _price(rows, prices, t, d, cell)
-                    extra += least[k, t + 1, then] - least[k, t, cell]
-                    move[k, t, d, cell] = max(extra, 0.0)
-                    sum_ = reach[k, t, cell] + move[k, t, d, cell]
-                    reach[k, t + 1, then] = min(reach[k, t + 1, then], sum_)
-        for j in range(goals):
-            if not eligible[k, j]:
+        for p in range(teams.pairs_from[k], teams.pairs_from[k + 1]):
+            cell, worth = teams.pair_cell[p], scratch.worth[teams.pair_target[p]]
+            t = first[p]
+            while t < span:
+                extra = parked[t, p] - worth - least[k, t, cell]
+                if reach[k, t, cell] + max(extra, 0.0) <= budget:
+                    break
+                t += 1
+            first[p] = t
+    return bound, kept
+
+
+@njit(cache=True)
+def may_be_late(teams, steps, scratch, budget):
+    """Tell whether some vehicle may be away from its targets after all steps, within a budget."""
+    reach = scratch.reach
+    for k in range(len(reach)):
+        for cell in range(reach.shape[2]):
+            if reach[k, steps, cell] > budget:
                 continue
-            target = teams.target[j]
-            stay = 0.0
-            for t in range(steps, -1, -1):
-                if t < steps:
-                    stay += _price(rows, prices, t, 0, target)
-                arrival[k, j, t] = max(stay - worth[j] - least[k, t, target], 0.0)
-    return bound, move, arrival, reach, worth
+            at_home = False
+            for p in range(teams.pairs_from[k], teams.pairs_from[k + 1]):
+                at_home = at_home or teams.pair_cell[p] == cell
+            if not at_home:
+                return True
+    return False

@@ -3,11 +3,11 @@
 Pairs of conflicting moves say what is forbidden; a linear relaxation that knows only pairs is weak.
 A *row* is a clique of the conflict relation: whatever the other vehicles do, at most one of its
 moves is made in a step. The rows here are maximal cliques that cover every conflicting pair. With
-footprints (mode 1 with node, edge and special-1; geometric) one kind of row is enough: all moves
+footprints (mode 1 with node, edge and special-1; geometric) one pattern is enough: all moves
 whose footprint contains a cell.
 
-Conflicts do not depend on where on the lattice they happen, so a kind of row is a pattern that is
-laid on every cell, its anchor.
+Conflicts do not depend on where on the lattice they happen, so a row is a pattern that is laid on
+every cell, its anchor.
 """
 
 from __future__ import annotations
@@ -15,8 +15,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import lru_cache
 from itertools import product
-
-import attrs
 
 from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.grid import Mode, Move, displacements
@@ -26,49 +24,34 @@ Member = tuple[int, int, int]
 """Columns and lanes from the anchor to the from-cell of a move, and its displacement."""
 
 
-@attrs.frozen
-class RowKind:
-    """One pattern of conflicting moves.
-
-    members: its moves.
-    column: columns from the anchor to a column that every one of its moves touches.
-    """
-
-    members: tuple[Member, ...]
-    column: int
+Row = tuple[Member, ...]
+"""Moves of which one step admits at most one, around an anchor."""
 
 
-@attrs.frozen
-class RowPatterns:
-    """All kinds of rows of a conflict model.
-
-    kinds: rows that cover all conflicting pairs.
-    local: whether two conflicting moves always touch a common column, and two vehicles never
-        share a cell; only then can a formation be swept column by column.
-    """
-
-    kinds: tuple[RowKind, ...]
-    local: bool
+def vehicles_share_cells(model: ConflictModel) -> bool:
+    """Tell whether two vehicles may be in one cell; then moves from one cell need not exclude."""
+    return not {"node", "geometric"} & set(model.kinds)
 
 
 @lru_cache(maxsize=64)
-def row_patterns(mode: Mode, model: ConflictModel) -> RowPatterns:
-    """Return the rows of a conflict model."""
+def row_patterns(mode: Mode, model: ConflictModel) -> tuple[Row, ...]:
+    """Return rows that cover all pairs of moves that conflict under a model.
+
+    Raises:
+        ValueError: under this model vehicles may share a cell.
+    """
+    if vehicles_share_cells(model):
+        raise ValueError(f"conflicts {model.kinds}: rows need vehicles that never share a cell")
     relation = _Relation(mode, model)
     uncovered = relation.pairs()
-    local = "node" in model.kinds or "geometric" in model.kinds
-    for a, b in uncovered:
-        local = local and bool(_columns(a, relation) & _columns(b, relation))
-    kinds = []
+    rows = []
     cliques = sorted(relation.maximal_cliques(), key=lambda clique: (-len(clique), clique))
     for clique in cliques:
         pairs = {_normal_pair(a, b) for a in clique for b in clique if a < b}
         if pairs & uncovered:
             uncovered -= pairs
-            common = frozenset.intersection(*(_columns(member, relation) for member in clique))
-            local = local and bool(common)
-            kinds.append(RowKind(clique, min(common, key=abs, default=0)))
-    return RowPatterns(tuple(kinds), local)
+            rows.append(clique)
+    return tuple(rows)
 
 
 class _Relation:
@@ -98,9 +81,9 @@ class _Relation:
             if other[:2] != (0, 0)
         }
 
-    def maximal_cliques(self) -> set[tuple[Member, ...]]:
+    def maximal_cliques(self) -> set[Row]:
         """Return the maximal cliques that contain a move from the origin, each once."""
-        found: set[tuple[Member, ...]] = set()
+        found: set[Row] = set()
         for d in range(len(self.steps)):
             origin = (0, 0, d)
             near = [b for b in self._moves if b != origin and self._exclude(origin, b)]
@@ -116,7 +99,7 @@ class _Relation:
 
 def _cliques(
     chosen: set[Member], open_: set[Member], closed: set[Member], near: dict[Member, set[Member]]
-) -> Iterator[tuple[Member, ...]]:
+) -> Iterator[Row]:
     """Yield maximal cliques (Bron and Kerbosch, Communications of the ACM 16, 1973)."""
     if not open_ and not closed:
         yield tuple(chosen)
@@ -128,12 +111,7 @@ def _cliques(
         closed = closed | {member}
 
 
-def _columns(member: Member, relation: _Relation) -> frozenset[int]:
-    column, _, d = member
-    return frozenset({column, column + relation.steps[d][0]})
-
-
-def _normal(members: tuple[Member, ...]) -> tuple[Member, ...]:
+def _normal(members: Row) -> Row:
     """Return members with the anchor on the least of their from-cells."""
     column, lane = min((member[0], member[1]) for member in members)
     return tuple(sorted((c - column, left - lane, d) for c, left, d in members))

@@ -1,4 +1,4 @@
-"""The sweep solver, beyond the comparison with the oracle in `test_against_milp`."""
+"""The solver by branching, beyond the comparison with the oracle in `test_against_milp`."""
 
 import pytest
 from attrs import evolve
@@ -15,23 +15,23 @@ from unit.planning.planning_oracles import requests
 COSTS_OF_TWELVE = {0: 35, 1: 33, 2: 29}
 
 
-def swept(request: PlanRequest, max_nodes: int | None = None) -> PlanResponse:
-    response = plan(request, solver="sweep", max_nodes=max_nodes)
+def solved(request: PlanRequest, max_nodes: int | None = None) -> PlanResponse:
+    response = plan(request, solver="branching", max_nodes=max_nodes)
     assert problems_of_response(request, response) == []
     return response
 
 
 @pytest.mark.parametrize(("seed", "cost"), COSTS_OF_TWELVE.items())
 def test_twelve_vehicles_are_planned_at_least_cost(seed: int, cost: int) -> None:
-    response = swept(formation_request(seed, vehicles=12))
+    response = solved(formation_request(seed, vehicles=12))
     assert (response.status, response.cost, response.lower_bound) == ("optimal", cost, cost)
 
 
 @settings(max_examples=60, deadline=None)
 @given(requests())
 def test_both_solvers_agree(request: PlanRequest) -> None:
-    by_tree, by_sweep = plan(request), swept(request)
-    assert (by_sweep.status, by_sweep.cost) == (by_tree.status, by_tree.cost)
+    by_tree, by_branching = plan(request), solved(request)
+    assert (by_branching.status, by_branching.cost) == (by_tree.status, by_tree.cost)
 
 
 def mirrored(request: PlanRequest, *, columns: bool) -> PlanRequest:
@@ -60,15 +60,15 @@ def mirrored(request: PlanRequest, *, columns: bool) -> PlanRequest:
 @given(st.integers(0, 10_000), st.integers(2, 8), st.sampled_from((1, 2)))
 def test_the_cost_does_not_depend_on_the_point_of_view(seed: int, size: int, mode: int) -> None:
     request = formation_request(seed, vehicles=size, mode=1 if mode == 1 else 2)
-    cost = swept(request).cost
-    assert swept(mirrored(request, columns=True)).cost == cost
-    assert swept(mirrored(request, columns=False)).cost == cost
-    assert swept(evolve(request, vehicles=request.vehicles[::-1])).cost == cost
+    cost = solved(request).cost
+    assert solved(mirrored(request, columns=True)).cost == cost
+    assert solved(mirrored(request, columns=False)).cost == cost
+    assert solved(evolve(request, vehicles=request.vehicles[::-1])).cost == cost
 
 
 def test_equal_requests_get_equal_plans() -> None:
     request = formation_request(5, vehicles=9)
-    first, second = swept(request), swept(request)
+    first, second = solved(request), solved(request)
     assert (first.paths, first.assignment) == (second.paths, second.assignment)
 
 
@@ -81,7 +81,7 @@ def test_what_cannot_be_solved_is_proven_so() -> None:
         (VehicleRequest("a", (0, 0), eligible=(1,)), VehicleRequest("b", (2, 0), eligible=(0,))),
         ((0, 0), (2, 0)),
     )
-    response = swept(request)
+    response = solved(request)
     assert (response.status, response.lower_bound) == ("infeasible", None)
 
 
@@ -98,24 +98,24 @@ def test_who_has_no_target_cannot_arrive(
     vehicles: tuple[VehicleRequest, ...], targets: tuple[Cell, ...]
 ) -> None:
     request = PlanRequest(Grid(3, 2), 1, ("geometric",), vehicles, targets)
-    assert swept(request).status == plan(request).status == "infeasible"
+    assert solved(request).status == plan(request).status == "infeasible"
 
 
 def test_a_wide_road_and_a_long_way_are_no_obstacle() -> None:
     vehicles = tuple(VehicleRequest(f"v{lane}", (0, lane), lane=15 - lane) for lane in (0, 5, 11))
     request = PlanRequest(Grid(4, 16), 2, ("geometric",), vehicles, ((3, 15), (3, 10), (3, 4)))
-    response = swept(request)
+    response = solved(request)
     assert (response.status, response.cost) == ("optimal", 15 + 5 + 7)
 
 
 def test_what_it_cannot_do_is_left_to_the_other_solver() -> None:
     request = evolve(formation_request(1, vehicles=4, mode=2), conflicts=("edge",))
-    assert swept(request).status == "optimal"
+    assert solved(request).status == "optimal"
 
 
 def test_without_time_for_a_proof_the_bound_tells_how_far_it_got() -> None:
     request = formation_request(3, vehicles=12)
-    response = swept(request, max_nodes=2_000)
+    response = solved(request, max_nodes=30)
     assert response.status in ("timeout", "feasible")
     assert response.lower_bound is not None
     assert 39 <= response.lower_bound <= 42

@@ -1,0 +1,299 @@
+"""The solver for large formations: branch and bound with prices.
+
+1. Prices on the conflict rows give a lower bound, and tell what is too dear (`relaxation`).
+2. For the least cost that is still possible a search decides whether it is. In each of its nodes
+   prices are improved and what no solution of this cost contains is forbidden. Either the bound
+   passes the cost, or the vehicles on their cheapest ways happen not to be in conflict, which is a
+   solution, or the moves of one row are told apart: at most one of them is made in its step, so
+   either all moves of a team (or from a cell) are forbidden in this row, or all others
+   (`branching_kernel`; this kind of branching is by Beale and Tomlin, Proc. 5th Int. Conf. on
+   Operational Research, 1970).
+3. If no node is left, the next cost is looked at.
+
+The first cost that is possible is the least one. A little price on moves lets the search go on for
+a solution with fewer moves of the same cost, for about as long as it took until then.
+
+The budget for what is too dear, the cost less the bound, is small; so few moves are left, and most
+nodes are decided soon. Other than trees of conflicts between single vehicles, it does not matter
+how many vehicles of a team could take one another's place.
+
+A path set that is found by other means (`reachability`, `incumbent`) is the answer when the
+deadline comes first.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from functools import cache
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from laneweave.coordinator.planning.arrays import UNREACHABLE, Ints, lattice, teams
+from laneweave.coordinator.planning.branching_kernel import FULL, search
+from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
+from laneweave.coordinator.planning.conflicts import ConflictModel
+from laneweave.coordinator.planning.grid import Grid
+from laneweave.coordinator.planning.incumbent import Incumbent, Solution, tidied
+from laneweave.coordinator.planning.problem import Problem
+from laneweave.coordinator.planning.reachability import explore
+from laneweave.coordinator.planning.relaxation import Relaxation, Stack, stack
+from laneweave.coordinator.planning.relaxation_kernel import (
+    BEST,
+    FOUND,
+    OPEN,
+    PARKED,
+    PER_MOVE,
+    REFUTED,
+)
+from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
+from laneweave.coordinator.planning.rows import vehicles_share_cells
+
+_TOLERANCE = 1e-6
+_SPARE_STEPS, _MORE_STEPS = 8, 6
+"""Steps with prices beyond the longest way; more when a solution may need more."""
+_ITERATIONS, _AT_A_TIME = 40, 10
+"""For first prices; iterations between two looks at the clock."""
+_FIRST_STACK: Final = 64
+_CHUNK_S = 0.005
+"""How long the search goes on between two looks at the clock, about."""
+_LOOK_AROUND_NODES, _GROWTH = 100, 4
+"""When a path set is looked for by other means, and how much later again."""
+_EXPLORE_MOVES = 5_000
+_INCUMBENT_NODES = 100
+"""How long the first path set is improved; see `Incumbent.work`."""
+_TIE_NODES = 20
+_STEPS_GUESSED, _MOST_NUMBERS = 32, 50_000_000
+"""Larger tables do not fit into memory."""
+
+
+def can_branch(problem: Problem, choices: Sequence[frozenset[int]]) -> bool:
+    """Tell whether there are rows, and their tables fit into memory."""
+    table = problem.table
+    cells = table.grid.lanes * table.grid.columns
+    numbers = cells * (sum(map(len, set(choices))) + 3 * len(set(choices)) * table.fan)
+    return not vehicles_share_cells(table.model) and numbers * _STEPS_GUESSED < _MOST_NUMBERS
+
+
+@cache
+def warm_up() -> None:
+    """Load the compiled code; where there is none yet, compile it, which takes half a minute."""
+    vehicles = (VehicleRequest("a", (0, 0), lane=1), VehicleRequest("b", (1, 1), lane=0))
+    request = PlanRequest(Grid(2, 2), 1, ("geometric",), vehicles, ((0, 1), (1, 0)))
+    model = ConflictModel(request.conflicts)
+    starts = [vehicle.cell for vehicle in vehicles]
+    problem = Problem(request.grid, request.mode, model, starts, request.targets)
+    Branching(problem, request.choices(), Budget()).run()
+
+
+class Branching:
+    """The state of the search; the same to its caller as `Tappa`.
+
+    best: the cheapest path set so far.
+    lower_bound: no path set costs less; infinite: there is none.
+    finished: the search is complete; `best` is optimal, or nothing exists.
+    """
+
+    def __init__(self, problem: Problem, choices: Sequence[frozenset[int]], budget: Budget) -> None:
+        """Prepare the search."""
+        self.lower_bound: float = 0
+        self.finished = False
+        self.tried = 0
+        self.gave_up = False
+        """It is stuck; see `branching_kernel.STUCK`."""
+        self._incumbent = Incumbent(problem, choices, budget)
+        self._problem = problem
+        self._choices = choices
+        self._budget = budget
+        self._nodes = 0
+        self._look_around = _LOOK_AROUND_NODES
+        self._explore_moves = _EXPLORE_MOVES
+        self._s_per_node = 0.0
+        self._best_value = UNREACHABLE
+        table = problem.table
+        self._lattice = lattice(table.grid, table.mode, table.model)
+        starts = [table.cell(start) for start in problem.starts]
+        targets = [table.cell(target) for target in problem.targets]
+        self._teams = teams(self._lattice, starts, targets, choices)
+
+    @property
+    def best(self) -> Solution | None:
+        """Return the cheapest path set so far."""
+        return self._incumbent.best
+
+    def run(self) -> None:
+        """Search until the optimum is proven or the budget is spent."""
+        try:
+            self._search()
+        except BudgetSpentError:
+            if self.best is not None:
+                self.lower_bound = min(self.lower_bound, self.best.cost)
+
+    def _search(self) -> None:
+        if len(self._teams.target) < len(self._teams.start) or not all(self._choices):
+            self.lower_bound, self.finished = math.inf, True
+            return
+        self._budget.check_time()
+        whole = Relaxation(self._lattice, self._teams, self._longest_way() + _SPARE_STEPS)
+        for _ in range(0, _ITERATIONS, _AT_A_TIME):
+            whole.improve(_AT_A_TIME)
+            self.lower_bound = max(self.lower_bound, whole.least_cost)
+            self._budget.check_time()
+        nodes = self._stack(whole, _FIRST_STACK)
+        while not self.finished and not self.gave_up:
+            if math.isinf(self.lower_bound):
+                self.finished = True
+            elif self.best is not None and self.best.cost <= self.lower_bound:
+                nodes = self._break_ties(whole, nodes, self.best)
+                self.finished = True
+            else:
+                nodes = self._decide(whole, nodes, int(self.lower_bound))
+
+    def _stack(self, whole: Relaxation, size: int) -> Stack:
+        return stack(self._teams, whole.prices, self._lattice.valid, size)
+
+    def _longest_way(self) -> int:
+        distance = self._teams.distance
+        nearest = [
+            distance[start, self._teams.pairs_from[k] : self._teams.pairs_from[k + 1]].min()
+            for start, k in zip(self._teams.start, self._teams.team, strict=True)
+        ]
+        return int(max((steps for steps in nearest if steps < UNREACHABLE), default=0))
+
+    def _decide(self, whole: Relaxation, nodes: Stack, cost: int) -> Stack:
+        """Find a solution of a cost, or show that there is none; or have more steps priced."""
+        ceiling = cost * (1.0 + PER_MOVE) + _TOLERANCE * PER_MOVE
+        may_be = whole.put(nodes, ceiling)
+        if may_be is None:
+            whole.lengthen(_MORE_STEPS)
+            return self._stack(whole, len(nodes.pace))
+        depth, ending = 1, OPEN if may_be else REFUTED
+        first = True
+        while ending in (OPEN, FULL):
+            if ending == FULL:
+                nodes = _doubled(nodes)
+            ending, depth = self._go_on(whole, nodes, depth, ceiling, 1 if first else None)
+            if first and depth > 1:
+                whole.take_prices(nodes.prices[0])
+            first = False
+            if ending == OPEN:
+                self._look_for_others()
+                if self.finished or (self.best is not None and self.best.cost <= cost):
+                    return nodes
+        if ending == REFUTED:
+            self.lower_bound = cost + 1
+        elif ending == FOUND:
+            self._search_fewer_moves(whole, nodes, depth)
+            self.finished = True
+        else:
+            self.gave_up = True
+        return nodes
+
+    def _break_ties(self, whole: Relaxation, nodes: Stack, best: Solution) -> Stack:
+        """Look for a solution that costs as much as a best one, with fewer moves."""
+        ceiling = self._value(best) - 0.5 * PER_MOVE
+        if whole.put(nodes, ceiling):
+            self._best_value = whole.memory[BEST] = self._value(best)
+            self._search_fewer_moves(whole, nodes, 1)
+        return nodes
+
+    def _search_fewer_moves(self, whole: Relaxation, nodes: Stack, depth: int) -> None:
+        """Go on with a search for about as long again; the deadline does not matter any more."""
+        left = self._nodes + _TIE_NODES
+        try:
+            while left > 0 and depth > 0:
+                ceiling = whole.memory[BEST] - 0.5 * PER_MOVE
+                before = self._nodes
+                ending, depth = self._go_on(whole, nodes, depth, ceiling, left)
+                left -= self._nodes - before
+                if ending not in (OPEN, FOUND):
+                    return
+        except BudgetSpentError:
+            return
+
+    def _go_on(
+        self, whole: Relaxation, nodes: Stack, depth: int, ceiling: float, most: int | None
+    ) -> tuple[int, int]:
+        """Look at some nodes; return how that ended and the new depth."""
+        left = self._budget.nodes_left(self._s_per_node)
+        chunk = max(1, int(_CHUNK_S / max(self._s_per_node, 1e-5)))
+        if left < 1:
+            raise BudgetSpentError
+        until_others = max(1, self._look_around - self._nodes)
+        count = min(chunk, left, until_others, chunk if most is None else most)
+        started = time.thread_time()
+        ending, depth, looked_at = search(
+            self._lattice, self._teams, nodes, depth, whole.scratch, whole.memory, ceiling, count
+        )
+        if looked_at:
+            spent = (time.thread_time() - started) / looked_at
+            self._s_per_node = max(spent, 0.5 * (self._s_per_node + spent))
+        if whole.memory[BEST] < self._best_value:
+            self._best_value = whole.memory[BEST]
+            self._incumbent.prefer(self._solution(whole.scratch.best_way))
+        self._nodes += looked_at
+        self._budget.take_nodes(looked_at)
+        return ending, depth
+
+    def _look_for_others(self) -> None:
+        """Every now and then find some path set by other means, or show that there is none."""
+        if self._nodes < self._look_around:
+            return
+        self._look_around *= _GROWTH
+        if self.best is not None:
+            return
+        assignment = self._nearest_targets()
+        self._incumbent.work(_INCUMBENT_NODES, [assignment])
+        if self.best is not None:
+            return
+        verdict = explore(self._problem, self._choices, self._budget, self._explore_moves)
+        self._explore_moves *= _GROWTH
+        if verdict.impossible:
+            self.lower_bound, self.finished = math.inf, True
+        elif verdict.solution is not None:
+            plain = tidied(self._problem, verdict.solution, self._budget)
+            self._incumbent.begin_with(plain)
+            self._incumbent.work(2 * _INCUMBENT_NODES, [plain.assignment])
+
+    def _nearest_targets(self) -> tuple[int, ...]:
+        """Return the assignment with the shortest ways, conflicts aside."""
+        pairs = self._teams.pair[self._teams.team]
+        ways = np.where(
+            pairs >= 0, self._teams.distance[self._teams.start[:, None], pairs], UNREACHABLE
+        )
+        return tuple(int(target) for target in linear_sum_assignment(ways)[1])
+
+    def _value(self, solution: Solution) -> float:
+        """Return the cost with the price of moves."""
+        landing = self._problem.table.landing
+        moves = 0
+        for start, path in zip(self._problem.starts, solution.paths, strict=True):
+            cells = [start, *map(landing, path)]
+            moves += sum(a != b for a, b in pairwise(cells))
+        return solution.cost + PER_MOVE * moves
+
+    def _solution(self, way: Ints) -> Solution:
+        """Walk the vehicles along their ways."""
+        table, lanes = self._problem.table, self._lattice.lanes
+        paths, assignment = [], []
+        for number, displacements in zip(self._teams.start.tolist(), way.tolist(), strict=True):
+            cell = number
+            path: list[int] = []
+            for d in displacements:
+                if d == PARKED:
+                    break
+                then = cell + int(self._lattice.step[d])
+                path.append(table.number((divmod(cell, lanes), divmod(then, lanes))))
+                cell = then
+            paths.append(tuple(path))
+            assignment.append(self._problem.targets.index(table.bit(divmod(cell, lanes))))
+        return Solution(tuple(assignment), tuple(paths))
+
+
+def _doubled(nodes: Stack) -> Stack:
+    """Return a stack with twice the room."""
+    return Stack(*(np.concatenate([array, np.zeros_like(array)]) for array in nodes))
