@@ -162,7 +162,7 @@ def plan(
     output: Annotated[OutputFormat, typer.Option("--format")] = OutputFormat.json,
     solver: Annotated[
         SolverChoice, typer.Option("--solver", help="How to plan here: see docs/PLANNING.md.")
-    ] = SolverChoice.tappa,
+    ] = SolverChoice.branching,
 ) -> None:
     """Plan one request here, or ask a running coordinator."""
     from laneweave.launch.plan_command import answer_request

@@ -18,6 +18,7 @@ from typing import Any
 import attrs
 from attrs import define, field
 
+from laneweave.coordinator.planning import warm_up
 from laneweave.launch.faults import Faults
 from laneweave.launch.logs import last_error
 from laneweave.launch.observer import Observer, View
@@ -99,6 +100,8 @@ class LocalRun:
             BadInputError: the environment does not allow the run.
         """
         check_temporary_folder()
+        # Compiled once, if need be, and not by each coordinator.
+        warm_up()
         self.folder.mkdir(parents=True, exist_ok=True)
         with (
             tempfile.TemporaryDirectory(prefix="laneweave-") as temporary,

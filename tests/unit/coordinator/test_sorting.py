@@ -195,8 +195,8 @@ def test_when_nothing_works_nobody_moves_and_the_answer_says_so() -> None:
 
 def test_a_search_that_ran_out_of_nodes_says_nothing_of_room() -> None:
     """With a neighbour's block as well it would only take longer."""
-    cells: dict[Name, Cell] = {A: (0, 0), B: (-1, 1), C: (-2, 0), D: (-3, 1), E: (0, 2)}
-    order = task(cells, {A: 2, B: 2, C: 1, D: 0, E: 0})
+    cells = {A: (0, 0), B: (-1, 1), C: (-2, 0), D: (-3, 1), E: (0, 2), F: (-2, 2)}
+    order = task(cells, {A: 2, B: 2, C: 1, D: 0, E: 0, F: 1})
     sorting = sort_lanes(order, 1, WEIGHTS)
     assert sorting.response is not None
     assert sorting.response.status == "timeout"

@@ -14,10 +14,13 @@
 | SPPA | `diagram` (all shortest paths), `sppa` (the choice among them) |
 | relative path map | `path_map` |
 
+Beyond the paper: branch and bound with prices, the default (`branching`, `relaxation`, `rows`);
+path sets by negotiation (`negotiation`) and by joint search (`reachability`).
+
 The package is pure: no I/O, no state between calls, and time only through the clock it is given.
 """
 
-from laneweave.coordinator.planning.facade import checked_plan, plan
+from laneweave.coordinator.planning.facade import checked_plan, plan, warm_up
 from laneweave.coordinator.planning.frd import Weights
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanResponse
@@ -32,4 +35,5 @@ __all__ = [
     "plan",
     "problems_of_paths",
     "problems_of_response",
+    "warm_up",
 ]

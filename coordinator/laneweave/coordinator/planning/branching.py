@@ -11,14 +11,15 @@
 3. If no node is left, the next cost is looked at.
 
 The first cost that is possible is the least one. A little price on moves lets the search go on for
-a solution with fewer moves of the same cost, for about as long as it took until then.
+a solution with fewer moves of the same cost, for about half as long as it took until then.
 
 The budget for what is too dear, the cost less the bound, is small; so few moves are left, and most
 nodes are decided soon. Other than trees of conflicts between single vehicles, it does not matter
 how many vehicles of a team could take one another's place.
 
-A path set that is found by other means (`reachability`, `incumbent`) is the answer when the
-deadline comes first.
+Between the nodes path sets are made by negotiation (`negotiation`), so that there is an answer when
+the deadline comes first; if that fails, by a joint search (`reachability`), which also finds out
+that there is none.
 """
 
 from __future__ import annotations
@@ -31,14 +32,14 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from laneweave.coordinator.planning.arrays import UNREACHABLE, Ints, lattice, teams
 from laneweave.coordinator.planning.branching_kernel import FULL, search
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
 from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.grid import Grid
-from laneweave.coordinator.planning.incumbent import Incumbent, Solution, tidied
+from laneweave.coordinator.planning.incumbent import Solution, tidied
+from laneweave.coordinator.planning.negotiation import Negotiation
 from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.reachability import explore
 from laneweave.coordinator.planning.relaxation import Relaxation, Stack, stack
@@ -61,12 +62,14 @@ _ITERATIONS, _AT_A_TIME = 40, 10
 _FIRST_STACK: Final = 64
 _CHUNK_S = 0.005
 """How long the search goes on between two looks at the clock, about."""
-_LOOK_AROUND_NODES, _GROWTH = 100, 4
-"""When a path set is looked for by other means, and how much later again."""
-_EXPLORE_MOVES = 5_000
-_INCUMBENT_NODES = 100
-"""How long the first path set is improved; see `Incumbent.work`."""
-_TIE_NODES = 20
+_NODES_BETWEEN = 8
+"""Nodes between two looks for path sets by other means."""
+_FIRST_WORK, _MOST_WORK, _NODES_FOR_MORE = 60, 3, 800
+"""How much is negotiated then until there is a path set, later at most, and after how many nodes
+that becomes more."""
+_EXPLORE_NODES, _EXPLORE_MOVES, _GROWTH = 100, 5_000, 4
+"""When the joint search is tried, if there is no path set yet, and how far; then more of both."""
+_TIE_NODES = 10
 _STEPS_GUESSED, _MOST_NUMBERS = 32, 50_000_000
 """Larger tables do not fit into memory."""
 
@@ -105,13 +108,14 @@ class Branching:
         self.tried = 0
         self.gave_up = False
         """It is stuck; see `branching_kernel.STUCK`."""
-        self._incumbent = Incumbent(problem, choices, budget)
+        self.best: Solution | None = None
+        self._negotiation: Negotiation | None = None
         self._problem = problem
         self._choices = choices
         self._budget = budget
         self._nodes = 0
-        self._look_around = _LOOK_AROUND_NODES
-        self._explore_moves = _EXPLORE_MOVES
+        self._look_around = _NODES_BETWEEN
+        self._explore_nodes, self._explore_moves = _EXPLORE_NODES, _EXPLORE_MOVES
         self._s_per_node = 0.0
         self._best_value = UNREACHABLE
         table = problem.table
@@ -119,11 +123,6 @@ class Branching:
         starts = [table.cell(start) for start in problem.starts]
         targets = [table.cell(target) for target in problem.targets]
         self._teams = teams(self._lattice, starts, targets, choices)
-
-    @property
-    def best(self) -> Solution | None:
-        """Return the cheapest path set so far."""
-        return self._incumbent.best
 
     def run(self) -> None:
         """Search until the optimum is proven or the budget is spent."""
@@ -181,7 +180,7 @@ class Branching:
                 whole.take_prices(nodes.prices[0])
             first = False
             if ending == OPEN:
-                self._look_for_others()
+                self._look_for_others(whole)
                 if self.finished or (self.best is not None and self.best.cost <= cost):
                     return nodes
         if ending == REFUTED:
@@ -203,7 +202,7 @@ class Branching:
 
     def _search_fewer_moves(self, whole: Relaxation, nodes: Stack, depth: int) -> None:
         """Go on with a search for about as long again; the deadline does not matter any more."""
-        left = self._nodes + _TIE_NODES
+        left = self._nodes // 2 + _TIE_NODES
         try:
             while left > 0 and depth > 0:
                 ceiling = whole.memory[BEST] - 0.5 * PER_MOVE
@@ -234,38 +233,45 @@ class Branching:
             self._s_per_node = max(spent, 0.5 * (self._s_per_node + spent))
         if whole.memory[BEST] < self._best_value:
             self._best_value = whole.memory[BEST]
-            self._incumbent.prefer(self._solution(whole.scratch.best_way))
+            self._prefer(self._solution(whole.scratch.best_way))
         self._nodes += looked_at
         self._budget.take_nodes(looked_at)
         return ending, depth
 
-    def _look_for_others(self) -> None:
-        """Every now and then find some path set by other means, or show that there is none."""
+    def _look_for_others(self, whole: Relaxation) -> None:
+        """Every now and then find path sets by other means, or show that there are none."""
         if self._nodes < self._look_around:
             return
-        self._look_around *= _GROWTH
-        if self.best is not None:
-            return
-        assignment = self._nearest_targets()
-        self._incumbent.work(_INCUMBENT_NODES, [assignment])
-        if self.best is not None:
-            return
+        self._look_around = self._nodes + _NODES_BETWEEN
+        if self._negotiation is None:
+            self._negotiation = Negotiation(
+                self._lattice, self._teams, whole.prices, whole.assignment()
+            )
+        left = min(1 + self._nodes // _NODES_FOR_MORE, _MOST_WORK)
+        if self._negotiation.cost is None:
+            left = _FIRST_WORK
+        while left > 0:
+            self._budget.check_time()
+            is_first = self._negotiation.cost is None
+            if self._negotiation.work():
+                self._prefer(self._solution(self._negotiation.way))
+            left = 1 if is_first and self.best is not None else left - 1
+        if self.best is None and self._nodes >= self._explore_nodes:
+            self._explore()
+
+    def _explore(self) -> None:
         verdict = explore(self._problem, self._choices, self._budget, self._explore_moves)
+        self._explore_nodes *= _GROWTH
         self._explore_moves *= _GROWTH
         if verdict.impossible:
             self.lower_bound, self.finished = math.inf, True
         elif verdict.solution is not None:
-            plain = tidied(self._problem, verdict.solution, self._budget)
-            self._incumbent.begin_with(plain)
-            self._incumbent.work(2 * _INCUMBENT_NODES, [plain.assignment])
+            self._prefer(tidied(self._problem, verdict.solution, self._budget))
 
-    def _nearest_targets(self) -> tuple[int, ...]:
-        """Return the assignment with the shortest ways, conflicts aside."""
-        pairs = self._teams.pair[self._teams.team]
-        ways = np.where(
-            pairs >= 0, self._teams.distance[self._teams.start[:, None], pairs], UNREACHABLE
-        )
-        return tuple(int(target) for target in linear_sum_assignment(ways)[1])
+    def _prefer(self, solution: Solution) -> None:
+        """Keep a path set unless it costs more than the best so far."""
+        if self.best is None or solution.cost <= self.best.cost:
+            self.best = solution
 
     def _value(self, solution: Solution) -> float:
         """Return the cost with the price of moves."""

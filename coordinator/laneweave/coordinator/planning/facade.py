@@ -57,7 +57,7 @@ def plan(
     *,
     max_nodes: int | None = None,
     weights: Weights | None = None,
-    solver: Solver = "tappa",
+    solver: Solver = "branching",
     clock: Clock = time.monotonic,
 ) -> PlanResponse:
     """Plan one request.
@@ -67,10 +67,7 @@ def plan(
     distance must give a lower bound.
     """
     if solver == "branching":
-        # Not on the request's time. Who uses the other solver need not wait for it at all.
-        from laneweave.coordinator.planning.branching import warm_up  # noqa: PLC0415
-
-        warm_up()
+        warm_up()  # not on the request's time
     started = clock()
     weights = (weights or Weights.for_mode(request.mode)).checked(request.mode)
     nodes = MAX_NODES if max_nodes is None else min(max_nodes, MAX_NODES)
@@ -112,6 +109,16 @@ def plan(
     )
 
 
+def warm_up() -> None:
+    """Load the compiled parts of the planner; where there are none yet, compile them.
+
+    Loading takes half a second, compiling half a minute; `plan` does it at its first call.
+    """
+    from laneweave.coordinator.planning import branching  # noqa: PLC0415 (numba is slow to load)
+
+    branching.warm_up()
+
+
 def _searches(
     solver: Solver,
     problem: Problem,
@@ -150,7 +157,7 @@ def checked_plan(
     *,
     max_nodes: int | None = None,
     weights: Weights | None = None,
-    solver: Solver = "tappa",
+    solver: Solver = "branching",
 ) -> PlanResponse:
     """Plan one request and check the answer against it; see `plan`.
 

@@ -91,11 +91,6 @@ class Incumbent:
         if self.best is None or solution.cost < self.best.cost:
             self.best = solution
 
-    def prefer(self, solution: Solution) -> None:
-        """Keep a path set unless it costs more than the best so far."""
-        if self.best is None or solution.cost <= self.best.cost:
-            self.best = solution
-
     def begin_with(self, solution: Solution) -> None:
         """Improve a path set that was found elsewhere from now on."""
         self.offer(solution)

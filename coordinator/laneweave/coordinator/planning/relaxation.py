@@ -27,6 +27,7 @@ from laneweave.coordinator.planning.relaxation_kernel import (
     BOUND,
     PACE,
     PER_MOVE,
+    evaluate,
     forbid_dear,
     improve,
     list_moves,
@@ -198,6 +199,15 @@ class Relaxation:
             UNREACHABLE,
             _GUESS,
         )
+
+    def assignment(self) -> Ints:
+        """Return (N,) the number of the target of each vehicle that is best at the prices."""
+        self._begin()
+        evaluate(self.lattice, self.teams, self.first, self.prices, self._span, self.scratch)
+        target = np.zeros(len(self.teams.start), dtype=np.int64)
+        taken = np.flatnonzero(self.scratch.holder >= 0)
+        target[self.scratch.holder[taken]] = taken
+        return target
 
     def put(self, nodes: Stack, ceiling: float) -> bool | None:
         """Put what solutions below a ceiling may contain at the bottom of a stack.

@@ -89,7 +89,7 @@ def improve(lattice, teams, allowed, first, prices, span, scratch, memory, count
         if not clash and arrived and value < memory[BEST] - _TOLERANCE:
             memory[BEST] = value
             scratch.best_way[:] = scratch.way
-        if memory[BEST] <= ceiling:
+        if memory[BEST] <= ceiling < _HALF:
             return FOUND
         if square == 0.0:
             return OPEN
@@ -155,7 +155,7 @@ def _look_back(lattice, teams, first, prices, span, scratch):
             )
         for p in range(len(cell_of)):
             cell = cell_of[p]
-            stay = parked[t + 1, p] + _price(row, prices[t], 0, cell)
+            stay = parked[t + 1, p] + _price(row, prices, t, 0, cell)
             parked[t, p] = stay
             if t >= first[p] and stay <= to_go[t, cell, p]:
                 to_go[t, cell, p] = stay
@@ -163,11 +163,18 @@ def _look_back(lattice, teams, first, prices, span, scratch):
 
 @njit(cache=True)
 def _step_back(move, move_price, begin, end, first_pair, end_pair, row, prices, here, then):
+    # The sum of prices is written out: as a call it takes four times as long.
+    most_rows = row.shape[2]
     for m in range(begin, end):
         d, cell, next_cell = move[m, 0], move[m, 1], move[m, 2]
-        price = 1.0 + _price(row, prices, d, cell)
+        price = 1.0
         if d != 0:
             price += PER_MOVE
+        for n in range(most_rows):
+            r = row[d, cell, n]
+            if r < 0:
+                break
+            price += prices[r]
         move_price[m] = price
         for p in range(first_pair, end_pair):
             total = price + then[next_cell, p]
@@ -176,14 +183,14 @@ def _step_back(move, move_price, begin, end, first_pair, end_pair, row, prices, 
 
 
 @njit(cache=True)
-def _price(row, prices, d, cell):
-    """Return what a move pays in a step with these prices."""
+def _price(row, prices, t, d, cell):
+    """Return what a move pays in a step."""
     total = 0.0
     for m in range(row.shape[2]):
         r = row[d, cell, m]
         if r < 0:
             break
-        total += prices[r]
+        total += prices[t, r]
     return total
 
 
@@ -271,7 +278,7 @@ def _walk(lattice, teams, allowed, first, prices, span, scratch, memory):
                 least = np.inf
                 for e in range(len(step)):
                     if allowed[k, t, e, cell]:
-                        total = _price(row, prices[t], e, cell) + to_go[t + 1, cell + step[e], p]
+                        total = _price(row, prices, t, e, cell) + to_go[t + 1, cell + step[e], p]
                         if e != 0:
                             total += PER_MOVE
                         if total < least - 1e-12:
@@ -321,12 +328,14 @@ def forbid_dear(lattice, teams, allowed, first, prices, span, scratch, ceiling):
     budget = ceiling - bound + _TOLERANCE
     to_go, parked, least, reach = scratch.to_go, scratch.parked, scratch.least, scratch.reach
     move, move_from, move_price = scratch.move, scratch.move_from, scratch.move_price
+    worth, pair_target = scratch.worth, teams.pair_target
     for k in range(groups):
+        begin, end = teams.pairs_from[k], teams.pairs_from[k + 1]
         for t in range(span + 1):
             for cell in range(cells):
                 value = UNREACHABLE
-                for p in range(teams.pairs_from[k], teams.pairs_from[k + 1]):
-                    value = min(value, to_go[t, cell, p] - scratch.worth[teams.pair_target[p]])
+                for p in range(begin, end):
+                    value = min(value, to_go[t, cell, p] - worth[pair_target[p]])
                 least[k, t, cell] = value
     reach[:] = UNREACHABLE
     for i in range(len(teams.start)):
@@ -346,10 +355,10 @@ def forbid_dear(lattice, teams, allowed, first, prices, span, scratch, ceiling):
                     reach[k, t + 1, next_cell] = total
     for k in range(groups):
         for p in range(teams.pairs_from[k], teams.pairs_from[k + 1]):
-            cell, worth = teams.pair_cell[p], scratch.worth[teams.pair_target[p]]
+            cell, worth_of = teams.pair_cell[p], worth[pair_target[p]]
             t = first[p]
             while t < span:
-                extra = parked[t, p] - worth - least[k, t, cell]
+                extra = parked[t, p] - worth_of - least[k, t, cell]
                 if reach[k, t, cell] + max(extra, 0.0) <= budget:
                     break
                 t += 1

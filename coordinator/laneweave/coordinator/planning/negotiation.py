@@ -1,0 +1,156 @@
+"""Path sets early, for any number of vehicles: ways are negotiated.
+
+At first vehicles may be in conflict. Then all whose way is contested look for another one, one
+after the other and again and again, while the price of what others use rises, and what stays
+contested gets dearer for good. That settles nearly always (McMurchie and Ebeling, PathFinder,
+FPGA 1995, who route wires in this way).
+
+After that a few vehicles at a time are taken out, perhaps exchange targets, and negotiate again
+around all others; what is not worse is kept (large-neighbourhood search). When that has been in
+vain for long, all begins anew.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from laneweave.coordinator.planning.arrays import Floats, Ints, Lattice, Teams
+from laneweave.coordinator.planning.negotiation_kernel import improve_ways, negotiate
+from laneweave.coordinator.planning.relaxation_kernel import PARKED
+
+_STRETCH, _MORE_STRETCH, _MOST_STRETCH = 2.0, 1.25, 10.0
+"""The horizon, relative to the steps with prices, and how it grows if it was too short."""
+_PASSES = 300
+_SPARE_STEPS = 4
+_PER_ATTEMPT = 4
+"""Attempts to improve that count as a pass."""
+_MOST_OUT = (6, 12)
+"""Vehicles that are taken out at most, by turns."""
+_IDLE_ATTEMPTS = 800
+
+
+class Trial(NamedTuple):
+    """What the compiled code works on. Shapes: N vehicles, T steps, R rows, X cells."""
+
+    way: Ints
+    """(N, T) displacements; `PARKED`: arrived."""
+    cost: Ints
+    """(N,)"""
+    target: Ints
+    """(N,) number of the target of each vehicle."""
+    use: Floats
+    """(T, R)"""
+    own: Floats
+    """(T, R) uses by those who are taken out."""
+    memory: Floats
+    """(T, R) what a row costs because it was contested."""
+    weight: Floats
+    """(T, R) what a row costs now."""
+    to_go: Floats
+    """(T + 1, X)"""
+    parked: Floats
+    """(T + 1,)"""
+    random: NDArray[np.uint64]
+    """(1,) state of the random numbers."""
+
+
+class Negotiation:
+    """The best path set so far; equal problems and equal work give equal path sets.
+
+    cost: of the best path set; None: there is none yet.
+    way: (N, T) its displacements.
+    """
+
+    def __init__(self, lattice: Lattice, teams: Teams, prices: Floats, target: Ints) -> None:
+        """Begin.
+
+        Args:
+            lattice: the moves.
+            teams: the vehicles.
+            prices: (T, R) of rows, to begin with.
+            target: (N,) number of the target of each vehicle, to begin with.
+        """
+        self.cost: int | None = None
+        self.way: Ints = np.empty((0, 0), dtype=np.int64)
+        self._lattice = lattice
+        self._teams = teams
+        self._prices = prices
+        self._target = target
+        self._rounds = 0
+        self._stretch = _STRETCH
+        self._begin()
+
+    def _begin(self) -> None:
+        """Begin a round."""
+        steps = int(np.ceil(self._stretch * len(self._prices)))
+        memory = np.zeros((steps, self._prices.shape[1]))
+        memory[: len(self._prices)] = self._prices
+        way = np.full((len(self._target), steps), PARKED, dtype=np.int64)
+        self._trial = self._with(way, self._target.copy(), memory)
+        self._trial.random[0] = self._rounds
+        self._rounds += 1
+        self._passes, self._idle = 0, 0
+        self._settled = False
+
+    def _with(self, way: Ints, target: Ints, memory: Floats) -> Trial:
+        steps = way.shape[1]
+        shape = memory.shape
+        return Trial(
+            way=way,
+            cost=np.count_nonzero(way != PARKED, axis=1).astype(np.int64),
+            target=target,
+            use=np.zeros(shape),
+            own=np.zeros(shape),
+            memory=memory,
+            weight=np.zeros(shape),
+            to_go=np.zeros((steps + 1, self._lattice.valid.shape[1])),
+            parked=np.zeros(steps + 1),
+            random=np.zeros(1, dtype=np.uint64),
+        )
+
+    def work(self) -> bool:
+        """Do a little; return whether there is a better path set now."""
+        if self._settled:
+            return self._improve()
+        ended = negotiate(self._lattice, self._teams, self._trial, 1, self._passes)
+        self._passes += 1
+        if ended >= 0:
+            self._settled = True
+            self._shorten()
+            return self._keep()
+        if self._passes >= _PASSES:
+            self._stretch = min(_MORE_STRETCH * self._stretch, _MOST_STRETCH)
+            self._begin()
+        return False
+
+    def _improve(self) -> bool:
+        most = _MOST_OUT[self._idle // 100 % len(_MOST_OUT)]
+        idle = improve_ways(self._lattice, self._teams, self._trial, _PER_ATTEMPT, most)
+        self._idle = self._idle + idle if idle >= _PER_ATTEMPT else idle
+        better = self._keep()
+        if better:
+            self._shorten()
+        if self._idle > _IDLE_ATTEMPTS:
+            self._begin()
+        return better
+
+    def _keep(self) -> bool:
+        cost = int(self._trial.cost.sum())
+        if self.cost is not None and cost >= self.cost:
+            return False
+        self.cost, self.way = cost, self._trial.way.copy()
+        return True
+
+    def _shorten(self) -> None:
+        """Drop the steps in which nobody moves any more, but a few."""
+        old = self._trial
+        steps = int(old.cost.max()) + _SPARE_STEPS
+        if steps < old.way.shape[1]:
+            way = np.ascontiguousarray(old.way[:, :steps])
+            new = self._with(way, old.target, np.zeros((steps, old.use.shape[1])))
+            new.use[:] = old.use[:steps]
+            new.random[:] = old.random
+            self._trial = new
