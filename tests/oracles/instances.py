@@ -55,6 +55,21 @@ def random_request(seed: int) -> dict[str, Any]:
             return request
 
 
+def large_request(seed: int) -> dict[str, Any]:
+    """Seven to twelve vehicles on three to five lanes, with more room than in `random_request`."""
+    rng = Random(seed)
+    mode, conflicts = variant(seed)
+    count = rng.randint(7, 12)
+    while True:
+        lanes = rng.randint(3, 5)
+        columns = -(-5 * count // lanes) + rng.randint(0, 3)
+        request = _draw(rng, columns, lanes, count, mode)
+        if conflicts is not None:
+            request["conflicts"] = conflicts
+        if _is_connected(Problem.of(request)):
+            return request
+
+
 def small_request(
     seed: int, *, columns: int, lanes: int, count: int, mode: int, conflicts: list[str] | None
 ) -> dict[str, Any]:

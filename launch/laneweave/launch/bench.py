@@ -1,6 +1,6 @@
-"""Benchmarks: `laneweave bench runtime` and `laneweave bench planner`.
+"""`laneweave bench runtime`: what a road full of processes costs.
 
-Machines differ and are noisy: medians, and CPU time where it is the solver that counts.
+Machines differ and are noisy: medians, and rates within one run.
 """
 
 from __future__ import annotations
@@ -20,8 +20,6 @@ import pyarrow.parquet as pq
 from attrs import define, field
 from rich.table import Table
 
-from laneweave.coordinator.planning import plan
-from laneweave.coordinator.planning.instances import block_request
 from laneweave.launch.local_run import LocalRun
 from laneweave.launch.observer import View
 from laneweave.protocol.scenario import Scenario, load_scenario
@@ -117,33 +115,6 @@ def bench_runtime(vehicles: int, *, seconds: float, per_process: int, seed: int)
     }
 
 
-def bench_planner(instances: int, *, seed: int) -> list[dict[str, Any]]:
-    """Measure the planner on the formations that the paper's operation brings about.
-
-    Returns:
-        One row per formation size: CPU milliseconds, median, 95th percentile, maximum.
-    """
-    rows = []
-    for size in (2, 3, 4, 5, 6):
-        times_ms = []
-        optimal = 0
-        for index in range(instances):
-            request = block_request(seed + index, vehicles=size)
-            began = time.process_time()
-            response = plan(request)
-            times_ms.append((time.process_time() - began) * 1e3)
-            optimal += response.status == "optimal"
-        rows.append(
-            {
-                "vehicles": size,
-                "instances": instances,
-                "optimal": optimal,
-                "cpu_ms": spread(np.array(times_ms), 50, 95, largest=True),
-            }
-        )
-    return rows
-
-
 def machine() -> dict[str, Any]:
     """Return what the figures depend on."""
     return {
@@ -168,19 +139,6 @@ def runtime_table(rows: list[dict[str, Any]]) -> Table:
             f"{row['tick_ms']['p50']:.1f} / {row['tick_ms']['p99']:.1f}",
             *(f"{cpu.get(role, 0.0):.2f}" for role in ROLES),
             f"{memory.get('total', 0.0):.0f} ({memory.get('each', 0.0):.1f})",
-        )
-    return table
-
-
-def planner_table(rows: list[dict[str, Any]]) -> Table:
-    """Return the results of `bench_planner` as a table."""
-    table = Table("vehicles", "optimal", "CPU ms p50", "p95", "max")
-    for row in rows:
-        cpu = row["cpu_ms"]
-        table.add_row(
-            str(row["vehicles"]),
-            f"{row['optimal']} of {row['instances']}",
-            *(f"{cpu[name]:.2f}" for name in ("p50", "p95", "max")),
         )
     return table
 

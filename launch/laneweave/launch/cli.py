@@ -330,42 +330,72 @@ def report(
 def bench(
     what: Annotated[Benchmark, typer.Argument(help="runtime or planner.")],
     vehicles: Annotated[
-        str, typer.Option("--vehicles", help="runtime: vehicles on the road, e.g. 30,60,90.")
-    ] = "30,60,90",
+        str | None,
+        typer.Option("--vehicles", help="Numbers with commas between; see below for defaults."),
+    ] = None,
     per_process: Annotated[
         int, typer.Option("--vehicles-per-process", min=1, help="runtime: agents per process.")
     ] = 1,
     seconds: Annotated[
         float, typer.Option("--seconds", min=5.0, max=3600.0, help="runtime: road time measured.")
     ] = 60.0,
+    families: Annotated[
+        str, typer.Option("--families", help="planner: of node-edge, following, geometric.")
+    ] = "node-edge,following,geometric",
     instances: Annotated[
         int, typer.Option("--instances", min=1, max=10_000, help="planner: per formation size.")
-    ] = 100,
-    seed: Annotated[int, typer.Option("--seed", min=0)] = 1,
+    ] = 20,
+    deadline: Annotated[
+        float, typer.Option("--deadline", min=0.01, max=3600.0, help="planner: s per instance.")
+    ] = 4.0,
+    solver: Annotated[
+        SolverChoice, typer.Option("--solver", help="planner: see docs/PLANNING.md.")
+    ] = SolverChoice.branching,
+    seed: Annotated[int, typer.Option("--seed", min=0)] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Measure this machine."""
-    from laneweave.launch import bench as benchmarks
-
+    """Measure this machine: roads of 30, 60 and 90 vehicles, or plans for 6 to 36."""
     if what is Benchmark.planner:
-        rows = benchmarks.bench_planner(instances, seed=seed)
-        table = benchmarks.planner_table(rows)
-    else:
-        counts = vehicles.split(",")
-        if not all(re.fullmatch(r"[1-9][0-9]?|1[0-9][0-9]|200", count) for count in counts):
-            raise BadInputError("--vehicles", vehicles, "numbers from 1 to 200 with commas between")
-        rows = [
-            benchmarks.bench_runtime(
-                int(count), seconds=seconds, per_process=per_process, seed=seed
+        from laneweave.launch import planner_bench
+
+        sizes = _counts(vehicles or "6,9,12,18,24,36")
+        chosen = families.split(",")
+        if not set(chosen) <= set(planner_bench.FAMILIES):
+            known = ", ".join(planner_bench.FAMILIES)
+            raise BadInputError("--families", families, f"some of {known}, with commas between")
+        rows = list(
+            planner_bench.bench_planner(
+                sizes,
+                chosen,
+                instances=instances,
+                seed=seed,
+                deadline_s=deadline,
+                solver=solver.value,
             )
-            for count in counts
+        )
+        table = planner_bench.planner_table(rows)
+    else:
+        from laneweave.launch import bench as runtime_bench
+
+        rows = [
+            runtime_bench.bench_runtime(count, seconds=seconds, per_process=per_process, seed=seed)
+            for count in _counts(vehicles or "30,60,90")
         ]
-        table = benchmarks.runtime_table(rows)
+        table = runtime_bench.runtime_table(rows)
     if as_json:
-        result = {"benchmark": what.value, "machine": benchmarks.machine(), "results": rows}
+        from laneweave.launch.bench import machine
+
+        result = {"benchmark": what.value, "machine": machine(), "results": rows}
         sys.stdout.write(json.dumps(result, indent=2) + "\n")
     else:
         Console().print(table)
+
+
+def _counts(text: str) -> list[int]:
+    counts = text.split(",")
+    if not all(re.fullmatch(r"[1-9][0-9]?|1[0-9][0-9]|200", count) for count in counts):
+        raise BadInputError("--vehicles", text, "numbers from 1 to 200 with commas between")
+    return [int(count) for count in counts]
 
 
 def _deployment(config: Path | None, endpoint: str | None) -> Scenario:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from laneweave.coordinator.planning.arrays_kernel import UNREACHABLE, least_steps
 from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.grid import Cell, Grid, Mode, displacements
 from laneweave.coordinator.planning.rows import Row, row_patterns
@@ -22,8 +23,7 @@ Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-UNREACHABLE = 1e9
-"""Stands for infinity, and can be added to."""
+__all__ = ["UNREACHABLE", "Bools", "Floats", "Ints", "Lattice", "Teams", "lattice", "teams"]
 
 
 class Lattice(NamedTuple):
@@ -137,25 +137,9 @@ def teams(
         pair_target=numbered,
         pair_cell=target[numbered],
         pair=pair,
-        distance=np.ascontiguousarray(_distances(ways, target)[:, numbered]),
+        distance=least_steps(ways.valid, ways.step, target[numbered]),
     )
 
 
 def _cells(cells: Sequence[Cell], ways: Lattice) -> Ints:
     return np.array([column * ways.lanes + lane for column, lane in cells], dtype=np.int64)
-
-
-def _distances(ways: Lattice, targets: Ints) -> Floats:
-    """Return (X, J) the least steps from every cell to each target, as if it were alone."""
-    cells = ways.valid.shape[1]
-    found = np.full((cells, len(targets)), UNREACHABLE)
-    found[targets, np.arange(len(targets))] = 0.0
-    moves = [(np.flatnonzero(ways.valid[d]), ways.step[d]) for d in range(len(ways.step))]
-    for _ in range(cells):
-        before = found.copy()
-        for from_, step in moves:
-            found[from_] = np.minimum(found[from_], before[from_ + step] + 1.0)
-        found = np.minimum(found, UNREACHABLE)
-        if np.array_equal(found, before):
-            break
-    return found

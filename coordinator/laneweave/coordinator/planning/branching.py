@@ -140,8 +140,11 @@ class Branching:
         whole = Relaxation(self._lattice, self._teams, self._longest_way() + _SPARE_STEPS)
         for _ in range(0, _ITERATIONS, _AT_A_TIME):
             whole.improve(_AT_A_TIME)
+            self._take_chance(whole)
             self.lower_bound = max(self.lower_bound, whole.least_cost)
             self._budget.check_time()
+            if self.best is not None and self.best.cost <= self.lower_bound:
+                break
         nodes = self._stack(whole, _FIRST_STACK)
         while not self.finished and not self.gave_up:
             if math.isinf(self.lower_bound):
@@ -231,12 +234,16 @@ class Branching:
         if looked_at:
             spent = (time.thread_time() - started) / looked_at
             self._s_per_node = max(spent, 0.5 * (self._s_per_node + spent))
-        if whole.memory[BEST] < self._best_value:
-            self._best_value = whole.memory[BEST]
-            self._prefer(self._solution(whole.scratch.best_way))
+        self._take_chance(whole)
         self._nodes += looked_at
         self._budget.take_nodes(looked_at)
         return ending, depth
+
+    def _take_chance(self, whole: Relaxation) -> None:
+        """Keep the best of the relaxed solutions that happened to be free of conflicts."""
+        if whole.memory[BEST] < self._best_value:
+            self._best_value = whole.memory[BEST]
+            self._prefer(self._solution(whole.scratch.best_way))
 
     def _look_for_others(self, whole: Relaxation) -> None:
         """Every now and then find path sets by other means, or show that there are none."""

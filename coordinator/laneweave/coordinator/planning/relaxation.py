@@ -233,5 +233,6 @@ class Relaxation:
         self.prices = prices.copy()
 
     def lengthen(self, steps: int) -> None:
-        """Let rows have prices in more steps."""
+        """Let rows have prices in more steps; the best solution so far is forgotten."""
+        self.memory[BEST] = UNREACHABLE
         self._lay_out(np.pad(self.prices, ((0, steps), (0, 0))))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from laneweave.coordinator.planning.arrays import UNREACHABLE
+from laneweave.coordinator.planning.arrays_kernel import UNREACHABLE
 
 PER_MOVE = 1e-5
 """Added to the cost of each move that is not a wait: of equal costs the fewest moves win."""
