@@ -70,6 +70,7 @@ that becomes more."""
 _EXPLORE_NODES, _EXPLORE_MOVES, _GROWTH = 100, 5_000, 4
 """When the joint search is tried, if there is no path set yet, and how far; then more of both."""
 _TIE_NODES = 10
+_WARM_UP_WORK = 8
 _STEPS_GUESSED, _MOST_NUMBERS = 32, 50_000_000
 """Larger tables do not fit into memory."""
 
@@ -85,12 +86,15 @@ def can_branch(problem: Problem, choices: Sequence[frozenset[int]]) -> bool:
 @cache
 def warm_up() -> None:
     """Load the compiled code; where there is none yet, compile it, which takes half a minute."""
-    vehicles = (VehicleRequest("a", (0, 0), lane=1), VehicleRequest("b", (1, 1), lane=0))
-    request = PlanRequest(Grid(2, 2), 1, ("geometric",), vehicles, ((0, 1), (1, 0)))
+    # Two who change places, which is not decided at once.
+    vehicles = (VehicleRequest("a", (0, 0), lane=1), VehicleRequest("b", (0, 1), lane=0))
+    request = PlanRequest(Grid(2, 2), 1, ("geometric",), vehicles, ((0, 0), (0, 1)))
     model = ConflictModel(request.conflicts)
     starts = [vehicle.cell for vehicle in vehicles]
     problem = Problem(request.grid, request.mode, model, starts, request.targets)
-    Branching(problem, request.choices(), Budget()).run()
+    search_ = Branching(problem, request.choices(), Budget())
+    search_.run()
+    search_.negotiate(search_.relaxation(), _WARM_UP_WORK)
 
 
 class Branching:
@@ -137,7 +141,7 @@ class Branching:
             self.lower_bound, self.finished = math.inf, True
             return
         self._budget.check_time()
-        whole = Relaxation(self._lattice, self._teams, self._longest_way() + _SPARE_STEPS)
+        whole = self.relaxation()
         for _ in range(0, _ITERATIONS, _AT_A_TIME):
             whole.improve(_AT_A_TIME)
             self._take_chance(whole)
@@ -154,6 +158,10 @@ class Branching:
                 self.finished = True
             else:
                 nodes = self._decide(whole, nodes, int(self.lower_bound))
+
+    def relaxation(self) -> Relaxation:
+        """Return the problem without prices."""
+        return Relaxation(self._lattice, self._teams, self._longest_way() + _SPARE_STEPS)
 
     def _stack(self, whole: Relaxation, size: int) -> Stack:
         return stack(self._teams, whole.prices, self._lattice.valid, size)
@@ -250,21 +258,25 @@ class Branching:
         if self._nodes < self._look_around:
             return
         self._look_around = self._nodes + _NODES_BETWEEN
+        if self._negotiation is None or self._negotiation.cost is None:
+            self.negotiate(whole, _FIRST_WORK, stop_at_first=True)
+        else:
+            self.negotiate(whole, min(1 + self._nodes // _NODES_FOR_MORE, _MOST_WORK))
+        if self.best is None and self._nodes >= self._explore_nodes:
+            self._explore()
+
+    def negotiate(self, whole: Relaxation, work: int, *, stop_at_first: bool = False) -> None:
+        """Go on with the negotiation for so much work; see `Negotiation.work`."""
         if self._negotiation is None:
             self._negotiation = Negotiation(
                 self._lattice, self._teams, whole.prices, whole.assignment()
             )
-        left = min(1 + self._nodes // _NODES_FOR_MORE, _MOST_WORK)
-        if self._negotiation.cost is None:
-            left = _FIRST_WORK
-        while left > 0:
+        for _ in range(work):
             self._budget.check_time()
-            is_first = self._negotiation.cost is None
             if self._negotiation.work():
                 self._prefer(self._solution(self._negotiation.way))
-            left = 1 if is_first and self.best is not None else left - 1
-        if self.best is None and self._nodes >= self._explore_nodes:
-            self._explore()
+                if stop_at_first:
+                    return
 
     def _explore(self) -> None:
         verdict = explore(self._problem, self._choices, self._budget, self._explore_moves)
