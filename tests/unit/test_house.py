@@ -85,6 +85,12 @@ def test_a_base_install_says_what_a_run_needs() -> None:
     assert "not installed" in done.stderr
 
 
+def test_a_base_install_says_what_a_drawing_needs() -> None:
+    done = run_base_install("plan", "docs/examples/case-study.json", "--draw", "plan.png")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "not installed" in done.stderr
+
+
 def services() -> dict[str, list[str]]:
     compose = yaml.safe_load((ROOT / "compose.yaml").read_text(encoding="utf-8"))
     return {name: service["command"] for name, service in compose["services"].items()}

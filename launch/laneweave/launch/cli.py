@@ -163,12 +163,18 @@ def plan(
     solver: Annotated[
         SolverChoice, typer.Option("--solver", help="How to plan here: see docs/PLANNING.md.")
     ] = SolverChoice.branching,
+    draw: Annotated[
+        Path | None,
+        typer.Option(
+            "--draw", metavar="FILE", help="Draw the answer: FILE.png, or FILE.gif that moves."
+        ),
+    ] = None,
 ) -> None:
     """Plan one request here, or ask a running coordinator."""
     from laneweave.launch.plan_command import answer_request
 
     as_table = output is OutputFormat.table
-    answer_request(request, deadline, connect, realm, solver.value, as_table=as_table)
+    answer_request(request, deadline, connect, realm, solver.value, as_table=as_table, drawing=draw)
 
 
 @app.command()

@@ -39,7 +39,7 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     return figure
 
 
-def save(figure: Figure, out: Path, dpi: int) -> None:
+def save(figure: Figure, out: Path, dpi: float) -> None:
     """Write a picture."""
     out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(out, dpi=dpi)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +26,18 @@ def answer_request(
     solver: Solver,
     *,
     as_table: bool,
+    drawing: Path | None = None,
 ) -> None:
-    """Read a request, have it planned, and print the answer; `solver` plans it here.
+    """Read a request, have it planned, print the answer and draw it; `solver` plans it here.
 
     Raises:
-        BadInputError: the request cannot be read or is not valid, or nobody is at the endpoint.
+        BadInputError: the request cannot be read or is not valid, nobody is at the endpoint, or
+            the drawing cannot be written.
         RefusedError: the coordinator refused the request.
-        CommandFailedError: the coordinator failed or did not answer in time.
+        CommandFailedError: the coordinator failed or did not answer in time, or the drawing could
+            not be written after all.
     """
+    draw = None if drawing is None else _checked_drawer(drawing)
     data = _read(path)
     if deadline_s is not None:
         data["deadline_s"] = deadline_s
@@ -45,6 +50,22 @@ def answer_request(
         sys.stdout.write(_table(request, response))
     else:
         sys.stdout.write(json.dumps(response.to_dict(), indent=2) + "\n")
+    if draw is not None:
+        draw(request, response)
+
+
+def _checked_drawer(out: Path) -> Callable[[PlanRequest, PlanResponse], None]:
+    from laneweave.launch.plan_drawing import check_drawing, draw_plan  # noqa: PLC0415 - an extra
+
+    check_drawing(out)
+
+    def draw(request: PlanRequest, response: PlanResponse) -> None:
+        try:
+            draw_plan(request, response, out)
+        except OSError as error:
+            raise CommandFailedError(f"{out}: not drawn: {error}") from error
+
+    return draw
 
 
 def _table(request: PlanRequest, response: PlanResponse) -> str:
