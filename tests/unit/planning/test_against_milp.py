@@ -9,11 +9,17 @@ import pytest
 
 from laneweave.coordinator.planning import PlanRequest, plan
 from laneweave.coordinator.planning.facade import Solver
+from laneweave.coordinator.planning.grid import Mode
+from laneweave.coordinator.planning.instances import formation_request
 from oracles import joint_search, milp_oracle
-from oracles.instances import VARIANTS, random_request, small_request, variant
+from oracles.instances import VARIANTS, large_request, random_request, small_request, variant
 from oracles.path_rules import check_paths
 
 INSTANCES = 200
+MORE_INSTANCES = 1_600
+FORMATION_INSTANCES = 100
+LARGE_INSTANCES = 100
+LARGE_DEADLINE_S = 4.0
 CHUNK = 10
 
 # Costs that the oracle needs 4 to 20 seconds each to prove, written down once.
@@ -37,7 +43,13 @@ def _faults(request: dict[str, Any], cost: int, solver: Solver) -> list[str]:
     return check_paths(request, response)
 
 
-@pytest.mark.parametrize("first", range(0, INSTANCES, CHUNK))
+FEW = range(0, INSTANCES, CHUNK)
+MANY = range(INSTANCES, INSTANCES + MORE_INSTANCES, CHUNK)
+
+
+@pytest.mark.parametrize(
+    "first", [*FEW, *(pytest.param(first, marks=pytest.mark.full) for first in MANY)]
+)
 def test_planner_agrees_with_the_oracle(first: int) -> None:
     wrong = []
     for seed in range(first, first + CHUNK):
@@ -50,6 +62,38 @@ def test_planner_agrees_with_the_oracle(first: int) -> None:
             for fault in _faults(request, cost, solver)
         ]
     assert not wrong, "\n".join(wrong)
+
+
+FORMATIONS: tuple[tuple[Mode, tuple[str, ...]], ...] = (
+    (1, ("node", "edge")),
+    (1, ("node", "edge", "special-1")),
+    (2, ("geometric",)),
+)
+
+
+@pytest.mark.parametrize("first", range(0, FORMATION_INSTANCES, CHUNK))
+def test_planner_agrees_with_the_oracle_on_formations_beyond_six(first: int) -> None:
+    wrong = []
+    for seed in range(first, first + CHUNK):
+        mode, conflicts = FORMATIONS[seed % len(FORMATIONS)]
+        size = 7 + seed % 6 if mode == 1 else 7
+        request = formation_request(seed, vehicles=size, mode=mode, conflicts=conflicts).to_dict()
+        cost = milp_oracle.optimal_cost(request)
+        assert cost is not None
+        wrong += [f"seed {seed}: {fault}" for fault in _faults(request, cost, "branching")]
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("seed", range(LARGE_INSTANCES))
+def test_what_is_proven_of_large_requests_of_every_kind_is_true(seed: int) -> None:
+    """Three to five lanes, all conflicts, blocked cells, lists of targets, more than are needed."""
+    request = {**large_request(seed), "deadline_s": LARGE_DEADLINE_S}
+    response = _plan(request, "branching")
+    cost = milp_oracle.optimal_cost(request)
+    assert not check_paths(request, response)
+    assert response["lower_bound"] <= cost <= response["cost"]
+    assert (response["status"] == "optimal") == (response["lower_bound"] == response["cost"])
 
 
 def test_all_sets_of_conflicts_and_all_sizes_occur() -> None:

@@ -64,7 +64,9 @@ _CHUNK_S = 0.005
 """How long the search goes on between two looks at the clock, about."""
 _NODES_BETWEEN = 8
 """Nodes between two looks for path sets by other means."""
-_FIRST_WORK, _MOST_WORK, _NODES_FOR_MORE = 60, 3, 800
+_MANY_VEHICLES = 20
+"""So many are not decided soon: they get a path set first."""
+_FIRST_WORK, _MOST_WORK, _NODES_FOR_MORE = 200, 3, 800
 """How much is negotiated then until there is a path set, later at most, and after how many nodes
 that becomes more."""
 _EXPLORE_NODES, _EXPLORE_MOVES, _GROWTH = 100, 5_000, 4
@@ -142,6 +144,9 @@ class Branching:
             return
         self._budget.check_time()
         whole = self.relaxation()
+        if len(self._choices) >= _MANY_VEHICLES:
+            whole.improve(2 * _AT_A_TIME)
+            self.negotiate(whole, _FIRST_WORK, stop_at_first=True)
         for _ in range(0, _ITERATIONS, _AT_A_TIME):
             whole.improve(_AT_A_TIME)
             self._take_chance(whole)

@@ -41,9 +41,12 @@ def _cheapest_way(lattice, weight, distance, start, target, to_go, parked, way):
         to_go[steps, cell] = NOT_IN_TIME + _DETOUR * distance[cell]
     to_go[steps, target] = 0.0
     parked[steps] = 0.0
+    lanes = lattice.lanes
+    column = start // lanes
     for t in range(steps - 1, -1, -1):
         parked[t] = parked[t + 1] + _weight(row, weight, t, 0, target)
-        for cell in range(cells):
+        # Nobody gets further than one column a step.
+        for cell in range(max(0, column - t) * lanes, min(cells, (column + t + 1) * lanes)):
             best = np.inf
             for d in range(displacements):
                 if valid[d, cell]:

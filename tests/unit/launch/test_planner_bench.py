@@ -1,0 +1,34 @@
+"""`laneweave bench planner`."""
+
+import math
+
+from attrs import evolve
+
+from laneweave.coordinator.planning import plan
+from laneweave.coordinator.planning.instances import formation_request
+from laneweave.launch.planner_bench import FAMILIES, bench_planner, gap_percent, planner_table
+
+
+def test_every_family_and_size_gets_a_row() -> None:
+    rows = list(
+        bench_planner([2, 4], list(FAMILIES), instances=3, seed=5, deadline_s=4.0, solver="tappa")
+    )
+    assert [(row["family"], row["vehicles"]) for row in rows] == [
+        (family, size) for family in FAMILIES for size in (2, 4)
+    ]
+    for row in rows:
+        assert row["optimal"] == row["instances"] == row["answered_in_100_ms"] == 3
+        assert 0 < row["cpu_ms"]["p50"] <= row["cpu_ms"]["max"]
+        assert row["gap_percent"]["max"] == 0.0
+    assert planner_table(rows).row_count == len(rows)
+
+
+def test_what_is_not_proven_has_a_gap() -> None:
+    response = plan(formation_request(0, vehicles=4))
+    assert gap_percent(response) == 0.0
+    cost = response.cost
+    assert cost is not None
+    assert gap_percent(evolve(response, status="feasible", lower_bound=cost - 1)) == 100 / (
+        cost - 1
+    )
+    assert gap_percent(evolve(response, status="timeout", cost=None)) == math.inf

@@ -1,0 +1,79 @@
+"""Path sets by negotiation: legal, the same each time, and better with more work."""
+
+import pytest
+
+from laneweave.coordinator.planning import PlanRequest, plan, problems_of_response
+from laneweave.coordinator.planning.arrays import Lattice, Teams, lattice, teams
+from laneweave.coordinator.planning.conflicts import ConflictModel
+from laneweave.coordinator.planning.grid import Mode
+from laneweave.coordinator.planning.instances import formation_request
+from laneweave.coordinator.planning.negotiation import Negotiation
+from laneweave.coordinator.planning.relaxation import Relaxation
+from laneweave.coordinator.planning.relaxation_kernel import PARKED
+
+
+def arrays_of(request: PlanRequest) -> tuple[Lattice, Teams]:
+    ways = lattice(request.grid, request.mode, ConflictModel(request.conflicts))
+    starts = [vehicle.cell for vehicle in request.vehicles]
+    return ways, teams(ways, starts, request.targets, request.choices())
+
+
+def negotiation_of(request: PlanRequest) -> Negotiation:
+    ways, vehicles = arrays_of(request)
+    whole = Relaxation(ways, vehicles, 16)
+    whole.improve(20)
+    return Negotiation(ways, vehicles, whole.prices, whole.assignment())
+
+
+def uses_of_rows(request: PlanRequest, negotiation: Negotiation) -> dict[tuple[int, int], int]:
+    ways, vehicles = arrays_of(request)
+    uses: dict[tuple[int, int], int] = {}
+    for cell, way in zip(vehicles.start.tolist(), negotiation.way.tolist(), strict=True):
+        at = cell
+        for t, d in enumerate(way):
+            move = max(d, 0)
+            assert ways.valid[move, at]
+            for row in ways.row[move, at][ways.row[move, at] >= 0].tolist():
+                uses[t, row] = uses.get((t, row), 0) + 1
+            at += int(ways.step[move])
+    return uses
+
+
+@pytest.mark.parametrize(("vehicles", "mode"), [(6, 1), (18, 2), (36, 1), (36, 2)])
+def test_it_settles_and_no_row_is_used_twice(vehicles: int, mode: Mode) -> None:
+    request = formation_request(3, vehicles=vehicles, mode=mode)
+    negotiation = negotiation_of(request)
+    for _ in range(2_000):
+        if negotiation.work():
+            break
+    assert negotiation.cost == (negotiation.way != PARKED).sum()
+    assert max(uses_of_rows(request, negotiation).values()) == 1
+
+
+def test_more_work_makes_it_cheaper_and_never_dearer() -> None:
+    request = formation_request(5, vehicles=18)
+    negotiation = negotiation_of(request)
+    costs = []
+    for _ in range(400):
+        negotiation.work()
+        if negotiation.cost is not None:
+            costs.append(negotiation.cost)
+    assert costs == sorted(costs, reverse=True)
+    assert costs[-1] < 0.8 * costs[0]
+    assert max(uses_of_rows(request, negotiation).values()) == 1
+
+
+def test_equal_work_gives_equal_ways() -> None:
+    request = formation_request(5, vehicles=12)
+    a, b = negotiation_of(request), negotiation_of(request)
+    for _ in range(100):
+        assert a.work() == b.work()
+    assert a.way.tolist() == b.way.tolist()
+
+
+@pytest.mark.parametrize("mode", [1, 2])
+def test_thirty_six_vehicles_get_an_answer_from_few_nodes(mode: Mode) -> None:
+    request = formation_request(1, vehicles=36, mode=mode, deadline_s=60.0)
+    response = plan(request, max_nodes=24)
+    assert response.status == "feasible"
+    assert problems_of_response(request, response) == []
