@@ -24,6 +24,8 @@ FOUND = DOCS / "evidence" / "planted-bugs-found.json"
 """What the random search found, as `tests/simulation/search_bugs.py` prints it."""
 MEASURED = DOCS / "evidence" / "resilience.json"
 """What `benchmarks/resilience.py` wrote."""
+PLANNED = DOCS / "evidence" / "planner.json"
+"""What `laneweave bench planner --json` printed."""
 
 
 def _diagram(text: str) -> str:
@@ -92,6 +94,23 @@ def _more(run: dict[str, Any]) -> Iterator[str]:
     yield f"real-time factor {run['real_time_factor']:.2f}"
 
 
+def _planner() -> str:
+    """Return the table of what `laneweave bench planner` measured."""
+    lines = [
+        "| conflicts | vehicles | proven in 4 s | CPU ms p50 / p95 | gap p50 / max | by 0.1 s |",
+        "|---|---|---|---|---|---|",
+    ]
+    for row in json.loads(PLANNED.read_text(encoding="utf-8"))["results"]:
+        cpu, gap = row["cpu_ms"], row["gap_percent"]
+        of = f"of {row['instances']}"
+        lines.append(
+            f"| {row['family']} | {row['vehicles']} | {row['optimal']} {of} "
+            f"| {cpu['p50']:.1f} / {cpu['p95']:.1f} | {gap['p50']:.1f} / {gap['max']:.1f} % "
+            f"| {row['answered_in_100_ms']} {of} |"
+        )
+    return "\n".join(lines)
+
+
 @cache
 def parts() -> dict[str, str]:
     """Return each generated part by its name."""
@@ -103,6 +122,7 @@ def parts() -> dict[str, str]:
         "planted bugs": _planted_bugs(),
         "profiles": _profiles(),
         "resilience": _resilience(),
+        "planner": _planner(),
     }
 
 

@@ -56,6 +56,12 @@ def outlines(axes: Axes, label: str) -> list[Rectangle]:
     return [patch for patch in found if patch.get_label() == label]
 
 
+@pytest.fixture(autouse=True)
+def _logs_stay_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command would bind them to a stream that ends with the test."""
+    monkeypatch.setattr(cli, "log_to_terminal", lambda: None)
+
+
 def test_a_panel_for_each_time_point_shows_where_everybody_is() -> None:
     figure = plan_figure(REQUEST, PLAN)
     assert len(figure.axes) == 4

@@ -66,9 +66,8 @@ _NODES_BETWEEN = 8
 """Nodes between two looks for path sets by other means."""
 _MANY_VEHICLES = 20
 """So many are not decided soon: they get a path set first."""
-_FIRST_WORK, _MOST_WORK, _NODES_FOR_MORE = 200, 3, 800
-"""How much is negotiated then until there is a path set, later at most, and after how many nodes
-that becomes more."""
+_FIRST_WORK, _WORK_FOR_GAP = 200, 20
+"""How much is negotiated then until there is a path set; later, the more the larger the gap is."""
 _EXPLORE_NODES, _EXPLORE_MOVES, _GROWTH = 100, 5_000, 4
 """When the joint search is tried, if there is no path set yet, and how far; then more of both."""
 _TIE_NODES = 10
@@ -159,7 +158,7 @@ class Branching:
             if math.isinf(self.lower_bound):
                 self.finished = True
             elif self.best is not None and self.best.cost <= self.lower_bound:
-                nodes = self._break_ties(whole, nodes, self.best)
+                nodes = self._break_ties(whole, nodes)
                 self.finished = True
             else:
                 nodes = self._decide(whole, nodes, int(self.lower_bound))
@@ -181,6 +180,7 @@ class Branching:
 
     def _decide(self, whole: Relaxation, nodes: Stack, cost: int) -> Stack:
         """Find a solution of a cost, or show that there is none; or have more steps priced."""
+        self._budget.check_time()
         ceiling = cost * (1.0 + PER_MOVE) + _TOLERANCE * PER_MOVE
         may_be = whole.put(nodes, ceiling)
         if may_be is None:
@@ -208,20 +208,20 @@ class Branching:
             self.gave_up = True
         return nodes
 
-    def _break_ties(self, whole: Relaxation, nodes: Stack, best: Solution) -> Stack:
-        """Look for a solution that costs as much as a best one, with fewer moves."""
-        ceiling = self._value(best) - 0.5 * PER_MOVE
+    def _break_ties(self, whole: Relaxation, nodes: Stack) -> Stack:
+        """Look for a solution that costs as much as the best one, with fewer moves."""
+        ceiling = self._best_value - 0.5 * PER_MOVE
         if whole.put(nodes, ceiling):
-            self._best_value = whole.memory[BEST] = self._value(best)
+            whole.memory[BEST] = self._best_value
             self._search_fewer_moves(whole, nodes, 1)
         return nodes
 
     def _search_fewer_moves(self, whole: Relaxation, nodes: Stack, depth: int) -> None:
-        """Go on with a search for about as long again; the deadline does not matter any more."""
+        """Go on with a search for about half as long; the deadline does not matter any more."""
         left = self._nodes // 2 + _TIE_NODES
         try:
             while left > 0 and depth > 0:
-                ceiling = whole.memory[BEST] - 0.5 * PER_MOVE
+                ceiling = self._best_value - 0.5 * PER_MOVE
                 before = self._nodes
                 ending, depth = self._go_on(whole, nodes, depth, ceiling, left)
                 left -= self._nodes - before
@@ -254,8 +254,7 @@ class Branching:
 
     def _take_chance(self, whole: Relaxation) -> None:
         """Keep the best of the relaxed solutions that happened to be free of conflicts."""
-        if whole.memory[BEST] < self._best_value:
-            self._best_value = whole.memory[BEST]
+        if whole.memory[BEST] < self._best_value - _TOLERANCE * PER_MOVE:
             self._prefer(self._solution(whole.scratch.best_way))
 
     def _look_for_others(self, whole: Relaxation) -> None:
@@ -266,9 +265,14 @@ class Branching:
         if self._negotiation is None or self._negotiation.cost is None:
             self.negotiate(whole, _FIRST_WORK, stop_at_first=True)
         else:
-            self.negotiate(whole, min(1 + self._nodes // _NODES_FOR_MORE, _MOST_WORK))
+            self.negotiate(whole, 1 + int(_WORK_FOR_GAP * self._gap()))
         if self.best is None and self._nodes >= self._explore_nodes:
             self._explore()
+
+    def _gap(self) -> float:
+        if self.best is None or self.lower_bound <= 0:
+            return 0.0
+        return min(1.0, (self.best.cost - self.lower_bound) / self.lower_bound)
 
     def negotiate(self, whole: Relaxation, work: int, *, stop_at_first: bool = False) -> None:
         """Go on with the negotiation for so much work; see `Negotiation.work`."""
@@ -293,9 +297,10 @@ class Branching:
             self._prefer(tidied(self._problem, verdict.solution, self._budget))
 
     def _prefer(self, solution: Solution) -> None:
-        """Keep a path set unless it costs more than the best so far."""
-        if self.best is None or solution.cost <= self.best.cost:
-            self.best = solution
+        """Keep a path set if it is cheaper than the best so far, or as cheap with fewer moves."""
+        value = self._value(solution)
+        if value < self._best_value:
+            self.best, self._best_value = solution, value
 
     def _value(self, solution: Solution) -> float:
         """Return the cost with the price of moves."""
