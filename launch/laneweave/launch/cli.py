@@ -346,7 +346,7 @@ def bench(
         float, typer.Option("--seconds", min=5.0, max=3600.0, help="runtime: road time measured.")
     ] = 60.0,
     families: Annotated[
-        str, typer.Option("--families", help="planner: of node-edge, following, geometric.")
+        str, typer.Option("--families", help="planner: of node-edge, following, geometric, block.")
     ] = "node-edge,following,geometric",
     instances: Annotated[
         int, typer.Option("--instances", min=1, max=10_000, help="planner: per formation size.")

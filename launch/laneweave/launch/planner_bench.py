@@ -1,4 +1,4 @@
-"""`laneweave bench planner`: seeded formations of growing size, as `instances.formation_request`.
+"""`laneweave bench planner`: seeded formations of growing size (`instances`).
 
 CPU time of one thread, with the compiled parts loaded. What a size or a family costs is told by the
 median and the 95th percentile of its instances; those that reach the deadline count with it.
@@ -18,15 +18,48 @@ from rich.table import Table
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan, warm_up
 from laneweave.coordinator.planning.facade import Solver
 from laneweave.coordinator.planning.grid import Mode
-from laneweave.coordinator.planning.instances import formation_request
+from laneweave.coordinator.planning.instances import block_request, formation_request
+from laneweave.protocol.errors import BadInputError
 from laneweave.sim_bridge.run_record import spread
 
-FAMILIES: Final[dict[str, tuple[Mode, tuple[str, ...]]]] = {
-    "node-edge": (1, ("node", "edge")),
-    "following": (1, ("node", "edge", "special-1")),
-    "geometric": (2, ("geometric",)),
+
+@attrs.frozen
+class Family:
+    """A motion mode with conflicts, and how much room there is.
+
+    in_block: in a block of four columns without spare ones, as coordinators plan; else with two to
+        four spare columns in front and behind.
+    """
+
+    mode: Mode
+    conflicts: tuple[str, ...]
+    in_block: bool = False
+
+    def request(self, seed: int, vehicles: int, deadline_s: float) -> PlanRequest:
+        """Return an instance.
+
+        Raises:
+            BadInputError: so many vehicles do not fit into a block.
+        """
+        make = block_request if self.in_block else formation_request
+        try:
+            return make(
+                seed,
+                vehicles=vehicles,
+                mode=self.mode,
+                conflicts=self.conflicts,
+                deadline_s=deadline_s,
+            )
+        except ValueError as error:
+            raise BadInputError("--vehicles", vehicles, f"fewer ({error})") from error
+
+
+FAMILIES: Final[dict[str, Family]] = {
+    "node-edge": Family(1, ("node", "edge")),
+    "following": Family(1, ("node", "edge", "special-1")),
+    "geometric": Family(2, ("geometric",)),
+    "block": Family(1, ("node", "edge", "special-1"), in_block=True),
 }
-"""Motion mode and conflicts; three lanes, two to four spare columns in front and behind."""
 FIRST_ANSWER_S = 0.1
 """Who decides quickly what to do has a path set by then, though perhaps not the best."""
 
@@ -55,16 +88,9 @@ def bench_planner(
     """
     warm_up()
     for family in families:
-        mode, conflicts = FAMILIES[family]
         for size in vehicles:
             requests = [
-                formation_request(
-                    seed + index,
-                    vehicles=size,
-                    mode=mode,
-                    conflicts=conflicts,
-                    deadline_s=deadline_s,
-                )
+                FAMILIES[family].request(seed + index, size, deadline_s)
                 for index in range(instances)
             ]
             yield {

@@ -2,11 +2,13 @@
 
 import math
 
+import pytest
 from attrs import evolve
 
 from laneweave.coordinator.planning import plan
 from laneweave.coordinator.planning.instances import formation_request
 from laneweave.launch.planner_bench import FAMILIES, bench_planner, gap_percent, planner_table
+from laneweave.protocol.errors import BadInputError
 
 
 def test_every_family_and_size_gets_a_row() -> None:
@@ -21,6 +23,11 @@ def test_every_family_and_size_gets_a_row() -> None:
         assert 0 < row["cpu_ms"]["p50"] <= row["cpu_ms"]["max"]
         assert row["gap_percent"]["max"] == 0.0
     assert planner_table(rows).row_count == len(rows)
+
+
+def test_what_does_not_fit_into_a_block_is_told() -> None:
+    with pytest.raises(BadInputError, match="13 vehicles do not fit"):
+        FAMILIES["block"].request(0, 13, 4.0)
 
 
 def test_what_is_not_proven_has_a_gap() -> None:
