@@ -66,7 +66,7 @@ _NODES_BETWEEN = 8
 """Nodes between two looks for path sets by other means."""
 _MANY_VEHICLES = 20
 """So many are not decided soon: they get a path set first."""
-_FIRST_WORK, _WORK_FOR_GAP = 200, 20
+_FIRST_WORK, _WORK_FOR_GAP = 200, 60
 """How much is negotiated then until there is a path set; later, the more the larger the gap is."""
 _EXPLORE_NODES, _EXPLORE_MOVES, _GROWTH = 100, 5_000, 4
 """When the joint search is tried, if there is no path set yet, and how far; then more of both."""
