@@ -6,8 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, plan, problems_of_response
+from laneweave.coordinator.planning.branching import ceiling_of
 from laneweave.coordinator.planning.grid import Cell, Grid
 from laneweave.coordinator.planning.instances import formation_request
+from laneweave.coordinator.planning.relaxation_kernel import PER_MOVE
 from laneweave.coordinator.planning.request import VehicleRequest
 from unit.planning.planning_oracles import requests
 
@@ -100,6 +102,46 @@ def test_who_has_no_target_cannot_arrive(
     request = PlanRequest(Grid(3, 2), 1, ("geometric",), vehicles, targets)
     by_tree = plan(request, solver="tappa")
     assert solved(request).status == by_tree.status == "infeasible"
+
+
+def test_of_many_too_who_has_no_target_cannot_arrive() -> None:
+    """A path set must not be made of targets that a vehicle may not have."""
+    block = [(1 + number // 3, number % 3) for number in range(20)]
+    vehicles = (
+        VehicleRequest("a", (0, 0), eligible=(0,)),
+        VehicleRequest("b", (0, 2), eligible=(0,)),
+        *(VehicleRequest(f"v{number}", cell) for number, cell in enumerate(block[:18])),
+    )
+    targets = ((13, 1), *block, (14, 0))
+    request = PlanRequest(Grid(16, 3), 1, ("node", "edge", "special-1"), vehicles, targets)
+    response = solved(request)
+    assert (response.status, response.lower_bound) == ("infeasible", None)
+
+
+def test_rounding_does_not_refute_a_cost() -> None:
+    """The value of 24 vehicles that move 180 times each, added up move by move."""
+    moved = sum(1.0 + PER_MOVE for _ in range(24 * 180))
+    assert moved > 24 * 180 * (1.0 + PER_MOVE)
+    assert moved <= ceiling_of(24 * 180) < 24 * 180 + 1
+
+
+def test_a_far_target_of_few_vehicles_is_no_obstacle() -> None:
+    """Longer ways than to the nearest targets are needed."""
+    vehicles = (
+        VehicleRequest("a", (0, 0)),
+        VehicleRequest("b", (0, 1)),
+        VehicleRequest("c", (1, 0), lane=1),
+    )
+    request = PlanRequest(Grid(60, 3), 1, ("geometric",), vehicles, ((0, 0), (59, 0), (1, 1)))
+    response = solved(request)
+    assert response.status == "optimal"
+    assert response.cost == plan(request, solver="tappa").cost
+
+
+def test_tables_that_do_not_fit_into_memory_are_not_made() -> None:
+    vehicles = (VehicleRequest("a", (0, 0)),)
+    request = PlanRequest(Grid(1000, 16), 1, ("geometric",), vehicles, ((999, 15),), 20.0)
+    assert solved(request).cost == 999 + 15
 
 
 def test_a_wide_road_and_a_long_way_are_no_obstacle() -> None:

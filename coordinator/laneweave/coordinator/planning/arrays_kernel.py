@@ -9,7 +9,7 @@ UNREACHABLE = 1e9
 """Stands for infinity, and can be added to."""
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def least_steps(valid, step, targets):
     """Return (X, P) the least steps from every cell to each target, as if it were alone."""
     displacements, cells = valid.shape

@@ -32,9 +32,10 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from laneweave.coordinator.planning.arrays import UNREACHABLE, Ints, lattice, teams
-from laneweave.coordinator.planning.branching_kernel import FULL, search
+from laneweave.coordinator.planning.branching_kernel import FULL, STUCK, search
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
 from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.grid import Grid
@@ -52,14 +53,13 @@ from laneweave.coordinator.planning.relaxation_kernel import (
     REFUTED,
 )
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
-from laneweave.coordinator.planning.rows import vehicles_share_cells
 
 _TOLERANCE = 1e-6
 _SPARE_STEPS, _MORE_STEPS = 8, 6
 """Steps with prices beyond the longest way; more when a solution may need more."""
 _ITERATIONS, _AT_A_TIME = 40, 10
 """For first prices; iterations between two looks at the clock."""
-_FIRST_STACK: Final = 64
+_FIRST_STACK: Final = 16
 _CHUNK_S = 0.005
 """How long the search goes on between two looks at the clock, about."""
 _NODES_BETWEEN = 8
@@ -68,20 +68,12 @@ _MANY_VEHICLES = 20
 """So many are not decided soon: they get a path set first."""
 _FIRST_WORK, _WORK_FOR_GAP = 200, 60
 """How much is negotiated then until there is a path set; later, the more the larger the gap is."""
-_EXPLORE_NODES, _EXPLORE_MOVES, _GROWTH = 100, 5_000, 4
+_EXPLORE_NODES, _EXPLORE_MOVES, _MOST_EXPLORE_MOVES, _GROWTH = 100, 5_000, 1_500_000, 4
 """When the joint search is tried, if there is no path set yet, and how far; then more of both."""
 _TIE_NODES = 10
 _WARM_UP_WORK = 8
-_STEPS_GUESSED, _MOST_NUMBERS = 32, 50_000_000
-"""Larger tables do not fit into memory."""
-
-
-def can_branch(problem: Problem, choices: Sequence[frozenset[int]]) -> bool:
-    """Tell whether there are rows, and their tables fit into memory."""
-    table = problem.table
-    cells = table.grid.lanes * table.grid.columns
-    numbers = cells * (sum(map(len, set(choices))) + 3 * len(set(choices)) * table.fan)
-    return not vehicles_share_cells(table.model) and numbers * _STEPS_GUESSED < _MOST_NUMBERS
+_MOST_BYTES = 1_500_000_000
+"""Larger tables are not made."""
 
 
 @cache
@@ -96,6 +88,14 @@ def warm_up() -> None:
     search_ = Branching(problem, request.choices(), Budget())
     search_.run()
     search_.negotiate(search_.relaxation(), _WARM_UP_WORK)
+
+
+def ceiling_of(cost: int) -> float:
+    """Return what no solution of a cost is above, whatever its number of moves.
+
+    Values are multiples of the price of a move, so half of it is room for rounding.
+    """
+    return cost * (1.0 + PER_MOVE) + 0.5 * PER_MOVE
 
 
 class Branching:
@@ -122,6 +122,8 @@ class Branching:
         self._look_around = _NODES_BETWEEN
         self._explore_nodes, self._explore_moves = _EXPLORE_NODES, _EXPLORE_MOVES
         self._s_per_node = 0.0
+        self._s_per_iteration = 1.0
+        self._stuck_at: int | None = None
         self._best_value = UNREACHABLE
         table = problem.table
         self._lattice = lattice(table.grid, table.mode, table.model)
@@ -142,26 +144,48 @@ class Branching:
             self.lower_bound, self.finished = math.inf, True
             return
         self._budget.check_time()
+        if not self._fits(self._longest_way() + _SPARE_STEPS, _FIRST_STACK):
+            self.gave_up = True
+            return
         whole = self.relaxation()
-        if len(self._choices) >= _MANY_VEHICLES:
-            whole.improve(2 * _AT_A_TIME)
-            self.negotiate(whole, _FIRST_WORK, stop_at_first=True)
-        for _ in range(0, _ITERATIONS, _AT_A_TIME):
-            whole.improve(_AT_A_TIME)
-            self._take_chance(whole)
-            self.lower_bound = max(self.lower_bound, whole.least_cost)
-            self._budget.check_time()
-            if self.best is not None and self.best.cost <= self.lower_bound:
+        for number in range(0, _ITERATIONS, _AT_A_TIME):
+            self._improve(whole, _AT_A_TIME)
+            if math.isinf(self.lower_bound) or self._is_proven():
                 break
+            if number == _AT_A_TIME and len(self._choices) >= _MANY_VEHICLES:
+                self.negotiate(whole, _FIRST_WORK, stop_at_first=True)
         nodes = self._stack(whole, _FIRST_STACK)
         while not self.finished and not self.gave_up:
             if math.isinf(self.lower_bound):
                 self.finished = True
-            elif self.best is not None and self.best.cost <= self.lower_bound:
+            elif self._is_proven():
                 nodes = self._break_ties(whole, nodes)
                 self.finished = True
             else:
                 nodes = self._decide(whole, nodes, int(self.lower_bound))
+
+    def _is_proven(self) -> bool:
+        return self.best is not None and self.best.cost <= self.lower_bound
+
+    def _improve(self, whole: Relaxation, iterations: int) -> None:
+        """Improve the first prices; looks at the clock between a few iterations."""
+        while iterations > 0:
+            count = max(1, min(iterations, int(_CHUNK_S / max(self._s_per_iteration, 1e-6))))
+            started = time.thread_time()
+            whole.improve(count)
+            self._s_per_iteration = (time.thread_time() - started) / count
+            iterations -= count
+            self._budget.check_time()
+        self._take_chance(whole)
+        self.lower_bound = max(self.lower_bound, whole.least_cost)
+
+    def _fits(self, steps: int, nodes: int) -> bool:
+        """Tell whether tables of so many steps and nodes fit into memory."""
+        displacements, cells = self._lattice.valid.shape
+        groups, rows = len(self._teams.pair), self._lattice.row_count
+        moves = groups * displacements * cells
+        size = 8 * cells * len(self._teams.pair_cell) + 33 * moves + 8 * rows * (groups + 12)
+        return bool(steps * (size + nodes * (moves + 8 * rows)) < _MOST_BYTES)
 
     def relaxation(self) -> Relaxation:
         """Return the problem without prices."""
@@ -171,25 +195,27 @@ class Branching:
         return stack(self._teams, whole.prices, self._lattice.valid, size)
 
     def _longest_way(self) -> int:
-        distance = self._teams.distance
-        nearest = [
-            distance[start, self._teams.pairs_from[k] : self._teams.pairs_from[k + 1]].min()
-            for start, k in zip(self._teams.start, self._teams.team, strict=True)
-        ]
-        return int(max((steps for steps in nearest if steps < UNREACHABLE), default=0))
+        """Return the steps of the longest way when targets are assigned at least cost."""
+        pairs = self._teams.pair[self._teams.team]
+        ways = np.where(
+            pairs >= 0, self._teams.distance[self._teams.start[:, None], pairs], UNREACHABLE
+        )
+        steps = ways[linear_sum_assignment(ways)]
+        return int(max(steps[steps < UNREACHABLE], default=0))
 
     def _decide(self, whole: Relaxation, nodes: Stack, cost: int) -> Stack:
         """Find a solution of a cost, or show that there is none; or have more steps priced."""
         self._budget.check_time()
-        ceiling = cost * (1.0 + PER_MOVE) + _TOLERANCE * PER_MOVE
+        ceiling = ceiling_of(cost)
         may_be = whole.put(nodes, ceiling)
         if may_be is None:
-            whole.lengthen(_MORE_STEPS)
-            return self._stack(whole, len(nodes.pace))
+            return self._lengthened(whole, nodes)
         depth, ending = 1, OPEN if may_be else REFUTED
         first = True
         while ending in (OPEN, FULL):
             if ending == FULL:
+                if not self._fits(len(whole.prices), 2 * len(nodes.pace)):
+                    break
                 nodes = _doubled(nodes)
             ending, depth = self._go_on(whole, nodes, depth, ceiling, 1 if first else None)
             if first and depth > 1:
@@ -204,9 +230,22 @@ class Branching:
         elif ending == FOUND:
             self._search_fewer_moves(whole, nodes, depth)
             self.finished = True
+        elif ending == STUCK and self._stuck_at != cost:
+            # Perhaps somebody must pass another target of its team after the last priced step.
+            self._stuck_at = cost
+            return self._lengthened(whole, nodes)
         else:
             self.gave_up = True
         return nodes
+
+    def _lengthened(self, whole: Relaxation, nodes: Stack) -> Stack:
+        """Have more steps priced; return an empty stack."""
+        more = max(_MORE_STEPS, len(whole.prices) // 2)
+        if not self._fits(len(whole.prices) + more, len(nodes.pace)):
+            self.gave_up = True
+            return nodes
+        whole.lengthen(more)
+        return self._stack(whole, len(nodes.pace))
 
     def _break_ties(self, whole: Relaxation, nodes: Stack) -> Stack:
         """Look for a solution that costs as much as the best one, with fewer moves."""
@@ -238,8 +277,9 @@ class Branching:
         chunk = max(1, int(_CHUNK_S / max(self._s_per_node, 1e-5)))
         if left < 1:
             raise BudgetSpentError
-        until_others = max(1, self._look_around - self._nodes)
-        count = min(chunk, left, until_others, chunk if most is None else most)
+        # Without a limit until others are looked for, so the same however fast the machine is.
+        most = max(1, self._look_around - self._nodes) if most is None else most
+        count = min(chunk, left, most)
         started = time.thread_time()
         ending, depth, looked_at = search(
             self._lattice, self._teams, nodes, depth, whole.scratch, whole.memory, ceiling, count
@@ -290,7 +330,7 @@ class Branching:
     def _explore(self) -> None:
         verdict = explore(self._problem, self._choices, self._budget, self._explore_moves)
         self._explore_nodes *= _GROWTH
-        self._explore_moves *= _GROWTH
+        self._explore_moves = min(self._explore_moves * _GROWTH, _MOST_EXPLORE_MOVES)
         if verdict.impossible:
             self.lower_bound, self.finished = math.inf, True
         elif verdict.solution is not None:
@@ -318,13 +358,16 @@ class Branching:
         for number, displacements in zip(self._teams.start.tolist(), way.tolist(), strict=True):
             cell = number
             path: list[int] = []
+            arrival = 0
             for d in displacements:
                 if d == PARKED:
                     break
                 then = cell + int(self._lattice.step[d])
                 path.append(table.number((divmod(cell, lanes), divmod(then, lanes))))
+                if then != cell:
+                    arrival = len(path)
                 cell = then
-            paths.append(tuple(path))
+            paths.append(tuple(path[:arrival]))
             assignment.append(self._problem.targets.index(table.bit(divmod(cell, lanes))))
         return Solution(tuple(assignment), tuple(paths))
 

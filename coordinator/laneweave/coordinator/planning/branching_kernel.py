@@ -32,7 +32,7 @@ _CELLS_COUNT = 0.5
 _PRICE_COUNTS = 10.0
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def search(lattice, teams, stack, depth, scratch, memory, ceiling, nodes):
     """Look at so many nodes of the stack, depth first.
 

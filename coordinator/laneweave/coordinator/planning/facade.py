@@ -21,6 +21,7 @@ from laneweave.coordinator.planning.preference import BoolMatrix, preference_mat
 from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse, Status
+from laneweave.coordinator.planning.rows import vehicles_share_cells
 from laneweave.coordinator.planning.tappa import Tappa
 from laneweave.coordinator.planning.validate import problems_of_response
 
@@ -129,9 +130,9 @@ def _searches(
 ) -> Iterator[Search]:
     """Yield what to search with; the next one where one gives up."""
     if solver == "branching":
-        from laneweave.coordinator.planning.branching import Branching, can_branch  # noqa: PLC0415
+        from laneweave.coordinator.planning.branching import Branching  # noqa: PLC0415
 
-        if can_branch(problem, choices):
+        if not vehicles_share_cells(problem.table.model):
             yield Branching(problem, choices, budget)
     costs, allowed = matrices(request, weights, choices, budget)
     yield Tappa(problem, assignments(costs, allowed, budget), choices, budget)

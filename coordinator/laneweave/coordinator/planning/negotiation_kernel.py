@@ -129,7 +129,7 @@ def _shuffle(items, random):
         items[i], items[j] = items[j], items[i]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def negotiate(lattice, teams, trial, passes, first_pass):
     """Do some passes of negotiation; return the number that it took, or -1: not solved yet.
 
@@ -179,7 +179,7 @@ def _find_way(lattice, teams, trial, i):
     )
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def improve_ways(lattice, teams, trial, attempts, most):
     """Take a few vehicles out, let them negotiate, and keep what is not worse; so many times.
 

@@ -33,7 +33,7 @@ _FADING = 0.92
 """Weight of a relaxed solution, relative to the next one."""
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def list_moves(lattice, allowed, scratch):
     """List the allowed moves of every step; return their number and the steps there are any in."""
     teams, steps, displacements, cells = allowed.shape
@@ -55,7 +55,7 @@ def list_moves(lattice, allowed, scratch):
     return count, span
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def start_over(prices, span, scratch, memory):
     """Begin to improve prices; there are none where nobody can move any more."""
     prices[span:] = 0.0
@@ -65,7 +65,7 @@ def start_over(prices, span, scratch, memory):
     memory[BOUND], memory[STALE], memory[WEIGHT], memory[WEIGHTS] = -UNREACHABLE, 0.0, 1.0, 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def improve(lattice, teams, allowed, first, prices, span, scratch, memory, count, ceiling, goal):
     """Go on with a subgradient method, until the ceiling is passed or a solution below it is found.
 
@@ -110,7 +110,7 @@ def improve(lattice, teams, allowed, first, prices, span, scratch, memory, count
     return OPEN
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def evaluate(lattice, teams, first, prices, span, scratch):
     """Return the bound at some prices; fills in costs to go and the assignment."""
     _look_back(lattice, teams, first, prices, span, scratch)
@@ -316,7 +316,7 @@ def _excess(prices, use, span):
     return clash, square
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def forbid_dear(lattice, teams, allowed, first, prices, span, scratch, ceiling):
     """Forbid what no solution below the ceiling contains.
 
@@ -366,7 +366,7 @@ def forbid_dear(lattice, teams, allowed, first, prices, span, scratch, ceiling):
     return bound, kept
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def may_be_late(teams, steps, scratch, budget):
     """Tell whether some vehicle may be away from its targets after all steps, within a budget."""
     reach = scratch.reach
