@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from laneweave.coordinator.planning.relaxation_kernel import PARKED, PER_MOVE
+from laneweave.coordinator.planning.relaxation_kernel import PARKED, PER_MOVE, price_of
 
 NOT_IN_TIME = 1_000_000
 """Cost of a vehicle that does not arrive within the horizon, and price of what is taken."""
@@ -44,7 +44,7 @@ def _cheapest_way(lattice, weight, distance, start, target, to_go, parked, way):
     lanes = lattice.lanes
     column = start // lanes
     for t in range(steps - 1, -1, -1):
-        parked[t] = parked[t + 1] + _weight(row, weight, t, 0, target)
+        parked[t] = parked[t + 1] + price_of(row, weight, t, 0, target)
         # Nobody gets further than one column a step.
         for cell in range(max(0, column - t) * lanes, min(cells, (column + t + 1) * lanes)):
             best = np.inf
@@ -70,7 +70,7 @@ def _cheapest_way(lattice, weight, distance, start, target, to_go, parked, way):
         best, choice = np.inf, 0
         for d in range(displacements):
             if valid[d, cell]:
-                total = 1.0 + _weight(row, weight, t, d, cell) + to_go[t + 1, cell + step[d]]
+                total = 1.0 + price_of(row, weight, t, d, cell) + to_go[t + 1, cell + step[d]]
                 if d != 0:
                     total += PER_MOVE
                 if total < best:
@@ -78,17 +78,6 @@ def _cheapest_way(lattice, weight, distance, start, target, to_go, parked, way):
         way[t] = choice
         cell += step[choice]
     return steps if cell == target else NOT_IN_TIME
-
-
-@njit(cache=True)
-def _weight(row, weight, t, d, cell):
-    total = 0.0
-    for m in range(row.shape[2]):
-        r = row[d, cell, m]
-        if r < 0:
-            break
-        total += weight[t, r]
-    return total
 
 
 @njit(cache=True)

@@ -155,7 +155,7 @@ def _look_back(lattice, teams, first, prices, span, scratch):
             )
         for p in range(len(cell_of)):
             cell = cell_of[p]
-            stay = parked[t + 1, p] + _price(row, prices, t, 0, cell)
+            stay = parked[t + 1, p] + price_of(row, prices, t, 0, cell)
             parked[t, p] = stay
             if t >= first[p] and stay <= to_go[t, cell, p]:
                 to_go[t, cell, p] = stay
@@ -183,8 +183,8 @@ def _step_back(move, move_price, begin, end, first_pair, end_pair, row, prices, 
 
 
 @njit(cache=True)
-def _price(row, prices, t, d, cell):
-    """Return what a move pays in a step."""
+def price_of(row, prices, t, d, cell):
+    """Return the sum of the prices of the rows that a move is in."""
     total = 0.0
     for m in range(row.shape[2]):
         r = row[d, cell, m]
@@ -278,7 +278,7 @@ def _walk(lattice, teams, allowed, first, prices, span, scratch, memory):
                 least = np.inf
                 for e in range(len(step)):
                     if allowed[k, t, e, cell]:
-                        total = _price(row, prices, t, e, cell) + to_go[t + 1, cell + step[e], p]
+                        total = price_of(row, prices, t, e, cell) + to_go[t + 1, cell + step[e], p]
                         if e != 0:
                             total += PER_MOVE
                         if total < least - 1e-12:
