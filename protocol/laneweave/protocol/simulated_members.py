@@ -16,6 +16,7 @@ from laneweave.protocol.transport import (
     Received,
     TokenDown,
     TokenUp,
+    learn,
 )
 
 WAKE_AGAIN_S = 0.001
@@ -67,7 +68,7 @@ class Member:
         """Hand over what was sent to it while it had this connection."""
         if not self.connected or self.connection != connection:
             return
-        if not isinstance(delivery, (TokenUp, TokenDown)) or self._learn(delivery):
+        if not isinstance(delivery, (TokenUp, TokenDown)) or learn(self.seen, delivery):
             self.hand_over(delivery)
 
     def hand_over(self, item: Item) -> None:
@@ -93,15 +94,6 @@ class Member:
             self.node.deliver(item, local_s)
         else:
             self.node.dispatch(item, local_s)
-
-    def _learn(self, news: TokenUp | TokenDown) -> bool:
-        """Remember what it is shown; false when that is nothing new."""
-        known = news.key in self.seen
-        if isinstance(news, TokenUp):
-            self.seen[news.key] = None
-            return not known
-        self.seen.pop(news.key, None)
-        return known
 
     # --- its time ---------------------------------------------------------------------------
 

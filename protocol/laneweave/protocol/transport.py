@@ -59,6 +59,16 @@ class Question:
     token: int
 
 
+def learn(seen: dict[str, None], news: TokenUp | TokenDown) -> bool:
+    """Note in the keys that are seen what became of a token; false when that is nothing new."""
+    known = news.key in seen
+    if isinstance(news, TokenUp):
+        seen[news.key] = None
+        return not known
+    seen.pop(news.key, None)
+    return known
+
+
 Delivery = Received | TokenUp | TokenDown | LinkUp | LinkDown | Question
 Deliver = Callable[[Delivery], None]
 

@@ -42,6 +42,7 @@ from laneweave.protocol.transport import (
     Received,
     TokenDown,
     TokenUp,
+    learn,
 )
 
 log = structlog.get_logger(__name__)
@@ -133,7 +134,7 @@ class ZenohTransport:
         self._subscriptions: dict[str, Any] = {}
         self._tokens: dict[str, Any] = {}
         self._watched: dict[str, Any] = {}
-        self._seen: set[str] = set()
+        self._seen: dict[str, None] = {}
         """Keys of the tokens that were last delivered as being there."""
         self._seen_lock = threading.Lock()
         self._served: dict[str, Any] = {}
@@ -210,16 +211,11 @@ class ZenohTransport:
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         # A session's own token comes from itself and, at times, again from the router.
-        key, is_there = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
+        kind = TokenUp if sample.kind == zenoh.SampleKind.PUT else TokenDown
+        news = kind(str(sample.key_expr))
         with self._seen_lock:
-            if is_there == (key in self._seen):
-                return
-            if is_there:
-                self._seen.add(key)
-                self._deliver(TokenUp(key))
-            else:
-                self._seen.discard(key)
-                self._deliver(TokenDown(key))
+            if learn(self._seen, news):
+                self._deliver(news)
 
     def _on_link(self, event: zenoh.TransportEvent) -> None:
         self._deliver(LinkUp() if event.kind == zenoh.SampleKind.PUT else LinkDown())

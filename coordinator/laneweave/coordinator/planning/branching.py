@@ -29,7 +29,6 @@ import time
 from collections.abc import Sequence
 from functools import cache
 from itertools import pairwise
-from typing import Final
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -54,12 +53,11 @@ from laneweave.coordinator.planning.relaxation_kernel import (
 )
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 
-_TOLERANCE = 1e-6
 _SPARE_STEPS, _MORE_STEPS = 8, 6
 """Steps with prices beyond the longest way; more when a solution may need more."""
 _ITERATIONS, _AT_A_TIME = 40, 10
 """For first prices; iterations between two looks at the clock."""
-_FIRST_STACK: Final = 16
+_FIRST_STACK = 16
 _CHUNK_S = 0.005
 """How long the search goes on between two looks at the clock, about."""
 _NODES_BETWEEN = 8
@@ -87,7 +85,7 @@ def warm_up() -> None:
     problem = Problem(request.grid, request.mode, model, starts, request.targets)
     search_ = Branching(problem, request.choices(), Budget())
     search_.run()
-    search_.negotiate(search_.relaxation(), _WARM_UP_WORK)
+    search_.negotiate(search_.relaxation(_SPARE_STEPS), _WARM_UP_WORK)
 
 
 def ceiling_of(cost: int) -> float:
@@ -112,7 +110,7 @@ class Branching:
         self.finished = False
         self.tried = 0
         self.gave_up = False
-        """It is stuck; see `branching_kernel.STUCK`."""
+        """It is stuck (`branching_kernel.STUCK`), or its tables would get too large."""
         self.best: Solution | None = None
         self._negotiation: Negotiation | None = None
         self._problem = problem
@@ -144,10 +142,11 @@ class Branching:
             self.lower_bound, self.finished = math.inf, True
             return
         self._budget.check_time()
-        if not self._fits(self._longest_way() + _SPARE_STEPS, _FIRST_STACK):
+        steps = self._longest_way() + _SPARE_STEPS
+        if not self._fits(steps, _FIRST_STACK):
             self.gave_up = True
             return
-        whole = self.relaxation()
+        whole = self.relaxation(steps)
         for number in range(0, _ITERATIONS, _AT_A_TIME):
             self._improve(whole, _AT_A_TIME)
             if math.isinf(self.lower_bound) or self._is_proven():
@@ -187,9 +186,9 @@ class Branching:
         size = 8 * cells * len(self._teams.pair_cell) + 33 * moves + 8 * rows * (groups + 12)
         return bool(steps * (size + nodes * (moves + 8 * rows)) < _MOST_BYTES)
 
-    def relaxation(self) -> Relaxation:
+    def relaxation(self, steps: int) -> Relaxation:
         """Return the problem without prices."""
-        return Relaxation(self._lattice, self._teams, self._longest_way() + _SPARE_STEPS)
+        return Relaxation(self._lattice, self._teams, steps)
 
     def _stack(self, whole: Relaxation, size: int) -> Stack:
         return stack(self._teams, whole.prices, self._lattice.valid, size)
@@ -294,7 +293,7 @@ class Branching:
 
     def _take_chance(self, whole: Relaxation) -> None:
         """Keep the best of the relaxed solutions that happened to be free of conflicts."""
-        if whole.memory[BEST] < self._best_value - _TOLERANCE * PER_MOVE:
+        if whole.memory[BEST] < self._best_value - 0.5 * PER_MOVE:
             self._prefer(self._solution(whole.scratch.best_way))
 
     def _look_for_others(self, whole: Relaxation) -> None:

@@ -115,10 +115,9 @@ class Negotiation:
         """Do a little; return whether there is a better path set now."""
         if self._settled:
             return self._improve()
-        ended = negotiate(self._lattice, self._teams, self._trial, 1, self._passes)
+        self._settled = negotiate(self._lattice, self._teams, self._trial, self._passes)
         self._passes += 1
-        if ended >= 0:
-            self._settled = True
+        if self._settled:
             self._shorten()
             return self._keep()
         if self._passes >= _PASSES:

@@ -119,38 +119,34 @@ def _shuffle(items, random):
 
 
 @njit(cache=True, nogil=True)
-def negotiate(lattice, teams, trial, passes, first_pass):
-    """Do some passes of negotiation; return the number that it took, or -1: not solved yet.
+def negotiate(lattice, teams, trial, number):
+    """Do one pass of negotiation, counted from 0; return whether it is settled.
 
-    In a pass all vehicles on contested rows look for other ways, one after the other.
+    All vehicles on contested rows look for other ways, one after the other.
     """
     use, memory, weight = trial.use, trial.memory, trial.weight
     steps, rows = use.shape
-    vehicles = len(teams.start)
-    order = np.arange(vehicles)
-    for number in range(first_pass, first_pass + passes):
-        price = min(_FIRST_PRICE * _GROWTH**number, _HIGHEST_PRICE)
-        _shuffle(order, trial.random)
-        for i in order:
-            if number > 0:
-                late = trial.cost[i] >= NOT_IN_TIME
-                if not late and not _is_contested(lattice, teams.start[i], trial.way[i], use):
-                    continue
-                _add(lattice, teams.start[i], trial.way[i], use, -1.0)
-            for t in range(steps):
-                for row in range(rows):
-                    weight[t, row] = memory[t, row] + price * use[t, row]
-            _find_way(lattice, teams, trial, i)
-            _add(lattice, teams.start[i], trial.way[i], use, 1.0)
-        solved = True
+    price = min(_FIRST_PRICE * _GROWTH**number, _HIGHEST_PRICE)
+    order = np.arange(len(teams.start))
+    _shuffle(order, trial.random)
+    for i in order:
+        if number > 0:
+            late = trial.cost[i] >= NOT_IN_TIME
+            if not late and not _is_contested(lattice, teams.start[i], trial.way[i], use):
+                continue
+            _add(lattice, teams.start[i], trial.way[i], use, -1.0)
         for t in range(steps):
             for row in range(rows):
-                if use[t, row] > 1.5:
-                    solved = False
-                    memory[t, row] += _MEMORY * (use[t, row] - 1.0)
-        if solved and trial.cost.max() < NOT_IN_TIME:
-            return number + 1
-    return -1
+                weight[t, row] = memory[t, row] + price * use[t, row]
+        _find_way(lattice, teams, trial, i)
+        _add(lattice, teams.start[i], trial.way[i], use, 1.0)
+    settled = trial.cost.max() < NOT_IN_TIME
+    for t in range(steps):
+        for row in range(rows):
+            if use[t, row] > 1.5:
+                settled = False
+                memory[t, row] += _MEMORY * (use[t, row] - 1.0)
+    return settled
 
 
 @njit(cache=True)
