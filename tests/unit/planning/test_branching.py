@@ -68,6 +68,24 @@ def test_the_cost_does_not_depend_on_the_point_of_view(seed: int, size: int, mod
     assert solved(evolve(request, vehicles=request.vehicles[::-1])).cost == cost
 
 
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10_000), st.integers(2, 8), st.sampled_from((1, 2)), st.data())
+def test_a_blocked_cell_never_lowers_the_cost(
+    seed: int, size: int, mode: int, data: st.DataObject
+) -> None:
+    request = formation_request(seed, vehicles=size, mode=1 if mode == 1 else 2)
+    grid = request.grid
+    used = {*request.targets, *(vehicle.cell for vehicle in request.vehicles)}
+    cells = ((c, lane) for c in range(grid.columns) for lane in range(grid.lanes))
+    blocked = data.draw(st.sampled_from([cell for cell in cells if cell not in used]))
+    narrower = evolve(request, grid=Grid(grid.columns, grid.lanes, [blocked]))
+    before, after = solved(request), solved(narrower)
+    assert before.cost is not None
+    if after.status != "infeasible":
+        assert after.cost is not None
+        assert after.cost >= before.cost
+
+
 def test_equal_requests_get_equal_plans() -> None:
     request = formation_request(5, vehicles=9)
     first, second = solved(request), solved(request)
