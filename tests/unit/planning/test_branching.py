@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, plan, problems_of_response
-from laneweave.coordinator.planning.branching import ceiling_of
 from laneweave.coordinator.planning.grid import Cell, Grid
 from laneweave.coordinator.planning.instances import formation_request
+from laneweave.coordinator.planning.relaxation import ceiling_of
 from laneweave.coordinator.planning.relaxation_kernel import PER_MOVE
 from laneweave.coordinator.planning.request import VehicleRequest
 from unit.planning.planning_oracles import requests

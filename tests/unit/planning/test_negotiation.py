@@ -1,5 +1,6 @@
 """Path sets by negotiation: legal, the same each time, and better with more work."""
 
+import numpy as np
 import pytest
 
 from laneweave.coordinator.planning import PlanRequest, plan, problems_of_response
@@ -8,8 +9,16 @@ from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.grid import Mode
 from laneweave.coordinator.planning.instances import formation_request
 from laneweave.coordinator.planning.negotiation import Negotiation
+from laneweave.coordinator.planning.negotiation_kernel import negotiate
 from laneweave.coordinator.planning.relaxation import Relaxation
 from laneweave.coordinator.planning.relaxation_kernel import PARKED
+from laneweave.coordinator.planning.repair import Repair
+from laneweave.coordinator.planning.repair_kernel import put_back
+from laneweave.coordinator.planning.trial import trial
+
+
+def no_limit() -> None:
+    """Let it take its time."""
 
 
 def arrays_of(request: PlanRequest) -> tuple[Lattice, Teams]:
@@ -44,7 +53,7 @@ def test_it_settles_and_no_row_is_used_twice(vehicles: int, mode: Mode) -> None:
     request = formation_request(3, vehicles=vehicles, mode=mode)
     negotiation = negotiation_of(request)
     for _ in range(2_000):
-        if negotiation.work():
+        if negotiation.work(no_limit):
             break
     assert negotiation.cost == (negotiation.way != PARKED).sum()
     assert max(uses_of_rows(request, negotiation).values()) == 1
@@ -55,7 +64,7 @@ def test_more_work_makes_it_cheaper_and_never_dearer() -> None:
     negotiation = negotiation_of(request)
     costs = []
     for _ in range(400):
-        negotiation.work()
+        negotiation.work(no_limit)
         if negotiation.cost is not None:
             costs.append(negotiation.cost)
     assert costs == sorted(costs, reverse=True)
@@ -67,8 +76,39 @@ def test_equal_work_gives_equal_ways() -> None:
     request = formation_request(5, vehicles=12)
     a, b = negotiation_of(request), negotiation_of(request)
     for _ in range(100):
-        assert a.work() == b.work()
+        assert a.work(no_limit) == b.work(no_limit)
     assert a.way.tolist() == b.way.tolist()
+
+
+@pytest.mark.parametrize("mode", [1, 2])
+def test_vehicles_that_are_planned_anew_end_legally_and_cheaper(mode: Mode) -> None:
+    request = formation_request(2, vehicles=24, mode=mode)
+    ways, vehicles = arrays_of(request)
+    whole = Relaxation(ways, vehicles, 24)
+    whole.improve(20)
+    target = whole.assignment()
+    settled = trial(ways, np.full((24, 48), PARKED), target, np.zeros((48, ways.row_count)))
+    for number in range(2_000):
+        if negotiate(ways, vehicles, settled, number):
+            break
+    repair = Repair(ways, vehicles, whole.prices)
+    costs = [int(settled.cost.sum())]
+    for _ in range(120):
+        better = repair.attempt(settled, no_limit)
+        costs.append(int(settled.cost.sum()))
+        assert better == (costs[-1] < costs[-2])
+        assert costs[-1] == np.count_nonzero(settled.way != PARKED)
+    assert costs[-1] < 0.9 * costs[0]
+    uses = settled.use.copy()
+    settled.use[:] = 0.0
+    put_back(ways, vehicles, settled, np.arange(24))
+    assert np.array_equal(uses, settled.use)
+    assert uses.max() == 1.0
+    held = vehicles.target[settled.target]
+    assert len(set(settled.target.tolist())) == 24
+    for i, (start, way) in enumerate(zip(vehicles.start, settled.way, strict=True)):
+        assert start + ways.step[np.maximum(way, 0)].sum() == held[i]
+        assert vehicles.pair[vehicles.team[i], settled.target[i]] >= 0
 
 
 @pytest.mark.parametrize("mode", [1, 2])

@@ -23,7 +23,7 @@ Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-__all__ = ["UNREACHABLE", "Bools", "Floats", "Ints", "Lattice", "Teams", "lattice", "teams"]
+__all__ = ["UNREACHABLE", "Bools", "Floats", "Ints", "Lattice", "Teams", "lattice", "part", "teams"]
 
 
 class Lattice(NamedTuple):
@@ -143,3 +143,29 @@ def teams(
 
 def _cells(cells: Sequence[Cell], ways: Lattice) -> Ints:
     return np.array([column * ways.lanes + lane for column, lane in cells], dtype=np.int64)
+
+
+def part(whole: Teams, vehicles: Ints, targets: Ints) -> Teams:
+    """Return some vehicles (n,) and the targets (m,) that they may share; all must be at one.
+
+    Beyond the steps with prices there is no way to a target any more: `distance` is 0 there, and
+    elsewhere `UNREACHABLE`.
+    """
+    numbers = np.unique(whole.team[vehicles])
+    pair = np.full((len(numbers), len(targets)), -1, dtype=np.int64)
+    may = whole.pair[numbers][:, targets] >= 0
+    pair[may] = np.arange(np.count_nonzero(may))
+    _, pair_target = np.nonzero(may)
+    cell = whole.target[targets]
+    distance = np.full((len(whole.distance), len(pair_target)), UNREACHABLE)
+    distance[cell[pair_target], np.arange(len(pair_target))] = 0.0
+    return Teams(
+        start=whole.start[vehicles],
+        team=np.searchsorted(numbers, whole.team[vehicles]).astype(np.int64),
+        target=cell,
+        pairs_from=np.concatenate([[0], np.cumsum(may.sum(axis=1))]).astype(np.int64),
+        pair_target=pair_target.astype(np.int64),
+        pair_cell=cell[pair_target],
+        pair=pair,
+        distance=distance,
+    )

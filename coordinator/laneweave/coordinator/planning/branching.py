@@ -42,7 +42,7 @@ from laneweave.coordinator.planning.incumbent import Solution, tidied
 from laneweave.coordinator.planning.negotiation import Negotiation
 from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.reachability import explore
-from laneweave.coordinator.planning.relaxation import Relaxation, Stack, stack
+from laneweave.coordinator.planning.relaxation import Relaxation, Stack, ceiling_of, stack
 from laneweave.coordinator.planning.relaxation_kernel import (
     BEST,
     FOUND,
@@ -51,7 +51,9 @@ from laneweave.coordinator.planning.relaxation_kernel import (
     PER_MOVE,
     REFUTED,
 )
+from laneweave.coordinator.planning.repair import Repair
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
+from laneweave.coordinator.planning.trial import trial
 
 _SPARE_STEPS, _MORE_STEPS = 8, 6
 """Steps with prices beyond the longest way; more when a solution may need more."""
@@ -64,7 +66,7 @@ _NODES_BETWEEN = 8
 """Nodes between two looks for path sets by other means."""
 _MANY_VEHICLES = 20
 """So many are not decided soon: they get a path set first."""
-_FIRST_WORK, _WORK_FOR_GAP = 200, 60
+_FIRST_WORK, _WORK_FOR_GAP = 200, 100
 """How much is negotiated then until there is a path set; later, the more the larger the gap is."""
 _EXPLORE_NODES, _EXPLORE_MOVES, _MOST_EXPLORE_MOVES, _GROWTH = 100, 5_000, 1_500_000, 4
 """When the joint search is tried, if there is no path set yet, and how far; then more of both."""
@@ -86,14 +88,7 @@ def warm_up() -> None:
     search_ = Branching(problem, request.choices(), Budget())
     search_.run()
     search_.negotiate(search_.relaxation(_SPARE_STEPS), _WARM_UP_WORK)
-
-
-def ceiling_of(cost: int) -> float:
-    """Return what no solution of a cost is above, whatever its number of moves.
-
-    Values are multiples of the price of a move, so half of it is room for rounding.
-    """
-    return cost * (1.0 + PER_MOVE) + 0.5 * PER_MOVE
+    search_.repair_once()
 
 
 class Branching:
@@ -320,11 +315,17 @@ class Branching:
                 self._lattice, self._teams, whole.prices, whole.assignment()
             )
         for _ in range(work):
-            self._budget.check_time()
-            if self._negotiation.work():
+            if self._negotiation.work(self._budget.check_time):
                 self._prefer(self._solution(self._negotiation.way))
                 if stop_at_first:
                     return
+
+    def repair_once(self) -> None:
+        """Plan the vehicles anew around nobody, in vain: for `warm_up`."""
+        whole = self.relaxation(_SPARE_STEPS)
+        nowhere = np.full((len(self._choices), _SPARE_STEPS), PARKED, dtype=np.int64)
+        parked = trial(self._lattice, nowhere, whole.assignment(), np.zeros_like(whole.prices))
+        Repair(self._lattice, self._teams, whole.prices).attempt(parked, self._budget.check_time)
 
     def _explore(self) -> None:
         verdict = explore(self._problem, self._choices, self._budget, self._explore_moves)

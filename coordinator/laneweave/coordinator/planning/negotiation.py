@@ -12,49 +12,28 @@ vain for long, all begins anew.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from laneweave.coordinator.planning.arrays import Floats, Ints, Lattice, Teams
 from laneweave.coordinator.planning.negotiation_kernel import improve_ways, negotiate
 from laneweave.coordinator.planning.relaxation_kernel import PARKED
+from laneweave.coordinator.planning.repair import Repair
+from laneweave.coordinator.planning.trial import trial
 
 _STRETCH, _MORE_STRETCH, _MOST_STRETCH = 2.0, 1.25, 10.0
 """The horizon, relative to the steps with prices, and how it grows if it was too short."""
 _PASSES = 300
 _SPARE_STEPS = 4
-_PER_ATTEMPT = 4
+_ATTEMPTS = 4
 """Attempts to improve that count as a pass."""
 _MOST_OUT = (6, 12)
 """Vehicles that are taken out at most, by turns."""
-_IDLE_ATTEMPTS = 800
-
-
-class Trial(NamedTuple):
-    """What the compiled code works on. Shapes: N vehicles, T steps, R rows, X cells."""
-
-    way: Ints
-    """(N, T) displacements; `PARKED`: arrived."""
-    cost: Ints
-    """(N,)"""
-    target: Ints
-    """(N,) number of the target of each vehicle."""
-    use: Floats
-    """(T, R)"""
-    own: Floats
-    """(T, R) uses by those who are taken out."""
-    memory: Floats
-    """(T, R) what a row costs because it was contested."""
-    weight: Floats
-    """(T, R) what a row costs now."""
-    to_go: Floats
-    """(T + 1, X)"""
-    parked: Floats
-    """(T + 1,)"""
-    random: NDArray[np.uint64]
-    """(1,) state of the random numbers."""
+_EXACT_AFTER = 60
+"""After so many attempts in vain exact ones begin."""
+_IDLE_ATTEMPTS, _IDLE_REPAIRS = 800, 50
+"""After so many attempts in vain, or so many exact ones, all begins anew."""
 
 
 class Negotiation:
@@ -79,6 +58,7 @@ class Negotiation:
         self._teams = teams
         self._prices = prices
         self._target = target
+        self._repair = Repair(lattice, teams, prices)
         self._rounds = 0
         self._stretch = _STRETCH
         self._begin()
@@ -89,32 +69,21 @@ class Negotiation:
         memory = np.zeros((steps, self._prices.shape[1]))
         memory[: len(self._prices)] = self._prices
         way = np.full((len(self._target), steps), PARKED, dtype=np.int64)
-        self._trial = self._with(way, self._target.copy(), memory)
+        self._trial = trial(self._lattice, way, self._target.copy(), memory)
         self._trial.random[0] = self._rounds
         self._rounds += 1
-        self._passes, self._idle = 0, 0
+        self._passes, self._idle, self._idle_repairs = 0, 0, 0
         self._settled = False
+        self._repair.begin()
 
-    def _with(self, way: Ints, target: Ints, memory: Floats) -> Trial:
-        steps = way.shape[1]
-        shape = memory.shape
-        return Trial(
-            way=way,
-            cost=np.count_nonzero(way != PARKED, axis=1).astype(np.int64),
-            target=target,
-            use=np.zeros(shape),
-            own=np.zeros(shape),
-            memory=memory,
-            weight=np.zeros(shape),
-            to_go=np.zeros((steps + 1, self._lattice.valid.shape[1])),
-            parked=np.zeros(steps + 1),
-            random=np.zeros(1, dtype=np.uint64),
-        )
+    def work(self, check_time: Callable[[], None]) -> bool:
+        """Do a little; return whether there is a better path set now.
 
-    def work(self) -> bool:
-        """Do a little; return whether there is a better path set now."""
+        `check_time` may raise an error to end all work.
+        """
+        check_time()
         if self._settled:
-            return self._improve()
+            return self._improve(check_time)
         self._settled = negotiate(self._lattice, self._teams, self._trial, self._passes)
         self._passes += 1
         if self._settled:
@@ -125,14 +94,19 @@ class Negotiation:
             self._begin()
         return False
 
-    def _improve(self) -> bool:
+    def _improve(self, check_time: Callable[[], None]) -> bool:
+        before = self._trial.cost.sum()
         most = _MOST_OUT[self._idle // 100 % len(_MOST_OUT)]
-        idle = improve_ways(self._lattice, self._teams, self._trial, _PER_ATTEMPT, most)
-        self._idle = self._idle + idle if idle >= _PER_ATTEMPT else idle
+        idle = improve_ways(self._lattice, self._teams, self._trial, _ATTEMPTS, most)
+        self._idle = self._idle + idle if idle >= _ATTEMPTS else idle
+        if self._idle >= _EXACT_AFTER and self._repair.fits(self._trial):
+            self._idle_repairs += 1
+            self._repair.attempt(self._trial, check_time)
         better = self._keep()
-        if better:
+        if self._trial.cost.sum() < before:
+            self._idle_repairs = 0
             self._shorten()
-        if self._idle > _IDLE_ATTEMPTS:
+        if self._idle > _IDLE_ATTEMPTS or self._idle_repairs > _IDLE_REPAIRS:
             self._begin()
         return better
 
@@ -149,7 +123,7 @@ class Negotiation:
         steps = int(old.cost.max()) + _SPARE_STEPS
         if steps < old.way.shape[1]:
             way = np.ascontiguousarray(old.way[:, :steps])
-            new = self._with(way, old.target, np.zeros((steps, old.use.shape[1])))
+            new = trial(self._lattice, way, old.target, np.zeros((steps, old.use.shape[1])))
             new.use[:] = old.use[:steps]
             new.random[:] = old.random
             self._trial = new

@@ -24,7 +24,7 @@ _SWAP_SHARE = 60
 
 
 @njit(cache=True)
-def _random(state, below):
+def random_below(state, below):
     """Return a number from 0 to `below` - 1 (a linear congruential generator)."""
     state[0] = state[0] * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
     return np.int64((state[0] >> np.uint64(33)) % np.uint64(below))
@@ -81,7 +81,7 @@ def _cheapest_way(lattice, weight, distance, start, target, to_go, parked, way):
 
 
 @njit(cache=True)
-def _add(lattice, start, way, use, times):
+def add_uses(lattice, start, way, use, times):
     """Count the rows that a vehicle uses, or take them back."""
     row, step = lattice.row, lattice.step
     cell = start
@@ -114,7 +114,7 @@ def _is_contested(lattice, start, way, use):
 @njit(cache=True)
 def _shuffle(items, random):
     for i in range(len(items) - 1, 0, -1):
-        j = _random(random, i + 1)
+        j = random_below(random, i + 1)
         items[i], items[j] = items[j], items[i]
 
 
@@ -134,12 +134,12 @@ def negotiate(lattice, teams, trial, number):
             late = trial.cost[i] >= NOT_IN_TIME
             if not late and not _is_contested(lattice, teams.start[i], trial.way[i], use):
                 continue
-            _add(lattice, teams.start[i], trial.way[i], use, -1.0)
+            add_uses(lattice, teams.start[i], trial.way[i], use, -1.0)
         for t in range(steps):
             for row in range(rows):
                 weight[t, row] = memory[t, row] + price * use[t, row]
         _find_way(lattice, teams, trial, i)
-        _add(lattice, teams.start[i], trial.way[i], use, 1.0)
+        add_uses(lattice, teams.start[i], trial.way[i], use, 1.0)
     settled = trial.cost.max() < NOT_IN_TIME
     for t in range(steps):
         for row in range(rows):
@@ -178,13 +178,13 @@ def improve_ways(lattice, teams, trial, attempts, most):
     idle = 0
     for _ in range(attempts):
         idle += 1
-        size = min(2 + _random(trial.random, most - 1), vehicles)
-        seed = _random(trial.random, vehicles)
+        size = min(2 + random_below(trial.random, most - 1), vehicles)
+        seed = random_below(trial.random, vehicles)
         middle = start[seed] + teams.target[target[seed]]
         for i in range(vehicles):
             delay = cost[i] - teams.distance[start[i], pair[team[i], target[i]]]
             away = 0.5 * abs(start[i] + teams.target[target[i]] - middle)
-            chance = _NEARNESS * _random(trial.random, 1000) / 1000.0
+            chance = _NEARNESS * random_below(trial.random, 1000) / 1000.0
             score[i] = away + chance - _DELAY_COUNTS * delay
         score[seed] = -np.inf
         chosen = np.argsort(score)[:size]
@@ -192,10 +192,10 @@ def improve_ways(lattice, teams, trial, attempts, most):
         for i in chosen:
             before += cost[i]
             old_way[i], old_cost[i], old_target[i] = way[i], cost[i], target[i]
-            _add(lattice, start[i], way[i], use, -1.0)
-        if _random(trial.random, 100) < _SWAP_SHARE:
+            add_uses(lattice, start[i], way[i], use, -1.0)
+        if random_below(trial.random, 100) < _SWAP_SHARE:
             for i in chosen:
-                j = chosen[_random(trial.random, size)]
+                j = chosen[random_below(trial.random, size)]
                 if pair[team[i], target[j]] >= 0 and pair[team[j], target[i]] >= 0:
                     target[i], target[j] = target[j], target[i]
         least = 0.0
@@ -207,7 +207,7 @@ def improve_ways(lattice, teams, trial, attempts, most):
             if not solved:
                 way[i], cost[i], target[i] = old_way[i], old_cost[i], old_target[i]
             after += cost[i]
-            _add(lattice, start[i], way[i], use, 1.0)
+            add_uses(lattice, start[i], way[i], use, 1.0)
         if after < before:
             idle = 0
     return idle
@@ -229,7 +229,7 @@ def _negotiate_among(lattice, teams, trial, chosen, most):
             if number > 0:
                 if not _is_contested(lattice, start[i], way[i], own):
                     continue
-                _add(lattice, start[i], way[i], own, -1.0)
+                add_uses(lattice, start[i], way[i], own, -1.0)
             for t in range(steps):
                 for row in range(rows):
                     taken = NOT_IN_TIME * use[t, row]
@@ -237,7 +237,7 @@ def _negotiate_among(lattice, teams, trial, chosen, most):
             _find_way(lattice, teams, trial, i)
             if trial.to_go[0, start[i]] >= NOT_IN_TIME:
                 return False
-            _add(lattice, start[i], way[i], own, 1.0)
+            add_uses(lattice, start[i], way[i], own, 1.0)
         total = 0
         for i in chosen:
             total += cost[i]

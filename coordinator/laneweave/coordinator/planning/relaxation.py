@@ -29,6 +29,7 @@ from laneweave.coordinator.planning.relaxation_kernel import (
     PER_MOVE,
     evaluate,
     forbid_dear,
+    forbid_taken,
     improve,
     list_moves,
     may_be_late,
@@ -132,6 +133,14 @@ def stack(teams: Teams, prices: Floats, valid: Bools, size: int) -> Stack:
     )
 
 
+def ceiling_of(cost: int) -> float:
+    """Return what no solution of a cost is above, whatever its number of moves.
+
+    Values are multiples of the price of a move, so half of it is room for rounding.
+    """
+    return cost * (1.0 + PER_MOVE) + 0.5 * PER_MOVE
+
+
 class Relaxation:
     """The whole problem at its best prices so far.
 
@@ -139,10 +148,20 @@ class Relaxation:
     bound: at least what every solution costs; `UNREACHABLE`: there is none.
     """
 
-    def __init__(self, lattice: Lattice, teams: Teams, steps: int) -> None:
-        """Begin without prices."""
+    def __init__(
+        self, lattice: Lattice, teams: Teams, steps: int, taken: Bools | None = None
+    ) -> None:
+        """Begin without prices.
+
+        Args:
+            lattice: the moves.
+            teams: the vehicles.
+            steps: in which rows have prices.
+            taken: (steps, R) rows that may not be used.
+        """
         self.lattice = lattice
         self.teams = teams
+        self._taken = np.zeros((steps, lattice.row_count), np.bool_) if taken is None else taken
         self.memory = np.zeros(BEST + 1)
         self.memory[BOUND], self.memory[PACE], self.memory[BEST] = -UNREACHABLE, 1.0, UNREACHABLE
         self._lay_out(np.zeros((steps, lattice.row_count)))
@@ -154,6 +173,7 @@ class Relaxation:
         self.allowed = np.empty(shape, dtype=np.bool_)
         self.allowed[:] = self.lattice.valid
         self.first = np.zeros(len(self.teams.pair_cell), dtype=np.int64)
+        forbid_taken(self.lattice, self.teams, self._taken, self.allowed, self.first)
         # Where nobody can get in time, nobody moves.
         self._list()
         self._forbid(self.allowed, self.first, self.prices, UNREACHABLE)
@@ -235,4 +255,5 @@ class Relaxation:
     def lengthen(self, steps: int) -> None:
         """Let rows have prices in more steps; the best solution so far is forgotten."""
         self.memory[BEST] = UNREACHABLE
+        self._taken = np.pad(self._taken, ((0, steps), (0, 0)))
         self._lay_out(np.pad(self.prices, ((0, steps), (0, 0))))

@@ -56,6 +56,27 @@ def list_moves(lattice, allowed, scratch):
 
 
 @njit(cache=True, nogil=True)
+def forbid_taken(lattice, teams, taken, allowed, first):
+    """Forbid the moves that use a row which is taken, and arrivals before such a wait."""
+    row = lattice.row
+    displacements, cells, most_rows = row.shape
+    for t in range(len(taken)):
+        for d in range(displacements):
+            for cell in range(cells):
+                for m in range(most_rows):
+                    r = row[d, cell, m]
+                    if r < 0:
+                        break
+                    if taken[t, r]:
+                        allowed[:, t, d, cell] = False
+                        if d == 0:
+                            for p in range(len(first)):
+                                if teams.pair_cell[p] == cell:
+                                    first[p] = t + 1
+                        break
+
+
+@njit(cache=True, nogil=True)
 def start_over(prices, span, scratch, memory):
     """Begin to improve prices; there are none where nobody can move any more."""
     prices[span:] = 0.0
