@@ -47,7 +47,7 @@ def cheapest_plan(request: PlanRequest, fixed: Sequence[int] | None = None) -> i
     A vehicle on a target that nobody else has taken may declare that it has arrived for good; each
     other vehicle pays one per step.
     """
-    model = ConflictModel(request.conflicts)
+    model = request.conflict_model
     choices = [frozenset({j}) for j in fixed] if fixed is not None else request.choices()
     start = tuple(v.cell for v in request.vehicles)
     moving = (-1,) * len(start)

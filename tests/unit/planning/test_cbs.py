@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from laneweave.coordinator.planning import PlanRequest, problems_of_paths
 from laneweave.coordinator.planning.budget import Budget
 from laneweave.coordinator.planning.cbs import ConflictTree, Node, least_cover
-from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.facade import cells_of
 from laneweave.coordinator.planning.incumbent import Solution
 from laneweave.coordinator.planning.path_map import RelativePathMap
@@ -20,7 +19,7 @@ ENOUGH = 600
 
 def _problem(request: PlanRequest) -> Problem:
     cells = [vehicle.cell for vehicle in request.vehicles]
-    model = ConflictModel(request.conflicts)
+    model = request.conflict_model
     return Problem(request.grid, request.mode, model, cells, request.targets)
 
 

@@ -22,7 +22,6 @@ from laneweave.coordinator.planning import (
     plan,
     problems_of_response,
 )
-from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.facade import Solver
 from laneweave.coordinator.planning.grid import Cell, Grid
 from laneweave.coordinator.planning.instances import block_request, formation_request
@@ -112,7 +111,7 @@ def test_no_needless_moves() -> None:
 
 def _is_lazy(request: PlanRequest, path: tuple[Cell, ...], others: list[tuple[Cell, ...]]) -> bool:
     """Tell whether no detour (leave a cell, come straight back) could be replaced by waiting."""
-    model = ConflictModel(request.conflicts)
+    model = request.conflict_model
     for k in range(len(path) - 2):
         if path[k] == path[k + 2] != path[k + 1]:
             calm = (*path[: k + 1], path[k], *path[k + 2 :])

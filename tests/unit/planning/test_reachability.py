@@ -17,7 +17,7 @@ from unit.planning.planning_oracles import cheapest_plan, requests
 
 def _explore(request: PlanRequest, max_moves: int = 10**6) -> tuple[Problem, Verdict]:
     cells = [vehicle.cell for vehicle in request.vehicles]
-    model = ConflictModel(request.conflicts)
+    model = request.conflict_model
     problem = Problem(request.grid, request.mode, model, cells, request.targets)
     return problem, explore(problem, request.choices(), Budget(), max_moves)
 

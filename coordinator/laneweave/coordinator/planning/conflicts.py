@@ -3,6 +3,10 @@
 Section "Conflict model" defines node conflicts, edge conflicts and four special types of edge
 conflict. Which special types matter depends on the width of the lanes and on the column pitch, so
 each can be chosen on its own. Every kind is symmetric in the two vehicles.
+
+The kind `geometric` goes beyond the paper. By itself it means footprints: rectangles of cells,
+which the execution protocol reserves. With a `Geometry` it is the table computed from that
+(`clearances`).
 """
 
 from __future__ import annotations
@@ -12,6 +16,8 @@ from typing import Final
 
 import attrs
 
+from laneweave.coordinator.planning.clearances import close_pairs
+from laneweave.coordinator.planning.geometry import Geometry
 from laneweave.coordinator.planning.grid import Cell, Mode, Move
 
 KINDS: Final = ("node", "edge", "special-1", "special-2", "special-3", "special-4", "geometric")
@@ -102,6 +108,16 @@ _PREDICATES: Final[dict[str, Callable[[Move, Move], bool]]] = {
 }
 
 
+def _relative(a: Move, b: Move) -> tuple[Cell, Cell, Cell]:
+    """Return the offset from A's cell to B's, and what A and B do."""
+    offset = b[0][0] - a[0][0], b[0][1] - a[0][1]
+    return offset, _displacement(a), _displacement(b)
+
+
+def _displacement(move: Move) -> Cell:
+    return move[1][0] - move[0][0], move[1][1] - move[0][1]
+
+
 def _as_kinds(kinds: Iterable[str]) -> tuple[str, ...]:
     chosen = frozenset(kinds)
     unknown = chosen.difference(KINDS)
@@ -120,16 +136,32 @@ class ConflictModel:
         vehicles in the same direction, too.
     special-2, special-3, special-4: A moves obliquely and B moves longitudinally, moves laterally
         or stays, and their initial and target cells form a right triangle.
-    geometric: the footprints intersect. The footprint of a move is its two cells and, if it is
-        oblique, both corner cells of its square; that of a wait is its cell. This is the sound
-        footprint table of the execution protocol, and it contains all other kinds.
+    geometric: without a geometry, the footprints intersect. The footprint of a move is its two
+        cells and, if it is oblique, both corner cells of its square; that of a wait is its cell.
+        This is what the execution protocol reserves, whatever is late. It contains all other kinds
+        and, closed to whole cells, the table of any geometry.
+        With a geometry, exactly the pairs that bring two bodies too close.
     """
 
     kinds: tuple[str, ...] = attrs.field(converter=_as_kinds)
+    geometry: Geometry | None = None
+
+    def __attrs_post_init__(self) -> None:
+        """Check that the geometry is of use.
+
+        Raises:
+            ValueError: there is a geometry, but `geometric` is not among the kinds.
+        """
+        if self.geometry is not None and "geometric" not in self.kinds:
+            raise ValueError(f"a geometry, but conflict kinds {self.kinds} without geometric")
 
     def kind(self, a: Move, b: Move) -> str | None:
         """Return the first kind of conflict between two moves made in the same step, or None."""
         for kind in self.kinds:
+            if kind == "geometric" and self.geometry is not None:
+                if _relative(a, b) in close_pairs(self.geometry):
+                    return kind
+                continue
             predicate = _PREDICATES[kind]
             if predicate(a, b) or predicate(b, a):
                 return kind

@@ -12,7 +12,6 @@ import numpy as np
 
 from laneweave.coordinator.planning.assignments import assignments
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError, Clock
-from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.frd import IntMatrix, Weights, cost_matrix
 from laneweave.coordinator.planning.grid import Cell
 from laneweave.coordinator.planning.incumbent import Solution, tidied
@@ -76,7 +75,7 @@ def plan(
     problem = Problem(
         request.grid,
         request.mode,
-        ConflictModel(request.conflicts),
+        request.conflict_model,
         [vehicle.cell for vehicle in request.vehicles],
         request.targets,
     )

@@ -15,10 +15,11 @@ from collections.abc import Iterator
 from functools import lru_cache
 from typing import Final
 
+from laneweave.coordinator.planning.clearances import FARTHEST
 from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.grid import Cell, Grid, Mode, Move, displacements
 
-REACH: Final = 2
+REACH: Final = FARTHEST
 """Two moves can only conflict when their from-cells are at most this far apart."""
 
 Offsets = tuple[tuple[int, int, int], ...]

@@ -99,11 +99,13 @@ def _can_be_made_one_after_another(table: MoveTable) -> bool:
     """Tell whether the moves of any one step could also be made in single file.
 
     True if no vehicle moves into a cell that another one is leaving, and if passing a waiting
-    vehicle is not forbidden unless every overlap of footprints is.
+    vehicle is not forbidden unless every overlap of footprints is. A computed table is of this kind
+    if it holds for any lateness: that one vehicle waits until the other has arrived is part of it.
+    If vehicles are not very late it allows some to follow each other that cannot go one by one.
     """
-    kinds = table.model.kinds
+    kinds, geometry = table.model.kinds, table.model.geometry
     if "geometric" in kinds:
-        return True
+        return geometry is None or geometry.lateness_s is None
     no_following = "node" in kinds and "special-1" in kinds
     return no_following and (table.mode == 1 or "special-4" not in kinds)
 

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import attrs
 
-from laneweave.coordinator.planning.conflicts import DEFAULT_KINDS, KINDS
+from laneweave.coordinator.planning.conflicts import DEFAULT_KINDS, KINDS, ConflictModel
 from laneweave.coordinator.planning.fields import (
     as_cell,
     as_int,
@@ -22,6 +22,7 @@ from laneweave.coordinator.planning.fields import (
     as_text,
     require,
 )
+from laneweave.coordinator.planning.geometry import Geometry
 from laneweave.coordinator.planning.grid import Cell, Grid, Mode
 from laneweave.coordinator.planning.preference import eligible_targets
 from laneweave.protocol.errors import BadInputError
@@ -36,6 +37,17 @@ MAX_TARGETS: Final = 400
 MAX_ID_LENGTH: Final = 100
 MAX_DEADLINE_S: Final = 3600.0
 
+_KEYS: Final = (
+    "schema",
+    "grid",
+    "mode",
+    "conflicts",
+    "vehicles",
+    "targets",
+    "deadline_s",
+    "geometry",
+)
+
 
 @attrs.frozen
 class VehicleRequest:
@@ -49,7 +61,10 @@ class VehicleRequest:
 
 @attrs.frozen
 class PlanRequest:
-    """Vehicles, targets and rules of one planning problem; checked when it is made."""
+    """Vehicles, targets and rules of one planning problem; checked when it is made.
+
+    geometry: what `geometric` is computed from; None: footprints.
+    """
 
     grid: Grid
     mode: Mode
@@ -57,6 +72,7 @@ class PlanRequest:
     vehicles: tuple[VehicleRequest, ...]
     targets: tuple[Cell, ...]
     deadline_s: float = DEFAULT_DEADLINE_S
+    geometry: Geometry | None = None
 
     def __attrs_post_init__(self) -> None:
         """Reject what is inconsistent, however the request was made."""
@@ -64,11 +80,19 @@ class PlanRequest:
         if self.mode not in (1, 2):
             raise BadInputError("mode", self.mode, "1 or 2")
         _check_conflicts(self.conflicts)
+        if self.geometry is not None and "geometric" not in self.conflicts:
+            allowed = "none, unless geometric is among conflicts"
+            raise BadInputError("geometry", self.geometry.to_dict(), allowed)
         _check_targets(self)
         _check_vehicles(self)
         if not (math.isfinite(self.deadline_s) and 0 < self.deadline_s <= MAX_DEADLINE_S):
             allowed = f"a number above 0, at most {MAX_DEADLINE_S:g}"
             raise BadInputError("deadline_s", self.deadline_s, allowed)
+
+    @property
+    def conflict_model(self) -> ConflictModel:
+        """Return which moves must not be made in the same step."""
+        return ConflictModel(self.conflicts, self.geometry)
 
     def choices(self) -> list[frozenset[int]]:
         """Return, per vehicle, the indices of the targets it may be assigned to."""
@@ -77,8 +101,7 @@ class PlanRequest:
     @classmethod
     def from_dict(cls, data: object) -> PlanRequest:
         """Read the JSON form."""
-        known = ("schema", "grid", "mode", "conflicts", "vehicles", "targets", "deadline_s")
-        fields = as_mapping("request", data, known)
+        fields = as_mapping("request", data, _KEYS)
         require(fields, "", ("schema", "grid", "vehicles", "targets"))
         if fields["schema"] != REQUEST_SCHEMA:
             raise BadInputError("schema", fields["schema"], repr(REQUEST_SCHEMA))
@@ -96,10 +119,12 @@ class PlanRequest:
             vehicles=tuple(_read_vehicle(f"vehicles[{i}]", v) for i, v in enumerate(vehicles)),
             targets=tuple(as_cell(f"targets[{i}]", t) for i, t in enumerate(targets)),
             deadline_s=_read_deadline(fields.get("deadline_s", DEFAULT_DEADLINE_S)),
+            geometry=Geometry.from_dict(fields["geometry"]) if "geometry" in fields else None,
         )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON form."""
+        geometry = {} if self.geometry is None else {"geometry": self.geometry.to_dict()}
         return {
             "schema": REQUEST_SCHEMA,
             "grid": {
@@ -112,6 +137,7 @@ class PlanRequest:
             "vehicles": [_write_vehicle(vehicle) for vehicle in self.vehicles],
             "targets": [list(target) for target in self.targets],
             "deadline_s": self.deadline_s,
+            **geometry,
         }
 
 

@@ -4,7 +4,7 @@ Pairs of conflicting moves say what is forbidden; a linear relaxation that knows
 A *row* is a clique of the conflict relation: whatever the other vehicles do, at most one of its
 moves is made in a step. The rows here are maximal cliques that cover every conflicting pair. With
 footprints (mode 1 with node, edge and special-1; geometric) one pattern is enough: all moves
-whose footprint contains a cell.
+whose footprint contains a cell. Tables computed from a geometry take more patterns.
 
 Conflicts do not depend on where on the lattice they happen, so a row is a pattern that is laid on
 every cell, its anchor.
@@ -29,7 +29,10 @@ Row = tuple[Member, ...]
 
 
 def vehicles_share_cells(model: ConflictModel) -> bool:
-    """Tell whether two vehicles may be in one cell; then moves from one cell need not exclude."""
+    """Tell whether two vehicles may be in one cell; then moves from one cell need not exclude.
+
+    Bodies that start in one cell or end in one are too close in every geometry.
+    """
     return not {"node", "geometric"} & set(model.kinds)
 
 

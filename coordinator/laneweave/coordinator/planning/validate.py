@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 
-from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.grid import Cell
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanResponse
@@ -92,7 +91,7 @@ def _problems_of_vehicle(
 
 
 def _conflicts(request: PlanRequest, paths: Sequence[Sequence[Cell]]) -> Iterator[str]:
-    model = ConflictModel(request.conflicts)
+    model = request.conflict_model
     for (i, a), (j, b) in combinations(enumerate(paths), 2):
         for step in range(len(a) - 1):
             if abs(a[step][0] - b[step][0]) >= _FAR_APART:
