@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from itertools import combinations, pairwise
 from typing import Any
 
+from oracles.moving_bodies import Bodies, too_close
+
 Cell = tuple[int, int]
 Move = tuple[Cell, Cell]
 Path = list[Cell]
@@ -108,9 +110,29 @@ _ORDERED: dict[str, Callable[[Move, Move], bool]] = {
 KINDS = tuple(_ORDERED)
 
 
-def conflict_kinds(a: Move, b: Move, kinds: Iterable[str] = KINDS) -> list[str]:
-    """Which of `kinds` two vehicles commit that make the moves `a` and `b` in the same step."""
-    return [kind for kind in kinds if _ORDERED[kind](a, b) or _ORDERED[kind](b, a)]
+def conflict_kinds(
+    a: Move, b: Move, kinds: Iterable[str] = KINDS, bodies: Bodies | None = None
+) -> list[str]:
+    """Which of `kinds` two vehicles commit that make the moves `a` and `b` in the same step.
+
+    With `bodies`, `geometric` is what these do when they move, instead of a matter of footprints.
+    """
+    return [
+        kind
+        for kind in kinds
+        if (
+            _bodies_meet(bodies, a, b)
+            if kind == "geometric" and bodies is not None
+            else _ORDERED[kind](a, b) or _ORDERED[kind](b, a)
+        )
+    ]
+
+
+def _bodies_meet(bodies: Bodies, a: Move, b: Move) -> bool:
+    def difference(to: Cell, cell: Cell) -> Cell:
+        return to[0] - cell[0], to[1] - cell[1]
+
+    return too_close(bodies, difference(b[0], a[0]), difference(a[1], a[0]), difference(b[1], b[0]))
 
 
 # ---------------------------------------------------------------------------------- a request
@@ -127,6 +149,7 @@ class Problem:
     targets: tuple[Cell, ...]
     eligible: tuple[frozenset[int], ...]
     """For each vehicle the indices of the targets it may take."""
+    bodies: Bodies | None = None
 
     @classmethod
     def of(cls, request: dict[str, Any]) -> "Problem":
@@ -149,6 +172,7 @@ class Problem:
             starts=tuple(_cell(vehicle["cell"]) for vehicle in request["vehicles"]),
             targets=targets,
             eligible=tuple(eligible),
+            bodies=Bodies(**request["geometry"]) if "geometry" in request else None,
         )
 
     def is_free(self, cell: Cell) -> bool:
@@ -176,7 +200,7 @@ class Problem:
         return distance
 
     def conflict(self, a: Move, b: Move) -> bool:
-        return bool(conflict_kinds(a, b, self.conflicts))
+        return bool(conflict_kinds(a, b, self.conflicts, self.bodies))
 
 
 def _cell(pair: Iterable[int]) -> Cell:
@@ -244,7 +268,7 @@ def _conflicts(problem: Problem, paths: list[Path]) -> list[str]:
     for (i, p), (j, q) in combinations(enumerate(paths), 2):
         for step in range(len(p) - 1):
             a, b = (p[step], p[step + 1]), (q[step], q[step + 1])
-            kinds = conflict_kinds(a, b, problem.conflicts)
+            kinds = conflict_kinds(a, b, problem.conflicts, problem.bodies)
             if kinds:
                 found.append(f"vehicles {i}, {j}: step {step}: {a} and {b}: {', '.join(kinds)}")
     return found
