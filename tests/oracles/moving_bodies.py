@@ -137,18 +137,21 @@ def least_gap_of_plan_m(
     late_s: float,
     slot_s: float,
     profile: Profile | None = None,
+    window_s: tuple[float, float] = (0.0, np.inf),
 ) -> float:
     """Drive a plan by a timetable; the least gap while there is less than the clearance sideways.
 
     In every step every vehicle begins up to `late_s` late, and not before its last move has ended.
+    Only what happens within the window of time counts.
     """
     steps = len(paths[0]) - 1
     clock_s = np.arange(0.0, steps * slot_s + bodies.move_s + late_s + TICK_S, TICK_S)
     driven = [_driven(bodies, path, rng, late_s, slot_s, clock_s, profile) for path in paths]
+    inside = (clock_s >= window_s[0]) & (clock_s <= window_s[1])
     least_m = np.inf
     for (low_a, high_a), (low_b, high_b) in combinations(driven, 2):
         gaps = np.maximum(low_b - high_a, low_a - high_b)
-        near = gaps[:, 1] < bodies.clearance_across_m
+        near = (gaps[:, 1] < bodies.clearance_across_m) & inside
         if near.any():
             least_m = min(least_m, float(gaps[near, 0].min()))
     return least_m

@@ -10,6 +10,7 @@ from functools import lru_cache
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.conflicts import KINDS, ConflictModel
+from laneweave.coordinator.planning.geometry import Geometry
 from laneweave.coordinator.planning.grid import Cell, Grid, Mode, Move
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 
@@ -81,6 +82,8 @@ def cheapest_plan(request: PlanRequest, fixed: Sequence[int] | None = None) -> i
     return None
 
 
+GEOMETRIES = (None, Geometry(), Geometry(lateness_s=0.0), Geometry(lateness_s=0.5))
+
 MODES: st.SearchStrategy[Mode] = st.sampled_from((1, 2))
 
 
@@ -88,7 +91,7 @@ MODES: st.SearchStrategy[Mode] = st.sampled_from((1, 2))
 def requests(
     draw: st.DrawFn, *, most_vehicles: int = 3, most_cells: int = 8, deadline_s: float = 60.0
 ) -> PlanRequest:
-    """Draw small requests over both modes and all sets of conflicts."""
+    """Draw small requests over both modes, all sets of conflicts and some geometries."""
     mode = draw(MODES)
     lanes = draw(st.integers(1, 3))
     columns = draw(st.integers(2, max(2, most_cells // lanes)))
@@ -107,11 +110,13 @@ def requests(
     vehicles = tuple(
         VehicleRequest(f"v{i}", cell, eligible=draw(preference)) for i, cell in enumerate(starts)
     )
+    kinds = draw(common | any_kinds)
     return PlanRequest(
         Grid(columns, lanes, blocked),
         mode,
-        draw(common | any_kinds),
+        kinds,
         vehicles,
         tuple(targets),
         deadline_s,
+        draw(st.sampled_from(GEOMETRIES)) if "geometric" in kinds else None,
     )

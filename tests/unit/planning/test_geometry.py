@@ -81,8 +81,8 @@ UNFIT: list[tuple[str, Mapping[str, float]]] = [
     ("clearance_across_m", {"clearance_across_m": 1.6}),
     ("clearance_across_m", {"lane_width_m": 2.2}),
     ("clearance_across_m", {"profile_error_across_m": 1.5}),
-    ("lateness_s", {"lateness_s": 1.3}),
-    ("lateness_s", {"lateness_s": 1.2, "slot_s": 3.8}),
+    ("lateness_s", {"lateness_s": 1.63}),
+    ("lateness_s", {"lateness_s": 1.6, "slot_s": 3.8}),
     ("lateness_s", {"lateness_s": 1.2, "clearance_along_m": 9.0}),
 ]
 
@@ -99,8 +99,8 @@ def test_fields_that_do_not_fit_together_are_named(name: str, fields: dict[str, 
     [
         {"clearance_along_m": 9.19},
         {"clearance_across_m": 1.57},
-        {"lateness_s": 1.26},
-        {"lateness_s": 1.45, "slot_s": 4.2},
+        {"lateness_s": 1.62},
+        {"lateness_s": 1.82, "slot_s": 4.2},
         {"speed_mps": 7.5, "clearance_across_m": 0.14},
         {"clearance_along_m": 0, "clearance_across_m": 0, "lateness_s": 0},
     ],

@@ -163,13 +163,15 @@ class Geometry:
     def _most_lateness_s(self, along_m: float, across_m: float) -> float:
         """Return how late moves may be without being in the way of those of the next step.
 
-        A late move ends when others have begun to leave their cells. Each of the two is away from
-        its cell by the share of the way that is made in what exceeds the slot, at most; the cells
-        are different ones.
+        A late move ends when others have begun to leave their cells, which are different ones.
+        The less the one has still to go, the more the others have gone: together no more than the
+        way made in the time by which lateness exceeds the rest of the slot (its first half grows
+        ever faster).
         """
         share = min(
-            (along_m - self.clearance_along_m) / (2.0 * self.pitch_m),
-            (across_m - self.clearance_across_m) / (2.0 * self.lane_width_m),
+            (along_m - self.clearance_along_m) / self.pitch_m,
+            (across_m - self.clearance_across_m) / self.lane_width_m,
+            0.5,
         )
         times = np.linspace(0.0, 1.0, _SAMPLES + 1)
         passed = np.flatnonzero(minimum_jerk_share(times) <= share)
