@@ -1,7 +1,7 @@
 """Writes the parts of the documents that follow from the code: `python docs/generate.py`.
 
 In a document a generated part stands between `<!-- begin NAME -->` and `<!-- end NAME -->`; a test
-compares it with what this script would write.
+compares it with what this script would write. The picture of the conflict table is drawn, too.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from laneweave.coordinator.leader_rules import LEADER_RULES, Phase
+from laneweave.launch.conflict_drawing import counts, draw_conflicts
 from laneweave.launch.simulation.profiles import PROFILES
 from laneweave.protocol.transitions import markdown_table, mermaid_diagram
 from laneweave.protocol.vehicle_rules import VEHICLE_RULES, Stage
@@ -26,6 +27,10 @@ MEASURED = DOCS / "evidence" / "resilience.json"
 """What `benchmarks/resilience.py` wrote."""
 PLANNED = DOCS / "evidence" / "planner.json"
 """What `laneweave bench planner --json` printed."""
+
+GEOMETRY = DOCS / "evidence" / "geometry.json"
+"""What `benchmarks/geometry.py` wrote."""
+CONFLICTS = DOCS / "images" / "conflict-table.png"
 
 
 def _diagram(text: str) -> str:
@@ -111,6 +116,28 @@ def _planner() -> str:
     return "\n".join(lines)
 
 
+def _conflicts() -> str:
+    """Return the table of how many pairs of moves are forbidden."""
+    lines = ["| `geometric` | pairs in mode 1 | pairs in mode 2 |", "|---|---|---|"]
+    lines += [f"| {name} | {one} | {two} |" for name, one, two in counts()]
+    return "\n".join(lines)
+
+
+def _geometry() -> str:
+    """Return the table of what tables cost and save, as `benchmarks/geometry.py` measured."""
+    lines = [
+        "| vehicles | `geometric` | steps of all | cheaper | proven | CPU ms p50 / p95 |",
+        "|---|---|---|---|---|---|",
+    ]
+    for row in json.loads(GEOMETRY.read_text(encoding="utf-8"))["results"]:
+        of = f"of {row['instances']}"
+        lines.append(
+            f"| {row['vehicles']} | {row['conflicts']} | {row['cost']} | {row['cheaper']} {of} "
+            f"| {row['proven']} {of} | {row['cpu_ms_p50']:.1f} / {row['cpu_ms_p95']:.1f} |"
+        )
+    return "\n".join(lines)
+
+
 @cache
 def parts() -> dict[str, str]:
     """Return each generated part by its name."""
@@ -123,6 +150,8 @@ def parts() -> dict[str, str]:
         "profiles": _profiles(),
         "resilience": _resilience(),
         "planner": _planner(),
+        "conflict counts": _conflicts(),
+        "geometry": _geometry(),
     }
 
 
@@ -140,3 +169,4 @@ def rewritten(text: str) -> str:
 if __name__ == "__main__":
     for path in sorted(DOCS.glob("*.md")):
         path.write_text(rewritten(path.read_text(encoding="utf-8")), encoding="utf-8")
+    draw_conflicts(CONFLICTS)

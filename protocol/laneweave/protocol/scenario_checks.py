@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
 LEAST_GAP_M = 1.0
 """Between bumpers of neighbouring cells: bodies turn to change lanes, and track with some error."""
+LEAST_SIDE_M = 0.5
+"""Between bodies side by side, for the same reasons."""
 
 
 def check_scenario(scenario: Scenario) -> None:
@@ -48,10 +50,11 @@ def _check_lanes(scenario: Scenario) -> None:
         "numbers >= 0, not all 0, with a finite sum",
     )
     _require(
-        road.lane_width_m > vehicle.width_m,
+        road.lane_width_m >= vehicle.width_m + LEAST_SIDE_M,
         "road.lane_width_m",
         road.lane_width_m,
-        f"wider than vehicle.width_m = {vehicle.width_m:g}",
+        f"at least {vehicle.width_m + LEAST_SIDE_M:g}: vehicle.width_m = {vehicle.width_m:g} and "
+        f"{LEAST_SIDE_M:g} between bodies side by side",
     )
     _require(
         3600.0 / demand.volume_veh_per_lane_h >= demand.min_headway_s,

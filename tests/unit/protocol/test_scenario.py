@@ -228,6 +228,7 @@ MISFITS: list[tuple[str, dict[str, Any]]] = [
     ("demand.lane_shares", {"demand": {"lane_shares": [1e308, 1e308, 1e308]}}),
     ("road.lane_width_m", {"road": {"lane_width_m": 2.0}, "vehicle": {"width_m": 2.0}}),
     ("road.lane_width_m", {"road": {"lane_width_m": 2.0}, "vehicle": {"width_m": 3.0}}),
+    ("road.lane_width_m", {"road": {"lane_width_m": 2.25}}),
     (
         "demand.volume_veh_per_lane_h",
         {"demand": {"volume_veh_per_lane_h": 3600, "min_headway_s": 1.01}},

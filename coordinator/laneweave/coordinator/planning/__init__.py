@@ -15,18 +15,21 @@
 | relative path map | `path_map` |
 
 Beyond the paper: branch and bound with prices, the default (`branching`, `relaxation`, `rows`);
-path sets by negotiation (`negotiation`) and by joint search (`reachability`).
+path sets by negotiation (`negotiation`) and by joint search (`reachability`); conflicts computed
+from sizes and motions (`geometry`, `bodies`, `clearances`).
 
 The package is pure: no I/O, no state between calls, and time only through the clock it is given.
 """
 
 from laneweave.coordinator.planning.facade import checked_plan, plan, warm_up
 from laneweave.coordinator.planning.frd import Weights
+from laneweave.coordinator.planning.geometry import Geometry
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.validate import problems_of_paths, problems_of_response
 
 __all__ = [
+    "Geometry",
     "PlanRequest",
     "PlanResponse",
     "VehicleRequest",
