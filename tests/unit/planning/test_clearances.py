@@ -11,6 +11,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from laneweave.agents.trajectory import move_profile
+from laneweave.coordinator.planning import clearances
 from laneweave.coordinator.planning.bodies import Floats, minimum_jerk_path, outline
 from laneweave.coordinator.planning.clearances import (
     FARTHEST,
@@ -217,6 +218,20 @@ def test_it_contains_what_simulated_bodies_do(geometry: Geometry, seed: int) -> 
         elif pair in table:
             nearly_m = least_gap_m(bodies, *pair, more_across_m=0.15)
             assert nearly_m < geometry.clearance_along_m + slack_m, pair
+
+
+@pytest.mark.parametrize("parts", [3, 8, clearances.PARTS])
+@pytest.mark.parametrize("lateness_s", [None, 0.0, 0.3, 0.7])
+def test_it_never_says_more_than_there_is(
+    parts: int, lateness_s: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However coarse it computes; then it says less."""
+    monkeypatch.setattr(clearances, "PARTS", parts)
+    geometry, bodies = Geometry(lateness_s=lateness_s), Bodies(lateness_s=lateness_s)
+    found = least_clearances(geometry)
+    for (column, lane), a, b in every_pair():
+        least_m = found[column + 3, lane + 3, STEPS.index(a), STEPS.index(b)]
+        assert least_m <= least_gap_m(bodies, (column, lane), a, b) + 1e-6
 
 
 @pytest.mark.parametrize("lateness_s", [None, 0.0, 0.2, 0.5])

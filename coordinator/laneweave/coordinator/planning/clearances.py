@@ -9,9 +9,9 @@ clearance is the smallest gap between bumpers at all moments at which the bodies
 - all moments at which they can be there together, if neither is later than `lateness_s`.
 
 Nothing is lost between samples. A move is cut into parts of 1/160 of its time, 24 ms; during a
-part the body stays in the box around its outlines at both ends (`bodies.outline`), and two parts
-count as simultaneous if any of their moments may be. So a clearance is too small by what both
-bodies drive in a part, at most 0.36 m in the default geometry, and never too large.
+part the body stays in the box around all its outlines (`bodies.outline`), and two parts count as
+simultaneous if any of their moments may be. So a clearance is too small by what both bodies drive
+in a part, at most 0.36 m in the default geometry, and never too large.
 """
 
 from __future__ import annotations
@@ -103,17 +103,17 @@ def _parts_late(geometry: Geometry) -> int:
 def _boxes(geometry: Geometry, path: Floats) -> Floats:
     """Return the edges (4, PARTS) within which a body stays during each part of its move."""
     outline = geometry.outline(path)
-    sampled = np.linspace(0.0, 1.0, len(outline))
-    ends = np.linspace(0.0, 1.0, PARTS + 1)
-    rear, front, right, left = (np.interp(ends, sampled, edge) for edge in outline.T)
-    return np.stack(
-        [
-            np.minimum(rear[1:], rear[:-1]),
-            np.maximum(front[1:], front[:-1]),
-            np.minimum(right[1:], right[:-1]),
-            np.maximum(left[1:], left[:-1]),
-        ]
-    )
+    sampled, ends = np.linspace(0.0, 1.0, len(outline)), np.linspace(0.0, 1.0, PARTS + 1)
+    times = np.union1d(sampled, ends)
+    first = np.searchsorted(times, ends[:-1])
+    rear, front, right, left = (np.interp(times, sampled, edge) for edge in outline.T)
+
+    def least(edge: Floats) -> Floats:
+        after = np.append(edge[first[1:]], edge[-1])
+        within: Floats = np.minimum(np.minimum.reduceat(edge, first), after)
+        return within
+
+    return np.stack([least(rear), -least(-front), least(right), -least(-left)])
 
 
 def _fill(found: Floats, a: Floats, b: Floats, geometry: Geometry) -> None:
