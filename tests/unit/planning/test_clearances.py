@@ -246,14 +246,22 @@ def test_what_agents_drive_is_not_closer_than_the_default_profile_says(
     assert pairs_closer_than(exact, actual_paths()) <= close_pairs(geometry)
 
 
-def test_at_any_delay_the_table_of_what_agents_drive_is_the_same() -> None:
-    assert pairs_closer_than(ANY_DELAY, actual_paths()) == close_pairs(ANY_DELAY)
-    straight = {step: path for step, path in actual_paths().items() if 0 in step}
-    in_mode_1 = close_pairs(ANY_DELAY) & {
-        *every_pair(1),
-        *(((0, 0), a, b) for a in displacements(1) for b in displacements(1)),
-    }
-    assert pairs_closer_than(ANY_DELAY, straight) == in_mode_1
+@pytest.mark.parametrize(
+    ("lateness_s", "more", "more_with_errors"),
+    [(None, 0, 0), (0.0, 0, 8), (0.2, 0, 0), (0.5, 4, 20)],
+)
+def test_the_table_is_nearly_that_of_what_agents_drive(
+    lateness_s: float | None, more: int, more_with_errors: int
+) -> None:
+    geometry = Geometry(lateness_s=lateness_s)
+    exact = attrs.evolve(geometry, profile_error_along_m=0.0, profile_error_across_m=0.0)
+    driven = pairs_closer_than(exact, actual_paths())
+    assert driven <= close_pairs(exact)
+    assert len(close_pairs(exact) - driven) == more
+    assert len(close_pairs(geometry) - driven) == more_with_errors
+    of_mode_1 = {step: path for step, path in actual_paths().items() if 0 in step}
+    straight = pairs_closer_than(exact, of_mode_1)
+    assert straight == {pair for pair in driven if 0 in pair[1] and 0 in pair[2]}
 
 
 def test_profile_errors_cover_the_profiles_of_the_default_scenario() -> None:
