@@ -57,8 +57,9 @@ from laneweave.coordinator.planning.trial import trial
 
 _SPARE_STEPS, _MORE_STEPS = 8, 6
 """Steps with prices beyond the longest way; more when a solution may need more."""
-_ITERATIONS, _AT_A_TIME = 40, 10
-"""For first prices; iterations between two looks at the clock."""
+_ITERATIONS, _FEW_ITERATIONS, _AT_A_TIME = 40, 10, 10
+"""For first prices, if there are many or few vehicles; iterations between two looks at bounds."""
+_FEW_VEHICLES = 11
 _FIRST_STACK = 16
 _CHUNK_S = 0.005
 """How long the search goes on between two looks at the clock, about."""
@@ -97,6 +98,7 @@ class Branching:
     best: the cheapest path set so far.
     lower_bound: no path set costs less; infinite: there is none.
     finished: the search is complete; `best` is optimal, or nothing exists.
+    has_fewest_moves: it is proven, too, that nothing as cheap has fewer moves.
     """
 
     def __init__(self, problem: Problem, choices: Sequence[frozenset[int]], budget: Budget) -> None:
@@ -104,6 +106,7 @@ class Branching:
         self.lower_bound: float = 0
         self.finished = False
         self.tried = 0
+        self.has_fewest_moves = False
         self.gave_up = False
         """It is stuck (`branching_kernel.STUCK`), or its tables would get too large."""
         self.best: Solution | None = None
@@ -142,7 +145,8 @@ class Branching:
             self.gave_up = True
             return
         whole = self.relaxation(steps)
-        for number in range(0, _ITERATIONS, _AT_A_TIME):
+        few = len(self._choices) <= _FEW_VEHICLES
+        for number in range(0, _FEW_ITERATIONS if few else _ITERATIONS, _AT_A_TIME):
             self._improve(whole, _AT_A_TIME)
             if math.isinf(self.lower_bound) or self._is_proven():
                 break
@@ -244,9 +248,11 @@ class Branching:
     def _break_ties(self, whole: Relaxation, nodes: Stack) -> Stack:
         """Look for a solution that costs as much as the best one, with fewer moves."""
         ceiling = self._best_value - 0.5 * PER_MOVE
-        if whole.put(nodes, ceiling):
+        may_be = whole.put(nodes, ceiling)
+        if may_be:
             whole.memory[BEST] = self._best_value
             self._search_fewer_moves(whole, nodes, 1)
+        self.has_fewest_moves = self.has_fewest_moves or may_be is False
         return nodes
 
     def _search_fewer_moves(self, whole: Relaxation, nodes: Stack, depth: int) -> None:
@@ -259,6 +265,7 @@ class Branching:
                 ending, depth = self._go_on(whole, nodes, depth, ceiling, left)
                 left -= self._nodes - before
                 if ending not in (OPEN, FOUND):
+                    self.has_fewest_moves = ending == REFUTED
                     return
         except BudgetSpentError:
             return

@@ -43,6 +43,8 @@ class Search(Protocol):
     """Another solver is the better tool for this problem."""
     tried: int
     """Assignments that were looked at one by one."""
+    has_fewest_moves: bool
+    """Nothing as cheap as `best` has fewer moves, for certain."""
 
     @property
     def best(self) -> Solution | None:
@@ -89,7 +91,7 @@ def plan(
                 break
     found = [search.best for search in searches if search.best is not None]
     best = min(found, key=lambda solution: solution.cost, default=None)
-    if best is not None:
+    if best is not None and not any(search.has_fewest_moves for search in searches):
         best = tidied(problem, best, budget)
     cells = [] if best is None else cells_of(problem, best)
     path_map = RelativePathMap.padded([v.id for v in request.vehicles][: len(cells)], cells)

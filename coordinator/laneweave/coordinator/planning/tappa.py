@@ -35,7 +35,7 @@ class Tappa:
     best: the best path set P* so far; its cost is C'*.
     lower_bound: no path set costs less.
     finished: the search is complete; `best` is optimal, or nothing exists.
-    gave_up: never.
+    gave_up, has_fewest_moves: never.
     tried: the assignments A_1 ... A_k whose trees were opened.
     """
 
@@ -49,7 +49,7 @@ class Tappa:
         """Prepare the search; `candidates` are the assignments in order of cost."""
         self.lower_bound: float = 0
         self.finished = False
-        self.gave_up = False
+        self.gave_up = self.has_fewest_moves = False
         self.tried = 0
         self._problem = problem
         self._candidates = candidates
