@@ -21,6 +21,8 @@ from scipy.sparse import coo_array
 
 from oracles.path_rules import Cell, Move, Path, Problem
 
+PROGRAMME_LIMIT_S = 60.0
+"""A programme that takes longer is given up; few do."""
 FORBIDDEN = 10_000
 """Distance to a target that a vehicle may not take or cannot reach."""
 
@@ -342,7 +344,7 @@ class _Programme:
             integrality=np.ones(count),
             bounds=Bounds(0, 1),
             constraints=self.rows.constraint(count),
-            options={"mip_rel_gap": 0.0},
+            options={"mip_rel_gap": 0.0, "time_limit": PROGRAMME_LIMIT_S},
         )
         if result.status == 2:
             return None

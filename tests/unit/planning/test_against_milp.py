@@ -93,8 +93,12 @@ def test_what_is_proven_of_large_requests_of_every_kind_is_true(seed: int) -> No
     """Three to five lanes, all conflicts, blocked cells, lists of targets, more than are needed."""
     request = {**large_request(seed), "deadline_s": LARGE_DEADLINE_S}
     response = _plan(request, "branching")
-    cost = milp_oracle.optimal_cost(request)
     assert not check_paths(request, response)
+    try:
+        cost = milp_oracle.optimal_cost(request)
+    except milp_oracle.UndecidedError as error:
+        pytest.skip(f"the oracle cannot decide this one in a minute: {error}")
+    assert cost is not None
     assert response["lower_bound"] <= cost <= response["cost"]
     assert (response["status"] == "optimal") == (response["lower_bound"] == response["cost"])
 
