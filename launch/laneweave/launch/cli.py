@@ -6,11 +6,8 @@ that names the field, the value and what is allowed.
 
 from __future__ import annotations
 
-import json
-import re
 import signal
 import sys
-import time
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,8 +16,10 @@ import typer
 from rich.console import Console
 
 from laneweave.launch.logs import log_to_terminal
+from laneweave.launch.role_commands import agent, bridge, check_pace, coordinator, ping, router
+from laneweave.launch.run_folder import draw, draw_own, new_folder
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
-from laneweave.protocol.scenario import Scenario, load_scenario
+from laneweave.protocol.scenario import load_scenario
 
 app = typer.Typer(
     name="laneweave",
@@ -66,14 +65,6 @@ class OutputFormat(StrEnum):
 
     json = "json"
     table = "table"
-
-
-ConfigOption = Annotated[
-    Path | None, typer.Option("--config", metavar="DEPLOYMENT.toml", help="Scenario and network.")
-]
-RealmEndpoint = Annotated[
-    str | None, typer.Option("--endpoint", help="Zenoh endpoint; overrides the configuration.")
-]
 
 
 @app.command()
@@ -122,7 +113,7 @@ def run(
         runtime__vehicles_per_process=vehicles_per_process,
         runtime__coordinators=coordinators,
     )
-    _check_pace(pace)
+    check_pace(pace)
 
     from laneweave.agents.trajectory import check_moves
     from laneweave.launch.faults import load_faults
@@ -133,7 +124,7 @@ def run(
     check_moves(settings)
     vehicles = {arrival.vehicle for arrival in arrivals(settings)}
     plan_of_faults = load_faults(faults, coordinator_names(settings), vehicles)
-    folder = _new_folder(out, settings, method.value)
+    folder = new_folder(out, settings, method.value)
     show = not no_progress and sys.stderr.isatty()
     if transport is TransportChoice.simulated:
         from laneweave.launch.simulated_run import SimulatedRun
@@ -145,7 +136,7 @@ def run(
         outcome = LocalRun(settings, folder, method.value, plan_of_faults, show, pace).run()
     print_outcome(outcome, Console())
     if outcome.summary is not None:
-        _draw_own(folder)
+        draw_own(folder)
     raise typer.Exit(outcome.exit_status)
 
 
@@ -177,97 +168,8 @@ def plan(
     answer_request(request, deadline, connect, realm, solver.value, as_table=as_table, drawing=draw)
 
 
-@app.command()
-def router(config: ConfigOption = None, endpoint: RealmEndpoint = None) -> None:
-    """Run the Zenoh router of a deployment."""
-    from laneweave.protocol.zenoh_transport import run_router
-
-    settings = _deployment(config, endpoint)
-    run_router(settings.network.endpoint, settings.network.lease_s)
-
-
-@app.command()
-def ping(config: ConfigOption = None, endpoint: RealmEndpoint = None) -> None:
-    """Open a session at a router and close it: the health check of a deployment."""
-    from laneweave.protocol.zenoh_transport import ZenohTransport
-
-    network = _deployment(config, endpoint).network
-    ZenohTransport(network.endpoint, lambda _: None, network.lease_s).close()
-
-
-@app.command()
-def coordinator(
-    config: ConfigOption = None,
-    endpoint: RealmEndpoint = None,
-    name: Annotated[str, typer.Option("--name", help="Rank: the lowest name leads.")] = "c1",
-) -> None:
-    """Run a coordinator candidate; it also answers plan requests."""
-    from laneweave.coordinator.process import run_coordinator
-    from laneweave.protocol.topics import NAME_PATTERN, NAME_RULE
-
-    if not NAME_PATTERN.fullmatch(name):
-        raise BadInputError("--name", name, NAME_RULE)
-    run_coordinator(_deployment(config, endpoint), name)
-
-
-@app.command()
-def agent(
-    vehicles: Annotated[
-        list[str] | None, typer.Argument(metavar="[VEHICLE]...", help="Default: all announced.")
-    ] = None,
-    config: ConfigOption = None,
-    endpoint: RealmEndpoint = None,
-    shard: Annotated[
-        str, typer.Option("--shard", metavar="I/N", help="Take every N-th announced vehicle.")
-    ] = "0/1",
-) -> None:
-    """Run the agents of named vehicles, or of all that are announced."""
-    from laneweave.agents.host import Shard
-    from laneweave.agents.process import run_agents
-    from laneweave.agents.trajectory import check_moves
-    from laneweave.protocol.topics import NAME_PATTERN, NAME_RULE
-
-    for vehicle in vehicles or ():
-        if not NAME_PATTERN.fullmatch(vehicle):
-            raise BadInputError("VEHICLE", vehicle, NAME_RULE)
-    settings = _deployment(config, endpoint)
-    check_moves(settings)
-    if vehicles:
-        run_agents(settings, vehicles)
-        return
-    index, _, count = shard.partition("/")
-    digits = index.isdecimal() and count.isdecimal() and len(shard) < 20
-    if not digits or int(index) >= int(count):
-        raise BadInputError("--shard", shard, "I/N with 0 <= I < N")
-    run_agents(settings, (), Shard(int(index), int(count)))
-
-
-@app.command()
-def bridge(
-    config: ConfigOption = None,
-    endpoint: RealmEndpoint = None,
-    out: Annotated[Path | None, typer.Option("--out", metavar="DIR")] = None,
-    pace: Annotated[
-        float | None, typer.Option("--pace", help="Road seconds per second; default 1.")
-    ] = 1.0,
-) -> None:
-    """Run the simulated world of a deployment."""
-    from laneweave.launch.outcome import complete_summary, print_outcome
-    from laneweave.sim_bridge.process import run_bridge
-
-    # Until the bridge is up; then it ends in good order.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    _check_pace(pace)
-    settings = _deployment(config, endpoint)
-    folder = _new_folder(out, settings, Method.formation.value)
-    run_bridge(settings, folder, Method.formation.value, pace)
-    outcome = complete_summary(folder, problems=())
-    print_outcome(outcome, Console())
-    _draw_own(folder)
-    # A role that was asked to end did what it was asked, however far the run had come.
-    asked_to_end = outcome.summary is not None and outcome.summary["ending"] == "interrupted"
-    broken = outcome.summary is None or outcome.summary["safety"]["overlaps"]
-    raise typer.Exit(1 if broken else 0 if asked_to_end else outcome.exit_status)
+for command in (router, ping, coordinator, agent, bridge):
+    app.command()(command)
 
 
 @app.command()
@@ -324,7 +226,7 @@ def report(
             )
     for folder in folders:
         try:
-            _draw(folder)
+            draw(folder)
         except (OSError, ValueError, KeyError) as error:
             raise BadInputError(
                 "DIR", str(folder), f"the folder of a finished run ({error})"
@@ -361,110 +263,15 @@ def bench(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Measure this machine: roads of 30, 60 and 90 vehicles, or plans for 6 to 36."""
+    from laneweave.launch import bench_command
+
     if what is Benchmark.planner:
-        from laneweave.launch import planner_bench
-
-        sizes = _counts(vehicles or "6,9,12,18,24,36")
-        chosen = families.split(",")
-        if not set(chosen) <= set(planner_bench.FAMILIES):
-            known = ", ".join(planner_bench.FAMILIES)
-            raise BadInputError("--families", families, f"some of {known}, with commas between")
-        rows = list(
-            planner_bench.bench_planner(
-                sizes,
-                chosen,
-                instances=instances,
-                seed=seed,
-                deadline_s=deadline,
-                solver=solver.value,
-            )
+        report = bench_command.measure_planner(
+            vehicles, families, instances, seed, deadline, solver.value
         )
-        table = planner_bench.planner_table(rows)
     else:
-        from laneweave.launch import bench as runtime_bench
-
-        rows = [
-            runtime_bench.bench_runtime(count, seconds=seconds, per_process=per_process, seed=seed)
-            for count in _counts(vehicles or "30,60,90")
-        ]
-        table = runtime_bench.runtime_table(rows)
-    if as_json:
-        from laneweave.launch.bench import machine
-
-        result = {"benchmark": what.value, "machine": machine(), "results": rows}
-        sys.stdout.write(json.dumps(result, indent=2) + "\n")
-    else:
-        Console().print(table)
-
-
-def _counts(text: str) -> list[int]:
-    counts = text.split(",")
-    if not all(re.fullmatch(r"[1-9][0-9]?|1[0-9][0-9]|200", count) for count in counts):
-        raise BadInputError("--vehicles", text, "numbers from 1 to 200 with commas between")
-    return [int(count) for count in counts]
-
-
-def _deployment(config: Path | None, endpoint: str | None) -> Scenario:
-    settings = load_scenario(config, network__endpoint=endpoint)
-    if not settings.network.endpoint:
-        raise BadInputError(
-            "network.endpoint", "", "an endpoint, in the configuration or with --endpoint"
-        )
-    return settings
-
-
-def _check_pace(pace: float | None) -> None:
-    if pace is not None and not 0.01 <= pace <= 1000:
-        raise BadInputError("--pace", pace, "[0.01, 1000]")
-
-
-def _new_folder(out: Path | None, settings: Scenario, method: str) -> Path:
-    """Return a folder that holds no other run.
-
-    Raises:
-        BadInputError: it does, or it cannot be made.
-    """
-    if out is None:
-        stamp = time.strftime("%Y%m%d-%H%M%S")
-        volume = f"{settings.demand.volume_veh_per_lane_h:g}"
-        base = Path("runs") / f"{method}-{volume}-seed{settings.seed}-{stamp}"
-        out = base
-        copies = 1
-        while out.exists():
-            copies += 1
-            out = base.with_name(f"{base.name}-{copies}")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        if any(out.iterdir()):
-            raise BadInputError("--out", str(out), "a new or empty folder")
-        # Two runs that begin at the same time: the second one fails here.
-        (out / "log.jsonl").touch(exist_ok=False)
-    except FileExistsError as error:
-        raise BadInputError("--out", str(out), "a new or empty folder") from error
-    except OSError as error:
-        raise BadInputError("--out", str(out), f"a folder ({error.strerror})") from error
-    return out
-
-
-def _draw(folder: Path) -> None:
-    from laneweave.launch.figures import speed_heatmap, travel_time_boxplot
-    from laneweave.launch.snapshots import road_snapshots
-
-    travel_time_boxplot([folder], folder / "travel_time.png")
-    speed_heatmap(folder, folder / "speed.png")
-    road_snapshots(folder, folder / "road.png")
-
-
-def _draw_own(folder: Path) -> None:
-    """Draw the pictures of the run that has just ended.
-
-    Raises:
-        CommandFailedError: they cannot be written.
-    """
-    try:
-        _draw(folder)
-    except OSError as error:
-        raise CommandFailedError(f"{folder}: pictures not drawn: {error}") from error
+        report = bench_command.measure_runtime(vehicles, seconds, per_process, seed)
+    report.show(as_json=as_json)
 
 
 def main() -> None:

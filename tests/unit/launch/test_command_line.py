@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from laneweave.launch import cli
+from laneweave.launch import role_commands, run_folder
 from laneweave.launch.local_run import (
     MAX_TEMPORARY_BYTES,
     check_temporary_folder,
@@ -23,7 +23,7 @@ def test_a_new_folder_tells_what_is_in_it(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(time, "strftime", lambda _: "20260102-030405")
     settings = load_scenario(None, seed=7, demand__volume_veh_per_lane_h=1450.5)
 
-    folders = [cli._new_folder(None, settings, "formation") for _ in range(3)]
+    folders = [run_folder.new_folder(None, settings, "formation") for _ in range(3)]
 
     name = "formation-1450.5-seed7-20260102-030405"
     assert [str(folder) for folder in folders] == [
@@ -37,27 +37,27 @@ def test_a_new_folder_tells_what_is_in_it(tmp_path: Path, monkeypatch: pytest.Mo
 def test_an_empty_folder_will_do_once(tmp_path: Path) -> None:
     out = tmp_path / "a" / "b"
     out.mkdir(parents=True)
-    assert cli._new_folder(out, Scenario(), "formation").is_dir()
+    assert run_folder.new_folder(out, Scenario(), "formation").is_dir()
     with pytest.raises(BadInputError, match="a new or empty folder"):
-        cli._new_folder(out, Scenario(), "formation")
+        run_folder.new_folder(out, Scenario(), "formation")
 
 
 def test_a_folder_with_something_in_it_will_not(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for out in (tmp_path, tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(BadInputError, match="--out: got "):
-            cli._new_folder(out, Scenario(), "formation")
+            run_folder.new_folder(out, Scenario(), "formation")
 
 
 @pytest.mark.parametrize("pace", [None, 0.01, 1, 1000])
 def test_paces(pace: float | None) -> None:
-    cli._check_pace(pace)
+    role_commands.check_pace(pace)
 
 
 @pytest.mark.parametrize("pace", [0, -1, 1001, float("nan"), float("inf")])
 def test_impossible_paces(pace: float) -> None:
     with pytest.raises(BadInputError, match="--pace"):
-        cli._check_pace(pace)
+        role_commands.check_pace(pace)
 
 
 def test_coordinators_are_named_in_their_order() -> None:

@@ -33,7 +33,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from laneweave.coordinator.planning.arrays import UNREACHABLE, Ints, lattice, teams
+from laneweave.coordinator.planning.arrays import UNREACHABLE, Floats, Ints, lattice, teams
 from laneweave.coordinator.planning.branching_kernel import FULL, STUCK, search
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
 from laneweave.coordinator.planning.conflicts import ConflictModel
@@ -67,8 +67,9 @@ _NODES_BETWEEN = 8
 """Nodes between two looks for path sets by other means."""
 _MANY_VEHICLES = 20
 """So many are not decided soon: they get a path set first."""
-_FIRST_WORK, _WORK_FOR_GAP = 200, 100
-"""How much is negotiated then until there is a path set; later, the more the larger the gap is."""
+_FIRST_WORK, _WORK_FOR_GAP, _STALE = 200, 100, 100
+"""How much is negotiated then until there is a path set; later, the more the larger the gap is, and
+half as much after so much work in vain."""
 _EXPLORE_NODES, _EXPLORE_MOVES, _MOST_EXPLORE_MOVES, _GROWTH = 100, 5_000, 1_500_000, 4
 """When the joint search is tried, if there is no path set yet, and how far; then more of both."""
 _TIE_NODES = 10
@@ -220,7 +221,7 @@ class Branching:
                 whole.take_prices(nodes.prices[0])
             first = False
             if ending == OPEN:
-                self._look_for_others(whole)
+                self._look_for_others(whole, nodes.prices[depth - 1])
                 if self.finished or (self.best is not None and self.best.cost <= cost):
                     return nodes
         if ending == REFUTED:
@@ -298,7 +299,7 @@ class Branching:
         if whole.memory[BEST] < self._best_value - 0.5 * PER_MOVE:
             self._prefer(self._solution(whole.scratch.best_way))
 
-    def _look_for_others(self, whole: Relaxation) -> None:
+    def _look_for_others(self, whole: Relaxation, prices: Floats) -> None:
         """Every now and then find path sets by other means, or show that there are none."""
         if self._nodes < self._look_around:
             return
@@ -306,7 +307,9 @@ class Branching:
         if self._negotiation is None or self._negotiation.cost is None:
             self.negotiate(whole, _FIRST_WORK, stop_at_first=True)
         else:
-            self.negotiate(whole, 1 + int(_WORK_FOR_GAP * self._gap()))
+            self._negotiation.suggest(prices.copy(), whole.held_targets())
+            hope = 1.0 / (1.0 + self._negotiation.stale / _STALE)
+            self.negotiate(whole, 1 + int(_WORK_FOR_GAP * self._gap() * hope))
         if self.best is None and self._nodes >= self._explore_nodes:
             self._explore()
 

@@ -41,6 +41,7 @@ class Negotiation:
 
     cost: of the best path set; None: there is none yet.
     way: (N, T) its displacements.
+    stale: how often work has been in vain since it was found.
     """
 
     def __init__(self, lattice: Lattice, teams: Teams, prices: Floats, target: Ints) -> None:
@@ -54,6 +55,7 @@ class Negotiation:
         """
         self.cost: int | None = None
         self.way: Ints = np.empty((0, 0), dtype=np.int64)
+        self.stale = 0
         self._lattice = lattice
         self._teams = teams
         self._prices = prices
@@ -62,6 +64,10 @@ class Negotiation:
         self._rounds = 0
         self._stretch = _STRETCH
         self._begin()
+
+    def suggest(self, prices: Floats, target: Ints) -> None:
+        """Begin the next round from other prices and targets."""
+        self._prices, self._target = prices, target
 
     def _begin(self) -> None:
         """Begin a round."""
@@ -82,6 +88,7 @@ class Negotiation:
         `check_time` may raise an error to end all work.
         """
         check_time()
+        self.stale += 1
         if self._settled:
             return self._improve(check_time)
         self._settled = negotiate(self._lattice, self._teams, self._trial, self._passes)
@@ -114,7 +121,7 @@ class Negotiation:
         cost = int(self._trial.cost.sum())
         if self.cost is not None and cost >= self.cost:
             return False
-        self.cost, self.way = cost, self._trial.way.copy()
+        self.cost, self.way, self.stale = cost, self._trial.way.copy(), 0
         return True
 
     def _shorten(self) -> None:

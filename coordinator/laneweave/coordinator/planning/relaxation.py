@@ -224,6 +224,10 @@ class Relaxation:
         """Return (N,) the number of the target of each vehicle that is best at the prices."""
         self._begin()
         evaluate(self.lattice, self.teams, self.first, self.prices, self._span, self.scratch)
+        return self.held_targets()
+
+    def held_targets(self) -> Ints:
+        """Return (N,) the number of the target of each vehicle in the last relaxed solution."""
         target = np.zeros(len(self.teams.start), dtype=np.int64)
         taken = np.flatnonzero(self.scratch.holder >= 0)
         target[self.scratch.holder[taken]] = taken
