@@ -15,8 +15,8 @@
 | relative path map | `path_map` |
 
 Beyond the paper: branch and bound with prices, the default (`branching`, `relaxation`, `rows`);
-path sets by negotiation (`negotiation`) and by joint search (`reachability`); conflicts computed
-from sizes and motions (`geometry`, `bodies`, `clearances`).
+path sets by negotiation (`negotiation`, `repair`) and by joint search (`reachability`); conflicts
+computed from sizes and motions (`geometry`, `bodies`, `clearances`).
 
 The package is pure: no I/O, no state between calls, and time only through the clock it is given.
 """

@@ -6,8 +6,9 @@ contested gets dearer for good. That settles nearly always (McMurchie and Ebelin
 FPGA 1995, who route wires in this way).
 
 After that a few vehicles at a time are taken out, perhaps exchange targets, and negotiate again
-around all others; what is not worse is kept (large-neighbourhood search). When that has been in
-vain for long, all begins anew.
+around all others; what is not worse is kept (large-neighbourhood search). Where that finds nothing
+any more, neighbourhoods are decided exactly (`repair`). When that has been in vain for long, too,
+all begins anew, from the newest prices and targets that were suggested.
 """
 
 from __future__ import annotations
