@@ -49,7 +49,7 @@ def measure_planner(
     Raises:
         BadInputError: a family or a number is not known.
     """
-    sizes = _counts(vehicles or _PLANNER_SIZES)
+    sizes = _counts(_PLANNER_SIZES if vehicles is None else vehicles)
     chosen = families.split(",")
     if not set(chosen) <= set(planner_bench.FAMILIES):
         known = ", ".join(planner_bench.FAMILIES)
@@ -70,7 +70,7 @@ def measure_runtime(vehicles: str | None, seconds: float, per_process: int, seed
     """
     rows = [
         bench_runtime(count, seconds=seconds, per_process=per_process, seed=seed)
-        for count in _counts(vehicles or _RUNTIME_SIZES)
+        for count in _counts(_RUNTIME_SIZES if vehicles is None else vehicles)
     ]
     return Report("runtime", rows, runtime_table(rows))
 

@@ -6,8 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, plan, problems_of_response
+from laneweave.coordinator.planning.branching import Branching
+from laneweave.coordinator.planning.budget import Budget
 from laneweave.coordinator.planning.grid import Cell, Grid
 from laneweave.coordinator.planning.instances import formation_request
+from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.relaxation import ceiling_of
 from laneweave.coordinator.planning.relaxation_kernel import PER_MOVE
 from laneweave.coordinator.planning.request import VehicleRequest
@@ -160,6 +163,21 @@ def test_tables_that_do_not_fit_into_memory_are_not_made() -> None:
     vehicles = (VehicleRequest("a", (0, 0)),)
     request = PlanRequest(Grid(1000, 16), 1, ("geometric",), vehicles, ((999, 15),), 20.0)
     assert solved(request).cost == 999 + 15
+
+
+def test_tables_of_too_many_targets_are_not_made() -> None:
+    """Each vehicle has a list of its own: 60 teams with 399 targets on 16,000 cells."""
+    targets = [(column, lane) for column in range(900, 925) for lane in range(16)]
+    vehicles = tuple(
+        VehicleRequest(f"v{i}", (i, 0), eligible=tuple(j for j in range(400) if j != i))
+        for i in range(60)
+    )
+    kinds = ("node", "edge", "special-1")
+    request = PlanRequest(Grid(1000, 16), 1, kinds, vehicles, tuple(targets))
+    problem = Problem(request.grid, 1, request.conflict_model, [v.cell for v in vehicles], targets)
+    search = Branching(problem, request.choices(), Budget())
+    search.run()
+    assert search.gave_up
 
 
 def test_a_wide_road_and_a_long_way_are_no_obstacle() -> None:

@@ -71,6 +71,8 @@ UNFIT: list[tuple[str, Mapping[str, float]]] = [
     ("pitch_m", {"pitch_m": 5.0}),
     ("pitch_m", {"length_m": 15.0}),
     ("lane_width_m", {"lane_width_m": 2.0, "width_m": 2.0}),
+    ("pitch_m", {"pitch_m": 5.2, "clearance_along_m": 0.0}),
+    ("lane_width_m", {"width_m": 3.49}),
     ("slot_s", {"slot_s": 3.7}),
     ("slot_s", {"move_s": 4.1}),
     ("speed_mps", {"speed_mps": 7.4}),

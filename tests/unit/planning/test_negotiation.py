@@ -80,6 +80,24 @@ def test_equal_work_gives_equal_ways() -> None:
     assert a.way.tolist() == b.way.tolist()
 
 
+def test_targets_that_a_vehicle_may_not_have_are_not_taken_over() -> None:
+    """A node that is refuted may leave vehicles at any target."""
+    ways, vehicles = arrays_of(formation_request(3, vehicles=6))
+    whole = Relaxation(ways, vehicles, 16)
+    legal = whole.assignment()
+    negotiation = Negotiation(ways, vehicles, whole.prices, legal)
+    forbidden = legal[::-1].copy()
+    assert (vehicles.pair[vehicles.team, forbidden] < 0).any()
+    for target in (forbidden, np.zeros_like(legal)):
+        negotiation.suggest(whole.prices, target)
+        assert np.array_equal(negotiation._target, legal)
+    mates = [i for i in range(6) if vehicles.team[i] == vehicles.team[0]][:2]
+    exchanged = legal.copy()
+    exchanged[mates] = exchanged[mates[::-1]]
+    negotiation.suggest(whole.prices, exchanged)
+    assert np.array_equal(negotiation._target, exchanged)
+
+
 @pytest.mark.parametrize("mode", [1, 2])
 def test_vehicles_that_are_planned_anew_end_legally_and_cheaper(mode: Mode) -> None:
     request = formation_request(2, vehicles=24, mode=mode)
@@ -91,7 +109,8 @@ def test_vehicles_that_are_planned_anew_end_legally_and_cheaper(mode: Mode) -> N
     for number in range(2_000):
         if negotiate(ways, vehicles, settled, number):
             break
-    repair = Repair(ways, vehicles, whole.prices)
+    repair = Repair(ways, vehicles)
+    repair.begin(whole.prices)
     costs = [int(settled.cost.sum())]
     for _ in range(120):
         better = repair.attempt(settled, no_limit)

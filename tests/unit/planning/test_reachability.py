@@ -7,6 +7,7 @@ from laneweave.coordinator.planning import PlanRequest, VehicleRequest, problems
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
 from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.facade import cells_of, plan
+from laneweave.coordinator.planning.geometry import Geometry
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.coordinator.planning.problem import Problem
@@ -82,3 +83,29 @@ def test_a_crowded_block_gets_an_answer_long_before_the_trees_find_one() -> None
     assert 25 <= response.cost <= 40
     assert not problems_of_response(request, response)
     assert plan(request).cost == 25
+
+
+def test_who_may_pass_but_not_wait_beside_is_not_impossible() -> None:
+    """In wide cells two may pass each other obliquely, but special-4 forbids to pass who waits."""
+    geometry = Geometry(
+        length_m=3.5,
+        width_m=2.0,
+        lane_width_m=8.0,
+        pitch_m=26.0,
+        move_s=10.0,
+        slot_s=10.2,
+        speed_mps=27.0,
+        clearance_along_m=0.0,
+        clearance_across_m=0.0,
+    )
+    grid = Grid(2, 3, [(0, 2), (1, 0)])
+    targets = ((1, 2), (0, 0))
+    vehicles = (
+        VehicleRequest("a", (0, 1), eligible=(0,)),
+        VehicleRequest("b", (1, 1), eligible=(1,)),
+    )
+    kinds = ("geometric", "special-4")
+    request = PlanRequest(grid, 2, kinds, vehicles, targets, geometry=geometry)
+    _, verdict = _explore(request)
+    assert verdict.solution is not None
+    assert verdict.solution.cost == plan(request).cost == 2

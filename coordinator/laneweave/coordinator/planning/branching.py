@@ -70,12 +70,12 @@ _MANY_VEHICLES = 20
 _FIRST_WORK, _WORK_FOR_GAP, _STALE = 200, 100, 100
 """How much is negotiated then until there is a path set; later, the more the larger the gap is, and
 half as much after so much work in vain."""
-_EXPLORE_NODES, _EXPLORE_MOVES, _MOST_EXPLORE_MOVES, _GROWTH = 100, 5_000, 1_500_000, 4
+_EXPLORE_NODES, _EXPLORE_MOVES, _MOST_EXPLORE_MOVES, _GROWTH = 16, 5_000, 1_500_000, 4
 """When the joint search is tried, if there is no path set yet, and how far; then more of both."""
 _TIE_NODES = 10
 _WARM_UP_WORK = 8
-_MOST_BYTES = 1_500_000_000
-"""Larger tables are not made."""
+_MOST_BYTES, _BYTES_PER_S = 1_500_000_000, 1_000_000_000
+"""Larger tables are not made; and how fast they are filled, about."""
 
 
 @cache
@@ -123,6 +123,10 @@ class Branching:
         self._stuck_at: int | None = None
         self._best_value = UNREACHABLE
         table = problem.table
+        pairs = sum(map(len, set(choices)))
+        if 8 * pairs * table.grid.columns * table.grid.lanes > _MOST_BYTES:
+            self.gave_up = True
+            return
         self._lattice = lattice(table.grid, table.mode, table.model)
         starts = [table.cell(start) for start in problem.starts]
         targets = [table.cell(target) for target in problem.targets]
@@ -130,6 +134,8 @@ class Branching:
 
     def run(self) -> None:
         """Search until the optimum is proven or the budget is spent."""
+        if self.gave_up:
+            return
         try:
             self._search()
         except BudgetSpentError:
@@ -140,11 +146,11 @@ class Branching:
         if len(self._teams.target) < len(self._teams.start) or not all(self._choices):
             self.lower_bound, self.finished = math.inf, True
             return
-        self._budget.check_time()
         steps = self._longest_way() + _SPARE_STEPS
         if not self._fits(steps, _FIRST_STACK):
             self.gave_up = True
             return
+        self._budget.check_time(self._bytes_of(steps, _FIRST_STACK) / _BYTES_PER_S)
         whole = self.relaxation(steps)
         few = len(self._choices) <= _FEW_VEHICLES
         for number in range(0, _FEW_ITERATIONS if few else _ITERATIONS, _AT_A_TIME):
@@ -180,11 +186,14 @@ class Branching:
 
     def _fits(self, steps: int, nodes: int) -> bool:
         """Tell whether tables of so many steps and nodes fit into memory."""
+        return self._bytes_of(steps, nodes) < _MOST_BYTES
+
+    def _bytes_of(self, steps: int, nodes: int) -> int:
         displacements, cells = self._lattice.valid.shape
         groups, rows = len(self._teams.pair), self._lattice.row_count
         moves = groups * displacements * cells
         size = 8 * cells * len(self._teams.pair_cell) + 33 * moves + 8 * rows * (groups + 12)
-        return bool(steps * (size + nodes * (moves + 8 * rows)) < _MOST_BYTES)
+        return int(steps * (size + nodes * (moves + 8 * rows)))
 
     def relaxation(self, steps: int) -> Relaxation:
         """Return the problem without prices."""
@@ -243,6 +252,8 @@ class Branching:
         if not self._fits(len(whole.prices) + more, len(nodes.pace)):
             self.gave_up = True
             return nodes
+        steps = len(whole.prices) + more
+        self._budget.check_time(self._bytes_of(steps, len(nodes.pace)) / _BYTES_PER_S)
         whole.lengthen(more)
         return self._stack(whole, len(nodes.pace))
 
@@ -335,7 +346,9 @@ class Branching:
         whole = self.relaxation(_SPARE_STEPS)
         nowhere = np.full((len(self._choices), _SPARE_STEPS), PARKED, dtype=np.int64)
         parked = trial(self._lattice, nowhere, whole.assignment(), np.zeros_like(whole.prices))
-        Repair(self._lattice, self._teams, whole.prices).attempt(parked, self._budget.check_time)
+        repair = Repair(self._lattice, self._teams)
+        repair.begin(whole.prices)
+        repair.attempt(parked, self._budget.check_time)
 
     def _explore(self) -> None:
         verdict = explore(self._problem, self._choices, self._budget, self._explore_moves)

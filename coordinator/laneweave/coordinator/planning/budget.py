@@ -33,11 +33,11 @@ class Budget:
         self._clock = clock
         self.nodes = 0
 
-    def check_time(self) -> None:
-        """Raise `BudgetSpentError` once the deadline has passed."""
+    def check_time(self, ahead_s: float = 0.0) -> None:
+        """Raise `BudgetSpentError` once the deadline has passed, or will pass so far ahead."""
         if self._deadline is None:
             return
-        if self._clock() + self.nodes * _RELEASE_S_PER_NODE >= self._deadline:
+        if self._clock() + ahead_s + self.nodes * _RELEASE_S_PER_NODE >= self._deadline:
             raise BudgetSpentError
 
     def take_node(self) -> None:

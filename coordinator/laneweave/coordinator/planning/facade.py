@@ -12,6 +12,7 @@ import numpy as np
 
 from laneweave.coordinator.planning.assignments import assignments
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError, Clock
+from laneweave.coordinator.planning.clearances import close_pairs
 from laneweave.coordinator.planning.frd import IntMatrix, Weights, cost_matrix
 from laneweave.coordinator.planning.grid import Cell
 from laneweave.coordinator.planning.incumbent import Solution, tidied
@@ -70,6 +71,8 @@ def plan(
     """
     if solver == "branching":
         warm_up()  # not on the request's time
+    if request.geometry is not None:
+        close_pairs(request.geometry)  # nor is its table
     started = clock()
     weights = (weights or Weights.for_mode(request.mode)).checked(request.mode)
     nodes = MAX_NODES if max_nodes is None else min(max_nodes, MAX_NODES)

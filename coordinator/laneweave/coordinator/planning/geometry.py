@@ -108,16 +108,30 @@ class Geometry:
         )
         along_m, across_m = self._gaps_of_neighbours_m()
         _require(
+            along_m >= 0.0,
+            self,
+            "pitch_m",
+            f"at least {_up(self.pitch_m - along_m)}, for length_m = {self.length_m:g}, bodies "
+            "that turn, and profile errors",
+        )
+        _require(
+            across_m >= 0.0,
+            self,
+            "lane_width_m",
+            f"at least {_up(self.lane_width_m - across_m)}, for width_m = {self.width_m:g}, bodies "
+            "that turn, and profile errors",
+        )
+        _require(
             self.clearance_along_m <= along_m,
             self,
             "clearance_along_m",
-            f"at most {_down(along_m)}: pitch_m less length_m, and bodies turn",
+            f"at most {_down(along_m)}: pitch_m less length_m, turned bodies, profile errors",
         )
         _require(
             self.clearance_across_m <= across_m,
             self,
             "clearance_across_m",
-            f"at most {_down(across_m)}: lane_width_m less width_m, and bodies turn",
+            f"at most {_down(across_m)}: lane_width_m less width_m, turned bodies, profile errors",
         )
         if self.lateness_s is not None:
             most_s = self._most_lateness_s(along_m, across_m)
@@ -199,6 +213,11 @@ class Geometry:
 def _require(ok: bool, geometry: Geometry, name: str, allowed: str) -> None:
     if not ok:
         raise BadInputError(name, getattr(geometry, name), allowed)
+
+
+def _up(value: float) -> str:
+    """Return a number that is not below the value."""
+    return f"{math.ceil(value * 1e3) / 1e3:g}"
 
 
 def _down(value: float) -> str:

@@ -17,7 +17,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from laneweave.coordinator.planning.arrays import Floats, Ints, Lattice, Teams
+from laneweave.coordinator.planning.arrays import UNREACHABLE, Floats, Ints, Lattice, Teams
 from laneweave.coordinator.planning.negotiation_kernel import improve_ways, negotiate
 from laneweave.coordinator.planning.relaxation_kernel import PARKED
 from laneweave.coordinator.planning.repair import Repair
@@ -61,14 +61,18 @@ class Negotiation:
         self._teams = teams
         self._prices = prices
         self._target = target
-        self._repair = Repair(lattice, teams, prices)
+        self._repair = Repair(lattice, teams)
         self._rounds = 0
         self._stretch = _STRETCH
         self._begin()
 
     def suggest(self, prices: Floats, target: Ints) -> None:
-        """Begin the next round from other prices and targets."""
-        self._prices, self._target = prices, target
+        """Begin the next round from other prices, and from other targets if they are legal."""
+        self._prices = prices
+        pair = self._teams.pair[self._teams.team, target]
+        reachable = self._teams.distance[self._teams.start, pair] < UNREACHABLE
+        if np.all(pair >= 0) and np.all(reachable) and len(np.unique(target)) == len(target):
+            self._target = target
 
     def _begin(self) -> None:
         """Begin a round."""
@@ -81,7 +85,7 @@ class Negotiation:
         self._rounds += 1
         self._passes, self._idle, self._idle_repairs = 0, 0, 0
         self._settled = False
-        self._repair.begin()
+        self._repair.begin(self._prices)
 
     def work(self, check_time: Callable[[], None]) -> bool:
         """Do a little; return whether there is a better path set now.
@@ -109,7 +113,8 @@ class Negotiation:
         self._idle = self._idle + idle if idle >= _ATTEMPTS else idle
         if self._idle >= _EXACT_AFTER and self._repair.fits(self._trial):
             self._idle_repairs += 1
-            self._repair.attempt(self._trial, check_time)
+            if self._repair.attempt(self._trial, check_time):
+                self._idle = _EXACT_AFTER
         better = self._keep()
         if self._trial.cost.sum() < before:
             self._idle_repairs = 0

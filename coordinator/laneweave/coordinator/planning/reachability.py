@@ -105,7 +105,8 @@ def _can_be_made_one_after_another(table: MoveTable) -> bool:
     """
     kinds, geometry = table.model.kinds, table.model.geometry
     if "geometric" in kinds:
-        return geometry is None or geometry.lateness_s is None
+        passing = table.mode == 1 or "special-4" not in kinds
+        return geometry is None or (geometry.lateness_s is None and passing)
     no_following = "node" in kinds and "special-1" in kinds
     return no_following and (table.mode == 1 or "special-4" not in kinds)
 

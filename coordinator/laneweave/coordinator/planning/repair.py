@@ -26,37 +26,30 @@ LEAST_VEHICLES = 16
 _SIZES = 6, 14
 """Vehicles that are taken out: more when smaller neighbourhoods hold nothing better."""
 _PATIENCE = 6
-_CHUNKS, _NODES, _STACK = 4, 10, 16
+_CHUNKS, _NODES, _STACK = 20, 2, 16
 """To decide a neighbourhood: looks at the clock, nodes after each, and room for open ones."""
-_MOST_BYTES = 20_000_000
-"""Larger tables are not worth it."""
+_MOST_BYTES, _BYTES_OF_A_MOVE = 50_000_000, 40
+"""Larger tables are not worth it; and what a move needs in them, but for the stack."""
 
 
 class Repair:
     """The search and how large its neighbourhoods are now."""
 
-    def __init__(self, lattice: Lattice, teams: Teams, prices: Floats) -> None:
-        """Begin.
-
-        Args:
-            lattice: the moves.
-            teams: the vehicles.
-            prices: (T, R) of rows in the whole problem.
-        """
+    def __init__(self, lattice: Lattice, teams: Teams) -> None:
+        """Prepare; `begin` comes next."""
         self._lattice = lattice
         self._teams = teams
-        self._prices = prices
         self._number = 0
-        self.begin()
 
-    def begin(self) -> None:
-        """Start over with small neighbourhoods."""
+    def begin(self, prices: Floats) -> None:
+        """Start with small neighbourhoods; prices (T, R) are those of the whole problem."""
+        self._prices = prices
         self._size, self._in_vain = _SIZES[0], 0
 
     def fits(self, trial: Trial) -> bool:
         """Tell whether there are enough vehicles, and tables do not get too large."""
-        groups = len(self._teams.pair)
-        size = _STACK * groups * len(trial.use) * self._lattice.valid.size
+        moves = len(self._teams.pair) * len(trial.use) * self._lattice.valid.size
+        size = (_STACK + _BYTES_OF_A_MOVE) * moves
         return len(self._teams.start) >= LEAST_VEHICLES and size <= _MOST_BYTES
 
     def attempt(self, trial: Trial, check_time: Callable[[], None]) -> bool:
@@ -71,6 +64,7 @@ class Repair:
         targets = np.sort(trial.target[chosen])
         some = part(self._teams, chosen, targets)
         problem = Relaxation(self._lattice, some, steps, taken)
+        check_time()
         prices = np.zeros_like(problem.prices)
         prices[: len(self._prices)] = self._prices[:steps]
         problem.take_prices(prices)
