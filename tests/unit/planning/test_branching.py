@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, plan, problems_of_response
 from laneweave.coordinator.planning.branching import Branching
 from laneweave.coordinator.planning.budget import Budget
-from laneweave.coordinator.planning.grid import Cell, Grid
+from laneweave.coordinator.planning.grid import Cell, Grid, Mode
 from laneweave.coordinator.planning.instances import formation_request
 from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.relaxation import ceiling_of
@@ -37,6 +37,26 @@ def test_twelve_vehicles_are_planned_at_least_cost(seed: int, cost: int) -> None
 def test_both_solvers_agree(request: PlanRequest) -> None:
     by_tree, by_branching = plan(request, solver="tappa"), solved(request)
     assert (by_branching.status, by_branching.cost) == (by_tree.status, by_tree.cost)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("size", [7, 8])
+@pytest.mark.parametrize(
+    ("mode", "conflicts"),
+    [(1, ("node", "edge")), (1, None), (2, ("node", "edge")), (2, None)],
+    ids=["node and edge", "following", "mode 2, node and edge", "geometric"],
+)
+def test_both_solvers_agree_on_formations(
+    seed: int, size: int, mode: Mode, conflicts: tuple[str, ...] | None
+) -> None:
+    request = formation_request(seed, vehicles=size, mode=mode, conflicts=conflicts)
+    branching, tappa = solved(request), plan(request, solver="tappa", max_nodes=3_000)
+    assert branching.status == "optimal"
+    assert branching.cost is not None
+    assert tappa.cost is not None
+    assert tappa.lower_bound is not None
+    assert tappa.lower_bound <= branching.cost <= tappa.cost
+    assert tappa.status != "optimal" or tappa.cost == branching.cost
 
 
 def mirrored(request: PlanRequest, *, columns: bool) -> PlanRequest:
