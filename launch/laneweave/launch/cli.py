@@ -16,7 +16,15 @@ import typer
 from rich.console import Console
 
 from laneweave.launch.logs import log_to_terminal
-from laneweave.launch.role_commands import agent, bridge, check_pace, coordinator, ping, router
+from laneweave.launch.role_commands import (
+    METHOD,
+    agent,
+    bridge,
+    check_pace,
+    coordinator,
+    ping,
+    router,
+)
 from laneweave.launch.run_folder import draw, draw_own, new_folder
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
 from laneweave.protocol.scenario import load_scenario
@@ -43,7 +51,7 @@ class TransportChoice(StrEnum):
 class Method(StrEnum):
     """How vehicles are controlled."""
 
-    formation = "formation"
+    formation = METHOD
 
 
 class Benchmark(StrEnum):

@@ -17,6 +17,7 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario import Scenario, load_scenario
 
 METHOD = "formation"
+"""How a bridge's vehicles are controlled, as its summary says."""
 
 ConfigOption = Annotated[
     Path | None, typer.Option("--config", metavar="DEPLOYMENT.toml", help="Scenario and network.")

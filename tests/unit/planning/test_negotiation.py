@@ -5,7 +5,6 @@ import pytest
 
 from laneweave.coordinator.planning import PlanRequest, plan, problems_of_response
 from laneweave.coordinator.planning.arrays import Lattice, Teams, lattice, teams
-from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.grid import Mode
 from laneweave.coordinator.planning.instances import formation_request
 from laneweave.coordinator.planning.negotiation import Negotiation
@@ -22,7 +21,7 @@ def no_limit() -> None:
 
 
 def arrays_of(request: PlanRequest) -> tuple[Lattice, Teams]:
-    ways = lattice(request.grid, request.mode, ConflictModel(request.conflicts))
+    ways = lattice(request.grid, request.mode, request.conflict_model)
     starts = [vehicle.cell for vehicle in request.vehicles]
     return ways, teams(ways, starts, request.targets, request.choices())
 

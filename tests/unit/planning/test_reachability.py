@@ -5,7 +5,6 @@ from hypothesis import given, settings
 
 from laneweave.coordinator.planning import PlanRequest, VehicleRequest, problems_of_paths
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
-from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.facade import cells_of, plan
 from laneweave.coordinator.planning.geometry import Geometry
 from laneweave.coordinator.planning.grid import Grid
@@ -56,7 +55,7 @@ def test_a_search_that_is_cut_off_shows_nothing() -> None:
 
 def test_time_is_checked() -> None:
     cells = [vehicle.cell for vehicle in PUZZLE.vehicles]
-    model = ConflictModel(PUZZLE.conflicts)
+    model = PUZZLE.conflict_model
     problem = Problem(PUZZLE.grid, 1, model, cells, PUZZLE.targets)
     ticks = iter(range(1000))
     budget = Budget(deadline=3.0, clock=lambda: float(next(ticks)))

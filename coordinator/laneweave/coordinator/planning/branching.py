@@ -36,7 +36,6 @@ from scipy.optimize import linear_sum_assignment
 from laneweave.coordinator.planning.arrays import UNREACHABLE, Floats, Ints, lattice, teams
 from laneweave.coordinator.planning.branching_kernel import FULL, STUCK, search
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
-from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.incumbent import Solution, tidied
 from laneweave.coordinator.planning.negotiation import Negotiation
@@ -84,8 +83,8 @@ def warm_up() -> None:
     # Two who change places, which is not decided at once.
     vehicles = (VehicleRequest("a", (0, 0), lane=1), VehicleRequest("b", (0, 1), lane=0))
     request = PlanRequest(Grid(2, 2), 1, ("geometric",), vehicles, ((0, 0), (0, 1)))
-    model = ConflictModel(request.conflicts)
     starts = [vehicle.cell for vehicle in vehicles]
+    model = request.conflict_model
     problem = Problem(request.grid, request.mode, model, starts, request.targets)
     search_ = Branching(problem, request.choices(), Budget())
     search_.run()
@@ -147,10 +146,9 @@ class Branching:
             self.lower_bound, self.finished = math.inf, True
             return
         steps = self._longest_way() + _SPARE_STEPS
-        if not self._fits(steps, _FIRST_STACK):
+        if not self._may_make(steps, _FIRST_STACK):
             self.gave_up = True
             return
-        self._budget.check_time(self._bytes_of(steps, _FIRST_STACK) / _BYTES_PER_S)
         whole = self.relaxation(steps)
         few = len(self._choices) <= _FEW_VEHICLES
         for number in range(0, _FEW_ITERATIONS if few else _ITERATIONS, _AT_A_TIME):
@@ -184,16 +182,21 @@ class Branching:
         self._take_chance(whole)
         self.lower_bound = max(self.lower_bound, whole.least_cost)
 
-    def _fits(self, steps: int, nodes: int) -> bool:
-        """Tell whether tables of so many steps and nodes fit into memory."""
-        return self._bytes_of(steps, nodes) < _MOST_BYTES
+    def _may_make(self, steps: int, nodes: int) -> bool:
+        """Tell whether tables of so many steps and nodes fit into memory.
 
-    def _bytes_of(self, steps: int, nodes: int) -> int:
+        Raises:
+            BudgetSpentError: they do, but there is no time left to fill them.
+        """
         displacements, cells = self._lattice.valid.shape
         groups, rows = len(self._teams.pair), self._lattice.row_count
         moves = groups * displacements * cells
         size = 8 * cells * len(self._teams.pair_cell) + 33 * moves + 8 * rows * (groups + 12)
-        return int(steps * (size + nodes * (moves + 8 * rows)))
+        size = int(steps * (size + nodes * (moves + 8 * rows)))
+        if size >= _MOST_BYTES:
+            return False
+        self._budget.check_time(size / _BYTES_PER_S)
+        return True
 
     def relaxation(self, steps: int) -> Relaxation:
         """Return the problem without prices."""
@@ -222,7 +225,7 @@ class Branching:
         first = True
         while ending in (OPEN, FULL):
             if ending == FULL:
-                if not self._fits(len(whole.prices), 2 * len(nodes.pace)):
+                if not self._may_make(len(whole.prices), 2 * len(nodes.pace)):
                     break
                 nodes = _doubled(nodes)
             ending, depth = self._go_on(whole, nodes, depth, ceiling, 1 if first else None)
@@ -249,11 +252,9 @@ class Branching:
     def _lengthened(self, whole: Relaxation, nodes: Stack) -> Stack:
         """Have more steps priced; return an empty stack."""
         more = max(_MORE_STEPS, len(whole.prices) // 2)
-        if not self._fits(len(whole.prices) + more, len(nodes.pace)):
+        if not self._may_make(len(whole.prices) + more, len(nodes.pace)):
             self.gave_up = True
             return nodes
-        steps = len(whole.prices) + more
-        self._budget.check_time(self._bytes_of(steps, len(nodes.pace)) / _BYTES_PER_S)
         whole.lengthen(more)
         return self._stack(whole, len(nodes.pace))
 

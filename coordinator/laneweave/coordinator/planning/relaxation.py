@@ -161,7 +161,7 @@ class Relaxation:
         """
         self.lattice = lattice
         self.teams = teams
-        self._taken = np.zeros((steps, lattice.row_count), np.bool_) if taken is None else taken
+        self._taken = taken
         self.memory = np.zeros(BEST + 1)
         self.memory[BOUND], self.memory[PACE], self.memory[BEST] = -UNREACHABLE, 1.0, UNREACHABLE
         self._lay_out(np.zeros((steps, lattice.row_count)))
@@ -173,7 +173,8 @@ class Relaxation:
         self.allowed = np.empty(shape, dtype=np.bool_)
         self.allowed[:] = self.lattice.valid
         self.first = np.zeros(len(self.teams.pair_cell), dtype=np.int64)
-        forbid_taken(self.lattice, self.teams, self._taken, self.allowed, self.first)
+        if self._taken is not None:
+            forbid_taken(self.lattice, self.teams, self._taken, self.allowed, self.first)
         # Where nobody can get in time, nobody moves.
         self._list()
         self._forbid(self.allowed, self.first, self.prices, UNREACHABLE)
@@ -239,8 +240,7 @@ class Relaxation:
         Returns:
             Whether there may be one; None: perhaps one that needs more steps than have prices.
         """
-        nodes.allowed[0], nodes.first[0] = self.allowed, self.first
-        nodes.prices[0], nodes.pace[0] = self.prices, 1.0
+        self.put_whole(nodes)
         self._begin()
         bound = self._forbid(nodes.allowed[0], nodes.first[0], nodes.prices[0], ceiling)
         if bound > ceiling:
@@ -252,6 +252,11 @@ class Relaxation:
             return None
         return True
 
+    def put_whole(self, nodes: Stack) -> None:
+        """Put everything that is allowed at the bottom of a stack, at the present prices."""
+        nodes.allowed[0], nodes.first[0] = self.allowed, self.first
+        nodes.prices[0], nodes.pace[0] = self.prices, 1.0
+
     def take_prices(self, prices: Floats) -> None:
         """Go on from other prices."""
         self.prices = prices.copy()
@@ -259,5 +264,6 @@ class Relaxation:
     def lengthen(self, steps: int) -> None:
         """Let rows have prices in more steps; the best solution so far is forgotten."""
         self.memory[BEST] = UNREACHABLE
-        self._taken = np.pad(self._taken, ((0, steps), (0, 0)))
+        if self._taken is not None:
+            self._taken = np.pad(self._taken, ((0, steps), (0, 0)))
         self._lay_out(np.pad(self.prices, ((0, steps), (0, 0))))

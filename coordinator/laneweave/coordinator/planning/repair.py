@@ -65,12 +65,9 @@ class Repair:
         some = part(self._teams, chosen, targets)
         problem = Relaxation(self._lattice, some, steps, taken)
         check_time()
-        prices = np.zeros_like(problem.prices)
-        prices[: len(self._prices)] = self._prices[:steps]
-        problem.take_prices(prices)
-        nodes = stack(some, prices, self._lattice.valid, _STACK)
-        nodes.allowed[0], nodes.first[0] = problem.allowed, problem.first
-        nodes.prices[0] = prices
+        problem.prices[: len(self._prices)] = self._prices[:steps]
+        nodes = stack(some, problem.prices, self._lattice.valid, _STACK)
+        problem.put_whole(nodes)
         cost = int(trial.cost[chosen].sum())
         depth, ending = 1, OPEN
         for _ in range(_CHUNKS):
