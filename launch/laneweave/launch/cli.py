@@ -111,8 +111,6 @@ def run(
     no_progress: Annotated[bool, typer.Option("--no-progress", help="Show no bar.")] = False,
 ) -> None:
     """Run a scenario on this machine and write its folder."""
-    # As Ctrl-C: files are completed and temporary folders removed.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     settings = load_scenario(
         scenario,
         seed=seed,
@@ -208,7 +206,6 @@ def simulate(
     chosen = profiles.profile_named(profile)
     numbers, count = search.parse_seeds(seeds), search.check_jobs(jobs)
     search.quiet_logs()
-    search.end_on_sigterm()
     show = not no_progress and sys.stderr.isatty()
     result = search.search(numbers, chosen, count, digest=digest, show=show)
     if verbose and (result.failed or len(numbers) == 1):
@@ -284,6 +281,8 @@ def bench(
 
 def main() -> None:
     """Run the command line with the arguments of this process."""
+    # As Ctrl-C: files are completed and temporary folders removed. Roles have their own way.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     sys.exit(_status(sys.argv[1:]))
 
 

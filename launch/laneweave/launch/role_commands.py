@@ -5,7 +5,6 @@ Each imports what it needs when it runs: an agent starts without SUMO, a coordin
 
 from __future__ import annotations
 
-import signal
 from pathlib import Path
 from typing import Annotated
 
@@ -100,8 +99,6 @@ def bridge(
     from laneweave.launch.outcome import complete_summary, print_outcome
     from laneweave.sim_bridge.process import run_bridge
 
-    # Until the bridge is up; then it ends in good order.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     check_pace(pace)
     settings = _deployment(config, endpoint)
     folder = new_folder(out, settings, METHOD)

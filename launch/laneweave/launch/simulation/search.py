@@ -178,11 +178,6 @@ def _collect_seldom() -> None:
     gc.set_threshold(50_000)
 
 
-def end_on_sigterm() -> None:
-    """End as Ctrl-C does when the process is asked to end."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-
-
 def quiet_logs() -> None:
     """Log errors only: refused messages and failing plannings are what a search consists of."""
     structlog.configure(
