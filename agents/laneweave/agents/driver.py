@@ -1,7 +1,9 @@
 """The driver: from the cell to hold, or the move to make, to jerks for the motion controller.
 
-It lays the reference through the lattice points (`trajectory`), tracks it (`tracker`), and has
-something sensible to drive when a solution is not usable. It knows nothing of the protocol.
+It lays the reference through the lattice points (`trajectory`) and tracks it (`tracker`). When a
+solution is not usable it has nothing to say: the motion controller goes on with the last good
+trajectory, and knows how to go on from there (`sim_bridge.motion_controller`: the ladder). It knows
+nothing of the protocol.
 """
 
 from __future__ import annotations
@@ -11,17 +13,14 @@ from typing import Protocol
 
 import numpy as np
 from attrs import frozen
-from numpy.typing import NDArray
 
-from laneweave.agents.tracker import Tracker, remaining_jerk
+from laneweave.agents.surroundings import Surroundings
+from laneweave.agents.tracker import Tracker
 from laneweave.agents.trajectory import Reference
 from laneweave.protocol.lattice import Cell, Move
 from laneweave.protocol.messages import Sense
-from laneweave.protocol.motion import at_rest_in_cell, cell_state, hold_law, integrate
+from laneweave.protocol.motion import at_rest_in_cell, commanded_state
 from laneweave.protocol.scenario import Scenario
-
-SENSED_S = 1.0
-"""How far ahead local sensing is extrapolated; what others plan to do is not known here."""
 
 
 @frozen
@@ -32,7 +31,8 @@ class Drive:
     """End of the motion under way; 0 when the vehicle holds."""
     motion_origin: Cell
     jerks: bytes
-    """Little-endian float32 pairs (along, across) in m/s3, one for each tick of the horizon."""
+    """Little-endian float32 pairs (along, across) in m/s3, one for each tick of the horizon; none
+    when there is nothing better than what is being played."""
 
 
 @frozen
@@ -76,8 +76,8 @@ class TrackingDriver:
         self._tracker = make_tracker(scenario)
         self._reference: Reference | None = None
         self._goal: Cell = (0, 0)
-        self._jerks: NDArray[np.float64] = np.zeros((0, 2))
-        self._jerks_tick = 0
+        self._speed_mps = scenario.lattice.speed_mps
+        self._surroundings = Surroundings(scenario)
         self._solve_ms: list[float] = []
         self._unusable = 0
 
@@ -114,68 +114,23 @@ class TrackingDriver:
         )
 
     def drive(self, sense: Sense, *, moving: bool) -> Drive:
-        """Track the reference; on an unusable solution continue what there is."""
+        """Track the reference."""
         reference = self._path
-        result = self._tracker.solve(
-            sense.state, reference.window(sense.tick), self._predict_ahead(sense)
+        state = commanded_state(
+            sense.state, sense.setpoint, self._scenario.vehicle, self._speed_mps
         )
+        gaps = self._surroundings.gaps(sense, state, self._goal[1])
+        result = self._tracker.solve(state, reference.window(sense.tick), gaps)
         self._solve_ms.append(result.solve_ms)
-        if result.usable:
-            self._jerks, self._jerks_tick = result.jerk, sense.tick
-        else:
-            self._unusable += 1
-            self._fall_back(sense)
+        self._unusable += not result.usable
         return Drive(
             # Past its time but not there yet: still moving, for whoever takes the vehicle over.
             motion_end_tick=max(reference.end_tick, sense.tick + 1) if moving else 0,
             motion_origin=reference.origin,
-            jerks=self._jerks.astype("<f4").tobytes(),
+            jerks=result.jerk.astype("<f4").tobytes() if result.usable else b"",
         )
 
     @property
     def _path(self) -> Reference:
         assert self._reference is not None  # noqa: S101 (it has taken over)
         return self._reference
-
-    def _fall_back(self, sense: Sense) -> None:
-        """Continue the last good trajectory; when it has run out, go to rest in the hold cell."""
-        rest = remaining_jerk(self._jerks, sense.tick - self._jerks_tick)
-        if len(rest) == 0:
-            rest = self._hold(sense)
-        self._jerks, self._jerks_tick = rest, sense.tick
-
-    def _hold(self, sense: Sense) -> NDArray[np.float64]:
-        scenario = self._scenario
-        tick_s = scenario.runtime.tick_s
-        state, jerks = sense.state, []
-        for index in range(scenario.tracking.horizon_ticks):
-            goal = cell_state(scenario.lattice, self._goal, sense.t_s + index * tick_s)
-            jerk = hold_law(state, goal, scenario.vehicle, tick_s)
-            state = integrate(state, jerk, tick_s)
-            jerks.append(jerk)
-        return np.array(jerks)
-
-    def _predict_ahead(self, sense: Sense) -> NDArray[np.float64] | None:
-        """Return where the nearest vehicle ahead will end, at constant speed, as far as that holds.
-
-        It counts in the lanes that the body touches and in the lane that it enters.
-        """
-        if not sense.ahead:
-            return None
-        scenario = self._scenario
-        lane_width_m, half_m = scenario.road.lane_width_m, scenario.vehicle.width_m / 2
-        y_m = sense.state[3]
-        lanes = {
-            int((y_m - half_m) // lane_width_m),
-            int((y_m + half_m) // lane_width_m),
-            self._goal[1],
-        }
-        near = [other for other in sense.ahead if other.lane in lanes]
-        if not near:
-            return None
-        ticks = scenario.tracking.horizon_ticks + 1
-        times_s = np.arange(ticks) * scenario.runtime.tick_s
-        rears = [sense.state[0] + other.gap_m + other.speed_mps * times_s for other in near]
-        rear: NDArray[np.float64] = np.min(rears, axis=0)
-        rear[times_s > SENSED_S + 1e-9] = np.inf
-        return rear

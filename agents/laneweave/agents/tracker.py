@@ -1,20 +1,24 @@
 """The tracker: a quadratic program per tick that keeps the vehicle on its reference.
 
 Model predictive control over N ticks of h seconds, in error coordinates z = z_ref + e,
-u = u_ref + w, with z = (s, v, a, y, v_y, a_y) and u = (j_s, j_y):
+u = u_ref + w, with z = (s, v, a, y, v_y, a_y), the commanded state (`protocol.motion`: so the lag
+of the actuators is compensated), and u = (j_s, j_y):
 
     minimise    sum_k 1/2 (e_k' Q e_k + w_k' R w_k) + 1/2 e_N' S e_N + 1/2 G sum_k g_k^2
     subject to  e_{k+1} = A e_k + B w_k + c_k                  exact: jerks are constant per tick
                 0 <= v_k <= v_max,  a_min <= a_k <= a_max,  |a_y,k| <= a_y,max
                 |v_y,k| <= slip v_k                            no sliding sideways
                 |j_s,k| <= j_max,  |j_y,k| <= j_y,max
-                s_k <= ahead_k - min_gap + g_k                 ahead_k: predicted rear bumper
+                earliest_k <= s_k - g_k <= latest_k            those behind and ahead (`Gaps`)
 
 c is zero for a reference that obeys the dynamics. S is the cost to go of the unlimited problem,
-so without active rows this is the infinite-horizon linear-quadratic regulator. On the reference
-the solution is zero, which the solver's tolerance cannot spoil; in absolute coordinates it leaves
-1.6 m/s3 of noise on the jerk. The slack g is quadratic: an exact (linear) penalty takes four
-times as long. All matrices are set up once; a tick changes bounds only.
+so without active rows this is the infinite-horizon linear-quadratic regulator: w_k = -K e_k. **The
+fast path** is that regulator: the solution without rows is one precomputed matrix times e_0, and
+so are all rows. Where it keeps every row it *is* the solution, and OSQP does not run.
+
+On the reference the solution is zero, which the solver's tolerance cannot spoil; in absolute
+coordinates it leaves 1.6 m/s3 of noise on the jerk. The slack g is quadratic: an exact (linear)
+penalty takes four times as long. All matrices are set up once; a tick changes bounds only.
 
 Three things keep the program small in its numbers, and with them the solver quick. A reference
 that runs into the vehicle ahead yields (see `yielding`). Near standstill the prediction has some
@@ -38,6 +42,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from laneweave.agents.qp import QPResult, QPSettings, QuadraticProgram
+from laneweave.agents.surroundings import NOBODY, Gaps
 from laneweave.agents.trajectory import Window, axis_matrices
 from laneweave.agents.yielding import yield_behind
 from laneweave.protocol.motion import State, hold_law, integrate, limited_jerk
@@ -61,7 +66,9 @@ _SETTINGS = QPSettings(
     row_tolerance=2e-2,
 )
 _FAR_M = 1e4
-"""Stands for no vehicle ahead: finite, so that the row keeps its kind and OSQP its factors."""
+"""Stands for nobody there: finite, so that the row keeps its kind and OSQP its factors."""
+_PUSH_M = 1.0
+"""Those behind push a vehicle ahead of its reference by no more: they have brakes, too."""
 _NEAR = (8.0, 4.0, 6.0, 3.0, 2.5, 6.0)
 """Largest errors of (s, v, a, y, v_y, a_y) at which the reference is tracked as it is."""
 _SPEED_PLAY_MPS = 0.3
@@ -80,18 +87,11 @@ class TrackResult:
     usable: bool
     """Whether to drive by `jerk`; otherwise play the rest of the last good one."""
     iterations: int
+    """OSQP's; 0 on the fast path."""
     solve_ms: float
     """CPU time of the calling thread [ms]."""
     row_violation: float
     """Largest violation of a row by the solver's answer, before limits were applied."""
-
-
-def remaining_jerk(jerk: Array, elapsed_ticks: int) -> Array:
-    """Return what is left of a plan's jerks (N, 2) after some ticks: (N - elapsed, 2), a view.
-
-    The fallback when no new plan is usable; when nothing is left, drive by `hold_law`.
-    """
-    return jerk[max(elapsed_ticks, 0) :]
 
 
 @frozen(eq=False)
@@ -107,27 +107,28 @@ class _Path:
 
 
 class Tracker:
-    """Tracks a reference; one object per vehicle, not to be shared between threads.
+    """Tracks references; see the module for the program. One object per vehicle."""
 
-    Equal sequences of calls give bit-identical jerks.
-    """
+    def __init__(self, scenario: Scenario, *, fast_path: bool = True) -> None:
+        """Set the program up.
 
-    def __init__(self, scenario: Scenario) -> None:
-        """Set up matrices and solver for a scenario's limits, tick and horizon."""
-        n = scenario.tracking.horizon_ticks
-        self._n = n
+        Args:
+            scenario: horizon, tick, limits.
+            fast_path: whether OSQP rests where the solution without rows keeps all of them.
+        """
+        n = self._n = scenario.tracking.horizon_ticks
         self._tick_s = scenario.runtime.tick_s
         self._axis = axis_matrices(self._tick_s)
         self._limits = scenario.vehicle
-        self._min_gap_m = scenario.tracking.min_gap_m
         self._jerk_limits = np.array(
             [self._limits.max_jerk_mps3, self._limits.max_lateral_jerk_mps3]
         )
         self._low, self._high = _Bounds(n), _Bounds(n)
-        self._low.slip_left[:] = self._low.gap[:] = -np.inf
+        self._low.slip_left[:] = -np.inf
         self._high.slip_right[:] = np.inf
-        self._high.gap[:] = _FAR_M
-        self._no_gap = True
+        self._low.gap[:], self._high.gap[:] = -_FAR_M, _FAR_M
+        self._gaps = NOBODY
+        self._regulator = Regulator(n, self._tick_s) if fast_path else None
         self._qp = QuadraticProgram(
             _cost(n, self._tick_s),
             _rows(n, self._tick_s, self._limits.max_slip_ratio),
@@ -136,14 +137,13 @@ class Tracker:
             settings=_SETTINGS,
         )
 
-    def solve(self, state: State, window: Window, ahead: Array | None = None) -> TrackResult:
+    def solve(self, state: State, window: Window, gaps: Gaps = NOBODY) -> TrackResult:
         """Return the jerks that bring the vehicle to its reference.
 
         Args:
-            state: (s, v, a, y, v_y, a_y) now.
+            state: commanded state (s, v, a, y, v_y, a_y) now.
             window: the reference from now on, N + 1 states and N jerks.
-            ahead: predicted rear bumper of the vehicle ahead now and at the next N ticks,
-                (N + 1,) [m]; +inf where there is none. None: no vehicle ahead.
+            gaps: what the others leave.
 
         Raises:
             ValueError: a shape is wrong, a number is NaN or the state not finite.
@@ -156,17 +156,21 @@ class Tracker:
             )
         if not all(map(math.isfinite, state)):
             raise ValueError(f"state is not finite: {state}")
-        latest = self._latest(ahead)
+        gaps.check(self._n)
+        path = self._give_way(state, states, jerks, gaps.latest)
+        jerk = self._regulated(state, path, gaps)
+        if jerk is not None:
+            elapsed_ms = (time.thread_time() - start) * 1e3
+            return TrackResult(jerk, True, 0, elapsed_ms, 0.0)
         iterations = 0
-        path = self._give_way(state, states, jerks, latest)
         usable = _is_near(state, path.states[0].tolist())
         if usable:
-            self._set_bounds(state, path, latest)
+            self._set_bounds(state, path, gaps)
             result = self._solve_program()
             usable, iterations = result.usable, result.iterations
         if not usable:
-            path = self._give_way(state, *self._way_back(state, states), latest)
-            self._set_bounds(state, path, latest)
+            path = self._give_way(state, *self._way_back(state, states), gaps.latest)
+            self._set_bounds(state, path, gaps)
             np.minimum(self._low.limits, 0.0, out=self._low.limits)
             np.maximum(self._high.limits, 0.0, out=self._high.limits)
             result = self._solve_program()
@@ -179,18 +183,33 @@ class Tracker:
         elapsed_ms = (time.thread_time() - start) * 1e3
         return TrackResult(jerk, usable, iterations, elapsed_ms, result.row_violation)
 
+    def _regulated(self, state: State, path: _Path, gaps: Gaps) -> Array | None:
+        """Return the jerks (N, 2) of the solution without rows if it keeps all of them."""
+        if self._regulator is None or path.defect is not None:
+            return None
+        errors = np.array(state) - path.states[0]
+        jerk, along, across = self._regulator.respond(errors, path)
+        limits = self._limits
+        if not (
+            _within(jerk[:, 0], limits.max_jerk_mps3)
+            and _within(jerk[:, 1], limits.max_lateral_jerk_mps3)
+            and _within(across[:, 2], limits.max_lateral_accel_mps2)
+            and along[:, 2].max() <= limits.max_accel_mps2
+            and along[:, 2].min() >= limits.min_accel_mps2
+            and along[:, 1].max() <= limits.max_speed_mps
+            and along[:, 1].min() >= 0.0
+            and (np.abs(across[:, 1]) <= limits.max_slip_ratio * along[:, 1]).all()
+        ):
+            return None
+        if gaps.latest is not None and not (along[:, 0] <= gaps.latest[1:]).all():
+            return None
+        if gaps.earliest is not None and not (along[:, 0] >= gaps.earliest[1:]).all():
+            return None
+        return jerk
+
     def _solve_program(self) -> QPResult:
         self._qp.update(self._low.all, self._high.all)
         return self._qp.solve()
-
-    def _latest(self, ahead: Array | None) -> Array | None:
-        """Return the furthest that the front bumper may be, (N + 1,) [m]."""
-        if ahead is None:
-            return None
-        if ahead.shape != (self._n + 1,):
-            raise ValueError(f"ahead has shape {ahead.shape}, expected {(self._n + 1,)}")
-        latest: Array = ahead - self._min_gap_m
-        return latest
 
     def _give_way(self, state: State, states: Array, jerks: Array, latest: Array | None) -> _Path:
         """Return the reference as it is, or yielding if it violates a gap."""
@@ -203,21 +222,14 @@ class Tracker:
         defect = along[:-1] @ transition.T + jerks[:, :1] * effect[:, 0] - along[1:]
         return _Path(states, jerks, defect)
 
-    def _set_bounds(self, state: State, path: _Path, latest: Array | None) -> None:
+    def _set_bounds(self, state: State, path: _Path, gaps: Gaps) -> None:
         """Write all bounds."""
         states, jerks = path.states, path.jerks
         low, high, limits = self._low, self._high, self._limits
         low.dynamics[:] = 0.0
         if path.defect is not None:
             low.dynamics[:, :3] -= path.defect
-        if latest is not None:
-            np.subtract(latest[1:], states[1:, 0], out=high.gap)
-            # A gap that even the yielding path cannot keep asks for no more than the path.
-            np.clip(high.gap, 0.0, _FAR_M, out=high.gap)
-            self._no_gap = False
-        elif not self._no_gap:
-            high.gap[:] = _FAR_M
-            self._no_gap = True
+        self._set_gaps(states, gaps)
         s, v, a, y, v_y, a_y = states[0].tolist()
         error = (
             state[0] - s,
@@ -245,6 +257,23 @@ class Tracker:
         np.subtract(self._jerk_limits, jerks, out=high.jerk)
         np.add(self._jerk_limits, jerks, out=low.jerk)
         np.negative(low.jerk, out=low.jerk)
+
+    def _set_gaps(self, states: Array, gaps: Gaps) -> None:
+        """Write the bounds of the gap rows."""
+        low, high = self._low.gap, self._high.gap
+        if gaps.latest is not None:
+            np.subtract(gaps.latest[1:], states[1:, 0], out=high)
+            # A gap that even the yielding path cannot keep asks for no more than the path.
+            np.clip(high, 0.0, _FAR_M, out=high)
+        elif self._gaps.latest is not None:
+            high[:] = _FAR_M
+        if gaps.earliest is not None:
+            np.subtract(gaps.earliest[1:], states[1:, 0], out=low)
+            np.clip(low, -_FAR_M, _PUSH_M, out=low)
+            np.minimum(low, high, out=low)
+        elif self._gaps.earliest is not None:
+            low[:] = -_FAR_M
+        self._gaps = gaps
 
     def _way_back(self, state: State, states: Array) -> tuple[Array, Array]:
         """Return the hold law's way from a state to a reference: states (N + 1, 6), jerks."""
@@ -286,6 +315,48 @@ class Tracker:
             -float(v.min()),
             float((np.abs(speed[:, 1]) - limits.max_slip_ratio * v).max()),
         )
+
+
+class Regulator:
+    """The solution of the program without rows: w_k = -K e_k, rolled out over the horizon."""
+
+    def __init__(self, ticks: int, tick_s: float) -> None:
+        """Roll out both axes from each of the six initial errors, over N ticks."""
+        transition, effect = axis_matrices(tick_s)
+        rolled = []
+        for weights in (np.diag(_WEIGHTS), np.diag(_LATERAL_WEIGHTS)):
+            gain = _gain(_cost_to_go(weights, tick_s), tick_s)
+            error, inputs, errors = np.eye(3), [], []
+            for _ in range(ticks):
+                inputs.append(-gain @ error)
+                error = transition @ error + effect @ inputs[-1]
+                errors.append(error)
+            rolled.append(np.concatenate([*inputs, *errors]))
+        self._ticks = ticks
+        self._along, self._across = rolled
+
+    def respond(self, errors: Array, path: _Path) -> tuple[Array, Array, Array]:
+        """Return jerks (N, 2) and the states along and across (N, 3) that follow from them.
+
+        Args:
+            errors: e_0 (6,).
+            path: what is tracked, without defect.
+        """
+        n = self._ticks
+        along, across = self._along @ errors[:3], self._across @ errors[3:]
+        jerk = np.empty((n, 2))
+        jerk[:, 0], jerk[:, 1] = along[:n], across[:n]
+        jerk += path.jerks
+        states = path.states[1:]
+        return (
+            jerk,
+            along[n:].reshape(n, 3) + states[:, :3],
+            across[n:].reshape(n, 3) + states[:, 3:],
+        )
+
+
+def _within(values: Array, most: float) -> bool:
+    return bool(values.max() <= most and values.min() >= -most)
 
 
 def _is_near(state: State, reference: list[float]) -> bool:
@@ -357,9 +428,15 @@ def _cost_to_go(weights: Array, h: float) -> Array:
     transition, effect = axis_matrices(h)
     cost = weights
     for _ in range(1000):
-        gain = effect.T @ cost @ transition / (_JERK_WEIGHT + effect.T @ cost @ effect)
-        following = weights + transition.T @ cost @ (transition - effect @ gain)
+        following = weights + transition.T @ cost @ (transition - effect @ _gain(cost, h))
         if np.abs(following - cost).max() < 1e-9 * np.abs(following).max():
             break
         cost = (following + following.T) / 2.0
     return cost
+
+
+def _gain(cost: Array, h: float) -> Array:
+    """Return K (1, 3) of the last tick before a cost to go (3, 3)."""
+    transition, effect = axis_matrices(h)
+    gain: Array = effect.T @ cost @ transition / (_JERK_WEIGHT + effect.T @ cost @ effect)
+    return gain

@@ -12,6 +12,16 @@ splits a path into legs, and each leg is the quadratic program over n ticks of h
 that is solved once per kind of leg and process. Its jerks are integrated again, exactly, and the
 result is checked, whatever the solver said.
 
+States are commanded states (`protocol.motion`): the body follows them with its actuators' lag and
+is 0.1 m short of its cell when the time of the move is over, 0.03 m at the end of the slot (default
+lags). A move forwards closes up on whoever holds in the cell beyond its target. It keeps so far
+behind that the emergency brake (`protocol.braking`) need not act, with room for errors:
+
+    s_k+r + (lag + r h) v_F + (v_F + v_k+r)^2 / (2 b)
+        <=  2 d_F - L + way of the vehicle ahead - margin - errors
+
+for every tick k and r ticks of reaction; the square is replaced by its tangents.
+
 A `Reference` is what the tracker follows: trajectories strung along the road clock, cell to cell.
 """
 
@@ -28,6 +38,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from laneweave.agents.qp import QPSettings, QuadraticProgram
+from laneweave.protocol.braking import lead_way_m, spare_error_m
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario import Scenario, Vehicle
@@ -40,11 +51,19 @@ _END_TOLERANCE = 1e-3
 """Accepted error of a leg's end [m, m/s, m/s2]."""
 _LIMIT_TOLERANCE = 1e-4
 """Accepted excess over a limit's share [m/s, m/s2, m/s3]."""
+_ERROR_SIGMAS = 4.5
+"""Errors of measurement that a move forwards leaves room for, in standard deviations."""
+_TRACKING_ERROR_M = 0.25
+"""Room that it leaves for errors of tracking."""
+_CLOSING_SPEEDUP = 0.5
+"""Greatest closing speed to speak of, as a share of v_F."""
+_TANGENTS = 5
 _SETTINGS = QPSettings(
-    eps_abs=1e-7,
+    eps_abs=1e-6,
     max_iter=8000,
     check_termination=25,
-    rho=1.0,
+    rho=0.3,
+    alpha=1.8,
     eps_infeasible=1e-8,
     polishing=True,
     row_tolerance=1e-4,
@@ -100,12 +119,38 @@ class Leg:
     trajectory: Trajectory
 
 
-def plan_trajectory(scenario: Scenario, waypoints: Sequence[Waypoint]) -> Trajectory:
+@frozen
+class Envelope:
+    """How far and how fast a leg may go behind somebody who holds, so that braking is in time."""
+
+    ticks: int
+    """Ticks of reaction."""
+    brake_mps2: float
+    most_m: float
+    """Greatest s + (v_F + v)^2 / (2 brake), with s and v relative to the lattice."""
+
+    @classmethod
+    def behind(cls, scenario: Scenario, room_m: float) -> Envelope:
+        """Return the envelope of a leg that starts with a net gap of `room_m` to who is ahead."""
+        speed_mps, braking = scenario.formation.speed_mps, scenario.braking
+        ticks = max(round(braking.reaction_s / scenario.runtime.tick_s), 1)
+        lost_s = scenario.vehicle.actuator_lag_s + ticks * scenario.runtime.tick_s
+        errors_m = _ERROR_SIGMAS * spare_error_m(scenario, (1.0 + _CLOSING_SPEEDUP) * speed_mps)
+        kept_m = braking.margin_m + errors_m + _TRACKING_ERROR_M
+        most_m = room_m + lead_way_m(scenario, speed_mps) - kept_m - lost_s * speed_mps
+        return cls(ticks, -scenario.vehicle.min_accel_mps2, most_m)
+
+
+def plan_trajectory(
+    scenario: Scenario, waypoints: Sequence[Waypoint], room_m: float | None = None
+) -> Trajectory:
     """Return the trajectory of least jerk that rests at every waypoint.
 
     Args:
         scenario: limits, tick and lattice speed.
         waypoints: at least two, ticks ascending; the first is the start, where the vehicle rests.
+        room_m: net gap at the start to somebody ahead who holds, and behind whom it must be able
+            to stop; None: there is nobody.
 
     Raises:
         InfeasibleTrajectoryError: a leg cannot be driven within the limits.
@@ -117,6 +162,7 @@ def plan_trajectory(scenario: Scenario, waypoints: Sequence[Waypoint]) -> Trajec
     for start, end in pairwise(waypoints):
         if end.tick <= start.tick:
             raise ValueError(f"waypoint ticks do not ascend: {start.tick}, {end.tick}")
+        gone_m = start.position_m - waypoints[0].position_m
         leg = _leg(
             scenario.vehicle,
             scenario.formation.speed_mps,
@@ -124,6 +170,7 @@ def plan_trajectory(scenario: Scenario, waypoints: Sequence[Waypoint]) -> Trajec
             end.tick - start.tick,
             end.position_m - start.position_m,
             end.lateral_m - start.lateral_m,
+            None if room_m is None else Envelope.behind(scenario, room_m - gone_m),
         )
         shifted = leg.states + np.array([start.position_m, 0.0, 0.0, start.lateral_m, 0.0, 0.0])
         states.append(shifted[:-1] if end is not waypoints[-1] else shifted)
@@ -145,7 +192,12 @@ def move_profile(scenario: Scenario, dx: int, dy: int) -> Trajectory:
         raise ValueError(f"({dx}, {dy}) does not lead to a neighbouring cell")
     ticks = round(scenario.formation.move_s / scenario.runtime.tick_s)
     along_m, across_m = dx * scenario.formation.gap_m, dy * scenario.road.lane_width_m
-    return plan_trajectory(scenario, (Waypoint(0, 0.0, 0.0), Waypoint(ticks, along_m, across_m)))
+    beyond_m = 2.0 * scenario.formation.gap_m - scenario.vehicle.length_m
+    return plan_trajectory(
+        scenario,
+        (Waypoint(0, 0.0, 0.0), Waypoint(ticks, along_m, across_m)),
+        room_m=beyond_m if dx > 0 else None,
+    )
 
 
 def check_moves(scenario: Scenario) -> None:
@@ -272,7 +324,13 @@ class Reference:
 
 @lru_cache(maxsize=256)
 def _leg(
-    limits: Vehicle, speed_mps: float, tick_s: float, ticks: int, ds_m: float, dy_m: float
+    limits: Vehicle,
+    speed_mps: float,
+    tick_s: float,
+    ticks: int,
+    ds_m: float,
+    dy_m: float,
+    envelope: Envelope | None,
 ) -> Trajectory:
     """Return the motion from rest at (0, 0) to rest at (ds, dy) in `ticks` ticks.
 
@@ -284,8 +342,12 @@ def _leg(
         return _frozen(np.zeros((ticks, 2)), tick_s)
     # With a unit of time near an eighth of the leg, all states are of similar size.
     unit_s = ticks * tick_s / 8.0
-    program = _leg_program(limits, speed_mps, tick_s / unit_s, unit_s, ticks, (ds_m, dy_m))
+    program = _leg_program(
+        limits, speed_mps, tick_s / unit_s, unit_s, ticks, (ds_m, dy_m), envelope
+    )
     what = f"{ds_m:g} m along and {dy_m:g} m across in {ticks * tick_s:g} s"
+    if envelope is not None:
+        what += ", with room to brake behind whoever holds beyond"
     solution = program.solve()
     if not solution.usable:
         raise InfeasibleTrajectoryError(
@@ -311,6 +373,7 @@ def _leg_program(
     unit_s: float,
     n: int,
     end_m: tuple[float, float],
+    envelope: Envelope | None,
 ) -> QuadraticProgram:
     """Set up a leg in units of `unit_s`: x = (z_s [3n], z_y [3n], j_s [n], j_y [n])."""
     transition, effect = axis_matrices(h)
@@ -350,6 +413,14 @@ def _leg_program(
         ([last, None, None, None], ends[0], ends[0]),
         ([None, last, None, None], ends[1], ends[1]),
     ]
+    if envelope is not None:
+        brake, later = envelope.brake_mps2, eye.tocsr()[envelope.ticks - 1 :]
+        for share in np.linspace(0.0, _CLOSING_SPEEDUP, _TANGENTS):
+            speed = speed_mps * (1.0 + share)
+            # At this speed: v^2 / (2 b) >= speed (2 v - speed) / (2 b).
+            row = sparse.kron(later, np.array([[1.0, speed / brake / unit_s, 0.0]]))
+            most = envelope.most_m - speed * (2.0 * speed_mps - speed) / (2.0 * brake)
+            rows.append(([row, None, None, None], -infinite, most))
     heights = [next(m for m in blocks if m is not None).shape[0] for blocks, _, _ in rows]
     return QuadraticProgram(
         sparse.diags([np.concatenate([np.zeros(6 * n), np.ones(2 * n)])], [0]),

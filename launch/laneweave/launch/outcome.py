@@ -115,6 +115,7 @@ def _traffic_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
             _join(summary["travel_time_s"], "mean", "p95", "max", unit=" s"),
         ),
         ("ticks driven without an agent", f"{summary['tracking']['hold_law_ticks']}"),
+        ("ticks of emergency braking", f"{summary['tracking']['emergency_ticks']}"),
         ("overlaps", f"{safety['overlaps']} (SUMO reports {safety['sumo_collisions']})"),
         ("least gap, least headway", f"{gap} m, {headway} s"),
         ("acceleration", f"{low} to {high} m/s2"),

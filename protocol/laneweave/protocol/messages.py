@@ -128,12 +128,13 @@ class VehicleState:
 
 @frozen
 class Neighbour:
-    """The nearest vehicle ahead in a lane, as local sensing sees it."""
+    """The nearest vehicle ahead in a lane, or behind in it, as local sensing sees it."""
 
     lane: int
     gap_m: float
     """Net bumper-to-bumper distance along the road; negative: side by side."""
     speed_mps: float
+    accel_mps2: float = 0.0
 
 
 @frozen
@@ -149,7 +150,8 @@ class Sense:
     tick: int
     t_s: float
     state: tuple[float, float, float, float, float, float]
-    """(s m, v m/s, a m/s2, y m, v_y m/s, a_y m/s2); s is the front bumper, y the body centre."""
+    """(s m, v m/s, a m/s2, y m, v_y m/s, a_y m/s2) as measured; s is the front bumper, y the body
+    centre."""
     hold_cell: Cell
     """The cell in which the motion controller will hold when nothing new comes."""
     motion_end_tick: int
@@ -159,6 +161,10 @@ class Sense:
     preferred_lane: int
     ahead: tuple[Neighbour, ...]
     """One for each lane that the body touches or that is next to it, where there is somebody."""
+    behind: tuple[Neighbour, ...] = ()
+    """Likewise."""
+    setpoint: tuple[float, float] = (0.0, 0.0)
+    """Accelerations that the actuators were told last, along and across [m/s2]."""
     formation: int = 0
     """In whose block the vehicle entered."""
     attendant: int = 0

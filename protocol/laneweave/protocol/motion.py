@@ -5,6 +5,16 @@ body centre y across it):
 
     state z = (s, v, a, y, v_y, a_y)        input u = (j_s, j_y), constant during a tick
 
+**The commanded state.** A body does not follow its set-point of acceleration u at once, but as a
+first-order lag does: lag da/dt = u - a. Let c = s + lag v. Then dc/dt = v + lag a and
+d2c/dt2 = u: the point c moves as if there were no lag, and the body follows it as a low-pass
+filter does, lag ds/dt = c - s. So whoever steers the *commanded state* (c, dc/dt, u) has
+compensated the lag exactly, and since a low-pass filter averages, the body keeps every limit on
+speed, acceleration and jerk, and every distance between two bodies of equal lag, that the commanded
+states keep. All laws here, the tracker and the references are about commanded states. They
+are counted from where they are at rest in the lattice (lag v_F is left out of c), so that a
+vehicle that holds has equal true and commanded states.
+
 Everything here is a pure function of plain floats. The agent plans with it, the vehicle's own
 motion controller runs on it when the agent's commands run out, and the plant integrates with it,
 so the three agree to the last bit.
@@ -68,6 +78,29 @@ def integrate(state: State, jerk: Jerk, tick_s: float) -> State:
         y + v_y * tick_s + a_y * half + j_y * sixth,
         v_y + a_y * tick_s + j_y * half,
         a_y + j_y * tick_s,
+    )
+
+
+def commanded_state(
+    state: State, setpoint: tuple[float, float], limits: Vehicle, speed_mps: float
+) -> State:
+    """Return the state that a body pursues through its actuators; see the module.
+
+    Args:
+        state: of the body, (s, v, a, y, v_y, a_y) in m and s.
+        setpoint: accelerations that its actuators were told, along and across [m/s2].
+        limits: the vehicle; its lags count.
+        speed_mps: v_F, the speed of the lattice.
+    """
+    s, v, a, y, v_y, a_y = state
+    lag_s, lateral_lag_s = limits.actuator_lag_s, limits.lateral_actuator_lag_s
+    return (
+        s + lag_s * (v - speed_mps),
+        v + lag_s * a,
+        setpoint[0],
+        y + lateral_lag_s * v_y,
+        v_y + lateral_lag_s * a_y,
+        setpoint[1],
     )
 
 

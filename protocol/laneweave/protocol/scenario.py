@@ -165,6 +165,42 @@ class Vehicle:
     max_lateral_jerk_mps3: float = field(default=8.0, validator=within(0.1, 100.0))
     max_slip_ratio: float = field(default=0.25, validator=within(0.01, 1.0))
     """Lateral speed is at most this share of the forward speed: no sliding sideways."""
+    actuator_lag_s: float = field(default=0.2, validator=within(0.0, 2.0))
+    """The body's acceleration follows its set-point as a first-order lag of this time constant."""
+    lateral_actuator_lag_s: float = field(default=0.1, validator=within(0.0, 2.0))
+
+
+@frozen
+class Sensing:
+    """How well a vehicle knows itself and those around it: standard deviations, each tick anew."""
+
+    position_noise_m: float = field(default=0.05, validator=within(0.0, 5.0))
+    lateral_noise_m: float = field(default=0.02, validator=within(0.0, 1.0))
+    speed_noise_mps: float = field(default=0.02, validator=within(0.0, 2.0))
+    """Of its own speed, along and across."""
+    accel_noise_mps2: float = field(default=0.05, validator=within(0.0, 2.0))
+    """Of its own acceleration, along and across."""
+    gap_noise_m: float = field(default=0.05, validator=within(0.0, 2.0))
+    """Of the gap to another vehicle."""
+    other_speed_noise_mps: float = field(default=0.03, validator=within(0.0, 2.0))
+    other_accel_noise_mps2: float = field(default=0.2, validator=within(0.0, 5.0))
+
+
+@frozen
+class Braking:
+    """What the emergency brake of every vehicle assumes of whoever is ahead, and of itself.
+
+    Its own braking is `vehicle.min_accel_mps2`, through `vehicle.actuator_lag_s`.
+    """
+
+    lead_brake_mps2: float = field(default=10.0, validator=within(0.1, 30.0))
+    """Hardest braking of the vehicle ahead."""
+    lead_lag_s: float = field(default=0.2, validator=within(0.0, 2.0))
+    """Its brakes build up no faster than a first-order lag of this time constant does."""
+    reaction_s: float = field(default=0.1, validator=within(0.01, 5.0))
+    """From what the sensors see to the set-point of the brakes; a tick or more."""
+    margin_m: float = field(default=0.3, validator=within(0.0, 10.0))
+    """Net gap that is left when both stand still; errors of measurement come out of it."""
 
 
 @frozen
@@ -229,6 +265,8 @@ class Scenario:
     demand: Demand = Demand()
     formation: FormationSettings = FormationSettings()
     vehicle: Vehicle = Vehicle()
+    sensing: Sensing = Sensing()
+    braking: Braking = Braking()
     tracking: Tracking = Tracking()
     network: Network = Network()
     runtime: Runtime = Runtime()

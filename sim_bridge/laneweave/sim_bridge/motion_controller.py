@@ -1,9 +1,15 @@
 """A vehicle's own motion controller: it outlives the vehicle's agent process.
 
-It plays the trajectory of the newest command. When that runs out - the agent died, fell silent, or
-its commands were lost - it brings the vehicle to rest in the cell that the last command named and
-holds there: the vehicle goes on driving at v_F in a cell that is its own, and keeps its distance
-to whoever its own sensors see ahead.
+What it drives by is a ladder, `Rung`, and on its own it only ever goes down:
+
+    play        the trajectory of the newest command, as far as it goes
+    hold        to rest in the cell that the last command named, and stay there at v_F
+    give way    the same, with comfortable braking behind whoever is ahead
+    emergency   brakes as hard as the vehicle can, for as long as `EmergencyBrake` says so
+
+Play is what a vehicle does whose agent is well, or died, or whose commands were lost a moment ago.
+A trajectory that ran out or that an emergency interrupted is not taken up again: only a command
+that comes now leads back up. The emergency brake acts on every rung, on local sensing alone.
 
 It also keeps what must survive the agent, or must not be believed of one that has been replaced:
 who is in charge of the vehicle, which formations it has joined, and which plan the process in
@@ -13,20 +19,40 @@ charge has accepted. Nobody but that process changes where the vehicle holds or 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from enum import IntEnum
 
 import numpy as np
 from attrs import define, field
 from numpy.typing import NDArray
 
+from laneweave.protocol.braking import EmergencyBrake
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, Lattice
 from laneweave.protocol.messages import Ballot, Command, Neighbour
-from laneweave.protocol.motion import Jerk, at_rest_in_cell, cell_state, hold_law, keep_gap
-from laneweave.protocol.scenario import Vehicle
+from laneweave.protocol.motion import (
+    Jerk,
+    State,
+    at_rest_in_cell,
+    cell_state,
+    commanded_state,
+    hold_law,
+    keep_gap,
+)
+from laneweave.protocol.scenario import Scenario
+from laneweave.sim_bridge.overlap import NOBODY_AROUND, Around
 from laneweave.sim_bridge.plant import Plant
 
 MAX_COLUMN = 2**31 - 1
 """Columns are recorded with 32 bits; no vehicle gets this far. Formations have lesser numbers."""
+
+
+class Rung(IntEnum):
+    """What a vehicle drives by; see the module."""
+
+    PLAY = 0
+    HOLD = 1
+    GIVE_WAY = 2
+    EMERGENCY = 3
 
 
 @define
@@ -34,12 +60,8 @@ class MotionController:
     """What the controller of one vehicle has been told last."""
 
     plant: Plant
-    limits: Vehicle
-    lattice: Lattice
-    tick_s: float
+    _scenario: Scenario
     hold_cell: Cell
-    min_gap_m: float = 0.0
-    """Net gap that the controller keeps by its own sensing while nobody drives."""
     attendant: int = 0
     """Incarnation of the process in charge; 0: none yet."""
     joined: tuple[int, ...] = field(init=False)
@@ -50,17 +72,38 @@ class MotionController:
     motion_end_tick: int = 0
     command_tick: int = -1
     """Tick of the newest command; -1: none yet."""
-    played_from_hold: int = 0
-    """Ticks that were driven by the hold law, for want of a command."""
+    rung: Rung = Rung.HOLD
+    """What it drove by in the last tick."""
+    rung_ticks: dict[Rung, int] = field(init=False)
+    """Ticks on each rung."""
+    around: Around = NOBODY_AROUND
+    """Whom its sensors see."""
+    _measured: State | None = None
     _jerks: NDArray[np.float32] = field(init=False)
     _jerks_tick: int = 0
     """Tick that the first of the jerks is for."""
+    lattice: Lattice = field(init=False)
+    tick_s: float = field(init=False)
+    _brake: EmergencyBrake = field(init=False)
 
     def __attrs_post_init__(self) -> None:
         """Begin with nothing to play, in the formation of the cell."""
+        self.lattice = self._scenario.lattice
+        self.tick_s = self._scenario.runtime.tick_s
         self.joined = (self.lattice.block_of(self.hold_cell[0]),)
         self.motion_origin = self.hold_cell
+        self.rung_ticks = dict.fromkeys(Rung, 0)
         self._jerks = np.zeros((0, 2), dtype=np.float32)
+        self._brake = EmergencyBrake(self._scenario)
+
+    @property
+    def measured(self) -> State:
+        """State of the body as its sensors measure it; the true one before they have."""
+        return self.plant.state if self._measured is None else self._measured
+
+    def perceive(self, measured: State, around: Around) -> None:
+        """Take what its sensors measure now."""
+        self._measured, self.around = measured, around
 
     def take(self, command: Command) -> bool:
         """Take a command of the process in charge, or of one that takes charge with it.
@@ -135,17 +178,24 @@ class MotionController:
         A body that is late still moves, though the time of its motion is over.
         """
         return tick < self.motion_end_tick or not at_rest_in_cell(
-            self.plant.state, self.lattice, self.hold_cell, tick * self.tick_s
+            self.measured, self.lattice, self.hold_cell, tick * self.tick_s
         )
 
-    def step(self, tick: int, ahead: Iterable[Neighbour] = ()) -> None:
-        """Drive from `tick` to the next one.
-
-        Args:
-            tick: number of the tick that begins.
-            ahead: whom the vehicle's sensors see.
-        """
-        self.plant.step(*self._jerk(tick, ahead))
+    def step(self, tick: int) -> None:
+        """Drive from `tick` to the next one."""
+        near = [other for other in self.around.ahead if self._is_in_the_way(other)]
+        rung, jerk = self._way(tick, near)
+        setpoint = self.plant.setpoint[0]
+        if self._brake.spare_m(self.measured, setpoint, jerk, near) < 0.0:
+            rung = Rung.EMERGENCY
+            # The body is not where the trajectory would have it any more.
+            self._jerks = self._jerks[:0]
+            self.plant.brake(jerk[1])
+        else:
+            self.plant.step(*jerk)
+        self.rung = rung
+        self.rung_ticks[rung] += 1
+        self._measured = None
 
     def _checked_jerks(self, command: Command) -> NDArray[np.float32]:
         for cell in (command.hold_cell, command.motion_origin):
@@ -160,21 +210,32 @@ class MotionController:
             raise BadInputError("Command.jerks", "NaN or infinity", "finite numbers")
         return jerks
 
-    def _jerk(self, tick: int, ahead: Iterable[Neighbour]) -> Jerk:
+    def _way(self, tick: int, near: Iterable[Neighbour]) -> tuple[Rung, Jerk]:
+        """Return what to drive by, and the jerk, if there is no emergency."""
         index = tick - self._jerks_tick
         if 0 <= index < len(self._jerks):
             j_s, j_y = self._jerks[index].tolist()
-            return j_s, j_y
-        self.played_from_hold += 1
-        state = self.plant.state
-        reference = cell_state(self.lattice, self.hold_cell, tick * self.tick_s)
-        jerk = hold_law(state, reference, self.limits, self.tick_s)
-        near = [(other.gap_m, other.speed_mps) for other in ahead if self._is_in_the_way(other)]
-        return keep_gap(state, jerk, near, self.limits, self.min_gap_m, self.tick_s)
+            return Rung.PLAY, (j_s, j_y)
+        limits, speed_mps = self._scenario.vehicle, self.lattice.speed_mps
+        body = self.measured
+        state = commanded_state(body, self.plant.setpoint, limits, speed_mps)
+        goal = cell_state(self.lattice, self.hold_cell, tick * self.tick_s)
+        jerk = hold_law(state, goal, limits, self.tick_s)
+        lag_s = limits.actuator_lag_s
+        ahead = [
+            (
+                other.gap_m + lag_s * (other.speed_mps - body[1]),
+                other.speed_mps + lag_s * other.accel_mps2,
+            )
+            for other in near
+        ]
+        least_m = self._scenario.tracking.min_gap_m
+        careful = keep_gap(state, jerk, ahead, limits, least_m, self.tick_s)
+        return (Rung.HOLD if careful == jerk else Rung.GIVE_WAY), careful
 
     def _is_in_the_way(self, other: Neighbour) -> bool:
         """Tell whether somebody is on a lane that the body touches or that it steers for."""
-        y_m, half_m = self.plant.state[3], 0.5 * self.limits.width_m
+        y_m, half_m = self.measured[3], 0.5 * self._scenario.vehicle.width_m
         width_m = self.lattice.lane_width_m
         first, last = int((y_m - half_m) // width_m), int((y_m + half_m) // width_m)
         return first <= other.lane <= last or other.lane == self.hold_cell[1]

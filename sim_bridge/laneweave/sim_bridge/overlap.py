@@ -16,7 +16,7 @@ Everything here sorts the vehicles along the road once and looks at near ones on
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from laneweave.protocol.messages import Neighbour
@@ -37,6 +37,16 @@ class LeastGaps(NamedTuple):
     """Bumper to bumper, along the road."""
     headway_s: float
     """Distance front to front divided by the speed of the follower."""
+
+
+class Around(NamedTuple):
+    """Whom a vehicle sees, by lane."""
+
+    ahead: tuple[Neighbour, ...]
+    behind: tuple[Neighbour, ...]
+
+
+NOBODY_AROUND = Around((), ())
 
 
 def pose_of(state: Sequence[float]) -> Pose:
@@ -134,14 +144,15 @@ def neighbours(
     lane_width_m: float,
     length_m: float,
     width_m: float,
-) -> dict[str, tuple[Neighbour, ...]]:
-    """Return whom each vehicle's local sensing sees ahead.
+    accels_mps2: Mapping[str, float] | None = None,
+) -> dict[str, Around]:
+    """Return whom each vehicle's local sensing would see around it if it were exact.
 
     In each lane that its body touches or that is adjacent to such a lane, a vehicle sees the
-    nearest vehicle ahead that touches the lane. A vehicle that straddles two lanes is seen in both.
-    The gap is bumper to bumper, with bodies taken as unrotated; it is negative for vehicles side by
-    side, of which the one with the front ahead is ahead (at equal positions: the one with the
-    greater name).
+    nearest vehicle ahead that touches the lane, and the nearest one behind. A vehicle that
+    straddles two lanes is seen in both. The gap is bumper to bumper, with bodies taken as
+    unrotated; it is negative for vehicles side by side, of which the one with the front ahead is
+    ahead (at equal positions: the one with the greater name).
 
     Args:
         poses: pose of each vehicle.
@@ -149,27 +160,46 @@ def neighbours(
         lane_width_m: width of a lane.
         length_m: length of every body.
         width_m: width of every body.
+        accels_mps2: acceleration of each vehicle; None: all zero.
 
     Returns:
-        For each vehicle at most one neighbour in each lane, by lane.
+        For each vehicle at most one neighbour ahead in each lane and one behind, by lane.
     """
     order = sorted(((pose[0], name) for name, pose in poses.items()), reverse=True)
-    # From the front: the last vehicle that was met in each lane is the nearest one.
-    nearest: list[tuple[float, float] | None] = [None] * lanes
-    seen = {}
-    for s_m, name in order:
-        _, _, low, high = _extent(poses[name], length_m, width_m)
-        first = min(max(int((low + _TOUCH_M) // lane_width_m), 0), lanes - 1)
-        last = min(max(int((high - _TOUCH_M) // lane_width_m), first), lanes - 1)
-        found = []
-        for lane in range(max(first - 1, 0), min(last + 2, lanes)):
-            other = nearest[lane]
-            if other is not None:
-                found.append(Neighbour(lane, other[0] - s_m - length_m, other[1]))
-        seen[name] = tuple(found)
-        for lane in range(first, last + 1):
-            nearest[lane] = (s_m, poses[name][3])
-    return seen
+    touched = {
+        name: _lanes_of(pose, lanes, lane_width_m, length_m, width_m)
+        for name, pose in poses.items()
+    }
+    accels = accels_mps2 or {}
+
+    def nearest(order: Iterable[tuple[float, str]], sign: float) -> dict[str, list[Neighbour]]:
+        last: list[tuple[float, str] | None] = [None] * lanes
+        seen = {}
+        for s_m, name in order:
+            first, final = touched[name]
+            found = []
+            for lane in range(max(first - 1, 0), min(final + 2, lanes)):
+                other = last[lane]
+                if other is not None:
+                    gap_m = sign * (other[0] - s_m) - length_m
+                    speed_mps, accel = poses[other[1]][3], accels.get(other[1], 0.0)
+                    found.append(Neighbour(lane, gap_m, speed_mps, accel))
+            seen[name] = found
+            for lane in range(first, final + 1):
+                last[lane] = (s_m, name)
+        return seen
+
+    ahead, behind = nearest(order, 1.0), nearest(reversed(order), -1.0)
+    return {name: Around(tuple(ahead[name]), tuple(behind[name])) for name in poses}
+
+
+def _lanes_of(
+    pose: Pose, lanes: int, lane_width_m: float, length_m: float, width_m: float
+) -> tuple[int, int]:
+    """Return the first and the last lane that a body touches."""
+    _, _, low, high = _extent(pose, length_m, width_m)
+    first = min(max(int((low + _TOUCH_M) // lane_width_m), 0), lanes - 1)
+    return first, min(max(int((high - _TOUCH_M) // lane_width_m), first), lanes - 1)
 
 
 def _near_pairs(poses: Mapping[str, Pose], reach_m: float) -> Iterator[tuple[str, str]]:

@@ -1,31 +1,39 @@
 """The plant: how a vehicle really moves, whatever its agent asks for.
 
-A vehicle is a triple integrator along and across the road (`protocol.motion`). The plant takes a
-jerk for each tick, keeps it within the vehicle's limits, integrates exactly, and remembers the
-extremes.
+Along and across the road the set-point of acceleration changes by a jerk that is constant during a
+tick, and the body's acceleration follows it as a first-order lag does (`protocol.motion`: the body
+pursues a commanded state). The plant keeps the commanded state within the vehicle's limits, moves
+both on exactly, and remembers the extremes.
 """
 
 from __future__ import annotations
 
-from laneweave.protocol.motion import State, integrate, limited_jerk
+import math
+
+from laneweave.protocol.motion import State, commanded_state, integrate, limited_jerk
 from laneweave.protocol.scenario import Vehicle
 from laneweave.sim_bridge.overlap import Pose, pose_of
+
+Axis = tuple[float, float, float]
+"""(position [m], speed [m/s], acceleration [m/s2])."""
 
 
 class Plant:
     """One vehicle's body: state, limits, and what its motion has demanded of it so far."""
 
     def __init__(self, state: State, limits: Vehicle, tick_s: float) -> None:
-        """Start at a state.
+        """Start at a state, with set-points that are its accelerations.
 
         Args:
             state: (s, v, a, y, v_y, a_y) in m and s.
-            limits: the vehicle's limits.
+            limits: the vehicle's limits and lags.
             tick_s: length of a tick [s].
         """
         self._state = state
+        self._setpoint = (state[2], state[5])
         self._limits = limits
         self._tick_s = tick_s
+        self._braking = False
         self._max_jerk = 0.0
         self._min_accel = self._max_accel = state[2]
 
@@ -35,13 +43,23 @@ class Plant:
         return self._state
 
     @property
+    def setpoint(self) -> tuple[float, float]:
+        """Accelerations that its actuators were told, along and across [m/s2]."""
+        return self._setpoint
+
+    @property
     def pose(self) -> Pose:
         """(s m, y m, heading rad, speed m/s)."""
-        return pose_of(self._state)
+        return pose_of(self.state)
+
+    @property
+    def in_emergency(self) -> bool:
+        """Whether it brakes past the jerk limit, or has not recovered from that."""
+        return self._braking
 
     @property
     def max_jerk_mps3(self) -> float:
-        """Largest change of longitudinal acceleration in a tick, per second."""
+        """Largest change of longitudinal acceleration in a tick, per second, but in emergencies."""
         return self._max_jerk
 
     @property
@@ -64,12 +82,88 @@ class Plant:
         Returns:
             The new state.
         """
-        before = self._state
-        jerk = limited_jerk(before, (jerk_s, jerk_y), self._limits, self._tick_s)
-        s, v, a, y, v_y, a_y = integrate(before, jerk, self._tick_s)
-        # Rounding may leave a stopped vehicle rolling back by a hair.
-        self._state = (s, max(v, 0.0), a, y, v_y, a_y)
-        self._max_jerk = max(self._max_jerk, abs(a - before[2]) / self._tick_s)
-        self._min_accel = min(self._min_accel, a)
-        self._max_accel = max(self._max_accel, a)
+        commanded = self._commanded()
+        before = self._state[2]
+        allowed = limited_jerk(commanded, (jerk_s, jerk_y), self._limits, self._tick_s)
+        self._move(commanded, allowed)
+        if not self.in_emergency:
+            self._max_jerk = max(self._max_jerk, abs(self._state[2] - before) / self._tick_s)
+        self._braking = self._braking and self._lags_behind()
         return self._state
+
+    def brake(self, jerk_y: float) -> State:
+        """Brake as hard as the vehicle can for one tick, past the limit on jerk.
+
+        Args:
+            jerk_y: wanted lateral jerk [m/s3]; limited as `limited_jerk` does.
+
+        Returns:
+            The new state.
+        """
+        self._braking = True
+        s, v, _, y, v_y, a_y = self._commanded()
+        # The commanded state stands still first, and the body comes to rest behind it.
+        accel = max(self._limits.min_accel_mps2, -v / self._tick_s)
+        now = (s, v, accel, y, v_y, a_y)
+        _, allowed_y = limited_jerk(now, (0.0, jerk_y), self._limits, self._tick_s)
+        self._move(now, (0.0, allowed_y))
+        if accel * self._tick_s <= -v:
+            self._setpoint = (0.0, self._setpoint[1])
+        return self._state
+
+    def _lags_behind(self) -> bool:
+        """Tell whether the body's acceleration changes faster than the jerk limit allows."""
+        most = self._limits.max_jerk_mps3 * self._limits.actuator_lag_s
+        return abs(self._setpoint[0] - self._state[2]) > most + 1e-6
+
+    def _commanded(self) -> State:
+        return commanded_state(self._state, self._setpoint, self._limits, 0.0)
+
+    def _move(self, commanded: State, jerk: tuple[float, float]) -> None:
+        """Move on from a commanded state whose frame stands on the road."""
+        limits, tick_s = self._limits, self._tick_s
+        then = integrate(commanded, jerk, tick_s)
+        now = self._state
+        along = _follow(now[:3], commanded[:3], then[:3], jerk[0], limits.actuator_lag_s, tick_s)
+        across = _follow(
+            now[3:], commanded[3:], then[3:], jerk[1], limits.lateral_actuator_lag_s, tick_s
+        )
+        setpoint = (then[2], then[5])
+        # Rounding may leave a stopped vehicle rolling back by a hair.
+        along = (along[0], max(along[1], 0.0), along[2])
+        slip = limits.max_slip_ratio * along[1]
+        if abs(across[1]) > slip:
+            # A body does not slide sideways, though its axes lag differently.
+            across = (across[0], math.copysign(slip, across[1]), 0.0)
+            setpoint = (setpoint[0], 0.0)
+        self._state = (*along, *across)
+        self._setpoint = setpoint
+        self._min_accel = min(self._min_accel, along[2])
+        self._max_accel = max(self._max_accel, along[2])
+
+
+def _follow(
+    body: Axis, commanded: Axis, then: Axis, jerk: float, lag_s: float, tick_s: float
+) -> Axis:
+    """Return a body's axis after a tick in which its commanded axis goes on with constant jerk.
+
+    The commanded position is a cubic in time, so the body's is another cubic, which follows it,
+    and what it was off that cubic dies away.
+    """
+    if lag_s <= 0.0:
+        return then
+    rest = math.exp(-tick_s / lag_s)
+    before, after = _followed(commanded, jerk, lag_s), _followed(then, jerk, lag_s)
+    s, v, a = (
+        end + (now - begin) * rest for now, begin, end in zip(body, before, after, strict=True)
+    )
+    return s, v, a
+
+
+def _followed(commanded: Axis, jerk: float, lag_s: float) -> Axis:
+    s, v, a = commanded
+    return (
+        s - lag_s * (v - lag_s * (a - lag_s * jerk)),
+        v - lag_s * (a - lag_s * jerk),
+        a - lag_s * jerk,
+    )

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from laneweave.protocol.messages import Heartbeat, LogEvent, Name, Report
 from laneweave.protocol.scenario import Scenario
 from laneweave.sim_bridge.demand import Arrival
+from laneweave.sim_bridge.motion_controller import Rung
 from laneweave.sim_bridge.overlap import LeastGaps
 from laneweave.sim_bridge.recorder import Recorder
 from laneweave.sim_bridge.traffic import RoadVehicle
@@ -69,7 +70,7 @@ class RunRecord:
         self._reports: dict[tuple[Name, Name], Report] = {}
         self._plans: list[dict[str, Any]] = []
         self._ticks: list[tuple[float, int, float]] = []
-        self._agentless_ticks = 0
+        self._rung_ticks = dict.fromkeys(Rung, 0)
         self._missed_ticks = 0
         self._caretaker_takeovers = 0
         self._agent_takeovers = 0
@@ -111,7 +112,7 @@ class RunRecord:
         left_s = t_s - beyond_m / v_mps if v_mps > 0 else t_s
         lane = int(y_m // self._scenario.road.lane_width_m)
         self._recorder.left(vehicle.name, left_s, lane)
-        self._agentless_ticks += vehicle.controller.played_from_hold
+        self._count_rungs(vehicle)
         preferred_lane = vehicle.admission.arrival.preferred_lane
         self.note(
             left_s,
@@ -134,7 +135,7 @@ class RunRecord:
 
     def on_still_on_road(self, vehicle: RoadVehicle) -> None:
         """The run ends while a vehicle is on the road."""
-        self._agentless_ticks += vehicle.controller.played_from_hold
+        self._count_rungs(vehicle)
 
     def on_missed(self, agents: int) -> None:
         """So many agents have not answered a tick by its deadline."""
@@ -232,8 +233,12 @@ class RunRecord:
         )
         pq.write_table(table, self._folder / "ticks.parquet", compression="zstd")
 
+    def _count_rungs(self, vehicle: RoadVehicle) -> None:
+        for rung, ticks in vehicle.controller.rung_ticks.items():
+            self._rung_ticks[rung] += ticks
+
     def _rest(self, t_s: float) -> dict[str, Any]:
-        wall_s = self._stopwatch() - self._began
+        wall_s, ticks = self._stopwatch() - self._began, self._rung_ticks
         reports = self._reports.values()
         solve_ms = _milliseconds(report.solve_ms for report in reports)
         plan_ms = np.array([_number(plan.get("solve_ms")) for plan in self._plans])
@@ -249,7 +254,8 @@ class RunRecord:
             "tracking": {
                 "solves": sum(report.solves for report in reports),
                 "unusable": sum(report.unusable for report in reports),
-                "hold_law_ticks": self._agentless_ticks,
+                "hold_law_ticks": ticks[Rung.HOLD] + ticks[Rung.GIVE_WAY],
+                "emergency_ticks": ticks[Rung.EMERGENCY],
                 "missed_ticks": self._missed_ticks,
                 "caretaker_takeovers": self._caretaker_takeovers,
                 "agent_takeovers": self._agent_takeovers,

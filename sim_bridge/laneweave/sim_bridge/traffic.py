@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from attrs import define
 
-from laneweave.protocol.messages import Name, Neighbour, Sense
+from laneweave.protocol.messages import Name, Sense
 from laneweave.protocol.motion import State, cell_state
 from laneweave.protocol.scenario import Scenario
 from laneweave.sim_bridge.entry import Admission
 from laneweave.sim_bridge.motion_controller import MotionController
+from laneweave.sim_bridge.overlap import Around
 from laneweave.sim_bridge.plant import Plant
+from laneweave.sim_bridge.sensors import Sensors
 
 
 @define
@@ -19,22 +21,19 @@ class RoadVehicle:
     name: Name
     admission: Admission
     controller: MotionController
-    ahead: tuple[Neighbour, ...] = ()
+    sensors: Sensors | None = None
+    """None: it knows itself exactly, and sees nobody."""
 
     @classmethod
     def entering(cls, admission: Admission, t_s: float, scenario: Scenario) -> RoadVehicle:
         """Return a vehicle in the cell in which it was admitted, at road time `t_s`."""
         lattice, tick_s = scenario.lattice, scenario.runtime.tick_s
         state = cell_state(lattice, admission.cell, t_s)
+        name = Name(admission.arrival.vehicle)
         controller = MotionController(
-            Plant(state, scenario.vehicle, tick_s),
-            scenario.vehicle,
-            lattice,
-            tick_s,
-            admission.cell,
-            min_gap_m=scenario.tracking.min_gap_m,
+            Plant(state, scenario.vehicle, tick_s), scenario, admission.cell
         )
-        return cls(Name(admission.arrival.vehicle), admission, controller)
+        return cls(name, admission, controller, Sensors(scenario, name))
 
     @property
     def state(self) -> State:
@@ -45,6 +44,15 @@ class RoadVehicle:
     def formation(self) -> int:
         """Number of the formation in whose block it entered."""
         return self.controller.lattice.block_of(self.admission.cell[0])
+
+    def perceive(self, around: Around) -> None:
+        """Let its sensors measure where it is now, and whom it sees.
+
+        Args:
+            around: whom exact sensors would see.
+        """
+        if self.sensors is not None:
+            self.controller.perceive(self.sensors.measure(self.state), self.sensors.look(around))
 
     def sense(self, tick: int, *, caretaker: bool, left: bool = False) -> Sense:
         """Return what its sensors and its motion controller know at a tick.
@@ -59,12 +67,14 @@ class RoadVehicle:
             vehicle=self.name,
             tick=tick,
             t_s=tick * controller.tick_s,
-            state=self.state,
+            state=controller.measured,
             hold_cell=controller.hold_cell,
             motion_end_tick=controller.motion_end_tick,
             motion_origin=controller.motion_origin,
             preferred_lane=self.admission.arrival.preferred_lane,
-            ahead=self.ahead,
+            ahead=controller.around.ahead,
+            behind=controller.around.behind,
+            setpoint=controller.plant.setpoint,
             formation=self.formation,
             attendant=controller.attendant,
             caretaker=caretaker,
@@ -75,4 +85,4 @@ class RoadVehicle:
 
     def step(self, tick: int) -> None:
         """Drive from `tick` to the next one."""
-        self.controller.step(tick, self.ahead)
+        self.controller.step(tick)

@@ -8,8 +8,9 @@ from typing import Protocol
 from laneweave.protocol.messages import Name
 from laneweave.protocol.motion import State
 from laneweave.protocol.scenario import Scenario
-from laneweave.sim_bridge.overlap import Pose, least_gaps, neighbours, overlapping_pairs
+from laneweave.sim_bridge.overlap import Pose, least_gaps, overlapping_pairs
 from laneweave.sim_bridge.run_record import RunRecord
+from laneweave.sim_bridge.sensors import who_is_around
 from laneweave.sim_bridge.traffic import RoadVehicle
 
 
@@ -42,7 +43,7 @@ def show_bodies(
     record: RunRecord,
     t_s: float,
 ) -> None:
-    """Let the world show all bodies, record what it shows, and let each vehicle see who is ahead.
+    """Let the world show all bodies, record what it shows, and let each vehicle's sensors look.
 
     Args:
         world: advanced by one tick.
@@ -56,16 +57,12 @@ def show_bodies(
     world.step()
     poses = world.positions()
     size = (scenario.vehicle.length_m, scenario.vehicle.width_m)
-    road = scenario.road
-    ahead = neighbours(
-        poses,
-        lanes=road.lanes,
-        lane_width_m=road.lane_width_m,
-        length_m=size[0],
-        width_m=size[1],
-    )
+    accels_mps2: dict[str, float] = {
+        vehicle.name: vehicle.state[2] for vehicle in vehicles.values()
+    }
+    around = who_is_around(scenario, poses, accels_mps2)
     for name, vehicle in vehicles.items():
-        vehicle.ahead = ahead[name]
+        vehicle.perceive(around[name])
     record.on_shown(
         t_s,
         vehicles.values(),

@@ -138,13 +138,7 @@ class LightVehicle(RoadVehicle):
         super().__init__(
             visit.vehicle,
             Admission(arrival, visit.cell, visit.enters_s),
-            MotionController(
-                self.body,
-                scenario.vehicle,
-                scenario.lattice,
-                scenario.runtime.tick_s,
-                visit.cell,
-            ),
+            MotionController(self.body, scenario, visit.cell),
         )
         self._visit = visit
         self._speed_mps = scenario.lattice.speed_mps
