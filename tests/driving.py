@@ -1,0 +1,273 @@
+"""Vehicles in closed loop, without network and SUMO, and what is measured of their true motion.
+
+A `Road` carries the bridge's vehicles (body, motion controller, sensors), each driven by an agent's
+real driver. A tick is what it is in a run: sense, begin a move, drive, COMMAND, step, and look
+around. There is no protocol: who uses the road says when which move begins, and when messages stop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from math import inf
+
+import numpy as np
+from attrs import define, field, frozen
+from numpy.typing import NDArray
+
+from laneweave.agents.driver import TrackingDriver
+from laneweave.protocol.lattice import Cell, Move
+from laneweave.protocol.messages import Command, Name
+from laneweave.protocol.motion import State, cell_state, integrate
+from laneweave.protocol.scenario import Scenario, load_scenario
+from laneweave.sim_bridge.demand import Arrival
+from laneweave.sim_bridge.entry import Admission
+from laneweave.sim_bridge.overlap import Pose, least_gaps, neighbours, overlapping_pairs
+from laneweave.sim_bridge.plant import Plant
+from laneweave.sim_bridge.traffic import RoadVehicle
+
+Array = NDArray[np.float64]
+
+ROUNDING = 1e-6
+"""An excess over a limit that is rounding [m/s, m/s2, m/s3]."""
+
+
+def road_scenario(seed: int, mode: int = 1, lanes: int = 3) -> Scenario:
+    """Return the default scenario with another seed, relative motion mode and number of lanes."""
+    return load_scenario(None, seed=seed, formation__mode=mode, road__lanes=lanes)
+
+
+# --- what the lower level is asked for: the places to adapt when it changes -----------------------
+
+
+def look_around(vehicles: Mapping[Name, RoadVehicle], scenario: Scenario) -> None:
+    """Let each vehicle see who is near, as the bridge does after each tick (`show_bodies`)."""
+    poses = _poses(vehicles)
+    road, body = scenario.road, scenario.vehicle
+    ahead = neighbours(
+        poses,
+        lanes=road.lanes,
+        lane_width_m=road.lane_width_m,
+        length_m=body.length_m,
+        width_m=body.width_m,
+    )
+    for name, vehicle in vehicles.items():
+        vehicle.ahead = ahead[name]
+
+
+def brake_hard(plant: Plant, scenario: Scenario) -> None:
+    """Brake for one tick as hard as a vehicle can, past its jerk limit, and straight ahead."""
+    brake = getattr(plant, "brake", None)
+    if brake is not None:
+        brake(0.0)
+        return
+    # A plant that cannot: its body takes on the deceleration at once, until it stands still.
+    tick_s, decel_mps2 = scenario.runtime.tick_s, -scenario.vehicle.min_accel_mps2
+    s, v, _, y, v_y, a_y = plant.state
+    if v <= decel_mps2 * tick_s:
+        plant._state = (s + v * v / (2.0 * decel_mps2), 0.0, 0.0, y, 0.0, 0.0)
+    else:
+        plant._state = integrate((s, v, -decel_mps2, y, v_y, a_y), (0.0, 0.0), tick_s)
+
+
+def braked_ticks(vehicle: RoadVehicle) -> int:
+    """Return for how many ticks its motion controller has braked in emergency so far."""
+    return int(getattr(vehicle.controller, "braked", 0))
+
+
+def in_emergency(vehicle: RoadVehicle) -> bool:
+    """Tell whether its body brakes past the jerk limit, or has not recovered from that."""
+    return bool(getattr(vehicle.controller.plant, "in_emergency", False))
+
+
+# --- the road -------------------------------------------------------------------------------------
+
+
+@define
+class Driven:
+    """A vehicle and what drives it."""
+
+    vehicle: RoadVehicle
+    driver: TrackingDriver
+    hold_cell: Cell
+    moving: bool = False
+
+
+@define
+class Record:
+    """What is true of all bodies at the beginning of each tick, and at the end of the last one."""
+
+    states: list[list[State]] = field(factory=list)
+    """By tick, then vehicle: (s, v, a, y, v_y, a_y) in m and s."""
+    exempt: list[list[bool]] = field(factory=list)
+    """By tick, then vehicle: it brakes in emergency in this tick, past its jerk limit."""
+    gaps_m: list[float] = field(factory=list)
+    """By tick: least gap of two bodies that overlap laterally; infinite if there are none."""
+    overlaps: list[tuple[int, str, str]] = field(factory=list)
+    """(tick, lesser name, greater name)."""
+
+
+class Road:
+    """Vehicles on the lattice; all of them are at rest in their cells at tick 0."""
+
+    def __init__(self, scenario: Scenario, cells: Mapping[str, Cell]) -> None:
+        """Put vehicles into cells; `scenario.road.lanes` must be enough for them."""
+        self.scenario = scenario
+        self.tick = 0
+        self.messages = True
+        """Whether drivers hear and are heard; if not, motion controllers go on with what they have.
+        """
+        self.late = 0
+        """Moves that began before the one under way had ended."""
+        self.record = Record()
+        self.driven: dict[Name, Driven] = {}
+        for name, cell in cells.items():
+            admission = Admission(Arrival(name, cell[1], cell[1], 0.0), cell, 0.0)
+            vehicle = RoadVehicle.entering(admission, 0.0, scenario)
+            self.driven[vehicle.name] = Driven(vehicle, TrackingDriver(scenario), cell)
+        self.vehicles = {name: one.vehicle for name, one in self.driven.items()}
+        self._show()
+        for one in self.driven.values():
+            one.driver.take_over(one.vehicle.sense(0, caretaker=False))
+
+    @property
+    def braked(self) -> int:
+        """Vehicle ticks of emergency braking by motion controllers."""
+        return sum(braked_ticks(vehicle) for vehicle in self.vehicles.values())
+
+    @property
+    def unusable(self) -> int:
+        """Solutions of trackers that could not be used."""
+        return sum(one.driver.effort.unusable for one in self.driven.values())
+
+    def step(
+        self, begins: Mapping[Name, Move] | None = None, braking: Collection[Name] = ()
+    ) -> None:
+        """Go on by one tick.
+
+        Args:
+            begins: moves that begin with this tick; none without messages.
+            braking: who brakes as hard as it can, whatever it was told.
+        """
+        if self.messages:
+            for name, one in self.driven.items():
+                self._drive(one, (begins or {}).get(name))
+        exempt = []
+        for name, vehicle in self.vehicles.items():
+            before = braked_ticks(vehicle), in_emergency(vehicle)
+            if name in braking:
+                brake_hard(vehicle.controller.plant, self.scenario)
+            else:
+                vehicle.step(self.tick)
+            after = braked_ticks(vehicle), in_emergency(vehicle)
+            exempt.append(name in braking or before != after or after[1])
+        self.record.exempt.append(exempt)
+        self.tick += 1
+        self._show()
+
+    def _drive(self, one: Driven, move: Move | None) -> None:
+        """Hear the vehicle's sensors and answer with a COMMAND, as its agent does."""
+        sense = one.vehicle.sense(self.tick, caretaker=False)
+        one.moving = one.moving and not one.driver.at_rest(sense)
+        if move is not None:
+            self.late += one.moving
+            one.driver.begin(move, self.tick)
+            one.moving, one.hold_cell = True, move[2]
+        drive = one.driver.drive(sense, moving=one.moving)
+        command = Command(
+            vehicle=one.vehicle.name,
+            incarnation=1,
+            tick=self.tick,
+            hold_cell=one.hold_cell,
+            motion_end_tick=drive.motion_end_tick,
+            motion_origin=drive.motion_origin,
+            jerks=drive.jerks,
+        )
+        if not one.vehicle.controller.take(command):
+            raise RuntimeError(f"the motion controller refused {command}")
+
+    def _show(self) -> None:
+        poses = _poses(self.vehicles)
+        size = self.scenario.vehicle.length_m, self.scenario.vehicle.width_m
+        record = self.record
+        record.states.append([one.controller.plant.state for one in self.vehicles.values()])
+        record.gaps_m.append(least_gaps(poses, *size).gap_m)
+        record.overlaps += [(self.tick, *pair) for pair in overlapping_pairs(poses, *size)]
+        look_around(self.vehicles, self.scenario)
+
+
+def _poses(vehicles: Mapping[Name, RoadVehicle]) -> dict[str, Pose]:
+    return {name: vehicle.controller.plant.pose for name, vehicle in vehicles.items()}
+
+
+# --- what is measured -----------------------------------------------------------------------------
+
+
+@frozen
+class LimitUse:
+    """How much of one limit was used."""
+
+    excess: float
+    """Largest excess over the limit, in its unit; negative: what was left of it."""
+    violations: int
+    """Vehicle ticks with an excess."""
+
+    def __add__(self, other: LimitUse) -> LimitUse:
+        """Return the use of both."""
+        return LimitUse(max(self.excess, other.excess), self.violations + other.violations)
+
+
+def limit_use(
+    record: Record, scenario: Scenario, only: Sequence[int] | None = None
+) -> dict[str, LimitUse]:
+    """Return by name how the limits of motion were kept.
+
+    Jerk is the change of the true acceleration in a tick, divided by the tick; that along the road
+    does not count in ticks of emergency braking.
+
+    Args:
+        record: of a road.
+        scenario: its limits.
+        only: numbers of the vehicles that count, in the order of the road; None: all.
+    """
+    states, exempt = np.array(record.states), np.array(record.exempt)
+    if only is not None:
+        states, exempt = states[:, only], exempt[:, only]
+    limits, tick_s = scenario.vehicle, scenario.runtime.tick_s
+    _, v, a, _, v_y, a_y = np.moveaxis(states, 2, 0)
+    jerk = np.abs(np.diff(a, axis=0)) / tick_s
+    lateral_jerk = np.abs(np.diff(a_y, axis=0)) / tick_s
+    excesses = {
+        "speed_mps": np.maximum(-v, v - limits.max_speed_mps),
+        "accel_mps2": np.maximum(limits.min_accel_mps2 - a, a - limits.max_accel_mps2),
+        "jerk_mps3": np.where(exempt, -inf, jerk - limits.max_jerk_mps3),
+        "lateral_accel_mps2": np.abs(a_y) - limits.max_lateral_accel_mps2,
+        "lateral_jerk_mps3": lateral_jerk - limits.max_lateral_jerk_mps3,
+        "slip_mps": np.abs(v_y) - limits.max_slip_ratio * v,
+    }
+    return {
+        name: LimitUse(float(excess.max()), int((excess > ROUNDING).sum()))
+        for name, excess in excesses.items()
+    }
+
+
+def lattice_errors_m(
+    record: Record, scenario: Scenario, ticks: Sequence[int], cells: Sequence[Sequence[Cell]]
+) -> Array:
+    """Return how far bodies are from where the lattice wants them, (ticks, vehicles, 2) [m].
+
+    Args:
+        record: of a road.
+        scenario: its lattice.
+        ticks: when.
+        cells: by tick, then vehicle in the order of the road: whose lattice point counts.
+
+    Returns:
+        Distances along and across, >= 0.
+    """
+    lattice, tick_s = scenario.lattice, scenario.runtime.tick_s
+    errors = np.zeros((len(ticks), len(cells[0]) if cells else 0, 2))
+    for row, (tick, each) in enumerate(zip(ticks, cells, strict=True)):
+        for column, (state, cell) in enumerate(zip(record.states[tick], each, strict=True)):
+            goal = cell_state(lattice, cell, tick * tick_s)
+            errors[row, column] = abs(state[0] - goal[0]), abs(state[3] - goal[3])
+    return errors
