@@ -1,0 +1,95 @@
+"""How well vehicles drive: goals of the lower level, on random formations.
+
+    python benchmarks/driving.py switches [--count 1000] [--seed 0] [--json]
+
+In closed loop without network and SUMO (`tests/driving.py`). `switches`: formation switches on the
+timetable, half in each mode, against lattice points, limits and gaps. `--json` prints all figures;
+`--first N --count 1` plays one again. The exit status is 1 if a goal is missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+if __name__ == "__main__":  # run as a program: as `pythonpath` in pyproject.toml
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+import switches
+
+T = TypeVar("T")
+
+
+def played(play: Callable[[int], T], numbers: Sequence[int], jobs: int) -> list[T]:
+    """Return what becomes of each number, in order; says on a terminal how far it is."""
+    results = []
+    with ProcessPoolExecutor(jobs) as pool:
+        for result in pool.map(play, numbers, chunksize=4):
+            results.append(result)
+            if sys.stderr.isatty():
+                sys.stderr.write(f"\r{len(results)} of {len(numbers)} ")
+                sys.stderr.flush()
+    if sys.stderr.isatty():
+        sys.stderr.write("\r\033[K")
+    return results
+
+
+def judge_switches(seed: int, numbers: Sequence[int], jobs: int) -> dict[str, Any]:
+    """Return figures and missed goals of formation switches, by mode."""
+    results = played(partial(switches.switch_result, seed), numbers, jobs)
+    judged = {}
+    for mode in (1, 2):
+        chosen = [result for result in results if result.mode == mode]
+        if chosen:
+            figures = switches.summary(chosen)
+            judged[f"mode {mode}"] = figures | {"missed": switches.missed_goals(figures)}
+    return judged
+
+
+PROGRAMMES = {"switches": (judge_switches, 1000)}
+
+
+def lines(figures: dict[str, Any], indent: str = "  ") -> list[str]:
+    """Return figures as text, one line for each."""
+    text = []
+    for name, value in figures.items():
+        if isinstance(value, dict):
+            text += [f"{indent}{name}", *lines(value, indent + "  ")]
+        elif isinstance(value, list):
+            text += [f"{indent}{name}: {', '.join(map(str, value)) or 'none'}"]
+        else:
+            shown = f"{value:.6g}" if isinstance(value, float) else value
+            text.append(f"{indent}{name}: {shown}")
+    return text
+
+
+def main() -> int:
+    """Play, print, and return the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("programme", choices=PROGRAMMES)
+    parser.add_argument("--count", type=int, help="how many to play")
+    parser.add_argument("--seed", type=int, default=0, help="of everything random")
+    parser.add_argument("--first", type=int, default=0, help="number of the first one")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    chosen = parser.parse_args()
+    judge, count = PROGRAMMES[chosen.programme]
+    numbers = range(chosen.first, chosen.first + (chosen.count or count))
+    judged = judge(chosen.seed, numbers, chosen.jobs)
+    if chosen.json:
+        sys.stdout.write(json.dumps(judged, indent=1) + "\n")
+    else:
+        for name, figures in judged.items():
+            sys.stdout.write("\n".join([name, *lines(figures)]) + "\n")
+    return int(any(figures["missed"] for figures in judged.values()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
