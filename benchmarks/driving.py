@@ -1,9 +1,11 @@
 """How well vehicles drive: goals of the lower level, on random formations.
 
     python benchmarks/driving.py switches [--count 1000] [--seed 0] [--json]
+    python benchmarks/driving.py emergencies [--count 2000] [--seed 0] [--json]
 
 In closed loop without network and SUMO (`tests/driving.py`). `switches`: formation switches on the
-timetable, half in each mode, against lattice points, limits and gaps. `--json` prints all figures;
+timetable, half in each mode, against lattice points, limits and gaps. `emergencies`: the vehicle
+ahead brakes to a stand while all messages stop; bodies must not touch. `--json` prints JSON;
 `--first N --count 1` plays one again. The exit status is 1 if a goal is missed.
 """
 
@@ -22,6 +24,7 @@ from typing import Any, TypeVar
 if __name__ == "__main__":  # run as a program: as `pythonpath` in pyproject.toml
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
+import emergencies
 import switches
 
 T = TypeVar("T")
@@ -53,7 +56,19 @@ def judge_switches(seed: int, numbers: Sequence[int], jobs: int) -> dict[str, An
     return judged
 
 
-PROGRAMMES = {"switches": (judge_switches, 1000)}
+def judge_emergencies(seed: int, numbers: Sequence[int], jobs: int) -> dict[str, Any]:
+    """Return figures and missed goals of emergencies, by kind."""
+    outcomes = played(partial(emergencies.outcome, seed), numbers, jobs)
+    judged = {}
+    for kind in emergencies.KINDS:
+        chosen = [outcome for outcome in outcomes if outcome.kind == kind]
+        if chosen:
+            figures = emergencies.summary(chosen)
+            judged[kind] = figures | {"missed": emergencies.missed_goals(figures)}
+    return judged
+
+
+PROGRAMMES = {"switches": (judge_switches, 1000), "emergencies": (judge_emergencies, 2000)}
 
 
 def lines(figures: dict[str, Any], indent: str = "  ") -> list[str]:
@@ -74,7 +89,7 @@ def main() -> int:
     """Play, print, and return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("programme", choices=PROGRAMMES)
-    parser.add_argument("--count", type=int, help="how many to play")
+    parser.add_argument("--count", type=int, help="how many to play; 1000 or 2000")
     parser.add_argument("--seed", type=int, default=0, help="of everything random")
     parser.add_argument("--first", type=int, default=0, help="number of the first one")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")

@@ -109,7 +109,7 @@ class Record:
 class Road:
     """Vehicles on the lattice; all of them are at rest in their cells at tick 0."""
 
-    def __init__(self, scenario: Scenario, cells: Mapping[str, Cell]) -> None:
+    def __init__(self, scenario: Scenario, cells: Mapping[Name, Cell]) -> None:
         """Put vehicles into cells; `scenario.road.lanes` must be enough for them."""
         self.scenario = scenario
         self.tick = 0

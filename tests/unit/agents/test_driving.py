@@ -6,8 +6,10 @@ import attrs
 import numpy as np
 import pytest
 
+import emergencies
 import switches
 from driving import Record, Road, lattice_errors_m, limit_use, road_scenario
+from laneweave.protocol.lattice import footprint
 from laneweave.protocol.messages import Name
 from laneweave.protocol.motion import State
 
@@ -36,6 +38,63 @@ def test_equal_seeds_give_equal_switches() -> None:
     one, other = (switches.switch_result(3, 5, vehicles=(3, 3)) for _ in range(2))
     assert one == other
     assert one != switches.switch_result(4, 5, vehicles=(3, 3))
+
+
+# --- emergencies ----------------------------------------------------------------------------------
+
+EMERGENCIES = 20
+"""Of each kind."""
+
+
+@pytest.mark.xfail(reason="motion controllers do not brake in emergency yet", strict=False)
+@pytest.mark.parametrize("kind", emergencies.KINDS)
+def test_nobody_runs_into_who_brakes_to_a_stand_while_messages_stop(kind: str) -> None:
+    first, every = emergencies.KINDS.index(kind), len(emergencies.KINDS)
+    numbers = range(first, EMERGENCIES * every, every)
+    outcomes = [emergencies.outcome(0, number) for number in numbers]
+    assert {outcome.kind for outcome in outcomes} == {kind}
+    figures = emergencies.summary(outcomes)
+    assert emergencies.missed_goals(figures) == []
+    # In a lane-entry, who has not begun to move when messages stop drives past.
+    assert kind == "lane-entry" or figures["standing"] == EMERGENCIES
+
+
+def test_situations_are_of_all_sorts() -> None:
+    chosen = [emergencies.random_situation(0, number) for number in range(300)]
+    assert {len(one.cells) for one in chosen} == {2, 3}
+    assert {(one.kind, one.diagonal) for one in chosen} == {
+        ("holding", False),
+        ("closing", False),
+        ("lane-entry", False),
+        ("lane-entry", True),
+    }
+    for one in chosen:
+        first, second, *third = one.cells.values()
+        assert one.target == (first[0] - 1, first[1])
+        own = footprint(second, one.target)
+        assert first not in own
+        assert own.isdisjoint(third)
+    phases = [one.braking_tick - emergencies.MOVE_TICK for one in chosen if one.kind == "closing"]
+    assert min(phases) < 0 < 38 < max(phases)
+    assert len(set(phases)) > 30
+
+
+def test_equal_seeds_give_equal_emergencies() -> None:
+    assert emergencies.outcome(3, 5) == emergencies.outcome(3, 5)
+    assert emergencies.random_situation(3, 5).cells == emergencies.random_situation(3, 5).cells
+    assert emergencies.outcome(3, 5) != emergencies.outcome(4, 5)
+
+
+def test_one_brakes_and_the_others_are_on_their_way() -> None:
+    chosen = (emergencies.random_situation(0, number) for number in range(1, 300, 3))
+    situation = next(one for one in chosen if 15 <= one.braking_tick - emergencies.MOVE_TICK <= 20)
+    assert situation.kind == "closing"
+    states = np.array(emergencies.play(situation).record.states)
+    ahead, follower = states[:, 0], states[:, 1]
+    before = situation.braking_tick + 1
+    assert ahead[:before, 1] == pytest.approx(15.0, abs=0.2)
+    assert (np.diff(ahead[before - 1 : before + 10, 1]) < 0.0).all()
+    assert follower[:before, 1].max() > 18.0
 
 
 # --- the measures themselves ----------------------------------------------------------------------
