@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 from laneweave.agents.driver import TrackingDriver
 from laneweave.protocol.lattice import Cell, Move
 from laneweave.protocol.messages import Command, Name
-from laneweave.protocol.motion import State, cell_state, integrate
+from laneweave.protocol.motion import State, cell_state
 from laneweave.protocol.scenario import Scenario, load_scenario
 from laneweave.sim_bridge.demand import Arrival
 from laneweave.sim_bridge.entry import Admission
-from laneweave.sim_bridge.overlap import Pose, least_gaps, neighbours, overlapping_pairs
-from laneweave.sim_bridge.plant import Plant
+from laneweave.sim_bridge.motion_controller import Rung
+from laneweave.sim_bridge.overlap import Pose, least_gaps, overlapping_pairs
+from laneweave.sim_bridge.sensors import who_is_around
 from laneweave.sim_bridge.traffic import RoadVehicle
 
 Array = NDArray[np.float64]
@@ -34,49 +35,6 @@ ROUNDING = 1e-6
 def road_scenario(seed: int, mode: int = 1, lanes: int = 3) -> Scenario:
     """Return the default scenario with another seed, relative motion mode and number of lanes."""
     return load_scenario(None, seed=seed, formation__mode=mode, road__lanes=lanes)
-
-
-# --- what the lower level is asked for: the places to adapt when it changes -----------------------
-
-
-def look_around(vehicles: Mapping[Name, RoadVehicle], scenario: Scenario) -> None:
-    """Let each vehicle see who is near, as the bridge does after each tick (`show_bodies`)."""
-    poses = _poses(vehicles)
-    road, body = scenario.road, scenario.vehicle
-    ahead = neighbours(
-        poses,
-        lanes=road.lanes,
-        lane_width_m=road.lane_width_m,
-        length_m=body.length_m,
-        width_m=body.width_m,
-    )
-    for name, vehicle in vehicles.items():
-        vehicle.ahead = ahead[name]
-
-
-def brake_hard(plant: Plant, scenario: Scenario) -> None:
-    """Brake for one tick as hard as a vehicle can, past its jerk limit, and straight ahead."""
-    brake = getattr(plant, "brake", None)
-    if brake is not None:
-        brake(0.0)
-        return
-    # A plant that cannot: its body takes on the deceleration at once, until it stands still.
-    tick_s, decel_mps2 = scenario.runtime.tick_s, -scenario.vehicle.min_accel_mps2
-    s, v, _, y, v_y, a_y = plant.state
-    if v <= decel_mps2 * tick_s:
-        plant._state = (s + v * v / (2.0 * decel_mps2), 0.0, 0.0, y, 0.0, 0.0)
-    else:
-        plant._state = integrate((s, v, -decel_mps2, y, v_y, a_y), (0.0, 0.0), tick_s)
-
-
-def braked_ticks(vehicle: RoadVehicle) -> int:
-    """Return for how many ticks its motion controller has braked in emergency so far."""
-    return int(getattr(vehicle.controller, "braked", 0))
-
-
-def in_emergency(vehicle: RoadVehicle) -> bool:
-    """Tell whether its body brakes past the jerk limit, or has not recovered from that."""
-    return bool(getattr(vehicle.controller.plant, "in_emergency", False))
 
 
 # --- the road -------------------------------------------------------------------------------------
@@ -132,7 +90,9 @@ class Road:
     @property
     def braked(self) -> int:
         """Vehicle ticks of emergency braking by motion controllers."""
-        return sum(braked_ticks(vehicle) for vehicle in self.vehicles.values())
+        return sum(
+            vehicle.controller.rung_ticks[Rung.EMERGENCY] for vehicle in self.vehicles.values()
+        )
 
     @property
     def unusable(self) -> int:
@@ -153,13 +113,13 @@ class Road:
                 self._drive(one, (begins or {}).get(name))
         exempt = []
         for name, vehicle in self.vehicles.items():
-            before = braked_ticks(vehicle), in_emergency(vehicle)
+            plant = vehicle.controller.plant
+            before = plant.in_emergency
             if name in braking:
-                brake_hard(vehicle.controller.plant, self.scenario)
+                plant.brake(0.0)
             else:
                 vehicle.step(self.tick)
-            after = braked_ticks(vehicle), in_emergency(vehicle)
-            exempt.append(name in braking or before != after or after[1])
+            exempt.append(before or plant.in_emergency)
         self.record.exempt.append(exempt)
         self.tick += 1
         self._show()
@@ -192,7 +152,11 @@ class Road:
         record.states.append([one.controller.plant.state for one in self.vehicles.values()])
         record.gaps_m.append(least_gaps(poses, *size).gap_m)
         record.overlaps += [(self.tick, *pair) for pair in overlapping_pairs(poses, *size)]
-        look_around(self.vehicles, self.scenario)
+        around = who_is_around(
+            self.scenario, poses, {name: one.state[2] for name, one in self.vehicles.items()}
+        )
+        for name, vehicle in self.vehicles.items():
+            vehicle.perceive(around[name])
 
 
 def _poses(vehicles: Mapping[Name, RoadVehicle]) -> dict[str, Pose]:

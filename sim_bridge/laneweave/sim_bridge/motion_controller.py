@@ -46,6 +46,11 @@ MAX_COLUMN = 2**31 - 1
 """Columns are recorded with 32 bits; no vehicle gets this far. Formations have lesser numbers."""
 
 
+RELEASE_M = 1.0
+"""An emergency is over when this much would be to spare. Were it nothing, the brake would be
+released at each favourable error of measurement, and these would add up."""
+
+
 class Rung(IntEnum):
     """What a vehicle drives by; see the module."""
 
@@ -185,8 +190,8 @@ class MotionController:
         """Drive from `tick` to the next one."""
         near = [other for other in self.around.ahead if self._is_in_the_way(other)]
         rung, jerk = self._way(tick, near)
-        setpoint = self.plant.setpoint[0]
-        if self._brake.spare_m(self.measured, setpoint, jerk, near) < 0.0:
+        spare_m = self._brake.spare_m(self.measured, self.plant.setpoint[0], jerk, near)
+        if spare_m < (RELEASE_M if self.rung is Rung.EMERGENCY else 0.0):
             rung = Rung.EMERGENCY
             # The body is not where the trajectory would have it any more.
             self._jerks = self._jerks[:0]
