@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from laneweave.agents.qp import QPSettings, QuadraticProgram
-from laneweave.protocol.braking import lead_way_m, spare_error_m
+from laneweave.protocol.braking import lead_way_m, own_braking_mps2, spare_error_m
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario import Scenario, Vehicle
@@ -138,7 +138,7 @@ class Envelope:
         errors_m = _ERROR_SIGMAS * spare_error_m(scenario, (1.0 + _CLOSING_SPEEDUP) * speed_mps)
         kept_m = braking.margin_m + errors_m + _TRACKING_ERROR_M
         most_m = room_m + lead_way_m(scenario, speed_mps) - kept_m - lost_s * speed_mps
-        return cls(ticks, -scenario.vehicle.min_accel_mps2, most_m)
+        return cls(ticks, own_braking_mps2(scenario), most_m)
 
 
 def plan_trajectory(

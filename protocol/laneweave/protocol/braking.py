@@ -43,6 +43,14 @@ def stopping_distance_m(
     return max(travelled, speed_mps * speed_mps / (2.0 * brake_mps2))
 
 
+def own_braking_mps2(scenario: Scenario) -> float:
+    """Return the braking that a vehicle counts on: its own, but no more than is assumed ahead.
+
+    Who can brake harder than the vehicle ahead may come closest on the way, not at the end.
+    """
+    return min(-scenario.vehicle.min_accel_mps2, scenario.braking.lead_brake_mps2)
+
+
 def lead_way_m(scenario: Scenario, speed_mps: float, accel_mps2: float = 0.0) -> float:
     """Return how far a vehicle ahead goes at least, by the assumptions of a scenario.
 
@@ -52,11 +60,11 @@ def lead_way_m(scenario: Scenario, speed_mps: float, accel_mps2: float = 0.0) ->
         accel_mps2: its acceleration.
     """
     assumed = scenario.braking
+    # Nor is it relied upon that brakes ahead take longer to build up than one's own.
+    lag_s = min(assumed.lead_lag_s, scenario.vehicle.actuator_lag_s)
     # Who speeds up may stop doing so at once; who brakes harder than assumed does so for good.
     accel = min(max(accel_mps2, -assumed.lead_brake_mps2), 0.0)
-    return stopping_distance_m(
-        max(speed_mps, 0.0), accel, assumed.lead_brake_mps2, assumed.lead_lag_s
-    )
+    return stopping_distance_m(max(speed_mps, 0.0), accel, assumed.lead_brake_mps2, lag_s)
 
 
 def spare_error_m(scenario: Scenario, speed_mps: float) -> float:
@@ -67,7 +75,7 @@ def spare_error_m(scenario: Scenario, speed_mps: float) -> float:
         speed_mps: speed of the vehicle itself; whoever is ahead drives at v_F.
     """
     noise, assumed, limits = scenario.sensing, scenario.braking, scenario.vehicle
-    own_s = limits.actuator_lag_s + assumed.reaction_s - speed_mps / limits.min_accel_mps2
+    own_s = limits.actuator_lag_s + assumed.reaction_s + speed_mps / own_braking_mps2(scenario)
     other_s = scenario.formation.speed_mps / assumed.lead_brake_mps2 + assumed.lead_lag_s
     return math.hypot(
         noise.gap_noise_m,
@@ -84,7 +92,8 @@ class EmergencyBrake:
     def __init__(self, scenario: Scenario) -> None:
         """Take the assumptions from a scenario: its `braking`, `vehicle` and tick."""
         limits, assumed = scenario.vehicle, scenario.braking
-        self._brake_mps2 = -limits.min_accel_mps2
+        self._brake_mps2 = own_braking_mps2(scenario)
+        self._limits = limits
         self._lag_s = limits.actuator_lag_s
         self._scenario = scenario
         self._reaction_s = assumed.reaction_s
@@ -116,7 +125,10 @@ class EmergencyBrake:
     def _own_way_m(self, state: State, setpoint_mps2: float, jerk_mps3: float) -> float:
         """Return how far it goes if it brakes after the time of reaction."""
         _, v, a, _, _, _ = state
-        lag_s, time_s = self._lag_s, self._reaction_s
+        lag_s, time_s, limits = self._lag_s, self._reaction_s, self._limits
+        # What it will do is within its limits, whatever it was told.
+        jerk_mps3 = min(max(jerk_mps3, -limits.max_jerk_mps3), limits.max_jerk_mps3)
+        jerk_mps3 = max(jerk_mps3, (limits.min_accel_mps2 - setpoint_mps2) / time_s)
         # The commanded state has no lag, and the body comes to rest where it does.
         speed = v + lag_s * a + (setpoint_mps2 + jerk_mps3 * time_s / 2.0) * time_s
         ahead_m = (
