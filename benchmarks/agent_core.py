@@ -1,0 +1,365 @@
+"""What an agent costs per tick without the network: `python benchmarks/agent_core.py [--json]`.
+
+Formations drive from the entrance to the end of the road and sort their lanes on the way, in a
+closed loop with real bodies and motion controllers and without disturbances. Each vehicle has a
+node and an agent host of its own, as in a process of its own, and is handed bytes as the transport
+hands them over. CPU time of this thread, garbage collection included:
+
+    total      from the bytes of a SENSE to those of the COMMAND and the STATE that answer it
+    tracking   of it `Driver.drive`
+    rest       the difference: decode, decide, encode
+    states     what other vehicles show, where an agent listens to it; not in the total
+
+The caches of a machine are warmer here than in a process that wakes up once per tick.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterator
+from itertools import count
+from typing import Any, cast
+
+from attrs import define, field
+
+from laneweave.agents.core import AgentCore
+from laneweave.agents.driver import Drive, TrackingDriver
+from laneweave.agents.host import AgentHost
+from laneweave.coordinator.formation import start_time_s, steps_left
+from laneweave.coordinator.planning import Weights
+from laneweave.coordinator.sorting import SortingTask, sort_lanes
+from laneweave.protocol.codec import decode, encode
+from laneweave.protocol.lattice import territory
+from laneweave.protocol.messages import Ballot, Command, Name, Plan, Prepare, Sense
+from laneweave.protocol.motion import State
+from laneweave.protocol.node import Node, Started, read_message
+from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.topics import (
+    PLAN,
+    PREPARE,
+    SENSE,
+    Keys,
+    Quality,
+    matches_any,
+)
+from laneweave.protocol.transport import Received
+from laneweave.sim_bridge.demand import Arrival
+from laneweave.sim_bridge.entry import Admission
+from laneweave.sim_bridge.overlap import Pose, pose_of
+from laneweave.sim_bridge.run_record import RunRecord
+from laneweave.sim_bridge.traffic import RoadVehicle
+from laneweave.sim_bridge.world import show_bodies
+
+FORMATIONS = 3
+VEHICLES = 6
+PLAN_TICK = 50
+REPEATS = 5
+KEYS = Keys("bench")
+WEIGHTS = Weights.for_mode(1)
+SHIFT = (1, 2, 0)
+"""Lane that the vehicles of each lane prefer: all have to move."""
+
+
+@define
+class Clock:
+    """CPU time that was spent on one thing."""
+
+    spent_ns: int = 0
+
+    def call(self, work: Callable[..., Any], *args: object, **named: object) -> Any:  # noqa: ANN401
+        """Do some work and add up what it takes."""
+        began_ns = time.thread_time_ns()
+        result = work(*args, **named)
+        self.spent_ns += time.thread_time_ns() - began_ns
+        return result
+
+
+class TimedDriver(TrackingDriver):
+    """The real driver, with a clock on `drive`."""
+
+    def __init__(self, scenario: Scenario, clock: Clock) -> None:
+        """Make a driver whose cost is added to a clock."""
+        super().__init__(scenario)
+        self._clock = clock
+
+    def drive(self, sense: Sense, *, moving: bool) -> Drive:
+        """Track the reference."""
+        drive: Drive = self._clock.call(super().drive, sense, moving=moving)
+        return drive
+
+
+class Outbox:
+    """A transport that only keeps what is sent, and what is listened to."""
+
+    def __init__(self) -> None:
+        """Begin empty."""
+        self.sent: list[tuple[str, bytes]] = []
+        self.expressions: set[str] = set()
+
+    def publish(self, key: str, payload: bytes, quality: Quality) -> None:
+        """Keep a payload."""
+        del quality
+        self.sent.append((key, payload))
+
+    def subscribe(self, key_expression: str) -> None:
+        """Keep an expression."""
+        self.expressions.add(key_expression)
+
+    def unsubscribe(self, key_expression: str) -> None:
+        """Forget an expression."""
+        self.expressions.discard(key_expression)
+
+    def announce(self, key: str) -> None:
+        """Do nothing, as all that follow."""
+
+    withdraw = watch = serve = announce
+
+    def answer(self, token: int, payload: bytes, *, ok: bool) -> None:
+        """Do nothing."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+@define
+class Meadow:
+    """A world that shows bodies where they are put, and a record that keeps nothing."""
+
+    at: dict[str, State] = field(factory=dict)
+
+    def place(self, vehicle: str, state: State) -> None:
+        """Say where a vehicle is."""
+        self.at[vehicle] = state
+
+    add = place
+
+    def step(self) -> None:
+        """Do nothing."""
+
+    def positions(self) -> dict[str, Pose]:
+        """Return where each vehicle is."""
+        return {vehicle: pose_of(state) for vehicle, state in self.at.items()}
+
+    def collisions(self) -> list[tuple[str, str]]:
+        """Return none."""
+        return []
+
+    def remove(self, vehicle: str) -> None:
+        """Take a vehicle away."""
+        del self.at[vehicle]
+
+    def on_shown(self, t_s: float, vehicles: object, **measured: object) -> None:
+        """Keep nothing."""
+
+
+@define
+class Stand:
+    """A vehicle and the node of its agent."""
+
+    vehicle: RoadVehicle
+    node: Node
+    outbox: Outbox
+
+    def take(self) -> list[tuple[str, bytes]]:
+        """Return what was sent since the last call."""
+        sent, self.outbox.sent = self.outbox.sent, []
+        return sent
+
+
+@define
+class Road:
+    """Some formations in a closed loop with their agents."""
+
+    scenario: Scenario
+    stands: dict[Name, Stand] = field(factory=dict)
+    tick: int = 0
+    world: Meadow = field(factory=Meadow)
+    total: Clock = field(factory=Clock)
+    tracking: Clock = field(factory=Clock)
+    states: Clock = field(factory=Clock)
+    senses: list[tuple[str, bytes]] = field(factory=list)
+    answers: list[tuple[str, bytes]] = field(factory=list)
+    moving: int = 0
+    """Vehicle ticks in motion."""
+
+    def __attrs_post_init__(self) -> None:
+        """Put the vehicles into interlaced cells of the first blocks, and start their agents."""
+        lattice = self.scenario.lattice
+        numbers = count(1)
+        for block in range(FORMATIONS):
+            cells = [
+                cell for cell in sorted(lattice.block_cells(block)) if lattice.interlaced(cell)
+            ]
+            for cell in cells[:VEHICLES]:
+                name = Name(f"v{next(numbers):04d}")
+                arrival = Arrival(name, cell[1], SHIFT[cell[1]], 0.0)
+                vehicle = RoadVehicle.entering(Admission(arrival, cell, 0.0), 0.0, self.scenario)
+                self.stands[name] = self._stand(vehicle)
+
+    def _stand(self, vehicle: RoadVehicle) -> Stand:
+        incarnations, outbox = count(1), Outbox()
+        host = AgentHost(
+            lambda name: AgentCore(
+                name,
+                incarnations.__next__,
+                self.scenario,
+                lambda scenario: TimedDriver(scenario, self.tracking),
+            ),
+            [vehicle.name],
+        )
+        node = Node(host, outbox, KEYS, lambda _: None, Name("bench"))
+        node.dispatch(Started(), 0.0)
+        return Stand(vehicle, node, outbox)
+
+    def drive(self) -> None:
+        """Drive until the first formation leaves the road."""
+        lattice = self.scenario.lattice
+        end_s = lattice.passing_time_s(0, self.scenario.road.length_m)
+        while self.tick * self.scenario.runtime.tick_s < end_s:
+            self._step()
+            if self.tick == PLAN_TICK:
+                for block in range(FORMATIONS):
+                    self._sort(block)
+        for name, stand in self.stands.items():
+            cell, preferred = stand.vehicle.controller.hold_cell, stand.vehicle.admission.arrival
+            if cell[1] != preferred.preferred_lane:
+                raise RuntimeError(f"{name} did not get to its lane")
+
+    def _step(self) -> None:
+        tick = self.tick
+        for name, stand in self.stands.items():
+            self.senses.append((KEYS.key(SENSE, vehicle=name), self._sensed(stand)))
+        now = self.senses[-len(self.stands) :]
+        nodes = [stand.node for stand in self.stands.values()]
+        self.total.call(_deliver, nodes, [Received(*each) for each in now])
+        shown = [sent for stand in self.stands.values() for sent in self._listen_to(stand)]
+        for stand in self.stands.values():
+            heard = [
+                Received(*each) for each in shown if matches_any(stand.outbox.expressions, each[0])
+            ]
+            self.states.call(_deliver, [stand.node] * len(heard), heard)
+        for stand in self.stands.values():
+            self.moving += stand.vehicle.controller.motion_end_tick > tick
+            stand.vehicle.step(tick)
+        self.tick = tick + 1
+        self._look()
+
+    def _sensed(self, stand: Stand) -> bytes:
+        return encode(stand.vehicle.sense(self.tick, caretaker=False))
+
+    def _listen_to(self, stand: Stand) -> Iterator[tuple[str, bytes]]:
+        """Let the motion controller take the command; yield the state."""
+        for key, payload in stand.take():
+            self.answers.append((key, payload))
+            message = decode(payload)
+            if isinstance(message, Command):
+                if not stand.vehicle.controller.take(message):
+                    raise RuntimeError(f"a command was refused at tick {self.tick}")
+            else:
+                yield key, payload
+
+    def _look(self) -> None:
+        """Let everybody's sensors see who is around."""
+        vehicles = {name: stand.vehicle for name, stand in self.stands.items()}
+        record = cast("RunRecord", self.world)
+        t_s = self.tick * self.scenario.runtime.tick_s
+        show_bodies(self.world, vehicles, self.scenario, record, t_s)
+
+    def _sort(self, block: int) -> None:
+        """Have a formation promise and accept a plan, as its leader would."""
+        plan = self._plan(block)
+        members = [self.stands[name] for name in plan.roster]
+        prepare = Prepare(plan.ballot, plan.formations, plan.roster)
+        for topic, message in ((PREPARE, prepare), (PLAN, plan)):
+            for stand in members:
+                name = stand.vehicle.name
+                stand.node.deliver(Received(KEYS.key(topic, vehicle=name), encode(message)), 0.0)
+                for _, payload in stand.take():
+                    answer = decode(payload)
+                    if isinstance(answer, Command):
+                        stand.vehicle.controller.note(answer)
+        # The controllers' confirmations come with the next tick.
+
+    def _plan(self, block: int) -> Plan:
+        scenario = self.scenario
+        members = {
+            name: stand.vehicle
+            for name, stand in self.stands.items()
+            if stand.vehicle.formation == block
+        }
+        cells = {name: vehicle.controller.hold_cell for name, vehicle in members.items()}
+        wishes = {name: each.admission.arrival.preferred_lane for name, each in members.items()}
+        start_s = start_time_s((block,), self.tick * scenario.runtime.tick_s, scenario)
+        task = SortingTask((block,), cells, wishes, (), scenario)
+        moves = sort_lanes(task, scenario.formation.max_nodes, WEIGHTS).moves
+        every = [move for each in moves.values() for move in each]
+        if max(step for step, _, _ in every) >= steps_left((block,), start_s, scenario):
+            raise RuntimeError("the road is too short for the plan")
+        return Plan(
+            ballot=Ballot(1, Name("c1"), 1, block),
+            formations=(block,),
+            roster=tuple(cells),
+            incarnations={name: each.controller.attendant for name, each in members.items()},
+            start_cells=cells,
+            moves=moves,
+            t0_s=start_s,
+            slot_s=scenario.formation.cycle_s,
+            territory=tuple(sorted(territory(cells.values(), every))),
+        )
+
+
+def _deliver(nodes: list[Node], received: list[Received]) -> None:
+    for node, each in zip(nodes, received, strict=True):
+        node.deliver(each, 0.0)
+
+
+def _each(work: Callable[[Any], object], items: list[Any]) -> None:
+    for item in items:
+        work(item)
+
+
+def measured() -> dict[str, float]:
+    """Return the figures of one drive, in microseconds per vehicle and tick."""
+    road = Road(Scenario())
+    road.drive()
+    reading, writing = Clock(), Clock()
+    reading.call(_each, lambda sense: read_message(KEYS, *sense), road.senses)
+    writing.call(_each, encode, [decode(payload) for _, payload in road.answers])
+    per_tick = {
+        "total_us": road.total.spent_ns,
+        "tracking_us": road.tracking.spent_ns,
+        "rest_us": road.total.spent_ns - road.tracking.spent_ns,
+        "decode_us": reading.spent_ns,
+        "encode_us": writing.spent_ns,
+        "states_us": road.states.spent_ns,
+    }
+    solves = len(road.senses)
+    figures = {name: spent_ns / 1e3 / solves for name, spent_ns in per_tick.items()}
+    figures["decide_us"] = figures["rest_us"] - figures["decode_us"] - figures["encode_us"]
+    figures["moving_share"] = road.moving / solves
+    return figures
+
+
+def main() -> None:
+    """Measure and print medians of several drives."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--repeats", type=int, default=REPEATS, help="drives")
+    options = parser.parse_args()
+    drives = [measured() for _ in range(options.repeats)]
+    medians = {
+        name: round(statistics.median(drive[name] for drive in drives), 3) for name in drives[0]
+    }
+    if options.json:
+        sys.stdout.write(json.dumps(medians) + "\n")
+        return
+    for name, value in medians.items():
+        sys.stdout.write(f"{name:14}{value:9.2f}\n")
+
+
+if __name__ == "__main__":
+    main()
