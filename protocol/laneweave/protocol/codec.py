@@ -35,8 +35,8 @@ KINDS: dict[str, type] = {
         messages.LogEvent,
     )
 }
-_MAX_INT = 2**63
-_MAX_FLOAT = 1e12
+_MIN_INT, _MAX_INT = -(2**63), 2**63 - 1
+_MIN_FLOAT, _MAX_FLOAT = -1e12, 1e12
 """Far beyond every position, speed and time, and small enough to calculate with."""
 _MAX_DEPTH = 8
 
@@ -48,15 +48,18 @@ def _name(value: object, _: type) -> str:
 
 
 def _integer(value: object, _: type) -> int:
-    if type(value) is not int or not -_MAX_INT <= value < _MAX_INT:
+    if type(value) is not int or not _MIN_INT <= value <= _MAX_INT:
         raise BadInputError("", value, "a 64-bit integer")
     return value
 
 
 def _measure(value: object, _: type) -> float:
-    if type(value) not in (int, float) or not -_MAX_FLOAT <= value <= _MAX_FLOAT:  # type: ignore[operator]
-        raise BadInputError("", value, f"a number in [{-_MAX_FLOAT:g}, {_MAX_FLOAT:g}]")
-    return float(value)  # type: ignore[arg-type]
+    if type(value) is float:
+        if _MIN_FLOAT <= value <= _MAX_FLOAT:
+            return value
+    elif type(value) is int and _MIN_FLOAT <= value <= _MAX_FLOAT:
+        return float(value)
+    raise BadInputError("", value, f"a number in [{_MIN_FLOAT:g}, {_MAX_FLOAT:g}]")
 
 
 def _ballot(value: object, _: type) -> Ballot:
@@ -83,7 +86,7 @@ def _is_plain(value: object, depth: int) -> bool:
         case None | bool() | str():
             return True
         case int():
-            return -_MAX_INT <= value < _MAX_INT
+            return _MIN_INT <= value <= _MAX_INT
         case float():
             return math.isfinite(value)
         case list():

@@ -84,17 +84,19 @@ def _tuple_hook(kind: Any, converter: Converter) -> Hook:  # noqa: ANN401 (a gen
     endless = kinds[-1] is Ellipsis
     hooks = [(converter.get_structure_hook(part), part) for part in kinds if part is not Ellipsis]
     first_hook, first_part = hooks[0]
+    count = None if endless else len(hooks)
 
     def parts(value: object) -> Sequence[Any]:
         if not isinstance(value, (list, tuple)):
             raise BadInputError("", value, "a list")
-        if not endless and len(value) != len(hooks):
-            raise BadInputError("", value, f"a list of {len(hooks)}")
+        if count is not None and len(value) != count:
+            raise BadInputError("", value, f"a list of {count}")
         return value
 
-    def fast(value: object, _: type) -> tuple[Any, ...]:
-        if endless:
-            return tuple([first_hook(item, first_part) for item in parts(value)])
+    def fast_alike(value: object, _: type) -> tuple[Any, ...]:
+        return tuple([first_hook(item, first_part) for item in parts(value)])
+
+    def fast_mixed(value: object, _: type) -> tuple[Any, ...]:
         return tuple(
             [hook(item, part) for item, (hook, part) in zip(parts(value), hooks, strict=True)]
         )
@@ -108,7 +110,10 @@ def _tuple_hook(kind: Any, converter: Converter) -> Hook:  # noqa: ANN401 (a gen
                 raise first_problem(error).within(f"[{len(done)}]") from error
         return tuple(done)
 
-    return detailed if converter.detailed_validation else fast
+    if converter.detailed_validation:
+        return detailed
+    # States, cells and lists are all of one kind, and most of what a vehicle hears.
+    return fast_alike if all(part is first_part for _, part in hooks) else fast_mixed
 
 
 def _dict_hook(kind: Any, converter: Converter) -> Hook:  # noqa: ANN401 (a generic alias)
