@@ -18,6 +18,7 @@ from laneweave.protocol.messages import Ballot, Name, Plan, Prepare, Sense, Vehi
 from laneweave.protocol.plans import Needs
 from laneweave.protocol.transitions import RuleBook
 from laneweave.protocol.vehicle_rules import (
+    ACCEPTED,
     GATE,
     NOTED,
     PLAN,
@@ -125,7 +126,7 @@ class PlanExecution:
     @property
     def accepted(self) -> bool:
         """It has a plan, and its motion controller has noted that."""
-        return self.phase in (Stage.GATED, Stage.GOING)
+        return self.phase in ACCEPTED
 
     @property
     def go(self) -> bool:

@@ -46,7 +46,8 @@ class RuleBook:
         """
         self.table = tuple(table)
         self.functions = dict(functions)
-        self._rows: dict[tuple[str, Enum], tuple[_Row, ...]] = {}
+        self._rows: dict[str, tuple[_Row, ...]] = {}
+        """Of each event; few enough to be looked through, and phases are slow to hash."""
         for transition in self.table:
             for name in (*transition.guards, *transition.actions):
                 if name not in self.functions:
@@ -56,13 +57,14 @@ class RuleBook:
                 tuple(self.functions[name] for name in transition.guards),
                 tuple(self.functions[name] for name in transition.actions),
             )
-            for source in transition.sources:
-                key = (transition.event, source)
-                self._rows[key] = (*self._rows.get(key, ()), row)
+            event = transition.event
+            self._rows[event] = (*self._rows.get(event, ()), row)
 
     def take(self, machine: Any, event: str, message: Any) -> Transition | None:  # noqa: ANN401
         """Take the first transition that fits and return it; None: nothing changes."""
-        for row in self._rows.get((event, machine.phase), ()):
+        for row in self._rows.get(event, ()):
+            if machine.phase not in row.transition.sources:
+                continue
             for guard in row.guards:
                 if not guard(machine, message):
                     break

@@ -31,6 +31,9 @@ class Stage(Enum):
     """The start gate is open."""
 
 
+ACCEPTED = (Stage.GATED, Stage.GOING)
+"""Phases in which a plan is accepted."""
+
 PREPARE, PLAN, NOTED, STATE = "PREPARE", "PLAN", "SENSE", "STATE"
 GATE, TICK, REST = "tick (gate)", "tick (move)", "motion ends"
 
@@ -201,7 +204,6 @@ def _rest(me: PlanExecution, _: object) -> None:
 
 _ANY = tuple(Stage)
 _WITH_PLAN = (Stage.TAKEN, Stage.GATED, Stage.GOING)
-_ACCEPTED = (Stage.GATED, Stage.GOING)
 
 VEHICLE_RULES: RuleBook = RuleBook(
     (
