@@ -156,6 +156,8 @@ class AgentHost:
         They are most of the traffic, and most of the time nobody waits for anybody.
         """
         wanted = {number for agent in self._agents.values() for number in agent.wanted_states}
+        if wanted == self._formations:
+            return
         for number in sorted(self._formations - wanted):
             yield Unlisten(STATE, {"formation": number})
         for number in sorted(wanted - self._formations):

@@ -238,7 +238,10 @@ class Node:
         if self.ended:
             return
         for effect in self.core.handle(event, now_s):
-            self._carry_out(effect)
+            if isinstance(effect, Send):
+                self._send(effect)
+            else:
+                self._carry_out(effect)
 
     def _event(self, delivery: Delivery) -> Event | None:
         if isinstance(delivery, (LinkUp, LinkDown)):
@@ -260,22 +263,24 @@ class Node:
         if self.rejected == 10 ** (len(str(self.rejected)) - 1):
             log.warning("message ignored", key=key, reason=reason, ignored=self.rejected)
 
+    def _send(self, effect: Send) -> None:
+        message, topic = effect.message, effect.topic
+        self.published += 1
+        if isinstance(message, Report):
+            message = attrs.evolve(
+                message,
+                process=self._label,
+                published=self.published,
+                rejected=self.rejected,
+            )
+        if message is not self._encoded[0]:
+            self._encoded = message, encode(message)
+        key = self._keys.key(topic, **effect.parameters)
+        self._transport.publish(key, self._encoded[1], topic.quality)
+
     def _carry_out(self, effect: Effect) -> None:
         transport = self._transport
         match effect:
-            case Send(topic, message, parameters):
-                if isinstance(message, Report):
-                    message = attrs.evolve(
-                        message,
-                        process=self._label,
-                        published=self.published + 1,
-                        rejected=self.rejected,
-                    )
-                self.published += 1
-                if message is not self._encoded[0]:
-                    self._encoded = message, encode(message)
-                key = self._keys.key(topic, **parameters)
-                transport.publish(key, self._encoded[1], topic.quality)
             case Compute():
                 self._order_work(effect)
             case Reply(token, payload, ok):
