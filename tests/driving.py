@@ -185,8 +185,8 @@ def limit_use(
 ) -> dict[str, LimitUse]:
     """Return by name how the limits of motion were kept.
 
-    Jerk is the change of the true acceleration in a tick, divided by the tick; that along the road
-    does not count in ticks of emergency braking.
+    Jerk is the change of the true acceleration in a tick, divided by the tick; it does not count
+    in ticks of emergency braking.
 
     Args:
         record: of a road.
@@ -205,7 +205,7 @@ def limit_use(
         "accel_mps2": np.maximum(limits.min_accel_mps2 - a, a - limits.max_accel_mps2),
         "jerk_mps3": np.where(exempt, -inf, jerk - limits.max_jerk_mps3),
         "lateral_accel_mps2": np.abs(a_y) - limits.max_lateral_accel_mps2,
-        "lateral_jerk_mps3": lateral_jerk - limits.max_lateral_jerk_mps3,
+        "lateral_jerk_mps3": np.where(exempt, -inf, lateral_jerk - limits.max_lateral_jerk_mps3),
         "slip_mps": np.abs(v_y) - limits.max_slip_ratio * v,
     }
     return {

@@ -46,7 +46,6 @@ EMERGENCIES = 20
 """Of each kind."""
 
 
-@pytest.mark.xfail(reason="motion controllers do not brake in emergency yet", strict=False)
 @pytest.mark.parametrize("kind", emergencies.KINDS)
 def test_nobody_runs_into_who_brakes_to_a_stand_while_messages_stop(kind: str) -> None:
     first, every = emergencies.KINDS.index(kind), len(emergencies.KINDS)
