@@ -1,0 +1,185 @@
+"""What one more agent process costs: `python benchmarks/startup.py [--json] [--agents N]`.
+
+A router and agent processes of one vehicle each, started one after the other by the real fork
+server. An agent is ready when its token is up: it has its tracker and its subscriptions then. Some
+ticks follow, in which the vehicles hold their cell. For each process:
+
+    ready_cpu_ms   CPU time of all its threads, user and system, from the fork to its token
+    first_cpu_ms   the same for the answer to its first SENSE
+    own_mb         its own memory (USS) after some ticks: what it does not share with the fork
+                   server or its siblings
+
+The CPU time of starting the fork server, which happens once, is given apart.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import queue
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Iterable
+from contextlib import closing, suppress
+from multiprocessing.context import ForkServerProcess
+from pathlib import Path
+from typing import Any
+
+import psutil
+from attrs import define, evolve, field
+
+from laneweave.launch.roles import fork_server, start_role
+from laneweave.protocol.codec import encode
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.messages import Name, Sense
+from laneweave.protocol.scenario import Scenario, to_tables
+from laneweave.protocol.topics import COMMAND, SENSE, VEHICLE_ALIVE, Keys
+from laneweave.protocol.transport import Delivery, Received, TokenUp
+from laneweave.protocol.zenoh_transport import ZenohTransport
+from laneweave.sim_bridge.demand import Arrival
+from laneweave.sim_bridge.entry import Admission
+from laneweave.sim_bridge.traffic import RoadVehicle
+
+AGENTS = 20
+WAIT_S = 60.0
+TICKS = 20
+
+
+def cpu_ms(process_id: int) -> float:
+    """Return the CPU time of a process in ms.
+
+    The kernel's clock of the process has ns, the figures in /proc have 10 ms; this is how Linux
+    numbers that clock.
+    """
+    return time.clock_gettime((~process_id << 3) | 2) * 1e3
+
+
+@define
+class Fleet:
+    """Agents that have been started."""
+
+    scenario: Scenario
+    processes: dict[Name, ForkServerProcess] = field(factory=dict)
+    ready_ms: dict[Name, float] = field(factory=dict)
+    first_ms: dict[Name, float] = field(factory=dict)
+
+    def start(self, count: int, folder: str) -> None:
+        """Start a router and agents; wait for each agent, drive some ticks, end nobody."""
+        context, network = fork_server(), self.scenario.network
+        tables, options = to_tables(self.scenario), {"folder": folder, "temporary": folder}
+        router = Name("router")
+        self.processes[router] = start_role(context, router, router, tables, options)
+        inbox: queue.SimpleQueue[Delivery] = queue.SimpleQueue()
+        keys = Keys(network.realm)
+        with closing(_connected(network.endpoint, inbox)) as transport:
+            transport.watch(keys.all_of(VEHICLE_ALIVE))
+            transport.subscribe(keys.all_of(COMMAND))
+            for number in range(1, count + 1):
+                name = Name(f"v{number:04d}")
+                self.processes[name] = start_role(
+                    context, "agent", f"agent-{name}", tables, options | {"vehicles": [name]}
+                )
+                _await_key(inbox, keys.key(VEHICLE_ALIVE, vehicle=name))
+                self.ready_ms[name] = self._cpu_ms(name)
+            for tick in range(TICKS):
+                for name in self.ready_ms:
+                    before_ms = self._cpu_ms(name)
+                    payload = encode(self._sense(name, tick))
+                    transport.publish(keys.key(SENSE, vehicle=name), payload, SENSE.quality)
+                    _await_key(inbox, keys.key(COMMAND, vehicle=name))
+                    if tick == 0:
+                        self.first_ms[name] = self._cpu_ms(name) - before_ms
+
+    def _cpu_ms(self, name: Name) -> float:
+        return cpu_ms(self.processes[name].pid or 0)
+
+    def _sense(self, name: Name, tick: int) -> Sense:
+        admission = Admission(Arrival(name, 1, 1, 0.0), (-1, 1), 0.0)
+        t_s = tick * self.scenario.runtime.tick_s
+        return RoadVehicle.entering(admission, t_s, self.scenario).sense(tick, caretaker=False)
+
+    def end(self) -> None:
+        """End all processes."""
+        for process in reversed(self.processes.values()):
+            process.terminate()
+            process.join()
+
+
+def _connected(endpoint: str, inbox: queue.SimpleQueue[Delivery]) -> ZenohTransport:
+    give_up = time.monotonic() + WAIT_S
+    while True:
+        try:
+            return ZenohTransport(endpoint, inbox.put, lease_s=1.0)
+        except BadInputError:
+            if time.monotonic() > give_up:
+                raise
+            time.sleep(0.05)
+
+
+def _await_key(inbox: queue.SimpleQueue[Delivery], key: str) -> None:
+    """Wait for a token or a message on a key."""
+    give_up = time.monotonic() + WAIT_S
+    while time.monotonic() < give_up:
+        with suppress(queue.Empty):
+            news = inbox.get(timeout=1.0)
+            if isinstance(news, (TokenUp, Received)) and news.key == key:
+                return
+    raise RuntimeError(f"nothing came on {key}")
+
+
+def measured(count: int) -> dict[str, Any]:
+    """Start agents and return what they have cost."""
+    # Each process runs its supervisor's main file, for what that may define: the same one here.
+    sys.modules["__main__"].__file__ = str(Path(sys.executable).with_name("laneweave"))
+    with tempfile.TemporaryDirectory(prefix="laneweave-") as folder:
+        base = Scenario()
+        network = evolve(base.network, endpoint=f"unixsock-stream/{folder}/router.sock")
+        fleet = Fleet(evolve(base, network=network))
+        try:
+            fleet.start(count, folder)
+            return _figures(fleet)
+        finally:
+            fleet.end()
+
+
+def _figures(fleet: Fleet) -> dict[str, Any]:
+    agents = [psutil.Process(fleet.processes[name].pid) for name in fleet.ready_ms]
+    server = agents[0].parent()
+    if server is None:
+        raise RuntimeError("the fork server is gone")
+    memory = [agent.memory_full_info() for agent in agents]
+    return {
+        "agents": len(agents),
+        "ready_cpu_ms": _median(fleet.ready_ms.values()),
+        "first_cpu_ms": _median(fleet.first_ms.values()),
+        "own_mb": _median(each.uss / 1e6 for each in memory),
+        "resident_mb": _median(each.rss / 1e6 for each in memory),
+        "threads": _median(agent.num_threads() for agent in agents),
+        "server_cpu_ms": round(cpu_ms(server.pid), 1),
+        "server_resident_mb": round(server.memory_info().rss / 1e6, 1),
+        "server_threads": server.num_threads(),
+    }
+
+
+def _median(values: Iterable[float]) -> float:
+    return round(statistics.median(values), 2)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description="What one more agent process costs.")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--agents", type=int, default=AGENTS, help="processes")
+    options = parser.parse_args()
+    figures = measured(options.agents)
+    if options.json:
+        sys.stdout.write(json.dumps(figures) + "\n")
+        return
+    for name, value in figures.items():
+        sys.stdout.write(f"{name:20}{value:10.2f}\n")
+
+
+if __name__ == "__main__":
+    main()
