@@ -3,14 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import product
 
 from laneweave.agents.core import AgentCore
+from laneweave.agents.driver import TrackingDriver
 from laneweave.agents.host import AgentHost, Shard
 from laneweave.protocol.faulty_core import Wrap, bare
 from laneweave.protocol.incarnations import Incarnations
-from laneweave.protocol.messages import Name
+from laneweave.protocol.messages import Name, Sense
+from laneweave.protocol.motion import cell_state
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.zenoh_transport import run_core
+
+
+def warm_up(scenario: Scenario) -> None:
+    """Plan all moves and drive a tick of one, so that processes forked from this one need not."""
+    driver = TrackingDriver(scenario)
+    column, lane = cell = (0, 1)
+    for step in product((-1, 0, 1), repeat=2):
+        if step != (0, 0):
+            driver.begin((0, cell, (column + step[0], lane + step[1])), tick=0)
+    sense = Sense(
+        vehicle=Name("warm-up"),
+        tick=0,
+        t_s=0.0,
+        state=cell_state(scenario.lattice, cell, 0.0),
+        hold_cell=cell,
+        motion_end_tick=0,
+        motion_origin=cell,
+        preferred_lane=lane,
+        ahead=(),
+    )
+    driver.drive(sense, moving=True)
 
 
 def run_agents(

@@ -1,7 +1,7 @@
 """Starting a role in a process of its own.
 
-Processes come from a fork server that has imported what agents need and opened nothing, so that
-one more vehicle costs a fork and not the start of an interpreter.
+Processes come from a fork server that has imported and prepared what agents need and opened nothing
+(`preloaded`), so that one more vehicle costs a fork and not the start of an interpreter.
 """
 
 from __future__ import annotations
@@ -34,11 +34,9 @@ from laneweave.protocol.scenario import parse_scenario
 
 log = structlog.get_logger(__name__)
 
-PRELOADED = [
-    "laneweave.launch.roles",
-    "laneweave.agents.process",
-    "laneweave.coordinator.process",
-]
+PRELOADED = "laneweave.launch.preloaded"
+THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""Environment variables that bound the threads of linear algebra."""
 AGENT_NICENESS = 5
 CONNECT_AGAIN_S = 0.1
 """Where there are faults, a role that cannot connect tries again after this time."""
@@ -71,10 +69,10 @@ def fork_server() -> ForkServerContext:
 
     Linear algebra in every process stays on one thread: many processes share few cores.
     """
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    for name in THREAD_LIMITS:
         os.environ.setdefault(name, "1")
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(PRELOADED)
+    context.set_forkserver_preload([PRELOADED])
     # Ctrl-C reaches the whole process group: the supervisor ends its processes, in order. They
     # inherit that they ignore it, so none is caught unprepared.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)

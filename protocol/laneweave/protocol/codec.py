@@ -112,6 +112,13 @@ _FAST = _make_converter(detailed=False)
 _DETAILED = _make_converter(detailed=True)
 
 
+def warm_up() -> None:
+    """Generate the code for all messages, as the first one of each kind would."""
+    for kind in KINDS.values():
+        _FAST.get_structure_hook(kind)
+        _FAST.get_unstructure_hook(kind)
+
+
 def encode(message: object) -> bytes:
     """Return the bytes of a message."""
     body = _FAST.unstructure(message)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from typing import NoReturn
 
 import pytest
 
-from laneweave.launch.roles import start_role
+from laneweave.launch.roles import PRELOADED, THREAD_LIMITS, start_role
 from laneweave.protocol.errors import CommandFailedError
 
 
@@ -33,3 +36,24 @@ class _DeadServer:
 def test_a_dead_fork_server_is_a_failure_with_words(error: Exception, reason: str) -> None:
     with pytest.raises(CommandFailedError, match=rf"cannot start agent-v1: .*{reason}"):
         start_role(_DeadServer(error), "agent", "agent-v1", {}, {})  # type: ignore[arg-type]
+
+
+LOOK_AROUND = """
+import gc, importlib, os, sys
+before = len(os.listdir("/proc/self/fd"))
+importlib.import_module(sys.argv[1])
+print(len(os.listdir("/proc/self/task")))
+print(len(os.listdir("/proc/self/fd")) - before)
+print(gc.get_count()[2], gc.get_freeze_count() > len(gc.get_objects()))
+"""
+
+
+def test_the_fork_server_has_one_thread_and_nothing_open_and_leaves_nothing_to_collect() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", LOOK_AROUND, PRELOADED],
+        env=os.environ | dict.fromkeys(THREAD_LIMITS, "1"),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.split() == ["1", "0", "0", "True"], done.stderr
