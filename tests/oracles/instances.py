@@ -15,6 +15,12 @@ def _subsets(kinds: tuple[str, ...]) -> list[list[str]]:
 Variant = tuple[int, list[str] | None]
 """A mode, and conflicts; None: the default of the mode."""
 
+CLOSING: tuple[tuple[int, list[str]], ...] = (
+    (1, ["node", "edge", "special-1", "closing"]),
+    (2, ["geometric", "closing"]),
+    (2, ["node", "edge", "closing"]),
+)
+
 # Mode 1 knows no oblique moves, so that only special-1 makes a difference there.
 VARIANTS: tuple[Variant, ...] = (
     *((2, ["node", "edge", *subset]) for subset in _subsets(SPECIALS)),
@@ -27,19 +33,23 @@ VARIANTS: tuple[Variant, ...] = (
     (1, ["geometric"]),
     (1, None),
 )
+"""Which of them a seed takes depends on their number."""
+
+EVERY_VARIANT = (*VARIANTS, *CLOSING)
 
 
 def variant(seed: int) -> Variant:
     return VARIANTS[seed % len(VARIANTS)]
 
 
-def random_request(seed: int) -> dict[str, Any]:
+def random_request(seed: int, chosen: Variant | None = None) -> dict[str, Any]:
     """Two to six vehicles on two to four lanes and three to seven columns.
 
-    Each has a target that it may take and can reach alone; nothing more is promised.
+    The variant is the chosen one, or that of the seed. Each vehicle has a target that it may take
+    and can reach alone; nothing more is promised.
     """
     rng = Random(seed)
-    mode, conflicts = variant(seed)
+    mode, conflicts = chosen or variant(seed)
     count = rng.choice((2, 3, 3, 4, 4, 5, 5, 6))
     while True:
         columns, lanes = rng.randint(3, 7), rng.randint(2, 4)
@@ -68,6 +78,44 @@ def large_request(seed: int) -> dict[str, Any]:
             request["conflicts"] = conflicts
         if _is_connected(Problem.of(request)):
             return request
+
+
+def meeting_request(seed: int, chosen: Variant) -> dict[str, Any]:
+    """Vehicles from both ends of one to three lanes whose targets lie nearer to the middle.
+
+    The first two are to stand behind each other there, on the lane on which both are.
+    """
+    rng = Random(seed)
+    mode, conflicts = chosen
+    lanes, half = rng.randint(1, 3), rng.choice((2, 3, 3))
+    columns = 2 * half
+    count = rng.randint(2, 2 + lanes)
+    grid = [(c, lane) for c in range(columns) for lane in range(lanes)]
+    while True:
+        away, lane = rng.randint(1, half - 1), rng.randrange(lanes)
+        met = [(half - 1 - away, lane), (half + away, lane)]
+        starts = met + rng.sample([cell for cell in grid if cell not in met], count - 2)
+        targets = [(half - 1, lane), (half, lane)]
+        for column, lane in starts[2:]:
+            ahead = rng.randint(0, 2) * (1 if column < half else -1)
+            aside = rng.choice((0, 0, 0, -1, 1))
+            targets.append((column + ahead, min(max(lane + aside, 0), lanes - 1)))
+        if len(set(targets)) == count and set(targets) <= set(grid):
+            break
+    style = rng.choice(("lane", "eligible"))
+    return {
+        "schema": "laneweave.plan.request/1",
+        "grid": {"columns": columns, "lanes": lanes},
+        "mode": mode,
+        "conflicts": conflicts,
+        "vehicles": [
+            {"id": f"v{i}", "cell": list(cell)}
+            | ({"lane": targets[i][1]} if style == "lane" else {"eligible": [i]})
+            for i, cell in enumerate(starts)
+        ],
+        "targets": [list(cell) for cell in targets],
+        "deadline_s": 60.0,
+    }
 
 
 def small_request(

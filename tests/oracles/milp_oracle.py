@@ -135,7 +135,7 @@ def conflict_cliques(problem: Problem) -> list[frozenset[Move]]:
     beside: dict[Move, set[Move]] = {move: set() for move in moves}
     for a in moves:
         for b in moves:
-            near = abs(a[0][0] - b[0][0]) <= 2 and abs(a[0][1] - b[0][1]) <= 2
+            near = abs(a[0][0] - b[0][0]) <= 3 and abs(a[0][1] - b[0][1]) <= 2
             if a != b and near and (a[0] == b[0] or problem.conflict(a, b)):
                 beside[a].add(b)
     uncovered = {move: set(others) for move, others in beside.items()}

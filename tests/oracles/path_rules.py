@@ -98,6 +98,21 @@ def _geometric(a: Move, b: Move) -> bool:
     return bool(footprint(a) & footprint(b))
 
 
+def _closing(a: Move, b: Move) -> bool:
+    """`a` comes from behind, `b` from ahead: the two columns between them become none.
+
+    It matters only if one of them is, before or after the step, on a lane of the other.
+    """
+    (behind, lane_a), (behind_then, lane_a_then) = a
+    (ahead, lane_b), (ahead_then, lane_b_then) = b
+    free, free_then = ahead - behind - 1, ahead_then - behind_then - 1
+    same_lane = any(
+        mine == other for mine in (lane_a, lane_a_then) for other in (lane_b, lane_b_then)
+    )
+    both_move = behind != behind_then and ahead != ahead_then
+    return both_move and (free, free_then) == (2, 0) and same_lane
+
+
 _ORDERED: dict[str, Callable[[Move, Move], bool]] = {
     "node": _node,
     "edge": _edge,
@@ -106,6 +121,7 @@ _ORDERED: dict[str, Callable[[Move, Move], bool]] = {
     "special-3": _special_3,
     "special-4": _special_4,
     "geometric": _geometric,
+    "closing": _closing,
 }
 KINDS = tuple(_ORDERED)
 

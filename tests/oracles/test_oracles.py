@@ -6,7 +6,14 @@ from typing import Any
 import pytest
 
 from oracles import joint_search, milp_oracle
-from oracles.instances import VARIANTS, random_request, small_request
+from oracles.instances import (
+    CLOSING,
+    EVERY_VARIANT,
+    Variant,
+    meeting_request,
+    random_request,
+    small_request,
+)
 from oracles.path_rules import KINDS, Move, Problem, check_paths, conflict_kinds
 
 DIAGONAL: Move = ((0, 0), (1, 1))
@@ -92,6 +99,35 @@ def _mirrored(move: Move) -> Move:
     return ((-move[0][0], move[0][1]), (-move[1][0], move[1][1]))
 
 
+@pytest.mark.parametrize(
+    ("a", "b", "closing"),
+    [
+        # two free cells become none: on one lane, and where lanes are changed
+        (((0, 0), (1, 0)), ((3, 0), (2, 0)), True),
+        (DIAGONAL, ((3, 1), (2, 1)), True),
+        (DIAGONAL, ((3, 0), (2, 0)), True),
+        (DIAGONAL, ((3, 1), (2, 0)), True),
+        (DIAGONAL, ((3, 2), (2, 1)), True),
+        (DIAGONAL, ((3, 0), (2, -1)), True),
+        # no lane of both
+        (((0, 0), (1, 0)), ((3, 1), (2, 1)), False),
+        (DIAGONAL, ((3, 2), (2, 2)), False),
+        # three become one, two become one or stay two
+        (((0, 0), (1, 0)), ((4, 0), (3, 0)), False),
+        (((0, 0), (1, 0)), ((3, 0), (3, 0)), False),
+        (((0, 0), (1, 0)), ((3, 0), (3, 1)), False),
+        (((0, 0), (1, 0)), ((3, 0), (4, 0)), False),
+        (((1, 0), (0, 0)), ((3, 0), (4, 0)), False),
+        (((1, 0), (0, 0)), ((2, 0), (3, 0)), False),
+    ],
+)
+def test_two_that_close_up(a: Move, b: Move, closing: bool) -> None:
+    for turn in (lambda move: move, _mirrored):
+        for first, second in ((a, b), (b, a)):
+            found = conflict_kinds(turn(first), turn(second))
+            assert found == ["closing"] * closing
+
+
 def test_edge_conflict_is_where_the_points_on_two_paths_meet() -> None:
     """Points that travel at constant speed and are neither at the start nor the end together."""
     moves = [((0, 0), (dc, dl)) for dc in (-1, 0, 1) for dl in (-1, 0, 1) if (dc, dl) != (0, 0)]
@@ -110,12 +146,13 @@ def test_edge_conflict_is_where_the_points_on_two_paths_meet() -> None:
                 assert ("edge" in conflict_kinds(a, b)) == meet
 
 
-def test_geometric_contains_all_other_kinds() -> None:
+def test_geometric_contains_all_kinds_of_the_paper() -> None:
     around = [(c, lane) for c in range(-1, 3) for lane in range(-1, 3)]
     moves = [(u, v) for u in around for v in around if max(abs(u[0] - v[0]), abs(u[1] - v[1])) < 2]
     for a, b in combinations(moves, 2):
         kinds = conflict_kinds(a, b)
-        assert not kinds or kinds[-1] == KINDS[-1] == "geometric"
+        others = [kind for kind in kinds if kind not in ("geometric", "closing")]
+        assert not others or "geometric" in kinds
 
 
 def test_faults_in_a_response_are_found() -> None:
@@ -169,9 +206,9 @@ def _assert_oracles_agree(request: dict[str, Any]) -> int | None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("code", range(len(VARIANTS)))
+@pytest.mark.parametrize("code", range(len(EVERY_VARIANT)))
 def test_oracles_agree(code: int, seed: int) -> None:
-    mode, conflicts = VARIANTS[code]
+    mode, conflicts = EVERY_VARIANT[code]
     shape = ((3, 2, 2), (4, 2, 2), (3, 3, 2), (5, 3, 2))[seed]
     columns, lanes, count = shape
     request = small_request(
@@ -180,14 +217,21 @@ def test_oracles_agree(code: int, seed: int) -> None:
     _assert_oracles_agree(request)
 
 
-@pytest.mark.parametrize("code", range(len(VARIANTS)))
+@pytest.mark.parametrize("code", range(len(EVERY_VARIANT)))
 def test_oracles_agree_on_three_vehicles(code: int) -> None:
-    mode, conflicts = VARIANTS[code]
+    mode, conflicts = EVERY_VARIANT[code]
     for seed, (columns, lanes) in enumerate(((3, 2), (4, 2), (3, 3))):
         request = small_request(
             seed + 7 * code, columns=columns, lanes=lanes, count=3, mode=mode, conflicts=conflicts
         )
         _assert_oracles_agree(request)
+
+
+@pytest.mark.parametrize("chosen", CLOSING)
+def test_oracles_agree_on_vehicles_that_meet(chosen: Variant) -> None:
+    requests = [meeting_request(seed, chosen) for seed in range(40)]
+    costs = [_assert_oracles_agree(r) for r in requests if len(r["vehicles"]) == 2]
+    assert len(costs) >= 5
 
 
 @pytest.mark.parametrize("kinds", [*KINDS, "edge special-1", "special-2 special-4", ""])
@@ -243,7 +287,7 @@ def test_start_of_the_horizon_does_not_matter() -> None:
 
 
 def test_rows_cover_exactly_the_moves_that_exclude_one_another() -> None:
-    for mode, conflicts in VARIANTS:
+    for mode, conflicts in EVERY_VARIANT:
         request = small_request(1, columns=3, lanes=3, count=2, mode=mode, conflicts=conflicts)
         problem = Problem.of(request)
         covered = {

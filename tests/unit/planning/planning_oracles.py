@@ -102,7 +102,9 @@ def requests(
     some_cells = st.permutations(cells)
     starts = draw(some_cells)[:count]
     targets = draw(some_cells)[: min(len(cells), count + draw(st.integers(0, 1)))]
-    common = st.just(("node", "edge", "special-1"))
+    common = st.sampled_from(
+        [("node", "edge", "special-1"), ("node", "edge", "special-1", "closing")]
+    )
     any_kinds = st.lists(st.sampled_from(KINDS), unique=True).map(tuple)
     preference = st.none() | st.lists(
         st.integers(0, len(targets) - 1), unique=True, min_size=1

@@ -12,13 +12,23 @@ from laneweave.coordinator.planning.facade import Solver
 from laneweave.coordinator.planning.grid import Mode
 from laneweave.coordinator.planning.instances import formation_request
 from oracles import joint_search, milp_oracle
-from oracles.instances import VARIANTS, large_request, random_request, small_request, variant
+from oracles.instances import (
+    CLOSING,
+    EVERY_VARIANT,
+    VARIANTS,
+    large_request,
+    meeting_request,
+    random_request,
+    small_request,
+    variant,
+)
 from oracles.path_rules import check_paths
 
 INSTANCES = 200
 MORE_INSTANCES = 1_600
 FORMATION_INSTANCES = 100
 LARGE_INSTANCES = 100
+CLOSING_INSTANCES = 60
 LARGE_DEADLINE_S = 4.0
 CHUNK = 10
 
@@ -87,6 +97,25 @@ def test_planner_agrees_with_the_oracle_on_formations_beyond_six(first: int) -> 
     assert not wrong, "\n".join(wrong)
 
 
+@pytest.mark.parametrize("first", range(0, CLOSING_INSTANCES, CHUNK))
+def test_planner_agrees_with_the_oracle_where_nobody_may_close_up(first: int) -> None:
+    wrong, dearer = [], 0
+    for seed in range(first, first + CHUNK):
+        mode, conflicts = CLOSING[seed // 2 % len(CLOSING)]
+        make = meeting_request if seed % 2 else random_request
+        request = make(seed, (mode, conflicts))
+        cost = milp_oracle.optimal_cost(request)
+        free = {**request, "conflicts": [kind for kind in conflicts if kind != "closing"]}
+        dearer += cost != milp_oracle.optimal_cost(free)
+        wrong += [
+            f"seed {seed}, {solver}: {fault}: {json.dumps(request)}"
+            for solver in SOLVERS
+            for fault in _faults(request, cost, solver)
+        ]
+    assert not wrong, "\n".join(wrong)
+    assert dearer, "than where two may close up"
+
+
 @pytest.mark.full
 @pytest.mark.parametrize("seed", range(LARGE_INSTANCES))
 def test_what_is_proven_of_large_requests_of_every_kind_is_true(seed: int) -> None:
@@ -120,10 +149,10 @@ def test_all_sets_of_conflicts_and_all_sizes_occur() -> None:
 CROWDED = list(product(range(8), ((3, 2, 2), (4, 1, 2), (3, 2, 3))))
 
 
-@pytest.mark.parametrize("code", range(len(VARIANTS)))
+@pytest.mark.parametrize("code", range(len(EVERY_VARIANT)))
 def test_planner_agrees_with_joint_search_where_space_is_scarce(code: int) -> None:
     """Many of these have no solution, which the planner must prove."""
-    mode, conflicts = VARIANTS[code]
+    mode, conflicts = EVERY_VARIANT[code]
     wrong = []
     for seed, (columns, lanes, count) in CROWDED:
         request = small_request(

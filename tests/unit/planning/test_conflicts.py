@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.conflicts import KINDS, ConflictModel, footprint
 from laneweave.coordinator.planning.grid import Cell, Move, displacements
+from oracles.path_rules import conflict_kinds
 
-CELLS = st.tuples(st.integers(0, 3), st.integers(0, 3))
+CELLS = st.tuples(st.integers(0, 4), st.integers(0, 3))
 
 
 @st.composite
@@ -75,8 +76,9 @@ def test_every_kind_is_symmetric(a: Move, b: Move, kind: str) -> None:
 
 @settings(deadline=None)
 @given(moves(), moves())
-def test_geometric_contains_all_other_kinds(a: Move, b: Move) -> None:
-    if ConflictModel(KINDS[:-1]).kind(a, b) is not None:
+def test_geometric_contains_all_kinds_of_the_paper(a: Move, b: Move) -> None:
+    others = [kind for kind in KINDS if kind not in ("geometric", "closing")]
+    if ConflictModel(others).kind(a, b) is not None:
         assert ConflictModel(["geometric"]).kind(a, b) == "geometric"
 
 
@@ -89,6 +91,96 @@ def test_conflicts_do_not_depend_on_the_place(a: Move, b: Move, shift: Cell) -> 
 
     model = ConflictModel(KINDS)
     assert model.kind(a, b) == model.kind(moved(a), moved(b))
+
+
+CLOSING: list[tuple[Move, Move]] = [
+    # Head-on on one lane.
+    (((0, 0), (1, 0)), ((3, 0), (2, 0))),
+    # One goes to the other's lane, or leaves it.
+    (((0, 0), (1, 1)), ((3, 1), (2, 1))),
+    (((0, 1), (1, 0)), ((3, 1), (2, 1))),
+    (((0, 0), (1, 0)), ((3, 1), (2, 0))),
+    (((0, 0), (1, 0)), ((3, 0), (2, 1))),
+    # Both change lanes: to one lane, past each other, from one lane, from and to that between them.
+    (((0, 0), (1, 1)), ((3, 2), (2, 1))),
+    (((0, 0), (1, 1)), ((3, 1), (2, 0))),
+    (((0, 0), (1, 1)), ((3, 0), (2, -1))),
+    (((0, 0), (1, 1)), ((3, 1), (2, 2))),
+]
+
+
+@pytest.mark.parametrize(("a", "b"), CLOSING)
+def test_closing_is_a_kind_of_its_own(a: Move, b: Move) -> None:
+    for first, second in ((a, b), (b, a)):
+        found = [kind for kind in KINDS if ConflictModel([kind]).kind(first, second) is not None]
+        assert found == ["closing"]
+        assert ConflictModel(KINDS).kind(first, second) == "closing"
+
+
+@pytest.mark.parametrize(
+    ("a", "b"),
+    [
+        # One free cell more, and one less.
+        (((0, 0), (1, 0)), ((4, 0), (3, 0))),
+        (((0, 0), (1, 0)), ((2, 0), (1, 0))),
+        # Only one moves, or only sideways; one follows the other; they draw apart.
+        (((0, 0), (1, 0)), ((3, 0), (3, 0))),
+        (((0, 0), (0, 0)), ((3, 0), (2, 0))),
+        (((0, 0), (1, 0)), ((3, 0), (3, 1))),
+        (((0, 0), (0, 1)), ((3, 1), (2, 1))),
+        (((0, 0), (1, 0)), ((3, 0), (4, 0))),
+        (((0, 0), (-1, 0)), ((3, 0), (2, 0))),
+        (((0, 0), (-1, 0)), ((3, 0), (4, 0))),
+        # No lane in common.
+        (((0, 0), (1, 0)), ((3, 1), (2, 1))),
+        (((0, 0), (1, 0)), ((3, 1), (2, 2))),
+        (((0, 0), (1, -1)), ((3, 1), (2, 2))),
+    ],
+)
+def test_not_closing(a: Move, b: Move) -> None:
+    model = ConflictModel(["closing"])
+    assert model.kind(a, b) is None
+    assert model.kind(b, a) is None
+
+
+@settings(deadline=None)
+@given(moves(), moves())
+def test_closing_is_the_same_from_either_end_of_the_road_and_from_either_side(
+    a: Move, b: Move
+) -> None:
+    def turned(move: Move, along: int, across: int) -> Move:
+        start, end = ((along * c, across * lane) for c, lane in move)
+        return start, end
+
+    model = ConflictModel(["closing"])
+    for signs in ((-1, 1), (1, -1)):
+        assert model.kind(a, b) == model.kind(turned(a, *signs), turned(b, *signs))
+
+
+def test_all_kinds_are_those_of_rules_that_share_no_code() -> None:
+    steps = displacements(2)
+    for column, lane in itertools.product(range(-4, 5), range(-3, 4)):
+        for step, other in itertools.product(steps, steps):
+            a, b = ((0, 0), step), ((column, lane), (column + other[0], lane + other[1]))
+            found = [kind for kind in KINDS if ConflictModel([kind]).kind(a, b) is not None]
+            assert found == conflict_kinds(a, b)
+
+
+def test_the_reach_of_a_model_holds_all_its_conflicts() -> None:
+    near = list(itertools.product(range(-5, 6), repeat=2))
+    steps = displacements(2)
+    for kind in KINDS:
+        model = ConflictModel([kind])
+        found = {
+            (column, lane)
+            for column, lane in near
+            for a, b in itertools.product(steps, steps)
+            if model.kind(((0, 0), a), ((column, lane), (column + b[0], lane + b[1]))) is not None
+        }
+        assert max(abs(c) for c, _ in found) <= model.reach[0]
+        assert max(abs(lane) for _, lane in found) <= model.reach[1]
+    assert ConflictModel(KINDS).reach == (3, 2)
+    assert ConflictModel([kind for kind in KINDS if kind != "closing"]).reach == (2, 2)
 
 
 def test_footprints() -> None:

@@ -8,8 +8,18 @@ from laneweave.coordinator.planning.conflicts import KINDS, ConflictModel
 from laneweave.coordinator.planning.grid import Grid, Mode, Move
 from laneweave.coordinator.planning.moves import MoveTable, bits
 
-GRIDS = [Grid(4, 3, []), Grid(3, 4, [(1, 1), (2, 3)]), Grid(5, 1, []), Grid(1, 2, [])]
-MODELS = [ConflictModel([kind]) for kind in KINDS]
+GRIDS = [
+    Grid(4, 3, []),
+    Grid(3, 4, [(1, 1), (2, 3)]),
+    Grid(5, 1, []),
+    Grid(1, 2, []),
+    Grid(7, 2, []),
+]
+MODELS = [
+    *(ConflictModel([kind]) for kind in KINDS),
+    ConflictModel(["geometric", "closing"]),
+    ConflictModel(KINDS),
+]
 
 
 def _moves(table: MoveTable) -> set[Move]:

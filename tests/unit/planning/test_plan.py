@@ -22,8 +22,9 @@ from laneweave.coordinator.planning import (
     plan,
     problems_of_response,
 )
+from laneweave.coordinator.planning.conflicts import KINDS
 from laneweave.coordinator.planning.facade import Solver
-from laneweave.coordinator.planning.grid import Cell, Grid
+from laneweave.coordinator.planning.grid import Cell, Grid, Mode
 from laneweave.coordinator.planning.instances import block_request, formation_request
 from laneweave.coordinator.planning.path_map import RelativePathMap, final_arrival
 from laneweave.protocol.errors import BadInputError
@@ -181,6 +182,23 @@ class TestInfeasible:
         assert response.cost == cheapest_plan(request)
 
 
+@pytest.mark.parametrize("solver", ["tappa", "branching"])
+@pytest.mark.parametrize(
+    ("mode", "kinds"), [(1, ("node", "edge", "special-1")), (2, ("geometric",))]
+)
+def test_who_would_close_up_goes_one_after_the_other(
+    solver: Solver, mode: Mode, kinds: tuple[str, ...]
+) -> None:
+    vehicles = VehicleRequest("a", (0, 0), eligible=(0,)), VehicleRequest("b", (3, 0), lane=0)
+    targets = ((1, 0), (2, 0))
+    at_once = PlanRequest(Grid(4, 1), mode, kinds, vehicles, targets)
+    assert plan(at_once, solver=solver).cost == 2
+    in_turn = attrs.evolve(at_once, conflicts=(*kinds, "closing"))
+    response = plan(in_turn, solver=solver)
+    assert (response.status, response.cost) == ("optimal", 3)
+    assert problems_of_response(in_turn, response) == []
+
+
 class TestDeadline:
     @pytest.mark.parametrize(
         ("solver", "looks"),
@@ -310,15 +328,14 @@ class TestSymmetry:
             assert (one.status, one.cost) == (other.status, other.cost)
 
     def test_more_conflicts_never_make_it_cheaper(self) -> None:
-        kinds = ("node", "edge", "special-1", "special-2", "special-3", "special-4", "geometric")
         for seed in range(3):
             costs = [
                 plan(
                     formation_request(
-                        seed, vehicles=5, mode=2, conflicts=kinds[:count], deadline_s=60.0
+                        seed, vehicles=5, mode=2, conflicts=KINDS[:count], deadline_s=60.0
                     )
                 ).cost
-                for count in range(1, len(kinds) + 1)
+                for count in range(1, len(KINDS) + 1)
             ]
             proven = [cost for cost in costs if cost is not None]
             assert len(proven) == len(costs)

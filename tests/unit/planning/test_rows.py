@@ -2,16 +2,19 @@
 
 from itertools import combinations
 
+import numpy as np
 import pytest
 
+from laneweave.coordinator.planning.arrays import lattice
 from laneweave.coordinator.planning.conflicts import KINDS, ConflictModel
-from laneweave.coordinator.planning.grid import Mode, Move, displacements
+from laneweave.coordinator.planning.grid import Grid, Mode, Move, displacements
 from laneweave.coordinator.planning.rows import Row, row_patterns
-from oracles.instances import VARIANTS
+from oracles.instances import EVERY_VARIANT
 
 MODELS: list[tuple[Mode, tuple[str, ...]]] = [
-    (1 if mode == 1 else 2, tuple(kinds)) for mode, kinds in VARIANTS if kinds is not None
+    (1 if mode == 1 else 2, tuple(kinds)) for mode, kinds in EVERY_VARIANT if kinds is not None
 ]
+FAR = range(-3, 4)
 NEAR = range(-2, 3)
 
 
@@ -34,7 +37,7 @@ def test_every_conflict_is_in_a_row_and_every_row_excludes(
     rows = [
         moves_of(pattern, mode, column, lane)
         for pattern in patterns
-        for column in range(-4, 5)
+        for column in range(-6, 7)
         for lane in range(-4, 5)
     ]
     for pattern in patterns:
@@ -44,7 +47,7 @@ def test_every_conflict_is_in_a_row_and_every_row_excludes(
     origin = [((0, 0), step) for step in steps]
     others = [
         ((column, lane), (column + along, lane + across))
-        for column in NEAR
+        for column in FAR
         for lane in NEAR
         for along, across in steps
         if (column, lane) != (0, 0)
@@ -56,13 +59,18 @@ def test_every_conflict_is_in_a_row_and_every_row_excludes(
 
 
 @pytest.mark.parametrize(("mode", "kinds"), MODELS)
-def test_from_cells_of_a_row_can_be_told_apart_by_thirds(
-    mode: Mode, kinds: tuple[str, ...]
-) -> None:
+def test_from_cells_of_a_row_can_be_told_apart(mode: Mode, kinds: tuple[str, ...]) -> None:
     """See `Lattice.near`."""
-    for pattern in row_patterns(mode, ConflictModel(kinds)):
-        for a, b in combinations({member[:2] for member in pattern}, 2):
-            assert max(abs(a[0] - b[0]), abs(a[1] - b[1])) <= 2
+    grid, model = Grid(9, 5), ConflictModel(kinds)
+    ways = lattice(grid, mode, model)
+    assert ways.near_count == (12 if "closing" in kinds else 9)
+    assert set(ways.near.tolist()) == set(range(ways.near_count))
+    cells: dict[int, set[int]] = {}
+    for d, cell, m in np.argwhere(ways.row >= 0).tolist():
+        cells.setdefault(int(ways.row[d, cell, m]), set()).add(cell)
+    assert len(cells) == ways.row_count
+    for of_row in cells.values():
+        assert len({int(ways.near[cell]) for cell in of_row}) == len(of_row)
 
 
 @pytest.mark.parametrize(
@@ -73,6 +81,19 @@ def test_of_footprints_there_is_one_row_for_each_cell(
     mode: Mode, kinds: tuple[str, ...], moves: int
 ) -> None:
     (pattern,) = row_patterns(mode, ConflictModel(kinds))
+    assert len(pattern) == moves
+
+
+@pytest.mark.parametrize(
+    ("mode", "kinds", "moves"),
+    [(1, ("node", "edge", "special-1"), 4), (1, ("geometric",), 4), (2, ("geometric",), 20)],
+)
+def test_of_vehicles_that_close_up_there_is_one_row_more(
+    mode: Mode, kinds: tuple[str, ...], moves: int
+) -> None:
+    others = row_patterns(mode, ConflictModel(kinds))
+    *same, pattern = row_patterns(mode, ConflictModel((*kinds, "closing")))
+    assert tuple(same) == others
     assert len(pattern) == moves
 
 

@@ -13,7 +13,7 @@ from laneweave.coordinator.planning import (
     problems_of_paths,
     problems_of_response,
 )
-from laneweave.coordinator.planning.grid import Cell, Grid
+from laneweave.coordinator.planning.grid import Cell, Grid, Mode
 
 REQUEST = PlanRequest(
     Grid(4, 3, [(0, 2)]),
@@ -70,6 +70,20 @@ def test_problems_are_found(
     assignment: tuple[int, ...], paths: tuple[tuple[Cell, ...], ...], text: str
 ) -> None:
     assert any(text in problem for problem in problems_of_paths(REQUEST, assignment, paths))
+
+
+@pytest.mark.parametrize(("mode", "kinds"), [(1, REQUEST.conflicts), (2, ("geometric",))])
+def test_vehicles_that_close_up_from_three_columns_are_not_too_far_apart(
+    mode: Mode, kinds: tuple[str, ...]
+) -> None:
+    vehicles = VehicleRequest("a", (0, 0), eligible=(0,)), VehicleRequest("b", (3, 0), lane=0)
+    paths = ((0, 0), (1, 0)), ((3, 0), (2, 0))
+    targets = ((1, 0), (2, 0))
+    request = PlanRequest(Grid(4, 1), mode, (*kinds, "closing"), vehicles, targets)
+    found = problems_of_paths(request, (0, 1), paths)
+    assert found == ["closing conflict of a and b in step 0"]
+    free = PlanRequest(Grid(4, 1), mode, kinds, vehicles, targets)
+    assert problems_of_paths(free, (0, 1), paths) == []
 
 
 def test_oblique_moves_belong_to_mode_2() -> None:

@@ -41,8 +41,9 @@ class Lattice(NamedTuple):
     """(D, X, M) numbers of the rows that a move is in; -1: no more."""
     row_count: int
     near: Ints
-    """(X,) a number from 0 to 8 that tells the from-cells of the moves in one row apart: they are
-    at most two columns and two lanes away from each other."""
+    """(X,) a number from 0 to `near_count` - 1 that tells the from-cells of the moves in one row
+    apart: they are no farther away from each other than conflicts reach."""
+    near_count: int
 
 
 class Teams(NamedTuple):
@@ -86,8 +87,10 @@ def lattice(grid: Grid, mode: Mode, model: ConflictModel) -> Lattice:
     )
     row, row_count = _rows(grid, patterns, len(steps), valid)
     cell = np.arange(grid.columns * grid.lanes)
-    near = cell // grid.lanes % 3 * 3 + cell % grid.lanes % 3
-    return Lattice(grid.lanes, steps[:, 0] * grid.lanes + steps[:, 1], valid, row, row_count, near)
+    columns, lanes = (reach + 1 for reach in model.reach)
+    near = cell // grid.lanes % columns * lanes + cell % grid.lanes % lanes
+    step = steps[:, 0] * grid.lanes + steps[:, 1]
+    return Lattice(grid.lanes, step, valid, row, row_count, near, columns * lanes)
 
 
 def _rows(

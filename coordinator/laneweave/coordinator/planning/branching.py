@@ -190,8 +190,8 @@ class Branching:
         """
         displacements, cells = self._lattice.valid.shape
         groups, rows = len(self._teams.pair), self._lattice.row_count
-        moves = groups * displacements * cells
-        size = 8 * cells * len(self._teams.pair_cell) + 33 * moves + 8 * rows * (groups + 12)
+        moves, masses = groups * displacements * cells, groups + self._lattice.near_count
+        size = 8 * cells * len(self._teams.pair_cell) + 33 * moves + 8 * rows * (masses + 3)
         size = int(steps * (size + nodes * (moves + 8 * rows)))
         if size >= _MOST_BYTES:
             return False

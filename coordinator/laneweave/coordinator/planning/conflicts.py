@@ -4,9 +4,9 @@ Section "Conflict model" defines node conflicts, edge conflicts and four special
 conflict. Which special types matter depends on the width of the lanes and on the column pitch, so
 each can be chosen on its own. Every kind is symmetric in the two vehicles.
 
-The kind `geometric` goes beyond the paper. By itself it means footprints: rectangles of cells,
-which the execution protocol reserves. With a `Geometry` it is the table computed from that
-(`clearances`).
+Two kinds go beyond the paper. `geometric` by itself means footprints: rectangles of cells, which
+the execution protocol reserves. With a `Geometry` it is the table computed from that
+(`clearances`). `closing` keeps the room that an emergency brake needs.
 """
 
 from __future__ import annotations
@@ -16,16 +16,28 @@ from typing import Final
 
 import attrs
 
-from laneweave.coordinator.planning.clearances import close_pairs
+from laneweave.coordinator.planning.clearances import FARTHEST, close_pairs
 from laneweave.coordinator.planning.geometry import Geometry
 from laneweave.coordinator.planning.grid import Cell, Mode, Move
 
-KINDS: Final = ("node", "edge", "special-1", "special-2", "special-3", "special-4", "geometric")
+KINDS: Final = (
+    "node",
+    "edge",
+    "special-1",
+    "special-2",
+    "special-3",
+    "special-4",
+    "geometric",
+    "closing",
+)
 
 DEFAULT_KINDS: Final[dict[Mode, tuple[str, ...]]] = {
     1: ("node", "edge", "special-1"),
     2: ("geometric",),
 }
+
+CLOSING_COLUMNS: Final = 3
+"""From-cells of two vehicles that close up from two free columns to none."""
 
 
 def is_wait(move: Move) -> bool:
@@ -97,6 +109,16 @@ def _geometric(a: Move, b: Move) -> bool:
     return not footprint(a).isdisjoint(footprint(b))
 
 
+def _closing(a: Move, b: Move) -> bool:
+    """A moves forwards, and B, three columns ahead, backwards; some lane is touched by both."""
+    return (
+        a[1][0] - a[0][0] == 1
+        and b[1][0] - b[0][0] == -1
+        and b[0][0] - a[0][0] == CLOSING_COLUMNS
+        and not {a[0][1], a[1][1]}.isdisjoint((b[0][1], b[1][1]))
+    )
+
+
 _PREDICATES: Final[dict[str, Callable[[Move, Move], bool]]] = {
     "node": _node,
     "edge": _edge,
@@ -105,6 +127,7 @@ _PREDICATES: Final[dict[str, Callable[[Move, Move], bool]]] = {
     "special-3": _special_3,
     "special-4": _special_4,
     "geometric": _geometric,
+    "closing": _closing,
 }
 
 
@@ -138,9 +161,11 @@ class ConflictModel:
         or stays, and their initial and target cells form a right triangle.
     geometric: without a geometry, the footprints intersect. The footprint of a move is its two
         cells and, if it is oblique, both corner cells of its square; that of a wait is its cell.
-        This is what the execution protocol reserves, whatever is late. It contains all other kinds
+        This is what the execution protocol reserves, whatever is late. It contains all kinds above
         and, closed to whole cells, the table of any geometry.
         With a geometry, exactly the pairs that bring two bodies too close.
+    closing: A moves forwards, straight or obliquely, B moves backwards and starts three columns
+        ahead of A, and some lane is the from-lane or to-lane of both. No other kind contains it.
     """
 
     kinds: tuple[str, ...] = attrs.field(converter=_as_kinds)
@@ -154,6 +179,11 @@ class ConflictModel:
         """
         if self.geometry is not None and "geometric" not in self.kinds:
             raise ValueError(f"a geometry, but conflict kinds {self.kinds} without geometric")
+
+    @property
+    def reach(self) -> Cell:
+        """Columns and lanes between two from-cells beyond which no two moves conflict."""
+        return (CLOSING_COLUMNS if "closing" in self.kinds else FARTHEST), FARTHEST
 
     def kind(self, a: Move, b: Move) -> str | None:
         """Return the first kind of conflict between two moves made in the same step, or None."""

@@ -15,12 +15,8 @@ from collections.abc import Iterator
 from functools import lru_cache
 from typing import Final
 
-from laneweave.coordinator.planning.clearances import FARTHEST
 from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.grid import Cell, Grid, Mode, Move, displacements
-
-REACH: Final = FARTHEST
-"""Two moves can only conflict when their from-cells are at most this far apart."""
 
 Offsets = tuple[tuple[int, int, int], ...]
 """Column and lane from A's cell to B's cell, and the displacement of B."""
@@ -46,12 +42,12 @@ def conflict_offsets(
     Conflicts do not depend on where on the lattice they happen, so one table serves all grids.
     """
     steps = displacements(mode)
-    reach = range(-REACH, REACH + 1)
+    columns, lanes = (range(-reach, reach + 1) for reach in model.reach)
 
     def conflicting(d: int) -> Iterator[tuple[int, int, int]]:
         a: Move = ((0, 0), steps[d])
-        for column in reach:
-            for lane in reach:
+        for column in columns:
+            for lane in lanes:
                 for e, step in enumerate(steps):
                     b: Move = ((column, lane), (column + step[0], lane + step[1]))
                     if model.kind(a, b) is not None:
@@ -70,7 +66,7 @@ class MoveTable:
         self.model = model
         self.steps = displacements(mode)
         self.fan = len(self.steps)
-        self.width = grid.lanes + REACH
+        self.width = grid.lanes + model.reach[1]
         self.every = (1 << self.fan) - 1
         self.shifts = tuple((c * self.width + lane) * self.fan for c, lane in self.steps)
         self.cells = self._free_cells()
@@ -159,7 +155,8 @@ class _ConflictSets(dict[int, int]):
 
     def __init__(self, table: MoveTable) -> None:
         super().__init__()
-        self._base = REACH * (table.width + 1)
+        columns, lanes = table.model.reach
+        self._base = columns * table.width + lanes
         self._fan = table.fan
         self._valid = table.valid
         self._patterns = tuple(

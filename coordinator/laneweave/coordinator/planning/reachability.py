@@ -102,6 +102,7 @@ def _can_be_made_one_after_another(table: MoveTable) -> bool:
     vehicle is not forbidden unless every overlap of footprints is. A computed table is of this kind
     if it holds for any lateness: that one vehicle waits until the other has arrived is part of it.
     If vehicles are not very late it allows some to follow each other that cannot go one by one.
+    `closing` takes two vehicles that both move, so it never stands in the way of a single one.
     """
     kinds, geometry = table.model.kinds, table.model.geometry
     if "geometric" in kinds:

@@ -64,7 +64,7 @@ class Scratch(NamedTuple):
     mass_of_team: Floats
     """(T, R, K)"""
     mass_of_cell: Floats
-    """(T, R, 9)"""
+    """(T, R, numbers of from-cells in a row)"""
     reach: Floats
     """(K, T + 1, X) least reduced cost with which a team gets to a cell before a step."""
     least: Floats
@@ -111,7 +111,7 @@ def scratch(lattice: Lattice, teams: Teams, steps: int) -> Scratch:
         use=np.zeros((steps, rows)),
         mass=np.zeros((groups, steps, displacements, cells)),
         mass_of_team=np.zeros((steps, rows, groups)),
-        mass_of_cell=np.zeros((steps, rows, 9)),
+        mass_of_cell=np.zeros((steps, rows, lattice.near_count)),
         reach=np.zeros((groups, steps + 1, cells)),
         least=np.zeros((groups, steps + 1, cells)),
         cost=np.zeros((vehicles, goals)),

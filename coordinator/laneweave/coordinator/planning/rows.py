@@ -4,7 +4,8 @@ Pairs of conflicting moves say what is forbidden; a linear relaxation that knows
 A *row* is a clique of the conflict relation: whatever the other vehicles do, at most one of its
 moves is made in a step. The rows here are maximal cliques that cover every conflicting pair. With
 footprints (mode 1 with node, edge and special-1; geometric) one pattern is enough: all moves
-whose footprint contains a cell. Tables computed from a geometry take more patterns.
+whose footprint contains a cell. Tables computed from a geometry, and `closing`, take more
+patterns.
 
 Conflicts do not depend on where on the lattice they happen, so a row is a pattern that is laid on
 every cell, its anchor.
@@ -18,7 +19,7 @@ from itertools import product
 
 from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.grid import Mode, Move, displacements
-from laneweave.coordinator.planning.moves import REACH, conflict_offsets
+from laneweave.coordinator.planning.moves import conflict_offsets
 
 Member = tuple[int, int, int]
 """Columns and lanes from the anchor to the from-cell of a move, and its displacement."""
@@ -64,8 +65,8 @@ class _Relation:
         self.steps = displacements(mode)
         self._mode = mode
         self._model = model
-        reach = range(-REACH, REACH + 1)
-        self._moves = list(product(reach, reach, range(len(self.steps))))
+        columns, lanes = (range(-reach, reach + 1) for reach in model.reach)
+        self._moves = list(product(columns, lanes, range(len(self.steps))))
 
     def move(self, member: Member) -> Move:
         column, lane, d = member

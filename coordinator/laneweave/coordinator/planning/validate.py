@@ -13,8 +13,8 @@ from laneweave.coordinator.planning.grid import Cell
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanResponse
 
-_FAR_APART = 3
-"""Vehicles this many columns or lanes apart cannot touch within one step."""
+_FAR_APART = 4
+"""Of vehicles this many columns or lanes apart no two moves conflict."""
 
 
 def problems_of_response(request: PlanRequest, response: PlanResponse) -> list[str]:
