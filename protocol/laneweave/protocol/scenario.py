@@ -32,6 +32,7 @@ CONFLICT_KINDS = (
     "special-3",
     "special-4",
     "geometric",
+    "closing",
 )
 
 Validator = Callable[[Any, "attrs.Attribute[Any]", Any], None]
@@ -123,7 +124,7 @@ class FormationSettings:
     mode: int = field(default=1, validator=one_of(1, 2))
     """Relative motion mode."""
     conflicts: tuple[str, ...] = field(default=(), validator=_conflict_kinds)
-    """Conflict kinds the planner avoids; empty: the mode's default."""
+    """Conflict kinds the planner avoids; empty: those of the mode, and closing."""
     weight_straight: int = field(default=1, validator=one_of(0, 1))
     """l_s of the formation relative distance."""
     weight_oblique: int | None = field(default=None, validator=one_of(None, 0, 1, 2))
@@ -142,7 +143,7 @@ class FormationSettings:
         """The conflict kinds in force."""
         if self.conflicts:
             return self.conflicts
-        return BASE_CONFLICTS if self.mode == 1 else ("geometric",)
+        return (*(BASE_CONFLICTS if self.mode == 1 else ("geometric",)), "closing")
 
     @property
     def executable(self) -> bool:

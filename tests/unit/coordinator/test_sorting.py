@@ -59,7 +59,11 @@ def test_the_request_is_in_the_blocks_own_columns_and_in_the_order_of_the_roster
 def test_the_request_follows_the_scenario() -> None:
     scenario = evolve(SCENARIO, formation=FormationSettings(mode=2, planning_deadline_s=1.5))
     request = plan_request(task({A: (0, 0)}, {A: 1}, scenario=scenario))
-    assert (request.mode, request.conflicts, request.deadline_s) == (2, ("geometric",), 1.5)
+    assert (request.mode, request.conflicts, request.deadline_s) == (
+        2,
+        ("geometric", "closing"),
+        1.5,
+    )
 
 
 def test_joined_formations_have_one_grid_from_the_last_rear_to_the_first_front() -> None:

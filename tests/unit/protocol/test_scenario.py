@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario import (
+    FormationSettings,
     Scenario,
     load_scenario,
     parse_scenario,
@@ -69,7 +70,8 @@ def test_defaults_are_the_table_of_the_paper() -> None:
     assert road.lanes == 3
     assert formation.max_vehicles == 6
     assert formation.mode == 1
-    assert formation.conflict_kinds == ("node", "edge", "special-1")
+    assert formation.conflict_kinds == ("node", "edge", "special-1", "closing")
+    assert FormationSettings(mode=2).conflict_kinds == ("geometric", "closing")
     assert scenario.demand.volume_veh_per_lane_h == 1000.0
     assert road.length_m == 1000.0
     assert road.sorting_start_m == 400.0
@@ -77,7 +79,7 @@ def test_defaults_are_the_table_of_the_paper() -> None:
 
 
 def test_the_file_of_the_paper_holds_the_defaults() -> None:
-    explicit = ("node", "edge", "special-1")
+    explicit = ("node", "edge", "special-1", "closing")
     default = Scenario()
     formation = attrs.evolve(default.formation, conflicts=explicit)
     assert load_scenario(FOLDER / "paper.toml") == attrs.evolve(default, formation=formation)
