@@ -30,6 +30,8 @@ PLANNED = DOCS / "evidence" / "planner.json"
 
 GEOMETRY = DOCS / "evidence" / "geometry.json"
 """What `benchmarks/geometry.py` wrote."""
+CLOSING = DOCS / "evidence" / "closing.json"
+"""What `benchmarks/closing.py` wrote."""
 CONFLICTS = DOCS / "images" / "conflict-table.png"
 
 
@@ -138,6 +140,25 @@ def _geometry() -> str:
     return "\n".join(lines)
 
 
+def _closing() -> str:
+    """Return the table of what it costs not to close up, as `benchmarks/closing.py` measured."""
+    lines = [
+        "| conflicts | vehicles | closes up | steps | dearer | more | CPU ms p50 | mean | factor |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for row in json.loads(CLOSING.read_text(encoding="utf-8")):
+        cost, p50_ms, mean_ms = (row[key] for key in ("cost", "cpu_ms_p50", "cpu_ms_mean"))
+        of = f"of {row['instances']}"
+        lines.append(
+            f"| {row['conflicts']} | {row['vehicles']} | {row['closing_up']} {of} "
+            f"| {cost[0]}, {cost[1]} | {row['dearer']} {of} "
+            f"| {row['more_steps_p50']:g} / {row['more_steps_mean']:.2f} / {row['more_steps_max']} "
+            f"| {p50_ms[0]:.1f}, {p50_ms[1]:.1f} | {mean_ms[0]:.1f}, {mean_ms[1]:.1f} "
+            f"| {row['cpu_factor_p50']:.2f} |"
+        )
+    return "\n".join(lines)
+
+
 @cache
 def parts() -> dict[str, str]:
     """Return each generated part by its name."""
@@ -152,6 +173,7 @@ def parts() -> dict[str, str]:
         "planner": _planner(),
         "conflict counts": _conflicts(),
         "geometry": _geometry(),
+        "closing": _closing(),
     }
 
 
