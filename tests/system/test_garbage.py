@@ -108,7 +108,9 @@ def messages(vehicle: Name, *, number: int, real: float) -> dict[type, Any]:
             number,
             cell,
             number,
-            (Neighbour(number, real, real),),
+            (Neighbour(number, real, real, real),),
+            (Neighbour(number, real, real, real),),
+            (real, real),
         ),
         Command(
             vehicle, number, number, cell, number, cell, b"\xff\xff\x7f\x7f" * 80, (number,) * 3

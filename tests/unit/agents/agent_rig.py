@@ -1,4 +1,4 @@
-"""One vehicle on a bench: a toy plant, a toy motion controller, and the agent that drives it."""
+"""One vehicle on a bench: its body, a toy motion controller, and the agent that drives it."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ from laneweave.protocol.messages import (
     Sense,
     VehicleState,
 )
-from laneweave.protocol.motion import State, cell_state, hold_law, integrate, limited_jerk
+from laneweave.protocol.motion import State, cell_state, commanded_state, hold_law
 from laneweave.protocol.node import Arrived, Effect, Event, Send
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.topics import PLAN, PREPARE, SENSE, Topic
+from laneweave.sim_bridge.plant import Plant
 
 T = TypeVar("T")
 MakeDriver = Callable[[Scenario], Driver]
@@ -39,23 +40,32 @@ BALLOT = Ballot(1, Name("c1"), 1, 1)
 
 
 class Rig:
-    """A vehicle: plant, motion controller, and whatever agent drives it at the moment."""
+    """A vehicle: plant, motion controller, and whatever agent drives it at the moment.
+
+    Its sensors are exact.
+    """
 
     def __init__(self, make_driver: MakeDriver = TrackingDriver) -> None:
         """Put a vehicle into its cell, with an agent that has not met it yet."""
         self.tick = 0
-        self.state: State = cell_state(LATTICE, HOME, 0.0)
+        self.plant = Plant(cell_state(LATTICE, HOME, 0.0), SCENARIO.vehicle, TICK_S)
         self.hold_cell, self.motion_origin, self.motion_end_tick = HOME, HOME, 0
         self.attendant, self.caretaker = 0, False
         self.formation, self.joined = 0, tuple[int, ...]((0,))
         self.accepted: Ballot | None = None
         self.played: Command | None = None
+        """The newest that has jerks or names another cell."""
         self.shown: list[VehicleState] = []
         self.ahead: tuple[Neighbour, ...] = ()
         self._incarnations = count(1)
         self._make_driver = make_driver
         self._sensed: Sense | None = None
         self.restart()
+
+    @property
+    def state(self) -> State:
+        """(s, v, a, y, v_y, a_y) of the body, in m and s."""
+        return self.plant.state
 
     def restart(self) -> None:
         """Let another process drive the vehicle; its incarnation is the next number."""
@@ -70,6 +80,7 @@ class Rig:
             tick=self.tick,
             t_s=self.tick * TICK_S,
             state=self.state,
+            setpoint=self.plant.setpoint,
             hold_cell=self.hold_cell,
             motion_end_tick=self.motion_end_tick,
             motion_origin=self.motion_origin,
@@ -116,10 +127,11 @@ class Rig:
             self.caretaker, self.accepted = False, None
         self.attendant = command.incarnation
         self._note(command)
-        self.played = command
-        self.hold_cell = command.hold_cell
-        self.motion_end_tick = command.motion_end_tick
-        self.motion_origin = command.motion_origin
+        if command.jerks or command.hold_cell != self.hold_cell:
+            self.played = command
+            self.hold_cell = command.hold_cell
+            self.motion_end_tick = command.motion_end_tick
+            self.motion_origin = command.motion_origin
 
     def _note(self, command: Command) -> None:
         assert command.incarnation == self.attendant
@@ -145,9 +157,11 @@ class Rig:
                 jerk = (float(jerks[index, 0]), float(jerks[index, 1]))
             else:
                 goal = cell_state(LATTICE, self.hold_cell, self.tick * TICK_S)
-                jerk = hold_law(self.state, goal, SCENARIO.vehicle, TICK_S)
-            jerk = limited_jerk(self.state, jerk, SCENARIO.vehicle, TICK_S)
-            self.state = integrate(self.state, jerk, TICK_S)
+                pursued = commanded_state(
+                    self.state, self.plant.setpoint, SCENARIO.vehicle, LATTICE.speed_mps
+                )
+                jerk = hold_law(pursued, goal, SCENARIO.vehicle, TICK_S)
+            self.plant.step(*jerk)
             self.tick += 1
 
     def off(self, cell: Cell) -> float:

@@ -1,4 +1,4 @@
-"""The driver takes motions over, ends them when the body is there, and always has jerks to play."""
+"""The driver takes motions over, ends them when the body is there, and tracks or is silent."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from laneweave.agents.driver import SENSED_S, Drive, Effort, TrackingDriver
+from driving import Road
+from laneweave.agents.driver import Drive, Effort, TrackingDriver
+from laneweave.agents.surroundings import NOBODY, Gaps
 from laneweave.agents.tracker import Tracker, TrackResult
 from laneweave.agents.trajectory import Window
 from laneweave.protocol.lattice import Cell, Move
@@ -22,8 +24,10 @@ from laneweave.protocol.motion import (
     integrate,
     limited_jerk,
 )
-from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.scenario import Scenario, Sensing
 from laneweave.protocol.topics import SENSE
+from laneweave.sim_bridge.motion_controller import Rung
+from laneweave.sim_bridge.plant import Plant
 from unit.agents.agent_rig import (
     HOME,
     LATTICE,
@@ -40,19 +44,18 @@ MOVE: Move = (0, HOME, (-1, 2))
 
 
 class Probe(Tracker):
-    """A tracker that can be broken, and remembers what it was told of the vehicle ahead."""
+    """A tracker that can be broken, and remembers what it was told of the others."""
 
     def __init__(self, scenario: Scenario) -> None:
         """Begin unbroken."""
         super().__init__(scenario)
         self.broken = False
-        self.ahead: NDArray[np.float64] | None = None
+        self.gaps = NOBODY
+        self.state: State | None = None
 
-    def solve(
-        self, state: State, window: Window, ahead: NDArray[np.float64] | None = None
-    ) -> TrackResult:
-        self.ahead = ahead
-        result = super().solve(state, window, ahead)
+    def solve(self, state: State, window: Window, gaps: Gaps = NOBODY) -> TrackResult:
+        self.state, self.gaps = state, gaps
+        result = super().solve(state, window, gaps)
         if self.broken:
             return attrs.evolve(result, usable=False, jerk=np.full_like(result.jerk, np.nan))
         return result
@@ -66,12 +69,13 @@ def sense(
     origin: Cell | None = None,
     off: tuple[float, float] = (0.0, 0.0),
     ahead: tuple[Neighbour, ...] = (),
+    behind: tuple[Neighbour, ...] = (),
 ) -> Sense:
     """Return what a vehicle senses that is `off` metres from its cell, along and across."""
     t_s = tick * TICK_S
     s, v, a, y, v_y, a_y = cell_state(LATTICE, cell, t_s)
     state = (s + off[0], v, a, y + off[1], v_y, a_y)
-    return Sense(ME, tick, t_s, state, cell, end_tick, origin or cell, 0, ahead)
+    return Sense(ME, tick, t_s, state, cell, end_tick, origin or cell, 0, ahead, behind)
 
 
 def driver(make_tracker: Callable[[Scenario], Tracker] = Tracker) -> TrackingDriver:
@@ -125,13 +129,15 @@ def test_a_move_ends_after_its_time_and_its_horizon_ends_in_the_target() -> None
 def test_a_motion_under_way_is_taken_over_where_it_is() -> None:
     made = driver()
     made.begin(MOVE, 10)
-    state = sense().state
+    plant = Plant(sense().state, SCENARIO.vehicle, TICK_S)
     for tick in range(10, 25):
-        drive = made.drive(attrs.evolve(sense(tick), state=state), moving=True)
-        along, across = jerks(drive)[0].tolist()
-        state = integrate(state, (along, across), TICK_S)
+        felt = attrs.evolve(sense(tick), state=plant.state, setpoint=plant.setpoint)
+        drive = made.drive(felt, moving=True)
+        plant.step(*jerks(drive)[0].tolist())
     felt = attrs.evolve(
-        sense(25, MOVE[2], end_tick=drive.motion_end_tick, origin=drive.motion_origin), state=state
+        sense(25, MOVE[2], end_tick=drive.motion_end_tick, origin=drive.motion_origin),
+        state=plant.state,
+        setpoint=plant.setpoint,
     )
     heir = TrackingDriver(SCENARIO)
     heir.take_over(felt)
@@ -188,115 +194,106 @@ def test_a_late_motion_says_that_it_goes_on() -> None:
     assert made.drive(late, moving=False).motion_end_tick == 0
 
 
-# --- the vehicle ahead ------------------------------------------------------------------------
+# --- what is tracked --------------------------------------------------------------------------
+
+
+def test_the_commanded_state_is_tracked_and_not_the_bodys() -> None:
+    """What the set-point is about to do needs no correction."""
+    made, probe = probed()
+    s, v, a, y, v_y, a_y = sense().state
+    felt = attrs.evolve(sense(), state=(s, v + 0.4, a - 0.5, y, v_y, a_y), setpoint=(0.7, 0.2))
+    made.drive(felt, moving=False)
+    lag_s = SCENARIO.vehicle.actuator_lag_s
+    expected = (s + lag_s * 0.4, v + 0.4 - lag_s * 0.5, 0.7, y, v_y, 0.2)
+    assert probe.state == pytest.approx(expected)
+
+
+LEAST_M = SCENARIO.tracking.min_gap_m
 
 
 @pytest.mark.parametrize(
-    ("ahead", "rear_m"),
+    ("ahead", "gap_m"),
     [
         ((), None),
-        ((Neighbour(1, 10.0, 15.0),), 10.0),
-        ((Neighbour(0, 5.0, 15.0), Neighbour(2, 6.0, 15.0)), None),
-        ((Neighbour(0, 5.0, 15.0), Neighbour(1, 9.0, 15.0), Neighbour(2, 6.0, 15.0)), 9.0),
+        ((Neighbour(1, 4.0, 15.0),), 4.0),
+        ((Neighbour(0, 3.5, 15.0), Neighbour(2, 4.0, 15.0)), None),
+        ((Neighbour(0, 3.5, 15.0), Neighbour(1, 4.5, 15.0), Neighbour(2, 4.0, 15.0)), 4.5),
     ],
     ids=["nobody", "own lane", "beside", "own lane counts only"],
 )
-def test_who_holds_minds_its_own_lane(ahead: tuple[Neighbour, ...], rear_m: float | None) -> None:
+def test_who_holds_minds_its_own_lane(ahead: tuple[Neighbour, ...], gap_m: float | None) -> None:
     made, probe = probed()
-    felt = sense(ahead=ahead)
+    felt = sense(ahead=ahead, behind=ahead)
     made.drive(felt, moving=False)
-    if rear_m is None:
-        assert probe.ahead is None
+    if gap_m is None:
+        assert probe.gaps is NOBODY
     else:
-        assert probe.ahead is not None
-        assert probe.ahead[0] == felt.state[0] + rear_m
+        assert probe.gaps.latest is not None
+        assert probe.gaps.latest[0] == pytest.approx(felt.state[0] + gap_m - LEAST_M)
+        assert probe.gaps.earliest is not None
+        assert probe.gaps.earliest[0] == pytest.approx(felt.state[0] - gap_m + LEAST_M)
 
 
 def test_who_changes_lanes_minds_the_lane_that_it_enters_from_the_start() -> None:
     made, probe = probed()
     made.begin(MOVE, 10)
-    felt = sense(ahead=(Neighbour(0, 3.0, 15.0), Neighbour(1, 9.0, 15.0), Neighbour(2, 6.0, 15.0)))
+    felt = sense(ahead=(Neighbour(0, 3.0, 15.0), Neighbour(1, 4.5, 15.0), Neighbour(2, 4.0, 15.0)))
     made.drive(felt, moving=True)
-    assert probe.ahead is not None
-    assert probe.ahead[0] == felt.state[0] + 6.0
-
-
-@pytest.mark.parametrize(("across_m", "rear_m"), [(1.0, 4.0), (0.8, 9.0), (-1.0, 5.0)])
-def test_a_body_between_lanes_minds_all_that_it_touches(across_m: float, rear_m: float) -> None:
-    """Lanes are 3.5 m wide and bodies 1.8 m: more than 0.85 m off, it is in two lanes."""
-    made, probe = probed()
-    ahead = (Neighbour(0, 5.0, 15.0), Neighbour(1, 9.0, 15.0), Neighbour(2, 4.0, 15.0))
-    felt = sense(off=(0.0, across_m), ahead=ahead)
-    made.drive(felt, moving=False)
-    assert probe.ahead is not None
-    assert probe.ahead[0] == felt.state[0] + rear_m
-
-
-def test_what_is_sensed_is_extrapolated_at_constant_speed_for_a_while() -> None:
-    made, probe = probed()
-    felt = sense(ahead=(Neighbour(1, 20.0, 5.0),))
-    made.drive(felt, moving=False)
-    times_s = np.arange(N + 1) * TICK_S
-    assert probe.ahead is not None
-    known = times_s <= SENSED_S + 1e-9
-    assert probe.ahead[known] == pytest.approx(felt.state[0] + 20.0 + 5.0 * times_s[known])
-    assert np.isinf(probe.ahead[~known]).all()
-
-
-def test_of_two_ahead_the_nearer_one_counts_at_each_moment() -> None:
-    """While it changes lanes: the one behind is faster and passes the other's place."""
-    made, probe = probed()
-    made.begin(MOVE, 10)
-    felt = sense(ahead=(Neighbour(1, 10.0, 5.0), Neighbour(2, 6.0, 15.0)))
-    made.drive(felt, moving=True)
-    assert probe.ahead is not None
-    gaps = probe.ahead[:11] - felt.state[0]
-    assert (gaps[0], gaps[10]) == pytest.approx((6.0, 15.0))
+    assert probe.gaps.latest is not None
+    assert probe.gaps.latest[0] == pytest.approx(felt.state[0] + 4.0 - LEAST_M)
 
 
 # --- when tracking fails ----------------------------------------------------------------------
 
 
-def test_unusable_answers_continue_the_last_good_trajectory() -> None:
+def test_an_unusable_answer_leaves_what_is_being_played() -> None:
     made, probe = probed()
     made.begin(MOVE, 10)
-    good = made.drive(sense(), moving=True)
+    assert len(jerks(made.drive(sense(), moving=True))) == N
     probe.broken = True
     for ticks in (3, 4, 20):
         drive = made.drive(sense(10 + ticks), moving=True)
-        assert drive.jerks == good.jerks[8 * ticks :]
-        assert drive.motion_end_tick == 10 + MOVE_TICKS
+        assert drive == Drive(10 + MOVE_TICKS, HOME, b"")
 
 
-def test_when_that_has_run_out_it_goes_to_rest_in_the_target() -> None:
-    made, probe = probed()
-    made.begin(MOVE, 10)
-    made.drive(sense(), moving=True)
-    probe.broken = True
-    felt = sense(10 + N, MOVE[2], off=(-2.0, 0.4))
-    drive = made.drive(felt, moving=True)
-    assert jerks(drive).shape == (N, 2)
-    end = play(felt.state, drive)
-    goal = cell_state(LATTICE, MOVE[2], (10 + 2 * N) * TICK_S)
-    assert abs(end[0] - goal[0]) < 1.0
-    assert abs(end[3] - goal[3]) < 0.2
-
-
-def test_without_any_good_answer_it_keeps_its_cell() -> None:
+def test_a_usable_answer_ends_the_silence() -> None:
     made, probe = probed()
     probe.broken = True
-    assert jerks(made.drive(sense(), moving=False)) == pytest.approx(np.zeros((N, 2)), abs=1e-6)
-
-
-def test_a_usable_answer_ends_the_fallback() -> None:
-    made, probe = probed()
-    probe.broken = True
-    made.drive(sense(11), moving=False)
+    assert made.drive(sense(11), moving=False).jerks == b""
     probe.broken = False
     felt = sense(12, off=(-1.0, 0.0))
     drive = made.drive(felt, moving=False)
     assert jerks(drive)[0, 0] > 1.0
     assert drive == driver().drive(felt, moving=False)
+
+
+def test_meanwhile_the_body_goes_on_with_the_last_good_trajectory_and_then_holds() -> None:
+    """With exact sensors the body moves as if nothing had failed."""
+    exact = Sensing(**dict.fromkeys((field.name for field in attrs.fields(Sensing)), 0.0))
+    scenario = attrs.evolve(SCENARIO, sensing=exact)
+    broken_at, probes = 25, []
+
+    def make(of: Scenario) -> Tracker:
+        probes.append(Probe(of))
+        return probes[-1]
+
+    roads = [Road(scenario, {ME: HOME}) for _ in range(2)]
+    for road in roads:
+        road.driven[ME].driver = TrackingDriver(scenario, make)
+        road.driven[ME].driver.take_over(road.vehicles[ME].sense(0, caretaker=False))
+        for _ in range(10 + 4 * N):
+            probes[-1].broken = road is roads[1] and road.tick > broken_at
+            road.step({ME: MOVE} if road.tick == 10 else None)
+    good, bad = (road.record.states for road in roads)
+    trajectory = slice(0, broken_at + N + 1)
+    assert np.array(bad)[trajectory] == pytest.approx(np.array(good)[trajectory], abs=1e-4)
+    controller = roads[1].vehicles[ME].controller
+    assert controller.rung_ticks == {
+        Rung.PLAY: broken_at + N, Rung.HOLD: 10 + 4 * N - broken_at - N,
+        Rung.GIVE_WAY: 0, Rung.EMERGENCY: 0,
+    }  # fmt: skip
+    goal = cell_state(LATTICE, MOVE[2], roads[1].tick * TICK_S)
+    assert bad[-1][0] == pytest.approx(goal, abs=0.01)
 
 
 def test_the_effort_counts_solves_and_failures() -> None:

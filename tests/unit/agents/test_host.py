@@ -87,7 +87,7 @@ def sense(
     state = cell_state(SCENARIO.lattice, cell, t_s)
     formation = SCENARIO.lattice.block_of(cell[0])
     return Sense(
-        vehicle, tick, t_s, state, cell, 0, cell, 0, (), formation, attendant,
+        vehicle, tick, t_s, state, cell, 0, cell, 0, (), formation=formation, attendant=attendant,
         joined=(formation,) if joined is None else joined, accepted=accepted, left=left,
     )  # fmt: skip
 

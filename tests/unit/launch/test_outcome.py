@@ -42,7 +42,11 @@ def summary(
             "largest_formation": 3,
             "solve_ms": dict.fromkeys(("p50", "p95", "max"), measured),
         },
-        "tracking": {"hold_law_ticks": 0, "solve_ms": dict.fromkeys(("p50", "p99"), measured)},
+        "tracking": {
+            "hold_law_ticks": 0,
+            "emergency_ticks": 0,
+            "solve_ms": dict.fromkeys(("p50", "p99"), measured),
+        },
         "runtime": {
             "real_time_factor": 2.0,
             "processes": 1,

@@ -57,8 +57,8 @@ SAMPLES: tuple[object, ...] = (
     ),
     Sense(
         V1, 130, 13.0, (1.5, 15.0, 0.0, 1.75, 0.0, 0.0), (0, 1), 120, (0, 0), 2,
-        (Neighbour(0, 10.0, 15.0), Neighbour(1, -0.5, 14.0)), formation=-1, attendant=11,
-        caretaker=True, joined=(-1, 0),
+        (Neighbour(0, 10.0, 15.0), Neighbour(1, -0.5, 14.0, -1.5)), (Neighbour(0, 4.0, 16.0, 0.5),),
+        (0.25, -0.5), formation=-1, attendant=11, caretaker=True, joined=(-1, 0),
     ),
     Command(V1, 11, 130, (0, 1), 140, (0, 0), b"\0" * 16, (-1, 0)),
     Census(13.0, (CensusEntry(V1, (0, 1), 2, 5.0),), (Announcement(V2, 0, 1, 20.0),)),
@@ -333,7 +333,8 @@ def wrong_values(hint: Any) -> list[Any]:  # noqa: ANN401
         return [*NOT_LISTS, [], good[:-1], [*good, good[-1]], *nested]
     if attrs.has(hint):
         body = {name: right_value(part) for name, part in HINTS[hint].items()}
-        lacking: list[Any] = [{k: v for k, v in body.items() if k != name} for name in body]
+        needed = [field.name for field in attrs.fields(hint) if field.default is attrs.NOTHING]
+        lacking: list[Any] = [{k: v for k, v in body.items() if k != name} for name in needed]
         parts_wrong: list[Any] = [
             body | {name: wrong}
             for name, part in HINTS[hint].items()
@@ -408,6 +409,12 @@ def test_a_field_whose_name_is_no_text_is_refused(sample: object, key: object) -
         ),
         ("ahead", [{"lane": 0, "gap_m": 1.0, "speed_mps": 1.0, "x": 1}], "Sense.ahead[0].x"),
         ("ahead", [[0, 1.0, 1.0]], "Sense.ahead[0]"),
+        (
+            "behind",
+            [{"lane": 0, "gap_m": 1.0, "speed_mps": 1.0, "accel_mps2": None}],
+            "Sense.behind[0].accel_mps2",
+        ),
+        ("setpoint", [0.0, math.inf], "Sense.setpoint[1]"),
         ("state", [0.0, 0.0, math.nan, 0.0, 0.0, 0.0], "Sense.state[2]"),
         ("hold_cell", [0, "1"], "Sense.hold_cell[1]"),
     ],

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from attrs import define, field
+from attrs import define, field, fields
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost, Shard
@@ -32,7 +32,7 @@ from laneweave.protocol.node import (
     Started,
     Wakeup,
 )
-from laneweave.protocol.scenario import Scenario, parse_scenario
+from laneweave.protocol.scenario import Scenario, Sensing, parse_scenario
 from laneweave.protocol.simulated_network import Conditions, SimulatedNetwork
 from laneweave.protocol.topics import COMMAND, PLAN, PREPARE, REPORT, VEHICLE_ALIVE, Keys
 from laneweave.sim_bridge.core import BRIDGE, BridgeCore, Phase
@@ -42,13 +42,16 @@ from laneweave.sim_bridge.run_record import RunRecord
 
 ROAD = {"lanes": 2, "s1_m": 20.0, "s2_m": 20.0, "s3_m": 160.0}
 """As short as the checks allow: a vehicle takes 14 s."""
+EXACT = {field.name: 0.0 for field in fields(Sensing)}
+"""Sensors without errors."""
 REALM = "bench"
 KEYS = Keys(REALM)
 FOR_EVER_S = 1e6
 
 
 def make_scenario(**tables: dict[str, Any]) -> Scenario:
-    return parse_scenario({"road": ROAD} | tables)
+    """Return a scenario with a short road and exact sensors, but for some tables."""
+    return parse_scenario({"road": ROAD, "sensing": EXACT} | tables)
 
 
 def arrival(vehicle: str, t_s: float, lane: int = 0, preferred_lane: int = 0) -> Arrival:

@@ -11,6 +11,7 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import Name
 from laneweave.protocol.simulated_network import Conditions
 from laneweave.sim_bridge.core import Phase
+from laneweave.sim_bridge.motion_controller import Rung
 from unit.sim_bridge.bench import (
     Sleeper,
     Street,
@@ -21,7 +22,8 @@ from unit.sim_bridge.bench import (
 )
 
 LONG_ROAD = make_scenario(road={"lanes": 3, "s1_m": 20.0, "s2_m": 20.0, "s3_m": 400.0})
-SHORT_ROAD = make_scenario()
+SHORT_ROAD = make_scenario(sensing={})
+"""With errors of measurement."""
 TICK_S, LATTICE = LONG_ROAD.runtime.tick_s, LONG_ROAD.lattice
 BODY, LANE_M = LONG_ROAD.vehicle, LONG_ROAD.road.lane_width_m
 HOME: Cell = (-1, 1)
@@ -221,7 +223,9 @@ def test_the_move_of_an_agent_that_died_is_finished_and_held(
     ):
         assert (along, across) == pytest.approx(expected, abs=0.1)
     check_arrived(street, target)
-    assert (street.bridge.vehicles[A].controller.played_from_hold > 0) == (not restarts)
+    rung_ticks = street.bridge.vehicles[A].controller.rung_ticks
+    assert (rung_ticks[Rung.HOLD] > 0) == (not restarts)
+    assert rung_ticks[Rung.EMERGENCY] == 0
     if restarts:
         execution = street.agents[A].execution
         assert execution is not None

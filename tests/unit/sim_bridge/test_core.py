@@ -31,6 +31,7 @@ from laneweave.protocol.topics import (
 from laneweave.protocol.transport import LinkDown, LinkUp
 from laneweave.sim_bridge.core import WIND_UP_S, Phase
 from laneweave.sim_bridge.leaving import LEFT_REPEATS
+from laneweave.sim_bridge.motion_controller import Rung
 from laneweave.sim_bridge.overlap import pose_of
 from unit.sim_bridge.bench import (
     Desk,
@@ -133,11 +134,12 @@ def test_a_tick_ends_when_all_have_answered(desk: Desk) -> None:
 
 
 def test_the_answers_are_played_from_this_tick_on(desk: Desk) -> None:
-    before = {name: desk.core.vehicles[name].state for name in (A, B)}
+    plants = {name: desk.core.vehicles[name].controller.plant for name in (A, B)}
+    before = {name: plant.setpoint for name, plant in plants.items()}
     desk.answer(A, jerks=jerks((2.0, 0.0), (-3.0, 1.0)))
     desk.answer(B)
-    assert desk.core.vehicles[A].state[2] == pytest.approx(before[A][2] + 2.0 * TICK_S)
-    assert desk.core.vehicles[B].state[2] == before[B][2]
+    assert plants[A].setpoint[0] == pytest.approx(before[A][0] + 2.0 * TICK_S)
+    assert plants[B].setpoint[0] == before[B][0]
 
 
 def test_ticks_keep_the_pace_and_do_not_make_up_for_lost_time(desk: Desk) -> None:
@@ -165,6 +167,29 @@ def test_everybody_sees_who_is_ahead(tmp_path: Path) -> None:
     ((lane, gap_m, speed_mps),) = [(n.lane, n.gap_m, n.speed_mps) for n in senses[B].ahead]
     assert (lane, speed_mps) == (0, 15.0)
     assert gap_m == pytest.approx(30.0 - SCENARIO.vehicle.length_m)
+    assert [(n.lane, n.gap_m) for n in senses[A].behind] == [(0, pytest.approx(gap_m))]
+    assert senses[B].behind == ()
+
+
+def test_everybody_sees_with_errors_of_measurement_that_are_the_same_whenever_asked(
+    tmp_path: Path,
+) -> None:
+    desk = Desk(make_scenario(sensing={}), tmp_path, [arrival(A, 0.1), arrival(B, 2.1)])
+    desk.start(A, B)
+    desk.drive_to_entry(B)
+    desk.answer(A)
+    desk.answer(B)
+    senses = {sense.vehicle: sense for sense in sent(desk.wake(), Sense)}
+    for name, sense in senses.items():
+        true = desk.core.vehicles[name].state
+        assert sense.state != true
+        assert sense.state == pytest.approx(true, abs=0.4)
+        controller = desk.core.vehicles[name].controller
+        assert (sense.state, sense.ahead) == (controller.measured, controller.around.ahead)
+    (other,) = senses[B].ahead
+    assert other.gap_m != 25.0
+    assert other.gap_m == pytest.approx(25.0, abs=0.4)
+    assert {sense.vehicle: sense for sense in sent(desk.wake(), Sense)} == senses
 
 
 # --- who does not answer ----------------------------------------------------------------------
@@ -203,15 +228,16 @@ def test_at_the_deadline_the_road_goes_on_and_the_next_tick_waits_for_all(desk: 
 
 def test_who_misses_a_tick_plays_what_it_has(desk: Desk) -> None:
     pairs = [(2.0, 0.0), (-1.0, 0.0), (0.0, 0.0)]
-    before = desk.core.vehicles[B].state
+    before = desk.core.vehicles[B].controller.plant.setpoint[0]
     desk.answer(A)
     desk.answer(B, jerks=jerks(*pairs))
     desk.wake()
     tick = desk.core.tick
     desk.answer(A)
     desk.drive(lambda: desk.core.tick > tick, B)
-    assert desk.core.vehicles[B].state[2] == pytest.approx(before[2] + 1.0 * TICK_S)
-    assert desk.core.vehicles[B].controller.played_from_hold == 0
+    controller = desk.core.vehicles[B].controller
+    assert controller.plant.setpoint[0] == pytest.approx(before + 1.0 * TICK_S)
+    assert controller.rung is Rung.PLAY
 
 
 def test_who_has_not_answered_for_long_is_silent_and_not_waited_for(desk: Desk) -> None:

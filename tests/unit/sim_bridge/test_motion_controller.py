@@ -10,10 +10,10 @@ from attrs import evolve
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.messages import Ballot, Command, Name, Neighbour
-from laneweave.protocol.motion import cell_state
+from laneweave.protocol.messages import Ballot, Command, Name
+from laneweave.protocol.motion import Jerk, cell_state
 from laneweave.protocol.scenario import Scenario
-from laneweave.sim_bridge.motion_controller import MAX_COLUMN, MotionController
+from laneweave.sim_bridge.motion_controller import MAX_COLUMN, MotionController, Rung
 from laneweave.sim_bridge.plant import Plant
 
 SCENARIO = Scenario()
@@ -26,7 +26,7 @@ AGENT = 5
 @pytest.fixture
 def controller() -> MotionController:
     plant = Plant(cell_state(LATTICE, HOME, 0.0), SCENARIO.vehicle, TICK_S)
-    controller = MotionController(plant, SCENARIO.vehicle, LATTICE, TICK_S, HOME, min_gap_m=3.0)
+    controller = MotionController(plant, SCENARIO, HOME)
     controller.hand_over(AGENT)
     return controller
 
@@ -38,11 +38,22 @@ def command(
     return Command(Name("v"), incarnation, tick, hold_cell, tick + len(pairs), HOME, played)
 
 
+def driven(controller: MotionController) -> dict[Rung, int]:
+    """Return for how many ticks it drove by which rung."""
+    return {rung: ticks for rung, ticks in controller.rung_ticks.items() if ticks}
+
+
+def plays(controller: MotionController, tick: int) -> Jerk | None:
+    """Return the jerk that it would play at a tick; None: it would play nothing."""
+    rung, jerk = controller._way(tick, ())
+    return jerk if rung is Rung.PLAY else None
+
+
 def test_without_a_command_it_holds_its_cell(controller: MotionController) -> None:
     for tick in range(50):
         controller.step(tick)
     assert controller.plant.state == pytest.approx(cell_state(LATTICE, HOME, 50 * TICK_S))
-    assert controller.played_from_hold == 50
+    assert driven(controller) == {Rung.HOLD: 50}
     assert (controller.motion_origin, controller.motion_end_tick) == (HOME, 0)
 
 
@@ -51,11 +62,10 @@ def test_plays_jerk_by_jerk_and_from_the_middle_when_ticks_were_missed(
 ) -> None:
     assert controller.take(command(10, (1.0, 0.0), (2.0, 0.5), (-4.0, 0.0)))
     controller.step(11)
-    assert controller.plant.state[2] == pytest.approx(2.0 * TICK_S)
-    assert controller.plant.state[5] == pytest.approx(0.5 * TICK_S)
+    assert controller.plant.setpoint == pytest.approx((2.0 * TICK_S, 0.5 * TICK_S))
     controller.step(12)
-    assert controller.plant.state[2] == pytest.approx(-2.0 * TICK_S)
-    assert controller.played_from_hold == 0
+    assert controller.plant.setpoint == pytest.approx((-2.0 * TICK_S, 0.5 * TICK_S))
+    assert driven(controller) == {Rung.PLAY: 2}
 
 
 def test_comes_to_rest_in_the_last_cell_when_the_trajectory_has_run_out(
@@ -65,7 +75,7 @@ def test_comes_to_rest_in_the_last_cell_when_the_trajectory_has_run_out(
     controller.take(command(0, *[(3.0, 0.0)] * 4, hold_cell=target))
     for tick in range(300):
         controller.step(tick)
-    assert controller.played_from_hold == 296
+    assert driven(controller) == {Rung.PLAY: 4, Rung.HOLD: 296}
     assert controller.plant.state == pytest.approx(cell_state(LATTICE, target, 30.0), abs=0.01)
 
 
@@ -87,8 +97,8 @@ def test_a_command_without_jerks_leaves_the_motion_under_way_as_it_is(
     assert controller.take(command(6, hold_cell=(1, 1)))
     assert (controller.command_tick, controller.motion_end_tick) == (6, 7)
     controller.step(6)
-    assert controller.plant.state[2] == pytest.approx(3.0 * TICK_S)
-    assert controller.played_from_hold == 0
+    assert controller.plant.setpoint[0] == pytest.approx(3.0 * TICK_S)
+    assert driven(controller) == {Rung.PLAY: 2}
 
 
 def test_a_command_without_jerks_that_names_another_cell_goes_there_by_the_hold_law(
@@ -97,7 +107,8 @@ def test_a_command_without_jerks_that_names_another_cell_goes_there_by_the_hold_
     controller.take(command(5, (1.0, 0.0), (2.0, 0.0)))
     assert controller.take(command(6, hold_cell=(1, 1)))
     controller.step(6)
-    assert (controller.hold_cell, controller.played_from_hold) == ((1, 1), 1)
+    assert controller.hold_cell == (1, 1)
+    assert driven(controller) == {Rung.HOLD: 1}
 
 
 # --- who is in charge -------------------------------------------------------------------------
@@ -112,13 +123,13 @@ def known(controller: MotionController) -> tuple[object, ...]:
         controller.hold_cell,
         controller.motion_origin,
         controller.motion_end_tick,
-        controller._jerk(3, ()),
+        plays(controller, 3),
     )
 
 
 def test_nobody_is_in_charge_of_a_new_vehicle() -> None:
     plant = Plant(cell_state(LATTICE, HOME, 0.0), SCENARIO.vehicle, TICK_S)
-    controller = MotionController(plant, SCENARIO.vehicle, LATTICE, TICK_S, (-9, 1))
+    controller = MotionController(plant, SCENARIO, (-9, 1))
     assert (controller.attendant, controller.joined) == (0, (LATTICE.block_of(-9),))
     assert controller.accepted is None
 
@@ -137,9 +148,9 @@ def test_a_newer_process_takes_charge_with_its_command(controller: MotionControl
     controller.take(command(3, (1.0, 0.0)))
     assert controller.take(command(4, (2.0, 0.0), incarnation=AGENT + 1))
     assert controller.attendant == AGENT + 1
-    assert controller._jerk(4, ()) == (2.0, 0.0)
+    assert plays(controller, 4) == (2.0, 0.0)
     assert not controller.take(command(5, (3.0, 0.0)))
-    assert controller._jerk(4, ()) == (2.0, 0.0)
+    assert plays(controller, 4) == (2.0, 0.0)
 
 
 def test_who_takes_charge_cannot_move_with_the_same_command(controller: MotionController) -> None:
@@ -325,46 +336,3 @@ def test_a_motion_is_over_when_its_time_is_and_the_body_is_there(
 def _moving_after(controller: MotionController, tick: int) -> bool:
     controller.step(tick - 1)
     return controller.moving(tick)
-
-
-def drive_behind(
-    controller: MotionController, speed_mps: float, lane: int, *, ticks: int
-) -> list[float]:
-    """Let it hold its cell behind somebody who is 40 m ahead; return the gaps."""
-    gaps, rear_m = [], controller.plant.state[0] + 40.0
-    for tick in range(ticks):
-        gap_m = rear_m - controller.plant.state[0]
-        controller.step(tick, (Neighbour(lane, gap_m, speed_mps),))
-        rear_m += speed_mps * TICK_S
-        gaps.append(rear_m - controller.plant.state[0])
-    return gaps
-
-
-@pytest.mark.parametrize("speed_mps", [0.0, 7.0])
-def test_keeps_its_distance_while_nobody_drives(
-    controller: MotionController, speed_mps: float
-) -> None:
-    gaps = drive_behind(controller, speed_mps, HOME[1], ticks=300)
-    assert min(gaps) > 2.9
-    assert controller.plant.state[1] == pytest.approx(speed_mps, abs=0.1)
-    assert controller.plant.min_accel_mps2 >= 0.6 * SCENARIO.vehicle.min_accel_mps2 - 1e-9
-
-
-def test_nobody_on_another_lane_is_in_its_way(controller: MotionController) -> None:
-    for lane in (0, 2):
-        assert min(drive_behind(controller, 0.0, lane, ticks=60)) < -20.0
-
-
-def test_somebody_on_the_lane_that_it_steers_for_is_in_its_way(
-    controller: MotionController,
-) -> None:
-    controller.take(command(0, hold_cell=(0, 2)))
-    gaps = drive_behind(controller, 0.0, 2, ticks=200)
-    assert min(gaps) > 2.9
-
-
-def test_what_it_is_told_to_play_it_plays(controller: MotionController) -> None:
-    controller.take(command(0, *[(0.0, 0.0)] * 40))
-    for tick in range(40):
-        controller.step(tick, (Neighbour(HOME[1], 1.0, 0.0),))
-    assert controller.plant.state[1] == 15.0

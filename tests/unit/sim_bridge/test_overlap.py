@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from laneweave.protocol.messages import Neighbour
 from laneweave.sim_bridge import overlap
 from laneweave.sim_bridge.overlap import (
+    Around,
     LeastGaps,
     Pose,
     corners,
@@ -162,8 +163,15 @@ def test_nobody_in_line_is_infinitely_far() -> None:
     assert least_gaps({}, LENGTH_M, WIDTH_M) == LeastGaps(math.inf, math.inf)
 
 
-def sense(road: dict[str, Pose]) -> dict[str, tuple[Neighbour, ...]]:
-    return neighbours(road, lanes=3, lane_width_m=LANE_M, length_m=LENGTH_M, width_m=WIDTH_M)
+def sense(road: dict[str, Pose], accels_mps2: dict[str, float] | None = None) -> dict[str, Around]:
+    return neighbours(
+        road,
+        lanes=3,
+        lane_width_m=LANE_M,
+        length_m=LENGTH_M,
+        width_m=WIDTH_M,
+        accels_mps2=accels_mps2,
+    )
 
 
 def test_sensing_sees_the_nearest_in_its_own_and_adjacent_lanes() -> None:
@@ -175,9 +183,21 @@ def test_sensing_sees_the_nearest_in_its_own_and_adjacent_lanes() -> None:
         "two lanes over": (110.0, 8.75, 0.0, 12.0),
     }
     seen = sense(road)
-    assert seen["ego"] == (Neighbour(0, 15.0, 14.0),)
-    assert seen["left behind"] == (Neighbour(0, -2.0, 15.0), Neighbour(2, 8.0, 12.0))
-    assert seen["far ahead"] == seen["two lanes over"] == ()
+    assert seen["ego"].ahead == (Neighbour(0, 15.0, 14.0),)
+    assert seen["left behind"].ahead == (Neighbour(0, -2.0, 15.0), Neighbour(2, 8.0, 12.0))
+    assert seen["far ahead"].ahead == seen["two lanes over"].ahead == ()
+    assert seen["ego"].behind == (Neighbour(1, -2.0, 16.0),)
+    assert seen["left behind"].behind == ()
+    assert seen["far ahead"].behind == (Neighbour(0, 15.0, 14.0), Neighbour(1, 38.0, 16.0))
+    assert seen["two lanes over"].behind == (Neighbour(1, 8.0, 16.0),)
+
+
+def test_sensing_sees_how_others_accelerate() -> None:
+    road = {"first": (120.0, 1.75, 0.0, 14.0), "ego": (100.0, 1.75, 0.0, 15.0)}
+    seen = sense(road, {"first": -2.5, "ego": 1.5})
+    assert seen["ego"].ahead == (Neighbour(0, 15.0, 14.0, -2.5),)
+    assert seen["first"].behind == (Neighbour(0, 15.0, 15.0, 1.5),)
+    assert sense(road)["ego"].ahead == (Neighbour(0, 15.0, 14.0, 0.0),)
 
 
 def test_a_vehicle_between_lanes_is_seen_in_both_and_sees_further() -> None:
@@ -188,9 +208,11 @@ def test_a_vehicle_between_lanes_is_seen_in_both_and_sees_further() -> None:
         "far ahead": (140.0, 8.75, 0.0, 15.0),
     }
     seen = sense(road)
-    assert [other.lane for other in seen["right"]] == [0, 1]
-    assert [other.lane for other in seen["left"]] == [1, 2]
-    assert [other.lane for other in seen["changing"]] == [2]
+    assert [other.lane for other in seen["right"].ahead] == [0, 1]
+    assert [other.lane for other in seen["left"].ahead] == [1, 2]
+    assert [other.lane for other in seen["changing"].ahead] == [2]
+    assert [other.lane for other in seen["changing"].behind] == [0, 2]
+    assert [other.lane for other in seen["far ahead"].behind] == [1, 2]
 
 
 @given(ROADS)
@@ -204,22 +226,26 @@ def test_sensing_agrees_with_brute_force(road: dict[str, Pose]) -> None:
         low = min(max(low, 0), 2)
         lanes_of[name] = range(low, min(max(high, low), 2) + 1)
     for name in road:
-        ahead = {}
+        ahead, behind = {}, {}
+        own = road[name][0], name
         for lane in range(max(lanes_of[name].start - 1, 0), min(lanes_of[name].stop + 1, 3)):
-            front = [
-                (road[other][0], other)
-                for other in road
-                if lane in lanes_of[other] and (road[other][0], other) > (road[name][0], name)
-            ]
+            there = [(road[other][0], other) for other in road if lane in lanes_of[other]]
+            front = [each for each in there if each > own]
+            back = [each for each in there if each < own]
             if front:
                 nearest_m, other = min(front)
-                ahead[lane] = (nearest_m - LENGTH_M - road[name][0], road[other][3])
-        assert {other.lane: other.gap_m for other in seen[name]} == pytest.approx(
-            {lane: gap_m for lane, (gap_m, _) in ahead.items()}
-        )
-        assert {other.lane: other.speed_mps for other in seen[name]} == {
-            lane: speed_mps for lane, (_, speed_mps) in ahead.items()
-        }
+                ahead[lane] = (nearest_m - LENGTH_M - own[0], road[other][3])
+            if back:
+                nearest_m, other = max(back)
+                behind[lane] = (own[0] - LENGTH_M - nearest_m, road[other][3])
+        for found, expected in ((seen[name].ahead, ahead), (seen[name].behind, behind)):
+            assert [other.lane for other in found] == sorted(expected)
+            assert {other.lane: other.gap_m for other in found} == pytest.approx(
+                {lane: gap_m for lane, (gap_m, _) in expected.items()}
+            )
+            assert {other.lane: other.speed_mps for other in found} == {
+                lane: speed_mps for lane, (_, speed_mps) in expected.items()
+            }
 
 
 def test_heading_points_where_the_body_goes() -> None:

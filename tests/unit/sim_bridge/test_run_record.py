@@ -14,6 +14,7 @@ from laneweave.protocol.messages import Heartbeat, LogEvent, Name, Report
 from laneweave.protocol.scenario import Scenario
 from laneweave.sim_bridge.demand import Arrival
 from laneweave.sim_bridge.entry import Admission
+from laneweave.sim_bridge.motion_controller import Rung
 from laneweave.sim_bridge.overlap import LeastGaps
 from laneweave.sim_bridge.run_record import Ending, RunRecord, write_summary
 from laneweave.sim_bridge.traffic import RoadVehicle
@@ -185,11 +186,11 @@ def test_a_trip_is_written_down(record: RunRecord, tmp_path: Path) -> None:
     record.on_entered(traveller)
     plant = traveller.controller.plant
     plant._state = (SCENARIO.road.length_m + 6.0, 15.0, 0.0, 5.25, 0.0, 0.0)
-    traveller.controller.played_from_hold = 4
+    traveller.controller.rung_ticks |= {Rung.PLAY: 90, Rung.HOLD: 3, Rung.GIVE_WAY: 1}
     stays = vehicle("v0002")
     record.on_demanded(stays.admission.arrival)
     record.on_entered(stays)
-    stays.controller.played_from_hold = 3
+    stays.controller.rung_ticks |= {Rung.HOLD: 2, Rung.GIVE_WAY: 1, Rung.EMERGENCY: 5}
     record.on_left(traveller, 70.0, attended=True)
     record.on_still_on_road(stays)
     record.close(70.0, Ending.LIMIT)
@@ -201,6 +202,7 @@ def test_a_trip_is_written_down(record: RunRecord, tmp_path: Path) -> None:
     summary = read_summary(tmp_path)
     assert (summary["vehicles"]["entered"], summary["vehicles"]["left"]) == (2, 1)
     assert summary["tracking"]["hold_law_ticks"] == 7
+    assert summary["tracking"]["emergency_ticks"] == 5
 
 
 def test_a_vehicle_that_stands_at_the_end_has_left(record: RunRecord, tmp_path: Path) -> None:

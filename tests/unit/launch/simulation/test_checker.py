@@ -60,7 +60,9 @@ def state(vehicle: Name, seq: int | None, hold_cell: Cell = (0, 0), **more: obje
 
 
 def sense(attendant: int, joined: tuple[int, ...] = (0,)) -> Sense:
-    return Sense(A, 1, 0.1, (0.0,) * 6, (0, 0), 0, (0, 0), 0, (), 0, attendant, joined=joined)
+    return Sense(
+        A, 1, 0.1, (0.0,) * 6, (0, 0), 0, (0, 0), 0, (), attendant=attendant, joined=joined
+    )
 
 
 class Scene:
