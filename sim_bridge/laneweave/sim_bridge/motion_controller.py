@@ -37,6 +37,7 @@ from laneweave.protocol.motion import (
     commanded_state,
     hold_law,
     keep_gap,
+    limited_jerk,
 )
 from laneweave.protocol.scenario import Scenario
 from laneweave.sim_bridge.overlap import NOBODY_AROUND, Around
@@ -190,7 +191,9 @@ class MotionController:
         """Drive from `tick` to the next one."""
         near = [other for other in self.around.ahead if self._is_in_the_way(other)]
         rung, jerk = self._way(tick, near)
-        spare_m = self._brake.spare_m(self.measured, self.plant.setpoint[0], jerk, near)
+        spare_m = self._brake.spare_m(
+            self.measured, self.plant.setpoint[0], self._allowed(jerk), near
+        )
         if spare_m < (RELEASE_M if self.rung is Rung.EMERGENCY else 0.0):
             rung = Rung.EMERGENCY
             # The body is not where the trajectory would have it any more.
@@ -237,6 +240,12 @@ class MotionController:
         least_m = self._scenario.tracking.min_gap_m
         careful = keep_gap(state, jerk, ahead, limits, least_m, self.tick_s)
         return (Rung.HOLD if careful == jerk else Rung.GIVE_WAY), careful
+
+    def _allowed(self, jerk: Jerk) -> Jerk:
+        """Return what the body will make of a jerk: whoever commands it cannot wish it braked."""
+        limits, speed_mps = self._scenario.vehicle, self.lattice.speed_mps
+        state = commanded_state(self.measured, self.plant.setpoint, limits, speed_mps)
+        return limited_jerk(state, jerk, limits, self.tick_s)
 
     def _is_in_the_way(self, other: Neighbour) -> bool:
         """Tell whether somebody is on a lane that the body touches or that it steers for."""
