@@ -93,7 +93,6 @@ class EmergencyBrake:
         """Take the assumptions from a scenario: its `braking`, `vehicle` and tick."""
         limits, assumed = scenario.vehicle, scenario.braking
         self._brake_mps2 = own_braking_mps2(scenario)
-        self._limits = limits
         self._lag_s = limits.actuator_lag_s
         self._scenario = scenario
         self._reaction_s = assumed.reaction_s
@@ -107,7 +106,8 @@ class EmergencyBrake:
         Args:
             state: of the body, as measured.
             setpoint_mps2: set-point of its acceleration along the road.
-            jerk: what it would do until it looks again; what counts is along the road.
+            jerk: what it would do until it looks again, within its limits; what counts is along
+                the road.
             others: those ahead that it must not run into.
 
         Returns:
@@ -125,10 +125,7 @@ class EmergencyBrake:
     def _own_way_m(self, state: State, setpoint_mps2: float, jerk_mps3: float) -> float:
         """Return how far it goes if it brakes after the time of reaction."""
         _, v, a, _, _, _ = state
-        lag_s, time_s, limits = self._lag_s, self._reaction_s, self._limits
-        # What it will do is within its limits, whatever it was told.
-        jerk_mps3 = min(max(jerk_mps3, -limits.max_jerk_mps3), limits.max_jerk_mps3)
-        jerk_mps3 = max(jerk_mps3, (limits.min_accel_mps2 - setpoint_mps2) / time_s)
+        lag_s, time_s = self._lag_s, self._reaction_s
         # The commanded state has no lag, and the body comes to rest where it does.
         speed = v + lag_s * a + (setpoint_mps2 + jerk_mps3 * time_s / 2.0) * time_s
         ahead_m = (
