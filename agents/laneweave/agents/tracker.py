@@ -57,7 +57,7 @@ _JERK_WEIGHT = 0.02
 _GAP_WEIGHT = 10.0
 
 # A fixed rho leaves nothing behind but the warm start, so a reset is complete.
-_SETTINGS = QPSettings(
+SETTINGS = QPSettings(
     eps_abs=1e-3,
     max_iter=400,
     check_termination=5,
@@ -129,12 +129,10 @@ class Tracker:
         self._low.gap[:], self._high.gap[:] = -_FAR_M, _FAR_M
         self._gaps = NOBODY
         self._regulator = Regulator(n, self._tick_s) if fast_path else None
+        self._cost = _cost(n, self._tick_s)
+        self._rows = _rows(n, self._tick_s, self._limits.max_slip_ratio)
         self._qp = QuadraticProgram(
-            _cost(n, self._tick_s),
-            _rows(n, self._tick_s, self._limits.max_slip_ratio),
-            self._low.all,
-            self._high.all,
-            settings=_SETTINGS,
+            self._cost, self._rows, self._low.all, self._high.all, settings=SETTINGS
         )
 
     def solve(self, state: State, window: Window, gaps: Gaps = NOBODY) -> TrackResult:
@@ -206,6 +204,14 @@ class Tracker:
         if gaps.earliest is not None and not (along[:, 0] >= gaps.earliest[1:]).all():
             return None
         return jerk
+
+    def last_program(self) -> tuple[Any, Any, Array, Array]:
+        """Return the program that was solved last, for benchmarks: P, A, lower, upper.
+
+        P and A are sparse and the same for all programs of a tracker; the bounds are copies. The
+        unknowns are x = (e_1 .. e_N, w_0 .. w_N-1, g_1 .. g_N), the first 6 N rows the dynamics.
+        """
+        return self._cost, self._rows, self._low.all.copy(), self._high.all.copy()
 
     def _solve_program(self) -> QPResult:
         self._qp.update(self._low.all, self._high.all)
