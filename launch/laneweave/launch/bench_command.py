@@ -12,9 +12,10 @@ from rich.console import Console
 from rich.table import Table
 
 from laneweave.coordinator.planning.facade import Solver
-from laneweave.launch import planner_bench
+from laneweave.launch import planner_bench, tracker_bench
 from laneweave.launch.bench import bench_runtime, machine, runtime_table
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario import load_scenario
 
 _PLANNER_SIZES, _RUNTIME_SIZES = "6,9,12,18,24,36", "30,60,90"
 
@@ -26,11 +27,14 @@ class Report:
     benchmark: str
     rows: list[dict[str, Any]]
     table: Table
+    goals: dict[str, Any] | None = None
 
     def show(self, *, as_json: bool) -> None:
         """Print it."""
         if as_json:
             result = {"benchmark": self.benchmark, "machine": machine(), "results": self.rows}
+            if self.goals is not None:
+                result["goals"] = self.goals
             sys.stdout.write(json.dumps(result, indent=2) + "\n")
         else:
             Console().print(self.table)
@@ -73,6 +77,13 @@ def measure_runtime(vehicles: str | None, seconds: float, per_process: int, seed
         for count in _counts(_RUNTIME_SIZES if vehicles is None else vehicles)
     ]
     return Report("runtime", rows, runtime_table(rows))
+
+
+def measure_tracker(instances: int, seed: int) -> Report:
+    """Measure a tick of tracking, on `instances` recorded episodes of each situation."""
+    rows = tracker_bench.bench_tracker(load_scenario(None), instances=instances, seed=seed)
+    goals = {"family": "gap-rows", "solver": "tracker", "cpu_ms": tracker_bench.GOALS_MS}
+    return Report("tracker", rows, tracker_bench.tracker_table(rows), goals)
 
 
 def _counts(text: str) -> list[int]:

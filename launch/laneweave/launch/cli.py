@@ -59,6 +59,7 @@ class Benchmark(StrEnum):
 
     runtime = "runtime"
     planner = "planner"
+    tracker = "tracker"
 
 
 class SolverChoice(StrEnum):
@@ -241,7 +242,7 @@ def report(
 
 @app.command()
 def bench(
-    what: Annotated[Benchmark, typer.Argument(help="runtime or planner.")],
+    what: Annotated[Benchmark, typer.Argument(help="runtime, planner or tracker.")],
     vehicles: Annotated[
         str | None,
         typer.Option("--vehicles", help="Numbers with commas between; see below for defaults."),
@@ -256,7 +257,13 @@ def bench(
         str, typer.Option("--families", help="planner: of node-edge, following, geometric, block.")
     ] = "node-edge,following,geometric",
     instances: Annotated[
-        int, typer.Option("--instances", min=1, max=10_000, help="planner: per formation size.")
+        int,
+        typer.Option(
+            "--instances",
+            min=1,
+            max=10_000,
+            help="planner: per formation size; tracker: episodes per situation.",
+        ),
     ] = 20,
     deadline: Annotated[
         float, typer.Option("--deadline", min=0.01, max=3600.0, help="planner: s per instance.")
@@ -267,13 +274,15 @@ def bench(
     seed: Annotated[int, typer.Option("--seed", min=0)] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Measure this machine: roads of 30, 60 and 90 vehicles, or plans for 6 to 36."""
+    """Measure this machine: roads of 30, 60 and 90 vehicles, plans for 6 to 36, or tracking."""
     from laneweave.launch import bench_command
 
     if what is Benchmark.planner:
         report = bench_command.measure_planner(
             vehicles, families, instances, seed, deadline, solver.value
         )
+    elif what is Benchmark.tracker:
+        report = bench_command.measure_tracker(instances, seed)
     else:
         report = bench_command.measure_runtime(vehicles, seconds, per_process, seed)
     report.show(as_json=as_json)
