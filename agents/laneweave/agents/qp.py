@@ -19,6 +19,7 @@ import numpy as np
 from attrs import frozen
 from numpy.typing import NDArray
 from osqp import ext_builtin
+from scipy import sparse
 
 Vector = NDArray[np.float64]
 
@@ -56,6 +57,20 @@ class QPSettings:
     """A result that violates a row by more is not usable, whatever OSQP says about it."""
 
 
+@frozen(eq=False)
+class QPScale:
+    """Units in which OSQP sees a program, its own balancing (Ruiz) coming on top.
+
+    They decide how fast it is: a row with a large factor is enforced with a large step size, and
+    both say how much a residual counts at the end.
+    """
+
+    rows: Vector
+    """Positive factors (m,) of rows and their bounds."""
+    unknowns: Vector
+    """Positive units (n,) of x; the gradient counts in them."""
+
+
 @frozen
 class QPResult:
     """What came out of one solution."""
@@ -85,6 +100,7 @@ class QuadraticProgram:
         upper: Vector,
         linear: Vector | None = None,
         settings: QPSettings | None = None,
+        scale: QPScale | None = None,
     ) -> None:
         """Set up the solver: scaling and factorisation happen here.
 
@@ -95,17 +111,22 @@ class QuadraticProgram:
             upper: upper bounds (m,); +inf for none.
             linear: q (n,); None for zero.
             settings: None for the defaults.
+            scale: units in which OSQP sees the program; None for those of the caller.
 
         Raises:
-            ValueError: the matrices or vectors do not fit, are not finite, or lower > upper.
+            ValueError: the matrices or vectors do not fit, are not finite, lower > upper, or a
+                scale is not positive.
         """
         m, n = rows.shape
         if cost.shape != (n, n):
             raise ValueError(f"cost has shape {cost.shape}, rows have {n} columns")
         self._n = n
         self._settings = settings or QPSettings()
-        self._rows = rows.tocsr()
-        cost_csc, rows_csc = cost.tocsc(), rows.tocsc()
+        self._scale = _checked_scale(scale or QPScale(np.ones(m), np.ones(n)), m, n)
+        by_rows, by_unknowns = (sparse.diags(by) for by in (self._scale.rows, self._scale.unknowns))
+        cost_csc = (by_unknowns @ cost @ by_unknowns).tocsc()
+        rows_csc = (by_rows @ rows @ by_unknowns).tocsc()
+        self._rows = rows_csc.tocsr()
         for name, matrix in (("cost", cost_csc), ("rows", rows_csc)):
             if not np.isfinite(matrix.data).all():
                 raise ValueError(f"{name} has entries that are not finite")
@@ -155,11 +176,12 @@ class QuadraticProgram:
             solver.solve()
         info = solver.info
         status = int(info.status_val)
-        x: Vector = solver.solution.x
+        scaled: Vector = solver.solution.x
         violation = math.inf
         if status in (SOLVED, SOLVED_INACCURATE, MAX_ITERATIONS):
-            violation = self._row_violation(x)
+            violation = self._row_violation(scaled)
         usable = violation <= self._settings.row_tolerance
+        x = scaled * self._scale.unknowns
         result = QPResult(x, usable, status, int(info.iter), violation)
         if not usable:
             self.reset()
@@ -171,11 +193,12 @@ class QuadraticProgram:
         if self._settings.adaptive_rho_interval:
             self._solver.update_rho(self._settings.rho)
 
-    def _row_violation(self, x: Vector) -> float:
-        values = self._rows @ x
+    def _row_violation(self, scaled: Vector) -> float:
+        values = self._rows @ scaled
         np.subtract(values, self._upper, out=self._above)
         np.subtract(self._lower, values, out=self._below)
         np.maximum(self._above, self._below, out=self._above)
+        self._above /= self._scale.rows
         # A NaN anywhere stays NaN and fails every comparison.
         return max(float(self._above.max()), 0.0) if self._above.size else 0.0
 
@@ -184,20 +207,29 @@ class QuadraticProgram:
             raise ValueError(f"linear has shape {linear.shape}, expected {(self._n,)}")
         if not np.isfinite(linear).all():
             raise ValueError("linear cost is not finite")
-        return linear
+        return linear * self._scale.unknowns
 
     def _check_bounds(self, lower: Vector, upper: Vector) -> None:
         """Copy checked bounds, clipped to OSQP's infinity, or raise and change nothing."""
         shape = self._lower.shape
         if lower.shape != shape or upper.shape != shape:
             raise ValueError(f"bounds have shapes {lower.shape}, {upper.shape}, expected {shape}")
-        np.maximum(lower, -_INFINITY, out=self._new_lower)
-        np.minimum(upper, _INFINITY, out=self._new_upper)
+        np.multiply(lower, self._scale.rows, out=self._new_lower)
+        np.multiply(upper, self._scale.rows, out=self._new_upper)
+        np.maximum(self._new_lower, -_INFINITY, out=self._new_lower)
+        np.minimum(self._new_upper, _INFINITY, out=self._new_upper)
         if not (self._new_lower <= self._new_upper).all():
             row = int(np.argmin(self._new_lower <= self._new_upper))
             raise ValueError(f"row {row}: bounds [{lower[row]}, {upper[row]}] admit nothing")
         self._lower, self._new_lower = self._new_lower, self._lower
         self._upper, self._new_upper = self._new_upper, self._upper
+
+
+def _checked_scale(scale: QPScale, m: int, n: int) -> QPScale:
+    for name, factors, size in (("row", scale.rows, m), ("unknown", scale.unknowns, n)):
+        if factors.shape != (size,) or not (np.isfinite(factors) & (factors > 0.0)).all():
+            raise ValueError(f"{name} scale is not {size} positive numbers")
+    return scale
 
 
 def _osqp_settings(settings: QPSettings) -> Any:  # noqa: ANN401 - OSQP's own type has no stub

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
 
-from laneweave.agents.qp import QPSettings, QuadraticProgram
+from laneweave.agents.qp import QPScale, QPSettings, QuadraticProgram
 
 TIGHT = QPSettings(eps_abs=1e-8, max_iter=4000, row_tolerance=1e-6)
 
@@ -65,6 +65,39 @@ def test_uses_both_triangles_and_coupling_of_the_cost() -> None:
     result = program.solve()
     assert result.usable
     np.testing.assert_allclose(result.x, np.linalg.solve(cost, -linear), atol=1e-6)
+
+
+def test_scales_change_neither_the_solution_nor_what_violates_a_row() -> None:
+    cost = sparse.csc_matrix(np.array([[4.0, 1.0], [1.0, 3.0]]))
+    rows = sparse.csc_matrix(np.array([[1.0, 1.0], [1.0, -2.0], [0.0, 1.0]]))
+    lower, upper = np.array([1.0, -np.inf, -1.0]), np.array([1.0, 0.5, np.inf])
+    linear = np.array([1.0, -2.0])
+    scale = QPScale(np.array([20.0, 0.4, 1e-2]), np.array([0.3, 7.0]))
+    plain = QuadraticProgram(cost, rows, lower, upper, linear, TIGHT)
+    scaled = QuadraticProgram(cost, rows, lower, upper, linear, TIGHT, scale)
+    for _ in range(2):
+        expected, result = plain.solve(), scaled.solve()
+        assert result.usable
+        np.testing.assert_allclose(result.x, expected.x, atol=1e-5)
+        upper = upper - (0.0, 0.7, 0.0)
+        linear = linear + 1.0
+        plain.update(lower, upper, linear)
+        scaled.update(lower, upper, linear)
+    short = QPSettings(eps_abs=1e-9, max_iter=1, check_termination=1)
+    unfinished = QuadraticProgram(cost, rows, lower, upper, linear, short, scale).solve()
+    values = rows @ unfinished.x
+    violation = max((values - upper).max(), (lower - values).max())
+    assert unfinished.row_violation == pytest.approx(violation, abs=1e-12)
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, float("nan"), float("inf")])
+def test_scales_that_are_not_positive_raise(bad: float) -> None:
+    eye, ones = sparse.eye(2, format="csc"), np.ones(2)
+    for scale in (QPScale(np.array([1.0, bad]), ones), QPScale(ones, np.array([bad, 1.0]))):
+        with pytest.raises(ValueError, match="positive"):
+            QuadraticProgram(eye, eye, -ones, ones, scale=scale)
+    with pytest.raises(ValueError, match="row scale"):
+        QuadraticProgram(eye, eye, -ones, ones, scale=QPScale(np.ones(3), ones))
 
 
 def test_infinite_bounds_are_allowed_on_their_own_side() -> None:
