@@ -26,7 +26,7 @@ from rich import box
 from rich.table import Table
 
 from laneweave.agents.qp import QuadraticProgram
-from laneweave.agents.tracker import SETTINGS, Tracker
+from laneweave.agents.tracker import SETTINGS, Tracker, program_scale
 from laneweave.launch.tracker_problems import FAMILIES, Parts, Problem, Recording, record
 from laneweave.protocol.scenario import Scenario
 from laneweave.sim_bridge.run_record import spread
@@ -94,7 +94,10 @@ class OsqpSolver:
         """Set up the program."""
         free = np.full(parts.rows.shape[0], np.inf)
         self._parts = parts
-        self._qp = QuadraticProgram(parts.cost, parts.rows, -free, free, settings=SETTINGS)
+        scale = program_scale(parts.jerks // 2)
+        self._qp = QuadraticProgram(
+            parts.cost, parts.rows, -free, free, settings=SETTINGS, scale=scale
+        )
 
     def reset(self) -> None:
         """Forget the solution of the tick before."""
@@ -349,7 +352,7 @@ def tracker_table(rows: Sequence[dict[str, Any]]) -> Table:
     )
     for name in ("family", "solver", "ticks", "ms\nmean", "\np50", "\np99", "\nmax"):
         table.add_column(name, no_wrap=True)
-    for name in ("done\n%", "off\nmax", "steps\n50, 99"):
+    for name in ("done\n%", "off\nmax", "steps\n50/99"):
         table.add_column(name, no_wrap=True)
     family, missing = "", {}
     for row in rows:
@@ -368,7 +371,7 @@ def tracker_table(rows: Sequence[dict[str, Any]]) -> Table:
             *(_text(row["cpu_ms"][name], 3) for name in ("mean", "p50", "p99", "max")),
             _text(None if share is None else 100.0 * share, 1),
             _text(row["first_jerk_difference_mps3"]["max"], 2),
-            f"{_text(iterations['p50'], 0)}, {_text(iterations['p99'], 0)}",
+            f"{_text(iterations['p50'], 0)}/{_text(iterations['p99'], 0)}",
         )
     for name, reason in missing.items():
         table.caption = f"{table.caption}\n{name}: {reason}"
