@@ -4,6 +4,7 @@ All solvers get the same recorded problems (`tracker_problems`), the ticks of an
 order, since most of them start from the solution of the tick before:
 
     tracker     the whole call of the tracker
+    no-shortcut the same without the fast path: OSQP runs at every tick
     osqp        its program alone: bounds replaced, solved, answer checked
     daqp        the same program without its states, by a dual active-set method
     lq          the same program without its inequalities, a matrix times a vector: the floor
@@ -83,7 +84,7 @@ class TrackerSolver:
 
     def solve(self, prepared: Problem) -> Answer:
         """Track."""
-        result = self._tracker.solve(prepared.state, prepared.window, prepared.ahead)
+        result = self._tracker.solve(prepared.state, prepared.window, prepared.gaps)
         return Answer(result.jerk[0], result.usable, result.iterations)
 
 
@@ -266,6 +267,7 @@ def solvers(scenario: Scenario, parts: Parts) -> dict[str, Solver | None]:
         daqp = None
     return {
         "tracker": TrackerSolver(lambda: Tracker(scenario)),
+        "no-shortcut": TrackerSolver(lambda: Tracker(scenario, fast_path=False)),
         "osqp": OsqpSolver(parts),
         "daqp": daqp,
         "lq": LqSolver(parts, condensed),

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from laneweave.agents.qp import QPSettings, QuadraticProgram
+from laneweave.agents.surroundings import NOBODY, SENSED_S, Gaps
 from laneweave.agents.tracker import Tracker
 from laneweave.agents.trajectory import Reference, Window
 from laneweave.protocol.motion import State, integrate
@@ -30,8 +31,6 @@ near another vehicle. Other ticks are recorded too, as what comes before these."
 _NOISE = (0.05, 0.02, 0.05, 0.05, 0.02, 0.05)
 """Standard deviations of what is measured of (s, v, a, y, v_y, a_y)."""
 _PUSH_TICKS = 20
-_SENSED_S = 1.0
-"""How far ahead a vehicle is predicted that is only sensed."""
 _PRESSING_M = 1e-3
 _REFERENCE = QPSettings(
     eps_abs=1e-7,
@@ -86,8 +85,7 @@ class Problem:
 
     state: State
     window: Window
-    ahead: Array | None
-    """Predicted rear bumper of the vehicle ahead (N + 1,) [m]."""
+    gaps: Gaps
     lower: Array
     upper: Array
     jerk: Array
@@ -169,17 +167,19 @@ def _drive(scenario: Scenario, episode: _Episode, rng: random.Random) -> Iterato
     """Close the loop with the exact plant, from the reference's first state."""
     tick_s = scenario.runtime.tick_s
     ahead_s = np.array([tick_s * k for k in range(scenario.tracking.horizon_ticks + 1)])
-    tracker, body = Tracker(scenario), _row(episode.reference.window(0).states[0])
+    tracker = Tracker(scenario, fast_path=False)
+    body = _row(episode.reference.window(0).states[0])
     for tick in range(episode.ticks):
         if tick and tick % _PUSH_TICKS == 0 and tick // _PUSH_TICKS <= len(episode.pushes):
             by_m, by_mps = episode.pushes[tick // _PUSH_TICKS - 1]
             body = (body[0] + by_m, body[1] + by_mps, *body[2:])
         state = _row(np.array([x + rng.gauss(0.0, by) for x, by in zip(body, _NOISE, strict=True)]))
         window = episode.reference.window(tick)
-        ahead = _predicted(episode, tick * tick_s, ahead_s)
-        jerk = tracker.solve(state, window, ahead).jerk
+        rear = _predicted(episode, tick * tick_s, ahead_s)
+        gaps = NOBODY if rear is None else Gaps(latest=rear - scenario.tracking.min_gap_m)
+        jerk = tracker.solve(state, window, gaps).jerk
         _, _, lower, upper = tracker.last_program()
-        yield Problem(state, window, ahead, lower, upper, jerk, jerk[0], pressing=False)
+        yield Problem(state, window, gaps, lower, upper, jerk, jerk[0], pressing=False)
         along, across = jerk[0].tolist()
         body = integrate(body, (along, across), tick_s)
 
@@ -191,7 +191,7 @@ def _predicted(episode: _Episode, now_s: float, ahead_s: Array) -> Array | None:
         return episode.rear_m(now_s + ahead_s)
     now_m, soon_m = episode.rear_m(now_s + np.array([0.0, 0.01]))
     rear = now_m + (soon_m - now_m) / 0.01 * ahead_s
-    rear[ahead_s > _SENSED_S + 1e-9] = np.inf
+    rear[ahead_s > SENSED_S + 1e-9] = np.inf
     return np.asarray(rear)
 
 

@@ -66,7 +66,7 @@ def test_a_program_says_what_the_tracker_was_asked(recording: Recording) -> None
         values = parts.rows @ np.concatenate([states, at_rest])
         np.testing.assert_allclose(values[: parts.states], problem.lower[: parts.states], atol=1e-9)
         tracker = Tracker(SCENARIO)
-        tracker.solve(problem.state, problem.window, problem.ahead)
+        tracker.solve(problem.state, problem.window, problem.gaps)
         _, _, lower, upper = tracker.last_program()
         assert lower.tobytes() == problem.lower.tobytes()
         assert upper.tobytes() == problem.upper.tobytes()
