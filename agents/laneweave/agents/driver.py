@@ -76,7 +76,7 @@ class TrackingDriver:
         self._tracker = make_tracker(scenario)
         self._reference: Reference | None = None
         self._goal: Cell = (0, 0)
-        self._speed_mps = scenario.lattice.speed_mps
+        self._lattice = scenario.lattice
         self._surroundings = Surroundings(scenario)
         self._solve_ms: list[float] = []
         self._unusable = 0
@@ -110,14 +110,14 @@ class TrackingDriver:
         A body that is late still moves, though the time of its motion is over.
         """
         return sense.tick >= self._path.end_tick and at_rest_in_cell(
-            sense.state, self._scenario.lattice, self._goal, sense.t_s
+            sense.state, self._lattice, self._goal, sense.t_s
         )
 
     def drive(self, sense: Sense, *, moving: bool) -> Drive:
         """Track the reference."""
         reference = self._path
         state = commanded_state(
-            sense.state, sense.setpoint, self._scenario.vehicle, self._speed_mps
+            sense.state, sense.setpoint, self._scenario.vehicle, self._lattice.speed_mps
         )
         gaps = self._surroundings.gaps(sense, state, self._goal[1])
         result = self._tracker.solve(state, reference.window(sense.tick), gaps)

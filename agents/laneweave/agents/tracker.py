@@ -133,7 +133,9 @@ class Tracker:
         self._high.slip_right[:] = np.inf
         self._low.gap[:], self._high.gap[:] = -_FAR_M, _FAR_M
         self._gaps = NOBODY
-        self._regulator = Regulator(n, self._tick_s) if fast_path else None
+        self._regulator = (
+            Regulator(n, self._tick_s, self._limits.max_slip_ratio) if fast_path else None
+        )
         self._cost = _cost(n, self._tick_s)
         self._rows = _rows(n, self._tick_s, self._limits.max_slip_ratio)
         self._qp = QuadraticProgram(
@@ -166,14 +168,14 @@ class Tracker:
             raise ValueError(f"state is not finite: {state}")
         gaps.check(self._n)
         path = self._give_way(state, states, jerks, gaps.latest)
-        jerk = self._regulated(state, path, gaps)
-        if jerk is not None:
-            elapsed_ms = (time.thread_time() - start) * 1e3
-            return TrackResult(jerk, True, 0, elapsed_ms, 0.0)
         iterations = 0
         usable = _is_near(state, path.states[0].tolist())
         if usable:
             self._set_bounds(state, path, gaps)
+            jerk = self._regulated(state, path)
+            if jerk is not None:
+                elapsed_ms = (time.thread_time() - start) * 1e3
+                return TrackResult(jerk, True, 0, elapsed_ms, 0.0)
             result = self._solve_program()
             usable, iterations = result.usable, result.iterations
         if not usable:
@@ -191,29 +193,23 @@ class Tracker:
         elapsed_ms = (time.thread_time() - start) * 1e3
         return TrackResult(jerk, usable, iterations, elapsed_ms, result.row_violation)
 
-    def _regulated(self, state: State, path: _Path, gaps: Gaps) -> Array | None:
+    def _regulated(self, state: State, path: _Path) -> Array | None:
         """Return the jerks (N, 2) of the solution without rows if it keeps all of them."""
         if self._regulator is None or path.defect is not None:
             return None
-        errors = np.array(state) - path.states[0]
-        jerk, along, across = self._regulator.respond(errors, path)
-        limits = self._limits
+        values = self._regulator.rows @ (state - path.states[0])
+        low, high = self._low, self._high
+        # Exactly: the play near standstill is for OSQP, whose answers are limited afterwards.
         if not (
-            _within(jerk[:, 0], limits.max_jerk_mps3)
-            and _within(jerk[:, 1], limits.max_lateral_jerk_mps3)
-            and _within(across[:, 2], limits.max_lateral_accel_mps2)
-            and along[:, 2].max() <= limits.max_accel_mps2
-            and along[:, 2].min() >= limits.min_accel_mps2
-            and along[:, 1].max() <= limits.max_speed_mps
-            and along[:, 1].min() >= 0.0
-            and (np.abs(across[:, 1]) <= limits.max_slip_ratio * along[:, 1]).all()
+            (low.rows <= values).all()
+            and (values <= high.rows).all()
+            and (low.speed + _SPEED_PLAY_MPS <= values[: self._n]).all()
+            and (values[3 * self._n : 4 * self._n] <= high.slip_left - _SLIP_PLAY_MPS).all()
+            and (low.slip_right + _SLIP_PLAY_MPS <= values[4 * self._n : 5 * self._n]).all()
         ):
             return None
-        if gaps.latest is not None and not (along[:, 0] <= gaps.latest[1:]).all():
-            return None
-        if gaps.earliest is not None and not (along[:, 0] >= gaps.earliest[1:]).all():
-            return None
-        return jerk
+        answer: Array = values[5 * self._n : 7 * self._n].reshape(-1, 2)
+        return path.jerks + answer
 
     def last_program(self) -> tuple[Any, Any, Array, Array]:
         """Return the program that was solved last, for benchmarks: P, A, lower, upper.
@@ -336,43 +332,36 @@ class Tracker:
 class Regulator:
     """The solution of the program without rows: w_k = -K e_k, rolled out over the horizon."""
 
-    def __init__(self, ticks: int, tick_s: float) -> None:
-        """Roll out both axes from each of the six initial errors, over N ticks."""
-        transition, effect = axis_matrices(tick_s)
-        rolled = []
-        for weights in (np.diag(_WEIGHTS), np.diag(_LATERAL_WEIGHTS)):
-            gain = _gain(_cost_to_go(weights, tick_s), tick_s)
-            error, inputs, errors = np.eye(3), [], []
-            for _ in range(ticks):
-                inputs.append(-gain @ error)
-                error = transition @ error + effect @ inputs[-1]
-                errors.append(error)
-            rolled.append(np.concatenate([*inputs, *errors]))
-        self._ticks = ticks
-        self._along, self._across = rolled
-
-    def respond(self, errors: Array, path: _Path) -> tuple[Array, Array, Array]:
-        """Return jerks (N, 2) and the states along and across (N, 3) that follow from them.
+    def __init__(self, ticks: int, tick_s: float, slip: float) -> None:
+        """Roll out both axes from each of the six initial errors, over N ticks.
 
         Args:
-            errors: e_0 (6,).
-            path: what is tracked, without defect.
+            ticks: N.
+            tick_s: length of a tick.
+            slip: `max_slip_ratio` of the vehicle.
         """
-        n = self._ticks
-        along, across = self._along @ errors[:3], self._across @ errors[3:]
-        jerk = np.empty((n, 2))
-        jerk[:, 0], jerk[:, 1] = along[:n], across[:n]
-        jerk += path.jerks
-        states = path.states[1:]
-        return (
-            jerk,
-            along[n:].reshape(n, 3) + states[:, :3],
-            across[n:].reshape(n, 3) + states[:, 3:],
+        transition, effect = axis_matrices(tick_s)
+        inputs = np.zeros((ticks, 2, 6))
+        errors = np.zeros((ticks, 6, 6))
+        for axis, weights in enumerate((np.diag(_WEIGHTS), np.diag(_LATERAL_WEIGHTS))):
+            gain = _gain(_cost_to_go(weights, tick_s), tick_s)
+            block, error = slice(3 * axis, 3 * axis + 3), np.eye(3)
+            for k in range(ticks):
+                inputs[k, axis, block] = (-gain @ error)[0]
+                error = (transition - effect @ gain) @ error
+                errors[k, block, block] = error
+        self.rows: Array = np.concatenate(
+            [
+                errors[:, 1],
+                errors[:, 2],
+                errors[:, 5],
+                errors[:, 4] - slip * errors[:, 1],
+                errors[:, 4] + slip * errors[:, 1],
+                inputs.reshape(2 * ticks, 6),
+                errors[:, 0],
+            ]
         )
-
-
-def _within(values: Array, most: float) -> bool:
-    return bool(values.max() <= most and values.min() >= -most)
+        """What all rows but the dynamics come to, (8 N, 6) times e_0, in the order of `_Bounds`."""
 
 
 def _is_near(state: State, reference: list[float]) -> bool:
@@ -395,6 +384,8 @@ class _Bounds:
         self.jerk = self.all[11 * n : 13 * n].reshape(n, 2)
         self.limits = self.all[6 * n : 13 * n]
         self.gap = self.all[13 * n :]
+        self.rows = self.all[6 * n :]
+        """All but the dynamics."""
 
 
 def program_scale(n: int) -> QPScale:

@@ -34,7 +34,7 @@ def recording() -> Recording:
 def test_every_family_and_solver_gets_a_row() -> None:
     rows = bench_tracker(SCENARIO, instances=1, seed=3, repeats=1)
     names = list(dict.fromkeys(row["solver"] for row in rows))
-    assert names == ["tracker", "osqp", "daqp", "lq"]
+    assert names == ["tracker", "no-shortcut", "osqp", "daqp", "lq"]
     assert [(row["family"], row["solver"]) for row in rows] == [
         (family, name) for family in FAMILIES for name in names
     ]
