@@ -38,7 +38,12 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from laneweave.agents.qp import QPSettings, QuadraticProgram
-from laneweave.protocol.braking import lead_way_m, own_braking_mps2, spare_error_m
+from laneweave.protocol.braking import (
+    ERROR_SIGMAS,
+    lead_way_m,
+    own_braking_mps2,
+    spare_error_m,
+)
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario import Scenario, Vehicle
@@ -51,8 +56,6 @@ _END_TOLERANCE = 1e-3
 """Accepted error of a leg's end [m, m/s, m/s2]."""
 _LIMIT_TOLERANCE = 1e-4
 """Accepted excess over a limit's share [m/s, m/s2, m/s3]."""
-_ERROR_SIGMAS = 4.5
-"""Errors of measurement that a move forwards leaves room for, in standard deviations."""
 _TRACKING_ERROR_M = 0.25
 """Room that it leaves for errors of tracking."""
 _CLOSING_SPEEDUP = 0.5
@@ -135,7 +138,7 @@ class Envelope:
         speed_mps, braking = scenario.formation.speed_mps, scenario.braking
         ticks = max(round(braking.reaction_s / scenario.runtime.tick_s), 1)
         lost_s = scenario.vehicle.actuator_lag_s + ticks * scenario.runtime.tick_s
-        errors_m = _ERROR_SIGMAS * spare_error_m(scenario, (1.0 + _CLOSING_SPEEDUP) * speed_mps)
+        errors_m = ERROR_SIGMAS * spare_error_m(scenario, (1.0 + _CLOSING_SPEEDUP) * speed_mps)
         kept_m = braking.margin_m + errors_m + _TRACKING_ERROR_M
         most_m = room_m + lead_way_m(scenario, speed_mps) - kept_m - lost_s * speed_mps
         return cls(ticks, own_braking_mps2(scenario), most_m)
@@ -215,8 +218,8 @@ def check_moves(scenario: Scenario) -> None:
             raise BadInputError(
                 "formation.move_s",
                 scenario.formation.move_s,
-                f"long enough for a move by {dx} columns and {dy} lanes within the limits of the "
-                f"vehicle ({error})",
+                f"long enough for a move by {dx} columns and {dy} lanes ({error}), or change "
+                + ("formation.gap_m or the table braking" if dx > 0 else "the table vehicle"),
             ) from error
 
 

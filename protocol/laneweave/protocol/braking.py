@@ -24,6 +24,9 @@ from laneweave.protocol.messages import Neighbour
 from laneweave.protocol.motion import Jerk, State
 from laneweave.protocol.scenario import Scenario
 
+ERROR_SIGMAS = 4.5
+"""Errors of measurement for which plans leave room, in standard deviations."""
+
 
 def stopping_distance_m(
     speed_mps: float, accel_mps2: float, brake_mps2: float, lag_s: float
@@ -135,3 +138,15 @@ class EmergencyBrake:
         speed = max(speed, 0.0)
         brake = self._brake_mps2
         return ahead_m + speed * speed / (2.0 * brake)
+
+
+def least_pitch_m(scenario: Scenario) -> float:
+    """Return the column pitch with which two that hold one cell apart do not brake, nearly ever.
+
+    Errors of measurement are less than what is to spare, up to `ERROR_SIGMAS`.
+    """
+    speed_mps, pitch_m = scenario.formation.speed_mps, scenario.formation.gap_m
+    ahead = Neighbour(0, pitch_m - scenario.vehicle.length_m, speed_mps)
+    holding = (0.0, speed_mps, 0.0, 0.0, 0.0, 0.0)
+    spare_m = EmergencyBrake(scenario).spare_m(holding, 0.0, (0.0, 0.0), [ahead])
+    return pitch_m - spare_m + ERROR_SIGMAS * spare_error_m(scenario, speed_mps)

@@ -27,6 +27,7 @@ def check_scenario(scenario: Scenario) -> None:
     _check_motion(scenario)
     _check_conflicts(scenario)
     _check_timing(scenario)
+    _check_braking(scenario)
 
 
 def _require(ok: bool, name: str, value: object, allowed: str) -> None:
@@ -160,4 +161,26 @@ def _check_timing(scenario: Scenario) -> None:
         network.lease_s,
         f"at most runtime.agent_silent_s = {runtime.agent_silent_s:g}: a session that is lost is "
         "noticed before its agent counts as silent",
+    )
+
+
+def _check_braking(scenario: Scenario) -> None:
+    # The emergency brake is made from scenarios, so its module imports theirs.
+    from laneweave.protocol.braking import least_pitch_m  # noqa: PLC0415
+
+    reaction_s, tick_s = scenario.braking.reaction_s, scenario.runtime.tick_s
+    _require(
+        reaction_s >= tick_s,
+        "braking.reaction_s",
+        reaction_s,
+        f"at least runtime.tick_s = {tick_s:g}: a vehicle looks once in a tick",
+    )
+    gap_m, least_m = scenario.formation.gap_m, least_pitch_m(scenario)
+    _require(
+        gap_m >= least_m,
+        "formation.gap_m",
+        gap_m,
+        f"at least {math.ceil(1000.0 * least_m) / 1000.0:g}: who holds one cell behind another at "
+        f"formation.speed_mps = {scenario.formation.speed_mps:g} must not brake in emergency "
+        "(vehicle.length_m, the tables braking and sensing)",
     )

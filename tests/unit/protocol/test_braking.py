@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+import re
 import statistics
 
 import pytest
@@ -12,14 +13,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laneweave.protocol.braking import (
+    ERROR_SIGMAS,
     EmergencyBrake,
     lead_way_m,
+    least_pitch_m,
     spare_error_m,
     stopping_distance_m,
 )
+from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.messages import Neighbour
 from laneweave.protocol.motion import Jerk, State
-from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.scenario import Scenario, parse_scenario
 
 SCENARIO = Scenario()
 LIMITS, ASSUMED, NOISE = SCENARIO.vehicle, SCENARIO.braking, SCENARIO.sensing
@@ -159,3 +163,31 @@ def test_each_noise_adds_to_the_error() -> None:
     assert (
         spare_error_m(evolve(SCENARIO, sensing=evolve(NOISE, position_noise_m=3.0)), V_F) == whole
     )
+
+
+# --- what it asks of a scenario -------------------------------------------------------------------
+
+
+def with_pitch(gap_m: float, **sensing: float) -> Scenario:
+    data = {"formation": {"gap_m": gap_m}, "tracking": {"min_gap_m": 0.0}, "sensing": sensing}
+    return parse_scenario(data)
+
+
+def test_the_least_pitch_leaves_room_for_errors_of_measurement_and_for_nothing_more() -> None:
+    least_m = least_pitch_m(SCENARIO)
+    assert with_pitch(least_m + 1e-6).formation.gap_m == pytest.approx(least_m)
+    state, ahead = body(V_F), Neighbour(0, least_m - LIMITS.length_m, V_F)
+    spare_m = BRAKE.spare_m(state, 0.0, NO_JERK, [ahead])
+    assert spare_m == pytest.approx(ERROR_SIGMAS * spare_error_m(SCENARIO, V_F))
+    with pytest.raises(BadInputError) as caught:
+        with_pitch(least_m - 1e-3)
+    assert caught.value.field == "formation.gap_m"
+    allowed = re.search(r"at least (\S+):", caught.value.allowed)
+    assert allowed is not None
+    # What is named as allowed is.
+    assert with_pitch(float(allowed[1])).formation.gap_m == pytest.approx(least_m, abs=1.1e-3)
+
+
+def test_worse_sensors_ask_for_a_greater_pitch() -> None:
+    noisy = with_pitch(15.0, other_speed_noise_mps=0.5)
+    assert least_pitch_m(noisy) > least_pitch_m(SCENARIO) + 1.0

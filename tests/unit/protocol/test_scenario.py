@@ -221,6 +221,7 @@ def test_a_value_out_of_range_is_refused_by_name(field: str, value: object) -> N
 
 # --- fields that do not fit together ----------------------------------------------------------
 
+LATE = {"reaction_s": 0.4}
 MISFITS: list[tuple[str, dict[str, Any]]] = [
     ("demand.lane_shares", {"demand": {"lane_shares": [0.5, 0.5]}}),
     ("demand.lane_shares", {"demand": {"lane_shares": [1, 1, 1, 1]}}),
@@ -272,6 +273,16 @@ MISFITS: list[tuple[str, dict[str, Any]]] = [
     ("runtime.tick_resend_s", {"runtime": {"tick_deadline_s": 0.05}}),
     ("runtime.tick_deadline_s", {"runtime": {"tick_deadline_s": 3.1}}),
     ("runtime.tick_deadline_s", {"runtime": {"tick_deadline_s": 2.0, "agent_silent_s": 1.5}}),
+    ("braking.reaction_s", {"braking": {"reaction_s": 0.09}}),
+    ("braking.reaction_s", {"runtime": {"tick_s": 0.2}}),
+    ("formation.gap_m", {"formation": {"gap_m": 14.0, "speed_mps": 24.0}, "braking": LATE}),
+    ("formation.gap_m", {"braking": {"reaction_s": 0.65}}),
+    ("formation.gap_m", {"braking": {"margin_m": 9.0}}),
+    ("formation.gap_m", {"sensing": {"other_speed_noise_mps": 1.5}}),
+    (
+        "formation.gap_m",
+        {"braking": {"lead_brake_mps2": 30.0}, "vehicle": {"min_accel_mps2": -5.0}},
+    ),
 ]
 
 
@@ -295,6 +306,9 @@ def test_fields_that_do_not_fit_are_refused_by_name(field: str, data: dict[str, 
         {"runtime": {"tick_deadline_s": 3.0}},
         {"runtime": {"tick_resend_s": 0.29}},
         {"runtime": {"tick_s": 0.05}, "tracking": {"horizon_ticks": 76}},
+        {"runtime": {"tick_s": 0.2}, "braking": {"reaction_s": 0.2}},
+        {"formation": {"gap_m": 8.0}},
+        {"braking": {"reaction_s": 0.55}},
         {"seed": 2**63 - 1},
         {"road": {}},
     ],
