@@ -88,12 +88,13 @@ class Surroundings:
         for other in in_the_way(sense.ahead):
             lag_m, other_mps = self._commanded(other)
             front_m = sense.state[0] + other.gap_m + lag_m - self._least_m
-            if s_m + (speed_mps - other_mps) * SENSED_S + self._gain_m > front_m:
+            # Greatest now or at the end of prediction, since it cannot but bend upwards.
+            if s_m + max((speed_mps - other_mps) * SENSED_S + self._gain_m, 0.0) > front_m:
                 latest.append((front_m, other_mps))
         for other in in_the_way(sense.behind):
             lag_m, other_mps = self._commanded(other)
             front_m = sense.state[0] - other.gap_m + lag_m + self._least_m
-            if s_m + (speed_mps - other_mps) * SENSED_S - self._loss_m < front_m:
+            if s_m + min((speed_mps - other_mps) * SENSED_S - self._loss_m, 0.0) < front_m:
                 earliest.append((front_m, other_mps))
         if not (latest or earliest):
             return NOBODY
