@@ -44,7 +44,7 @@ def problems(count: int, seed: int = 2) -> Iterator[Problem]:
             now + rng.gauss(0.0, scale * each)
             for now, each in zip(window.states[0].tolist(), SPREAD, strict=True)
         )
-        yield Problem(state, window, random_gaps(rng, window, scale))  # type: ignore[arg-type]
+        yield Problem(state, window, random_gaps(rng, window, scale))
 
 
 def random_gaps(rng: random.Random, window: Window, scale: float) -> Gaps:

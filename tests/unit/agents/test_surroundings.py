@@ -161,8 +161,8 @@ def test_who_is_left_out_cannot_matter() -> None:
         s, _, _, y, _, _ = AT_HOME
         state = (s, rng.uniform(0.0, 25.0), rng.uniform(-9.0, 5.0), y, 0.0, 0.0)
         side = rng.choice(("latest", "earliest"))
-        felt = sense(state=state, setpoint=(state[2], 0.0))
-        felt = evolve(felt, **{"ahead" if side == "latest" else "behind": (other,)})
+        ahead, behind = ((other,), ()) if side == "latest" else ((), (other,))
+        felt = sense(ahead, behind, state, (state[2], 0.0))
         pursued = commanded_state(state, felt.setpoint, LIMITS, V_F)
         every = getattr(minded(felt, all_of_them=True), side)
         found = getattr(minded(felt), side)
@@ -181,6 +181,6 @@ def test_who_is_left_out_cannot_matter() -> None:
 @pytest.mark.parametrize("side", ["ahead", "behind"])
 def test_who_is_too_close_counts_even_while_the_gap_opens(side: str) -> None:
     opens = Neighbour(1, 2.2, 18.0) if side == "ahead" else Neighbour(1, 1.5, 9.0)
-    gaps = minded(evolve(sense(), **{side: (opens,)}))  # type: ignore[arg-type]
+    gaps = minded(sense((opens,), ()) if side == "ahead" else sense((), (opens,)))
     assert gaps is not NOBODY
     assert (off(gaps.latest)[0] < 0.0) if side == "ahead" else (off(gaps.earliest)[0] > 0.0)
