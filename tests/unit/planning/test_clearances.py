@@ -249,7 +249,7 @@ def test_what_agents_drive_is_not_closer_than_the_default_profile_says(
 
 @pytest.mark.parametrize(
     ("lateness_s", "more", "more_with_errors"),
-    [(None, 0, 0), (0.0, 0, 8), (0.2, 0, 0), (0.5, 4, 20)],
+    [(None, 0, 0), (0.0, 0, 8), (0.2, 0, 0), (0.5, 0, 16)],
 )
 def test_the_table_is_nearly_that_of_what_agents_drive(
     lateness_s: float | None, more: int, more_with_errors: int
