@@ -59,7 +59,7 @@ _GAP_WEIGHT = 10.0
 # A fixed rho leaves nothing behind but the warm start, so a reset is complete.
 SETTINGS = QPSettings(
     eps_abs=3e-3,
-    max_iter=160,
+    max_iter=100,
     check_termination=4,
     rho=0.1,
     adaptive_rho_interval=0,

@@ -60,8 +60,8 @@ def random_gaps(rng: random.Random, window: Window, scale: float) -> Gaps:
 @pytest.fixture
 def exact(monkeypatch: pytest.MonkeyPatch) -> Tracker:
     """Return a tracker that always runs OSQP, with tight tolerances."""
-    tight = evolve(tracker_module._SETTINGS, eps_abs=1e-7, max_iter=20_000, row_tolerance=1e-3)
-    monkeypatch.setattr(tracker_module, "_SETTINGS", tight)
+    tight = evolve(tracker_module.SETTINGS, eps_abs=1e-7, max_iter=20_000, row_tolerance=1e-3)
+    monkeypatch.setattr(tracker_module, "SETTINGS", tight)
     return Tracker(SCENARIO, fast_path=False)
 
 
