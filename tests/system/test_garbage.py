@@ -23,6 +23,7 @@ from laneweave.protocol.messages import (
     Command,
     Heartbeat,
     LogEvent,
+    Motion,
     Name,
     Neighbour,
     Plan,
@@ -99,6 +100,7 @@ def messages(vehicle: Name, *, number: int, real: float) -> dict[type, Any]:
             speed_mps=real,
             t_s=real,
         ),
+        Motion(vehicle, number, number, cell, (number, 0), number, number),
         Sense(
             vehicle,
             number,

@@ -27,6 +27,7 @@ KINDS: dict[str, type] = {
         messages.Prepare,
         messages.Plan,
         messages.VehicleState,
+        messages.Motion,
         messages.Sense,
         messages.Command,
         messages.Census,

@@ -127,6 +127,27 @@ class VehicleState:
 
 
 @frozen
+class Motion:
+    """Vehicle to those of its formation and of the two next to it: the motion that is under way.
+
+    When the motion begins and every ten ticks while it lasts; who holds says nothing, since its
+    speed is constant. Its trajectory is not sent: all vehicles share the scenario, from which it
+    follows. Missing or late: those around go by what they sense. Duplicated: no effect. Older than
+    the newest motion of the vehicle, by incarnation and then by `begin_tick`: ignored.
+    """
+
+    vehicle: Name
+    incarnation: int
+    formation: int
+    """In whose block it entered."""
+    origin: Cell
+    target: Cell
+    begin_tick: int
+    tick: int
+    """When this was sent."""
+
+
+@frozen
 class Neighbour:
     """The nearest vehicle ahead in a lane, or behind in it, as local sensing sees it."""
 

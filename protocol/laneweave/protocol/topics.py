@@ -60,6 +60,7 @@ COMMAND = Topic("command", "command/{vehicle}", messages.Command, "vehicle", Qua
 STATE = Topic(
     "state", "state/{formation}/{vehicle}", messages.VehicleState, "vehicle", Quality.LATEST
 )
+MOTION = Topic("motion", "motion/{formation}/{vehicle}", messages.Motion, "vehicle", Quality.LATEST)
 PREPARE = Topic("prepare", "prepare/{vehicle}", messages.Prepare, "coordinator", Quality.ASSURED)
 PLAN = Topic("plan", "plan/{vehicle}", messages.Plan, "coordinator", Quality.ASSURED)
 HEARTBEAT = Topic(
@@ -81,6 +82,7 @@ TOPICS = (
     SENSE,
     COMMAND,
     STATE,
+    MOTION,
     PREPARE,
     PLAN,
     HEARTBEAT,

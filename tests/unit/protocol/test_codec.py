@@ -23,6 +23,7 @@ from laneweave.protocol.messages import (
     Command,
     Heartbeat,
     LogEvent,
+    Motion,
     Name,
     Neighbour,
     Plan,
@@ -65,6 +66,7 @@ SAMPLES: tuple[object, ...] = (
     RoadClock(130, 13.0, demanded=5, entered=4, on_road=3, left=1, ended=False),
     Report(Name("agent"), V1, Name("17-4"), 10, 3, 5, 1, b"\0\0\0\0"),
     LogEvent(Name("bridge"), Name("b"), 13.0, Name("overlap"), {"n": 1, "pair": ["v1", "v2"]}),
+    Motion(V1, 11, -1, (0, 0), (0, 1), begin_tick=120, tick=130),
 )  # fmt: skip
 NAMES_NOT_ALLOWED = ("a/b", "a*", "", "x" * 65, "a b", "a#", "$", "a?", "é", "a\n", "v1\n", "\0")
 
