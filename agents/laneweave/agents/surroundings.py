@@ -1,27 +1,30 @@
 """Surroundings: what those ahead and behind leave a vehicle, as its own sensors see them.
 
 They count in the lanes that the body touches and in the lane that it enters. Each is predicted at
-constant speed, as far as that holds. All positions are commanded ones (`protocol.motion`): bodies
-of equal lag keep every distance that their commanded states keep.
+constant speed, as far as that holds; and where one is at the place of a motion that was heard of
+(`motions`), along its trajectory from where it is sensed, too. At each tick the nearer one of both
+counts: what is said can only add to what is seen. All positions are commanded ones
+(`protocol.motion`): bodies of equal lag keep every distance that their commanded states keep.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from attrs import frozen
 from numpy.typing import NDArray
 
-from laneweave.protocol.messages import Neighbour, Sense
+from laneweave.agents.motions import Motions
+from laneweave.protocol.messages import Motion, Neighbour, Sense
 from laneweave.protocol.motion import State
 from laneweave.protocol.scenario import Scenario
 
 Array = NDArray[np.float64]
 
 SENSED_S = 1.0
-"""How far ahead local sensing is extrapolated; what others plan to do is not known here."""
+"""How far ahead local sensing is extrapolated: speeds change."""
 
 
 @frozen(eq=False)
@@ -50,12 +53,26 @@ class Gaps:
 NOBODY = Gaps()
 
 
+@frozen
+class _Side:
+    """Ahead or behind."""
+
+    sign: float
+    nearest: Callable[[Any, Any], Any]
+    nobody: float
+
+
+_AHEAD = _Side(1.0, np.minimum, np.inf)
+_BEHIND = _Side(-1.0, np.maximum, -np.inf)
+
+
 class Surroundings:
     """Predicts those around one vehicle."""
 
     def __init__(self, scenario: Scenario) -> None:
         """Take sizes, limits and horizon from a scenario."""
         limits = scenario.vehicle
+        self._motions = Motions(scenario)
         self._lane_width_m = scenario.road.lane_width_m
         self._half_width_m = limits.width_m / 2.0
         self._length_m = limits.length_m
@@ -68,6 +85,10 @@ class Surroundings:
         self._times_s = np.arange(scenario.tracking.horizon_ticks + 1) * scenario.runtime.tick_s
         self._beyond = self._times_s > SENSED_S + 1e-9
 
+    def hear(self, motion: Motion) -> None:
+        """Take what another vehicle says of its motion."""
+        self._motions.hear(motion)
+
     def gaps(self, sense: Sense, state: State, lane: int) -> Gaps:
         """Return what the others leave; those that cannot come into question are left out.
 
@@ -79,48 +100,76 @@ class Surroundings:
         y_m = sense.state[3]
         first = int((y_m - self._half_width_m) // self._lane_width_m)
         last = int((y_m + self._half_width_m) // self._lane_width_m)
-
-        def in_the_way(others: Iterable[Neighbour]) -> Iterable[Neighbour]:
-            return (each for each in others if first <= each.lane <= last or each.lane == lane)
-
+        ahead = [
+            self._seen(sense, each, _AHEAD)
+            for each in sense.ahead
+            if first <= each.lane <= last or each.lane == lane
+        ]
+        behind = [
+            self._seen(sense, each, _BEHIND)
+            for each in sense.behind
+            if first <= each.lane <= last or each.lane == lane
+        ]
         s_m, speed_mps = state[0], state[1]
-        latest, earliest = [], []
-        for other in in_the_way(sense.ahead):
-            lag_m, other_mps = self._commanded(other)
-            front_m = sense.state[0] + other.gap_m + lag_m - self._least_m
+        near_ahead = [
+            (front_m, other_mps)
+            for _, front_m, other_mps in ahead
             # Greatest now or at the end of prediction, since it cannot but bend upwards.
-            if s_m + max((speed_mps - other_mps) * SENSED_S + self._gain_m, 0.0) > front_m:
-                latest.append((front_m, other_mps))
-        for other in in_the_way(sense.behind):
-            lag_m, other_mps = self._commanded(other)
-            front_m = sense.state[0] - other.gap_m + lag_m + self._least_m
-            if s_m + min((speed_mps - other_mps) * SENSED_S - self._loss_m, 0.0) < front_m:
-                earliest.append((front_m, other_mps))
-        if not (latest or earliest):
-            return NOBODY
-        return Gaps(
-            self._predicted(earliest, np.maximum, -np.inf),
-            self._predicted(latest, np.minimum, np.inf),
-        )
+            if s_m + max((speed_mps - other_mps) * SENSED_S + self._gain_m, 0.0) > front_m
+        ]
+        near_behind = [
+            (front_m, other_mps)
+            for _, front_m, other_mps in behind
+            if s_m + min((speed_mps - other_mps) * SENSED_S - self._loss_m, 0.0) < front_m
+        ]
+        latest = self._sensed(near_ahead, _AHEAD) if near_ahead else None
+        earliest = self._sensed(near_behind, _BEHIND) if near_behind else None
+        if self._motions.heard:
+            lanes = min(first, lane), max(last, lane)
+            self._motions.advance(sense.tick)
+            latest = self._said(latest, ahead, _AHEAD, lanes)
+            earliest = self._said(earliest, behind, _BEHIND, lanes)
+        return NOBODY if latest is None and earliest is None else Gaps(earliest, latest)
 
-    def _commanded(self, other: Neighbour) -> tuple[float, float]:
-        """Return how far another one's commanded position is from its position, and its speed."""
-        lag_s = self._lag_s
+    def _seen(self, sense: Sense, other: Neighbour, side: _Side) -> tuple[int, float, float]:
+        """Return another one's lane, where the front bumper should be for its sake, its speed."""
+        lag_s, sign = self._lag_s, side.sign
+        # How far its commanded position is from its position.
+        lag_m = lag_s * (other.speed_mps - self._speed_mps)
         return (
-            lag_s * (other.speed_mps - self._speed_mps),
+            other.lane,
+            sense.state[0] + sign * (other.gap_m - self._least_m) + lag_m,
             max(other.speed_mps + lag_s * other.accel_mps2, 0.0),
         )
 
-    def _predicted(
-        self,
-        fronts: list[tuple[float, float]],
-        nearest: Callable[[Any, Any], Any],
-        nobody: float,
-    ) -> Array | None:
-        if not fronts:
-            return None
-        positions = np.full(self._times_s.shape, nobody)
+    def _sensed(self, fronts: list[tuple[float, float]], side: _Side) -> Array:
+        """Return the nearest positions at constant speeds."""
+        positions = np.full(self._times_s.shape, side.nobody)
         for front_m, speed_mps in fronts:
-            positions = nearest(positions, front_m + speed_mps * self._times_s)
-        positions[self._beyond] = nobody
+            positions = side.nearest(positions, front_m + speed_mps * self._times_s)
+        positions[self._beyond] = side.nobody
+        return positions
+
+    def _said(
+        self,
+        positions: Array | None,
+        others: list[tuple[int, float, float]],
+        side: _Side,
+        lanes: tuple[int, int],
+    ) -> Array | None:
+        """Return positions, or nearer ones of those whose motions are known.
+
+        Args:
+            positions: as sensed.
+            others: who is sensed, as `_seen` says.
+            side: where they are.
+            lanes: the first and the last one that count.
+        """
+        apart_m = side.sign * (self._length_m + self._least_m)
+        for lane, front_m, speed_mps in others:
+            fronts = self._motions.fronts(lane, front_m + apart_m, speed_mps, lanes, side.nobody)
+            if fronts is None:
+                continue
+            fronts -= apart_m
+            positions = fronts if positions is None else side.nearest(positions, fronts)
         return positions
