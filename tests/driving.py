@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from laneweave.agents.driver import TrackingDriver
 from laneweave.protocol.lattice import Cell, Move
-from laneweave.protocol.messages import Command, Name
+from laneweave.protocol.messages import Command, Motion, Name
 from laneweave.protocol.motion import State, cell_state
 from laneweave.protocol.scenario import Scenario, load_scenario
 from laneweave.sim_bridge.demand import Arrival
@@ -74,6 +74,8 @@ class Road:
         self.messages = True
         """Whether drivers hear and are heard; if not, motion controllers go on with what they have.
         """
+        self.broadcast = True
+        """Whether vehicles tell each other of their motions."""
         self.late = 0
         """Moves that began before the one under way had ended."""
         self.record = Record()
@@ -111,6 +113,8 @@ class Road:
         if self.messages:
             for name, one in self.driven.items():
                 self._drive(one, (begins or {}).get(name))
+            if self.broadcast:
+                self._tell_motions()
         exempt = []
         for name, vehicle in self.vehicles.items():
             plant = vehicle.controller.plant
@@ -144,6 +148,20 @@ class Road:
         )
         if not one.vehicle.controller.take(command):
             raise RuntimeError(f"the motion controller refused {command}")
+
+    def _tell_motions(self) -> None:
+        """Tell everybody of the others' motions, as their agents do after a tick."""
+        for name, one in self.driven.items():
+            course = one.driver.motion(self.tick)
+            if course is None:
+                continue
+            motion = Motion(
+                name, 1, one.vehicle.formation, course.origin, course.target,
+                course.begin_tick, self.tick,
+            )  # fmt: skip
+            for other, listener in self.driven.items():
+                if other != name:
+                    listener.driver.hear(motion)
 
     def _show(self) -> None:
         poses = _poses(self.vehicles)

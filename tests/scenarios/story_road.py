@@ -15,7 +15,7 @@ from laneweave.agents.core import AgentCore
 from laneweave.agents.driver import Drive, Effort
 from laneweave.protocol.execution import PlanExecution
 from laneweave.protocol.lattice import Cell, Lattice, Move
-from laneweave.protocol.messages import Command, Name, Plan, Prepare, Sense, VehicleState
+from laneweave.protocol.messages import Command, Motion, Name, Plan, Prepare, Sense, VehicleState
 from laneweave.protocol.motion import at_rest_in_cell, cell_state
 from laneweave.protocol.node import Arrived, Effect, Send, Started
 from laneweave.protocol.scenario import FormationSettings, Network, Road, Runtime, Scenario
@@ -63,6 +63,12 @@ class StoryDriver:
 
     def drive(self, sense: Sense, *, moving: bool) -> Drive:
         return Drive(sense.tick + 1 if moving else 0, self._origin, b"")
+
+    def motion(self, tick: int) -> None:
+        """Tell others nothing: there are no trajectories."""
+
+    def hear(self, motion: Motion) -> None:
+        """Ignore others' motions."""
 
 
 @define(eq=False)

@@ -17,11 +17,20 @@ from collections.abc import Callable, Iterator
 
 from attrs import evolve
 
-from laneweave.agents.driver import Driver, TrackingDriver
+from laneweave.agents.driver import Course, Driver, TrackingDriver
 from laneweave.protocol.execution import PlanExecution
 from laneweave.protocol.incarnations import above
 from laneweave.protocol.lattice import Move
-from laneweave.protocol.messages import Command, Name, Plan, Prepare, Report, Sense, VehicleState
+from laneweave.protocol.messages import (
+    Command,
+    Motion,
+    Name,
+    Plan,
+    Prepare,
+    Report,
+    Sense,
+    VehicleState,
+)
 from laneweave.protocol.node import (
     Announce,
     Arrived,
@@ -37,6 +46,7 @@ from laneweave.protocol.node import (
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.topics import (
     COMMAND,
+    MOTION,
     PLAN,
     PREPARE,
     REPORT,
@@ -82,6 +92,10 @@ class AgentCore:
         self._driver = make_driver(scenario)
         self._rules = rules
         self._formation: int | None = None
+        self.wanted_motions: tuple[int, ...] = ()
+        """Formations whose vehicles may come near this one; none while it is not in charge."""
+        self._near: tuple[int, ...] = ()
+        """Its own formation and the next ones."""
         self._move: Move | None = None
         """The newest move that it has begun."""
         self._sense: Sense | None = None
@@ -129,6 +143,10 @@ class AgentCore:
             case _:
                 pass
 
+    def hear(self, motion: Motion) -> None:
+        """Take what another vehicle of the wanted formations says of its motion."""
+        self._driver.hear(motion)
+
     def _on_message(self, message: object) -> Iterator[Effect]:
         execution = self.execution
         assert execution is not None  # noqa: S101 (in charge: it has met the vehicle)
@@ -161,7 +179,7 @@ class AgentCore:
         was_in_charge = self.in_charge
         self._sense = sense
         if sense.attendant > self._incarnation:
-            self._command = None
+            self._command, self.wanted_motions = None, ()
             if not sense.caretaker:
                 return  # another process is in charge, and well: it is not for this one to drive
             self._incarnation = above(self._new_incarnation(), sense.attendant)
@@ -173,7 +191,9 @@ class AgentCore:
     def _act(self, sense: Sense) -> Iterator[Effect]:
         execution = self.execution
         assert execution is not None  # noqa: S101 (met the vehicle)
-        if self.in_charge:
+        in_charge = self.in_charge
+        self.wanted_motions = self._near if in_charge else ()
+        if in_charge:
             execution.on_joined(sense.joined)
             execution.on_noted(sense.accepted)
             self._decide(sense, execution)
@@ -190,8 +210,11 @@ class AgentCore:
             accepted=execution.wanted_accepted,
         )
         yield Send(COMMAND, self._command, self._own)
-        if self.in_charge:
+        if in_charge:
             yield self._show()
+            course = self._driver.motion(sense.tick)
+            if course is not None:
+                yield self._tell(course, sense.tick)
 
     def _take_note(self, sense: Sense) -> Iterator[Effect]:
         """Hear within a tick what the controller has noted for the process in charge."""
@@ -215,6 +238,7 @@ class AgentCore:
     def _meet_vehicle(self, sense: Sense) -> None:
         """V1: take over what the motion controller is doing."""
         self._formation, self._move = sense.formation, None
+        self._near = (sense.formation - 1, sense.formation, sense.formation + 1)
         self._driver.take_over(sense)
         self.execution = PlanExecution(
             vehicle=self.vehicle,
@@ -249,10 +273,22 @@ class AgentCore:
         state = execution.state(sense, self._formation or 0, attended=True)
         return Send(STATE, state, {"formation": self._formation, "vehicle": self.vehicle})
 
+    def _tell(self, course: Course, tick: int) -> Effect:
+        motion = Motion(
+            vehicle=self.vehicle,
+            incarnation=self._incarnation,
+            formation=self._formation or 0,
+            origin=course.origin,
+            target=course.target,
+            begin_tick=course.begin_tick,
+            tick=tick,
+        )
+        return Send(MOTION, motion, {"formation": self._formation, "vehicle": self.vehicle})
+
     def leave(self) -> Iterator[Effect]:
         """End: the vehicle is not on the road any more."""
         if not self.ended:
-            self.ended = True
+            self.ended, self.wanted_motions = True, ()
             yield self._report()
             for topic in (SENSE, PREPARE, PLAN):
                 yield Unlisten(topic, self._own)

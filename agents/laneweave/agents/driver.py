@@ -14,11 +14,12 @@ from typing import Protocol
 import numpy as np
 from attrs import frozen
 
+from laneweave.agents.motions import REPEAT_TICKS
 from laneweave.agents.surroundings import Surroundings
 from laneweave.agents.tracker import Tracker
 from laneweave.agents.trajectory import Reference
 from laneweave.protocol.lattice import Cell, Move
-from laneweave.protocol.messages import Sense
+from laneweave.protocol.messages import Motion, Sense
 from laneweave.protocol.motion import at_rest_in_cell, commanded_state
 from laneweave.protocol.scenario import Scenario
 
@@ -33,6 +34,15 @@ class Drive:
     jerks: bytes
     """Little-endian float32 pairs (along, across) in m/s3, one for each tick of the horizon; none
     when there is nothing better than what is being played."""
+
+
+@frozen
+class Course:
+    """A motion, as it is told to others."""
+
+    origin: Cell
+    target: Cell
+    begin_tick: int
 
 
 @frozen
@@ -59,6 +69,12 @@ class Driver(Protocol):
 
     def drive(self, sense: Sense, *, moving: bool) -> Drive:
         """Return what to play from this tick on."""
+
+    def motion(self, tick: int) -> Course | None:
+        """Return what to tell others at this tick of the motion under way; None: nothing."""
+
+    def hear(self, motion: Motion) -> None:
+        """Take what another vehicle says of its motion."""
 
     @property
     def effort(self) -> Effort:
@@ -129,6 +145,17 @@ class TrackingDriver:
             motion_origin=reference.origin,
             jerks=result.jerk.astype("<f4").tobytes() if result.usable else b"",
         )
+
+    def motion(self, tick: int) -> Course | None:
+        """Return the motion when it begins and now and then while it lasts."""
+        path = self._reference
+        if path is None or tick >= path.end_tick or (tick - path.start_tick) % REPEAT_TICKS:
+            return None
+        return Course(path.origin, self._goal, path.start_tick)
+
+    def hear(self, motion: Motion) -> None:
+        """Reckon with another vehicle's motion."""
+        self._surroundings.hear(motion)
 
     @property
     def _path(self) -> Reference:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from attrs import frozen
 
 from laneweave.agents.core import AgentCore
-from laneweave.protocol.messages import Census, Name, VehicleState
+from laneweave.protocol.messages import Census, Motion, Name, VehicleState
 from laneweave.protocol.node import (
     Arrived,
     Effect,
@@ -23,7 +23,7 @@ from laneweave.protocol.node import (
     Wakeup,
     Watch,
 )
-from laneweave.protocol.topics import BRIDGE_ALIVE, CENSUS, STATE, incarnation_of
+from laneweave.protocol.topics import BRIDGE_ALIVE, CENSUS, MOTION, STATE, Topic, incarnation_of
 
 ALONE_S = 60.0
 """Agents end when no bridge has been there for this long (node clock)."""
@@ -55,7 +55,12 @@ class AgentHost:
         self._shard = shard
         self._agents: dict[Name, AgentCore] = {name: make_agent(name) for name in vehicles}
         self._seen: set[Name] = set(self._agents)
-        self._formations: set[int] = set()
+        self._formations: dict[Topic, set[int]] = {MOTION: set(), STATE: set()}
+        """Those whose messages of a topic it listens to."""
+        self._near: list[tuple[int, ...]] = []
+        """Formations whose motions each vehicle wants, when that was looked at last."""
+        self._awaited: list[tuple[int, ...]] = []
+        """Likewise of states."""
         self._census_s = 0.0
         self._bridge = -1
         """Incarnation of the newest bridge."""
@@ -71,6 +76,9 @@ class AgentHost:
 
     def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
         """Take an event; see `Core`."""
+        if isinstance(event, Arrived) and isinstance(event.message, Motion):
+            self._on_motion(event.message)  # after which there is nothing else to listen to
+            return
         hosted = bool(self._agents)
         yield from self._on_event(event, now_s)
         yield from self._listen_to_formations()
@@ -109,6 +117,11 @@ class AgentHost:
                     yield from agent.handle(event, now_s)
         elif event.parameters.get("vehicle") in self._agents:
             yield from self._hand_on(event, Name(event.parameters["vehicle"]), now_s)
+
+    def _on_motion(self, motion: Motion) -> None:
+        for name, agent in self._agents.items():
+            if name != motion.vehicle and motion.formation in agent.wanted_motions:
+                agent.hear(motion)
 
     def _hand_to_all(self, event: Event, now_s: float) -> Iterator[Effect]:
         for agent in self._agents.values():
@@ -151,15 +164,25 @@ class AgentHost:
         self._seen = set(listed)
 
     def _listen_to_formations(self) -> Iterator[Effect]:
-        """Subscribe to the states that matter now, and only to those.
+        """Subscribe to the motions and states that matter now, and only to those.
 
-        They are most of the traffic, and most of the time nobody waits for anybody.
+        States are most of the traffic, and most of the time nobody waits for anybody.
         """
-        wanted = {number for agent in self._agents.values() for number in agent.wanted_states}
-        if wanted == self._formations:
-            return
-        for number in sorted(self._formations - wanted):
-            yield Unlisten(STATE, {"formation": number})
-        for number in sorted(wanted - self._formations):
-            yield Listen(STATE, {"formation": number})
-        self._formations = wanted
+        near, awaited = [], []
+        for agent in self._agents.values():
+            near.append(agent.wanted_motions)
+            awaited.append(agent.wanted_states)
+        if near != self._near:
+            self._near = near
+            yield from self._listen(MOTION, near)
+        if awaited != self._awaited:
+            self._awaited = awaited
+            yield from self._listen(STATE, awaited)
+
+    def _listen(self, topic: Topic, numbers: Iterable[Iterable[int]]) -> Iterator[Effect]:
+        before, wanted = self._formations[topic], {one for each in numbers for one in each}
+        for number in sorted(before - wanted):
+            yield Unlisten(topic, {"formation": number})
+        for number in sorted(wanted - before):
+            yield Listen(topic, {"formation": number})
+        self._formations[topic] = wanted

@@ -13,6 +13,7 @@ from laneweave.protocol.lattice import Cell, Move
 from laneweave.protocol.messages import (
     Ballot,
     Command,
+    Motion,
     Name,
     Prepare,
     Report,
@@ -60,6 +61,12 @@ class Passenger:
 
     def drive(self, sense: Sense, *, moving: bool) -> Drive:
         return Drive(sense.tick + 1 if moving else 0, HOME, b"")
+
+    def motion(self, tick: int) -> None:
+        """Tell others nothing."""
+
+    def hear(self, motion: Motion) -> None:
+        """Ignore others' motions."""
 
 
 class Seat:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from laneweave.agents.driver import Drive, Effort
 from laneweave.protocol.lattice import Cell, Move
-from laneweave.protocol.messages import Sense
+from laneweave.protocol.messages import Motion, Sense
 from laneweave.protocol.motion import at_rest_in_cell
 from laneweave.protocol.scenario import Scenario
 
@@ -49,3 +49,9 @@ class LightDriver:
         """Return when the motion under way ends, without jerks."""
         end_tick = max(self._end_tick, sense.tick + 1) if moving else 0
         return Drive(end_tick, self._origin, b"")
+
+    def motion(self, tick: int) -> None:
+        """Tell others nothing: nobody here has trajectories, and events are what a search costs."""
+
+    def hear(self, motion: Motion) -> None:
+        """Ignore others' motions."""
