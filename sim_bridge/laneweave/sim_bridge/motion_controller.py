@@ -48,8 +48,9 @@ MAX_COLUMN = 2**31 - 1
 
 
 RELEASE_M = 1.0
-"""An emergency is over when this much would be to spare. Were it nothing, the brake would be
-released at each favourable error of measurement, and these would add up."""
+"""An emergency is over when this much would be to spare beyond the way of a tick, which every tick of
+braking gains. Were it nothing, the brake would be released at each favourable error of measurement,
+and these would add up."""
 
 
 class Rung(IntEnum):
@@ -194,7 +195,8 @@ class MotionController:
         spare_m = self._brake.spare_m(
             self.measured, self.plant.setpoint[0], self._allowed(jerk), near
         )
-        if spare_m < (RELEASE_M if self.rung is Rung.EMERGENCY else 0.0):
+        release_m = RELEASE_M + self.measured[1] * self.tick_s
+        if spare_m < (release_m if self.rung is Rung.EMERGENCY else 0.0):
             rung = Rung.EMERGENCY
             # The body is not where the trajectory would have it any more.
             self._jerks = self._jerks[:0]
