@@ -48,9 +48,9 @@ MAX_COLUMN = 2**31 - 1
 
 
 RELEASE_M = 1.0
-"""An emergency is over when this much would be to spare beyond the way of a tick, which every tick of
-braking gains. Were it nothing, the brake would be released at each favourable error of measurement,
-and these would add up."""
+"""An emergency is over when this much would be to spare beyond the way of a tick, which every tick
+of braking gains. Were it nothing, the brake would be released at each favourable error of
+measurement, and these would add up."""
 
 
 class Rung(IntEnum):

@@ -138,7 +138,7 @@ def test_it_brakes_as_hard_as_it_can_whatever_it_is_told_to_play(track: Track) -
     first = rungs.index(Rung.EMERGENCY)
     assert set(rungs[:first]) <= {Rung.PLAY}
     assert Rung.PLAY not in rungs[first:]
-    assert rungs[first : first + 15] == [Rung.EMERGENCY] * 15
+    assert rungs[first : first + 12] == [Rung.EMERGENCY] * 12
     assert track.plant.min_accel_mps2 < -9.5
     assert track.plant.state[1] == pytest.approx(0.0, abs=0.01)
     assert track.gap_m > 0.2
