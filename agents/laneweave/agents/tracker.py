@@ -58,7 +58,7 @@ _GAP_WEIGHT = 10.0
 
 # A fixed rho leaves nothing behind but the warm start, so a reset is complete.
 SETTINGS = QPSettings(
-    eps_abs=3e-3,
+    eps_abs=6e-3,
     max_iter=100,
     check_termination=4,
     rho=0.1,
@@ -133,6 +133,8 @@ class Tracker:
         self._high.slip_right[:] = np.inf
         self._low.gap[:], self._high.gap[:] = -_FAR_M, _FAR_M
         self._gaps = NOBODY
+        self._stale = False
+        """Whether the fast path was taken since OSQP ran."""
         self._regulator = (
             Regulator(n, self._tick_s, self._limits.max_slip_ratio) if fast_path else None
         )
@@ -174,6 +176,7 @@ class Tracker:
             self._set_bounds(state, path, gaps)
             jerk = self._regulated(state, path)
             if jerk is not None:
+                self._stale = True
                 elapsed_ms = (time.thread_time() - start) * 1e3
                 return TrackResult(jerk, True, 0, elapsed_ms, 0.0)
             result = self._solve_program()
@@ -220,6 +223,10 @@ class Tracker:
         return self._cost, self._rows, self._low.all.copy(), self._high.all.copy()
 
     def _solve_program(self) -> QPResult:
+        if self._stale:
+            # A solution of another situation is a worse start than none.
+            self._qp.reset()
+            self._stale = False
         self._qp.update(self._low.all, self._high.all)
         return self._qp.solve()
 
