@@ -155,11 +155,11 @@ class Motions:
         """Return where somebody who is sensed now will be, if a motion tells it.
 
         Args:
-            lane: in which somebody is sensed.
+            lane: in which somebody is sensed; it counts.
             s_m: commanded position of the front bumper.
             speed_mps: commanded speed.
             lanes: the first and the last one that count.
-            nobody: stands for the position while it touches none of them.
+            nobody: stands for the position when it has left them.
 
         Returns:
             Commanded positions (N + 1,), the first one where it is sensed.
@@ -179,9 +179,7 @@ class Motions:
                 if (lane == origin and k < kind.left) or (lane == target and k >= kind.entered):
                     fronts: Array = kind.ways_m[k] + s_m
                     if not lanes[0] <= target <= lanes[1]:
-                        fronts[max(kind.left - k, 0) :] = nobody
-                    elif not lanes[0] <= origin <= lanes[1]:
-                        fronts[: max(kind.entered - k, 0)] = nobody
+                        fronts[kind.left - k :] = nobody
                     return fronts
         return None
 

@@ -111,10 +111,10 @@ class Surroundings:
             if first <= each.lane <= last or each.lane == lane
         ]
         s_m, speed_mps = state[0], state[1]
+        # Greatest now or at the end of prediction, since it cannot but bend upwards.
         near_ahead = [
             (front_m, other_mps)
             for _, front_m, other_mps in ahead
-            # Greatest now or at the end of prediction, since it cannot but bend upwards.
             if s_m + max((speed_mps - other_mps) * SENSED_S + self._gain_m, 0.0) > front_m
         ]
         near_behind = [

@@ -88,7 +88,8 @@ class TrackResult:
     """The plan of one tick."""
 
     jerk: Array
-    """Jerks (N, 2) from now on [m/s3], within the vehicle's limits; zero unless `usable`."""
+    """Jerks (N, 2) from now on [m/s3], within the vehicle's limits as far as the state allows; zero
+    unless `usable`."""
     usable: bool
     """Whether to drive by `jerk`; otherwise play the rest of the last good one."""
     iterations: int

@@ -13,7 +13,7 @@ that is solved once per kind of leg and process. Its jerks are integrated again,
 result is checked, whatever the solver said.
 
 States are commanded states (`protocol.motion`): the body follows them with its actuators' lag and
-is 0.1 m short of its cell when the time of the move is over, 0.03 m at the end of the slot (default
+is 0.1 m short of its cell when the time of the move is over, 0.04 m at the end of the slot (default
 lags). A move forwards closes up on whoever holds in the cell beyond its target. It keeps so far
 behind that the emergency brake (`protocol.braking`) need not act, with room for errors:
 
@@ -37,9 +37,10 @@ from attrs import frozen
 from numpy.typing import NDArray
 from scipy import sparse
 
-from laneweave.agents.qp import QPSettings, QuadraticProgram
+from laneweave.agents.qp import MAX_ITERATIONS, QPSettings, QuadraticProgram
 from laneweave.protocol.braking import (
     ERROR_SIGMAS,
+    last_tick_m,
     lead_way_m,
     own_braking_mps2,
     spare_error_m,
@@ -63,7 +64,7 @@ _CLOSING_SPEEDUP = 0.5
 _TANGENTS = 5
 _SETTINGS = QPSettings(
     eps_abs=1e-6,
-    max_iter=8000,
+    max_iter=40_000,
     check_termination=25,
     rho=0.3,
     alpha=1.8,
@@ -139,9 +140,10 @@ class Envelope:
         ticks = max(round(braking.reaction_s / scenario.runtime.tick_s), 1)
         lost_s = scenario.vehicle.actuator_lag_s + ticks * scenario.runtime.tick_s
         errors_m = ERROR_SIGMAS * spare_error_m(scenario, (1.0 + _CLOSING_SPEEDUP) * speed_mps)
-        kept_m = braking.margin_m + errors_m + _TRACKING_ERROR_M
+        brake_mps2, tick_s = own_braking_mps2(scenario), scenario.runtime.tick_s
+        kept_m = braking.margin_m + errors_m + _TRACKING_ERROR_M + last_tick_m(brake_mps2, tick_s)
         most_m = room_m + lead_way_m(scenario, speed_mps) - kept_m - lost_s * speed_mps
-        return cls(ticks, own_braking_mps2(scenario), most_m)
+        return cls(ticks, brake_mps2, most_m)
 
 
 def plan_trajectory(
@@ -353,9 +355,10 @@ def _leg(
         what += ", with room to brake behind whoever holds beyond"
     solution = program.solve()
     if not solution.usable:
+        out = solution.status == MAX_ITERATIONS
+        why = "out of iterations" if out else f"solver status {solution.status}"
         raise InfeasibleTrajectoryError(
-            f"{what}: no trajectory within {LIMIT_SHARE:.0%} of the vehicle's limits "
-            f"(solver status {solution.status})"
+            f"{what}: no trajectory within {LIMIT_SHARE:.0%} of the vehicle's limits ({why})"
         )
     jerks = solution.x[6 * ticks :].reshape(2, ticks).T / unit_s**3
     trajectory = _frozen(jerks, tick_s)

@@ -21,7 +21,7 @@ import math
 from collections.abc import Iterable
 
 from laneweave.protocol.messages import Neighbour
-from laneweave.protocol.motion import Jerk, State
+from laneweave.protocol.motion import Jerk, State, integrate
 from laneweave.protocol.scenario import Scenario
 
 ERROR_SIGMAS = 4.5
@@ -89,6 +89,14 @@ def spare_error_m(scenario: Scenario, speed_mps: float) -> float:
     )
 
 
+def last_tick_m(brake_mps2: float, tick_s: float) -> float:
+    """Return how much further a body goes at most because its last tick of braking is a whole one.
+
+    In that tick it brakes just so hard that it stands still at the end.
+    """
+    return brake_mps2 * tick_s * tick_s / 8.0
+
+
 class EmergencyBrake:
     """Decides when a vehicle brakes past everything else that it was told."""
 
@@ -98,7 +106,9 @@ class EmergencyBrake:
         self._brake_mps2 = own_braking_mps2(scenario)
         self._lag_s = limits.actuator_lag_s
         self._scenario = scenario
-        self._reaction_s = assumed.reaction_s
+        self._tick_s = scenario.runtime.tick_s
+        self._last_tick_m = last_tick_m(self._brake_mps2, self._tick_s)
+        self._later_s = max(assumed.reaction_s - self._tick_s, 0.0)
         self._margin_m = assumed.margin_m
 
     def spare_m(
@@ -128,16 +138,12 @@ class EmergencyBrake:
     def _own_way_m(self, state: State, setpoint_mps2: float, jerk_mps3: float) -> float:
         """Return how far it goes if it brakes after the time of reaction."""
         _, v, a, _, _, _ = state
-        lag_s, time_s = self._lag_s, self._reaction_s
         # The commanded state has no lag, and the body comes to rest where it does.
-        speed = v + lag_s * a + (setpoint_mps2 + jerk_mps3 * time_s / 2.0) * time_s
-        ahead_m = (
-            lag_s * v
-            + (v + lag_s * a + (setpoint_mps2 / 2.0 + jerk_mps3 * time_s / 6.0) * time_s) * time_s
-        )
+        commanded = (self._lag_s * v, v + self._lag_s * a, setpoint_mps2, 0.0, 0.0, 0.0)
+        after = integrate(commanded, (jerk_mps3, 0.0), self._tick_s)
+        ahead_m, speed, *_ = integrate(after, (0.0, 0.0), self._later_s)
         speed = max(speed, 0.0)
-        brake = self._brake_mps2
-        return ahead_m + speed * speed / (2.0 * brake)
+        return ahead_m + speed * speed / (2.0 * self._brake_mps2) + self._last_tick_m
 
 
 def least_pitch_m(scenario: Scenario) -> float:

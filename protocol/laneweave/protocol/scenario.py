@@ -199,7 +199,8 @@ class Braking:
     lead_lag_s: float = field(default=0.2, validator=within(0.0, 2.0))
     """Its brakes build up no faster than a first-order lag of this time constant does."""
     reaction_s: float = field(default=0.1, validator=within(0.01, 5.0))
-    """From what the sensors see to the set-point of the brakes; a tick or more."""
+    """From a look of the sensors to the set-point that follows from the next one: whole ticks, one
+    and what sensors and brakes need beside it (in this plant nothing)."""
     margin_m: float = field(default=0.3, validator=within(0.0, 10.0))
     """Net gap that is left when both stand still; errors of measurement come out of it."""
 

@@ -169,11 +169,13 @@ def _check_braking(scenario: Scenario) -> None:
     from laneweave.protocol.braking import least_pitch_m  # noqa: PLC0415
 
     reaction_s, tick_s = scenario.braking.reaction_s, scenario.runtime.tick_s
+    ticks = reaction_s / tick_s
     _require(
-        reaction_s >= tick_s,
+        ticks >= 1 - 1e-6 and abs(ticks - round(ticks)) < 1e-6,
         "braking.reaction_s",
         reaction_s,
-        f"at least runtime.tick_s = {tick_s:g}: a vehicle looks once in a tick",
+        f"a multiple of runtime.tick_s = {tick_s:g}, at least once it: a vehicle looks once in a "
+        "tick",
     )
     gap_m, least_m = scenario.formation.gap_m, least_pitch_m(scenario)
     _require(

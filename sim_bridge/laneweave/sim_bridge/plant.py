@@ -107,7 +107,7 @@ class Plant:
         now = (s, v, accel, y, v_y, a_y)
         _, allowed_y = limited_jerk(now, (0.0, jerk_y), self._limits, self._tick_s)
         self._move(now, (0.0, allowed_y))
-        if accel * self._tick_s <= -v:
+        if accel > self._limits.min_accel_mps2:
             self._setpoint = (0.0, self._setpoint[1])
         return self._state
 
@@ -133,7 +133,8 @@ class Plant:
         along = (along[0], max(along[1], 0.0), along[2])
         slip = limits.max_slip_ratio * along[1]
         if abs(across[1]) > slip:
-            # A body does not slide sideways, though its axes lag differently.
+            # A body does not slide sideways, though its axes lag differently; here the limit on
+            # lateral jerk gives way.
             across = (across[0], math.copysign(slip, across[1]), 0.0)
             setpoint = (setpoint[0], 0.0)
         self._state = (*along, *across)

@@ -160,6 +160,13 @@ def test_listens_to_the_formations_around_its_vehicles_while_they_are_in_charge(
     assert of_motions(put(host, B, 5, 2, charge=9)) == [(Unlisten, 4), (Unlisten, 5), (Unlisten, 6)]
 
 
+def test_who_has_left_wants_nothing_any_more() -> None:
+    rig = up_and_running()
+    assert rig.agent.wanted_motions == (-1, 0, 1)
+    rig.hand(SENSE, rig.sense(left=True))
+    assert not rig.agent.wanted_motions
+
+
 def test_hands_motions_to_all_but_the_sender_whose_formations_are_near() -> None:
     host = host_of(A, B, C)
     for vehicle, formation in ((A, 4), (B, 5), (C, 6)):
@@ -292,7 +299,8 @@ def test_a_motion_that_has_ended_or_was_not_repeated_does_not_count() -> None:
 def test_a_motion_that_comes_when_it_has_ended_does_not_count() -> None:
     """Also within the tick in which others were forgotten already."""
     tick = BEGIN + MOVE_TICKS
-    around, seen = hearing(motion(name=Name("third"))), neighbour(path(tick), 1, tick)
+    third = attrs.evolve(motion(name=Name("third")), begin_tick=tick, tick=tick)
+    around, seen = hearing(third), neighbour(path(tick), 1, tick)
     assert not beyond_sensing(around, tick, seen)
     around.hear(motion(tick=tick - 1))
     assert not beyond_sensing(around, tick, seen)
