@@ -21,6 +21,7 @@ def solve() -> None:
     from laneweave.protocol.motion import cell_state
     from laneweave.protocol.scenario import Scenario
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    signal.alarm(90)  # whoever started it may be gone
     scenario = Scenario()
     tracker, window = Tracker(scenario), Reference.hold(scenario, (3, 1)).window(0)
     s, *rest = cell_state(scenario.lattice, (3, 1), 0.0)
