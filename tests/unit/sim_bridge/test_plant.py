@@ -116,23 +116,28 @@ def test_a_body_at_rest_in_the_lattice_is_where_it_is_told_to_be() -> None:
 # --- limits ---------------------------------------------------------------------------------------
 
 
+SLIP_ROOM_MPS = 2.5
+
+
 @given(COMMANDS, LAGS, LAGS)
 @settings(max_examples=150, deadline=None)
 def test_limits_hold_whatever_is_commanded(
     commands: list[Jerk], lag_s: float, lateral_lag_s: float
 ) -> None:
     limits = evolve(LIMITS, actuator_lag_s=lag_s, lateral_actuator_lag_s=lateral_lag_s)
-    plant = Plant(CRUISE, limits, TICK_S)
+    plant, slid = Plant(CRUISE, limits, TICK_S), False
     for jerk in commands:
         before = plant.state
+        _, v, _, _, v_y, _ = commanded_state(before, plant.setpoint, limits, 0.0)
+        # With less room to the slip limit than any lateral motion needs to end, it may bind.
+        slid = slid or limits.max_slip_ratio * v - abs(v_y) < SLIP_ROOM_MPS
         after = plant.step(*jerk)
         assert after[0] >= before[0] - 1e-9
         assert within(after)
         assert not plant.in_emergency
         assert abs(after[2] - before[2]) <= LIMITS.max_jerk_mps3 * TICK_S + 1e-9
-        if abs(after[4]) < LIMITS.max_slip_ratio * after[1] - 1e-9:  # it would not slide
-            # Where the slip limit holds it back, the lateral jerk gives way a little.
-            assert abs(after[5] - before[5]) <= 1.1 * LIMITS.max_lateral_jerk_mps3 * TICK_S
+        if not slid:  # where the slip limit holds a body back, its lateral jerk gives way
+            assert abs(after[5] - before[5]) <= LIMITS.max_lateral_jerk_mps3 * TICK_S + 1e-9
     assert plant.max_jerk_mps3 <= LIMITS.max_jerk_mps3 + 1e-9
     assert LIMITS.min_accel_mps2 - 1e-9 <= plant.min_accel_mps2 <= 0.0
     assert 0.0 <= plant.max_accel_mps2 <= LIMITS.max_accel_mps2 + 1e-9
