@@ -107,7 +107,7 @@ class Plant:
         now = (s, v, accel, y, v_y, a_y)
         _, allowed_y = limited_jerk(now, (0.0, jerk_y), self._limits, self._tick_s)
         self._move(now, (0.0, allowed_y))
-        if accel > self._limits.min_accel_mps2:
+        if v + accel * self._tick_s <= 1e-9:
             self._setpoint = (0.0, self._setpoint[1])
         return self._state
 
@@ -129,8 +129,9 @@ class Plant:
             now[3:], commanded[3:], then[3:], jerk[1], limits.lateral_actuator_lag_s, tick_s
         )
         setpoint = (then[2], then[5])
-        # Rounding may leave a stopped vehicle rolling back by a hair.
-        along = (along[0], max(along[1], 0.0), along[2])
+        # Brakes hold a body, they do not push it back: not when they are released just before it
+        # stands still, nor by rounding.
+        along = (max(along[0], now[0]), max(along[1], 0.0), along[2])
         slip = limits.max_slip_ratio * along[1]
         if abs(across[1]) > slip:
             # A body does not slide sideways, though its axes lag differently; here the limit on
