@@ -73,8 +73,8 @@ class Surroundings:
         """Take sizes, limits and horizon from a scenario."""
         limits = scenario.vehicle
         self._motions = Motions(scenario)
-        self._lane_width_m = scenario.road.lane_width_m
-        self._half_width_m = limits.width_m / 2.0
+        self._lattice = scenario.lattice
+        self._width_m = limits.width_m
         self._length_m = limits.length_m
         self._lag_s = limits.actuator_lag_s
         self._speed_mps = scenario.formation.speed_mps
@@ -97,9 +97,7 @@ class Surroundings:
             state: commanded state of this vehicle.
             lane: the lane that it is in or enters.
         """
-        y_m = sense.state[3]
-        first = int((y_m - self._half_width_m) // self._lane_width_m)
-        last = int((y_m + self._half_width_m) // self._lane_width_m)
+        first, last = self._lattice.lanes_touched(sense.state[3], self._width_m)
         ahead = [
             self._seen(sense, each, _AHEAD)
             for each in sense.ahead

@@ -67,6 +67,11 @@ class Lattice:
         """Return the lateral position of a lane's centre line."""
         return (lane + 0.5) * self.lane_width_m
 
+    def lanes_touched(self, y_m: float, width_m: float) -> tuple[int, int]:
+        """Return the first and the last lane that a body of this width touches around `y_m`."""
+        half_m = 0.5 * width_m
+        return int((y_m - half_m) // self.lane_width_m), int((y_m + half_m) // self.lane_width_m)
+
     def passing_time_s(self, column: int, s_m: float = 0.0) -> float:
         """Return the road time at which a column passes position `s_m`."""
         return (s_m - column * self.pitch_m) / self.speed_mps

@@ -251,9 +251,7 @@ class MotionController:
 
     def _is_in_the_way(self, other: Neighbour) -> bool:
         """Tell whether somebody is on a lane that the body touches or that it steers for."""
-        y_m, half_m = self.measured[3], 0.5 * self._scenario.vehicle.width_m
-        width_m = self.lattice.lane_width_m
-        first, last = int((y_m - half_m) // width_m), int((y_m + half_m) // width_m)
+        first, last = self.lattice.lanes_touched(self.measured[3], self._scenario.vehicle.width_m)
         return first <= other.lane <= last or other.lane == self.hold_cell[1]
 
 
