@@ -16,6 +16,8 @@ import typer
 from rich.console import Console
 
 from laneweave.launch.logs import log_to_terminal
+from laneweave.launch.many_runs_commands import sweep
+from laneweave.launch.option_values import check_jobs, parse_seeds
 from laneweave.launch.role_commands import (
     METHOD,
     agent,
@@ -175,7 +177,7 @@ def plan(
     answer_request(request, deadline, connect, realm, solver.value, as_table=as_table, drawing=draw)
 
 
-for command in (router, ping, coordinator, agent, bridge):
+for command in (router, ping, coordinator, agent, bridge, sweep):
     app.command()(command)
 
 
@@ -205,7 +207,7 @@ def simulate(
     from laneweave.launch.simulation import profiles, search
 
     chosen = profiles.profile_named(profile)
-    numbers, count = search.parse_seeds(seeds), search.check_jobs(jobs)
+    numbers, count = parse_seeds(seeds), check_jobs(jobs)
     search.quiet_logs()
     show = not no_progress and sys.stderr.isatty()
     result = search.search(numbers, chosen, count, digest=digest, show=show)

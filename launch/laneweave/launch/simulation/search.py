@@ -6,8 +6,6 @@ import gc
 import hashlib
 import logging
 import multiprocessing
-import os
-import re
 import signal
 import sys
 from collections.abc import Iterator, Sequence
@@ -25,10 +23,8 @@ from laneweave.launch.simulation.checker import Violation
 from laneweave.launch.simulation.profiles import Profile
 from laneweave.launch.simulation.story import Story
 from laneweave.launch.simulation.world import Outcome, Totals, World
-from laneweave.protocol.errors import BadInputError, CommandFailedError
+from laneweave.protocol.errors import CommandFailedError
 
-MOST_SEEDS = 10_000_000
-MOST_JOBS = 256
 BATCH = 20
 """Seeds that a process takes at a time."""
 SHOWN_VIOLATIONS = 5
@@ -57,32 +53,6 @@ class Result:
         """One digest of all seeds."""
         lines = "".join(f"{seed} {digest}\n" for seed, digest in sorted(self.digests.items()))
         return hashlib.blake2b(lines.encode(), digest_size=16).hexdigest()
-
-
-def parse_seeds(text: str) -> range:
-    """Return the seeds of `A:B`, B excluded.
-
-    Raises:
-        BadInputError: it is no such range, an empty one or too long.
-    """
-    match = re.fullmatch(r"(\d{1,12}):(\d{1,12})", text)
-    seeds = range(int(match[1]), int(match[2])) if match else range(0)
-    if not 0 < len(seeds) <= MOST_SEEDS:
-        raise BadInputError("--seeds", text, f"A:B with A < B, at most {MOST_SEEDS} seeds")
-    return seeds
-
-
-def check_jobs(jobs: int | None) -> int:
-    """Return the number of processes to use; None: as many as there are cores.
-
-    Raises:
-        BadInputError: it is out of range.
-    """
-    if jobs is None:
-        return len(os.sched_getaffinity(0))
-    if not 1 <= jobs <= MOST_JOBS:
-        raise BadInputError("--jobs", jobs, f"[1, {MOST_JOBS}]")
-    return jobs
 
 
 def run_seeds(seeds: Sequence[int], profile: Profile, *, digest: bool = False) -> list[Outcome]:

@@ -11,13 +11,12 @@ from pathlib import Path
 import pytest
 from attrs import evolve
 
+from laneweave.launch.option_values import check_jobs, parse_seeds
 from laneweave.launch.simulation.checker import Violation
 from laneweave.launch.simulation.profiles import PROFILES
 from laneweave.launch.simulation.search import (
     Result,
-    check_jobs,
     describe,
-    parse_seeds,
     run_seeds,
     search,
     tell_story,

@@ -1,0 +1,89 @@
+"""The commands about many runs: `sweep`."""
+
+from __future__ import annotations
+
+import sys
+import time
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from laneweave.launch.option_values import KeepTrajectories, check_jobs, parse_seeds
+from laneweave.launch.sweep.methods import METHODS
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario import load_scenario
+
+VOLUMES = "1000,1150,1300,1450,1600"
+"""Those of the paper (Section 5.2.3), in vehicles/(lane h)."""
+
+
+def sweep(
+    scenario: Annotated[
+        Path | None, typer.Argument(metavar="[SCENARIO.toml]", help="Default: the paper's road.")
+    ] = None,
+    methods: Annotated[
+        str, typer.Option("--methods", metavar="LIST", help=f"Of {', '.join(METHODS)}.")
+    ] = "formation",
+    volumes: Annotated[
+        str, typer.Option("--volumes", metavar="LIST", help="Vehicles per lane and hour.")
+    ] = VOLUMES,
+    seeds: Annotated[
+        str, typer.Option("--seeds", metavar="A:B", help="Seeds to run; B is not included.")
+    ] = "1:4",
+    duration: Annotated[
+        float | None, typer.Option("--duration", help="Seconds during which vehicles arrive.")
+    ] = None,
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", metavar="N", help="Processes; default: all cores.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="DIR",
+            help="Default: a new folder in runs/. That of a sweep: goes on with it.",
+        ),
+    ] = None,
+    keep_trajectories: Annotated[
+        KeepTrajectories, typer.Option("--keep-trajectories", help="Of which runs.")
+    ] = KeepTrajectories.first_seed,
+    dask: Annotated[
+        str | None,
+        typer.Option("--dask", metavar="ADDRESS", help="Run on a Dask cluster: its scheduler."),
+    ] = None,
+    no_progress: Annotated[bool, typer.Option("--no-progress", help="Show no progress.")] = False,
+) -> None:
+    """Run methods x volumes x seeds in parallel, in virtual time; what is finished stays."""
+    from laneweave.launch.sweep.conduct import Runner, conduct, print_results
+    from laneweave.launch.sweep.folder import SweepFolder
+    from laneweave.launch.sweep.local_workers import run_locally
+    from laneweave.launch.sweep.methods import parse_methods
+    from laneweave.launch.sweep.points import parse_volumes, plan_points
+
+    base = load_scenario(scenario, demand__duration_s=duration)
+    points = plan_points(
+        base,
+        parse_methods(methods),
+        parse_volumes(volumes, base),
+        parse_seeds(seeds),
+        keep_trajectories,
+    )
+    run: Runner
+    if dask is None:
+        run = partial(run_locally, workers=check_jobs(jobs))
+    else:
+        if jobs is not None:
+            raise BadInputError("--jobs", jobs, "only without --dask; a cluster has workers")
+        from laneweave.launch.sweep.dask_workers import run_on_dask
+
+        run = partial(run_on_dask, address=dask)
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    with SweepFolder(out or Path("runs") / f"sweep-{stamp}") as folder:
+        folder.check_settings(base)
+        failed = conduct(points, folder, run, show=not no_progress)
+        print_results(points, folder, Console())
+    sys.stdout.flush()
+    raise typer.Exit(1 if failed else 0)

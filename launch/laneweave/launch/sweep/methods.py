@@ -1,0 +1,74 @@
+"""The labels of a sweep: each names a method and the settings that it is run with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+from attrs import field, frozen
+
+from laneweave.launch.role_commands import METHOD
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario import Scenario, parse_scenario, to_tables
+
+
+@frozen
+class LabelledMethod:
+    """A method with settings."""
+
+    method: str
+    """As `laneweave run --method` names it."""
+    meaning: str
+    overrides: Mapping[str, object] = field(factory=dict)
+    """`table.field` -> value, in place of the scenario's."""
+
+    def settings(self, base: Scenario) -> Scenario:
+        """Return a scenario with these settings.
+
+        Raises:
+            BadInputError: they do not fit the rest of the scenario.
+        """
+        tables = to_tables(base)
+        for name, value in self.overrides.items():
+            table, _, key = name.partition(".")
+            tables[table][key] = value
+        return parse_scenario(tables)
+
+
+def _paper(max_vehicles: int, block_columns: int) -> LabelledMethod:
+    """Return the paper's formations, of at most so many vehicles in so many columns."""
+    return LabelledMethod(
+        METHOD,
+        f"formations of at most {max_vehicles} vehicles in {block_columns} columns",
+        {"formation.max_vehicles": max_vehicles, "formation.block_columns": block_columns},
+    )
+
+
+METHODS: Final[dict[str, LabelledMethod]] = {
+    "formation": LabelledMethod(METHOD, "formation control as the scenario says"),
+    "paper-6": _paper(6, 4),
+    "paper-12": _paper(12, 8),
+    "paper-18": _paper(18, 12),
+}
+"""In the order in which tables and figures show them."""
+
+
+def parse_methods(text: str) -> tuple[str, ...]:
+    """Return the labels of a list with commas.
+
+    Raises:
+        BadInputError: a label is unknown or named twice.
+    """
+    labels = tuple(text.split(","))
+    for number, label in enumerate(labels):
+        if label not in METHODS:
+            raise BadInputError("--methods", label, "some of " + ", ".join(METHODS))
+        if label in labels[:number]:
+            raise BadInputError("--methods", text, f"{label} only once")
+    return labels
+
+
+def rank(label: str) -> tuple[int, str]:
+    """Return by what labels are sorted: their place in the table, unknown ones behind them."""
+    known = list(METHODS)
+    return (known.index(label) if label in METHODS else len(known), label)

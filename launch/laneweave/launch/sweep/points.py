@@ -1,0 +1,118 @@
+"""The points of a sweep: one run each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from attrs import evolve, frozen
+
+from laneweave.agents.trajectory import check_moves
+from laneweave.launch.option_values import KeepTrajectories
+from laneweave.launch.sweep.methods import METHODS
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario import Scenario, parse_scenario, to_tables
+
+MOST_POINTS = 100_000
+
+
+@frozen
+class Point:
+    """One run of a sweep."""
+
+    label: str
+    method: str
+    scenario: Scenario
+    keep_trajectories: bool
+
+    @property
+    def volume_veh_per_lane_h(self) -> float:
+        """The demand on each lane."""
+        return self.scenario.demand.volume_veh_per_lane_h
+
+    @property
+    def seed(self) -> int:
+        """The seed of everything random."""
+        return self.scenario.seed
+
+    @property
+    def name(self) -> str:
+        """Name of the point's folder."""
+        return f"{self.label}-{volume_text(self.volume_veh_per_lane_h)}-{self.seed}"
+
+
+def volume_text(volume_veh_per_lane_h: float) -> str:
+    """Return a volume as it stands in names."""
+    return f"{volume_veh_per_lane_h:.10g}"
+
+
+def parse_volumes(text: str, base: Scenario) -> tuple[float, ...]:
+    """Return the volumes of a list with commas, in vehicles/(lane h).
+
+    Raises:
+        BadInputError: one is not a number, not possible in this scenario, or named twice.
+    """
+    volumes: list[float] = []
+    for entry in text.split(","):
+        try:
+            volume = float(entry)
+        except ValueError:
+            raise BadInputError("--volumes", entry, "numbers with commas between") from None
+        try:
+            _with_volume(base, volume)
+        except BadInputError as error:
+            raise BadInputError("--volumes", entry, error.allowed) from error
+        if volume_text(volume) in map(volume_text, volumes):
+            raise BadInputError("--volumes", text, f"{volume_text(volume)} only once")
+        volumes.append(volume)
+    return tuple(volumes)
+
+
+def plan_points(
+    base: Scenario,
+    labels: Sequence[str],
+    volumes: Sequence[float],
+    seeds: Sequence[int],
+    keep: KeepTrajectories,
+) -> tuple[Point, ...]:
+    """Return all points, in the order in which they are run: a whole set for each seed.
+
+    Raises:
+        BadInputError: there are too many, or the settings of a label do not fit the scenario.
+    """
+    count = len(labels) * len(volumes) * len(seeds)
+    if count > MOST_POINTS:
+        raise BadInputError("--seeds", len(seeds), f"at most {MOST_POINTS} runs, not {count}")
+    return tuple(_points(base, labels, volumes, seeds, keep))
+
+
+def _points(
+    base: Scenario,
+    labels: Sequence[str],
+    volumes: Sequence[float],
+    seeds: Sequence[int],
+    keep: KeepTrajectories,
+) -> Iterator[Point]:
+    settings: dict[tuple[str, float], Scenario] = {}
+    for label in labels:
+        for volume in volumes:
+            try:
+                settings[label, volume] = _with_volume(METHODS[label].settings(base), volume)
+                check_moves(settings[label, volume])
+            except BadInputError as error:
+                raise BadInputError(
+                    f"{error.field} ({label})", error.value, error.allowed
+                ) from error
+    kept = {
+        KeepTrajectories.none: (),
+        KeepTrajectories.first_seed: seeds[:1],
+        KeepTrajectories.all: seeds,
+    }[keep]
+    for seed in seeds:
+        for (label, _), scenario in settings.items():
+            yield Point(label, METHODS[label].method, evolve(scenario, seed=seed), seed in kept)
+
+
+def _with_volume(scenario: Scenario, volume_veh_per_lane_h: float) -> Scenario:
+    tables = to_tables(scenario)
+    tables["demand"]["volume_veh_per_lane_h"] = volume_veh_per_lane_h
+    return parse_scenario(tables)

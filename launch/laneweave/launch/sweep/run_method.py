@@ -1,0 +1,30 @@
+"""A run with a method in this process, from its scenario to its outcome."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from laneweave.launch.outcome import Outcome
+from laneweave.launch.role_commands import METHOD
+from laneweave.launch.simulated_run import SimulatedRun
+from laneweave.protocol.scenario import Scenario
+
+
+def _run_formation(scenario: Scenario, folder: Path) -> Outcome:
+    return SimulatedRun(scenario, folder, METHOD, show_progress=False).run()
+
+
+_RUNS: Final[dict[str, Callable[[Scenario, Path], Outcome]]] = {METHOD: _run_formation}
+
+
+def run_method(scenario: Scenario, method: str, folder: Path) -> Outcome:
+    """Run a scenario with a method, repeatably: equal scenarios give equal trajectories.
+
+    Args:
+        scenario: what is run.
+        method: as `laneweave run --method` names it.
+        folder: where the run's files go.
+    """
+    return _RUNS[method](scenario, folder)

@@ -1,0 +1,120 @@
+"""Which points a sweep has, and which input is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from laneweave.launch import cli
+from laneweave.launch.option_values import KeepTrajectories
+from laneweave.launch.sweep.methods import METHODS, parse_methods, rank
+from laneweave.launch.sweep.points import parse_volumes, plan_points
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario import Scenario, load_scenario
+
+
+def test_points_are_named_by_label_volume_and_seed() -> None:
+    points = plan_points(
+        load_scenario(None, demand__duration_s=40.0),
+        ["formation", "paper-12"],
+        [1450.5],
+        range(7, 9),
+        KeepTrajectories.first_seed,
+    )
+    assert [(point.name, point.keep_trajectories) for point in points] == [
+        ("formation-1450.5-7", True),
+        ("paper-12-1450.5-7", True),
+        ("formation-1450.5-8", False),
+        ("paper-12-1450.5-8", False),
+    ]
+    for point in points:
+        assert point.scenario.demand.duration_s == 40.0
+        assert point.scenario.demand.volume_veh_per_lane_h == 1450.5
+        assert point.name.endswith(f"-{point.scenario.seed}")
+
+
+@pytest.mark.parametrize(
+    ("label", "columns", "vehicles"), [("paper-6", 4, 6), ("paper-12", 8, 12), ("paper-18", 12, 18)]
+)
+def test_labels_bring_their_settings(label: str, columns: int, vehicles: int) -> None:
+    base = load_scenario(None, formation__block_columns=6, formation__max_vehicles=4)
+    formation = METHODS[label].settings(base).formation
+    assert (formation.block_columns, formation.max_vehicles) == (columns, vehicles)
+    assert METHODS["formation"].settings(base) == base
+
+
+def test_labels_are_sorted_as_in_their_table() -> None:
+    labels = ["z", "paper-12", "a", "formation"]
+    assert sorted(labels, key=rank) == ["formation", "paper-12", "a", "z"]
+
+
+@pytest.mark.parametrize(
+    ("keep", "kept"),
+    [
+        (KeepTrajectories.none, [False, False]),
+        (KeepTrajectories.first_seed, [True, False]),
+        (KeepTrajectories.all, [True, True]),
+    ],
+)
+def test_kept_trajectories(keep: KeepTrajectories, kept: list[bool]) -> None:
+    points = plan_points(Scenario(), ["formation"], [1000.0], range(2), keep)
+    assert [point.keep_trajectories for point in points] == kept
+
+
+@pytest.mark.parametrize("text", ["", "magic", "formation,", "formation,formation"])
+def test_bad_methods(text: str) -> None:
+    with pytest.raises(BadInputError, match="--methods: got "):
+        parse_methods(text)
+
+
+@pytest.mark.parametrize("text", ["", "a", "1000,", "0", "-5", "5000", "nan", "inf", "1e3,1000"])
+def test_bad_volumes(text: str) -> None:
+    with pytest.raises(BadInputError, match="--volumes: got "):
+        parse_volumes(text, Scenario())
+
+
+def test_a_volume_that_does_not_fit_the_scenario() -> None:
+    base = load_scenario(None, demand__min_headway_s=3.0)
+    with pytest.raises(BadInputError, match="--volumes: got '1600'"):
+        parse_volumes("1000,1600", base)
+
+
+def test_a_label_that_does_not_fit_the_scenario() -> None:
+    base = load_scenario(None, road__s3_m=160.0)
+    with pytest.raises(BadInputError, match=r"road.s3_m \(paper-12\): got 160.0"):
+        plan_points(base, ["paper-12"], [1000.0], range(1), KeepTrajectories.none)
+
+
+def test_too_many_points() -> None:
+    with pytest.raises(BadInputError, match="at most 100000 runs, not 200000"):
+        plan_points(Scenario(), ["formation"], [1.0, 2.0], range(100_000), KeepTrajectories.none)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--methods", "magic"], "--methods: got 'magic'; allowed: some of formation"),
+        (["--volumes", "1000,x"], "--volumes: got 'x'; allowed: numbers with commas between"),
+        (["--seeds", "3"], "--seeds: got '3'; allowed: A:B with A < B"),
+        (["--jobs", "0"], "--jobs: got 0; allowed: [1, 256]"),
+        (["--duration", "0"], "demand.duration_s: got 0.0"),
+        (["--dask", "tcp://127.0.0.1:1", "--jobs", "2"], "--jobs: got 2; allowed: only without"),
+        (["--dask", "nonsense"], "--dask: got 'nonsense'; allowed: a Dask scheduler that answers"),
+        (["--out", "/dev/null/out"], "--out: got '/dev/null/out'"),
+        (["--keep-trajectories", "some"], "--keep-trajectories"),
+        (["missing.toml"], "missing.toml"),
+    ],
+)
+def test_one_line_says_what_is_wrong(
+    arguments: list[str],
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli._status(["sweep", *arguments]) == 2
+    shown = capsys.readouterr()
+    assert (shown.out, len(shown.err.splitlines())) == ("", 1)
+    assert said in shown.err

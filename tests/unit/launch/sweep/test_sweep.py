@@ -1,0 +1,146 @@
+"""Sweeps with real runs: what they leave, how they go on, what a failed run is."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import psutil
+import pyarrow.parquet as pq
+import pytest
+
+from unit.launch.sweep.sweeping import command, results, short_road, sweep
+
+LISTS = ("--volumes", "1200,1600", "--seeds", "1:3")
+
+
+@pytest.fixture(scope="module")
+def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return short_road(tmp_path_factory.mktemp("scenario"))
+
+
+@pytest.fixture(scope="module")
+def whole(scenario: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a sweep that nobody disturbed, with two processes."""
+    out = tmp_path_factory.mktemp("whole") / "sweep"
+    done = sweep(scenario, out, *LISTS, "--jobs", 2)
+    assert done.returncode == 0, done.stderr
+    assert len(done.stderr.splitlines()) == 4
+    return out
+
+
+def test_what_a_sweep_leaves(whole: Path) -> None:
+    rows = pq.read_table(whole / "results.parquet").to_pylist()
+    assert [(row["label"], row["volume_veh_per_lane_h"], row["seed"]) for row in rows] == [
+        ("formation", 1200.0, 1),
+        ("formation", 1200.0, 2),
+        ("formation", 1600.0, 1),
+        ("formation", 1600.0, 2),
+    ]
+    for row in rows:
+        folder = whole / f"formation-{row['volume_veh_per_lane_h']:g}-{row['seed']}"
+        summary = json.loads((folder / "summary.json").read_text())
+        assert (row["status"], row["reason"]) == ("done", "")
+        assert row["vehicles_left"] == summary["vehicles"]["left"] > 0
+        assert row["planning_solve_ms_p95"] == summary["planning"]["solve_ms"]["p95"]
+        assert row["travel_time_s_mean"] is summary["travel_time_s"]["mean"] is None
+        assert row["wall_s"] > row["runtime_wall_s"] > 0.0
+        kept = {"point.json", "summary.json", "trips.parquet"}
+        if row["seed"] == 1:
+            kept.add("trajectories.parquet")
+        assert {path.name for path in folder.iterdir()} == kept
+    assert {path.name for path in whole.iterdir() if path.is_file()} == {
+        "results.parquet",
+        "sweep.json",
+    }
+
+
+def test_a_sweep_that_is_ended_goes_on_where_it_was(
+    whole: Path, scenario: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "sweep"
+    process = subprocess.Popen(
+        command(scenario, out, *LISTS, "--jobs", 1),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stderr is not None
+    assert ": done in " in process.stderr.readline()
+    children = running_points(process.pid)
+    process.send_signal(signal.SIGTERM)
+    last_words = process.stderr.read()
+    assert process.wait(20) == 1
+    assert last_words.splitlines()[-1] == "interrupted"
+    assert not any(child.is_running() for child in children)
+    finished = sorted(path.name for path in out.iterdir() if path.is_dir())
+    assert 1 <= len(finished) < 4
+    assert len(results(out)) == len(finished)
+    times = {name: (out / name / "summary.json").stat().st_mtime_ns for name in finished}
+
+    done = sweep(scenario, out, *LISTS, "--jobs", 1)
+
+    assert done.returncode == 0, done.stderr
+    assert f"{len(finished)} of 4 runs were finished before" in done.stderr
+    for name, time_ns in times.items():
+        assert (out / name / "summary.json").stat().st_mtime_ns == time_ns
+    assert results(out) == results(whole)
+
+
+def running_points(sweep_pid: int) -> list[psutil.Process]:
+    """Return the processes of a sweep's points, once there are some."""
+    deadline = time.monotonic() + 20.0
+    while time.monotonic() < deadline:
+        children = psutil.Process(sweep_pid).children()
+        if children:
+            return children
+        time.sleep(0.02)
+    raise AssertionError("no point was started")
+
+
+def test_a_run_whose_process_dies_is_a_failed_row_and_tried_again(
+    scenario: Path, tmp_path: Path
+) -> None:
+    out, lists = tmp_path / "sweep", ("--volumes", "1200", "--seeds", "1:2")
+    process = subprocess.Popen(
+        command(scenario, out, *lists), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    running_points(process.pid)[0].kill()
+    shown, _ = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "FAILED: formation-1200-1: its process was ended by SIGKILL" in shown
+    (row,) = pq.read_table(out / "results.parquet").to_pylist()
+    assert (row["status"], row["reason"]) == ("failed", "its process was ended by SIGKILL")
+
+    assert sweep(scenario, out, *lists).returncode == 0
+    assert [row["status"] for row in results(out)] == ["done"]
+
+
+def test_a_run_that_breaks_a_promise_is_a_failed_row_with_its_numbers(tmp_path: Path) -> None:
+    scenario = short_road(tmp_path)
+    scenario.write_text(scenario.read_text() + "\n[runtime]\nmax_road_s = 8.0\n")
+    done = sweep(scenario, tmp_path / "sweep", "--volumes", "1600", "--seeds", "1:2")
+    assert done.returncode == 1
+    (row,) = results(tmp_path / "sweep")
+    assert row["status"] == "failed"
+    assert "the run is not complete: limit" in row["reason"]
+    assert row["vehicles_left"] < row["vehicles_demanded"]
+    assert (tmp_path / "sweep" / "formation-1600-1" / "log.txt").is_file()
+
+
+def test_other_settings_are_refused(whole: Path, scenario: Path) -> None:
+    refused = sweep(scenario, whole, *LISTS, "--duration", 7)
+    assert refused.returncode == 2
+    (line,) = refused.stderr.splitlines()
+    assert line.startswith("demand.duration_s: got 7.0; allowed: 8.0, as recorded in ")
+
+
+def test_other_folders_are_refused(scenario: Path, tmp_path: Path) -> None:
+    (tmp_path / "letter.txt").touch()
+    refused = sweep(scenario, tmp_path)
+    assert refused.returncode == 2
+    assert "allowed: a new or empty folder, or that of a sweep" in refused.stderr
+    assert {path.name for path in tmp_path.iterdir()} == {"letter.txt"}
