@@ -16,7 +16,7 @@ import typer
 from rich.console import Console
 
 from laneweave.launch.logs import log_to_terminal
-from laneweave.launch.many_runs_commands import sweep
+from laneweave.launch.many_runs_commands import report, sweep
 from laneweave.launch.option_values import check_jobs, parse_seeds
 from laneweave.launch.role_commands import (
     METHOD,
@@ -27,7 +27,7 @@ from laneweave.launch.role_commands import (
     ping,
     router,
 )
-from laneweave.launch.run_folder import draw, draw_own, new_folder
+from laneweave.launch.run_folder import draw_own, new_folder
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
 from laneweave.protocol.scenario import load_scenario
 
@@ -177,7 +177,7 @@ def plan(
     answer_request(request, deadline, connect, realm, solver.value, as_table=as_table, drawing=draw)
 
 
-for command in (router, ping, coordinator, agent, bridge, sweep):
+for command in (router, ping, coordinator, agent, bridge, sweep, report):
     app.command()(command)
 
 
@@ -220,26 +220,6 @@ def simulate(
     for line in search.describe(result, chosen):
         typer.echo(line)
     raise typer.Exit(1 if result.failed else 0)
-
-
-@app.command()
-def report(
-    folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Folders of runs.")],
-) -> None:
-    """Draw the pictures of finished runs again."""
-    for folder in folders:
-        if not (folder / "trajectories.parquet").is_file():
-            raise BadInputError(
-                "DIR", str(folder), "the folder of a run, with trajectories.parquet"
-            )
-    for folder in folders:
-        try:
-            draw(folder)
-        except (OSError, ValueError, KeyError) as error:
-            raise BadInputError(
-                "DIR", str(folder), f"the folder of a finished run ({error})"
-            ) from error
-        Console().print(f"{folder}: drawn", highlight=False)
 
 
 @app.command()

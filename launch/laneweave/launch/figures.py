@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
+from attrs import frozen
+from numpy.typing import NDArray
 
 from laneweave.launch.drawing import DPI, FAINT_INK, INK, new_figure, save, scenario_of
+from laneweave.protocol.scenario import Scenario
+
+Floats = NDArray[np.float64]
 
 
 def travel_time_boxplot(folders: Sequence[Path], out: Path, *, dpi: int = DPI) -> None:
@@ -92,27 +98,17 @@ def speed_heatmap(
         bin_s: length of a bin in time.
         dpi: resolution in dots per inch.
     """
-    path = folder / "trajectories.parquet"
-    scenario = scenario_of(path)
-    table = pq.read_table(path, columns=["t_s", "s_m", "speed_mps"])
-    t_s, s_m, speed = (table[name].to_numpy().astype(np.float64) for name in table.column_names)
-    end_s = float(t_s.max(initial=0.0))
-    edges_t = np.arange(0.0, end_s + bin_s, bin_s) if end_s > 0.0 else np.array([0.0, bin_s])
-    edges_s = np.linspace(
-        0.0, scenario.road.length_m, max(1, round(scenario.road.length_m / bin_m)) + 1
-    )
-    count, _, _ = np.histogram2d(s_m, t_s, bins=[edges_s, edges_t])
-    total, _, _ = np.histogram2d(s_m, t_s, bins=[edges_s, edges_t], weights=speed)
-    mean = np.ma.masked_invalid(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+    scenario = scenario_of(folder / "trajectories.parquet")
+    speeds = mean_speeds(folder, bin_m=bin_m, bin_s=bin_s)
     figure = new_figure(7.2, 3.4)
     axes = figure.subplots()
     mesh = axes.pcolormesh(
-        edges_t,
-        edges_s,
-        mean,
+        speeds.edges_s,
+        speeds.edges_m,
+        speeds.speed_mps,
         cmap="inferno",
         vmin=0.0,
-        vmax=max(1.2 * scenario.formation.speed_mps, float(mean.max()) if mean.count() else 0.0),
+        vmax=speed_ceiling_mps(scenario, speeds),
         rasterized=True,
     )
     axes.axhline(scenario.road.sorting_start_m, color="white", linewidth=0.8, linestyle="--")
@@ -132,3 +128,42 @@ def speed_heatmap(
     axes.set_ylabel("position on the road (m)")
     figure.colorbar(mesh, ax=axes, label="mean speed (m/s)", pad=0.015)
     save(figure, out, dpi)
+
+
+@frozen
+class MeanSpeeds:
+    """Mean speeds over road and time."""
+
+    edges_m: Floats
+    """Of the bins along the road."""
+    edges_s: Floats
+    """Of the bins in time."""
+    speed_mps: np.ma.MaskedArray[Any, np.dtype[np.float64]]
+    """Shape (bins along the road, bins in time); masked where no vehicle was."""
+
+
+def mean_speeds(folder: Path, *, bin_m: float = 20.0, bin_s: float = 5.0) -> MeanSpeeds:
+    """Return the mean speed over road and time.
+
+    Args:
+        folder: a run's folder.
+        bin_m: length of a bin along the road.
+        bin_s: length of a bin in time.
+    """
+    path = folder / "trajectories.parquet"
+    length_m = scenario_of(path).road.length_m
+    table = pq.read_table(path, columns=["t_s", "s_m", "speed_mps"])
+    t_s, s_m, speed = (table[name].to_numpy().astype(np.float64) for name in table.column_names)
+    end_s = float(t_s.max(initial=0.0))
+    edges_s = np.arange(0.0, end_s + bin_s, bin_s) if end_s > 0.0 else np.array([0.0, bin_s])
+    edges_m = np.linspace(0.0, length_m, max(1, round(length_m / bin_m)) + 1)
+    count, _, _ = np.histogram2d(s_m, t_s, bins=[edges_m, edges_s])
+    total, _, _ = np.histogram2d(s_m, t_s, bins=[edges_m, edges_s], weights=speed)
+    mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    return MeanSpeeds(edges_m, edges_s, np.ma.masked_invalid(mean))
+
+
+def speed_ceiling_mps(scenario: Scenario, speeds: MeanSpeeds) -> float:
+    """Return the upper end of a colour scale for speeds."""
+    found = float(speeds.speed_mps.max()) if speeds.speed_mps.count() else 0.0
+    return max(1.2 * scenario.formation.speed_mps, found)

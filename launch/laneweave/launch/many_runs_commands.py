@@ -1,4 +1,4 @@
-"""The commands about many runs: `sweep`."""
+"""The commands about many runs: `sweep` makes them, `report` shows them."""
 
 from __future__ import annotations
 
@@ -87,3 +87,46 @@ def sweep(
         print_results(points, folder, Console())
     sys.stdout.flush()
     raise typer.Exit(1 if failed else 0)
+
+
+def report(
+    folders: Annotated[
+        list[Path], typer.Argument(metavar="DIR...", help="Folders of runs and sweeps.")
+    ],
+    formation: Annotated[
+        int | None,
+        typer.Option("--formation", metavar="N", help="Whose path map; default: moves most."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="DIR",
+            help="Where several folders are compared; default: a new folder in runs/.",
+        ),
+    ] = None,
+) -> None:
+    """Draw finished runs: figures and one page for each run, or for a sweep as a whole."""
+    from laneweave.launch.report.make import REPORT_DPI, report_comparison, report_run
+    from laneweave.launch.report.runs import Comparison, is_sweep, runs_of, single_run
+
+    if out is not None and len(folders) == 1:
+        raise BadInputError("--out", str(out), "only with several folders")
+    runs = list(runs_of(folders))
+    try:
+        for folder in folders:
+            if not is_sweep(folder):
+                page = report_run(single_run(folder), formation=formation, dpi=REPORT_DPI)
+                Console().print(f"{page}: written", highlight=False, soft_wrap=True)
+        if len(folders) > 1 or is_sweep(folders[0]):
+            if len(folders) == 1:
+                out = folders[0]
+            place = out or Path("runs") / f"report-{time.strftime('%Y%m%d-%H%M%S')}"
+            title = "laneweave: " + ", ".join(folder.resolve().name for folder in folders)
+            page = report_comparison(Comparison.of(runs), place, title, formation=formation)
+            Console().print(f"{page}: written", highlight=False, soft_wrap=True)
+    except BadInputError:
+        raise
+    except (OSError, ValueError, KeyError) as error:
+        names = ", ".join(map(str, folders))
+        raise BadInputError("DIR", names, f"folders of finished runs ({error})") from error

@@ -87,14 +87,15 @@ def print_outcome(outcome: Outcome, console: Console) -> None:
         table = Table(title=f"laneweave run: {outcome.folder}", show_header=False)
         table.add_column()
         table.add_column(justify="right")
-        for label, value in _rows(summary):
+        for label, value in summary_rows(summary):
             table.add_row(label, value)
         console.print(table)
     for problem in outcome.problems:
         console.print(f"FAILED: {problem}", style="bold red", highlight=False)
 
 
-def _rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
+def summary_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return what a run's table says, row by row: (what, value)."""
     return [*_traffic_rows(summary), *_control_rows(summary), *_fault_rows(summary)]
 
 

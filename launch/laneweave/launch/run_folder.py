@@ -1,4 +1,4 @@
-"""The folder of a run: a new one, and the pictures in it."""
+"""The folder of a run: a new one, and the report in it."""
 
 from __future__ import annotations
 
@@ -37,28 +37,16 @@ def new_folder(out: Path | None, settings: Scenario, method: str) -> Path:
     return out
 
 
-def draw(folder: Path) -> None:
-    """Draw the pictures of a run.
-
-    Raises:
-        OSError: a file cannot be read or written.
-        ValueError, KeyError: it is not the folder of a finished run.
-    """
-    from laneweave.launch.figures import speed_heatmap, travel_time_boxplot
-    from laneweave.launch.snapshots import road_snapshots
-
-    travel_time_boxplot([folder], folder / "travel_time.png")
-    speed_heatmap(folder, folder / "speed.png")
-    road_snapshots(folder, folder / "road.png")
-
-
 def draw_own(folder: Path) -> None:
-    """Draw the pictures of the run that has just ended.
+    """Draw the pictures and write the page of the run that has just ended.
 
     Raises:
         CommandFailedError: they cannot be written.
     """
+    from laneweave.launch.report.make import report_run
+    from laneweave.launch.report.runs import single_run
+
     try:
-        draw(folder)
+        report_run(single_run(folder))
     except OSError as error:
         raise CommandFailedError(f"{folder}: pictures not drawn: {error}") from error

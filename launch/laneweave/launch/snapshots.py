@@ -37,9 +37,9 @@ _ACROSS_SCALE = 1.8
 """Roads are drawn this much wider than they are, or their lanes would be threads."""
 _HEADROOM_M = 4.5
 """Room above the road for the numbers of formations."""
-_SPEED_SPAN_MPS = 5.0
+SPEED_SPAN_MPS = 5.0
 """Speeds this far below or above the lattice's have the darkest and lightest shade."""
-_SHADE_STRENGTH = 0.45
+SHADE_STRENGTH = 0.45
 
 
 @attrs.frozen
@@ -218,7 +218,7 @@ def _draw_legend(figure: Figure, scenario: Scenario) -> None:
 
     speed_mps = scenario.formation.speed_mps
     colours = lane_colours(scenario.road.lanes)
-    names = _lane_names(scenario.road.lanes)
+    names = lane_names(scenario.road.lanes)
     handles = [
         Patch(facecolor=colours[lane], edgecolor=INK, linewidth=0.5, label=f"prefers {names[lane]}")
         for lane in reversed(range(scenario.road.lanes))
@@ -226,7 +226,7 @@ def _draw_legend(figure: Figure, scenario: Scenario) -> None:
     for sign, word in ((-1, "slower"), (1, "faster")):
         handles.append(
             Patch(
-                facecolor=_shade("#8a8f96", sign * _SPEED_SPAN_MPS),
+                facecolor=_shade("#8a8f96", sign * SPEED_SPAN_MPS),
                 edgecolor=INK,
                 linewidth=0.5,
                 label=f"{word} than {speed_mps:g} m/s",
@@ -243,7 +243,7 @@ def _draw_legend(figure: Figure, scenario: Scenario) -> None:
     )
 
 
-def _lane_names(lanes: int) -> tuple[str, ...]:
+def lane_names(lanes: int) -> tuple[str, ...]:
     """Return what people call the lanes, from the right."""
     if lanes == 1:
         return ("the lane",)
@@ -258,9 +258,9 @@ def _shade(colour: str, over_mps: float) -> tuple[float, float, float]:
     """Return a colour, darker below the lattice's speed and lighter above it."""
     from matplotlib.colors import to_rgb  # noqa: PLC0415 - lazily, see above
 
-    share = float(np.clip(over_mps / _SPEED_SPAN_MPS, -1.0, 1.0))
+    share = float(np.clip(over_mps / SPEED_SPAN_MPS, -1.0, 1.0))
     end = 1.0 if share > 0.0 else 0.0
-    strength = _SHADE_STRENGTH * abs(share)
+    strength = SHADE_STRENGTH * abs(share)
     mixed = [(1.0 - strength) * part + strength * end for part in to_rgb(colour)]
     return (mixed[0], mixed[1], mixed[2])
 

@@ -1,0 +1,233 @@
+"""Figures with the labels side by side: travel times, throughput and shares, speeds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from laneweave.launch.drawing import FAINT_INK, INK, new_figure, save
+from laneweave.launch.figures import Floats, mean_speeds, speed_ceiling_mps
+from laneweave.launch.report.runs import Comparison, Run
+from laneweave.launch.report.styling import (
+    label_colours,
+    legend_above,
+    note,
+    plain,
+    spread_evenly,
+    volume_title,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+def draw_travel_times(comparison: Comparison, out: Path, dpi: int) -> None:
+    """Draw boxes of the counted vehicles' travel times, all seeds together, by volume."""
+    from matplotlib.patches import Patch  # noqa: PLC0415 - lazily
+
+    labels, volumes = comparison.labels, comparison.volumes
+    colours = label_colours(labels)
+    figure = new_figure(max(5.6, 1.6 + 0.42 * len(volumes) * (len(labels) + 0.8)), 3.9)
+    axes = figure.subplots()
+    _draw_free_flow(axes, comparison)
+    width = 0.8 / len(labels)
+    for number, label in enumerate(labels):
+        times = [_travel_times(comparison.at(label, volume)) for volume in volumes]
+        places = np.arange(len(volumes)) + (number - 0.5 * (len(labels) - 1)) * width
+        axes.boxplot(
+            times,
+            positions=places,
+            widths=0.72 * width,
+            manage_ticks=False,
+            patch_artist=True,
+            boxprops={"facecolor": colours[label] + "55", "edgecolor": colours[label]},
+            medianprops={"color": INK, "linewidth": 1.2},
+            whiskerprops={"color": colours[label]},
+            capprops={"color": colours[label]},
+            flierprops={"marker": ".", "markersize": 2.5, "markeredgecolor": colours[label]},
+        )
+        means = [float(np.mean(one)) if len(one) else np.nan for one in times]
+        axes.plot(
+            places, means, color=colours[label], marker="o", markersize=3.5, linewidth=1.3, zorder=3
+        )
+        for place, one in zip(places, times, strict=True):
+            if not len(one):
+                axes.text(
+                    place,
+                    0.03,
+                    "no vehicle",
+                    transform=axes.get_xaxis_transform(),
+                    rotation=90,
+                    ha="center",
+                    va="bottom",
+                    fontsize=7,
+                    color=FAINT_INK,
+                )
+    axes.set_xticks(range(len(volumes)), labels=[f"{volume:g}" for volume in volumes])
+    axes.set_xlim(-0.6, len(volumes) - 0.4)
+    axes.set_xlabel("traffic volume (veh/(lane·h))")
+    axes.set_ylabel("travel time (s)")
+    plain(axes, grid="y")
+    handles = [Patch(facecolor=colours[one] + "55", edgecolor=colours[one]) for one in labels]
+    legend_above(figure, handles, labels)
+    save(figure, out, dpi)
+
+
+def _draw_free_flow(axes: Axes, comparison: Comparison) -> None:
+    times_s = {
+        run.scenario.road.length_m / run.scenario.formation.speed_mps for run in comparison.runs
+    }
+    for t_s in sorted(times_s):
+        axes.axhline(t_s, color="#8a9099", linewidth=1.0, linestyle="--", zorder=0)
+        axes.annotate(
+            f"free flow\n{t_s:.1f} s",
+            (1.0, t_s),
+            xycoords=("axes fraction", "data"),
+            xytext=(4, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=7.5,
+            color=FAINT_INK,
+            annotation_clip=False,
+        )
+
+
+def _travel_times(runs: tuple[Run, ...]) -> Floats:
+    """Return the travel times in s of the counted vehicles."""
+    found = [np.empty(0)]
+    for run in runs:
+        table = pq.read_table(run.folder / "trips.parquet", columns=["travel_time_s", "counted"])
+        counted = table.filter(pc.field("counted"))["travel_time_s"].drop_null()
+        found.append(counted.to_numpy().astype(np.float64))
+    return np.concatenate(found)
+
+
+def draw_flows(comparison: Comparison, out: Path, dpi: int) -> None:
+    """Draw throughput and the share on the preferred lane against the demand."""
+    figure = new_figure(9.2, 3.7)
+    left, right = figure.subplots(1, 2)
+    volumes = np.array(comparison.volumes)
+    margin = 0.06 * (float(np.ptp(volumes)) or 400.0)
+    span = np.array([volumes[0] - margin, volumes[-1] + margin])
+    left.plot(span, span, color="#8a9099", linewidth=1.0, linestyle="--", zorder=0)
+    left.annotate(
+        "dashed: throughput = demand",
+        (0.97, 0.04),
+        xycoords="axes fraction",
+        ha="right",
+        fontsize=7.5,
+        color=FAINT_INK,
+    )
+    left.set_ylabel("throughput (veh/(lane·h))")
+    _draw_seeds(left, comparison, _throughput)
+    right.set_ylabel("left on the preferred lane (%)")
+    _draw_seeds(right, comparison, preferred_share)
+    low = right.get_ylim()[0]
+    right.set_ylim(min(low, 95.0), 100.0 + 0.04 * (100.0 - min(low, 95.0)))
+    for axes in (left, right):
+        axes.set_xlabel("traffic volume (veh/(lane·h))")
+        axes.set_xlim(*span)
+        axes.set_xticks(volumes if len(volumes) <= 8 else volumes[:: 1 + len(volumes) // 8])
+        plain(axes)
+    handles, labels = right.get_legend_handles_labels()
+    if handles:
+        legend_above(figure, handles, labels)
+    save(figure, out, dpi)
+
+
+def _draw_seeds(axes: Axes, comparison: Comparison, value: Callable[[Run], float | None]) -> None:
+    """Draw each run as a dot, and the mean over seeds with its standard deviation as a line."""
+    colours = label_colours(comparison.labels)
+    shown = False
+    volumes = np.array(comparison.volumes)
+    apart = 0.012 * (float(np.ptp(volumes)) or 400.0)
+    for number, label in enumerate(comparison.labels):
+        # Side by side, where several labels have the same value.
+        places = volumes + (number - 0.5 * (len(comparison.labels) - 1)) * apart
+        means, spreads = [], []
+        for place, volume in zip(places, comparison.volumes, strict=True):
+            found = [value(run) for run in comparison.at(label, volume)]
+            values = np.array([one for one in found if one is not None])
+            means.append(values.mean() if len(values) else np.nan)
+            spreads.append(values.std(ddof=1) if len(values) > 1 else 0.0)
+            axes.plot(
+                [place] * len(values), values, ".", color=colours[label], markersize=4, alpha=0.45
+            )
+            shown = shown or len(values) > 0
+        axes.errorbar(
+            places,
+            means,
+            yerr=spreads,
+            color=colours[label],
+            label=label,
+            marker="o",
+            markersize=4.5,
+            linewidth=1.5,
+            capsize=3,
+        )
+    if not shown:
+        note(axes, "runs too short to count vehicles")
+
+
+def _throughput(run: Run) -> float | None:
+    value = run.summary["throughput_veh_per_lane_h"]
+    return None if value is None else float(value)
+
+
+def preferred_share(run: Run) -> float | None:
+    """Return the share in % of those who left that left on the lane that they prefer."""
+    vehicles = run.summary["vehicles"]
+    return 100.0 * vehicles["on_preferred_lane"] / vehicles["left"] if vehicles["left"] else None
+
+
+def draw_speeds(comparison: Comparison, out: Path, dpi: int) -> None:
+    """Draw the mean speed over space and time, a panel for each label and volume."""
+    labels, volumes = comparison.labels, spread_evenly(comparison.volumes)
+    shown = {
+        (label, volume): comparison.shown(label, volume) for label in labels for volume in volumes
+    }
+    maps = {key: mean_speeds(run.folder) for key, run in shown.items() if run is not None}
+    last_s = max(one.edges_s[-1] for one in maps.values())
+    last_m = max(one.edges_m[-1] for one in maps.values())
+    top_mps = max(speed_ceiling_mps(run.scenario, maps[key]) for key, run in shown.items() if run)
+    figure = new_figure(1.5 + 2.05 * max(2, len(volumes)), 0.75 + 1.75 * len(labels))
+    panels = figure.subplots(len(labels), len(volumes), sharex=True, sharey=True, squeeze=False)
+    mesh = None
+    for row, label in enumerate(labels):
+        for column, volume in enumerate(volumes):
+            axes, run = panels[row, column], shown[label, volume]
+            axes.set_xlim(0.0, last_s)
+            axes.set_ylim(0.0, last_m)
+            axes.set_facecolor("#f2f3f5")
+            axes.tick_params(colors=INK, labelsize=7.5, length=2.5)
+            if row == 0:
+                axes.set_title(volume_title(volume), fontsize=9, color=INK)
+            if column == 0:
+                axes.set_ylabel(label, fontsize=9, color=INK, fontweight="bold")
+            if run is None:
+                note(axes, "no trajectories")
+                continue
+            one = maps[label, volume]
+            mesh = axes.pcolormesh(
+                one.edges_s,
+                one.edges_m,
+                one.speed_mps,
+                cmap="inferno",
+                vmin=0.0,
+                vmax=top_mps,
+                rasterized=True,
+            )
+            start_m = run.scenario.road.sorting_start_m
+            axes.axhline(start_m, color="white", linewidth=0.7, linestyle="--")
+    figure.supxlabel("time (s)", fontsize=9, color=INK)
+    figure.supylabel("position on the road (m)", fontsize=9, color=INK)
+    if mesh is not None:
+        bar = figure.colorbar(mesh, ax=panels, pad=0.012, aspect=22 * len(labels), fraction=0.03)
+        bar.set_label("mean speed (m/s)", fontsize=9, color=INK)
+        bar.ax.tick_params(labelsize=7.5)
+    save(figure, out, dpi)

@@ -1,0 +1,116 @@
+"use strict";
+// The moving road. Data: laneweave/launch/report/animation.py. Times in s, lengths in m.
+
+const laneweave = (() => {
+  /** Whole numbers of `bytes` bytes each, little-endian, from base64. */
+  function unpack(text, bytes) {
+    const raw = Uint8Array.from(atob(text), (char) => char.charCodeAt(0));
+    if (bytes === 1) return raw;
+    const view = new DataView(raw.buffer);
+    return Uint16Array.from({ length: raw.length / 2 }, (_, i) => view.getUint16(2 * i, true));
+  }
+
+  /** A run that can be asked where everybody is. */
+  function decode(data) {
+    let offset = 0;
+    const vehicles = data.vehicles.map((vehicle) => {
+      const placed = { ...vehicle, offset };
+      offset += vehicle.count;
+      return placed;
+    });
+    return {
+      ...data,
+      vehicles,
+      s: unpack(data.columns.s_m, 2),
+      y: unpack(data.columns.y_m, 2),
+      v: unpack(data.columns.speed_mps, 1),
+    };
+  }
+
+  /** Where a vehicle is: {s, y, v, slope}, null when it is not on the road. */
+  function stateAt(run, vehicle, t) {
+    const place = t / run.step_s - vehicle.first;
+    if (place < -1e-9 || place > vehicle.count - 1 + 1e-9) return null;
+    const here = Math.min(Math.max(Math.floor(place), 0), Math.max(vehicle.count - 2, 0));
+    const share = vehicle.count > 1 ? place - here : 0;
+    const a = vehicle.offset + here;
+    const b = vehicle.count > 1 ? a + 1 : a;
+    const mix = (column) => column[a] + share * (column[b] - column[a]);
+    const ds = (run.s[b] - run.s[a]) * run.units.s_m;
+    const dy = (run.y[b] - run.y[a]) * run.units.y_m;
+    return {
+      s: mix(run.s) * run.units.s_m,
+      y: mix(run.y) * run.units.y_m,
+      v: mix(run.v) * run.units.speed_mps,
+      slope: ds > 0.05 ? dy / ds : 0,
+    };
+  }
+
+  /** Everybody on the road: [[vehicle, state], ...]. */
+  function allAt(run, t) {
+    const found = [];
+    for (const vehicle of run.vehicles) {
+      if (vehicle.first * run.step_s > t + run.step_s) break; // in order of entry
+      const state = stateAt(run, vehicle, t);
+      if (state) found.push([vehicle, state]);
+    }
+    return found;
+  }
+
+  /** A colour, darker below the lattice's speed and lighter above it. */
+  function shade(colour, over, span, strength) {
+    const share = Math.max(-1, Math.min(1, over / span));
+    const end = share > 0 ? 255 : 0;
+    const part = strength * Math.abs(share);
+    const mixed = [1, 3, 5].map((i) => {
+      const value = parseInt(colour.slice(i, i + 2), 16);
+      return Math.round((1 - part) * value + part * end);
+    });
+    return `rgb(${mixed.join(",")})`;
+  }
+
+  /** Middle of a formation's block of columns at a time, on the road or not. */
+  function blockCentre(run, formation, t) {
+    const width = run.lattice.block_columns;
+    const column = -formation * width - (width - 1) / 2;
+    return run.lattice.speed_mps * t + column * run.lattice.pitch_m - run.body_m[0] / 2;
+  }
+
+  /** Stretches [from, to] of road that are shown below each other; `follow` null: the whole road. */
+  function stretches(run, follow, t, windowLength) {
+    const length = run.road.length_m;
+    if (follow === null) {
+      const count = Math.max(1, Math.min(6, Math.round(length / 250)));
+      return Array.from({ length: count }, (_, i) => [(length * i) / count, (length * (i + 1)) / count]);
+    }
+    const state = follow.vehicle ? stateAt(run, follow.vehicle, t) : null;
+    const first = follow.vehicle ? follow.vehicle.first * run.step_s : 0;
+    let centre = state ? state.s : t < first ? 0 : length;
+    if (!follow.vehicle) centre = blockCentre(run, follow.formation, t);
+    const half = Math.min(windowLength, length) / 2;
+    const middle = Math.max(half, Math.min(length - half, centre));
+    return [[middle - half, middle + half]];
+  }
+
+  /** What can be followed: formations, or vehicles where there are none. */
+  function followable(run, most) {
+    const numbers = new Set(run.vehicles.map((vehicle) => vehicle.formation));
+    numbers.delete(null);
+    if (numbers.size > 0) {
+      return [...numbers]
+        .sort((a, b) => a - b)
+        .slice(0, most)
+        .map((formation) => ({ name: `formation ${formation}`, formation }));
+    }
+    return run.vehicles.slice(0, most).map((vehicle) => ({ name: vehicle.name, vehicle }));
+  }
+
+  /** When what is followed is at the middle of the window as lane sorting begins. */
+  function arrivalTime(run, follow) {
+    if (follow.vehicle) return follow.vehicle.first * run.step_s;
+    const ahead = run.road.sorting_start_m - 20 - blockCentre(run, follow.formation, 0);
+    return Math.max(0, Math.min(run.end_s, ahead / run.lattice.speed_mps));
+  }
+
+  return { unpack, decode, stateAt, allAt, shade, blockCentre, stretches, followable, arrivalTime };
+})();

@@ -1,0 +1,75 @@
+"""A run's trajectories as arrays, vehicle by vehicle."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from attrs import frozen
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+OFF_LATTICE = np.iinfo(np.int64).min
+"""Column of a vehicle that has none."""
+
+
+@frozen
+class Tracks:
+    """All rows of trajectories.parquet, sorted by vehicle, then time; arrays of shape (rows,)."""
+
+    names: tuple[str, ...]
+    """Of the vehicles."""
+    starts: Ints
+    """Of each vehicle the first row, and behind the last one the number of rows."""
+    t_s: Floats
+    s_m: Floats
+    y_m: Floats
+    speed_mps: Floats
+    accel_mps2: Floats
+    column: Ints
+    """`OFF_LATTICE` where there is none."""
+    lane: Ints
+
+    @property
+    def vehicle(self) -> Ints:
+        """Number of each row's vehicle."""
+        return np.repeat(np.arange(len(self.names)), np.diff(self.starts))
+
+    def rows(self, number: int) -> slice:
+        """Return the rows of a vehicle."""
+        return slice(int(self.starts[number]), int(self.starts[number + 1]))
+
+
+def read_tracks(folder: Path) -> Tracks:
+    """Return a run's trajectories.
+
+    Raises:
+        OSError, ValueError, KeyError: it has none that can be read.
+    """
+    table = pq.read_table(folder / "trajectories.parquet")
+    codes = table["vehicle"].combine_chunks().dictionary_encode()
+    names = [str(name) for name in codes.dictionary.to_pylist()]
+    vehicle = codes.indices.to_numpy(zero_copy_only=False).astype(np.int64)
+    t_s = table["t_s"].to_numpy().astype(np.float64)
+    order = np.lexsort((t_s, vehicle))
+    counts = np.bincount(vehicle, minlength=len(names))
+
+    def floats(name: str) -> Floats:
+        return np.asarray(table[name].to_numpy()[order], dtype=np.float64)
+
+    column = pc.fill_null(pc.cast(table["column"], "int64"), int(OFF_LATTICE)).to_numpy()
+    return Tracks(
+        names=tuple(names),
+        starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        t_s=t_s[order],
+        s_m=floats("s_m"),
+        y_m=floats("y_m"),
+        speed_mps=floats("speed_mps"),
+        accel_mps2=floats("accel_mps2"),
+        column=column[order].astype(np.int64),
+        lane=table["lane"].to_numpy()[order].astype(np.int64),
+    )
