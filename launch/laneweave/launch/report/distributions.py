@@ -44,9 +44,9 @@ def _centred(step: float, last: float) -> Floats:
     return np.asarray(np.arange(-0.5, last / step + 1.0) * step, dtype=np.float64)
 
 
-SPACING: Final = Quantity("spacing", "m", _centred(2.5, 90.0), exceedance=False)
+SPACING: Final = Quantity("spacing", "m", _centred(0.5, 90.0), exceedance=False)
 """Front bumper to front bumper of the next vehicle ahead on the lane."""
-HEADWAY: Final = Quantity("time headway", "s", _centred(0.2, 6.0), exceedance=False)
+HEADWAY: Final = Quantity("time headway", "s", _centred(0.05, 6.0), exceedance=False)
 """Spacing over the speed of the one behind."""
 DECELERATION: Final = Quantity("deceleration", "m/s²", np.linspace(0.0, 10.0, 201), exceedance=True)
 JERK: Final = Quantity("jerk", "m/s³", np.linspace(0.0, 20.0, 201), exceedance=True)
@@ -55,7 +55,6 @@ LATERAL: Final = Quantity(
     "lateral acceleration", "m/s²", np.linspace(0.0, 5.0, 201), exceedance=True
 )
 """Second difference of the place across the road over three ticks."""
-QUANTITIES: Final = (SPACING, HEADWAY, DECELERATION, JERK, LATERAL)
 
 
 @frozen

@@ -1,0 +1,186 @@
+"""The moving road: the data decode to the trajectories, in Python and in the page's own script."""
+
+from __future__ import annotations
+
+import base64
+import json
+import shutil
+import subprocess
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from attrs import evolve
+from numpy.typing import NDArray
+
+from laneweave.launch.report import animation
+from laneweave.launch.report.animation import animation_data
+from laneweave.launch.report.runs import Run, single_run
+from laneweave.launch.report.tracks import Tracks, read_tracks
+from laneweave.launch.snapshots import _shade
+
+NODE = shutil.which("node")
+needs_node = pytest.mark.skipif(
+    NODE is None, reason="node is not installed: nothing here can run the page's script"
+)
+KINDS = {"s_m": "<u2", "y_m": "<u2", "speed_mps": "u1"}
+
+
+@pytest.fixture(scope="module")
+def run(swept: Path) -> Run:
+    return single_run(swept / "formation-1600-1")
+
+
+@pytest.fixture(scope="module")
+def tracks(run: Run) -> Tracks:
+    return read_tracks(run.folder)
+
+
+def column(data: dict[str, Any], name: str) -> NDArray[np.float64]:
+    raw = base64.b64decode(data["columns"][name], validate=True)
+    return np.frombuffer(raw, KINDS[name]) * float(data["units"][name])
+
+
+def test_data_decode_to_the_trajectories(run: Run, tracks: Tracks) -> None:
+    data = json.loads(json.dumps(animation_data(run, tracks, "")))
+    assert sorted(vehicle["name"] for vehicle in data["vehicles"]) == sorted(tracks.names)
+    decoded = {name: column(data, name) for name in KINDS}
+    offset = 0
+    for vehicle in data["vehicles"]:
+        rows = tracks.rows(tracks.names.index(vehicle["name"]))
+        times_s = data["step_s"] * (vehicle["first"] + np.arange(vehicle["count"]))
+        assert times_s[0] - tracks.t_s[rows][0] < data["step_s"]
+        assert tracks.t_s[rows][-1] - times_s[-1] < data["step_s"]
+        for name, values in decoded.items():
+            expected = np.interp(times_s, tracks.t_s[rows], getattr(tracks, name)[rows])
+            found = values[offset : offset + vehicle["count"]]
+            assert np.abs(found - expected).max() <= 0.501 * data["units"][name]
+        offset += vehicle["count"]
+    assert {len(values) for values in decoded.values()} == {offset}
+    # Finer than a pixel of the player.
+    assert data["units"]["s_m"] <= 0.05
+    assert data["units"]["y_m"] <= 0.001
+
+
+def test_long_runs_are_sampled_more_coarsely_and_then_cut(
+    run: Run, tracks: Tracks, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    samples = len(tracks.t_s) * run.scenario.runtime.tick_s
+    for most, step_s in ((samples / 0.5 + 200, 0.5), (samples / 4, 1.0)):
+        monkeypatch.setattr(animation, "MOST_SAMPLES", most)
+        data = animation_data(run, tracks, "")
+        assert data["step_s"] == step_s
+        assert len(column(data, "s_m")) <= most
+    assert data["end_s"] < float(tracks.t_s.max())
+    assert len(data["vehicles"]) < len(tracks.names)
+
+
+def test_a_run_without_vehicles(run: Run, tracks: Tracks) -> None:
+    nothing = np.empty(0)
+    none = evolve(
+        tracks,
+        names=(),
+        starts=np.zeros(1, np.int64),
+        t_s=nothing,
+        s_m=nothing,
+        y_m=nothing,
+        speed_mps=nothing,
+        accel_mps2=nothing,
+    )
+    data = animation_data(run, none, "")
+    assert (data["vehicles"], data["columns"]["s_m"], data["end_s"]) == ([], "", 0.0)
+
+
+def in_node(expression: str, data: dict[str, Any]) -> Any:  # noqa: ANN401 - any JSON
+    """Return the value of an expression in which `run` is the decoded data."""
+    script = (files("laneweave.launch.report") / "templates" / "player.js").read_text("utf-8")
+    program = (
+        f"{script}\nconst run = laneweave.decode(JSON.parse(require('fs').readFileSync(0)));\n"
+        f"console.log(JSON.stringify({expression}));"
+    )
+    done = subprocess.run(
+        [str(NODE), "-e", program],
+        input=json.dumps(data),
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@needs_node
+def test_the_player_shows_everybody_where_they_were(run: Run, tracks: Tracks) -> None:
+    data = animation_data(run, tracks, "")
+    times_s = [0.0, 7.3, 21.05, 33.33, data["end_s"], data["end_s"] + 5.0]
+    expression = (
+        f"{json.dumps(times_s)}.map((t) => "
+        "laneweave.allAt(run, t).map(([vehicle, state]) => [vehicle.name, state]))"
+    )
+    seen = 0
+    for t_s, shown in zip(times_s, in_node(expression, data), strict=True):
+        found = dict(shown)
+        for number, name in enumerate(tracks.names):
+            rows = tracks.rows(number)
+            first_s, last_s = tracks.t_s[rows][0], tracks.t_s[rows][-1]
+            if first_s + 0.2 <= t_s <= last_s - 0.2:
+                assert name in found
+            if t_s < first_s - 1e-6 or t_s > last_s + 1e-6:
+                assert name not in found
+            if name in found:
+                seen += 1
+                near = {
+                    key: float(np.interp(t_s, tracks.t_s[rows], getattr(tracks, key)[rows]))
+                    for key in KINDS
+                }
+                assert found[name]["s"] == pytest.approx(near["s_m"], abs=0.06)
+                assert found[name]["y"] == pytest.approx(near["y_m"], abs=0.03)
+                assert found[name]["v"] == pytest.approx(near["speed_mps"], abs=0.2)
+    assert seen > 20
+
+
+@needs_node
+def test_the_player_follows_blocks_of_the_lattice(run: Run, tracks: Tracks) -> None:
+    data = animation_data(run, tracks, "")
+    lattice = run.scenario.lattice
+    centres = in_node("[0, 3].map((f) => laneweave.blockCentre(run, f, 20))", data)
+    for number, centre_m in zip((0, 3), centres, strict=True):
+        columns = lattice.block_range(number)
+        fronts_m = [lattice.cell_s_m(one, 20.0) for one in (columns[0], columns[-1])]
+        rear_m = fronts_m[0] - run.scenario.vehicle.length_m
+        assert centre_m == pytest.approx(0.5 * (rear_m + fronts_m[1]))
+    names = in_node("laneweave.followable(run, 3).map((one) => one.name)", data)
+    assert names == ["formation 0", "formation 1", "formation 2"]
+
+
+@needs_node
+def test_the_player_shows_the_whole_road_or_a_window_on_it(run: Run, tracks: Tracks) -> None:
+    data = animation_data(run, tracks, "")
+    length_m = run.scenario.road.length_m
+    expression = (
+        "[laneweave.stretches(run, null, 5, 80),"
+        " ...[0, 15, 500].map((t) => laneweave.stretches(run, {formation: 0}, t, 80)[0]),"
+        " laneweave.stretches(run, {vehicle: run.vehicles[0]}, 500, 80)[0]]"
+    )
+    whole, *windows = in_node(expression, data)
+    assert whole[0][0] == 0.0
+    assert whole[-1][1] == length_m
+    for begin_m, end_m in windows:
+        assert end_m - begin_m == 80.0
+        assert 0.0 <= begin_m < end_m <= length_m
+    assert windows[0][0] == 0.0
+    assert windows[2] == windows[3] == [length_m - 80.0, length_m]
+
+
+@needs_node
+def test_the_player_shades_as_the_pictures_do(run: Run, tracks: Tracks) -> None:
+    data = animation_data(run, tracks, "")
+    for over_mps in (-9.0, -2.5, 0.0, 1.0, 7.0):
+        shade = data["shade"]
+        call = f"laneweave.shade('#2f6fc4', {over_mps}, {shade['span_mps']}, {shade['strength']})"
+        shown = in_node(call, data)
+        expected = ",".join(str(round(255 * part)) for part in _shade("#2f6fc4", over_mps))
+        assert shown == f"rgb({expected})"

@@ -1,0 +1,143 @@
+"""What is counted in trajectories, and formations' path maps as they were driven."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from numpy.typing import ArrayLike
+
+from laneweave.launch.report.distributions import (
+    DECELERATION,
+    HEADWAY,
+    JERK,
+    LATERAL,
+    SPACING,
+    Counts,
+    Quantity,
+    count,
+)
+from laneweave.launch.report.path_maps import driven_map
+from laneweave.launch.report.runs import single_run
+from laneweave.launch.report.styling import label_colours, spread_evenly
+from laneweave.launch.report.tracks import Tracks, read_tracks
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario import load_scenario
+
+T_S = 0.1 * np.arange(101)
+SHORT = load_scenario(None, demand__duration_s=10.0)
+
+
+def tracks(*vehicles: Sequence[ArrayLike]) -> Tracks:
+    """Return tracks of 10 s from (s m, y m, speed m/s, acceleration m/s2) of each vehicle."""
+    rows = len(T_S)
+    s_m, y_m, speed_mps, accel_mps2 = (
+        np.concatenate([np.broadcast_to(vehicle[number], rows) for vehicle in vehicles])
+        for number in range(4)
+    )
+    return Tracks(
+        names=tuple(f"v{number}" for number in range(len(vehicles))),
+        starts=rows * np.arange(len(vehicles) + 1),
+        t_s=np.tile(T_S, len(vehicles)),
+        s_m=s_m,
+        y_m=y_m,
+        speed_mps=speed_mps,
+        accel_mps2=accel_mps2,
+        column=np.zeros(rows * len(vehicles), np.int64),
+        lane=np.zeros(rows * len(vehicles), np.int64),
+    )
+
+
+def centres(counts: Counts, quantity: Quantity) -> list[float]:
+    """Return the middles of the bins that something was counted in."""
+    middles = 0.5 * (quantity.edges[1:] + quantity.edges[:-1])
+    return [round(float(one), 3) for one in middles[counts.of[quantity.name] > 0]]
+
+
+def test_spacings_are_those_to_the_next_ahead_on_the_lane() -> None:
+    s_m = 10.0 * T_S
+    counts = count(
+        tracks(
+            (s_m, 1.75, 10.0, 0.0),
+            (s_m + 40.0, 1.75, 20.0, 0.0),
+            (s_m + 30.0, 5.25, 10.0, 0.0),  # the other lane
+            (s_m + 60.0, 1.0, 0.0, 0.0),  # beside the centre
+        ),
+        SHORT,
+    )
+    assert centres(counts, SPACING) == [20.0, 40.0]
+    assert centres(counts, HEADWAY) == [1.0, 4.0]
+    assert counts.of["spacing"].sum() == 2 * 11
+    np.testing.assert_allclose(counts.cumulative(SPACING)[[38, 40, 78, 80]], [0, 0.5, 0.5, 1.0])
+
+
+def test_decelerations_jerks_and_lateral_accelerations() -> None:
+    accel_mps2 = np.where(T_S < 5.0, -2.02, 0.0)
+    counts = count(tracks((0.0, 0.5 * 1.01 * T_S**2, 10.0, accel_mps2)), SHORT)
+    assert counts.exceedance(DECELERATION)[40] == pytest.approx(50 / 101)
+    assert counts.exceedance(DECELERATION)[41] == 0.0
+    assert counts.of[JERK.name][-1] == 1
+    assert counts.of[JERK.name][0] == 99
+    assert centres(counts, LATERAL) == pytest.approx([1.0125], abs=1e-3)
+
+
+def test_only_steady_traffic_is_counted_where_there_is_some() -> None:
+    late = tracks((0.0, 1.75, 10.0, 0.0))
+    scenario = load_scenario(None, demand__duration_s=80.0)
+    assert count(late, scenario).of[DECELERATION.name].sum() == 0
+    assert count(late, load_scenario(None, demand__duration_s=65.0)).of["deceleration"].sum() == 101
+
+
+def test_counts_add_up() -> None:
+    one = count(tracks((0.0, 1.75, 10.0, -1.0)), SHORT)
+    both = Counts() + one + one
+    assert both.of[DECELERATION.name].sum() == 202
+    np.testing.assert_array_equal(both.exceedance(DECELERATION), one.exceedance(DECELERATION))
+
+
+def test_path_maps_are_what_was_driven(swept: Path) -> None:
+    run = single_run(swept / "formation-1600-1")
+    driven_tracks = read_tracks(run.folder)
+    trips = {row["vehicle"]: row for row in pq.read_table(run.folder / "trips.parquet").to_pylist()}
+    formations = sorted({trip["formation"] for trip in trips.values()})
+    moved = 0
+    for formation in formations:
+        driven = driven_map(run, driven_tracks, formation)
+        assert driven is not None
+        path_map = driven.path_map
+        moved += path_map.cost()
+        members = {name for name, trip in trips.items() if trip["formation"] == formation}
+        assert set(path_map.ids) == members
+        for name, row, lane in zip(
+            path_map.ids, path_map.rows, driven.preferred_lanes, strict=True
+        ):
+            assert row[0][1] == trips[name]["arrival_lane"]
+            if driven.start_s + path_map.steps * driven.slot_s < trips[name]["left_s"]:
+                assert row[-1][1] == trips[name]["final_lane"]
+            assert lane == trips[name]["preferred_lane"]
+            assert all(0 <= column < 4 for column, _ in row)
+            for (column, lane_a), (next_column, lane_b) in pairwise(row):
+                assert abs(next_column - column) + abs(lane_b - lane_a) <= 1
+        for cells in zip(*path_map.rows, strict=True):
+            assert len(set(cells)) == len(cells)
+    assert moved > 10
+    most = driven_map(run, driven_tracks, None)
+    assert most is not None
+    with pytest.raises(BadInputError, match="--formation: got -1"):
+        driven_map(run, driven_tracks, -1)
+
+
+def test_colours_of_labels_stay_whatever_is_beside_them() -> None:
+    alone = label_colours(["paper-12"])["paper-12"]
+    several = label_colours(["formation", "paper-12", "mine", "yours"])
+    assert several["paper-12"] == alone
+    assert len(set(several.values())) == 4
+
+
+def test_volumes_that_fit_side_by_side() -> None:
+    assert spread_evenly([1.0, 2.0]) == (1.0, 2.0)
+    assert spread_evenly(list(map(float, range(11)))) == (0.0, 2.0, 4.0, 6.0, 8.0, 10.0)
