@@ -52,7 +52,7 @@ def test_constraints_hold_names_and_versions_only() -> None:
 
 BASE_INSTALL = """
 import sys
-for missing in ("osqp", "libsumo", "pyarrow", "matplotlib", "psutil"):
+for missing in ("osqp", "libsumo", "pyarrow", "matplotlib", "psutil", "distributed"):
     sys.modules[missing] = None
 import laneweave.coordinator.process
 from laneweave.launch.cli import main

@@ -41,6 +41,7 @@ app = typer.Typer(
 TYPER_INTERRUPTED = 130
 """What typer makes of Ctrl-C."""
 MISSING_SIM = "the simulation packages: install laneweave[sim]"
+MISSING_DASK = "Dask: install laneweave[dask]"
 
 
 class TransportChoice(StrEnum):
@@ -300,7 +301,8 @@ def _status(arguments: list[str]) -> int:
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("laneweave"):
             raise
-        return _refuse(f"{error.name}: not installed; allowed: {MISSING_SIM}")
+        missing = MISSING_DASK if error.name == "distributed" else MISSING_SIM
+        return _refuse(f"{error.name}: not installed; allowed: {missing}")
     if result == TYPER_INTERRUPTED:
         sys.stderr.write("interrupted\n")
         return 1

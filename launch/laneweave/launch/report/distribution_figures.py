@@ -111,7 +111,7 @@ def _draw_limits(axes: Axes, quantity: Quantity, scenario: Scenario) -> None:
         JERK.name: vehicle.max_jerk_mps3,
         LATERAL.name: vehicle.max_lateral_accel_mps2,
     }[quantity.name]
-    axes.axvline(place, color="#8a9099", linewidth=1.0, linestyle="--", zorder=0)
+    axes.axvline(place, color="#8a9099", linewidth=1.0, linestyle="--", zorder=1)
 
 
 def _axis_label(quantity: Quantity) -> str:

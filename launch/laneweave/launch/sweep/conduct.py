@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 from rich.console import Console
@@ -19,8 +18,8 @@ from laneweave.launch.sweep.points import Point, volume_text
 from laneweave.protocol.errors import CommandFailedError
 from laneweave.protocol.scenario import to_tables
 
-Runner = Callable[[Sequence[Job], Path], Iterator[Ended]]
-"""Runs jobs in a folder, and yields each when it has ended; closing the iterator ends all."""
+Runner = Callable[[Sequence[Job], Path], Generator[Ended, None, None]]
+"""Runs jobs in a folder, and yields each when it has ended; closing it ends all of them."""
 
 
 def conduct(points: Sequence[Point], folder: SweepFolder, run: Runner, *, show: bool) -> int:
@@ -44,7 +43,7 @@ def conduct(points: Sequence[Point], folder: SweepFolder, run: Runner, *, show: 
     try:
         with (
             _Progress(len(points), len(points) - len(jobs), show=show) as progress,
-            closing(cast("Generator[Ended]", run(jobs, folder.unfinished))) as ends,
+            closing(run(jobs, folder.unfinished)) as ends,
         ):
             for ended in ends:
                 record = folder.take(waiting[ended.name], ended)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import tempfile
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from pathlib import Path
 
 from attrs import frozen
@@ -32,8 +32,10 @@ class Returned:
     files: dict[str, bytes]
 
 
-def run_on_dask(jobs: Sequence[Job], unfinished: Path, address: str) -> Iterator[Ended]:
-    """Run all jobs on a cluster, and yield each when it has ended; close the iterator to end them.
+def run_on_dask(
+    jobs: Sequence[Job], unfinished: Path, address: str
+) -> Generator[Ended, None, None]:
+    """Run all jobs on a cluster, and yield each when it has ended; close this to end them.
 
     Args:
         jobs: the points.

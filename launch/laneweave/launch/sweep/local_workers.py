@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
 from laneweave.launch.sweep.execution import Ended, Job, run_in_process
 
 
-def run_locally(jobs: Sequence[Job], unfinished: Path, workers: int) -> Iterator[Ended]:
-    """Run all jobs, and yield each when it has ended; close the iterator to end them.
+def run_locally(
+    jobs: Sequence[Job], unfinished: Path, workers: int
+) -> Generator[Ended, None, None]:
+    """Run all jobs, and yield each when it has ended; close this to end them.
 
     Args:
         jobs: the points.

@@ -16,7 +16,7 @@ from attrs import evolve
 from numpy.typing import NDArray
 
 from laneweave.launch.report import animation
-from laneweave.launch.report.animation import animation_data
+from laneweave.launch.report.animation import KINDS, animation_data
 from laneweave.launch.report.runs import Run, single_run
 from laneweave.launch.report.tracks import Tracks, read_tracks
 from laneweave.launch.snapshots import _shade
@@ -25,7 +25,6 @@ NODE = shutil.which("node")
 needs_node = pytest.mark.skipif(
     NODE is None, reason="node is not installed: nothing here can run the page's script"
 )
-KINDS = {"s_m": "<u2", "y_m": "<u2", "speed_mps": "u1"}
 
 
 @pytest.fixture(scope="module")

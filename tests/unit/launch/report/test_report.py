@@ -8,6 +8,8 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
@@ -109,6 +111,20 @@ def test_of_a_run(swept: Path, tmp_path: Path) -> None:
     reader = check_page(folder / "report.html", len(RUN_FIGURES))
     assert "laneweave run: run" in reader.texts
     assert len(reader.data) == 1
+
+
+def test_of_a_run_without_formations(swept: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(swept / "formation-1000-1", folder)
+    for file, name in (("trips.parquet", "formation"), ("trajectories.parquet", "column")):
+        whole = pq.read_table(folder / file)
+        place = whole.schema.get_field_index(name)
+        nothing = pa.nulls(whole.num_rows, whole.schema.field(name).type)
+        pq.write_table(whole.set_column(place, whole.schema.field(name), nothing), folder / file)
+    assert report(folder) == 0
+    assert {path.name for path in folder.glob("*.png")} == RUN_FIGURES - {"path_map.png"}
+    reader = check_page(folder / "report.html", len(RUN_FIGURES) - 1)
+    assert {vehicle["formation"] for vehicle in reader.data[0]["vehicles"]} == {None}
 
 
 def test_of_several_runs(swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
