@@ -32,7 +32,7 @@ def draw_travel_times(comparison: Comparison, out: Path, dpi: int) -> None:
 
     labels, volumes = comparison.labels, comparison.volumes
     colours = label_colours(labels)
-    figure = new_figure(max(5.6, 1.6 + 0.42 * len(volumes) * (len(labels) + 0.8)), 3.9)
+    figure = new_figure(max(5.6, 1.6 + 0.3 * len(volumes) * (len(labels) + 0.8)), 3.9)
     axes = figure.subplots()
     _draw_free_flow(axes, comparison)
     width = 0.8 / len(labels)
