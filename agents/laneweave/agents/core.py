@@ -196,6 +196,7 @@ class AgentCore:
         if in_charge:
             execution.on_joined(sense.joined)
             execution.on_noted(sense.accepted)
+            execution.on_estate(sense)
             self._decide(sense, execution)
         drive = self._driver.drive(sense, moving=execution.moving)
         self._command = Command(
@@ -208,6 +209,8 @@ class AgentCore:
             jerks=drive.jerks,
             joined=execution.wanted_joined,
             accepted=execution.wanted_accepted,
+            promised=execution.wanted_promised,
+            deed=execution.deed,
         )
         yield Send(COMMAND, self._command, self._own)
         if in_charge:
@@ -221,8 +224,13 @@ class AgentCore:
         execution = self.execution
         if execution is None or not self.in_charge or sense.attendant != self._incarnation:
             return
-        joined = execution.on_joined(sense.joined)
-        if execution.on_noted(sense.accepted) or joined:
+        self._sense = sense
+        news = [
+            execution.on_joined(sense.joined),
+            execution.on_noted(sense.accepted),
+            execution.on_estate(sense),
+        ]
+        if any(news):
             yield self._show()
 
     def _ask_to_note(self, execution: PlanExecution) -> Iterator[Effect]:
@@ -230,7 +238,11 @@ class AgentCore:
         command = self._command
         assert command is not None  # noqa: S101 (in charge: it has commanded)
         self._command = evolve(
-            command, joined=execution.wanted_joined, accepted=execution.wanted_accepted
+            command,
+            joined=execution.wanted_joined,
+            accepted=execution.wanted_accepted,
+            promised=execution.wanted_promised,
+            deed=execution.deed,
         )
         if self._command != command:
             yield Send(COMMAND, self._command, self._own)
@@ -249,6 +261,7 @@ class AgentCore:
             joined=sense.joined,
             moving=not self._driver.at_rest(sense),
             rules=self._rules,
+            estate=frozenset(sense.estate) if self._scenario.formation.rolling else None,
         )
 
     def _decide(self, sense: Sense, execution: PlanExecution) -> None:

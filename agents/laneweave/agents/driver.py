@@ -107,7 +107,14 @@ class TrackingDriver:
         """Go on with what the motion controller is doing."""
         scenario = self._scenario
         self._goal = sense.hold_cell
-        if sense.motion_end_tick > sense.tick:
+        if sense.motion_origin == sense.hold_cell and sense.motion_end_tick > sense.tick + 3:
+            state = commanded_state(
+                sense.state, sense.setpoint, scenario.vehicle, self._lattice.speed_mps
+            )
+            self._reference = Reference.settling(
+                scenario, sense.hold_cell, state, sense.tick, sense.motion_end_tick
+            )
+        elif sense.motion_end_tick > sense.tick and sense.motion_origin != sense.hold_cell:
             ticks = round(scenario.formation.move_s / scenario.runtime.tick_s)
             self._reference = Reference.move(
                 scenario, sense.motion_origin, sense.hold_cell, sense.motion_end_tick - ticks
@@ -149,7 +156,9 @@ class TrackingDriver:
     def motion(self, tick: int) -> Course | None:
         """Return the motion when it begins and now and then while it lasts."""
         path = self._reference
-        if path is None or tick >= path.end_tick or (tick - path.start_tick) % REPEAT_TICKS:
+        if path is None or path.origin == self._goal:
+            return None
+        if tick >= path.end_tick or (tick - path.start_tick) % REPEAT_TICKS:
             return None
         return Course(path.origin, self._goal, path.start_tick)
 

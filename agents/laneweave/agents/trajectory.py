@@ -47,6 +47,7 @@ from laneweave.protocol.braking import (
 )
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
+from laneweave.protocol.motion import State, cell_state
 from laneweave.protocol.scenario import Scenario, Vehicle
 
 Array = NDArray[np.float64]
@@ -315,6 +316,28 @@ class Reference:
             cell = target
         return cls(scenario, origin, legs)
 
+    @classmethod
+    def settling(
+        cls, scenario: Scenario, cell: Cell, state: State, tick: int, end_tick: int
+    ) -> Reference:
+        """Return the reference that leads into a cell, at rest there from a tick on.
+
+        It has the least sum of squared jerks that does, whatever the limits: who enters the road
+        has so long for half a column that no limit comes into question.
+
+        Args:
+            scenario: lattice and tick.
+            cell: where it leads.
+            state: commanded state at `tick`.
+            tick: when it begins.
+            end_tick: when it ends, at least three ticks later.
+        """
+        goal = cell_state(scenario.lattice, cell, tick * scenario.runtime.tick_s)
+        start = np.array(state) - goal
+        ticks = end_tick - tick
+        jerks = _least_jerks(scenario.runtime.tick_s, ticks, start)
+        return cls(scenario, cell, [Leg(tick, _frozen(jerks, scenario.runtime.tick_s, start))])
+
     def window(self, tick: int) -> Window:
         """Return the reference from `tick` on: states (N + 1, 6), jerks (N, 2, read-only)."""
         n = self._horizon
@@ -447,10 +470,25 @@ def _both(limit: float) -> tuple[float, float]:
     return -limit, limit
 
 
-def _frozen(jerks: Array, tick_s: float) -> Trajectory:
-    """Integrate jerks (n, 2) from rest at the origin, exactly; the arrays become read-only."""
+def _least_jerks(tick_s: float, ticks: int, start: Array) -> Array:
+    """Return the jerks (ticks, 2) of least norm that lead from a state to rest at the origin."""
+    transition, effect = axis_matrices(tick_s)
+    effects, power = [], np.eye(3)
+    for _ in range(ticks):
+        effects.append(power @ effect[:, 0])
+        power = transition @ power
+    reach = np.array(effects[::-1]).T
+    ends = np.stack([power @ start[:3], power @ start[3:]], axis=1)
+    jerks: Array = np.linalg.lstsq(reach, -ends, rcond=None)[0]
+    return jerks
+
+
+def _frozen(jerks: Array, tick_s: float, start: Array | None = None) -> Trajectory:
+    """Integrate jerks (n, 2) from a state, or rest at the origin; the arrays become read-only."""
     transition, effect = axis_matrices(tick_s)
     states = np.zeros((len(jerks) + 1, 6))
+    if start is not None:
+        states[0] = start
     for k, (along, across) in enumerate(jerks):
         states[k + 1, :3] = transition @ states[k, :3] + effect[:, 0] * along
         states[k + 1, 3:] = transition @ states[k, 3:] + effect[:, 0] * across

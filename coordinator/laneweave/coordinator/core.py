@@ -18,6 +18,8 @@ from laneweave.coordinator.groups import Groups
 from laneweave.coordinator.leader import FormationControl
 from laneweave.coordinator.leader_rules import LEADER_RULES, Phase
 from laneweave.coordinator.service import PlanningService
+from laneweave.coordinator.stream_control import Note as StreamNote
+from laneweave.coordinator.stream_control import StreamControl
 from laneweave.protocol.messages import (
     Ballot,
     Census,
@@ -25,6 +27,7 @@ from laneweave.protocol.messages import (
     LogEvent,
     Name,
     Plan,
+    Prepare,
     Report,
     RoadClock,
     VehicleState,
@@ -102,6 +105,10 @@ class CoordinatorCore:
         self._rules = rules
         self._groups = Groups()
         self._planner = FormationPlanner(scenario, self._groups)
+        self._stream = (
+            StreamControl(scenario, self._new_ballot) if scenario.formation.rolling else None
+        )
+        """The rolling operation; None: formations."""
         self._handled_s = self._awake_since_s = 0.0
         """When the last event was, and since when this leader has missed nothing (node clock)."""
         self._incarnation = incarnation
@@ -199,6 +206,8 @@ class CoordinatorCore:
     def _forget_formations(self) -> None:
         self.controls = {}
         self._planner.forget()
+        if self._stream is not None:
+            self._stream.forget()
 
     def _on_message(self, message: object, now_s: float) -> None:
         match message:
@@ -224,6 +233,9 @@ class CoordinatorCore:
     def _on_state(self, state: VehicleState, now_s: float) -> Iterator[Effect]:
         if self._formation_of.get(state.vehicle) != state.formation:
             return  # of a vehicle that has left, or that the census does not know yet
+        if self._stream is not None:
+            yield from self._carry_out(self._stream.on_state(state))
+            return
         # What a vehicle has joined stays joined, whoever had it joined.
         if self._groups.join((state.formation, *state.joined)):
             self._road_changed = True
@@ -240,6 +252,8 @@ class CoordinatorCore:
     def _on_computed(self, computed: Computed, now_s: float) -> Iterator[Effect]:
         if self._service.owns(computed.job):
             yield from self._service.finish(computed.job, computed.result, computed.error)
+        elif self._stream is not None:
+            yield from self._carry_out(self._stream.finish(computed, self.t_s, now_s))
         else:
             notes = self._planner.finish(computed, self.controls, self.t_s, now_s)
             yield from self._carry_out(notes)
@@ -264,7 +278,11 @@ class CoordinatorCore:
     def _heartbeat(self, now_s: float) -> Iterator[Effect]:
         if now_s >= self._heartbeat_s:
             self._heartbeat_s = now_s + self.scenario.network.heartbeat_s
-            in_force = sum(control.phase is Phase.WATCHING for control in self.controls.values())
+            in_force = (
+                sum(control.phase is Phase.WATCHING for control in self.controls.values())
+                if self._stream is None
+                else self._stream.in_force
+            )
             election = self.election
             yield Send(
                 HEARTBEAT,
@@ -280,6 +298,9 @@ class CoordinatorCore:
     def _lead(self, now_s: float) -> Iterator[Effect]:
         if not self.election.leading or self.census is None:
             return
+        if self._stream is not None:
+            yield from self._lead_stream(self._stream, self.census, now_s)
+            return
         if self._road_changed:
             self._road_changed = False
             self._update_members(self.census, now_s)
@@ -292,8 +313,22 @@ class CoordinatorCore:
                     self._planner.order(self._job(), control, self.t_s, now_s)
                 )
             for vehicle, message in control.outgoing(now_s):
-                topic = PLAN if isinstance(message, Plan) else PREPARE
-                yield Send(topic, message, {"vehicle": vehicle})
+                yield self._to_vehicle(vehicle, message)
+
+    def _lead_stream(
+        self, stream: StreamControl, census: Census, now_s: float
+    ) -> Iterator[Effect]:
+        if self._road_changed:
+            self._road_changed = False
+            stream.on_census(census)
+            yield from self._carry_out(stream.order(self._job, self.t_s))
+        for vehicle, message in stream.outgoing(now_s):
+            yield self._to_vehicle(vehicle, message)
+
+    @staticmethod
+    def _to_vehicle(vehicle: Name, message: Prepare | Plan) -> Effect:
+        topic = PLAN if isinstance(message, Plan) else PREPARE
+        return Send(topic, message, {"vehicle": vehicle})
 
     def _update_members(self, census: Census, now_s: float) -> None:
         formations = closed_formations(census, self.t_s, self.scenario, self._groups)
@@ -329,7 +364,7 @@ class CoordinatorCore:
             ballot = ballot._replace(term=self.election.term)
         return ballot
 
-    def _carry_out(self, outcomes: Iterable[Compute | Note]) -> Iterator[Effect]:
+    def _carry_out(self, outcomes: Iterable[Compute | Note | StreamNote]) -> Iterator[Effect]:
         """Pass computations on; write notes down; a new group changes who plans together."""
         for outcome in outcomes:
             if isinstance(outcome, Compute):
@@ -356,6 +391,8 @@ class CoordinatorCore:
         times = [self._heartbeat_s, self._report_s, self.election.next_change_s(now_s)]
         if not self.election.leading:
             times.append(self.election.started_s + self.election.election_s)
+        elif self._stream is not None:
+            times += self._stream.wakeups
         else:
             times += [
                 control.wakeup_s

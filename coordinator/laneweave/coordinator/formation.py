@@ -55,9 +55,10 @@ def closed_formations(
 
 
 def closing_time_s(numbers: Numbers, scenario: Scenario) -> float:
-    """Return the road time at which the last block has passed the start of the road."""
+    """Return the road time from which on nobody can enter the last block any more."""
     lattice = scenario.lattice
-    return lattice.passing_time_s(lattice.block_range(numbers[-1])[0])
+    passing_s = lattice.passing_time_s(lattice.block_range(numbers[-1])[0])
+    return passing_s + scenario.formation.entry_spread_s
 
 
 def start_time_s(numbers: Numbers, not_before_s: float, scenario: Scenario) -> float:

@@ -14,7 +14,7 @@ from __future__ import annotations
 from attrs import define, field
 
 from laneweave.protocol.lattice import Cell, Lattice, Move
-from laneweave.protocol.messages import Ballot, Name, Plan, Prepare, Sense, VehicleState
+from laneweave.protocol.messages import Ballot, Deed, Name, Plan, Prepare, Sense, VehicleState
 from laneweave.protocol.plans import Needs
 from laneweave.protocol.transitions import RuleBook
 from laneweave.protocol.vehicle_rules import (
@@ -64,6 +64,14 @@ class PlanExecution:
     """For each of my moves what it needs of the others."""
     t_s: float = 0.0
     """Road time of the tick."""
+    shown: bool = False
+    """The controller has noted what is promised, so that the promise counts."""
+    estate: frozenset[Cell] | None = None
+    """Cells that the vehicle owns, as its controller has said last; None: formations own blocks."""
+    deed: Deed | None = None
+    """By which cells change hands: of the newest plan that was taken."""
+    noted: Deed | None = None
+    """The newest deed of the vehicle, as its controller has said last."""
 
     def __attrs_post_init__(self) -> None:
         """Want no more than the controller has."""
@@ -95,6 +103,18 @@ class PlanExecution:
         self.joined = tuple(sorted({*self.joined, *formations}))
         return True
 
+    def on_estate(self, sense: Sense) -> bool:
+        """The controller says what the vehicle owns; true when it has noted a promise by now.
+
+        Without effect where formations own blocks.
+        """
+        if self.estate is None:
+            return False
+        before = self.shown
+        self.estate, self.noted = frozenset(sense.estate), sense.deed
+        self.shown = sense.promised == self.promised
+        return self.shown and not before
+
     def on_state(self, state: VehicleState) -> None:
         """V4: remember what another member of the same plan has shown."""
         self.rules.take(self, STATE, state)
@@ -122,6 +142,11 @@ class PlanExecution:
     def wanted_accepted(self) -> Ballot | None:
         """The plan that the motion controller should note as accepted."""
         return self.plan.ballot if self.plan is not None else None
+
+    @property
+    def wanted_promised(self) -> Ballot | None:
+        """The promise that the motion controller should note, where it must."""
+        return self.promised if self.estate is not None else None
 
     @property
     def accepted(self) -> bool:
@@ -181,6 +206,8 @@ class PlanExecution:
             y_m=sense.state[3],
             speed_mps=sense.state[1],
             t_s=sense.t_s,
+            estate=sense.estate if sense.promised == self.promised else (),
+            deed=sense.deed,
         )
 
     def needs_states(self, t_s: float) -> bool:

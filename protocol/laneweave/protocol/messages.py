@@ -48,6 +48,22 @@ class Heartbeat:
 
 
 @frozen
+class Deed:
+    """How cells change hands with one plan of the rolling operation, as one vehicle keeps it.
+
+    The vehicle owns `before` until it knows that the start gate is open, then `after`.
+    """
+
+    ballot: Ballot
+    before: tuple[Cell, ...] = ()
+    after: tuple[Cell, ...] = ()
+    roster: tuple[Name, ...] = ()
+    """Who has a deed of this ballot."""
+    open: bool = False
+    """The start gate is open; the other fields say nothing any more."""
+
+
+@frozen
 class Prepare:
     """Leader to each vehicle of the roster that has not promised, every `network.resend_s`.
 
@@ -85,6 +101,11 @@ class Plan:
     slot_s: float
     """T_F: step n may begin at t0 + n slot."""
     territory: tuple[Cell, ...]
+    before: dict[Name, tuple[Cell, ...]] = field(factory=dict)
+    """Rolling operation: the cells that each vehicle owns as the plan is made. Empty: formations
+    own their blocks."""
+    after: dict[Name, tuple[Cell, ...]] = field(factory=dict)
+    """Rolling operation: the cells that each vehicle owns when the start gate is open."""
 
 
 @frozen
@@ -124,6 +145,11 @@ class VehicleState:
     y_m: float
     speed_mps: float
     t_s: float
+    estate: tuple[Cell, ...] = ()
+    """Rolling operation: the cells that it owns, as its motion controller keeps them; none while
+    that has not noted the promise."""
+    deed: Deed | None = None
+    """Rolling operation: the newest plan by which cells change hands."""
 
 
 @frozen
@@ -198,6 +224,12 @@ class Sense:
     """Newest plan that the process in charge has accepted, as the controller has noted."""
     left: bool = False
     """The vehicle has left the road: its agent reports and ends."""
+    estate: tuple[Cell, ...] = ()
+    """Rolling operation: the cells that it owns."""
+    promised: Ballot | None = None
+    """Highest ballot that the process in charge has promised, as the controller has noted."""
+    deed: Deed | None = None
+    """Newest deed of the vehicle."""
 
 
 @frozen
@@ -223,6 +255,10 @@ class Command:
     """Formations that the controller should note as joined, beside those that it knows."""
     accepted: Ballot | None = None
     """The plan that the sender has accepted: the controller should note it."""
+    promised: Ballot | None = None
+    """Rolling operation: what the sender has promised: the controller should note it."""
+    deed: Deed | None = None
+    """Rolling operation: the deed of the newest plan that the sender has taken."""
 
 
 @frozen

@@ -67,6 +67,35 @@ def plan_problems(plan: Plan) -> list[str]:
     return problems
 
 
+def estate_problems(plan: Plan) -> list[str]:
+    """Return what is wrong with how a plan hands cells over; empty when nothing is.
+
+    Checked: the maps cover the roster; no cell has two owners, before or after; no owner appears
+    from nowhere; every vehicle owns afterwards what it occupies.
+    """
+    problems = [
+        f"{name} does not cover the roster"
+        for name, mapping in (("before", plan.before), ("after", plan.after))
+        if set(mapping) != set(plan.roster)
+    ]
+    if problems:
+        return problems
+    for name, mapping in (("before", plan.before), ("after", plan.after)):
+        cells = [cell for each in mapping.values() for cell in each]
+        if len(cells) != len(set(cells)):
+            problems.append(f"a cell has two owners {name}")
+    owned = {cell for each in plan.before.values() for cell in each}
+    for vehicle, cells in plan.after.items():
+        occupied = {plan.start_cells[vehicle]}
+        for _, origin, target in plan.moves[vehicle]:
+            occupied |= footprint(origin, target)
+        if not occupied <= set(cells):
+            problems.append(f"{vehicle} does not own {sorted(occupied - set(cells))}")
+        if not set(cells) <= owned:
+            problems.append(f"nobody owned {sorted(set(cells) - owned)}")
+    return problems
+
+
 def _roster_problems(plan: Plan) -> Iterator[str]:
     if len(set(plan.roster)) != len(plan.roster):
         yield "roster names a vehicle twice"

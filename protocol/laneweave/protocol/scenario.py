@@ -107,6 +107,9 @@ class Demand:
 class FormationSettings:
     """Formation control parameters d_F, T_F, v_F and the planner's choices."""
 
+    operation: str = field(default="paper", validator=one_of("paper", "rolling"))
+    """`paper`: closed formations in blocks, planned once. `rolling`: every cell may be entered, and
+    the whole stream is planned anew in each slot."""
     gap_m: float = field(default=15.0, validator=within(1.0, 200.0))
     """d_F, the column pitch."""
     cycle_s: float = field(default=4.0, validator=within(0.5, 60.0))
@@ -132,6 +135,19 @@ class FormationSettings:
     planning_deadline_s: float = field(default=4.0, validator=within(0.01, 3600.0))
     max_nodes: int = field(default=20_000, validator=within(1, 100_000_000))
     """Bound on search nodes per plan: keeps equal seeds equal whatever the machine's speed."""
+
+    @property
+    def rolling(self) -> bool:
+        """Whether the operation is the rolling one."""
+        return self.operation == "rolling"
+
+    @property
+    def entry_spread_s(self) -> float:
+        """Half the time between two cells of a lane that may be entered.
+
+        A vehicle may enter so long before or after its cell passes the start of the road.
+        """
+        return (0.5 if self.rolling else 1.0) * self.gap_m / self.speed_mps
 
     @property
     def oblique_steps(self) -> int:

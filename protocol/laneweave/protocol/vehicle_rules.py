@@ -9,8 +9,8 @@ from __future__ import annotations
 from enum import Enum
 from typing import TYPE_CHECKING
 
-from laneweave.protocol.messages import Ballot, Plan, Prepare, VehicleState
-from laneweave.protocol.plans import dependencies, plan_problems
+from laneweave.protocol.messages import Ballot, Deed, Plan, Prepare, VehicleState
+from laneweave.protocol.plans import dependencies, estate_problems, plan_problems
 from laneweave.protocol.transitions import RuleBook, Transition, named
 
 if TYPE_CHECKING:
@@ -53,8 +53,9 @@ def _is_above_promise(me: PlanExecution, prepare: Prepare) -> bool:
 
 def _promise(me: PlanExecution, prepare: Prepare) -> None:
     """Promise the ballot, ask the controller to join its formations."""
-    me.promised = prepare.ballot
-    me.wanted_joined = tuple(sorted({*me.wanted_joined, *prepare.formations}))
+    me.promised, me.shown = prepare.ballot, False
+    if me.estate is None:
+        me.wanted_joined = tuple(sorted({*me.wanted_joined, *prepare.formations}))
 
 
 def _drop_plan(me: PlanExecution, _: object) -> None:
@@ -96,6 +97,8 @@ def _is_executable(_: PlanExecution, plan: Plan) -> bool:
 
 def _keeps_to_its_blocks(me: PlanExecution, plan: Plan) -> bool:
     """Its territory lies in the blocks of its formations."""
+    if me.estate is not None:
+        return True
     blocks = set(plan.formations)
     return all(
         me.lattice.block_of(column) in blocks and 0 <= lane < me.lattice.lanes
@@ -105,13 +108,24 @@ def _keeps_to_its_blocks(me: PlanExecution, plan: Plan) -> bool:
 
 def _has_joined(me: PlanExecution, plan: Plan) -> bool:
     """My controller has confirmed that its formations are joined."""
-    return set(plan.formations) <= set(me.joined)
+    return me.estate is not None or set(plan.formations) <= set(me.joined)
+
+
+def _keeps_to_its_estates(me: PlanExecution, plan: Plan) -> bool:
+    """Its cells change hands among their owners, and none is taken for mine that is not."""
+    if me.estate is None:
+        return True
+    mine = me.estate | set(me.noted.after if me.noted is not None else ())
+    return not estate_problems(plan) and set(plan.before[me.vehicle]) <= mine
 
 
 def _accept(me: PlanExecution, plan: Plan) -> None:
     """Take the plan, derive what its moves need, ask the controller to note it."""
     me.plan = plan
     me.needs = me.rules.functions["dependencies"](plan, me.vehicle)
+    if me.estate is not None:
+        name = me.vehicle
+        me.deed = Deed(plan.ballot, plan.before[name], plan.after[name], plan.roster)
 
 
 def _is_noted(me: PlanExecution, ballot: Ballot | None) -> bool:
@@ -157,6 +171,12 @@ def _all_are_ready(me: PlanExecution, _: object) -> bool:
     return me.plan is not None and all(
         me.heard.get(other, -1) >= 0 for other in me.plan.roster if other != me.vehicle
     )
+
+
+def _take_possession(me: PlanExecution, _: object) -> None:
+    """Own what the plan gives me, and no more what it takes."""
+    if me.deed is not None:
+        me.deed = Deed(me.deed.ballot, open=True)
 
 
 def _has_next_move(me: PlanExecution, _: object) -> bool:
@@ -227,6 +247,7 @@ VEHICLE_RULES: RuleBook = RuleBook(
                 "is_executable",
                 "keeps_to_its_blocks",
                 "has_joined",
+                "keeps_to_its_estates",
             ),
             ("accept",),
             Stage.TAKEN,
@@ -237,11 +258,11 @@ VEHICLE_RULES: RuleBook = RuleBook(
             STATE,
             (Stage.GATED,),
             ("is_of_my_plan", "shows_open_gate"),
-            ("hear",),
+            ("hear", "take_possession"),
             Stage.GOING,
         ),
         Transition("V4", STATE, _WITH_PLAN, ("is_of_my_plan",), ("hear",)),
-        Transition("V5", GATE, (Stage.GATED,), ("is_holding", "all_are_ready"), (), Stage.GOING),
+        Transition("V5", GATE, (Stage.GATED,), ("is_holding", "all_are_ready"), ("take_possession",), Stage.GOING),
         Transition(
             "V6",
             TICK,
@@ -265,6 +286,7 @@ VEHICLE_RULES: RuleBook = RuleBook(
         _is_executable,
         _keeps_to_its_blocks,
         _has_joined,
+        _keeps_to_its_estates,
         _accept,
         _is_noted,
         _is_of_my_plan,
@@ -273,6 +295,7 @@ VEHICLE_RULES: RuleBook = RuleBook(
         _is_ready,
         _is_holding,
         _all_are_ready,
+        _take_possession,
         _has_next_move,
         _is_time,
         _is_released,

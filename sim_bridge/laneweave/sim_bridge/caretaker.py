@@ -43,6 +43,7 @@ class Caretaker:
             overdue_s=math.inf,
             joined=controller.joined,
             moving=controller.moving(tick),
+            estate=frozenset(controller.estate) if controller.rolling else None,
         )
 
     def on_message(self, message: Prepare | Plan, tick: int) -> VehicleState | None:
@@ -51,16 +52,21 @@ class Caretaker:
         Returns:
             The state to show at once; None: there is nothing to say.
         """
-        execution = self._execution
+        execution, controller = self._execution, self._vehicle.controller
         if isinstance(message, Prepare):
             heeded = execution.on_prepare(message)
-            self._vehicle.controller.join(execution.wanted_joined)
-            execution.on_joined(self._vehicle.controller.joined)
+            controller.join(execution.wanted_joined)
+            execution.on_joined(controller.joined)
+            if execution.promised is not None:
+                controller.promise(execution.promised)
         else:
+            execution.on_estate(self._vehicle.sense(tick, caretaker=True))
             heeded = not message.moves.get(execution.vehicle) and execution.on_plan(message)
             if heeded:
-                self._vehicle.controller.accept(message.ballot)
-                execution.on_noted(self._vehicle.controller.accepted)
+                if execution.deed is not None:
+                    controller.draw_up(execution.deed)
+                controller.accept(message.ballot)
+                execution.on_noted(controller.accepted)
         return self.show(tick) if heeded else None
 
     def show(self, tick: int) -> VehicleState:

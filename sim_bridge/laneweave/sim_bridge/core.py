@@ -266,6 +266,7 @@ class BridgeCore:
 
     def _begin_tick(self, now_s: float) -> Iterator[Effect]:
         self._let_enter()
+        self._roadside.hand_out(self.vehicles)
         yield from self._roadside.news(self.tick, self.t_s, self.vehicles.values())
         yield from self._take_care(now_s)
         for vehicle in self.vehicles.values():

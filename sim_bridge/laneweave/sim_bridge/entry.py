@@ -1,10 +1,12 @@
-"""Entry metering at the start of the road: the paper's interlaced ("checkerboard") entry.
+"""Entry metering at the start of the road.
 
-A vehicle enters at s = 0 with the lattice speed v_F exactly when its cell passes s = 0. Its cell is
-the first free interlaced cell on its lane, behind its lane predecessor, whose passing time is not
-before the arrival. Vehicles of a lane enter in order of arrival.
+A vehicle enters at s = 0 with the lattice speed v_F. Its cell is the first free one on its lane,
+behind its lane predecessor, that passes s = 0 at most `spread_s` before or after the vehicle; from
+there it settles in its cell on the first stretch of road. In the paper's operation only every other
+cell may be entered (interlaced, "checkerboard"). Vehicles of a lane enter in order of arrival, at
+least a column's time apart.
 
-A block of columns becomes one formation, so two rules bound what it takes:
+In the paper's operation a block of columns becomes one formation, so two rules bound what it takes:
 
 - at most `max_vehicles` vehicles, the paper's largest formation;
 - at most as many vehicles that prefer one lane as that lane has cells in the block. **This refines
@@ -12,12 +14,13 @@ A block of columns becomes one formation, so two rules bound what it takes:
   and then forms a group that wants more places on a lane than there are. Here a formation can
   always satisfy every preference; the price is that a vehicle sometimes waits for the next block.
 
-Decisions are causal: columns are taken in the order in which they pass s = 0, and at that moment
-the lanes from the right, so nothing depends on arrivals that are still to come.
+Decisions are causal: they are taken in the order of time, and at one moment the lanes from the
+right, so nothing depends on arrivals that are still to come.
 """
 
 from __future__ import annotations
 
+import math
 from bisect import insort
 from collections import Counter
 
@@ -37,32 +40,50 @@ class Admission:
     arrival: Arrival
     cell: Cell
     t_s: float
-    """Road time at which its cell passes s = 0."""
+    """Road time at which it passes s = 0."""
 
 
 class EntryMeter:
     """Assigns lattice cells to arriving vehicles; pure and incremental."""
 
-    def __init__(self, lattice: Lattice, max_vehicles: int) -> None:
+    def __init__(
+        self,
+        lattice: Lattice,
+        max_vehicles: int,
+        spread_s: float = 0.0,
+        *,
+        interlaced: bool = True,
+    ) -> None:
         """Start with an empty road at road time 0.
 
         Args:
             lattice: the lattice whose cells are given out.
-            max_vehicles: most vehicles in one block.
+            max_vehicles: most vehicles in one block, where entry is interlaced.
+            spread_s: most time between a vehicle and its cell at s = 0.
+            interlaced: whether only every other cell may be entered, and blocks are metered.
         """
         self._lattice = lattice
         self._max_vehicles = max_vehicles
+        self._spread_s = spread_s
+        self._interlaced = interlaced
         self._queues: list[list[Arrival]] = [[] for _ in range(lattice.lanes)]
         self._names: set[str] = set()
-        self._column = 0  # the next column to pass s = 0
-        self._block = 0  # the block of that column, how many it took, and their preferences
-        self._taken = 0
-        self._preferring: Counter[int] = Counter()
+        self._columns = [0] * lattice.lanes
+        """The next column of each lane that may be entered."""
+        self._free_s = [-math.inf] * lattice.lanes
+        """When the next vehicle of each lane may follow the one before."""
+        self._taken: Counter[int] = Counter()
+        """How many each block took, and (block, lane) how many of them prefer a lane."""
+        self._preferring: Counter[tuple[int, int]] = Counter()
 
     @property
     def waiting(self) -> tuple[Arrival, ...]:
         """Vehicles that were demanded and not admitted yet, lane by lane."""
         return tuple(arrival for queue in self._queues for arrival in queue)
+
+    def closed_column(self, lane: int) -> int:
+        """Return the last column of a lane that nobody will enter any more."""
+        return self._columns[lane] + 1
 
     def demand(self, arrival: Arrival) -> None:
         """Queue a vehicle on its lane, in order of arrival time.
@@ -82,42 +103,60 @@ class EntryMeter:
         insort(self._queues[arrival.lane], arrival, key=lambda other: other.t_s)
 
     def admit(self, until_s: float) -> list[Admission]:
-        """Decide on all columns that pass s = 0 up to a road time and were not decided on before.
+        """Decide on all entries up to a road time that were not decided on before.
 
         Args:
-            until_s: road time, usually now; a vehicle demanded later cannot take these columns.
+            until_s: road time, usually now; a vehicle demanded later enters later.
 
         Returns:
             The vehicles that enter, by time, then lane.
         """
         admissions = []
-        while (t_s := self._lattice.passing_time_s(self._column)) <= until_s + TIME_TOLERANCE_S:
-            for lane in range(self._lattice.lanes):
-                arrival = self._takes((self._column, lane), t_s)
-                if arrival is not None:
-                    admissions.append(Admission(arrival, (self._column, lane), t_s))
-            self._column -= 1
+        while True:
+            t_s, lane = min((self._entry_s(lane), lane) for lane in range(self._lattice.lanes))
+            if t_s > until_s + TIME_TOLERANCE_S:
+                break
+            arrival = self._takes((self._columns[lane], lane))
+            if arrival is not None:
+                cell = (self._columns[lane], lane)
+                admissions.append(Admission(arrival, cell, t_s))
+                self._free_s[lane] = t_s + self._lattice.pitch_m / self._lattice.speed_mps
+            self._columns[lane] -= 1
+        # A column that has passed is not for those who are demanded later.
+        for lane in range(self._lattice.lanes):
+            self._skip(lane, until_s - TIME_TOLERANCE_S)
         return admissions
 
-    def _takes(self, cell: Cell, t_s: float) -> Arrival | None:
-        """Return the vehicle that takes a cell which passes s = 0 now, if any."""
+    def _entry_s(self, lane: int) -> float:
+        """Return when the first of a queue enters, if its next cell is free for it."""
+        queue = self._queues[lane]
+        if not queue:
+            return math.inf
+        ready_s = max(queue[0].t_s, self._free_s[lane])
+        self._skip(lane, ready_s)
+        return max(ready_s, self._lattice.passing_time_s(self._columns[lane]) - self._spread_s)
+
+    def _skip(self, lane: int, t_s: float) -> None:
+        """Go on to the first column of a lane that can still be entered at a time."""
+        lattice, column = self._lattice, self._columns[lane]
+        while lattice.passing_time_s(column) + self._spread_s < t_s or (
+            self._interlaced and not lattice.interlaced((column, lane))
+        ):
+            column -= 1
+        self._columns[lane] = column
+
+    def _takes(self, cell: Cell) -> Arrival | None:
+        """Return the first of the queue, if its block takes it."""
         column, lane = cell
         queue = self._queues[lane]
-        if not (queue and self._lattice.interlaced(cell)):
-            return None
-        arrival = queue[0]
-        if arrival.t_s > t_s:
-            return None
-        block = self._lattice.block_of(column)
-        if block != self._block:
-            self._block, self._taken, self._preferring = block, 0, Counter()
-        preferred = arrival.preferred_lane
-        if (
-            self._taken >= self._max_vehicles
-            or self._preferring[preferred] >= self._lattice.block_columns
-        ):
-            return None
-        self._taken += 1
-        self._preferring[preferred] += 1
-        self._names.discard(arrival.vehicle)
+        if self._interlaced:
+            block, preferred = self._lattice.block_of(column), queue[0].preferred_lane
+            if (
+                self._taken[block] >= self._max_vehicles
+                or self._preferring[block, preferred] >= self._lattice.block_columns
+            ):
+                return None
+            self._taken[block] += 1
+            self._preferring[block, preferred] += 1
+        self._names.discard(queue[0].vehicle)
         return queue.pop(0)

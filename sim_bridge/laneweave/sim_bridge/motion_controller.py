@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from laneweave.protocol.braking import EmergencyBrake
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, Lattice
-from laneweave.protocol.messages import Ballot, Command, Neighbour
+from laneweave.protocol.messages import Ballot, Command, Deed, Neighbour
 from laneweave.protocol.motion import (
     Jerk,
     State,
@@ -75,6 +75,12 @@ class MotionController:
     """Formations whose blocks the vehicle's plans may use, ascending; it only ever grows."""
     accepted: Ballot | None = None
     """Newest plan that the process in charge has accepted."""
+    promised: Ballot | None = None
+    """Highest ballot that the process in charge has promised (rolling operation)."""
+    estate: tuple[Cell, ...] = ()
+    """Cells that the vehicle owns, ascending (rolling operation)."""
+    deed: Deed | None = None
+    """Newest plan by which cells change hands."""
     motion_origin: Cell = field(init=False)
     motion_end_tick: int = 0
     command_tick: int = -1
@@ -102,6 +108,11 @@ class MotionController:
         self.rung_ticks = dict.fromkeys(Rung, 0)
         self._jerks = np.zeros((0, 2), dtype=np.float32)
         self._brake = EmergencyBrake(self._scenario)
+
+    @property
+    def rolling(self) -> bool:
+        """Whether vehicles own cells, not formations blocks."""
+        return self._scenario.formation.rolling
 
     @property
     def measured(self) -> State:
@@ -155,7 +166,7 @@ class MotionController:
         if incarnation <= self.attendant:
             raise ValueError(f"incarnation {incarnation} is not above {self.attendant}")
         self.attendant = incarnation
-        self.accepted = None
+        self.accepted = self.promised = None
 
     def note(self, command: Command) -> bool:
         """Note what the process in charge asks for, whatever the tick of its command.
@@ -165,15 +176,40 @@ class MotionController:
         """
         if command.incarnation != self.attendant or not _in_range(command.joined):
             return False
-        before = self.joined, self.accepted
+        before = self.joined, self.accepted, self.promised, self.deed
         self.join(command.joined)
+        if command.deed is not None and command.deed.open:
+            self.take_possession(command.deed.ballot)
+        if command.promised is not None:
+            self.promise(command.promised)
+        if command.deed is not None and not command.deed.open:
+            self.draw_up(command.deed)
         if command.accepted is not None:
             self.accept(command.accepted)
-        return (self.joined, self.accepted) != before
+        return (self.joined, self.accepted, self.promised, self.deed) != before
 
     def accept(self, ballot: Ballot) -> None:
         """Note a plan that the process in charge has accepted; an older one changes nothing."""
         self.accepted = ballot if self.accepted is None else max(self.accepted, ballot)
+
+    def promise(self, ballot: Ballot) -> None:
+        """Note a promise; an older one changes nothing."""
+        self.promised = ballot if self.promised is None else max(self.promised, ballot)
+
+    def draw_up(self, deed: Deed) -> None:
+        """Note the deed of an accepted plan, unless more has been promised since."""
+        newer = self.deed is None or deed.ballot > self.deed.ballot
+        if newer and self.promised is not None and deed.ballot >= self.promised:
+            self.deed, self.estate = deed, deed.before
+
+    def take_possession(self, ballot: Ballot) -> None:
+        """Note that the start gate of the newest deed's plan is open."""
+        if self.deed is not None and self.deed.ballot == ballot and not self.deed.open:
+            self.estate, self.deed = self.deed.after, Deed(ballot, open=True)
+
+    def own(self, cell: Cell) -> None:
+        """Own a cell that nobody has entered in: the roadside says so."""
+        self.estate = tuple(sorted({*self.estate, cell}))
 
     def join(self, formations: Iterable[int]) -> None:
         """Remember formations as joined, for the process in charge."""

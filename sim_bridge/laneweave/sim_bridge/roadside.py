@@ -6,7 +6,7 @@ Its census is complete, which is what lets a coordinator know a roster for certa
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from itertools import chain
 
 from attrs import frozen
@@ -20,6 +20,8 @@ from laneweave.sim_bridge.entry import TIME_TOLERANCE_S, Admission, EntryMeter
 from laneweave.sim_bridge.traffic import RoadVehicle
 
 CENSUS_EVERY_TICKS = 10
+MOST_EMPTY = 12
+"""A vehicle gets at most so many empty cells behind it."""
 
 
 @frozen
@@ -54,13 +56,19 @@ class Roadside:
         self._announce_s = scenario.runtime.announce_s
         self._tick_s = scenario.runtime.tick_s
         self._lanes = scenario.road.lanes
-        # Every other cell of a lane is free to enter. A tick and one more, so that nobody comes
-        # unannounced.
-        lattice = scenario.lattice
-        between_entries_s = 2.0 * lattice.pitch_m / lattice.speed_mps
+        # A tick and one more, so that nobody comes unannounced.
+        lattice, formation = scenario.lattice, scenario.formation
+        between_entries_s = 2.0 * formation.entry_spread_s
         ahead_s = self._announce_s + self._tick_s
         self._announced_per_lane = math.ceil(ahead_s / between_entries_s) + 1
-        self._meter = EntryMeter(scenario.lattice, scenario.formation.max_vehicles)
+        self._rolling = formation.rolling
+        self._spread_s = formation.entry_spread_s
+        self._meter = EntryMeter(
+            lattice, formation.max_vehicles, self._spread_s, interlaced=not self._rolling
+        )
+        self._last: list[Name | None] = [None] * self._lanes
+        """Who entered last on each lane, and the last column that is somebody's."""
+        self._owned = [1] * self._lanes
         self._arrivals = arrivals(scenario)
         self._demanded = 0
         self._queued = 0
@@ -94,9 +102,30 @@ class Roadside:
             self._meter.demand(self._arrivals[self._queued])
             self._queued += 1
         admissions = self._meter.admit(t_s)
+        for admission in admissions:
+            column, lane = admission.cell
+            self._last[lane] = Name(admission.arrival.vehicle)
         self._entered += len(admissions)
         self._census_changed |= bool(admissions)
         return admissions
+
+    def hand_out(self, vehicles: Mapping[Name, RoadVehicle]) -> None:
+        """Give empty cells at the entrance to whoever entered last before them on their lane.
+
+        Nothing happens where formations own blocks. A cell becomes somebody's when nobody can
+        enter in it any more; the first ones, which nobody is ahead of, are nobody's, and so are
+        those far behind whoever entered last.
+        """
+        if not self._rolling:
+            return
+        for lane in range(self._lanes):
+            closed = self._meter.closed_column(lane)
+            last = self._last[lane]
+            owner = vehicles.get(last) if last is not None else None
+            for column in range(self._owned[lane] - 1, closed - 1, -1):
+                if owner is not None and owner.admission.cell[0] - column <= MOST_EMPTY:
+                    owner.controller.own((column, lane))
+            self._owned[lane] = min(self._owned[lane], closed)
 
     def count_left(self) -> None:
         """Count a vehicle that passed the end of the road."""
@@ -128,7 +157,10 @@ class Roadside:
 
     def _note_closed_blocks(self, t_s: float) -> None:
         lattice = self._lattice
-        while lattice.passing_time_s(lattice.block_range(self._closing_block)[0]) < t_s:
+        while (
+            lattice.passing_time_s(lattice.block_range(self._closing_block)[0]) + self._spread_s
+            < t_s
+        ):
             self._closing_block += 1
             self._census_changed = True
 

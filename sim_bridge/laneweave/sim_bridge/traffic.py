@@ -13,6 +13,12 @@ from laneweave.sim_bridge.overlap import Around
 from laneweave.sim_bridge.plant import Plant
 from laneweave.sim_bridge.sensors import Sensors
 
+SETTLE_S = 10.0
+"""Time from the entry until a vehicle is in its cell. Two that follow each other closely stay at
+least 13 m apart, front to front, when both fall back by half a column in it."""
+NEAR_M = 0.01
+"""A vehicle that enters this near to its cell is there."""
+
 
 @define
 class RoadVehicle:
@@ -26,13 +32,21 @@ class RoadVehicle:
 
     @classmethod
     def entering(cls, admission: Admission, t_s: float, scenario: Scenario) -> RoadVehicle:
-        """Return a vehicle in the cell in which it was admitted, at road time `t_s`."""
+        """Return a vehicle that has driven at v_F since it was admitted, at road time `t_s`.
+
+        It is to settle in its cell within `SETTLE_S`.
+        """
         lattice, tick_s = scenario.lattice, scenario.runtime.tick_s
-        state = cell_state(lattice, admission.cell, t_s)
+        rest = cell_state(lattice, admission.cell, t_s)
+        s_m = lattice.speed_mps * (t_s - admission.t_s)
         name = Name(admission.arrival.vehicle)
         controller = MotionController(
-            Plant(state, scenario.vehicle, tick_s), scenario, admission.cell
+            Plant((s_m, *rest[1:]), scenario.vehicle, tick_s), scenario, admission.cell
         )
+        if abs(s_m - rest[0]) > NEAR_M:
+            controller.motion_end_tick = round((t_s + SETTLE_S) / tick_s)
+        if scenario.formation.rolling:
+            controller.own(admission.cell)
         return cls(name, admission, controller, Sensors(scenario, name))
 
     @property
@@ -81,6 +95,9 @@ class RoadVehicle:
             joined=controller.joined,
             accepted=controller.accepted,
             left=left,
+            estate=controller.estate,
+            promised=controller.promised,
+            deed=controller.deed,
         )
 
     def step(self, tick: int) -> None:

@@ -1,0 +1,186 @@
+"""One ballot of the rolling operation: some vehicles move, and cells change hands for it.
+
+The roster is whoever moves and whoever owns a cell that is moved through. As with formations the
+whole roster promises, from where it then holds the plan is made, and the plan is in force when all
+have accepted it (rules L3 to L6). It is short: one move of each vehicle at most, in one slot. What
+does not come about in time is given up; everybody holds, and the next slot is planned from there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from enum import Enum
+
+from attrs import define, field
+
+from laneweave.protocol.lattice import Cell, footprint, territory
+from laneweave.protocol.messages import Ballot, Name, Plan, Prepare, VehicleState
+from laneweave.protocol.plans import estate_problems, plan_problems
+
+Moves = Mapping[Name, tuple[Cell, Cell]]
+"""(from, to) of each vehicle that moves."""
+States = Mapping[Name, VehicleState]
+
+
+class Phase(Enum):
+    """Where a handover stands."""
+
+    PREPARING = "preparing"
+    ISSUING = "issuing"
+    IN_FORCE = "in force"
+    GIVEN_UP = "given up"
+
+
+def estate_of(state: VehicleState, states: States) -> frozenset[Cell] | None:
+    """Return what a vehicle owns for certain, from its state and from those of others.
+
+    A vehicle whose newest deed is not open does not know what it owns: others of the roster may
+    have opened their gates. It is open if one of them has; it never will be if one of them has
+    promised more and has no deed of it.
+
+    Args:
+        state: of the vehicle; it shows an estate.
+        states: the newest ones of others, what they show stays true.
+
+    Returns:
+        None: it cannot be told.
+    """
+    deed = state.deed
+    if deed is None or deed.open:
+        return frozenset(state.estate)
+    for name in deed.roster:
+        other = states.get(name)
+        if other is None or name == state.vehicle:
+            continue
+        known = other.deed.ballot if other.deed is not None else None
+        if known == deed.ballot and other.deed is not None and other.deed.open:
+            return frozenset(deed.after)
+        if (
+            other.promised is not None
+            and other.promised > deed.ballot
+            and other.estate
+            and (known is None or known < deed.ballot)
+        ):
+            return frozenset(deed.before)
+    if all(
+        name in states
+        and states[name].promised == state.promised
+        and states[name].estate
+        and not states[name].accepted
+        for name in deed.roster
+    ) and state.promised != deed.ballot:
+        # All have turned to one newer ballot, and none of them had opened its gate.
+        return frozenset(deed.before)
+    return None
+
+
+@define
+class Handover:
+    """A leader's state of one ballot."""
+
+    ballot: Ballot
+    roster: tuple[Name, ...]
+    moves: Moves
+    t0_s: float
+    """When the moves begin."""
+    slot_s: float
+    resend_s: float
+    due_s: float
+    """When something is to be sent, again (node clock)."""
+    phase: Phase = Phase.PREPARING
+    promises: dict[Name, VehicleState] = field(factory=dict)
+    accepted: set[Name] = field(factory=set)
+    plan: Plan | None = None
+    why: str = ""
+    """Why it was given up."""
+
+    def on_state(self, state: VehicleState, states: States) -> None:
+        """Take a newer state of a member; `states` has the newest one of everybody."""
+        name = state.vehicle
+        if self.phase not in (Phase.PREPARING, Phase.ISSUING):
+            return
+        if state.promised is not None and state.promised > self.ballot:
+            self.give_up("outbid")
+        elif state.promised == self.ballot:
+            if self.phase is Phase.PREPARING and not state.accepted and state.estate:
+                self.promises[name] = state
+                if len(self.promises) == len(self.roster):
+                    self._issue(states)
+            elif self.phase is Phase.ISSUING and state.accepted:
+                self.accepted.add(name)
+                if len(self.accepted) == len(self.roster):
+                    self.phase = Phase.IN_FORCE
+        elif name in self.promises:
+            self.give_up("restarted")
+
+    def give_up(self, why: str) -> None:
+        """Send nothing more."""
+        self.phase, self.why = Phase.GIVEN_UP, why
+
+    def outgoing(self, now_s: float) -> Iterable[tuple[Name, Prepare | Plan]]:
+        """Return what has to be sent (again) now, and to whom."""
+        if now_s < self.due_s:
+            return []
+        if self.phase is Phase.PREPARING:
+            self.due_s = now_s + self.resend_s
+            message = Prepare(self.ballot, (), self.roster)
+            return [(name, message) for name in self.roster if name not in self.promises]
+        if self.phase is Phase.ISSUING and self.plan is not None:
+            self.due_s = now_s + self.resend_s
+            return [(name, self.plan) for name in self.roster if name not in self.accepted]
+        return []
+
+    @property
+    def wakeup_s(self) -> float | None:
+        """When `outgoing` has something to send."""
+        return self.due_s if self.phase in (Phase.PREPARING, Phase.ISSUING) else None
+
+    def _issue(self, states: States) -> None:
+        """Make the plan from the promises, if it still can be made."""
+        before: dict[Name, frozenset[Cell]] = {}
+        for name, promise in self.promises.items():
+            estate = estate_of(promise, dict(states) | self.promises)
+            if estate is None:
+                self.give_up(f"nobody can tell what {name} owns")
+                return
+            before[name] = estate
+        for name, (origin, _) in self.moves.items():
+            promise = self.promises[name]
+            if promise.hold_cell != origin or not promise.attended:
+                self.give_up(f"{name} is not where it was planned from")
+                return
+        plan = self._plan(before)
+        problems = [*plan_problems(plan), *estate_problems(plan)]
+        if problems:
+            self.give_up("; ".join(problems))
+            return
+        self.plan, self.phase = plan, Phase.ISSUING
+        self.due_s = 0.0
+
+    def _plan(self, before: Mapping[Name, frozenset[Cell]]) -> Plan:
+        needed = {name: footprint(*move) for name, move in self.moves.items()}
+        given = {cell for cells in needed.values() for cell in cells}
+        after = {name: (cells - given) | needed.get(name, set()) for name, cells in before.items()}
+        moves = {
+            name: ((0, *self.moves[name]),) if name in self.moves else () for name in self.roster
+        }
+        start_cells = {name: self.promises[name].hold_cell for name in self.roster}
+        return Plan(
+            ballot=self.ballot,
+            formations=tuple(sorted({promise.formation for promise in self.promises.values()})),
+            roster=self.roster,
+            incarnations={name: self.promises[name].incarnation for name in self.roster},
+            start_cells=start_cells,
+            moves=moves,
+            t0_s=self.t0_s,
+            slot_s=self.slot_s,
+            territory=tuple(
+                sorted(
+                    territory(
+                        start_cells.values(), [move for each in moves.values() for move in each]
+                    )
+                )
+            ),
+            before={name: tuple(sorted(before[name])) for name in self.roster},
+            after={name: tuple(sorted(after[name])) for name in self.roster},
+        )

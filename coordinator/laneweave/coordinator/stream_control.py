@@ -1,0 +1,303 @@
+"""The rolling operation under a leader: the whole stream is planned anew in each slot.
+
+Shortly after a slot has begun, everybody's hold cell at its end is known. From there the stream
+planner lays complete ways for all vehicles; what they do in the next slot is put into force by
+ballots over exactly the vehicles that it concerns (`handover`), while the moves of this slot are
+under way. Nobody stops for a replan: who is not reached holds, and is planned from there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from typing import Any
+
+from attrs import field, frozen
+
+from laneweave.coordinator.handover import Handover, Phase, estate_of
+from laneweave.coordinator.planning.conflicts import ConflictModel
+from laneweave.coordinator.planning.grid import Mode
+from laneweave.coordinator.planning.stream import (
+    StreamCosts,
+    StreamPlan,
+    StreamPlanner,
+    StreamRoad,
+    StreamVehicle,
+)
+from laneweave.protocol.lattice import Cell, footprint
+from laneweave.protocol.messages import Ballot, Census, Name, Plan, Prepare, VehicleState
+from laneweave.protocol.node import Compute, Computed
+from laneweave.protocol.scenario import Scenario
+
+SHOWN_S = 0.5
+"""Who moves in a slot has begun, and shown it, this long after the slot has."""
+LATEST_S = 1.0
+"""A plan that is ready later than this after its slot has begun is not put into force any more."""
+BESIDE = 10
+"""Columns ahead of the foremost vehicle and behind the rearmost one that planning looks at."""
+
+
+@frozen
+class Note:
+    """Something worth a line in `events.jsonl`."""
+
+    kind: str
+    data: dict[str, Any] = field(factory=dict)
+
+
+@frozen
+class _Order:
+    """What is planned."""
+
+    slot: int
+    vehicles: tuple[StreamVehicle, ...]
+    blocked: frozenset[Cell]
+    before: StreamPlan | None
+
+
+class StreamControl:
+    """All vehicles under one leader."""
+
+    def __init__(self, scenario: Scenario, new_ballot: Callable[[Ballot | None], Ballot]) -> None:
+        """Begin with nothing known.
+
+        Args:
+            scenario: road, lattice, timing.
+            new_ballot: returns a ballot never used before and above the given one, if one is given.
+        """
+        self._scenario = scenario
+        self._new_ballot = new_ballot
+        self._planner = StreamPlanner(stream_road(scenario), StreamCosts(), scenario.seed)
+        self._slot_s = scenario.formation.cycle_s
+        self.states: dict[Name, VehicleState] = {}
+        """The newest state of each vehicle."""
+        self.handovers: list[Handover] = []
+        self._of: dict[Name, Handover] = {}
+        self._census: Census | None = None
+        self._highest: Ballot | None = None
+        self._since_s: float | None = None
+        """Since when states have been heard (road time)."""
+        self._ordered: tuple[int, int] | None = None
+        """Number of the computation under way, and of the slot that it plans."""
+        self._newest_slot = -1
+        self._table: StreamPlan | None = None
+
+    # --- inputs -------------------------------------------------------------------------------
+
+    def forget(self) -> None:
+        """Begin anew: another road, or another leadership."""
+        self.states.clear()
+        self.handovers.clear()
+        self._of.clear()
+        self._census = self._table = self._ordered = self._since_s = None
+        self._newest_slot = -1
+
+    def on_census(self, census: Census) -> None:
+        """Take note of who is on the road."""
+        self._census = census
+        listed = {entry.vehicle for entry in census.on_road}
+        for name in [name for name in self.states if name not in listed]:
+            del self.states[name]
+            handover = self._of.pop(name, None)
+            if handover is not None and handover.wakeup_s is not None:
+                handover.give_up(f"{name} has left")
+
+    def on_state(self, state: VehicleState) -> Iterator[Note]:
+        """Take a vehicle's state, unless a newer one is known."""
+        known = self.states.get(state.vehicle)
+        if known is not None and _age(state) < _age(known):
+            return
+        self.states[state.vehicle] = state
+        if state.promised is not None:
+            self._highest = max(self._highest or state.promised, state.promised)
+        handover = self._of.get(state.vehicle)
+        if handover is None or handover.wakeup_s is None:
+            return
+        handover.on_state(state, self.states)
+        if handover.phase is Phase.GIVEN_UP:
+            yield Note("handover-given-up", {"roster": list(handover.roster), "why": handover.why})
+
+    # --- the slot -----------------------------------------------------------------------------
+
+    def order(self, job: Callable[[], int], t_s: float) -> Iterator[Compute]:
+        """Order the planning of the next slot when it is time for it.
+
+        Args:
+            job: returns the number of a new computation.
+            t_s: road time.
+        """
+        census = self._census
+        if census is None or not census.on_road or self._ordered is not None:
+            return
+        if self._since_s is None:
+            self._since_s = t_s
+        slot = math.floor(t_s / self._slot_s + 1e-9)
+        begun_s = slot * self._slot_s
+        if slot < self._newest_slot or t_s < max(begun_s, self._since_s) + SHOWN_S:
+            return
+        order = self._order(census, slot + 1, begun_s)
+        self._newest_slot = slot + 1
+        number = job()
+        self._ordered = (number, slot + 1)
+        yield Compute(number, partial(self._plan, order))
+
+    def _plan(self, order: _Order) -> StreamPlan:
+        return self._planner.plan(order.slot, order.vehicles, order.before, order.blocked)
+
+    def _order(self, census: Census, slot: int, begun_s: float) -> _Order:
+        vehicles, owned, taken = [], set[Cell](), set[Cell]()
+        for entry in census.on_road:
+            state = self.states.get(entry.vehicle)
+            if state is None:
+                vehicles.append(
+                    StreamVehicle(entry.vehicle, entry.cell, entry.preferred_lane, held=True)
+                )
+                continue
+            late = state.accepted and not state.done and not state.moving
+            estate = estate_of(state, self.states) if state.estate else None
+            if estate is not None:
+                owned |= estate
+            if late and state.deed is not None:
+                # Its move may begin at any time until it promises something else.
+                taken |= {*state.estate, *state.deed.after} - {state.hold_cell}
+            held = late or not state.attended
+            vehicles.append(
+                StreamVehicle(entry.vehicle, state.hold_cell, entry.preferred_lane, held)
+            )
+        columns = [vehicle.cell[0] for vehicle in vehicles]
+        blocked = {
+            (column, lane)
+            for column in range(min(columns) - BESIDE, max(columns) + BESIDE + 1)
+            for lane in range(self._scenario.road.lanes)
+            if (column, lane) not in owned or (column, lane) in taken
+        }
+        return _Order(slot, tuple(vehicles), frozenset(blocked), self._table)
+
+    def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterator[Note]:
+        """Take a plan, and begin to put its first moves into force.
+
+        Args:
+            computed: the result of the newest computation, or of another one, which is ignored.
+            t_s: road time.
+            now_s: node clock.
+        """
+        if self._ordered is None or computed.job != self._ordered[0]:
+            return
+        slot = self._ordered[1]
+        self._ordered = None
+        table = computed.result
+        if not isinstance(table, StreamPlan):
+            yield Note("planning-failed", {"slot": slot, "error": computed.error})
+            return
+        self._table = table
+        t0_s = slot * self._slot_s
+        if t_s > t0_s + LATEST_S:
+            yield Note("planning-late", {"slot": slot})
+            return
+        for handover in self.handovers:
+            if handover.wakeup_s is not None:
+                handover.give_up("the next slot is planned")
+        self.handovers = list(self._handovers(table, t0_s, now_s))
+        self._of = {name: each for each in self.handovers for name in each.roster}
+        yield Note("stream-planned", self._facts(table))
+
+    def _facts(self, table: StreamPlan) -> dict[str, Any]:
+        sizes = [len(handover.roster) for handover in self.handovers]
+        return {
+            "slot": table.slot,
+            "vehicles": len(table.ways),
+            "missed": len(table.missed),
+            "moves": sum(len(handover.moves) for handover in self.handovers),
+            "ballots": len(sizes),
+            "largest": max(sizes, default=0),
+            "status": "feasible",
+        }
+
+    def _handovers(self, table: StreamPlan, t0_s: float, now_s: float) -> Iterator[Handover]:
+        owner = {
+            cell: name
+            for name, state in self.states.items()
+            for cell in (estate_of(state, self.states) or ())
+        }
+        moves: dict[Name, tuple[Cell, Cell]] = {}
+        concerned: dict[Name, set[Name]] = {}
+        for vehicle, way in table.ways.items():
+            if len(way) < 2 or way[0] == way[1]:
+                continue
+            name = Name(vehicle)
+            cells = footprint(way[0], way[1])
+            if all(cell in owner for cell in cells):
+                moves[name] = (way[0], way[1])
+                concerned[name] = {owner[cell] for cell in cells} | {name}
+        for roster in _clusters(concerned.values()):
+            yield Handover(
+                ballot=self._new_ballot(self._highest),
+                roster=tuple(sorted(roster)),
+                moves={name: moves[name] for name in sorted(roster) if name in moves},
+                t0_s=t0_s,
+                slot_s=self._slot_s,
+                resend_s=self._scenario.network.resend_s,
+                due_s=now_s,
+            )
+
+    # --- outputs ------------------------------------------------------------------------------
+
+    def outgoing(self, now_s: float) -> Iterator[tuple[Name, Prepare | Plan]]:
+        """Return what has to be sent (again) now, and to whom."""
+        for handover in self.handovers:
+            yield from handover.outgoing(now_s)
+
+    @property
+    def wakeups(self) -> list[float]:
+        """When `outgoing` has something to send."""
+        return [each.wakeup_s for each in self.handovers if each.wakeup_s is not None]
+
+    @property
+    def in_force(self) -> int:
+        """Ballots of this slot that are in force."""
+        return sum(handover.phase is Phase.IN_FORCE for handover in self.handovers)
+
+
+def stream_road(scenario: Scenario) -> StreamRoad:
+    """Return the road of a scenario as the stream planner sees it."""
+    formation, road = scenario.formation, scenario.road
+    mode: Mode = 1 if formation.mode == 1 else 2
+    return StreamRoad(
+        lanes=road.lanes,
+        pitch_m=formation.gap_m,
+        advance_m=formation.speed_mps * formation.cycle_s,
+        sorting_m=(road.sorting_start_m, road.length_m),
+        length_m=road.length_m,
+        body_m=scenario.vehicle.length_m,
+        mode=mode,
+        model=ConflictModel(formation.conflict_kinds),
+    )
+
+
+def _clusters(groups: Iterable[set[Name]]) -> list[set[Name]]:
+    """Join groups that share a vehicle."""
+    clusters: list[set[Name]] = []
+    for group in groups:
+        joined = set(group)
+        apart = []
+        for cluster in clusters:
+            if cluster & joined:
+                joined |= cluster
+            else:
+                apart.append(cluster)
+        clusters = [*apart, joined]
+    return clusters
+
+
+def _age(state: VehicleState) -> tuple[object, ...]:
+    """Return what orders the states of one vehicle, older ones first."""
+    deed = state.deed
+    return (
+        state.incarnation,
+        state.t_s,
+        state.promised or (),
+        bool(state.estate),
+        state.accepted,
+        (deed.ballot, deed.open) if deed is not None else (),
+    )
