@@ -79,7 +79,7 @@ class SimulatedRun:
         scenario = self.scenario
         check_simulated(self.faults)
         self.folder.mkdir(parents=True, exist_ok=True)
-        network = SimulatedNetwork(scenario.seed, self.conditions)
+        network = SimulatedNetwork(scenario.seed, self.conditions, in_kind=True)
         self._roles = SimulatedRoles(network, coordinator_names(scenario), self._start)
         if self.faults:
             self._active_faults = SimulatedFaults.open(self.faults, scenario, self._roles)

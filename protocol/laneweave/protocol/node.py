@@ -209,11 +209,13 @@ class Node:
         order_work: Callable[[Compute], None],
         label: Name,
         read: Callable[[str, bytes], Arrived] | None = None,
+        write: Callable[[object], bytes] = encode,
     ) -> None:
         """Join a core to its transport; nothing is sent before the first `dispatch`.
 
         `label` tells this process from all others in reports. `read` does what
-        `read_message` does with `keys`, which is also the default; it may remember.
+        `read_message` does with `keys`, which is also the default; it may remember. `write` turns a
+        message into what `read` understands.
         """
         self._label = label
         self.core = core
@@ -224,6 +226,7 @@ class Node:
         self._keys = keys
         self._order_work = order_work
         self._read = read or partial(read_message, keys)
+        self._write = write
         self._encoded: tuple[object, bytes] = (None, b"")
         """The newest message sent, and its bytes: a plan goes to one vehicle after the other."""
 
@@ -274,7 +277,7 @@ class Node:
                 rejected=self.rejected,
             )
         if message is not self._encoded[0]:
-            self._encoded = message, encode(message)
+            self._encoded = message, self._write(message)
         key = self._keys.key(topic, **effect.parameters)
         self._transport.publish(key, self._encoded[1], topic.quality)
 

@@ -8,7 +8,8 @@ killed process is seen at once, a silent one after its lease; a node that loses 
 everybody else vanish).
 
 Every message travels as bytes and is checked on receipt, as on Zenoh. But all who receive the same
-bytes are handed one and the same message: no core may change what it is handed.
+bytes are handed one and the same message: no core may change what it is handed. Where speed is all
+that matters messages may travel as they are (`in_kind`).
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from collections.abc import Callable, Iterable
 from functools import lru_cache, partial
 from itertools import count
 
-from laneweave.protocol.codec import decode
+from laneweave.protocol.codec import decode, encode
 from laneweave.protocol.messages import Name
 from laneweave.protocol.node import Arrived, Core, Node, Started, Stopping, read_message
 from laneweave.protocol.simulated_conditions import Clock, Conditions
@@ -46,12 +47,41 @@ _REMEMBERED = 4096
 """Messages that are remembered as they were read, once for all receivers."""
 
 
+class Parcel(bytes):
+    """A message that travels as it is, in place of its bytes."""
+
+    message: object
+
+    def __new__(cls, message: object) -> Parcel:
+        """Wrap a message."""
+        parcel = super().__new__(cls)
+        parcel.message = message
+        return parcel
+
+
+def _unpack(
+    keys: Keys, read: Callable[[str, bytes], Arrived], key: str, payload: bytes
+) -> Arrived:
+    """Return what arrived, whether it travelled as bytes or as it is."""
+    if not isinstance(payload, Parcel):
+        return read(key, payload)
+    return read_message(keys, key, payload, _message_in)
+
+
+def _message_in(payload: bytes, _: type) -> object:
+    assert isinstance(payload, Parcel)  # noqa: S101 (nothing else is handed on)
+    return payload.message
+
+
 class SimulatedNetwork(Simulation):
     """The network and its nodes, in virtual time."""
 
-    def __init__(self, seed: int, conditions: Conditions | None = None) -> None:
-        """Make an empty network at time 0."""
+    def __init__(
+        self, seed: int, conditions: Conditions | None = None, *, in_kind: bool = False
+    ) -> None:
+        """Make an empty network at time 0; `in_kind`: messages travel without codec and checks."""
         super().__init__(seed, conditions)
+        self._in_kind = in_kind
         self._members: dict[str, Member] = {}
         self._tokens = Tokens(self, self._members)
         self._clocks: dict[str, Clock] = {}
@@ -87,6 +117,7 @@ class SimulatedNetwork(Simulation):
             member.compute,
             Name(f"{next(self._label_count)}"),
             self._reader(realm),
+            Parcel if self._in_kind else encode,
         )
         self._members[name] = member
         self.at(self.now_s, member.hand_over, Started())
@@ -281,7 +312,8 @@ class SimulatedNetwork(Simulation):
         if realm not in self._readers:
             # Some go to many on keys of their own, like a plan: they are still decoded only once.
             read = partial(read_message, Keys(realm), decode=self._decode)
-            self._readers[realm] = lru_cache(maxsize=_REMEMBERED)(read)
+            remembering = lru_cache(maxsize=_REMEMBERED)(read)
+            self._readers[realm] = partial(_unpack, Keys(realm), remembering)
         return self._readers[realm]
 
     def _vanish(self, name: str, seen_after_s: float) -> None:
