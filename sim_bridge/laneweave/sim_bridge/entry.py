@@ -41,6 +41,8 @@ class Admission:
     cell: Cell
     t_s: float
     """Road time at which it passes s = 0."""
+    offset_m: float = 0.0
+    """How far ahead of its cell it is."""
 
 
 class EntryMeter:
@@ -119,7 +121,9 @@ class EntryMeter:
             arrival = self._takes((self._columns[lane], lane))
             if arrival is not None:
                 cell = (self._columns[lane], lane)
-                admissions.append(Admission(arrival, cell, t_s))
+                late_s = self._lattice.passing_time_s(cell[0]) - t_s
+                offset_m = late_s * self._lattice.speed_mps
+                admissions.append(Admission(arrival, cell, t_s, offset_m))
                 self._free_s[lane] = t_s + self._lattice.pitch_m / self._lattice.speed_mps
             self._columns[lane] -= 1
         # A column that has passed is not for those who are demanded later.

@@ -38,12 +38,12 @@ class RoadVehicle:
         """
         lattice, tick_s = scenario.lattice, scenario.runtime.tick_s
         rest = cell_state(lattice, admission.cell, t_s)
-        s_m = lattice.speed_mps * (t_s - admission.t_s)
+        s_m = rest[0] + admission.offset_m
         name = Name(admission.arrival.vehicle)
         controller = MotionController(
             Plant((s_m, *rest[1:]), scenario.vehicle, tick_s), scenario, admission.cell
         )
-        if abs(s_m - rest[0]) > NEAR_M:
+        if abs(admission.offset_m) > NEAR_M:
             controller.motion_end_tick = round((t_s + SETTLE_S) / tick_s)
         if scenario.formation.rolling:
             controller.own(admission.cell)
