@@ -57,6 +57,13 @@ class Method(StrEnum):
     formation = METHOD
 
 
+class Operation(StrEnum):
+    """How formation control runs a stream."""
+
+    paper = "paper"
+    rolling = "rolling"
+
+
 class Benchmark(StrEnum):
     """What `laneweave bench` measures."""
 
@@ -94,6 +101,10 @@ def run(
     method: Annotated[
         Method, typer.Option("--method", help="How vehicles are controlled.")
     ] = Method.formation,
+    operation: Annotated[
+        Operation | None,
+        typer.Option("--operation", help="Default: formation.operation of the scenario."),
+    ] = None,
     vehicles_per_process: Annotated[
         int | None, typer.Option("--vehicles-per-process", help="Agents that share a process.")
     ] = None,
@@ -120,6 +131,7 @@ def run(
         seed=seed,
         demand__volume_veh_per_lane_h=volume,
         demand__duration_s=duration,
+        formation__operation=operation.value if operation is not None else None,
         runtime__vehicles_per_process=vehicles_per_process,
         runtime__coordinators=coordinators,
     )

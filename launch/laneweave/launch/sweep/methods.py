@@ -40,12 +40,19 @@ def _paper(max_vehicles: int, block_columns: int) -> LabelledMethod:
     return LabelledMethod(
         METHOD,
         f"formations of at most {max_vehicles} vehicles in {block_columns} columns",
-        {"formation.max_vehicles": max_vehicles, "formation.block_columns": block_columns},
+        {
+            "formation.operation": "paper",
+            "formation.max_vehicles": max_vehicles,
+            "formation.block_columns": block_columns,
+        },
     )
 
 
 METHODS: Final[dict[str, LabelledMethod]] = {
     "formation": LabelledMethod(METHOD, "formation control as the scenario says"),
+    "rolling": LabelledMethod(
+        METHOD, "the whole stream, planned anew in each slot", {"formation.operation": "rolling"}
+    ),
     "paper-6": _paper(6, 4),
     "paper-12": _paper(12, 8),
     "paper-18": _paper(18, 12),
