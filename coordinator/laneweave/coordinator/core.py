@@ -263,7 +263,10 @@ class CoordinatorCore:
     def _on_election(self, now_s: float) -> Iterator[Effect]:
         if not self.election.update(now_s):
             return
-        self._forget_formations()
+        if self._stream is None:
+            self._forget_formations()
+        else:
+            self._stream.take_over()
         self._road_changed = True
         self._awake_since_s = now_s
         if self.election.leading:

@@ -32,6 +32,9 @@ from laneweave.protocol.scenario import Scenario
 
 SHOWN_S = 0.5
 """Who moves in a slot has begun, and shown it, this long after the slot has."""
+PATIENCE_S = 1.0
+"""A new leader listens for so long (road time). One that leads only for a moment, because it has not
+heard another one, must not outbid what that one has begun."""
 LATEST_S = 1.0
 """A plan that is ready later than this after its slot has begun is not put into force any more."""
 BESIDE = 10
@@ -93,6 +96,15 @@ class StreamControl:
         self._census = self._table = self._ordered = self._since_s = None
         self._newest_slot = -1
 
+    def take_over(self) -> None:
+        """Lead, again or for the first time: listen for a while before anything is planned.
+
+        What vehicles have shown stays true; what was begun under an earlier lead is left alone.
+        """
+        self.handovers.clear()
+        self._of.clear()
+        self._ordered = self._since_s = None
+
     def on_census(self, census: Census) -> None:
         """Take note of who is on the road."""
         self._census = census
@@ -134,7 +146,7 @@ class StreamControl:
             self._since_s = t_s
         slot = math.floor(t_s / self._slot_s + 1e-9)
         begun_s = slot * self._slot_s
-        if slot < self._newest_slot or t_s < max(begun_s, self._since_s) + SHOWN_S:
+        if slot < self._newest_slot or t_s < max(begun_s + SHOWN_S, self._since_s + PATIENCE_S):
             return
         order = self._order(census, slot + 1, begun_s)
         self._newest_slot = slot + 1
