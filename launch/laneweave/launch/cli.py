@@ -10,7 +10,7 @@ import signal
 import sys
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -29,7 +29,10 @@ from laneweave.launch.role_commands import (
 )
 from laneweave.launch.run_folder import draw_own, new_folder
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
-from laneweave.protocol.scenario import load_scenario
+from laneweave.protocol.scenario import Scenario, load_scenario
+
+if TYPE_CHECKING:
+    from laneweave.launch.outcome import Outcome
 
 app = typer.Typer(
     name="laneweave",
@@ -55,6 +58,8 @@ class Method(StrEnum):
     """How vehicles are controlled."""
 
     formation = METHOD
+    rule = "rule"
+    lc2013 = "lc2013"
 
 
 class Operation(StrEnum):
@@ -136,30 +141,53 @@ def run(
         runtime__coordinators=coordinators,
     )
     check_pace(pace)
+    show = not no_progress and sys.stderr.isatty()
+    if method is Method.formation:
+        outcome = _run_formations(settings, out, transport, faults, pace, show=show)
+    elif faults is not None:
+        raise BadInputError("--faults", faults, f"no faults with --method {method.value}")
+    else:
+        outcome = _run_reference(settings, out, method, show=show)
 
+    from laneweave.launch.outcome import print_outcome
+
+    print_outcome(outcome, Console())
+    if outcome.summary is not None:
+        draw_own(outcome.folder)
+    raise typer.Exit(outcome.exit_status)
+
+
+def _run_formations(
+    settings: Scenario,
+    out: Path | None,
+    transport: TransportChoice,
+    faults: str | None,
+    pace: float | None,
+    *,
+    show: bool,
+) -> Outcome:
     from laneweave.agents.trajectory import check_moves
     from laneweave.launch.faults import load_faults
     from laneweave.launch.local_run import LocalRun, coordinator_names
-    from laneweave.launch.outcome import print_outcome
     from laneweave.sim_bridge.demand import arrivals
 
     check_moves(settings)
     vehicles = {arrival.vehicle for arrival in arrivals(settings)}
     plan_of_faults = load_faults(faults, coordinator_names(settings), vehicles)
-    folder = new_folder(out, settings, method.value)
-    show = not no_progress and sys.stderr.isatty()
+    folder = new_folder(out, settings, METHOD)
     if transport is TransportChoice.simulated:
         from laneweave.launch.simulated_run import SimulatedRun
 
-        outcome = SimulatedRun(
-            settings, folder, method.value, plan_of_faults, show_progress=show
-        ).run()
-    else:
-        outcome = LocalRun(settings, folder, method.value, plan_of_faults, show, pace).run()
-    print_outcome(outcome, Console())
-    if outcome.summary is not None:
-        draw_own(folder)
-    raise typer.Exit(outcome.exit_status)
+        return SimulatedRun(settings, folder, METHOD, plan_of_faults, show_progress=show).run()
+    return LocalRun(settings, folder, METHOD, plan_of_faults, show, pace).run()
+
+
+def _run_reference(settings: Scenario, out: Path | None, method: Method, *, show: bool) -> Outcome:
+    from laneweave.launch.reference_run import ReferenceRun, check_reference
+
+    check_reference(settings, method.value)
+    folder = new_folder(out, settings, method.value)
+    return ReferenceRun(settings, folder, method.value, show_progress=show).run()
 
 
 @app.command()

@@ -231,6 +231,42 @@ class Tracking:
 
 
 @frozen
+class RuleSettings:
+    """The rule-based reference method (paper, Section 5.2.2), as decision 20 reads it."""
+
+    standstill_gap_m: float = field(default=5.0, validator=within(0.0, 100.0))
+    """d_0 of the gap d_R = d_0 + v tau; the paper's table calls it d_R."""
+    headway_s: float = field(default=0.66, validator=within(0.0, 10.0))
+    """tau of the same."""
+    stop_distance_m: float = field(default=150.0, validator=within(1.0, 20_000.0))
+    """d_stop: who gives way so near to the end stops; the paper's table calls it d_end."""
+    gap: str = field(default="front-to-front", validator=one_of("front-to-front", "net"))
+    """What d_R is measured between: front bumpers, or bumper to bumper."""
+    yielding: str = field(default="unsorted", validator=one_of("unsorted", "all"))
+    """Who slows down for a vehicle of higher priority."""
+    slow_down_mps2: float = field(default=3.0, validator=within(0.1, 20.0))
+    """Braking of those who give way; vehicles ahead are braked for as hard as it takes."""
+    lane_change_s: float = field(default=0.0, validator=within(0.0, 20.0))
+    """Time that a lane change takes; 0: none."""
+    min_gap_m: float = field(default=1.0, validator=within(0.1, 50.0))
+    """Least net gap: d_R alone, front to front, would let bumpers touch."""
+
+
+@frozen
+class Lc2013Settings:
+    """The reference method that is SUMO's own: lane changing LC2013, car following of Krauss."""
+
+    headway_s: float = field(default=0.66, validator=within(0.0, 10.0, open_low=True))
+    """tau of the car following, from bumper to bumper."""
+    min_gap_m: float = field(default=0.0, validator=within(0.0, 50.0))
+    """Net gap of those who stand."""
+    lane_change_s: float = field(default=0.0, validator=within(0.0, 20.0))
+    """Time that a lane change takes; 0: none."""
+    lane_changes: str = field(default="sorting", validator=one_of("sorting", "everywhere"))
+    """Where lanes are changed: in S3 only, or on the whole road."""
+
+
+@frozen
 class Network:
     """How roles find each other and when they give each other up; wall-clock seconds."""
 
@@ -286,6 +322,8 @@ class Scenario:
     sensing: Sensing = Sensing()
     braking: Braking = Braking()
     tracking: Tracking = Tracking()
+    rule: RuleSettings = RuleSettings()
+    lc2013: Lc2013Settings = Lc2013Settings()
     network: Network = Network()
     runtime: Runtime = Runtime()
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -16,12 +16,44 @@ from attrs import define, field
 from numpy.typing import NDArray
 
 from laneweave.protocol.messages import Heartbeat, LogEvent, Name, Report
+from laneweave.protocol.motion import State
 from laneweave.protocol.scenario import Scenario
 from laneweave.sim_bridge.demand import Arrival
 from laneweave.sim_bridge.motion_controller import Rung
 from laneweave.sim_bridge.overlap import LeastGaps
 from laneweave.sim_bridge.recorder import Recorder
-from laneweave.sim_bridge.traffic import RoadVehicle
+
+
+class RecordedVehicle(Protocol):
+    """What is recorded of a vehicle on the road, whatever moves it."""
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+
+    @property
+    def arrival(self) -> Arrival:
+        """Its demand."""
+
+    @property
+    def entered_s(self) -> float:
+        """Road time at which its front passed s = 0."""
+
+    @property
+    def formation(self) -> int | None:
+        """Number of its formation, None if the method has none."""
+
+    @property
+    def state(self) -> State:
+        """(s m, v m/s, a m/s2, y m, v_y m/s, a_y m/s2)."""
+
+    @property
+    def cell(self) -> tuple[int | None, int]:
+        """Column and lane that it holds or moves to; column None off the lattice."""
+
+    @property
+    def rung_ticks(self) -> Mapping[Rung, int]:
+        """Ticks on each rung of the ladder; empty without a motion controller."""
 
 
 @define
@@ -89,20 +121,19 @@ class RunRecord:
         """A vehicle wants to enter."""
         self._recorder.demanded(arrival)
 
-    def on_entered(self, vehicle: RoadVehicle) -> None:
+    def on_entered(self, vehicle: RecordedVehicle) -> None:
         """A vehicle entered the road."""
-        admission = vehicle.admission
-        self._recorder.entered(vehicle.name, admission.t_s, vehicle.formation)
+        self._recorder.entered(vehicle.name, vehicle.entered_s, vehicle.formation)
         self.note(
-            admission.t_s,
+            vehicle.entered_s,
             "entered",
             vehicle=vehicle.name,
-            lane=admission.arrival.lane,
-            preferred_lane=admission.arrival.preferred_lane,
+            lane=vehicle.arrival.lane,
+            preferred_lane=vehicle.arrival.preferred_lane,
             formation=vehicle.formation,
         )
 
-    def on_left(self, vehicle: RoadVehicle, t_s: float, *, attended: bool) -> None:
+    def on_left(self, vehicle: RecordedVehicle, t_s: float, *, attended: bool) -> None:
         """A vehicle passed the end of the road since the last tick.
 
         `attended`: an agent was in charge of it, not its caretaker.
@@ -113,7 +144,7 @@ class RunRecord:
         lane = int(y_m // self._scenario.road.lane_width_m)
         self._recorder.left(vehicle.name, left_s, lane)
         self._count_rungs(vehicle)
-        preferred_lane = vehicle.admission.arrival.preferred_lane
+        preferred_lane = vehicle.arrival.preferred_lane
         self.note(
             left_s,
             "left",
@@ -133,7 +164,7 @@ class RunRecord:
                 attended=attended,
             )
 
-    def on_still_on_road(self, vehicle: RoadVehicle) -> None:
+    def on_still_on_road(self, vehicle: RecordedVehicle) -> None:
         """The run ends while a vehicle is on the road."""
         self._count_rungs(vehicle)
 
@@ -154,7 +185,7 @@ class RunRecord:
     def on_shown(
         self,
         t_s: float,
-        vehicles: Iterable[RoadVehicle],
+        vehicles: Iterable[RecordedVehicle],
         *,
         overlaps: Iterable[tuple[str, str]],
         collisions: Iterable[tuple[str, str]],
@@ -233,8 +264,8 @@ class RunRecord:
         )
         pq.write_table(table, self._folder / "ticks.parquet", compression="zstd")
 
-    def _count_rungs(self, vehicle: RoadVehicle) -> None:
-        for rung, ticks in vehicle.controller.rung_ticks.items():
+    def _count_rungs(self, vehicle: RecordedVehicle) -> None:
+        for rung, ticks in vehicle.rung_ticks.items():
             self._rung_ticks[rung] += ticks
 
     def _rest(self, t_s: float) -> dict[str, Any]:
@@ -280,9 +311,9 @@ class RunRecord:
         }
 
 
-def _sample(vehicle: RoadVehicle) -> tuple[str, float, float, float, float, int | None, int]:
+def _sample(vehicle: RecordedVehicle) -> tuple[str, float, float, float, float, int | None, int]:
     s_m, v_mps, a_mps2, y_m, _, _ = vehicle.state
-    column, lane = vehicle.controller.hold_cell
+    column, lane = vehicle.cell
     return (vehicle.name, s_m, y_m, v_mps, a_mps2, column, lane)
 
 

@@ -1,4 +1,4 @@
-"""The road in SUMO; the only module that imports libsumo.
+"""The road in SUMO, with bodies that SUMO shows and does not drive.
 
 SUMO shows every vehicle exactly where the plant says it is: position, lateral position, heading
 and speed, between lanes as well. It drives none of them. Each tick goes
@@ -9,45 +9,25 @@ and speed, between lanes as well. It drives none of them. Each tick goes
 takes both as they are). During its step SUMO derives a speed of its own from the displacement;
 `step` replaces it by the vehicle's (setPreviousSpeed), so the speed read back is exact, too.
 
-libsumo holds its simulation in global variables: there is one `SumoWorld` per process at a time.
-It is imported when the first world opens, so that everything else works without it.
+There is one `SumoWorld` per process at a time, see `sumo.py`.
 """
 
 from __future__ import annotations
 
-import ctypes
 import math
-import os
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
-from laneweave.protocol.errors import CommandFailedError
 from laneweave.protocol.motion import State
 from laneweave.protocol.scenario import Scenario
 from laneweave.sim_bridge.network_file import EDGE, ROUTE, VEHICLE_TYPE, margin_m, write_network
 from laneweave.sim_bridge.overlap import Pose, pose_of
-
-DEBIAN_PACKAGES = {
-    "libX11.so.6": "libx11-6",
-    "libXext.so.6": "libxext6",
-    "libXrender.so.1": "libxrender1",
-    "libGL.so.1": "libgl1",
-    "libatomic.so.1": "libatomic1",
-}
-"""System libraries that libsumo loads and a slim container lacks, and what brings them."""
-
-_IMPORT_SWITCH = "LIBSUMO_AS_TRACI"
-
-
-class SumoUnavailableError(CommandFailedError):
-    """libsumo or a system library that it needs cannot be loaded; the message says what to do."""
+from laneweave.sim_bridge.sumo import SumoSession
 
 
 class SumoWorld:
     """One road with vehicles in SUMO. Close it, or use it as a context manager."""
-
-    _open: SumoWorld | None = None
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
         """Write the network into a folder and start SUMO on it.
@@ -60,9 +40,7 @@ class SumoWorld:
             SumoUnavailableError: libsumo cannot be loaded.
             RuntimeError: another world is open in this process.
         """
-        if SumoWorld._open is not None:
-            raise RuntimeError("libsumo holds one simulation per process, and one is open")
-        self._sumo: Any = _load_libsumo()
+        self._sumo = SumoSession(lambda: write_network(scenario, folder).options)
         self._length_m = scenario.road.length_m
         self._margin_m = margin_m(scenario)
         self._lane_width_m = scenario.road.lane_width_m
@@ -71,8 +49,6 @@ class SumoWorld:
         self._states: dict[str, State] = {}
         self._placed: set[str] = set()
         self._shown: list[str] = []
-        self._sumo.start([*write_network(scenario, folder).options])
-        SumoWorld._open = self
 
     def add(self, vehicle: str, state: State) -> None:
         """Put a new vehicle on the road; SUMO shows it from the next step on.
@@ -122,7 +98,7 @@ class SumoWorld:
             if vehicle not in self._placed:
                 self._move(vehicle, state)
         self._placed.clear()
-        self._sumo.simulationStep()
+        self._sumo.step()
         api = self._sumo.vehicle
         if api.getIDCount() != len(self._states):
             raise RuntimeError(f"SUMO shows {api.getIDCount()} of {len(self._states)} vehicles")
@@ -151,12 +127,7 @@ class SumoWorld:
 
         SUMO misses pairs that overlap between lanes: `overlap.overlapping_pairs` is the truth.
         """
-        return sorted(
-            {
-                (min(found.collider, found.victim), max(found.collider, found.victim))
-                for found in self._sumo.simulation.getCollisions()
-            }
-        )
+        return self._sumo.collisions()
 
     def remove(self, vehicle: str) -> None:
         """Take a vehicle off the road.
@@ -172,8 +143,7 @@ class SumoWorld:
 
     def close(self) -> None:
         """End SUMO; a second call does nothing."""
-        if SumoWorld._open is self:
-            SumoWorld._open = None
+        if self._sumo.is_open:
             self._states.clear()
             self._shown.clear()
             self._sumo.close()
@@ -209,43 +179,3 @@ class SumoWorld:
         degrees = 90.0 - math.degrees(heading)
         self._sumo.vehicle.moveToXY(vehicle, EDGE, lane, s_m, front_y_m, degrees, 2)
         self._placed.add(vehicle)
-
-
-def _load_libsumo() -> Any:  # noqa: ANN401 - libsumo has no types
-    """Import libsumo.
-
-    Its complaint about another version of pyarrow is switched off: it concerns SUMO's own Parquet
-    output, which is not used; both were tried together, imported in either order.
-    """
-    previous = os.environ.get(_IMPORT_SWITCH)
-    os.environ[_IMPORT_SWITCH] = "quiet"
-    try:
-        import libsumo  # noqa: PLC0415 - lazily, see above
-    except (ImportError, OSError) as error:
-        raise SumoUnavailableError(_advice(error)) from error
-    else:
-        return libsumo
-    finally:
-        if previous is None:
-            del os.environ[_IMPORT_SWITCH]
-        else:
-            os.environ[_IMPORT_SWITCH] = previous
-
-
-def _advice(error: Exception) -> str:
-    """Return what to install so that libsumo loads."""
-    if isinstance(error, ModuleNotFoundError):
-        return "libsumo is not installed: pip install 'laneweave[sim]'"
-    missing = [package for library, package in DEBIAN_PACKAGES.items() if not _loads(library)]
-    if missing:
-        return f"libsumo lacks system libraries: apt-get install {' '.join(missing)} ({error})"
-    return f"libsumo cannot be loaded: {error}; it needs {' '.join(DEBIAN_PACKAGES.values())}"
-
-
-def _loads(library: str) -> bool:
-    """Tell whether the dynamic loader finds a shared library."""
-    try:
-        ctypes.CDLL(library)
-    except OSError:
-        return False
-    return True

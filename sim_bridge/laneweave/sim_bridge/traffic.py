@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from attrs import define
 
+from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import Name, Sense
 from laneweave.protocol.motion import State, cell_state
 from laneweave.protocol.scenario import Scenario
+from laneweave.sim_bridge.demand import Arrival
 from laneweave.sim_bridge.entry import Admission
-from laneweave.sim_bridge.motion_controller import MotionController
+from laneweave.sim_bridge.motion_controller import MotionController, Rung
 from laneweave.sim_bridge.overlap import Around
 from laneweave.sim_bridge.plant import Plant
 from laneweave.sim_bridge.sensors import Sensors
@@ -58,6 +62,26 @@ class RoadVehicle:
     def formation(self) -> int:
         """Number of the formation in whose block it entered."""
         return self.controller.lattice.block_of(self.admission.cell[0])
+
+    @property
+    def arrival(self) -> Arrival:
+        """Its demand."""
+        return self.admission.arrival
+
+    @property
+    def entered_s(self) -> float:
+        """Road time at which its front passed s = 0."""
+        return self.admission.t_s
+
+    @property
+    def cell(self) -> Cell:
+        """The cell that it holds or moves to."""
+        return self.controller.hold_cell
+
+    @property
+    def rung_ticks(self) -> Mapping[Rung, int]:
+        """Ticks on each rung of the ladder."""
+        return self.controller.rung_ticks
 
     def perceive(self, around: Around) -> None:
         """Let its sensors measure where it is now, and whom it sees.

@@ -15,9 +15,10 @@ import pytest
 
 from laneweave.protocol.motion import State
 from laneweave.protocol.scenario import Scenario, parse_scenario
-from laneweave.sim_bridge import sumo_world
+from laneweave.sim_bridge import sumo
 from laneweave.sim_bridge.overlap import pose_of
-from laneweave.sim_bridge.sumo_world import SumoUnavailableError, SumoWorld
+from laneweave.sim_bridge.sumo import SumoUnavailableError
+from laneweave.sim_bridge.sumo_world import SumoWorld
 
 SCENARIO = Scenario()
 
@@ -203,7 +204,7 @@ def test_missing_system_libraries_are_named_by_their_debian_packages(
     monkeypatch.setattr(ctypes, "CDLL", lacks_some)
     with pytest.raises(SumoUnavailableError, match="apt-get install libx11-6 libatomic1 "):
         SumoWorld(SCENARIO, tmp_path)
-    assert sumo_world.DEBIAN_PACKAGES.keys() >= {"libXext.so.6", "libXrender.so.1", "libGL.so.1"}
+    assert sumo.DEBIAN_PACKAGES.keys() >= {"libXext.so.6", "libXrender.so.1", "libGL.so.1"}
 
 
 def test_nothing_but_a_world_imports_libsumo() -> None:

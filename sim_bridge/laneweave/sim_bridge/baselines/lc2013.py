@@ -1,0 +1,121 @@
+"""SUMO's own lane changing and car following: LC2013 and Krauss, as automated vehicles.
+
+Headway and desired speed are those of the other methods, all vehicles are alike and drive without
+imperfection. On the route to its exit SUMO makes each vehicle want its preferred lane; in S1 and S2
+lane changes are switched off unless the scenario allows them everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario import Scenario
+from laneweave.sim_bridge.baselines.entrance import Entrance
+from laneweave.sim_bridge.baselines.vehicle import Vehicle
+from laneweave.sim_bridge.overlap import Pose
+from laneweave.sim_bridge.sumo_traffic import SumoTraffic
+
+
+class Lc2013Traffic:
+    """Everybody on the road, driven by SUMO; see `Traffic`."""
+
+    def __init__(self, scenario: Scenario, sumo: SumoTraffic) -> None:
+        """Begin with an empty road."""
+        self._sumo = sumo
+        self._vehicles: dict[str, Vehicle] = {}
+        self._offered: dict[str, int] = {}
+        """Who waits in SUMO for room, at most one on each lane, and its lane."""
+        self._kept_on_lane: set[Vehicle] = set()
+        """Who may not change lanes yet."""
+        self._poses: dict[str, Pose] = {}
+        self._road = scenario.road
+        self._everywhere = scenario.lc2013.lane_changes == "everywhere"
+        self._speed_mps = scenario.formation.speed_mps
+        self._tick_s = scenario.runtime.tick_s
+
+    @property
+    def vehicles(self) -> Collection[Vehicle]:
+        """All on the road, in order of entry."""
+        return self._vehicles.values()
+
+    def step(self, t_s: float, entrance: Entrance) -> list[Vehicle]:
+        """Let SUMO move everybody on to `t_s`, and let enter for whom there is room then."""
+        self._offer(t_s, entrance)
+        entered = self._sumo.step()
+        self._poses = self._sumo.positions()
+        came = [self._entered(name, t_s, entrance) for name in sorted(entered)]
+        for vehicle in self._vehicles.values():
+            self._look(vehicle)
+        self._release()
+        return came
+
+    def poses(self) -> dict[str, Pose]:
+        """Return where SUMO has each vehicle."""
+        return self._poses
+
+    def collisions(self) -> list[tuple[str, str]]:
+        """Return the pairs that SUMO takes for colliding."""
+        return self._sumo.collisions()
+
+    def remove(self, vehicle: Vehicle) -> None:
+        """Take a vehicle off the road."""
+        del self._vehicles[vehicle.name]
+        self._kept_on_lane.discard(vehicle)
+        self._sumo.remove(vehicle.name)
+
+    def _offer(self, t_s: float, entrance: Entrance) -> None:
+        """Offer SUMO who is next on each lane, once: it knows when there is room."""
+        for arrival in entrance.firsts():
+            if arrival.vehicle not in self._offered:
+                s_m = entrance.furthest_m(arrival, t_s)
+                self._sumo.offer(arrival.vehicle, arrival.lane, arrival.preferred_lane, s_m)
+                if not self._everywhere:
+                    self._sumo.allow_lane_changes(arrival.vehicle, allowed=False)
+                self._offered[arrival.vehicle] = arrival.lane
+
+    def _entered(self, name: str, t_s: float, entrance: Entrance) -> Vehicle:
+        s_m, y_m, _, speed_mps = self._poses[name]
+        lane = self._offered.pop(name)
+        vehicle = Vehicle(
+            arrival=entrance.take(lane),
+            entered_s=t_s - s_m / self._speed_mps,
+            s_m=s_m,
+            speed_mps=speed_mps,
+            y_m=y_m,
+            lane=lane,
+        )
+        self._vehicles[name] = vehicle
+        if not self._everywhere:
+            self._kept_on_lane.add(vehicle)
+        return vehicle
+
+    def _look(self, vehicle: Vehicle) -> None:
+        """Take over where SUMO has a vehicle."""
+        s_m, y_m, _, speed_mps = self._poses[vehicle.name]
+        vehicle.accel_mps2 = (speed_mps - vehicle.speed_mps) / self._tick_s
+        vehicle.s_m, vehicle.y_m, vehicle.speed_mps = s_m, y_m, speed_mps
+        vehicle.lane = int(y_m // self._road.lane_width_m)
+
+    def _release(self) -> None:
+        """Let those who are in S3 now change lanes."""
+        for vehicle in [
+            each for each in self._kept_on_lane if each.s_m >= self._road.sorting_start_m
+        ]:
+            self._kept_on_lane.remove(vehicle)
+            self._sumo.allow_lane_changes(vehicle.name, allowed=True)
+
+
+def check_lc2013(scenario: Scenario) -> None:
+    """Check that SUMO can drive the vehicles.
+
+    Raises:
+        BadInputError: names the field that does not fit.
+    """
+    headway_s, tick_s = scenario.lc2013.headway_s, scenario.runtime.tick_s
+    if headway_s < tick_s:
+        raise BadInputError(
+            "lc2013.headway_s",
+            headway_s,
+            f"at least runtime.tick_s = {tick_s:g}: a vehicle looks once in a tick",
+        )

@@ -1,0 +1,143 @@
+"""SUMO in this process; the only module that imports libsumo.
+
+libsumo holds its simulation in global variables: there is one `SumoSession` per process at a time.
+It is imported when the first session opens, so that everything else works without it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any, Self
+
+from laneweave.protocol.errors import CommandFailedError
+
+DEBIAN_PACKAGES = {
+    "libX11.so.6": "libx11-6",
+    "libXext.so.6": "libxext6",
+    "libXrender.so.1": "libxrender1",
+    "libGL.so.1": "libgl1",
+    "libatomic.so.1": "libatomic1",
+}
+"""System libraries that libsumo loads and a slim container lacks, and what brings them."""
+
+_IMPORT_SWITCH = "LIBSUMO_AS_TRACI"
+
+
+class SumoUnavailableError(CommandFailedError):
+    """libsumo or a system library that it needs cannot be loaded; the message says what to do."""
+
+
+class SumoSession:
+    """SUMO, started. Close it, or use it as a context manager."""
+
+    _open: SumoSession | None = None
+
+    def __init__(self, options: Callable[[], tuple[str, ...]]) -> None:
+        """Load libsumo and start SUMO.
+
+        Args:
+            options: writes SUMO's input files and returns its whole argument list; called when
+                SUMO can be started.
+
+        Raises:
+            SumoUnavailableError: libsumo cannot be loaded.
+            RuntimeError: another session is open in this process.
+        """
+        if SumoSession._open is not None:
+            raise RuntimeError("libsumo holds one simulation per process, and one is open")
+        self._sumo: Any = _load_libsumo()
+        self._sumo.start([*options()])
+        SumoSession._open = self
+
+    @property
+    def vehicle(self) -> Any:  # noqa: ANN401 - libsumo has no types
+        """Libsumo's functions on vehicles."""
+        return self._sumo.vehicle
+
+    @property
+    def is_open(self) -> bool:
+        """Whether SUMO runs in it."""
+        return SumoSession._open is self
+
+    def step(self) -> None:
+        """Advance SUMO by one tick."""
+        self._sumo.simulationStep()
+
+    def departed(self) -> tuple[str, ...]:
+        """Return the vehicles that SUMO has put on the road in the last step."""
+        departed: tuple[str, ...] = self._sumo.simulation.getDepartedIDList()
+        return departed
+
+    def collisions(self) -> list[tuple[str, str]]:
+        """Return the pairs that SUMO reports as colliding in the last step, sorted, each once.
+
+        SUMO misses pairs that overlap between lanes: `overlap.overlapping_pairs` is the truth.
+        """
+        return sorted(
+            {
+                (min(found.collider, found.victim), max(found.collider, found.victim))
+                for found in self._sumo.simulation.getCollisions()
+            }
+        )
+
+    def close(self) -> None:
+        """End SUMO; a second call does nothing."""
+        if SumoSession._open is self:
+            SumoSession._open = None
+            self._sumo.close()
+
+    def __enter__(self) -> Self:
+        """Return this session."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close this session."""
+        self.close()
+
+
+def _load_libsumo() -> Any:  # noqa: ANN401 - libsumo has no types
+    """Import libsumo.
+
+    Its complaint about another version of pyarrow is switched off: it concerns SUMO's own Parquet
+    output, which is not used; both were tried together, imported in either order.
+    """
+    previous = os.environ.get(_IMPORT_SWITCH)
+    os.environ[_IMPORT_SWITCH] = "quiet"
+    try:
+        import libsumo  # noqa: PLC0415 - lazily, see above
+    except (ImportError, OSError) as error:
+        raise SumoUnavailableError(_advice(error)) from error
+    else:
+        return libsumo
+    finally:
+        if previous is None:
+            del os.environ[_IMPORT_SWITCH]
+        else:
+            os.environ[_IMPORT_SWITCH] = previous
+
+
+def _advice(error: Exception) -> str:
+    """Return what to install so that libsumo loads."""
+    if isinstance(error, ModuleNotFoundError):
+        return "libsumo is not installed: pip install 'laneweave[sim]'"
+    missing = [package for library, package in DEBIAN_PACKAGES.items() if not _loads(library)]
+    if missing:
+        return f"libsumo lacks system libraries: apt-get install {' '.join(missing)} ({error})"
+    return f"libsumo cannot be loaded: {error}; it needs {' '.join(DEBIAN_PACKAGES.values())}"
+
+
+def _loads(library: str) -> bool:
+    """Tell whether the dynamic loader finds a shared library."""
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
