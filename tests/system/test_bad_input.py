@@ -50,6 +50,7 @@ def refused(lab: Lab, *arguments: object, **environment: str) -> str:
         (["run", "--vehicles-per-process", "0"], "runtime.vehicles_per_process: got 0"),
         (["run", "--coordinators", "0"], "runtime.coordinators: got 0"),
         (["run", "--method", "magic"], "magic"),
+        (["run", "--method", "rule", "--faults", "lossy10"], "--faults: got 'lossy10'"),
         (["run", "--transport", "pigeon"], "pigeon"),
         (["run", "--pace", "0"], "--pace: got 0.0"),
         (["run", "--pace", "nan"], "--pace: got nan"),
