@@ -226,6 +226,9 @@ def _extent(pose: Pose, length_m: float, width_m: float) -> tuple[float, float, 
 
 def _intersect(one: Pose, other: Pose, length_m: float, width_m: float) -> bool:
     """Tell whether two bodies overlap, by the separating axis theorem."""
+    if one[2] == 0.0 == other[2]:
+        aside_m = abs(other[1] - one[1])
+        return abs(other[0] - one[0]) < length_m - _TOUCH_M and aside_m < width_m - _TOUCH_M
     half_length, half_width = 0.5 * length_m, 0.5 * width_m
     turn = other[2] - one[2]
     half_along = half_length + half_length * abs(math.cos(turn)) + half_width * abs(math.sin(turn))
