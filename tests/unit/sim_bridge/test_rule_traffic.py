@@ -108,6 +108,17 @@ def test_everybody_leaves_on_its_lane_and_nobody_touches(
     assert all(one.lane == one.preferred_lane for one in road.left)
 
 
+@pytest.mark.parametrize("yielding", ["unsorted", "all"])
+def test_who_is_stuck_in_its_lane_change_gives_way(yielding: str) -> None:
+    """`v1` cannot finish before `v0` is gone, and `v0` cannot change while `v1` is so near."""
+    waiting = vehicle("v0", 860.0, 1, 0, speed_mps=0.0)
+    stuck = vehicle("v1", 860.0 - 5.99, 1, 0, speed_mps=0.0)
+    road = RuleRoad(rule_scenario(lane_change_s=4.0, yielding=yielding), [waiting, stuck])
+    road.traffic._lanes.begin_change(stuck, 0)
+    road.run(60.0)
+    assert [one.lane for one in road.left] == [0, 0]
+
+
 def test_a_lane_change_takes_its_time_and_counts_on_both_lanes() -> None:
     road = RuleRoad(rule_scenario(lane_change_s=4.0), [vehicle("v1", 500.0, 0, 1)])
     (one,) = road.traffic.vehicles

@@ -146,8 +146,9 @@ class Rules:
         if behind is not None and not suits(
             behind.s_m, behind.speed_mps, vehicle.s_m, vehicle.speed_mps
         ):
-            # By rule 1 who is on its lane goes on at v_F: then it is for the other one to wait.
-            yields = self._all_yield or behind.lane != behind.preferred_lane
+            # By rule 1 who has finished goes on at v_F: then it is for the other one to wait.
+            # Who is still changing has not: it may be stuck on its old lane behind the other one.
+            yields = self._all_yield or not behind.finished
             yield behind if yields else vehicle
 
     def slow_speed_mps(self, s_m: float) -> float:

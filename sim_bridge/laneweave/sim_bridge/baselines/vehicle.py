@@ -42,6 +42,11 @@ class Vehicle:
         return self.arrival.preferred_lane
 
     @property
+    def finished(self) -> bool:
+        """Whether it has finished all its lane changes."""
+        return self.lane == self.preferred_lane and self.previous_lane is None
+
+    @property
     def state(self) -> State:
         """(s m, v m/s, a m/s2, y m, v_y m/s, a_y m/s2)."""
         return (
