@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -11,6 +12,7 @@ from laneweave.protocol.scenario import Scenario, parse_scenario
 from laneweave.sim_bridge.baselines.entrance import Entrance
 from laneweave.sim_bridge.baselines.rule import RuleTraffic
 from laneweave.sim_bridge.baselines.vehicle import Vehicle
+from laneweave.sim_bridge.demand import Arrival
 from laneweave.sim_bridge.overlap import overlapping_pairs
 from unit.sim_bridge.bench import PlainWorld, arrival
 
@@ -79,6 +81,14 @@ class RuleRoad:
         poses = self.traffic.poses()
         assert overlapping_pairs(poses, limits.length_m, limits.width_m) == []
         return entered
+
+    def serve(self, arrivals: Sequence[Arrival], until_s: float) -> None:
+        """Advance until all of a demand have left, up to a road time at most."""
+        coming = deque(arrivals)
+        while (coming or len(self.entrance) or self.traffic.vehicles) and self.t_s < until_s:
+            while coming and coming[0].t_s <= self.t_s + self.scenario.runtime.tick_s:
+                self.entrance.queue(coming.popleft())
+            self.step()
 
     def run(self, seconds: float) -> None:
         """Advance until everybody has left, for so long at most."""

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario import parse_scenario
 from laneweave.sim_bridge.baselines.rule import check_rule
+from laneweave.sim_bridge.demand import arrivals
 from unit.sim_bridge.bench import arrival
 from unit.sim_bridge.rule_road import PAPER, RuleRoad, rule_scenario, vehicle
 
@@ -106,6 +107,22 @@ def test_everybody_leaves_on_its_lane_and_nobody_touches(
     road.run(300.0)
     assert len(road.left) == len(places)
     assert all(one.lane == one.preferred_lane for one in road.left)
+
+
+@pytest.mark.parametrize("gap", ["front-to-front", "net"])
+@pytest.mark.parametrize("lane_change_s", [0.0, 4.0])
+def test_a_jam_clears_up(gap: str, lane_change_s: float) -> None:
+    scenario = parse_scenario(
+        {
+            "seed": 3,
+            "demand": {"volume_veh_per_lane_h": 2400.0, "duration_s": 60.0},
+            "rule": {"gap": gap, "lane_change_s": lane_change_s},
+        }
+    )
+    road, demand = RuleRoad(scenario), arrivals(scenario)
+    road.serve(demand, until_s=600.0)
+    assert len(road.left) == len(demand) > 100
+    assert all(one.finished for one in road.left)
 
 
 @pytest.mark.parametrize("yielding", ["unsorted", "all"])
