@@ -149,6 +149,17 @@ def test_a_lane_change_takes_its_time_and_counts_on_both_lanes() -> None:
     assert [len(lane) for lane in road.traffic._lanes] == [0, 1, 0]
 
 
+def test_who_changes_lanes_follows_the_slower_of_two() -> None:
+    """On the old lane somebody near drives on; on the new one somebody farther ahead stands."""
+    changing, standing = vehicle("v2", 500.0, 0, 1), vehicle("v1", 560.0, 1)
+    road = RuleRoad(rule_scenario(lane_change_s=4.0), [changing, standing, vehicle("v0", 515.0, 0)])
+    road.traffic._lanes.begin_change(changing, 1)
+    for _ in range(60):
+        standing.speed_mps = 0.0
+        road.step()
+    assert standing.s_m - changing.s_m >= 5.0 + 1.0 - 0.05
+
+
 def test_nobody_slides_sideways() -> None:
     road = RuleRoad(
         rule_scenario(lane_change_s=4.0),

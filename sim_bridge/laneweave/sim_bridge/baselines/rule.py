@@ -7,7 +7,7 @@ lane change has constant speed, no faster than the slip limit allows, or takes n
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario import Scenario
@@ -50,7 +50,7 @@ class RuleTraffic:
         slowing = self._rules.sort(self._lanes)
         leaders = self._lanes.leaders()
         for vehicle in sorted(self._vehicles.values(), key=priority):
-            self._drive(vehicle, leaders.get(vehicle), slows_down=vehicle in slowing)
+            self._drive(vehicle, leaders.get(vehicle, ()), slows_down=vehicle in slowing)
             self._shift(vehicle)
         entered = self._let_enter(t_s, entrance)
         for vehicle in self._vehicles.values():
@@ -72,8 +72,8 @@ class RuleTraffic:
         self._lanes.leave(vehicle)
         self._world.remove(vehicle.name)
 
-    def _drive(self, vehicle: Vehicle, ahead: Vehicle | None, *, slows_down: bool) -> None:
-        """Move a vehicle along the road by one tick; whoever is ahead has been moved."""
+    def _drive(self, vehicle: Vehicle, leaders: Iterable[Vehicle], *, slows_down: bool) -> None:
+        """Move a vehicle along the road by one tick; whom it follows has been moved."""
         before_mps, tick_s = vehicle.speed_mps, self._tick_s
         wanted_mps = min(
             self._rules.approach_speed_mps(vehicle),
@@ -83,7 +83,7 @@ class RuleTraffic:
             braked_mps = before_mps - self._rule.slow_down_mps2 * tick_s
             slow_mps = self._rules.slow_speed_mps(vehicle.s_m)
             wanted_mps = min(wanted_mps, max(slow_mps, braked_mps))
-        if ahead is not None:
+        for ahead in leaders:
             follow = self._rules.following.speed_mps
             safe_mps = follow(vehicle.s_m, before_mps, ahead.s_m, ahead.speed_mps)
             wanted_mps = min(wanted_mps, safe_mps)

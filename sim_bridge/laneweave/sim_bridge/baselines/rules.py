@@ -74,14 +74,15 @@ class Lanes:
             self._lanes[vehicle.previous_lane].remove(vehicle)
             vehicle.previous_lane = None
 
-    def leaders(self) -> dict[Vehicle, Vehicle]:
-        """Return the next one ahead of each vehicle that has one, on all lanes on which it is."""
-        found: dict[Vehicle, Vehicle] = {}
+    def leaders(self) -> dict[Vehicle, list[Vehicle]]:
+        """Return the next one ahead of each vehicle, on each lane on which it is and has one.
+
+        Who changes lanes follows two: the nearer one need not be the slower one.
+        """
+        found: dict[Vehicle, list[Vehicle]] = {}
         for lane in self._lanes:
             for ahead, vehicle in pairwise(lane):
-                other = found.get(vehicle)
-                if other is None or ahead.s_m < other.s_m:
-                    found[vehicle] = ahead
+                found.setdefault(vehicle, []).append(ahead)
         return found
 
 
