@@ -7,6 +7,7 @@ from typing import Final
 
 from attrs import field, frozen
 
+from laneweave.launch.reference_run import LC2013, RULE
 from laneweave.launch.role_commands import METHOD
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario import Scenario, parse_scenario, to_tables
@@ -56,6 +57,17 @@ METHODS: Final[dict[str, LabelledMethod]] = {
     "paper-6": _paper(6, 4),
     "paper-12": _paper(12, 8),
     "paper-18": _paper(18, 12),
+    "rule": LabelledMethod(RULE, "the paper's rules, d_R from front to front"),
+    "rule-net": LabelledMethod(
+        RULE, "the paper's rules, d_R as a net gap", {"rule.gap": "net"}
+    ),
+    "rule-yielding": LabelledMethod(
+        RULE, "the paper's rules, everybody gives way", {"rule.yielding": "all"}
+    ),
+    "lc2013": LabelledMethod(LC2013, "SUMO's own lane changing and Krauss following"),
+    "lc2013-4s": LabelledMethod(
+        LC2013, "the same with lane changes of 4 s", {"lc2013.lane_change_s": 4.0}
+    ),
 }
 """In the order in which tables and figures show them."""
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from laneweave.launch.outcome import Outcome
+from laneweave.launch.reference_run import LC2013, RULE, ReferenceRun
 from laneweave.launch.role_commands import METHOD
 from laneweave.launch.simulated_run import SimulatedRun
 from laneweave.protocol.scenario import Scenario
@@ -16,7 +17,19 @@ def _run_formation(scenario: Scenario, folder: Path) -> Outcome:
     return SimulatedRun(scenario, folder, METHOD, show_progress=False).run()
 
 
-_RUNS: Final[dict[str, Callable[[Scenario, Path], Outcome]]] = {METHOD: _run_formation}
+def _run_rule(scenario: Scenario, folder: Path) -> Outcome:
+    return ReferenceRun(scenario, folder, RULE, show_progress=False).run()
+
+
+def _run_lc2013(scenario: Scenario, folder: Path) -> Outcome:
+    return ReferenceRun(scenario, folder, LC2013, show_progress=False).run()
+
+
+_RUNS: Final[dict[str, Callable[[Scenario, Path], Outcome]]] = {
+    METHOD: _run_formation,
+    RULE: _run_rule,
+    LC2013: _run_lc2013,
+}
 
 
 def run_method(scenario: Scenario, method: str, folder: Path) -> Outcome:
