@@ -15,12 +15,12 @@ import numpy as np
 from attrs import frozen
 
 from laneweave.agents.motions import REPEAT_TICKS
-from laneweave.agents.surroundings import Surroundings
+from laneweave.agents.surroundings import NOBODY, Surroundings
 from laneweave.agents.tracker import Tracker
 from laneweave.agents.trajectory import Reference
 from laneweave.protocol.lattice import Cell, Move
 from laneweave.protocol.messages import Motion, Sense
-from laneweave.protocol.motion import at_rest_in_cell, commanded_state
+from laneweave.protocol.motion import at_rest_in_cell, cell_state, commanded_state
 from laneweave.protocol.scenario import Scenario
 
 
@@ -143,7 +143,12 @@ class TrackingDriver:
             sense.state, sense.setpoint, self._scenario.vehicle, self._lattice.speed_mps
         )
         gaps = self._surroundings.gaps(sense, state, self._goal[1])
-        result = self._tracker.solve(state, reference.window(sense.tick), gaps)
+        result = None
+        if gaps is NOBODY and sense.tick >= reference.end_tick:
+            goal = cell_state(self._lattice, self._goal, sense.t_s)
+            result = self._tracker.rest(state, goal)
+        if result is None:
+            result = self._tracker.solve(state, reference.window(sense.tick), gaps)
         self._solve_ms.append(result.solve_ms)
         self._unusable += not result.usable
         return Drive(

@@ -46,7 +46,7 @@ from laneweave.agents.surroundings import NOBODY, Gaps
 from laneweave.agents.trajectory import Window, axis_matrices
 from laneweave.agents.yielding import yield_behind
 from laneweave.protocol.motion import State, hold_law, integrate, limited_jerk
-from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.scenario import Scenario, Vehicle
 
 Array = NDArray[np.float64]
 
@@ -139,6 +139,12 @@ class Tracker:
         self._regulator = (
             Regulator(n, self._tick_s, self._limits.max_slip_ratio) if fast_path else None
         )
+        self.harmless = (
+            self._regulator.harmless(self._limits, scenario.formation.speed_mps)
+            if self._regulator is not None
+            else ()
+        )
+        """Errors so small that no row binds while a cell is held."""
         self._cost = _cost(n, self._tick_s)
         self._rows = _rows(n, self._tick_s, self._limits.max_slip_ratio)
         self._qp = QuadraticProgram(
@@ -196,6 +202,29 @@ class Tracker:
             jerk = np.zeros((self._n, 2))
         elapsed_ms = (time.thread_time() - start) * 1e3
         return TrackResult(jerk, usable, iterations, elapsed_ms, result.row_violation)
+
+    def rest(self, state: State, goal: State) -> TrackResult | None:
+        """Return the jerks that keep a vehicle in the cell that it holds, if nobody is near.
+
+        They are those of `solve`, for a fraction of its time: so close to its cell none of its rows
+        can come into question.
+
+        Args:
+            state: commanded state now.
+            goal: that of a vehicle which holds the cell, now.
+
+        Returns:
+            None: it is not so close.
+        """
+        if self._regulator is None:
+            return None
+        start = time.thread_time()
+        error = [now - wanted for now, wanted in zip(state, goal, strict=True)]
+        if not all(-most <= each <= most for each, most in zip(error, self.harmless, strict=True)):
+            return None
+        self._stale = True
+        jerk = (self._regulator.inputs @ error).reshape(-1, 2)
+        return TrackResult(jerk, True, 0, (time.thread_time() - start) * 1e3, 0.0)
 
     def _regulated(self, state: State, path: _Path) -> Array | None:
         """Return the jerks (N, 2) of the solution without rows if it keeps all of them."""
@@ -337,6 +366,10 @@ class Tracker:
         )
 
 
+_AT_REST = (0.5, 0.5, 0.5, 0.3, 0.3, 0.5)
+"""Errors of a vehicle that holds: some times those of its sensors."""
+
+
 class Regulator:
     """The solution of the program without rows: w_k = -K e_k, rolled out over the horizon."""
 
@@ -370,6 +403,30 @@ class Regulator:
             ]
         )
         """What all rows but the dynamics come to, (8 N, 6) times e_0, in the order of `_Bounds`."""
+        self.inputs = np.ascontiguousarray(self.rows[5 * ticks : 7 * ticks])
+        """Those that are jerks, (2 N, 6)."""
+        self._ticks = ticks
+
+    def harmless(self, limits: Vehicle, speed_mps: float) -> tuple[float, ...]:
+        """Return the greatest errors (6,) with which no row but gaps binds while a cell is held.
+
+        Args:
+            limits: the vehicle.
+            speed_mps: v_F.
+        """
+        n = self._ticks
+        rooms = (
+            min(speed_mps, limits.max_speed_mps - speed_mps),
+            min(-limits.min_accel_mps2, limits.max_accel_mps2),
+            limits.max_lateral_accel_mps2,
+            limits.max_slip_ratio * speed_mps,
+            limits.max_slip_ratio * speed_mps,
+        )
+        jerks = np.tile([limits.max_jerk_mps3, limits.max_lateral_jerk_mps3], n)
+        room = np.concatenate([np.repeat(rooms, n), jerks])
+        used = np.abs(self.rows[: 7 * n]) @ np.array(_AT_REST)
+        share = min(float((room / np.maximum(used, 1e-12)).min()), 1.0)
+        return tuple(share * each for each in _AT_REST)
 
 
 def _is_near(state: State, reference: list[float]) -> bool:

@@ -27,7 +27,7 @@ from laneweave.protocol.simulated_members import Member
 from laneweave.protocol.simulated_time import Simulation
 from laneweave.protocol.simulated_tokens import Tokens
 from laneweave.protocol.simulated_transport import SimulatedTransport
-from laneweave.protocol.topics import Keys, matches_any
+from laneweave.protocol.topics import Keys, matches, matches_any
 from laneweave.protocol.transport import (
     Delivery,
     LinkDown,
@@ -59,9 +59,7 @@ class Parcel(bytes):
         return parcel
 
 
-def _unpack(
-    keys: Keys, read: Callable[[str, bytes], Arrived], key: str, payload: bytes
-) -> Arrived:
+def _unpack(keys: Keys, read: Callable[[str, bytes], Arrived], key: str, payload: bytes) -> Arrived:
     """Return what arrived, whether it travelled as bytes or as it is."""
     if not isinstance(payload, Parcel):
         return read(key, payload)
@@ -298,8 +296,15 @@ class SimulatedNetwork(Simulation):
 
     def forget_routes(self, expressions: Iterable[str]) -> None:
         """Subscriptions changed: look the receivers on matching keys up again."""
-        for key in [key for key in self._routes if matches_any(expressions, key)]:
-            del self._routes[key]
+        for expression in expressions:
+            fixed, star, _ = expression.partition("*")
+            if not star:
+                self._routes.pop(expression, None)
+                continue
+            near = [key for key in self._routes if key.startswith(fixed.rstrip("/"))]
+            for key in near:
+                if matches(expression, key):
+                    del self._routes[key]
 
     def remove(self, name: str) -> None:
         """Take a node out that left in good order."""

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from attrs import evolve, frozen
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy import linalg
 
 from laneweave.agents import tracker as tracker_module
@@ -214,3 +216,33 @@ def test_rows_of_those_behind_leave_nothing_behind() -> None:
     for _ in range(20):
         result = used.solve(state, window)
     np.testing.assert_allclose(result.jerk, 0.0, atol=0.05)
+
+
+@given(
+    st.tuples(*[st.floats(-1.0, 1.0)] * 6),
+    st.sampled_from([(0, 0), (-40, 1), (7, 2)]),
+    st.integers(0, 4000),
+)
+def test_who_rests_in_its_cell_gets_the_same_jerks_without_the_program(
+    shares: tuple[float, ...], cell: tuple[int, int], tick: int
+) -> None:
+    """Whatever the errors for which rows are not looked at: none of them binds."""
+    scenario = Scenario()
+    tracker = Tracker(scenario)
+    goal = cell_state(scenario.lattice, cell, tick * scenario.runtime.tick_s)
+    harmless = tracker.harmless
+    state = tuple(at + share * most for at, share, most in zip(goal, shares, harmless, strict=True))
+    quick = tracker.rest(state, goal)
+    whole = tracker.solve(state, Reference.hold(scenario, cell).window(tick))
+    assert quick is not None
+    assert whole.iterations == 0
+    np.testing.assert_allclose(quick.jerk, whole.jerk, atol=1e-9)
+
+
+def test_who_is_farther_from_its_cell_is_not_at_rest() -> None:
+    scenario = Scenario()
+    tracker = Tracker(scenario)
+    goal = cell_state(scenario.lattice, (0, 0), 0.0)
+    for axis, most in enumerate(tracker.harmless):
+        state = tuple(at + 1.01 * most * (index == axis) for index, at in enumerate(goal))
+        assert tracker.rest(state, goal) is None
