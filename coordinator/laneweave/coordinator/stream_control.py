@@ -37,6 +37,11 @@ PATIENCE_S = 1.0
 heard another one, must not outbid what that one has begun."""
 LATEST_S = 1.0
 """A plan that is ready later than this after its slot has begun is not put into force any more."""
+AHEAD_M = 600.0
+"""Vehicles are planned for from so far before the place where moves begin: as far as S3 is long, so
+that whoever can come near each other there is known in time."""
+REWARD = -0.5
+"""Cost of a column gained, where drift is rewarded; a move costs 0.3."""
 BESIDE = 10
 """Columns ahead of the foremost vehicle and behind the rearmost one that planning looks at."""
 
@@ -71,7 +76,7 @@ class StreamControl:
         """
         self._scenario = scenario
         self._new_ballot = new_ballot
-        self._planner = StreamPlanner(stream_road(scenario), StreamCosts(), scenario.seed)
+        self._planner = StreamPlanner(stream_road(scenario), _costs(scenario), scenario.seed)
         self._slot_s = scenario.formation.cycle_s
         self.states: dict[Name, VehicleState] = {}
         """The newest state of each vehicle."""
@@ -159,8 +164,12 @@ class StreamControl:
 
     def _order(self, census: Census, slot: int, begun_s: float) -> _Order:
         vehicles, owned, taken = [], set[Cell](), set[Cell]()
+        far_m = self._scenario.moves_from_m - AHEAD_M
         for entry in census.on_road:
             state = self.states.get(entry.vehicle)
+            column = entry.cell[0] if state is None else state.hold_cell[0]
+            if self._scenario.lattice.cell_s_m(column, begun_s) < far_m:
+                continue
             if state is None:
                 vehicles.append(
                     StreamVehicle(entry.vehicle, entry.cell, entry.preferred_lane, held=True)
@@ -177,7 +186,7 @@ class StreamControl:
             vehicles.append(
                 StreamVehicle(entry.vehicle, state.hold_cell, entry.preferred_lane, held)
             )
-        columns = [vehicle.cell[0] for vehicle in vehicles]
+        columns = [vehicle.cell[0] for vehicle in vehicles] or [0]
         blocked = {
             (column, lane)
             for column in range(min(columns) - BESIDE, max(columns) + BESIDE + 1)
@@ -279,12 +288,16 @@ def stream_road(scenario: Scenario) -> StreamRoad:
         lanes=road.lanes,
         pitch_m=formation.gap_m,
         advance_m=formation.speed_mps * formation.cycle_s,
-        sorting_m=(road.sorting_start_m, road.length_m),
+        sorting_m=(scenario.moves_from_m, road.length_m),
         length_m=road.length_m,
         body_m=scenario.vehicle.length_m,
         mode=mode,
         model=ConflictModel(formation.conflict_kinds),
     )
+
+
+def _costs(scenario: Scenario) -> StreamCosts:
+    return StreamCosts(forward=REWARD if scenario.formation.reward_drift else 0.0)
 
 
 def _clusters(groups: Iterable[set[Name]]) -> list[set[Name]]:

@@ -118,6 +118,12 @@ class FormationSettings:
     """Time that a move takes within its slot; the rest is slack for lost messages."""
     speed_mps: float = field(default=15.0, validator=within(1.0, 60.0))
     """v_F, the speed of the lattice."""
+    settle_s: float = field(default=10.0, validator=within(1.0, 60.0))
+    """Time from the entry until a vehicle is in its cell."""
+    sort_in_s2: bool = False
+    """Rolling operation: lanes are changed in S2, too, as soon as vehicles have settled."""
+    reward_drift: bool = False
+    """Rolling operation: moving ahead of v_F counts as a gain where it costs nobody else."""
     block_columns: int = field(default=4, validator=within(1, 24))
     """Width of a formation's block; the interlaced structure puts half of its cells to use."""
     max_vehicles: int = field(default=6, validator=within(1, 36))
@@ -337,6 +343,14 @@ class Scenario:
             lanes=self.road.lanes,
             block_columns=self.formation.block_columns,
         )
+
+    @property
+    def moves_from_m(self) -> float:
+        """Position from which on bodies may move from cell to cell: S3, or S2 where that is used."""
+        start_m, formation = self.road.sorting_start_m, self.formation
+        if not (formation.rolling and formation.sort_in_s2):
+            return start_m
+        return min(start_m, max(self.road.s1_m, formation.speed_mps * (formation.settle_s + 4.0)))
 
     @property
     def lane_shares(self) -> tuple[float, ...]:

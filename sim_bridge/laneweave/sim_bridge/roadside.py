@@ -21,7 +21,8 @@ from laneweave.sim_bridge.traffic import RoadVehicle
 
 CENSUS_EVERY_TICKS = 10
 MOST_EMPTY = 12
-"""A vehicle gets at most so many empty cells behind it."""
+"""A vehicle gets at most so many empty cells behind it; fewer where moves begin soon, since it must
+have them all before it is asked for any."""
 
 
 @frozen
@@ -69,6 +70,8 @@ class Roadside:
         self._last: list[Name | None] = [None] * self._lanes
         """Who entered last on each lane, and the last column that is somebody's."""
         self._owned = [1] * self._lanes
+        columns = int(scenario.moves_from_m / lattice.pitch_m)
+        self._most_empty = max(0, min(MOST_EMPTY, columns - 2))
         self._arrivals = arrivals(scenario)
         self._demanded = 0
         self._queued = 0
@@ -123,7 +126,7 @@ class Roadside:
             last = self._last[lane]
             owner = vehicles.get(last) if last is not None else None
             for column in range(self._owned[lane] - 1, closed - 1, -1):
-                if owner is not None and owner.admission.cell[0] - column <= MOST_EMPTY:
+                if owner is not None and owner.admission.cell[0] - column <= self._most_empty:
                     owner.controller.own((column, lane))
             self._owned[lane] = min(self._owned[lane], closed)
 

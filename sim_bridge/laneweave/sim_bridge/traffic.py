@@ -17,9 +17,6 @@ from laneweave.sim_bridge.overlap import Around
 from laneweave.sim_bridge.plant import Plant
 from laneweave.sim_bridge.sensors import Sensors
 
-SETTLE_S = 10.0
-"""Time from the entry until a vehicle is in its cell. Two that follow each other closely stay at
-least 13 m apart, front to front, when both fall back by half a column in it."""
 NEAR_M = 0.01
 """A vehicle that enters this near to its cell is there."""
 
@@ -38,7 +35,7 @@ class RoadVehicle:
     def entering(cls, admission: Admission, t_s: float, scenario: Scenario) -> RoadVehicle:
         """Return a vehicle that has driven at v_F since it was admitted, at road time `t_s`.
 
-        It is to settle in its cell within `SETTLE_S`.
+        It is to settle in its cell within `formation.settle_s`.
         """
         lattice, tick_s = scenario.lattice, scenario.runtime.tick_s
         rest = cell_state(lattice, admission.cell, t_s)
@@ -48,7 +45,7 @@ class RoadVehicle:
             Plant((s_m, *rest[1:]), scenario.vehicle, tick_s), scenario, admission.cell
         )
         if abs(admission.offset_m) > NEAR_M:
-            controller.motion_end_tick = round((t_s + SETTLE_S) / tick_s)
+            controller.motion_end_tick = round((t_s + scenario.formation.settle_s) / tick_s)
         if scenario.formation.rolling:
             controller.own(admission.cell)
         return cls(name, admission, controller, Sensors(scenario, name))
