@@ -154,6 +154,7 @@ def test_the_command_leaves_all_files(tmp_path: Path, method: str) -> None:
         *("events.jsonl", "log.jsonl", "summary.json"),
         *("ticks.parquet", "trajectories.parquet", "trips.parquet"),
         *("road.png", "speed.png", "travel_time.png"),
+        *("comfort.png", "spacing.png", "report.html"),
     }
 
 

@@ -93,7 +93,9 @@ def _map_of(
     changes_s = [t_s for part in parts for t_s in _change_times(tracks, part)]
     slot_s, tick_s = run.scenario.formation.cycle_s, run.scenario.runtime.tick_s
     entered_s = max(float(tracks.t_s[part.start]) for part in parts)
-    start_s = min(changes_s, default=entered_s + tick_s) - 0.5 * tick_s
+    # The first one to move may be late already, by no more than the slack of a slot.
+    slack_s = max(slot_s - run.scenario.formation.move_s, 0.0) + 0.5 * tick_s
+    start_s = min(changes_s, default=entered_s + slack_s + tick_s) - slack_s
     last_s = max(changes_s, default=start_s)
     steps = max(0, int(np.ceil((last_s - start_s) / slot_s)))
     times_s = start_s + slot_s * np.arange(steps + 1, dtype=np.float64)
@@ -114,7 +116,7 @@ def _map_of(
             tuple(rows[row] for row in order),
         ),
         tuple(members[row][1] for row in order),
-        start_s + 0.5 * tick_s,
+        start_s + slack_s,
         slot_s,
         run.scenario.road.lanes,
     )
