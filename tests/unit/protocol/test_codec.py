@@ -21,6 +21,7 @@ from laneweave.protocol.messages import (
     Census,
     CensusEntry,
     Command,
+    Deed,
     Heartbeat,
     LogEvent,
     Motion,
@@ -37,6 +38,7 @@ from laneweave.protocol.topics import NAME_PATTERN
 
 V1, V2 = Name("v1"), Name("v2")
 BALLOT = Ballot(3, Name("c1"), 1_700_000_000_000_000_000, 2)
+DEED = Deed(BALLOT, ((0, 0), (1, 0)), ((0, 1),), (V1, V2))
 SAMPLES: tuple[object, ...] = (
     Heartbeat(Name("c1"), 17, 3, leading=True, formations=2),
     Prepare(BALLOT, (-1, 0), (V1, V2)),
@@ -50,18 +52,21 @@ SAMPLES: tuple[object, ...] = (
         t0_s=12.5,
         slot_s=4.0,
         territory=((0, 0), (0, 1), (2, 1)),
+        before={V1: ((0, 0),), V2: ((0, 1), (2, 1))},
+        after={V1: ((0, 0), (0, 1)), V2: ((2, 1),)},
     ),
     VehicleState(
         V1, 11, -1, (-1, 0), BALLOT, accepted=True, ready=True, completed=1, hold_cell=(0, 1),
         moving=False, go=True, done=False, overdue=False, attended=True, s_m=1.5, y_m=1.75,
-        speed_mps=15.0, t_s=13.0,
+        speed_mps=15.0, t_s=13.0, estate=((0, 0), (1, 0)), deed=DEED,
     ),
     Sense(
         V1, 130, 13.0, (1.5, 15.0, 0.0, 1.75, 0.0, 0.0), (0, 1), 120, (0, 0), 2,
         (Neighbour(0, 10.0, 15.0), Neighbour(1, -0.5, 14.0, -1.5)), (Neighbour(0, 4.0, 16.0, 0.5),),
         (0.25, -0.5), formation=-1, attendant=11, caretaker=True, joined=(-1, 0),
+        estate=((0, 1),), promised=BALLOT, deed=Deed(BALLOT, open=True),
     ),
-    Command(V1, 11, 130, (0, 1), 140, (0, 0), b"\0" * 16, (-1, 0)),
+    Command(V1, 11, 130, (0, 1), 140, (0, 0), b"\0" * 16, (-1, 0), BALLOT, BALLOT, DEED),
     Census(13.0, (CensusEntry(V1, (0, 1), 2, 5.0),), (Announcement(V2, 0, 1, 20.0),)),
     RoadClock(130, 13.0, demanded=5, entered=4, on_road=3, left=1, ended=False),
     Report(Name("agent"), V1, Name("17-4"), 10, 3, 5, 1, b"\0\0\0\0"),
@@ -70,8 +75,8 @@ SAMPLES: tuple[object, ...] = (
 )  # fmt: skip
 NAMES_NOT_ALLOWED = ("a/b", "a*", "", "x" * 65, "a b", "a#", "$", "a?", "é", "a\n", "v1\n", "\0")
 
-HINTS = {kind: get_type_hints(kind) for kind in (*KINDS.values(), Neighbour, CensusEntry)}
-HINTS[Announcement] = get_type_hints(Announcement)
+PARTS = (Neighbour, CensusEntry, Announcement, Deed)
+HINTS = {kind: get_type_hints(kind) for kind in (*KINDS.values(), *PARTS)}
 
 Body = dict[Any, Any]
 
@@ -352,6 +357,8 @@ def wrong_values(hint: Any) -> list[Any]:  # noqa: ANN401
         Ballot: [None, *BALLOTS_NOT_ALLOWED],
         Ballot | None: [*BALLOTS_NOT_ALLOWED],
     }
+    if hint not in simple and NoneType in parts:
+        return [wrong for wrong in wrong_values(parts[0]) if wrong is not None]
     return simple[hint]
 
 
@@ -360,7 +367,7 @@ def right_value(hint: Any) -> Any:  # noqa: ANN401
     parts = get_args(hint)
     if get_origin(hint) is tuple:
         return [] if parts[-1] is Ellipsis else [right_value(part) for part in parts]
-    return {int: 1, float: 1.0, bool: True, bytes: b"", Name: "v1"}[hint]
+    return {int: 1, float: 1.0, bool: True, bytes: b"", Name: "v1", Ballot: [1, "c", 2, 3]}[hint]
 
 
 @pytest.mark.parametrize(("sample", "name"), FIELDS)
