@@ -347,6 +347,11 @@ BUGS: tuple[PlantedBug, ...] = (
     ),
 )  # fmt: skip
 
+IN_THE_ROLLING_OPERATION: Mapping[str, str] = {
+    "keeps_to_its_estates": "tests/unit/protocol/test_estates.py",
+    "take_possession": "tests/unit/protocol/test_estates.py",
+}
+"""What has no effect where formations own blocks, as in all stories; and where it is tested."""
 NOT_A_SAFETY_MATTER: Mapping[str, str] = {
     "is_in_roster": "a PREPARE is sent to its roster only; to promise more means to hold",
     "show": "what is not shown now is shown at the next tick",

@@ -235,10 +235,10 @@ def test_an_older_census_is_ignored() -> None:
 def test_a_formation_that_is_not_closed_is_not_touched() -> None:
     desk = Desk()
     desk.lead()
-    desk.tell(census({A: (0, 0)}, t_s=2.9))
+    desk.tell(census({A: (0, 0)}, t_s=3.9))
     desk.tell(RoadClock(99, 9.9, 1, 1, 1, 0, ended=False))
     assert desk.core.controls == {}  # the census is too old to be complete
-    desk.tell(census({A: (0, 0)}, t_s=3.1))
+    desk.tell(census({A: (0, 0)}, t_s=4.1))
     assert set(desk.core.controls) == {0}
 
 
@@ -279,7 +279,7 @@ def test_prepare_promise_plan_acceptance() -> None:
     assert desk.core.controls[0].phase is Phase.WATCHING
     (note,) = messages(told, LogEvent)
     assert (note.message.kind, note.message.data) == (
-        "plan-in-force", {"formation": 0, "closed_s": 3.0}
+        "plan-in-force", {"formation": 0, "closed_s": 4.0}
     )  # fmt: skip
     desk.wait(1.0)
     assert messages(desk.wait(10.0), Plan) == []
@@ -452,7 +452,7 @@ def rosters(draw: st.DrawFn) -> tuple[Cells, dict[Name, int]]:
 
 
 @settings(max_examples=40, deadline=None)
-@given(roster=rosters(), t_s=st.floats(3.1, 40.0))
+@given(roster=rosters(), t_s=st.floats(4.1, 40.0))
 def test_every_plan_is_executable_and_serves_all_preferences(
     roster: tuple[Cells, dict[Name, int]], t_s: float
 ) -> None:

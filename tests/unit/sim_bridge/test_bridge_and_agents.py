@@ -44,7 +44,7 @@ MOVES: tuple[Cell, ...] = ((0, 1), (-2, 1), (-1, 2), (-1, 0), (0, 2), (-2, 0))
 @pytest.fixture
 def street(tmp_path: Path) -> Street:
     """A and B will be on the road, of which A is about to move; B has a process."""
-    street = Street(LONG_ROAD, tmp_path, [arrival(A, 0.5, 1), arrival(B, 5.5, 0)], pace=PACE)
+    street = Street(LONG_ROAD, tmp_path, [arrival(A, 1.0, 1), arrival(B, 6.0, 0)], pace=PACE)
     street.start_agents(B)
     return street
 
@@ -235,10 +235,9 @@ def test_the_move_of_an_agent_that_died_is_finished_and_held(
 # --- whole runs -------------------------------------------------------------------------------
 
 MANY = tuple(
-    arrival(f"v{number:04d}", 1.3 * number + 0.2, number % 2, (number // 2) % 2)
-    for number in range(7)
+    arrival(f"v{number:04d}", number + 2.0, number % 2, (number // 2) % 2) for number in range(7)
 )
-"""Some of them want the other lane."""
+"""Each comes when a cell does, as there is no room to settle; some want the other lane."""
 
 
 def check_complete(street: Street, folder: Path) -> None:

@@ -100,12 +100,12 @@ def test_start(tmp_path: Path) -> None:
 
 
 def test_the_census_is_sent_on_changes_and_now_and_then(tmp_path: Path) -> None:
-    scenario = make_scenario(runtime={"announce_s": 1.0})
+    scenario = make_scenario(runtime={"announce_s": 1.5})
     desk = Desk(scenario, tmp_path, [arrival(A, 4.05)])
     desk.start(A)
     desk.drive_to_entry(A)
     sent_at = [round(census.t_s / TICK_S) for census in sent(desk.effects, Census)]
-    assert sent_at == [0, 10, 20, 30, 31, 41, 51, 60]  # announced at 3.1 s, entered at 6.0 s
+    assert sent_at == [0, 10, 20, 26, 36, 41]  # announced at 2.6 s, entered at 4.1 s
     assert [e.vehicle for e in sent(desk.effects, Census)[-1].on_road] == [A]
 
 

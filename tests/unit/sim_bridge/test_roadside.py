@@ -197,7 +197,10 @@ def test_a_census_tells_at_once_that_a_block_has_closed() -> None:
         if isinstance(effect, Send) and isinstance(effect.message, Census)
     ]
     lattice = scenario.lattice
-    closing = [lattice.passing_time_s(lattice.block_range(block)[0]) for block in range(2)]
+    closing = [
+        lattice.passing_time_s(lattice.block_range(block)[0]) + scenario.formation.entry_spread_s
+        for block in range(2)
+    ]
     first_later = [min(n for n in range(100) if n * tick_s > closes_s) for closes_s in closing]
     assert set(first_later) <= set(censuses)
     assert len(censuses) < 20
