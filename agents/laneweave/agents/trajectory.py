@@ -473,14 +473,14 @@ def _both(limit: float) -> tuple[float, float]:
 def _least_jerks(tick_s: float, ticks: int, start: Array) -> Array:
     """Return the jerks (ticks, 2) of least norm that lead from a state to rest at the origin."""
     transition, effect = axis_matrices(tick_s)
-    effects, power = [], np.eye(3)
+    power: Array = np.eye(3)
+    effects = []
     for _ in range(ticks):
         effects.append(power @ effect[:, 0])
         power = transition @ power
     reach = np.array(effects[::-1]).T
     ends = np.stack([power @ start[:3], power @ start[3:]], axis=1)
-    jerks: Array = np.linalg.lstsq(reach, -ends, rcond=None)[0]
-    return jerks
+    return np.asarray(np.linalg.lstsq(reach, -ends, rcond=None)[0], dtype=np.float64)
 
 
 def _frozen(jerks: Array, tick_s: float, start: Array | None = None) -> Trajectory:

@@ -318,9 +318,7 @@ class CoordinatorCore:
             for vehicle, message in control.outgoing(now_s):
                 yield self._to_vehicle(vehicle, message)
 
-    def _lead_stream(
-        self, stream: StreamControl, census: Census, now_s: float
-    ) -> Iterator[Effect]:
+    def _lead_stream(self, stream: StreamControl, census: Census, now_s: float) -> Iterator[Effect]:
         if self._road_changed:
             self._road_changed = False
             stream.on_census(census)

@@ -13,8 +13,8 @@ from enum import Enum
 
 from attrs import define, field
 
-from laneweave.protocol.lattice import Cell, footprint, territory
-from laneweave.protocol.messages import Ballot, Name, Plan, Prepare, VehicleState
+from laneweave.protocol.lattice import Cell, Move, footprint, territory
+from laneweave.protocol.messages import Ballot, Deed, Name, Plan, Prepare, VehicleState
 from laneweave.protocol.plans import estate_problems, plan_problems
 
 Moves = Mapping[Name, tuple[Cell, Cell]]
@@ -35,43 +35,54 @@ def estate_of(state: VehicleState, states: States) -> frozenset[Cell] | None:
     """Return what a vehicle owns for certain, from its state and from those of others.
 
     A vehicle whose newest deed is not open does not know what it owns: others of the roster may
-    have opened their gates. It is open if one of them has; it never will be if one of them has
-    promised more and has no deed of it.
+    have opened their gates. They have if one of them shows it. They never will if somebody has
+    promised more and has no such deed, or if all have promised more with closed gates. Where
+    somebody has a newer deed, which says nothing of this one, only those cells are certain that the
+    vehicle owns either way.
 
     Args:
         state: of the vehicle; it shows an estate.
         states: the newest ones of others, what they show stays true.
 
     Returns:
-        None: it cannot be told.
+        None: it cannot be told yet.
     """
     deed = state.deed
     if deed is None or deed.open:
         return frozenset(state.estate)
-    for name in deed.roster:
-        other = states.get(name)
-        if other is None or name == state.vehicle:
-            continue
-        known = other.deed.ballot if other.deed is not None else None
-        if known == deed.ballot and other.deed is not None and other.deed.open:
-            return frozenset(deed.after)
-        if (
-            other.promised is not None
-            and other.promised > deed.ballot
-            and other.estate
-            and (known is None or known < deed.ballot)
-        ):
-            return frozenset(deed.before)
-    if all(
-        name in states
-        and states[name].promised == state.promised
-        and states[name].estate
-        and not states[name].accepted
-        for name in deed.roster
-    ) and state.promised != deed.ballot:
-        # All have turned to one newer ballot, and none of them had opened its gate.
-        return frozenset(deed.before)
-    return None
+    before, after = frozenset(deed.before), frozenset(deed.after)
+    signs = {_sign(state, deed)} | {
+        _sign(states.get(name), deed) for name in deed.roster if name != state.vehicle
+    }
+    if _Sign.OPEN in signs:
+        return after
+    if _Sign.WITHOUT in signs or signs == {_Sign.CLOSED}:
+        return before
+    return before & after if _Sign.NEWER in signs else None
+
+
+class _Sign(Enum):
+    """What somebody shows of the start gate of a deed's plan; all but `NONE` for ever."""
+
+    OPEN = "it is open"
+    CLOSED = "it has promised more with a closed gate"
+    WITHOUT = "it has promised more, and has never had the deed"
+    NEWER = "it has a newer deed"
+    NONE = "nothing"
+
+
+def _sign(state: VehicleState | None, deed: Deed) -> _Sign:
+    if state is None:
+        return _Sign.NONE
+    theirs = state.deed
+    if theirs is not None and theirs.ballot > deed.ballot:
+        return _Sign.NEWER
+    known = theirs is not None and theirs.ballot == deed.ballot
+    if known and theirs is not None and theirs.open:
+        return _Sign.OPEN
+    if state.promised is None or state.promised <= deed.ballot or not state.estate:
+        return _Sign.NONE
+    return _Sign.CLOSED if known else _Sign.WITHOUT
 
 
 @define
@@ -99,19 +110,21 @@ class Handover:
         name = state.vehicle
         if self.phase not in (Phase.PREPARING, Phase.ISSUING):
             return
+        promise = self.promises.get(name)
         if state.promised is not None and state.promised > self.ballot:
             self.give_up("outbid")
-        elif state.promised == self.ballot:
-            if self.phase is Phase.PREPARING and not state.accepted and state.estate:
-                self.promises[name] = state
-                if len(self.promises) == len(self.roster):
-                    self._issue(states)
-            elif self.phase is Phase.ISSUING and state.accepted:
-                self.accepted.add(name)
-                if len(self.accepted) == len(self.roster):
-                    self.phase = Phase.IN_FORCE
-        elif name in self.promises:
-            self.give_up("restarted")
+        elif promise is not None and state.incarnation != promise.incarnation:
+            self.give_up(f"{name} has restarted")
+        elif state.promised != self.ballot:
+            return
+        elif self.phase is Phase.PREPARING and not state.accepted and state.estate:
+            self.promises[name] = state
+            if len(self.promises) == len(self.roster):
+                self._issue(states)
+        elif self.phase is Phase.ISSUING and state.accepted:
+            self.accepted.add(name)
+            if len(self.accepted) == len(self.roster):
+                self.phase = Phase.IN_FORCE
 
     def give_up(self, why: str) -> None:
         """Send nothing more."""
@@ -161,9 +174,8 @@ class Handover:
         needed = {name: footprint(*move) for name, move in self.moves.items()}
         given = {cell for cells in needed.values() for cell in cells}
         after = {name: (cells - given) | needed.get(name, set()) for name, cells in before.items()}
-        moves = {
-            name: ((0, *self.moves[name]),) if name in self.moves else () for name in self.roster
-        }
+        moves: dict[Name, tuple[Move, ...]] = dict.fromkeys(self.roster, ())
+        moves |= {name: ((0, *move),) for name, move in self.moves.items()}
         start_cells = {name: self.promises[name].hold_cell for name in self.roster}
         return Plan(
             ballot=self.ballot,

@@ -153,7 +153,7 @@ class StreamControl:
         begun_s = slot * self._slot_s
         if slot < self._newest_slot or t_s < max(begun_s + SHOWN_S, self._since_s + PATIENCE_S):
             return
-        order = self._order(census, slot + 1, begun_s)
+        order = self._order(census, slot + 1)
         self._newest_slot = slot + 1
         number = job()
         self._ordered = (number, slot + 1)
@@ -162,7 +162,7 @@ class StreamControl:
     def _plan(self, order: _Order) -> StreamPlan:
         return self._planner.plan(order.slot, order.vehicles, order.before, order.blocked)
 
-    def _order(self, census: Census, slot: int, begun_s: float) -> _Order:
+    def _order(self, census: Census, slot: int) -> _Order:
         vehicles, owned, taken = [], set[Cell](), set[Cell]()
         far_m = self._scenario.moves_from_m - AHEAD_M
         for entry in census.on_road:

@@ -106,10 +106,13 @@ class PlanExecution:
     def on_estate(self, sense: Sense) -> bool:
         """The controller says what the vehicle owns; true when it has noted a promise by now.
 
-        Without effect where formations own blocks.
+        What an earlier process has promised binds this one: it is taken for a PREPARE. Without
+        effect where formations own blocks.
         """
         if self.estate is None:
             return False
+        if sense.promised is not None:
+            self.on_prepare(Prepare(sense.promised, (), (self.vehicle,)))
         before = self.shown
         self.estate, self.noted = frozenset(sense.estate), sense.deed
         self.shown = sense.promised == self.promised

@@ -81,8 +81,8 @@ def estate_problems(plan: Plan) -> list[str]:
     if problems:
         return problems
     for name, mapping in (("before", plan.before), ("after", plan.after)):
-        cells = [cell for each in mapping.values() for cell in each]
-        if len(cells) != len(set(cells)):
+        all_cells = [cell for cells in mapping.values() for cell in cells]
+        if len(all_cells) != len(set(all_cells)):
             problems.append(f"a cell has two owners {name}")
     owned = {cell for each in plan.before.values() for cell in each}
     for vehicle, cells in plan.after.items():

@@ -262,7 +262,14 @@ VEHICLE_RULES: RuleBook = RuleBook(
             Stage.GOING,
         ),
         Transition("V4", STATE, _WITH_PLAN, ("is_of_my_plan",), ("hear",)),
-        Transition("V5", GATE, (Stage.GATED,), ("is_holding", "all_are_ready"), ("take_possession",), Stage.GOING),
+        Transition(
+            "V5",
+            GATE,
+            (Stage.GATED,),
+            ("is_holding", "all_are_ready"),
+            ("take_possession",),
+            Stage.GOING,
+        ),
         Transition(
             "V6",
             TICK,

@@ -45,6 +45,7 @@ class Caretaker:
             moving=controller.moving(tick),
             estate=frozenset(controller.estate) if controller.rolling else None,
         )
+        self._execution.on_estate(vehicle.sense(tick, caretaker=True))
 
     def on_message(self, message: Prepare | Plan, tick: int) -> VehicleState | None:
         """V2 and V3: promise, or accept a plan in which this vehicle only holds.

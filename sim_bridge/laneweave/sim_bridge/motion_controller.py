@@ -12,8 +12,9 @@ A trajectory that ran out or that an emergency interrupted is not taken up again
 that comes now leads back up. The emergency brake acts on every rung, on local sensing alone.
 
 It also keeps what must survive the agent, or must not be believed of one that has been replaced:
-who is in charge of the vehicle, which formations it has joined, and which plan the process in
-charge has accepted. Nobody but that process changes where the vehicle holds or what it plays.
+who is in charge of the vehicle, which formations it has joined, which plan the process in charge
+has accepted, and in the rolling operation what any process has promised and which cells the vehicle
+owns. Nobody but the process in charge changes where the vehicle holds or what it plays.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from collections.abc import Iterable
 from enum import IntEnum
 
 import numpy as np
-from attrs import define, field
+from attrs import define, evolve, field
 from numpy.typing import NDArray
 
 from laneweave.protocol.braking import EmergencyBrake
@@ -76,11 +77,14 @@ class MotionController:
     accepted: Ballot | None = None
     """Newest plan that the process in charge has accepted."""
     promised: Ballot | None = None
-    """Highest ballot that the process in charge has promised (rolling operation)."""
+    """Highest ballot that any process in charge has promised (rolling operation): a promise binds
+    those who come after, so what is shown with it stays true."""
     estate: tuple[Cell, ...] = ()
     """Cells that the vehicle owns, ascending (rolling operation)."""
     deed: Deed | None = None
     """Newest plan by which cells change hands."""
+    _granted: frozenset[Cell] = frozenset()
+    """Cells that the roadside has given and that no plan has mentioned yet."""
     motion_origin: Cell = field(init=False)
     motion_end_tick: int = 0
     command_tick: int = -1
@@ -166,7 +170,7 @@ class MotionController:
         if incarnation <= self.attendant:
             raise ValueError(f"incarnation {incarnation} is not above {self.attendant}")
         self.attendant = incarnation
-        self.accepted = self.promised = None
+        self.accepted = None
 
     def note(self, command: Command) -> bool:
         """Note what the process in charge asks for, whatever the tick of its command.
@@ -189,7 +193,12 @@ class MotionController:
         return (self.joined, self.accepted, self.promised, self.deed) != before
 
     def accept(self, ballot: Ballot) -> None:
-        """Note a plan that the process in charge has accepted; an older one changes nothing."""
+        """Note a plan that the process in charge has accepted; an older one changes nothing.
+
+        Nor does one whose deed has not been drawn up, where vehicles own cells.
+        """
+        if self.rolling and (self.deed is None or self.deed.ballot != ballot):
+            return
         self.accepted = ballot if self.accepted is None else max(self.accepted, ballot)
 
     def promise(self, ballot: Ballot) -> None:
@@ -197,10 +206,15 @@ class MotionController:
         self.promised = ballot if self.promised is None else max(self.promised, ballot)
 
     def draw_up(self, deed: Deed) -> None:
-        """Note the deed of an accepted plan, unless more has been promised since."""
+        """Note the deed of an accepted plan, unless more has been promised since.
+
+        The plan may have been made before the roadside gave a cell, which is kept all the same.
+        """
         newer = self.deed is None or deed.ballot > self.deed.ballot
         if newer and self.promised is not None and deed.ballot >= self.promised:
-            self.deed, self.estate = deed, deed.before
+            self._granted -= set(deed.before)
+            self.deed = _with_cells(deed, self._granted)
+            self.estate = self.deed.before
 
     def take_possession(self, ballot: Ballot) -> None:
         """Note that the start gate of the newest deed's plan is open."""
@@ -209,7 +223,10 @@ class MotionController:
 
     def own(self, cell: Cell) -> None:
         """Own a cell that nobody has entered in: the roadside says so."""
+        self._granted |= {cell}
         self.estate = tuple(sorted({*self.estate, cell}))
+        if self.deed is not None and not self.deed.open:
+            self.deed = _with_cells(self.deed, {cell})
 
     def join(self, formations: Iterable[int]) -> None:
         """Remember formations as joined, for the process in charge."""
@@ -289,6 +306,15 @@ class MotionController:
         """Tell whether somebody is on a lane that the body touches or that it steers for."""
         first, last = self.lattice.lanes_touched(self.measured[3], self._scenario.vehicle.width_m)
         return first <= other.lane <= last or other.lane == self.hold_cell[1]
+
+
+def _with_cells(deed: Deed, cells: Iterable[Cell]) -> Deed:
+    """Return a deed with cells that it leaves with the vehicle."""
+    return evolve(
+        deed,
+        before=tuple(sorted({*deed.before, *cells})),
+        after=tuple(sorted({*deed.after, *cells})),
+    )
 
 
 def _in_range(formations: Iterable[int]) -> bool:

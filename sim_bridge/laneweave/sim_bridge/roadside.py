@@ -67,9 +67,12 @@ class Roadside:
         self._meter = EntryMeter(
             lattice, formation.max_vehicles, self._spread_s, interlaced=not self._rolling
         )
-        self._last: list[Name | None] = [None] * self._lanes
-        """Who entered last on each lane, and the last column that is somebody's."""
-        self._owned = [1] * self._lanes
+        self._last: list[tuple[int, Name] | None] = [None] * self._lanes
+        """Who gets the empty cells of each lane, and in which column it entered."""
+        self._next: list[list[tuple[int, Name]]] = [[] for _ in range(self._lanes)]
+        """Who has entered behind them since cells were handed out, foremost first."""
+        self._handed_out = [1] * self._lanes
+        """The last column of each lane that was handed out."""
         columns = int(scenario.moves_from_m / lattice.pitch_m)
         self._most_empty = max(0, min(MOST_EMPTY, columns - 2))
         self._arrivals = arrivals(scenario)
@@ -107,7 +110,7 @@ class Roadside:
         admissions = self._meter.admit(t_s)
         for admission in admissions:
             column, lane = admission.cell
-            self._last[lane] = Name(admission.arrival.vehicle)
+            self._next[lane].append((column, Name(admission.arrival.vehicle)))
         self._entered += len(admissions)
         self._census_changed |= bool(admissions)
         return admissions
@@ -123,12 +126,14 @@ class Roadside:
             return
         for lane in range(self._lanes):
             closed = self._meter.closed_column(lane)
-            last = self._last[lane]
-            owner = vehicles.get(last) if last is not None else None
-            for column in range(self._owned[lane] - 1, closed - 1, -1):
-                if owner is not None and owner.admission.cell[0] - column <= self._most_empty:
-                    owner.controller.own((column, lane))
-            self._owned[lane] = min(self._owned[lane], closed)
+            for column in range(self._handed_out[lane] - 1, closed - 1, -1):
+                if self._next[lane] and self._next[lane][0][0] == column:
+                    self._last[lane] = self._next[lane].pop(0)
+                    continue  # its own cell
+                last = self._last[lane]
+                if last is not None and last[0] - column <= self._most_empty and last[1] in vehicles:
+                    vehicles[last[1]].controller.own((column, lane))
+            self._handed_out[lane] = closed
 
     def count_left(self) -> None:
         """Count a vehicle that passed the end of the road."""
