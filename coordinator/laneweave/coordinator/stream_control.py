@@ -168,7 +168,7 @@ class StreamControl:
         for entry in census.on_road:
             state = self.states.get(entry.vehicle)
             column = entry.cell[0] if state is None else state.hold_cell[0]
-            if self._scenario.lattice.cell_s_m(column, begun_s) < far_m:
+            if self._scenario.lattice.cell_s_m(column, (slot - 1) * self._slot_s) < far_m:
                 continue
             if state is None:
                 vehicles.append(
