@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
 import structlog
 
@@ -19,7 +19,7 @@ from laneweave.coordinator.leader import FormationControl
 from laneweave.coordinator.leader_rules import LEADER_RULES, Phase
 from laneweave.coordinator.service import PlanningService
 from laneweave.coordinator.stream_control import Note as StreamNote
-from laneweave.coordinator.stream_control import StreamControl
+from laneweave.coordinator.stream_control import Planner, StreamControl, stream_planner
 from laneweave.protocol.messages import (
     Ballot,
     Census,
@@ -84,6 +84,7 @@ class CoordinatorCore:
         incarnation: int,
         scenario: Scenario,
         rules: RuleBook = LEADER_RULES,
+        make_planner: Callable[[Scenario], Planner] = stream_planner,
     ) -> None:
         """Make a candidate that has seen nothing yet.
 
@@ -92,6 +93,7 @@ class CoordinatorCore:
             incarnation: a number that no process of this name has used before.
             scenario: road, formations, timing.
             rules: of a leader; others than `LEADER_RULES` only in tests.
+            make_planner: makes what plans the stream in the rolling operation.
         """
         self.name = name
         self.scenario = scenario
@@ -106,7 +108,9 @@ class CoordinatorCore:
         self._groups = Groups()
         self._planner = FormationPlanner(scenario, self._groups)
         self._stream = (
-            StreamControl(scenario, self._new_ballot) if scenario.formation.rolling else None
+            StreamControl(scenario, self._new_ballot, make_planner(scenario))
+            if scenario.formation.rolling
+            else None
         )
         """The rolling operation; None: formations."""
         self._handled_s = self._awake_since_s = 0.0

@@ -37,8 +37,9 @@ def estate_of(state: VehicleState, states: States) -> frozenset[Cell] | None:
     A vehicle whose newest deed is not open does not know what it owns: others of the roster may
     have opened their gates. They have if one of them shows it. They never will if somebody has
     promised more and has no such deed, or if all have promised more with closed gates. Where
-    somebody has a newer deed, which says nothing of this one, only those cells are certain that the
-    vehicle owns either way.
+    somebody will never tell, since it has a newer deed, has left the road or was not heard, only
+    those cells are certain that the vehicle owns either way. While it is under way it may still be
+    in one of the others.
 
     Args:
         state: of the vehicle; it shows an estate.
@@ -51,29 +52,54 @@ def estate_of(state: VehicleState, states: States) -> frozenset[Cell] | None:
     if deed is None or deed.open:
         return frozenset(state.estate)
     before, after = frozenset(deed.before), frozenset(deed.after)
-    signs = {_sign(state, deed)} | {
-        _sign(states.get(name), deed) for name in deed.roster if name != state.vehicle
-    }
+    signs = _signs(state, deed, states)
     if _Sign.OPEN in signs:
         return after
     if _Sign.WITHOUT in signs or signs == {_Sign.CLOSED}:
         return before
-    return before & after if _Sign.NEWER in signs else None
+    if state.moving or signs.isdisjoint({_Sign.NEWER, _Sign.GONE}):
+        return None
+    return before & after
+
+
+def sure_of(state: VehicleState, states: States) -> frozenset[Cell]:
+    """Return what a vehicle owns for certain, or at least whatever becomes of its newest deed."""
+    estate, deed = estate_of(state, states), state.deed
+    if estate is not None or deed is None:
+        return estate or frozenset()
+    return frozenset(deed.before) & frozenset(deed.after)
+
+
+def partners(state: VehicleState, states: States) -> frozenset[Name]:
+    """Return those whose promises would tell what a vehicle owns, where that is not certain."""
+    deed = state.deed
+    if deed is None or deed.open:
+        return frozenset()
+    signs = _signs(state, deed, states)
+    if _Sign.OPEN in signs or _Sign.WITHOUT in signs or signs == {_Sign.CLOSED}:
+        return frozenset()
+    return frozenset(name for name in deed.roster if name in states)
 
 
 class _Sign(Enum):
-    """What somebody shows of the start gate of a deed's plan; all but `NONE` for ever."""
+    """What somebody shows of the start gate of a deed's plan; all but the last two for ever."""
 
     OPEN = "it is open"
     CLOSED = "it has promised more with a closed gate"
     WITHOUT = "it has promised more, and has never had the deed"
     NEWER = "it has a newer deed"
+    GONE = "it is not there"
     NONE = "nothing"
+
+
+def _signs(state: VehicleState, deed: Deed, states: States) -> set[_Sign]:
+    others = (states.get(name) for name in deed.roster if name != state.vehicle)
+    return {_sign(state, deed), *(_sign(other, deed) for other in others)}
 
 
 def _sign(state: VehicleState | None, deed: Deed) -> _Sign:
     if state is None:
-        return _Sign.NONE
+        return _Sign.GONE
     theirs = state.deed
     if theirs is not None and theirs.ballot > deed.ballot:
         return _Sign.NEWER

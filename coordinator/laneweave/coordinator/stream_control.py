@@ -9,13 +9,13 @@ under way. Nobody stops for a replan: who is not reached holds, and is planned f
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 from attrs import field, frozen
 
-from laneweave.coordinator.handover import Handover, Phase, estate_of
+from laneweave.coordinator.handover import Handover, Phase, partners, sure_of
 from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.grid import Mode
 from laneweave.coordinator.planning.stream import (
@@ -64,19 +64,43 @@ class _Order:
     before: StreamPlan | None
 
 
+class Planner(Protocol):
+    """Plans the stream; `StreamPlanner` wherever vehicles are real."""
+
+    def plan(
+        self,
+        slot: int,
+        vehicles: Sequence[StreamVehicle],
+        before: StreamPlan | None = None,
+        blocked: Collection[Cell] = (),
+    ) -> StreamPlan:
+        """Return ways for all vehicles from the beginning of a slot on."""
+
+
+def stream_planner(scenario: Scenario) -> Planner:
+    """Return the planner of a scenario's road."""
+    return StreamPlanner(stream_road(scenario), _costs(scenario), scenario.seed)
+
+
 class StreamControl:
     """All vehicles under one leader."""
 
-    def __init__(self, scenario: Scenario, new_ballot: Callable[[Ballot | None], Ballot]) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        new_ballot: Callable[[Ballot | None], Ballot],
+        planner: Planner,
+    ) -> None:
         """Begin with nothing known.
 
         Args:
             scenario: road, lattice, timing.
             new_ballot: returns a ballot never used before and above the given one, if one is given.
+            planner: plans the stream.
         """
         self._scenario = scenario
         self._new_ballot = new_ballot
-        self._planner = StreamPlanner(stream_road(scenario), _costs(scenario), scenario.seed)
+        self._planner = planner
         self._slot_s = scenario.formation.cycle_s
         self.states: dict[Name, VehicleState] = {}
         """The newest state of each vehicle."""
@@ -175,13 +199,12 @@ class StreamControl:
                     StreamVehicle(entry.vehicle, entry.cell, entry.preferred_lane, held=True)
                 )
                 continue
-            late = state.accepted and not state.done and not state.moving
-            estate = estate_of(state, self.states) if state.estate else None
-            if estate is not None:
-                owned |= estate
-            if late and state.deed is not None:
-                # Its move may begin at any time until it promises something else.
-                taken |= {*state.estate, *state.deed.after} - {state.hold_cell}
+            # Its move begins at any moment. Without an open gate it may never: who takes part in
+            # something newer is asked, and then it does not.
+            late = state.go and not state.done and not state.moving
+            owned |= sure_of(state, self.states)
+            if late:
+                taken |= {*state.estate} - {state.hold_cell}
             held = late or not state.attended
             vehicles.append(
                 StreamVehicle(entry.vehicle, state.hold_cell, entry.preferred_lane, held)
@@ -239,7 +262,7 @@ class StreamControl:
         owner = {
             cell: name
             for name, state in self.states.items()
-            for cell in (estate_of(state, self.states) or ())
+            for cell in sure_of(state, self.states)
         }
         moves: dict[Name, tuple[Cell, Cell]] = {}
         concerned: dict[Name, set[Name]] = {}
@@ -250,7 +273,7 @@ class StreamControl:
             cells = footprint(way[0], way[1])
             if all(cell in owner for cell in cells):
                 moves[name] = (way[0], way[1])
-                concerned[name] = {owner[cell] for cell in cells} | {name}
+                concerned[name] = self._with_partners({owner[cell] for cell in cells} | {name})
         for roster in _clusters(concerned.values()):
             yield Handover(
                 ballot=self._new_ballot(self._highest),
@@ -261,6 +284,15 @@ class StreamControl:
                 resend_s=self._scenario.network.resend_s,
                 due_s=now_s,
             )
+
+    def _with_partners(self, names: set[Name]) -> set[Name]:
+        """Add those without whose promises nobody could tell what some vehicles own."""
+        roster, waiting = set(names), sorted(names)
+        while waiting:
+            new = partners(self.states[waiting.pop()], self.states) - roster
+            roster |= new
+            waiting += sorted(new)
+        return roster
 
     # --- outputs ------------------------------------------------------------------------------
 

@@ -130,8 +130,9 @@ class MotionController:
     def take(self, command: Command) -> bool:
         """Take a command of the process in charge, or of one that takes charge with it.
 
-        A command is refused when its incarnation is less than the attendant's, or when one of this
-        tick or of a later one has been taken. A greater incarnation takes charge; it must name the
+        A command is refused when its incarnation is less than the attendant's, when one of this
+        tick or of a later one has been taken, or when it names a cell that the vehicle does not own
+        (where vehicles own cells). A greater incarnation takes charge; it must name the
         cell in which the vehicle holds already: it could not speak for the vehicle before, so it
         cannot have got leave to move. Refused as well, it may try again with the next tick.
 
@@ -154,6 +155,8 @@ class MotionController:
             self.hand_over(command.incarnation)
         self.command_tick = command.tick
         self.note(command)
+        if self.rolling and command.hold_cell not in self.estate:
+            return False
         if len(jerks) > 0 or command.hold_cell != self.hold_cell:
             self._jerks, self._jerks_tick = jerks, command.tick
             self.hold_cell = command.hold_cell

@@ -9,6 +9,9 @@ machines inside the processes and shares no code with them.
 | `cell` | two vehicles occupy one cell: both ends of a motion and its corners, or the cell held |
 | `motion` | a body begins a motion that is not its next move of the plan that its agent shows |
 | `interleaved` | of two plans with a common vehicle, both have motions before one has ended |
+| `owner` | a cell has two owners (rolling operation; `estates` tells who owns what) |
+| `trespass` | a body is in a cell that its vehicle does not own (likewise) |
+| `gate` | a body begins a motion while no start gate of its plan is open (likewise) |
 | `monotone` | somebody takes back what it has said: promise, acceptance, progress, joined, charge |
 | `two-plans` | two different plans are sent under one ballot |
 | `stuck` | a vehicle is not on its lane long after everything was whole again |
@@ -22,8 +25,9 @@ from typing import Any
 from attrs import define, frozen
 
 from laneweave.launch.simulation.bodies import Body, Geometry, overlap_between
+from laneweave.launch.simulation.estates import Estates
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.messages import Ballot, Name, Plan, Sense, VehicleState
+from laneweave.protocol.messages import Ballot, Deed, Name, Plan, Sense, VehicleState
 
 MOST_VIOLATIONS = 20
 """After so many a run has been told enough about."""
@@ -69,9 +73,20 @@ class Checker:
     """Watches one run; `violations` says what it saw."""
 
     def __init__(
-        self, geometry: Geometry, note: Callable[[float, str], None] | None = None
+        self,
+        geometry: Geometry,
+        note: Callable[[float, str], None] | None = None,
+        *,
+        rolling: bool = False,
     ) -> None:
-        """Watch an empty road; `note` is told of what happens on it."""
+        """Watch an empty road.
+
+        Args:
+            geometry: sizes of cells and bodies.
+            note: is told of what happens on the road.
+            rolling: whether vehicles own cells.
+        """
+        self._estates = Estates(self._tell) if rolling else None
         self.violations: list[Violation] = []
         self.motions = 0
         self.plans: dict[Ballot, Plan] = {}
@@ -106,12 +121,19 @@ class Checker:
         self._bodies[vehicle] = Body.standing(self._geometry, cell, t_s)
         self._check_cells(t_s, vehicle)
 
+    def own(self, t_s: float, vehicle: str, estate: tuple[Cell, ...], deed: Deed | None) -> None:
+        """A motion controller shows what its vehicle owns."""
+        if self._estates is not None:
+            self._estates.show(t_s, vehicle, estate, deed)
+
     def leave(self, t_s: float, vehicle: str) -> None:
         """A vehicle left the road."""
         self._tell_of(t_s, f"{vehicle} leaves the road")
         self.advance(t_s)
         self._end_motion(vehicle)
         del self._bodies[vehicle]
+        if self._estates is not None:
+            self._estates.leave(vehicle)
 
     def begin(
         self, t_s: float, vehicle: str, incarnation: int, way: tuple[Cell, Cell], lasts_s: float
@@ -140,7 +162,11 @@ class Checker:
             self._tell("motion", t_s, [vehicle], f"moves from {way[0]} to {way[1]} without a plan")
             return
         self._check_order(t_s, vehicle, ballot, way)
-        self._check_serial(t_s, vehicle, ballot)
+        if self._estates is None:
+            self._check_serial(t_s, vehicle, ballot)
+        else:
+            self._estates.move(t_s, vehicle, ballot)
+            self._check_members(t_s, vehicle, ballot)
 
     def advance(self, t_s: float) -> None:
         """Look at all that moved since the last time: no two bodies overlapped."""
@@ -168,11 +194,15 @@ class Checker:
         if vehicle in self._moving:
             _, cell, ballot = self._moving.pop(vehicle)
             self._bodies[vehicle].rest(cell)
+            if self._estates is not None:
+                self._estates.occupy(self._checked_s, vehicle, self._bodies[vehicle].cells)
             if ballot in self._runs:
                 self._runs[ballot].under_way -= 1
 
     def _check_cells(self, t_s: float, vehicle: str) -> None:
         mine = self._bodies[vehicle].cells
+        if self._estates is not None:
+            self._estates.occupy(t_s, vehicle, mine)
         for other, body in self._bodies.items():
             if other != vehicle and not mine.isdisjoint(body.cells):
                 shared = sorted(mine & body.cells)
@@ -199,6 +229,14 @@ class Checker:
                 text = f"a motion of {_short(ballot)} amid those of {_short(other)}"
                 self._tell("interleaved", t_s, [vehicle], text)
         run.under_way += 1
+
+    def _check_members(self, t_s: float, vehicle: str, ballot: Ballot) -> None:
+        """Rosters differ from plan to plan: look at those whom both plans concern."""
+        for other in self.plans[ballot].roster:
+            _, _, its = self._moving.get(other, (0.0, (0, 0), ballot))
+            if its is not None and its < ballot:
+                text = f"a motion of {_short(ballot)}, and {other} is in one of {_short(its)}"
+                self._tell("interleaved", t_s, [vehicle, other], text)
 
     # --- the network --------------------------------------------------------------------------
 
@@ -241,6 +279,8 @@ class Checker:
             self._begun[key] = state.promised if state.accepted else None
         if state.promised != shown.promised:
             shown.completed, shown.go = 0, False
+        if state.go and state.promised is not None and self._estates is not None:
+            self._estates.open(t_s, state.promised)
         shown.promised, shown.accepted = state.promised, state.accepted
         shown.completed, shown.go = state.completed, state.go
         shown.hold_cell = state.hold_cell

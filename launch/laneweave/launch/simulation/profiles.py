@@ -26,6 +26,10 @@ class Profile:
     name: str
     text: str
     """What it is for, in one line."""
+    rolling: bool = False
+    """Vehicles own cells and are planned as one stream, not in formations."""
+    density: tuple[float, float] = (0.3, 0.7)
+    """Share of the cells of a stretch that vehicles enter in (rolling operation)."""
     vehicles: Span = (2, 16)
     blocks: Span = (1, 4)
     lanes: Span = (2, 4)
@@ -143,6 +147,24 @@ _ALL = (
         blocks=(2, 2),
         lanes=(4, 4),
         max_joined=(1, 1),
+    ),
+    evolve(
+        _MIXED,
+        name="rolling",
+        text="the rolling operation: vehicles own cells, which change hands; everything goes wrong",
+        rolling=True,
+        vehicles=(3, 14),
+        fault_s=(9.0, 14.0),
+    ),
+    evolve(
+        _MIXED,
+        name="rolling-dense",
+        text="the same with up to nine of ten cells taken",
+        rolling=True,
+        vehicles=(8, 18),
+        density=(0.6, 0.9),
+        fault_s=(9.0, 14.0),
+        events=(0, 6),
     ),
 )
 PROFILES = {profile.name: profile for profile in _ALL}

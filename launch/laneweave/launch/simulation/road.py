@@ -20,6 +20,7 @@ from laneweave.protocol.messages import (
     Census,
     CensusEntry,
     Command,
+    Deed,
     Name,
     Plan,
     Prepare,
@@ -71,8 +72,20 @@ class Visit:
     """Seconds that its clock gains in a second."""
 
 
+@frozen
+class Grant:
+    """An empty cell becomes somebody's, as the roadside does it (rolling operation)."""
+
+    t_s: float
+    owner: Name
+    cell: Cell
+
+
 class Watcher(Protocol):
     """Is told what happens on the road; the checker is one."""
+
+    def own(self, t_s: float, vehicle: str, estate: tuple[Cell, ...], deed: Deed | None) -> None:
+        """A motion controller shows what its vehicle owns."""
 
     def enter(self, t_s: float, vehicle: str, cell: Cell) -> None:
         """A vehicle entered."""
@@ -140,6 +153,8 @@ class LightVehicle(RoadVehicle):
             Admission(arrival, visit.cell, visit.enters_s),
             MotionController(self.body, scenario, visit.cell),
         )
+        if scenario.formation.rolling:
+            self.controller.own(visit.cell)
         self._visit = visit
         self._speed_mps = scenario.lattice.speed_mps
 
@@ -185,6 +200,7 @@ class LightRoad:
         new_incarnation: Callable[[], int],
         move_lasts_s: Callable[[], float],
         lost: Callable[[], bool],
+        grants: Iterable[Grant] = (),
     ) -> None:
         """Make a road without vehicles; they enter when their time comes.
 
@@ -196,6 +212,7 @@ class LightRoad:
             new_incarnation: numbers for caretakers.
             move_lasts_s: draws how long the next motion takes.
             lost: draws whether the next SENSE or COMMAND is lost beside what the network loses.
+            grants: which empty cells are whose, and from when on.
         """
         self.tick = -1
         self.vehicles: dict[Name, LightVehicle] = {}
@@ -206,6 +223,7 @@ class LightRoad:
         self._scenario = scenario
         self._tick_s = scenario.runtime.tick_s
         self._visits = sorted(visits, key=lambda visit: (visit.enters_s, visit.vehicle))
+        self._grants = sorted(grants, key=lambda grant: (grant.t_s, grant.cell))
         self._preferred_lanes = preferred_lanes
         self._watcher = watcher
         self._move_lasts_s = move_lasts_s
@@ -226,8 +244,10 @@ class LightRoad:
             case Arrived(_, _, Command() as command):
                 yield from self._on_command(command, now_s)
             case Arrived(_, parameters, (Prepare() | Plan()) as message):
-                vehicle = Name(parameters["vehicle"])
-                yield from self._attendance.on_message(vehicle, message, self.tick)
+                name = Name(parameters["vehicle"])
+                yield from self._attendance.on_message(name, message, self.tick)
+                if name in self.vehicles:
+                    self._show_estate(name, now_s)
             case Wakeup() if now_s >= self.wakeup_s:
                 yield from self._on_tick(now_s)
             case Started():
@@ -257,6 +277,7 @@ class LightRoad:
         except BadInputError:
             taken = False
         self.refused += not taken
+        self._show_estate(command.vehicle, now_s)
         if controller.hold_cell != held:
             lasts_s = self._move_lasts_s()
             way = (held, controller.hold_cell)
@@ -270,6 +291,7 @@ class LightRoad:
         t_s = self.tick * self._tick_s
         self._watcher.advance(now_s)
         self._let_enter(now_s)
+        self._hand_out(now_s)
         yield from self._let_leave(now_s)
         for vehicle in self.vehicles.values():
             vehicle.body.t_s = t_s
@@ -291,10 +313,29 @@ class LightRoad:
             lane = self._preferred_lanes[visit.vehicle]
             self.vehicles[visit.vehicle] = LightVehicle(visit, lane, self._scenario)
             self._watcher.enter(now_s, visit.vehicle, visit.cell)
+            self._show_estate(visit.vehicle, now_s)
             self._census_due_tick = 0
 
+    def _hand_out(self, now_s: float) -> None:
+        while self._grants and self._grants[0].t_s <= now_s + 1e-6:
+            grant = self._grants.pop(0)
+            owner = self.vehicles.get(grant.owner)
+            if owner is not None:
+                owner.controller.own(grant.cell)
+                self._show_estate(grant.owner, now_s)
+
+    def _show_estate(self, name: Name, now_s: float) -> None:
+        controller = self.vehicles[name].controller
+        self._watcher.own(now_s, name, controller.estate, controller.deed)
+
     def _let_leave(self, now_s: float) -> Iterator[Effect]:
-        for name in [name for name, each in self.vehicles.items() if each.leaves_by(now_s)]:
+        length_m = self._scenario.road.length_m
+        leaving = [
+            name
+            for name, each in self.vehicles.items()
+            if each.leaves_by(now_s) or each.body.state[0] > length_m
+        ]
+        for name in leaving:
             self._leaving.add(self.vehicles.pop(name))
             yield from self._attendance.forget(name)
             self._watcher.leave(now_s, name)

@@ -9,7 +9,8 @@ from attrs import frozen
 
 from laneweave.launch.simulation.faults import CLOCK_DRIFT, CLOCK_OFFSET_S, LEASE_S, Mix
 from laneweave.launch.simulation.profiles import Profile
-from laneweave.launch.simulation.road import Visit
+from laneweave.launch.simulation.road import Grant, Visit
+from laneweave.launch.simulation.rolling import Stretch, grants, make_rolling_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import Name
 from laneweave.protocol.scenario import FormationSettings, Network, Road, Runtime, Scenario
@@ -19,6 +20,8 @@ LAST_BLOCKS = (-1, -1, 0, 1)
 """Number of the rearmost formation. Those below 0 are on the road at the start; others enter cell
 by cell: formation 0 is closed after 3 s, formation 1 after 7 s."""
 LEAVES_S = (2.0, 9.0)
+THOROUGH = 0.1
+"""Share of runs of the rolling operation with the stream planner; it costs ten times the rest."""
 LARGEST = 6
 """Vehicles in a formation, as many as the paper's largest one has."""
 LARGEST_JOINED = 10
@@ -53,17 +56,45 @@ class Setup:
     visits: tuple[Visit, ...]
     crowded: bool
     """Now and then more vehicles want a lane of a block than it has cells."""
+    grants: tuple[Grant, ...] = ()
+    """Which empty cells are whose (rolling operation)."""
+    stretch_columns: int = 0
+    """Length of the stretch in which vehicles enter (rolling operation)."""
+    thorough: bool = False
+    """The stream planner plans, not the light one (rolling operation)."""
 
     @classmethod
     def drawn(cls, profile: Profile, rng: random.Random) -> Setup:
         """Draw from a profile."""
         lanes = rng.randint(*profile.lanes)
+        if profile.rolling:
+            return cls._drawn_rolling(profile, lanes, rng)
         scenario = make_scenario(lanes, rng.randint(*profile.max_joined))
         last, number = rng.choice(LAST_BLOCKS), rng.randint(*profile.blocks)
         blocks = tuple(range(last - number + 1, last + 1))
         mix = Mix.drawn(profile, rng)
         visits = tuple(_draw_visits(profile, scenario, blocks, mix, rng))
         return cls(scenario, mix, blocks, visits, rng.random() < profile.crowding)
+
+    @classmethod
+    def _drawn_rolling(cls, profile: Profile, lanes: int, rng: random.Random) -> Setup:
+        scenario = make_rolling_scenario(lanes, TICK_S, rng)
+        mix = Mix.drawn(profile, rng)
+        stretch = Stretch.drawn(profile, scenario, rng)
+        visits = tuple(
+            _visit(Name(f"v{number:02}"), cell, rng.random() < profile.leavers, scenario, mix, rng)
+            for number, cell in enumerate(stretch.cells, start=1)
+        )
+        return cls(
+            scenario,
+            mix,
+            (),
+            visits,
+            rng.random() < profile.crowding,
+            tuple(grants(scenario, stretch, visits)),
+            stretch.columns,
+            rng.random() < THOROUGH,
+        )
 
     def wishes(self, rng: random.Random, *, last: bool) -> dict[Name, int]:
         """Draw the lane that each vehicle prefers.
@@ -72,6 +103,11 @@ class Setup:
         has cells there. Where two formations may be joined, that holds for both together.
         """
         lanes, columns = self.scenario.road.lanes, self.scenario.formation.block_columns
+        if self.scenario.formation.rolling:
+            room = [self.stretch_columns] * lanes
+            weights = [6.0 if self.crowded and lane == 0 else 1.0 for lane in range(lanes)]
+            vehicles = [visit.vehicle for visit in self.visits]
+            return _draw_lanes(vehicles, room, weights, rng)
         may_join = len(self.blocks) == 2 and self.scenario.formation.max_joined >= 2
         if self.crowded and (may_join or not last):
             # One lane that everybody likes best.

@@ -70,6 +70,7 @@ def _words(effect: Send) -> str | None:
             return (
                 f"STATE of {state.vehicle}/{state.incarnation} promised {_short(state.promised)} "
                 f"k={state.completed} at {state.hold_cell} joined {state.joined} {' '.join(marks)}"
+                f"{_owned(state)}"
             )
         case Command() as command:
             return (
@@ -93,6 +94,17 @@ def _words(effect: Send) -> str | None:
             return f"heartbeat term {beat.term} leading {beat.leading}"
         case _:
             return None
+
+
+def _owned(state: VehicleState) -> str:
+    """Return what a vehicle of the rolling operation shows to own."""
+    if not state.estate and state.deed is None:
+        return ""
+    deed = state.deed
+    if deed is None:
+        return f" owns {list(state.estate)}"
+    word = "open" if deed.open else f"waits for {list(deed.after)} with {' '.join(deed.roster)}"
+    return f" owns {list(state.estate)}, deed {_short(deed.ballot)} {word}"
 
 
 def _short(ballot: Ballot | None) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import random
 import time
 from collections import Counter, deque
+from collections.abc import Sequence
 from itertools import count
 
 from attrs import field, frozen
@@ -17,18 +18,22 @@ from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.leader_rules import LEADER_RULES
+from laneweave.coordinator.stream_control import Planner, stream_planner
 from laneweave.launch.simulation.bodies import Geometry
 from laneweave.launch.simulation.checker import Checker, Violation
 from laneweave.launch.simulation.driver import LightDriver
 from laneweave.launch.simulation.faults import CLOCK_DRIFT, CLOCK_OFFSET_S, ROAD, Injector
+from laneweave.launch.simulation.planner import LightPlanner, Watched
 from laneweave.launch.simulation.profiles import Profile
 from laneweave.launch.simulation.road import LightRoad
-from laneweave.launch.simulation.setup import SLOT_S, Setup
+from laneweave.launch.simulation.setup import Setup
 from laneweave.launch.simulation.story import Story
 from laneweave.launch.simulation.tap import Tap
 from laneweave.protocol.codec import encode
+from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import Command, Name, Plan, Prepare, Sense, VehicleState
 from laneweave.protocol.node import Core, Send
+from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.simulated_network import SimulatedNetwork
 from laneweave.protocol.simulated_trace import TraceDigest
 from laneweave.protocol.topics import Keys
@@ -44,6 +49,10 @@ NEW_WISHES_S = (0.8, 3.0)
 """While faults happen vehicles change their minds after such times."""
 PATIENCE_S = 90.0
 """Time that everybody has to arrive once everything is whole."""
+FUTILE = 8
+"""A vehicle that does not move though so many plans would move it is stuck."""
+SLOTS_WHOLE = 14
+"""Slots that a run of the rolling operation goes on for once everything is whole."""
 LOOK_S = 0.5
 """How often it is looked whether a run is over."""
 KEPT = 400
@@ -138,6 +147,7 @@ class World:
                 scenario.formation.gap_m, scenario.road.lane_width_m, size.length_m, size.width_m
             ),
             story.tell if story is not None else None,
+            rolling=profile.rolling,
         )
         self._rules = vehicle_rules, leader_rules
         self._story = story
@@ -148,6 +158,13 @@ class World:
         self.injector = Injector(
             self.network, self, mix, self._rng, scenario.network.realm, self._note
         )
+        self._proposed: Counter[str] = Counter()
+        """How often a planner meant to move each vehicle since everything was made whole, or was
+        told that it must hold."""
+        self._first_cells: dict[Name, Cell] = {}
+        """Where each vehicle was found first since then (rolling operation)."""
+        self._moved: set[Name] = set()
+        """Who has been found elsewhere since."""
         self._wishes = self.setup.wishes(self._rng, last=False)
         self.road = LightRoad(
             scenario,
@@ -157,6 +174,7 @@ class World:
             self._incarnations.__next__,
             self._move_lasts_s,
             self._loses_command,
+            self.setup.grants,
         )
         self._set_clocks()
         self.network.add(ROAD, Tap(self.road, ROAD, self._on_sent), scenario.network.realm)
@@ -174,7 +192,7 @@ class World:
             last = change_s + NEW_WISHES_S[1] > fault_s
             network.at(change_s, self._change_wishes, last)
         network.at(fault_s, self.injector.heal)
-        end_s = fault_s + PATIENCE_S
+        end_s = fault_s + self._patience_s
         while network.now_s < end_s and not self._is_over():
             network.run(network.now_s + LOOK_S)
         self.checker.advance(network.now_s)
@@ -216,13 +234,23 @@ class World:
         core: Core
         if name in COORDINATORS:
             incarnation = next(self._incarnations)
-            core = CoordinatorCore(Name(name), incarnation, scenario, leader_rules)
+            core = CoordinatorCore(
+                Name(name), incarnation, scenario, leader_rules, self._make_planner
+            )
         else:
             agent = AgentCore(
                 vehicle, self._incarnations.__next__, scenario, LightDriver, vehicle_rules
             )
             core = AgentHost(lambda _: agent, [vehicle])
         self.network.add(name, Tap(core, name, self._on_sent), scenario.network.realm)
+
+    def _make_planner(self, scenario: Scenario) -> Planner:
+        planner = stream_planner(scenario) if self.setup.thorough else LightPlanner(scenario)
+        return Watched(planner, self._on_planned)
+
+    def _on_planned(self, movers: Sequence[str]) -> None:
+        if self.injector.healed:
+            self._proposed.update(movers)
 
     def old_payload(self, rng: random.Random) -> tuple[str, bytes] | None:
         """Return a message that was sent some time ago, with its key."""
@@ -251,7 +279,8 @@ class World:
     def _move_lasts_s(self) -> float:
         rng = self._rng
         if not self.injector.healed and rng.random() < self.setup.mix.slow_moves:
-            return rng.uniform(SLOT_S, SLOWEST_SLOTS * SLOT_S)
+            slot_s = self.setup.scenario.formation.cycle_s
+            return rng.uniform(slot_s, SLOWEST_SLOTS * slot_s)
         return self.setup.scenario.formation.move_s
 
     def _loses_command(self) -> bool:
@@ -281,19 +310,43 @@ class World:
     # --- the end ------------------------------------------------------------------------------
 
     def _is_over(self) -> bool:
+        if self.profile.rolling:
+            self._astray()
+            return bool(self.checker.violations)
         return bool(self.checker.violations) or (self.injector.healed and not self._astray())
+
+    @property
+    def _patience_s(self) -> float:
+        scenario = self.setup.scenario
+        if scenario.formation.rolling:
+            return SLOTS_WHOLE * scenario.formation.cycle_s
+        return PATIENCE_S
 
     def _astray(self) -> list[Name]:
         """Return who is on the road but does not rest on the lane that it prefers."""
         if self.checker.violations or not self.injector.healed:
             return []
         now_s = self.network.now_s
-        return [
+        astray = [
             name
             for name, vehicle in self.road.vehicles.items()
             if vehicle.controller.hold_cell[1] != vehicle.preferred_lane
             or not vehicle.body.has_arrived(now_s)
         ]
+        if not self.profile.rolling:
+            return astray
+        return [name for name in astray if not self._has_done_its_part(name)]
+
+    def _has_done_its_part(self, name: Name) -> bool:
+        """Tell whether a vehicle of the rolling operation moves, or nobody means to move it.
+
+        Who has been on its lane may have made room for others since, and some lanes are full.
+        """
+        cell = self.road.vehicles[name].controller.hold_cell
+        moved = self._first_cells.setdefault(name, cell) != cell
+        if moved:
+            self._moved.add(name)
+        return name in self._moved or self._proposed[name] < FUTILE
 
     def _outcome(self, cpu_s: float) -> Outcome:
         network, checker = self.network, self.checker
