@@ -58,6 +58,9 @@ real planner. It understands what a leader does, but it plans itself:
 | `c1 loses the router`, `c1 finds the router` | its own connection |
 | `c1 plans` | the planner finishes what c1 has ordered first |
 | `c1 brings its plan into force` | in short: it plans, all get the PLAN and hear each other |
+
+Stories of the rolling operation have names that begin with `rolling_`; `story_rolling` has what
+they understand beside.
 """
 
 from __future__ import annotations
@@ -66,7 +69,11 @@ from pathlib import Path
 
 from attrs import frozen
 
+from laneweave.coordinator.leader_rules import LEADER_RULES
+from laneweave.protocol.transitions import RuleBook
+from laneweave.protocol.vehicle_rules import VEHICLE_RULES
 from scenarios.story_player import Player
+from scenarios.story_rolling import RollingPlayer, is_rolling
 from scenarios.story_text import CollisionError, StoryError
 
 
@@ -98,6 +105,15 @@ def read_story(path: Path) -> list[Line]:
     return lines
 
 
+def player_of(
+    path: Path, vehicle_rules: RuleBook = VEHICLE_RULES, leader_rules: RuleBook = LEADER_RULES
+) -> Player:
+    """Return an empty road for a story; other rules plant a bug."""
+    if is_rolling(path.stem):
+        return RollingPlayer(vehicle_rules, leader_rules)
+    return Player(vehicle_rules, leader_rules)
+
+
 def check_story(path: Path, player: Player | None = None) -> None:
     """Play a story.
 
@@ -108,7 +124,7 @@ def check_story(path: Path, player: Player | None = None) -> None:
     Raises:
         StoryError: it went otherwise; the message names the line.
     """
-    player = player or Player()
+    player = player or player_of(path)
     for line in read_story(path):
         try:
             happened = tuple(player.play(line.command))

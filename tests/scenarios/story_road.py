@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from itertools import count
 
-from attrs import define, field
+from attrs import define, evolve, field
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.driver import Drive, Effort
@@ -38,6 +38,10 @@ SCENARIO = Scenario(
     network=Network(election_s=1.0),
     runtime=Runtime(tick_s=TICK_S),
 )
+
+
+ROLLING = evolve(SCENARIO, formation=evolve(SCENARIO.formation, operation="rolling"))
+"""The same with vehicles that own cells."""
 
 
 class StoryDriver:
@@ -81,12 +85,21 @@ class Vehicle:
     caretakers: set[int] = field(factory=set)
     """Incarnations that were caretakers."""
     incarnations: Iterator[int] = field(factory=lambda: count(1))
+    scenario: Scenario = SCENARIO
 
     @classmethod
-    def entering(cls, name: str, cell: Cell, preferred_lane: int, t_s: float) -> Vehicle:
+    def entering(
+        cls,
+        name: str,
+        cell: Cell,
+        preferred_lane: int,
+        t_s: float,
+        scenario: Scenario = SCENARIO,
+    ) -> Vehicle:
         """Return a vehicle that nobody is in charge of yet."""
         arrival = Arrival(Name(name), cell[1], preferred_lane, t_s)
-        return cls(RoadVehicle.entering(Admission(arrival, cell, t_s), t_s, SCENARIO), cell)
+        road = RoadVehicle.entering(Admission(arrival, cell, t_s), t_s, scenario)
+        return cls(road, cell, scenario=scenario)
 
     @property
     def name(self) -> Name:
@@ -134,7 +147,7 @@ class Agent:
         self.tick = -1
         """The newest tick that it has sensed."""
         self._core = AgentCore(
-            vehicle.name, lambda: next(vehicle.incarnations), SCENARIO, StoryDriver, rules
+            vehicle.name, lambda: next(vehicle.incarnations), vehicle.scenario, StoryDriver, rules
         )
         self._note(self._core.handle(Started(), 0.0))
 
@@ -157,13 +170,15 @@ class Agent:
         self.tick, self.command = tick, None
         self._note(self._core.handle(self._arrived(SENSE, self.vehicle.sense(tick)), 0.0))
 
-    def get(self, message: Prepare | Plan, tick: int) -> None:
+    def get(self, message: Prepare | Plan, tick: int, *, noted: bool = True) -> None:
         del tick
         topic = PLAN if isinstance(message, Plan) else PREPARE
         before = self.command
         self._note(self._core.handle(self._arrived(topic, message), 0.0))
         asked = self.command
         # What is to be noted goes to the controller at once, and back: within one vehicle.
+        if not noted:
+            return
         if asked is not None and asked is not before and self.vehicle.road.controller.note(asked):
             sense = self.vehicle.sense(self.tick)
             self._note(self._core.handle(self._arrived(SENSE, sense), 0.0))

@@ -49,4 +49,8 @@ def told(name: str, state: VehicleState) -> str:
             parts.append(word)
     if len(state.joined) > 1:
         parts.append(f"joined {' '.join(map(str, state.joined))}")
+    if state.estate:
+        parts.append(f"owns {' '.join(map(shown, state.estate))}")
+    if state.deed is not None:
+        parts.append(f"deed {written(state.deed.ballot)} {'open' if state.deed.open else 'shut'}")
     return ", ".join(parts)

@@ -8,6 +8,7 @@ import pytest
 
 from laneweave.coordinator.leader_rules import LEADER_RULES
 from laneweave.protocol.vehicle_rules import VEHICLE_RULES
+<<<<<<< HEAD
 from planted_bugs import (
     BUGS,
     IN_THE_ROLLING_OPERATION,
@@ -17,6 +18,10 @@ from planted_bugs import (
 )
 from scenarios.stories import check_story, ends_in_collision
 from scenarios.story_player import Player
+=======
+from planted_bugs import BUGS, NOT_A_SAFETY_MATTER, ROWS_OF_OTHERS, PlantedBug
+from scenarios.stories import check_story, ends_in_collision, player_of
+>>>>>>> dad596a (Stories of the rolling operation)
 from scenarios.story_text import StoryError
 
 HERE = Path(__file__).parent
@@ -27,8 +32,8 @@ def test_planted_bug_spoils_its_story(bug: PlantedBug, monkeypatch: pytest.Monke
     path = HERE / f"{bug.story}.txt"
     bug.plant(monkeypatch)
     with pytest.raises(StoryError):
-        check_story(path, Player(bug.vehicle_rules, bug.leader_rules))
-    collides = ends_in_collision(path, Player(bug.vehicle_rules, bug.leader_rules))
+        check_story(path, player_of(path, bug.vehicle_rules, bug.leader_rules))
+    collides = ends_in_collision(path, player_of(path, bug.vehicle_rules, bug.leader_rules))
     assert collides is bug.collides
 
 

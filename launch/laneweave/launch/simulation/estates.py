@@ -50,10 +50,27 @@ class Estates:
         self._bodies: dict[str, Cells] = {}
         """Cells that each body occupies."""
 
-    def show(self, t_s: float, vehicle: str, estate: tuple[Cell, ...], deed: Deed | None) -> None:
-        """A motion controller shows what its vehicle owns."""
+    def show(
+        self,
+        t_s: float,
+        vehicle: str,
+        estate: tuple[Cell, ...],
+        deed: Deed | None,
+        body: Cells | None = None,
+    ) -> None:
+        """A motion controller shows what its vehicle owns.
+
+        Args:
+            t_s: virtual time.
+            vehicle: which.
+            estate: its cells.
+            deed: its newest deed.
+            body: the cells that its body occupies from now on, where that changes, too.
+        """
         known = self._holdings.get(vehicle)
-        if known is not None and known.deed == deed and known.estate == frozenset(estate):
+        if body is not None:
+            self._bodies[vehicle] = body
+        elif known is not None and known.deed == deed and known.estate == frozenset(estate):
             return
         self._holdings[vehicle] = Holding(frozenset(estate), deed)
         if deed is not None and deed.open:

@@ -1,0 +1,245 @@
+"""Stories of the rolling operation: vehicles own cells, and short ballots hand them over.
+
+| command | what it does |
+|---|---|
+| `vehicle A at 3,0 wants 1, owns 4,0 2,0` | it owns these cells beside its own |
+| `vehicle A at 3,0 from 2,0 wants 1, owns 2,0` | it is still on its way into its cell |
+| `stream L1 term 1` | a leader that has just taken over |
+| `L1 hands over A>3,1 with B` | a new ballot: A moves to 3,1; the roster is A and B |
+| `L1 hands over A>3,1 claiming 3,1` | the same of a faulty leader: A owns 3,1, it says |
+| `L1 collects promises` | in short: all get the PREPARE, and are heard |
+| `L1 brings its plan to A B` | in short: they get the PLAN |
+| `A B hear each other` | in short |
+| `A gets PREPARE 1/L1/1/1 late` | its COMMAND, with which that is to be noted, is under way |
+| `COMMAND of A arrives` | the one that was under way |
+| `L1 forgets A` | the census shows that A has left |
+
+After each command no cell has two owners, and every vehicle owns the cells that it occupies.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+
+from attrs import define, evolve, field
+
+from laneweave.coordinator.handover import Handover, Phase
+from laneweave.launch.simulation.estates import Estates
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.messages import Ballot, Command, Heartbeat, Name, VehicleState
+from scenarios.story_leaders import RESEND_S, Mail, post
+from scenarios.story_player import Player
+from scenarios.story_road import ROLLING, SLOT_S, Agent, Vehicle
+from scenarios.story_text import CollisionError, StoryError, cell_of, written
+
+Lines = Iterator[str]
+
+
+@define(eq=False)
+class StreamLeader:
+    """A leader with one ballot under way; the story plans for it."""
+
+    name: str
+    term: int
+    states: dict[Name, VehicleState] = field(factory=dict)
+    handover: Handover | None = None
+    claims: tuple[Cell, ...] = ()
+    """Cells that it takes for the mover's, whoever owns them."""
+    ballots: int = 0
+
+    def begin(self, mover: Name, target: Cell, others: tuple[Name, ...], now_s: float) -> None:
+        """Begin a ballot over a mover and others."""
+        self.ballots += 1
+        roster = tuple(sorted({mover, *others}))
+        self.handover = Handover(
+            ballot=Ballot(self.term, Name(self.name), 1, self.ballots),
+            roster=roster,
+            moves={mover: (self.states[mover].hold_cell, target)},
+            t0_s=0.0,
+            slot_s=SLOT_S,
+            resend_s=RESEND_S,
+            due_s=now_s,
+        )
+
+    def send(self, mail: Mail, now_s: float) -> Lines:
+        if self.handover is not None:
+            for vehicle, message in self.handover.outgoing(now_s):
+                yield post(mail, message, vehicle)
+
+    def hear(self, state: VehicleState) -> Lines:
+        handover = self.handover
+        if self.claims and handover is not None and state.vehicle in handover.moves:
+            state = evolve(state, estate=tuple(sorted({*state.estate, *self.claims})))
+        self.states[state.vehicle] = state
+        if handover is None:
+            return
+        before = handover.phase
+        handover.on_state(state, self.states)
+        if handover.phase is not before:
+            yield self.about()
+
+    def about(self) -> str:
+        handover = self.handover
+        if handover is None:
+            return f"{self.name} has no ballot"
+        why = f": {handover.why}" if handover.phase is Phase.GIVEN_UP else ""
+        return f"{self.name} {handover.phase.value} {written(handover.ballot)}{why}"
+
+
+class RollingPlayer(Player):
+    """The world of a story of the rolling operation."""
+
+    def __init__(self, *rules: object) -> None:
+        """Begin with an empty road; other rules plant a bug."""
+        super().__init__(*rules)  # type: ignore[arg-type]
+        self.streams: dict[str, StreamLeader] = {}
+        self._late: dict[str, Command] = {}
+        self._wrong: list[str] = []
+        self._estates = Estates(self._tell)
+        mine: tuple[tuple[str, Callable[..., Lines | None]], ...] = (
+            (r"vehicle (\w+) at (\S+)(?: from (\S+))? wants (\d+)(?:, owns (.+))?", self._enter),
+            (r"stream (\w+) term (\d+)", self._stream),
+            (r"(\w+) hands over (\w+)>(\S+)(?: with ([\w ]+))?(?: claiming (.+))?", self._hands),
+            (r"(\w+) brings its plan to (.+)", self._issues),
+            (r"([\w ]+) hear each other", self._hear_each_other),
+            (r"(\w+) gets (PREPARE|PLAN) (\S+) late", self._gets_late),
+            (r"COMMAND of (\w+) arrives", self._late_command),
+            (r"(\w+) forgets (\w+)", self._forgets),
+        )
+        self._grammar = (*mine, *self._grammar)
+
+    def _tell(self, kind: str, t_s: float, vehicles: list[str], text: str) -> None:
+        del t_s
+        self._wrong.append(f"{kind}: {' '.join(vehicles)}: {text}")
+
+    def _check_cells(self, command: str) -> None:
+        super()._check_cells(command)
+        for name, vehicle in self.vehicles.items():
+            controller = vehicle.road.controller
+            body = frozenset(vehicle.occupied)
+            self._estates.show(0.0, name, controller.estate, controller.deed, body)
+        for process in self.processes.values():
+            state = process.shown
+            if state is not None and state.go and state.promised is not None:
+                self._estates.open(0.0, state.promised)
+        if self._wrong:
+            wrong, self._wrong = self._wrong, []
+            raise CollisionError(f"{command}: {wrong[0]}")
+
+    # --- the road -----------------------------------------------------------------------------
+
+    def _enter(
+        self, name: str, cell: str, origin: str | None, lane: str, owned: str | None
+    ) -> None:
+        vehicle = Vehicle.entering(name, cell_of(cell), int(lane), self.t_s, ROLLING)
+        for each in (owned or "").split():
+            vehicle.road.controller.own(cell_of(each))
+        if origin is not None:
+            vehicle.at = cell_of(origin)
+        self.vehicles[name] = vehicle
+        self._put_in_charge(name, vehicle)
+
+    def _leaves(self, name: str) -> None:
+        super()._leaves(name)
+        self._estates.leave(name)
+
+    def _gets_late(self, name: str, kind: str, ballot: str) -> None:
+        agent = self._agent_named(name)
+        agent.get(self._mail[kind, ballot, agent.vehicle.name], self.tick, noted=False)
+        if agent.command is not None:
+            self._late[name] = agent.command
+
+    def _late_command(self, name: str) -> Lines:
+        controller = self._agent_named(name).vehicle.road.controller
+        command = self._late.pop(name)
+        noted = controller.note(command)
+        controller.take(command)
+        yield "something is noted" if noted else "nothing is noted"
+
+    def _agent_named(self, name: str) -> Agent:
+        process = self.processes[name]
+        if not isinstance(process, Agent):
+            raise StoryError(f"{name} is no agent")
+        return process
+
+    # --- leaders ------------------------------------------------------------------------------
+
+    def _stream(self, name: str, term: str) -> None:
+        self.streams[name] = StreamLeader(name, int(term))
+
+    def _forgets(self, name: str, vehicle: str) -> None:
+        del self.streams[name].states[Name(vehicle)]
+
+    def _hands(
+        self, name: str, mover: str, target: str, others: str | None, claimed: str | None
+    ) -> None:
+        leader = self.streams[name]
+        for each in (mover, *(others or "").split()):
+            list(leader.hear(self._shown_by(each)))
+        leader.claims = tuple(map(cell_of, (claimed or "").split()))
+        names = tuple(map(Name, (others or "").split()))
+        leader.begin(Name(mover), cell_of(target), names, self.t_s)
+
+    def _sends(self, name: str) -> Lines:
+        if name in self.streams:
+            yield from self.streams[name].send(self._mail, self.t_s)
+        else:
+            yield from super()._sends(name)
+
+    def _collects(self, name: str) -> Lines:
+        leader, handover = self.streams[name], self._handover_of(name)
+        list(leader.send(self._mail, self.t_s))
+        told: list[str] = []
+        for vehicle in handover.roster:
+            self._deliver_to(vehicle, "PREPARE", handover)
+            told += leader.hear(self._shown_by(vehicle))
+        yield f"{' '.join(sorted(handover.promises)) or 'none'} promise {written(handover.ballot)}"
+        yield from told
+
+    def _issues(self, name: str, vehicles: str) -> Lines:
+        leader, handover = self.streams[name], self._handover_of(name)
+        list(leader.send(self._mail, self.t_s))
+        for vehicle in vehicles.split():
+            self._deliver_to(vehicle, "PLAN", handover)
+            state = self._shown_by(vehicle)
+            accepts = state.accepted and state.promised == handover.ballot
+            yield f"{vehicle} accepts" if accepts else f"{vehicle} does not accept"
+
+    def _deliver_to(self, vehicle: str, kind: str, handover: Handover) -> None:
+        message = self._mail.get((kind, written(handover.ballot), vehicle))
+        if message is not None:
+            self._in_charge_of(vehicle).get(message, self.tick)
+
+    def _hear_each_other(self, names: str) -> Lines:
+        for name in names.split():
+            for other in names.split():
+                if other != name:
+                    yield from self._hear(name, self._shown_by(other))
+
+    def _hear(self, name: str, what: VehicleState | Heartbeat | None) -> Lines:
+        if name in self.streams and isinstance(what, VehicleState):
+            yield from self.streams[name].hear(what)
+        else:
+            yield from super()._hear(name, what)
+
+    def _show(self, name: str) -> Lines:
+        yield from [self.streams[name].about()] if name in self.streams else super()._show(name)
+
+    def _handover_of(self, name: str) -> Handover:
+        handover = self.streams[name].handover
+        if handover is None:
+            raise StoryError(f"{name} has no ballot")
+        return handover
+
+    def _shown_by(self, name: str) -> VehicleState:
+        """Return what a process shows, or whoever is in charge of a vehicle of this name."""
+        process = self._in_charge_of(name) if name in self.vehicles else self.processes[name]
+        if process.shown is None:
+            raise StoryError(f"{name} has shown nothing")
+        return process.shown
+
+
+def is_rolling(stem: str) -> bool:
+    """Tell whether a story of this name is one of the rolling operation."""
+    return re.match("rolling_", stem) is not None
