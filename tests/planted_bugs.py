@@ -348,8 +348,8 @@ BUGS: tuple[PlantedBug, ...] = (
 )  # fmt: skip
 
 IN_THE_ROLLING_OPERATION: Mapping[str, str] = {
-    "keeps_to_its_estates": "tests/unit/protocol/test_estates.py",
-    "take_possession": "tests/unit/protocol/test_estates.py",
+    "keeps_to_its_estates": "tests/unit/rolling/test_vehicle_rules.py",
+    "take_possession": "tests/unit/rolling/test_vehicle_rules.py",
 }
 """What has no effect where formations own blocks, as in all stories; and where it is tested."""
 NOT_A_SAFETY_MATTER: Mapping[str, str] = {
