@@ -127,6 +127,8 @@ def test_every_wrong_type_of_every_field_is_refused_by_name(field: str, default:
         wrongs = (1, True, None, "node", {}, {"a": 1}, [True], [[]], [None], [math.nan], [{}])
     elif default is None:
         wrongs = ("1", True, 1.0, [], {}, math.nan)
+    elif isinstance(default, bool):
+        wrongs = (0, 1, 1.0, "true", None, [], {}, math.nan)
     elif isinstance(default, int):
         wrongs = (*NOT_NUMBERS, 1.0, 16**5000)
     else:
