@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 import pytest
 from attrs import field, frozen
 
+import broken_estates as rolling
 import broken_rules as broken
 from laneweave.coordinator.leader_rules import LEADER_RULES
 from laneweave.protocol.transitions import Function, RuleBook, Transition
@@ -24,6 +25,8 @@ ROWS_OF_OTHERS = {
     "joining": "which formations are joined: coordinator.groups",
     "charge": "who acts for a vehicle: AgentCore, MotionController",
     "caretaker": "who acts for a vehicle without agent: sim_bridge.caretaker",
+    "estate": "which cells are whose in the rolling operation: MotionController, plans",
+    "handover": "how a leader hands cells over: coordinator.handover",
 }
 """Rules that are not, or not only, in the rule books, and where they are."""
 
@@ -44,8 +47,9 @@ class PlantedBug:
     story: str
     """A story of tests/scenarios that it spoils."""
     collides: bool = True
-    """The spoilt story ends with two vehicles in one cell; otherwise nothing worse than disorder,
-    or a vehicle that waits for ever."""
+    """The spoilt story ends with two vehicles in one cell (in the rolling operation also: with two
+    owners of one, or with a body in a cell that is not its own); otherwise nothing worse than
+    disorder, or a vehicle that waits for ever."""
     vehicle: Mapping[str, Function] = field(factory=dict)
     """Guards and actions of a vehicle that are replaced."""
     leader: Mapping[str, Function] = field(factory=dict)
@@ -345,13 +349,63 @@ BUGS: tuple[PlantedBug, ...] = (
         "caretaker-forgets-motion", "caretaker", "A vehicle under way counts as being there.",
         "caretaker_of_a_moving_vehicle", plant=broken.never_moving,
     ),
+    # --- the rolling operation
+    PlantedBug(
+        "estate-not-checked", "V3", "A plan that takes a cell for the vehicle's is accepted.",
+        "rolling_false_claim", vehicle={"keeps_to_its_estates": broken.always},
+    ),
+    PlantedBug(
+        "possession-not-taken", "V5", "Who opens its gate moves, and takes no possession.",
+        "rolling_handover", collides=False, vehicle={"take_possession": broken.skip},
+    ),
+    PlantedBug(
+        "moves-off-its-estate", "V5", "Without possession, and the controller obeys all the same.",
+        "rolling_handover", vehicle={"take_possession": broken.skip}, plant=rolling.obey,
+    ),
+    PlantedBug(
+        "possession-without-gate", "estate", "A vehicle owns what a plan gives when it accepts.",
+        "rolling_gate", plant=rolling.possess_at_once,
+    ),
+    PlantedBug(
+        "deed-after-promise", "estate", "An old deed is drawn up after a higher promise.",
+        "rolling_late_command", plant=rolling.draw_up_anything,
+    ),
+    PlantedBug(
+        "promise-dies-with-process", "estate", "A new process may promise less than the one before.",
+        "rolling_agent_restarts", collides=False, plant=rolling.forget_promise,
+    ),
+    PlantedBug(
+        "estate-dies-with-process", "estate", "With the agent the cells are lost.",
+        "rolling_agent_restarts", collides=False, plant=rolling.forget_estate,
+    ),
+    PlantedBug(
+        "promise-not-noted", "handover", "A promise counts before the controller has noted it.",
+        "rolling_promise_not_noted", collides=False, plant=rolling.show_estate_at_once,
+    ),
+    PlantedBug(
+        "shut-deeds-ignored", "handover", "A deed whose gate is shut at one vehicle is void for it.",
+        "rolling_gates_moved_on", plant=rolling.void_shut_deeds,
+    ),
+    PlantedBug(
+        "common-promise-voids-deeds", "handover", "When all have promised the same, deeds are void.",
+        "rolling_gates_moved_on", plant=rolling.void_by_common_promise,
+    ),
+    PlantedBug(
+        "body-left-out", "handover", "Who is under way does without the cell that it comes from.",
+        "rolling_under_way", plant=rolling.forget_motion,
+    ),
+    PlantedBug(
+        "owner-left-out", "handover", "A cell is taken from an owner that is not in the roster.",
+        "rolling_owner_left_out", vehicle={"keeps_to_its_estates": broken.always},
+        plant=rolling.check_no_estates,
+    ),
+    PlantedBug(
+        "cell-kept-by-both", "handover", "Who gives a cell keeps it, too.",
+        "rolling_handover", vehicle={"keeps_to_its_estates": broken.always},
+        plant=rolling.keep_what_is_given,
+    ),
 )  # fmt: skip
 
-IN_THE_ROLLING_OPERATION: Mapping[str, str] = {
-    "keeps_to_its_estates": "tests/unit/rolling/test_vehicle_rules.py",
-    "take_possession": "tests/unit/rolling/test_vehicle_rules.py",
-}
-"""What has no effect where formations own blocks, as in all stories; and where it is tested."""
 NOT_A_SAFETY_MATTER: Mapping[str, str] = {
     "is_in_roster": "a PREPARE is sent to its roster only; to promise more means to hold",
     "show": "what is not shown now is shown at the next tick",
