@@ -371,7 +371,7 @@ BUGS: tuple[PlantedBug, ...] = (
         "rolling_late_command", plant=rolling.draw_up_anything,
     ),
     PlantedBug(
-        "promise-dies-with-process", "estate", "A new process may promise less than the one before.",
+        "promise-dies-with-process", "estate", "A new process may promise less than the last one.",
         "rolling_agent_restarts", collides=False, plant=rolling.forget_promise,
     ),
     PlantedBug(
@@ -383,11 +383,11 @@ BUGS: tuple[PlantedBug, ...] = (
         "rolling_promise_not_noted", collides=False, plant=rolling.show_estate_at_once,
     ),
     PlantedBug(
-        "shut-deeds-ignored", "handover", "A deed whose gate is shut at one vehicle is void for it.",
+        "shut-deeds-ignored", "handover", "Whose gate is shut owns what it owned before the deed.",
         "rolling_gates_moved_on", plant=rolling.void_shut_deeds,
     ),
     PlantedBug(
-        "common-promise-voids-deeds", "handover", "When all have promised the same, deeds are void.",
+        "common-promise-voids-deeds", "handover", "A newer promise of all makes older deeds void.",
         "rolling_gates_moved_on", plant=rolling.void_by_common_promise,
     ),
     PlantedBug(

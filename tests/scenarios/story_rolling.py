@@ -119,10 +119,6 @@ class RollingPlayer(Player):
             controller = vehicle.road.controller
             body = frozenset(vehicle.occupied)
             self._estates.show(0.0, name, controller.estate, controller.deed, body)
-        for process in self.processes.values():
-            state = process.shown
-            if state is not None and state.go and state.promised is not None:
-                self._estates.open(0.0, state.promised)
         if self._wrong:
             wrong, self._wrong = self._wrong, []
             raise CollisionError(f"{command}: {wrong[0]}")

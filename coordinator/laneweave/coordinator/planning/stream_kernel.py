@@ -8,7 +8,6 @@ for a way needs.
 
 from __future__ import annotations
 
-import numpy as np
 from numba import njit
 
 from laneweave.coordinator.planning.negotiation_kernel import random_below

@@ -11,7 +11,7 @@ machines inside the processes and shares no code with them.
 | `interleaved` | of two plans with a common vehicle, both have motions before one has ended |
 | `owner` | a cell has two owners (rolling operation; `estates` tells who owns what) |
 | `trespass` | a body is in a cell that its vehicle does not own (likewise) |
-| `gate` | a body begins a motion while no start gate of its plan is open (likewise) |
+| `gate` | a body begins a motion of a plan by which nobody has taken possession (likewise) |
 | `monotone` | somebody takes back what it has said: promise, acceptance, progress, joined, charge |
 | `two-plans` | two different plans are sent under one ballot |
 | `stuck` | a vehicle is not on its lane long after everything was whole again |
@@ -279,8 +279,6 @@ class Checker:
             self._begun[key] = state.promised if state.accepted else None
         if state.promised != shown.promised:
             shown.completed, shown.go = 0, False
-        if state.go and state.promised is not None and self._estates is not None:
-            self._estates.open(t_s, state.promised)
         shown.promised, shown.accepted = state.promised, state.accepted
         shown.completed, shown.go = state.completed, state.go
         shown.hold_cell = state.hold_cell

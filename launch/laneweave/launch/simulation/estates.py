@@ -1,9 +1,9 @@
 """Who owns which cells in a simulated run of the rolling operation; part of the checker.
 
-It looks into the motion controllers, and hears from the states which start gates are open. Whose
-newest deed is not open may not know what it owns; the checker does: what the deed gives if the gate
-of anybody in its roster has been opened, else what was before. So for the checker a cell has one
-owner at most, always.
+It looks into the motion controllers. Whose newest deed is not open may not know what it owns; the
+checker does: what the deed gives if anybody in its roster has taken possession, else what was
+before. So for the checker a cell has one owner at most, always. (An agent may have opened its gate
+and died before its controller knew: nobody has moved then, and nothing has changed hands.)
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Holding:
     deed: Deed | None
 
     def certain(self, opened: set[Ballot]) -> Cells:
-        """Return what the vehicle owns, for somebody who knows which gates have been opened."""
+        """Return what the vehicle owns, for somebody who knows who has taken possession."""
         deed = self.deed
         if deed is None or deed.open:
             return self.estate
@@ -46,7 +46,7 @@ class Estates:
         self._owned: dict[str, Cells] = {}
         """What each vehicle owns; the inverse of `_owner`."""
         self._opened: set[Ballot] = set()
-        """Ballots of which a start gate has been open."""
+        """Ballots of which somebody has taken possession."""
         self._bodies: dict[str, Cells] = {}
         """Cells that each body occupies."""
 
@@ -73,21 +73,14 @@ class Estates:
         elif known is not None and known.deed == deed and known.estate == frozenset(estate):
             return
         self._holdings[vehicle] = Holding(frozenset(estate), deed)
-        if deed is not None and deed.open:
-            self.open(t_s, deed.ballot)
-        self._settle(t_s, [vehicle])
-        self._check_body(t_s, vehicle)
-
-    def open(self, t_s: float, ballot: Ballot) -> None:
-        """Somebody shows that the start gate of a ballot is open."""
-        if ballot in self._opened:
-            return
-        self._opened.add(ballot)
-        concerned = [
-            name
-            for name, holding in self._holdings.items()
-            if holding.deed is not None and holding.deed.ballot == ballot
-        ]
+        concerned = [vehicle]
+        if deed is not None and deed.open and deed.ballot not in self._opened:
+            self._opened.add(deed.ballot)
+            concerned += [
+                name
+                for name, holding in self._holdings.items()
+                if name != vehicle and holding.deed and holding.deed.ballot == deed.ballot
+            ]
         self._settle(t_s, concerned)
 
     def occupy(self, t_s: float, vehicle: str, cells: Cells) -> None:
@@ -98,7 +91,7 @@ class Estates:
     def move(self, t_s: float, vehicle: str, ballot: Ballot) -> None:
         """A body begins a motion of a plan."""
         if ballot not in self._opened:
-            self._tell("gate", t_s, [vehicle], "moves, and nobody's start gate is open")
+            self._tell("gate", t_s, [vehicle], "moves, and nobody has taken possession")
 
     def leave(self, vehicle: str) -> None:
         """A vehicle left the road, and its cells are nobody's."""

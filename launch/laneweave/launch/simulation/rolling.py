@@ -18,7 +18,7 @@ from laneweave.launch.simulation.road import Grant, Visit
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario import FormationSettings, Network, Road, Runtime, Scenario
 
-SLOTS_S = (1.0, 1.0, 2.0)
+SLOTS_S = (1.0, 1.0, 1.0, 2.0)
 """Lengths of a slot to choose from. In the shortest, ballots are often given up in the middle."""
 MODES = (1, 1, 2)
 MOVE_SHARE = 0.8

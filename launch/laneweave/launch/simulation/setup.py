@@ -20,7 +20,7 @@ LAST_BLOCKS = (-1, -1, 0, 1)
 """Number of the rearmost formation. Those below 0 are on the road at the start; others enter cell
 by cell: formation 0 is closed after 3 s, formation 1 after 7 s."""
 LEAVES_S = (2.0, 9.0)
-THOROUGH = 0.1
+THOROUGH = 0.05
 """Share of runs of the rolling operation with the stream planner; it costs ten times the rest."""
 LARGEST = 6
 """Vehicles in a formation, as many as the paper's largest one has."""

@@ -49,9 +49,9 @@ NEW_WISHES_S = (0.8, 3.0)
 """While faults happen vehicles change their minds after such times."""
 PATIENCE_S = 90.0
 """Time that everybody has to arrive once everything is whole."""
-FUTILE = 8
+FUTILE = 5
 """A vehicle that does not move though so many plans would move it is stuck."""
-SLOTS_WHOLE = 14
+SLOTS_WHOLE = 8
 """Slots that a run of the rolling operation goes on for once everything is whole."""
 LOOK_S = 0.5
 """How often it is looked whether a run is over."""

@@ -10,7 +10,16 @@ import pytest
 from laneweave.launch.simulation.road import LightRoad, Visit
 from laneweave.launch.simulation.setup import make_scenario
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.messages import Ballot, Census, Command, Name, Prepare, Sense, VehicleState
+from laneweave.protocol.messages import (
+    Ballot,
+    Census,
+    Command,
+    Deed,
+    Name,
+    Prepare,
+    Sense,
+    VehicleState,
+)
 from laneweave.protocol.motion import at_rest_in_cell
 from laneweave.protocol.node import Arrived, Effect, PeerDown, PeerUp, Send, Started, Wakeup
 from laneweave.protocol.topics import COMMAND, PREPARE, VEHICLE_ALIVE
@@ -29,6 +38,9 @@ class Log:
 
     def enter(self, t_s: float, vehicle: str, cell: Cell) -> None:
         self.lines.append(("enter", round(t_s, 3), vehicle, cell))
+
+    def own(self, t_s: float, vehicle: str, estate: tuple[Cell, ...], deed: Deed | None) -> None:
+        pass
 
     def leave(self, t_s: float, vehicle: str) -> None:
         self.lines.append(("leave", round(t_s, 3), vehicle))

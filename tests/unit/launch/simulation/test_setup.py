@@ -10,7 +10,12 @@ from laneweave.launch.simulation.setup import Setup
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario_checks import check_scenario
 
-EVERY = pytest.mark.parametrize("name", PROFILES)
+EVERY = pytest.mark.parametrize(
+    "name", [name for name, profile in PROFILES.items() if not profile.rolling]
+)
+ROLLING = pytest.mark.parametrize(
+    "name", [name for name, profile in PROFILES.items() if profile.rolling]
+)
 
 
 def draw(name: str, count: int = 60) -> list[tuple[Setup, random.Random]]:
@@ -71,10 +76,30 @@ def test_profiles_draw_from_their_ranges() -> None:
         for setup, _ in draw(name):
             assert setup.mix.conditions.loss in profile.loss
             assert setup.scenario.road.lanes in range(profile.lanes[0], profile.lanes[1] + 1)
-            assert len(setup.blocks) in range(profile.blocks[0], profile.blocks[1] + 1)
+            if not profile.rolling:
+                assert len(setup.blocks) in range(profile.blocks[0], profile.blocks[1] + 1)
     assert all(len(setup.visits) == 12 for setup, _ in draw("dense"))
 
 
 def test_an_unknown_profile_is_refused() -> None:
     with pytest.raises(BadInputError, match="mixed, calm, loss"):
         profile_named("mild")
+
+
+@ROLLING
+def test_a_stretch_of_the_rolling_operation_has_one_owner_for_each_cell(name: str) -> None:
+    for setup, rng in draw(name):
+        check_scenario(setup.scenario)
+        cells = [visit.cell for visit in setup.visits] + [grant.cell for grant in setup.grants]
+        assert len(set(cells)) == len(cells)
+        enters = {visit.vehicle: visit.enters_s for visit in setup.visits}
+        for grant in setup.grants:
+            assert grant.t_s >= enters[grant.owner]
+        wanted = Counter(setup.wishes(rng, last=True).values())
+        assert max(wanted.values()) <= setup.stretch_columns
+
+
+def test_dense_stretches_are_dense() -> None:
+    for setup, _ in draw("rolling-dense"):
+        room = setup.stretch_columns * setup.scenario.road.lanes
+        assert 0.5 <= len(setup.visits) / room <= 0.9
