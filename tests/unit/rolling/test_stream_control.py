@@ -1,0 +1,439 @@
+"""The stream is planned once in each slot, from what is known for certain, and put into force."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import count
+
+import pytest
+from attrs import define, evolve, field
+
+from laneweave.coordinator.handover import Phase
+from laneweave.coordinator.planning.stream import StreamPlan, StreamPlanner, StreamVehicle
+from laneweave.coordinator.stream_control import (
+    BESIDE,
+    LATEST_S,
+    SHOWN_S,
+    Note,
+    StreamControl,
+    _clusters,
+    stream_road,
+)
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.messages import Ballot, Census, CensusEntry, Deed, Name, Plan, Prepare
+from laneweave.protocol.messages import VehicleState as State
+from laneweave.protocol.node import Compute, Computed
+from unit.rolling.road import ROLLING
+from unit.rolling.samples import state
+
+A, B, C, D = (Name(letter) for letter in "ABCD")
+SLOT_S = ROLLING.formation.cycle_s
+SLOT = 5
+BEGUN_S = SLOT * SLOT_S
+HOMES: dict[Name, Cell] = {A: (0, 0), B: (2, 1), C: (-4, 0), D: (-8, 2)}
+ESTATES: dict[Name, tuple[Cell, ...]] = {
+    A: ((0, 0), (1, 0), (-1, 0)),
+    B: ((2, 1), (1, 1), (0, 1), (-1, 1)),
+    C: ((-4, 0), (-5, 0), (-4, 1)),
+    D: ((-8, 2), (-9, 2), (-8, 1)),
+}
+OLD = Ballot(1, Name("c0"), 1, 1)
+
+
+def shown(
+    name: Name, promised: Ballot | None = None, deed: Deed | None = None, **changes: object
+) -> State:
+    plain = state(name, promised, deed, estate=ESTATES[name], t_s=BEGUN_S + 0.4)
+    return evolve(plain, hold_cell=HOMES[name], done=True, **changes)
+
+
+def census(*names: Name) -> Census:
+    entries = tuple(CensusEntry(name, HOMES[name], 1, 0.0) for name in names)
+    return Census(BEGUN_S, entries, ())
+
+
+@define
+class Call:
+    """What the planner was asked."""
+
+    slot: int
+    vehicles: dict[str, StreamVehicle]
+    before: StreamPlan | None
+    blocked: frozenset[Cell]
+
+
+@define
+class Bench:
+    """A stream control with a planner that answers what the test says."""
+
+    ways: dict[str, tuple[Cell, ...]] = field(factory=dict)
+    calls: list[Call] = field(factory=list)
+    seq: Iterable[int] = field(factory=lambda: count(1))
+    jobs: Iterable[int] = field(factory=lambda: count(100))
+    asked_above: list[Ballot | None] = field(factory=list)
+    control: StreamControl = field(init=False)
+
+    def __attrs_post_init__(self) -> None:
+        """Put a planner in its place."""
+        self.control = StreamControl(ROLLING, self.new_ballot)
+        planner = StreamPlanner(stream_road(ROLLING))
+        planner.plan = self.plan  # type: ignore[method-assign]
+        self.control._planner = planner
+
+    def new_ballot(self, above: Ballot | None) -> Ballot:
+        self.asked_above.append(above)
+        return Ballot(7, Name("c1"), 1, next(iter(self.seq)))
+
+    def plan(
+        self,
+        slot: int,
+        vehicles: Iterable[StreamVehicle],
+        before: StreamPlan | None = None,
+        blocked: Iterable[Cell] = (),
+    ) -> StreamPlan:
+        asked = {vehicle.vehicle: vehicle for vehicle in vehicles}
+        self.calls.append(Call(slot, asked, before, frozenset(blocked)))
+        return StreamPlan(slot, self.ways, ())
+
+    def hear(self, *states: State) -> list[Note]:
+        return [note for each in states for note in self.control.on_state(each)]
+
+    def order(self, t_s: float = BEGUN_S + SHOWN_S) -> Compute | None:
+        orders = list(self.control.order(lambda: next(iter(self.jobs)), t_s))
+        assert len(orders) <= 1
+        return orders[0] if orders else None
+
+    def think(self, t_s: float = BEGUN_S + SHOWN_S) -> list[Note]:
+        """Order a plan, compute it, and take it at once."""
+        compute = self.order(t_s)
+        assert compute is not None
+        return self.finish(compute, t_s)
+
+    def finish(self, compute: Compute, t_s: float) -> list[Note]:
+        computed = Computed(compute.job, compute.work())
+        return list(self.control.finish(computed, t_s, 50.0))
+
+
+def bench(*names: Name) -> Bench:
+    """Return a bench that has heard of vehicles for long enough."""
+    made = Bench()
+    made.control.on_census(census(*names))
+    assert made.order(BEGUN_S - 2.0) is None
+    made.hear(*(shown(name) for name in names))
+    return made
+
+
+# --- when it plans ----------------------------------------------------------------------------
+
+
+def test_plans_the_next_slot_when_this_one_s_moves_are_shown() -> None:
+    desk = bench(A, B)
+    assert desk.order(BEGUN_S + SHOWN_S - 0.01) is None
+    desk.think()
+    assert [call.slot for call in desk.calls] == [SLOT + 1]
+    assert desk.order(BEGUN_S + SLOT_S - 0.1) is None  # once a slot
+    assert desk.order(BEGUN_S + SLOT_S + SHOWN_S - 0.01) is None
+    desk.think(BEGUN_S + SLOT_S + SHOWN_S)
+    assert [call.slot for call in desk.calls] == [SLOT + 1, SLOT + 2]
+
+
+def test_only_one_planning_at_a_time() -> None:
+    desk = bench(A)
+    compute = desk.order()
+    assert compute is not None
+    later_s = BEGUN_S + SLOT_S + SHOWN_S
+    assert desk.order(later_s) is None
+    desk.finish(compute, later_s - SLOT_S + 1.0)
+    assert desk.order(later_s) is not None
+
+
+def test_nothing_is_planned_without_a_road() -> None:
+    desk = Bench()
+    assert desk.order() is None
+    desk.control.on_census(census())
+    assert desk.order() is None
+
+
+def test_a_new_leader_listens_first() -> None:
+    desk = Bench()
+    desk.control.on_census(census(A))
+    assert desk.order(BEGUN_S + 1.0) is None
+    assert desk.order(BEGUN_S + 1.0 + SHOWN_S - 0.01) is None
+    assert desk.order(BEGUN_S + 1.0 + SHOWN_S) is not None
+
+
+def test_a_plan_that_comes_late_is_dropped() -> None:
+    desk = bench(A)
+    desk.ways = {A: ((0, 0), (1, 0))}
+    begins_s = (SLOT + 1) * SLOT_S
+    compute = desk.order()
+    assert compute is not None
+    assert [note.kind for note in desk.finish(compute, begins_s + LATEST_S + 0.1)] == [
+        "planning-late"
+    ]
+    assert desk.control.handovers == []
+    desk = bench(A)
+    desk.ways = {A: ((0, 0), (1, 0))}
+    compute = desk.order()
+    assert compute is not None
+    assert [note.kind for note in desk.finish(compute, begins_s + LATEST_S - 0.1)] == [
+        "stream-planned"
+    ]
+    assert len(desk.control.handovers) == 1
+
+
+def test_results_of_others_and_failures_change_nothing() -> None:
+    desk = bench(A)
+    compute = desk.order()
+    assert compute is not None
+    stranger = Computed(compute.job + 1, compute.work())
+    assert list(desk.control.finish(stranger, BEGUN_S, 0.0)) == []
+    failed = Computed(compute.job, None, "out of memory")
+    (note,) = desk.control.finish(failed, BEGUN_S, 0.0)
+    assert (note.kind, note.data["error"]) == ("planning-failed", "out of memory")
+    assert list(desk.control.finish(failed, BEGUN_S, 0.0)) == []
+    assert desk.order(BEGUN_S + SLOT_S + SHOWN_S) is not None
+
+
+# --- what it plans from -----------------------------------------------------------------------
+
+
+def test_the_planner_sees_everybody_and_what_is_owned() -> None:
+    desk = bench(A, B)
+    desk.think()
+    (call,) = desk.calls
+    assert call.vehicles == {
+        name: StreamVehicle(name, HOMES[name], 1, held=False) for name in (A, B)
+    }
+    free = {*ESTATES[A], *ESTATES[B]}
+    lanes = range(ROLLING.road.lanes)
+    window = {(column, lane) for column in range(-BESIDE, 2 + BESIDE + 1) for lane in lanes}
+    assert call.blocked == window - free
+    assert call.before is None
+    desk.think(BEGUN_S + SLOT_S + SHOWN_S)
+    assert desk.calls[1].before == StreamPlan(SLOT + 1, {}, ())
+
+
+def test_it_plans_from_where_vehicles_will_hold() -> None:
+    desk = bench(A, B)
+    desk.hear(shown(A, OLD, moving=True, accepted=True, t_s=BEGUN_S + 0.5))
+    desk.hear(evolve(shown(A, OLD, moving=True, accepted=True), hold_cell=(1, 0), t_s=BEGUN_S + 1))
+    desk.think()
+    assert desk.calls[0].vehicles[A].cell == (1, 0)
+    assert not desk.calls[0].vehicles[A].held
+
+
+def test_whoever_is_late_is_held_and_its_cells_are_blocked() -> None:
+    """Its move may begin at any time until it promises something else."""
+    desk = bench(A, B)
+    deed = Deed(OLD, ESTATES[A], (*ESTATES[A], (0, 1)), (A, B))
+    late = shown(A, OLD, deed, accepted=True)
+    desk.hear(evolve(late, done=False, t_s=BEGUN_S + 0.5))
+    desk.think()
+    (call,) = desk.calls
+    assert call.vehicles[A].held
+    assert {(1, 0), (-1, 0), (0, 1)} <= call.blocked
+    assert (1, 1) not in call.blocked
+
+
+def test_whoever_nobody_drives_is_held_and_its_cells_are_free() -> None:
+    desk = bench(A, B)
+    desk.hear(shown(B, attended=False))
+    desk.think()
+    (call,) = desk.calls
+    assert [vehicle.held for vehicle in call.vehicles.values()] == [False, True]
+    assert not set(ESTATES[B]) & call.blocked
+
+
+def test_whoever_was_not_heard_stays_where_it_entered_and_owns_nothing() -> None:
+    desk = bench(A)
+    desk.control.on_census(census(A, B))
+    desk.ways = {A: ((0, 0), (0, 1)), B: ((2, 1), (2, 1))}
+    desk.think()
+    (call,) = desk.calls
+    assert call.vehicles[B] == StreamVehicle(B, HOMES[B], 1, held=True)
+    assert set(ESTATES[B]) <= call.blocked
+    assert desk.control.handovers == []  # A would need a cell that is B's
+
+
+def test_cells_of_which_nobody_can_tell_whose_they_are_are_blocked() -> None:
+    desk = bench(A, B)
+    desk.hear(shown(B, OLD, Deed(OLD, ESTATES[B], (HOMES[B],), (A, B)), accepted=True))
+    desk.think()
+    assert set(ESTATES[B]) <= desk.calls[0].blocked
+
+
+def test_a_promise_that_is_not_noted_shows_no_estate() -> None:
+    desk = bench(A, B)
+    desk.hear(evolve(shown(B, OLD), estate=(), t_s=BEGUN_S + 0.5))
+    desk.think()
+    assert set(ESTATES[B]) <= desk.calls[0].blocked
+
+
+# --- states -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("older", "newer"),
+    [
+        (shown(A), evolve(shown(A), t_s=BEGUN_S + 1.0)),
+        (evolve(shown(A), t_s=BEGUN_S + 1.0), evolve(shown(A), incarnation=8)),
+        (shown(A), shown(A, OLD)),
+        (evolve(shown(A, OLD), estate=()), shown(A, OLD)),
+        (shown(A, OLD), shown(A, OLD, accepted=True)),
+        (shown(A, OLD), shown(A, OLD, Deed(OLD))),
+        (shown(A, OLD, Deed(OLD)), shown(A, OLD, Deed(OLD, open=True))),
+    ],
+    ids=["tick", "process", "promise", "noted", "acceptance", "deed", "gate"],
+)
+def test_the_newest_state_counts_in_whichever_order_they_come(older: State, newer: State) -> None:
+    for states in ((older, newer), (newer, older)):
+        desk = Bench()
+        desk.control.on_census(census(A))
+        desk.hear(*states)
+        assert desk.control.states[A] == newer
+
+
+def test_ballots_are_above_all_that_was_promised() -> None:
+    desk = bench(A, B)
+    desk.hear(evolve(shown(B, OLD), t_s=BEGUN_S + 0.5))
+    desk.ways = {A: ((0, 0), (1, 0))}
+    desk.think()
+    assert desk.asked_above == [OLD]
+
+
+# --- ballots ----------------------------------------------------------------------------------
+
+
+def test_one_ballot_for_the_mover_and_the_owners_of_its_cells() -> None:
+    desk = bench(A, B, C)
+    desk.ways = {A: ((0, 0), (0, 1)), B: ((2, 1), (2, 1)), C: ((-4, 0),)}
+    (note,) = desk.think()
+    (handover,) = desk.control.handovers
+    assert handover.roster == (A, B)
+    assert handover.moves == {A: ((0, 0), (0, 1))}
+    assert (handover.t0_s, handover.slot_s) == ((SLOT + 1) * SLOT_S, SLOT_S)
+    expected = {"slot": SLOT + 1, "moves": 1, "ballots": 1, "largest": 2, "vehicles": 3}
+    assert expected.items() <= note.data.items()
+
+
+def test_moves_that_share_an_owner_share_a_ballot() -> None:
+    desk = bench(A, B, C, D)
+    desk.ways = {
+        A: ((0, 0), (0, 1)),
+        B: ((2, 1), (1, 1)),
+        C: ((-4, 0), (-5, 0)),
+        D: ((-8, 2), (-8, 2)),
+    }
+    desk.think()
+    assert [handover.roster for handover in desk.control.handovers] == [(A, B), (C,)]
+    assert set(desk.control.handovers[0].moves) == {A, B}
+
+
+def test_clusters_are_what_hangs_together() -> None:
+    groups = [{A, B}, {C}, {D}, {B, C}]
+    assert sorted(map(sorted, _clusters(groups))) == [[A, B, C], [D]]
+    assert _clusters([]) == []
+
+
+def run_ballot(desk: Bench) -> Plan:
+    """Let A and B promise what they are asked; return the plan that A is sent."""
+    sent = dict(desk.control.outgoing(50.0))
+    assert {type(message) for message in sent.values()} == {Prepare}
+    ballot = desk.control.handovers[0].ballot
+    desk.hear(*(evolve(shown(name, ballot), t_s=BEGUN_S + 1.0) for name in sent))
+    plan = dict(desk.control.outgoing(50.0))[A]
+    assert isinstance(plan, Plan)
+    return plan
+
+
+def test_from_the_plan_to_a_ballot_in_force() -> None:
+    desk = bench(A, B)
+    desk.ways = {A: ((0, 0), (0, 1))}
+    desk.think()
+    assert desk.control.wakeups == [50.0]
+    plan = run_ballot(desk)
+    assert plan.moves == {A: ((0, (0, 0), (0, 1)),), B: ()}
+    assert desk.control.in_force == 0
+    for name in (A, B):
+        accepted = shown(name, plan.ballot, accepted=True)
+        desk.hear(evolve(accepted, t_s=BEGUN_S + 1.0))
+    assert desk.control.in_force == 1
+    assert desk.control.wakeups == []
+
+
+def test_what_has_not_come_about_is_given_up_with_the_next_plan() -> None:
+    desk = bench(A, B)
+    desk.ways = {A: ((0, 0), (0, 1))}
+    desk.think()
+    (old,) = desk.control.handovers
+    desk.think(BEGUN_S + SLOT_S + SHOWN_S)
+    assert old.phase is Phase.GIVEN_UP
+    assert old not in desk.control.handovers
+    assert desk.control.handovers[0].ballot > old.ballot
+
+
+def test_a_ballot_that_fails_is_noted() -> None:
+    desk = bench(A, B)
+    desk.ways = {A: ((0, 0), (0, 1))}
+    desk.think()
+    (note,) = desk.hear(evolve(shown(B, Ballot(9, Name("c2"), 1, 1)), t_s=BEGUN_S + 1.0))
+    assert (note.kind, note.data) == ("handover-given-up", {"roster": [A, B], "why": "outbid"})
+    assert desk.hear(evolve(shown(A), t_s=BEGUN_S + 1.0)) == []
+
+
+# --- the census -------------------------------------------------------------------------------
+
+
+def test_whoever_leaves_is_forgotten_and_its_ballot_given_up() -> None:
+    desk = bench(A, B, C)
+    desk.ways = {A: ((0, 0), (0, 1)), C: ((-4, 0), (-5, 0))}
+    desk.think()
+    first, second = desk.control.handovers
+    desk.control.on_census(census(A, C))
+    assert set(desk.control.states) == {A, C}
+    assert (first.phase, first.why) == (Phase.GIVEN_UP, "B has left")
+    assert second.phase is Phase.PREPARING
+
+
+def test_what_is_in_force_stays_so_when_somebody_leaves() -> None:
+    desk = bench(A, B)
+    desk.ways = {A: ((0, 0), (0, 1))}
+    desk.think()
+    (handover,) = desk.control.handovers
+    handover.phase = Phase.IN_FORCE
+    desk.control.on_census(census(A))
+    assert handover.phase is Phase.IN_FORCE
+
+
+def test_a_new_leadership_begins_with_nothing() -> None:
+    desk = bench(A, B)
+    desk.ways = {A: ((0, 0), (0, 1))}
+    desk.think()
+    desk.control.forget()
+    assert (desk.control.states, desk.control.handovers, desk.control.wakeups) == ({}, [], [])
+    assert desk.order(BEGUN_S + SLOT_S + SHOWN_S) is None
+    desk.control.on_census(census(A))
+    assert desk.order(BEGUN_S + SLOT_S + SHOWN_S) is None  # it listens first
+    assert desk.order(BEGUN_S + SLOT_S + 2 * SHOWN_S) is not None
+
+
+# --- the real planner -------------------------------------------------------------------------
+
+
+def test_the_real_planner_takes_what_it_is_given() -> None:
+    """Also somebody who was not heard, whose own cell is blocked."""
+    control = StreamControl(ROLLING, lambda _: Ballot(7, Name("c1"), 1, 1))
+    control.on_census(census(A, B, C))
+    assert list(control.order(lambda: 1, BEGUN_S - 2.0)) == []
+    for name in (A, B):
+        assert list(control.on_state(shown(name))) == []
+    (compute,) = control.order(lambda: 1, BEGUN_S + SHOWN_S)
+    plan = compute.work()
+    assert isinstance(plan, StreamPlan)
+    assert set(plan.ways) == {A, B, C}
+    for name, way in plan.ways.items():
+        assert way[0] == HOMES[Name(name)]
+    assert set(plan.ways[C]) == {HOMES[C]}
+    (note,) = control.finish(Computed(1, plan), BEGUN_S + SHOWN_S, 0.0)
+    assert note.kind == "stream-planned"
