@@ -121,7 +121,7 @@ def perform(network: SimulatedNetwork, name: str, *effects: Effect) -> None:
 
 
 def chatter(
-    seed: int, conditions: Conditions, trace: Trace | None = None
+    seed: int, conditions: Conditions, trace: Trace | None = None, *, in_kind: bool = False
 ) -> tuple[list[list[tuple[float, Event]]], tuple[int, int]]:
     """Run nodes that talk, with all faults, and return what each saw."""
 
@@ -144,7 +144,7 @@ def chatter(
         return core
 
     cores = {name: make(name) for name in ("a", "b", "c")}
-    network = SimulatedNetwork(seed, conditions)
+    network = SimulatedNetwork(seed, conditions, in_kind=in_kind)
     network.trace = trace
     for name, core in cores.items():
         network.add(name, core, REALM)

@@ -363,7 +363,7 @@ class Road:
                     raise WrongError(f"{cell} is of {owner[cell]} and of {name}")
                 owner[cell] = name
             controller = car.controller
-            occupied = {controller.hold_cell}
+            occupied = frozenset({controller.hold_cell})
             if car.under_way:
                 occupied = footprint(controller.motion_origin, controller.hold_cell)
             if not occupied <= cells:

@@ -26,6 +26,7 @@ from unit.rolling.samples import (
 )
 
 RESEND_S = 0.2
+OWNED_BEFORE, OWNED_AFTER = frozenset(BEFORE[A]), frozenset(AFTER[A])
 BETWEEN = Ballot(2, Name("c1"), 10, 2)
 """Above MID, below HIGH."""
 
@@ -64,24 +65,24 @@ CLOSED = state(A, HIGH, DEED)
 
 
 def test_without_a_deed_or_with_an_open_one_the_estate_is_what_is_shown() -> None:
-    assert estate_of(state(A, HIGH), {}) == set(BEFORE[A])
+    assert estate_of(state(A, HIGH), {}) == OWNED_BEFORE
     taken = state(A, HIGH, Deed(MID, open=True), estate=AFTER[A])
-    assert estate_of(taken, {}) == set(AFTER[A])
+    assert estate_of(taken, {}) == OWNED_AFTER
 
 
 def test_one_that_knows_the_open_gate_is_enough() -> None:
     knows = state(C, MID, Deed(MID, open=True))
-    assert estate_of(CLOSED, {C: knows}) == set(AFTER[A])
+    assert estate_of(CLOSED, {C: knows}) == OWNED_AFTER
     # Also while A still could open its own gate.
-    assert estate_of(state(A, MID, DEED), {C: knows}) == set(AFTER[A])
+    assert estate_of(state(A, MID, DEED), {C: knows}) == OWNED_AFTER
 
 
 @pytest.mark.parametrize("older", [None, Deed(LOW, open=True)])
 def test_one_that_has_promised_more_without_the_deed_keeps_the_gate_closed(
     older: Deed | None,
 ) -> None:
-    assert estate_of(CLOSED, {C: state(C, BETWEEN, older)}) == set(BEFORE[A])
-    assert estate_of(state(A, MID, DEED), {C: state(C, BETWEEN, older)}) == set(BEFORE[A])
+    assert estate_of(CLOSED, {C: state(C, BETWEEN, older)}) == OWNED_BEFORE
+    assert estate_of(state(A, MID, DEED), {C: state(C, BETWEEN, older)}) == OWNED_BEFORE
 
 
 @pytest.mark.parametrize(
@@ -101,7 +102,7 @@ def test_what_may_still_come_tells_nothing(silent: VehicleState) -> None:
 
 def test_all_have_turned_away_with_closed_gates() -> None:
     others = {B: state(B, BETWEEN, DEED), C: state(C, HIGH, DEED)}
-    assert estate_of(CLOSED, others) == set(BEFORE[A])
+    assert estate_of(CLOSED, others) == OWNED_BEFORE
     assert estate_of(CLOSED, {B: others[B]}) is None  # C has not been heard
     assert estate_of(state(A, MID, DEED), others) is None  # A may open its own gate
     assert estate_of(evolve(CLOSED, estate=()), others) is None
@@ -110,11 +111,11 @@ def test_all_have_turned_away_with_closed_gates() -> None:
 def test_a_newer_deed_leaves_what_is_certain_either_way() -> None:
     """Somebody opened the gate or did not, and has taken part in another plan since."""
     newer = state(C, HIGH, Deed(BETWEEN, open=True))
-    assert estate_of(CLOSED, {C: newer}) == set(BEFORE[A]) & set(AFTER[A])
+    assert estate_of(CLOSED, {C: newer}) == OWNED_BEFORE & OWNED_AFTER
     closed = {B: state(B, HIGH, DEED), C: newer}
-    assert estate_of(CLOSED, closed) == set(BEFORE[A]) & set(AFTER[A])
-    assert estate_of(CLOSED, closed | {B: state(B, HIGH, Deed(MID, open=True))}) == set(AFTER[A])
-    assert estate_of(CLOSED, closed | {B: state(B, HIGH)}) == set(BEFORE[A])
+    assert estate_of(CLOSED, closed) == OWNED_BEFORE & OWNED_AFTER
+    assert estate_of(CLOSED, closed | {B: state(B, HIGH, Deed(MID, open=True))}) == OWNED_AFTER
+    assert estate_of(CLOSED, closed | {B: state(B, HIGH)}) == OWNED_BEFORE
 
 
 def test_strangers_and_older_states_of_oneself_tell_nothing() -> None:
@@ -125,7 +126,7 @@ def test_strangers_and_older_states_of_oneself_tell_nothing() -> None:
 
 def test_whoever_was_alone_in_a_plan_knows() -> None:
     alone = deed_of(A, MID, (A,))
-    assert estate_of(state(A, HIGH, alone), {}) == set(BEFORE[A])
+    assert estate_of(state(A, HIGH, alone), {}) == OWNED_BEFORE
     assert estate_of(state(A, MID, alone), {}) is None
 
 

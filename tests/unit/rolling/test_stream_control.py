@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from itertools import count
+from typing import Any
 
 import pytest
 from attrs import define, evolve, field
@@ -41,7 +42,10 @@ OLD = Ballot(1, Name("c0"), 1, 1)
 
 
 def shown(
-    name: Name, promised: Ballot | None = None, deed: Deed | None = None, **changes: object
+    name: Name,
+    promised: Ballot | None = None,
+    deed: Deed | None = None,
+    **changes: Any,  # noqa: ANN401 (fields)
 ) -> State:
     plain = state(name, promised, deed, estate=ESTATES[name], t_s=BEGUN_S + 0.4)
     return evolve(plain, hold_cell=HOMES[name], done=True, **changes)
@@ -432,8 +436,8 @@ def test_the_real_planner_takes_what_it_is_given() -> None:
     plan = compute.work()
     assert isinstance(plan, StreamPlan)
     assert set(plan.ways) == {A, B, C}
-    for name, way in plan.ways.items():
-        assert way[0] == HOMES[Name(name)]
+    for vehicle, way in plan.ways.items():
+        assert way[0] == HOMES[Name(vehicle)]
     assert set(plan.ways[C]) == {HOMES[C]}
     (note,) = control.finish(Computed(1, plan), BEGUN_S + SHOWN_S, 0.0)
     assert note.kind == "stream-planned"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 from attrs import evolve
@@ -55,14 +56,16 @@ def accepted() -> PlanExecution:
 
 def without(name: str) -> Callable[[Plan], Plan]:
     def spoil(plan: Plan) -> Plan:
-        return evolve(plan, **{name: {A: getattr(plan, name)[A]}})
+        part: dict[str, Any] = {name: {A: getattr(plan, name)[A]}}
+        return evolve(plan, **part)
 
     return spoil
 
 
 def changed(name: str, **cells: tuple[tuple[int, int], ...]) -> Callable[[Plan], Plan]:
     def spoil(plan: Plan) -> Plan:
-        return evolve(plan, **{name: getattr(plan, name) | cells})
+        part: dict[str, Any] = {name: getattr(plan, name) | cells}
+        return evolve(plan, **part)
 
     return spoil
 
