@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from attrs import evolve
 
-from laneweave.coordinator.handover import Handover, Phase, estate_of
+from laneweave.coordinator.handover import Handover, Phase, estate_of, partners, sure_of
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import Ballot, Deed, Name, Plan, Prepare, VehicleState
 from laneweave.protocol.plans import estate_problems, plan_problems
@@ -27,6 +27,7 @@ from unit.rolling.samples import (
 
 RESEND_S = 0.2
 OWNED_BEFORE, OWNED_AFTER = frozenset(BEFORE[A]), frozenset(AFTER[A])
+SURE = OWNED_BEFORE & OWNED_AFTER
 BETWEEN = Ballot(2, Name("c1"), 10, 2)
 """Above MID, below HIGH."""
 
@@ -47,7 +48,8 @@ def tell(handover: Handover, *states: VehicleState) -> None:
     known: dict[Name, VehicleState] = {}
     for each in states:
         known[each.vehicle] = each
-        handover.on_state(each, known)
+        if each.vehicle in handover.roster:
+            handover.on_state(each, known)
 
 
 def issued() -> Handover:
@@ -96,32 +98,41 @@ def test_one_that_has_promised_more_without_the_deed_keeps_the_gate_closed(
     ],
 )  # fmt: skip
 def test_what_may_still_come_tells_nothing(silent: VehicleState) -> None:
-    assert estate_of(CLOSED, {C: silent}) is None
-    assert estate_of(CLOSED, {B: state(B, HIGH, DEED), C: silent}) is None
+    others = {B: state(B, HIGH, DEED), C: silent}
+    assert estate_of(CLOSED, others) is None
+    assert sure_of(CLOSED, others) == SURE
+    assert partners(CLOSED, others) == {B, C}
 
 
 def test_all_have_turned_away_with_closed_gates() -> None:
     others = {B: state(B, BETWEEN, DEED), C: state(C, HIGH, DEED)}
-    assert estate_of(CLOSED, others) == OWNED_BEFORE
-    assert estate_of(CLOSED, {B: others[B]}) is None  # C has not been heard
+    assert estate_of(CLOSED, others) == sure_of(CLOSED, others) == OWNED_BEFORE
+    assert partners(CLOSED, others) == frozenset()
     assert estate_of(state(A, MID, DEED), others) is None  # A may open its own gate
     assert estate_of(evolve(CLOSED, estate=()), others) is None
 
 
-def test_a_newer_deed_leaves_what_is_certain_either_way() -> None:
-    """Somebody opened the gate or did not, and has taken part in another plan since."""
-    newer = state(C, HIGH, Deed(BETWEEN, open=True))
-    assert estate_of(CLOSED, {C: newer}) == OWNED_BEFORE & OWNED_AFTER
-    closed = {B: state(B, HIGH, DEED), C: newer}
-    assert estate_of(CLOSED, closed) == OWNED_BEFORE & OWNED_AFTER
-    assert estate_of(CLOSED, closed | {B: state(B, HIGH, Deed(MID, open=True))}) == OWNED_AFTER
-    assert estate_of(CLOSED, closed | {B: state(B, HIGH)}) == OWNED_BEFORE
+@pytest.mark.parametrize("newer", [None, state(C, HIGH, Deed(BETWEEN, open=True))])
+def test_where_nobody_will_tell_some_cells_are_certain_either_way(
+    newer: VehicleState | None,
+) -> None:
+    """Somebody opened the gate or did not, and has gone, or taken part in another plan since."""
+    there = {} if newer is None else {C: newer}
+    assert estate_of(CLOSED, {B: state(B, HIGH, DEED), **there}) == SURE
+    assert estate_of(CLOSED, {B: state(B, MID, DEED), **there}) == SURE
+    assert estate_of(CLOSED, {B: state(B, HIGH, Deed(MID, open=True)), **there}) == OWNED_AFTER
+    assert estate_of(CLOSED, {B: state(B, HIGH), **there}) == OWNED_BEFORE
+    assert partners(CLOSED, {B: state(B, HIGH, DEED), **there}) == {B, *there}
+    # Under way it may still be in a cell that it is about to give.
+    moving = evolve(CLOSED, moving=True)
+    assert estate_of(moving, there) is None
+    assert sure_of(moving, there) == SURE
 
 
 def test_strangers_and_older_states_of_oneself_tell_nothing() -> None:
-    stranger = Name("X")
-    assert estate_of(CLOSED, {stranger: state(stranger, HIGH)}) is None
-    assert estate_of(CLOSED, {A: state(A, HIGH, Deed(MID, open=True))}) is None
+    stranger, others = Name("X"), {B: state(B, MID, DEED), C: state(C, MID, DEED)}
+    assert estate_of(CLOSED, {stranger: state(stranger, HIGH), **others}) is None
+    assert estate_of(CLOSED, {A: state(A, HIGH, Deed(MID, open=True)), **others}) is None
 
 
 def test_whoever_was_alone_in_a_plan_knows() -> None:
@@ -210,8 +221,9 @@ WRONG = {
     "nobody owned": [state(A, MID), state(B, MID, estate=((2, 1),))],
     "a cell has two owners": [state(A, MID, estate=(*BEFORE[A], (2, 1))), state(B, MID)],
     "nobody can tell what B owns": [
-        state(A, MID),
-        state(B, MID, Deed(LOW, BEFORE[B], (), (B, C))),
+        state(C, LOW, Deed(LOW, (), (), (A, B, C))),  # it may open its gate yet
+        state(A, MID, Deed(LOW, BEFORE[A], BEFORE[A], (A,))),
+        state(B, MID, Deed(LOW, BEFORE[B], (), (A, B, C))),
     ],
     "outbid": [state(A, MID), state(B, HIGH)],
     "A has restarted": [state(A, MID), evolve(state(A, LOW), incarnation=8)],

@@ -16,15 +16,15 @@ from laneweave.protocol.scenario import Scenario
 from laneweave.sim_bridge.demand import Arrival
 from laneweave.sim_bridge.entry import Admission
 from laneweave.sim_bridge.plant import Plant
-from laneweave.sim_bridge.traffic import SETTLE_S, RoadVehicle
+from laneweave.sim_bridge.traffic import RoadVehicle
 
 SCENARIO = Scenario()
 LATTICE, LIMITS, TICK_S = SCENARIO.lattice, SCENARIO.vehicle, SCENARIO.runtime.tick_s
 CELL: Cell = (-3, 1)
 BEGIN_TICK = 30
-END_TICK = BEGIN_TICK + round(SETTLE_S / TICK_S)
+END_TICK = BEGIN_TICK + round(SCENARIO.formation.settle_s / TICK_S)
 TWO_CLOSE_M = 13.0
-"""What `SETTLE_S` promises of two that follow each other closely, front to front."""
+"""What `formation.settle_s` promises of two that follow each other closely, front to front."""
 
 
 def beside(offset_m: float, tick: int = BEGIN_TICK, *, faster_mps: float = 0.0) -> State:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from itertools import count
 from typing import Any
@@ -10,20 +11,23 @@ import pytest
 from attrs import define, evolve, field
 
 from laneweave.coordinator.handover import Phase
-from laneweave.coordinator.planning.stream import StreamPlan, StreamPlanner, StreamVehicle
+from laneweave.coordinator.planning.stream import StreamPlan, StreamVehicle
 from laneweave.coordinator.stream_control import (
+    AHEAD_M,
     BESIDE,
     LATEST_S,
+    PATIENCE_S,
     SHOWN_S,
     Note,
     StreamControl,
     _clusters,
-    stream_road,
+    stream_planner,
 )
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import Ballot, Census, CensusEntry, Deed, Name, Plan, Prepare
 from laneweave.protocol.messages import VehicleState as State
 from laneweave.protocol.node import Compute, Computed
+from laneweave.protocol.scenario import parse_scenario
 from unit.rolling.road import ROLLING
 from unit.rolling.samples import state
 
@@ -78,11 +82,8 @@ class Bench:
     control: StreamControl = field(init=False)
 
     def __attrs_post_init__(self) -> None:
-        """Put a planner in its place."""
-        self.control = StreamControl(ROLLING, self.new_ballot)
-        planner = StreamPlanner(stream_road(ROLLING))
-        planner.plan = self.plan  # type: ignore[method-assign]
-        self.control._planner = planner
+        """Be the planner."""
+        self.control = StreamControl(ROLLING, self.new_ballot, self)
 
     def new_ballot(self, above: Ballot | None) -> Ballot:
         self.asked_above.append(above)
@@ -162,8 +163,20 @@ def test_a_new_leader_listens_first() -> None:
     desk = Bench()
     desk.control.on_census(census(A))
     assert desk.order(BEGUN_S + 1.0) is None
-    assert desk.order(BEGUN_S + 1.0 + SHOWN_S - 0.01) is None
-    assert desk.order(BEGUN_S + 1.0 + SHOWN_S) is not None
+    assert desk.order(BEGUN_S + 1.0 + PATIENCE_S - 0.01) is None
+    assert desk.order(BEGUN_S + 1.0 + PATIENCE_S) is not None
+
+
+def test_who_leads_again_listens_again_and_leaves_alone_what_was_begun() -> None:
+    desk = bench(A, B)
+    desk.ways = {A: ((0, 0), (0, 1))}
+    desk.think()
+    desk.control.take_over()
+    assert (desk.control.handovers, desk.control.wakeups) == ([], [])
+    assert set(desk.control.states) == {A, B}  # what they have shown stays true
+    later_s = BEGUN_S + SLOT_S + SHOWN_S
+    assert desk.order(later_s) is None
+    assert desk.order(later_s + PATIENCE_S) is not None
 
 
 def test_a_plan_that_comes_late_is_dropped() -> None:
@@ -228,16 +241,41 @@ def test_it_plans_from_where_vehicles_will_hold() -> None:
 
 
 def test_whoever_is_late_is_held_and_its_cells_are_blocked() -> None:
-    """Its move may begin at any time until it promises something else."""
+    """Its gate is open, so its move may begin at any time until it promises something else."""
     desk = bench(A, B)
-    deed = Deed(OLD, ESTATES[A], (*ESTATES[A], (0, 1)), (A, B))
-    late = shown(A, OLD, deed, accepted=True)
-    desk.hear(evolve(late, done=False, t_s=BEGUN_S + 0.5))
+    late = shown(A, OLD, Deed(OLD, open=True), accepted=True, go=True)
+    desk.hear(evolve(late, done=False, estate=(*ESTATES[A], (5, 1)), t_s=BEGUN_S + 0.5))
     desk.think()
     (call,) = desk.calls
     assert call.vehicles[A].held
-    assert {(1, 0), (-1, 0), (0, 1)} <= call.blocked
-    assert (1, 1) not in call.blocked
+    assert {(1, 0), (-1, 0), (5, 1)} <= call.blocked
+    assert not {HOMES[A], (1, 1)} & call.blocked
+
+
+def test_whoever_waits_at_a_closed_gate_is_asked_for_something_newer() -> None:
+    """What it owns either way may be used."""
+    desk = bench(A, B)
+    deed = Deed(OLD, ESTATES[A], (HOMES[A], (1, 0)), (A, B))
+    waits = shown(A, OLD, deed, accepted=True)
+    desk.hear(evolve(waits, done=False, t_s=BEGUN_S + 0.5))
+    desk.think()
+    (call,) = desk.calls
+    assert not call.vehicles[A].held
+    assert (1, 0) not in call.blocked
+    assert (-1, 0) in call.blocked
+
+
+def test_whoever_is_far_from_where_moves_begin_is_not_planned_for() -> None:
+    road = parse_scenario({"formation": {"operation": "rolling"}, "road": {"s2_m": 2000.0}})
+    desk = Bench()
+    desk.control = StreamControl(road, desk.new_ballot, desk)
+    far_s = (road.moves_from_m - AHEAD_M) / 15.0
+    slot = math.ceil(far_s / SLOT_S)
+    desk.control.on_census(census(A, D))  # D is 120 m behind A
+    assert desk.order(slot * SLOT_S - 2.0) is None
+    desk.hear(shown(A), shown(D))
+    desk.think(slot * SLOT_S + SHOWN_S)
+    assert set(desk.calls[0].vehicles) == {A}
 
 
 def test_whoever_nobody_drives_is_held_and_its_cells_are_free() -> None:
@@ -264,7 +302,7 @@ def test_cells_of_which_nobody_can_tell_whose_they_are_are_blocked() -> None:
     desk = bench(A, B)
     desk.hear(shown(B, OLD, Deed(OLD, ESTATES[B], (HOMES[B],), (A, B)), accepted=True))
     desk.think()
-    assert set(ESTATES[B]) <= desk.calls[0].blocked
+    assert set(ESTATES[B]) & desk.calls[0].blocked == set(ESTATES[B]) - {HOMES[B]}
 
 
 def test_a_promise_that_is_not_noted_shows_no_estate() -> None:
@@ -332,6 +370,24 @@ def test_moves_that_share_an_owner_share_a_ballot() -> None:
     desk.think()
     assert [handover.roster for handover in desk.control.handovers] == [(A, B), (C,)]
     assert set(desk.control.handovers[0].moves) == {A, B}
+
+
+def test_whose_promises_would_tell_what_somebody_owns_are_asked_for() -> None:
+    """C's gate is closed as far as it knows: B may have opened its own, and D of an older plan."""
+    newer = OLD._replace(seq=2)
+    desk = bench(A, B, C, D)
+    desk.hear(
+        shown(C, newer, Deed(newer, ESTATES[C], ESTATES[C], (B, C)), accepted=True),
+        shown(B, newer, Deed(newer, ESTATES[B], ESTATES[B], (B, C)), accepted=True),
+        shown(D, OLD, Deed(OLD, open=True), accepted=True),
+    )
+    desk.ways = {C: ((-4, 0), (-5, 0))}
+    desk.think()
+    assert [handover.roster for handover in desk.control.handovers] == [(B, C)]
+    desk = bench(A, B, C, D)
+    desk.ways = {C: ((-4, 0), (-5, 0))}
+    desk.think()
+    assert [handover.roster for handover in desk.control.handovers] == [(C,)]
 
 
 def test_clusters_are_what_hangs_together() -> None:
@@ -419,7 +475,7 @@ def test_a_new_leadership_begins_with_nothing() -> None:
     assert desk.order(BEGUN_S + SLOT_S + SHOWN_S) is None
     desk.control.on_census(census(A))
     assert desk.order(BEGUN_S + SLOT_S + SHOWN_S) is None  # it listens first
-    assert desk.order(BEGUN_S + SLOT_S + 2 * SHOWN_S) is not None
+    assert desk.order(BEGUN_S + SLOT_S + SHOWN_S + PATIENCE_S) is not None
 
 
 # --- the real planner -------------------------------------------------------------------------
@@ -427,7 +483,7 @@ def test_a_new_leadership_begins_with_nothing() -> None:
 
 def test_the_real_planner_takes_what_it_is_given() -> None:
     """Also somebody who was not heard, whose own cell is blocked."""
-    control = StreamControl(ROLLING, lambda _: Ballot(7, Name("c1"), 1, 1))
+    control = StreamControl(ROLLING, lambda _: Ballot(7, Name("c1"), 1, 1), stream_planner(ROLLING))
     control.on_census(census(A, B, C))
     assert list(control.order(lambda: 1, BEGUN_S - 2.0)) == []
     for name in (A, B):
