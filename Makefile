@@ -4,15 +4,16 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 RUN    ?= runs/demo
+BUDGET ?= 90
 
 # Linear algebra stays on one thread: many processes share few cores.
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test test-full evaluation docs check format clean install help
+.PHONY: demo test test-full evaluation evaluation-faults docs check format clean install help
 
 help: ## list the targets
-	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 19
 
 install: $(STAMP) ## make .venv and install laneweave with everything
 
@@ -45,8 +46,11 @@ test: $(STAMP) ## what CI runs
 test-full: $(STAMP) ## the long programmes too
 	$(BIN)/pytest -n 2
 
-evaluation: $(STAMP) ## measure what docs/EVALUATION.md reports under faults (over an hour)
-	$(BIN)/python benchmarks/resilience.py
+evaluation: $(STAMP) ## run what docs/EVALUATION.md reports and write its tables (BUDGET=90 minutes on 2 cores)
+	$(BIN)/python benchmarks/evaluation.py --budget $(BUDGET)
+
+evaluation-faults: $(STAMP) ## the same for "Under faults": apart, since it takes 70 minutes
+	$(BIN)/python benchmarks/evaluation.py --only faults
 
 docs: $(STAMP) ## write the generated parts of the documents
 	$(BIN)/python docs/generate.py

@@ -3,14 +3,15 @@
     python benchmarks/resilience.py [--only NAME ...] [--out FOLDER]
 
 Each experiment is one `laneweave run` with a faults file. Its figures are read from the run's
-folder and written to FOLDER/resilience.json; experiments that are there already are kept, so that
-a part can be measured again. A run's own verdict (overlaps, who did not leave) is among them.
+folder and written to FOLDER/resilience.json. Experiments that are there already are kept, unless
+`--only` names them. A run's own verdict (overlaps, who did not leave) is among the figures.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import subprocess
 import sys
 from collections import Counter
@@ -132,19 +133,21 @@ def main() -> None:
     """Run what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     names = [experiment.name for experiment in EXPERIMENTS]
-    parser.add_argument("--only", nargs="+", choices=names, default=names)
+    parser.add_argument("--only", nargs="+", choices=names)
     parser.add_argument("--out", type=Path, default=Path("runs/resilience"))
     arguments = parser.parse_args()
     folder: Path = arguments.out
     folder.mkdir(parents=True, exist_ok=True)
     record = folder / "resilience.json"
+    known = json.loads(record.read_text(encoding="utf-8")) if record.exists() else {}
+    chosen = arguments.only or [name for name in names if name not in known]
     for experiment in EXPERIMENTS:
-        if experiment.name in arguments.only:
-            result = run(experiment, folder / experiment.name)
-            known = json.loads(record.read_text(encoding="utf-8")) if record.exists() else {}
-            known[experiment.name] = result
-            record.write_text(json.dumps(known, indent=1), encoding="utf-8")
-            print(experiment.name, json.dumps(result), flush=True)  # noqa: T201
+        if experiment.name in chosen:
+            shutil.rmtree(folder / experiment.name, ignore_errors=True)
+            known[experiment.name] = run(experiment, folder / experiment.name)
+            ordered = {name: known[name] for name in names if name in known}
+            record.write_text(json.dumps(ordered, indent=1), encoding="utf-8")
+            print(experiment.name, json.dumps(known[experiment.name]), flush=True)  # noqa: T201
 
 
 if __name__ == "__main__":
