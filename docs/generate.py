@@ -16,6 +16,8 @@ from typing import Any
 
 from laneweave.coordinator.leader_rules import LEADER_RULES, Phase
 from laneweave.launch.conflict_drawing import counts, draw_conflicts
+from laneweave.launch.evaluation.evidence import read_evidence
+from laneweave.launch.evaluation.tables import document_parts
 from laneweave.launch.simulation.profiles import PROFILES
 from laneweave.protocol.transitions import markdown_table, mermaid_diagram
 from laneweave.protocol.vehicle_rules import VEHICLE_RULES, Stage
@@ -32,6 +34,8 @@ GEOMETRY = DOCS / "evidence" / "geometry.json"
 """What `benchmarks/geometry.py` wrote."""
 CLOSING = DOCS / "evidence" / "closing.json"
 """What `benchmarks/closing.py` wrote."""
+EVALUATED = DOCS / "evidence" / "evaluation.json"
+"""What `benchmarks/evaluation.py` wrote."""
 CONFLICTS = DOCS / "images" / "conflict-table.png"
 
 
@@ -174,6 +178,7 @@ def parts() -> dict[str, str]:
         "conflict counts": _conflicts(),
         "geometry": _geometry(),
         "closing": _closing(),
+        **document_parts(read_evidence(EVALUATED)),
     }
 
 
