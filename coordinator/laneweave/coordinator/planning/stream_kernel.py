@@ -1,4 +1,4 @@
-"""Compiled code of `stream`; see `relaxation_kernel` for its style.
+"""Compiled code of `stream`: ways of single vehicles; see `relaxation_kernel` for its style.
 
 The table of a window says, for each slot, cell and displacement, what it costs that somebody is in
 the way: the sum of the prices of all vehicles whose own moves conflict (`load`). Putting a vehicle
@@ -10,18 +10,11 @@ from __future__ import annotations
 
 from numba import njit
 
-from laneweave.coordinator.planning.negotiation_kernel import random_below
+from laneweave.coordinator.planning.stream_arrays import FIXED, PRICE
 
-FIXED = 1_000_000
-"""Price of a vehicle that cannot be moved out of the way."""
+_PASSABLE = FIXED - 1
 NO_WAY = 1e9
 """Cost of a vehicle that has no way."""
-PRICE = 10
-"""Least price of a vehicle, so that a price can grow by tenths of itself."""
-_FIRST_SOFTNESS, _SOFTNESS_GROWTH, _TURNS = 0.5, 1.25, 25
-_MEMORY = 0.3
-_PRICE_GROWTH = 3
-"""Added to the price of a vehicle each time that a chain of ejections hits it."""
 
 
 @njit(cache=True, nogil=True)
@@ -45,72 +38,84 @@ def put(table, ways, v, sign):
 
 
 @njit(cache=True, nogil=True)
-def find_way(table, soft, ways, costs, v, limit, softness, scratch):
-    """Lay the cheapest way of a vehicle that is in neither table; return its own cost.
+def _may_move(table, s, column, lane, d):
+    """Tell whether a move stays on the road and in S3, and enters nothing that is blocked.
 
-    Nobody of `table` whose price is above `limit` is in the way of it; those of `soft` cost
-    softness times their prices, and what the memory of places says.
+    The corners of an oblique move count as entered, except where the vehicle is anyway.
     """
-    load, steps = table.load, table.steps
-    value, came, delay, memory = scratch.value, scratch.came, scratch.delay, scratch.memory
-    priced = softness > 0.0
+    to_column, to_lane = column + table.steps[d, 0], lane + table.steps[d, 1]
+    columns, lanes = table.blocked.shape
+    if not (0 <= to_column < columns and 0 <= to_lane < lanes):
+        return False
+    if not (table.rear[s, min(column, to_column)] and table.front[s, max(column, to_column)]):
+        return False
+    if table.blocked[to_column, to_lane]:
+        return False
+    if to_column == column or to_lane == lane:
+        return True
+    return not (table.blocked[column, to_lane] or table.blocked[to_column, lane])
+
+
+@njit(cache=True, nogil=True)
+def find_way(table, ways, costs, v, softness, ceiling, scratch):
+    """Lay the cheapest way of a vehicle that is not in the table; return what it costs by itself.
+
+    A way below `ceiling` is looked for, by dynamic programming over slots, columns and lanes. With
+    a softness of 0 nobody may be in its way; otherwise that costs softness for each least price,
+    and only what is `FIXED` is never passed. Without such a way: `NO_WAY`, and nothing is laid.
+    """
+    load, steps, of_move = table.load, table.steps, costs.of_move
+    value, came, delay = scratch.value, scratch.came, scratch.delay
     slots, columns, lanes, fan = load.shape
     reach = (value.shape[1] - 1) // 2
-    column0, wanted = ways.column[v, 0], ways.wanted[v]
+    column0, wanted, missing = ways.column[v, 0], ways.wanted[v], ways.missing[v]
+    limit = _PASSABLE if softness > 0.0 else 0
+    per_price = softness / PRICE
     value[:] = NO_WAY
     value[0, reach, ways.lane[v, 0]] = 0.0
-    best, best_s, best_c, best_l = NO_WAY, -1, 0, 0
-    widest = 0
+    best, best_s, best_offset, best_lane = ceiling, -1, 0, 0
+    low = high = reach
     for s in range(slots + 1):
-        alive, widened = False, widest
-        for offset in range(reach - widest, reach + widest + 1):
+        alive, next_low, next_high = False, low, high
+        for offset in range(low, high + 1):
             column = column0 + offset - reach
-            if not 0 <= column < columns:
-                continue
             for lane in range(lanes):
                 so_far = value[s, offset, lane]
                 if so_far >= best:
                     continue
                 if s == slots or table.gone[s, column]:
-                    total = so_far + (0.0 if lane == wanted else ways.missing[v])
+                    total = so_far + (0.0 if lane == wanted else missing)
                     if total < best:
-                        best, best_s, best_c, best_l = total, s, offset, lane
+                        best, best_s, best_offset, best_lane = total, s, offset, lane
                     continue
                 alive = True
+                if lane != wanted:
+                    so_far += costs.off_lane
                 for d in range(fan):
-                    c, n = column + steps[d, 0], lane + steps[d, 1]
-                    if d > 0:
-                        if ways.held[v] or not (0 <= c < columns and 0 <= n < lanes):
-                            continue
-                        if not (table.rear[s, min(c, column)] and table.front[s, max(c, column)]):
-                            continue
-                        if table.blocked[c, n] or table.blocked[column, n] or table.blocked[c, lane]:
-                            continue
-                        if not 0 <= offset + steps[d, 0] <= 2 * reach:
-                            continue
                     if load[s, column, lane, d] > limit:
                         continue
-                    total = so_far + costs.of_move[d]
-                    if priced:
-                        total += softness * soft.load[s, column, lane, d] / PRICE
-                        total += memory[s, c, n]
-                    if lane != wanted:
-                        total += costs.off_lane
+                    to, to_lane = offset + steps[d, 0], lane + steps[d, 1]
+                    total = so_far + of_move[d] + per_price * load[s, column, lane, d]
                     if d > 0:
+                        if ways.held[v] or not 0 <= to <= 2 * reach:
+                            continue
+                        if not _may_move(table, s, column, lane, d):
+                            continue
                         total += delay[s]
-                    to = offset + steps[d, 0]
-                    if total < value[s + 1, to, n]:
-                        value[s + 1, to, n] = total
-                        came[s + 1, to, n] = d
-                        if abs(to - reach) > widened:
-                            widened = abs(to - reach)
+                    to_go = min(missing, abs(to_lane - wanted) * costs.per_lane)
+                    if total + to_go + costs.rebate * (slots - s) >= best:
+                        continue
+                    if total < value[s + 1, to, to_lane]:
+                        value[s + 1, to, to_lane] = total
+                        came[s + 1, to, to_lane] = d
+                        next_low, next_high = min(next_low, to), max(next_high, to)
         if not alive:
             break
-        widest = widened
+        low, high = next_low, next_high
     if best_s < 0:
         return NO_WAY
     ways.slots[v] = best_s
-    offset, lane = best_c, best_l
+    offset, lane = best_offset, best_lane
     for s in range(best_s, -1, -1):
         ways.column[v, s], ways.lane[v, s] = column0 + offset - reach, lane
         if s > 0:
@@ -134,33 +139,51 @@ def own_cost(ways, costs, v):
 
 
 @njit(cache=True, nogil=True)
-def _save(ways, saved, count, v):
-    saved.who[count] = v
-    saved.slots[count] = ways.slots[v]
-    saved.cost[count] = ways.cost[v]
-    saved.column[count] = ways.column[v]
-    saved.lane[count] = ways.lane[v]
-    saved.made[count] = ways.made[v]
+def follow(table, ways, costs, v, cells):
+    """Lay an old way, if it still is one, and nobody is in it; tell whether it was laid.
+
+    `cells`: columns and lanes at the beginning of each slot. It need not reach the road's end.
+    """
+    slots, columns, lanes, fan = table.load.shape
+    if len(cells) == 0 or cells[0, 0] != ways.column[v, 0] or cells[0, 1] != ways.lane[v, 0]:
+        return False
+    s = 0
+    while s < slots and not table.gone[s, ways.column[v, s]]:
+        if s + 1 >= len(cells):
+            return False
+        column, lane = ways.column[v, s], ways.lane[v, s]
+        made = -1
+        for d in range(fan):
+            if cells[s + 1, 0] - column == table.steps[d, 0]:
+                if cells[s + 1, 1] - lane == table.steps[d, 1]:
+                    made = d
+        if made < 0 or table.load[s, column, lane, made] > 0:
+            return False
+        if made > 0 and not _may_move(table, s, column, lane, made):
+            return False
+        ways.made[v, s] = made
+        ways.column[v, s + 1], ways.lane[v, s + 1] = cells[s + 1, 0], cells[s + 1, 1]
+        s += 1
+    ways.slots[v] = s
+    ways.cost[v] = own_cost(ways, costs, v)
+    return True
 
 
 @njit(cache=True, nogil=True)
-def _restore(table, ways, saved, begin, count):
-    for i in range(begin, count):
-        if ways.placed[saved.who[i]]:
-            put(table, ways, saved.who[i], -1)
-    for i in range(begin, count):
-        v = saved.who[i]
-        ways.slots[v] = saved.slots[i]
-        ways.cost[v] = saved.cost[i]
-        ways.column[v] = saved.column[i]
-        ways.lane[v] = saved.lane[i]
-        ways.made[v] = saved.made[i]
-        put(table, ways, v, 1)
+def stay(table, ways, costs, v):
+    """Lay the way of a vehicle that stays in its cell."""
+    s = 0
+    while s < len(table.load) and not table.gone[s, ways.column[v, s]]:
+        ways.column[v, s + 1], ways.lane[v, s + 1] = ways.column[v, s], ways.lane[v, s]
+        ways.made[v, s] = 0
+        s += 1
+    ways.slots[v] = s
+    ways.cost[v] = own_cost(ways, costs, v)
 
 
 @njit(cache=True, nogil=True)
-def _victims(table, ways, v, victims):
-    """List those in the table whose moves conflict with a way that is not in it."""
+def find_victims(table, ways, v, victims):
+    """List those in the table whose moves conflict with a way that is not in it; return how many."""
     load, who, made, offsets, first = table.load, table.who, table.made, table.offsets, table.first
     _, columns, lanes, _ = load.shape
     count = 0
@@ -183,253 +206,27 @@ def _victims(table, ways, v, victims):
 
 
 @njit(cache=True, nogil=True)
-def eject(table, ways, costs, start, softness, most, slack, rng, scratch):
-    """Give a vehicle a better way, at the price of those that are in it; return what is gained.
+def save(ways, saved, count, v):
+    """Keep a vehicle's way as number `count`."""
+    saved.who[count] = v
+    saved.slots[count] = ways.slots[v]
+    saved.cost[count] = ways.cost[v]
+    saved.column[count] = ways.column[v]
+    saved.lane[count] = ways.lane[v]
+    saved.made[count] = ways.made[v]
 
-    Whoever is hit is replanned in turn, and may hit others. The chain is undone, and nothing
-    gained, if it gets longer than `most` or does not lower the sum of costs by more than `slack`.
-    """
-    saved, queue, victims, delay = scratch.saved, scratch.queue, scratch.victims, scratch.delay
-    queue[0] = start
-    waiting, kept, before = 1, 1, ways.cost[start]
-    _save(ways, saved, 0, start)
-    was_placed = ways.placed[start]
-    if was_placed:
-        put(table, ways, start, -1)
-    failed, hits = False, 0
-    while waiting > 0:
-        waiting -= 1
-        v = queue[waiting]
-        # Who was hit goes round the others if it can.
-        if v != start:
-            ways.cost[v] = find_way(table, table, ways, costs, v, 0, 0.0, scratch)
-            if ways.cost[v] < ways.missing[v]:
-                put(table, ways, v, 1)
-                continue
-        # Two that must swap would take the same slot for ever if they did not sometimes hesitate.
-        for s in range(len(delay)):
-            delay[s] = 0.1 * random_below(rng, 10) if hits > 0 else 0.0
-        ways.cost[v] = find_way(table, table, ways, costs, v, FIXED - 1, softness, scratch)
-        if ways.cost[v] >= NO_WAY:
-            failed = True
-            break
-        count = _victims(table, ways, v, victims)
-        hits += count
-        if hits > most:
-            failed = True
-            break
-        for i in range(count):
-            u = victims[i]
-            known = False
-            for k in range(kept):
-                known |= saved.who[k] == u
-            if not known:
-                _save(ways, saved, kept, u)
-                kept += 1
-                before += ways.cost[u]
-            put(table, ways, u, -1)
-            ways.price[u] += _PRICE_GROWTH
-            queue[waiting] = u
-            waiting += 1
+
+@njit(cache=True, nogil=True)
+def restore(table, ways, saved, begin, count):
+    """Put kept ways back into the table, instead of what is there of the same vehicles."""
+    for i in range(begin, count):
+        if ways.placed[saved.who[i]]:
+            put(table, ways, saved.who[i], -1)
+    for i in range(begin, count):
+        v = saved.who[i]
+        ways.slots[v] = saved.slots[i]
+        ways.cost[v] = saved.cost[i]
+        ways.column[v] = saved.column[i]
+        ways.lane[v] = saved.lane[i]
+        ways.made[v] = saved.made[i]
         put(table, ways, v, 1)
-    delay[:] = 0.0
-    after = 0.0
-    for k in range(kept):
-        after += ways.cost[saved.who[k]]
-    worse = failed or after >= before + slack
-    if worse:
-        for k in range(kept):
-            if ways.placed[saved.who[k]]:
-                put(table, ways, saved.who[k], -1)
-    # Prices are back to their least before anybody is put in for good.
-    for k in range(kept):
-        v = saved.who[k]
-        if ways.price[v] != PRICE:
-            if not worse:
-                put(table, ways, v, -1)
-                ways.price[v] = PRICE
-                put(table, ways, v, 1)
-            else:
-                ways.price[v] = PRICE
-    if worse:
-        ways.cost[start] = saved.cost[0]
-        _restore(table, ways, saved, 0 if was_placed else 1, kept)
-        return 0.0
-    return before - after
-
-
-@njit(cache=True, nogil=True)
-def stand(table, ways, costs, start, scratch):
-    """Let a vehicle that has no way stay in its cell, and whoever is in the way of that likewise.
-
-    It always works: if all stay where they are, nobody meets.
-    """
-    queue, victims = scratch.queue, scratch.victims
-    queue[0] = start
-    waiting = 1
-    slots = len(table.load)
-    while waiting > 0:
-        waiting -= 1
-        v = queue[waiting]
-        s = 0
-        while s < slots and not table.gone[s, ways.column[v, s]]:
-            ways.column[v, s + 1], ways.lane[v, s + 1] = ways.column[v, s], ways.lane[v, s]
-            ways.made[v, s] = 0
-            s += 1
-        ways.slots[v] = s
-        ways.cost[v] = own_cost(ways, costs, v)
-        for i in range(_victims(table, ways, v, victims)):
-            put(table, ways, victims[i], -1)
-            queue[waiting] = victims[i]
-            waiting += 1
-        put(table, ways, v, 1)
-
-
-@njit(cache=True, nogil=True)
-def _take_out(table, ways, seed, size, share, rng, scratch):
-    """Take a vehicle and some neighbours out of the table, in a random order; return how many."""
-    saved, chosen = scratch.saved, scratch.chosen
-    count = len(ways.cost)
-    near = 0
-    # Those nearest by column: vehicles are in the order of their columns.
-    low = high = seed
-    while near < size:
-        pick_low = low - 1 >= 0 and (high + 1 >= count or random_below(rng, 2) == 0)
-        if pick_low:
-            low -= 1
-        elif high + 1 < count:
-            high += 1
-        else:
-            break
-        v = low if pick_low else high
-        if not ways.held[v] and random_below(rng, 100) < share:
-            chosen[near] = v
-            near += 1
-    chosen[near] = seed
-    near += 1
-    for i in range(near):
-        other = i + random_below(rng, near - i)
-        chosen[i], chosen[other] = chosen[other], chosen[i]
-        _save(ways, saved, i, chosen[i])
-        put(table, ways, chosen[i], -1)
-    return near
-
-
-@njit(cache=True, nogil=True)
-def _negotiate(table, soft, ways, costs, seed, size, rng, scratch):
-    """Let a vehicle and its neighbours bargain for their ways; return what is gained.
-
-    Each in turn takes the way that is cheapest for it when every conflict with another of them has
-    a price. Prices grow, and places that were fought over are remembered, until nobody conflicts
-    (negotiated congestion, as for the path sets of `negotiation`).
-    """
-    saved, chosen, memory = scratch.saved, scratch.chosen, scratch.memory
-    near = _take_out(table, ways, seed, size, 90, rng, scratch)
-    before = 0.0
-    for i in range(near):
-        before += saved.cost[i]
-    softness, conflicts = _FIRST_SOFTNESS, 1
-    for turn in range(_TURNS):
-        conflicts = 0
-        for i in range(near):
-            v = chosen[i]
-            if ways.placed[v]:
-                if turn > 0 and not _meets(soft, ways, v):
-                    continue
-                put(soft, ways, v, -1)
-            ways.cost[v] = find_way(table, soft, ways, costs, v, 0, softness, scratch)
-            if ways.cost[v] >= NO_WAY:
-                conflicts = -1
-                break
-            for s in range(ways.slots[v]):
-                column, lane = ways.column[v, s], ways.lane[v, s]
-                if soft.load[s, column, lane, ways.made[v, s]] > 0:
-                    memory[s, column, lane] += _MEMORY
-                    conflicts += 1
-            put(soft, ways, v, 1)
-        if conflicts <= 0:
-            break
-        softness *= _SOFTNESS_GROWTH
-    after = 0.0
-    for i in range(near):
-        v = chosen[i]
-        after += ways.cost[v]
-        if ways.placed[v]:
-            put(soft, ways, v, -1)
-    memory[:] = 0.0
-    if conflicts != 0 or after >= before:
-        _restore(table, ways, saved, 0, near)
-        return 0.0
-    for i in range(near):
-        put(table, ways, chosen[i], 1)
-    return before - after
-
-
-@njit(cache=True, nogil=True)
-def _meets(soft, ways, v):
-    """Tell whether a vehicle's way meets another one's; its own moves do not count."""
-    for s in range(ways.slots[v]):
-        if soft.load[s, ways.column[v, s], ways.lane[v, s], ways.made[v, s]] > PRICE * (
-            soft.own[ways.made[v, s]]
-        ):
-            return True
-    return False
-
-
-@njit(cache=True, nogil=True)
-def _reorder(table, ways, costs, seed, size, slack, rng, scratch):
-    """Take some neighbours out and put them in anew, in another order; return what is gained."""
-    saved, chosen = scratch.saved, scratch.chosen
-    near = _take_out(table, ways, seed, size, 67, rng, scratch)
-    before = after = 0.0
-    for i in range(near):
-        before += saved.cost[i]
-    for i in range(near):
-        v = chosen[i]
-        ways.cost[v] = find_way(table, table, ways, costs, v, 0, 0.0, scratch)
-        after += ways.cost[v]
-        if after >= before + slack:
-            break
-        put(table, ways, v, 1)
-    if after >= before + slack:
-        _restore(table, ways, saved, 0, near)
-        return 0.0
-    return before - after
-
-
-@njit(cache=True, nogil=True)
-def improve(table, soft, ways, costs, rounds, most, rng, scratch):
-    """Improve all ways for some rounds; return how many vehicles miss their lanes.
-
-    While somebody misses its lane, chains of ejections and new orders take turns; slack cools down
-    from a few moves to none. Afterwards a few rounds more look for cheaper ways.
-    """
-    count = len(ways.cost)
-    failing = scratch.failing
-    missed = 0
-    for turn in range(rounds):
-        missed = 0
-        for v in range(count):
-            if ways.cost[v] >= ways.missing[v] and not ways.held[v]:
-                failing[missed] = v
-                missed += 1
-        slack = 8.0 * max(0.0, 1.0 - 1.5 * turn / rounds) if missed else -1e-9
-        if missed and turn % 30 == 31:
-            v = failing[random_below(rng, missed)]
-            size = min(6 + random_below(rng, 20), count - 1)
-            _negotiate(table, soft, ways, costs, v, size, rng, scratch)
-        elif missed and turn % 8 < 7:
-            v = failing[random_below(rng, missed)]
-            softness = 2.0 + 2.0 * random_below(rng, 12)
-            eject(table, ways, costs, v, softness, most, slack, rng, scratch)
-        else:
-            seed = failing[random_below(rng, missed)] if missed and turn % 2 else random_below(
-                rng, count
-            )
-            if ways.held[seed]:
-                continue
-            size = 2 + random_below(rng, 12)
-            _reorder(table, ways, costs, seed, min(size, count - 1), slack, rng, scratch)
-        if not missed and turn > rounds // 8:
-            break
-    return missed

@@ -1,0 +1,239 @@
+"""How well the stream planner sorts: `python benchmarks/stream.py [--volumes V ...] [--seeds N]`.
+
+A lattice without faults. Arrivals are those of a scenario; everybody enters the column nearest to
+its arrival that is free behind its lane predecessor. At each slot all vehicles on the road are
+planned, and the first step of every way is made. CPU time of one thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+from attrs import field, frozen
+
+from laneweave.coordinator.planning import warm_up
+from laneweave.coordinator.planning.conflicts import ConflictModel
+from laneweave.coordinator.planning.geometry import Geometry
+from laneweave.coordinator.planning.stream import (
+    StreamCosts,
+    StreamPlan,
+    StreamPlanner,
+    StreamRoad,
+    StreamVehicle,
+)
+from laneweave.coordinator.planning.stream_validate import problems_of_ways
+from laneweave.protocol.scenario import load_scenario
+from laneweave.sim_bridge.demand import arrivals
+
+OUT = Path(__file__).resolve().parents[1] / "docs" / "evidence" / "stream.json"
+VOLUMES = (1000, 1600, 1800, 2000, 2200, 2400, 2500, 2600)
+DURATION_S, NOT_COUNTED_S = 600.0, 60.0
+PITCH_M, SPEED_MPS, SLOT_S, LENGTH_M = 15.0, 15.0, 4.0, 1000.0
+ROAD = StreamRoad(3, PITCH_M, SPEED_MPS * SLOT_S, (400.0, LENGTH_M), LENGTH_M, 5.0)
+
+
+@frozen
+class Variant:
+    """A road and costs that are measured."""
+
+    road: StreamRoad = ROAD
+    costs: StreamCosts = field(factory=StreamCosts)
+    volumes: tuple[int, ...] = (1800, 2400, 2600)
+
+
+VARIANTS = {
+    "default": Variant(volumes=VOLUMES),
+    "S2 too": Variant(attrs.evolve(ROAD, sorting_m=(200.0, LENGTH_M))),
+    "drift rewarded": Variant(costs=StreamCosts(forward=-0.4)),
+    "drift costs": Variant(costs=StreamCosts(forward=2.0)),
+    "trains": Variant(attrs.evolve(ROAD, model=ConflictModel(("node", "edge", "closing")))),
+    "0.5 s late": Variant(
+        attrs.evolve(ROAD, model=ConflictModel(("geometric", "closing"), Geometry(lateness_s=0.5)))
+    ),
+    "mode 2": Variant(
+        attrs.evolve(ROAD, mode=2, model=ConflictModel(("geometric", "closing"))),
+    ),
+}
+
+
+@frozen
+class Traveller:
+    """A vehicle with what is known of it on arrival."""
+
+    vehicle: str
+    column: int
+    lane: int
+    wanted: int
+    arrival_s: float
+
+
+def travellers(volume: float, seed: int, duration_s: float) -> list[Traveller]:
+    """Return who comes, by time of entry, each in the free column nearest to its arrival.
+
+    Column c is at the beginning of the road at -c PITCH_M / SPEED_MPS.
+    """
+    scenario = load_scenario(
+        None,
+        seed=seed,
+        demand__volume_veh_per_lane_h=float(volume),
+        demand__duration_s=duration_s,
+    )
+    last: dict[int, int] = {}
+    found = []
+    for one in arrivals(scenario):
+        column = -round(one.t_s * SPEED_MPS / PITCH_M)
+        column = min(column, last.get(one.lane, column + 1) - 1)
+        last[one.lane] = column
+        found.append(Traveller(one.vehicle, column, one.lane, one.preferred_lane, one.t_s))
+    return sorted(found, key=lambda one: -one.column)
+
+
+@frozen
+class Slot:
+    """What one planning did."""
+
+    cpu_ms: float
+    rounds: int
+    missed: int
+    vehicles: int
+
+
+@frozen
+class Left:
+    """A vehicle that has left the road."""
+
+    traveller: Traveller
+    column: int
+    lane: int
+
+    @property
+    def travel_s(self) -> float:
+        """From arrival to the end of the road."""
+        return (LENGTH_M - PITCH_M * self.column) / SPEED_MPS - self.traveller.arrival_s
+
+
+class Run:
+    """A lattice that is driven slot by slot."""
+
+    def __init__(self, variant: Variant, volume: float, seed: int, duration_s: float) -> None:
+        """Prepare the first slot."""
+        self.road = variant.road
+        self.planner = StreamPlanner(variant.road, variant.costs, seed)
+        self.coming = travellers(volume, seed, duration_s)[::-1]
+        self.on_road: dict[str, tuple[Traveller, tuple[int, int]]] = {}
+        self.plan: StreamPlan | None = None
+        self.number = 0
+        self.left: list[Left] = []
+        self.slots: list[Slot] = []
+
+    def step(self) -> bool:
+        """Plan a slot and drive it; tell whether anybody is left."""
+        front_m = self.number * self.road.advance_m
+        while self.coming and self.coming[-1].column * PITCH_M + front_m >= 0:
+            one = self.coming.pop()
+            self.on_road[one.vehicle] = one, (one.column, one.lane)
+        for name, (one, (column, lane)) in list(self.on_road.items()):
+            if column * PITCH_M + front_m > self.road.length_m:
+                self.left.append(Left(one, column, lane))
+                del self.on_road[name]
+        vehicles = [StreamVehicle(v, cell, one.wanted) for v, (one, cell) in self.on_road.items()]
+        began = time.thread_time()
+        plan = self.planner.plan(self.number, vehicles, self.plan)
+        cpu_ms = (time.thread_time() - began) * 1e3
+        wrong = problems_of_ways(self.road, plan, vehicles)
+        if wrong:
+            raise RuntimeError("; ".join(wrong))
+        self.slots.append(Slot(cpu_ms, plan.rounds, len(plan.missed), len(vehicles)))
+        for name, (one, cell) in self.on_road.items():
+            way = plan.ways[name]
+            self.on_road[name] = one, way[1] if len(way) > 1 else cell
+        self.plan = plan
+        self.number += 1
+        return bool(self.coming or self.on_road)
+
+
+def measured(name: str, volume: int, seeds: int, duration_s: float) -> dict[str, Any]:
+    """Return what a volume reaches over some seeds."""
+    left: list[Left] = []
+    slots: list[Slot] = []
+    off = []
+    for seed in range(1, seeds + 1):
+        run = Run(VARIANTS[name], volume, seed, duration_s)
+        while run.step():
+            pass
+        counted = [one for one in run.left if one.traveller.arrival_s >= NOT_COUNTED_S]
+        off.append(sum(one.lane != one.traveller.wanted for one in counted))
+        left += counted
+        slots += run.slots
+    travel_s = np.array([one.travel_s for one in left])
+    drift = np.array([one.column - one.traveller.column for one in left])
+    cpu_ms = np.array([slot.cpu_ms for slot in slots])
+    rounds = np.array([slot.rounds for slot in slots])
+    return {
+        "variant": name,
+        "volume_veh_per_lane_h": volume,
+        "seeds": seeds,
+        "vehicles": len(left),
+        "off_lane": sum(off),
+        "off_lane_by_seed": off,
+        "on_lane_percent": round(100.0 * (1.0 - sum(off) / len(left)), 3),
+        "travel_s_mean": round(float(travel_s.mean()), 2),
+        "travel_s_p95": round(float(np.percentile(travel_s, 95)), 2),
+        "delay_s_mean": round(float(travel_s.mean()) - LENGTH_M / SPEED_MPS, 2),
+        "drift_columns_mean": round(float(drift.mean()), 3),
+        "drifted_percent": round(100.0 * float((drift != 0).mean()), 1),
+        "slots": len(slots),
+        "vehicles_on_road_max": max(slot.vehicles for slot in slots),
+        "slots_with_missed_percent": round(
+            100.0 * float(np.mean([s.missed > 0 for s in slots])), 1
+        ),
+        "rounds_mean": round(float(rounds.mean()), 1),
+        "cpu_ms_mean": round(float(cpu_ms.mean()), 2),
+        "cpu_ms_p50": round(float(np.percentile(cpu_ms, 50)), 2),
+        "cpu_ms_p99": round(float(np.percentile(cpu_ms, 99)), 1),
+        "cpu_ms_max": round(float(cpu_ms.max()), 1),
+    }
+
+
+def rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Yield one row for each variant and volume."""
+    for name in options.variants or VARIANTS:
+        for volume in options.volumes or VARIANTS[name].volumes:
+            yield measured(name, volume, options.seeds, options.duration)
+
+
+_SHOWN = ("on_lane_percent", "travel_s_mean", "drift_columns_mean", "rounds_mean", "cpu_ms_mean")
+_SHOWN += ("cpu_ms_p50", "cpu_ms_p99", "cpu_ms_max")
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--volumes", type=int, nargs="+", help="veh/(lane*h); default: all")
+    parser.add_argument("--variants", nargs="+", choices=VARIANTS, help="default: all")
+    parser.add_argument("--seeds", type=int, default=5, help="how many; default 5")
+    parser.add_argument("--duration", type=float, default=DURATION_S, help="of arrivals, in s")
+    parser.add_argument("--json", type=Path, default=OUT, help="where to write")
+    options = parser.parse_args()
+    warm_up()
+    results = []
+    sys.stdout.write(f"{'variant':15} volume  off of      {' '.join(_SHOWN)}\n")
+    for row in rows(options):
+        results.append(row)
+        shown = " ".join(f"{row[key]:>{len(key)}}" for key in _SHOWN)
+        head = f"{row['variant']:15} {row['volume_veh_per_lane_h']:6} {row['off_lane']:4}"
+        sys.stdout.write(f"{head} of {row['vehicles']:5} {shown}\n")
+        sys.stdout.flush()
+    options.json.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,255 @@
+"""What the compiled code of `stream` works on: one window of the lattice, as arrays.
+
+A window holds the columns that the vehicles on the road can reach, and the slots until the last of
+them has left the road. Indices: slot s from the current one, column c from the window's lowest,
+lane, and displacement d as numbered by `displacements`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from functools import lru_cache
+from typing import NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from laneweave.coordinator.planning.conflicts import ConflictModel
+from laneweave.coordinator.planning.grid import Cell, Mode, displacements
+from laneweave.coordinator.planning.moves import conflict_offsets
+from laneweave.coordinator.planning.stream_types import StreamCosts, StreamRoad, StreamVehicle
+
+FIXED = 1_000_000
+"""Price of a vehicle that cannot be moved out of the way."""
+PRICE = 10
+"""Least price of a vehicle, so that a price can grow by tenths of itself."""
+MOST_EJECTED = 100
+"""Vehicles hit by one chain of ejections."""
+_SAVED = MOST_EJECTED + 32
+"""Ways that are kept while a chain or a new order is tried."""
+_ROUNDING_M = 1e-6
+
+Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+class Table(NamedTuple):
+    """Who makes which moves, and with which moves that conflicts."""
+
+    load: NDArray[np.int32]
+    """Sum of the prices of all whose moves conflict with this one; (slots, columns, lanes, d)."""
+    who: NDArray[np.int32]
+    """Who is in a cell at the beginning of a slot, -1: nobody; (slots, columns, lanes)."""
+    made: NDArray[np.int8]
+    """Displacement that it makes in the slot; same shape."""
+    offsets: Ints
+    """Column, lane and displacement of what conflicts with a move; (conflicts, 3)."""
+    first: Ints
+    """Where in `offsets` the conflicts of each displacement begin; (d + 1)."""
+    steps: Ints
+    """Column and lane of each displacement; (d, 2)."""
+    rear: Bools
+    """Whether a move may have this column as its rearmost one; (slots, columns)."""
+    front: Bools
+    """Whether a move may have this column as its foremost one; (slots, columns)."""
+    gone: Bools
+    """Whether a column is beyond the end of the road; (slots + 1, columns)."""
+    blocked: Bools
+    """Cells that nobody may enter; (columns, lanes)."""
+
+
+class Ways(NamedTuple):
+    """The vehicles, by column, and the way of each; first index: vehicle."""
+
+    column: Ints
+    """At the beginning of each slot; (vehicles, slots + 1)."""
+    lane: Ints
+    made: NDArray[np.int8]
+    """Displacements; (vehicles, slots)."""
+    slots: Ints
+    """How many slots the way has until the road ends."""
+    wanted: Ints
+    """Lane that is needed."""
+    held: Bools
+    missing: Floats
+    """Cost of ending off the lane."""
+    least: Floats
+    """No way that ends on the lane costs less."""
+    price: Ints
+    """What it costs another one to be in its way."""
+    cost: Floats
+    placed: Bools
+    """Whether the way is in the table."""
+
+
+class Costs(NamedTuple):
+    """`StreamCosts` for the compiled code."""
+
+    of_move: Floats
+    """Of each displacement."""
+    off_lane: float
+    per_lane: float
+    """Least cost of each lane that is still to go."""
+    rebate: float
+    """What a slot may earn, at most (not above 0)."""
+
+
+class Saved(NamedTuple):
+    """Ways as they were before a change that may be undone."""
+
+    who: Ints
+    slots: Ints
+    cost: Floats
+    column: Ints
+    lane: Ints
+    made: NDArray[np.int8]
+
+
+class Scratch(NamedTuple):
+    """Memory of the search, allocated once."""
+
+    saved: Saved
+    queue: Ints
+    victims: Ints
+    chosen: Ints
+    """Up to all vehicles, each."""
+    marked: Bools
+    """Vehicles whose ways are saved."""
+    value: Floats
+    """Least cost of being somewhere; (slots + 1, columns from the own one, lanes)."""
+    came: NDArray[np.int8]
+    """By which displacement; same shape."""
+    delay: Floats
+    """What a move costs more in each slot."""
+
+
+class Window(NamedTuple):
+    """All arrays of one planning."""
+
+    low: int
+    """Column of the lattice that is the window's lowest."""
+    table: Table
+    ways: Ways
+    costs: Costs
+    scratch: Scratch
+
+
+def window(
+    road: StreamRoad,
+    costs: StreamCosts,
+    slot: int,
+    vehicles: Sequence[StreamVehicle],
+    blocked: Collection[Cell],
+) -> Window:
+    """Return the arrays for vehicles that are sorted by column and on the road; no way is laid."""
+    start_m, end_m = road.sorting_m
+    # Nobody moves in more slots than it takes to pass S3.
+    reach = max(0, int((end_m - start_m) / road.advance_m) + 1)
+    low = vehicles[0].cell[0] - reach
+    columns = vehicles[-1].cell[0] + reach - low + 1
+    now_m = (np.arange(columns) + low) * road.pitch_m + slot * road.advance_m
+    rearmost_m = now_m[reach]
+    slots = max(1, int(np.ceil((road.length_m - rearmost_m) / road.advance_m)) + 1)
+    # Whoever falls behind has further to go.
+    slots += int(np.ceil(reach * road.pitch_m / road.advance_m))
+    at_m = now_m + np.arange(slots + 1)[:, None] * road.advance_m
+    table = _table(road, at_m, low, blocked)
+    return Window(
+        low,
+        table,
+        _ways(costs, table, low, vehicles),
+        _costs(costs, table.steps),
+        _scratch(len(vehicles), slots, reach, road.lanes),
+    )
+
+
+def _table(road: StreamRoad, at_m: Floats, low: int, blocked: Collection[Cell]) -> Table:
+    """Return an empty table; `at_m`: where columns are at the beginning of slots."""
+    slots, columns = at_m.shape[0] - 1, at_m.shape[1]
+    start_m, end_m = road.sorting_m
+    offsets, first = _offsets(road.mode, road.model)
+    barred = np.zeros((columns, road.lanes), dtype=np.bool_)
+    for column, lane in blocked:
+        if 0 <= column - low < columns and 0 <= lane < road.lanes:
+            barred[column - low, lane] = True
+    shape = (slots, columns, road.lanes)
+    steps = np.array(displacements(road.mode), dtype=np.int64)
+    return Table(
+        np.zeros((*shape, len(steps)), dtype=np.int32),
+        np.full(shape, -1, dtype=np.int32),
+        np.zeros(shape, dtype=np.int8),
+        offsets,
+        first,
+        steps,
+        at_m[:-1] - road.body_m >= start_m - _ROUNDING_M,
+        at_m[1:] <= end_m + _ROUNDING_M,
+        at_m > road.length_m + _ROUNDING_M,
+        barred,
+    )
+
+
+def _ways(costs: StreamCosts, table: Table, low: int, vehicles: Sequence[StreamVehicle]) -> Ways:
+    slots, count = len(table.load), len(vehicles)
+    column = np.zeros((count, slots + 1), dtype=np.int64)
+    lane = np.zeros((count, slots + 1), dtype=np.int64)
+    column[:, 0] = [vehicle.cell[0] - low for vehicle in vehicles]
+    lane[:, 0] = [vehicle.cell[1] for vehicle in vehicles]
+    wanted = np.array([vehicle.lane for vehicle in vehicles], dtype=np.int64)
+    held = np.array([vehicle.held for vehicle in vehicles], dtype=np.bool_)
+    may_move = (table.rear & table.front)[:, column[:, 0]]
+    chances = may_move.sum(axis=0)
+    # So many slots begin off the lane in any case, and so many moves are made.
+    away = np.abs(lane[:, 0] - wanted)
+    waits = np.where(away > 0, may_move.argmax(axis=0), 0)
+    least = away * (costs.move + costs.off_lane) + waits * costs.off_lane
+    least += chances * min(0.0, costs.forward)
+    return Ways(
+        column,
+        lane,
+        np.zeros((count, slots), dtype=np.int8),
+        np.zeros(count, dtype=np.int64),
+        wanted,
+        held,
+        costs.missing * (1.0 + 1.0 / (1.0 + chances)),
+        least,
+        np.where(held, FIXED, PRICE),
+        np.zeros(count),
+        np.zeros(count, dtype=np.bool_),
+    )
+
+
+def _costs(costs: StreamCosts, steps: Ints) -> Costs:
+    of_move = np.where((steps != 0).any(axis=1), costs.move, 0.0)
+    of_move += np.where(steps[:, 0] < 0, costs.backward, 0.0)
+    of_move += np.where(steps[:, 0] > 0, costs.forward, 0.0)
+    return Costs(of_move, costs.off_lane, costs.move + costs.off_lane, min(0.0, costs.forward))
+
+
+def _scratch(count: int, slots: int, reach: int, lanes: int) -> Scratch:
+    return Scratch(
+        Saved(
+            np.zeros(_SAVED, dtype=np.int64),
+            np.zeros(_SAVED, dtype=np.int64),
+            np.zeros(_SAVED),
+            np.zeros((_SAVED, slots + 1), dtype=np.int64),
+            np.zeros((_SAVED, slots + 1), dtype=np.int64),
+            np.zeros((_SAVED, slots), dtype=np.int8),
+        ),
+        np.zeros(count + 1, dtype=np.int64),
+        np.zeros(count + 1, dtype=np.int64),
+        np.zeros(count + 1, dtype=np.int64),
+        np.zeros(count, dtype=np.bool_),
+        np.zeros((slots + 1, 2 * reach + 1, lanes)),
+        np.zeros((slots + 1, 2 * reach + 1, lanes), dtype=np.int8),
+        np.zeros(slots),
+    )
+
+
+@lru_cache(maxsize=16)
+def _offsets(mode: Mode, model: ConflictModel) -> tuple[Ints, Ints]:
+    """Return the conflicts of all displacements in a row, and where those of each begin."""
+    table = conflict_offsets(mode, model)
+    flat = [entry for entries in table for entry in entries]
+    first = np.cumsum([0, *(len(entries) for entries in table)])
+    return np.array(flat, dtype=np.int64), cast("Ints", first)
