@@ -27,36 +27,34 @@ MOST_EJECTED = 100
 """Vehicles hit by one chain of ejections."""
 _SAVED = MOST_EJECTED + 32
 """Ways that are kept while a chain or a new order is tried."""
-_ROUNDING_M = 1e-6
+ROUNDING_M = 1e-6
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 
 
 class Table(NamedTuple):
     """Who makes which moves, and with which moves that conflicts."""
 
-    load: NDArray[np.int32]
-    """Sum of the prices of all whose moves conflict with this one; (slots, columns, lanes, d)."""
+    load: Singles
+    """Sum of the prices of all whose moves conflict with this one, and `FIXED` for moves that
+    nobody may make; (slots, displacements, lanes, columns)."""
     who: NDArray[np.int32]
-    """Who is in a cell at the beginning of a slot, -1: nobody; (slots, columns, lanes)."""
+    """Who is in a cell at the beginning of a slot, -1: nobody; (slots, lanes, columns)."""
     made: NDArray[np.int8]
     """Displacement that it makes in the slot; same shape."""
     offsets: Ints
     """Column, lane and displacement of what conflicts with a move; (conflicts, 3)."""
     first: Ints
-    """Where in `offsets` the conflicts of each displacement begin; (d + 1)."""
+    """Where in `offsets` the conflicts of each displacement begin; (displacements + 1)."""
     steps: Ints
-    """Column and lane of each displacement; (d, 2)."""
-    rear: Bools
-    """Whether a move may have this column as its rearmost one; (slots, columns)."""
-    front: Bools
-    """Whether a move may have this column as its foremost one; (slots, columns)."""
-    gone: Bools
-    """Whether a column is beyond the end of the road; (slots + 1, columns)."""
-    blocked: Bools
-    """Cells that nobody may enter; (columns, lanes)."""
+    """Column and lane of each displacement; (displacements, 2)."""
+    opened: Ints
+    """First and last column from which there are moves in a slot; (slots, 2)."""
+    ended: Ints
+    """Column from which on all are beyond the end of the road; (slots + 1)."""
 
 
 class Ways(NamedTuple):
@@ -86,13 +84,9 @@ class Ways(NamedTuple):
 class Costs(NamedTuple):
     """`StreamCosts` for the compiled code."""
 
-    of_move: Floats
+    of_move: Singles
     """Of each displacement."""
-    off_lane: float
-    per_lane: float
-    """Least cost of each lane that is still to go."""
-    rebate: float
-    """What a slot may earn, at most (not above 0)."""
+    off_lane: np.float32
 
 
 class Saved(NamedTuple):
@@ -116,11 +110,10 @@ class Scratch(NamedTuple):
     """Up to all vehicles, each."""
     marked: Bools
     """Vehicles whose ways are saved."""
-    value: Floats
-    """Least cost of being somewhere; (slots + 1, columns from the own one, lanes)."""
-    came: NDArray[np.int8]
-    """By which displacement; same shape."""
-    delay: Floats
+    value: Singles
+    """Least cost of being somewhere; (slots + 1, lanes, columns about the own one, and one more on
+    either side that nobody leaves)."""
+    delay: Singles
     """What a move costs more in each slot."""
 
 
@@ -167,26 +160,53 @@ def window(
 def _table(road: StreamRoad, at_m: Floats, low: int, blocked: Collection[Cell]) -> Table:
     """Return an empty table; `at_m`: where columns are at the beginning of slots."""
     slots, columns = at_m.shape[0] - 1, at_m.shape[1]
-    start_m, end_m = road.sorting_m
     offsets, first = _offsets(road.mode, road.model)
-    barred = np.zeros((columns, road.lanes), dtype=np.bool_)
+    barred = np.zeros((road.lanes, columns), dtype=np.bool_)
     for column, lane in blocked:
         if 0 <= column - low < columns and 0 <= lane < road.lanes:
-            barred[column - low, lane] = True
-    shape = (slots, columns, road.lanes)
-    steps = np.array(displacements(road.mode), dtype=np.int64)
+            barred[lane, column - low] = True
+    steps = displacements(road.mode)
+    load = np.zeros((slots, len(steps), road.lanes, columns), dtype=np.float32)
+    may_move = _may_move(road, at_m, barred)
+    load[:, 1:][~may_move] = FIXED
+    may_leave = may_move.any(axis=(1, 2))
+    opened = np.stack([may_leave.argmax(axis=1), columns - 1 - may_leave[:, ::-1].argmax(axis=1)])
+    opened[:, ~may_leave.any(axis=1)] = [[columns], [-1]]
     return Table(
-        np.zeros((*shape, len(steps)), dtype=np.int32),
-        np.full(shape, -1, dtype=np.int32),
-        np.zeros(shape, dtype=np.int8),
+        load,
+        np.full((slots, road.lanes, columns), -1, dtype=np.int32),
+        np.zeros((slots, road.lanes, columns), dtype=np.int8),
         offsets,
         first,
-        steps,
-        at_m[:-1] - road.body_m >= start_m - _ROUNDING_M,
-        at_m[1:] <= end_m + _ROUNDING_M,
-        at_m > road.length_m + _ROUNDING_M,
-        barred,
+        np.array(steps, dtype=np.int64),
+        np.ascontiguousarray(opened.T),
+        (at_m <= road.length_m + ROUNDING_M).sum(axis=1),
     )
+
+
+def _may_move(road: StreamRoad, at_m: Floats, barred: Bools) -> Bools:
+    """Tell which moves stay on the road and in S3, and enter nothing that is blocked.
+
+    The corners of an oblique move count as entered, except where the vehicle is anyway. Shape:
+    (slots, displacements without the first, lanes, columns).
+    """
+    start_m, end_m = road.sorting_m
+    rear = at_m[:-1] - road.body_m >= start_m - ROUNDING_M
+    front = at_m[1:] <= end_m + ROUNDING_M
+    lanes, columns = barred.shape
+    steps = displacements(road.mode)[1:]
+    allowed = np.zeros((len(rear), len(steps), lanes, columns), dtype=np.bool_)
+    for d, (column, lane) in enumerate(steps):
+        here_c = slice(max(0, -column), columns - max(0, column))
+        there_c = slice(max(0, column), columns + min(0, column))
+        here_l = slice(max(0, -lane), lanes - max(0, lane))
+        there_l = slice(max(0, lane), lanes + min(0, lane))
+        inside = (rear & front)[:, here_c] & (rear & front)[:, there_c]
+        free = ~barred[there_l, there_c]
+        if column and lane:
+            free &= ~barred[here_l, there_c] & ~barred[there_l, here_c]
+        allowed[:, d, here_l, here_c] = inside[:, None, :] & free
+    return allowed
 
 
 def _ways(costs: StreamCosts, table: Table, low: int, vehicles: Sequence[StreamVehicle]) -> Ways:
@@ -197,7 +217,9 @@ def _ways(costs: StreamCosts, table: Table, low: int, vehicles: Sequence[StreamV
     lane[:, 0] = [vehicle.cell[1] for vehicle in vehicles]
     wanted = np.array([vehicle.lane for vehicle in vehicles], dtype=np.int64)
     held = np.array([vehicle.held for vehicle in vehicles], dtype=np.bool_)
-    may_move = (table.rear & table.front)[:, column[:, 0]]
+    # It may move sidewards in these slots, if nothing is in the way.
+    begin, end = table.opened.T[:, :, None]
+    may_move = (begin <= column[:, 0]) & (column[:, 0] <= end)
     chances = may_move.sum(axis=0)
     # So many slots begin off the lane in any case, and so many moves are made.
     away = np.abs(lane[:, 0] - wanted)
@@ -223,7 +245,7 @@ def _costs(costs: StreamCosts, steps: Ints) -> Costs:
     of_move = np.where((steps != 0).any(axis=1), costs.move, 0.0)
     of_move += np.where(steps[:, 0] < 0, costs.backward, 0.0)
     of_move += np.where(steps[:, 0] > 0, costs.forward, 0.0)
-    return Costs(of_move, costs.off_lane, costs.move + costs.off_lane, min(0.0, costs.forward))
+    return Costs(of_move.astype(np.float32), np.float32(costs.off_lane))
 
 
 def _scratch(count: int, slots: int, reach: int, lanes: int) -> Scratch:
@@ -240,9 +262,8 @@ def _scratch(count: int, slots: int, reach: int, lanes: int) -> Scratch:
         np.zeros(count + 1, dtype=np.int64),
         np.zeros(count + 1, dtype=np.int64),
         np.zeros(count, dtype=np.bool_),
-        np.zeros((slots + 1, 2 * reach + 1, lanes)),
-        np.zeros((slots + 1, 2 * reach + 1, lanes), dtype=np.int8),
-        np.zeros(slots),
+        np.zeros((slots + 1, lanes, 2 * reach + 3), dtype=np.float32),
+        np.zeros(slots, dtype=np.float32),
     )
 
 

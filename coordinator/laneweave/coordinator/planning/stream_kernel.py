@@ -8,11 +8,14 @@ for a way needs.
 
 from __future__ import annotations
 
+import numpy as np
 from numba import njit
 
-from laneweave.coordinator.planning.stream_arrays import FIXED, PRICE
+from laneweave.coordinator.planning.stream_arrays import PRICE
 
-_PASSABLE = FIXED - 1
+_IMPASSABLE = 2e4
+"""More than all that a way may cost; less than being in the way of what is `FIXED`."""
+_UNREACHED = 1e9
 NO_WAY = 1e9
 """Cost of a vehicle that has no way."""
 
@@ -21,108 +24,103 @@ NO_WAY = 1e9
 def put(table, ways, v, sign):
     """Put a vehicle's way into the table (sign 1), or take it out (sign -1)."""
     load, who, made, offsets, first = table.load, table.who, table.made, table.offsets, table.first
-    _, columns, lanes, _ = load.shape
+    _, _, lanes, columns = load.shape
     amount = sign * ways.price[v]
     for s in range(ways.slots[v]):
         column, lane, d = ways.column[v, s], ways.lane[v, s], ways.made[v, s]
         if sign > 0:
-            who[s, column, lane] = v
-            made[s, column, lane] = d
+            who[s, lane, column] = v
+            made[s, lane, column] = d
         else:
-            who[s, column, lane] = -1
+            who[s, lane, column] = -1
         for k in range(first[d], first[d + 1]):
             c, n = column + offsets[k, 0], lane + offsets[k, 1]
             if 0 <= c < columns and 0 <= n < lanes:
-                load[s, c, n, offsets[k, 2]] += amount
+                load[s, offsets[k, 2], n, c] += amount
     ways.placed[v] = sign > 0
 
 
 @njit(cache=True, nogil=True)
-def _may_move(table, s, column, lane, d):
-    """Tell whether a move stays on the road and in S3, and enters nothing that is blocked.
-
-    The corners of an oblique move count as entered, except where the vehicle is anyway.
-    """
-    to_column, to_lane = column + table.steps[d, 0], lane + table.steps[d, 1]
-    columns, lanes = table.blocked.shape
-    if not (0 <= to_column < columns and 0 <= to_lane < lanes):
-        return False
-    if not (table.rear[s, min(column, to_column)] and table.front[s, max(column, to_column)]):
-        return False
-    if table.blocked[to_column, to_lane]:
-        return False
-    if to_column == column or to_lane == lane:
-        return True
-    return not (table.blocked[column, to_lane] or table.blocked[to_column, lane])
+def _relax(here, there, load, base, scale):
+    """Offer what a displacement of neighbouring columns costs; compiled to vector instructions."""
+    for i in range(len(here)):
+        there[i] = min(there[i], here[i] + base + scale * load[i])
 
 
 @njit(cache=True, nogil=True)
 def find_way(table, ways, costs, v, softness, ceiling, scratch):
     """Lay the cheapest way of a vehicle that is not in the table; return what it costs by itself.
 
-    A way below `ceiling` is looked for, by dynamic programming over slots, columns and lanes. With
+    A way below `ceiling` is looked for, by dynamic programming over slots, lanes and columns. With
     a softness of 0 nobody may be in its way; otherwise that costs softness for each least price,
     and only what is `FIXED` is never passed. Without such a way: `NO_WAY`, and nothing is laid.
     """
-    load, steps, of_move = table.load, table.steps, costs.of_move
-    value, came, delay = scratch.value, scratch.came, scratch.delay
-    slots, columns, lanes, fan = load.shape
-    reach = (value.shape[1] - 1) // 2
-    column0, wanted, missing = ways.column[v, 0], ways.wanted[v], ways.missing[v]
-    limit = _PASSABLE if softness > 0.0 else 0
-    per_price = softness / PRICE
-    value[:] = NO_WAY
-    value[0, reach, ways.lane[v, 0]] = 0.0
-    best, best_s, best_offset, best_lane = ceiling, -1, 0, 0
-    low = high = reach
+    load, steps, of_move, value = table.load, table.steps, costs.of_move, scratch.value
+    slots, fan, lanes, _ = load.shape
+    wanted = ways.wanted[v]
+    scale = np.float32(softness / PRICE if softness > 0.0 else _IMPASSABLE)
+    # Offsets in `value` are columns less this.
+    shift = ways.column[v, 0] - (value.shape[2] // 2)
+    value[:] = _UNREACHED
+    low = high = value.shape[2] // 2
+    value[0, ways.lane[v, 0], low] = 0.0
+    best, best_s, best_offset, best_lane = min(ceiling, _IMPASSABLE), -1, 0, 0
     for s in range(slots + 1):
-        alive, next_low, next_high = False, low, high
-        for offset in range(low, high + 1):
-            column = column0 + offset - reach
-            for lane in range(lanes):
-                so_far = value[s, offset, lane]
-                if so_far >= best:
-                    continue
-                if s == slots or table.gone[s, column]:
-                    total = so_far + (0.0 if lane == wanted else missing)
-                    if total < best:
-                        best, best_s, best_offset, best_lane = total, s, offset, lane
-                    continue
-                alive = True
-                if lane != wanted:
-                    so_far += costs.off_lane
-                for d in range(fan):
-                    if load[s, column, lane, d] > limit:
-                        continue
-                    to, to_lane = offset + steps[d, 0], lane + steps[d, 1]
-                    total = so_far + of_move[d] + per_price * load[s, column, lane, d]
-                    if d > 0:
-                        if ways.held[v] or not 0 <= to <= 2 * reach:
-                            continue
-                        if not _may_move(table, s, column, lane, d):
-                            continue
-                        total += delay[s]
-                    to_go = min(missing, abs(to_lane - wanted) * costs.per_lane)
-                    if total + to_go + costs.rebate * (slots - s) >= best:
-                        continue
-                    if total < value[s + 1, to, to_lane]:
-                        value[s + 1, to, to_lane] = total
-                        came[s + 1, to, to_lane] = d
-                        next_low, next_high = min(next_low, to), max(next_high, to)
-        if not alive:
+        end = table.ended[s] - shift if s < slots else low
+        for lane in range(lanes):
+            for offset in range(max(low, end), high + 1):
+                total = value[s, lane, offset] + (0.0 if lane == wanted else ways.missing[v])
+                if total < best:
+                    best, best_s, best_offset, best_lane = total, s, offset, lane
+        high = min(high, end - 1)
+        if high < low:
             break
-        low, high = next_low, next_high
+        moves = low + shift <= table.opened[s, 1] and high + shift >= table.opened[s, 0]
+        for lane in range(lanes):
+            here = value[s, lane, low : high + 1]
+            for d in range(fan if moves else 1):
+                to_lane, to = lane + steps[d, 1], low + steps[d, 0]
+                if 0 <= to_lane < lanes:
+                    base = of_move[d] + (scratch.delay[s] if d > 0 else np.float32(0.0))
+                    if lane != wanted:
+                        base += costs.off_lane
+                    there = value[s + 1, to_lane, to : to + high + 1 - low]
+                    loads = load[s, d, lane, low + shift : high + shift + 1]
+                    _relax(here, there, loads, base, scale)
+        if moves:
+            low, high = max(1, low - 1), min(value.shape[2] - 2, high + 1)
     if best_s < 0:
         return NO_WAY
-    ways.slots[v] = best_s
-    offset, lane = best_offset, best_lane
-    for s in range(best_s, -1, -1):
-        ways.column[v, s], ways.lane[v, s] = column0 + offset - reach, lane
-        if s > 0:
-            d = came[s, offset, lane]
-            ways.made[v, s - 1] = d
-            offset, lane = offset - steps[d, 0], lane - steps[d, 1]
+    _trace(table, ways, costs, v, scale, best_s, best_lane, best_offset, scratch)
     return own_cost(ways, costs, v)
+
+
+@njit(cache=True, nogil=True)
+def _trace(table, ways, costs, v, scale, slots, lane, offset, scratch):
+    """Lay the way that `find_way` has found, from its end to its beginning."""
+    load, steps, value = table.load, table.steps, scratch.value
+    fan, lanes = load.shape[1:3]
+    shift = ways.column[v, 0] - (value.shape[2] // 2)
+    ways.slots[v] = slots
+    for s in range(slots - 1, -1, -1):
+        ways.column[v, s + 1], ways.lane[v, s + 1] = offset + shift, lane
+        best, made = np.float32(np.inf), 0
+        for d in range(fan):
+            before, from_lane = offset - steps[d, 0], lane - steps[d, 1]
+            if not (0 <= from_lane < lanes and 1 <= before < value.shape[2] - 1):
+                continue
+            if before + shift >= table.ended[s]:
+                continue
+            total = value[s, from_lane, before] + costs.of_move[d]
+            if d > 0:
+                total += scratch.delay[s]
+            total += scale * load[s, d, from_lane, before + shift]
+            if from_lane != ways.wanted[v]:
+                total += costs.off_lane
+            if total < best:
+                best, made = total, d
+        ways.made[v, s] = made
+        offset, lane = offset - steps[made, 0], lane - steps[made, 1]
 
 
 @njit(cache=True, nogil=True)
@@ -144,22 +142,20 @@ def follow(table, ways, costs, v, cells):
 
     `cells`: columns and lanes at the beginning of each slot. It need not reach the road's end.
     """
-    slots, columns, lanes, fan = table.load.shape
+    slots, fan = table.load.shape[:2]
     if len(cells) == 0 or cells[0, 0] != ways.column[v, 0] or cells[0, 1] != ways.lane[v, 0]:
         return False
     s = 0
-    while s < slots and not table.gone[s, ways.column[v, s]]:
+    while s < slots and ways.column[v, s] < table.ended[s]:
         if s + 1 >= len(cells):
             return False
         column, lane = ways.column[v, s], ways.lane[v, s]
         made = -1
         for d in range(fan):
-            if cells[s + 1, 0] - column == table.steps[d, 0]:
-                if cells[s + 1, 1] - lane == table.steps[d, 1]:
-                    made = d
-        if made < 0 or table.load[s, column, lane, made] > 0:
-            return False
-        if made > 0 and not _may_move(table, s, column, lane, made):
+            step = table.steps[d]
+            if cells[s + 1, 0] == column + step[0] and cells[s + 1, 1] == lane + step[1]:
+                made = d
+        if made < 0 or table.load[s, made, lane, column] > 0.0:
             return False
         ways.made[v, s] = made
         ways.column[v, s + 1], ways.lane[v, s + 1] = cells[s + 1, 0], cells[s + 1, 1]
@@ -173,7 +169,7 @@ def follow(table, ways, costs, v, cells):
 def stay(table, ways, costs, v):
     """Lay the way of a vehicle that stays in its cell."""
     s = 0
-    while s < len(table.load) and not table.gone[s, ways.column[v, s]]:
+    while s < len(table.load) and ways.column[v, s] < table.ended[s]:
         ways.column[v, s + 1], ways.lane[v, s + 1] = ways.column[v, s], ways.lane[v, s]
         ways.made[v, s] = 0
         s += 1
@@ -183,19 +179,19 @@ def stay(table, ways, costs, v):
 
 @njit(cache=True, nogil=True)
 def find_victims(table, ways, v, victims):
-    """List those in the table whose moves conflict with a way that is not in it; return how many."""
+    """List those whose moves conflict with a way that is not in the table; return how many."""
     load, who, made, offsets, first = table.load, table.who, table.made, table.offsets, table.first
-    _, columns, lanes, _ = load.shape
+    _, _, lanes, columns = load.shape
     count = 0
     for s in range(ways.slots[v]):
         column, lane, d = ways.column[v, s], ways.lane[v, s], ways.made[v, s]
-        if load[s, column, lane, d] == 0:
+        if load[s, d, lane, column] == 0:
             continue
         for k in range(first[d], first[d + 1]):
             c, n = column + offsets[k, 0], lane + offsets[k, 1]
             if 0 <= c < columns and 0 <= n < lanes:
-                u = who[s, c, n]
-                if u >= 0 and made[s, c, n] == offsets[k, 2]:
+                u = who[s, n, c]
+                if u >= 0 and made[s, n, c] == offsets[k, 2]:
                     known = False
                     for i in range(count):
                         known |= victims[i] == u

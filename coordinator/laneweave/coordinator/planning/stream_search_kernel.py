@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 from numba import njit
 
 from laneweave.coordinator.planning.negotiation_kernel import random_below
@@ -100,7 +101,7 @@ def eject(table, ways, costs, start, softness, most, slack, rng, scratch):
                 continue
         # Two that must swap would take the same slot for ever if they did not sometimes hesitate.
         for s in range(len(delay)):
-            delay[s] = 0.1 * random_below(rng, 10) if hits > 0 else 0.0
+            delay[s] = np.float32(0.1 * random_below(rng, 10)) if hits > 0 else 0.0
         ways.cost[v] = find_way(table, ways, costs, v, softness, NO_WAY, scratch)
         if ways.cost[v] >= NO_WAY:
             failed = True
