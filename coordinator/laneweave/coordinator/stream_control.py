@@ -33,8 +33,8 @@ from laneweave.protocol.scenario import Scenario
 SHOWN_S = 0.5
 """Who moves in a slot has begun, and shown it, this long after the slot has."""
 PATIENCE_S = 1.0
-"""A new leader listens for so long (road time). One that leads only for a moment, because it has not
-heard another one, must not outbid what that one has begun."""
+"""A new leader listens for so long (road time). One that leads only for a moment, because it has
+not heard another one, must not outbid what that one has begun."""
 LATEST_S = 1.0
 """A plan that is ready later than this after its slot has begun is not put into force any more."""
 AHEAD_M = 600.0

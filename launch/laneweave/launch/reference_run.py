@@ -13,6 +13,7 @@ from attrs import define
 from laneweave.launch.observer import View
 from laneweave.launch.outcome import Outcome, complete_summary
 from laneweave.launch.progress import RunProgress
+from laneweave.launch.role_commands import RULE
 from laneweave.protocol.scenario import Scenario
 from laneweave.sim_bridge.baselines.lc2013 import Lc2013Traffic, check_lc2013
 from laneweave.sim_bridge.baselines.road import ReferenceRoad, Traffic
@@ -21,7 +22,6 @@ from laneweave.sim_bridge.run_record import Ending, RunRecord
 from laneweave.sim_bridge.sumo_traffic import SumoTraffic
 from laneweave.sim_bridge.sumo_world import SumoWorld
 
-RULE, LC2013 = "rule", "lc2013"
 PROGRESS_EVERY_TICKS = 50
 
 

@@ -17,6 +17,8 @@ from laneweave.protocol.scenario import Scenario, load_scenario
 
 METHOD = "formation"
 """How a bridge's vehicles are controlled, as its summary says."""
+RULE, LC2013 = "rule", "lc2013"
+"""Reference methods."""
 
 ConfigOption = Annotated[
     Path | None, typer.Option("--config", metavar="DEPLOYMENT.toml", help="Scenario and network.")

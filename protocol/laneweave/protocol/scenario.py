@@ -346,7 +346,7 @@ class Scenario:
 
     @property
     def moves_from_m(self) -> float:
-        """Position from which on bodies may move from cell to cell: S3, or S2 where that is used."""
+        """Position from which on bodies may move from cell to cell: S3, or S2 if that is used."""
         start_m, formation = self.road.sorting_start_m, self.formation
         if not (formation.rolling and formation.sort_in_s2):
             return start_m

@@ -11,6 +11,7 @@ from itertools import chain
 
 from attrs import frozen
 
+from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import Announcement, Census, CensusEntry, Name, RoadClock
 from laneweave.protocol.node import Effect, Send
 from laneweave.protocol.scenario import Scenario
@@ -71,7 +72,9 @@ class Roadside:
         """Who gets the empty cells of each lane, and in which column it entered."""
         self._next: list[list[tuple[int, Name]]] = [[] for _ in range(self._lanes)]
         """Who has entered behind them since cells were handed out, foremost first."""
-        self._handed_out = [1] * self._lanes
+        self._left_over: list[Cell] = []
+        """Empty cells that nobody has got yet."""
+        self._handed_out = [1 + MOST_EMPTY] * self._lanes
         """The last column of each lane that was handed out."""
         columns = int(scenario.moves_from_m / lattice.pitch_m)
         self._most_empty = max(0, min(MOST_EMPTY, columns - 2))
@@ -116,11 +119,12 @@ class Roadside:
         return admissions
 
     def hand_out(self, vehicles: Mapping[Name, RoadVehicle]) -> None:
-        """Give empty cells at the entrance to whoever entered last before them on their lane.
+        """Give empty cells at the entrance to vehicles near them.
 
         Nothing happens where formations own blocks. A cell becomes somebody's when nobody can
-        enter in it any more; the first ones, which nobody is ahead of, are nobody's, and so are
-        those far behind whoever entered last.
+        enter in it any more: of whoever entered last on its lane, or else on another one. Those
+        that are too far behind them, or that nobody is ahead of, wait for the next vehicle; what is
+        too far ahead of that one, too, stays nobody's.
         """
         if not self._rolling:
             return
@@ -129,11 +133,39 @@ class Roadside:
             for column in range(self._handed_out[lane] - 1, closed - 1, -1):
                 if self._next[lane] and self._next[lane][0][0] == column:
                     self._last[lane] = self._next[lane].pop(0)
-                    continue  # its own cell
-                last = self._last[lane]
-                if last is not None and last[0] - column <= self._most_empty and last[1] in vehicles:
-                    vehicles[last[1]].controller.own((column, lane))
+                    self._take_left_over(column, self._last[lane], vehicles)
+                else:
+                    self._hand_over((column, lane), vehicles)
             self._handed_out[lane] = closed
+
+    def _hand_over(self, cell: Cell, vehicles: Mapping[Name, RoadVehicle]) -> None:
+        """Give an empty cell to whoever is ahead of it."""
+        column, lane = cell
+        near = [
+            (one[0] - column if number == lane else one[0] - column + self._most_empty, one[1])
+            for number, one in enumerate(self._last)
+            if one is not None and 0 <= one[0] - column <= self._most_empty and one[1] in vehicles
+        ]
+        if near:
+            vehicles[min(near)[1]].controller.own(cell)
+        else:
+            self._left_over = [
+                one for one in self._left_over if one[0] - column <= self._most_empty
+            ]
+            self._left_over.append(cell)
+
+    def _take_left_over(
+        self, column: int, owner: tuple[int, Name] | None, vehicles: Mapping[Name, RoadVehicle]
+    ) -> None:
+        """Give what is left over ahead of a vehicle that has just entered to it."""
+        kept = []
+        for cell in self._left_over:
+            if owner is not None and owner[1] in vehicles and cell[0] >= column:
+                if cell[0] - column <= self._most_empty:
+                    vehicles[owner[1]].controller.own(cell)
+            else:
+                kept.append(cell)
+        self._left_over = kept
 
     def count_left(self) -> None:
         """Count a vehicle that passed the end of the road."""

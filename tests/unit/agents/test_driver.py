@@ -56,6 +56,7 @@ class Probe(Tracker):
     def rest(self, state: State, goal: State) -> TrackResult | None:
         """Leave everything to the program, which can be broken."""
         del state, goal
+        return None
 
     def solve(self, state: State, window: Window, gaps: Gaps = NOBODY) -> TrackResult:
         self.state, self.gaps = state, gaps

@@ -218,6 +218,11 @@ def test_rows_of_those_behind_leave_nothing_behind() -> None:
     np.testing.assert_allclose(result.jerk, 0.0, atol=0.05)
 
 
+def _as_state(values: tuple[float, ...]) -> State:
+    s, v, a, y, v_y, a_y = values
+    return s, v, a, y, v_y, a_y
+
+
 @given(
     st.tuples(*[st.floats(-1.0, 1.0)] * 6),
     st.sampled_from([(0, 0), (-40, 1), (7, 2)]),
@@ -232,8 +237,8 @@ def test_who_rests_in_its_cell_gets_the_same_jerks_without_the_program(
     goal = cell_state(scenario.lattice, cell, tick * scenario.runtime.tick_s)
     harmless = tracker.harmless
     state = tuple(at + share * most for at, share, most in zip(goal, shares, harmless, strict=True))
-    quick = tracker.rest(state, goal)
-    whole = tracker.solve(state, Reference.hold(scenario, cell).window(tick))
+    quick = tracker.rest(_as_state(state), goal)
+    whole = tracker.solve(_as_state(state), Reference.hold(scenario, cell).window(tick))
     assert quick is not None
     assert whole.iterations == 0
     np.testing.assert_allclose(quick.jerk, whole.jerk, atol=1e-9)
@@ -245,4 +250,4 @@ def test_who_is_farther_from_its_cell_is_not_at_rest() -> None:
     goal = cell_state(scenario.lattice, (0, 0), 0.0)
     for axis, most in enumerate(tracker.harmless):
         state = tuple(at + 1.01 * most * (index == axis) for index, at in enumerate(goal))
-        assert tracker.rest(state, goal) is None
+        assert tracker.rest(_as_state(state), goal) is None

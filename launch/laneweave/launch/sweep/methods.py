@@ -7,8 +7,7 @@ from typing import Final
 
 from attrs import field, frozen
 
-from laneweave.launch.reference_run import LC2013, RULE
-from laneweave.launch.role_commands import METHOD
+from laneweave.launch.role_commands import LC2013, METHOD, RULE
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario import Scenario, parse_scenario, to_tables
 
@@ -58,9 +57,7 @@ METHODS: Final[dict[str, LabelledMethod]] = {
     "paper-12": _paper(12, 8),
     "paper-18": _paper(18, 12),
     "rule": LabelledMethod(RULE, "the paper's rules, d_R from front to front"),
-    "rule-net": LabelledMethod(
-        RULE, "the paper's rules, d_R as a net gap", {"rule.gap": "net"}
-    ),
+    "rule-net": LabelledMethod(RULE, "the paper's rules, d_R as a net gap", {"rule.gap": "net"}),
     "rule-yielding": LabelledMethod(
         RULE, "the paper's rules, everybody gives way", {"rule.yielding": "all"}
     ),

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Final
 
 from laneweave.launch.outcome import Outcome
-from laneweave.launch.reference_run import LC2013, RULE, ReferenceRun
-from laneweave.launch.role_commands import METHOD
+from laneweave.launch.reference_run import ReferenceRun
+from laneweave.launch.role_commands import LC2013, METHOD, RULE
 from laneweave.launch.simulated_run import SimulatedRun
 from laneweave.protocol.scenario import Scenario
 
