@@ -143,8 +143,9 @@ def _unit(name: str) -> str:
 def _allowed(attribute: attrs.Attribute[Any]) -> str:
     if attribute.validator is None:
         # Parsing any scenario resolves the annotations from text to types.
-        kind = attribute.type.__name__ if attribute.type is str else str(attribute.type)
-        return {"str": "text", "tuple[float, ...]": "list of numbers"}[kind]
+        kind = attribute.type.__name__ if attribute.type in (str, bool) else str(attribute.type)
+        kinds = {"str": "text", "tuple[float, ...]": "list of numbers", "bool": "`true`, `false`"}
+        return kinds[kind]
     found = inspect.getclosurevars(attribute.validator).nonlocals
     if "choices" in found:
         return ", ".join(f"`{json.dumps(one)}`" for one in found["choices"] if one is not None)
@@ -214,7 +215,7 @@ def test_table_of_topics() -> None:
     assert shown == expected, f"the table in PROTOCOL.md should begin with\n\n{table}\n"
 
 
-PARTS = (messages.Neighbour, messages.CensusEntry, messages.Announcement)
+PARTS = (messages.Neighbour, messages.CensusEntry, messages.Announcement, messages.Deed)
 
 
 @pytest.mark.parametrize("kind", [*KINDS.values(), *PARTS], ids=lambda kind: kind.__name__)
