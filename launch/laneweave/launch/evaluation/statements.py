@@ -13,7 +13,7 @@ from attrs import frozen
 from laneweave.launch.evaluation.evidence import Evidence
 from laneweave.launch.evaluation.markdown import HOLDS, MISSING, markdown, number
 from laneweave.launch.evaluation.points import PointRow
-from laneweave.launch.evaluation.programme import PAPER_BOUND
+from laneweave.launch.evaluation.programme import PAPER_BOUND, ROLLING_VOLUMES, SEEDS, planned
 
 PAPER_VOLUMES: Final = (1000.0, 1150.0, 1300.0, 1450.0, 1600.0)
 """At which the paper compares, in vehicles/(lane h)."""
@@ -48,7 +48,10 @@ class Statement:
 def statements_table(evidence: Evidence) -> str:
     """Return the table of all statements."""
     rows = [(one.text, one.measured, one.verdict) for one in _Judge(evidence).statements()]
-    return markdown(["the paper", "here", ""], rows)
+    table = markdown(["the paper", "here", ""], rows)
+    few = any(len(row.seeds) < len(SEEDS) for row in evidence.points)
+    note = f"Not all of this rests on {len(SEEDS)} seeds yet: see the table of runs."
+    return f"{table}\n\n{note}" if few else table
 
 
 @frozen
@@ -105,31 +108,41 @@ class _Judge:
         return Statement(text, "; ".join(parts), _all(kept))
 
     def _congested_from(self, label: str) -> tuple[float | None, float | None]:
-        """Return the least congested volume, and the greatest that was looked at."""
+        """Return the least congested volume, and the greatest below it that was looked at."""
         setting = self.evidence.setting
-        rows = [row for row in self.evidence.points if row.label == label and row.travel_s]
-        if setting is None or not rows:
+        times = {
+            row.volume_veh_per_lane_h: row.travel_s
+            for row in self.evidence.points
+            if row.label == label and row.travel_s is not None
+        }
+        if setting is None:
             return None, None
         most_s = CONGESTED * setting.free_flow_s
-        volumes = sorted(row.volume_veh_per_lane_h for row in rows)
-        jammed = (row.volume_veh_per_lane_h for row in rows if (row.travel_s or 0.0) > most_s)
-        return min(jammed, default=None), volumes[-1]
+        first = min((volume for volume, t_s in times.items() if t_s > most_s), default=None)
+        below = (volume for volume in times if first is None or volume < first)
+        return first, max(below, default=None)
+
+    def _rows(self, *labels: str) -> tuple[list[PointRow], list[bool | None]]:
+        """Return all points of labels, and None for each one that is planned and missing."""
+        rows = [
+            self._row(label, volume)
+            for label in labels
+            for volume in ROLLING_VOLUMES
+            if planned(label, volume)
+        ]
+        return [row for row in rows if row is not None], [None for row in rows if row is None]
 
     def _congestion(self) -> Statement:
         text = "Severe congestion under the rules at 1450 and 1600, none with formation control"
         parts: list[str] = []
         kept: list[bool | None] = []
         for label in (*READINGS, OWN, "lc2013"):
-            first, last = self._congested_from(label)
-            if last is None:
-                parts.append(f"`{label}` {MISSING}")
-                kept.append(None)
-                continue
+            first, below = self._congested_from(label)
             if label in READINGS:
-                kept.append(first is not None and first <= 1450.0)
-            where = f"from {first:g}" if first is not None else f"not up to {last:g}"
-            parts.append(f"`{label}` {where}")
-        return Statement(text, "congested " + "; ".join(parts), _some(kept))
+                known = self._row(label, 1450.0) is not None
+                kept.append(first is not None and first <= 1450.0 if known else None)
+            parts.append(f"`{label}` {_onset(first, below)}")
+        return Statement(text, "congested: " + "; ".join(parts), _some(kept))
 
     def _where(self) -> Statement:
         text = "The congestion is at 500 to 800 m"
@@ -139,6 +152,7 @@ class _Judge:
             first, _ = self._congested_from(label)
             row = None if first is None else self._row(label, first)
             if row is None or row.traced is None or row.traced.slow_m is None:
+                kept.extend(self._rows(label)[1][:1])
                 continue
             from_m, to_m = row.traced.slow_m
             low_m, high_m = PAPER_STRETCH_M
@@ -195,27 +209,27 @@ class _Judge:
 
     def _safe(self) -> Statement:
         text = "Formation control plans ways without collisions, to the preferred lanes"
-        rows = [row for row in self.evidence.points if row.label in (OWN, "paper-12") and row.seeds]
+        rows, missing = self._rows(OWN, "paper-12")
         if not rows:
             return Statement(text, MISSING, "")
         off = sum(row.demanded - row.on_preferred_lane for row in rows)
         overlaps = sum(row.overlaps for row in rows)
         vehicles = sum(row.demanded for row in rows)
         measured = f"{overlaps} overlaps, {off} of {vehicles:,} vehicles not on their lane"
-        return Statement(text, measured, _all([not overlaps and not off]))
+        return Statement(text, measured, _all([not overlaps and not off, *missing]))
 
     def _rules_complete(self) -> Statement:
         text = "The rules bring everybody to the preferred lane, whatever the traffic"
-        rows = [row for row in self.evidence.points if row.label in READINGS and row.seeds]
+        rows, missing = self._rows(*READINGS)
         if not rows:
             return Statement(text, MISSING, "")
         off = sum(row.demanded - row.on_preferred_lane for row in rows)
         measured = f"{off} of {sum(row.demanded for row in rows):,} did not get there"
-        return Statement(text, measured, _all([not off]))
+        return Statement(text, measured, _all([not off, *missing]))
 
     def _sumo_blocks(self) -> Statement:
         text = "SUMO's own lane changing may block itself at the end of the road"
-        rows = [row for row in self.evidence.points if row.label == "lc2013" and row.seeds]
+        rows, missing = self._rows("lc2013")
         if not rows:
             return Statement(text, MISSING, "")
         off = sum(row.demanded - row.on_preferred_lane for row in rows)
@@ -224,7 +238,7 @@ class _Judge:
             f"`lc2013`: {off} of {sum(row.demanded for row in rows):,} did not get to their lane; "
             f"{number(last.travel_s, 1)} s at {last.volume_veh_per_lane_h:g}"
         )
-        return Statement(text, measured, "not seen" if not off else HOLDS)
+        return Statement(text, measured, _so_far("not seen" if not off else HOLDS, missing))
 
     def _six(self) -> Statement:
         text = "Formations have at most six vehicles, for computational reasons"
@@ -234,6 +248,13 @@ class _Judge:
             found = None if row is None else row.planning_p95_ms
             parts.append(f"`{label}` {MISSING if found is None else f'{found:.0f} ms'}")
         return Statement(text, "planning at 1600, p95: " + ", ".join(parts), OTHERWISE)
+
+
+def _onset(first: float | None, below: float | None) -> str:
+    """Return from which volume on a method is congested, as far as was looked."""
+    if first is None:
+        return MISSING if below is None else f"not up to {below:g}"
+    return f"at {first:g}" + ("" if below is None else f", not yet at {below:g}")
 
 
 def _series(texts: Sequence[str], known: Sequence[float]) -> str:

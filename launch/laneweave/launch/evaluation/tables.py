@@ -19,6 +19,7 @@ def document_parts(evidence: Evidence) -> dict[str, str]:
         "evaluation travel times": _by_volume(evidence, _travel_time),
         "evaluation lanes": _by_volume(evidence, _lanes),
         "evaluation margins": _by_volume(evidence, _margins),
+        "evaluation brakes": _by_volume(evidence, _brakes),
         "evaluation throughput": _by_volume(evidence, _throughput),
         "evaluation lattice": _lattice(evidence),
         "evaluation statements": statements_table(evidence),
@@ -77,12 +78,16 @@ def _lanes(row: PointRow) -> str:
 
 def _margins(row: PointRow) -> str:
     figures = (
-        number(row.min_gap_m, 1),
+        number(row.min_gap_m, 2),
         number(row.min_headway_s, 2),
         number(row.min_accel_mps2, 1),
     )
     text = " / ".join(figures)
     return text + (f", **{row.overlaps} overlaps**" if row.overlaps else "")
+
+
+def _brakes(row: PointRow) -> str:
+    return number(100.0 * row.emergency_brakes / row.demanded, 1) if row.demanded else "-"
 
 
 def _throughput(row: PointRow) -> str:

@@ -127,14 +127,17 @@ def run_trial(trial: Trial, out: Path, root: Path) -> None:
     if folder.exists():
         shutil.rmtree(folder)
     program = str(Path(sys.executable).with_name("laneweave"))
-    done = subprocess.run(  # noqa: S603 - this package, with options of its own
-        [program, "run", *trial.options, "--no-progress", "--out", str(folder)],
-        cwd=root,
-        capture_output=True,
-        text=True,
-        timeout=TIMEOUT_S,
-        check=False,
-    )
+    try:
+        done = subprocess.run(  # noqa: S603 - this package, with options of its own
+            [program, "run", *trial.options, "--no-progress", "--out", str(folder)],
+            cwd=root,
+            capture_output=True,
+            text=True,
+            timeout=TIMEOUT_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise CommandFailedError(f"{trial.command}: not over after {TIMEOUT_S:g} s") from error
     summary = read_summary(folder) or {}
     if summary.get("ending") != trial.ending:
         words = " ".join((done.stdout + done.stderr).split())

@@ -85,18 +85,20 @@ def test_cells() -> None:
         seeds=(1, 2),
         failed=((2, "1 pairs of vehicles overlapped"),),
         overlaps=1,
+        emergency_brakes=8,
         on_preferred_lane=3998,
     )
     parts = document_parts(evidence(some))
     place = 1 + LABELS.index("lc2013")
     shown = {name: cells(parts[f"evaluation {name}"], "1000")[place] for name in (
-        "runs", "travel times", "lanes", "margins", "throughput"
+        "runs", "travel times", "lanes", "margins", "brakes", "throughput"
     )}  # fmt: skip
     assert shown == {
         "runs": "2 of 5, 1 failed",
         "travel times": "67.12 (68.1)",
         "lanes": "99.950 % (2 off)",
-        "margins": "9.8 / 0.86 / -6.8, **1 overlaps**",
+        "margins": "9.80 / 0.86 / -6.8, **1 overlaps**",
+        "brakes": "0.2",
         "throughput": "1000",
     }
     assert "Arrivals in each run: 600 s." in parts["evaluation runs"]
@@ -147,7 +149,7 @@ def test_statements_follow_the_data() -> None:
     assert cells(table, "The travel time of formation control")[2] == "holds"
     # 60 s + volume / 100: congested, above 83.3 s, from 2400 on; faster than formations below 740.
     assert cells(table, "Severe congestion")[2] == "**does not hold**"
-    assert "`rule` from 2400" in cells(table, "Severe congestion")[1]
+    assert "`rule` at 2400, not yet at 2200" in cells(table, "Severe congestion")[1]
     assert cells(table, "The congestion is at")[2] == "holds"
     assert cells(table, "Formation control is faster")[2] == "holds"
     assert cells(table, "At most 1800")[2] == "holds"
@@ -158,6 +160,9 @@ def test_readings_of_the_rules_may_differ() -> None:
     rows += [point("rule", volume, 67.0) for volume in PAPER_VOLUMES]
     rows += [point("rule-net", volume, 200.0) for volume in PAPER_VOLUMES]
     table = statements_table(evidence(*rows))
+    assert cells(table, "The rules bring")[2] == "so far: holds"
+    assert "seeds yet" not in table
+    assert "5 seeds yet" in statements_table(evidence(evolve(rows[0], seeds=(1,))))
     for statement in ("Severe congestion", "Formation control is faster"):
         assert cells(table, statement)[2] == "so far: depends on the reading"
     assert "`rule` minus `paper-6` -1.0, -1.0, -1.0, -1.0, -1.0 s" in table
