@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import pytest
 from attrs import evolve
@@ -84,8 +84,8 @@ def show_estate_at_once(patch: Patch) -> None:
 
 
 def void_shut_deeds(patch: Patch) -> None:
-    def mutant(state: VehicleState, states: States) -> frozenset[Cell]:
-        del states
+    def mutant(state: VehicleState, states: States, gone: Collection[Name]) -> frozenset[Cell]:
+        del states, gone
         return frozenset(state.estate)
 
     patch.setattr(handover, "estate_of", mutant)
@@ -94,13 +94,15 @@ def void_shut_deeds(patch: Patch) -> None:
 def void_by_common_promise(patch: Patch) -> None:
     estate_of = handover.estate_of
 
-    def mutant(state: VehicleState, states: States) -> frozenset[Cell] | None:
+    def mutant(
+        state: VehicleState, states: States, gone: Collection[Name]
+    ) -> frozenset[Cell] | None:
         deed = state.deed
         if deed is not None and not deed.open:
             promised = {states[name].promised for name in deed.roster if name in states}
             if promised == {state.promised} and state.promised != deed.ballot:
                 return frozenset(deed.before)
-        return estate_of(state, states)
+        return estate_of(state, states, gone)
 
     patch.setattr(handover, "estate_of", mutant)
 
@@ -108,8 +110,10 @@ def void_by_common_promise(patch: Patch) -> None:
 def forget_motion(patch: Patch) -> None:
     estate_of = handover.estate_of
 
-    def mutant(state: VehicleState, states: States) -> frozenset[Cell] | None:
-        return estate_of(evolve(state, moving=False), states)
+    def mutant(
+        state: VehicleState, states: States, gone: Collection[Name]
+    ) -> frozenset[Cell] | None:
+        return estate_of(evolve(state, moving=False), states, gone)
 
     patch.setattr(handover, "estate_of", mutant)
 

@@ -47,6 +47,8 @@ class StreamLeader:
     claims: tuple[Cell, ...] = ()
     """Cells that it takes for the mover's, whoever owns them."""
     ballots: int = 0
+    gone: frozenset[Name] = frozenset()
+    """Who has left the road."""
 
     def begin(self, mover: Name, target: Cell, others: tuple[Name, ...], now_s: float) -> None:
         """Begin a ballot over a mover and others."""
@@ -60,6 +62,7 @@ class StreamLeader:
             slot_s=SLOT_S,
             resend_s=RESEND_S,
             due_s=now_s,
+            gone=self.gone,
         )
 
     def send(self, mail: Mail, now_s: float) -> Lines:
@@ -165,7 +168,9 @@ class RollingPlayer(Player):
         self.streams[name] = StreamLeader(name, int(term))
 
     def _forgets(self, name: str, vehicle: str) -> None:
-        del self.streams[name].states[Name(vehicle)]
+        leader = self.streams[name]
+        del leader.states[Name(vehicle)]
+        leader.gone |= {Name(vehicle)}
 
     def _hands(
         self, name: str, mover: str, target: str, others: str | None, claimed: str | None

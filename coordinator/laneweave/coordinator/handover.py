@@ -8,7 +8,7 @@ does not come about in time is given up; everybody holds, and the next slot is p
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from enum import Enum
 
 from attrs import define, field
@@ -31,19 +31,22 @@ class Phase(Enum):
     GIVEN_UP = "given up"
 
 
-def estate_of(state: VehicleState, states: States) -> frozenset[Cell] | None:
+def estate_of(
+    state: VehicleState, states: States, gone: Collection[Name] = ()
+) -> frozenset[Cell] | None:
     """Return what a vehicle owns for certain, from its state and from those of others.
 
     A vehicle whose newest deed is not open does not know what it owns: others of the roster may
     have opened their gates. They have if one of them shows it. They never will if somebody has
     promised more and has no such deed, or if all have promised more with closed gates. Where
-    somebody will never tell, since it has a newer deed, has left the road or was not heard, only
-    those cells are certain that the vehicle owns either way. While it is under way it may still be
-    in one of the others.
+    somebody will never tell, since it has a newer deed or has left the road, only those cells are
+    certain that the vehicle owns either way. While it is under way it may still be in one of the
+    others.
 
     Args:
         state: of the vehicle; it shows an estate.
         states: the newest ones of others, what they show stays true.
+        gone: who has left the road.
 
     Returns:
         None: it cannot be told yet.
@@ -52,7 +55,7 @@ def estate_of(state: VehicleState, states: States) -> frozenset[Cell] | None:
     if deed is None or deed.open:
         return frozenset(state.estate)
     before, after = frozenset(deed.before), frozenset(deed.after)
-    signs = _signs(state, deed, states)
+    signs = _signs(state, deed, states, gone)
     if _Sign.OPEN in signs:
         return after
     if _Sign.WITHOUT in signs or signs == {_Sign.CLOSED}:
@@ -62,9 +65,11 @@ def estate_of(state: VehicleState, states: States) -> frozenset[Cell] | None:
     return before & after
 
 
-def sure_of(state: VehicleState, states: States) -> frozenset[Cell]:
+def sure_of(
+    state: VehicleState, states: States, gone: Collection[Name] = ()
+) -> frozenset[Cell]:
     """Return what a vehicle owns for certain, or at least whatever becomes of its newest deed."""
-    estate, deed = estate_of(state, states), state.deed
+    estate, deed = estate_of(state, states, gone), state.deed
     if estate is not None or deed is None:
         return estate or frozenset()
     return frozenset(deed.before) & frozenset(deed.after)
@@ -75,31 +80,36 @@ def partners(state: VehicleState, states: States) -> frozenset[Name]:
     deed = state.deed
     if deed is None or deed.open:
         return frozenset()
-    signs = _signs(state, deed, states)
+    signs = _signs(state, deed, states, ())
     if _Sign.OPEN in signs or _Sign.WITHOUT in signs or signs == {_Sign.CLOSED}:
         return frozenset()
     return frozenset(name for name in deed.roster if name in states)
 
 
 class _Sign(Enum):
-    """What somebody shows of the start gate of a deed's plan; all but the last two for ever."""
+    """What somebody shows of the start gate of a deed's plan; all but the last one for ever."""
 
     OPEN = "it is open"
     CLOSED = "it has promised more with a closed gate"
     WITHOUT = "it has promised more, and has never had the deed"
     NEWER = "it has a newer deed"
-    GONE = "it is not there"
+    GONE = "it has left the road"
     NONE = "nothing"
 
 
-def _signs(state: VehicleState, deed: Deed, states: States) -> set[_Sign]:
-    others = (states.get(name) for name in deed.roster if name != state.vehicle)
-    return {_sign(state, deed), *(_sign(other, deed) for other in others)}
+def _signs(
+    state: VehicleState, deed: Deed, states: States, gone: Collection[Name]
+) -> set[_Sign]:
+    others = [name for name in deed.roster if name != state.vehicle]
+    signs = {_sign(states.get(name), deed) for name in others if name not in gone}
+    if any(name in gone for name in others):
+        signs.add(_Sign.GONE)
+    return signs | {_sign(state, deed)}
 
 
 def _sign(state: VehicleState | None, deed: Deed) -> _Sign:
     if state is None:
-        return _Sign.GONE
+        return _Sign.NONE
     theirs = state.deed
     if theirs is not None and theirs.ballot > deed.ballot:
         return _Sign.NEWER
@@ -124,6 +134,8 @@ class Handover:
     resend_s: float
     due_s: float
     """When something is to be sent, again (node clock)."""
+    gone: frozenset[Name] = frozenset()
+    """Who has left the road, of those that members share deeds with."""
     phase: Phase = Phase.PREPARING
     promises: dict[Name, VehicleState] = field(factory=dict)
     accepted: set[Name] = field(factory=set)
@@ -178,7 +190,7 @@ class Handover:
         """Make the plan from the promises, if it still can be made."""
         before: dict[Name, frozenset[Cell]] = {}
         for name, promise in self.promises.items():
-            estate = estate_of(promise, dict(states) | self.promises)
+            estate = estate_of(promise, dict(states) | self.promises, self.gone)
             if estate is None:
                 self.give_up(f"nobody can tell what {name} owns")
                 return

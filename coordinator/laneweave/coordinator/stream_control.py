@@ -187,7 +187,7 @@ class StreamControl:
         return self._planner.plan(order.slot, order.vehicles, order.before, order.blocked)
 
     def _order(self, census: Census, slot: int) -> _Order:
-        vehicles, owned, taken = [], set[Cell](), set[Cell]()
+        vehicles, owned, taken, gone = [], set[Cell](), set[Cell](), self._gone
         far_m = self._scenario.moves_from_m - AHEAD_M
         for entry in census.on_road:
             state = self.states.get(entry.vehicle)
@@ -202,7 +202,7 @@ class StreamControl:
             # Its move begins at any moment. Without an open gate it may never: who takes part in
             # something newer is asked, and then it does not.
             late = state.go and not state.done and not state.moving
-            owned |= sure_of(state, self.states)
+            owned |= sure_of(state, self.states, gone)
             if late:
                 taken |= {*state.estate} - {state.hold_cell}
             held = late or not state.attended
@@ -259,10 +259,11 @@ class StreamControl:
         }
 
     def _handovers(self, table: StreamPlan, t0_s: float, now_s: float) -> Iterator[Handover]:
+        gone = self._gone
         owner = {
             cell: name
             for name, state in self.states.items()
-            for cell in sure_of(state, self.states)
+            for cell in sure_of(state, self.states, gone)
         }
         moves: dict[Name, tuple[Cell, Cell]] = {}
         concerned: dict[Name, set[Name]] = {}
@@ -283,7 +284,15 @@ class StreamControl:
                 slot_s=self._slot_s,
                 resend_s=self._scenario.network.resend_s,
                 due_s=now_s,
+                gone=gone,
             )
+
+    @property
+    def _gone(self) -> frozenset[Name]:
+        """Who shares deeds with somebody and has left the road."""
+        listed = {entry.vehicle for entry in self._census.on_road} if self._census else set[Name]()
+        deeds = [state.deed for state in self.states.values() if state.deed is not None]
+        return frozenset(name for deed in deeds for name in deed.roster if name not in listed)
 
     def _with_partners(self, names: set[Name]) -> set[Name]:
         """Add those without whose promises nobody could tell what some vehicles own."""

@@ -103,8 +103,7 @@ def newer_deed_is_no_news(patch: pytest.MonkeyPatch) -> None:
 def never_open(patch: pytest.MonkeyPatch) -> None:
     """A vehicle owns what it thinks it owns."""
 
-    def mutant(state: VehicleState, states: object) -> frozenset[tuple[int, int]]:
-        del states
+    def mutant(state: VehicleState, *_: object) -> frozenset[tuple[int, int]]:
         return frozenset(state.estate)
 
     patch.setattr(handover_module, "estate_of", mutant)
