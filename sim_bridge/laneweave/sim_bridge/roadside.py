@@ -68,8 +68,8 @@ class Roadside:
         self._meter = EntryMeter(
             lattice, formation.max_vehicles, self._spread_s, interlaced=not self._rolling
         )
-        self._last: list[tuple[int, Name] | None] = [None] * self._lanes
-        """Who gets the empty cells of each lane, and in which column it entered."""
+        self._recent: list[tuple[int, int, Name]] = []
+        """Column, lane and name of those who have entered, as far as they are near."""
         self._next: list[list[tuple[int, Name]]] = [[] for _ in range(self._lanes)]
         """Who has entered behind them since cells were handed out, foremost first."""
         self._left_over: list[Cell] = []
@@ -122,9 +122,8 @@ class Roadside:
         """Give empty cells at the entrance to vehicles near them.
 
         Nothing happens where formations own blocks. A cell becomes somebody's when nobody can
-        enter in it any more: of whoever entered last on its lane, or else on another one. Those
-        that are too far behind them, or that nobody is ahead of, wait for the next vehicle; what is
-        too far ahead of that one, too, stays nobody's.
+        enter in it any more. Those that nobody is near to wait for the next vehicles; what is
+        too far ahead of these, too, stays nobody's.
         """
         if not self._rolling:
             return
@@ -132,40 +131,33 @@ class Roadside:
             closed = self._meter.closed_column(lane)
             for column in range(self._handed_out[lane] - 1, closed - 1, -1):
                 if self._next[lane] and self._next[lane][0][0] == column:
-                    self._last[lane] = self._next[lane].pop(0)
-                    self._take_left_over(column, self._last[lane], vehicles)
+                    self._meet(column, lane, self._next[lane].pop(0)[1])
                 else:
                     self._hand_over((column, lane), vehicles)
             self._handed_out[lane] = closed
+        left_over, self._left_over = self._left_over, []
+        for cell in left_over:
+            if cell[0] <= max(self._handed_out) + 2 * self._most_empty:
+                self._hand_over(cell, vehicles)
 
     def _hand_over(self, cell: Cell, vehicles: Mapping[Name, RoadVehicle]) -> None:
-        """Give an empty cell to whoever is ahead of it."""
+        """Give an empty cell to whoever is near; best to whoever is ahead, on the same lane."""
         column, lane = cell
         near = [
-            (one[0] - column if number == lane else one[0] - column + self._most_empty, one[1])
-            for number, one in enumerate(self._last)
-            if one is not None and 0 <= one[0] - column <= self._most_empty and one[1] in vehicles
+            (entered < column, number != lane, abs(entered - column), name)
+            for entered, number, name in self._recent
+            if abs(entered - column) <= self._most_empty and name in vehicles
         ]
         if near:
-            vehicles[min(near)[1]].controller.own(cell)
+            vehicles[min(near)[-1]].controller.own(cell)
         else:
-            self._left_over = [
-                one for one in self._left_over if one[0] - column <= self._most_empty
-            ]
             self._left_over.append(cell)
 
-    def _take_left_over(
-        self, column: int, owner: tuple[int, Name] | None, vehicles: Mapping[Name, RoadVehicle]
-    ) -> None:
-        """Give what is left over ahead of a vehicle that has just entered to it."""
-        kept = []
-        for cell in self._left_over:
-            if owner is not None and owner[1] in vehicles and cell[0] >= column:
-                if cell[0] - column <= self._most_empty:
-                    vehicles[owner[1]].controller.own(cell)
-            else:
-                kept.append(cell)
-        self._left_over = kept
+    def _meet(self, column: int, lane: int, name: Name) -> None:
+        """Take note of a vehicle in its cell, and forget what is far ahead of it."""
+        far = column + 2 * self._most_empty
+        self._recent = [one for one in self._recent if one[0] <= far]
+        self._recent.append((column, lane, name))
 
     def count_left(self) -> None:
         """Count a vehicle that passed the end of the road."""

@@ -118,15 +118,18 @@ def test_where_nobody_will_tell_some_cells_are_certain_either_way(
 ) -> None:
     """Somebody opened the gate or did not, and has gone, or taken part in another plan since."""
     there = {} if newer is None else {C: newer}
-    assert estate_of(CLOSED, {B: state(B, HIGH, DEED), **there}) == SURE
-    assert estate_of(CLOSED, {B: state(B, MID, DEED), **there}) == SURE
-    assert estate_of(CLOSED, {B: state(B, HIGH, Deed(MID, open=True)), **there}) == OWNED_AFTER
-    assert estate_of(CLOSED, {B: state(B, HIGH), **there}) == OWNED_BEFORE
+    gone = {C} if newer is None else set[Name]()
+    assert estate_of(CLOSED, {B: state(B, HIGH, DEED), **there}, gone) == SURE
+    assert estate_of(CLOSED, {B: state(B, MID, DEED), **there}, gone) == SURE
+    assert (
+        estate_of(CLOSED, {B: state(B, HIGH, Deed(MID, open=True)), **there}, gone) == OWNED_AFTER
+    )
+    assert estate_of(CLOSED, {B: state(B, HIGH), **there}, gone) == OWNED_BEFORE
     assert partners(CLOSED, {B: state(B, HIGH, DEED), **there}) == {B, *there}
     # Under way it may still be in a cell that it is about to give.
     moving = evolve(CLOSED, moving=True)
-    assert estate_of(moving, there) is None
-    assert sure_of(moving, there) == SURE
+    assert estate_of(moving, there, gone) is None
+    assert sure_of(moving, there, gone) == SURE
 
 
 def test_strangers_and_older_states_of_oneself_tell_nothing() -> None:
