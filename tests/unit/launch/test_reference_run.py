@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 
 from laneweave.launch.cli import app
 from laneweave.launch.outcome import Outcome
-from laneweave.launch.reference_run import ReferenceRun
-from laneweave.launch.role_commands import LC2013, RULE, check_reference
+from laneweave.launch.reference_run import ReferenceRun, check_reference
+from laneweave.launch.role_commands import LC2013, RULE
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario import Scenario, parse_scenario, to_tables
 from laneweave.sim_bridge.baselines import road
