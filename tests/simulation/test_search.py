@@ -60,7 +60,7 @@ def test_no_rule_is_broken_and_everybody_arrives_long(first: int) -> None:
 
 @pytest.mark.parametrize("profile", [name for name in PROFILES if name != "mixed"])
 def test_profile(profile: str) -> None:
-    search(profile, range(8))
+    search(profile, range(4 if profile == "rolling-dense" else 8))
 
 
 @pytest.mark.full
@@ -68,6 +68,14 @@ def test_profile(profile: str) -> None:
 @pytest.mark.parametrize("profile", [name for name in PROFILES if name != "mixed"])
 def test_profile_long(profile: str) -> None:
     search(profile, range(1000, 1200))
+
+
+@pytest.mark.full
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("first", range(100_000, 102_000, 100))
+def test_cells_change_hands_and_everybody_moves_long(first: int) -> None:
+    totals = search("rolling", range(first, first + 100))
+    assert totals.motions > 2000
 
 
 def test_formations_are_joined() -> None:
