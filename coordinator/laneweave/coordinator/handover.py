@@ -65,9 +65,7 @@ def estate_of(
     return before & after
 
 
-def sure_of(
-    state: VehicleState, states: States, gone: Collection[Name] = ()
-) -> frozenset[Cell]:
+def sure_of(state: VehicleState, states: States, gone: Collection[Name] = ()) -> frozenset[Cell]:
     """Return what a vehicle owns for certain, or at least whatever becomes of its newest deed."""
     estate, deed = estate_of(state, states, gone), state.deed
     if estate is not None or deed is None:
@@ -97,9 +95,7 @@ class _Sign(Enum):
     NONE = "nothing"
 
 
-def _signs(
-    state: VehicleState, deed: Deed, states: States, gone: Collection[Name]
-) -> set[_Sign]:
+def _signs(state: VehicleState, deed: Deed, states: States, gone: Collection[Name]) -> set[_Sign]:
     others = [name for name in deed.roster if name != state.vehicle]
     signs = {_sign(states.get(name), deed) for name in others if name not in gone}
     if any(name in gone for name in others):
