@@ -155,9 +155,10 @@ class MotionController:
             self.hand_over(command.incarnation)
         self.command_tick = command.tick
         self.note(command)
-        if self.rolling and command.hold_cell not in self.estate:
+        leaves = command.hold_cell != self.hold_cell
+        if self.rolling and leaves and command.hold_cell not in self.estate:
             return False
-        if len(jerks) > 0 or command.hold_cell != self.hold_cell:
+        if len(jerks) > 0 or leaves:
             self._jerks, self._jerks_tick = jerks, command.tick
             self.hold_cell = command.hold_cell
             self.motion_origin = command.motion_origin
