@@ -26,7 +26,7 @@ from laneweave.launch.simulation.world import World
 from planted_bugs import BUGS, PlantedBug
 
 SEEDS = 500
-SEARCHED = ("mixed", "joint")
+SEARCHED = ("mixed", "joint", "rolling")
 """Profiles that are searched, one after the other."""
 
 

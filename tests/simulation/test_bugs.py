@@ -19,6 +19,11 @@ SOON = {
     "promise-keeps-plan": "stuck",
 }
 """Bugs that a few seeds show, and as what; one for each kind of violation but `overlap`."""
+SOON_ROLLING = {
+    "possession-not-taken": "gate",
+    "possession-without-gate": "owner",
+}
+"""Likewise of the rolling operation."""
 FOUND = (
     "lower-ballot-promised",
     "promise-keeps-count",
@@ -43,6 +48,14 @@ FOUND = (
     "counted-at-the-start",
     "old-motion-counts",
     "second-plan-under-one-ballot",
+    "possession-not-taken",
+    "moves-off-its-estate",
+    "possession-without-gate",
+    "deed-after-promise",
+    "estate-dies-with-process",
+    "shut-deeds-ignored",
+    "common-promise-voids-deeds",
+    "cell-kept-by-both",
 )
 """Bugs that the search has been seen to find, each with a run that passes without the bug."""
 
@@ -52,6 +65,13 @@ def test_planted_bug_is_found_soon(name: str) -> None:
     catch = first_catch(bug_named(name), range(25), ["mixed"])
     assert catch is not None
     assert SOON[name] in catch.kinds
+
+
+@pytest.mark.parametrize("name", SOON_ROLLING)
+def test_planted_bug_of_the_rolling_operation_is_found_soon(name: str) -> None:
+    catch = first_catch(bug_named(name), range(25), ["rolling"])
+    assert catch is not None
+    assert SOON_ROLLING[name] in catch.kinds
 
 
 @pytest.mark.full
