@@ -76,7 +76,13 @@ class StreamPlanner:
             kernel.lay(arrays.table, arrays.ways, arrays.costs, *kept, rng, arrays.scratch)
             if len(order) > 1:
                 rounds = kernel.improve(
-                    arrays.table, arrays.ways, arrays.costs, self.road.rounds, rng, arrays.scratch
+                    arrays.table,
+                    arrays.ways,
+                    arrays.costs,
+                    self.road.rounds,
+                    self.road.most_ways,
+                    rng,
+                    arrays.scratch,
                 )
             ways |= _ways_of(order, arrays)
         missed = tuple(v.vehicle for v in vehicles if ways[v.vehicle][-1][1] != v.lane)

@@ -19,10 +19,13 @@ from laneweave.coordinator.planning.grid import Cell, Mode, displacements
 from laneweave.coordinator.planning.moves import conflict_offsets
 from laneweave.coordinator.planning.stream_types import StreamCosts, StreamRoad, StreamVehicle
 
-FIXED = 1_000_000
+FIXED = 100_000
 """Price of a vehicle that cannot be moved out of the way."""
-PRICE = 10
-"""Least price of a vehicle, so that a price can grow by tenths of itself."""
+PRICE = 8
+"""Least price of a vehicle; prices grow by parts of it."""
+ENTERING = 8
+"""How often the price is paid by moves that conflict with a vehicle; by staying in its cell as
+long as it does: once. So who takes its place does not pay anew with each slot."""
 MOST_EJECTED = 100
 """Vehicles hit by one chain of ejections."""
 _SAVED = MOST_EJECTED + 32
@@ -46,7 +49,8 @@ class Table(NamedTuple):
     made: NDArray[np.int8]
     """Displacement that it makes in the slot; same shape."""
     offsets: Ints
-    """Column, lane and displacement of what conflicts with a move; (conflicts, 3)."""
+    """Column, lane and displacement of what conflicts with a move, and how often it pays the
+    price; (conflicts, 4)."""
     first: Ints
     """Where in `offsets` the conflicts of each displacement begin; (displacements + 1)."""
     steps: Ints
@@ -74,6 +78,8 @@ class Ways(NamedTuple):
     """Cost of ending off the lane."""
     least: Floats
     """No way that ends on the lane costs less."""
+    able: Bools
+    """Whether there are slots enough to reach the lane, if nobody were in the way."""
     price: Ints
     """What it costs another one to be in its way."""
     cost: Floats
@@ -107,6 +113,8 @@ class Scratch(NamedTuple):
     queue: Ints
     victims: Ints
     chosen: Ints
+    failing: Ints
+    dear: Ints
     """Up to all vehicles, each."""
     marked: Bools
     """Vehicles whose ways are saved."""
@@ -115,6 +123,8 @@ class Scratch(NamedTuple):
     either side that nobody leaves)."""
     delay: Singles
     """What a move costs more in each slot."""
+    laid: Ints
+    """How many ways were looked for; (1)."""
 
 
 class Window(NamedTuple):
@@ -168,8 +178,8 @@ def _table(road: StreamRoad, at_m: Floats, low: int, blocked: Collection[Cell]) 
     steps = displacements(road.mode)
     load = np.zeros((slots, len(steps), road.lanes, columns), dtype=np.float32)
     may_move = _may_move(road, at_m, barred)
-    load[:, 1:][~may_move] = FIXED
-    may_leave: NDArray[np.bool_] = np.asarray(may_move.any(axis=(1, 2)), dtype=np.bool_)
+    load[:, 1:][~may_move] = FIXED * ENTERING
+    may_leave = may_move.any(axis=(1, 2))
     opened = np.stack([may_leave.argmax(axis=1), columns - 1 - may_leave[:, ::-1].argmax(axis=1)])
     opened[:, ~may_leave.any(axis=1)] = [[columns], [-1]]
     return Table(
@@ -235,6 +245,7 @@ def _ways(costs: StreamCosts, table: Table, low: int, vehicles: Sequence[StreamV
         held,
         costs.missing * (1.0 + 1.0 / (1.0 + chances)),
         least,
+        ~held & (chances >= away),
         np.where(held, FIXED, PRICE),
         np.zeros(count),
         np.zeros(count, dtype=np.bool_),
@@ -261,9 +272,12 @@ def _scratch(count: int, slots: int, reach: int, lanes: int) -> Scratch:
         np.zeros(count + 1, dtype=np.int64),
         np.zeros(count + 1, dtype=np.int64),
         np.zeros(count + 1, dtype=np.int64),
+        np.zeros(count + 1, dtype=np.int64),
+        np.zeros(count + 1, dtype=np.int64),
         np.zeros(count, dtype=np.bool_),
         np.zeros((slots + 1, lanes, 2 * reach + 3), dtype=np.float32),
         np.zeros(slots, dtype=np.float32),
+        np.zeros(1, dtype=np.int64),
     )
 
 
@@ -271,6 +285,10 @@ def _scratch(count: int, slots: int, reach: int, lanes: int) -> Scratch:
 def _offsets(mode: Mode, model: ConflictModel) -> tuple[Ints, Ints]:
     """Return the conflicts of all displacements in a row, and where those of each begin."""
     table = conflict_offsets(mode, model)
-    flat = [entry for entries in table for entry in entries]
+    flat = [
+        (*entry, 1 if (d, *entry) == (0, 0, 0, 0) else ENTERING)
+        for d, entries in enumerate(table)
+        for entry in entries
+    ]
     first = np.cumsum([0, *(len(entries) for entries in table)])
     return np.array(flat, dtype=np.int64), cast("Ints", first)

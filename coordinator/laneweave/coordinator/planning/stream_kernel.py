@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from laneweave.coordinator.planning.stream_arrays import PRICE
+from laneweave.coordinator.planning.stream_arrays import ENTERING, PRICE
 
-_IMPASSABLE = 2e4
+_IMPASSABLE = 5e3
 """More than all that a way may cost; less than being in the way of what is `FIXED`."""
 _UNREACHED = 1e9
 NO_WAY = 1e9
@@ -36,7 +36,7 @@ def put(table, ways, v, sign):
         for k in range(first[d], first[d + 1]):
             c, n = column + offsets[k, 0], lane + offsets[k, 1]
             if 0 <= c < columns and 0 <= n < lanes:
-                load[s, offsets[k, 2], n, c] += amount
+                load[s, offsets[k, 2], n, c] += amount * offsets[k, 3]
     ways.placed[v] = sign > 0
 
 
@@ -56,9 +56,10 @@ def find_way(table, ways, costs, v, softness, ceiling, scratch):
     and only what is `FIXED` is never passed. Without such a way: `NO_WAY`, and nothing is laid.
     """
     load, steps, of_move, value = table.load, table.steps, costs.of_move, scratch.value
+    scratch.laid[0] += 1
     slots, fan, lanes, _ = load.shape
     wanted = ways.wanted[v]
-    scale = np.float32(softness / PRICE if softness > 0.0 else _IMPASSABLE)
+    scale = np.float32(softness / (PRICE * ENTERING) if softness > 0.0 else _IMPASSABLE)
     # Offsets in `value` are columns less this.
     shift = ways.column[v, 0] - (value.shape[2] // 2)
     value[:] = _UNREACHED

@@ -19,7 +19,19 @@ from laneweave.coordinator.planning.stream_kernel import (
 )
 
 _PRICE_GROWTH = 3
-"""Added to the price of a vehicle each time that a chain of ejections hits it."""
+"""Added to the price of a vehicle, at first `PRICE`, each time that a chain hits it."""
+_LEAST_SOFTNESS, _MORE_SOFTNESS = 15.0, 25.0
+"""What it costs in a chain to be in the way of a vehicle: so much, and up to so much more."""
+_HESITATION = 0.9
+_TRIES = 4
+"""Chains for a vehicle that has no way at all."""
+_FIRST_SLACK, _COOLED_AFTER = 8.0, 0.67
+"""By how much the sum of costs may grow at first, and when that is over, in parts of all work."""
+_REORDER_EVERY = 8
+_MOST_REORDERED = 13
+_IDLE_ROUNDS = 40
+"""Rounds after nobody misses its lane any more."""
+_ROUNDING = 1e-4
 
 
 @njit(cache=True, nogil=True)
@@ -45,8 +57,9 @@ def lay(table, ways, costs, kept, first, rng, scratch):
         if ways.cost[v] < NO_WAY:
             put(table, ways, v, 1)
             continue
-        for softness in (0.3, 0.5, 1.0, 1.5, 3.0):
-            if eject(table, ways, costs, v, softness, MOST_EJECTED, 0.0, rng, scratch) > 0.0:
+        ways.cost[v] = NO_WAY
+        for _ in range(_TRIES):
+            if _eject(table, ways, costs, v, _LEAST_SOFTNESS, 0.0, rng, scratch) > 0.0:
                 break
         if not ways.placed[v]:
             _let_stand(table, ways, costs, v, scratch)
@@ -73,43 +86,40 @@ def _let_stand(table, ways, costs, start, scratch):
 
 
 @njit(cache=True, nogil=True)
-def eject(table, ways, costs, start, softness, most, slack, rng, scratch):
+def _eject(table, ways, costs, start, softness, slack, rng, scratch):
     """Give a vehicle a better way, at the price of those that are in it; return what is gained.
 
-    Whoever is hit is planned anew in turn, and may hit others (ejection chains: Glover 1996). The
-    chain is undone, and nothing gained, if it hits more than `most` or does not lower the sum of
-    costs by more than -`slack`.
+    Whoever is hit is planned anew in turn, and may hit others (ejection chains: Glover 1996). Each
+    time the price of who is hit grows. The chain is undone, and nothing gained, if it hits more
+    than `MOST_EJECTED` or the sum of costs does not stay below what it was and `slack`.
     """
-    saved, queue, victims, delay = scratch.saved, scratch.queue, scratch.victims, scratch.delay
-    marked = scratch.marked
+    saved, queue, victims, marked = scratch.saved, scratch.queue, scratch.victims, scratch.marked
+    was_placed = ways.placed[start]
     queue[0] = start
-    waiting, kept, before = 1, 1, ways.cost[start]
+    waiting, kept, hits, before = 1, 1, 0, ways.cost[start]
     save(ways, saved, 0, start)
     marked[start] = True
-    was_placed = ways.placed[start]
     if was_placed:
         put(table, ways, start, -1)
-    failed, hits = False, 0
-    while waiting > 0:
+    while waiting > 0 and hits <= MOST_EJECTED:
         waiting -= 1
-        v = queue[waiting]
+        i = random_below(rng, waiting + 1)
+        v, queue[i] = queue[i], queue[waiting]
         # Who was hit goes round the others if it can.
-        if v != start:
+        if v != start or hits > 0:
             ways.cost[v] = find_way(table, ways, costs, v, 0.0, ways.missing[v], scratch)
             if ways.cost[v] < NO_WAY:
                 put(table, ways, v, 1)
                 continue
-        # Two that must swap would take the same slot for ever if they did not sometimes hesitate.
-        for s in range(len(delay)):
-            delay[s] = np.float32(0.1 * random_below(rng, 10)) if hits > 0 else 0.0
+        _hesitate(scratch.delay, rng)
         ways.cost[v] = find_way(table, ways, costs, v, softness, NO_WAY, scratch)
+        scratch.delay[:] = 0.0
         if ways.cost[v] >= NO_WAY:
-            failed = True
+            hits = MOST_EJECTED + 1
             break
         count = find_victims(table, ways, v, victims)
         hits += count
-        if hits > most:
-            failed = True
+        if hits > MOST_EJECTED:
             break
         for i in range(count):
             u = victims[i]
@@ -123,27 +133,41 @@ def eject(table, ways, costs, start, softness, most, slack, rng, scratch):
             queue[waiting] = u
             waiting += 1
         put(table, ways, v, 1)
-    delay[:] = 0.0
     after = 0.0
     for k in range(kept):
         after += ways.cost[saved.who[k]]
-    worse = failed or after >= before + slack
+    better = hits <= MOST_EJECTED and after < before + slack
+    _settle(table, ways, kept, better, was_placed, scratch)
+    return before - after if better else 0.0
+
+
+@njit(cache=True, nogil=True)
+def _hesitate(delay, rng):
+    """Draw what moves cost more in each slot, for the next way.
+
+    Two that must swap would want the same slot for ever if they did not sometimes hesitate.
+    """
+    for s in range(len(delay)):
+        delay[s] = np.float32(_HESITATION * random_below(rng, 1000) / 1000.0)
+
+
+@njit(cache=True, nogil=True)
+def _settle(table, ways, kept, better, was_placed, scratch):
+    """End a chain that has changed `kept` ways: all prices are the least again, or all is undone."""
+    saved = scratch.saved
     for k in range(kept):
         v = saved.who[k]
-        marked[v] = False
-        if worse and ways.placed[v]:
+        scratch.marked[v] = False
+        # The table holds the price that a way was put in with.
+        again = ways.placed[v] and (not better or ways.price[v] != PRICE)
+        if again:
             put(table, ways, v, -1)
-        # Nobody keeps its price: it is back to the least before the way is in for good.
-        elif ways.price[v] != PRICE and ways.placed[v]:
-            put(table, ways, v, -1)
-            ways.price[v] = PRICE
-            put(table, ways, v, 1)
         ways.price[v] = PRICE
-    if worse:
-        ways.cost[start] = saved.cost[0]
+        if again and better:
+            put(table, ways, v, 1)
+    if not better:
+        ways.cost[saved.who[0]] = saved.cost[0]
         restore(table, ways, saved, 0 if was_placed else 1, kept)
-        return 0.0
-    return before - after
 
 
 @njit(cache=True, nogil=True)
@@ -203,34 +227,47 @@ def _reorder(table, ways, costs, seed, size, slack, rng, scratch):
 
 
 @njit(cache=True, nogil=True)
-def improve(table, ways, costs, rounds, rng, scratch):
+def _list_dear(ways, failing, dear):
+    """List who misses its lane and may reach it, and who has a way that is not the cheapest."""
+    missed = more = 0
+    for v in range(len(ways.cost)):
+        if ways.able[v]:
+            if ways.cost[v] >= ways.missing[v]:
+                failing[missed] = v
+                missed += 1
+            elif ways.cost[v] > ways.least[v] + _ROUNDING:
+                dear[more] = v
+                more += 1
+    return missed, more
+
+
+@njit(cache=True, nogil=True)
+def improve(table, ways, costs, rounds, most_ways, rng, scratch):
     """Improve all ways for some rounds; return how many rounds it took.
 
     While somebody misses its lane, chains of ejections and new orders take turns; slack cools down
-    from a few moves to none. Afterwards a few rounds more look for cheaper ways.
+    from some moves to none. Afterwards a few rounds more look for cheaper ways.
     """
-    count = len(ways.cost)
-    failing = scratch.chosen
-    turn = 0
-    while turn < rounds:
-        missed = 0
-        for v in range(count):
-            if ways.cost[v] >= ways.missing[v] and not ways.held[v]:
-                failing[missed] = v
-                missed += 1
-        slack = 8.0 * max(0.0, 1.0 - 1.5 * turn / rounds) if missed else -1e-9
-        if missed and turn % 8 < 7:
-            v = failing[random_below(rng, missed)]
-            softness = 2.0 + 2.0 * random_below(rng, 12)
-            eject(table, ways, costs, v, softness, MOST_EJECTED, slack, rng, scratch)
-        else:
-            seed = random_below(rng, count)
-            if missed and turn % 2:
-                seed = failing[random_below(rng, missed)]
-            size = 2 + random_below(rng, 12)
-            if not ways.held[seed]:
-                _reorder(table, ways, costs, seed, min(size, count - 1), slack, rng, scratch)
-        turn += 1
-        if not missed and turn > rounds // 8:
+    failing, dear = scratch.failing, scratch.dear
+    turn = idle = 0
+    scratch.laid[0] = 0
+    while turn < rounds and scratch.laid[0] < most_ways and idle < _IDLE_ROUNDS:
+        missed, more = _list_dear(ways, failing, dear)
+        if missed == 0 and more == 0:
             break
+        slack = -_ROUNDING
+        if missed > 0:
+            done = max(turn / rounds, scratch.laid[0] / most_ways)
+            slack = max(slack, _FIRST_SLACK * (1.0 - done / _COOLED_AFTER))
+        else:
+            idle += 1
+        if missed > 0 and turn % _REORDER_EVERY > 0:
+            v = failing[random_below(rng, missed)]
+            softness = _LEAST_SOFTNESS + _MORE_SOFTNESS * random_below(rng, 1000) / 1000.0
+            _eject(table, ways, costs, v, softness, slack, rng, scratch)
+        else:
+            v = dear[random_below(rng, more)] if more > 0 else failing[random_below(rng, missed)]
+            size = min(2 + random_below(rng, _MOST_REORDERED - 1), len(ways.cost) - 1)
+            _reorder(table, ways, costs, v, size, slack, rng, scratch)
+        turn += 1
     return turn

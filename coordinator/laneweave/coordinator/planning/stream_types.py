@@ -37,8 +37,10 @@ class StreamRoad:
     model: ConflictModel = field(
         default=ConflictModel(("node", "edge", "special-1", "closing")), validator=_one_per_cell
     )
-    rounds: int = 400
+    rounds: int = 2000
     """Most rounds of improvement for one slot."""
+    most_ways: int = 50_000
+    """So many ways are looked for in one slot at most, for about 5 us each."""
 
 
 @frozen
