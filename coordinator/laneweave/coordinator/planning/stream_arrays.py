@@ -179,7 +179,7 @@ def _table(road: StreamRoad, at_m: Floats, low: int, blocked: Collection[Cell]) 
     load = np.zeros((slots, len(steps), road.lanes, columns), dtype=np.float32)
     may_move = _may_move(road, at_m, barred)
     load[:, 1:][~may_move] = FIXED * ENTERING
-    may_leave = may_move.any(axis=(1, 2))
+    may_leave: NDArray[np.bool_] = np.asarray(may_move.any(axis=(1, 2)), dtype=np.bool_)
     opened = np.stack([may_leave.argmax(axis=1), columns - 1 - may_leave[:, ::-1].argmax(axis=1)])
     opened[:, ~may_leave.any(axis=1)] = [[columns], [-1]]
     return Table(

@@ -153,7 +153,7 @@ def _hesitate(delay, rng):
 
 @njit(cache=True, nogil=True)
 def _settle(table, ways, kept, better, was_placed, scratch):
-    """End a chain that has changed `kept` ways: all prices are the least again, or all is undone."""
+    """End a chain that has changed `kept` ways: prices are the least again, or all is undone."""
     saved = scratch.saved
     for k in range(kept):
         v = saved.who[k]
