@@ -12,7 +12,7 @@ from typing import Any
 
 from attrs import field, frozen
 
-from laneweave.coordinator.formation import start_time_s, steps_left
+from laneweave.coordinator.formation import closing_time_s, start_time_s, steps_left
 from laneweave.coordinator.groups import Groups, Numbers
 from laneweave.coordinator.leader import FormationControl
 from laneweave.coordinator.leader_rules import Phase
@@ -26,6 +26,8 @@ from laneweave.protocol.scenario import Scenario
 
 START_MARGIN_S = 0.5
 """A plan made late starts this much road time after it is ready."""
+ROOM_S = 2.0
+"""A formation that lacks room waits at most so long for the next one to close (road time)."""
 MOST_DOUBLINGS = 4
 """The bound on search nodes doubles with each failed planning, this often."""
 
@@ -123,6 +125,10 @@ class FormationPlanner:
             if result.short_of_room and self._join_neighbour(control, controls, t_s):
                 yield Note("formations-joined", {"formations": list(self._groups.of(number))})
                 return
+            if result.short_of_room and self._room_is_coming(control.formation.numbers, t_s):
+                control.on_planning_failed(now_s)
+                yield Note("room-awaited", {"formation": number})
+                return
             if result.solved:
                 plan = self._plan(control, result, t_s)
                 problems = plan_problems(plan)
@@ -153,6 +159,13 @@ class FormationPlanner:
             if steps_left(union, self._start_s(union, t_s), self._scenario) > 0:
                 return self._groups.join(union)
         return False
+
+    def _room_is_coming(self, numbers: Numbers, t_s: float) -> bool:
+        """Tell whether the next formation, which may be joined, is closed in a moment."""
+        if len(numbers) >= self._scenario.formation.max_joined:
+            return False
+        closes_s = closing_time_s((numbers[-1] + 1,), self._scenario)
+        return closes_s - ROOM_S < t_s <= closes_s + START_MARGIN_S
 
     def _plan(self, control: FormationControl, sorting: Sorting, t_s: float) -> Plan:
         hold_cells, numbers, ballot = control.hold_cells, control.formation.numbers, control.ballot

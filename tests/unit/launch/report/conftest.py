@@ -16,8 +16,9 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = folder / "a <b> & 'c'"
     lists = ("--volumes", "1000,1600", "--seeds", "1:2", "--duration", 40)
     scenario = short_road(folder)
-    # Long enough for everybody to reach the preferred lane.
-    scenario.write_text(scenario.read_text().replace("s3_m = 120.0", "s3_m = 240.0"))
+    # Long enough for everybody to settle, and to reach the preferred lane.
+    text = scenario.read_text().replace("s3_m = 120.0", "s3_m = 240.0")
+    scenario.write_text(text.replace("s2_m = 10.0", "s2_m = 180.0"))
     done = sweep(scenario, out, *lists)
     assert done.returncode == 0, done.stderr
     return out
