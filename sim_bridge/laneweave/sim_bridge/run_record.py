@@ -23,6 +23,9 @@ from laneweave.sim_bridge.motion_controller import Rung
 from laneweave.sim_bridge.overlap import LeastGaps
 from laneweave.sim_bridge.recorder import Recorder
 
+PLANNED = ("plan-made", "stream-planned")
+"""Events that tell of a plan: of a formation, or of the whole stream."""
+
 
 class RecordedVehicle(Protocol):
     """What is recorded of a vehicle on the road, whatever moves it."""
@@ -211,7 +214,7 @@ class RunRecord:
         # The sender's own words about who it is do not count.
         data = event.data | {"role": event.role, "name": event.name}
         self._recorder.event(event.t_s, event.kind, **data)
-        if event.kind == "plan-made":
+        if event.kind in PLANNED:
             self._plans.append(event.data)
 
     def on_report(self, report: Report) -> None:

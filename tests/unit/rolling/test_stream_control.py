@@ -18,10 +18,12 @@ from laneweave.coordinator.stream_control import (
     LATEST_S,
     PATIENCE_S,
     SHOWN_S,
+    CheckedPlanner,
     Note,
     StreamControl,
     _clusters,
     stream_planner,
+    stream_road,
 )
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import Ballot, Census, CensusEntry, Deed, Name, Plan, Prepare
@@ -497,3 +499,20 @@ def test_the_real_planner_takes_what_it_is_given() -> None:
     assert set(plan.ways[C]) == {HOMES[C]}
     (note,) = control.finish(Computed(1, plan), BEGUN_S + SHOWN_S, 0.0)
     assert note.kind == "stream-planned"
+
+
+def test_a_wrong_plan_is_no_plan() -> None:
+    """The planner is not trusted: a way that ends on the road is not issued."""
+    bench = Bench(ways={A: (HOMES[A], HOMES[A])})
+    planner = CheckedPlanner(stream_road(ROLLING), bench)
+    bench.control = StreamControl(ROLLING, bench.new_ballot, planner)
+    bench.control.on_census(census(A))
+    bench.hear(shown(A))
+    assert bench.order(BEGUN_S - 2.0) is None
+    compute = bench.order()
+    assert compute is not None
+    with pytest.raises(ValueError, match=f"the plan of slot {SLOT + 1} is wrong: .* on the road"):
+        compute.work()
+    (note,) = bench.control.finish(Computed(compute.job, None, "wrong"), BEGUN_S + SHOWN_S, 0.0)
+    assert note == Note("planning-failed", {"slot": SLOT + 1, "error": "wrong"})
+    assert bench.control.handovers == []

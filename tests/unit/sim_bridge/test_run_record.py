@@ -145,14 +145,14 @@ def test_plans_are_counted_from_events(record: RunRecord, tmp_path: Path) -> Non
         {"status": "bounded", "vehicles": 6, "solve_ms": 30.0},
         {"status": [], "vehicles": "many", "solve_ms": None, "name": "somebody-else"},
     )
-    for data in made:
-        record.on_event(LogEvent(*coordinator, 5.0, Name("plan-made"), data))
+    for kind, data in zip(("plan-made", "stream-planned", "plan-made"), made, strict=True):
+        record.on_event(LogEvent(*coordinator, 5.0, Name(kind), data))
     record.on_event(LogEvent(*coordinator, 6.0, Name("leader-elected"), {"term": 3}))
     record.close(9.0, Ending.COMPLETE)
     planning = read_summary(tmp_path)["planning"]
     assert (planning["plans"], planning["optimal"], planning["largest_formation"]) == (3, 1, 6)
     assert planning["solve_ms"]["max"] == 30.0
-    assert [event["name"] for event in read_events(tmp_path, "plan-made")] == ["c0"] * 3
+    assert [event["name"] for event in read_events(tmp_path, "plan-made")] == ["c0"] * 2
     assert read_events(tmp_path, "leader-elected")[0]["term"] == 3
 
 

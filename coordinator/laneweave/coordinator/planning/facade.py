@@ -70,7 +70,7 @@ def plan(
     distance must give a lower bound.
     """
     if solver == "branching":
-        warm_up()  # not on the request's time
+        _warm_up_branching()  # not on the request's time
     if request.geometry is not None:
         close_pairs(request.geometry)  # nor is its table
     started = clock()
@@ -115,11 +115,18 @@ def plan(
 
 
 def warm_up() -> None:
-    """Load the compiled parts of the planner; where there are none yet, compile them.
+    """Load the compiled parts of the planners; where there are none yet, compile them.
 
-    Loading takes half a second, compiling half a minute; `plan` does it at its first call.
+    Loading takes a second, compiling a minute.
     """
-    from laneweave.coordinator.planning import branching  # noqa: PLC0415 (numba is slow to load)
+    from laneweave.coordinator.planning import stream  # noqa: PLC0415 (numba is slow to load)
+
+    _warm_up_branching()
+    stream.warm_up()
+
+
+def _warm_up_branching() -> None:
+    from laneweave.coordinator.planning import branching  # noqa: PLC0415
 
     branching.warm_up()
 

@@ -16,7 +16,9 @@ What a move conflicts with is the `ConflictModel` of the other planners.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Collection, Mapping, Sequence
+from functools import cache
 from itertools import chain
 
 import numpy as np
@@ -32,7 +34,24 @@ from laneweave.coordinator.planning.stream_types import (
     Way,
 )
 
-__all__ = ["StreamCosts", "StreamPlan", "StreamPlanner", "StreamRoad", "StreamVehicle", "Way"]
+__all__ = [
+    "StreamCosts",
+    "StreamPlan",
+    "StreamPlanner",
+    "StreamRoad",
+    "StreamVehicle",
+    "Way",
+    "warm_up",
+]
+
+
+@cache
+def warm_up() -> None:
+    """Load the compiled code; where there is none yet, compile it, which takes half a minute."""
+    road = StreamRoad(2, 15.0, 60.0, (0.0, 600.0), 600.0, 5.0)
+    # Two who change places.
+    vehicles = [StreamVehicle("a", (5, 0), 1), StreamVehicle("b", (5, 1), 0)]
+    StreamPlanner(road).plan(0, vehicles)
 
 
 class StreamPlanner:
@@ -62,6 +81,7 @@ class StreamPlanner:
         Raises:
             ValueError: two vehicles in one cell, or one beside the road.
         """
+        began_s = time.monotonic()
         _check(self.road, vehicles)
         end = self.road.length_m - slot * self.road.advance_m
         ways: dict[str, Way] = {v.vehicle: (v.cell,) for v in vehicles}
@@ -86,7 +106,8 @@ class StreamPlanner:
                 )
             ways |= _ways_of(order, arrays)
         missed = tuple(v.vehicle for v in vehicles if ways[v.vehicle][-1][1] != v.lane)
-        return StreamPlan(slot, ways, missed, rounds)
+        solve_ms = round(1e3 * (time.monotonic() - began_s), 3)
+        return StreamPlan(slot, ways, missed, rounds, solve_ms)
 
 
 def _check(road: StreamRoad, vehicles: Sequence[StreamVehicle]) -> None:

@@ -25,12 +25,13 @@ _LEAST_SOFTNESS, _MORE_SOFTNESS = 15.0, 25.0
 _HESITATION = 0.9
 _TRIES = 4
 """Chains for a vehicle that has no way at all."""
-_FIRST_SLACK, _COOLED_AFTER = 8.0, 0.67
+_FIRST_SLACK, _COOLED_AFTER = 16.0, 0.67
 """By how much the sum of costs may grow at first, and when that is over, in parts of all work."""
 _REORDER_EVERY = 8
 _MOST_REORDERED = 13
-_IDLE_ROUNDS = 40
+_IDLE_ROUNDS = 200
 """Rounds after nobody misses its lane any more."""
+_IDLE_SOFTNESS = 3.0
 _ROUNDING = 1e-4
 
 
@@ -105,12 +106,6 @@ def _eject(table, ways, costs, start, softness, slack, rng, scratch):
         waiting -= 1
         i = random_below(rng, waiting + 1)
         v, queue[i] = queue[i], queue[waiting]
-        # Who was hit goes round the others if it can.
-        if v != start or hits > 0:
-            ways.cost[v] = find_way(table, ways, costs, v, 0.0, ways.missing[v], scratch)
-            if ways.cost[v] < NO_WAY:
-                put(table, ways, v, 1)
-                continue
         _hesitate(scratch.delay, rng)
         ways.cost[v] = find_way(table, ways, costs, v, softness, NO_WAY, scratch)
         scratch.delay[:] = 0.0
@@ -264,6 +259,10 @@ def improve(table, ways, costs, rounds, most_ways, rng, scratch):
         if missed > 0 and turn % _REORDER_EVERY > 0:
             v = failing[random_below(rng, missed)]
             softness = _LEAST_SOFTNESS + _MORE_SOFTNESS * random_below(rng, 1000) / 1000.0
+            _eject(table, ways, costs, v, softness, slack, rng, scratch)
+        elif missed == 0 and turn % 2 > 0:
+            v = dear[random_below(rng, more)]
+            softness = _IDLE_SOFTNESS * random_below(rng, 1000) / 1000.0 + 0.2
             _eject(table, ways, costs, v, softness, slack, rng, scratch)
         else:
             v = dear[random_below(rng, more)] if more > 0 else failing[random_below(rng, missed)]

@@ -80,3 +80,5 @@ class StreamPlan:
     """Vehicles whose ways do not end on their lanes."""
     rounds: int = 0
     """How many rounds of improvement it took."""
+    solve_ms: float = field(default=0.0, eq=False)
+    """Wall-clock time that it took."""
