@@ -34,6 +34,7 @@ from __future__ import annotations
 
 import math
 import time
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -137,7 +138,7 @@ class Tracker:
         self._stale = False
         """Whether the fast path was taken since OSQP ran."""
         self._regulator = (
-            Regulator(n, self._tick_s, self._limits.max_slip_ratio) if fast_path else None
+            _regulator(n, self._tick_s, self._limits.max_slip_ratio) if fast_path else None
         )
         self.harmless = (
             self._regulator.harmless(self._limits, scenario.formation.speed_mps)
@@ -429,6 +430,12 @@ class Regulator:
         return tuple(share * each for each in _AT_REST)
 
 
+@cache
+def _regulator(ticks: int, tick_s: float, slip: float) -> Regulator:
+    """Return that of a scenario: every vehicle of a process has the same."""
+    return Regulator(ticks, tick_s, slip)
+
+
 def _is_near(state: State, reference: list[float]) -> bool:
     return all(
         abs(now - wanted) <= most for now, wanted, most in zip(state, reference, _NEAR, strict=True)
@@ -464,6 +471,7 @@ def program_scale(n: int) -> QPScale:
     return QPScale(rows.all, unknowns)
 
 
+@cache
 def _rows(n: int, h: float, slip: float) -> Any:  # noqa: ANN401 - scipy.sparse has no types
     """Return A over x = (e_1 .. e_N, w_0 .. w_N-1, g_1 .. g_N), rows in the order of `_Bounds`."""
     transition, effect = axis_matrices(h)
@@ -490,6 +498,7 @@ def _rows(n: int, h: float, slip: float) -> Any:  # noqa: ANN401 - scipy.sparse 
     )
 
 
+@cache
 def _cost(n: int, h: float) -> Any:  # noqa: ANN401
     """Return P over the same x."""
     along, across = np.diag(_WEIGHTS), np.diag(_LATERAL_WEIGHTS)

@@ -176,8 +176,10 @@ def _run_formations(
     plan_of_faults = load_faults(faults, coordinator_names(settings), vehicles)
     folder = new_folder(out, settings, METHOD)
     if transport is TransportChoice.simulated:
+        from laneweave.launch.garbage import collect_seldom
         from laneweave.launch.simulated_run import SimulatedRun
 
+        collect_seldom()
         return SimulatedRun(settings, folder, METHOD, plan_of_faults, show_progress=show).run()
     return LocalRun(settings, folder, METHOD, plan_of_faults, show, pace).run()
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import hashlib
 import logging
 import multiprocessing
@@ -18,6 +17,7 @@ from attrs import field, frozen
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from laneweave.launch.garbage import collect_seldom
 from laneweave.launch.roles import die_with_supervisor
 from laneweave.launch.simulation.checker import Violation
 from laneweave.launch.simulation.profiles import Profile
@@ -102,7 +102,7 @@ def search(
 def _batches(seeds: range, profile: Profile, jobs: int, *, digest: bool) -> Iterator[list[Outcome]]:
     batches = [seeds[first : first + BATCH] for first in range(0, len(seeds), BATCH)]
     if jobs == 1 or len(batches) == 1:
-        _collect_seldom()
+        collect_seldom()
         for batch in batches:
             yield run_seeds(batch, profile, digest=digest)
         return
@@ -139,13 +139,7 @@ def _quiet() -> None:
     die_with_supervisor()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     quiet_logs()
-    _collect_seldom()
-
-
-def _collect_seldom() -> None:
-    """Look for cyclic garbage about once a run: what a run makes lives as long as the run."""
-    gc.freeze()
-    gc.set_threshold(50_000)
+    collect_seldom()
 
 
 def quiet_logs() -> None:

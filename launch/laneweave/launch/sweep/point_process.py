@@ -8,6 +8,7 @@ import signal
 import sys
 from pathlib import Path
 
+from laneweave.launch.garbage import collect_seldom
 from laneweave.launch.logs import log_to_terminal
 from laneweave.launch.roles import die_with_parent
 from laneweave.launch.sweep.execution import JOB_FILE, RESULT_FILE
@@ -28,6 +29,7 @@ def main(folder: Path, parent: int) -> None:
     if os.getppid() != parent:
         sys.exit("nobody waits for this run")
     log_to_terminal()
+    collect_seldom()
     job = json.loads((folder / JOB_FILE).read_text(encoding="utf-8"))
     outcome = run_method(parse_scenario(job["tables"]), job["method"], folder)
     result = folder / RESULT_FILE
