@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from functools import partial
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from attrs import field, frozen
 
@@ -32,7 +32,10 @@ from laneweave.protocol.node import Compute, Computed
 from laneweave.protocol.scenario import Scenario
 
 SHOWN_S = 0.5
-"""Who moves in a slot has begun, and shown it, this long after the slot has."""
+"""Who moves in a slot has begun, and shown it, this long after the slot has.
+
+Planned is from what was shown up to then, once road time has gone on and all of it has arrived: so
+plans do not depend on how fast messages are."""
 PATIENCE_S = 1.0
 """A new leader listens for so long (road time). One that leads only for a moment, because it has
 not heard another one, must not outbid what that one has begun."""
@@ -133,9 +136,14 @@ class StreamControl:
         self._slot_s = scenario.formation.cycle_s
         self.states: dict[Name, VehicleState] = {}
         """The newest state of each vehicle."""
+        self._before: dict[Name, VehicleState] = {}
+        """The newest one with an earlier time."""
+        self._left: dict[Name, VehicleState] = {}
+        """The newest state of each that has left since it was planned last."""
         self.handovers: list[Handover] = []
         self._of: dict[Name, Handover] = {}
         self._census: Census | None = None
+        self._census_before: Census | None = None
         self._highest: Ballot | None = None
         self._since_s: float | None = None
         """Since when states have been heard (road time)."""
@@ -149,9 +157,11 @@ class StreamControl:
     def forget(self) -> None:
         """Begin anew: another road, or another leadership."""
         self.states.clear()
+        self._before.clear()
+        self._left.clear()
         self.handovers.clear()
         self._of.clear()
-        self._census = self._table = self._ordered = self._since_s = None
+        self._census = self._census_before = self._table = self._ordered = self._since_s = None
         self._newest_slot = -1
 
     def take_over(self) -> None:
@@ -165,10 +175,12 @@ class StreamControl:
 
     def on_census(self, census: Census) -> None:
         """Take note of who is on the road."""
+        if self._census is not None and census.t_s > self._census.t_s:
+            self._census_before = self._census
         self._census = census
         listed = {entry.vehicle for entry in census.on_road}
         for name in [name for name in self.states if name not in listed]:
-            del self.states[name]
+            self._left[name] = self.states.pop(name)
             handover = self._of.pop(name, None)
             if handover is not None and handover.wakeup_s is not None:
                 handover.give_up(f"{name} has left")
@@ -178,6 +190,8 @@ class StreamControl:
         known = self.states.get(state.vehicle)
         if known is not None and _age(state) < _age(known):
             return
+        if known is not None and state.t_s > known.t_s:
+            self._before[state.vehicle] = known
         self.states[state.vehicle] = state
         if state.promised is not None:
             self._highest = max(self._highest or state.promised, state.promised)
@@ -203,10 +217,10 @@ class StreamControl:
         if self._since_s is None:
             self._since_s = t_s
         slot = math.floor(t_s / self._slot_s + 1e-9)
-        begun_s = slot * self._slot_s
-        if slot < self._newest_slot or t_s < max(begun_s + SHOWN_S, self._since_s + PATIENCE_S):
+        look_s = max(slot * self._slot_s + SHOWN_S, self._since_s + PATIENCE_S) + 1e-6
+        if slot < self._newest_slot or t_s <= look_s:
             return
-        order = self._order(census, slot + 1)
+        order = self._order(slot + 1, look_s)
         self._newest_slot = slot + 1
         number = job()
         self._ordered = (number, slot + 1)
@@ -215,11 +229,23 @@ class StreamControl:
     def _plan(self, order: _Order) -> StreamPlan:
         return self._planner.plan(order.slot, order.vehicles, order.before, order.blocked)
 
-    def _order(self, census: Census, slot: int) -> _Order:
-        vehicles, owned, taken, gone = [], set[Cell](), set[Cell](), self._gone
+    def _order(self, slot: int, look_s: float) -> _Order:
+        """Lay down what is to be planned: what was the case at a time, by now known."""
+        vehicles, owned, taken = [], set[Cell](), set[Cell]()
         far_m = self._scenario.moves_from_m - AHEAD_M
+        census = _at(look_s, self._census, self._census_before) or self._census
+        assert census is not None  # noqa: S101 (asked by the caller)
+        states = {
+            entry.vehicle: state
+            for entry in census.on_road
+            if (state := self._shown_at(look_s, entry.vehicle)) is not None
+        }
+        gone = _gone(states.values(), census)
+        for name in self._left:
+            self._before.pop(name, None)
+        self._left.clear()
         for entry in census.on_road:
-            state = self.states.get(entry.vehicle)
+            state = states.get(entry.vehicle)
             column = entry.cell[0] if state is None else state.hold_cell[0]
             if self._scenario.lattice.cell_s_m(column, (slot - 1) * self._slot_s) < far_m:
                 continue
@@ -231,7 +257,7 @@ class StreamControl:
             # Its move begins at any moment. Without an open gate it may never: who takes part in
             # something newer is asked, and then it does not.
             late = state.go and not state.done and not state.moving
-            owned |= sure_of(state, self.states, gone)
+            owned |= sure_of(state, states, gone)
             if late:
                 taken |= {*state.estate} - {state.hold_cell}
             held = late or not state.attended
@@ -317,12 +343,13 @@ class StreamControl:
                 gone=gone,
             )
 
+    def _shown_at(self, t_s: float, name: Name) -> VehicleState | None:
+        newest = self.states.get(name) or self._left.get(name)
+        return _at(t_s, newest, self._before.get(name))
+
     @property
     def _gone(self) -> frozenset[Name]:
-        """Who shares deeds with somebody and has left the road."""
-        listed = {entry.vehicle for entry in self._census.on_road} if self._census else set[Name]()
-        deeds = [state.deed for state in self.states.values() if state.deed is not None]
-        return frozenset(name for deed in deeds for name in deed.roster if name not in listed)
+        return _gone(self.states.values(), self._census)
 
     def _with_partners(self, names: set[Name]) -> set[Name]:
         """Add those without whose promises nobody could tell what some vehicles own."""
@@ -365,6 +392,21 @@ def stream_road(scenario: Scenario) -> StreamRoad:
         mode=mode,
         model=ConflictModel(formation.conflict_kinds),
     )
+
+
+_News = TypeVar("_News", Census, VehicleState)
+
+
+def _at(t_s: float, newest: _News | None, before: _News | None) -> _News | None:
+    """Return what was known at a time (road time); None: nothing yet."""
+    return newest if newest is not None and newest.t_s <= t_s else before
+
+
+def _gone(states: Iterable[VehicleState], census: Census | None) -> frozenset[Name]:
+    """Return who shares deeds with somebody and has left the road."""
+    listed = {entry.vehicle for entry in census.on_road} if census else set[Name]()
+    deeds = [state.deed for state in states if state.deed is not None]
+    return frozenset(name for deed in deeds for name in deed.roster if name not in listed)
 
 
 def _costs(scenario: Scenario) -> StreamCosts:

@@ -110,7 +110,8 @@ def test_a_column_closes_when_nobody_can_enter_it_any_more() -> None:
 
 
 def test_in_the_paper_s_operation_half_a_checkerboard_is_a_column_s_time() -> None:
-    assert parse_scenario({}).formation.entry_spread_s == COLUMN_S
+    paper = parse_scenario({"formation": {"operation": "paper"}})
+    assert paper.formation.entry_spread_s == COLUMN_S
     rolling = parse_scenario({"formation": {"operation": "rolling"}})
     assert rolling.formation.entry_spread_s == COLUMN_S / 2
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import Ballot, Command, Deed, Name, Prepare
-from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.scenario import parse_scenario
 from laneweave.sim_bridge.caretaker import Caretaker
 from laneweave.sim_bridge.demand import Arrival
 from laneweave.sim_bridge.entry import Admission
@@ -116,7 +116,8 @@ def test_a_deed_outlives_the_process_and_its_acceptance_does_not() -> None:
 
 def test_where_formations_own_blocks_acceptance_needs_no_deed() -> None:
     admission = Admission(Arrival("A", 0, 0, 0.0), HOME, 0.0)
-    controller = RoadVehicle.entering(admission, 0.0, Scenario()).controller
+    paper = parse_scenario({"formation": {"operation": "paper"}})
+    controller = RoadVehicle.entering(admission, 0.0, paper).controller
     controller.hand_over(AGENT)
     controller.note(order(accepted=MID))
     assert (controller.accepted, controller.estate) == (MID, ())
