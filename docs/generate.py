@@ -34,6 +34,8 @@ GEOMETRY = DOCS / "evidence" / "geometry.json"
 """What `benchmarks/geometry.py` wrote."""
 CLOSING = DOCS / "evidence" / "closing.json"
 """What `benchmarks/closing.py` wrote."""
+STREAM = DOCS / "evidence" / "stream.json"
+"""What `benchmarks/stream.py` wrote."""
 EVALUATED = DOCS / "evidence" / "evaluation.json"
 """What `benchmarks/evaluation.py` wrote."""
 CONFLICTS = DOCS / "images" / "conflict-table.png"
@@ -163,6 +165,27 @@ def _closing() -> str:
     return "\n".join(lines)
 
 
+def _stream() -> str:
+    """Return the table of how well the stream planner sorts, by `benchmarks/stream.py`."""
+    lines = [
+        (
+            "| variant | veh/(lane h) | off their lanes | travel time mean / p95 | columns gained "
+            "| CPU ms p50 / mean / p99 / max |"
+        ),
+        "|---|---|---|---|---|---|",
+    ]
+    for row in json.loads(STREAM.read_text(encoding="utf-8")):
+        cpu_ms = " / ".join(f"{row[f'cpu_ms_{key}']:.1f}" for key in ("p50", "mean", "p99", "max"))
+        off, vehicles = row["off_lane"], row["vehicles"]
+        lines.append(
+            f"| {row['variant']} | {row['volume_veh_per_lane_h']} "
+            f"| {off} of {vehicles:,} ({100.0 - row['on_lane_percent']:.2f} %) "
+            f"| {row['travel_s_mean']:.2f} / {row['travel_s_p95']:.2f} s "
+            f"| {row['drift_columns_mean']:.2f} | {cpu_ms} |"
+        )
+    return "\n".join(lines)
+
+
 @cache
 def parts() -> dict[str, str]:
     """Return each generated part by its name."""
@@ -178,6 +201,7 @@ def parts() -> dict[str, str]:
         "conflict counts": _conflicts(),
         "geometry": _geometry(),
         "closing": _closing(),
+        "stream": _stream(),
         **document_parts(read_evidence(EVALUATED)),
     }
 

@@ -25,6 +25,7 @@ from laneweave.sim_bridge.motion_controller import Rung
 from laneweave.sim_bridge.overlap import Pose, least_gaps, overlapping_pairs
 from laneweave.sim_bridge.sensors import who_is_around
 from laneweave.sim_bridge.traffic import RoadVehicle
+from paper import paper
 
 Array = NDArray[np.float64]
 
@@ -33,8 +34,8 @@ ROUNDING = 1e-6
 
 
 def road_scenario(seed: int, mode: int = 1, lanes: int = 3) -> Scenario:
-    """Return the default scenario with another seed, relative motion mode and number of lanes."""
-    return load_scenario(None, seed=seed, formation__mode=mode, road__lanes=lanes)
+    """Return the paper's scenario with another seed, relative motion mode and number of lanes."""
+    return paper(load_scenario(None, seed=seed, formation__mode=mode, road__lanes=lanes))
 
 
 # --- the road -------------------------------------------------------------------------------------

@@ -24,9 +24,9 @@ from laneweave.protocol.messages import (
     VehicleState,
 )
 from laneweave.protocol.node import Arrived, Compute, Effect, Event, Send, Started, Wakeup, run_job
-from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.topics import CENSUS, HEARTBEAT, STATE, Topic
 from laneweave.protocol.transitions import RuleBook
+from paper import PAPER
 from scenarios.story_road import SCENARIO, SLOT_S, Vehicle
 from scenarios.story_text import cell_of, shown, written
 
@@ -55,7 +55,7 @@ class Leader:
         rules: RuleBook,
     ) -> Leader:
         """Return a leader that begins to observe."""
-        core = CoordinatorCore(Name(name), incarnation, Scenario())
+        core = CoordinatorCore(Name(name), incarnation, PAPER)
         core.election.term = term
         rng = random.Random(0)
         control = FormationControl(formation, core._new_ballot, rng, RESEND_S, rules)

@@ -33,7 +33,11 @@ SCENARIO = Scenario(
     road=Road(s1_m=0.0, s2_m=0.0, s3_m=20_000.0),
     # The bound on nodes ends a search; the clock of a busy machine must not.
     formation=FormationSettings(
-        cycle_s=SLOT_S, move_s=0.8, max_joined=2, planning_deadline_s=3600.0
+        operation="paper",
+        cycle_s=SLOT_S,
+        move_s=0.8,
+        max_joined=2,
+        planning_deadline_s=3600.0,
     ),
     network=Network(election_s=1.0),
     runtime=Runtime(tick_s=TICK_S),

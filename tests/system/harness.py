@@ -184,6 +184,11 @@ def events(folder: Path, kind: str | None = None) -> list[dict[str, Any]]:
     ]
 
 
+def plans(folder: Path) -> list[dict[str, Any]]:
+    """Return the events that tell of a plan, of a formation or of the whole stream."""
+    return [event for event in events(folder) if event["kind"] in ("plan-made", "stream-planned")]
+
+
 def log_lines(folder: Path) -> list[dict[str, Any]]:
     """Return what the processes of a run logged."""
     return list(_json_lines(folder / "log.jsonl"))

@@ -16,6 +16,7 @@ from system.harness import (
     check_safe_and_complete,
     events,
     final_lanes,
+    plans,
     summary,
 )
 
@@ -136,7 +137,7 @@ def test_the_router_is_killed_and_started_again(lab: Lab, short: Path) -> None:
 
     assert injected(found, "killed") == ["router"]
     # The network came back: somebody was told where to go after it.
-    planned_s = [event["t_s"] for event in events(lab.folder / "out", "plan-made")]
+    planned_s = [event["t_s"] for event in plans(lab.folder / "out")]
     assert max(planned_s) > 9.0
 
 

@@ -54,6 +54,7 @@ from system.harness import (
     events,
     final_lanes,
     log_lines,
+    plans,
     summary,
 )
 
@@ -314,7 +315,7 @@ def test_forged_messages_crash_nobody(
         *("run", road, *DEMAND, "--vehicles-per-process", "4"),
         *("--pace", "10", "--out", folder),
     )
-    lab.wait_until(lambda: len(events(folder, "plan-made")) > 0)
+    lab.wait_until(lambda: len(plans(folder)) > 0)
     known = [Name(event["vehicle"]) for event in events(folder, "entered")]
 
     def say(transport: ZenohTransport) -> None:

@@ -17,6 +17,7 @@ from system.harness import (
     final_lanes,
     log_lines,
     mean_travel_time_s,
+    plans,
     summary,
     trips,
 )
@@ -118,7 +119,7 @@ def test_a_run_leaves_all_its_files(finished_run: FinishedRun, name: str) -> Non
     assert set(rows["vehicle"].unique().to_pylist()) == set(vehicles)
     assert {event["vehicle"] for event in events(folder, "left")} == set(vehicles)
     assert all({"t_s", "kind", "role"} <= event.keys() for event in events(folder))
-    assert len(events(folder, "plan-made")) == summary(folder)["planning"]["plans"]
+    assert len(plans(folder)) == summary(folder)["planning"]["plans"]
     for picture in ("travel_time", "speed", "road"):
         assert (folder / f"{picture}.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 

@@ -326,7 +326,7 @@ class CoordinatorCore:
         if self._road_changed:
             self._road_changed = False
             stream.on_census(census)
-            yield from self._carry_out(stream.order(self._job, self.t_s))
+            yield from self._carry_out(stream.order(self._job, self.t_s, now_s))
         for vehicle, message in stream.outgoing(now_s):
             yield self._to_vehicle(vehicle, message)
 

@@ -36,8 +36,8 @@ SHOWN_S = 0.5
 
 Planned is from what was shown up to then, once road time has gone on and all of it has arrived: so
 plans do not depend on how fast messages are."""
-PATIENCE_S = 1.0
-"""A new leader listens for so long (road time). One that leads only for a moment, because it has
+PATIENCE_S = 0.5
+"""A new leader listens for so long (node clock). One that leads only for a moment, because it has
 not heard another one, must not outbid what that one has begun."""
 LATEST_S = 1.0
 """A plan that is ready later than this after its slot has begun is not put into force any more."""
@@ -146,7 +146,7 @@ class StreamControl:
         self._census_before: Census | None = None
         self._highest: Ballot | None = None
         self._since_s: float | None = None
-        """Since when states have been heard (road time)."""
+        """Since when states have been heard (node clock)."""
         self._ordered: tuple[int, int] | None = None
         """Number of the computation under way, and of the slot that it plans."""
         self._newest_slot = -1
@@ -204,22 +204,26 @@ class StreamControl:
 
     # --- the slot -----------------------------------------------------------------------------
 
-    def order(self, job: Callable[[], int], t_s: float) -> Iterator[Compute]:
+    def order(self, job: Callable[[], int], t_s: float, now_s: float) -> Iterator[Compute]:
         """Order the planning of the next slot when it is time for it.
 
         Args:
             job: returns the number of a new computation.
             t_s: road time.
+            now_s: node clock.
         """
-        census = self._census
-        if census is None or not census.on_road or self._ordered is not None:
+        if self._census is None:
             return
         if self._since_s is None:
-            self._since_s = t_s
-        slot = math.floor(t_s / self._slot_s + 1e-9)
-        look_s = max(slot * self._slot_s + SHOWN_S, self._since_s + PATIENCE_S) + 1e-6
-        if slot < self._newest_slot or t_s <= look_s:
+            self._since_s = now_s
+        if not self._census.on_road or self._ordered is not None:
             return
+        slot = math.floor(t_s / self._slot_s + 1e-9)
+        look_s = slot * self._slot_s + SHOWN_S + 1e-6
+        if slot < self._newest_slot or t_s <= look_s or now_s < self._since_s + PATIENCE_S:
+            return
+        if t_s > look_s + 1.5 * self._scenario.runtime.tick_s:
+            look_s = t_s  # it could not look in time: the newest is the best
         order = self._order(slot + 1, look_s)
         self._newest_slot = slot + 1
         number = job()

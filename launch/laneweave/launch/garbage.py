@@ -1,4 +1,4 @@
-"""Garbage of simulated runs: most of what they make lives as long as they do."""
+"""When cyclic garbage is looked for: hardly ever, since hardly any is made."""
 
 from __future__ import annotations
 

@@ -4,9 +4,9 @@ What is done here is done once and not by each process: loading libraries, gener
 reads and writes messages and scenarios, planning the moves of vehicles with the default limits (a
 scenario with others gains all the rest). Nothing is opened: no session, no thread, no file.
 
-Last of all, whatever is there by now is taken out of garbage collection. It lives as long as its
-process, and a collection writes to every object that it looks at: each process would soon have a
-copy of its own of all of it.
+Last of all, whatever is there by now is taken out of garbage collection, and the rest is seldom
+looked at. It lives as long as its process, and a collection writes to every object that it looks
+at: each process would soon have a copy of its own of all of it.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ import laneweave.coordinator.process
 import laneweave.launch.entry
 import laneweave.launch.roles  # noqa: F401 (its processes begin there)
 from laneweave.agents.process import warm_up
+from laneweave.launch.garbage import collect_seldom
 from laneweave.protocol import codec
 from laneweave.protocol.scenario import parse_scenario
 
 codec.warm_up()
 warm_up(parse_scenario({}))
 gc.collect()
-gc.freeze()
+collect_seldom()

@@ -107,9 +107,9 @@ class Demand:
 class FormationSettings:
     """Formation control parameters d_F, T_F, v_F and the planner's choices."""
 
-    operation: str = field(default="paper", validator=one_of("paper", "rolling"))
-    """`paper`: closed formations in blocks, planned once. `rolling`: every cell may be entered, and
-    the whole stream is planned anew in each slot."""
+    operation: str = field(default="rolling", validator=one_of("rolling", "paper"))
+    """`rolling`: every cell may be entered, and the whole stream is planned anew in each slot.
+    `paper`: closed formations in blocks, planned once."""
     gap_m: float = field(default=15.0, validator=within(1.0, 200.0))
     """d_F, the column pitch."""
     cycle_s: float = field(default=4.0, validator=within(0.5, 60.0))

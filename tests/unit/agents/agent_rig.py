@@ -27,11 +27,12 @@ from laneweave.protocol.node import Arrived, Effect, Event, Send
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.topics import PLAN, PREPARE, SENSE, Topic
 from laneweave.sim_bridge.plant import Plant
+from paper import PAPER
 
 T = TypeVar("T")
 MakeDriver = Callable[[Scenario], Driver]
 
-SCENARIO = Scenario()
+SCENARIO = PAPER
 LATTICE, TICK_S = SCENARIO.lattice, SCENARIO.runtime.tick_s
 MOVE_TICKS = round(SCENARIO.formation.move_s / TICK_S)
 ME, OTHER = Name("me"), Name("other")

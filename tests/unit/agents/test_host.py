@@ -41,7 +41,6 @@ from laneweave.protocol.node import (
     Watch,
     Withdraw,
 )
-from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.topics import (
     BRIDGE_ALIVE,
     CENSUS,
@@ -53,8 +52,9 @@ from laneweave.protocol.topics import (
     VEHICLE_ALIVE,
     Topic,
 )
+from paper import PAPER
 
-SCENARIO = Scenario()
+SCENARIO = PAPER
 A, B, C = Name("A"), Name("B"), Name("C")
 BALLOT = Ballot(1, Name("c1"), 1, 1)
 FRONT: Cell = (0, 0)

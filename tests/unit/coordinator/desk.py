@@ -12,8 +12,9 @@ from laneweave.protocol.messages import Ballot, Census, CensusEntry, LogEvent, N
 from laneweave.protocol.node import Arrived, Compute, Effect, Send, Started, Wakeup
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.topics import CENSUS
+from paper import PAPER
 
-SCENARIO = Scenario()
+SCENARIO = PAPER
 LATTICE, ELECTION_S = SCENARIO.lattice, SCENARIO.network.election_s
 T_S = 20.0
 """Road time: block 0 has closed and is on the way to S3."""

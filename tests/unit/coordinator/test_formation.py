@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from attrs import evolve
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -17,8 +18,9 @@ from laneweave.coordinator.groups import Groups
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import Census, CensusEntry, Name
 from laneweave.protocol.scenario import FormationSettings, Road, Scenario
+from paper import FORMATIONS, PAPER
 
-SCENARIO = Scenario()
+SCENARIO = PAPER
 LATTICE = SCENARIO.lattice
 CLOSES_S = closing_time_s((0,), SCENARIO)
 """A column after the rear one of block 0 passes the start of the road, which it does at 3 s."""
@@ -115,7 +117,7 @@ def test_nobody_changes_lanes_before_the_rear_body_is_in_s3(
     number: int, gap_m: float, sorting_m: float, not_before_s: float
 ) -> None:
     scenario = Scenario(
-        road=Road(s1_m=0.0, s2_m=sorting_m), formation=FormationSettings(gap_m=gap_m)
+        road=Road(s1_m=0.0, s2_m=sorting_m), formation=evolve(FORMATIONS, gap_m=gap_m)
     )
     lattice, tick_s = scenario.lattice, scenario.runtime.tick_s
     start_s = start_time_s((number,), not_before_s, scenario)

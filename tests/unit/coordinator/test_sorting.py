@@ -13,9 +13,10 @@ from laneweave.coordinator.sorting import Sorting, SortingTask, plan_request, so
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.messages import Name
-from laneweave.protocol.scenario import FormationSettings, Scenario
+from laneweave.protocol.scenario import Scenario
+from paper import FORMATIONS, PAPER
 
-SCENARIO = Scenario()
+SCENARIO = PAPER
 LATTICE = SCENARIO.lattice
 WEIGHTS = Weights(1, 2)
 NODES = SCENARIO.formation.max_nodes
@@ -57,7 +58,7 @@ def test_the_request_is_in_the_blocks_own_columns_and_in_the_order_of_the_roster
 
 
 def test_the_request_follows_the_scenario() -> None:
-    scenario = evolve(SCENARIO, formation=FormationSettings(mode=2, planning_deadline_s=1.5))
+    scenario = evolve(SCENARIO, formation=evolve(FORMATIONS, mode=2, planning_deadline_s=1.5))
     request = plan_request(task({A: (0, 0)}, {A: 1}, scenario=scenario))
     assert (request.mode, request.conflicts, request.deadline_s) == (
         2,

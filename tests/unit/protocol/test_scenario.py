@@ -78,10 +78,10 @@ def test_defaults_are_the_table_of_the_paper() -> None:
     assert scenario.lane_shares == pytest.approx((1 / 3,) * 3)
 
 
-def test_the_file_of_the_paper_holds_the_defaults() -> None:
+def test_the_file_of_the_paper_holds_the_defaults_but_for_the_operation() -> None:
     explicit = ("node", "edge", "special-1", "closing")
     default = Scenario()
-    formation = attrs.evolve(default.formation, conflicts=explicit)
+    formation = attrs.evolve(default.formation, operation="paper", conflicts=explicit)
     assert load_scenario(FOLDER / "paper.toml") == attrs.evolve(default, formation=formation)
 
 

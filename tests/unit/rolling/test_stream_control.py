@@ -107,8 +107,10 @@ class Bench:
     def hear(self, *states: State) -> list[Note]:
         return [note for each in states for note in self.control.on_state(each)]
 
-    def order(self, t_s: float = LOOK_S) -> Compute | None:
-        orders = list(self.control.order(lambda: next(iter(self.jobs)), t_s))
+    def order(self, t_s: float = LOOK_S, now_s: float | None = None) -> Compute | None:
+        """Order at a road time; the node's clock is alike, unless it is given."""
+        clock_s = t_s if now_s is None else now_s
+        orders = list(self.control.order(lambda: next(iter(self.jobs)), t_s, clock_s))
         assert len(orders) <= 1
         return orders[0] if orders else None
 
@@ -164,11 +166,17 @@ def test_nothing_is_planned_without_a_road() -> None:
 
 
 def test_a_new_leader_listens_first() -> None:
+    """However fast or slow the road is; then it looks at once, and at the newest."""
     desk = Bench()
-    desk.control.on_census(census(A))
-    assert desk.order(BEGUN_S + 1.0) is None
-    assert desk.order(BEGUN_S + 1.0 + PATIENCE_S) is None
-    assert desk.order(BEGUN_S + 1.0 + PATIENCE_S + 0.1) is not None
+    desk.control.on_census(evolve(census(), t_s=BEGUN_S + 0.9))
+    assert desk.order(LOOK_S, now_s=10.0) is None
+    desk.control.on_census(evolve(census(A), t_s=BEGUN_S + 0.9))
+    desk.hear(evolve(shown(A), t_s=BEGUN_S + 1.0))
+    assert desk.order(BEGUN_S + 3.0, now_s=10.0 + PATIENCE_S - 0.01) is None
+    compute = desk.order(BEGUN_S + 1.0, now_s=10.0 + PATIENCE_S)
+    assert compute is not None
+    compute.work()
+    assert not desk.calls[0].vehicles[A].held
 
 
 def test_who_leads_again_listens_again_and_leaves_alone_what_was_begun() -> None:
@@ -180,7 +188,7 @@ def test_who_leads_again_listens_again_and_leaves_alone_what_was_begun() -> None
     assert set(desk.control.states) == {A, B}  # what they have shown stays true
     later_s = LOOK_S + SLOT_S
     assert desk.order(later_s) is None
-    assert desk.order(later_s + PATIENCE_S + 0.1) is not None
+    assert desk.order(later_s + PATIENCE_S) is not None
 
 
 def test_a_plan_that_comes_late_is_dropped() -> None:
@@ -503,7 +511,7 @@ def test_a_new_leadership_begins_with_nothing() -> None:
     assert desk.order(LOOK_S + SLOT_S) is None
     desk.control.on_census(census(A))
     assert desk.order(LOOK_S + SLOT_S) is None  # it listens first
-    assert desk.order(LOOK_S + SLOT_S + PATIENCE_S + 0.1) is not None
+    assert desk.order(LOOK_S + SLOT_S + PATIENCE_S) is not None
 
 
 # --- the real planner -------------------------------------------------------------------------
@@ -513,10 +521,10 @@ def test_the_real_planner_takes_what_it_is_given() -> None:
     """Also somebody who was not heard, whose own cell is blocked."""
     control = StreamControl(ROLLING, lambda _: Ballot(7, Name("c1"), 1, 1), stream_planner(ROLLING))
     control.on_census(census(A, B, C))
-    assert list(control.order(lambda: 1, BEGUN_S - 2.0)) == []
+    assert list(control.order(lambda: 1, BEGUN_S - 2.0, 0.0)) == []
     for name in (A, B):
         assert list(control.on_state(shown(name))) == []
-    (compute,) = control.order(lambda: 1, LOOK_S)
+    (compute,) = control.order(lambda: 1, LOOK_S, 9.0)
     plan = compute.work()
     assert isinstance(plan, StreamPlan)
     assert set(plan.ways) == {A, B, C}

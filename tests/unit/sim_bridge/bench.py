@@ -50,8 +50,9 @@ FOR_EVER_S = 1e6
 
 
 def make_scenario(**tables: dict[str, Any]) -> Scenario:
-    """Return a scenario with a short road and exact sensors, but for some tables."""
-    return parse_scenario({"road": ROAD, "sensing": EXACT} | tables)
+    """Return the paper's operation on a short road with exact sensors, but for some tables."""
+    formation = {"operation": "paper", **tables.pop("formation", {})}
+    return parse_scenario({"road": ROAD, "sensing": EXACT, "formation": formation} | tables)
 
 
 def arrival(vehicle: str, t_s: float, lane: int = 0, preferred_lane: int = 0) -> Arrival:

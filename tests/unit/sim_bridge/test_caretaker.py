@@ -10,13 +10,13 @@ from attrs import evolve
 
 from laneweave.protocol.lattice import Cell, Move, territory
 from laneweave.protocol.messages import Ballot, Command, Name, Plan, Prepare, VehicleState
-from laneweave.protocol.scenario import Scenario
 from laneweave.sim_bridge.caretaker import Caretaker
 from laneweave.sim_bridge.demand import Arrival
 from laneweave.sim_bridge.entry import Admission
 from laneweave.sim_bridge.traffic import RoadVehicle
+from paper import PAPER
 
-SCENARIO = Scenario()
+SCENARIO = PAPER
 A, B = Name("A"), Name("B")
 HOME: Cell = (-2, 0)
 NEXT: Cell = (-1, 0)

@@ -9,12 +9,12 @@ import pytest
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import Command, Name, Neighbour
 from laneweave.protocol.motion import State, cell_state, commanded_state, hold_law
-from laneweave.protocol.scenario import Scenario
 from laneweave.sim_bridge.motion_controller import RELEASE_M, MotionController, Rung
 from laneweave.sim_bridge.overlap import NOBODY_AROUND, Around
 from laneweave.sim_bridge.plant import Plant
+from paper import PAPER
 
-SCENARIO = Scenario()
+SCENARIO = PAPER
 LIMITS, LATTICE, TICK_S = SCENARIO.vehicle, SCENARIO.lattice, SCENARIO.runtime.tick_s
 V_F = LATTICE.speed_mps
 HOME: Cell = (0, 1)

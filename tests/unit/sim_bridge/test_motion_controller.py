@@ -12,11 +12,11 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import Ballot, Command, Name
 from laneweave.protocol.motion import Jerk, cell_state
-from laneweave.protocol.scenario import Scenario
 from laneweave.sim_bridge.motion_controller import MAX_COLUMN, MotionController, Rung
 from laneweave.sim_bridge.plant import Plant
+from paper import PAPER
 
-SCENARIO = Scenario()
+SCENARIO = PAPER
 LATTICE, TICK_S = SCENARIO.lattice, SCENARIO.runtime.tick_s
 HOME: Cell = (0, 1)
 AGENT = 5

@@ -16,11 +16,12 @@ from laneweave.sim_bridge.roadside import Counts, Roadside
 from laneweave.sim_bridge.traffic import RoadVehicle
 
 
-def crowded(**runtime: Any) -> Scenario:  # noqa: ANN401 (fields)
+def crowded(operation: str = "paper", **runtime: Any) -> Scenario:  # noqa: ANN401 (fields)
     """More than twice what can enter: the queue grows as long as there is demand."""
     return parse_scenario(
         {
             "demand": {"volume_veh_per_lane_h": 3600, "duration_s": 120, "min_headway_s": 0.5},
+            "formation": {"operation": operation},
             "runtime": runtime,
         }
     )
@@ -90,16 +91,17 @@ class Watch:
 
 
 @pytest.mark.parametrize("announce_s", [0.0, 0.05, 6.0, 30.0])
+@pytest.mark.parametrize(("operation", "columns"), [("paper", 2), ("rolling", 1)])
 def test_everybody_is_announced_before_entering_and_never_too_many_at_once(
-    announce_s: float,
+    announce_s: float, operation: str, columns: int
 ) -> None:
-    scenario = crowded(announce_s=announce_s)
+    scenario = crowded(operation, announce_s=announce_s)
     watch = Watch(scenario)
     watch.run()
     assert len(watch.entered) > 300
-    # On each lane one vehicle can enter in two columns' time.
+    # On each lane one vehicle can enter in so many columns' time.
     lattice = scenario.lattice
-    per_lane = math.ceil((announce_s + 0.1) * lattice.speed_mps / (2 * lattice.pitch_m)) + 1
+    per_lane = math.ceil((announce_s + 0.1) * lattice.speed_mps / (columns * lattice.pitch_m)) + 1
     assert watch.most_announced <= per_lane * lattice.lanes
 
 

@@ -33,6 +33,7 @@ def make_scenario(lanes: int, max_joined: int) -> Scenario:
     return Scenario(
         road=Road(lanes=lanes, s1_m=0.0, s2_m=0.0, s3_m=20_000.0),
         formation=FormationSettings(
+            operation="paper",
             cycle_s=SLOT_S,
             move_s=MOVE_S,
             max_joined=max_joined,
