@@ -1,10 +1,11 @@
-"""What faults on real processes cost: the table of docs/EVALUATION.md, "Under faults".
+"""What faults cost: the table of docs/EVALUATION.md, "Under faults".
 
     python benchmarks/resilience.py [--only NAME ...] [--out FOLDER]
 
-Each experiment is one `laneweave run` with a faults file. Its figures are read from the run's
-folder and written to FOLDER/resilience.json. Experiments that are there already are kept, unless
-`--only` names them. A run's own verdict (overlaps, who did not leave) is among the figures.
+Each experiment is one `laneweave run` with a faults file: real processes, or for the rolling
+operation all roles over the simulated network, which repeats exactly. Its figures are read from the
+run's folder and written to FOLDER/resilience.json. Experiments that are there already are kept,
+unless `--only` names them. A run's own verdict (overlaps, who did not leave) is among the figures.
 """
 
 from __future__ import annotations
@@ -42,9 +43,18 @@ REAL_TIME = ("--pace", "1")
 SHORT_TICKS = "short-ticks.toml"
 
 
-def demand(volume: int, duration_s: int) -> tuple[str, ...]:
+def demand(volume: int, duration_s: int, operation: str = "paper") -> tuple[str, ...]:
     """Return the options for vehicles per lane and hour that arrive for some time."""
-    return ("--volume", f"{volume}", "--seed", "1", "--duration", f"{duration_s}")
+    flow = ("--volume", f"{volume}", "--seed", "1", "--duration", f"{duration_s}")
+    return ("--operation", operation, *flow)
+
+
+def rolling(
+    name: str, faults: str | None, duration_s: int = 200, *, short: bool = False
+) -> Experiment:
+    """Return an experiment of the rolling operation at 1600 vehicles/(lane h), simulated."""
+    options = (*demand(1600, duration_s, "rolling"), "--transport", "simulated")
+    return Experiment(f"rolling-{name}", faults, options, SHORT_TICKS if short else None)
 
 
 EXPERIMENTS = (
@@ -60,6 +70,13 @@ EXPERIMENTS = (
     Experiment("router-killed", "router-killed-10-times.toml", (*demand(1000, 300), *REAL_TIME)),
     Experiment("leader-killed", "leader-killed-50-times.toml", (*demand(1000, 300), *REAL_TIME)),
     Experiment("leader-stopped", "leader-stopped-30-times.toml", (*demand(600, 560), *REAL_TIME)),
+    rolling("undisturbed", None),
+    rolling("loss-10", "lossy10", short=True),
+    rolling("loss-30", "loss-30.toml", short=True),
+    rolling("loss-50", "lossy50", short=True),
+    rolling("blackout", "blackout"),
+    rolling("agents-killed", "agents-killed.toml", 300),
+    rolling("everything", "everything"),
 )
 
 

@@ -70,16 +70,18 @@ def _profiles() -> str:
 
 
 def _resilience() -> str:
-    """Return the table of what faults on real processes cost."""
+    """Return the table of what faults cost."""
     measured = json.loads(MEASURED.read_text(encoding="utf-8"))
-    undisturbed_s = measured["undisturbed"]["travel_time_s"]
     lines = [
         "| experiment | left | on their lane | overlaps | least gap | travel time | more |",
         "|---|---|---|---|---|---|---|",
     ]
     for name, run in measured.items():
-        comparable = run["demanded"] == measured["undisturbed"]["demanded"]
-        times = f" ({run['travel_time_s'] / undisturbed_s:.3f}x)" if comparable else ""
+        prefix = "rolling-" if name.startswith("rolling-") else ""
+        calm = measured[f"{prefix}undisturbed"]
+        comparable = run["demanded"] == calm["demanded"]
+        factor = run["travel_time_s"] / calm["travel_time_s"]
+        times = f" ({factor:.3f}x)" if comparable else ""
         lines.append(
             f"| `{name}` | {run['left']} of {run['demanded']} | {run['on_lane_percent']:.1f} % "
             f"| {run['overlaps']} | {run['min_gap_m']:.2f} m | {run['travel_time_s']:.2f} s{times} "

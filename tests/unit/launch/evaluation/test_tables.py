@@ -38,7 +38,7 @@ def full() -> Evidence:
     """Return evidence with every point, formation control at its goals, rules that congest."""
     times = {"rolling": 66.5, "paper-6": 67.4, "paper-12": 67.4, "lc2013": 67.5}
     rows = [
-        point(label, volume, times.get(label, 60.0 + volume / 100.0))
+        point(label, volume, times.get(label, 45.0 + volume / 40.0))
         for label in LABELS
         for volume in ROLLING_VOLUMES
         if planned(label, volume)
@@ -63,7 +63,7 @@ def full() -> Evidence:
 
 def test_what_is_missing_says_so() -> None:
     parts = document_parts(Evidence())
-    assert cells(parts["evaluation travel times"], "1750") == ["1750", *["missing"] * len(LABELS)]
+    assert cells(parts["evaluation travel times"], "1600") == ["1600", *["missing"] * len(LABELS)]
     assert cells(parts["evaluation travel times"], "1800")[1:] == ["missing", *["-"] * 7]
     for name in ("lattice", "agreement", "factors", "costs"):
         assert "missing" in parts[f"evaluation {name}"]
@@ -147,9 +147,9 @@ def test_a_broken_promise_is_a_goal_missed() -> None:
 def test_statements_follow_the_data() -> None:
     table = statements_table(full())
     assert cells(table, "The travel time of formation control")[2] == "holds"
-    # 60 s + volume / 100: congested, above 83.3 s, from 2400 on; faster than formations below 740.
+    # 45 s + volume / 40: congested, above 83.3 s, from 1600 on; faster than formations below 900.
     assert cells(table, "Severe congestion")[2] == "**does not hold**"
-    assert "`rule` at 2400, not yet at 2200" in cells(table, "Severe congestion")[1]
+    assert "`rule` at 1600, not yet at 1450" in cells(table, "Severe congestion")[1]
     assert cells(table, "The congestion is at")[2] == "holds"
     assert cells(table, "Formation control is faster")[2] == "holds"
     assert cells(table, "At most 1800")[2] == "holds"
