@@ -101,6 +101,8 @@ def road_snapshots(
     ).to_pylist()
     preferred = {trip["vehicle"]: int(trip["preferred_lane"]) for trip in trips}
     formations = {int(trip["formation"]) for trip in trips if trip["formation"] is not None}
+    if scenario.formation.rolling:
+        formations = set()  # the stream has none
     width_in = 9.6
     strip_in = (
         _ACROSS_SCALE

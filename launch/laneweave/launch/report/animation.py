@@ -88,6 +88,7 @@ def _sample(run: Run, tracks: Tracks) -> _Samples:
         run.folder / "trips.parquet", columns=["vehicle", "preferred_lane", "formation"]
     ).to_pylist()
     trip_of = {trip["vehicle"]: trip for trip in trips}
+    rolling = run.scenario.formation.rolling
     driven_s = len(tracks.t_s) * run.scenario.runtime.tick_s
     step_s = next((step for step in STEPS_S if driven_s / step <= MOST_SAMPLES), STEPS_S[-1])
     end_s = float(tracks.t_s.max(initial=0.0))
@@ -114,7 +115,7 @@ def _sample(run: Run, tracks: Tracks) -> _Samples:
             {
                 "name": tracks.names[int(number)],
                 "lane": int(trip.get("preferred_lane") or 0),
-                "formation": trip.get("formation"),
+                "formation": None if rolling else trip.get("formation"),
                 "first": first,
                 "count": count,
             }

@@ -199,10 +199,10 @@ def _add_path_map(report: _Report, driven: DrivenMap | None) -> None:
         "Relative path map",
         "path_map.png",
         lambda path: draw_path_map(driven, path, report.dpi),
-        "The cells (column, lane) of a formation's vehicles at the ends of its slots, as driven. "
+        f"The cells (column, lane) of {driven.whose} at the ends of slots, as driven. "
         "The box before a name has the colour of the preferred lane; cells have the colour of "
         "their lane, strong where that is the preferred one; bold: moved in the slot before.",
-        f"Table of the cells of formation {driven.formation} by vehicle and slot",
+        f"Table of the cells of {driven.name} by vehicle and slot",
     )
 
 

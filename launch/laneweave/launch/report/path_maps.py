@@ -32,6 +32,8 @@ class DrivenMap:
     """A formation's relative path map as it was driven."""
 
     formation: int
+    rolling: bool
+    """There were no formations: these vehicles entered in the columns of one block."""
     path_map: RelativePathMap
     """Columns count from the block's first one."""
     preferred_lanes: tuple[int, ...]
@@ -40,6 +42,18 @@ class DrivenMap:
     """Road time of the first time point."""
     slot_s: float
     lanes: int
+
+    @property
+    def name(self) -> str:
+        """What it is called in figures."""
+        return f"{'block' if self.rolling else 'formation'} {self.formation}"
+
+    @property
+    def whose(self) -> str:
+        """Whose cells it shows."""
+        if self.rolling:
+            return "the vehicles that entered in the columns of a block"
+        return "a formation's vehicles"
 
 
 def driven_map(run: Run, tracks: Tracks, formation: int | None) -> DrivenMap | None:
@@ -111,6 +125,7 @@ def _map_of(
     order = sorted(range(len(rows)), key=lambda row: (-rows[row][0][0], rows[row][0][1]))
     return DrivenMap(
         formation,
+        run.scenario.formation.rolling,
         RelativePathMap(
             tuple(tracks.names[members[row][0]] for row in order),
             tuple(rows[row] for row in order),
@@ -160,7 +175,7 @@ def draw_path_map(driven: DrivenMap, out: Path, dpi: int) -> None:
     for row, (name, cells) in enumerate(zip(path_map.ids, path_map.rows, strict=True)):
         _draw_row(axes, row, name, cells, driven.preferred_lanes[row], colours)
     axes.set_title(
-        f"formation {driven.formation}: {rows} vehicles, {path_map.cost()} steps in all "
+        f"{driven.name}: {rows} vehicles, {path_map.cost()} steps in all "
         f"within {path_map.steps} slots",
         fontsize=9.5,
         color=INK,

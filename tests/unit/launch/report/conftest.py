@@ -18,7 +18,8 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scenario = short_road(folder)
     # Long enough for everybody to settle, and to reach the preferred lane.
     text = scenario.read_text().replace("s3_m = 120.0", "s3_m = 240.0")
-    scenario.write_text(text.replace("s2_m = 10.0", "s2_m = 180.0"))
+    text = text.replace("s2_m = 10.0", "s2_m = 180.0")
+    scenario.write_text(text + '\n[formation]\noperation = "paper"\n')
     done = sweep(scenario, out, *lists)
     assert done.returncode == 0, done.stderr
     return out

@@ -119,6 +119,7 @@ def test_path_maps_are_what_was_driven(swept: Path) -> None:
             if driven.start_s + path_map.steps * driven.slot_s < trips[name]["left_s"]:
                 assert row[-1][1] == trips[name]["final_lane"]
             assert lane == trips[name]["preferred_lane"]
+            assert all(0 <= column < 4 for column, _ in row)
             for (column, lane_a), (next_column, lane_b) in pairwise(row):
                 assert abs(next_column - column) + abs(lane_b - lane_a) <= 1
         for cells in zip(*path_map.rows, strict=True):
