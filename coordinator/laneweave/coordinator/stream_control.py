@@ -145,8 +145,8 @@ class StreamControl:
         self._census: Census | None = None
         self._census_before: Census | None = None
         self._highest: Ballot | None = None
-        self._since_s: float | None = None
-        """Since when states have been heard (node clock)."""
+        self._since: tuple[float, float] | None = None
+        """Since when states have been heard: road time, node clock."""
         self._ordered: tuple[int, int] | None = None
         """Number of the computation under way, and of the slot that it plans."""
         self._newest_slot = -1
@@ -155,23 +155,26 @@ class StreamControl:
     # --- inputs -------------------------------------------------------------------------------
 
     def forget(self) -> None:
-        """Begin anew: another road, or another leadership."""
+        """Begin anew: another road."""
         self.states.clear()
         self._before.clear()
         self._left.clear()
         self.handovers.clear()
         self._of.clear()
-        self._census = self._census_before = self._table = self._ordered = self._since_s = None
+        self._census = self._census_before = self._table = self._ordered = self._since = None
         self._newest_slot = -1
 
     def take_over(self) -> None:
         """Lead, again or for the first time: listen for a while before anything is planned.
 
-        What vehicles have shown stays true; what was begun under an earlier lead is left alone.
+        What vehicles have shown stays true of what they own, but not of where they are; what was
+        begun under an earlier lead is left alone.
         """
         self.handovers.clear()
         self._of.clear()
-        self._ordered = self._since_s = None
+        self._before.clear()
+        self._left.clear()
+        self._census = self._census_before = self._ordered = self._since = None
 
     def on_census(self, census: Census) -> None:
         """Take note of who is on the road."""
@@ -189,9 +192,11 @@ class StreamControl:
         """Take a vehicle's state, unless a newer one is known."""
         known = self.states.get(state.vehicle)
         if known is not None and _age(state) < _age(known):
+            if state.t_s < known.t_s:
+                self._keep_before(state)
             return
         if known is not None and state.t_s > known.t_s:
-            self._before[state.vehicle] = known
+            self._keep_before(known)
         self.states[state.vehicle] = state
         if state.promised is not None:
             self._highest = max(self._highest or state.promised, state.promised)
@@ -201,6 +206,15 @@ class StreamControl:
         handover.on_state(state, self.states)
         if handover.phase is Phase.GIVEN_UP:
             yield Note("handover-given-up", {"roster": list(handover.roster), "why": handover.why})
+        elif handover.phase is Phase.IN_FORCE and self.in_force == 1:
+            slot = round(handover.t0_s / self._slot_s)
+            begun_s = handover.t0_s - self._slot_s
+            yield Note("plan-in-force", {"slot": slot, "closed_s": begun_s + SHOWN_S})
+
+    def _keep_before(self, state: VehicleState) -> None:
+        before = self._before.get(state.vehicle)
+        if before is None or _age(before) < _age(state):
+            self._before[state.vehicle] = state
 
     # --- the slot -----------------------------------------------------------------------------
 
@@ -214,15 +228,18 @@ class StreamControl:
         """
         if self._census is None:
             return
-        if self._since_s is None:
-            self._since_s = now_s
+        if self._since is None:
+            self._since = t_s, now_s
+        for handover in self.handovers:
+            if handover.wakeup_s is not None and t_s > handover.t0_s + LATEST_S:
+                handover.give_up("its slot has begun")
         if not self._census.on_road or self._ordered is not None:
             return
         slot = math.floor(t_s / self._slot_s + 1e-9)
         look_s = slot * self._slot_s + SHOWN_S + 1e-6
-        if slot < self._newest_slot or t_s <= look_s or now_s < self._since_s + PATIENCE_S:
+        if slot < self._newest_slot or t_s <= look_s or now_s < self._since[1] + PATIENCE_S:
             return
-        if t_s > look_s + 1.5 * self._scenario.runtime.tick_s:
+        if max(self._since[0], t_s - 1.5 * self._scenario.runtime.tick_s) > look_s:
             look_s = t_s  # it could not look in time: the newest is the best
         order = self._order(slot + 1, look_s)
         self._newest_slot = slot + 1
@@ -235,7 +252,10 @@ class StreamControl:
 
     def _order(self, slot: int, look_s: float) -> _Order:
         """Lay down what is to be planned: what was the case at a time, by now known."""
-        vehicles, owned, taken = [], set[Cell](), set[Cell]()
+        vehicles: dict[Cell, StreamVehicle] = {}
+        owned, taken = set[Cell](), set[Cell]()
+        # Where vehicles were in an earlier lead says nothing of where they are.
+        since_s = self._since[0] - 1e-6 if self._since is not None else 0.0
         far_m = self._scenario.moves_from_m - AHEAD_M
         census = _at(look_s, self._census, self._census_before) or self._census
         assert census is not None  # noqa: S101 (asked by the caller)
@@ -254,9 +274,11 @@ class StreamControl:
             if self._scenario.lattice.cell_s_m(column, (slot - 1) * self._slot_s) < far_m:
                 continue
             if state is None:
-                vehicles.append(
-                    StreamVehicle(entry.vehicle, entry.cell, entry.preferred_lane, held=True)
+                # It may be elsewhere by now, and somebody else in its cell.
+                held_there = StreamVehicle(
+                    entry.vehicle, entry.cell, entry.preferred_lane, held=True
                 )
+                vehicles.setdefault(entry.cell, held_there)
                 continue
             # Its move begins at any moment. Without an open gate it may never: who takes part in
             # something newer is asked, and then it does not.
@@ -264,18 +286,20 @@ class StreamControl:
             owned |= sure_of(state, states, gone)
             if late:
                 taken |= {*state.estate} - {state.hold_cell}
-            held = late or not state.attended
-            vehicles.append(
-                StreamVehicle(entry.vehicle, state.hold_cell, entry.preferred_lane, held)
-            )
-        columns = [vehicle.cell[0] for vehicle in vehicles] or [0]
+            held = late or not state.attended or state.t_s < since_s
+            known = vehicles.get(state.hold_cell)
+            if known is None or known.vehicle not in states:
+                vehicles[state.hold_cell] = StreamVehicle(
+                    entry.vehicle, state.hold_cell, entry.preferred_lane, held
+                )
+        columns = [column for column, _ in vehicles] or [0]
         blocked = {
             (column, lane)
             for column in range(min(columns) - BESIDE, max(columns) + BESIDE + 1)
             for lane in range(self._scenario.road.lanes)
             if (column, lane) not in owned or (column, lane) in taken
         }
-        return _Order(slot, tuple(vehicles), frozenset(blocked), self._table)
+        return _Order(slot, tuple(vehicles.values()), frozenset(blocked), self._table)
 
     def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterator[Note]:
         """Take a plan, and begin to put its first moves into force.
@@ -289,6 +313,9 @@ class StreamControl:
             return
         slot = self._ordered[1]
         self._ordered = None
+        for handover in self.handovers:
+            if handover.wakeup_s is not None:
+                handover.give_up("the next slot is planned")
         table = computed.result
         if not isinstance(table, StreamPlan):
             yield Note("planning-failed", {"slot": slot, "error": computed.error})
@@ -298,9 +325,6 @@ class StreamControl:
         if t_s > t0_s + LATEST_S:
             yield Note("planning-late", {"slot": slot})
             return
-        for handover in self.handovers:
-            if handover.wakeup_s is not None:
-                handover.give_up("the next slot is planned")
         self.handovers = list(self._handovers(table, t0_s, now_s))
         self._of = {name: each for each in self.handovers for name in each.roster}
         yield Note("stream-planned", self._facts(table))
@@ -331,6 +355,9 @@ class StreamControl:
             if len(way) < 2 or way[0] == way[1]:
                 continue
             name = Name(vehicle)
+            state = self.states.get(name)
+            if state is None or state.hold_cell != way[0]:
+                continue  # it has gone on meanwhile
             cells = footprint(way[0], way[1])
             if all(cell in owner for cell in cells):
                 moves[name] = (way[0], way[1])

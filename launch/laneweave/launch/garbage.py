@@ -10,5 +10,6 @@ _THRESHOLD = 50_000
 
 def collect_seldom() -> None:
     """Look for cyclic garbage seldom, in this process from now on, and never at what is there."""
+    gc.collect()
     gc.freeze()
     gc.set_threshold(_THRESHOLD)

@@ -11,8 +11,6 @@ at: each process would soon have a copy of its own of all of it.
 
 from __future__ import annotations
 
-import gc
-
 import laneweave.coordinator.process
 import laneweave.launch.entry
 import laneweave.launch.roles  # noqa: F401 (its processes begin there)
@@ -23,5 +21,4 @@ from laneweave.protocol.scenario import parse_scenario
 
 codec.warm_up()
 warm_up(parse_scenario({}))
-gc.collect()
 collect_seldom()

@@ -130,7 +130,7 @@ def plan_once(planner: Orders, *states: VehicleState) -> StreamControl:
     control.on_census(Census(0.0, entries, ()))
     for each in states:
         list(control.on_state(each))
-    assert not list(control.order(lambda: 1, 8.0, 0.0))
+    assert not list(control.order(lambda: 1, 0.0, 0.0))
     (order,) = control.order(lambda: 1, 9.5, 9.5)
     list(control.finish(Computed(order.job, order.work()), 9.6, 9.6))
     return control

@@ -211,7 +211,7 @@ def test_two_vehicles_never_cost_less_than_the_least_and_mostly_that() -> None:
     random = Random(7)
     equal = 0
     for seed in range(30):
-        vehicles = dense(random, range(2), 1.0, SHORT)[:2]
+        vehicles = random.sample(dense(random, range(3), 1.0, SHORT), 2)
         plan = StreamPlanner(SHORT, seed=seed).plan(0, vehicles)
         cost = oracle.cost_of_plan(SHORT, plan, vehicles)
         least = oracle.least_cost_of_two(SHORT, 0, vehicles[0], vehicles[1])

@@ -162,7 +162,8 @@ def test_nothing_is_planned_without_a_road() -> None:
     desk = Bench()
     assert desk.order() is None
     desk.control.on_census(census())
-    assert desk.order() is None
+    assert desk.order(now_s=0.0) is None
+    assert desk.order(now_s=10.0) is None
 
 
 def test_a_new_leader_listens_first() -> None:
@@ -187,8 +188,17 @@ def test_who_leads_again_listens_again_and_leaves_alone_what_was_begun() -> None
     assert (desk.control.handovers, desk.control.wakeups) == ([], [])
     assert set(desk.control.states) == {A, B}  # what they have shown stays true
     later_s = LOOK_S + SLOT_S
+    assert desk.order(later_s + PATIENCE_S) is None  # it needs a census, too
+    desk.control.on_census(census(A, B))
     assert desk.order(later_s) is None
-    assert desk.order(later_s + PATIENCE_S) is not None
+    desk.hear(evolve(shown(A), hold_cell=(1, 0), t_s=later_s + 0.2))
+    compute = desk.order(later_s + PATIENCE_S)
+    assert compute is not None
+    compute.work()
+    assert desk.calls[-1].vehicles == {
+        A: StreamVehicle(A, (1, 0), 1, held=False),
+        B: StreamVehicle(B, HOMES[B], 1, held=True),  # where it was when it was heard last
+    }
 
 
 def test_a_plan_that_comes_late_is_dropped() -> None:
@@ -266,6 +276,74 @@ def test_what_is_shown_later_does_not_count() -> None:
     }
     desk.think(LOOK_S + SLOT_S)
     assert set(desk.calls[1].vehicles) == {B, D}
+
+
+def test_what_has_arrived_in_another_order_counts() -> None:
+    desk = bench(A)
+    desk.hear(evolve(shown(A), hold_cell=(2, 0), t_s=LOOK_S))
+    desk.hear(evolve(shown(A), hold_cell=(1, 0), t_s=BEGUN_S + SHOWN_S))
+    desk.hear(evolve(shown(A), hold_cell=(0, 0), t_s=BEGUN_S + SHOWN_S - 0.1))
+    desk.hear(evolve(shown(A, OLD), hold_cell=(2, 0), t_s=LOOK_S))  # twice in a tick
+    desk.think()
+    assert desk.calls[0].vehicles[A].cell == (1, 0)
+
+
+def test_who_has_just_left_was_there_when_it_looked() -> None:
+    desk = bench(A, B)
+    desk.control.on_census(evolve(census(A), t_s=LOOK_S))
+    desk.think()
+    assert desk.calls[0].vehicles[B] == StreamVehicle(B, HOMES[B], 1, held=False)
+
+
+def test_whoever_is_not_heard_does_not_keep_others_from_being_planned() -> None:
+    """Somebody else may be where it entered by now."""
+    for names in ((A, B), (B, A)):
+        desk = bench(*names)
+        desk.control.on_census(census(*names, C))
+        desk.hear(evolve(shown(A), hold_cell=HOMES[C], t_s=BEGUN_S + SHOWN_S))
+        desk.think()
+        assert set(desk.calls[0].vehicles) == {A, B}
+    desk = bench(A, B)
+    desk.hear(evolve(shown(A), hold_cell=HOMES[B], t_s=BEGUN_S + SHOWN_S))
+    desk.think()
+    assert len(desk.calls[0].vehicles) == 1
+
+
+def test_who_has_gone_on_since_takes_nobody_along() -> None:
+    desk = bench(A, B)
+    desk.ways = {A: ((0, 0), (0, 1)), B: ((2, 1), (2, 2))}
+    compute = desk.order()
+    assert compute is not None
+    desk.hear(evolve(shown(A, OLD, moving=True), hold_cell=(1, 0), t_s=LOOK_S))
+    desk.hear(evolve(shown(B), estate=(*ESTATES[B], (2, 2)), t_s=LOOK_S))
+    desk.finish(compute, LOOK_S)
+    assert [set(handover.moves) for handover in desk.control.handovers] == [{B}]
+
+
+def test_what_has_not_come_about_is_given_up_when_its_slot_has_begun() -> None:
+    desk = bench(A)
+    desk.ways = {A: ((0, 0), (1, 0))}
+    desk.think()
+    (handover,) = desk.control.handovers
+    desk.order(handover.t0_s + LATEST_S)
+    assert handover.wakeup_s is not None
+    desk.order(handover.t0_s + LATEST_S + 0.1)
+    assert handover.phase is Phase.GIVEN_UP
+
+
+@pytest.mark.parametrize("late", [True, False])
+def test_a_plan_that_is_not_used_ends_what_was_begun_all_the_same(*, late: bool) -> None:
+    desk = bench(A)
+    desk.ways = {A: ((0, 0), (1, 0))}
+    desk.think()
+    (handover,) = desk.control.handovers
+    compute = desk.order(LOOK_S + SLOT_S)
+    assert compute is not None
+    if late:
+        desk.finish(compute, (SLOT + 2) * SLOT_S + LATEST_S + 0.1)
+    else:
+        list(desk.control.finish(Computed(compute.job, None, "out of memory"), LOOK_S, 0.0))
+    assert handover.phase is Phase.GIVEN_UP
 
 
 def test_whoever_has_shown_nothing_in_time_is_held() -> None:
@@ -451,9 +529,13 @@ def test_from_the_plan_to_a_ballot_in_force() -> None:
     plan = run_ballot(desk)
     assert plan.moves == {A: ((0, (0, 0), (0, 1)),), B: ()}
     assert desk.control.in_force == 0
-    for name in (A, B):
-        accepted = shown(name, plan.ballot, accepted=True)
-        desk.hear(evolve(accepted, t_s=BEGUN_S + 1.0))
+    accepted = [
+        evolve(shown(name, plan.ballot, accepted=True), t_s=BEGUN_S + 1.0) for name in (A, B)
+    ]
+    assert desk.hear(accepted[0]) == []
+    assert desk.hear(accepted[1]) == [
+        Note("plan-in-force", {"slot": SLOT + 1, "closed_s": BEGUN_S + SHOWN_S})
+    ]
     assert desk.control.in_force == 1
     assert desk.control.wakeups == []
 
@@ -502,16 +584,32 @@ def test_what_is_in_force_stays_so_when_somebody_leaves() -> None:
     assert handover.phase is Phase.IN_FORCE
 
 
-def test_a_new_leadership_begins_with_nothing() -> None:
+def test_another_road_begins_with_nothing() -> None:
+    """Its clock begins at 0."""
     desk = bench(A, B)
     desk.ways = {A: ((0, 0), (0, 1))}
     desk.think()
     desk.control.forget()
     assert (desk.control.states, desk.control.handovers, desk.control.wakeups) == ({}, [], [])
     assert desk.order(LOOK_S + SLOT_S) is None
-    desk.control.on_census(census(A))
-    assert desk.order(LOOK_S + SLOT_S) is None  # it listens first
-    assert desk.order(LOOK_S + SLOT_S + PATIENCE_S) is not None
+    desk.control.on_census(evolve(census(A), t_s=0.0))
+    assert desk.order(0.0, now_s=100.0) is None  # it listens first
+    compute = desk.order(SHOWN_S + 0.1, now_s=101.0)
+    assert compute is not None
+    compute.work()
+    call = desk.calls[-1]
+    assert (call.slot, call.before) == (1, None)
+    assert call.vehicles == {A: StreamVehicle(A, HOMES[A], 1, held=True)}  # not heard
+
+
+def test_nothing_is_kept_of_those_that_have_left() -> None:
+    desk = bench(A, B, C)
+    desk.hear(*(evolve(shown(name), t_s=BEGUN_S + 0.5) for name in (A, B, C)))
+    desk.control.on_census(evolve(census(B), t_s=BEGUN_S + 0.5))
+    desk.think()
+    kept = desk.control
+    assert set(kept.states) == {B}
+    assert (set(kept._before), kept._left) == ({B}, {})
 
 
 # --- the real planner -------------------------------------------------------------------------

@@ -14,7 +14,8 @@ from numba import njit
 from laneweave.coordinator.planning.stream_arrays import ENTERING, PRICE
 
 _IMPASSABLE = 5e3
-"""More than all that a way may cost; less than being in the way of what is `FIXED`."""
+"""More than all that a way may cost; less than being in the way of what is `FIXED`, in chains for
+somebody who misses its lane. Others have a way at a hundredth of that."""
 _UNREACHED = 1e9
 NO_WAY = 1e9
 """Cost of a vehicle that has no way."""
