@@ -26,7 +26,7 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -c 'from laneweave.coordinator.planning import warm_up; warm_up()'
 	touch $@
 
-demo: $(STAMP) ## run the paper's lane-sorting scenario with one process per vehicle
+demo: $(STAMP) ## let vehicles sort themselves on the paper's road, one process per vehicle
 	rm -rf $(RUN)
 	$(BIN)/laneweave run scenarios/demo.toml --out $(RUN)
 
@@ -49,7 +49,7 @@ test-full: $(STAMP) ## the long programmes too
 evaluation: $(STAMP) ## run what docs/EVALUATION.md reports and write its tables (BUDGET=90 minutes on 2 cores)
 	$(BIN)/python benchmarks/evaluation.py --budget $(BUDGET)
 
-evaluation-faults: $(STAMP) ## the same for "Under faults": apart, since it takes 70 minutes
+evaluation-faults: $(STAMP) ## the same for "Under faults": apart, since it takes an hour and a half
 	$(BIN)/python benchmarks/evaluation.py --only faults
 
 docs: $(STAMP) ## write the generated parts of the documents

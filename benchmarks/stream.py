@@ -30,6 +30,7 @@ from laneweave.coordinator.planning.stream import (
     StreamVehicle,
 )
 from laneweave.coordinator.planning.stream_validate import problems_of_ways
+from laneweave.coordinator.stream_control import REWARD
 from laneweave.protocol.scenario import load_scenario
 from laneweave.sim_bridge.demand import arrivals
 
@@ -37,6 +38,7 @@ OUT = Path(__file__).resolve().parents[1] / "docs" / "evidence" / "stream.json"
 VOLUMES = (1000, 1600, 1800, 2000, 2200, 2400, 2500, 2600)
 DURATION_S, NOT_COUNTED_S = 600.0, 60.0
 PITCH_M, SPEED_MPS, SLOT_S, LENGTH_M = 15.0, 15.0, 4.0, 1000.0
+IN_S2 = load_scenario(None, formation__sort_in_s2=True)
 ROAD = StreamRoad(3, PITCH_M, SPEED_MPS * SLOT_S, (400.0, LENGTH_M), LENGTH_M, 5.0)
 
 
@@ -51,8 +53,8 @@ class Variant:
 
 VARIANTS = {
     "default": Variant(volumes=VOLUMES),
-    "S2 too": Variant(attrs.evolve(ROAD, sorting_m=(200.0, LENGTH_M))),
-    "drift rewarded": Variant(costs=StreamCosts(forward=-0.4)),
+    "S2 too": Variant(attrs.evolve(ROAD, sorting_m=(IN_S2.moves_from_m, LENGTH_M))),
+    "drift rewarded": Variant(costs=StreamCosts(forward=REWARD)),
     "drift costs": Variant(costs=StreamCosts(forward=2.0)),
     "trains": Variant(attrs.evolve(ROAD, model=ConflictModel(("node", "edge", "closing")))),
     "0.5 s late": Variant(

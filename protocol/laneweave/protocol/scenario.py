@@ -364,7 +364,7 @@ def load_scenario(path: Path | None, **overrides: object) -> Scenario:
     """Read a scenario and apply overrides such as `seed=3` or `demand__volume_veh_per_lane_h=1600`.
 
     Args:
-        path: a TOML file; None takes the defaults, which are the paper's scenario.
+        path: a TOML file; None takes the defaults: the paper's road in the rolling operation.
         **overrides: values that replace those of the file; `None` leaves the file's value.
             `table__field` names a field of a table.
 
