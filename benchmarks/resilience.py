@@ -91,9 +91,8 @@ def run(experiment: Experiment, folder: Path) -> dict[str, Any]:
         command += ["--faults", str(path) if path.exists() else experiment.faults]
     done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)  # noqa: S603
     failures = [line for line in done.stdout.splitlines() if line.startswith("FAILED")]
-    return {"status": done.returncode, "failures": failures, "stderr": done.stderr} | figures(
-        folder
-    )
+    (folder / "stderr.txt").write_text(done.stderr, encoding="utf-8")
+    return {"status": done.returncode, "failures": failures} | figures(folder)
 
 
 def figures(folder: Path) -> dict[str, Any]:
