@@ -30,16 +30,16 @@ from laneweave.coordinator.planning.stream import (
     StreamVehicle,
 )
 from laneweave.coordinator.planning.stream_validate import problems_of_ways
-from laneweave.coordinator.stream_control import REWARD
+from laneweave.coordinator.stream_control import REWARD, stream_road
 from laneweave.protocol.scenario import load_scenario
 from laneweave.sim_bridge.demand import arrivals
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "evidence" / "stream.json"
 VOLUMES = (1000, 1600, 1800, 2000, 2200, 2400, 2500, 2600)
 DURATION_S, NOT_COUNTED_S = 600.0, 60.0
-PITCH_M, SPEED_MPS, SLOT_S, LENGTH_M = 15.0, 15.0, 4.0, 1000.0
-IN_S2 = load_scenario(None, formation__sort_in_s2=True)
-ROAD = StreamRoad(3, PITCH_M, SPEED_MPS * SLOT_S, (400.0, LENGTH_M), LENGTH_M, 5.0)
+SCENARIO = load_scenario(None)
+SPEED_MPS, ROAD = SCENARIO.formation.speed_mps, stream_road(SCENARIO)
+PITCH_M, LENGTH_M = ROAD.pitch_m, ROAD.length_m
 
 
 @frozen
@@ -53,7 +53,7 @@ class Variant:
 
 VARIANTS = {
     "default": Variant(volumes=VOLUMES),
-    "S2 too": Variant(attrs.evolve(ROAD, sorting_m=(IN_S2.moves_from_m, LENGTH_M))),
+    "S2 too": Variant(stream_road(load_scenario(None, formation__sort_in_s2=True))),
     "drift rewarded": Variant(costs=StreamCosts(forward=REWARD)),
     "drift costs": Variant(costs=StreamCosts(forward=2.0)),
     "trains": Variant(attrs.evolve(ROAD, model=ConflictModel(("node", "edge", "closing")))),

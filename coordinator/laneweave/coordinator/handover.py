@@ -161,8 +161,9 @@ class Handover:
                 self.phase = Phase.IN_FORCE
 
     def give_up(self, why: str) -> None:
-        """Send nothing more."""
-        self.phase, self.why = Phase.GIVEN_UP, why
+        """Send nothing more; what has come into force, or was given up before, stays so."""
+        if self.wakeup_s is not None:
+            self.phase, self.why = Phase.GIVEN_UP, why
 
     def outgoing(self, now_s: float) -> Iterable[tuple[Name, Prepare | Plan]]:
         """Return what has to be sent (again) now, and to whom."""

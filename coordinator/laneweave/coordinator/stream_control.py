@@ -109,9 +109,8 @@ class CheckedPlanner:
 
 def stream_planner(scenario: Scenario) -> Planner:
     """Return the planner of a scenario's road."""
-    return CheckedPlanner(
-        stream_road(scenario), StreamPlanner(stream_road(scenario), _costs(scenario), scenario.seed)
-    )
+    road = stream_road(scenario)
+    return CheckedPlanner(road, StreamPlanner(road, _costs(scenario), scenario.seed))
 
 
 class StreamControl:
@@ -185,7 +184,7 @@ class StreamControl:
         for name in [name for name in self.states if name not in listed]:
             self._left[name] = self.states.pop(name)
             handover = self._of.pop(name, None)
-            if handover is not None and handover.wakeup_s is not None:
+            if handover is not None:
                 handover.give_up(f"{name} has left")
 
     def on_state(self, state: VehicleState) -> Iterator[Note]:
@@ -231,7 +230,7 @@ class StreamControl:
         if self._since is None:
             self._since = t_s, now_s
         for handover in self.handovers:
-            if handover.wakeup_s is not None and t_s > handover.t0_s + LATEST_S:
+            if t_s > handover.t0_s + LATEST_S:
                 handover.give_up("its slot has begun")
         if not self._census.on_road or self._ordered is not None:
             return
@@ -268,17 +267,15 @@ class StreamControl:
         for name in self._left:
             self._before.pop(name, None)
         self._left.clear()
-        for entry in census.on_road:
+        # Whoever was not heard may be elsewhere by now, and somebody else in its cell.
+        for entry in sorted(census.on_road, key=lambda entry: entry.vehicle not in states):
             state = states.get(entry.vehicle)
             column = entry.cell[0] if state is None else state.hold_cell[0]
             if self._scenario.lattice.cell_s_m(column, (slot - 1) * self._slot_s) < far_m:
                 continue
             if state is None:
-                # It may be elsewhere by now, and somebody else in its cell.
-                held_there = StreamVehicle(
-                    entry.vehicle, entry.cell, entry.preferred_lane, held=True
-                )
-                vehicles.setdefault(entry.cell, held_there)
+                unheard = StreamVehicle(entry.vehicle, entry.cell, entry.preferred_lane, held=True)
+                vehicles.setdefault(entry.cell, unheard)
                 continue
             # Its move begins at any moment. Without an open gate it may never: who takes part in
             # something newer is asked, and then it does not.
@@ -287,11 +284,8 @@ class StreamControl:
             if late:
                 taken |= {*state.estate} - {state.hold_cell}
             held = late or not state.attended or state.t_s < since_s
-            known = vehicles.get(state.hold_cell)
-            if known is None or known.vehicle not in states:
-                vehicles[state.hold_cell] = StreamVehicle(
-                    entry.vehicle, state.hold_cell, entry.preferred_lane, held
-                )
+            heard = StreamVehicle(entry.vehicle, state.hold_cell, entry.preferred_lane, held)
+            vehicles.setdefault(state.hold_cell, heard)
         columns = [column for column, _ in vehicles] or [0]
         blocked = {
             (column, lane)
@@ -314,8 +308,7 @@ class StreamControl:
         slot = self._ordered[1]
         self._ordered = None
         for handover in self.handovers:
-            if handover.wakeup_s is not None:
-                handover.give_up("the next slot is planned")
+            handover.give_up("the next slot is planned")
         table = computed.result
         if not isinstance(table, StreamPlan):
             yield Note("planning-failed", {"slot": slot, "error": computed.error})

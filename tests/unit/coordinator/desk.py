@@ -13,6 +13,7 @@ from laneweave.protocol.node import Arrived, Compute, Effect, Send, Started, Wak
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.topics import CENSUS
 from paper import PAPER
+from states import holding
 
 SCENARIO = PAPER
 LATTICE, ELECTION_S = SCENARIO.lattice, SCENARIO.network.election_s
@@ -102,24 +103,14 @@ def state(
     joined: tuple[int, ...] | None = None,
 ) -> VehicleState:
     formation = LATTICE.block_of(cell[0]) if -8 < cell[0] <= 0 else 0
-    return VehicleState(
-        vehicle=name,
-        incarnation=1,
+    return holding(
+        name,
+        promised,
+        cell,
         formation=formation,
         joined=(formation,) if joined is None else joined,
-        promised=promised,
         accepted=accepted,
         ready=accepted,
-        completed=0,
-        hold_cell=cell,
-        moving=False,
-        go=False,
-        done=False,
-        overdue=False,
-        attended=True,
-        s_m=0.0,
-        y_m=0.0,
-        speed_mps=0.0,
         t_s=t_s,
     )
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from itertools import count
-from typing import Any
 
 import pytest
 from attrs import evolve
@@ -16,6 +15,7 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import Ballot, Census, CensusEntry, Deed, Name, VehicleState
 from laneweave.protocol.node import Computed
 from laneweave.protocol.scenario import FormationSettings, Road, Scenario
+from states import holding
 
 A, B, C = Name("a"), Name("b"), Name("c")
 SCENARIO = Scenario(
@@ -32,28 +32,7 @@ def deed(seq: int, before: tuple[Cell, ...], after: tuple[Cell, ...]) -> Deed:
 
 
 def state(vehicle: Name, promised: int, *estate: Cell, **more: object) -> VehicleState:
-    values: dict[str, Any] = {
-        "vehicle": vehicle,
-        "incarnation": 1,
-        "formation": 0,
-        "joined": (0,),
-        "promised": ballot(promised),
-        "accepted": False,
-        "ready": False,
-        "completed": 0,
-        "hold_cell": estate[0],
-        "moving": False,
-        "go": False,
-        "done": False,
-        "overdue": False,
-        "attended": True,
-        "s_m": 0.0,
-        "y_m": 0.0,
-        "speed_mps": 0.0,
-        "t_s": 0.0,
-        "estate": estate,
-    }
-    return VehicleState(**(values | more))
+    return holding(vehicle, ballot(promised), estate[0], estate=estate, **more)
 
 
 TAKES = deed(1, ((3, 0),), ((3, 0), (3, 1)))

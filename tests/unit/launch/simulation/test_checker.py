@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import attrs
 import pytest
 
@@ -11,6 +9,7 @@ from laneweave.launch.simulation.bodies import Geometry
 from laneweave.launch.simulation.checker import MOST_VIOLATIONS, Checker, Violation
 from laneweave.protocol.lattice import Cell, Move
 from laneweave.protocol.messages import Ballot, Name, Plan, Sense, VehicleState
+from states import holding
 
 GEOMETRY = Geometry(pitch_m=15.0, lane_width_m=3.5, length_m=5.0, width_m=1.8)
 A, B, C = Name("a"), Name("b"), Name("c")
@@ -36,27 +35,7 @@ def plan(seq: int, moves: dict[Name, tuple[Move, ...]]) -> Plan:
 
 
 def state(vehicle: Name, seq: int | None, hold_cell: Cell = (0, 0), **more: object) -> VehicleState:
-    values: dict[str, Any] = {
-        "vehicle": vehicle,
-        "incarnation": 1,
-        "formation": 0,
-        "joined": (0,),
-        "promised": None if seq is None else ballot(seq),
-        "accepted": False,
-        "ready": False,
-        "completed": 0,
-        "hold_cell": hold_cell,
-        "moving": False,
-        "go": False,
-        "done": False,
-        "overdue": False,
-        "attended": True,
-        "s_m": 0.0,
-        "y_m": 0.0,
-        "speed_mps": 0.0,
-        "t_s": 0.0,
-    }
-    return VehicleState(**(values | more))
+    return holding(vehicle, None if seq is None else ballot(seq), hold_cell, **more)
 
 
 def sense(attendant: int, joined: tuple[int, ...] = (0,)) -> Sense:
