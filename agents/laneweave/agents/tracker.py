@@ -220,11 +220,13 @@ class Tracker:
         if self._regulator is None:
             return None
         start = time.thread_time()
-        error = [now - wanted for now, wanted in zip(state, goal, strict=True)]
-        if not all(-most <= each <= most for each, most in zip(error, self.harmless, strict=True)):
-            return None
+        error = []
+        for now, wanted, most in zip(state, goal, self.harmless, strict=True):
+            if not -most <= now - wanted <= most:
+                return None
+            error.append(now - wanted)
         self._stale = True
-        jerk = (self._regulator.inputs @ error).reshape(-1, 2)
+        jerk = self._regulator.inputs.dot(error).reshape(-1, 2)
         return TrackResult(jerk, True, 0, (time.thread_time() - start) * 1e3, 0.0)
 
     def _regulated(self, state: State, path: _Path) -> Array | None:

@@ -323,7 +323,7 @@ class Reference:
         """Return the reference that leads into a cell, at rest there from a tick on.
 
         It has the least sum of squared jerks that does, whatever the limits: who enters the road
-        has so long for half a column that no limit comes into question.
+        has so long for one and a half columns that no limit comes into question.
 
         Args:
             scenario: lattice and tick.

@@ -241,6 +241,8 @@ def keep_gap(
 
 def _clamp(value: float, low: float, high: float) -> float:
     """Return `value` within [low, high]; NaN becomes 0."""
+    if low <= value <= high:
+        return value
     return 0.0 if math.isnan(value) else min(max(value, low), high)
 
 

@@ -33,6 +33,8 @@ class Plant:
         self._setpoint = (state[2], state[5])
         self._limits = limits
         self._tick_s = tick_s
+        self._rest = _rest(tick_s, limits.actuator_lag_s)
+        self._rest_y = _rest(tick_s, limits.lateral_actuator_lag_s)
         self._braking = False
         self._max_jerk = 0.0
         self._min_accel = self._max_accel = state[2]
@@ -124,9 +126,11 @@ class Plant:
         limits, tick_s = self._limits, self._tick_s
         then = integrate(commanded, jerk, tick_s)
         now = self._state
-        along = _follow(now[:3], commanded[:3], then[:3], jerk[0], limits.actuator_lag_s, tick_s)
+        along = _follow(
+            now[:3], commanded[:3], then[:3], jerk[0], limits.actuator_lag_s, self._rest
+        )
         across = _follow(
-            now[3:], commanded[3:], then[3:], jerk[1], limits.lateral_actuator_lag_s, tick_s
+            now[3:], commanded[3:], then[3:], jerk[1], limits.lateral_actuator_lag_s, self._rest_y
         )
         setpoint = (then[2], then[5])
         # Brakes hold a body, they do not push it back: not when they are released just before it
@@ -145,27 +149,32 @@ class Plant:
 
 
 def _follow(
-    body: Axis, commanded: Axis, then: Axis, jerk: float, lag_s: float, tick_s: float
+    body: Axis, commanded: Axis, then: Axis, jerk: float, lag_s: float, rest: float
 ) -> Axis:
     """Return a body's axis after a tick in which its commanded axis goes on with constant jerk.
 
     The commanded position is a cubic in time, so the body's is another cubic, which follows it,
-    and what it was off that cubic dies away.
+    and what it was off that cubic dies away, up to a `rest`.
     """
     if lag_s <= 0.0:
         return then
-    rest = math.exp(-tick_s / lag_s)
-    before, after = _followed(commanded, jerk, lag_s), _followed(then, jerk, lag_s)
-    s, v, a = (
-        end + (now - begin) * rest for now, begin, end in zip(body, before, after, strict=True)
+    begin_s, begin_v, begin_a = _followed(commanded, jerk, lag_s)
+    end_s, end_v, end_a = _followed(then, jerk, lag_s)
+    s, v, a = body
+    return (
+        end_s + (s - begin_s) * rest,
+        end_v + (v - begin_v) * rest,
+        end_a + (a - begin_a) * rest,
     )
-    return s, v, a
 
 
 def _followed(commanded: Axis, jerk: float, lag_s: float) -> Axis:
     s, v, a = commanded
-    return (
-        s - lag_s * (v - lag_s * (a - lag_s * jerk)),
-        v - lag_s * (a - lag_s * jerk),
-        a - lag_s * jerk,
-    )
+    accel = a - lag_s * jerk
+    speed = v - lag_s * accel
+    return s - lag_s * speed, speed, accel
+
+
+def _rest(tick_s: float, lag_s: float) -> float:
+    """Return the share of a deviation that is left after a tick."""
+    return math.exp(-tick_s / lag_s) if lag_s > 0.0 else 0.0

@@ -17,6 +17,9 @@ from laneweave.protocol.scenario import Scenario
 from laneweave.sim_bridge.overlap import Around, Pose, neighbours
 
 
+_DRAWN = 1024
+
+
 class Sensors:
     """The sensors of one vehicle."""
 
@@ -24,43 +27,61 @@ class Sensors:
         """Prepare the errors of a vehicle."""
         noise = scenario.sensing
         self._random = np.random.default_rng([scenario.seed, zlib.crc32(vehicle.encode())])
-        self._state_noise = np.array(
-            [
-                noise.position_noise_m,
-                noise.speed_noise_mps,
-                noise.accel_noise_mps2,
-                noise.lateral_noise_m,
-                noise.speed_noise_mps,
-                noise.accel_noise_mps2,
-            ]
+        self._normal: list[float] = []
+        """Drawn ahead of their use: numbers one at a time would be dear."""
+        self._used = 0
+        self._state_noise = (
+            noise.position_noise_m,
+            noise.speed_noise_mps,
+            noise.accel_noise_mps2,
+            noise.lateral_noise_m,
+            noise.speed_noise_mps,
+            noise.accel_noise_mps2,
         )
-        self._other_noise = np.array(
-            [noise.gap_noise_m, noise.other_speed_noise_mps, noise.other_accel_noise_mps2]
+        self._other_noise = (
+            noise.gap_noise_m,
+            noise.other_speed_noise_mps,
+            noise.other_accel_noise_mps2,
         )
 
     def measure(self, state: State) -> State:
         """Return what the vehicle takes for its state (s, v, a, y, v_y, a_y), in m and s."""
-        errors = (self._random.standard_normal(6) * self._state_noise).tolist()
-        s, v, a, y, v_y, a_y = (true + error for true, error in zip(state, errors, strict=True))
-        return s, max(v, 0.0), a, y, v_y, a_y
+        s, v, a, y, v_y, a_y = state
+        s_m, v_mps, a_mps2, y_m, vy_mps, ay_mps2 = self._state_noise
+        e_s, e_v, e_a, e_y, e_vy, e_ay = self._draw(6)
+        return (
+            s + e_s * s_m,
+            max(v + e_v * v_mps, 0.0),
+            a + e_a * a_mps2,
+            y + e_y * y_m,
+            v_y + e_vy * vy_mps,
+            a_y + e_ay * ay_mps2,
+        )
 
     def look(self, around: Around) -> Around:
         """Return what the vehicle sees of those around it."""
-        return Around(self._seen(around.ahead), self._seen(around.behind))
-
-    def _seen(self, others: tuple[Neighbour, ...]) -> tuple[Neighbour, ...]:
-        if not others:
-            return ()
-        errors = (self._random.standard_normal((len(others), 3)) * self._other_noise).tolist()
-        return tuple(
-            Neighbour(
-                other.lane,
-                other.gap_m + gap_m,
-                max(other.speed_mps + speed_mps, 0.0),
-                other.accel_mps2 + accel_mps2,
-            )
-            for other, (gap_m, speed_mps, accel_mps2) in zip(others, errors, strict=True)
+        return Around(
+            tuple([self._seen(other) for other in around.ahead]),
+            tuple([self._seen(other) for other in around.behind]),
         )
+
+    def _seen(self, other: Neighbour) -> Neighbour:
+        gap_m, speed_mps, accel_mps2 = self._other_noise
+        e_gap, e_speed, e_accel = self._draw(3)
+        return Neighbour(
+            other.lane,
+            other.gap_m + e_gap * gap_m,
+            max(other.speed_mps + e_speed * speed_mps, 0.0),
+            other.accel_mps2 + e_accel * accel_mps2,
+        )
+
+    def _draw(self, count: int) -> list[float]:
+        """Return the next numbers of the standard normal distribution."""
+        first, self._used = self._used, self._used + count
+        if self._used > len(self._normal):
+            self._normal = self._normal[first:] + self._random.standard_normal(_DRAWN).tolist()
+            first, self._used = 0, count
+        return self._normal[first : self._used]
 
 
 def who_is_around(

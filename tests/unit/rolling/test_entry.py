@@ -109,9 +109,9 @@ def test_a_column_closes_when_nobody_can_enter_it_any_more() -> None:
     assert admission.cell == (-4, 1)
 
 
-def test_in_the_paper_s_operation_half_a_checkerboard_is_a_column_s_time() -> None:
+def test_in_the_paper_s_operation_cells_farther_ahead_are_caught_up_with() -> None:
     paper = parse_scenario({"formation": {"operation": "paper"}})
-    assert paper.formation.entry_spread_s == COLUMN_S
+    assert paper.formation.entry_spread_s == 1.5 * COLUMN_S
     rolling = parse_scenario({"formation": {"operation": "rolling"}})
     assert rolling.formation.entry_spread_s == COLUMN_S / 2
 

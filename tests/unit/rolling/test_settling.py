@@ -49,7 +49,7 @@ def path(reference: Reference, tick: int = BEGIN_TICK) -> np.ndarray:
 # --- the reference ----------------------------------------------------------------------------
 
 
-@given(st.floats(-15.0, 15.0), st.floats(-1.0, 1.0))
+@given(st.floats(-22.5, 22.5), st.floats(-1.0, 1.0))
 @settings(max_examples=50, deadline=None)
 def test_leads_from_where_it_is_to_rest_in_the_cell(offset_m: float, faster_mps: float) -> None:
     rows = path(settling(beside(offset_m, faster_mps=faster_mps)))
@@ -57,7 +57,7 @@ def test_leads_from_where_it_is_to_rest_in_the_cell(offset_m: float, faster_mps:
     np.testing.assert_allclose(rows[END_TICK - BEGIN_TICK :], 0.0, atol=1e-6)
 
 
-@given(st.floats(-15.0, 15.0))
+@given(st.floats(-22.5, 22.5))
 @settings(max_examples=30, deadline=None)
 def test_no_limit_comes_into_question_and_nobody_overshoots(offset_m: float) -> None:
     reference = settling(beside(offset_m))
