@@ -16,7 +16,6 @@ from laneweave.protocol.motion import State
 from laneweave.protocol.scenario import Scenario
 from laneweave.sim_bridge.overlap import Around, Pose, neighbours
 
-
 _DRAWN = 1024
 
 
