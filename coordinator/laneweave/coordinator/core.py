@@ -138,7 +138,18 @@ class CoordinatorCore:
             # Whoever wakes up from a pause leads no better than one who has just begun.
             self._awake_since_s = now_s
         self._handled_s = now_s
-        effects = list(self._on_event(event, now_s))
+        stream = self._stream
+        if (
+            stream is not None
+            and isinstance(event, Arrived)
+            and isinstance(event.message, VehicleState)
+        ):
+            awaited = self._is_on_road(event.message) and stream.on_state(event.message)
+            if not awaited and self._wakeup_s is not None and now_s < self._wakeup_s:
+                return []  # as most: nobody waits for it, and nothing is due
+            effects = list(self._carry_out(stream.on_awaited(event.message))) if awaited else []
+        else:
+            effects = list(self._on_event(event, now_s))
         if not isinstance(event, Stopping):
             effects += self._on_election(now_s)
             effects += self._lead(now_s)
@@ -152,7 +163,7 @@ class CoordinatorCore:
         match event:
             case Started():
                 yield from self._start(now_s)
-            case Arrived(_, _, VehicleState() as state) if self.election.leading:
+            case Arrived(_, _, VehicleState() as state):
                 yield from self._on_state(state, now_s)
             case Arrived(_, _, message):
                 self._on_message(message, now_s)
@@ -234,11 +245,13 @@ class CoordinatorCore:
             case _:
                 pass
 
+    def _is_on_road(self, state: VehicleState) -> bool:
+        """Tell whether a leader knows the vehicle by its census, and it has not left."""
+        return self.election.leading and self._formation_of.get(state.vehicle) == state.formation
+
     def _on_state(self, state: VehicleState, now_s: float) -> Iterator[Effect]:
-        if self._formation_of.get(state.vehicle) != state.formation:
-            return  # of a vehicle that has left, or that the census does not know yet
-        if self._stream is not None:
-            yield from self._carry_out(self._stream.on_state(state))
+        """Take a state in the paper's operation."""
+        if not self._is_on_road(state):
             return
         # What a vehicle has joined stays joined, whoever had it joined.
         if self._groups.join((state.formation, *state.joined)):

@@ -187,21 +187,28 @@ class StreamControl:
             if handover is not None:
                 handover.give_up(f"{name} has left")
 
-    def on_state(self, state: VehicleState) -> Iterator[Note]:
-        """Take a vehicle's state, unless a newer one is known."""
+    def on_state(self, state: VehicleState) -> bool:
+        """Take a vehicle's state, unless a newer one is known.
+
+        Returns:
+            Whether a ballot under way waits for it: then `on_awaited` has to take it, too.
+        """
         known = self.states.get(state.vehicle)
-        if known is not None and _age(state) < _age(known):
+        if known is not None and _is_older(state, known):
             if state.t_s < known.t_s:
                 self._keep_before(state)
-            return
+            return False
         if known is not None and state.t_s > known.t_s:
             self._keep_before(known)
         self.states[state.vehicle] = state
         if state.promised is not None:
             self._highest = max(self._highest or state.promised, state.promised)
         handover = self._of.get(state.vehicle)
-        if handover is None or handover.wakeup_s is None:
-            return
+        return handover is not None and handover.wakeup_s is not None
+
+    def on_awaited(self, state: VehicleState) -> Iterator[Note]:
+        """Let the ballot under way of a vehicle go on with its newest state."""
+        handover = self._of[state.vehicle]
         handover.on_state(state, self.states)
         if handover.phase is Phase.GIVEN_UP:
             yield Note("handover-given-up", {"roster": list(handover.roster), "why": handover.why})
@@ -212,7 +219,7 @@ class StreamControl:
 
     def _keep_before(self, state: VehicleState) -> None:
         before = self._before.get(state.vehicle)
-        if before is None or _age(before) < _age(state):
+        if before is None or _is_older(before, state):
             self._before[state.vehicle] = state
 
     # --- the slot -----------------------------------------------------------------------------
@@ -450,6 +457,13 @@ def _clusters(groups: Iterable[set[Name]]) -> list[set[Name]]:
                 apart.append(cluster)
         clusters = [*apart, joined]
     return clusters
+
+
+def _is_older(state: VehicleState, other: VehicleState) -> bool:
+    """Tell whether a state of a vehicle was sent before another one of it."""
+    if state.incarnation == other.incarnation and state.t_s != other.t_s:
+        return state.t_s < other.t_s
+    return _age(state) < _age(other)
 
 
 def _age(state: VehicleState) -> tuple[object, ...]:

@@ -26,6 +26,7 @@ from laneweave.protocol.transport import (
     LinkUp,
     Question,
     Received,
+    TokenDown,
     TokenUp,
     Transport,
 )
@@ -232,9 +233,16 @@ class Node:
 
     def deliver(self, delivery: Delivery, now_s: float) -> None:
         """Translate what the transport hands over and let the core handle it."""
-        event = self._event(delivery)
-        if event is not None:
-            self.dispatch(event, now_s)
+        event: Event | None
+        try:
+            if isinstance(delivery, Received):
+                event = self._read(delivery.key, delivery.payload)
+            else:
+                event = self._news(delivery)
+        except BadInputError as error:
+            self._reject(delivery, str(error))
+            return
+        self.dispatch(event, now_s)
 
     def dispatch(self, event: Event, now_s: float) -> None:
         """Let the core handle an event and carry out the effects."""
@@ -246,24 +254,19 @@ class Node:
             else:
                 self._carry_out(effect)
 
-    def _event(self, delivery: Delivery) -> Event | None:
+    def _news(self, delivery: LinkUp | LinkDown | Question | TokenUp | TokenDown) -> Event:
         if isinstance(delivery, (LinkUp, LinkDown)):
             return delivery
         if isinstance(delivery, Question):
             return Asked(delivery.token, delivery.payload)
-        try:
-            if isinstance(delivery, Received):
-                return self._read(delivery.key, delivery.payload)
-            known = _known(self._keys, delivery.key)
-        except BadInputError as error:
-            self._reject(delivery.key, str(error))
-            return None
+        known = known_key(self._keys, delivery.key)
         return PeerUp(*known) if isinstance(delivery, TokenUp) else PeerDown(*known)
 
-    def _reject(self, key: str, reason: str) -> None:
+    def _reject(self, delivery: Delivery, reason: str) -> None:
         self.rejected += 1
         # One line for the 1st, 10th, 100th, ...: a flood must not fill the log.
         if self.rejected == 10 ** (len(str(self.rejected)) - 1):
+            key = getattr(delivery, "key", "")
             log.warning("message ignored", key=key, reason=reason, ignored=self.rejected)
 
     def _send(self, effect: Send) -> None:
@@ -322,13 +325,18 @@ def read_message(
     Raises:
         BadInputError: the key is none of `keys`, or the payload is no message of its topic.
     """
-    topic, parameters = _known(keys, key)
+    topic, parameters = known_key(keys, key)
     if topic.kind is None:
         raise BadInputError("key", key, "a topic that carries messages")
     return Arrived(topic, parameters, decode(payload, topic.kind))
 
 
-def _known(keys: Keys, key: str) -> tuple[Topic, Mapping[str, str]]:
+def known_key(keys: Keys, key: str) -> tuple[Topic, Mapping[str, str]]:
+    """Return a key's topic and parameters.
+
+    Raises:
+        BadInputError: the key is none of `keys`.
+    """
     known = keys.read(key)
     if known is None:
         raise BadInputError("key", key, f"a topic of realm {keys.realm}")

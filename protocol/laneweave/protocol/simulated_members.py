@@ -25,14 +25,19 @@ INJECTED_FAILURE = "injected failure"
 """The error of a computation that `Conditions.compute_failure` let fail."""
 
 
+_DELIVERIES = (Received, TokenUp, TokenDown, LinkUp, LinkDown, Question)
+
+
 class Member:
     """One node with its clock, its alarm, its computations and its place in the network."""
 
     node: Node
 
-    def __init__(self, simulation: Simulation, transport: SimulatedTransport) -> None:
+    def __init__(self, simulation: Simulation, transport: SimulatedTransport, number: int) -> None:
         """Be connected and awake, with an exact clock; whoever makes it sets `node`."""
         self.transport = transport
+        self.number = number
+        """Greater than those of all who joined before."""
         self.clock: Clock | None = None
         """None: it shows virtual time."""
         self.connected = True
@@ -68,7 +73,11 @@ class Member:
         """Hand over what was sent to it while it had this connection."""
         if not self.connected or self.connection != connection:
             return
-        if not isinstance(delivery, (TokenUp, TokenDown)) or learn(self.seen, delivery):
+        if (
+            isinstance(delivery, Received)
+            or not isinstance(delivery, (TokenUp, TokenDown))
+            or learn(self.seen, delivery)
+        ):
             self.hand_over(delivery)
 
     def hand_over(self, item: Item) -> None:
@@ -89,7 +98,7 @@ class Member:
         if simulation.trace is not None:
             simulation.trace(now_s, self.transport.name, item)
         local_s = now_s if self.clock is None else self.clock.local_s(now_s)
-        if isinstance(item, (Received, TokenUp, TokenDown, LinkUp, LinkDown, Question)):
+        if isinstance(item, _DELIVERIES):
             simulation.delivered += 1
             self.node.deliver(item, local_s)
         else:

@@ -15,13 +15,14 @@ that matters messages may travel as they are (`in_kind`).
 from __future__ import annotations
 
 import heapq
+from bisect import insort
 from collections.abc import Callable, Iterable
 from functools import lru_cache, partial
 from itertools import count
 
 from laneweave.protocol.codec import decode, encode
 from laneweave.protocol.messages import Name
-from laneweave.protocol.node import Arrived, Core, Node, Started, Stopping, read_message
+from laneweave.protocol.node import Arrived, Core, Node, Started, Stopping, known_key, read_message
 from laneweave.protocol.simulated_conditions import Clock, Conditions
 from laneweave.protocol.simulated_members import Member
 from laneweave.protocol.simulated_time import Simulation
@@ -61,14 +62,9 @@ class Parcel(bytes):
 
 def _unpack(keys: Keys, read: Callable[[str, bytes], Arrived], key: str, payload: bytes) -> Arrived:
     """Return what arrived, whether it travelled as bytes or as it is."""
-    if not isinstance(payload, Parcel):
-        return read(key, payload)
-    return read_message(keys, key, payload, _message_in)
-
-
-def _message_in(payload: bytes, _: type) -> object:
-    assert isinstance(payload, Parcel)  # noqa: S101 (nothing else is handed on)
-    return payload.message
+    if isinstance(payload, Parcel):
+        return Arrived(*known_key(keys, key), payload.message)
+    return read(key, payload)
 
 
 class SimulatedNetwork(Simulation):
@@ -84,7 +80,9 @@ class SimulatedNetwork(Simulation):
         self._tokens = Tokens(self, self._members)
         self._clocks: dict[str, Clock] = {}
         self._routes: dict[str, tuple[Member, ...]] = {}
-        """For each key who receives what is published on it."""
+        """For each key who receives what is published on it, in order of their start."""
+        self._beside: dict[str, list[str]] = {}
+        """Keys of the routes that differ in their last part only, by what they have in common."""
         self._cut: Callable[[str, str], bool] | None = None
         self._loss_on: Callable[[str], float] | None = None
         self._router_up = True
@@ -93,6 +91,7 @@ class SimulatedNetwork(Simulation):
         """For each open question who asked, and all tokens under which it was asked."""
         self._token_count = count(1)
         self._label_count = count(1)
+        self._member_count = count()
         self._readers: dict[str, Callable[[str, bytes], Arrived]] = {}
         self._decode = lru_cache(maxsize=_REMEMBERED)(decode)
 
@@ -106,7 +105,7 @@ class SimulatedNetwork(Simulation):
         """
         if name in self._members:
             raise ValueError(f"node {name} is already in the network")
-        member = Member(self, SimulatedTransport(self, name))
+        member = Member(self, SimulatedTransport(self, name), next(self._member_count))
         member.clock = self._clocks.get(name)
         member.node = Node(
             core,
@@ -238,23 +237,24 @@ class SimulatedNetwork(Simulation):
         if source is None or not source.connected:
             self.dropped += 1
             return
-        duplication, loss, draw = (
-            self.conditions.duplication,
-            self.conditions.loss,
-            self.random.random,
-        )
+        conditions, cut, draw = self.conditions, self._cut, self.random.random
+        duplication, loss = conditions.duplication, conditions.loss
         if self._loss_on is not None:
             loss = max(loss, self._loss_on(key))
+        route = self._routes.get(key)
         message = Received(key, payload)
-        for receiver in self._route(key):
+        for receiver in self._route(key) if route is None else route:
             if (
                 not receiver.connected
-                or (self._cut is not None and self._cut(sender, receiver.transport.name))
+                or (cut is not None and cut(sender, receiver.transport.name))
                 or (loss and draw() < loss)
             ):
                 self.dropped += 1
                 continue
-            self._send(receiver, message)
+            # `_send` written out: most events of a simulation are made here.
+            arrival_s = self.now_s + conditions.delay_s + conditions.jitter_s * draw()
+            arguments = (receiver.connection, message)
+            heapq.heappush(self.queue, (arrival_s, next(self.order), receiver.arrive, arguments))
             if duplication and draw() < duplication:
                 self._send(receiver, message)
 
@@ -294,17 +294,35 @@ class SimulatedNetwork(Simulation):
         if member.connected:
             self._tokens.introduce(member, (expression,))
 
-    def forget_routes(self, expressions: Iterable[str]) -> None:
-        """Subscriptions changed: look the receivers on matching keys up again."""
-        for expression in expressions:
-            fixed, star, _ = expression.partition("*")
-            if not star:
-                self._routes.pop(expression, None)
-                continue
-            near = [key for key in self._routes if key.startswith(fixed.rstrip("/"))]
-            for key in near:
-                if matches(expression, key):
-                    del self._routes[key]
+    def reroute(self, name: str, expressions: Iterable[str]) -> None:
+        """Bring the routes up to date after subscriptions of a node have changed.
+
+        Args:
+            name: the node.
+            expressions: what it has subscribed to, or does not subscribe to any more.
+        """
+        member = self._members.get(name)
+        if member is not None:
+            for expression in expressions:
+                self._reroute(member, expression)
+
+    def _reroute(self, member: Member, expression: str) -> None:
+        """Give a member its place in the routes of all keys that match, or take it out of them."""
+        for key in self._known_keys(expression):
+            receivers = [other for other in self._routes[key] if other is not member]
+            transport = member.transport
+            if not transport.closed and matches_any(transport.subscriptions, key):
+                insort(receivers, member, key=lambda other: other.number)
+            self._routes[key] = tuple(receivers)
+
+    def _known_keys(self, expression: str) -> list[str]:
+        """Return the keys of the routes that match."""
+        fixed, star, rest = expression.partition("*")
+        if not star:
+            return [expression] if expression in self._routes else []
+        if not rest and fixed.endswith("/"):
+            return self._beside.get(fixed, [])
+        return [key for key in self._routes if matches(expression, key)]
 
     def remove(self, name: str) -> None:
         """Take a node out that left in good order."""
@@ -326,7 +344,8 @@ class SimulatedNetwork(Simulation):
         if member is None:
             return
         member.transport.closed = True
-        self.forget_routes(member.transport.subscriptions)
+        for expression in member.transport.subscriptions:
+            self._reroute(member, expression)
         if member.visible:
             self.at(self.now_s + seen_after_s, self._tokens.hide_all, member)
 
@@ -375,11 +394,8 @@ class SimulatedNetwork(Simulation):
                 for member in self._members.values()
                 if matches_any(member.transport.subscriptions, key)
             )
+            self._beside.setdefault(key[: key.rfind("/") + 1], []).append(key)
         return route
 
     def _send(self, receiver: Member, delivery: Delivery) -> None:
-        # `at` and `delay_s` written out: most events of a simulation are made here.
-        conditions = self.conditions
-        arrival_s = self.now_s + conditions.delay_s + conditions.jitter_s * self.random.random()
-        arguments = (receiver.connection, delivery)
-        heapq.heappush(self.queue, (arrival_s, next(self.order), receiver.arrive, arguments))
+        self.at(self.now_s + self.delay_s(), receiver.arrive, receiver.connection, delivery)

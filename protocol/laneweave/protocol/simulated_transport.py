@@ -32,12 +32,12 @@ class SimulatedTransport:
     def subscribe(self, key_expression: str) -> None:
         """Subscribe."""
         self.subscriptions[key_expression] = None
-        self._network.forget_routes((key_expression,))
+        self._network.reroute(self.name, (key_expression,))
 
     def unsubscribe(self, key_expression: str) -> None:
         """Undo `subscribe`."""
         self.subscriptions.pop(key_expression, None)
-        self._network.forget_routes((key_expression,))
+        self._network.reroute(self.name, (key_expression,))
 
     def announce(self, key: str) -> None:
         """Show a token."""

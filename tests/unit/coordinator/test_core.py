@@ -235,10 +235,10 @@ def test_an_older_census_is_ignored() -> None:
 def test_a_formation_that_is_not_closed_is_not_touched() -> None:
     desk = Desk()
     desk.lead()
-    desk.tell(census({A: (0, 0)}, t_s=3.9))
+    desk.tell(census({A: (0, 0)}, t_s=4.4))
     desk.tell(RoadClock(99, 9.9, 1, 1, 1, 0, ended=False))
     assert desk.core.controls == {}  # the census is too old to be complete
-    desk.tell(census({A: (0, 0)}, t_s=4.1))
+    desk.tell(census({A: (0, 0)}, t_s=4.6))
     assert set(desk.core.controls) == {0}
 
 
@@ -279,7 +279,7 @@ def test_prepare_promise_plan_acceptance() -> None:
     assert desk.core.controls[0].phase is Phase.WATCHING
     (note,) = messages(told, LogEvent)
     assert (note.message.kind, note.message.data) == (
-        "plan-in-force", {"formation": 0, "closed_s": 4.0}
+        "plan-in-force", {"formation": 0, "closed_s": 4.5}
     )  # fmt: skip
     desk.wait(1.0)
     assert messages(desk.wait(10.0), Plan) == []

@@ -44,24 +44,24 @@ def joined(*numbers: int) -> Groups:
 
 
 def test_a_formation_closes_when_nobody_can_enter_its_block_any_more() -> None:
-    assert CLOSES_S == 4.0
+    assert CLOSES_S == 4.5
     assert closed(census(CLOSES_S, a=(0, 0))) == {}
     assert closed(census(CLOSES_S + 0.1, a=(0, 0)))[0].roster == ("a",)
 
 
-@pytest.mark.parametrize(("census_s", "clock_s"), [(4.0, 9.0), (9.0, 4.0)])
+@pytest.mark.parametrize(("census_s", "clock_s"), [(4.5, 9.0), (9.0, 4.5)])
 def test_neither_an_old_census_nor_an_old_clock_closes_it(census_s: float, clock_s: float) -> None:
     """A census from before the block passed could lack a member."""
     assert closed(census(census_s, a=(0, 0)), clock_s) == {}
 
 
 def test_members_are_grouped_by_the_block_of_their_entry_and_sorted() -> None:
-    found = closed(census(8.1, d=(-4, 0), b=(-3, 1), a=(-1, 1), c=(0, 2)))
+    found = closed(census(8.6, d=(-4, 0), b=(-3, 1), a=(-1, 1), c=(0, 2)))
     assert {number: (each.numbers, each.roster) for number, each in found.items()} == {
         0: ((0,), ("a", "b", "c")),
         1: ((1,), ("d",)),
     }
-    assert 1 not in closed(census(8.0, d=(-4, 0)))
+    assert 1 not in closed(census(8.5, d=(-4, 0)))
 
 
 def test_who_leaves_is_no_member_and_an_empty_formation_is_none() -> None:
@@ -80,26 +80,26 @@ def test_joined_formations_are_one_under_the_least_number() -> None:
 
 
 def test_joined_formations_are_closed_when_the_last_block_has_passed() -> None:
-    both = census(8.0, a=(0, 0), b=(-5, 1))
+    both = census(8.5, a=(0, 0), b=(-5, 1))
     assert closed(both, groups=joined(0, 1)) == {}
     assert closed(both) != {}
-    later = census(8.1, a=(0, 0), b=(-5, 1))
+    later = census(8.6, a=(0, 0), b=(-5, 1))
     assert closed(later, groups=joined(0, 1))[0].roster == ("a", "b")
     # Also when nobody of the last block has entered yet, or its vehicles have left.
-    assert closed(census(8.0, a=(0, 0)), groups=joined(0, 1)) == {}
-    assert closed(census(8.1, a=(0, 0)), groups=joined(0, 1))[0].numbers == (0, 1)
-    assert closed(census(8.1, b=(-5, 1)), groups=joined(0, 1))[0].roster == ("b",)
+    assert closed(census(8.5, a=(0, 0)), groups=joined(0, 1)) == {}
+    assert closed(census(8.6, a=(0, 0)), groups=joined(0, 1))[0].numbers == (0, 1)
+    assert closed(census(8.6, b=(-5, 1)), groups=joined(0, 1))[0].roster == ("b",)
 
 
 @given(st.lists(st.integers(0, 9), min_size=1, max_size=4, unique=True))
-def test_closing_is_a_column_after_the_rear_one_of_the_last_block_passes(
+def test_closing_is_one_and_a_half_columns_after_the_rear_one_of_the_last_block(
     numbers: list[int],
 ) -> None:
     several = tuple(sorted(numbers))
     closes_s = closing_time_s(several, SCENARIO)
     assert closes_s == max(closing_time_s((number,), SCENARIO) for number in several)
     rear = min(column for number in several for column in LATTICE.block_range(number))
-    assert LATTICE.cell_s_m(rear, closes_s) == pytest.approx(LATTICE.pitch_m)
+    assert LATTICE.cell_s_m(rear, closes_s) == pytest.approx(1.5 * LATTICE.pitch_m)
 
 
 def test_a_rolling_formation_closes_half_a_column_after_its_rear_one() -> None:

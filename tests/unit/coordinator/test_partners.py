@@ -108,7 +108,7 @@ def plan_once(planner: Orders, *states: VehicleState) -> StreamControl:
     entries = tuple(CensusEntry(each.vehicle, each.hold_cell, 0, 0.0) for each in states)
     control.on_census(Census(0.0, entries, ()))
     for each in states:
-        list(control.on_state(each))
+        control.on_state(each)
     assert not list(control.order(lambda: 1, 0.0, 0.0))
     (order,) = control.order(lambda: 1, 9.5, 9.5)
     list(control.finish(Computed(order.job, order.work()), 9.6, 9.6))
