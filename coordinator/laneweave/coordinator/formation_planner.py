@@ -12,6 +12,7 @@ from typing import Any
 
 from attrs import field, frozen
 
+from laneweave.coordinator.borders import kept_apart, steps_of
 from laneweave.coordinator.formation import closing_time_s, start_time_s, steps_left
 from laneweave.coordinator.groups import Groups, Numbers
 from laneweave.coordinator.leader import FormationControl
@@ -130,11 +131,12 @@ class FormationPlanner:
                 yield Note("room-awaited", {"formation": number})
                 return
             if result.solved:
-                plan = self._plan(control, result, t_s)
+                planned = self._plan(control, result, t_s)
+                plan = self._kept_apart(planned, controls)
                 problems = plan_problems(plan)
                 if not problems:
                     control.on_plan(plan, now_s, result.out_of_reach)
-                    yield from _notes(number, result)
+                    yield from _notes(number, result, steps_of(plan) - steps_of(planned))
                     return
                 error = "; ".join(problems)
         control.on_planning_failed(now_s)
@@ -149,9 +151,8 @@ class FormationPlanner:
         Both plan under one ballot from now on.
         """
         numbers, most = control.formation.numbers, self._scenario.formation.max_joined
-        for neighbour in (numbers[-1] + 1, numbers[0] - 1):
-            other = controls.get(self._groups.of(neighbour)[0])
-            if other is None or other.phase is Phase.SETTLED:
+        for other in self._neighbours(numbers, controls):
+            if other.phase is Phase.SETTLED:
                 continue
             union = tuple(sorted({*numbers, *other.formation.numbers}))
             if len(union) > most:
@@ -159,6 +160,15 @@ class FormationPlanner:
             if steps_left(union, self._start_s(union, t_s), self._scenario) > 0:
                 return self._groups.join(union)
         return False
+
+    def _neighbours(
+        self, numbers: Numbers, controls: Mapping[int, FormationControl]
+    ) -> Iterator[FormationControl]:
+        """Yield the formation behind and the one ahead, as far as there are any."""
+        for number in (numbers[-1] + 1, numbers[0] - 1):
+            neighbour = controls.get(self._groups.of(number)[0])
+            if neighbour is not None:
+                yield neighbour
 
     def _room_is_coming(self, numbers: Numbers, t_s: float) -> bool:
         """Tell whether the next formation, which may be joined, is closed in a moment."""
@@ -183,13 +193,29 @@ class FormationPlanner:
             territory=tuple(sorted(territory(hold_cells.values(), all_moves))),
         )
 
+    def _kept_apart(self, plan: Plan, controls: Mapping[int, FormationControl]) -> Plan:
+        """Return a plan with pauses for the plans of the neighbours that this leader has made."""
+        formation = self._scenario.formation
+        if "closing" not in formation.conflict_kinds:
+            return plan
+        others = [
+            neighbour.plan
+            for neighbour in self._neighbours(plan.formations, controls)
+            # Under another ballot it is not what is driven.
+            if neighbour.plan is not None and neighbour.plan.ballot == neighbour.ballot
+        ]
+        most_steps = steps_left(plan.formations, plan.t0_s, self._scenario)
+        return kept_apart(plan, others, formation.move_s, most_steps)
+
     def _start_s(self, numbers: Numbers, t_s: float) -> float:
         return start_time_s(numbers, t_s + START_MARGIN_S, self._scenario)
 
 
-def _notes(number: int, sorting: Sorting) -> Iterator[Note]:
+def _notes(number: int, sorting: Sorting, pauses: int) -> Iterator[Note]:
     if sorting.response is not None:
         yield Note("plan-made", _facts(number, sorting.response))
+    if pauses:
+        yield Note("neighbours-awaited", {"formation": number, "slots": pauses})
     if sorting.out_of_reach:
         vehicles = [str(name) for name in sorting.out_of_reach]
         yield Note("lane-out-of-reach", {"formation": number, "vehicles": vehicles})
