@@ -9,7 +9,7 @@ import pytest
 import emergencies
 import switches
 from driving import Record, Road, lattice_errors_m, limit_use, road_scenario
-from laneweave.protocol.lattice import footprint
+from laneweave.protocol.lattice import Move, footprint
 from laneweave.protocol.messages import Name
 from laneweave.protocol.motion import State
 
@@ -94,6 +94,32 @@ def test_one_brakes_and_the_others_are_on_their_way() -> None:
     assert ahead[:before, 1] == pytest.approx(15.0, abs=0.2)
     assert (np.diff(ahead[before - 1 : before + 10, 1]) < 0.0).all()
     assert follower[:before, 1].max() > 18.0
+
+
+# --- closing up -----------------------------------------------------------------------------------
+
+
+def closing_up(slots: int) -> Road:
+    """Let two close up from three columns to one, the one ahead so many slots later."""
+    road = Road(SCENARIO, {ME: (0, 1), OTHER: (3, 1)})
+    moves: dict[Name, Move] = {ME: (0, (0, 1), (1, 1)), OTHER: (0, (3, 1), (2, 1))}
+    first = SLOT_TICKS * (1 + max(-slots, 0))
+    begin = {ME: first, OTHER: first + slots * SLOT_TICKS}
+    while road.tick <= max(begin.values()) + SLOT_TICKS:
+        road.step({name: move for name, move in moves.items() if begin[name] == road.tick})
+    return road
+
+
+@pytest.mark.parametrize("slots", [-1, 1])
+def test_closing_up_head_on_one_after_the_other_needs_no_emergency_brake(slots: int) -> None:
+    assert closing_up(slots).braked == 0
+
+
+def test_closing_up_head_on_in_one_slot_does() -> None:
+    """The reason why plans keep such moves apart, across the borders of blocks, too."""
+    road = closing_up(0)
+    assert road.braked > 0
+    assert road.record.overlaps == []
 
 
 # --- the measures themselves ----------------------------------------------------------------------
