@@ -26,7 +26,7 @@ from typing import Any, Self
 from attrs import asdict, frozen
 
 from laneweave.launch.sweep.execution import LOG_FILE, Ended
-from laneweave.launch.sweep.methods import METHODS, rank
+from laneweave.launch.sweep.methods import METHODS, has_a_say, rank
 from laneweave.launch.sweep.points import Point
 from laneweave.launch.sweep.results import Row, write_results
 from laneweave.protocol.errors import BadInputError, CommandFailedError
@@ -148,7 +148,7 @@ class SweepFolder:
         return self._records
 
     def check_settings(self, base: Scenario) -> None:
-        """Check that what is recorded was run with the same settings.
+        """Check that what is recorded was run with the same settings, as far as they matter.
 
         Args:
             base: the scenario of this sweep, whatever its volume and seed.
@@ -167,7 +167,7 @@ class SweepFolder:
                 raise BadInputError("--out", str(self.out), f"a folder without {record.label}")
             expected = _flat(to_tables(labelled.settings(parse_scenario(tables))))
             for field, value in _flat(to_tables(recorded)).items():
-                if expected[field] != value:
+                if expected[field] != value and has_a_say(field, record.method):
                     raise BadInputError(field, expected[field], f"{value}, {where}")
 
     def is_finished(self, point: Point) -> bool:

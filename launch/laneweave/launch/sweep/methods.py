@@ -69,6 +69,23 @@ METHODS: Final[dict[str, LabelledMethod]] = {
 """In the order in which tables and figures show them."""
 
 
+_EVERYBODY = ("schema", "seed", "road", "demand", "vehicle", "runtime", "formation.speed_mps")
+"""Tables and fields of a scenario that all methods read."""
+
+
+def has_a_say(field_name: str, method: str) -> bool:
+    """Tell whether a field of a scenario can change what a method's runs bring.
+
+    Args:
+        field_name: `table.field`, or the name of a field outside tables.
+        method: as `laneweave run --method` names it.
+    """
+    table = field_name.partition(".")[0]
+    if method == METHOD:
+        return table not in (RULE, LC2013)
+    return table == method or table in _EVERYBODY or field_name in _EVERYBODY
+
+
 def parse_methods(text: str) -> tuple[str, ...]:
     """Return the labels of a list with commas.
 

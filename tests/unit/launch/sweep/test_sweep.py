@@ -12,6 +12,7 @@ import psutil
 import pyarrow.parquet as pq
 import pytest
 
+from laneweave.launch.sweep.methods import has_a_say
 from unit.launch.sweep.sweeping import command, results, short_road, sweep
 
 LISTS = ("--volumes", "1200,1600", "--seeds", "1:3")
@@ -136,6 +137,34 @@ def test_other_settings_are_refused(whole: Path, scenario: Path) -> None:
     assert refused.returncode == 2
     (line,) = refused.stderr.splitlines()
     assert line.startswith("demand.duration_s: got 7.0; allowed: 8.0, as recorded in ")
+
+
+def test_settings_that_a_method_does_not_read_may_be_others(whole: Path, tmp_path: Path) -> None:
+    scenario = short_road(tmp_path)
+    scenario.write_text(scenario.read_text() + '\n[rule]\ngap = "net"\n')
+    done = sweep(scenario, whole, *LISTS)
+    assert done.returncode == 0, done.stderr
+    assert "4 of 4 runs were finished before" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("field", "method", "matters"),
+    [
+        ("formation.operation", "formation", True),
+        ("formation.operation", "lc2013", False),
+        ("formation.speed_mps", "lc2013", True),
+        ("formation.speed_mps", "rule", True),
+        ("network.lease_s", "formation", True),
+        ("network.lease_s", "rule", False),
+        ("rule.gap", "rule", True),
+        ("rule.gap", "lc2013", False),
+        ("rule.gap", "formation", False),
+        ("road.s3_m", "rule", True),
+        ("seed", "lc2013", True),
+    ],
+)
+def test_what_has_a_say(field: str, method: str, matters: bool) -> None:
+    assert has_a_say(field, method) is matters
 
 
 def test_other_folders_are_refused(scenario: Path, tmp_path: Path) -> None:
