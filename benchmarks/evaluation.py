@@ -20,6 +20,7 @@ from __future__ import annotations
 import argparse
 import math
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -115,7 +116,7 @@ def run(arguments: argparse.Namespace) -> bool:
             say("faults")
             good &= run_faults(out) and write_documents()
         else:
-            good &= run_trials(part, out, ROOT)
+            good &= run_trials(part, out, ROOT, rounds.jobs)
     return good
 
 
@@ -132,6 +133,7 @@ def main() -> int:
         help="report: folders of sweeps instead of OUT/sweep",
     )  # fmt: skip
     parser.add_argument("--out", default="runs/evaluation", metavar="DIR", help="where runs go")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         return 0 if run(parser.parse_args()) else 1
     except BadInputError as error:

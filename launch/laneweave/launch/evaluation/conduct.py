@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -21,6 +23,7 @@ from laneweave.launch.evaluation.points import point_rows
 from laneweave.launch.evaluation.programme import FORMATIONS, points_of
 from laneweave.launch.evaluation.trials import (
     TRIALS,
+    Trial,
     agreement_rows,
     cost_rows,
     factor_rows,
@@ -29,6 +32,7 @@ from laneweave.launch.evaluation.trials import (
 )
 from laneweave.launch.report.runs import is_sweep, runs_of
 from laneweave.launch.sweep.conduct import conduct
+from laneweave.launch.sweep.execution import StoppedError
 from laneweave.launch.sweep.folder import FAILED, SweepFolder
 from laneweave.launch.sweep.local_workers import run_locally
 from laneweave.protocol.errors import BadInputError, CommandFailedError
@@ -87,25 +91,37 @@ class Rounds:
         return kept
 
 
-def run_trials(part: str, out: Path, root: Path) -> bool:
+def run_trials(part: str, out: Path, root: Path, jobs: int) -> bool:
     """Run the trials of a part; return whether all came to their end.
 
     Args:
         part: `zenoh`, `speed` or `length`.
         out: the evaluation's folder.
         root: of the repository.
+        jobs: how many may run at a time, of those that share the machine.
     """
-    complete = True
-    for trial in TRIALS:
-        if trial.part != part or is_finished(trial, out):
-            continue
+    stop = threading.Event()
+
+    def has_ended(trial: Trial) -> bool:
         say(f"{part}: {trial.command}")
         try:
-            run_trial(trial, out, root)
+            run_trial(trial, out, root, stop.is_set)
         except CommandFailedError as error:
             say(f"FAILED: {error}")
-            complete = False
-    return complete
+            return False
+        except StoppedError:
+            say(f"FAILED: {trial.command}: ended before it was over")
+            return False
+        return True
+
+    waiting = [trial for trial in TRIALS if trial.part == part and not is_finished(trial, out)]
+    ended = [has_ended(trial) for trial in waiting if not trial.shares]
+    with ThreadPoolExecutor(jobs) as pool:
+        try:
+            ended += pool.map(has_ended, [trial for trial in waiting if trial.shares])
+        finally:
+            stop.set()
+    return all(ended)
 
 
 def collect(out: Path, sweeps: Iterable[Path], images: Path) -> Evidence:

@@ -12,6 +12,9 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tempfile
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,12 +24,14 @@ from attrs import frozen
 
 from laneweave.launch.drawing import scenario_of
 from laneweave.launch.evaluation.agreement import Agreement, agreement, read_trips
+from laneweave.launch.sweep.execution import follow
 from laneweave.launch.sweep.folder import read_summary
 from laneweave.protocol.errors import CommandFailedError
 
 ZENOH_VOLUMES: Final = (1000, 1600, 2400)
 """Those that are repeated over Zenoh, in vehicles/(lane h)."""
 TIMEOUT_S: Final = 3600.0
+"""A run that takes longer is ended."""
 COMMAND_FILE: Final = "command.json"
 
 
@@ -40,6 +45,8 @@ class Trial:
     """Of `laneweave run`."""
     ending: str = "complete"
     """As in summary.json; a run with another one has failed."""
+    shares: bool = False
+    """It needs one core only, and others like it may run on the other ones."""
 
     @property
     def command(self) -> str:
@@ -98,50 +105,54 @@ TRIALS: Final = (
         for volume in ZENOH_VOLUMES
         for trial in (
             Trial("zenoh", f"zenoh-{volume}", _rolling(volume, 120)),
-            Trial("zenoh", f"simulated-{volume}", _rolling(volume, 120, *SIMULATED)),
+            Trial("zenoh", f"simulated-{volume}", _rolling(volume, 120, *SIMULATED), shares=True),
         )
     ),
     Trial("speed", "zenoh", _rolling(1600, 300)),
     Trial("speed", "zenoh-50", _rolling(1600, 300, "--vehicles-per-process", "50")),
     Trial("speed", "simulated", _rolling(1600, 300, *SIMULATED)),
-    Trial("length", "short", _rolling(1800, 600, *SIMULATED)),
     # Ended when the road has been full for a while: nobody has to wait until it is empty again.
-    Trial("length", "long", ("benchmarks/long-road.toml", *SIMULATED), ending="limit"),
+    Trial("length", "long", ("benchmarks/long-road.toml", *SIMULATED), ending="limit", shares=True),
+    Trial("length", "short", _rolling(1800, 600, *SIMULATED), shares=True),
 )
 
 
-def run_trial(trial: Trial, out: Path, root: Path) -> None:
+def run_trial(trial: Trial, out: Path, root: Path, stopped: Callable[[], bool]) -> None:
     """Run a trial unless it is there already, whole and with the same options.
 
     Args:
         trial: the run.
         out: the evaluation's folder.
         root: where the names of scenario files begin.
+        stopped: whether the evaluation has been ended meanwhile.
 
     Raises:
         CommandFailedError: the run did not come to its end.
+        StoppedError: the evaluation was ended, or the run took too long, and was ended.
     """
     folder = out.resolve() / trial.part / trial.name
     if is_finished(trial, out):
         return
     if folder.exists():
         shutil.rmtree(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
     program = str(Path(sys.executable).with_name("laneweave"))
-    try:
-        done = subprocess.run(  # noqa: S603 - this package, with options of its own
+    with tempfile.TemporaryFile() as words:
+        process = subprocess.Popen(  # noqa: S603 - this package, with options of its own
             [program, "run", *trial.options, "--no-progress", "--out", str(folder)],
             cwd=root,
-            capture_output=True,
-            text=True,
-            timeout=TIMEOUT_S,
-            check=False,
+            stdin=subprocess.DEVNULL,
+            stdout=words,
+            stderr=words,
+            process_group=0,
         )
-    except subprocess.TimeoutExpired as error:
-        raise CommandFailedError(f"{trial.command}: not over after {TIMEOUT_S:g} s") from error
+        end_s = time.monotonic() + TIMEOUT_S
+        follow(process, trial.name, lambda: stopped() or time.monotonic() > end_s)
+        words.seek(0)
+        said = " ".join(words.read().decode(errors="replace").split())
     summary = read_summary(folder) or {}
     if summary.get("ending") != trial.ending:
-        words = " ".join((done.stdout + done.stderr).split())
-        raise CommandFailedError(f"{trial.command}: status {done.returncode}: {words[-400:]}")
+        raise CommandFailedError(f"{trial.command}: status {process.returncode}: {said[-400:]}")
     (folder / COMMAND_FILE).write_text(json.dumps(trial.options), encoding="utf-8")
 
 

@@ -51,7 +51,7 @@ class Ended:
 
 
 class StoppedError(Exception):
-    """The sweep was ended before this point was finished."""
+    """What ordered this run was ended before it was finished."""
 
 
 def run_in_process(job: Job, folder: Path, stopped: Callable[[], bool]) -> Ended:
@@ -81,17 +81,31 @@ def run_in_process(job: Job, folder: Path, stopped: Callable[[], bool]) -> Ended
             # Ctrl-C reaches the whole group: the sweep ends its processes, in order.
             process_group=0,
         )
+    follow(process, job.name, stopped)
+    wall_s = time.monotonic() - began_s
+    return Ended(job.name, folder, _problems(folder, process.returncode), wall_s)
+
+
+def follow(process: subprocess.Popen[bytes], name: str, stopped: Callable[[], bool]) -> None:
+    """Wait until a process has ended; it has when this returns or raises.
+
+    Args:
+        process: what is waited for.
+        name: of its run.
+        stopped: whether nobody waits for it any more.
+
+    Raises:
+        StoppedError: nobody does, and it was ended.
+    """
     try:
         while process.poll() is None:
             try:
                 process.wait(LOOK_S)
             except subprocess.TimeoutExpired:
                 if stopped():
-                    raise StoppedError(job.name) from None
+                    raise StoppedError(name) from None
     finally:
         _end(process)
-    wall_s = time.monotonic() - began_s
-    return Ended(job.name, folder, _problems(folder, process.returncode), wall_s)
 
 
 def _environment(folder: Path) -> dict[str, str]:
