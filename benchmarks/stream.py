@@ -30,7 +30,7 @@ from laneweave.coordinator.planning.stream import (
     StreamVehicle,
 )
 from laneweave.coordinator.planning.stream_validate import problems_of_ways
-from laneweave.coordinator.stream_control import REWARD, stream_road
+from laneweave.coordinator.stream_planner import REWARD, stream_road
 from laneweave.protocol.scenario import load_scenario
 from laneweave.sim_bridge.demand import arrivals
 

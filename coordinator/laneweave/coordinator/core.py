@@ -19,7 +19,8 @@ from laneweave.coordinator.leader import FormationControl
 from laneweave.coordinator.leader_rules import LEADER_RULES, Phase
 from laneweave.coordinator.service import PlanningService
 from laneweave.coordinator.stream_control import Note as StreamNote
-from laneweave.coordinator.stream_control import Planner, StreamControl, stream_planner
+from laneweave.coordinator.stream_control import StreamControl
+from laneweave.coordinator.stream_planner import Planner, stream_planner
 from laneweave.protocol.messages import (
     Ballot,
     Census,

@@ -9,23 +9,16 @@ under way. Nobody stops for a replan: who is not reached holds, and is planned f
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 from attrs import field, frozen
 
 from laneweave.coordinator.handover import Handover, Phase, partners, sure_of
-from laneweave.coordinator.planning.conflicts import ConflictModel
-from laneweave.coordinator.planning.grid import Mode
-from laneweave.coordinator.planning.stream import (
-    StreamCosts,
-    StreamPlan,
-    StreamPlanner,
-    StreamRoad,
-    StreamVehicle,
-)
-from laneweave.coordinator.planning.stream_validate import problems_of_ways
+from laneweave.coordinator.planning.stream import StreamPlan, StreamVehicle
+from laneweave.coordinator.stream_planner import Planner
+from laneweave.coordinator.stream_shown import Shown
 from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.messages import Ballot, Census, Name, Plan, Prepare, VehicleState
 from laneweave.protocol.node import Compute, Computed
@@ -44,8 +37,6 @@ LATEST_S = 1.0
 AHEAD_M = 600.0
 """Vehicles are planned for from so far before the place where moves begin: as far as S3 is long, so
 that whoever can come near each other there is known in time."""
-REWARD = -0.5
-"""Cost of a column gained, where drift is rewarded; a move costs 0.3."""
 BESIDE = 10
 """Columns ahead of the foremost vehicle and behind the rearmost one that planning looks at."""
 
@@ -68,51 +59,6 @@ class _Order:
     before: StreamPlan | None
 
 
-class Planner(Protocol):
-    """Plans the stream; `StreamPlanner` wherever vehicles are real."""
-
-    def plan(
-        self,
-        slot: int,
-        vehicles: Sequence[StreamVehicle],
-        before: StreamPlan | None = None,
-        blocked: Collection[Cell] = (),
-    ) -> StreamPlan:
-        """Return ways for all vehicles from the beginning of a slot on."""
-
-
-class CheckedPlanner:
-    """Lets no plan pass that breaks a rule: it costs half a millisecond."""
-
-    def __init__(self, road: StreamRoad, planner: Planner) -> None:
-        """Check what a planner plans for a road."""
-        self._road, self._planner = road, planner
-
-    def plan(
-        self,
-        slot: int,
-        vehicles: Sequence[StreamVehicle],
-        before: StreamPlan | None = None,
-        blocked: Collection[Cell] = (),
-    ) -> StreamPlan:
-        """Return ways for all vehicles from the beginning of a slot on.
-
-        Raises:
-            ValueError: the vehicles cannot be as they are said to be, or the plan is wrong.
-        """
-        table = self._planner.plan(slot, vehicles, before, blocked)
-        problems = problems_of_ways(self._road, table, vehicles, blocked)
-        if problems:
-            raise ValueError(f"the plan of slot {slot} is wrong: {'; '.join(problems)}")
-        return table
-
-
-def stream_planner(scenario: Scenario) -> Planner:
-    """Return the planner of a scenario's road."""
-    road = stream_road(scenario)
-    return CheckedPlanner(road, StreamPlanner(road, _costs(scenario), scenario.seed))
-
-
 class StreamControl:
     """All vehicles under one leader."""
 
@@ -133,16 +79,9 @@ class StreamControl:
         self._new_ballot = new_ballot
         self._planner = planner
         self._slot_s = scenario.formation.cycle_s
-        self.states: dict[Name, VehicleState] = {}
-        """The newest state of each vehicle."""
-        self._before: dict[Name, VehicleState] = {}
-        """The newest one with an earlier time."""
-        self._left: dict[Name, VehicleState] = {}
-        """The newest state of each that has left since it was planned last."""
+        self.shown = Shown()
         self.handovers: list[Handover] = []
         self._of: dict[Name, Handover] = {}
-        self._census: Census | None = None
-        self._census_before: Census | None = None
         self._highest: Ballot | None = None
         self._since: tuple[float, float] | None = None
         """Since when states have been heard: road time, node clock."""
@@ -155,12 +94,10 @@ class StreamControl:
 
     def forget(self) -> None:
         """Begin anew: another road."""
-        self.states.clear()
-        self._before.clear()
-        self._left.clear()
+        self.shown.forget()
         self.handovers.clear()
         self._of.clear()
-        self._census = self._census_before = self._table = self._ordered = self._since = None
+        self._table = self._ordered = self._since = None
         self._newest_slot = -1
 
     def take_over(self) -> None:
@@ -171,18 +108,12 @@ class StreamControl:
         """
         self.handovers.clear()
         self._of.clear()
-        self._before.clear()
-        self._left.clear()
-        self._census = self._census_before = self._ordered = self._since = None
+        self.shown.take_over()
+        self._ordered = self._since = None
 
     def on_census(self, census: Census) -> None:
         """Take note of who is on the road."""
-        if self._census is not None and census.t_s > self._census.t_s:
-            self._census_before = self._census
-        self._census = census
-        listed = {entry.vehicle for entry in census.on_road}
-        for name in [name for name in self.states if name not in listed]:
-            self._left[name] = self.states.pop(name)
+        for name in self.shown.on_census(census):
             handover = self._of.pop(name, None)
             if handover is not None:
                 handover.give_up(f"{name} has left")
@@ -193,14 +124,8 @@ class StreamControl:
         Returns:
             Whether a ballot under way waits for it: then `on_awaited` has to take it, too.
         """
-        known = self.states.get(state.vehicle)
-        if known is not None and _is_older(state, known):
-            if state.t_s < known.t_s:
-                self._keep_before(state)
+        if not self.shown.on_state(state):
             return False
-        if known is not None and state.t_s > known.t_s:
-            self._keep_before(known)
-        self.states[state.vehicle] = state
         if state.promised is not None:
             self._highest = max(self._highest or state.promised, state.promised)
         handover = self._of.get(state.vehicle)
@@ -209,18 +134,13 @@ class StreamControl:
     def on_awaited(self, state: VehicleState) -> Iterator[Note]:
         """Let the ballot under way of a vehicle go on with its newest state."""
         handover = self._of[state.vehicle]
-        handover.on_state(state, self.states)
+        handover.on_state(state, self.shown.states)
         if handover.phase is Phase.GIVEN_UP:
             yield Note("handover-given-up", {"roster": list(handover.roster), "why": handover.why})
         elif handover.phase is Phase.IN_FORCE and self.in_force == 1:
             slot = round(handover.t0_s / self._slot_s)
             begun_s = handover.t0_s - self._slot_s
             yield Note("plan-in-force", {"slot": slot, "closed_s": begun_s + SHOWN_S})
-
-    def _keep_before(self, state: VehicleState) -> None:
-        before = self._before.get(state.vehicle)
-        if before is None or _is_older(before, state):
-            self._before[state.vehicle] = state
 
     # --- the slot -----------------------------------------------------------------------------
 
@@ -232,14 +152,15 @@ class StreamControl:
             t_s: road time.
             now_s: node clock.
         """
-        if self._census is None:
+        census = self.shown.census
+        if census is None:
             return
         if self._since is None:
             self._since = t_s, now_s
         for handover in self.handovers:
             if t_s > handover.t0_s + LATEST_S:
                 handover.give_up("its slot has begun")
-        if not self._census.on_road or self._ordered is not None:
+        if not census.on_road or self._ordered is not None:
             return
         slot = math.floor(t_s / self._slot_s + 1e-9)
         look_s = slot * self._slot_s + SHOWN_S + 1e-6
@@ -263,20 +184,12 @@ class StreamControl:
         # Where vehicles were in an earlier lead says nothing of where they are.
         since_s = self._since[0] - 1e-6 if self._since is not None else 0.0
         far_m = self._scenario.moves_from_m - AHEAD_M
-        census = _at(look_s, self._census, self._census_before) or self._census
-        assert census is not None  # noqa: S101 (asked by the caller)
-        states = {
-            entry.vehicle: state
-            for entry in census.on_road
-            if (state := self._shown_at(look_s, entry.vehicle)) is not None
-        }
-        gone = _gone(states.values(), census)
-        for name in self._left:
-            self._before.pop(name, None)
-        self._left.clear()
+        then = self.shown.at(look_s)
         # Whoever was not heard may be elsewhere by now, and somebody else in its cell.
-        for entry in sorted(census.on_road, key=lambda entry: entry.vehicle not in states):
-            state = states.get(entry.vehicle)
+        for entry in sorted(
+            then.census.on_road, key=lambda entry: entry.vehicle not in then.states
+        ):
+            state = then.states.get(entry.vehicle)
             column = entry.cell[0] if state is None else state.hold_cell[0]
             if self._scenario.lattice.cell_s_m(column, (slot - 1) * self._slot_s) < far_m:
                 continue
@@ -287,7 +200,7 @@ class StreamControl:
             # Its move begins at any moment. Without an open gate it may never: who takes part in
             # something newer is asked, and then it does not.
             late = state.go and not state.done and not state.moving
-            owned |= sure_of(state, states, gone)
+            owned |= sure_of(state, then.states, then.gone)
             if late:
                 taken |= {*state.estate} - {state.hold_cell}
             held = late or not state.attended or state.t_s < since_s
@@ -343,11 +256,9 @@ class StreamControl:
         }
 
     def _handovers(self, table: StreamPlan, t0_s: float, now_s: float) -> Iterator[Handover]:
-        gone = self._gone
+        states, gone = self.shown.states, self.shown.gone
         owner = {
-            cell: name
-            for name, state in self.states.items()
-            for cell in sure_of(state, self.states, gone)
+            cell: name for name, state in states.items() for cell in sure_of(state, states, gone)
         }
         moves: dict[Name, tuple[Cell, Cell]] = {}
         concerned: dict[Name, set[Name]] = {}
@@ -355,7 +266,7 @@ class StreamControl:
             if len(way) < 2 or way[0] == way[1]:
                 continue
             name = Name(vehicle)
-            state = self.states.get(name)
+            state = states.get(name)
             if state is None or state.hold_cell != way[0]:
                 continue  # it has gone on meanwhile
             cells = footprint(way[0], way[1])
@@ -374,19 +285,11 @@ class StreamControl:
                 gone=gone,
             )
 
-    def _shown_at(self, t_s: float, name: Name) -> VehicleState | None:
-        newest = self.states.get(name) or self._left.get(name)
-        return _at(t_s, newest, self._before.get(name))
-
-    @property
-    def _gone(self) -> frozenset[Name]:
-        return _gone(self.states.values(), self._census)
-
     def _with_partners(self, names: set[Name]) -> set[Name]:
         """Add those without whose promises nobody could tell what some vehicles own."""
-        roster, waiting = set(names), sorted(names)
+        roster, waiting, states = set(names), sorted(names), self.shown.states
         while waiting:
-            new = partners(self.states[waiting.pop()], self.states) - roster
+            new = partners(states[waiting.pop()], states) - roster
             roster |= new
             waiting += sorted(new)
         return roster
@@ -409,41 +312,6 @@ class StreamControl:
         return sum(handover.phase is Phase.IN_FORCE for handover in self.handovers)
 
 
-def stream_road(scenario: Scenario) -> StreamRoad:
-    """Return the road of a scenario as the stream planner sees it."""
-    formation, road = scenario.formation, scenario.road
-    mode: Mode = 1 if formation.mode == 1 else 2
-    return StreamRoad(
-        lanes=road.lanes,
-        pitch_m=formation.gap_m,
-        advance_m=formation.speed_mps * formation.cycle_s,
-        sorting_m=(scenario.moves_from_m, road.length_m),
-        length_m=road.length_m,
-        body_m=scenario.vehicle.length_m,
-        mode=mode,
-        model=ConflictModel(formation.conflict_kinds),
-    )
-
-
-_News = TypeVar("_News", Census, VehicleState)
-
-
-def _at(t_s: float, newest: _News | None, before: _News | None) -> _News | None:
-    """Return what was known at a time (road time); None: nothing yet."""
-    return newest if newest is not None and newest.t_s <= t_s else before
-
-
-def _gone(states: Iterable[VehicleState], census: Census | None) -> frozenset[Name]:
-    """Return who shares deeds with somebody and has left the road."""
-    listed = {entry.vehicle for entry in census.on_road} if census else set[Name]()
-    deeds = [state.deed for state in states if state.deed is not None]
-    return frozenset(name for deed in deeds for name in deed.roster if name not in listed)
-
-
-def _costs(scenario: Scenario) -> StreamCosts:
-    return StreamCosts(forward=REWARD if scenario.formation.reward_drift else 0.0)
-
-
 def _clusters(groups: Iterable[set[Name]]) -> list[set[Name]]:
     """Join groups that share a vehicle."""
     clusters: list[set[Name]] = []
@@ -457,23 +325,3 @@ def _clusters(groups: Iterable[set[Name]]) -> list[set[Name]]:
                 apart.append(cluster)
         clusters = [*apart, joined]
     return clusters
-
-
-def _is_older(state: VehicleState, other: VehicleState) -> bool:
-    """Tell whether a state of a vehicle was sent before another one of it."""
-    if state.incarnation == other.incarnation and state.t_s != other.t_s:
-        return state.t_s < other.t_s
-    return _age(state) < _age(other)
-
-
-def _age(state: VehicleState) -> tuple[object, ...]:
-    """Return what orders the states of one vehicle, older ones first."""
-    deed = state.deed
-    return (
-        state.incarnation,
-        state.t_s,
-        state.promised or (),
-        bool(state.estate),
-        state.accepted,
-        (deed.ballot, deed.open) if deed is not None else (),
-    )

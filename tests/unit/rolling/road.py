@@ -13,7 +13,7 @@ from random import Random
 from attrs import define, field, frozen
 
 from laneweave.coordinator.handover import Handover, estate_of
-from laneweave.coordinator.stream_control import _age
+from laneweave.coordinator.stream_shown import is_older
 from laneweave.protocol.execution import PlanExecution
 from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.messages import (
@@ -172,7 +172,7 @@ class Leader:
 
     def hear(self, state: VehicleState) -> None:
         known = self.states.get(state.vehicle)
-        if known is not None and _age(state) < _age(known):
+        if known is not None and is_older(state, known):
             return
         self.states[state.vehicle] = state
         for handover in self.handovers:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Sequence
 
 from laneweave.coordinator.planning.grid import displacements
 from laneweave.coordinator.planning.stream import StreamPlan, StreamVehicle, Way
-from laneweave.coordinator.stream_control import Planner, stream_road
+from laneweave.coordinator.stream_planner import Planner, stream_road
 from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.scenario import Scenario
 

@@ -18,7 +18,7 @@ from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.leader_rules import LEADER_RULES
-from laneweave.coordinator.stream_control import Planner, stream_planner
+from laneweave.coordinator.stream_planner import Planner, stream_planner
 from laneweave.launch.simulation.bodies import Geometry
 from laneweave.launch.simulation.checker import Checker, Violation
 from laneweave.launch.simulation.driver import LightDriver
