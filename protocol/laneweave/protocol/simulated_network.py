@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import heapq
 from bisect import insort
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache, partial
 from itertools import count
 
@@ -28,7 +28,7 @@ from laneweave.protocol.simulated_members import Member
 from laneweave.protocol.simulated_time import Simulation
 from laneweave.protocol.simulated_tokens import Tokens
 from laneweave.protocol.simulated_transport import SimulatedTransport
-from laneweave.protocol.topics import Keys, matches, matches_any
+from laneweave.protocol.topics import Keys, Topic, matches, matches_any
 from laneweave.protocol.transport import (
     Delivery,
     LinkDown,
@@ -60,11 +60,23 @@ class Parcel(bytes):
         return parcel
 
 
-def _unpack(keys: Keys, read: Callable[[str, bytes], Arrived], key: str, payload: bytes) -> Arrived:
-    """Return what arrived, whether it travelled as bytes or as it is."""
-    if isinstance(payload, Parcel):
-        return Arrived(*known_key(keys, key), payload.message)
-    return read(key, payload)
+class _Reader:
+    """Reads what arrives at the nodes of a realm, whether it travelled as bytes or as it is."""
+
+    def __init__(self, keys: Keys, decode: Callable[[bytes, type], object]) -> None:
+        self._keys = keys
+        self._known: dict[str, tuple[Topic, Mapping[str, str]]] = {}
+        # Some go to many on keys of their own, like a plan: they are still decoded only once.
+        read = partial(read_message, keys, decode=decode)
+        self._read = lru_cache(maxsize=_REMEMBERED)(read)
+
+    def __call__(self, key: str, payload: bytes) -> Arrived:
+        if not isinstance(payload, Parcel):
+            return self._read(key, payload)
+        known = self._known.get(key)
+        if known is None:
+            known = self._known[key] = known_key(self._keys, key)
+        return Arrived(known[0], known[1], payload.message)
 
 
 class SimulatedNetwork(Simulation):
@@ -92,7 +104,7 @@ class SimulatedNetwork(Simulation):
         self._token_count = count(1)
         self._label_count = count(1)
         self._member_count = count()
-        self._readers: dict[str, Callable[[str, bytes], Arrived]] = {}
+        self._readers: dict[str, _Reader] = {}
         self._decode = lru_cache(maxsize=_REMEMBERED)(decode)
 
     # --- nodes ------------------------------------------------------------------------------
@@ -330,13 +342,10 @@ class SimulatedNetwork(Simulation):
 
     # --- inside -----------------------------------------------------------------------------
 
-    def _reader(self, realm: str) -> Callable[[str, bytes], Arrived]:
+    def _reader(self, realm: str) -> _Reader:
         """Return what reads messages for all nodes of a realm: each only once."""
         if realm not in self._readers:
-            # Some go to many on keys of their own, like a plan: they are still decoded only once.
-            read = partial(read_message, Keys(realm), decode=self._decode)
-            remembering = lru_cache(maxsize=_REMEMBERED)(read)
-            self._readers[realm] = partial(_unpack, Keys(realm), remembering)
+            self._readers[realm] = _Reader(Keys(realm), self._decode)
         return self._readers[realm]
 
     def _vanish(self, name: str, seen_after_s: float) -> None:
