@@ -28,6 +28,7 @@ def check_scenario(scenario: Scenario) -> None:
     _check_conflicts(scenario)
     _check_timing(scenario)
     _check_braking(scenario)
+    _check_settling(scenario)
 
 
 def _require(ok: bool, name: str, value: object, allowed: str) -> None:
@@ -185,4 +186,28 @@ def _check_braking(scenario: Scenario) -> None:
         f"at least {math.ceil(1000.0 * least_m) / 1000.0:g}: who holds one cell behind another at "
         f"formation.speed_mps = {scenario.formation.speed_mps:g} must not brake in emergency "
         "(vehicle.length_m, the tables braking and sensing)",
+    )
+
+
+def _check_settling(scenario: Scenario) -> None:
+    """Who settles in its cell with the least jerk must stay within the vehicle's limits.
+
+    From rest to rest over d in T that takes a speed of 15/8 d/T, an acceleration of 10/sqrt(3) d/T2
+    and a jerk of 60 d/T3.
+    """
+    formation, vehicle = scenario.formation, scenario.vehicle
+    way_m = formation.entry_spread_s * formation.speed_mps
+    speed_mps = min(vehicle.max_speed_mps - formation.speed_mps, formation.speed_mps)
+    accel_mps2 = min(vehicle.max_accel_mps2, -vehicle.min_accel_mps2)
+    least_s = max(
+        15.0 / 8.0 * way_m / speed_mps,
+        math.sqrt(10.0 / math.sqrt(3.0) * way_m / accel_mps2),
+        math.cbrt(60.0 * way_m / vehicle.max_jerk_mps3),
+    )
+    _require(
+        formation.settle_s >= least_s,
+        "formation.settle_s",
+        formation.settle_s,
+        f"at least {math.ceil(10.0 * least_s) / 10.0:g}: whoever enters up to {way_m:g} m beside "
+        "its cell settles there within the vehicle's limits",
     )

@@ -225,6 +225,9 @@ def test_a_value_out_of_range_is_refused_by_name(field: str, value: object) -> N
 
 LATE = {"reaction_s": 0.4}
 MISFITS: list[tuple[str, dict[str, Any]]] = [
+    ("formation.settle_s", {"formation": {"settle_s": 3.1}}),
+    ("formation.settle_s", {"formation": {"settle_s": 5.0, "operation": "paper"}}),
+    ("formation.settle_s", {"vehicle": {"max_speed_mps": 15.5}, "formation": {"settle_s": 28.1}}),
     ("demand.lane_shares", {"demand": {"lane_shares": [0.5, 0.5]}}),
     ("demand.lane_shares", {"demand": {"lane_shares": [1, 1, 1, 1]}}),
     ("demand.lane_shares", {"road": {"lanes": 2}, "demand": {"lane_shares": [1, 1, 1]}}),
@@ -287,6 +290,14 @@ MISFITS: list[tuple[str, dict[str, Any]]] = [
         {"braking": {"lead_brake_mps2": 30.0}, "vehicle": {"min_accel_mps2": -5.0}},
     ),
 ]
+
+
+def test_there_is_time_to_settle() -> None:
+    """The longest way is half a column, or one and a half in the paper's operation."""
+    for settling in ({"settle_s": 3.2}, {"settle_s": 5.2, "operation": "paper"}):
+        parse_scenario({"formation": settling})
+    slow = {"max_speed_mps": 15.5}
+    parse_scenario({"vehicle": slow, "formation": {"settle_s": 28.2}})
 
 
 @pytest.mark.parametrize(("field", "data"), MISFITS)
