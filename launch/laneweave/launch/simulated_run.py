@@ -29,6 +29,8 @@ from laneweave.sim_bridge.sumo_world import SumoWorld
 
 STALL_S = 600.0
 """A road clock that stands still for this much virtual time has stopped for good."""
+STRIDE_S = 0.02
+"""Virtual time in which nobody has to look what happens, if there are no faults."""
 PROGRESS_EVERY_TICKS = 20
 AGENT_PREFIX = "agent-"
 
@@ -125,8 +127,11 @@ class SimulatedRun:
         self._add("bridge", bridge, "bridge")
         shown = advanced_tick = 0
         advanced_s = 0.0
-        while bridge.phase is not Phase.ENDED and network.step():
-            if faults is not None:
+        while bridge.phase is not Phase.ENDED and network.queue:
+            if faults is None:
+                network.run(network.now_s + STRIDE_S)
+            else:
+                network.step()
                 faults.step(network.now_s, self._view)
             if bridge.tick != advanced_tick:
                 advanced_tick, advanced_s = bridge.tick, network.now_s
