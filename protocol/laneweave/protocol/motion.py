@@ -53,6 +53,9 @@ _ACCEL_SHARE = 0.8
 _CATCH_UP_SHARE = 0.25
 """Largest speed towards the cell along the road, as a share of the cell's speed."""
 
+_PLENTY = 0.3
+"""More than the 1/4 of `_least_accel`, by far more than rounding."""
+
 _OPEN_GAIN = 0.6
 """Speed at which a gap that is too small is opened, per metre that it lacks [1/s]."""
 _SETTLE_TICKS = 2.0
@@ -142,20 +145,69 @@ def limited_jerk(state: State, jerk: Jerk, limits: Vehicle, tick_s: float) -> Je
         tick_s: length of the tick [s].
     """
     _, v, a, _, v_y, a_y = state
-    ratio, j_max = limits.max_slip_ratio, limits.max_jerk_mps3
-    a_next = a + tick_s * _clamp(jerk[0], -j_max, j_max)
-    a_next = max(a_next, _least_accel(v, a, j_max, tick_s))
-    a_next = min(a_next, -_least_accel(limits.max_speed_mps - v, -a, j_max, tick_s))
-    a_next = _clamp(a_next, limits.min_accel_mps2, limits.max_accel_mps2)
-
-    j_max, a_max = limits.max_lateral_jerk_mps3, limits.max_lateral_accel_mps2
-    ay_next = a_y + tick_s * _clamp(jerk[1], -j_max, j_max)
-    # Room to either side of the slip limit is a speed too: ratio v -+ v_y >= 0.
-    left = _least_accel(ratio * v - v_y, ratio * a - a_y, j_max, tick_s)
-    right = _least_accel(ratio * v + v_y, ratio * a + a_y, j_max, tick_s)
-    ay_next = min(max(ay_next, right - ratio * a_next), ratio * a_next - left)
-    ay_next = _clamp(ay_next, -a_max, a_max)
+    a_next = limited_accel(v, a, jerk[0], limits, tick_s)
+    ay_next = limited_lateral_accel((v, a, v_y, a_y), a_next, jerk[1], limits, tick_s)
     return ((a_next - a) / tick_s, (ay_next - a_y) / tick_s)
+
+
+def limited_accel(v: float, a: float, jerk: float, limits: Vehicle, tick_s: float) -> float:
+    """Return the acceleration along the road after a tick of the jerk that `limited_jerk` allows.
+
+    Args:
+        v: speed along the road [m/s].
+        a: acceleration along the road [m/s2].
+        jerk: wanted j_s [m/s3]; NaN counts as zero.
+        limits: the vehicle's limits.
+        tick_s: length of the tick [s].
+    """
+    j_max = limits.max_jerk_mps3
+    step = j_max * tick_s
+    a_next = a + tick_s * (jerk if -j_max <= jerk <= j_max else _clamp(jerk, -j_max, j_max))
+    # Mostly there is room in plenty, which is quicker to see than how much acceleration it leaves:
+    # see `_least_accel`.
+    share, x = (2.0 * v / tick_s + a) / step, -a_next / step
+    if share < (x + 1.0) * x + _PLENTY:
+        a_next = max(a_next, _least_accel(share, step))
+    share, x = (2.0 * (limits.max_speed_mps - v) / tick_s - a) / step, a_next / step
+    if share < (x + 1.0) * x + _PLENTY:
+        a_next = min(a_next, -_least_accel(share, step))
+    low, high = limits.min_accel_mps2, limits.max_accel_mps2
+    return a_next if low <= a_next <= high else _clamp(a_next, low, high)
+
+
+def limited_lateral_accel(
+    motion: tuple[float, float, float, float],
+    a_next: float,
+    jerk: float,
+    limits: Vehicle,
+    tick_s: float,
+) -> float:
+    """Return the acceleration across the road after a tick of the jerk that `limited_jerk` allows.
+
+    Args:
+        motion: (v, a, v_y, a_y) in m and s.
+        a_next: acceleration along the road after the tick [m/s2].
+        jerk: wanted j_y [m/s3]; NaN counts as zero.
+        limits: the vehicle's limits.
+        tick_s: length of the tick [s].
+    """
+    v, a, v_y, a_y = motion
+    j_max, ratio, a_max = (
+        limits.max_lateral_jerk_mps3,
+        limits.max_slip_ratio,
+        limits.max_lateral_accel_mps2,
+    )
+    step = j_max * tick_s
+    ay_next = a_y + tick_s * (jerk if -j_max <= jerk <= j_max else _clamp(jerk, -j_max, j_max))
+    # Room to either side of the slip limit is a speed too: ratio v -+ v_y >= 0.
+    speed, rate, rate_next = ratio * v, ratio * a, ratio * a_next
+    share, x = (2.0 * (speed + v_y) / tick_s + (rate + a_y)) / step, -(rate_next + ay_next) / step
+    if share < (x + 1.0) * x + _PLENTY:
+        ay_next = max(ay_next, _least_accel(share, step) - rate_next)
+    share, x = (2.0 * (speed - v_y) / tick_s + (rate - a_y)) / step, (ay_next - rate_next) / step
+    if share < (x + 1.0) * x + _PLENTY:
+        ay_next = min(ay_next, rate_next - _least_accel(share, step))
+    return ay_next if -a_max <= ay_next <= a_max else _clamp(ay_next, -a_max, a_max)
 
 
 def hold_law(state: State, reference: State, limits: Vehicle, tick_s: float) -> Jerk:
@@ -246,18 +298,23 @@ def _clamp(value: float, low: float, high: float) -> float:
     return 0.0 if math.isnan(value) else min(max(value, low), high)
 
 
-def _least_accel(room: float, rate: float, jerk: float, tick_s: float) -> float:
-    """Return the least rate after this tick from which `room` can be kept >= 0.
+def _least_accel(share: float, step: float) -> float:
+    """Return the least rate after this tick from which a room can be kept >= 0.
 
-    `room` is a speed above its lower bound [m/s] and `rate` its derivative [m/s2]. Raising the
+    The room is a speed above its lower bound [m/s] and the rate its derivative [m/s2]. Raising the
     rate to zero from -x jerk tick_s, whole ticks at full jerk and a last part tick, costs
     jerk tick_s^2 / 2 times the linear interpolation of m^2 at x, and this tick costs the mean of
     both rates. The bound is where both together use up the room:
 
         x + interp(m^2)(x) = 2 (room + rate tick_s / 2) / (jerk tick_s^2)
+
+    The interpolation is above x^2 by 1/4 at most: where the right side is more than x + x^2 + 1/4,
+    a rate of -x jerk tick_s is above the bound.
+
+    Args:
+        share: the right side.
+        step: jerk tick_s, the most that the rate changes in a tick [m/s2].
     """
-    step = jerk * tick_s
-    share = (2.0 * room / tick_s + rate) / step
     if share <= 0.0:
         return -share * step
     whole = math.floor((math.sqrt(1.0 + 4.0 * share) - 1.0) / 2.0)
