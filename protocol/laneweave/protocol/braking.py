@@ -21,7 +21,7 @@ import math
 from collections.abc import Iterable
 
 from laneweave.protocol.messages import Neighbour
-from laneweave.protocol.motion import Jerk, State, integrate
+from laneweave.protocol.motion import Jerk, State
 from laneweave.protocol.scenario import Scenario
 
 ERROR_SIGMAS = 4.5
@@ -62,12 +62,20 @@ def lead_way_m(scenario: Scenario, speed_mps: float, accel_mps2: float = 0.0) ->
         speed_mps: speed of the vehicle ahead.
         accel_mps2: its acceleration.
     """
-    assumed = scenario.braking
+    return _lead_way_m(
+        speed_mps, accel_mps2, scenario.braking.lead_brake_mps2, _lead_lag_s(scenario)
+    )
+
+
+def _lead_lag_s(scenario: Scenario) -> float:
     # Nor is it relied upon that brakes ahead take longer to build up than one's own.
-    lag_s = min(assumed.lead_lag_s, scenario.vehicle.actuator_lag_s)
+    return min(scenario.braking.lead_lag_s, scenario.vehicle.actuator_lag_s)
+
+
+def _lead_way_m(speed_mps: float, accel_mps2: float, brake_mps2: float, lag_s: float) -> float:
     # Who speeds up may stop doing so at once; who brakes harder than assumed does so for good.
-    accel = min(max(accel_mps2, -assumed.lead_brake_mps2), 0.0)
-    return stopping_distance_m(max(speed_mps, 0.0), accel, assumed.lead_brake_mps2, lag_s)
+    accel = min(max(accel_mps2, -brake_mps2), 0.0)
+    return stopping_distance_m(max(speed_mps, 0.0), accel, brake_mps2, lag_s)
 
 
 def spare_error_m(scenario: Scenario, speed_mps: float) -> float:
@@ -105,7 +113,7 @@ class EmergencyBrake:
         limits, assumed = scenario.vehicle, scenario.braking
         self._brake_mps2 = own_braking_mps2(scenario)
         self._lag_s = limits.actuator_lag_s
-        self._scenario = scenario
+        self._lead_brake_mps2, self._lead_lag_s = assumed.lead_brake_mps2, _lead_lag_s(scenario)
         self._tick_s = scenario.runtime.tick_s
         self._last_tick_m = last_tick_m(self._brake_mps2, self._tick_s)
         self._later_s = max(assumed.reaction_s - self._tick_s, 0.0)
@@ -131,18 +139,26 @@ class EmergencyBrake:
         for other in others:
             if own_m is None:
                 own_m = self._own_way_m(state, setpoint_mps2, jerk[0])
-            way_m = lead_way_m(self._scenario, other.speed_mps, other.accel_mps2)
+            way_m = _lead_way_m(
+                other.speed_mps, other.accel_mps2, self._lead_brake_mps2, self._lead_lag_s
+            )
             spare_m = min(spare_m, other.gap_m + way_m - own_m)
         return spare_m - self._margin_m
 
     def _own_way_m(self, state: State, setpoint_mps2: float, jerk_mps3: float) -> float:
         """Return how far it goes if it brakes after the time of reaction."""
         _, v, a, _, _, _ = state
-        # The commanded state has no lag, and the body comes to rest where it does.
-        commanded = (self._lag_s * v, v + self._lag_s * a, setpoint_mps2, 0.0, 0.0, 0.0)
-        after = integrate(commanded, (jerk_mps3, 0.0), self._tick_s)
-        ahead_m, speed, *_ = integrate(after, (0.0, 0.0), self._later_s)
-        speed = max(speed, 0.0)
+        lag_s, tick_s, later_s = self._lag_s, self._tick_s, self._later_s
+        # The commanded state has no lag, and the body comes to rest where it does. Along the road
+        # alone, as `integrate` moves it on: for a tick, and for what is left of the reaction.
+        speed, half = v + lag_s * a, tick_s * tick_s / 2.0
+        ahead_m = (
+            lag_s * v + speed * tick_s + setpoint_mps2 * half + jerk_mps3 * (half * tick_s / 3.0)
+        )
+        speed = speed + setpoint_mps2 * tick_s + jerk_mps3 * half
+        accel = setpoint_mps2 + jerk_mps3 * tick_s
+        ahead_m = ahead_m + speed * later_s + accel * (later_s * later_s / 2.0)
+        speed = max(speed + accel * later_s, 0.0)
         return ahead_m + speed * speed / (2.0 * self._brake_mps2) + self._last_tick_m
 
 
