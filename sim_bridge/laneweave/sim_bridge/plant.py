@@ -10,7 +10,13 @@ from __future__ import annotations
 
 import math
 
-from laneweave.protocol.motion import State, commanded_state, integrate, limited_jerk
+from laneweave.protocol.motion import (
+    Jerk,
+    State,
+    commanded_state,
+    integrate,
+    limited_jerk,
+)
 from laneweave.protocol.scenario import Vehicle
 from laneweave.sim_bridge.overlap import Pose, pose_of
 
@@ -32,6 +38,9 @@ class Plant:
         self._state = state
         self._setpoint = (state[2], state[5])
         self._limits = limits
+        # Looked up in each tick.
+        self._lag_s, self._lag_y_s = limits.actuator_lag_s, limits.lateral_actuator_lag_s
+        self._slip_ratio = limits.max_slip_ratio
         self._tick_s = tick_s
         self._rest = _rest(tick_s, limits.actuator_lag_s)
         self._rest_y = _rest(tick_s, limits.lateral_actuator_lag_s)
@@ -84,13 +93,15 @@ class Plant:
         Returns:
             The new state.
         """
-        commanded = self._commanded()
+        commanded = commanded_state(self._state, self._setpoint, self._limits, 0.0)
         before = self._state[2]
-        allowed = limited_jerk(commanded, (jerk_s, jerk_y), self._limits, self._tick_s)
-        self._move(commanded, allowed)
-        if not self.in_emergency:
-            self._max_jerk = max(self._max_jerk, abs(self._state[2] - before) / self._tick_s)
-        self._braking = self._braking and self._lags_behind()
+        self._move(commanded, limited_jerk(commanded, (jerk_s, jerk_y), self._limits, self._tick_s))
+        if self._braking:
+            self._braking = self._lags_behind()
+        else:
+            change = abs(self._state[2] - before) / self._tick_s
+            if change > self._max_jerk:
+                self._max_jerk = change
         return self._state
 
     def brake(self, jerk_y: float) -> State:
@@ -103,7 +114,7 @@ class Plant:
             The new state.
         """
         self._braking = True
-        s, v, _, y, v_y, a_y = self._commanded()
+        s, v, _, y, v_y, a_y = commanded_state(self._state, self._setpoint, self._limits, 0.0)
         # The commanded state stands still first, and the body comes to rest behind it.
         accel = max(self._limits.min_accel_mps2, -v / self._tick_s)
         now = (s, v, accel, y, v_y, a_y)
@@ -118,34 +129,41 @@ class Plant:
         most = self._limits.max_jerk_mps3 * self._limits.actuator_lag_s
         return abs(self._setpoint[0] - self._state[2]) > most + 1e-6
 
-    def _commanded(self) -> State:
-        return commanded_state(self._state, self._setpoint, self._limits, 0.0)
-
-    def _move(self, commanded: State, jerk: tuple[float, float]) -> None:
+    def _move(self, commanded: State, jerk: Jerk) -> None:
         """Move on from a commanded state whose frame stands on the road."""
-        limits, tick_s = self._limits, self._tick_s
-        then = integrate(commanded, jerk, tick_s)
-        now = self._state
-        along = _follow(
-            now[:3], commanded[:3], then[:3], jerk[0], limits.actuator_lag_s, self._rest
+        from_s, from_v, from_a, from_y, from_vy, from_ay = commanded
+        to_s, to_v, to_a, to_y, to_vy, to_ay = integrate(commanded, jerk, self._tick_s)
+        s, v, a, y, v_y, a_y = self._state
+        next_s, next_v, a = _follow(
+            (s, v, a),
+            (from_s, from_v, from_a),
+            (to_s, to_v, to_a),
+            jerk[0],
+            self._lag_s,
+            self._rest,
         )
-        across = _follow(
-            now[3:], commanded[3:], then[3:], jerk[1], limits.lateral_actuator_lag_s, self._rest_y
+        y, v_y, a_y = _follow(
+            (y, v_y, a_y),
+            (from_y, from_vy, from_ay),
+            (to_y, to_vy, to_ay),
+            jerk[1],
+            self._lag_y_s,
+            self._rest_y,
         )
-        setpoint = (then[2], then[5])
         # Brakes hold a body, they do not push it back: not when they are released just before it
         # stands still, nor by rounding.
-        along = (max(along[0], now[0]), max(along[1], 0.0), along[2])
-        slip = limits.max_slip_ratio * along[1]
-        if abs(across[1]) > slip:
+        next_s, next_v = max(next_s, s), max(next_v, 0.0)
+        slip = self._slip_ratio * next_v
+        if abs(v_y) > slip:
             # A body does not slide sideways, though its axes lag differently; here the limit on
             # lateral jerk gives way.
-            across = (across[0], math.copysign(slip, across[1]), 0.0)
-            setpoint = (setpoint[0], 0.0)
-        self._state = (*along, *across)
-        self._setpoint = setpoint
-        self._min_accel = min(self._min_accel, along[2])
-        self._max_accel = max(self._max_accel, along[2])
+            v_y, a_y, to_ay = math.copysign(slip, v_y), 0.0, 0.0
+        self._state = (next_s, next_v, a, y, v_y, a_y)
+        self._setpoint = (to_a, to_ay)
+        if a < self._min_accel:
+            self._min_accel = a
+        if a > self._max_accel:
+            self._max_accel = a
 
 
 def _follow(
@@ -158,21 +176,20 @@ def _follow(
     """
     if lag_s <= 0.0:
         return then
-    begin_s, begin_v, begin_a = _followed(commanded, jerk, lag_s)
-    end_s, end_v, end_a = _followed(then, jerk, lag_s)
-    s, v, a = body
-    return (
-        end_s + (s - begin_s) * rest,
-        end_v + (v - begin_v) * rest,
-        end_a + (a - begin_a) * rest,
-    )
-
-
-def _followed(commanded: Axis, jerk: float, lag_s: float) -> Axis:
+    # Both ends of that cubic, which is a lag behind in position, speed and acceleration.
     s, v, a = commanded
-    accel = a - lag_s * jerk
-    speed = v - lag_s * accel
-    return s - lag_s * speed, speed, accel
+    begin_a = a - lag_s * jerk
+    begin_v = v - lag_s * begin_a
+    end_s, end_v, end_a = then
+    end_a -= lag_s * jerk
+    end_v -= lag_s * end_a
+    end_s -= lag_s * end_v
+    body_s, body_v, body_a = body
+    return (
+        end_s + (body_s - (s - lag_s * begin_v)) * rest,
+        end_v + (body_v - begin_v) * rest,
+        end_a + (body_a - begin_a) * rest,
+    )
 
 
 def _rest(tick_s: float, lag_s: float) -> float:
