@@ -19,12 +19,13 @@ owns. Nobody but the process in charge changes where the vehicle holds or what i
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+import sys
+from array import array
+from collections.abc import Iterable, Sequence
 from enum import IntEnum
 
-import numpy as np
 from attrs import define, evolve, field
-from numpy.typing import NDArray
 
 from laneweave.protocol.braking import EmergencyBrake
 from laneweave.protocol.errors import BadInputError
@@ -38,7 +39,7 @@ from laneweave.protocol.motion import (
     commanded_state,
     hold_law,
     keep_gap,
-    limited_jerk,
+    limited_accel,
 )
 from laneweave.protocol.scenario import Scenario
 from laneweave.sim_bridge.overlap import NOBODY_AROUND, Around
@@ -96,7 +97,8 @@ class MotionController:
     around: Around = NOBODY_AROUND
     """Whom its sensors see."""
     _measured: State | None = None
-    _jerks: NDArray[np.float32] = field(init=False)
+    _jerks: array[float] = field(init=False)
+    """Along and across, one pair for each tick."""
     _jerks_tick: int = 0
     """Tick that the first of the jerks is for."""
     lattice: Lattice = field(init=False)
@@ -110,7 +112,7 @@ class MotionController:
         self.joined = (self.lattice.block_of(self.hold_cell[0]),)
         self.motion_origin = self.hold_cell
         self.rung_ticks = dict.fromkeys(Rung, 0)
-        self._jerks = np.zeros((0, 2), dtype=np.float32)
+        self._jerks = array("f")
         self._brake = EmergencyBrake(self._scenario)
 
     @property
@@ -182,7 +184,12 @@ class MotionController:
         Returns:
             Whether anything was new.
         """
-        if command.incarnation != self.attendant or not _in_range(command.joined):
+        if command.incarnation != self.attendant:
+            return False
+        asked = command.joined, command.accepted, command.promised, command.deed
+        if asked == (self.joined, self.accepted, self.promised, self.deed):
+            return False  # in nearly every tick
+        if not _in_range(command.joined):
             return False
         before = self.joined, self.accepted, self.promised, self.deed
         self.join(command.joined)
@@ -247,24 +254,24 @@ class MotionController:
 
     def step(self, tick: int) -> None:
         """Drive from `tick` to the next one."""
-        near = [other for other in self.around.ahead if self._is_in_the_way(other)]
+        measured, plant = self.measured, self.plant
+        near: Sequence[Neighbour] = self.around.ahead
+        if near:
+            near = self._in_the_way(near, measured[3])
         rung, jerk = self._way(tick, near)
-        spare_m = self._brake.spare_m(
-            self.measured, self.plant.setpoint[0], self._allowed(jerk), near
-        )
-        release_m = RELEASE_M + self.measured[1] * self.tick_s
-        if spare_m < (release_m if self.rung is Rung.EMERGENCY else 0.0):
+        # Who has nobody before it has nothing to brake for.
+        if near and self._must_brake(measured, jerk, near):
             rung = Rung.EMERGENCY
             # The body is not where the trajectory would have it any more.
             self._jerks = self._jerks[:0]
-            self.plant.brake(jerk[1])
+            plant.brake(jerk[1])
         else:
-            self.plant.step(*jerk)
+            plant.step(*jerk)
         self.rung = rung
         self.rung_ticks[rung] += 1
         self._measured = None
 
-    def _checked_jerks(self, command: Command) -> NDArray[np.float32]:
+    def _checked_jerks(self, command: Command) -> array[float]:
         for cell in (command.hold_cell, command.motion_origin):
             if not (0 <= cell[1] < self.lattice.lanes and abs(cell[0]) <= MAX_COLUMN):
                 raise BadInputError("Command", cell, f"cells on {self.lattice.lanes} lanes")
@@ -272,17 +279,19 @@ class MotionController:
             raise BadInputError("Command.joined", command.joined, f"at most {MAX_COLUMN}")
         if len(command.jerks) % 8:
             raise BadInputError("Command.jerks", f"{len(command.jerks)} bytes", "float32 pairs")
-        jerks = np.frombuffer(command.jerks, dtype="<f4").reshape(-1, 2)
-        if not np.isfinite(jerks).all():
+        jerks = array("f", command.jerks)
+        if sys.byteorder == "big":
+            jerks.byteswap()
+        # Finite numbers of 32 bits have a finite sum: one that is not tells of one that is not.
+        if not math.isfinite(sum(jerks)):
             raise BadInputError("Command.jerks", "NaN or infinity", "finite numbers")
         return jerks
 
     def _way(self, tick: int, near: Iterable[Neighbour]) -> tuple[Rung, Jerk]:
         """Return what to drive by, and the jerk, if there is no emergency."""
-        index = tick - self._jerks_tick
+        index = 2 * (tick - self._jerks_tick)
         if 0 <= index < len(self._jerks):
-            j_s, j_y = self._jerks[index].tolist()
-            return Rung.PLAY, (j_s, j_y)
+            return Rung.PLAY, (self._jerks[index], self._jerks[index + 1])
         limits, speed_mps = self._scenario.vehicle, self.lattice.speed_mps
         body = self.measured
         state = commanded_state(body, self.plant.setpoint, limits, speed_mps)
@@ -300,16 +309,23 @@ class MotionController:
         careful = keep_gap(state, jerk, ahead, limits, least_m, self.tick_s)
         return (Rung.HOLD if careful == jerk else Rung.GIVE_WAY), careful
 
-    def _allowed(self, jerk: Jerk) -> Jerk:
-        """Return what the body will make of a jerk: whoever commands it cannot wish it braked."""
-        limits, speed_mps = self._scenario.vehicle, self.lattice.speed_mps
-        state = commanded_state(self.measured, self.plant.setpoint, limits, speed_mps)
-        return limited_jerk(state, jerk, limits, self.tick_s)
+    def _must_brake(self, measured: State, jerk: Jerk, near: Iterable[Neighbour]) -> bool:
+        """Tell whether there is an emergency, or one that goes on."""
+        limits, tick_s = self._scenario.vehicle, self.tick_s
+        accel = self.plant.setpoint[0]
+        # What the body will make of the jerk: whoever commands it cannot wish it braked.
+        speed = measured[1] + limits.actuator_lag_s * measured[2]
+        allowed = (limited_accel(speed, accel, jerk[0], limits, tick_s) - accel) / tick_s
+        spare_m = self._brake.spare_m(measured, accel, (allowed, 0.0), near)
+        if self.rung is Rung.EMERGENCY:
+            return spare_m < RELEASE_M + measured[1] * tick_s
+        return spare_m < 0.0
 
-    def _is_in_the_way(self, other: Neighbour) -> bool:
-        """Tell whether somebody is on a lane that the body touches or that it steers for."""
-        first, last = self.lattice.lanes_touched(self.measured[3], self._scenario.vehicle.width_m)
-        return first <= other.lane <= last or other.lane == self.hold_cell[1]
+    def _in_the_way(self, others: Iterable[Neighbour], y_m: float) -> list[Neighbour]:
+        """Return who is on a lane that the body touches or that it steers for."""
+        first, last = self.lattice.lanes_touched(y_m, self._scenario.vehicle.width_m)
+        goal = self.hold_cell[1]
+        return [other for other in others if first <= other.lane <= last or other.lane == goal]
 
 
 def _with_cells(deed: Deed, cells: Iterable[Cell]) -> Deed:
