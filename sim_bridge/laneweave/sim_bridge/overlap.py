@@ -10,13 +10,14 @@ So the body's centre is (s - L/2 cos heading, y). The overlap test is exact for 
 is the ground truth of a run's safety; SUMO's collision list misses pairs that overlap between two
 lanes and is only a second opinion.
 
-Everything here sorts the vehicles along the road once and looks at near ones only.
+`Bodies` sorts the vehicles along the road once, for all that is asked about them, and looks at near
+ones only.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from laneweave.protocol.messages import Neighbour
@@ -47,6 +48,13 @@ class Around(NamedTuple):
 
 
 NOBODY_AROUND = Around((), ())
+
+Glimpse = tuple[int, float, float, float]
+"""(lane, gap m, speed m/s, acceleration m/s2): a `Neighbour` as plain numbers, of which sensors are
+to make one."""
+
+Glimpses = tuple[Sequence[Glimpse], Sequence[Glimpse]]
+"""(ahead, behind), by lane: an `Around` as plain numbers."""
 
 
 def pose_of(state: Sequence[float]) -> Pose:
@@ -86,13 +94,7 @@ def overlapping_pairs(
     Returns:
         Sorted pairs of names, the lesser name first. Bodies that merely touch are not among them.
     """
-    reach_m = math.hypot(length_m, width_m)
-    pairs = []
-    for follower, leader in _near_pairs(poses, length_m + width_m):
-        one, other = poses[follower], poses[leader]
-        if abs(one[1] - other[1]) < reach_m and _intersect(one, other, length_m, width_m):
-            pairs.append((min(follower, leader), max(follower, leader)))
-    return sorted(pairs)
+    return Bodies(poses, length_m, width_m).overlapping_pairs()
 
 
 def least_gaps(poses: Mapping[str, Pose], length_m: float, width_m: float) -> LeastGaps:
@@ -107,34 +109,7 @@ def least_gaps(poses: Mapping[str, Pose], length_m: float, width_m: float) -> Le
         length_m: length of every body.
         width_m: width of every body.
     """
-    bodies = sorted(poses.values())
-    extents = [_extent(pose, length_m, width_m) for pose in bodies]
-    # Of two leaders in line the one whose front is farther can only have the lesser gap if their
-    # fronts are closer than the most that rotation adds to a body.
-    slack_m = length_m + width_m
-    candidates = []
-    least_headway = math.inf
-    for index, (rear, front, low, high) in enumerate(extents):
-        s_m, _, _, speed_mps = bodies[index]
-        horizon_m = math.inf
-        for ahead in range(index + 1, len(bodies)):
-            distance_m = bodies[ahead][0] - s_m
-            if distance_m > horizon_m:
-                break
-            other_rear, other_front, other_low, other_high = extents[ahead]
-            if other_low >= high - _TOUCH_M or other_high <= low + _TOUCH_M:
-                continue
-            if horizon_m == math.inf:
-                horizon_m = distance_m + slack_m
-                if speed_mps > 0.0:
-                    least_headway = min(least_headway, distance_m / speed_mps)
-            candidates.append((max(other_rear - front, rear - other_front), index, ahead))
-    least_gap = math.inf
-    for bound_m, index, ahead in sorted(candidates):
-        if bound_m >= least_gap:
-            break
-        least_gap = min(least_gap, _gap_m(bodies[index], bodies[ahead], length_m, width_m))
-    return LeastGaps(least_gap, least_headway)
+    return Bodies(poses, length_m, width_m).least_gaps()
 
 
 def neighbours(
@@ -165,52 +140,130 @@ def neighbours(
     Returns:
         For each vehicle at most one neighbour ahead in each lane and one behind, by lane.
     """
-    order = sorted(((pose[0], name) for name, pose in poses.items()), reverse=True)
-    touched = {
-        name: _lanes_of(pose, lanes, lane_width_m, length_m, width_m)
-        for name, pose in poses.items()
+    seen = Bodies(poses, length_m, width_m).glimpses(lanes, lane_width_m, accels_mps2 or {})
+    return {
+        name: Around(*(tuple(Neighbour(*each) for each in others) for others in seen[name]))
+        for name in poses
     }
-    accels = accels_mps2 or {}
-
-    def nearest(order: Iterable[tuple[float, str]], sign: float) -> dict[str, list[Neighbour]]:
-        last: list[tuple[float, str] | None] = [None] * lanes
-        seen = {}
-        for s_m, name in order:
-            first, final = touched[name]
-            found = []
-            for lane in range(max(first - 1, 0), min(final + 2, lanes)):
-                other = last[lane]
-                if other is not None:
-                    gap_m = sign * (other[0] - s_m) - length_m
-                    speed_mps, accel = poses[other[1]][3], accels.get(other[1], 0.0)
-                    found.append(Neighbour(lane, gap_m, speed_mps, accel))
-            seen[name] = found
-            for lane in range(first, final + 1):
-                last[lane] = (s_m, name)
-        return seen
-
-    ahead, behind = nearest(order, 1.0), nearest(reversed(order), -1.0)
-    return {name: Around(tuple(ahead[name]), tuple(behind[name])) for name in poses}
 
 
-def _lanes_of(
-    pose: Pose, lanes: int, lane_width_m: float, length_m: float, width_m: float
-) -> tuple[int, int]:
-    """Return the first and the last lane that a body touches."""
-    _, _, low, high = _extent(pose, length_m, width_m)
-    first = min(max(int((low + _TOUCH_M) // lane_width_m), 0), lanes - 1)
-    return first, min(max(int((high - _TOUCH_M) // lane_width_m), first), lanes - 1)
+class Bodies:
+    """All bodies on the road at one time, of equal size."""
 
+    def __init__(self, poses: Mapping[str, Pose], length_m: float, width_m: float) -> None:
+        """Sort them along the road.
 
-def _near_pairs(poses: Mapping[str, Pose], reach_m: float) -> Iterator[tuple[str, str]]:
-    """Yield all pairs (behind, ahead) whose fronts are closer than `reach_m` along the road."""
-    order = sorted((pose[0], name) for name, pose in poses.items())
-    for index, (s_m, name) in enumerate(order):
-        for ahead in range(index + 1, len(order)):
-            other_s_m, other = order[ahead]
-            if other_s_m - s_m >= reach_m:
+        Args:
+            poses: pose of each vehicle.
+            length_m: length of every body.
+            width_m: width of every body.
+        """
+        self._length_m, self._width_m = length_m, width_m
+        order = sorted([(pose[0], name, pose) for name, pose in poses.items()])
+        self._names = [name for _, name, _ in order]
+        self._poses = [pose for _, _, pose in order]
+        self._extents = [_extent(pose, length_m, width_m) for pose in self._poses]
+
+    def overlapping_pairs(self) -> list[tuple[str, str]]:
+        """Return all pairs of vehicles whose bodies overlap; see the function of this name."""
+        names, poses, extents = self._names, self._poses, self._extents
+        length_m, width_m = self._length_m, self._width_m
+        reach_m = length_m + width_m
+        count = len(poses)
+        pairs = []
+        for index, one in enumerate(poses):
+            s_m, (_, _, low, high) = one[0], extents[index]
+            for ahead in range(index + 1, count):
+                other = poses[ahead]
+                if other[0] - s_m >= reach_m:
+                    break
+                _, _, other_low, other_high = extents[ahead]
+                if other_low >= high or other_high <= low:
+                    continue  # side by side: nearly all that are near
+                if _intersect(one, other, length_m, width_m):
+                    name, other_name = names[index], names[ahead]
+                    pairs.append((min(name, other_name), max(name, other_name)))
+        return sorted(pairs)
+
+    def least_gaps(self) -> LeastGaps:
+        """Return how close vehicles in line are at least; see the function of this name."""
+        length_m, width_m = self._length_m, self._width_m
+        # Of two with equal fronts names do not decide who is behind.
+        bodies = sorted(zip(self._poses, self._extents, strict=True))
+        # Of two leaders in line the one whose front is farther can only have the lesser gap if
+        # their fronts are closer than the most that rotation adds to a body.
+        slack_m = length_m + width_m
+        count = len(bodies)
+        turned = []
+        """Least possible gap and indices of pairs of which one body is turned."""
+        least_gap = least_headway = math.inf
+        for index, ((s_m, _, heading, speed_mps), (rear, front, low, high)) in enumerate(bodies):
+            low, high = low + _TOUCH_M, high - _TOUCH_M  # noqa: PLW2901
+            horizon_m = math.inf
+            for ahead in range(index + 1, count):
+                other, (other_rear, other_front, other_low, other_high) = bodies[ahead]
+                distance_m = other[0] - s_m
+                if distance_m > horizon_m:
+                    break
+                if other_low >= high or other_high <= low:
+                    continue
+                if horizon_m == math.inf:
+                    horizon_m = distance_m + slack_m
+                    if speed_mps > 0.0:
+                        least_headway = min(least_headway, distance_m / speed_mps)
+                bound_m = max(other_rear - front, rear - other_front)
+                if heading != 0.0 or other[2] != 0.0:
+                    turned.append((bound_m, index, ahead))
+                elif bound_m < least_gap:
+                    least_gap = bound_m  # of unturned bodies it is the gap itself
+        for bound_m, index, ahead in sorted(turned):
+            if bound_m >= least_gap:
                 break
-            yield name, other
+            gap_m = _gap_m(bodies[index][0], bodies[ahead][0], length_m, width_m)
+            least_gap = min(least_gap, gap_m)
+        return LeastGaps(least_gap, least_headway)
+
+    def glimpses(
+        self, lanes: int, lane_width_m: float, accels_mps2: Mapping[str, float]
+    ) -> dict[str, Glimpses]:
+        """Return whom each vehicle's local sensing would see if it were exact; see `neighbours`.
+
+        Args:
+            lanes: number of lanes.
+            lane_width_m: width of a lane.
+            accels_mps2: acceleration of each vehicle; of others: zero.
+        """
+        touched = []
+        """The first and the last lane that each body touches."""
+        for _, _, low, high in self._extents:
+            first = min(max(int((low + _TOUCH_M) // lane_width_m), 0), lanes - 1)
+            last = min(max(int((high - _TOUCH_M) // lane_width_m), first), lanes - 1)
+            touched.append((first, last))
+        names, poses, length_m = self._names, self._poses, self._length_m
+        accels = [accels_mps2.get(name, 0.0) for name in names]
+
+        def nearest(order: Iterable[int], sign: float) -> list[list[Glimpse]]:
+            """Return whom each one sees of those before it in an order, by lane."""
+            last_seen = [-1] * lanes
+            seen: list[list[Glimpse]] = [[]] * len(names)
+            for index in order:
+                first, last = touched[index]
+                s_m = poses[index][0]
+                found = []
+                for lane in range(max(first - 1, 0), min(last + 2, lanes)):
+                    other = last_seen[lane]
+                    if other >= 0:
+                        other_s_m, _, _, speed_mps = poses[other]
+                        gap_m = sign * (other_s_m - s_m) - length_m
+                        found.append((lane, gap_m, speed_mps, accels[other]))
+                seen[index] = found
+                for lane in range(first, last + 1):
+                    last_seen[lane] = index
+            return seen
+
+        ahead = nearest(range(len(names) - 1, -1, -1), 1.0)
+        behind = nearest(range(len(names)), -1.0)
+        return dict(zip(names, zip(ahead, behind, strict=True), strict=True))
 
 
 def _extent(pose: Pose, length_m: float, width_m: float) -> tuple[float, float, float, float]:

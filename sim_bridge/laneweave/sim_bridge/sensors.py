@@ -14,7 +14,7 @@ import numpy as np
 from laneweave.protocol.messages import Name, Neighbour
 from laneweave.protocol.motion import State
 from laneweave.protocol.scenario import Scenario
-from laneweave.sim_bridge.overlap import Around, Pose, neighbours
+from laneweave.sim_bridge.overlap import Around, Glimpse, Glimpses, Pose, neighbours
 
 _DRAWN = 1024
 
@@ -59,20 +59,31 @@ class Sensors:
 
     def look(self, around: Around) -> Around:
         """Return what the vehicle sees of those around it."""
-        return Around(
-            tuple([self._seen(other) for other in around.ahead]),
-            tuple([self._seen(other) for other in around.behind]),
-        )
+        ahead, behind = around
+        return self.see((list(map(_numbers, ahead)), list(map(_numbers, behind))))
 
-    def _seen(self, other: Neighbour) -> Neighbour:
-        gap_m, speed_mps, accel_mps2 = self._other_noise
-        e_gap, e_speed, e_accel = self._draw(3)
-        return Neighbour(
-            other.lane,
-            other.gap_m + e_gap * gap_m,
-            max(other.speed_mps + e_speed * speed_mps, 0.0),
-            other.accel_mps2 + e_accel * accel_mps2,
-        )
+    def see(self, glimpses: Glimpses) -> Around:
+        """Return what the vehicle sees of those around it, given as plain numbers."""
+        ahead, behind = glimpses
+        sigma_m, sigma_mps, sigma_mps2 = self._other_noise
+        # Drawn at once for all, in their order: the same numbers as one by one.
+        errors = self._draw(3 * (len(ahead) + len(behind)))
+        seen = []
+        index = 0
+        for lane, gap_m, speed_mps, accel_mps2 in (*ahead, *behind):
+            speed = speed_mps + errors[index + 1] * sigma_mps
+            if speed < 0.0:
+                speed = 0.0
+            seen.append(
+                Neighbour(
+                    lane,
+                    gap_m + errors[index] * sigma_m,
+                    speed,
+                    accel_mps2 + errors[index + 2] * sigma_mps2,
+                )
+            )
+            index += 3
+        return Around(tuple(seen[: len(ahead)]), tuple(seen[len(ahead) :]))
 
     def _draw(self, count: int) -> list[float]:
         """Return the next numbers of the standard normal distribution."""
@@ -102,3 +113,7 @@ def who_is_around(
         width_m=vehicle.width_m,
         accels_mps2=accels_mps2,
     )
+
+
+def _numbers(other: Neighbour) -> Glimpse:
+    return other.lane, other.gap_m, other.speed_mps, other.accel_mps2

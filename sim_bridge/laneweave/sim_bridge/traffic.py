@@ -13,7 +13,7 @@ from laneweave.protocol.scenario import Scenario
 from laneweave.sim_bridge.demand import Arrival
 from laneweave.sim_bridge.entry import Admission
 from laneweave.sim_bridge.motion_controller import MotionController, Rung
-from laneweave.sim_bridge.overlap import Around
+from laneweave.sim_bridge.overlap import Around, Glimpses
 from laneweave.sim_bridge.plant import Plant
 from laneweave.sim_bridge.sensors import Sensors
 
@@ -89,6 +89,12 @@ class RoadVehicle:
         if self.sensors is not None:
             self.controller.perceive(self.sensors.measure(self.state), self.sensors.look(around))
 
+    def see(self, state: State, glimpses: Glimpses) -> None:
+        """`perceive`, with its own state and whom it sees as plain numbers: in every tick."""
+        sensors = self.sensors
+        if sensors is not None:
+            self.controller.perceive(sensors.measure(state), sensors.see(glimpses))
+
     def sense(self, tick: int, *, caretaker: bool, left: bool = False) -> Sense:
         """Return what its sensors and its motion controller know at a tick.
 
@@ -98,6 +104,7 @@ class RoadVehicle:
             left: whether it has left the road.
         """
         controller = self.controller
+        around = controller.around
         return Sense(
             vehicle=self.name,
             tick=tick,
@@ -107,8 +114,8 @@ class RoadVehicle:
             motion_end_tick=controller.motion_end_tick,
             motion_origin=controller.motion_origin,
             preferred_lane=self.admission.arrival.preferred_lane,
-            ahead=controller.around.ahead,
-            behind=controller.around.behind,
+            ahead=around.ahead,
+            behind=around.behind,
             setpoint=controller.plant.setpoint,
             formation=self.formation,
             attendant=controller.attendant,

@@ -8,9 +8,8 @@ from typing import Protocol
 from laneweave.protocol.messages import Name
 from laneweave.protocol.motion import State
 from laneweave.protocol.scenario import Scenario
-from laneweave.sim_bridge.overlap import Pose, least_gaps, overlapping_pairs
+from laneweave.sim_bridge.overlap import Bodies, Pose
 from laneweave.sim_bridge.run_record import RunRecord
-from laneweave.sim_bridge.sensors import who_is_around
 from laneweave.sim_bridge.traffic import RoadVehicle
 
 
@@ -52,21 +51,20 @@ def show_bodies(
         record: takes overlaps, collisions, gaps and samples.
         t_s: road time after the tick.
     """
-    for vehicle in vehicles.values():
-        world.place(vehicle.name, vehicle.state)
+    states = {name: vehicle.state for name, vehicle in vehicles.items()}
+    for name, state in states.items():
+        world.place(name, state)
     world.step()
-    poses = world.positions()
-    size = (scenario.vehicle.length_m, scenario.vehicle.width_m)
-    accels_mps2: dict[str, float] = {
-        vehicle.name: vehicle.state[2] for vehicle in vehicles.values()
-    }
-    around = who_is_around(scenario, poses, accels_mps2)
+    road, size = scenario.road, scenario.vehicle
+    bodies = Bodies(world.positions(), size.length_m, size.width_m)
+    accels_mps2: dict[str, float] = {name: state[2] for name, state in states.items()}
+    around = bodies.glimpses(road.lanes, road.lane_width_m, accels_mps2)
     for name, vehicle in vehicles.items():
-        vehicle.perceive(around[name])
+        vehicle.see(states[name], around[name])
     record.on_shown(
         t_s,
         vehicles.values(),
-        overlaps=overlapping_pairs(poses, *size),
+        overlaps=bodies.overlapping_pairs(),
         collisions=world.collisions(),
-        gaps=least_gaps(poses, *size),
+        gaps=bodies.least_gaps(),
     )
