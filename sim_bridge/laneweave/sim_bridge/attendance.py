@@ -128,14 +128,15 @@ class Attendance:
         if not self.link_up:
             return  # nobody can be seen or heard: that says nothing about them
         absence_counts = now_s >= self._absence_counts_s
+        answers, caretakers = self.answers, self._caretakers
         for name, vehicle in vehicles.items():
-            if name in self:
+            if name in caretakers:
                 continue
-            if absence_counts and name not in self.answers.up:
+            if absence_counts and name not in answers.up:
                 yield vehicle, Absence.ABSENT
-            elif name in self.answers.silent:
+            elif name in answers.silent:
                 yield vehicle, Absence.SILENT
-            elif self.answers.ineffective(name):
+            elif answers.ineffective(name):
                 yield vehicle, Absence.LATE
 
     def take_charge(self, vehicle: RoadVehicle, tick: int) -> Iterator[Effect]:

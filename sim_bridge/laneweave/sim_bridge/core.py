@@ -146,8 +146,12 @@ class BridgeCore:
 
     def handle(self, event: Event, now_s: float) -> list[Effect]:
         """Take an event; see `Core`."""
-        effects = list(self._on_event(event, now_s))
-        effects += self._proceed(now_s)
+        if isinstance(event, Arrived) and isinstance(event.message, Command):
+            effects = self._on_command(event.message)  # nearly every event is one
+        else:
+            effects = list(self._on_event(event, now_s))
+        if self.phase is not Phase.ANSWERS or self._answers.complete(now_s):
+            effects += self._proceed(now_s)
         return effects
 
     def _on_event(self, event: Event, now_s: float) -> Iterator[Effect]:
@@ -184,8 +188,6 @@ class BridgeCore:
         self, message: object, parameters: Mapping[str, str], now_s: float
     ) -> Iterator[Effect]:
         match message:
-            case Command():
-                yield from self._on_command(message)
             case Prepare() | Plan():
                 vehicle = Name(parameters["vehicle"])
                 yield from self._attendance.on_message(vehicle, message, self.tick)
@@ -198,29 +200,32 @@ class BridgeCore:
             case _:
                 pass
 
-    def _on_command(self, command: Command) -> Iterator[Effect]:
+    def _on_command(self, command: Command) -> list[Effect]:
+        effects: list[Effect] = []
         name = command.vehicle
         vehicle = self.vehicles.get(name)
         if vehicle is None:
-            return
+            return effects
         attendant = vehicle.controller.attendant
         cared_for = name in self._attendance
         if self._attendance.hear(vehicle, command):
-            yield self._sense_of(vehicle)
+            effects.append(self._sense_of(vehicle))
         if command.tick != self.tick or self.phase is not Phase.ANSWERS:
             # A late answer was made for a state that is past: played now, from its middle, it
             # would end somewhere else.
             if command.tick < self.tick and command.incarnation == attendant:
                 self._answers.late(name)
-            return
+            return effects
         try:
-            taken = yield from self._attendance.take(vehicle, command)
+            effects += self._attendance.take(vehicle, command)
         except BadInputError as error:
             log.warning("command ignored", vehicle=name, reason=str(error))
-            return
-        if taken and attendant not in (0, vehicle.controller.attendant):
+            return effects
+        # Only a command that was taken puts somebody else in charge.
+        if attendant not in (0, vehicle.controller.attendant):
             previous = "caretaker" if cared_for else "agent"
             self._record.on_agent_took_over(self.t_s, name, previous)
+        return effects
 
     def _on_report(self, report: Report) -> None:
         if report.role in ("agent", "bridge"):
@@ -308,8 +313,9 @@ class BridgeCore:
 
     def _end_tick(self, now_s: float) -> Iterator[Effect]:
         self._record.on_missed(self._answers.close())
+        tick = self.tick
         for vehicle in self.vehicles.values():
-            vehicle.step(self.tick)
+            vehicle.controller.step(tick)
         self.tick += 1
         show_bodies(self._world, self.vehicles, self.scenario, self._record, self.t_s)
         yield from self._let_leave()
