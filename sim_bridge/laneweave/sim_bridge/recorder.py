@@ -135,7 +135,9 @@ class Recorder:
         }
         self._schema = pa.schema(_TRAJECTORIES, self._metadata)
         self._rows_per_group = rows_per_group
-        self._rows: list[tuple[float, Sample]] = []
+        self._times: list[float] = []
+        self._rows: list[Sample] = []
+        """What is not written yet; each row has its time."""
         self._trips: dict[str, _Trip] = {}
         self._safety = _Safety()
         self._brake_accel = EMERGENCY_SHARE * scenario.vehicle.min_accel_mps2
@@ -184,21 +186,26 @@ class Recorder:
     def tick(self, t_s: float, samples: Iterable[Sample]) -> None:
         """Record where all vehicles on the road are at a road time, once per tick."""
         self._check_open()
-        safety, last_accels, count = self._safety, self._last_accels, 0
-        for sample in samples:
-            vehicle, accel = sample[0], sample[4]
+        safety, last_accels, brake_accel = self._safety, self._last_accels, self._brake_accel
+        most_jerk = safety.max_jerk_mps3
+        rows = list(samples)
+        for vehicle, _, _, _, accel, _, _ in rows:
             last = last_accels.get(vehicle)
             if last is not None and t_s > last[0]:
                 jerk = abs(accel - last[1]) / (t_s - last[0])
-                safety.max_jerk_mps3 = max(safety.max_jerk_mps3, jerk)
-            if accel < self._brake_accel and (last is None or last[1] >= self._brake_accel):
+                if jerk > most_jerk:
+                    most_jerk = jerk
+            if accel < brake_accel and (last is None or last[1] >= brake_accel):
                 safety.emergency_brakes += 1
-            safety.min_accel_mps2 = min(safety.min_accel_mps2, accel)
-            safety.max_accel_mps2 = max(safety.max_accel_mps2, accel)
             last_accels[vehicle] = (t_s, accel)
-            self._rows.append((t_s, sample))
-            count += 1
-        self._peak = max(self._peak, count)
+        safety.max_jerk_mps3 = most_jerk
+        if rows:
+            accels = [sample[4] for sample in rows]
+            safety.min_accel_mps2 = min(safety.min_accel_mps2, *accels)
+            safety.max_accel_mps2 = max(safety.max_accel_mps2, *accels)
+        self._times += [t_s] * len(rows)
+        self._rows += rows
+        self._peak = max(self._peak, len(rows))
         if len(self._rows) >= self._rows_per_group:
             self._write_rows()
 
@@ -343,9 +350,8 @@ class Recorder:
         """Write the buffered rows as one row group."""
         if not self._rows:
             return
-        times, samples = zip(*self._rows, strict=True)
-        columns = [times, *zip(*samples, strict=True)]
-        self._rows = []
+        columns = [self._times, *zip(*self._rows, strict=True)]
+        self._times, self._rows = [], []
         arrays = [
             pa.array(column, field.type)
             for column, field in zip(columns, _TRAJECTORIES, strict=True)

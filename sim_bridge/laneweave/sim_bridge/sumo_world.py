@@ -41,8 +41,9 @@ class SumoWorld:
             RuntimeError: another world is open in this process.
         """
         self._sumo = SumoSession(lambda: write_network(scenario, folder).options)
-        self._length_m = scenario.road.length_m
-        self._margin_m = margin_m(scenario)
+        margin = margin_m(scenario)
+        self._range_m = (-margin, scenario.road.length_m + margin)
+        """Where SUMO can show vehicles."""
         self._lane_width_m = scenario.road.lane_width_m
         self._lanes = scenario.road.lanes
         self._half_body_m = 0.5 * scenario.vehicle.length_m
@@ -94,16 +95,18 @@ class SumoWorld:
         Raises:
             RuntimeError: SUMO shows other vehicles than those that were added (it never should).
         """
-        for vehicle, state in self._states.items():
-            if vehicle not in self._placed:
-                self._move(vehicle, state)
+        if len(self._placed) < len(self._states):
+            for vehicle, state in self._states.items():
+                if vehicle not in self._placed:
+                    self._move(vehicle, state)
         self._placed.clear()
         self._sumo.step()
         api = self._sumo.vehicle
         if api.getIDCount() != len(self._states):
             raise RuntimeError(f"SUMO shows {api.getIDCount()} of {len(self._states)} vehicles")
+        set_previous_speed = api.setPreviousSpeed
         for vehicle, state in self._states.items():
-            api.setPreviousSpeed(vehicle, state[1], state[2])
+            set_previous_speed(vehicle, state[1], state[2])
         self._shown = list(self._states)
 
     def positions(self) -> dict[str, Pose]:
@@ -165,7 +168,7 @@ class SumoWorld:
         """Refuse a state that SUMO would map to some other place."""
         if not math.isfinite(sum(state)):
             raise ValueError(f"{vehicle} must be at a finite state, not {state}")
-        low_m, high_m = -self._margin_m, self._length_m + self._margin_m
+        low_m, high_m = self._range_m
         if not low_m <= state[0] <= high_m:
             raise ValueError(
                 f"{vehicle} must be at s in [{low_m:g}, {high_m:g}] m, not at {state[0]:g} m"
