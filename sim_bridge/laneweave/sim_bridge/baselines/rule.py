@@ -74,7 +74,7 @@ class RuleTraffic:
 
     def _drive(self, vehicle: Vehicle, leaders: Iterable[Vehicle], *, slows_down: bool) -> None:
         """Move a vehicle along the road by one tick; whom it follows has been moved."""
-        before_mps, tick_s = vehicle.speed_mps, self._tick_s
+        s_m, before_mps, tick_s = vehicle.s_m, vehicle.speed_mps, self._tick_s
         wanted_mps = min(
             self._rules.approach_speed_mps(vehicle),
             before_mps + self._limits.max_accel_mps2 * tick_s,
@@ -83,24 +83,27 @@ class RuleTraffic:
             braked_mps = before_mps - self._rule.slow_down_mps2 * tick_s
             slow_mps = self._rules.slow_speed_mps(vehicle.s_m)
             wanted_mps = min(wanted_mps, max(slow_mps, braked_mps))
+        follow = self._rules.following.speed_mps
         for ahead in leaders:
-            follow = self._rules.following.speed_mps
-            safe_mps = follow(vehicle.s_m, before_mps, ahead.s_m, ahead.speed_mps)
-            wanted_mps = min(wanted_mps, safe_mps)
+            safe_mps = follow(s_m, before_mps, ahead.s_m, ahead.speed_mps)
+            if safe_mps < wanted_mps:
+                wanted_mps = safe_mps
         least_mps = before_mps + self._limits.min_accel_mps2 * tick_s
-        vehicle.speed_mps = max(wanted_mps, least_mps, 0.0)
-        vehicle.s_m += 0.5 * (before_mps + vehicle.speed_mps) * tick_s
-        vehicle.accel_mps2 = (vehicle.speed_mps - before_mps) / tick_s
+        after_mps = max(wanted_mps, least_mps, 0.0)
+        vehicle.speed_mps = after_mps
+        vehicle.s_m = s_m + 0.5 * (before_mps + after_mps) * tick_s
+        vehicle.accel_mps2 = (after_mps - before_mps) / tick_s
 
     def _shift(self, vehicle: Vehicle) -> None:
         """Move a vehicle across the road by one tick."""
         target_m = self._centre_m(vehicle.lane)
+        if vehicle.previous_lane is None:
+            vehicle.y_m, vehicle.lateral_speed_mps = target_m, 0.0
+            return
         way_m = target_m - vehicle.y_m
-        most_mps = 0.0
-        if vehicle.previous_lane is not None:
-            slip_mps = self._limits.max_slip_ratio * vehicle.speed_mps
-            most_mps = min(self._road.lane_width_m / self._rule.lane_change_s, slip_mps)
-        if vehicle.previous_lane is None or abs(way_m) <= most_mps * self._tick_s + _ROUNDING_M:
+        slip_mps = self._limits.max_slip_ratio * vehicle.speed_mps
+        most_mps = min(self._road.lane_width_m / self._rule.lane_change_s, slip_mps)
+        if abs(way_m) <= most_mps * self._tick_s + _ROUNDING_M:
             vehicle.y_m, vehicle.lateral_speed_mps = target_m, 0.0
             self._lanes.end_change(vehicle)
         else:
