@@ -143,10 +143,11 @@ class Roadside:
     def _hand_over(self, cell: Cell, vehicles: Mapping[Name, RoadVehicle]) -> None:
         """Give an empty cell to whoever is near; best to whoever is ahead, on the same lane."""
         column, lane = cell
+        first, last = column - self._most_empty, column + self._most_empty
         near = [
             (entered < column, number != lane, abs(entered - column), name)
             for entered, number, name in self._recent
-            if abs(entered - column) <= self._most_empty and name in vehicles
+            if first <= entered <= last and name in vehicles
         ]
         if near:
             vehicles[min(near)[-1]].controller.own(cell)
