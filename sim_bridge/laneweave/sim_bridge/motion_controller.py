@@ -338,4 +338,4 @@ def _with_cells(deed: Deed, cells: Iterable[Cell]) -> Deed:
 
 
 def _in_range(formations: Iterable[int]) -> bool:
-    return all(abs(number) <= MAX_COLUMN for number in formations)
+    return max(map(abs, formations), default=0) <= MAX_COLUMN

@@ -199,7 +199,7 @@ class RunRecord:
         for pair in overlaps:
             self.note(t_s, "overlap", vehicles=pair)
         self._recorder.safety(overlaps, collisions, gaps)
-        self._recorder.tick(t_s, (_sample(vehicle) for vehicle in vehicles))
+        self._recorder.tick(t_s, [_sample(vehicle) for vehicle in vehicles])
 
     def on_tick(self, t_s: float, on_road: int, duration_s: float) -> None:
         """A tick took this long."""

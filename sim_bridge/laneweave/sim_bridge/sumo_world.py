@@ -177,8 +177,10 @@ class SumoWorld:
     def _move(self, vehicle: str, state: State) -> None:
         """Give SUMO the middle of the front bumper, its lane, and the angle."""
         s_m, front_y_m, heading, _ = pose_of(state)
-        front_y_m += self._half_body_m * math.sin(heading)
+        degrees = 90.0
+        if heading != 0.0:
+            front_y_m += self._half_body_m * math.sin(heading)
+            degrees -= math.degrees(heading)
         lane = min(max(int(front_y_m // self._lane_width_m), 0), self._lanes - 1)
-        degrees = 90.0 - math.degrees(heading)
         self._sumo.vehicle.moveToXY(vehicle, EDGE, lane, s_m, front_y_m, degrees, 2)
         self._placed.add(vehicle)
