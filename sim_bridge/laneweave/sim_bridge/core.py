@@ -315,7 +315,7 @@ class BridgeCore:
         self._record.on_missed(self._answers.close())
         tick = self.tick
         for vehicle in self.vehicles.values():
-            vehicle.controller.step(tick)
+            vehicle.step(tick)
         self.tick += 1
         show_bodies(self._world, self.vehicles, self.scenario, self._record, self.t_s)
         yield from self._let_leave()
