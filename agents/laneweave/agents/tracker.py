@@ -38,11 +38,12 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from attrs import frozen
+from attrs import define
 from numpy.typing import NDArray
 from scipy import sparse
 
 from laneweave.agents.qp import QPResult, QPScale, QPSettings, QuadraticProgram
+from laneweave.agents.rooms import SLIP_PLAY_MPS, SPEED_PLAY_MPS, Rooms
 from laneweave.agents.surroundings import NOBODY, Gaps
 from laneweave.agents.trajectory import Window, axis_matrices
 from laneweave.agents.yielding import yield_behind
@@ -76,15 +77,13 @@ _FAR_M = 1e4
 _PUSH_M = 1.0
 """Those behind push a vehicle ahead of its reference by no more: they have brakes, too."""
 _NEAR = (8.0, 4.0, 6.0, 3.0, 2.5, 6.0)
-"""Largest errors of (s, v, a, y, v_y, a_y) at which the reference is tracked as it is."""
-_SPEED_PLAY_MPS = 0.3
-_SLIP_PLAY_MPS = 0.1
-"""Play of the prediction near standstill."""
+"""Largest errors of (s, v, a, y, v_y, a_y) at which the reference is tracked as it is; none of them
+takes the vehicle as far as `_FAR_M`."""
 _LIMIT_TOLERANCE = 1e-3
 """Jerks whose states exceed a limit by more are held within it tick by tick [m/s, m/s2]."""
 
 
-@frozen(eq=False)
+@define(eq=False)  # made at each tick: frozen ones take three times as long
 class TrackResult:
     """The plan of one tick."""
 
@@ -101,7 +100,7 @@ class TrackResult:
     """Largest violation of a row by the solver's answer, before limits were applied."""
 
 
-@frozen(eq=False)
+@define(eq=False)
 class _Path:
     """What is tracked in this tick."""
 
@@ -111,6 +110,8 @@ class _Path:
     """(N, 2)."""
     defect: Array | None
     """c (N, 3) of the axis along the road; None for zero."""
+    rooms: Rooms | None = None
+    """What the limits leave beside it; None: that is not known yet."""
 
 
 class Tracker:
@@ -135,6 +136,19 @@ class Tracker:
         self._high.slip_right[:] = np.inf
         self._low.gap[:], self._high.gap[:] = -_FAR_M, _FAR_M
         self._gaps = NOBODY
+        self._shapes = (n + 1, 6), (n, 2)
+        self._unwritten: tuple[State, _Path, Gaps] | None = None
+        """Of the newest program, if its bounds were not written because the fast path was taken."""
+        self._values = np.empty(8 * n)
+        """What all rows but the dynamics come to on the fast path, and its blocks, as views."""
+        self._free = self._values[: 5 * n].reshape(5, n)
+        self._free_jerk = self._values[5 * n : 7 * n].reshape(n, 2)
+        self._free_gap = self._values[7 * n :]
+        self._kept = np.empty(14 * n, dtype=np.bool_)
+        """Whether bounds are kept on the fast path, and the blocks, as views."""
+        kept = self._kept
+        self._kept_low, self._kept_high = kept[: 10 * n].reshape(2, 5, n)
+        self._kept_low_jerk, self._kept_high_jerk = kept[10 * n :].reshape(2, n, 2)
         self._stale = False
         """Whether the fast path was taken since OSQP ran."""
         self._regulator = (
@@ -170,23 +184,29 @@ class Tracker:
         """
         start = time.thread_time()
         states, jerks = window.states, window.jerks
-        if states.shape != (self._n + 1, 6) or jerks.shape != (self._n, 2):
+        if (states.shape, jerks.shape) != self._shapes:
             raise ValueError(
                 f"window has shapes {states.shape}, {jerks.shape}, not {self._n} ticks"
             )
-        if not all(map(math.isfinite, state)):
+        # A finite sum is one of finite numbers, which is the usual case.
+        if not math.isfinite(sum(state)) and not all(map(math.isfinite, state)):
             raise ValueError(f"state is not finite: {state}")
-        gaps.check(self._n)
+        if gaps is not NOBODY:
+            gaps.check(self._n)
         path = self._give_way(state, states, jerks, gaps.latest)
+        if path.states is states:
+            path.rooms = window.rooms
         iterations = 0
-        usable = _is_near(state, path.states[0].tolist())
+        error = _error(state, path)
+        usable = _is_near(error)
         if usable:
-            self._set_bounds(state, path, gaps)
-            jerk = self._regulated(state, path)
+            jerk = self._regulated(error, path, gaps)
             if jerk is not None:
                 self._stale = True
+                self._unwritten = state, path, gaps
                 elapsed_ms = (time.thread_time() - start) * 1e3
                 return TrackResult(jerk, True, 0, elapsed_ms, 0.0)
+            self._set_bounds(state, path, gaps)
             result = self._solve_program()
             usable, iterations = result.usable, result.iterations
         if not usable:
@@ -220,32 +240,51 @@ class Tracker:
         if self._regulator is None:
             return None
         start = time.thread_time()
-        error = []
-        for now, wanted, most in zip(state, goal, self.harmless, strict=True):
-            if not -most <= now - wanted <= most:
-                return None
-            error.append(now - wanted)
+        # Written out, as whatever is done at each tick for each vehicle.
+        most_s, most_v, most_a, most_y, most_vy, most_ay = self.harmless
+        s = state[0] - goal[0]
+        if not -most_s <= s <= most_s:
+            return None
+        v = state[1] - goal[1]
+        if not -most_v <= v <= most_v:
+            return None
+        a = state[2] - goal[2]
+        if not -most_a <= a <= most_a:
+            return None
+        y = state[3] - goal[3]
+        if not -most_y <= y <= most_y:
+            return None
+        v_y = state[4] - goal[4]
+        if not -most_vy <= v_y <= most_vy:
+            return None
+        a_y = state[5] - goal[5]
+        if not -most_ay <= a_y <= most_ay:
+            return None
         self._stale = True
-        jerk = self._regulator.inputs.dot(error).reshape(-1, 2)
+        jerk = self._regulator.inputs.dot((s, v, a, y, v_y, a_y)).reshape(-1, 2)
         return TrackResult(jerk, True, 0, (time.thread_time() - start) * 1e3, 0.0)
 
-    def _regulated(self, state: State, path: _Path) -> Array | None:
+    def _regulated(self, error: State, path: _Path, gaps: Gaps) -> Array | None:
         """Return the jerks (N, 2) of the solution without rows if it keeps all of them."""
         if self._regulator is None or path.defect is not None:
             return None
-        values = self._regulator.rows @ (state - path.states[0])
-        low, high = self._low, self._high
-        # Exactly: the play near standstill is for OSQP, whose answers are limited afterwards.
-        if not (
-            (low.rows <= values).all()
-            and (values <= high.rows).all()
-            and (low.speed + _SPEED_PLAY_MPS <= values[: self._n]).all()
-            and (values[3 * self._n : 4 * self._n] <= high.slip_left - _SLIP_PLAY_MPS).all()
-            and (low.slip_right + _SLIP_PLAY_MPS <= values[4 * self._n : 5 * self._n]).all()
-        ):
+        # Without play, exactly: that is for OSQP, whose answers are limited afterwards.
+        rooms = path.rooms or Rooms.beside(path.states[1:], path.jerks, self._limits)
+        self._regulator.rows.dot(error, self._values)
+        free, free_jerk = self._free, self._free_jerk
+        np.less_equal(rooms.low, free, self._kept_low)
+        np.less_equal(free, rooms.high, self._kept_high)
+        np.less_equal(rooms.low_jerk, free_jerk, self._kept_low_jerk)
+        np.less_equal(free_jerk, rooms.high_jerk, self._kept_high_jerk)
+        if not self._kept.all():
             return None
-        answer: Array = values[5 * self._n : 7 * self._n].reshape(-1, 2)
-        return path.jerks + answer
+        if gaps is not NOBODY:
+            self._set_gaps(path.states, gaps)
+            free_gap = self._free_gap
+            if not ((self._low.gap <= free_gap).all() and (free_gap <= self._high.gap).all()):
+                return None
+        answer: Array = path.jerks + free_jerk
+        return answer
 
     def last_program(self) -> tuple[Any, Any, Array, Array]:
         """Return the program that was solved last, for benchmarks: P, A, lower, upper.
@@ -253,6 +292,8 @@ class Tracker:
         P and A are sparse and the same for all programs of a tracker; the bounds are copies. The
         unknowns are x = (e_1 .. e_N, w_0 .. w_N-1, g_1 .. g_N), the first 6 N rows the dynamics.
         """
+        if self._unwritten is not None:
+            self._set_bounds(*self._unwritten)
         return self._cost, self._rows, self._low.all.copy(), self._high.all.copy()
 
     def _solve_program(self) -> QPResult:
@@ -276,33 +317,25 @@ class Tracker:
 
     def _set_bounds(self, state: State, path: _Path, gaps: Gaps) -> None:
         """Write all bounds."""
+        self._unwritten = None
         states, jerks = path.states, path.jerks
         low, high, limits = self._low, self._high, self._limits
         low.dynamics[:] = 0.0
         if path.defect is not None:
             low.dynamics[:, :3] -= path.defect
         self._set_gaps(states, gaps)
-        s, v, a, y, v_y, a_y = states[0].tolist()
-        error = (
-            state[0] - s,
-            state[1] - v,
-            state[2] - a,
-            state[3] - y,
-            state[4] - v_y,
-            state[5] - a_y,
-        )
-        low.dynamics[0] -= integrate(error, (0.0, 0.0), self._tick_s)
+        low.dynamics[0] -= integrate(_error(state, path), (0.0, 0.0), self._tick_s)
         high.dynamics[:] = low.dynamics
 
         _, speed, accel, _, slip, lateral_accel = states[1:].T
-        np.subtract(-_SPEED_PLAY_MPS, speed, out=low.speed)
+        np.subtract(-SPEED_PLAY_MPS, speed, out=low.speed)
         np.subtract(limits.max_speed_mps, speed, out=high.speed)
         np.subtract(limits.min_accel_mps2, accel, out=low.accel)
         np.subtract(limits.max_accel_mps2, accel, out=high.accel)
         np.subtract(-limits.max_lateral_accel_mps2, lateral_accel, out=low.lateral_accel)
         np.subtract(limits.max_lateral_accel_mps2, lateral_accel, out=high.lateral_accel)
         room = limits.max_slip_ratio * speed
-        room += _SLIP_PLAY_MPS
+        room += SLIP_PLAY_MPS
         np.subtract(room, slip, out=high.slip_left)
         np.add(room, slip, out=low.slip_right)
         np.negative(low.slip_right, out=low.slip_right)
@@ -316,12 +349,12 @@ class Tracker:
         if gaps.latest is not None:
             np.subtract(gaps.latest[1:], states[1:, 0], out=high)
             # A gap that even the yielding path cannot keep asks for no more than the path.
-            np.clip(high, 0.0, _FAR_M, out=high)
+            high.clip(0.0, _FAR_M, out=high)
         elif self._gaps.latest is not None:
             high[:] = _FAR_M
         if gaps.earliest is not None:
             np.subtract(gaps.earliest[1:], states[1:, 0], out=low)
-            np.clip(low, -_FAR_M, _PUSH_M, out=low)
+            low.clip(-_FAR_M, _PUSH_M, out=low)
             np.minimum(low, high, out=low)
         elif self._gaps.earliest is not None:
             low[:] = -_FAR_M
@@ -438,9 +471,28 @@ def _regulator(ticks: int, tick_s: float, slip: float) -> Regulator:
     return Regulator(ticks, tick_s, slip)
 
 
-def _is_near(state: State, reference: list[float]) -> bool:
-    return all(
-        abs(now - wanted) <= most for now, wanted, most in zip(state, reference, _NEAR, strict=True)
+def _error(state: State, path: _Path) -> State:
+    s, v, a, y, v_y, a_y = path.states[0].tolist()
+    return (
+        state[0] - s,
+        state[1] - v,
+        state[2] - a,
+        state[3] - y,
+        state[4] - v_y,
+        state[5] - a_y,
+    )
+
+
+def _is_near(error: State) -> bool:
+    s, v, a, y, v_y, a_y = error
+    most_s, most_v, most_a, most_y, most_vy, most_ay = _NEAR
+    return (
+        -most_s <= s <= most_s
+        and -most_v <= v <= most_v
+        and -most_a <= a <= most_a
+        and -most_y <= y <= most_y
+        and -most_vy <= v_y <= most_vy
+        and -most_ay <= a_y <= most_ay
     )
 
 

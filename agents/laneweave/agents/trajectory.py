@@ -33,11 +33,12 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from attrs import frozen
+from attrs import define, frozen
 from numpy.typing import NDArray
 from scipy import sparse
 
 from laneweave.agents.qp import MAX_ITERATIONS, QPSettings, QuadraticProgram
+from laneweave.agents.rooms import Rooms
 from laneweave.protocol.braking import (
     ERROR_SIGMAS,
     last_tick_m,
@@ -106,7 +107,7 @@ class Trajectory:
         return len(self.jerks)
 
 
-@frozen(eq=False)
+@define(eq=False)
 class Window:
     """A reference from some tick on, for N ticks."""
 
@@ -114,6 +115,8 @@ class Window:
     """(N + 1, 6): s, v, a, y, v_y, a_y on the road [m, s]."""
     jerks: Array
     """(N, 2): j_s, j_y [m/s3]."""
+    rooms: Rooms | None = None
+    """What the limits leave beside it, from the next tick on; None: that is not known yet."""
 
 
 @frozen
@@ -275,6 +278,9 @@ class Reference:
         self._jerks = np.concatenate(jerks)
         self._jerks.flags.writeable = False
         self._ramp = self._advance_m * np.arange(n + 1)
+        self._limits = scenario.vehicle
+        self._rooms: Rooms | None = None
+        """Of all of it; None until a window is wanted."""
 
     @classmethod
     def hold(cls, scenario: Scenario, cell: Cell) -> Reference:
@@ -347,7 +353,10 @@ class Reference:
         s = states[:, 0]
         s += self._ramp
         s += self._advance_m * tick
-        return Window(states, self._jerks[first : first + n])
+        rooms = self._rooms
+        if rooms is None:
+            rooms = self._rooms = Rooms.beside(self._states[1:], self._jerks, self._limits)
+        return Window(states, self._jerks[first : first + n], rooms.part(first, first + n))
 
 
 @lru_cache(maxsize=256)
