@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
-from attrs import frozen
+from attrs import define, frozen
 
 from laneweave.agents.motions import REPEAT_TICKS
 from laneweave.agents.surroundings import NOBODY, Surroundings
@@ -23,8 +23,10 @@ from laneweave.protocol.messages import Motion, Sense
 from laneweave.protocol.motion import at_rest_in_cell, cell_state, commanded_state
 from laneweave.protocol.scenario import Scenario
 
+_FLOAT32 = np.dtype("<f4")
 
-@frozen
+
+@define  # made at each tick: frozen ones take three times as long
 class Drive:
     """What the motion controller should play from this tick on."""
 
@@ -93,6 +95,8 @@ class TrackingDriver:
         self._reference: Reference | None = None
         self._goal: Cell = (0, 0)
         self._lattice = scenario.lattice
+        self._vehicle = scenario.vehicle
+        self._speed_mps = scenario.lattice.speed_mps
         self._surroundings = Surroundings(scenario)
         self._solve_ms: list[float] = []
         self._unusable = 0
@@ -138,24 +142,22 @@ class TrackingDriver:
 
     def drive(self, sense: Sense, *, moving: bool) -> Drive:
         """Track the reference."""
-        reference = self._path
-        state = commanded_state(
-            sense.state, sense.setpoint, self._scenario.vehicle, self._lattice.speed_mps
-        )
+        reference, tick = self._path, sense.tick
+        state = commanded_state(sense.state, sense.setpoint, self._vehicle, self._speed_mps)
         gaps = self._surroundings.gaps(sense, state, self._goal[1])
         result = None
-        if gaps is NOBODY and sense.tick >= reference.end_tick:
+        if gaps is NOBODY and tick >= reference.end_tick:
             goal = cell_state(self._lattice, self._goal, sense.t_s)
             result = self._tracker.rest(state, goal)
         if result is None:
-            result = self._tracker.solve(state, reference.window(sense.tick), gaps)
+            result = self._tracker.solve(state, reference.window(tick), gaps)
         self._solve_ms.append(result.solve_ms)
         self._unusable += not result.usable
         return Drive(
             # Past its time but not there yet: still moving, for whoever takes the vehicle over.
-            motion_end_tick=max(reference.end_tick, sense.tick + 1) if moving else 0,
+            motion_end_tick=max(reference.end_tick, tick + 1) if moving else 0,
             motion_origin=reference.origin,
-            jerks=result.jerk.astype("<f4").tobytes() if result.usable else b"",
+            jerks=result.jerk.astype(_FLOAT32).tobytes() if result.usable else b"",
         )
 
     def motion(self, tick: int) -> Course | None:

@@ -94,6 +94,8 @@ class Motions:
         self._kinds: dict[tuple[int, int], _Kind] = {}
         self.heard: dict[Name, _Heard] = {}
         """By vehicle; some may count no more."""
+        self._places: list[tuple[float, float, _Heard]] | None = None
+        """(`low_m`, `high_m`, all) of each; None when some have come or gone since."""
         self._tick = 0
         self._forget_tick = 0
         """Tick at which one of them counts no more."""
@@ -118,6 +120,7 @@ class Motions:
         start_m, end_m = column * self._pitch_m, to_column * self._pitch_m
         low_m, high_m = min(start_m, end_m) - NEAR_M, max(start_m, end_m) + NEAR_M
         self.heard[motion.vehicle] = _Heard(motion, kind, motion.tick, start_m, low_m, high_m)
+        self._places = None
         self._forget_tick = -1  # it may have ended already
 
     def advance(self, tick: int) -> None:
@@ -136,6 +139,7 @@ class Motions:
         ]
         for name in gone:
             del self.heard[name]
+        self._places = None
         self._forget_tick = min(
             (
                 min(heard.motion.begin_tick + self._ticks, heard.tick + FRESH_TICKS + 1)
@@ -166,8 +170,13 @@ class Motions:
         """
         tick = self._tick
         x_m = s_m - self._advance_m * tick
-        for heard in self.heard.values():
-            if not heard.low_m <= x_m <= heard.high_m:
+        places = self._places
+        if places is None:
+            # Tuples, since nearly all are passed over.
+            places = [(heard.low_m, heard.high_m, heard) for heard in self.heard.values()]
+            self._places = places
+        for low_m, high_m, heard in places:
+            if not low_m <= x_m <= high_m:
                 continue
             kind = heard.kind
             k = max(tick - heard.motion.begin_tick, 0)  # others may be a tick ahead

@@ -45,12 +45,17 @@ class Gaps:
         Raises:
             ValueError: one is not (N + 1,).
         """
+        shape = (ticks + 1,)
         for name, positions in (("earliest", self.earliest), ("latest", self.latest)):
-            if positions is not None and positions.shape != (ticks + 1,):
-                raise ValueError(f"{name} has shape {positions.shape}, expected {(ticks + 1,)}")
+            if positions is not None and positions.shape != shape:
+                raise ValueError(f"{name} has shape {positions.shape}, expected {shape}")
 
 
 NOBODY = Gaps()
+
+
+_Seen = tuple[int, float, float]
+"""Of somebody who is sensed: lane, where the front bumper should be for its sake, its speed."""
 
 
 @frozen
@@ -98,52 +103,69 @@ class Surroundings:
             lane: the lane that it is in or enters.
         """
         first, last = self._lattice.lanes_touched(sense.state[3], self._width_m)
-        ahead = [
-            self._seen(sense, each, _AHEAD)
-            for each in sense.ahead
-            if first <= each.lane <= last or each.lane == lane
-        ]
-        behind = [
-            self._seen(sense, each, _BEHIND)
-            for each in sense.behind
-            if first <= each.lane <= last or each.lane == lane
-        ]
-        s_m, speed_mps = state[0], state[1]
-        # Greatest now or at the end of prediction, since it cannot but bend upwards.
-        near_ahead = [
-            (front_m, other_mps)
-            for _, front_m, other_mps in ahead
-            if s_m + max((speed_mps - other_mps) * SENSED_S + self._gain_m, 0.0) > front_m
-        ]
-        near_behind = [
-            (front_m, other_mps)
-            for _, front_m, other_mps in behind
-            if s_m + min((speed_mps - other_mps) * SENSED_S - self._loss_m, 0.0) < front_m
-        ]
-        latest = self._sensed(near_ahead, _AHEAD) if near_ahead else None
-        earliest = self._sensed(near_behind, _BEHIND) if near_behind else None
+        touched = first, last, lane
+        latest = earliest = None
+        ahead, near = self._look(sense, state, sense.ahead, touched, 1.0, self._gain_m)
+        if near:
+            latest = self._sensed(near, _AHEAD)
+        behind, near = self._look(sense, state, sense.behind, touched, -1.0, -self._loss_m)
+        if near:
+            earliest = self._sensed(near, _BEHIND)
         if self._motions.heard:
-            lanes = min(first, lane), max(last, lane)
             self._motions.advance(sense.tick)
-            latest = self._said(latest, ahead, _AHEAD, lanes)
-            earliest = self._said(earliest, behind, _BEHIND, lanes)
+            lanes = min(first, lane), max(last, lane)
+            if ahead:
+                latest = self._said(latest, ahead, _AHEAD, lanes)
+            if behind:
+                earliest = self._said(earliest, behind, _BEHIND, lanes)
         return NOBODY if latest is None and earliest is None else Gaps(earliest, latest)
 
-    def _seen(self, sense: Sense, other: Neighbour, side: _Side) -> tuple[int, float, float]:
-        """Return another one's lane, where the front bumper should be for its sake, its speed."""
-        lag_s, sign = self._lag_s, side.sign
-        # How far its commanded position is from its position.
-        lag_m = lag_s * (other.speed_mps - self._speed_mps)
-        return (
-            other.lane,
-            sense.state[0] + sign * (other.gap_m - self._least_m) + lag_m,
-            max(other.speed_mps + lag_s * other.accel_mps2, 0.0),
-        )
+    def _look(
+        self,
+        sense: Sense,
+        state: State,
+        others: tuple[Neighbour, ...],
+        touched: tuple[int, int, int],
+        sign: float,
+        change_m: float,
+    ) -> tuple[list[_Seen], list[_Seen]]:
+        """Return who counts, if any motion is known, and who comes into question as sensed.
 
-    def _sensed(self, fronts: list[tuple[float, float]], side: _Side) -> Array:
+        It runs twice at each tick of each vehicle, and mostly nobody is near.
+
+        Args:
+            sense: what the sensors see.
+            state: commanded state of this vehicle.
+            others: those on one side.
+            touched: the first and the last lane that the body touches; the lane that it enters.
+            sign: 1 for those ahead, -1 for those behind.
+            change_m: how far the vehicle can get towards them in the time of prediction, beside
+                its speed; negative behind.
+        """
+        first, last, lane = touched
+        heard, lag_s = self._motions.heard, self._lag_s
+        counting: list[_Seen] = []
+        near: list[_Seen] = []
+        for other in others:
+            if first <= other.lane <= last or other.lane == lane:
+                # How far its commanded position is from its position.
+                lag_m = lag_s * (other.speed_mps - self._speed_mps)
+                front_m = sense.state[0] + sign * (other.gap_m - self._least_m) + lag_m
+                other_mps = max(other.speed_mps + lag_s * other.accel_mps2, 0.0)
+                if heard:
+                    counting.append((other.lane, front_m, other_mps))
+                # Greatest now or at the end of prediction, since it cannot but bend upwards.
+                closer_m = (state[1] - other_mps) * SENSED_S + change_m
+                if sign * closer_m < 0.0:
+                    closer_m = 0.0
+                if sign * (state[0] + closer_m) > sign * front_m:
+                    near.append((other.lane, front_m, other_mps))
+        return counting, near
+
+    def _sensed(self, others: list[_Seen], side: _Side) -> Array:
         """Return the nearest positions at constant speeds."""
         positions = np.full(self._times_s.shape, side.nobody)
-        for front_m, speed_mps in fronts:
+        for _, front_m, speed_mps in others:
             positions = side.nearest(positions, front_m + speed_mps * self._times_s)
         positions[self._beyond] = side.nobody
         return positions
@@ -151,7 +173,7 @@ class Surroundings:
     def _said(
         self,
         positions: Array | None,
-        others: list[tuple[int, float, float]],
+        others: list[_Seen],
         side: _Side,
         lanes: tuple[int, int],
     ) -> Array | None:
@@ -159,7 +181,7 @@ class Surroundings:
 
         Args:
             positions: as sensed.
-            others: who is sensed, as `_seen` says.
+            others: who is sensed.
             side: where they are.
             lanes: the first and the last one that count.
         """

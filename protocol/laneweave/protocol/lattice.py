@@ -69,8 +69,8 @@ class Lattice:
 
     def lanes_touched(self, y_m: float, width_m: float) -> tuple[int, int]:
         """Return the first and the last lane that a body of this width touches around `y_m`."""
-        half_m = 0.5 * width_m
-        return int((y_m - half_m) // self.lane_width_m), int((y_m + half_m) // self.lane_width_m)
+        half_m, lane_m = 0.5 * width_m, self.lane_width_m
+        return int((y_m - half_m) // lane_m), int((y_m + half_m) // lane_m)
 
     def passing_time_s(self, column: int, s_m: float = 0.0) -> float:
         """Return the road time at which a column passes position `s_m`."""
