@@ -13,7 +13,7 @@ hung, or was not heard - it takes a new incarnation and claims the vehicle anew.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
 
 from attrs import evolve
 
@@ -94,6 +94,8 @@ class AgentCore:
         self._formation: int | None = None
         self.wanted_motions: tuple[int, ...] = ()
         """Formations whose vehicles may come near this one; none while it is not in charge."""
+        self.wanted_states: tuple[int, ...] = ()
+        """Formations whose states matter to this vehicle now."""
         self._near: tuple[int, ...] = ()
         """Its own formation and the next ones."""
         self._move: Move | None = None
@@ -101,6 +103,8 @@ class AgentCore:
         self._sense: Sense | None = None
         self._command: Command | None = None
         self._own = {"vehicle": vehicle}
+        self._shown_by: dict[str, object] = {}
+        """Parameters of what others see of it."""
 
     @property
     def wakeup_s(self) -> float | None:
@@ -110,44 +114,52 @@ class AgentCore:
     @property
     def in_charge(self) -> bool:
         """Whether the last SENSE showed that this process acts for the vehicle."""
+        sense = self._sense
         return (
-            not self.ended
-            and self._sense is not None
-            and self._sense.attendant == self._incarnation
-            and not self._sense.caretaker
+            sense is not None
+            and sense.attendant == self._incarnation
+            and not sense.caretaker
+            and not self.ended
         )
 
-    @property
-    def wanted_states(self) -> tuple[int, ...]:
-        """Formations whose states matter to this vehicle now."""
-        execution, sense = self.execution, self._sense
-        if not self.in_charge or execution is None or sense is None or execution.plan is None:
-            return ()
-        return execution.plan.formations if execution.needs_states(sense.t_s) else ()
-
-    def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
+    def handle(self, event: Event, now_s: float) -> list[Effect]:
         """Take an event; see `Core`."""
         del now_s
+        if isinstance(event, Arrived):
+            message = event.message
+            if isinstance(message, Sense):
+                effects = self._on_sense(message)
+            elif self.in_charge:
+                effects = self._on_message(message)
+            else:
+                return []
+            self._want_states()
+            return effects
         match event:
             case Started():
-                for topic in (SENSE, PREPARE, PLAN):
-                    yield Listen(topic, self._own)
-                # Last: who sees the token may rely on the subscriptions.
-                yield Announce(VEHICLE_ALIVE, self._own)
-            case Arrived(_, _, Sense() as sense):
-                yield from self._on_sense(sense)
-            case Arrived(_, _, message) if self.in_charge:
-                yield from self._on_message(message)
+                return [
+                    *(Listen(topic, self._own) for topic in (SENSE, PREPARE, PLAN)),
+                    # Last: who sees the token may rely on the subscriptions.
+                    Announce(VEHICLE_ALIVE, self._own),
+                ]
             case Stopping():
-                yield self._report()
+                return [self._report()]
             case _:
-                pass
+                return []
+
+    def _want_states(self) -> None:
+        execution, sense = self.execution, self._sense
+        self.wanted_states = ()
+        if execution is None or execution.plan is None or sense is None or not self.in_charge:
+            return
+        if execution.needs_states(sense.t_s):
+            self.wanted_states = execution.plan.formations
 
     def hear(self, motion: Motion) -> None:
         """Take what another vehicle of the wanted formations says of its motion."""
         self._driver.hear(motion)
 
-    def _on_message(self, message: object) -> Iterator[Effect]:
+    def _on_message(self, message: object) -> list[Effect]:
         execution = self.execution
         assert execution is not None  # noqa: S101 (in charge: it has met the vehicle)
         match message:
@@ -155,43 +167,41 @@ class AgentCore:
                 execution.on_state(message)
             case Prepare():
                 if execution.on_prepare(message):
-                    yield from self._ask_to_note(execution)
-                    yield self._show()
+                    return [*self._ask_to_note(execution), self._show()]
             case Plan():
                 if execution.on_plan(message):
-                    yield from self._ask_to_note(execution)
+                    return [*self._ask_to_note(execution)]
             case _:
                 pass
+        return []
 
     # --- the tick -----------------------------------------------------------------------------
 
-    def _on_sense(self, sense: Sense) -> Iterator[Effect]:
+    def _on_sense(self, sense: Sense) -> list[Effect]:
         if sense.vehicle != self.vehicle:
-            return
+            return []
         if sense.left:
-            yield from self.leave()
-            return
+            return self.leave()
         if self._sense is not None and sense.tick <= self._sense.tick:
             if sense.tick == self._sense.tick and self._command is not None:
-                yield from self._take_note(sense)
-                yield Send(COMMAND, self._command, self._own)
-            return
+                return [*self._take_note(sense), Send(COMMAND, self._command, self._own)]
+            return []
         was_in_charge = self.in_charge
         self._sense = sense
         if sense.attendant > self._incarnation:
             self._command, self.wanted_motions = None, ()
             if not sense.caretaker:
-                return  # another process is in charge, and well: it is not for this one to drive
+                return []  # another process is in charge, and well: this one must not drive
             self._incarnation = above(self._new_incarnation(), sense.attendant)
-        if not (was_in_charge and self.in_charge):
+        in_charge = self.in_charge
+        if not (was_in_charge and in_charge):
             # Also while a claim is under way: until it is granted somebody else may have moved.
             self._meet_vehicle(sense)
-        yield from self._act(sense)
+        return self._act(sense, in_charge=in_charge)
 
-    def _act(self, sense: Sense) -> Iterator[Effect]:
+    def _act(self, sense: Sense, *, in_charge: bool) -> list[Effect]:
         execution = self.execution
         assert execution is not None  # noqa: S101 (met the vehicle)
-        in_charge = self.in_charge
         self.wanted_motions = self._near if in_charge else ()
         if in_charge:
             execution.on_joined(sense.joined)
@@ -212,28 +222,28 @@ class AgentCore:
             promised=execution.wanted_promised,
             deed=execution.deed,
         )
-        yield Send(COMMAND, self._command, self._own)
+        effects: list[Effect] = [Send(COMMAND, self._command, self._own)]
         if in_charge:
-            yield self._show()
+            effects.append(self._show())
             course = self._driver.motion(sense.tick)
             if course is not None:
-                yield self._tell(course, sense.tick)
+                effects.append(self._tell(course, sense.tick))
+        return effects
 
-    def _take_note(self, sense: Sense) -> Iterator[Effect]:
+    def _take_note(self, sense: Sense) -> list[Effect]:
         """Hear within a tick what the controller has noted for the process in charge."""
         execution = self.execution
         if execution is None or not self.in_charge or sense.attendant != self._incarnation:
-            return
+            return []
         self._sense = sense
         news = [
             execution.on_joined(sense.joined),
             execution.on_noted(sense.accepted),
             execution.on_estate(sense),
         ]
-        if any(news):
-            yield self._show()
+        return [self._show()] if any(news) else []
 
-    def _ask_to_note(self, execution: PlanExecution) -> Iterator[Effect]:
+    def _ask_to_note(self, execution: PlanExecution) -> Iterable[Effect]:
         """Ask the controller at once, not only with the next tick's COMMAND."""
         command = self._command
         assert command is not None  # noqa: S101 (in charge: it has commanded)
@@ -244,13 +254,13 @@ class AgentCore:
             promised=execution.wanted_promised,
             deed=execution.deed,
         )
-        if self._command != command:
-            yield Send(COMMAND, self._command, self._own)
+        return [Send(COMMAND, self._command, self._own)] if self._command != command else []
 
     def _meet_vehicle(self, sense: Sense) -> None:
         """V1: take over what the motion controller is doing."""
         self._formation, self._move = sense.formation, None
         self._near = (sense.formation - 1, sense.formation, sense.formation + 1)
+        self._shown_by = {"formation": sense.formation, "vehicle": self.vehicle}
         self._driver.take_over(sense)
         self.execution = PlanExecution(
             vehicle=self.vehicle,
@@ -284,7 +294,7 @@ class AgentCore:
         assert execution is not None  # noqa: S101 (met the vehicle)
         assert sense is not None  # noqa: S101 (met the vehicle)
         state = execution.state(sense, self._formation or 0, attended=True)
-        return Send(STATE, state, {"formation": self._formation, "vehicle": self.vehicle})
+        return Send(STATE, state, self._shown_by)
 
     def _tell(self, course: Course, tick: int) -> Effect:
         motion = Motion(
@@ -296,16 +306,18 @@ class AgentCore:
             begin_tick=course.begin_tick,
             tick=tick,
         )
-        return Send(MOTION, motion, {"formation": self._formation, "vehicle": self.vehicle})
+        return Send(MOTION, motion, self._shown_by)
 
-    def leave(self) -> Iterator[Effect]:
+    def leave(self) -> list[Effect]:
         """End: the vehicle is not on the road any more."""
-        if not self.ended:
-            self.ended, self.wanted_motions = True, ()
-            yield self._report()
-            for topic in (SENSE, PREPARE, PLAN):
-                yield Unlisten(topic, self._own)
-            yield Withdraw(VEHICLE_ALIVE, self._own)
+        if self.ended:
+            return []
+        self.ended, self.wanted_motions, self.wanted_states = True, (), ()
+        return [
+            self._report(),
+            *(Unlisten(topic, self._own) for topic in (SENSE, PREPARE, PLAN)),
+            Withdraw(VEHICLE_ALIVE, self._own),
+        ]
 
     def _report(self) -> Effect:
         effort = self._driver.effort

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 
 from attrs import frozen
 
@@ -74,96 +74,109 @@ class AgentHost:
             return None
         return self._alone_since_s + ALONE_S
 
-    def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
+    def handle(self, event: Event, now_s: float) -> list[Effect]:
         """Take an event; see `Core`."""
         if isinstance(event, Arrived) and isinstance(event.message, Motion):
             self._on_motion(event.message)  # after which there is nothing else to listen to
-            return
+            return []
         hosted = bool(self._agents)
-        yield from self._on_event(event, now_s)
-        yield from self._listen_to_formations()
+        if isinstance(event, Arrived):
+            effects = self._on_message(event, now_s)
+        else:
+            effects = self._on_event(event, now_s)
+        self._listen_to_formations(effects)
         if hosted and not self._agents and self._shard is None:
-            yield End()  # last: nothing can be undone on a network that the node has left
+            effects.append(End())  # last: nothing can be undone on a network that the node has left
+        return effects
 
-    def _on_event(self, event: Event, now_s: float) -> Iterator[Effect]:
+    def _on_event(self, event: Event, now_s: float) -> list[Effect]:
         match event:
             case Started():
                 self._alone_since_s = now_s
-                yield Watch(BRIDGE_ALIVE)
+                effects: list[Effect] = [Watch(BRIDGE_ALIVE)]
                 if self._shard is not None:
-                    yield Listen(CENSUS)
-                yield from self._hand_to_all(event, now_s)
-            case Arrived():
-                yield from self._on_message(event, now_s)
+                    effects.append(Listen(CENSUS))
+                return effects + self._hand_to_all(event, now_s)
             case PeerUp(topic, parameters) if topic is BRIDGE_ALIVE:
-                yield from self._meet_bridge(incarnation_of(parameters))
+                return self._meet_bridge(incarnation_of(parameters))
             case PeerDown(topic, parameters) if topic is BRIDGE_ALIVE:
                 if incarnation_of(parameters) == self._bridge:
                     self._alone_since_s = now_s
             case Wakeup() if self.wakeup_s is not None and now_s >= self.wakeup_s:
-                yield End()
+                return [End()]
             case Stopping():
-                yield from self._hand_to_all(event, now_s)
+                return self._hand_to_all(event, now_s)
             case _:
                 pass
+        return []
 
-    def _on_message(self, event: Arrived, now_s: float) -> Iterator[Effect]:
+    def _on_message(self, event: Arrived, now_s: float) -> list[Effect]:
         message = event.message
-        if isinstance(message, Census):
-            yield from self._on_census(message, now_s)
-        elif isinstance(message, VehicleState):
+        if isinstance(message, VehicleState):
+            effects = []
             for agent in self._agents.values():
                 if message.formation in agent.wanted_states:
-                    yield from agent.handle(event, now_s)
-        elif event.parameters.get("vehicle") in self._agents:
-            yield from self._hand_on(event, Name(event.parameters["vehicle"]), now_s)
+                    effects += agent.handle(event, now_s)
+            return effects
+        if isinstance(message, Census):
+            return self._on_census(message, now_s)
+        name = event.parameters.get("vehicle")
+        return self._hand_on(event, Name(name), now_s) if name in self._agents else []
 
     def _on_motion(self, motion: Motion) -> None:
         for name, agent in self._agents.items():
             if name != motion.vehicle and motion.formation in agent.wanted_motions:
                 agent.hear(motion)
 
-    def _hand_to_all(self, event: Event, now_s: float) -> Iterator[Effect]:
+    def _hand_to_all(self, event: Event, now_s: float) -> list[Effect]:
+        effects: list[Effect] = []
         for agent in self._agents.values():
-            yield from agent.handle(event, now_s)
+            effects += agent.handle(event, now_s)
+        return effects
 
-    def _meet_bridge(self, incarnation: int) -> Iterator[Effect]:
+    def _meet_bridge(self, incarnation: int) -> list[Effect]:
         """Take note of a bridge: a new one has new vehicles, whatever their names."""
+        effects: list[Effect] = []
         if incarnation < max(self._bridge, 0):
-            return  # left over from an earlier run, or no bridge at all
+            return effects  # left over from an earlier run, or no bridge at all
         self._alone_since_s = None
         if self._shard is not None and self._bridge not in (-1, incarnation):
             for agent in self._agents.values():
-                yield from agent.leave()
+                effects += agent.leave()
             self._agents.clear()
             self._seen.clear()
             self._census_s = 0.0
         self._bridge = incarnation
+        return effects
 
-    def _hand_on(self, event: Event, name: Name, now_s: float) -> Iterator[Effect]:
-        yield from self._agents[name].handle(event, now_s)
-        if self._agents[name].ended:
+    def _hand_on(self, event: Event, name: Name, now_s: float) -> list[Effect]:
+        agent = self._agents[name]
+        effects = agent.handle(event, now_s)
+        if agent.ended:
             del self._agents[name]
+        return effects
 
-    def _on_census(self, census: Census, now_s: float) -> Iterator[Effect]:
+    def _on_census(self, census: Census, now_s: float) -> list[Effect]:
+        effects: list[Effect] = []
         shard = self._shard
         if shard is None or census.bridge not in (0, self._bridge):
-            return  # of an earlier road, or of one whose token has not been seen yet
+            return effects  # of an earlier road, or of one whose token has not been seen yet
         if census.t_s < self._census_s:
-            return
+            return effects
         self._census_s = census.t_s
         listed = dict.fromkeys(entry.vehicle for entry in census.announced)
         listed |= dict.fromkeys(entry.vehicle for entry in census.on_road)
         for name in listed:
             if name not in self._seen and shard.takes(name):
                 self._agents[name] = self._make_agent(name)
-                yield from self._agents[name].handle(Started(), now_s)
+                effects += self._agents[name].handle(Started(), now_s)
         for name in sorted(set(self._agents) - set(listed)):
             # It left, and the bridge's word of it was lost.
-            yield from self._agents.pop(name).leave()
+            effects += self._agents.pop(name).leave()
         self._seen = set(listed)
+        return effects
 
-    def _listen_to_formations(self) -> Iterator[Effect]:
+    def _listen_to_formations(self, effects: list[Effect]) -> None:
         """Subscribe to the motions and states that matter now, and only to those.
 
         States are most of the traffic, and most of the time nobody waits for anybody.
@@ -174,15 +187,15 @@ class AgentHost:
             awaited.append(agent.wanted_states)
         if near != self._near:
             self._near = near
-            yield from self._listen(MOTION, near)
+            effects += self._listen(MOTION, near)
         if awaited != self._awaited:
             self._awaited = awaited
-            yield from self._listen(STATE, awaited)
+            effects += self._listen(STATE, awaited)
 
-    def _listen(self, topic: Topic, numbers: Iterable[Iterable[int]]) -> Iterator[Effect]:
+    def _listen(self, topic: Topic, numbers: Iterable[Iterable[int]]) -> list[Effect]:
         before, wanted = self._formations[topic], {one for each in numbers for one in each}
-        for number in sorted(before - wanted):
-            yield Unlisten(topic, {"formation": number})
-        for number in sorted(wanted - before):
-            yield Listen(topic, {"formation": number})
         self._formations[topic] = wanted
+        return [
+            *(Unlisten(topic, {"formation": number}) for number in sorted(before - wanted)),
+            *(Listen(topic, {"formation": number}) for number in sorted(wanted - before)),
+        ]

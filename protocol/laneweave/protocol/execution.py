@@ -98,7 +98,7 @@ class PlanExecution:
 
         What it says may be older than what is known already: nothing that has been joined parts.
         """
-        if set(formations) <= set(self.joined):
+        if formations == self.joined or set(formations) <= set(self.joined):
             return False
         self.joined = tuple(sorted({*self.joined, *formations}))
         return True
@@ -111,7 +111,7 @@ class PlanExecution:
         """
         if self.estate is None:
             return False
-        if sense.promised is not None:
+        if sense.promised is not None and sense.promised != self.promised:
             self.on_prepare(Prepare(sense.promised, (), (self.vehicle,)))
         before = self.shown
         self.estate, self.noted = frozenset(sense.estate), sense.deed
@@ -177,10 +177,13 @@ class PlanExecution:
 
     def is_due(self, t_s: float) -> bool:
         """Tell whether the time of the next move has come."""
-        plan, move = self.plan, self.next_move
-        if plan is None or move is None:
+        plan = self.plan
+        if plan is None:
             return False
-        return t_s + TIME_TOLERANCE_S >= plan.t0_s + move[0] * plan.slot_s
+        moves, completed = plan.moves[self.vehicle], self.completed
+        if completed >= len(moves):
+            return False
+        return t_s + TIME_TOLERANCE_S >= plan.t0_s + moves[completed][0] * plan.slot_s
 
     def state(self, sense: Sense, formation: int, *, attended: bool) -> VehicleState:
         """Return what to show to others.
@@ -190,20 +193,24 @@ class PlanExecution:
             formation: in whose block it entered.
             attended: whether an agent drives it.
         """
+        # The properties of these names, written out: this is shown at each tick.
+        accepted = self.phase in ACCEPTED
+        done = accepted and self.next_move is None
+        waits = accepted and not done and not self.moving
         return VehicleState(
             vehicle=self.vehicle,
             incarnation=self.incarnation,
             formation=formation,
             joined=self.joined,
             promised=self.promised,
-            accepted=self.accepted,
+            accepted=accepted,
             ready=self.ready,
             completed=self.completed,
             hold_cell=self.hold_cell,
             moving=self.moving,
-            go=self.go,
-            done=self.done,
-            overdue=self.overdue(sense.t_s),
+            go=self.phase is Stage.GOING,
+            done=done,
+            overdue=waits and self.is_due(sense.t_s - self.overdue_s),
             attended=attended,
             s_m=sense.state[0],
             y_m=sense.state[3],
@@ -222,10 +229,13 @@ class PlanExecution:
         plan = self.plan
         if plan is None:
             return False
-        if not self.go:
+        if self.phase is not Stage.GOING:
             return True
-        return t_s >= plan.t0_s - plan.slot_s and any(
-            self.heard.get(other, -1) < count
-            for needs in self.needs[self.completed :]
-            for other, count in needs.items()
-        )
+        if t_s < plan.t0_s - plan.slot_s:
+            return False
+        heard = self.heard
+        for needs in self.needs[self.completed :]:
+            for other, count in needs.items():
+                if heard.get(other, -1) < count:
+                    return True
+        return False

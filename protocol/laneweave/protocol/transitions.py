@@ -16,6 +16,7 @@ from typing import Any
 from attrs import frozen
 
 Function = Callable[..., Any]
+_Row = tuple[tuple[Enum, ...], tuple[Function, ...], tuple[Function, ...], "Transition"]
 
 
 @frozen
@@ -47,33 +48,36 @@ class RuleBook:
         self.table = tuple(table)
         self.functions = dict(functions)
         self._rows: dict[str, tuple[_Row, ...]] = {}
-        """Of each event; few enough to be looked through, and phases are slow to hash."""
+        """Of each event (sources, guards, actions, transition); few enough to be looked through,
+        and phases are slow to hash."""
         for transition in self.table:
             for name in (*transition.guards, *transition.actions):
                 if name not in self.functions:
                     raise ValueError(f"rule {transition.rule}: no function {name}")
-            row = _Row(
-                transition,
+            row = (
+                transition.sources,
                 tuple(self.functions[name] for name in transition.guards),
                 tuple(self.functions[name] for name in transition.actions),
+                transition,
             )
             event = transition.event
             self._rows[event] = (*self._rows.get(event, ()), row)
 
     def take(self, machine: Any, event: str, message: Any) -> Transition | None:  # noqa: ANN401
         """Take the first transition that fits and return it; None: nothing changes."""
-        for row in self._rows.get(event, ()):
-            if machine.phase not in row.transition.sources:
+        phase = machine.phase
+        for sources, guards, actions, transition in self._rows.get(event, ()):
+            if phase not in sources:
                 continue
-            for guard in row.guards:
+            for guard in guards:
                 if not guard(machine, message):
                     break
             else:
-                for action in row.actions:
+                for action in actions:
                     action(machine, message)
-                if row.transition.target is not None:
-                    machine.phase = row.transition.target
-                return row.transition
+                if transition.target is not None:
+                    machine.phase = transition.target
+                return transition
         return None
 
     def planted(self, **functions: Function) -> RuleBook:
@@ -91,13 +95,6 @@ class RuleBook:
         """Return what a guard or an action means: the first line of its docstring."""
         text = inspect.getdoc(self.functions[name]) or name
         return text.splitlines()[0].rstrip(".")
-
-
-@frozen
-class _Row:
-    transition: Transition
-    guards: tuple[Function, ...]
-    actions: tuple[Function, ...]
 
 
 def named(*functions: Function) -> dict[str, Function]:

@@ -130,7 +130,7 @@ def _accept(me: PlanExecution, plan: Plan) -> None:
 
 def _is_noted(me: PlanExecution, ballot: Ballot | None) -> bool:
     """My controller has noted for me that I accept it."""
-    return me.plan is not None and ballot == me.wanted_accepted
+    return me.plan is not None and ballot == me.plan.ballot
 
 
 def _is_of_my_plan(me: PlanExecution, state: VehicleState) -> bool:
@@ -158,7 +158,7 @@ def _hear(me: PlanExecution, state: VehicleState) -> None:
 
 def _is_ready(me: PlanExecution, _: object) -> bool:
     """Accepted, and not moving or moving in a move of this plan."""
-    return me.accepted and (not me.moving or me.moving_in_plan)
+    return me.phase in ACCEPTED and (not me.moving or me.moving_in_plan)
 
 
 def _is_holding(me: PlanExecution, _: object) -> bool:
@@ -191,7 +191,11 @@ def _is_time(me: PlanExecution, _: object) -> bool:
 
 def _is_released(me: PlanExecution, _: object) -> bool:
     """heard[A] >= need(A) for all dependencies of the move."""
-    return all(me.heard.get(other, -1) >= count for other, count in me.needs[me.completed].items())
+    heard = me.heard
+    for other, count in me.needs[me.completed].items():  # noqa: SIM110 (asked at each tick)
+        if heard.get(other, -1) < count:
+            return False
+    return True
 
 
 def _start_move(me: PlanExecution, _: object) -> None:
