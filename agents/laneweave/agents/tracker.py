@@ -95,7 +95,7 @@ class TrackResult:
     iterations: int
     """OSQP's; 0 on the fast path."""
     solve_ms: float
-    """CPU time of the calling thread [ms]."""
+    """CPU time of the calling thread [ms]; the first one that needs OSQP sets it up."""
     row_violation: float
     """Largest violation of a row by the solver's answer, before limits were applied."""
 
@@ -131,10 +131,7 @@ class Tracker:
         self._jerk_limits = np.array(
             [self._limits.max_jerk_mps3, self._limits.max_lateral_jerk_mps3]
         )
-        self._low, self._high = _Bounds(n), _Bounds(n)
-        self._low.slip_left[:] = -np.inf
-        self._high.slip_right[:] = np.inf
-        self._low.gap[:], self._high.gap[:] = -_FAR_M, _FAR_M
+        self._low, self._high = _first_bounds(n)
         self._gaps = NOBODY
         self._shapes = (n + 1, 6), (n, 2)
         self._unwritten: tuple[State, _Path, Gaps] | None = None
@@ -162,14 +159,10 @@ class Tracker:
         """Errors so small that no row binds while a cell is held."""
         self._cost = _cost(n, self._tick_s)
         self._rows = _rows(n, self._tick_s, self._limits.max_slip_ratio)
-        self._qp = QuadraticProgram(
-            self._cost,
-            self._rows,
-            self._low.all,
-            self._high.all,
-            settings=SETTINGS,
-            scale=program_scale(n),
-        )
+        self._settings = SETTINGS
+        self._qp: QuadraticProgram | None = None if fast_path else self._set_up()
+        """None until it is needed: most vehicles never leave the fast path, and to set it up takes
+        as long as hundreds of ticks."""
 
     def solve(self, state: State, window: Window, gaps: Gaps = NOBODY) -> TrackResult:
         """Return the jerks that bring the vehicle to its reference.
@@ -296,13 +289,24 @@ class Tracker:
             self._set_bounds(*self._unwritten)
         return self._cost, self._rows, self._low.all.copy(), self._high.all.copy()
 
+    def _set_up(self) -> QuadraticProgram:
+        """Set OSQP up, whatever has been written into the bounds by now."""
+        low, high = _first_bounds(self._n)
+        scale = program_scale(self._n)
+        return QuadraticProgram(
+            self._cost, self._rows, low.all, high.all, settings=self._settings, scale=scale
+        )
+
     def _solve_program(self) -> QPResult:
+        program = self._qp
+        if program is None:
+            program = self._qp = self._set_up()
         if self._stale:
             # A solution of another situation is a worse start than none.
-            self._qp.reset()
+            program.reset()
             self._stale = False
-        self._qp.update(self._low.all, self._high.all)
-        return self._qp.solve()
+        program.update(self._low.all, self._high.all)
+        return program.solve()
 
     def _give_way(self, state: State, states: Array, jerks: Array, latest: Array | None) -> _Path:
         """Return the reference as it is, or yielding if it violates a gap."""
@@ -512,6 +516,15 @@ class _Bounds:
         self.gap = self.all[13 * n :]
         self.rows = self.all[6 * n :]
         """All but the dynamics."""
+
+
+def _first_bounds(n: int) -> tuple[_Bounds, _Bounds]:
+    """Return lower and upper bounds before the first program: those that never change are right."""
+    low, high = _Bounds(n), _Bounds(n)
+    low.slip_left[:] = -np.inf
+    high.slip_right[:] = np.inf
+    low.gap[:], high.gap[:] = -_FAR_M, _FAR_M
+    return low, high
 
 
 def program_scale(n: int) -> QPScale:

@@ -481,15 +481,21 @@ def _both(limit: float) -> tuple[float, float]:
 
 def _least_jerks(tick_s: float, ticks: int, start: Array) -> Array:
     """Return the jerks (ticks, 2) of least norm that lead from a state to rest at the origin."""
+    reach, power = _reach(tick_s, ticks)
+    ends = np.stack([power @ start[:3], power @ start[3:]], axis=1)
+    return np.asarray(np.linalg.lstsq(reach, -ends, rcond=None)[0], dtype=np.float64)
+
+
+@lru_cache(maxsize=256)
+def _reach(tick_s: float, ticks: int) -> tuple[Array, Array]:
+    """Return what each tick's jerk (3, ticks), and the state at first (3, 3), add to the last."""
     transition, effect = axis_matrices(tick_s)
     power: Array = np.eye(3)
     effects = []
     for _ in range(ticks):
         effects.append(power @ effect[:, 0])
         power = transition @ power
-    reach = np.array(effects[::-1]).T
-    ends = np.stack([power @ start[:3], power @ start[3:]], axis=1)
-    return np.asarray(np.linalg.lstsq(reach, -ends, rcond=None)[0], dtype=np.float64)
+    return np.array(effects[::-1]).T, power
 
 
 def _frozen(jerks: Array, tick_s: float, start: Array | None = None) -> Trajectory:
@@ -498,9 +504,10 @@ def _frozen(jerks: Array, tick_s: float, start: Array | None = None) -> Trajecto
     states = np.zeros((len(jerks) + 1, 6))
     if start is not None:
         states[0] = start
-    for k, (along, across) in enumerate(jerks):
-        states[k + 1, :3] = transition @ states[k, :3] + effect[:, 0] * along
-        states[k + 1, 3:] = transition @ states[k, 3:] + effect[:, 0] * across
+    lasting, first, second = effect[:, 0], states[:, :3], states[:, 3:]
+    for k, (along, across) in enumerate(jerks.tolist()):
+        first[k + 1] = transition @ first[k] + lasting * along
+        second[k + 1] = transition @ second[k] + lasting * across
     jerks = np.ascontiguousarray(jerks)
     states.flags.writeable = False
     jerks.flags.writeable = False
