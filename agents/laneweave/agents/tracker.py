@@ -136,11 +136,6 @@ class Tracker:
         self._shapes = (n + 1, 6), (n, 2)
         self._unwritten: tuple[State, _Path, Gaps] | None = None
         """Of the newest program, if its bounds were not written because the fast path was taken."""
-        self._values = np.empty(8 * n)
-        """What all rows but the dynamics come to on the fast path, and its blocks, as views."""
-        self._free = self._values[: 5 * n].reshape(5, n)
-        self._free_jerk = self._values[5 * n : 7 * n].reshape(n, 2)
-        self._free_gap = self._values[7 * n :]
         self._kept = np.empty(14 * n, dtype=np.bool_)
         """Whether bounds are kept on the fast path, and the blocks, as views."""
         kept = self._kept
@@ -263,8 +258,9 @@ class Tracker:
             return None
         # Without play, exactly: that is for OSQP, whose answers are limited afterwards.
         rooms = path.rooms or Rooms.beside(path.states[1:], path.jerks, self._limits)
-        self._regulator.rows.dot(error, self._values)
-        free, free_jerk = self._free, self._free_jerk
+        n = self._n
+        values = self._regulator.rows.dot(error)
+        free, free_jerk = values[: 5 * n].reshape(5, n), values[5 * n : 7 * n].reshape(n, 2)
         np.less_equal(rooms.low, free, self._kept_low)
         np.less_equal(free, rooms.high, self._kept_high)
         np.less_equal(rooms.low_jerk, free_jerk, self._kept_low_jerk)
@@ -273,7 +269,7 @@ class Tracker:
             return None
         if gaps is not NOBODY:
             self._set_gaps(path.states, gaps)
-            free_gap = self._free_gap
+            free_gap = values[7 * n :]
             if not ((self._low.gap <= free_gap).all() and (free_gap <= self._high.gap).all()):
                 return None
         answer: Array = path.jerks + free_jerk
