@@ -22,8 +22,7 @@ from laneweave.protocol.scenario import Scenario, load_scenario
 from laneweave.sim_bridge.demand import Arrival
 from laneweave.sim_bridge.entry import Admission
 from laneweave.sim_bridge.motion_controller import Rung
-from laneweave.sim_bridge.overlap import Pose, least_gaps, overlapping_pairs
-from laneweave.sim_bridge.sensors import who_is_around
+from laneweave.sim_bridge.overlap import Bodies
 from laneweave.sim_bridge.traffic import RoadVehicle
 from paper import paper
 
@@ -165,21 +164,17 @@ class Road:
                     listener.driver.hear(motion)
 
     def _show(self) -> None:
-        poses = _poses(self.vehicles)
-        size = self.scenario.vehicle.length_m, self.scenario.vehicle.width_m
+        road, size = self.scenario.road, self.scenario.vehicle
+        poses = {name: one.controller.plant.pose for name, one in self.vehicles.items()}
+        bodies = Bodies(poses, size.length_m, size.width_m)
         record = self.record
         record.states.append([one.controller.plant.state for one in self.vehicles.values()])
-        record.gaps_m.append(least_gaps(poses, *size).gap_m)
-        record.overlaps += [(self.tick, *pair) for pair in overlapping_pairs(poses, *size)]
-        around = who_is_around(
-            self.scenario, poses, {name: one.state[2] for name, one in self.vehicles.items()}
-        )
+        record.gaps_m.append(bodies.least_gaps().gap_m)
+        record.overlaps += [(self.tick, *pair) for pair in bodies.overlapping_pairs()]
+        accels_mps2 = {name: one.state[2] for name, one in self.vehicles.items()}
+        around = bodies.glimpses(road.lanes, road.lane_width_m, accels_mps2)
         for name, vehicle in self.vehicles.items():
             vehicle.perceive(around[name])
-
-
-def _poses(vehicles: Mapping[Name, RoadVehicle]) -> dict[str, Pose]:
-    return {name: vehicle.controller.plant.pose for name, vehicle in vehicles.items()}
 
 
 # --- what is measured -----------------------------------------------------------------------------

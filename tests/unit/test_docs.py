@@ -32,7 +32,7 @@ from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.motion import cell_state
 from laneweave.protocol.scenario import CONFLICT_KINDS, Scenario, load_scenario, parse_scenario
 from laneweave.protocol.topics import NAME_RULE, TOPICS
-from laneweave.sim_bridge.overlap import least_gaps, pose_of
+from laneweave.sim_bridge.overlap import Bodies, pose_of
 from laneweave.sim_bridge.run_record import Ending
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -280,7 +280,7 @@ def _gaps_of_pairs(scenario: Scenario, late_ticks: Sequence[int]) -> Iterator[fl
         near = np.abs(first[:, 3] - second[:, 3]) < 3.0  # no turned body is wider
         for one, other in zip(first[near][::2], second[near][::2], strict=True):
             if abs(one[0] - other[0]) < 16.0:
-                yield least_gaps({"a": pose_of(one), "b": pose_of(other)}, *body).gap_m
+                yield Bodies({"a": pose_of(one), "b": pose_of(other)}, *body).least_gaps().gap_m
 
 
 @lru_cache(maxsize=1024)

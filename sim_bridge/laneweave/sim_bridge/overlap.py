@@ -81,72 +81,6 @@ def corners(pose: Pose, length_m: float, width_m: float) -> tuple[_Point, _Point
     )
 
 
-def overlapping_pairs(
-    poses: Mapping[str, Pose], length_m: float, width_m: float
-) -> list[tuple[str, str]]:
-    """Return all pairs of vehicles whose bodies overlap.
-
-    Args:
-        poses: pose of each vehicle.
-        length_m: length of every body.
-        width_m: width of every body.
-
-    Returns:
-        Sorted pairs of names, the lesser name first. Bodies that merely touch are not among them.
-    """
-    return Bodies(poses, length_m, width_m).overlapping_pairs()
-
-
-def least_gaps(poses: Mapping[str, Pose], length_m: float, width_m: float) -> LeastGaps:
-    """Return the least gap and the least time headway between vehicles in line.
-
-    Two vehicles are in line if their bodies overlap laterally. The gap is how far the one behind
-    would have to move along the road to touch the other: exact for rotated bodies, negative if and
-    only if the bodies overlap. The one behind is the one whose front is behind.
-
-    Args:
-        poses: pose of each vehicle.
-        length_m: length of every body.
-        width_m: width of every body.
-    """
-    return Bodies(poses, length_m, width_m).least_gaps()
-
-
-def neighbours(
-    poses: Mapping[str, Pose],
-    *,
-    lanes: int,
-    lane_width_m: float,
-    length_m: float,
-    width_m: float,
-    accels_mps2: Mapping[str, float] | None = None,
-) -> dict[str, Around]:
-    """Return whom each vehicle's local sensing would see around it if it were exact.
-
-    In each lane that its body touches or that is adjacent to such a lane, a vehicle sees the
-    nearest vehicle ahead that touches the lane, and the nearest one behind. A vehicle that
-    straddles two lanes is seen in both. The gap is bumper to bumper, with bodies taken as
-    unrotated; it is negative for vehicles side by side, of which the one with the front ahead is
-    ahead (at equal positions: the one with the greater name).
-
-    Args:
-        poses: pose of each vehicle.
-        lanes: number of lanes.
-        lane_width_m: width of a lane.
-        length_m: length of every body.
-        width_m: width of every body.
-        accels_mps2: acceleration of each vehicle; None: all zero.
-
-    Returns:
-        For each vehicle at most one neighbour ahead in each lane and one behind, by lane.
-    """
-    seen = Bodies(poses, length_m, width_m).glimpses(lanes, lane_width_m, accels_mps2 or {})
-    return {
-        name: Around(*(tuple(Neighbour(*each) for each in others) for others in seen[name]))
-        for name in poses
-    }
-
-
 class Bodies:
     """All bodies on the road at one time, of equal size."""
 
@@ -165,7 +99,10 @@ class Bodies:
         self._extents = [_extent(pose, length_m, width_m) for pose in self._poses]
 
     def overlapping_pairs(self) -> list[tuple[str, str]]:
-        """Return all pairs of vehicles whose bodies overlap; see the function of this name."""
+        """Return all pairs of vehicles whose bodies overlap.
+
+        Sorted pairs of names, the lesser name first. Bodies that merely touch are not among them.
+        """
         names, poses, extents = self._names, self._poses, self._extents
         length_m, width_m = self._length_m, self._width_m
         reach_m = length_m + width_m
@@ -186,7 +123,12 @@ class Bodies:
         return sorted(pairs)
 
     def least_gaps(self) -> LeastGaps:
-        """Return how close vehicles in line are at least; see the function of this name."""
+        """Return the least gap and the least time headway between vehicles in line.
+
+        Two vehicles are in line if their bodies overlap laterally. The gap is how far the one
+        behind would have to move along the road to touch the other: exact for rotated bodies,
+        negative if and only if the bodies overlap. The one behind is the one whose front is behind.
+        """
         length_m, width_m = self._length_m, self._width_m
         # Of two with equal fronts names do not decide who is behind.
         bodies = sorted(zip(self._poses, self._extents, strict=True))
@@ -226,12 +168,21 @@ class Bodies:
     def glimpses(
         self, lanes: int, lane_width_m: float, accels_mps2: Mapping[str, float]
     ) -> dict[str, Glimpses]:
-        """Return whom each vehicle's local sensing would see if it were exact; see `neighbours`.
+        """Return whom each vehicle's local sensing would see around it if it were exact.
+
+        In each lane that its body touches or that is adjacent to such a lane, a vehicle sees the
+        nearest vehicle ahead that touches the lane, and the nearest one behind. A vehicle that
+        straddles two lanes is seen in both. The gap is bumper to bumper, with bodies taken as
+        unrotated; it is negative for vehicles side by side, of which the one with the front ahead
+        is ahead (at equal positions: the one with the greater name).
 
         Args:
             lanes: number of lanes.
             lane_width_m: width of a lane.
-            accels_mps2: acceleration of each vehicle; of others: zero.
+            accels_mps2: acceleration of each vehicle; zero where none is given.
+
+        Returns:
+            For each vehicle at most one ahead in each lane and one behind, by lane.
         """
         touched = []
         """The first and the last lane that each body touches."""

@@ -218,9 +218,9 @@ class Recorder:
         """Record how close the vehicles are in one tick.
 
         Args:
-            overlaps: pairs of `overlap.overlapping_pairs`.
+            overlaps: pairs of `Bodies.overlapping_pairs`.
             collisions: pairs that SUMO reports.
-            gaps: least gap and headway of `overlap.least_gaps`.
+            gaps: least gap and headway of `Bodies.least_gaps`.
         """
         self._check_open()
         self._safety.overlaps.update(overlaps)

@@ -7,14 +7,13 @@ scenario), and drawn from the scenario's seed and the vehicle's name: equal seed
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
 
 import numpy as np
 
 from laneweave.protocol.messages import Name, Neighbour
 from laneweave.protocol.motion import State
 from laneweave.protocol.scenario import Scenario
-from laneweave.sim_bridge.overlap import Around, Glimpse, Glimpses, Pose, neighbours
+from laneweave.sim_bridge.overlap import Around, Glimpses
 
 _DRAWN = 1024
 
@@ -57,14 +56,9 @@ class Sensors:
             a_y + e_ay * ay_mps2,
         )
 
-    def look(self, around: Around) -> Around:
+    def look(self, around: Glimpses) -> Around:
         """Return what the vehicle sees of those around it."""
         ahead, behind = around
-        return self.see((list(map(_numbers, ahead)), list(map(_numbers, behind))))
-
-    def see(self, glimpses: Glimpses) -> Around:
-        """Return what the vehicle sees of those around it, given as plain numbers."""
-        ahead, behind = glimpses
         sigma_m, sigma_mps, sigma_mps2 = self._other_noise
         # Drawn at once for all, in their order: the same numbers as one by one.
         errors = self._draw(3 * (len(ahead) + len(behind)))
@@ -92,28 +86,3 @@ class Sensors:
             self._normal = self._normal[first:] + self._random.standard_normal(_DRAWN).tolist()
             first, self._used = 0, count
         return self._normal[first : self._used]
-
-
-def who_is_around(
-    scenario: Scenario, poses: Mapping[str, Pose], accels_mps2: Mapping[str, float]
-) -> dict[str, Around]:
-    """Return whom each vehicle would see if its sensors were exact.
-
-    Args:
-        scenario: size of vehicles and lanes.
-        poses: of all vehicles on the road.
-        accels_mps2: their accelerations along the road.
-    """
-    road, vehicle = scenario.road, scenario.vehicle
-    return neighbours(
-        poses,
-        lanes=road.lanes,
-        lane_width_m=road.lane_width_m,
-        length_m=vehicle.length_m,
-        width_m=vehicle.width_m,
-        accels_mps2=accels_mps2,
-    )
-
-
-def _numbers(other: Neighbour) -> Glimpse:
-    return other.lane, other.gap_m, other.speed_mps, other.accel_mps2

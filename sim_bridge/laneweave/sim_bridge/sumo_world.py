@@ -128,7 +128,7 @@ class SumoWorld:
     def collisions(self) -> list[tuple[str, str]]:
         """Return the pairs that SUMO reports as colliding in the last step, sorted, each once.
 
-        SUMO misses pairs that overlap between lanes: `overlap.overlapping_pairs` is the truth.
+        SUMO misses pairs that overlap between lanes: `Bodies.overlapping_pairs` is the truth.
         """
         return self._sumo.collisions()
 

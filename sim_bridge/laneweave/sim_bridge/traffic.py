@@ -13,7 +13,7 @@ from laneweave.protocol.scenario import Scenario
 from laneweave.sim_bridge.demand import Arrival
 from laneweave.sim_bridge.entry import Admission
 from laneweave.sim_bridge.motion_controller import MotionController, Rung
-from laneweave.sim_bridge.overlap import Around, Glimpses
+from laneweave.sim_bridge.overlap import Glimpses
 from laneweave.sim_bridge.plant import Plant
 from laneweave.sim_bridge.sensors import Sensors
 
@@ -80,20 +80,15 @@ class RoadVehicle:
         """Ticks on each rung of the ladder."""
         return self.controller.rung_ticks
 
-    def perceive(self, around: Around) -> None:
+    def perceive(self, around: Glimpses) -> None:
         """Let its sensors measure where it is now, and whom it sees.
 
         Args:
             around: whom exact sensors would see.
         """
-        if self.sensors is not None:
-            self.controller.perceive(self.sensors.measure(self.state), self.sensors.look(around))
-
-    def see(self, state: State, glimpses: Glimpses) -> None:
-        """`perceive`, with its own state and whom it sees as plain numbers: in every tick."""
         sensors = self.sensors
         if sensors is not None:
-            self.controller.perceive(sensors.measure(state), sensors.see(glimpses))
+            self.controller.perceive(sensors.measure(self.state), sensors.look(around))
 
     def sense(self, tick: int, *, caretaker: bool, left: bool = False) -> Sense:
         """Return what its sensors and its motion controller know at a tick.

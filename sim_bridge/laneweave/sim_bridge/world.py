@@ -60,7 +60,7 @@ def show_bodies(
     accels_mps2: dict[str, float] = {name: state[2] for name, state in states.items()}
     around = bodies.glimpses(road.lanes, road.lane_width_m, accels_mps2)
     for name, vehicle in vehicles.items():
-        vehicle.see(states[name], around[name])
+        vehicle.perceive(around[name])
     record.on_shown(
         t_s,
         vehicles.values(),

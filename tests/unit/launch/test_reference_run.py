@@ -123,7 +123,7 @@ def test_a_run_that_does_not_end_is_ended(tmp_path: Path, method: str) -> None:
 def test_bodies_that_overlap_break_a_promise(
     tmp_path: Path, method: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(road, "overlapping_pairs", lambda *_: [("v0001", "v0002")])
+    monkeypatch.setattr(road.Bodies, "overlapping_pairs", lambda _: [("v0001", "v0002")])
     outcome = finished(scenario(), tmp_path, method)
     assert outcome.exit_status == 1
     assert "1 pairs of vehicles overlapped" in outcome.problems

@@ -13,7 +13,7 @@ from laneweave.sim_bridge.baselines.entrance import Entrance
 from laneweave.sim_bridge.baselines.rule import RuleTraffic
 from laneweave.sim_bridge.baselines.vehicle import Vehicle
 from laneweave.sim_bridge.demand import Arrival
-from laneweave.sim_bridge.overlap import overlapping_pairs
+from laneweave.sim_bridge.overlap import Bodies
 from unit.sim_bridge.bench import PlainWorld, arrival
 
 PAPER = Scenario()
@@ -79,7 +79,7 @@ class RuleRoad:
                 self.traffic.remove(one)
                 self.left.append(one)
         poses = self.traffic.poses()
-        assert overlapping_pairs(poses, limits.length_m, limits.width_m) == []
+        assert Bodies(poses, limits.length_m, limits.width_m).overlapping_pairs() == []
         return entered
 
     def serve(self, arrivals: Sequence[Arrival], until_s: float) -> None:

@@ -16,16 +16,7 @@ from hypothesis import strategies as st
 
 from laneweave.protocol.messages import Neighbour
 from laneweave.sim_bridge import overlap
-from laneweave.sim_bridge.overlap import (
-    Around,
-    LeastGaps,
-    Pose,
-    corners,
-    least_gaps,
-    neighbours,
-    overlapping_pairs,
-    pose_of,
-)
+from laneweave.sim_bridge.overlap import Around, Bodies, LeastGaps, Pose, corners, pose_of
 
 LENGTH_M, WIDTH_M, LANE_M = 5.0, 1.8, 3.5
 
@@ -36,6 +27,10 @@ POSES: st.SearchStrategy[Pose] = st.tuples(
 ROADS = st.lists(POSES, min_size=2, max_size=8).map(
     lambda poses: {f"v{number}": pose for number, pose in enumerate(poses)}
 )
+
+
+def bodies(road: dict[str, Pose]) -> Bodies:
+    return Bodies(road, LENGTH_M, WIDTH_M)
 
 
 def grid_in(pose: Pose, points: int = 41) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
@@ -59,7 +54,7 @@ def depth(pose: Pose, points: np.ndarray[tuple[int, int], np.dtype[np.float64]])
 @given(ROADS)
 @settings(max_examples=150, deadline=None)
 def test_overlaps_agree_with_point_sampling(road: dict[str, Pose]) -> None:
-    found = set(overlapping_pairs(road, LENGTH_M, WIDTH_M))
+    found = set(bodies(road).overlapping_pairs())
     for one, other in itertools.combinations(sorted(road), 2):
         deepest = max(
             depth(road[one], grid_in(road[other])), depth(road[other], grid_in(road[one]))
@@ -73,7 +68,7 @@ def test_overlaps_agree_with_point_sampling(road: dict[str, Pose]) -> None:
 
 def test_touching_is_not_overlapping() -> None:
     def pairs(second: Pose) -> list[tuple[str, str]]:
-        return overlapping_pairs({"b": (20.0, 1.75, 0.0, 15.0), "a": second}, LENGTH_M, WIDTH_M)
+        return bodies({"b": (20.0, 1.75, 0.0, 15.0), "a": second}).overlapping_pairs()
 
     assert pairs((25.0, 1.75, 0.0, 15.0)) == []
     assert pairs((24.999, 1.75, 0.0, 15.0)) == [("a", "b")]
@@ -86,8 +81,8 @@ def test_rotation_counts() -> None:
     straight = (20.0, 1.75, 0.0, 15.0)
     beside = (20.0, 1.75 + WIDTH_M + 0.1, 0.0, 15.0)
     turned = (20.0, 1.75 + WIDTH_M + 0.1, 0.2, 15.0)
-    assert overlapping_pairs({"a": straight, "b": beside}, LENGTH_M, WIDTH_M) == []
-    assert overlapping_pairs({"a": straight, "b": turned}, LENGTH_M, WIDTH_M) == [("a", "b")]
+    assert bodies({"a": straight, "b": beside}).overlapping_pairs() == []
+    assert bodies({"a": straight, "b": turned}).overlapping_pairs() == [("a", "b")]
 
 
 def test_corners_of_a_turned_body_keep_bumper_and_centre_where_the_pose_says() -> None:
@@ -129,7 +124,7 @@ def brute_gap(road: dict[str, Pose]) -> float:
 def test_least_gap_agrees_with_slices(poses: list[Pose]) -> None:
     poses = [(s, y, 0.0 if abs(heading) < 1e-3 else heading, v) for s, y, heading, v in poses]
     road = {str(number): pose for number, pose in enumerate(poses)}
-    gap = least_gaps(road, LENGTH_M, WIDTH_M).gap_m
+    gap = bodies(road).least_gaps().gap_m
     expected = brute_gap(road)
     if math.isinf(expected):
         assert math.isinf(gap) or len(poses) > 2 or gap > -1e9
@@ -141,8 +136,8 @@ def test_least_gap_agrees_with_slices(poses: list[Pose]) -> None:
 @given(ROADS)
 @settings(max_examples=150, deadline=None)
 def test_a_negative_gap_means_an_overlap(road: dict[str, Pose]) -> None:
-    gap = least_gaps(road, LENGTH_M, WIDTH_M).gap_m
-    overlaps = bool(overlapping_pairs(road, LENGTH_M, WIDTH_M))
+    gap = bodies(road).least_gaps().gap_m
+    overlaps = bool(bodies(road).overlapping_pairs())
     if abs(gap) > 1e-6:
         assert (gap < 0.0) == overlaps
 
@@ -154,24 +149,21 @@ def test_gap_and_headway_of_a_simple_queue() -> None:
         "third": (76.0, 1.75, 0.0, 5.0),
         "other lane": (84.0, 5.25, 0.0, 15.0),
     }
-    assert least_gaps(road, LENGTH_M, WIDTH_M) == LeastGaps(4.0, 1.0)
+    assert bodies(road).least_gaps() == LeastGaps(4.0, 1.0)
 
 
 def test_nobody_in_line_is_infinitely_far() -> None:
     road = {"a": (10.0, 1.75, 0.0, 15.0), "b": (10.0, 5.25, 0.0, 15.0)}
-    assert least_gaps(road, LENGTH_M, WIDTH_M) == LeastGaps(math.inf, math.inf)
-    assert least_gaps({}, LENGTH_M, WIDTH_M) == LeastGaps(math.inf, math.inf)
+    assert bodies(road).least_gaps() == LeastGaps(math.inf, math.inf)
+    assert bodies({}).least_gaps() == LeastGaps(math.inf, math.inf)
 
 
 def sense(road: dict[str, Pose], accels_mps2: dict[str, float] | None = None) -> dict[str, Around]:
-    return neighbours(
-        road,
-        lanes=3,
-        lane_width_m=LANE_M,
-        length_m=LENGTH_M,
-        width_m=WIDTH_M,
-        accels_mps2=accels_mps2,
-    )
+    seen = bodies(road).glimpses(3, LANE_M, accels_mps2 or {})
+    return {
+        name: Around(*(tuple(Neighbour(*each) for each in others) for others in sides))
+        for name, sides in seen.items()
+    }
 
 
 def test_sensing_sees_the_nearest_in_its_own_and_adjacent_lanes() -> None:
@@ -271,17 +263,14 @@ def steps_taken(work: Callable[[], object]) -> int:
     return taken
 
 
-@pytest.mark.parametrize(
-    "work", [overlapping_pairs, least_gaps, neighbours], ids=lambda f: f.__name__
-)
+@pytest.mark.parametrize("work", [Bodies.overlapping_pairs, Bodies.least_gaps, Bodies.glimpses])
 def test_the_effort_grows_with_the_vehicles_and_not_with_their_pairs(
     work: Callable[..., object],
 ) -> None:
     def steps(vehicles: int) -> int:
         road = {f"v{n:04d}": (11.0 * n, (n % 3 + 0.5) * LANE_M, 0.1, 15.0) for n in range(vehicles)}
-        if work is neighbours:
-            return steps_taken(lambda: sense(road))
-        return steps_taken(lambda: work(road, LENGTH_M, WIDTH_M))
+        more = (3, LANE_M, {}) if work is Bodies.glimpses else ()
+        return steps_taken(lambda: work(bodies(road), *more))
 
     few = steps(90)
     assert 90 < few < 100_000

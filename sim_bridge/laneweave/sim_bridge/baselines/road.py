@@ -12,7 +12,7 @@ from laneweave.sim_bridge.baselines.entrance import Entrance
 from laneweave.sim_bridge.baselines.vehicle import Vehicle
 from laneweave.sim_bridge.demand import arrivals
 from laneweave.sim_bridge.entry import TIME_TOLERANCE_S
-from laneweave.sim_bridge.overlap import Pose, least_gaps, overlapping_pairs
+from laneweave.sim_bridge.overlap import Bodies, Pose
 from laneweave.sim_bridge.run_record import Ending, RunRecord
 
 
@@ -115,14 +115,14 @@ class ReferenceRoad:
 
     def _measure(self) -> None:
         """Record where everybody is, and how close they are."""
-        poses = self._traffic.poses()
-        size = (self._scenario.vehicle.length_m, self._scenario.vehicle.width_m)
+        size = self._scenario.vehicle
+        bodies = Bodies(self._traffic.poses(), size.length_m, size.width_m)
         self._record.on_shown(
             self.t_s,
             self._traffic.vehicles,
-            overlaps=overlapping_pairs(poses, *size),
+            overlaps=bodies.overlapping_pairs(),
             collisions=self._traffic.collisions(),
-            gaps=least_gaps(poses, *size),
+            gaps=bodies.least_gaps(),
         )
 
     def _let_leave(self) -> None:
