@@ -126,7 +126,11 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", metavar="PART", help=", ".join(PARTS))
     parser.add_argument("--seeds", default=f"{SEEDS[0]}:{SEEDS[-1] + 1}", help="of the sweep")
     parser.add_argument("--duration", default=f"{DURATION_S:g}", help="s of arrivals at a point")
-    parser.add_argument("--jobs", type=int, help="processes of the sweep; default: all cores")
+    parser.add_argument(
+        "--jobs",
+        type=int,
+        help="processes at a time, of the sweep and of trials that share; default: all cores",
+    )
     parser.add_argument("--budget", metavar="MINUTES", help="for everything; default: no limit")
     parser.add_argument(
         "--sweeps", nargs="+", type=Path, default=[], metavar="DIR",

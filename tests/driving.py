@@ -22,7 +22,7 @@ from laneweave.protocol.scenario import Scenario, load_scenario
 from laneweave.sim_bridge.demand import Arrival
 from laneweave.sim_bridge.entry import Admission
 from laneweave.sim_bridge.motion_controller import Rung
-from laneweave.sim_bridge.overlap import Bodies
+from laneweave.sim_bridge.overlap import Bodies, Pose
 from laneweave.sim_bridge.traffic import RoadVehicle
 from paper import paper
 
@@ -165,13 +165,15 @@ class Road:
 
     def _show(self) -> None:
         road, size = self.scenario.road, self.scenario.vehicle
-        poses = {name: one.controller.plant.pose for name, one in self.vehicles.items()}
+        poses: dict[str, Pose] = {
+            name: one.controller.plant.pose for name, one in self.vehicles.items()
+        }
         bodies = Bodies(poses, size.length_m, size.width_m)
         record = self.record
         record.states.append([one.controller.plant.state for one in self.vehicles.values()])
         record.gaps_m.append(bodies.least_gaps().gap_m)
         record.overlaps += [(self.tick, *pair) for pair in bodies.overlapping_pairs()]
-        accels_mps2 = {name: one.state[2] for name, one in self.vehicles.items()}
+        accels_mps2: dict[str, float] = {name: one.state[2] for name, one in self.vehicles.items()}
         around = bodies.glimpses(road.lanes, road.lane_width_m, accels_mps2)
         for name, vehicle in self.vehicles.items():
             vehicle.perceive(around[name])

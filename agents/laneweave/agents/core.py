@@ -13,7 +13,7 @@ hung, or was not heard - it takes a new incarnation and claims the vehicle anew.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 from attrs import evolve
 
@@ -170,7 +170,7 @@ class AgentCore:
                     return [*self._ask_to_note(execution), self._show()]
             case Plan():
                 if execution.on_plan(message):
-                    return [*self._ask_to_note(execution)]
+                    return self._ask_to_note(execution)
             case _:
                 pass
         return []
@@ -243,7 +243,7 @@ class AgentCore:
         ]
         return [self._show()] if any(news) else []
 
-    def _ask_to_note(self, execution: PlanExecution) -> Iterable[Effect]:
+    def _ask_to_note(self, execution: PlanExecution) -> list[Effect]:
         """Ask the controller at once, not only with the next tick's COMMAND."""
         command = self._command
         assert command is not None  # noqa: S101 (in charge: it has commanded)

@@ -84,7 +84,7 @@ class AgentHost:
             effects = self._on_message(event, now_s)
         else:
             effects = self._on_event(event, now_s)
-        self._listen_to_formations(effects)
+            self._listen_to_formations(effects)
         if hosted and not self._agents and self._shard is None:
             effects.append(End())  # last: nothing can be undone on a network that the node has left
         return effects
@@ -117,9 +117,12 @@ class AgentHost:
             for agent in self._agents.values():
                 if message.formation in agent.wanted_states:
                     effects += agent.handle(event, now_s)
+            self._listen_to_formations(effects)
             return effects
         if isinstance(message, Census):
-            return self._on_census(message, now_s)
+            effects = self._on_census(message, now_s)
+            self._listen_to_formations(effects)
+            return effects
         name = event.parameters.get("vehicle")
         return self._hand_on(event, Name(name), now_s) if name in self._agents else []
 
@@ -151,9 +154,13 @@ class AgentHost:
 
     def _hand_on(self, event: Event, name: Name, now_s: float) -> list[Effect]:
         agent = self._agents[name]
+        wanted = agent.wanted_motions, agent.wanted_states
         effects = agent.handle(event, now_s)
         if agent.ended:
             del self._agents[name]
+        # Not after every message: a host of many would look at all of them for each of them.
+        if agent.ended or wanted != (agent.wanted_motions, agent.wanted_states):
+            self._listen_to_formations(effects)
         return effects
 
     def _on_census(self, census: Census, now_s: float) -> list[Effect]:

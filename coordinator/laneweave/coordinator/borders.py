@@ -13,6 +13,7 @@ from attrs import evolve
 
 from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.grid import Move
+from laneweave.protocol.execution import TIME_TOLERANCE_S
 from laneweave.protocol.messages import Plan
 
 _MODEL = ConflictModel(("closing",))
@@ -32,8 +33,8 @@ def kept_apart(plan: Plan, others: Iterable[Plan], move_s: float, most_steps: in
         plan: the new one.
         others: of neighbouring formations; they stay as they are.
         move_s: how long a move takes [s].
-        most_steps: how many slots there are. What does not fit in is left to the brake: better
-            late than on a wrong lane.
+        most_steps: how many slots there are. What still closes up when they are used up is left to
+            the brake: better late than on a wrong lane.
     """
     theirs = [
         (other.t0_s + step * other.slot_s, (origin, target))
@@ -45,7 +46,8 @@ def kept_apart(plan: Plan, others: Iterable[Plan], move_s: float, most_steps: in
     def closes_up(step: int, move: Move) -> bool:
         begin_s = plan.t0_s + step * plan.slot_s
         return any(
-            abs(begin_s - other_s) < move_s and _MODEL.kind(move, other) is not None
+            abs(begin_s - other_s) < move_s - TIME_TOLERANCE_S
+            and _MODEL.kind(move, other) is not None
             for other_s, other in theirs
         )
 

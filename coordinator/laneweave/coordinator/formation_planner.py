@@ -201,8 +201,10 @@ class FormationPlanner:
         others = [
             neighbour.plan
             for neighbour in self._neighbours(plan.formations, controls)
-            # Under another ballot it is not what is driven.
-            if neighbour.plan is not None and neighbour.plan.ballot == neighbour.ballot
+            # In other phases it has been outbid, or given up, and is not what is driven.
+            if neighbour.plan is not None
+            and neighbour.plan.ballot == neighbour.ballot
+            and neighbour.phase in (Phase.ISSUING, Phase.WATCHING)
         ]
         most_steps = steps_left(plan.formations, plan.t0_s, self._scenario)
         return kept_apart(plan, others, formation.move_s, most_steps)

@@ -30,7 +30,9 @@ from laneweave.sim_bridge.sumo_world import SumoWorld
 STALL_S = 600.0
 """A road clock that stands still for this much virtual time has stopped for good."""
 STRIDE_S = 0.02
-"""Virtual time in which nobody has to look what happens, if there are no faults."""
+"""Virtual time in which nobody has to look what happens, if there are no faults.
+
+So much may go on after the bridge has ended, too; it changes nothing that is recorded."""
 PROGRESS_EVERY_TICKS = 20
 AGENT_PREFIX = "agent-"
 

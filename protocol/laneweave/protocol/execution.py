@@ -193,24 +193,20 @@ class PlanExecution:
             formation: in whose block it entered.
             attended: whether an agent drives it.
         """
-        # The properties of these names, written out: this is shown at each tick.
-        accepted = self.phase in ACCEPTED
-        done = accepted and self.next_move is None
-        waits = accepted and not done and not self.moving
         return VehicleState(
             vehicle=self.vehicle,
             incarnation=self.incarnation,
             formation=formation,
             joined=self.joined,
             promised=self.promised,
-            accepted=accepted,
+            accepted=self.accepted,
             ready=self.ready,
             completed=self.completed,
             hold_cell=self.hold_cell,
             moving=self.moving,
-            go=self.phase is Stage.GOING,
-            done=done,
-            overdue=waits and self.is_due(sense.t_s - self.overdue_s),
+            go=self.go,
+            done=self.done,
+            overdue=self.overdue(sense.t_s),
             attended=attended,
             s_m=sense.state[0],
             y_m=sense.state[3],

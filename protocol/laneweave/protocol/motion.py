@@ -146,7 +146,7 @@ def limited_jerk(state: State, jerk: Jerk, limits: Vehicle, tick_s: float) -> Je
     """
     _, v, a, _, v_y, a_y = state
     a_next = limited_accel(v, a, jerk[0], limits, tick_s)
-    ay_next = limited_lateral_accel((v, a, v_y, a_y), a_next, jerk[1], limits, tick_s)
+    ay_next = _limited_lateral_accel((v, a, v_y, a_y), a_next, jerk[1], limits, tick_s)
     return ((a_next - a) / tick_s, (ay_next - a_y) / tick_s)
 
 
@@ -175,7 +175,7 @@ def limited_accel(v: float, a: float, jerk: float, limits: Vehicle, tick_s: floa
     return a_next if low <= a_next <= high else _clamp(a_next, low, high)
 
 
-def limited_lateral_accel(
+def _limited_lateral_accel(
     motion: tuple[float, float, float, float],
     a_next: float,
     jerk: float,

@@ -233,7 +233,7 @@ class Node:
 
     def deliver(self, delivery: Delivery, now_s: float) -> None:
         """Translate what the transport hands over and let the core handle it."""
-        event: Event | None
+        event: Event
         try:
             if isinstance(delivery, Received):
                 event = self._read(delivery.key, delivery.payload)

@@ -148,14 +148,19 @@ class FormationSettings:
         return self.operation == "rolling"
 
     @property
+    def entry_spacing_s(self) -> float:
+        """Time between two cells of a lane that may be entered."""
+        return (1.0 if self.rolling else 2.0) * self.gap_m / self.speed_mps
+
+    @property
     def entry_spread_s(self) -> float:
         """Most time between a vehicle and its cell as they pass the start of the road.
 
         Rolling operation: half of what lies between two cells, so nobody waits who is not too close
-        behind another. Interlaced entry, where a cell stands for two columns: half as much again,
-        so that cells are caught up with that nobody took, and queues end sooner.
+        behind another. Interlaced entry: half as much again, so that cells are caught up with that
+        nobody took, and queues end sooner.
         """
-        return (0.5 if self.rolling else 1.5) * self.gap_m / self.speed_mps
+        return (0.5 if self.rolling else 0.75) * self.entry_spacing_s
 
     @property
     def oblique_steps(self) -> int:

@@ -63,11 +63,11 @@ class Parcel(bytes):
 class _Reader:
     """Reads what arrives at the nodes of a realm, whether it travelled as bytes or as it is."""
 
-    def __init__(self, keys: Keys, decode: Callable[[bytes, type], object]) -> None:
+    def __init__(self, keys: Keys, read_payload: Callable[[bytes, type], object]) -> None:
         self._keys = keys
         self._known: dict[str, tuple[Topic, Mapping[str, str]]] = {}
         # Some go to many on keys of their own, like a plan: they are still decoded only once.
-        read = partial(read_message, keys, decode=decode)
+        read = partial(read_message, keys, decode=read_payload)
         self._read = lru_cache(maxsize=_REMEMBERED)(read)
 
     def __call__(self, key: str, payload: bytes) -> Arrived:
@@ -407,4 +407,7 @@ class SimulatedNetwork(Simulation):
         return route
 
     def _send(self, receiver: Member, delivery: Delivery) -> None:
-        self.at(self.now_s + self.delay_s(), receiver.arrive, receiver.connection, delivery)
+        # As in `carry`, to the last bit.
+        conditions = self.conditions
+        arrival_s = self.now_s + conditions.delay_s + conditions.jitter_s * self.random.random()
+        self.at(arrival_s, receiver.arrive, receiver.connection, delivery)

@@ -60,9 +60,8 @@ class Roadside:
         self._lanes = scenario.road.lanes
         # A tick and one more, so that nobody comes unannounced.
         lattice, formation = scenario.lattice, scenario.formation
-        between_entries_s = 2.0 * formation.entry_spread_s
         ahead_s = self._announce_s + self._tick_s
-        self._announced_per_lane = math.ceil(ahead_s / between_entries_s) + 1
+        self._announced_per_lane = math.ceil(ahead_s / formation.entry_spacing_s) + 1
         self._rolling = formation.rolling
         self._spread_s = formation.entry_spread_s
         self._meter = EntryMeter(

@@ -16,6 +16,7 @@ from laneweave.protocol.scenario import Scenario
 from laneweave.sim_bridge.overlap import Around, Glimpses
 
 _DRAWN = 1024
+"""Numbers that are drawn at once."""
 
 
 class Sensors:

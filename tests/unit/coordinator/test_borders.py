@@ -6,6 +6,7 @@ import pytest
 from attrs import evolve
 
 from laneweave.coordinator.borders import kept_apart, steps_of
+from laneweave.coordinator.leader_rules import Phase
 from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.protocol.lattice import Move
 from laneweave.protocol.messages import Ballot, LogEvent, Name, Plan
@@ -177,7 +178,8 @@ def test_so_does_that_of_the_block_ahead_if_it_is_made_later() -> None:
 def test_nobody_pauses_for_a_plan_that_was_outbid() -> None:
     desk, ahead, behind = two_formations()
     desk.give(run_job(ahead))
-    desk.core.controls[0].ballot = Ballot(4, Name("c0"), 3, 2)
+    desk.tell(state(A, AHEAD[A], Ballot(4, Name("c0"), 3, 2), t_s=2.0))
+    assert desk.core.controls[0].phase is Phase.BACKING_OFF
     assert awaited(desk.give(run_job(behind))) == []
 
 

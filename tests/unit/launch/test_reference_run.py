@@ -17,6 +17,7 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario import Scenario, parse_scenario, to_tables
 from laneweave.sim_bridge.baselines import road
 from laneweave.sim_bridge.demand import Arrival
+from laneweave.sim_bridge.overlap import Bodies
 from laneweave.sim_bridge.run_record import Ending, RunRecord
 from unit.sim_bridge.bench import read_events, read_summary
 
@@ -123,7 +124,7 @@ def test_a_run_that_does_not_end_is_ended(tmp_path: Path, method: str) -> None:
 def test_bodies_that_overlap_break_a_promise(
     tmp_path: Path, method: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(road.Bodies, "overlapping_pairs", lambda _: [("v0001", "v0002")])
+    monkeypatch.setattr(Bodies, "overlapping_pairs", lambda _: [("v0001", "v0002")])
     outcome = finished(scenario(), tmp_path, method)
     assert outcome.exit_status == 1
     assert "1 pairs of vehicles overlapped" in outcome.problems

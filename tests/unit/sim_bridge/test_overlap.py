@@ -269,7 +269,7 @@ def test_the_effort_grows_with_the_vehicles_and_not_with_their_pairs(
 ) -> None:
     def steps(vehicles: int) -> int:
         road = {f"v{n:04d}": (11.0 * n, (n % 3 + 0.5) * LANE_M, 0.1, 15.0) for n in range(vehicles)}
-        more = (3, LANE_M, {}) if work is Bodies.glimpses else ()
+        more: tuple[object, ...] = (3, LANE_M, {}) if work is Bodies.glimpses else ()
         return steps_taken(lambda: work(bodies(road), *more))
 
     few = steps(90)

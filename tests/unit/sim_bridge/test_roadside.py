@@ -102,7 +102,7 @@ def test_everybody_is_announced_before_entering_and_never_too_many_at_once(
     # On each lane one vehicle can enter in so many columns' time.
     lattice = scenario.lattice
     per_lane = math.ceil((announce_s + 0.1) * lattice.speed_mps / (columns * lattice.pitch_m)) + 1
-    assert watch.most_announced <= per_lane * lattice.lanes
+    assert watch.most_announced == per_lane * lattice.lanes
 
 
 @pytest.mark.parametrize("announce_s", [0.0, 2.0])

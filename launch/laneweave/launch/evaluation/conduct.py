@@ -102,7 +102,7 @@ def run_trials(part: str, out: Path, root: Path, jobs: int) -> bool:
     """
     stop = threading.Event()
 
-    def has_ended(trial: Trial) -> bool:
+    def complete(trial: Trial) -> bool:
         say(f"{part}: {trial.command}")
         try:
             run_trial(trial, out, root, stop.is_set)
@@ -115,10 +115,10 @@ def run_trials(part: str, out: Path, root: Path, jobs: int) -> bool:
         return True
 
     waiting = [trial for trial in TRIALS if trial.part == part and not is_finished(trial, out)]
-    ended = [has_ended(trial) for trial in waiting if not trial.shares]
+    ended = [complete(trial) for trial in waiting if not trial.shares]
     with ThreadPoolExecutor(jobs) as pool:
         try:
-            ended += pool.map(has_ended, [trial for trial in waiting if trial.shares])
+            ended += pool.map(complete, [trial for trial in waiting if trial.shares])
         finally:
             stop.set()
     return all(ended)

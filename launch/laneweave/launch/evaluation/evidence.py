@@ -10,6 +10,7 @@ from typing import Final
 from attrs import asdict, evolve, frozen
 
 from laneweave.launch.evaluation.points import Key, PointRow
+from laneweave.launch.evaluation.programme import FORMATIONS
 from laneweave.launch.evaluation.trials import AgreementRow, CostRow, FactorRow
 from laneweave.launch.report.runs import Run
 from laneweave.protocol.structuring import structure
@@ -78,8 +79,11 @@ class Evidence:
 
 
 def setting_of(runs: Sequence[Run]) -> Setting:
-    """Return what some runs share; the first one speaks for all."""
-    scenario = runs[0].scenario
+    """Return what some runs share; the first one of formation control speaks for all.
+
+    The reference methods do not read all of it.
+    """
+    scenario = next((run for run in runs if run.label in FORMATIONS), runs[0]).scenario
     formation, vehicle = scenario.formation, scenario.vehicle
     return Setting(
         duration_s=scenario.demand.duration_s,

@@ -24,7 +24,7 @@ from attrs import frozen
 
 from laneweave.launch.drawing import scenario_of
 from laneweave.launch.evaluation.agreement import Agreement, agreement, read_trips
-from laneweave.launch.sweep.execution import follow
+from laneweave.launch.sweep.execution import StoppedError, follow
 from laneweave.launch.sweep.folder import read_summary
 from laneweave.protocol.errors import CommandFailedError
 
@@ -46,7 +46,7 @@ class Trial:
     ending: str = "complete"
     """As in summary.json; a run with another one has failed."""
     shares: bool = False
-    """It needs one core only, and others like it may run on the other ones."""
+    """It needs one core only, its times do not count, and others like it may run beside it."""
 
     @property
     def command(self) -> str:
@@ -112,8 +112,8 @@ TRIALS: Final = (
     Trial("speed", "zenoh-50", _rolling(1600, 300, "--vehicles-per-process", "50")),
     Trial("speed", "simulated", _rolling(1600, 300, *SIMULATED)),
     # Ended when the road has been full for a while: nobody has to wait until it is empty again.
-    Trial("length", "long", ("benchmarks/long-road.toml", *SIMULATED), ending="limit", shares=True),
-    Trial("length", "short", _rolling(1800, 600, *SIMULATED), shares=True),
+    Trial("length", "long", ("benchmarks/long-road.toml", *SIMULATED), ending="limit"),
+    Trial("length", "short", _rolling(1800, 600, *SIMULATED)),
 )
 
 
@@ -127,8 +127,8 @@ def run_trial(trial: Trial, out: Path, root: Path, stopped: Callable[[], bool]) 
         stopped: whether the evaluation has been ended meanwhile.
 
     Raises:
-        CommandFailedError: the run did not come to its end.
-        StoppedError: the evaluation was ended, or the run took too long, and was ended.
+        CommandFailedError: the run did not come to its end, or took too long and was ended.
+        StoppedError: the evaluation was ended, and the run with it.
     """
     folder = out.resolve() / trial.part / trial.name
     if is_finished(trial, out):
@@ -147,7 +147,13 @@ def run_trial(trial: Trial, out: Path, root: Path, stopped: Callable[[], bool]) 
             process_group=0,
         )
         end_s = time.monotonic() + TIMEOUT_S
-        follow(process, trial.name, lambda: stopped() or time.monotonic() > end_s)
+        try:
+            follow(process, trial.name, lambda: stopped() or time.monotonic() > end_s)
+        except StoppedError as error:
+            if stopped():
+                raise
+            late = f"{trial.command}: not over after {TIMEOUT_S:g} s"
+            raise CommandFailedError(late) from error
         words.seek(0)
         said = " ".join(words.read().decode(errors="replace").split())
     summary = read_summary(folder) or {}

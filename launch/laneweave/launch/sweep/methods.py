@@ -70,7 +70,7 @@ METHODS: Final[dict[str, LabelledMethod]] = {
 
 
 _EVERYBODY = ("schema", "seed", "road", "demand", "vehicle", "runtime", "formation.speed_mps")
-"""Tables and fields of a scenario that all methods read."""
+"""Tables and fields of a scenario that any method may read."""
 
 
 def has_a_say(field_name: str, method: str) -> bool:
