@@ -69,8 +69,6 @@ _QUALITY: dict[Quality, dict[str, Any]] = {
 
 
 DROP_AFTER_US = 50
-MOST_PUBLISHERS = 4096
-"""More keys than are in use at one time: those of vehicles that have left go first."""
 
 
 def _config(mode: str, lease_s: float) -> zenoh.Config:
@@ -134,8 +132,6 @@ class ZenohTransport:
             ) from error
         self._deliver = deliver
         self._subscriptions: dict[str, Any] = {}
-        self._publishers: dict[tuple[str, Quality], zenoh.Publisher] = {}
-        """Those for periodic messages, in order of their first use."""
         self._tokens: dict[str, Any] = {}
         self._watched: dict[str, Any] = {}
         self._seen: dict[str, None] = {}
@@ -153,25 +149,7 @@ class ZenohTransport:
     def publish(self, key: str, payload: bytes, quality: Quality) -> None:
         """Send; silently lost while there is no connection."""
         with contextlib.suppress(zenoh.ZError):
-            if quality is Quality.ASSURED:
-                self._session.put(key, payload, **_QUALITY[quality])
-            else:
-                self._publisher(key, quality).put(payload)
-
-    def _publisher(self, key: str, quality: Quality) -> zenoh.Publisher:
-        """Return what publishes on a key that is used again and again.
-
-        A declared key travels as a number, and the router looks its receivers up only once: that
-        takes a third off what a message costs (measured, all processes together).
-        """
-        publisher = self._publishers.get((key, quality))
-        if publisher is None:
-            publisher = self._session.declare_publisher(key, **_QUALITY[quality])
-            self._publishers[key, quality] = publisher
-            if len(self._publishers) > MOST_PUBLISHERS:
-                oldest = next(iter(self._publishers))
-                self._publishers.pop(oldest).undeclare()  # type: ignore[no-untyped-call]
-        return publisher
+            self._session.put(key, payload, **_QUALITY[quality])
 
     def subscribe(self, key_expression: str) -> None:
         """Subscribe once; a second call for the same expression does nothing."""
