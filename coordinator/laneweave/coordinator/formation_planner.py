@@ -27,7 +27,7 @@ from laneweave.protocol.scenario import Scenario
 
 START_MARGIN_S = 0.5
 """A plan made late starts this much road time after it is ready."""
-ROOM_S = 2.0
+ROOM_S = 2.5
 """A formation that lacks room waits at most so long for the next one to close (road time)."""
 MOST_DOUBLINGS = 4
 """The bound on search nodes doubles with each failed planning, this often."""
