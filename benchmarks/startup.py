@@ -31,6 +31,7 @@ import psutil
 from attrs import define, evolve, field
 
 from laneweave.launch.roles import fork_server, start_role
+from laneweave.protocol.access import Access
 from laneweave.protocol.codec import encode
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.messages import Name, Sense
@@ -111,7 +112,7 @@ def _connected(endpoint: str, inbox: queue.SimpleQueue[Delivery]) -> ZenohTransp
     give_up = time.monotonic() + WAIT_S
     while True:
         try:
-            return ZenohTransport(endpoint, inbox.put, lease_s=1.0)
+            return ZenohTransport(Access(endpoint), inbox.put)
         except BadInputError:
             if time.monotonic() > give_up:
                 raise

@@ -13,12 +13,13 @@ from attrs import define, evolve, field
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.driver import Drive, Effort
+from laneweave.protocol.deployment import Network
 from laneweave.protocol.execution import PlanExecution
 from laneweave.protocol.lattice import Cell, Lattice, Move
 from laneweave.protocol.messages import Command, Motion, Name, Plan, Prepare, Sense, VehicleState
 from laneweave.protocol.motion import at_rest_in_cell, cell_state
 from laneweave.protocol.node import Arrived, Effect, Send, Started
-from laneweave.protocol.scenario import FormationSettings, Network, Road, Runtime, Scenario
+from laneweave.protocol.scenario import FormationSettings, Road, Runtime, Scenario
 from laneweave.protocol.topics import PLAN, PREPARE, SENSE, STATE
 from laneweave.protocol.transitions import RuleBook
 from laneweave.sim_bridge.attendance import Attendance

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from laneweave.protocol.access import Access
 from laneweave.protocol.topics import BRIDGE_ALIVE, Keys
 from laneweave.protocol.transport import Delivery, TokenUp
 from laneweave.protocol.zenoh_transport import ZenohTransport
@@ -173,7 +174,7 @@ def test_the_bridge_ends_while_it_waits_for_agents(lab: Lab) -> None:
     tokens: queue.SimpleQueue[Delivery] = queue.SimpleQueue()
     router = start_router(lab, config)
     bridge = lab.start("bridge", "--config", config, "--pace", "100", "--out", "out")
-    with contextlib.closing(ZenohTransport(endpoint, tokens.put, lease_s=1.0)) as transport:
+    with contextlib.closing(ZenohTransport(Access(endpoint), tokens.put)) as transport:
         transport.watch(Keys("test").all_of(BRIDGE_ALIVE))
         assert isinstance(tokens.get(timeout=END_S), TokenUp)
 

@@ -13,6 +13,7 @@ import attrs
 import msgpack
 import pytest
 
+from laneweave.protocol.access import Access
 from laneweave.protocol.codec import MAX_BYTES, VERSION, encode
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.messages import (
@@ -201,7 +202,7 @@ def talk(lab: Lab) -> Iterator[Callable[[Callable[[ZenohTransport], None]], None
     threads: list[threading.Thread] = []
 
     def start(say: Callable[[ZenohTransport], None]) -> None:
-        transport = ZenohTransport(lab.router_endpoint, lambda _: None, lease_s=1.0)
+        transport = ZenohTransport(Access(lab.router_endpoint), lambda _: None)
 
         def work() -> None:
             try:

@@ -144,7 +144,12 @@ def _allowed(attribute: attrs.Attribute[Any]) -> str:
     if attribute.validator is None:
         # Parsing any scenario resolves the annotations from text to types.
         kind = attribute.type.__name__ if attribute.type in (str, bool) else str(attribute.type)
-        kinds = {"str": "text", "tuple[float, ...]": "list of numbers", "bool": "`true`, `false`"}
+        kinds = {
+            "str": "text",
+            "tuple[float, ...]": "list of numbers",
+            "tuple[str, ...]": "list of texts",
+            "bool": "`true`, `false`",
+        }
         return kinds[kind]
     found = inspect.getclosurevars(attribute.validator).nonlocals
     if "choices" in found:
@@ -153,7 +158,7 @@ def _allowed(attribute: attrs.Attribute[Any]) -> str:
         bracket = "(" if found["open_low"] else "["
         return f"{bracket}{_number(found['low'])}, {_number(found['high'])}]"
     rules = {
-        "_key_part": NAME_RULE,
+        "key_part": NAME_RULE,
         "_conflict_kinds": "any of " + ", ".join(f"`{kind}`" for kind in CONFLICT_KINDS),
     }
     return rules[getattr(attribute.validator, "__name__", "")]

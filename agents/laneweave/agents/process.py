@@ -8,6 +8,7 @@ from itertools import product
 from laneweave.agents.core import AgentCore
 from laneweave.agents.driver import TrackingDriver
 from laneweave.agents.host import AgentHost, Shard
+from laneweave.protocol.access import Access
 from laneweave.protocol.faulty_core import Wrap, bare
 from laneweave.protocol.incarnations import Incarnations
 from laneweave.protocol.messages import Name, Sense
@@ -39,16 +40,22 @@ def warm_up(scenario: Scenario) -> None:
 
 def run_agents(
     scenario: Scenario,
+    access: Access,
     vehicles: Iterable[str],
     shard: Shard | None = None,
     wrap: Wrap = bare,
 ) -> None:
     """Run agents until their vehicles have left the road, or until SIGINT or SIGTERM.
 
-    `wrap` may put faults before them.
+    Args:
+        scenario: what all vehicles know.
+        access: how this process gets onto the network.
+        vehicles: whom it drives; empty: all of the shard, as they are announced.
+        shard: see `AgentHost`.
+        wrap: may put faults before them.
 
     Raises:
-        BadInputError: nobody answers at the scenario's endpoint.
+        BadInputError: nobody answers at the endpoint.
     """
     incarnations = Incarnations()
     host = AgentHost(
@@ -56,5 +63,4 @@ def run_agents(
         [Name(vehicle) for vehicle in vehicles],
         shard,
     )
-    network = scenario.network
-    run_core(wrap(host), network.endpoint, network.realm, network.lease_s)
+    run_core(wrap(host), access)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.planning import warm_up
+from laneweave.protocol.access import access_of
 from laneweave.protocol.faulty_core import Wrap, bare
 from laneweave.protocol.incarnations import Incarnations
 from laneweave.protocol.messages import Name
@@ -21,5 +22,4 @@ def run_coordinator(scenario: Scenario, name: str, wrap: Wrap = bare) -> None:
     """
     warm_up()
     core = CoordinatorCore(Name(name), Incarnations()(), scenario)
-    network = scenario.network
-    run_core(wrap(core), network.endpoint, network.realm, network.lease_s)
+    run_core(wrap(core), access_of(scenario, f"coordinator.{name}"))

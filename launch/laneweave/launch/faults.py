@@ -20,7 +20,8 @@ from attrs.validators import optional
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.faulty_core import SENDERS, MessageRule
-from laneweave.protocol.scenario import one_of, read_toml, within
+from laneweave.protocol.ranges import one_of, within
+from laneweave.protocol.scenario import read_toml
 from laneweave.protocol.structuring import NumberOrRange, structure
 
 LEADER, COORDINATOR, ROUTER, AGENT = "leader", "coordinator", "router", "agent"

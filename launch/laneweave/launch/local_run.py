@@ -27,6 +27,7 @@ from laneweave.launch.process_faults import ProcessFaults
 from laneweave.launch.progress import RunProgress
 from laneweave.launch.role_processes import ROUTER, Order, RoleEnd, RoleProcesses
 from laneweave.launch.roles import fork_server
+from laneweave.protocol.access import access_of
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.scenario import Scenario, to_tables
 from laneweave.protocol.topics import Keys
@@ -194,11 +195,11 @@ class LocalRun:
         return max(view.t_s, faults.board.road_s) if faults is not None else view.t_s
 
     def _connect(self, observer: Observer) -> ZenohTransport:
-        network = self.scenario.network
+        access = access_of(self.scenario, "observer.run")
         give_up = time.monotonic() + ROUTER_START_S
         while True:
             try:
-                return ZenohTransport(network.endpoint, observer.inbox.put, network.lease_s)
+                return ZenohTransport(access, observer.inbox.put)
             except BadInputError:
                 if self._stop:
                     raise KeyboardInterrupt from None

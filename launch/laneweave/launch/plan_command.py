@@ -10,6 +10,7 @@ from typing import Any
 
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan
 from laneweave.coordinator.planning.facade import Solver
+from laneweave.protocol.access import Access
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
 from laneweave.protocol.topics import SERVICE, Keys
 from laneweave.protocol.zenoh_transport import ask
@@ -93,7 +94,7 @@ def _read(path: Path) -> dict[str, Any]:
 def _ask(endpoint: str, realm: str, data: dict[str, Any], timeout_s: float) -> PlanResponse:
     key = Keys(realm).key(SERVICE)
     try:
-        payload, ok = ask(endpoint, key, json.dumps(data).encode(), timeout_s)
+        payload, ok = ask(Access(endpoint, realm), key, json.dumps(data).encode(), timeout_s)
     except TimeoutError as error:
         raise CommandFailedError(f"{endpoint}: {error}") from error
     answer = json.loads(payload)

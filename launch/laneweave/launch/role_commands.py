@@ -12,6 +12,7 @@ import typer
 from rich.console import Console
 
 from laneweave.launch.run_folder import draw_own, new_folder
+from laneweave.protocol.access import access_of
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario import Scenario, load_scenario
 
@@ -32,16 +33,16 @@ def router(config: ConfigOption = None, endpoint: RealmEndpoint = None) -> None:
     """Run the Zenoh router of a deployment."""
     from laneweave.protocol.zenoh_transport import run_router
 
-    settings = _deployment(config, endpoint)
-    run_router(settings.network.endpoint, settings.network.lease_s)
+    network = _deployment(config, endpoint).network
+    run_router(network.listen or (network.endpoint,), network.lease_s)
 
 
 def ping(config: ConfigOption = None, endpoint: RealmEndpoint = None) -> None:
     """Open a session at a router and close it: the health check of a deployment."""
     from laneweave.protocol.zenoh_transport import ZenohTransport
 
-    network = _deployment(config, endpoint).network
-    ZenohTransport(network.endpoint, lambda _: None, network.lease_s).close()
+    access = access_of(_deployment(config, endpoint), "observer.ping")
+    ZenohTransport(access, lambda _: None).close()
 
 
 def coordinator(
@@ -80,13 +81,14 @@ def agent(
     settings = _deployment(config, endpoint)
     check_moves(settings)
     if vehicles:
-        run_agents(settings, vehicles)
+        run_agents(settings, access_of(settings, f"vehicle.{vehicles[0]}"), vehicles)
         return
     index, _, count = shard.partition("/")
     digits = index.isdecimal() and count.isdecimal() and len(shard) < 20
     if not digits or int(index) >= int(count):
         raise BadInputError("--shard", shard, "I/N with 0 <= I < N")
-    run_agents(settings, (), Shard(int(index), int(count)))
+    access = access_of(settings, f"fleet.{index}")
+    run_agents(settings, access, (), Shard(int(index), int(count)))
 
 
 def bridge(

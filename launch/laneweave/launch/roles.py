@@ -27,6 +27,7 @@ from attrs import frozen
 from laneweave.launch.fault_board import BoardWord
 from laneweave.launch.logs import log_to_file
 from laneweave.launch.namespaces import join_namespace
+from laneweave.protocol.access import access_of
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.faulty_core import FaultyCore, MessageRule, Wrap, bare
 from laneweave.protocol.node import Core
@@ -194,7 +195,7 @@ def _router(_: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
     from laneweave.protocol.zenoh_transport import run_router
 
     network = parse_scenario(tables).network
-    run_router(network.endpoint, network.lease_s, more_endpoints=options.get("listen", ()))
+    run_router((network.endpoint, *options.get("listen", ())), network.lease_s)
 
 
 def _coordinator(name: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
@@ -220,7 +221,10 @@ def _agent(_: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
 
     # Everybody waits for bridge, router and coordinators: they go first.
     os.nice(AGENT_NICENESS)
-    run_agents(parse_scenario(tables), options["vehicles"], wrap=_wrap(options))
+    scenario, vehicles = parse_scenario(tables), options["vehicles"]
+    run_agents(
+        scenario, access_of(scenario, f"vehicle.{vehicles[0]}"), vehicles, wrap=_wrap(options)
+    )
 
 
 _ROLES: dict[str, Callable[[str, dict[str, Any], dict[str, Any]], None]] = {

@@ -22,7 +22,7 @@ from attrs import field, frozen
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.messages import RoadClock
 from laneweave.protocol.node import Arrived, Core, Effect, Event, Send, Wakeup
-from laneweave.protocol.scenario import one_of, within
+from laneweave.protocol.ranges import one_of, within
 from laneweave.protocol.topics import TOPICS
 
 SENDER_OF_ROLE = {"agent": "vehicle", "coordinator": "coordinator", "bridge": "bridge"}

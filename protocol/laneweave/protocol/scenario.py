@@ -8,18 +8,19 @@ fit together, and raises `BadInputError` with the field, the value and what is a
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import attrs
 from attrs import field, frozen
 
+from laneweave.protocol.deployment import Network, Observation, Security, Service
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Lattice
+from laneweave.protocol.ranges import one_of, within
 from laneweave.protocol.scenario_checks import check_scenario
 from laneweave.protocol.structuring import structure
-from laneweave.protocol.topics import NAME_PATTERN, NAME_RULE
 
 SCHEMA = "laneweave.scenario/1"
 
@@ -34,35 +35,6 @@ CONFLICT_KINDS = (
     "geometric",
     "closing",
 )
-
-Validator = Callable[[Any, "attrs.Attribute[Any]", Any], None]
-
-
-def within(low: float, high: float, *, open_low: bool = False) -> Validator:
-    """Return a validator for a finite number in [low, high], or (low, high] if `open_low`."""
-
-    def check(_: object, attribute: attrs.Attribute[Any], value: float) -> None:
-        # NaN fails both comparisons.
-        if not low <= value <= high or (open_low and value == low):
-            bracket = "(" if open_low else "["
-            raise BadInputError(attribute.name, value, f"{bracket}{low:g}, {high:g}]")
-
-    return check
-
-
-def one_of(*choices: object) -> Validator:
-    """Return a validator for a fixed set of values."""
-
-    def check(_: object, attribute: attrs.Attribute[Any], value: object) -> None:
-        if value not in choices:
-            raise BadInputError(attribute.name, value, ", ".join(map(str, choices)))
-
-    return check
-
-
-def _key_part(_: object, attribute: attrs.Attribute[Any], value: str) -> None:
-    if not NAME_PATTERN.fullmatch(value):
-        raise BadInputError(attribute.name, value, NAME_RULE)
 
 
 def _conflict_kinds(_: object, attribute: attrs.Attribute[Any], value: Sequence[str]) -> None:
@@ -280,24 +252,6 @@ class Lc2013Settings:
 
 
 @frozen
-class Network:
-    """How roles find each other and when they give each other up; wall-clock seconds."""
-
-    realm: str = field(default="default", validator=_key_part)
-    """First part of every key: deployments with different realms do not see each other."""
-    endpoint: str = ""
-    """Zenoh endpoint of the router; empty: a socket in a temporary folder (`laneweave run`)."""
-    lease_s: float = field(default=1.0, validator=within(0.1, 60.0))
-    """A silent session is given up after this time (Zenoh's transport lease)."""
-    heartbeat_s: float = field(default=0.1, validator=within(0.01, 10.0))
-    election_s: float = field(default=0.7, validator=within(0.05, 60.0))
-    """A candidate leads when it has been the best-ranked one for this long. A process that dies is
-    noticed at once by its liveliness token; this is for one that hangs."""
-    resend_s: float = field(default=0.2, validator=within(0.01, 10.0))
-    """PREPARE and PLAN are sent again after this time without an answer."""
-
-
-@frozen
 class Runtime:
     """How a run is executed."""
 
@@ -339,6 +293,9 @@ class Scenario:
     lc2013: Lc2013Settings = Lc2013Settings()
     network: Network = Network()
     runtime: Runtime = Runtime()
+    security: Security = Security()
+    service: Service = Service()
+    observation: Observation = Observation()
 
     @property
     def lattice(self) -> Lattice:

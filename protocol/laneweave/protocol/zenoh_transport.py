@@ -20,6 +20,7 @@ from typing import Any
 import structlog
 import zenoh
 
+from laneweave.protocol.access import Access
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.messages import Name
 from laneweave.protocol.node import (
@@ -106,19 +107,18 @@ def check_endpoint(endpoint: str) -> str:
 class ZenohTransport:
     """One client session."""
 
-    def __init__(self, endpoint: str, deliver: Deliver, lease_s: float) -> None:
+    def __init__(self, access: Access, deliver: Deliver) -> None:
         """Connect to a router.
 
         Args:
-            endpoint: Zenoh endpoint of the router.
+            access: where the router is, and as whom to get there.
             deliver: called from Zenoh's threads with each delivery; must return at once.
-            lease_s: after this time of silence the others give this session up.
 
         Raises:
             BadInputError: the endpoint is malformed or nobody answers there.
         """
-        check_endpoint(endpoint)
-        config = _config("client", lease_s)
+        endpoint = check_endpoint(access.endpoint)
+        config = _config("client", access.lease_s)
         config.insert_json5(
             "connect/retry",
             json.dumps({"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 1.5}),
@@ -229,7 +229,7 @@ class ZenohTransport:
         self._deliver(Question(str(query.key_expr), payload, token))
 
 
-def run_core(core: Core, endpoint: str, realm: str, lease_s: float) -> None:
+def run_core(core: Core, access: Access) -> None:
     """Drive a core over Zenoh until it ends or the process gets SIGINT or SIGTERM.
 
     To be called from the main thread. Computations run in threads of their own.
@@ -237,10 +237,10 @@ def run_core(core: Core, endpoint: str, realm: str, lease_s: float) -> None:
     Raises:
         BadInputError: the realm is malformed or nobody answers at the endpoint.
     """
-    keys = Keys(realm)
+    keys = Keys(access.realm)
     # Enqueuing from callbacks and signal handlers alike: SimpleQueue.put is reentrant.
     inbox: queue.SimpleQueue[Delivery | Computed | Stopping] = queue.SimpleQueue()
-    transport = ZenohTransport(endpoint, inbox.put, lease_s)
+    transport = ZenohTransport(access, inbox.put)
     node = Node(
         core,
         transport,
@@ -323,23 +323,21 @@ def _stop_signals(stop: Callable[[], None]) -> Iterator[None]:
 
 
 def run_router(
-    endpoint: str,
+    listen: Sequence[str],
     lease_s: float,
     ready: Callable[[], None] | None = None,
-    more_endpoints: Sequence[str] = (),
 ) -> None:
     """Run a Zenoh router until SIGINT or SIGTERM.
 
     Args:
-        endpoint: where it listens. The socket file that a killed router left there is replaced.
+        listen: endpoints where it listens. A socket file that a killed router left is replaced.
         lease_s: after this time of silence the others give the router up.
         ready: called when it listens.
-        more_endpoints: where else it listens.
 
     Raises:
         BadInputError: it cannot listen at an endpoint.
     """
-    endpoints = [check_endpoint(each) for each in (endpoint, *more_endpoints)]
+    endpoints = [check_endpoint(endpoint) for endpoint in listen]
     config = _config("router", lease_s)
     stop: queue.SimpleQueue[bool] = queue.SimpleQueue()
     with _stop_signals(lambda: stop.put(True)):
@@ -348,7 +346,7 @@ def run_router(
             session = zenoh.open(config)
         except zenoh.ZError as error:
             raise BadInputError(
-                "network.endpoint", endpoint, "an endpoint that is free to listen at"
+                "network.listen", ", ".join(endpoints), "endpoints that are free to listen at"
             ) from error
         try:
             if ready is not None:
@@ -362,7 +360,7 @@ def run_router(
             session.close()  # type: ignore[no-untyped-call]
 
 
-def ask(endpoint: str, key: str, payload: bytes, timeout_s: float) -> tuple[bytes, bool]:
+def ask(access: Access, key: str, payload: bytes, timeout_s: float) -> tuple[bytes, bool]:
     """Ask a service and wait for the first answer, whoever serves it.
 
     Returns:
@@ -372,7 +370,7 @@ def ask(endpoint: str, key: str, payload: bytes, timeout_s: float) -> tuple[byte
         BadInputError: nobody answers at the endpoint, or no service is there.
         TimeoutError: there is a service but it did not answer in time.
     """
-    transport = ZenohTransport(endpoint, lambda _: None, lease_s=1.0)
+    transport = ZenohTransport(access, lambda _: None)
     try:
         return transport_ask(transport, key, payload, timeout_s)
     finally:

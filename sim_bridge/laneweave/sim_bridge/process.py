@@ -6,6 +6,7 @@ import tempfile
 import time
 from pathlib import Path
 
+from laneweave.protocol.access import access_of
 from laneweave.protocol.faulty_core import Wrap, bare
 from laneweave.protocol.incarnations import Incarnations
 from laneweave.protocol.scenario import Scenario
@@ -36,7 +37,6 @@ def run_bridge(
         SumoUnavailableError: libsumo cannot be loaded.
     """
     record = RunRecord(folder, scenario, method, time.perf_counter)
-    network = scenario.network
     with (
         tempfile.TemporaryDirectory(prefix="laneweave-sumo-") as sumo_folder,
         SumoWorld(scenario, Path(sumo_folder)) as world,
@@ -51,7 +51,7 @@ def run_bridge(
             incarnation=incarnations(),
         )
         try:
-            run_core(wrap(core), network.endpoint, network.realm, network.lease_s)
+            run_core(wrap(core), access_of(scenario, "bridge"))
         finally:
             # After an error, too: what was recorded is kept.
             record.close(core.t_s, Ending.INTERRUPTED)

@@ -13,6 +13,7 @@ from typing import Protocol
 import pytest
 from attrs import define, field
 
+from laneweave.protocol.access import Access
 from laneweave.protocol.codec import encode
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.messages import Heartbeat, Name
@@ -217,12 +218,13 @@ class SimulatedBed:
 ROUTER = """
 import sys
 from laneweave.protocol.zenoh_transport import run_router
-run_router(sys.argv[1], float(sys.argv[2]), ready=lambda: print("ready", flush=True))
+run_router([sys.argv[1]], float(sys.argv[2]), ready=lambda: print("ready", flush=True))
 """
 MEMBER = """
 import sys, time
 from laneweave.protocol.zenoh_transport import ZenohTransport
-transport = ZenohTransport(sys.argv[1], lambda delivery: None, float(sys.argv[2]))
+from laneweave.protocol.access import Access
+transport = ZenohTransport(Access(sys.argv[1], lease_s=float(sys.argv[2])), lambda delivery: None)
 transport.announce(sys.argv[3])
 print("ready", flush=True)
 time.sleep(60)
@@ -286,7 +288,7 @@ class ZenohBed:
 
     def _join(self) -> Party:
         got: list[Delivery] = []
-        transport = ZenohTransport(self.router.endpoint, got.append, LEASE_S)
+        transport = ZenohTransport(Access(self.router.endpoint, lease_s=LEASE_S), got.append)
         self._opened.append(transport)
         return Party(transport, got)
 
@@ -710,13 +712,13 @@ def test_without_the_link_everybody_vanishes_and_comes_back(breakable_bed: Bed) 
 )
 def test_a_malformed_endpoint_is_refused(endpoint: str) -> None:
     with pytest.raises(BadInputError) as caught:
-        ZenohTransport(endpoint, lambda _: None, LEASE_S)
+        ZenohTransport(Access(endpoint, lease_s=LEASE_S), lambda _: None)
     assert caught.value.field == "network.endpoint"
 
 
 def test_an_endpoint_without_a_router_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInputError) as caught:
-        ask(f"unixsock-stream/{tmp_path}/none", PLAN_SERVICE, b"", 1.0)
+        ask(Access(f"unixsock-stream/{tmp_path}/none"), PLAN_SERVICE, b"", 1.0)
     assert caught.value.field == "network.endpoint"
 
 
@@ -726,7 +728,7 @@ def test_a_service_that_does_not_answer_is_a_timeout(router: Router) -> None:
     server.transport.serve(PLAN_SERVICE)
     settle(bed, server)
     with pytest.raises(TimeoutError, match=r"0\.2 s"):
-        ask(router.endpoint, PLAN_SERVICE, b"", 0.2)
+        ask(Access(router.endpoint), PLAN_SERVICE, b"", 0.2)
     bed.close()
 
 
@@ -769,12 +771,12 @@ def test_a_core_runs_over_zenoh_until_it_ends(router: Router) -> None:
 
     def ask_at_last() -> None:
         watcher.until(lambda: any(isinstance(event, Computed) for event in core.events))
-        answers.append(ask(router.endpoint, PLAN_SERVICE, b"?", WAIT_S))
+        answers.append(ask(Access(router.endpoint), PLAN_SERVICE, b"?", WAIT_S))
 
     thread = threading.Thread(target=ask_at_last, daemon=True)
     thread.start()
     a_core: Core = core
-    run_core(a_core, router.endpoint, REALM, LEASE_S)
+    run_core(a_core, Access(router.endpoint, REALM, LEASE_S))
     thread.join(WAIT_S)
     watcher.until(lambda: client.tokens() == ["+errand", "-errand"])
     watcher.close()

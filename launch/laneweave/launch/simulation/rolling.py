@@ -15,8 +15,9 @@ from attrs import frozen
 from laneweave.launch.simulation.faults import LEASE_S
 from laneweave.launch.simulation.profiles import Profile
 from laneweave.launch.simulation.road import Grant, Visit
+from laneweave.protocol.deployment import Network
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario import FormationSettings, Network, Road, Runtime, Scenario
+from laneweave.protocol.scenario import FormationSettings, Road, Runtime, Scenario
 
 SLOTS_S = (1.0, 1.0, 1.0, 2.0)
 """Lengths of a slot to choose from. In the shortest, ballots are often given up in the middle."""

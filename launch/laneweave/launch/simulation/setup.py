@@ -11,9 +11,10 @@ from laneweave.launch.simulation.faults import CLOCK_DRIFT, CLOCK_OFFSET_S, LEAS
 from laneweave.launch.simulation.profiles import Profile
 from laneweave.launch.simulation.road import Grant, Visit
 from laneweave.launch.simulation.rolling import Stretch, grants, make_rolling_scenario
+from laneweave.protocol.deployment import Network
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import Name
-from laneweave.protocol.scenario import FormationSettings, Network, Road, Runtime, Scenario
+from laneweave.protocol.scenario import FormationSettings, Road, Runtime, Scenario
 
 SLOT_S, MOVE_S, TICK_S = 1.0, 0.8, 0.1
 LAST_BLOCKS = (-1, -1, 0, 1)

@@ -72,6 +72,9 @@ METHODS: Final[dict[str, LabelledMethod]] = {
 _EVERYBODY = ("schema", "seed", "road", "demand", "vehicle", "runtime", "formation.speed_mps")
 """Tables and fields of a scenario that any method may read."""
 
+_NOBODY = ("security", "service", "observation")
+"""Tables that change no run."""
+
 
 def has_a_say(field_name: str, method: str) -> bool:
     """Tell whether a field of a scenario can change what a method's runs bring.
@@ -81,6 +84,8 @@ def has_a_say(field_name: str, method: str) -> bool:
         method: as `laneweave run --method` names it.
     """
     table = field_name.partition(".")[0]
+    if table in _NOBODY:
+        return False
     if method == METHOD:
         return table not in (RULE, LC2013)
     return table == method or table in _EVERYBODY or field_name in _EVERYBODY

@@ -1,0 +1,67 @@
+"""The tables of a configuration that tell how roles are deployed: network, security, service.
+
+They are part of the one TOML file that every role reads (`scenario.py`); a file that holds only
+these is what docs/DEPLOYMENT.md calls a DEPLOYMENT.toml.
+"""
+
+from __future__ import annotations
+
+from attrs import field, frozen
+
+from laneweave.protocol.ranges import key_part, one_of, within
+
+
+@frozen
+class Network:
+    """How roles find each other and when they give each other up; wall-clock seconds."""
+
+    realm: str = field(default="default", validator=key_part)
+    """First part of every key: deployments with different realms do not see each other."""
+    endpoint: str = ""
+    """Zenoh endpoint of the router; empty: a socket in a temporary folder (`laneweave run`)."""
+    listen: tuple[str, ...] = ()
+    """Where the router listens; empty: at `endpoint`."""
+    lease_s: float = field(default=1.0, validator=within(0.1, 60.0))
+    """A silent session is given up after this time (Zenoh's transport lease)."""
+    heartbeat_s: float = field(default=0.1, validator=within(0.01, 10.0))
+    election_s: float = field(default=0.7, validator=within(0.05, 60.0))
+    """A candidate leads when it has been the best-ranked one for this long. A process that dies is
+    noticed at once by its liveliness token; this is for one that hangs."""
+    resend_s: float = field(default=0.2, validator=within(0.01, 10.0))
+    """PREPARE and PLAN are sent again after this time without an answer."""
+
+
+@frozen
+class Security:
+    """Who may do what on the network; off on one host, one switch for deployments."""
+
+    mode: str = field(default="off", validator=one_of("off", "mtls"))
+    """`mtls`: every process shows a certificate, and the router lets it do what its name allows."""
+    folder: str = "certs"
+    """Where the certificates are, as `laneweave certs init` makes them; relative to the file."""
+
+
+@frozen
+class Service:
+    """The planning service of every coordinator."""
+
+    workers: int = field(default=0, validator=within(0, 256))
+    """Processes that plan; 0: one less than there are cores, at least one."""
+    queue_limit: int = field(default=256, validator=within(1, 100_000))
+    """Requests in hand, those that are being planned among them; more are refused."""
+    max_request_bytes: int = field(default=262_144, validator=within(1024, 1 << 20))
+    """A longer request is refused."""
+    max_deadline_s: float = field(default=60.0, validator=within(0.001, 3600.0))
+    """A longer deadline is refused: nobody may have a worker for ever."""
+    cache_entries: int = field(default=1024, validator=within(0, 1_000_000))
+    """Answers that are kept for requests that are asked again by their id."""
+    cache_s: float = field(default=60.0, validator=within(0.0, 86_400.0))
+    """For how long."""
+
+
+@frozen
+class Observation:
+    """How a deployment is looked at."""
+
+    metrics: str = ""
+    """HOST:PORT at which a role shows its metrics in the Prometheus text format; empty: not."""
