@@ -119,7 +119,10 @@ class Outbox:
 
     withdraw = watch = serve = announce
 
-    def answer(self, token: int, payload: bytes, *, ok: bool) -> None:
+    def answer(self, token: int, payload: bytes, *, ok: bool, encoding: str = "") -> None:
+        """Do nothing."""
+
+    def decline(self, token: int) -> None:
         """Do nothing."""
 
     def close(self) -> None:

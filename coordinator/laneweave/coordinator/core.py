@@ -86,6 +86,7 @@ class CoordinatorCore:
         scenario: Scenario,
         rules: RuleBook = LEADER_RULES,
         make_planner: Callable[[Scenario], Planner] = stream_planner,
+        workers: int = 1,
     ) -> None:
         """Make a candidate that has seen nothing yet.
 
@@ -95,6 +96,7 @@ class CoordinatorCore:
             scenario: road, formations, timing.
             rules: of a leader; others than `LEADER_RULES` only in tests.
             make_planner: makes what plans the stream in the rolling operation.
+            workers: how many requests of others are planned at a time.
         """
         self.name = name
         self.scenario = scenario
@@ -119,7 +121,7 @@ class CoordinatorCore:
         self._incarnation = incarnation
         self._seq = 0
         self._rng = random.Random(f"{scenario.seed}/{name}/{incarnation}")  # noqa: S311
-        self._service = PlanningService()
+        self.service = PlanningService(name, scenario.service, workers)
         self._next_job = 0
         self._bridge = -1
         """Incarnation of the newest bridge."""
@@ -155,6 +157,7 @@ class CoordinatorCore:
             effects += self._on_election(now_s)
             effects += self._lead(now_s)
             effects += self._heartbeat(now_s)
+            effects += self.service.drop_late(now_s)
             self._plan_wakeup(now_s)
         return effects
 
@@ -176,8 +179,9 @@ class CoordinatorCore:
                 self._meet_bridge(incarnation_of(parameters))
             case LinkUp() | LinkDown():
                 self.election.on_link(up=isinstance(event, LinkUp), now_s=now_s)
-            case Asked(token, payload):
-                yield from self._service.take(token, payload, self._job())
+            case Asked(token, payload, encoding):
+                others = self.election.living(now_s)
+                yield from self.service.take(token, payload, encoding, self._job(), others, now_s)
             case Computed():
                 yield from self._on_computed(event, now_s)
             case Stopping():
@@ -268,8 +272,8 @@ class CoordinatorCore:
             yield self._log("plan-in-force", formation=group[0], closed_s=closed_s)
 
     def _on_computed(self, computed: Computed, now_s: float) -> Iterator[Effect]:
-        if self._service.owns(computed.job):
-            yield from self._service.finish(computed.job, computed.result, computed.error)
+        if self.service.owns(computed.job):
+            yield from self.service.finish(computed.job, computed.result, computed.error, now_s)
         elif self._stream is not None:
             yield from self._carry_out(self._stream.finish(computed, self.t_s, now_s))
         else:
@@ -408,6 +412,8 @@ class CoordinatorCore:
 
     def _plan_wakeup(self, now_s: float) -> None:
         times = [self._heartbeat_s, self._report_s, self.election.next_change_s(now_s)]
+        if self.service.wakeup_s is not None:
+            times.append(self.service.wakeup_s)
         if not self.election.leading:
             times.append(self.election.started_s + self.election.election_s)
         elif self._stream is not None:

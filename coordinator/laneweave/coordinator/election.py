@@ -8,6 +8,7 @@ at once are harmless, because vehicles promise one ballot at a time.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 from attrs import define, field
 
@@ -121,6 +122,12 @@ class Election:
     def raise_term(self, above: int) -> None:
         """Take a term above one that was seen on a vehicle (L3)."""
         self.term = max(self.term, above + 1)
+
+    def living(self, now_s: float) -> Iterator[str]:
+        """Yield the other candidates that were heard of late."""
+        for name, peer in self._peers.items():
+            if now_s < peer.heard_s + self.election_s:
+                yield name
 
     def _patience_s(self, peer: _Peer) -> float:
         """Return until when a leader waits for a better-ranked newcomer to say that it leads.

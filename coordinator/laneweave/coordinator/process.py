@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.planning import warm_up
 from laneweave.protocol.access import access_of
@@ -9,17 +12,30 @@ from laneweave.protocol.faulty_core import Wrap, bare
 from laneweave.protocol.incarnations import Incarnations
 from laneweave.protocol.messages import Name
 from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.worker_pool import WorkerPool
 from laneweave.protocol.zenoh_transport import run_core
 
 
-def run_coordinator(scenario: Scenario, name: str, wrap: Wrap = bare) -> None:
-    """Run a coordinator candidate until SIGINT or SIGTERM; `wrap` may put faults before it.
+def run_coordinator(
+    scenario: Scenario, name: str, wrap: Wrap = bare, *, workers_at_once: bool = False
+) -> None:
+    """Run a coordinator candidate until SIGINT or SIGTERM.
 
     It stands for election when it is able to plan at once, so the planner is loaded before.
+
+    Args:
+        scenario: the road, and the deployment.
+        name: by which candidates are ranked.
+        wrap: may put faults before the core.
+        workers_at_once: start the processes that plan for others now, not when somebody asks.
 
     Raises:
         BadInputError: nobody answers at the scenario's endpoint.
     """
     warm_up()
-    core = CoordinatorCore(Name(name), Incarnations()(), scenario)
-    run_core(wrap(core), access_of(scenario, f"coordinator.{name}"))
+    workers = scenario.service.workers or max(1, len(os.sched_getaffinity(0)) - 1)
+    core = CoordinatorCore(Name(name), Incarnations()(), scenario, workers=workers)
+    with contextlib.closing(WorkerPool(workers, warm_up)) as pool:
+        if workers_at_once:
+            pool.start()
+        run_core(wrap(core), access_of(scenario, f"coordinator.{name}"), pool)

@@ -1,78 +1,276 @@
-"""The planning service: answers plan requests of anyone on the network."""
+"""The planning service: answers plan requests of anyone on the network.
+
+Every coordinator of a network gets every request and takes those that fall to it (`sharing`): so
+any number of them share the load, without a word between them. A request waits until a worker is
+free, at most until its deadline, and is planned in the time that is left then. Asked again by its
+id, it is answered as before, or with the plan that is under way.
+"""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator
 from functools import partial
-from typing import Any
 
-import msgpack
-from attrs import define, field
+import attrs
+from attrs import define, field, frozen
 
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan
-from laneweave.protocol.codec import MAX_BYTES
+from laneweave.coordinator.service_format import (
+    FAILED,
+    INVALID,
+    LATE,
+    OVERLOADED,
+    Format,
+    Refusal,
+    format_of,
+)
+from laneweave.coordinator.sharing import falls_to
+from laneweave.protocol.deployment import Service
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.node import Compute, Effect, Reply
+from laneweave.protocol.node import Decline, Delegate, Effect
 
-MAX_WAITING = 64
-"""Requests in hand beyond which new ones are refused."""
+HANDED_OUT_AHEAD = 1
+"""Jobs for each worker beside the one that it does, so that it need not wait for the next."""
+
+
+@frozen
+class ServiceNumbers:
+    """What the service has done so far, and has in hand."""
+
+    taken_total: int = 0
+    """Requests that fell to this coordinator."""
+    left_total: int = 0
+    """Requests that were left to other coordinators."""
+    answered_total: int = 0
+    """Requests that were planned and answered."""
+    repeated_total: int = 0
+    """Requests that were answered with another one's answer, by their id."""
+    invalid_total: int = 0
+    """Refused: not valid."""
+    overloaded_total: int = 0
+    """Refused: too many in hand."""
+    late_total: int = 0
+    """Dropped: the deadline passed before a worker was free."""
+    failed_total: int = 0
+    """Planning failed."""
+    planning_seconds_total: float = 0.0
+    """Solvers' time."""
+    service_seconds_total: float = 0.0
+    """From a request's arrival to its answer, without the solver's time."""
+    waiting: int = 0
+    """Requests that wait for a worker."""
+    planning: int = 0
+    """Requests that workers have."""
 
 
 @define
-class PlanningService:
-    """Requests in hand; a request and its answer use the same encoding, JSON or MessagePack."""
+class _Entry:
+    """A request in hand, or one that was answered."""
 
-    _waiting: dict[int, tuple[int, bool]] = field(factory=dict)
+    request: PlanRequest
+    came_s: float
+    job: int
+    askers: list[tuple[int, Format]] = field(factory=list)
+    """Who waits for the answer, and in which format."""
+    answer: PlanResponse | Refusal | None = None
+    answered_s: float = 0.0
+
+    @property
+    def deadline_s(self) -> float:
+        return self.came_s + self.request.deadline_s
+
+
+class PlanningService:
+    """Pure core of the service; its coordinator hands it questions, results and the time."""
+
+    def __init__(self, name: str, settings: Service, workers: int) -> None:
+        """Make a service that has nothing in hand.
+
+        Args:
+            name: of the coordinator, among those who share the load.
+            settings: limits.
+            workers: how many requests are planned at a time.
+        """
+        self._name = name
+        self._settings = settings
+        self._most_planning = workers * (1 + HANDED_OUT_AHEAD)
+        self._waiting: deque[_Entry] = deque()
+        self._planning: dict[int, _Entry] = {}
+        self._in_hand: dict[str, _Entry] = {}
+        """Requests that wait or are planned, by id; those without one are not here."""
+        self._answers: dict[str, _Entry] = {}
+        """Requests that were answered, by id, in order of their time."""
+        self._numbers = ServiceNumbers()
+
+    @property
+    def numbers(self) -> ServiceNumbers:
+        """What has been done so far."""
+        return attrs.evolve(self._numbers, waiting=len(self._waiting), planning=len(self._planning))
+
+    @property
+    def wakeup_s(self) -> float | None:
+        """When the deadline of a request that waits passes."""
+        return min((entry.deadline_s for entry in self._waiting), default=None)
+
+    # --- questions ----------------------------------------------------------------------------
+
+    def take(
+        self,
+        token: int,
+        payload: bytes,
+        encoding: str,
+        job: int,
+        others: Iterable[str],
+        now_s: float,
+    ) -> Iterator[Effect]:
+        """Take a request, leave it to another coordinator, or refuse it.
+
+        Args:
+            token: of the question.
+            payload: the request, in whatever form it came.
+            encoding: what the asker says of it.
+            job: number of the computation that this may become.
+            others: names of the other coordinators that live.
+            now_s: node clock.
+        """
+        if not falls_to(self._name, others, payload):
+            self._count("left_total")
+            yield Decline(token)
+            return
+        self._count("taken_total")
+        form = format_of(payload, encoding)
+        try:
+            request = self._read(form, payload)
+            known = self._known(request, now_s)
+        except BadInputError as error:
+            self._count("invalid_total")
+            yield form.refuse(token, Refusal(INVALID, str(error), error.field))
+            return
+        if known is not None:
+            self._count("repeated_total")
+            yield from self._ask_again(known, token, form)
+            return
+        if len(self._waiting) + len(self._planning) >= self._settings.queue_limit:
+            self._count("overloaded_total")
+            yield form.refuse(token, self._overloaded())
+            return
+        entry = _Entry(request, now_s, job, [(token, form)])
+        if request.id:
+            self._in_hand[request.id] = entry
+        self._waiting.append(entry)
+        yield from self._hand_out(now_s)
+
+    def _read(self, form: Format, payload: bytes) -> PlanRequest:
+        most = self._settings.max_request_bytes
+        if len(payload) > most:
+            raise BadInputError("request", f"{len(payload)} bytes or more", f"at most {most} bytes")
+        request = PlanRequest.from_dict(form.read(payload))
+        if request.deadline_s > self._settings.max_deadline_s:
+            allowed = f"at most {self._settings.max_deadline_s:g} at this service"
+            raise BadInputError("deadline_s", request.deadline_s, allowed)
+        return request
+
+    def _known(self, request: PlanRequest, now_s: float) -> _Entry | None:
+        """Return what is known of a request that was asked before."""
+        self._forget_old(now_s)
+        known = self._in_hand.get(request.id) or self._answers.get(request.id)
+        if known is not None and known.request != request:
+            raise BadInputError("id", request.id, "an id that no other request has had of late")
+        return known
+
+    @staticmethod
+    def _ask_again(known: _Entry, token: int, form: Format) -> Iterator[Effect]:
+        if known.answer is None:
+            known.askers.append((token, form))
+        else:
+            yield form.reply(token, known.answer)
+
+    def _overloaded(self) -> Refusal:
+        limit = self._settings.queue_limit
+        text = (
+            f"service.queue_limit: got {limit} requests in hand; allowed: {limit}; ask again later"
+        )
+        return Refusal(OVERLOADED, text, "")
+
+    # --- planning -----------------------------------------------------------------------------
 
     def owns(self, job: int) -> bool:
         """Tell whether a computation belongs to a request."""
-        return job in self._waiting
+        return job in self._planning
 
-    def take(self, token: int, payload: bytes, job: int) -> Iterator[Effect]:
-        """Check a request and order its computation, or refuse it."""
-        is_json = payload.lstrip()[:1] == b"{"
-        try:
-            self._check_load()
-            request = PlanRequest.from_dict(_unpack(payload, is_json=is_json))
-        except BadInputError as error:
-            yield Reply(token, _error(error.field, str(error), is_json=is_json), ok=False)
-            return
-        self._waiting[job] = (token, is_json)
-        yield Compute(job, partial(checked_plan, request), background=True)
+    def _hand_out(self, now_s: float) -> Iterator[Effect]:
+        """Give workers what waits, in the order of its coming."""
+        while self._waiting and len(self._planning) < self._most_planning:
+            entry = self._waiting.popleft()
+            if entry.deadline_s <= now_s:
+                yield from self._end(entry, self._late(entry, now_s), now_s)
+                continue
+            self._planning[entry.job] = entry
+            yield Delegate(entry.job, partial(plan_in_time, entry.request), entry.deadline_s)
 
-    def _check_load(self) -> None:
-        if len(self._waiting) >= MAX_WAITING:
-            raise BadInputError("service", f"{MAX_WAITING} requests in hand", "a retry later")
-
-    def finish(self, job: int, result: object, error: str) -> Iterator[Effect]:
+    def finish(self, job: int, result: object, error: str, now_s: float) -> Iterator[Effect]:
         """Answer a request whose computation has ended."""
-        token, is_json = self._waiting.pop(job)
+        entry = self._planning.pop(job)
+        answer: PlanResponse | Refusal
         if isinstance(result, PlanResponse):
-            yield Reply(token, _pack(result.to_dict(), is_json=is_json))
+            answer = result
+        elif now_s >= entry.deadline_s:
+            answer = self._late(entry, now_s)
         else:
-            yield Reply(token, _error("", error, is_json=is_json), ok=False)
+            self._count("failed_total")
+            answer = Refusal(FAILED, f"planning failed: {error}", "")
+        yield from self._end(entry, answer, now_s)
+        yield from self._hand_out(now_s)
+
+    def drop_late(self, now_s: float) -> Iterator[Effect]:
+        """Drop what has waited until its deadline."""
+        late = [entry for entry in self._waiting if entry.deadline_s <= now_s]
+        for entry in late:
+            self._waiting.remove(entry)
+            yield from self._end(entry, self._late(entry, now_s), now_s)
+
+    def _late(self, entry: _Entry, now_s: float) -> Refusal:
+        self._count("late_total")
+        waited_s, deadline_s = now_s - entry.came_s, entry.request.deadline_s
+        text = (
+            f"deadline_s: got {deadline_s:g}; allowed: longer than the {waited_s:.3f} s that "
+            "requests wait for a worker at present"
+        )
+        return Refusal(LATE, text, "deadline_s")
+
+    def _end(self, entry: _Entry, answer: PlanResponse | Refusal, now_s: float) -> Iterator[Effect]:
+        """Answer all who have asked for it, and keep what is worth keeping."""
+        if isinstance(answer, PlanResponse):
+            self._count("answered_total")
+            planned_s = answer.solve_ms / 1e3
+            self._count("planning_seconds_total", planned_s)
+            self._count("service_seconds_total", max(0.0, now_s - entry.came_s - planned_s))
+        for token, form in entry.askers:
+            yield form.reply(token, answer)
+        if self._in_hand.pop(entry.request.id, None) is not None and isinstance(
+            answer, PlanResponse
+        ):
+            entry.answer, entry.answered_s = answer, now_s
+            entry.askers.clear()
+            self._answers[entry.request.id] = entry
+            self._forget_old(now_s)
+
+    def _forget_old(self, now_s: float) -> None:
+        """Let answers go that are too many, or too old."""
+        answers, settings = self._answers, self._settings
+        while answers:
+            oldest = next(iter(answers))
+            old = answers[oldest].answered_s <= now_s - settings.cache_s
+            if len(answers) <= settings.cache_entries and not old:
+                return
+            del answers[oldest]
+
+    def _count(self, name: str, by: float = 1) -> None:
+        counted = getattr(self._numbers, name) + by
+        self._numbers = attrs.evolve(self._numbers, **{name: counted})
 
 
-def _unpack(payload: bytes, *, is_json: bool) -> dict[str, Any]:
-    if len(payload) > MAX_BYTES:
-        raise BadInputError("request", f"{len(payload)} bytes", f"at most {MAX_BYTES} bytes")
-    try:
-        data = json.loads(payload) if is_json else msgpack.unpackb(payload)
-    except Exception as error:
-        raise BadInputError("request", payload[:16], "a map in JSON or MessagePack") from error
-    if not isinstance(data, dict):
-        raise BadInputError("request", type(data).__name__, "a map in JSON or MessagePack")
-    return data
-
-
-def _pack(data: dict[str, Any], *, is_json: bool) -> bytes:
-    if is_json:
-        return json.dumps(data).encode()
-    packed = msgpack.packb(data)
-    assert isinstance(packed, bytes)  # noqa: S101 (narrows msgpack's untyped result)
-    return packed
-
-
-def _error(name: str, message: str, *, is_json: bool) -> bytes:
-    return _pack({"field": name, "message": message}, is_json=is_json)
+def plan_in_time(request: PlanRequest, left_s: float) -> PlanResponse:
+    """Plan a request in the time that is left of its deadline; see `checked_plan`."""
+    return checked_plan(attrs.evolve(request, deadline_s=min(left_s, request.deadline_s)))

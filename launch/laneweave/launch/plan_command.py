@@ -8,12 +8,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from laneweave.coordinator.client import (
+    PlanClient,
+    PlanError,
+    RequestRefusedError,
+    ServiceUnavailableError,
+)
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan
 from laneweave.coordinator.planning.facade import Solver
 from laneweave.protocol.access import Access
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
-from laneweave.protocol.topics import SERVICE, Keys
-from laneweave.protocol.zenoh_transport import ask
 
 ANSWER_MARGIN_S = 5.0
 """A coordinator gets this much longer than the request's deadline."""
@@ -46,7 +50,7 @@ def answer_request(
     if endpoint is None:
         response = checked_plan(request, solver=solver)
     else:
-        response = _ask(endpoint, realm, data, request.deadline_s + ANSWER_MARGIN_S)
+        response = _ask(Access(endpoint, realm), request)
     if as_table:
         sys.stdout.write(_table(request, response))
     else:
@@ -91,15 +95,13 @@ def _read(path: Path) -> dict[str, Any]:
     return data
 
 
-def _ask(endpoint: str, realm: str, data: dict[str, Any], timeout_s: float) -> PlanResponse:
-    key = Keys(realm).key(SERVICE)
+def _ask(access: Access, request: PlanRequest) -> PlanResponse:
     try:
-        payload, ok = ask(Access(endpoint, realm), key, json.dumps(data).encode(), timeout_s)
-    except TimeoutError as error:
-        raise CommandFailedError(f"{endpoint}: {error}") from error
-    answer = json.loads(payload)
-    if ok:
-        return PlanResponse.from_dict(answer)
-    if answer["field"]:
-        raise RefusedError(answer["message"])
-    raise CommandFailedError(f"{endpoint}: {answer['message']}")
+        with PlanClient(access) as client:
+            return client.plan(request, request.deadline_s + ANSWER_MARGIN_S)
+    except RequestRefusedError as error:
+        raise RefusedError(str(error)) from error
+    except ServiceUnavailableError as error:
+        raise BadInputError("--connect", access.endpoint, "a network with a coordinator") from error
+    except (PlanError, TimeoutError) as error:
+        raise CommandFailedError(f"{access.endpoint}: {error}") from error

@@ -56,7 +56,7 @@ def coordinator(
 
     if not NAME_PATTERN.fullmatch(name):
         raise BadInputError("--name", name, NAME_RULE)
-    run_coordinator(_deployment(config, endpoint), name)
+    run_coordinator(_deployment(config, endpoint), name, workers_at_once=True)
 
 
 def agent(

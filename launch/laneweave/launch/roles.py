@@ -31,6 +31,7 @@ from laneweave.protocol.access import access_of
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.faulty_core import FaultyCore, MessageRule, Wrap, bare
 from laneweave.protocol.node import Core
+from laneweave.protocol.processes import die_with_parent
 from laneweave.protocol.scenario import parse_scenario
 
 log = structlog.get_logger(__name__)
@@ -43,7 +44,6 @@ CONNECT_AGAIN_S = 0.1
 """Where there are faults, a role that cannot connect tries again after this time."""
 ORPHAN_S = 5.0
 """How long a process whose supervisor died gets to end in good order."""
-_PR_SET_PDEATHSIG = 1
 _PR_SET_NAME = 15
 
 
@@ -145,14 +145,6 @@ def _run_once(role: str, name: str, tables: dict[str, Any], options: dict[str, A
             raise
         return False
     return True
-
-
-def die_with_parent() -> None:
-    """Have the kernel end this process when its parent dies, however that dies."""
-    parent = os.getppid()
-    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
-    if os.getppid() != parent:
-        sys.exit(1)
 
 
 def die_with_supervisor() -> None:

@@ -84,6 +84,8 @@ class Asked:
 
     token: int
     payload: bytes
+    encoding: str = ""
+    """MIME type of the payload; empty: not told."""
 
 
 @frozen
@@ -159,18 +161,37 @@ class Reply:
     token: int
     payload: bytes
     ok: bool = True
+    encoding: str = ""
+
+
+@frozen
+class Decline:
+    """Leave a question to others who serve the same topic."""
+
+    token: int
 
 
 @frozen
 class Compute:
-    """Run `work` beside the core; `Computed` brings its result.
-
-    Jobs run one after the other; those in the background do not delay the others.
-    """
+    """Run `work` beside the core, after what was ordered before; `Computed` brings its result."""
 
     job: int
     work: Callable[[], Any]
-    background: bool = False
+
+
+@frozen
+class Delegate:
+    """Run `work` in a process of its own, beside others; `Computed` brings its result.
+
+    It is called with the seconds that are left until `deadline_s`, and not at all when none are:
+    then it counts as failed. Where it does not end long after the deadline, it is killed. `work`
+    can be pickled.
+    """
+
+    job: int
+    work: Callable[[float], Any]
+    deadline_s: float
+    """On the clock of `now_s`."""
 
 
 @frozen
@@ -178,7 +199,20 @@ class End:
     """The core has nothing more to do; the node leaves the network."""
 
 
-Effect = Send | Listen | Unlisten | Announce | Withdraw | Watch | Serve | Reply | Compute | End
+Effect = (
+    Send
+    | Listen
+    | Unlisten
+    | Announce
+    | Withdraw
+    | Watch
+    | Serve
+    | Reply
+    | Decline
+    | Compute
+    | Delegate
+    | End
+)
 
 
 class Core(Protocol):
@@ -207,7 +241,7 @@ class Node:
         core: Core,
         transport: Transport,
         keys: Keys,
-        order_work: Callable[[Compute], None],
+        order_work: Callable[[Compute | Delegate], None],
         label: Name,
         read: Callable[[str, bytes], Arrived] | None = None,
         write: Callable[[object], bytes] = encode,
@@ -258,7 +292,7 @@ class Node:
         if isinstance(delivery, (LinkUp, LinkDown)):
             return delivery
         if isinstance(delivery, Question):
-            return Asked(delivery.token, delivery.payload)
+            return Asked(delivery.token, delivery.payload, delivery.encoding)
         known = known_key(self._keys, delivery.key)
         return PeerUp(*known) if isinstance(delivery, TokenUp) else PeerDown(*known)
 
@@ -287,10 +321,12 @@ class Node:
     def _carry_out(self, effect: Effect) -> None:
         transport = self._transport
         match effect:
-            case Compute():
+            case Compute() | Delegate():
                 self._order_work(effect)
-            case Reply(token, payload, ok):
-                transport.answer(token, payload, ok=ok)
+            case Reply(token, payload, ok, encoding):
+                transport.answer(token, payload, ok=ok, encoding=encoding)
+            case Decline(token):
+                transport.decline(token)
             case End():
                 self.ended = True
                 transport.close()
@@ -350,3 +386,20 @@ def run_job(job: Compute) -> Computed:
     except Exception as error:
         log.exception("computation failed", job=job.job)
         return Computed(job.job, None, f"{type(error).__name__}: {error}")
+
+
+def run_delegated(job: Delegate, now_s: Callable[[], float]) -> Computed:
+    """Run a delegated computation here, with the time that is left on the clock `now_s`."""
+    return run_job(Compute(job.job, partial(in_time, job.work, job.deadline_s, now_s)))
+
+
+def in_time(work: Callable[[float], Any], deadline_s: float, now_s: Callable[[], float]) -> object:
+    """Return what `work` does in the time that is left.
+
+    Raises:
+        TimeoutError: none is left.
+    """
+    left_s = deadline_s - now_s()
+    if left_s <= 0:
+        raise TimeoutError("the deadline has passed")
+    return work(left_s)

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 import math
 
-from laneweave.protocol.node import Compute, Computed, Node, Stopping, Wakeup, run_job
+from laneweave.protocol.node import (
+    Compute,
+    Computed,
+    Delegate,
+    Node,
+    Stopping,
+    Wakeup,
+    run_delegated,
+    run_job,
+)
 from laneweave.protocol.simulated_conditions import Clock
 from laneweave.protocol.simulated_time import Item, Simulation
 from laneweave.protocol.simulated_transport import SimulatedTransport
@@ -59,8 +68,8 @@ class Member:
         """Number of the newest alarm; older ones do not count any more."""
         self._alarm_s = math.inf
         """Virtual time at which the newest alarm is due; infinite: there is none."""
-        self._computed_s = {False: 0.0, True: 0.0}
-        """When the newest computation ends; those in the background are apart."""
+        self._computed_s = {Compute: 0.0, Delegate: 0.0}
+        """When the newest computation of each kind ends."""
 
     @property
     def visible(self) -> bool:
@@ -97,7 +106,7 @@ class Member:
         now_s = simulation.now_s
         if simulation.trace is not None:
             simulation.trace(now_s, self.transport.name, item)
-        local_s = now_s if self.clock is None else self.clock.local_s(now_s)
+        local_s = self._local_s()
         if isinstance(item, _DELIVERIES):
             simulation.delivered += 1
             self.node.deliver(item, local_s)
@@ -105,6 +114,11 @@ class Member:
             self.node.dispatch(item, local_s)
 
     # --- its time ---------------------------------------------------------------------------
+
+    def _local_s(self) -> float:
+        """Return the time on its own clock."""
+        now_s = self._simulation.now_s
+        return now_s if self.clock is None else self.clock.local_s(now_s)
 
     def wake(self) -> None:
         """End a pause: handle all that queued up, in order."""
@@ -147,14 +161,14 @@ class Member:
         self._alarm_s = math.inf
         now_s = self._simulation.now_s
         wakeup_s = self.node.core.wakeup_s
-        local_s = now_s if self.clock is None else self.clock.local_s(now_s)
+        local_s = self._local_s()
         if wakeup_s is not None and wakeup_s <= local_s:
             self._handle(Wakeup())
         self._set_alarm(now_s + WAKE_AGAIN_S)
 
     # --- its computations -------------------------------------------------------------------
 
-    def compute(self, job: Compute) -> None:
+    def compute(self, job: Compute | Delegate) -> None:
         """Do a computation and hand its result over when it is due."""
         simulation = self._simulation
         conditions, draw = simulation.conditions, simulation.random.random
@@ -164,8 +178,10 @@ class Member:
         if conditions.compute_failure and draw() < conditions.compute_failure:
             computed = Computed(job.job, None, INJECTED_FAILURE)
         else:
-            computed = run_job(job)
-        # As on a thread for each kind: jobs end in the order in which they were ordered.
-        end_s = max(self._computed_s[job.background], simulation.now_s + duration_s)
-        self._computed_s[job.background] = end_s
+            computed = (
+                run_job(job) if isinstance(job, Compute) else run_delegated(job, self._local_s)
+            )
+        # As on one thread and one worker: jobs of a kind end in the order in which they came.
+        end_s = max(self._computed_s[type(job)], simulation.now_s + duration_s)
+        self._computed_s[type(job)] = end_s
         simulation.at(end_s, self.hand_over, computed)

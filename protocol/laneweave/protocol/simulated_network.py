@@ -30,6 +30,7 @@ from laneweave.protocol.simulated_tokens import Tokens
 from laneweave.protocol.simulated_transport import SimulatedTransport
 from laneweave.protocol.topics import Keys, Topic, matches, matches_any
 from laneweave.protocol.transport import (
+    Answer,
     Delivery,
     LinkDown,
     LinkUp,
@@ -99,8 +100,8 @@ class SimulatedNetwork(Simulation):
         self._loss_on: Callable[[str], float] | None = None
         self._router_up = True
         self._outages = 0
-        self._answers: dict[int, tuple[Callable[[bytes, bool], None], tuple[int, ...]]] = {}
-        """For each open question who asked, and all tokens under which it was asked."""
+        self._answers: dict[int, tuple[Callable[[Answer | None], None], set[int]]] = {}
+        """For each open question who asked, and the tokens of those who may still answer."""
         self._token_count = count(1)
         self._label_count = count(1)
         self._member_count = count()
@@ -270,27 +271,32 @@ class SimulatedNetwork(Simulation):
             if duplication and draw() < duplication:
                 self._send(receiver, message)
 
-    def ask(self, key: str, payload: bytes, answer: Callable[[bytes, bool], None]) -> bool:
-        """Ask all who serve the key and take the first answer; false when nobody serves it."""
+    def ask(self, key: str, payload: bytes, answer: Callable[[Answer | None], None]) -> None:
+        """Ask all who serve the key and take the first answer; None: nobody serves it."""
         servers = [
             member
             for member in self._members.values()
             if member.connected and key in member.transport.served
         ]
-        tokens = tuple(next(self._token_count) for _ in servers)
-        for server, token in zip(servers, tokens, strict=True):
-            self._answers[token] = answer, tokens
+        numbered = {next(self._token_count): server for server in servers}
+        open_tokens = set(numbered)
+        for token, server in numbered.items():
+            self._answers[token] = answer, open_tokens
             self._send(server, Question(key, payload, token))
-        return bool(servers)
+        if not servers:
+            self.at(self.now_s + self.delay_s(), answer, None)
 
-    def take_answer(self, server: str, token: int, payload: bytes, *, ok: bool) -> None:
-        """Hand the first answer to whoever asked."""
+    def take_answer(self, server: str, token: int, given: Answer | None) -> None:
+        """Hand the first answer to whoever asked; None when all leave it to others."""
         if token not in self._answers or not self._members[server].connected:
             return
-        answer, tokens = self._answers[token]
-        for other in tokens:
+        answer, open_tokens = self._answers[token]
+        done = open_tokens if given is not None else {token}
+        for other in tuple(done):
             del self._answers[other]
-        self.at(self.now_s + self.delay_s(), answer, payload, ok)
+            open_tokens.discard(other)
+        if not open_tokens:
+            self.at(self.now_s + self.delay_s(), answer, given)
 
     def show_token(self, owner: str, key: str) -> None:
         """Tell all watchers of a new token."""

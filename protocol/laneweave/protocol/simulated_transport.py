@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from laneweave.protocol.topics import Quality
+from laneweave.protocol.transport import Answer
 
 if TYPE_CHECKING:
     from laneweave.protocol.simulated_network import SimulatedNetwork
@@ -61,10 +62,15 @@ class SimulatedTransport:
         """Answer questions on a key."""
         self.served.add(key)
 
-    def answer(self, token: int, payload: bytes, *, ok: bool) -> None:
+    def answer(self, token: int, payload: bytes, *, ok: bool, encoding: str = "") -> None:
         """Answer a question once."""
         if not self.closed:
-            self._network.take_answer(self.name, token, payload, ok=ok)
+            self._network.take_answer(self.name, token, Answer(payload, ok, encoding))
+
+    def decline(self, token: int) -> None:
+        """Leave a question to others."""
+        if not self.closed:
+            self._network.take_answer(self.name, token, None)
 
     def close(self) -> None:
         """Leave the network."""

@@ -57,6 +57,18 @@ class Question:
     key: str
     payload: bytes
     token: int
+    encoding: str = ""
+    """MIME type of the payload; empty: not told."""
+
+
+@frozen
+class Answer:
+    """What a question was answered."""
+
+    payload: bytes
+    ok: bool
+    """False: an error reply."""
+    encoding: str = ""
 
 
 def learn(seen: dict[str, None], news: TokenUp | TokenDown) -> bool:
@@ -103,8 +115,11 @@ class Transport(Protocol):
     def serve(self, key: str) -> None:
         """Deliver questions that are asked on this key."""
 
-    def answer(self, token: int, payload: bytes, *, ok: bool) -> None:
+    def answer(self, token: int, payload: bytes, *, ok: bool, encoding: str = "") -> None:
         """Answer a question once; unknown tokens are ignored."""
+
+    def decline(self, token: int) -> None:
+        """Leave a question to the others who serve its key; unknown tokens are ignored."""
 
     def close(self) -> None:
         """Leave the network. Idempotent; whatever is called after it does nothing."""

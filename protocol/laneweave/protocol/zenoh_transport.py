@@ -14,19 +14,23 @@ import queue
 import signal
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from concurrent.futures import Future, InvalidStateError
+from typing import TYPE_CHECKING, Any
 
 import structlog
 import zenoh
 
 from laneweave.protocol.access import Access
+from laneweave.protocol.codec import MAX_BYTES
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.messages import Name
 from laneweave.protocol.node import (
     Compute,
     Computed,
     Core,
+    Delegate,
     Node,
     Started,
     Stopping,
@@ -35,6 +39,7 @@ from laneweave.protocol.node import (
 )
 from laneweave.protocol.topics import Keys, Quality
 from laneweave.protocol.transport import (
+    Answer,
     Deliver,
     Delivery,
     LinkDown,
@@ -45,6 +50,9 @@ from laneweave.protocol.transport import (
     TokenUp,
     learn,
 )
+
+if TYPE_CHECKING:
+    from laneweave.protocol.worker_pool import WorkerPool
 
 log = structlog.get_logger(__name__)
 
@@ -70,6 +78,12 @@ _QUALITY: dict[Quality, dict[str, Any]] = {
 
 
 DROP_AFTER_US = 50
+MAX_QUESTIONS = 4096
+"""Open questions beyond which more are left to others."""
+TOO_LONG = bytes(MAX_BYTES + 1)
+"""Stands for each question that is too long: nobody looks at it."""
+QUESTION_WAITS_S = 0.02
+"""A question is taken at least so often, however much else there is to do."""
 
 
 def _config(mode: str, lease_s: float) -> zenoh.Config:
@@ -187,18 +201,57 @@ class ZenohTransport:
         if key not in self._served and not self._closed:
             self._served[key] = self._session.declare_queryable(key, self._on_query)
 
-    def answer(self, token: int, payload: bytes, *, ok: bool) -> None:
+    def answer(self, token: int, payload: bytes, *, ok: bool, encoding: str = "") -> None:
         """Answer a query once."""
-        with self._question_lock:
-            query = self._questions.pop(token, None)
+        query = self._take_question(token)
         if query is None:
             return
         with contextlib.suppress(zenoh.ZError):
             if ok:
-                query.reply(query.key_expr, payload)
+                query.reply(query.key_expr, payload, encoding=encoding or None)
             else:
-                query.reply_err(payload)
+                query.reply_err(payload, encoding=encoding or None)
             query.drop()  # type: ignore[no-untyped-call]
+
+    def decline(self, token: int) -> None:
+        """Leave a query to the others who serve its key."""
+        query = self._take_question(token)
+        if query is not None:
+            query.drop()  # type: ignore[no-untyped-call]
+
+    def _take_question(self, token: int) -> zenoh.Query | None:
+        with self._question_lock:
+            return self._questions.pop(token, None)
+
+    def ask(
+        self, key: str, payload: bytes, timeout_s: float, encoding: str = ""
+    ) -> Future[Answer | None]:
+        """Ask those who serve a key.
+
+        Returns:
+            The first answer, whoever gives it. None: nobody serves the key, or all who do have left
+            the question to others, died, or were cut off.
+
+        Raises:
+            TimeoutError: as the future's result, when nobody has answered in time.
+        """
+        first: Future[Answer | None] = Future()
+        first.set_running_or_notify_cancel()
+
+        def take(reply: zenoh.Reply) -> None:
+            _settle(first, _answer_of(reply))
+
+        # Without consolidation each reply is handed over as it comes: one server that hangs must
+        # not hold back the answers of the others.
+        self._session.get(
+            key,
+            zenoh.handlers.Callback(take, lambda: _settle(first, None)),
+            payload=payload,
+            encoding=encoding or None,
+            timeout=timeout_s,
+            consolidation=zenoh.ConsolidationMode.NONE,
+        )
+        return first
 
     def close(self) -> None:
         """Close the session; without it a callback subscriber hangs the interpreter at exit."""
@@ -222,32 +275,42 @@ class ZenohTransport:
 
     def _on_query(self, query: zenoh.Query) -> None:
         with self._question_lock:
+            if len(self._questions) >= MAX_QUESTIONS:
+                query.drop()  # type: ignore[no-untyped-call]
+                return
             self._question_count += 1
             token = self._question_count
             self._questions[token] = query
-        payload = query.payload.to_bytes() if query.payload is not None else b""
-        self._deliver(Question(str(query.key_expr), payload, token))
+        payload = b""
+        if query.payload is not None:
+            payload = query.payload.to_bytes() if len(query.payload) <= MAX_BYTES else TOO_LONG
+        encoding = "" if query.encoding is None else str(query.encoding)
+        self._deliver(Question(str(query.key_expr), payload, token, encoding))
 
 
-def run_core(core: Core, access: Access) -> None:
+def run_core(core: Core, access: Access, pool: WorkerPool | None = None) -> None:
     """Drive a core over Zenoh until it ends or the process gets SIGINT or SIGTERM.
 
-    To be called from the main thread. Computations run in threads of their own.
+    To be called from the main thread. Computations run in a thread of their own, those that are
+    delegated in `pool`, which only a core that delegates needs.
 
     Raises:
         BadInputError: the realm is malformed or nobody answers at the endpoint.
     """
     keys = Keys(access.realm)
-    # Enqueuing from callbacks and signal handlers alike: SimpleQueue.put is reentrant.
-    inbox: queue.SimpleQueue[Delivery | Computed | Stopping] = queue.SimpleQueue()
+    inbox = _Inbox()
     transport = ZenohTransport(access, inbox.put)
-    node = Node(
-        core,
-        transport,
-        keys,
-        _Workers(inbox.put).order,
-        Name(f"{os.getpid()}-{time.time_ns()}"),
-    )
+    worker = _Worker(inbox.put)
+
+    def order(job: Compute | Delegate) -> None:
+        if isinstance(job, Compute):
+            worker.order(job)
+        elif pool is not None:
+            pool.order(job, inbox.put)
+        else:
+            inbox.put(Computed(job.job, None, "this process has no workers"))
+
+    node = Node(core, transport, keys, order, Name(f"{os.getpid()}-{time.time_ns()}"))
     with _stop_signals(lambda: inbox.put(Stopping())):
         try:
             node.dispatch(Started(), time.monotonic())
@@ -257,13 +320,51 @@ def run_core(core: Core, access: Access) -> None:
             transport.close()
 
 
-def _step(node: Node, inbox: queue.SimpleQueue[Delivery | Computed | Stopping]) -> None:
+class _Inbox:
+    """What waits for a node.
+
+    Questions of others wait until there is nothing else to do, or long enough: a flood of them must
+    not keep a leader from leading. `put` may be called from callbacks and signal handlers:
+    `SimpleQueue.put` is reentrant.
+    """
+
+    def __init__(self) -> None:
+        self._items: queue.SimpleQueue[Delivery | Computed | Stopping | None] = queue.SimpleQueue()
+        self._questions: deque[Question] = deque()
+        self._asked_s = 0.0
+        """When a question was last taken."""
+
+    def put(self, item: Delivery | Computed | Stopping) -> None:
+        if isinstance(item, Question):
+            self._questions.append(item)
+            self._items.put(None)  # wakes who waits
+        else:
+            self._items.put(item)
+
+    def take(self, timeout_s: float) -> Iterator[Delivery | Computed | Stopping]:
+        """Yield what is next, after at most this time: nothing, an item, an item and a question."""
+        with contextlib.suppress(queue.Empty):
+            item = self._items.get(timeout=0.0 if self._questions else timeout_s)
+            if item is not None:
+                yield item
+        now_s = time.monotonic()
+        if self._questions and (self._items.empty() or now_s > self._asked_s + QUESTION_WAITS_S):
+            self._asked_s = now_s
+            yield self._questions.popleft()
+
+
+def _step(node: Node, inbox: _Inbox) -> None:
     wakeup_s = node.core.wakeup_s
     timeout_s = 1.0 if wakeup_s is None else min(1.0, max(0.0, wakeup_s - time.monotonic()))
-    try:
-        item = inbox.get(timeout=timeout_s)
-    except queue.Empty:
-        item = None
+    for item in inbox.take(timeout_s):
+        _hand_over(node, item)
+    now_s = time.monotonic()
+    wakeup_s = node.core.wakeup_s
+    if wakeup_s is not None and wakeup_s <= now_s:
+        node.dispatch(Wakeup(), now_s)
+
+
+def _hand_over(node: Node, item: Delivery | Computed | Stopping) -> None:
     now_s = time.monotonic()
     if isinstance(item, Stopping):
         log.info("stopping")
@@ -271,31 +372,27 @@ def _step(node: Node, inbox: queue.SimpleQueue[Delivery | Computed | Stopping]) 
         node.ended = True
     elif isinstance(item, Computed):
         node.dispatch(item, now_s)
-    elif item is not None:
+    else:
         node.deliver(item, now_s)
-    wakeup_s = node.core.wakeup_s
-    if wakeup_s is not None and wakeup_s <= now_s:
-        node.dispatch(Wakeup(), now_s)
 
 
-class _Workers:
-    """Threads that compute, one for the core's own jobs and one for those in the background.
+class _Worker:
+    """A thread that computes.
 
-    Started when first needed, and daemons: a process that is asked to end does not wait for them.
+    Started when first needed, and a daemon: a process that is asked to end does not wait for it.
     """
 
     def __init__(self, done: Callable[[Computed], None]) -> None:
-        """Prepare; `done` is called from the threads."""
+        """Prepare; `done` is called from the thread."""
         self._done = done
-        self._jobs: dict[bool, queue.SimpleQueue[Compute]] = {}
+        self._jobs: queue.SimpleQueue[Compute] | None = None
 
     def order(self, job: Compute) -> None:
         """Have a job computed after those that were ordered before it."""
-        jobs = self._jobs.get(job.background)
-        if jobs is None:
-            jobs = self._jobs[job.background] = queue.SimpleQueue()
-            threading.Thread(target=self._work, args=(jobs,), daemon=True).start()
-        jobs.put(job)
+        if self._jobs is None:
+            self._jobs = queue.SimpleQueue()
+            threading.Thread(target=self._work, args=(self._jobs,), daemon=True).start()
+        self._jobs.put(job)
 
     def _work(self, jobs: queue.SimpleQueue[Compute]) -> None:
         while True:
@@ -360,40 +457,23 @@ def run_router(
             session.close()  # type: ignore[no-untyped-call]
 
 
-def ask(access: Access, key: str, payload: bytes, timeout_s: float) -> tuple[bytes, bool]:
-    """Ask a service and wait for the first answer, whoever serves it.
-
-    Returns:
-        The answer and whether it is a result (true) or an error reply (false).
-
-    Raises:
-        BadInputError: nobody answers at the endpoint, or no service is there.
-        TimeoutError: there is a service but it did not answer in time.
-    """
-    transport = ZenohTransport(access, lambda _: None)
-    try:
-        return transport_ask(transport, key, payload, timeout_s)
-    finally:
-        transport.close()
-
-
-def transport_ask(
-    transport: ZenohTransport, key: str, payload: bytes, timeout_s: float
-) -> tuple[bytes, bool]:
-    """Ask over an open transport; see `ask`."""
-    session = transport._session  # noqa: SLF001 (same module)
-    # Without consolidation each reply is handed over as it comes: one server that hangs must not
-    # hold back the answers of the others.
-    replies = session.get(
-        key, payload=payload, timeout=timeout_s, consolidation=zenoh.ConsolidationMode.NONE
-    )
-    reply = next(iter(replies), None)
-    if reply is None:
-        raise BadInputError("connect", key, "a network with a running coordinator")
+def _answer_of(reply: zenoh.Reply) -> Answer | Exception:
     if reply.ok is not None:
-        return reply.ok.payload.to_bytes(), True
+        sample = reply.ok
+        return Answer(sample.payload.to_bytes(), True, str(sample.encoding))
     error = reply.err
     text = error.payload.to_bytes() if error is not None else b""
     if text == b"Timeout":
-        raise TimeoutError(f"no answer within {timeout_s:g} s")
-    return text, False
+        return TimeoutError("no answer in time")
+    return Answer(text, False, "" if error is None else str(error.encoding))
+
+
+def _settle(first: Future[Answer | None], outcome: Answer | Exception | None) -> None:
+    """Give a future its first outcome."""
+    if first.done():
+        return
+    with contextlib.suppress(InvalidStateError):
+        if isinstance(outcome, Exception):
+            first.set_exception(outcome)
+        else:
+            first.set_result(outcome)

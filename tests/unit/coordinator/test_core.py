@@ -27,6 +27,7 @@ from laneweave.protocol.node import (
     Announce,
     Asked,
     Computed,
+    Delegate,
     Effect,
     Listen,
     PeerDown,
@@ -38,6 +39,7 @@ from laneweave.protocol.node import (
     Unlisten,
     Wakeup,
     Watch,
+    run_delegated,
     run_job,
 )
 from laneweave.protocol.plans import plan_problems
@@ -527,8 +529,10 @@ def test_the_service_answers_without_leading() -> None:
         b'{"schema": "laneweave.plan.request/1", "grid": {"columns": 2, "lanes": 2},'
         b' "vehicles": [{"id": "a", "cell": [0, 0]}], "targets": [[1, 0]]}'
     )
-    (job,) = jobs(desk.give(Asked(5, request)))
-    (reply,) = [e for e in desk.give(run_job(job)) if isinstance(e, Reply)]
+    (job,) = [e for e in desk.give(Asked(5, request)) if isinstance(e, Delegate)]
+    (reply,) = [
+        e for e in desk.give(run_delegated(job, lambda: desk.now_s)) if isinstance(e, Reply)
+    ]
     assert (reply.token, reply.ok) == (5, True)
     (refusal,) = [e for e in desk.give(Asked(6, b"{}")) if isinstance(e, Reply)]
     assert (refusal.token, refusal.ok) == (6, False)

@@ -17,6 +17,8 @@ from laneweave.protocol.node import (
     Asked,
     Compute,
     Computed,
+    Decline,
+    Delegate,
     Effect,
     End,
     Event,
@@ -102,8 +104,11 @@ class Calls:
     def serve(self, key: str) -> None:
         self.calls.append(("serve", key))
 
-    def answer(self, token: int, payload: bytes, *, ok: bool) -> None:
-        self.calls.append(("answer", token, payload, ok))
+    def answer(self, token: int, payload: bytes, *, ok: bool, encoding: str = "") -> None:
+        self.calls.append(("answer", token, payload, ok, encoding))
+
+    def decline(self, token: int) -> None:
+        self.calls.append(("decline", token))
 
     def close(self) -> None:
         self.calls.append(("close",))
@@ -115,7 +120,7 @@ class Bench:
 
     core: Recorder = field(factory=Recorder)
     transport: Calls = field(factory=Calls)
-    jobs: list[Compute] = field(factory=list)
+    jobs: list[Compute | Delegate] = field(factory=list)
     node: Node = field(init=False)
 
     @node.default
@@ -227,7 +232,8 @@ def test_effects_reach_the_transport(bench: Bench) -> None:
         Watch(VEHICLE_ALIVE),
         Serve(SERVICE),
         Reply(5, b"a"),
-        Reply(6, b"e", ok=False),
+        Reply(6, b"e", ok=False, encoding="application/json"),
+        Decline(7),
         Send(HEARTBEAT, BEAT, {"coordinator": "c1"}),
         work,
     )
@@ -239,8 +245,9 @@ def test_effects_reach_the_transport(bench: Bench) -> None:
         ("withdraw", "laneweave/r/alive/vehicle/v1"),
         ("watch", "laneweave/r/alive/vehicle/*"),
         ("serve", "laneweave/r/service/plan"),
-        ("answer", 5, b"a", True),
-        ("answer", 6, b"e", False),
+        ("answer", 5, b"a", True, ""),
+        ("answer", 6, b"e", False, "application/json"),
+        ("decline", 7),
         ("publish", BEAT_KEY, encode(BEAT), Quality.LATEST),
     ]
     assert bench.jobs == [work]

@@ -13,6 +13,7 @@ from laneweave.protocol.node import (
     Arrived,
     Compute,
     Computed,
+    Delegate,
     Effect,
     End,
     Event,
@@ -169,7 +170,7 @@ def test_a_clock_that_is_none_is_refused(offset_s: float, rate: float) -> None:
 # --- computations -----------------------------------------------------------------------------
 
 
-def computing(conditions: Conditions, *jobs: Compute) -> Recorder:
+def computing(conditions: Conditions, *jobs: Compute | Delegate) -> Recorder:
     """Return what a core saw that ordered these jobs at its start."""
     core = Recorder(at_start(*jobs))
     network = SimulatedNetwork(3, conditions)
@@ -191,9 +192,12 @@ def test_computations_take_their_own_time_each_and_end_in_order() -> None:
     assert max(times) > 1.25
 
 
-def test_computations_in_the_background_hold_up_no_others() -> None:
+def test_delegated_computations_hold_up_no_others() -> None:
     conditions = Conditions(compute_s=0.0, compute_jitter_s=1.0)
-    jobs = [Compute(number, lambda: 7, background=number % 2 == 1) for number in range(40)]
+    jobs = [
+        Delegate(number, lambda _: 7, 1000.0) if number % 2 else Compute(number, lambda: 7)
+        for number in range(40)
+    ]
     numbers = [event.job for event in computing(conditions, *jobs).of(Computed)]  # type: ignore[union-attr]
     assert [number for number in numbers if number % 2] == list(range(1, 40, 2))
     assert [number for number in numbers if not number % 2] == list(range(0, 40, 2))

@@ -40,6 +40,7 @@ from laneweave.protocol.node import (
 from laneweave.protocol.simulated_network import SimulatedNetwork
 from laneweave.protocol.topics import HEARTBEAT, SERVICE, VEHICLE_ALIVE, Keys, Quality
 from laneweave.protocol.transport import (
+    Answer,
     Delivery,
     LinkDown,
     LinkUp,
@@ -49,7 +50,7 @@ from laneweave.protocol.transport import (
     TokenUp,
     Transport,
 )
-from laneweave.protocol.zenoh_transport import ZenohTransport, ask, run_core, transport_ask
+from laneweave.protocol.zenoh_transport import ZenohTransport, run_core
 
 REALM = "r"
 KEYS = Keys(REALM)
@@ -107,7 +108,7 @@ class Party:
         return [item for item in self.got if isinstance(item, Question)]
 
 
-Answers = list[tuple[bytes, bool] | None]
+Answers = list[Answer | None]
 
 
 class Bed(Protocol):
@@ -193,8 +194,7 @@ class SimulatedBed:
 
     def ask(self, payload: bytes) -> Answers:
         answers: Answers = []
-        if not self.network.ask(PLAN_SERVICE, payload, lambda text, ok: answers.append((text, ok))):
-            answers.append(None)
+        self.network.ask(PLAN_SERVICE, payload, answers.append)
         return answers
 
     def break_link(self, *parties: Party) -> None:
@@ -280,7 +280,6 @@ class ZenohBed:
     router: Router
     _opened: list[ZenohTransport] = field(factory=list)
     _processes: dict[str, subprocess.Popen[bytes]] = field(factory=dict)
-    _threads: list[threading.Thread] = field(factory=list)
 
     def join(self, name: str) -> Party:
         del name
@@ -305,15 +304,8 @@ class ZenohBed:
         client = self._join().transport
         assert isinstance(client, ZenohTransport)
 
-        def wait_for_answer() -> None:
-            try:
-                answers.append(transport_ask(client, PLAN_SERVICE, payload, ASK_S))
-            except BadInputError:
-                answers.append(None)
-
-        thread = threading.Thread(target=wait_for_answer, daemon=True)
-        thread.start()
-        self._threads.append(thread)
+        asked = client.ask(PLAN_SERVICE, payload, ASK_S)
+        asked.add_done_callback(lambda done: answers.append(done.result()))
         return answers
 
     def break_link(self, *parties: Party) -> None:
@@ -334,8 +326,6 @@ class ZenohBed:
         time.sleep(QUIET_S)
 
     def close(self) -> None:
-        for thread in self._threads:
-            thread.join(WAIT_S)
         for transport in self._opened:
             transport.close()
         for process in self._processes.values():
@@ -601,7 +591,7 @@ def test_a_question_gets_its_answer(bed: Bed, *, ok: bool) -> None:
     server.transport.answer(question.token, b"again", ok=True)
     bed.until(lambda: answers)
     bed.quiet()
-    assert answers == [(b"that", ok)]
+    assert [given and (given.payload, given.ok) for given in answers] == [(b"that", ok)]
     assert len(server.questions()) == 1
 
 
@@ -614,7 +604,7 @@ def test_questions_have_tokens_of_their_own(bed: Bed) -> None:
     for question in reversed(server.questions()):
         server.transport.answer(question.token, b"to " + question.payload, ok=True)
     bed.until(lambda: first and second)
-    assert (first, second) == ([(b"to 1", True)], [(b"to 2", True)])
+    assert [given and given.payload for given in first + second] == [b"to 1", b"to 2"]
 
 
 def test_an_answer_to_an_unknown_question_is_ignored(bed: Bed) -> None:
@@ -638,10 +628,41 @@ def test_one_server_that_hangs_does_not_hold_back_the_others(bed: Bed) -> None:
     bed.until(lambda: all(server.questions() for server in servers))
     servers[1].transport.answer(servers[1].questions()[0].token, b"!", ok=True)
     bed.until(lambda: answers)  # and the other one has not answered yet
-    assert answers == [(b"!", True)]
+    assert [given and given.payload for given in answers] == [b"!"]
     servers[0].transport.answer(servers[0].questions()[0].token, b"late", ok=True)
     bed.quiet()
-    assert answers == [(b"!", True)]
+    assert [given and given.payload for given in answers] == [b"!"]
+
+
+def test_a_question_is_left_to_those_who_answer(bed: Bed) -> None:
+    servers = [bed.join("leaves"), bed.join("answers")]
+    for server in servers:
+        server.transport.serve(PLAN_SERVICE)
+        settle(bed, server)
+    answers = bed.ask(b"?")
+    bed.until(lambda: all(server.questions() for server in servers))
+    servers[0].transport.decline(servers[0].questions()[0].token)
+    servers[0].transport.decline(servers[0].questions()[0].token)
+    servers[0].transport.answer(servers[0].questions()[0].token, b"after all", ok=True)
+    bed.quiet()
+    assert answers == []
+    servers[1].transport.answer(servers[1].questions()[0].token, b"!", ok=True)
+    bed.until(lambda: answers)
+    assert [given and given.payload for given in answers] == [b"!"]
+
+
+def test_a_question_that_all_leave_is_answered_by_nobody(bed: Bed) -> None:
+    servers = [bed.join("a"), bed.join("b")]
+    for server in servers:
+        server.transport.serve(PLAN_SERVICE)
+        settle(bed, server)
+    answers = bed.ask(b"?")
+    bed.until(lambda: all(server.questions() for server in servers))
+    for server in servers:
+        server.transport.decline(server.questions()[0].token)
+        server.transport.decline(-1)
+    bed.until(lambda: answers)
+    assert answers == [None]
 
 
 # --- the end ----------------------------------------------------------------------------------
@@ -718,7 +739,7 @@ def test_a_malformed_endpoint_is_refused(endpoint: str) -> None:
 
 def test_an_endpoint_without_a_router_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInputError) as caught:
-        ask(Access(f"unixsock-stream/{tmp_path}/none"), PLAN_SERVICE, b"", 1.0)
+        ZenohTransport(Access(f"unixsock-stream/{tmp_path}/none"), lambda _: None)
     assert caught.value.field == "network.endpoint"
 
 
@@ -727,8 +748,10 @@ def test_a_service_that_does_not_answer_is_a_timeout(router: Router) -> None:
     server = bed.join("server")
     server.transport.serve(PLAN_SERVICE)
     settle(bed, server)
-    with pytest.raises(TimeoutError, match=r"0\.2 s"):
-        ask(Access(router.endpoint), PLAN_SERVICE, b"", 0.2)
+    client = bed.join("client").transport
+    assert isinstance(client, ZenohTransport)
+    with pytest.raises(TimeoutError, match="in time"):
+        client.ask(PLAN_SERVICE, b"", 0.2).result(WAIT_S)
     bed.close()
 
 
@@ -764,14 +787,15 @@ class Errand:
 
 def test_a_core_runs_over_zenoh_until_it_ends(router: Router) -> None:
     core = Errand()
-    answers: list[tuple[bytes, bool]] = []
+    answers: Answers = []
     watcher = ZenohBed(router)
     client = watcher.join("client")
     client.transport.watch(TOKENS)
 
     def ask_at_last() -> None:
         watcher.until(lambda: any(isinstance(event, Computed) for event in core.events))
-        answers.append(ask(Access(router.endpoint), PLAN_SERVICE, b"?", WAIT_S))
+        assert isinstance(client.transport, ZenohTransport)
+        answers.append(client.transport.ask(PLAN_SERVICE, b"?", WAIT_S).result(WAIT_S))
 
     thread = threading.Thread(target=ask_at_last, daemon=True)
     thread.start()
@@ -780,7 +804,7 @@ def test_a_core_runs_over_zenoh_until_it_ends(router: Router) -> None:
     thread.join(WAIT_S)
     watcher.until(lambda: client.tokens() == ["+errand", "-errand"])
     watcher.close()
-    assert answers == [(b"yes", True)]
+    assert [given and (given.payload, given.ok) for given in answers] == [(b"yes", True)]
     kinds = [type(event) for event in core.events]
     assert kinds[0] is Started
     for kind in (Wakeup, Arrived, Computed, PeerUp, Asked):

@@ -39,6 +39,7 @@ MAX_DEADLINE_S: Final = 3600.0
 
 _KEYS: Final = (
     "schema",
+    "id",
     "grid",
     "mode",
     "conflicts",
@@ -64,6 +65,7 @@ class PlanRequest:
     """Vehicles, targets and rules of one planning problem; checked when it is made.
 
     geometry: what `geometric` is computed from; None: footprints.
+    id: names the request where it is asked again: a service answers it as before. Empty: no name.
     """
 
     grid: Grid
@@ -73,6 +75,7 @@ class PlanRequest:
     targets: tuple[Cell, ...]
     deadline_s: float = DEFAULT_DEADLINE_S
     geometry: Geometry | None = None
+    id: str = ""
 
     def __attrs_post_init__(self) -> None:
         """Reject what is inconsistent, however the request was made."""
@@ -85,6 +88,8 @@ class PlanRequest:
             raise BadInputError("geometry", self.geometry.to_dict(), allowed)
         _check_targets(self)
         _check_vehicles(self)
+        if len(self.id) > MAX_ID_LENGTH:
+            raise BadInputError("id", self.id, f"at most {MAX_ID_LENGTH} characters")
         if not (math.isfinite(self.deadline_s) and 0 < self.deadline_s <= MAX_DEADLINE_S):
             allowed = f"a number above 0, at most {MAX_DEADLINE_S:g}"
             raise BadInputError("deadline_s", self.deadline_s, allowed)
@@ -120,6 +125,7 @@ class PlanRequest:
             targets=tuple(as_cell(f"targets[{i}]", t) for i, t in enumerate(targets)),
             deadline_s=_read_deadline(fields.get("deadline_s", DEFAULT_DEADLINE_S)),
             geometry=Geometry.from_dict(fields["geometry"]) if "geometry" in fields else None,
+            id=as_text("id", fields.get("id", "")),
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -127,6 +133,7 @@ class PlanRequest:
         geometry = {} if self.geometry is None else {"geometry": self.geometry.to_dict()}
         return {
             "schema": REQUEST_SCHEMA,
+            **({"id": self.id} if self.id else {}),
             "grid": {
                 "columns": self.grid.columns,
                 "lanes": self.grid.lanes,

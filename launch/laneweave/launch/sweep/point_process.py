@@ -10,9 +10,9 @@ from pathlib import Path
 
 from laneweave.launch.garbage import collect_seldom
 from laneweave.launch.logs import log_to_terminal
-from laneweave.launch.roles import die_with_parent
 from laneweave.launch.sweep.execution import JOB_FILE, RESULT_FILE
 from laneweave.launch.sweep.run_method import run_method
+from laneweave.protocol.processes import die_with_parent
 from laneweave.protocol.scenario import parse_scenario
 
 

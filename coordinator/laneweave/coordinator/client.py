@@ -1,0 +1,155 @@
+"""Clients of the planning service: have plans made by whatever coordinators a network has.
+
+    with PlanClient("tcp/127.0.0.1:7447") as client:
+        response = client.plan(request, timeout_s=10.0)
+
+    async with AsyncPlanClient("tcp/127.0.0.1:7447") as client:
+        response = await client.plan(request, timeout_s=10.0)
+
+A client may be used by many threads, or tasks, at a time. A request is asked again, under its id,
+when the coordinator that had it dies.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+import uuid
+from concurrent.futures import Future
+from types import TracebackType
+from typing import Self
+
+import attrs
+
+from laneweave.coordinator.inquiry import (
+    AskAgain,
+    DeadlinePassedError,
+    Inquiry,
+    PlanError,
+    PlanningFailedError,
+    RequestRefusedError,
+    ServiceOverloadedError,
+    ServiceUnavailableError,
+)
+from laneweave.coordinator.planning import PlanRequest, PlanResponse
+from laneweave.protocol.access import Access
+from laneweave.protocol.topics import SERVICE, Keys
+from laneweave.protocol.transport import Answer
+from laneweave.protocol.zenoh_transport import ZenohTransport
+
+__all__ = [
+    "AsyncPlanClient",
+    "DeadlinePassedError",
+    "PlanClient",
+    "PlanError",
+    "PlanningFailedError",
+    "RequestRefusedError",
+    "ServiceOverloadedError",
+    "ServiceUnavailableError",
+]
+
+DEFAULT_TIMEOUT_S = 10.0
+
+
+class _Connection:
+    """A session at a router, and the key of the service."""
+
+    def __init__(self, access: Access | str) -> None:
+        """Connect.
+
+        Args:
+            access: how to get onto the network, or only the endpoint of its router.
+
+        Raises:
+            BadInputError: nobody answers there.
+        """
+        access = Access(access) if isinstance(access, str) else access
+        self._key = Keys(access.realm).key(SERVICE)
+        self._transport = ZenohTransport(access, lambda _: None)
+
+    def _begin(self, request: PlanRequest, timeout_s: float) -> Inquiry:
+        if not request.id:
+            request = attrs.evolve(request, id=uuid.uuid4().hex)
+        return Inquiry(request, timeout_s, time.monotonic())
+
+    def _ask(self, inquiry: Inquiry) -> Future[Answer | None]:
+        left_s = max(0.0, inquiry.left_s(time.monotonic()))
+        encoding = inquiry.form.encoding
+        return self._transport.ask(self._key, inquiry.payload, left_s, encoding)
+
+
+class PlanClient(_Connection):
+    """Asks and waits."""
+
+    def plan(self, request: PlanRequest, timeout_s: float = DEFAULT_TIMEOUT_S) -> PlanResponse:
+        """Have a request planned.
+
+        Args:
+            request: what to plan; one without an id gets one.
+            timeout_s: how long to wait, all attempts together.
+
+        Raises:
+            RequestRefusedError: the request is not valid.
+            ServiceUnavailableError: there is no coordinator.
+            ServiceOverloadedError: the coordinators had too much to do, all the time.
+            DeadlinePassedError: it was not begun before its deadline.
+            PlanningFailedError: the service made an error.
+            TimeoutError: no answer within `timeout_s`.
+        """
+        inquiry = self._begin(request, timeout_s)
+        while True:
+            answer = self._ask(inquiry).result()
+            outcome = inquiry.after(answer, time.monotonic())
+            if not isinstance(outcome, AskAgain):
+                return outcome
+            time.sleep(outcome.pause_s)
+
+    def close(self) -> None:
+        """Leave the network."""
+        self._transport.close()
+
+    def __enter__(self) -> Self:
+        """Return the client."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Leave the network."""
+        self.close()
+
+
+class AsyncPlanClient(_Connection):
+    """Asks and awaits."""
+
+    async def plan(
+        self, request: PlanRequest, timeout_s: float = DEFAULT_TIMEOUT_S
+    ) -> PlanResponse:
+        """Have a request planned; as `PlanClient.plan`."""
+        inquiry = self._begin(request, timeout_s)
+        while True:
+            answer = await asyncio.wrap_future(self._ask(inquiry))
+            outcome = inquiry.after(answer, time.monotonic())
+            if not isinstance(outcome, AskAgain):
+                return outcome
+            await asyncio.sleep(outcome.pause_s)
+
+    async def close(self) -> None:
+        """Leave the network."""
+        await asyncio.to_thread(self._transport.close)
+
+    async def __aenter__(self) -> Self:
+        """Return the client."""
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Leave the network."""
+        await self.close()
