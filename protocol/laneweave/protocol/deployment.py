@@ -51,7 +51,7 @@ class Service:
     """Requests in hand, those that are being planned among them; more are refused."""
     max_request_bytes: int = field(default=262_144, validator=within(1024, 1 << 20))
     """A longer request is refused."""
-    max_deadline_s: float = field(default=60.0, validator=within(0.001, 3600.0))
+    max_deadline_s: float = field(default=600.0, validator=within(0.001, 3600.0))
     """A longer deadline is refused: nobody may have a worker for ever."""
     cache_entries: int = field(default=1024, validator=within(0, 1_000_000))
     """Answers that are kept for requests that are asked again by their id."""

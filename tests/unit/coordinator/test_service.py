@@ -157,7 +157,7 @@ def spoiled(*path: str | int, value: object) -> dict[str, Any]:
         (spoiled("conflicts", value=["nodes"]), "conflicts[0]"),
         (spoiled("deadline_s", value=-1), "deadline_s"),
         (spoiled("deadline_s", value=float("nan")), "deadline_s"),
-        (spoiled("deadline_s", value=61.0), "deadline_s"),
+        (spoiled("deadline_s", value=601.0), "deadline_s"),
     ],
 )
 def test_a_malformed_request_is_refused_with_the_fields_name(
