@@ -273,4 +273,7 @@ class PlanningService:
 
 def plan_in_time(request: PlanRequest, left_s: float) -> PlanResponse:
     """Plan a request in the time that is left of its deadline; see `checked_plan`."""
-    return checked_plan(attrs.evolve(request, deadline_s=min(left_s, request.deadline_s)))
+    left_s = min(left_s, request.deadline_s)
+    response = checked_plan(attrs.evolve(request, deadline_s=left_s))
+    waited_ms = round(1e3 * (request.deadline_s - left_s), 3)
+    return attrs.evolve(response, waited_ms=waited_ms)

@@ -41,6 +41,7 @@ class PlanResponse:
     cost, steps: None without a plan. lower_bound: proven; None if infeasible.
     assignment: per vehicle, the index of its target; empty without a plan.
     paths: per vehicle, its cells at all `steps` + 1 time points; empty without a plan.
+    waited_ms: at a service, how long the request waited for a worker; None: it was planned here.
     """
 
     status: Status
@@ -52,6 +53,7 @@ class PlanResponse:
     solve_ms: float
     assignments_tried: int
     nodes_expanded: int
+    waited_ms: float | None = None
 
     def path_map(self, request: PlanRequest) -> RelativePathMap:
         """Return the plan as a relative path map."""
@@ -71,20 +73,18 @@ class PlanResponse:
             "solve_ms": self.solve_ms,
             "assignments_tried": self.assignments_tried,
             "nodes_expanded": self.nodes_expanded,
+            **({} if self.waited_ms is None else {"waited_ms": self.waited_ms}),
         }
 
     @classmethod
     def from_dict(cls, data: object) -> PlanResponse:
         """Read the JSON form."""
-        fields = as_mapping("response", data, _FIELDS)
+        fields = as_mapping("response", data, (*_FIELDS, "waited_ms"))
         require(fields, "", _FIELDS)
         if fields["schema"] != RESPONSE_SCHEMA:
             raise BadInputError("schema", fields["schema"], repr(RESPONSE_SCHEMA))
         if fields["status"] not in STATUSES:
             raise BadInputError("status", fields["status"], "one of " + ", ".join(STATUSES))
-        solve_ms = fields["solve_ms"]
-        if isinstance(solve_ms, bool) or not isinstance(solve_ms, int | float):
-            raise BadInputError("solve_ms", solve_ms, "a number")
         assignment = as_list("assignment", fields["assignment"], MAX_VEHICLES)
         return cls(
             status=fields["status"],
@@ -95,10 +95,19 @@ class PlanResponse:
                 as_int(f"assignment[{i}]", j, 0, MAX_TARGETS - 1) for i, j in enumerate(assignment)
             ),
             paths=_read_paths(fields["paths"]),
-            solve_ms=float(solve_ms),
+            solve_ms=_milliseconds("solve_ms", fields["solve_ms"]),
             assignments_tried=as_int("assignments_tried", fields["assignments_tried"], 0, _MOST),
             nodes_expanded=as_int("nodes_expanded", fields["nodes_expanded"], 0, _MOST),
+            waited_ms=_milliseconds("waited_ms", fields["waited_ms"])
+            if "waited_ms" in fields
+            else None,
         )
+
+
+def _milliseconds(field: str, value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise BadInputError(field, value, "a number")
+    return float(value)
 
 
 def _optional_int(field: str, value: object) -> int | None:

@@ -1,0 +1,323 @@
+"""What the planning service adds to planning: throughput, latency, and the loss of a coordinator.
+
+    python benchmarks/service.py [--json docs/evidence/service.json]
+
+Real processes: a router, coordinators as `laneweave coordinator` runs them, and clients in a
+process of their own. Requests are formations of 6 to 18 vehicles. Four measurements:
+
+- *alone*: the solver in a process that does nothing else, one request after the other. Its rate is
+  what a worker could do at best.
+- *load*: 200 requests in flight from 20 clients. Each must be answered, and the same request asked
+  once more under its id must get the same plan.
+- *half*: requests come at random, at half the rate that the service can do. What the service adds
+  to a request is its latency less the solver's time and less the time that it waited for a worker
+  that was busy: a queue forms at half load in front of any single server.
+- *loss*: three coordinators under load, one of which is killed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import json
+import os
+import random
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import attrs
+from attrs import define, field, frozen
+
+from laneweave.coordinator.client import AsyncPlanClient, PlanClient, PlanError
+from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan, warm_up
+from laneweave.coordinator.planning.instances import formation_request
+
+LANEWEAVE = str(Path(sys.executable).with_name("laneweave"))
+REQUESTS, CLIENTS = 200, 20
+SIZES = range(6, 19)
+DEADLINE_S = 300.0
+"""Longer than all of it takes: nothing is dropped, and plans do not depend on the load."""
+HALF_REQUESTS = 1000
+SMALL = range(6, 11)
+LOSSES = 10
+LOSS_PAUSE_S = 3.0
+LOSS_LOAD = 0.5
+"""Of what two cores can do, while coordinators are killed."""
+START_S = 60.0
+
+
+def instance(seed: int, sizes: Sequence[int]) -> PlanRequest:
+    """Return a formation; sizes take turns."""
+    request = formation_request(seed, vehicles=sizes[seed % len(sizes)], deadline_s=DEADLINE_S)
+    return attrs.evolve(request, id=f"request-{seed}")
+
+
+@define
+class Network:
+    """A router and coordinators, as processes."""
+
+    folder: Path
+    workers: int
+    processes: dict[str, subprocess.Popen[bytes]] = field(factory=dict)
+
+    @property
+    def endpoint(self) -> str:
+        """Where the router is."""
+        return f"unixsock-stream/{self.folder}/router.sock"
+
+    def start(self, *arguments: str, name: str) -> None:
+        """Start a role."""
+        config = self.folder / "deployment.toml"
+        config.write_text(
+            f'[network]\nendpoint = "{self.endpoint}"\n'
+            f"[service]\nworkers = {self.workers}\nqueue_limit = 1000\n"
+        )
+        self.processes[name] = subprocess.Popen(  # noqa: S603
+            [LANEWEAVE, *arguments, "--config", str(config)], stderr=subprocess.DEVNULL
+        )
+
+    def start_coordinator(self, name: str) -> None:
+        """Start a coordinator."""
+        self.start("coordinator", "--name", name, name=name)
+
+    def end(self) -> None:
+        """End all processes."""
+        for process in self.processes.values():
+            process.terminate()
+        for process in self.processes.values():
+            process.wait(30)
+
+
+@contextlib.contextmanager
+def network(coordinators: int, workers: int) -> Iterator[Network]:
+    """Start a router and coordinators, and wait until they plan."""
+    with tempfile.TemporaryDirectory(prefix="laneweave-") as folder:
+        started = Network(Path(folder), workers)
+        try:
+            started.start("router", name="router")
+            _until((Path(folder) / "router.sock").exists)
+            time.sleep(1.0)
+            for number in range(coordinators):
+                started.start_coordinator(f"c{number + 1}")
+            with PlanClient(started.endpoint) as client:
+                _until(lambda: _answers(client))
+                # Every worker of every coordinator gets ready.
+                for seed in range(60):
+                    client.plan(formation_request(seed), START_S)
+            time.sleep(3.0)
+            yield started
+        finally:
+            started.end()
+
+
+def _until(condition: Callable[[], bool]) -> None:
+    give_up = time.monotonic() + START_S
+    while not condition():
+        if time.monotonic() > give_up:
+            raise SystemExit("the network does not come up")
+        time.sleep(0.1)
+
+
+def _answers(client: PlanClient) -> bool:
+    try:
+        client.plan(formation_request(1), START_S)
+    except PlanError:
+        return False
+    return True
+
+
+@frozen
+class Asked:
+    """One request as its client saw it."""
+
+    asked_s: float
+    latency_s: float
+    response: PlanResponse
+
+    @property
+    def added_ms(self) -> float:
+        """Latency, less the solver's time and the time that it waited for a busy worker."""
+        waited_ms = self.response.waited_ms or 0.0
+        return 1e3 * self.latency_s - self.response.solve_ms - waited_ms
+
+
+async def ask(client: AsyncPlanClient, request: PlanRequest) -> Asked:
+    """Have a request planned."""
+    begun_s = time.monotonic()
+    response = await client.plan(request, timeout_s=2 * DEADLINE_S)
+    return Asked(begun_s, time.monotonic() - begun_s, response)
+
+
+async def with_clients(
+    endpoint: str, work: Callable[[list[AsyncPlanClient]], Awaitable[Any]], count: int = CLIENTS
+) -> Any:  # noqa: ANN401
+    """Connect clients, and let them work."""
+    async with contextlib.AsyncExitStack() as stack:
+        clients = [await stack.enter_async_context(AsyncPlanClient(endpoint)) for _ in range(count)]
+        return await work(clients)
+
+
+# --- the measurements -----------------------------------------------------------------------------
+
+
+def alone() -> dict[str, Any]:
+    """Measure the solver by itself."""
+    warm_up()
+    requests = [instance(seed, SIZES) for seed in range(REQUESTS)]
+    wall_s, cpu_s = time.perf_counter(), time.process_time()
+    for request in requests:
+        checked_plan(request)
+    wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
+    return {"requests": REQUESTS, "rate_per_s": REQUESTS / wall_s, "wall_s": wall_s, "cpu_s": cpu_s}
+
+
+def load(workers: int, solver_rate_per_s: float) -> dict[str, Any]:
+    """Measure 200 requests in flight from 20 clients, each asked again under its id."""
+
+    async def work(clients: list[AsyncPlanClient]) -> tuple[list[Asked], list[Asked], float]:
+        requests = [instance(seed, SIZES) for seed in range(REQUESTS)]
+        begun_s = time.monotonic()
+        first = await asyncio.gather(
+            *(ask(clients[i % CLIENTS], request) for i, request in enumerate(requests))
+        )
+        took_s = time.monotonic() - begun_s
+        again = await asyncio.gather(
+            *(ask(clients[-i % CLIENTS], request) for i, request in enumerate(requests))
+        )
+        return first, again, took_s
+
+    with network(coordinators=1, workers=workers) as net:
+        first, again, took_s = asyncio.run(with_clients(net.endpoint, work))
+    differ = sum(a.response != b.response for a, b in zip(first, again, strict=True))
+    rate = REQUESTS / took_s
+    return {
+        "workers": workers,
+        "clients": CLIENTS,
+        "requests": REQUESTS,
+        "answered": len(first),
+        "answered_differently": differ,
+        "took_s": took_s,
+        "rate_per_s": rate,
+        "of_solvers_rate": rate / (workers * solver_rate_per_s),
+        "repeated_ms_p50": 1e3 * statistics.median(one.latency_s for one in again),
+    }
+
+
+def half(workers: int) -> dict[str, Any]:
+    """Measure what the service adds to requests that come at random, at half load."""
+    mean_s = statistics.mean(
+        checked_plan(instance(seed, SMALL)).solve_ms / 1e3 for seed in range(200)
+    )
+    rng = random.Random(1)  # noqa: S311
+
+    async def work(clients: list[AsyncPlanClient]) -> list[Asked]:
+        tasks = []
+        due_s = time.monotonic()
+        for seed in range(HALF_REQUESTS):
+            due_s += rng.expovariate(0.5 * workers / mean_s)
+            await asyncio.sleep(max(0.0, due_s - time.monotonic()))
+            tasks.append(asyncio.create_task(ask(clients[seed % CLIENTS], instance(seed, SMALL))))
+        return await asyncio.gather(*tasks)
+
+    with network(coordinators=1, workers=workers) as net:
+        asked = asyncio.run(with_clients(net.endpoint, work))
+    added = [one.added_ms for one in asked]
+    return {
+        "workers": workers,
+        "requests": HALF_REQUESTS,
+        "solve_ms_mean": 1e3 * mean_s,
+        "added_ms": quantiles(added),
+        "waited_ms": quantiles([one.response.waited_ms or 0.0 for one in asked]),
+        "solve_ms": quantiles([one.response.solve_ms for one in asked]),
+    }
+
+
+def loss() -> dict[str, Any]:
+    """Kill one of three coordinators again and again, under load."""
+    mean_s = statistics.mean(
+        checked_plan(instance(seed, SMALL)).solve_ms / 1e3 for seed in range(200)
+    )
+    rng = random.Random(2)  # noqa: S311
+    killed_s: list[float] = []
+
+    async def work(clients: list[AsyncPlanClient], net: Network) -> list[Asked]:
+        tasks: list[asyncio.Task[Asked]] = []
+        seed = 0
+        for number in range(LOSSES):
+            name = f"c{1 + number % 3}"
+            kill_s, restart_s = time.monotonic() + LOSS_PAUSE_S, None
+            while time.monotonic() < kill_s + LOSS_PAUSE_S:
+                seed += 1
+                tasks.append(
+                    asyncio.create_task(ask(clients[seed % CLIENTS], instance(seed, SMALL)))
+                )
+                await asyncio.sleep(rng.expovariate(LOSS_LOAD * 2 / mean_s))
+                if restart_s is None and time.monotonic() > kill_s:
+                    net.processes[name].kill()
+                    killed_s.append(time.monotonic())
+                    restart_s = time.monotonic() + 1.0
+            net.processes[name].wait()
+            net.start_coordinator(name)
+            await asyncio.sleep(5.0)
+        return await asyncio.gather(*tasks)
+
+    with network(coordinators=3, workers=1) as net:
+        asked = asyncio.run(with_clients(net.endpoint, lambda clients: work(clients, net)))
+    hit = [
+        one
+        for one in asked
+        for at_s in killed_s
+        if one.asked_s < at_s + 1.0 and one.asked_s + one.latency_s > at_s
+    ]
+    beyond = [1e3 * one.latency_s - one.response.solve_ms for one in hit]
+    return {
+        "coordinators": 3,
+        "killed": len(killed_s),
+        "requests": len(asked),
+        "answered": sum(one.response.status in ("optimal", "feasible") for one in asked),
+        "around_the_kills": len(hit),
+        "beyond_solving_ms": quantiles(beyond),
+    }
+
+
+def quantiles(values: list[float]) -> dict[str, float]:
+    """Return what is worth knowing of a distribution."""
+    ordered = sorted(values)
+    at = {"p50": 0.5, "p95": 0.95, "p99": 0.99}
+    return {name: ordered[int(share * (len(ordered) - 1))] for name, share in at.items()} | {
+        "max": ordered[-1]
+    }
+
+
+def main() -> None:
+    """Measure all, or some."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--only", choices=("load", "half", "loss"))
+    options = parser.parse_args()
+    found: dict[str, Any] = {"cores": len(os.sched_getaffinity(0))}
+    if options.only in (None, "load"):
+        found["alone"] = alone()
+        rate = found["alone"]["rate_per_s"]
+        found["load"] = [load(workers, rate) for workers in (1, 2)]
+    if options.only in (None, "half"):
+        warm_up()
+        found["half"] = [half(workers) for workers in (1, 2)]
+    if options.only in (None, "loss"):
+        warm_up()
+        found["loss"] = loss()
+    text = json.dumps(found, indent=2) + "\n"
+    if options.json:
+        options.json.write_text(text, encoding="utf-8")
+    sys.stdout.write(text)
+
+
+if __name__ == "__main__":
+    main()

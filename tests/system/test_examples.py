@@ -1,0 +1,48 @@
+"""The examples, as README tells to run them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from system.harness import END_S, Lab
+from system.test_deployment import REQUEST, _ask, deployment, free_tcp, start_router, stop
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+MOST_LINES = 40
+
+
+@pytest.mark.parametrize("example", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
+def test_an_example_is_short(example: Path) -> None:
+    assert len(example.read_text(encoding="utf-8").splitlines()) < MOST_LINES
+
+
+def test_examples_ask_a_coordinator(lab: Lab) -> None:
+    endpoint = free_tcp()
+    config = deployment(lab, endpoint)
+    config.write_text(config.read_text(encoding="utf-8").replace('"test"', '"default"'), "utf-8")
+    router = start_router(lab, config)
+    coordinator = lab.start("coordinator", "--config", config)
+    lab.wait_until(lambda: _ask(lab, config, REQUEST, "--realm", "default").status == 0, END_S)
+
+    assert _run("ask_the_coordinator", endpoint).startswith("optimal: cost ")
+    assert _run("only_zenoh_and_json", endpoint).startswith("optimal cost 7\n")
+
+    stop(lab, coordinator, router)
+
+
+def _run(example: str, endpoint: str) -> str:
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / f"{example}.py", endpoint],
+        capture_output=True,
+        text=True,
+        timeout=END_S,
+        check=False,
+        env=dict(os.environ) | {"PYTHONWARNINGS": "error"},
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout
