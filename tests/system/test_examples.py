@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -46,3 +47,20 @@ def _run(example: str, endpoint: str) -> str:
     )
     assert (done.returncode, done.stderr) == (0, "")
     return done.stdout
+
+
+def test_a_plan_waits_for_router_and_coordinator(lab: Lab) -> None:
+    endpoint = free_tcp()
+    config = deployment(lab, endpoint)
+    path = lab.path("request.json", json.dumps(REQUEST))
+    asked = lab.start(
+        "plan", path, "--connect", endpoint, "--realm", "test", "--wait", f"{END_S:g}"
+    )
+    router = start_router(lab, config)
+    coordinator = lab.start("coordinator", "--config", config)
+
+    ended = lab.finish(asked)
+
+    assert (ended.status, ended.err) == (0, "")
+    assert json.loads(ended.out)["status"] == "optimal"
+    stop(lab, coordinator, router)

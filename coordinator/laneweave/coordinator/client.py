@@ -22,6 +22,7 @@ from typing import Self
 import attrs
 
 from laneweave.coordinator.inquiry import (
+    ABSENT_S,
     AskAgain,
     DeadlinePassedError,
     Inquiry,
@@ -54,23 +55,25 @@ DEFAULT_TIMEOUT_S = 10.0
 class _Connection:
     """A session at a router, and the key of the service."""
 
-    def __init__(self, access: Access | str) -> None:
+    def __init__(self, access: Access | str, patience_s: float = ABSENT_S) -> None:
         """Connect.
 
         Args:
             access: how to get onto the network, or only the endpoint of its router.
+            patience_s: where nobody answers for so long, there is no service.
 
         Raises:
             BadInputError: nobody answers there.
         """
         access = Access(access) if isinstance(access, str) else access
+        self._patience_s = patience_s
         self._key = Keys(access.realm).key(SERVICE)
         self._transport = ZenohTransport(access, lambda _: None)
 
     def _begin(self, request: PlanRequest, timeout_s: float) -> Inquiry:
         if not request.id:
             request = attrs.evolve(request, id=uuid.uuid4().hex)
-        return Inquiry(request, timeout_s, time.monotonic())
+        return Inquiry(request, timeout_s, time.monotonic(), patience_s=self._patience_s)
 
     def _ask(self, inquiry: Inquiry) -> Future[Answer | None]:
         left_s = max(0.0, inquiry.left_s(time.monotonic()))

@@ -25,8 +25,8 @@ from laneweave.protocol.transport import Answer
 FIRST_PAUSE_S = 0.02
 LONGEST_PAUSE_S = 0.5
 ABSENT_S = 3.0
-"""Nobody answers for so long: there is no service. A coordinator that is killed is given up at
-once, one that hangs after `network.lease_s`, and a new router is found in less than a second."""
+"""A coordinator that is killed is given up at once, one that hangs after `network.lease_s`, and a
+new router is found in less than a second."""
 
 
 class PlanError(Exception):
@@ -73,6 +73,8 @@ class Inquiry:
     timeout_s: float
     begun_s: float
     form: Format = JSON
+    patience_s: float = ABSENT_S
+    """Nobody answers for so long: there is no service."""
     _pause_s: float = FIRST_PAUSE_S
     _absent_since_s: float | None = field(default=None)
 
@@ -113,7 +115,7 @@ class Inquiry:
         since_s = now_s if self._absent_since_s is None else self._absent_since_s
         self._absent_since_s = since_s
         absent = ServiceUnavailableError("no coordinator answers on this network and realm")
-        if now_s >= since_s + ABSENT_S:
+        if now_s >= since_s + self.patience_s:
             raise absent
         return self._pause(now_s, absent)
 

@@ -202,6 +202,9 @@ def plan(
         str | None, typer.Option("--connect", metavar="ENDPOINT", help="Ask a coordinator there.")
     ] = None,
     realm: Annotated[str, typer.Option("--realm", help="Realm of that coordinator.")] = "default",
+    wait: Annotated[
+        float, typer.Option("--wait", help="Seconds to wait for a router and a coordinator there.")
+    ] = 0.0,
     output: Annotated[OutputFormat, typer.Option("--format")] = OutputFormat.json,
     solver: Annotated[
         SolverChoice, typer.Option("--solver", help="How to plan here: see docs/PLANNING.md.")
@@ -217,7 +220,16 @@ def plan(
     from laneweave.launch.plan_command import answer_request
 
     as_table = output is OutputFormat.table
-    answer_request(request, deadline, connect, realm, solver.value, as_table=as_table, drawing=draw)
+    answer_request(
+        request,
+        deadline,
+        connect,
+        realm,
+        solver.value,
+        as_table=as_table,
+        drawing=draw,
+        wait_s=wait,
+    )
 
 
 for command in (router, ping, coordinator, agent, bridge, sweep, report):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,11 +15,14 @@ from laneweave.coordinator.client import (
     RequestRefusedError,
     ServiceUnavailableError,
 )
+from laneweave.coordinator.inquiry import ABSENT_S
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan
 from laneweave.coordinator.planning.facade import Solver
 from laneweave.protocol.access import Access
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
 
+CONNECT_AGAIN_S = 0.2
+MOST_WAIT_S = 3600.0
 ANSWER_MARGIN_S = 5.0
 """A coordinator gets this much longer than the request's deadline."""
 
@@ -32,8 +36,11 @@ def answer_request(
     *,
     as_table: bool,
     drawing: Path | None = None,
+    wait_s: float = 0.0,
 ) -> None:
-    """Read a request, have it planned, print the answer and draw it; `solver` plans it here.
+    """Read a request, have it planned, print the answer and draw it.
+
+    `solver` plans it here; at `endpoint` it is waited `wait_s` for somebody who does.
 
     Raises:
         BadInputError: the request cannot be read or is not valid, nobody is at the endpoint, or
@@ -42,6 +49,8 @@ def answer_request(
         CommandFailedError: the coordinator failed or did not answer in time, or the drawing could
             not be written after all.
     """
+    if not 0 <= wait_s <= MOST_WAIT_S:
+        raise BadInputError("--wait", wait_s, f"[0, {MOST_WAIT_S:g}]")
     draw = None if drawing is None else _checked_drawer(drawing)
     data = _read(path)
     if deadline_s is not None:
@@ -50,7 +59,7 @@ def answer_request(
     if endpoint is None:
         response = checked_plan(request, solver=solver)
     else:
-        response = _ask(Access(endpoint, realm), request)
+        response = _ask(Access(endpoint, realm), request, wait_s)
     if as_table:
         sys.stdout.write(_table(request, response))
     else:
@@ -95,10 +104,23 @@ def _read(path: Path) -> dict[str, Any]:
     return data
 
 
-def _ask(access: Access, request: PlanRequest) -> PlanResponse:
+def _connected(access: Access, give_up_s: float) -> PlanClient:
+    """Return a client, as soon as there is a router."""
+    while True:
+        try:
+            return PlanClient(access, max(ABSENT_S, give_up_s - time.monotonic()))
+        except BadInputError:
+            if time.monotonic() > give_up_s:
+                raise
+            time.sleep(CONNECT_AGAIN_S)
+
+
+def _ask(access: Access, request: PlanRequest, wait_s: float) -> PlanResponse:
+    give_up_s = time.monotonic() + wait_s
+    timeout_s = request.deadline_s + ANSWER_MARGIN_S + wait_s
     try:
-        with PlanClient(access) as client:
-            return client.plan(request, request.deadline_s + ANSWER_MARGIN_S)
+        with _connected(access, give_up_s) as client:
+            return client.plan(request, timeout_s)
     except RequestRefusedError as error:
         raise RefusedError(str(error)) from error
     except ServiceUnavailableError as error:
