@@ -30,6 +30,7 @@ from laneweave.protocol import messages
 from laneweave.protocol.codec import KINDS, field_names
 from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.motion import cell_state
+from laneweave.protocol.ranges import HOST_PORT_RULE
 from laneweave.protocol.scenario import CONFLICT_KINDS, Scenario, load_scenario, parse_scenario
 from laneweave.protocol.topics import NAME_RULE, TOPICS
 from laneweave.sim_bridge.overlap import Bodies, pose_of
@@ -159,6 +160,7 @@ def _allowed(attribute: attrs.Attribute[Any]) -> str:
         return f"{bracket}{_number(found['low'])}, {_number(found['high'])}]"
     rules = {
         "key_part": NAME_RULE,
+        "host_port": HOST_PORT_RULE,
         "_conflict_kinds": "any of " + ", ".join(f"`{kind}`" for kind in CONFLICT_KINDS),
     }
     return rules[getattr(attribute.validator, "__name__", "")]

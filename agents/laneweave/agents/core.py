@@ -17,7 +17,7 @@ from collections.abc import Callable
 
 from attrs import evolve
 
-from laneweave.agents.driver import Course, Driver, TrackingDriver
+from laneweave.agents.driver import Course, Driver, Effort, TrackingDriver
 from laneweave.protocol.execution import PlanExecution
 from laneweave.protocol.incarnations import above
 from laneweave.protocol.lattice import Move
@@ -121,6 +121,11 @@ class AgentCore:
             and not sense.caretaker
             and not self.ended
         )
+
+    @property
+    def effort(self) -> Effort:
+        """What driving has cost so far."""
+        return self._driver.effort
 
     def handle(self, event: Event, now_s: float) -> list[Effect]:
         """Take an event; see `Core`."""
@@ -320,7 +325,7 @@ class AgentCore:
         ]
 
     def _report(self) -> Effect:
-        effort = self._driver.effort
+        effort = self.effort
         report = Report(
             role=Name("agent"),
             name=self.vehicle,

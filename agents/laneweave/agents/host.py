@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable
 from attrs import frozen
 
 from laneweave.agents.core import AgentCore
+from laneweave.agents.numbers import AgentNumbers
 from laneweave.protocol.messages import Census, Motion, Name, VehicleState
 from laneweave.protocol.node import (
     Arrived,
@@ -23,6 +24,7 @@ from laneweave.protocol.node import (
     Wakeup,
     Watch,
 )
+from laneweave.protocol.numbers import Snapshot
 from laneweave.protocol.topics import BRIDGE_ALIVE, CENSUS, MOTION, STATE, Topic, incarnation_of
 
 ALONE_S = 60.0
@@ -66,6 +68,22 @@ class AgentHost:
         """Incarnation of the newest bridge."""
         self._alone_since_s: float | None = 0.0
         """Since when no bridge is there."""
+        self._solves = self._unusable = 0
+        """Of agents that have ended."""
+
+    @property
+    def numbers(self) -> tuple[Snapshot, ...]:
+        """What the agents have counted."""
+        agents = self._agents.values()
+        efforts = [agent.effort for agent in agents]
+        return (
+            AgentNumbers(
+                vehicles=len(agents),
+                vehicles_in_charge=sum(agent.in_charge for agent in agents),
+                solves_total=self._solves + sum(effort.solves for effort in efforts),
+                unusable_total=self._unusable + sum(effort.unusable for effort in efforts),
+            ),
+        )
 
     @property
     def wakeup_s(self) -> float | None:
@@ -144,20 +162,27 @@ class AgentHost:
             return effects  # left over from an earlier run, or no bridge at all
         self._alone_since_s = None
         if self._shard is not None and self._bridge not in (-1, incarnation):
-            for agent in self._agents.values():
-                effects += agent.leave()
-            self._agents.clear()
+            for name in list(self._agents):
+                effects += self._part_with(name).leave()
             self._seen.clear()
             self._census_s = 0.0
         self._bridge = incarnation
         return effects
+
+    def _part_with(self, name: Name) -> AgentCore:
+        """Take an agent out; what it has counted stays."""
+        agent = self._agents.pop(name)
+        effort = agent.effort
+        self._solves += effort.solves
+        self._unusable += effort.unusable
+        return agent
 
     def _hand_on(self, event: Event, name: Name, now_s: float) -> list[Effect]:
         agent = self._agents[name]
         wanted = agent.wanted_motions, agent.wanted_states
         effects = agent.handle(event, now_s)
         if agent.ended:
-            del self._agents[name]
+            self._part_with(name)
         # Not after every message: a host of many would look at all of them for each of them.
         if agent.ended or wanted != (agent.wanted_motions, agent.wanted_states):
             self._listen_to_formations(effects)
@@ -179,7 +204,7 @@ class AgentHost:
                 effects += self._agents[name].handle(Started(), now_s)
         for name in sorted(set(self._agents) - set(listed)):
             # It left, and the bridge's word of it was lost.
-            effects += self._agents.pop(name).leave()
+            effects += self._part_with(name).leave()
         self._seen = set(listed)
         return effects
 

@@ -13,6 +13,7 @@ from laneweave.protocol.faulty_core import Wrap, bare
 from laneweave.protocol.incarnations import Incarnations
 from laneweave.protocol.messages import Name, Sense
 from laneweave.protocol.motion import cell_state
+from laneweave.protocol.numbers import Observe, unobserved
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.zenoh_transport import run_core
 
@@ -44,6 +45,7 @@ def run_agents(
     vehicles: Iterable[str],
     shard: Shard | None = None,
     wrap: Wrap = bare,
+    observe: Observe = unobserved,
 ) -> None:
     """Run agents until their vehicles have left the road, or until SIGINT or SIGTERM.
 
@@ -53,6 +55,7 @@ def run_agents(
         vehicles: whom it drives; empty: all of the shard, as they are announced.
         shard: see `AgentHost`.
         wrap: may put faults before them.
+        observe: is told where their numbers come from.
 
     Raises:
         BadInputError: nobody answers at the endpoint.
@@ -63,4 +66,4 @@ def run_agents(
         [Name(vehicle) for vehicle in vehicles],
         shard,
     )
-    run_core(wrap(host), access)
+    run_core(wrap(host), access, observe=observe)

@@ -17,6 +17,7 @@ from laneweave.coordinator.formation_planner import FormationPlanner, Note
 from laneweave.coordinator.groups import Groups
 from laneweave.coordinator.leader import FormationControl
 from laneweave.coordinator.leader_rules import LEADER_RULES, Phase
+from laneweave.coordinator.numbers import CoordinatorNumbers
 from laneweave.coordinator.service import PlanningService
 from laneweave.coordinator.stream_control import Note as StreamNote
 from laneweave.coordinator.stream_control import StreamControl
@@ -51,6 +52,7 @@ from laneweave.protocol.node import (
     Unlisten,
     Watch,
 )
+from laneweave.protocol.numbers import Snapshot
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.topics import (
     BRIDGE_ALIVE,
@@ -129,6 +131,28 @@ class CoordinatorCore:
         self._heartbeat_s = 0.0
         self._report_s = 0.0
         self._wakeup_s: float | None = None
+
+    @property
+    def numbers(self) -> tuple[Snapshot, ...]:
+        """What this candidate has counted."""
+        election = self.election
+        return (
+            CoordinatorNumbers(
+                leading=election.leading,
+                term=election.term,
+                candidates=election.candidates(self._handled_s),
+                elections_total=election.won,
+                plans_in_force=self._in_force,
+                road_seconds=self.t_s,
+            ),
+        )
+
+    @property
+    def _in_force(self) -> int:
+        """Plans in force: of formations, or of the slot."""
+        if self._stream is not None:
+            return self._stream.in_force
+        return sum(control.phase is Phase.WATCHING for control in self.controls.values())
 
     @property
     def wakeup_s(self) -> float | None:
@@ -303,15 +327,10 @@ class CoordinatorCore:
     def _heartbeat(self, now_s: float) -> Iterator[Effect]:
         if now_s >= self._heartbeat_s:
             self._heartbeat_s = now_s + self.scenario.network.heartbeat_s
-            in_force = (
-                sum(control.phase is Phase.WATCHING for control in self.controls.values())
-                if self._stream is None
-                else self._stream.in_force
-            )
-            election = self.election
+            term, leading = self.election.term, self.election.leading
             yield Send(
                 HEARTBEAT,
-                Heartbeat(self.name, self._incarnation, election.term, election.leading, in_force),
+                Heartbeat(self.name, self._incarnation, term, leading, self._in_force),
                 {"coordinator": self.name},
             )
         if now_s >= self._report_s:

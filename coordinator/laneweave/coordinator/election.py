@@ -41,6 +41,8 @@ class Election:
     """Highest term seen; the own term while leading."""
     leading: bool = False
     link_up: bool = True
+    won: int = 0
+    """Times that it has begun to lead."""
     _peers: dict[str, _Peer] = field(factory=dict)
     _dead: set[tuple[str, int]] = field(factory=set)
 
@@ -117,7 +119,13 @@ class Election:
         self.leading = lead
         if lead:
             self.term += 1
+            self.won += 1
         return True
+
+    def candidates(self, now_s: float) -> int:
+        """Return how many count, this one included."""
+        heard = (peer.heard_s for peer in self._peers.values())
+        return 1 + sum(now_s < heard_s + self.election_s for heard_s in heard)
 
     def raise_term(self, above: int) -> None:
         """Take a term above one that was seen on a vehicle (L3)."""

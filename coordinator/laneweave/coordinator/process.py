@@ -11,13 +11,19 @@ from laneweave.protocol.access import access_of
 from laneweave.protocol.faulty_core import Wrap, bare
 from laneweave.protocol.incarnations import Incarnations
 from laneweave.protocol.messages import Name
+from laneweave.protocol.numbers import Observe, unobserved
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.worker_pool import WorkerPool
 from laneweave.protocol.zenoh_transport import run_core
 
 
 def run_coordinator(
-    scenario: Scenario, name: str, wrap: Wrap = bare, *, workers_at_once: bool = False
+    scenario: Scenario,
+    name: str,
+    wrap: Wrap = bare,
+    observe: Observe = unobserved,
+    *,
+    workers_at_once: bool = False,
 ) -> None:
     """Run a coordinator candidate until SIGINT or SIGTERM.
 
@@ -27,6 +33,7 @@ def run_coordinator(
         scenario: the road, and the deployment.
         name: by which candidates are ranked.
         wrap: may put faults before the core.
+        observe: is told where its numbers come from.
         workers_at_once: start the processes that plan for others now, not when somebody asks.
 
     Raises:
@@ -38,4 +45,4 @@ def run_coordinator(
     with contextlib.closing(WorkerPool(workers, warm_up)) as pool:
         if workers_at_once:
             pool.start()
-        run_core(wrap(core), access_of(scenario, f"coordinator.{name}"), pool)
+        run_core(wrap(core), access_of(scenario, f"coordinator.{name}"), pool, observe)

@@ -44,7 +44,10 @@ app = typer.Typer(
 TYPER_INTERRUPTED = 130
 """What typer makes of Ctrl-C."""
 MISSING_SIM = "the simulation packages: install laneweave[sim]"
-MISSING_DASK = "Dask: install laneweave[dask]"
+MISSING_OTHERS = {
+    "distributed": "Dask: install laneweave[dask]",
+    "prometheus_client": "the package for metrics: install laneweave[metrics]",
+}
 
 
 class TransportChoice(StrEnum):
@@ -355,7 +358,7 @@ def _status(arguments: list[str]) -> int:
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("laneweave"):
             raise
-        missing = MISSING_DASK if error.name == "distributed" else MISSING_SIM
+        missing = MISSING_OTHERS.get(error.name or "", MISSING_SIM)
         return _refuse(f"{error.name}: not installed; allowed: {missing}")
     if result == TYPER_INTERRUPTED:
         sys.stderr.write("interrupted\n")

@@ -1,17 +1,56 @@
-"""Structured logs: JSON lines in the run's folder, or readable lines on a terminal."""
+"""Structured logs: JSON lines in the run's folder or for a collector, or readable lines."""
 
 from __future__ import annotations
 
 import json
 import logging
 import sys
+import threading
+from collections.abc import Callable
+from enum import StrEnum
 from pathlib import Path
+from typing import Any
 
 import structlog
+from structlog.typing import EventDict, Processor
 
 
-def log_to_terminal() -> None:
-    """Write warnings and errors to stderr, one readable line each."""
+class LogFormat(StrEnum):
+    """How a role writes its log to stderr."""
+
+    text = "text"
+    json = "json"
+
+
+class LogLevel(StrEnum):
+    """The least important entries that a role writes."""
+
+    debug = "debug"
+    info = "info"
+    warning = "warning"
+    error = "error"
+
+
+def log_role(role: str, name: str, form: LogFormat, level: LogLevel | None) -> None:
+    """Write a role's log to stderr; without a `level` from `info` on as JSON, else `warning`."""
+    if form is LogFormat.text:
+        log_to_terminal(level or LogLevel.warning)
+        return
+    _log_json(lambda *_: structlog.PrintLogger(sys.stderr), role, name, level or LogLevel.info)
+    log = structlog.get_logger(__name__)
+
+    def on_failure(kind: type[BaseException], error: BaseException | None, trace: Any) -> None:  # noqa: ANN401 (a traceback)
+        log.error("role failed", exc_info=(kind, error, trace))
+
+    # What nobody catches is a line like all others; a collector takes no lines together.
+    sys.excepthook = on_failure
+    threading.excepthook = lambda args: on_failure(
+        args.exc_type, args.exc_value, args.exc_traceback
+    )
+
+
+def log_to_terminal(level: LogLevel = LogLevel.warning) -> None:
+    """Write warnings and errors to stderr, one readable line each; or from `level` on."""
     structlog.configure(
         processors=[
             structlog.processors.TimeStamper(fmt="%H:%M:%S"),
@@ -19,7 +58,7 @@ def log_to_terminal() -> None:
             structlog.processors.format_exc_info,
             structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty()),
         ],
-        wrapper_class=structlog.make_filtering_bound_logger(logging.WARNING),
+        wrapper_class=structlog.make_filtering_bound_logger(_number(level)),
         # Whatever stderr is by then.
         logger_factory=lambda *_: structlog.PrintLogger(sys.stderr),
         cache_logger_on_first_use=False,
@@ -45,16 +84,34 @@ def log_to_file(path: Path, role: str, name: str) -> None:
     """Append JSON lines to a file that all processes of a run share."""
     # Unbuffered appends of whole lines do not mix, whoever writes them.
     stream = path.open("a", buffering=1, encoding="utf-8")
-    structlog.contextvars.bind_contextvars(role=role, name=name)
+    _log_json(structlog.WriteLoggerFactory(stream), role, name, LogLevel.info)
+
+
+def _log_json(make_logger: Callable[..., Any], role: str, name: str, level: LogLevel) -> None:
     structlog.configure(
         processors=[
-            structlog.contextvars.merge_contextvars,
+            _signed(role, name),
             structlog.processors.TimeStamper(fmt="iso"),
             structlog.processors.add_log_level,
             structlog.processors.format_exc_info,
             structlog.processors.JSONRenderer(),
         ],
-        wrapper_class=structlog.make_filtering_bound_logger(logging.INFO),
-        logger_factory=structlog.WriteLoggerFactory(stream),
+        wrapper_class=structlog.make_filtering_bound_logger(_number(level)),
+        logger_factory=make_logger,
         cache_logger_on_first_use=True,
     )
+
+
+def _signed(role: str, name: str) -> Processor:
+    """Return what puts role and name into every entry, whichever thread writes it."""
+
+    def sign(_logger: object, _method: str, entry: EventDict) -> EventDict:
+        entry.setdefault("role", role)
+        entry.setdefault("name", name)
+        return entry
+
+    return sign
+
+
+def _number(level: LogLevel) -> int:
+    return logging.getLevelNamesMapping()[level.value.upper()]

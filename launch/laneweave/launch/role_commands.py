@@ -5,16 +5,23 @@ Each imports what it needs when it runs: an agent starts without SUMO, a coordin
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
+import structlog
 import typer
 from rich.console import Console
 
+from laneweave.launch.logs import LogFormat, LogLevel, log_role
 from laneweave.launch.run_folder import draw_own, new_folder
 from laneweave.protocol.access import access_of
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.numbers import Observe, unobserved
 from laneweave.protocol.scenario import Scenario, load_scenario
+
+log = structlog.get_logger(__name__)
 
 METHOD = "formation"
 """How a bridge's vehicles are controlled, as its summary says."""
@@ -27,14 +34,41 @@ ConfigOption = Annotated[
 RealmEndpoint = Annotated[
     str | None, typer.Option("--endpoint", help="Zenoh endpoint; overrides the configuration.")
 ]
+MetricsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--metrics",
+        metavar="HOST:PORT",
+        help="Show metrics over HTTP there; overrides the configuration.",
+    ),
+]
+LogOption = Annotated[
+    LogFormat, typer.Option("--log", envvar="LANEWEAVE_LOG", help="How to log to stderr.")
+]
+LevelOption = Annotated[
+    LogLevel | None,
+    typer.Option(
+        "--log-level",
+        envvar="LANEWEAVE_LOG_LEVEL",
+        help="What to log; default: warning as text, info as JSON.",
+    ),
+]
 
 
-def router(config: ConfigOption = None, endpoint: RealmEndpoint = None) -> None:
+def router(
+    config: ConfigOption = None,
+    endpoint: RealmEndpoint = None,
+    metrics: MetricsOption = None,
+    log_format: LogOption = LogFormat.text,
+    log_level: LevelOption = None,
+) -> None:
     """Run the Zenoh router of a deployment."""
     from laneweave.protocol.zenoh_transport import run_router
 
-    network = _deployment(config, endpoint).network
-    run_router(network.listen or (network.endpoint,), network.lease_s)
+    settings = _deployment(config, endpoint, metrics)
+    network = settings.network
+    with _as_role("router", "router", settings, log_format, log_level) as observe:
+        run_router(network.listen or (network.endpoint,), network.lease_s, observe=observe)
 
 
 def ping(config: ConfigOption = None, endpoint: RealmEndpoint = None) -> None:
@@ -49,6 +83,9 @@ def coordinator(
     config: ConfigOption = None,
     endpoint: RealmEndpoint = None,
     name: Annotated[str, typer.Option("--name", help="Rank: the lowest name leads.")] = "c1",
+    metrics: MetricsOption = None,
+    log_format: LogOption = LogFormat.text,
+    log_level: LevelOption = None,
 ) -> None:
     """Run a coordinator candidate; it also answers plan requests."""
     from laneweave.coordinator.process import run_coordinator
@@ -56,7 +93,9 @@ def coordinator(
 
     if not NAME_PATTERN.fullmatch(name):
         raise BadInputError("--name", name, NAME_RULE)
-    run_coordinator(_deployment(config, endpoint), name, workers_at_once=True)
+    settings = _deployment(config, endpoint, metrics)
+    with _as_role("coordinator", name, settings, log_format, log_level) as observe:
+        run_coordinator(settings, name, observe=observe, workers_at_once=True)
 
 
 def agent(
@@ -68,6 +107,9 @@ def agent(
     shard: Annotated[
         str, typer.Option("--shard", metavar="I/N", help="Take every N-th announced vehicle.")
     ] = "0/1",
+    metrics: MetricsOption = None,
+    log_format: LogOption = LogFormat.text,
+    log_level: LevelOption = None,
 ) -> None:
     """Run the agents of named vehicles, or of all that are announced."""
     from laneweave.agents.host import Shard
@@ -78,17 +120,20 @@ def agent(
     for vehicle in vehicles or ():
         if not NAME_PATTERN.fullmatch(vehicle):
             raise BadInputError("VEHICLE", vehicle, NAME_RULE)
-    settings = _deployment(config, endpoint)
+    settings = _deployment(config, endpoint, metrics)
     check_moves(settings)
     if vehicles:
-        run_agents(settings, access_of(settings, f"vehicle.{vehicles[0]}"), vehicles)
+        access = access_of(settings, f"vehicle.{vehicles[0]}")
+        with _as_role("agent", vehicles[0], settings, log_format, log_level) as observe:
+            run_agents(settings, access, vehicles, observe=observe)
         return
     index, _, count = shard.partition("/")
     digits = index.isdecimal() and count.isdecimal() and len(shard) < 20
     if not digits or int(index) >= int(count):
         raise BadInputError("--shard", shard, "I/N with 0 <= I < N")
     access = access_of(settings, f"fleet.{index}")
-    run_agents(settings, access, (), Shard(int(index), int(count)))
+    with _as_role("agent", f"fleet.{index}", settings, log_format, log_level) as observe:
+        run_agents(settings, access, (), Shard(int(index), int(count)), observe=observe)
 
 
 def bridge(
@@ -98,15 +143,19 @@ def bridge(
     pace: Annotated[
         float | None, typer.Option("--pace", help="Road seconds per second; default 1.")
     ] = 1.0,
+    metrics: MetricsOption = None,
+    log_format: LogOption = LogFormat.text,
+    log_level: LevelOption = None,
 ) -> None:
     """Run the simulated world of a deployment."""
     from laneweave.launch.outcome import complete_summary, print_outcome
     from laneweave.sim_bridge.process import run_bridge
 
     check_pace(pace)
-    settings = _deployment(config, endpoint)
-    folder = new_folder(out, settings, METHOD)
-    run_bridge(settings, folder, METHOD, pace)
+    settings = _deployment(config, endpoint, metrics)
+    with _as_role("bridge", "bridge", settings, log_format, log_level) as observe:
+        folder = new_folder(out, settings, METHOD)
+        run_bridge(settings, folder, METHOD, pace, observe=observe)
     outcome = complete_summary(folder, problems=())
     print_outcome(outcome, Console())
     draw_own(folder)
@@ -126,8 +175,25 @@ def check_pace(pace: float | None) -> None:
         raise BadInputError("--pace", pace, "[0.01, 1000]")
 
 
-def _deployment(config: Path | None, endpoint: str | None) -> Scenario:
-    settings = load_scenario(config, network__endpoint=endpoint)
+@contextmanager
+def _as_role(
+    role: str, name: str, settings: Scenario, form: LogFormat, level: LogLevel | None
+) -> Iterator[Observe]:
+    """Log as a role, and show its metrics if the deployment wants them."""
+    log_role(role, name, form, level)
+    network, address = settings.network, settings.observation.metrics
+    log.info("starting", endpoint=network.endpoint, realm=network.realm, metrics=address)
+    if not address:
+        yield unobserved
+        return
+    from laneweave.launch.metrics import shown_metrics
+
+    with shown_metrics(address, role=role, name=name, realm=network.realm) as observe:
+        yield observe
+
+
+def _deployment(config: Path | None, endpoint: str | None, metrics: str | None = None) -> Scenario:
+    settings = load_scenario(config, network__endpoint=endpoint, observation__metrics=metrics)
     if not settings.network.endpoint:
         raise BadInputError(
             "network.endpoint", "", "an endpoint, in the configuration or with --endpoint"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from attrs import field, frozen
 
-from laneweave.protocol.ranges import key_part, one_of, within
+from laneweave.protocol.ranges import host_port, key_part, one_of, within
 
 
 @frozen
@@ -63,5 +63,5 @@ class Service:
 class Observation:
     """How a deployment is looked at."""
 
-    metrics: str = ""
+    metrics: str = field(default="", validator=host_port)
     """HOST:PORT at which a role shows its metrics in the Prometheus text format; empty: not."""

@@ -19,6 +19,7 @@ from attrs import field, frozen
 from laneweave.protocol.codec import decode, encode
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.messages import Name, Report
+from laneweave.protocol.numbers import NodeNumbers, Snapshot
 from laneweave.protocol.topics import Keys, Topic
 from laneweave.protocol.transport import (
     Delivery,
@@ -257,6 +258,12 @@ class Node:
         self.ended = False
         self.published = 0
         self.rejected = 0
+        self.received: dict[str, int] = {}
+        """Well-formed messages, by the name of their topic."""
+        self.handled = 0
+        """Events that the core has got."""
+        self.handling_s = 0.0
+        """Whoever drives the node may add up here how long that took."""
         self._transport = transport
         self._keys = keys
         self._order_work = order_work
@@ -271,6 +278,8 @@ class Node:
         try:
             if isinstance(delivery, Received):
                 event = self._read(delivery.key, delivery.payload)
+                name = event.topic.name
+                self.received[name] = self.received.get(name, 0) + 1
             else:
                 event = self._news(delivery)
         except BadInputError as error:
@@ -282,11 +291,20 @@ class Node:
         """Let the core handle an event and carry out the effects."""
         if self.ended:
             return
+        self.handled += 1
         for effect in self.core.handle(event, now_s):
             if isinstance(effect, Send):
                 self._send(effect)
             else:
                 self._carry_out(effect)
+
+    def numbers(self) -> list[Snapshot]:
+        """Return what this node and its core have counted."""
+        own = NodeNumbers(
+            self.published, self.received.copy(), self.rejected, self.handled, self.handling_s
+        )
+        offered: Iterable[Snapshot] = getattr(self.core, "numbers", ())
+        return [own, *offered]
 
     def _news(self, delivery: LinkUp | LinkDown | Question | TokenUp | TokenDown) -> Event:
         if isinstance(delivery, (LinkUp, LinkDown)):

@@ -10,6 +10,7 @@ import attrs
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.topics import NAME_PATTERN, NAME_RULE
 
+HOST_PORT_RULE = "HOST:PORT with a port from 1 to 65535, or nothing"
 Validator = Callable[[Any, "attrs.Attribute[Any]", Any], None]
 
 
@@ -39,3 +40,23 @@ def key_part(_: object, attribute: attrs.Attribute[Any], value: str) -> None:
     """Check that a value can be one part of a key."""
     if not NAME_PATTERN.fullmatch(value):
         raise BadInputError(attribute.name, value, NAME_RULE)
+
+
+def host_and_port(name: str, text: str) -> tuple[str, int]:
+    """Return the parts of HOST:PORT; an IPv6 address is in brackets.
+
+    Raises:
+        BadInputError: it is no such thing.
+    """
+    host, _, port = text.rpartition(":")
+    bare = host[1:-1] if host[:1] == "[" and host[-1:] == "]" else host
+    is_port = port.isascii() and port.isdecimal() and len(port) < 6 and 1 <= int(port) <= 65535
+    if not is_port or not bare or (":" in bare) != (bare != host) or " " in bare:
+        raise BadInputError(name, text, HOST_PORT_RULE)
+    return bare, int(port)
+
+
+def host_port(_: object, attribute: attrs.Attribute[Any], value: str) -> None:
+    """Check that a value is HOST:PORT, or empty."""
+    if value:
+        host_and_port(attribute.name, value)

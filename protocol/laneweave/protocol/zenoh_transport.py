@@ -37,6 +37,7 @@ from laneweave.protocol.node import (
     Wakeup,
     run_job,
 )
+from laneweave.protocol.numbers import Look, Observe, RouterNumbers, looking, unobserved
 from laneweave.protocol.topics import Keys, Quality
 from laneweave.protocol.transport import (
     Answer,
@@ -288,11 +289,21 @@ class ZenohTransport:
         self._deliver(Question(str(query.key_expr), payload, token, encoding))
 
 
-def run_core(core: Core, access: Access, pool: WorkerPool | None = None) -> None:
+_Item = Delivery | Computed | Look | Stopping
+"""What a process has to do next."""
+
+
+def run_core(
+    core: Core,
+    access: Access,
+    pool: WorkerPool | None = None,
+    observe: Observe = unobserved,
+) -> None:
     """Drive a core over Zenoh until it ends or the process gets SIGINT or SIGTERM.
 
     To be called from the main thread. Computations run in a thread of their own, those that are
-    delegated in `pool`, which only a core that delegates needs.
+    delegated in `pool`, which only a core that delegates needs. `observe` is told where the numbers
+    of node and core come from.
 
     Raises:
         BadInputError: the realm is malformed or nobody answers at the endpoint.
@@ -311,6 +322,7 @@ def run_core(core: Core, access: Access, pool: WorkerPool | None = None) -> None
             inbox.put(Computed(job.job, None, "this process has no workers"))
 
     node = Node(core, transport, keys, order, Name(f"{os.getpid()}-{time.time_ns()}"))
+    observe(looking(inbox.put))
     with _stop_signals(lambda: inbox.put(Stopping())):
         try:
             node.dispatch(Started(), time.monotonic())
@@ -329,19 +341,19 @@ class _Inbox:
     """
 
     def __init__(self) -> None:
-        self._items: queue.SimpleQueue[Delivery | Computed | Stopping | None] = queue.SimpleQueue()
+        self._items: queue.SimpleQueue[_Item | None] = queue.SimpleQueue()
         self._questions: deque[Question] = deque()
         self._asked_s = 0.0
         """When a question was last taken."""
 
-    def put(self, item: Delivery | Computed | Stopping) -> None:
+    def put(self, item: _Item) -> None:
         if isinstance(item, Question):
             self._questions.append(item)
             self._items.put(None)  # wakes who waits
         else:
             self._items.put(item)
 
-    def take(self, timeout_s: float) -> Iterator[Delivery | Computed | Stopping]:
+    def take(self, timeout_s: float) -> Iterator[_Item]:
         """Yield what is next, after at most this time: nothing, an item, an item and a question."""
         with contextlib.suppress(queue.Empty):
             item = self._items.get(timeout=0.0 if self._questions else timeout_s)
@@ -362,18 +374,22 @@ def _step(node: Node, inbox: _Inbox) -> None:
     wakeup_s = node.core.wakeup_s
     if wakeup_s is not None and wakeup_s <= now_s:
         node.dispatch(Wakeup(), now_s)
+        node.handling_s += time.monotonic() - now_s
 
 
-def _hand_over(node: Node, item: Delivery | Computed | Stopping) -> None:
+def _hand_over(node: Node, item: _Item) -> None:
     now_s = time.monotonic()
     if isinstance(item, Stopping):
         log.info("stopping")
         node.dispatch(item, now_s)
         node.ended = True
+    elif isinstance(item, Look):
+        item.answer(node.numbers())
     elif isinstance(item, Computed):
         node.dispatch(item, now_s)
     else:
         node.deliver(item, now_s)
+    node.handling_s += time.monotonic() - now_s
 
 
 class _Worker:
@@ -423,6 +439,7 @@ def run_router(
     listen: Sequence[str],
     lease_s: float,
     ready: Callable[[], None] | None = None,
+    observe: Observe = unobserved,
 ) -> None:
     """Run a Zenoh router until SIGINT or SIGTERM.
 
@@ -430,6 +447,7 @@ def run_router(
         listen: endpoints where it listens. A socket file that a killed router left is replaced.
         lease_s: after this time of silence the others give the router up.
         ready: called when it listens.
+        observe: is told where its numbers come from, when it listens.
 
     Raises:
         BadInputError: it cannot listen at an endpoint.
@@ -446,6 +464,7 @@ def run_router(
                 "network.listen", ", ".join(endpoints), "endpoints that are free to listen at"
             ) from error
         try:
+            observe(lambda: [RouterNumbers(len(session.info.transports()))])
             if ready is not None:
                 ready()
             stopping = False

@@ -58,6 +58,11 @@ class Attendance:
         """Tell whether a vehicle's caretaker is in charge."""
         return vehicle in self._caretakers
 
+    @property
+    def cared_for(self) -> int:
+        """How many vehicles have a caretaker in charge."""
+        return len(self._caretakers)
+
     # --- agents -------------------------------------------------------------------------------
 
     def on_network(self, event: Event, now_s: float) -> None:

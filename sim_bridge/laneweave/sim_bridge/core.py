@@ -40,6 +40,7 @@ from laneweave.protocol.node import (
     Wakeup,
     Watch,
 )
+from laneweave.protocol.numbers import Snapshot
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.topics import (
     BRIDGE_ALIVE,
@@ -52,6 +53,7 @@ from laneweave.protocol.topics import (
 )
 from laneweave.sim_bridge.attendance import Attendance
 from laneweave.sim_bridge.leaving import Leaving, tell_left
+from laneweave.sim_bridge.numbers import BridgeNumbers
 from laneweave.sim_bridge.roadside import Roadside
 from laneweave.sim_bridge.run_record import Ending, RunRecord
 from laneweave.sim_bridge.traffic import RoadVehicle
@@ -127,6 +129,23 @@ class BridgeCore:
         """When to go on, whatever is waited for; answers have a deadline of their own."""
 
     # --- as a core ----------------------------------------------------------------------------
+
+    @property
+    def numbers(self) -> tuple[Snapshot, ...]:
+        """What the bridge has counted."""
+        counts = self._roadside.counts(len(self.vehicles))
+        return (
+            BridgeNumbers(
+                road_seconds=self.t_s,
+                ticks_total=self.tick,
+                missed_answers_total=self._record.missed_ticks,
+                vehicles_demanded_total=counts.demanded,
+                vehicles_entered_total=counts.entered,
+                vehicles_left_total=counts.left,
+                vehicles_on_road=counts.on_road,
+                vehicles_unattended=self._attendance.cared_for,
+            ),
+        )
 
     @property
     def t_s(self) -> float:

@@ -9,6 +9,7 @@ from pathlib import Path
 from laneweave.protocol.access import access_of
 from laneweave.protocol.faulty_core import Wrap, bare
 from laneweave.protocol.incarnations import Incarnations
+from laneweave.protocol.numbers import Observe, unobserved
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.zenoh_transport import run_core
 from laneweave.sim_bridge.core import BridgeCore
@@ -22,6 +23,7 @@ def run_bridge(
     method: str = "formation",
     pace: float | None = None,
     wrap: Wrap = bare,
+    observe: Observe = unobserved,
 ) -> None:
     """Run the simulated world until all vehicles have left, or until SIGINT or SIGTERM.
 
@@ -31,6 +33,7 @@ def run_bridge(
         method: how vehicles are controlled, for the summary.
         pace: most road seconds per second; None: the scenario's maximum.
         wrap: may put faults before the core.
+        observe: is told where its numbers come from.
 
     Raises:
         BadInputError: nobody answers at the scenario's endpoint.
@@ -51,7 +54,7 @@ def run_bridge(
             incarnation=incarnations(),
         )
         try:
-            run_core(wrap(core), access_of(scenario, "bridge"))
+            run_core(wrap(core), access_of(scenario, "bridge"), observe=observe)
         finally:
             # After an error, too: what was recorded is kept.
             record.close(core.t_s, Ending.INTERRUPTED)

@@ -171,6 +171,11 @@ class RunRecord:
         """The run ends while a vehicle is on the road."""
         self._count_rungs(vehicle)
 
+    @property
+    def missed_ticks(self) -> int:
+        """Answers that had not come when their tick's deadline passed."""
+        return self._missed_ticks
+
     def on_missed(self, agents: int) -> None:
         """So many agents have not answered a tick by its deadline."""
         self._missed_ticks += agents
