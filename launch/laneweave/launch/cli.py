@@ -28,6 +28,7 @@ from laneweave.launch.role_commands import (
     router,
 )
 from laneweave.launch.run_folder import draw_own, new_folder
+from laneweave.launch.status_command import status
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
 from laneweave.protocol.scenario import Scenario, load_scenario
 
@@ -235,7 +236,7 @@ def plan(
     )
 
 
-for command in (router, ping, coordinator, agent, bridge, sweep, report):
+for command in (router, ping, coordinator, agent, bridge, status, sweep, report):
     app.command()(command)
 
 

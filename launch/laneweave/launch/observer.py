@@ -9,12 +9,21 @@ from collections.abc import Iterator
 
 from attrs import define, field
 
-from laneweave.protocol.codec import decode
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.messages import Census, Heartbeat, LogEvent, Name, RoadClock
-from laneweave.protocol.topics import CENSUS, CLOCK, EVENT, HEARTBEAT, Keys
-from laneweave.protocol.transport import Delivery, Received, Transport
+from laneweave.protocol.node import Arrived, PeerDown, PeerUp, known_key, read_message
+from laneweave.protocol.topics import CENSUS, CLOCK, EVENT, HEARTBEAT, Keys, Topic
+from laneweave.protocol.transport import (
+    Delivery,
+    LinkDown,
+    LinkUp,
+    Received,
+    TokenDown,
+    TokenUp,
+    Transport,
+)
 
+News = Arrived | PeerUp | PeerDown | LinkUp | LinkDown
 TOPICS = (CLOCK, CENSUS, HEARTBEAT, EVENT)
 MOST_NEWS = 1000
 """Events that are kept until somebody takes them."""
@@ -60,34 +69,51 @@ class View:
 
 @define
 class Observer:
-    """Fills a view from a transport's deliveries."""
+    """Fills a view from a transport's deliveries, or hands over what they say."""
 
     keys: Keys
     inbox: queue.SimpleQueue[Delivery] = field(factory=queue.SimpleQueue)
     view: View = field(factory=View)
+    topics: tuple[Topic, ...] = TOPICS
+    """What it listens to."""
+    tokens: tuple[Topic, ...] = ()
+    """Whose coming and going it watches."""
 
     def subscribe(self, transport: Transport) -> None:
         """Ask for what the view needs."""
-        for topic in TOPICS:
+        for topic in self.tokens:
+            transport.watch(self.keys.all_of(topic))
+        for topic in self.topics:
             transport.subscribe(self.keys.all_of(topic))
 
     def wait(self, timeout_s: float) -> None:
         """Wait for news at most this long, then take in all there are."""
-        for message in self._messages(timeout_s):
-            self.view.take(message)
+        for event in self.news(timeout_s):
+            if isinstance(event, Arrived):
+                self.view.take(event.message)
 
-    def _messages(self, timeout_s: float) -> Iterator[object]:
+    def news(self, timeout_s: float) -> Iterator[News]:
+        """Wait for news at most this long, then yield all there are."""
         try:
             delivery = self.inbox.get(timeout=timeout_s)
             while True:
                 with contextlib.suppress(BadInputError):
-                    yield from self._decoded(delivery)
+                    yield from self._read(delivery)
                 delivery = self.inbox.get_nowait()
         except queue.Empty:
             return
 
-    def _decoded(self, delivery: Delivery) -> Iterator[object]:
-        if isinstance(delivery, Received):
-            known = self.keys.read(delivery.key)
-            if known is not None and known[0] in TOPICS:
-                yield decode(delivery.payload, known[0].kind)
+    def _read(self, delivery: Delivery) -> Iterator[News]:
+        match delivery:
+            case Received(key, payload):
+                known = self.keys.read(key)
+                if known is not None and known[0] in self.topics:
+                    yield read_message(self.keys, key, payload)
+            case TokenUp(key):
+                yield PeerUp(*known_key(self.keys, key))
+            case TokenDown(key):
+                yield PeerDown(*known_key(self.keys, key))
+            case LinkUp() | LinkDown():
+                yield delivery
+            case _:
+                pass

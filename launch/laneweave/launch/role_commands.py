@@ -15,6 +15,7 @@ import typer
 from rich.console import Console
 
 from laneweave.launch.logs import LogFormat, LogLevel, log_role
+from laneweave.launch.option_values import parse_shard
 from laneweave.launch.run_folder import draw_own, new_folder
 from laneweave.protocol.access import access_of
 from laneweave.protocol.errors import BadInputError
@@ -127,13 +128,10 @@ def agent(
         with _as_role("agent", vehicles[0], settings, log_format, log_level) as observe:
             run_agents(settings, access, vehicles, observe=observe)
         return
-    index, _, count = shard.partition("/")
-    digits = index.isdecimal() and count.isdecimal() and len(shard) < 20
-    if not digits or int(index) >= int(count):
-        raise BadInputError("--shard", shard, "I/N with 0 <= I < N")
+    index, count = parse_shard(shard)
     access = access_of(settings, f"fleet.{index}")
     with _as_role("agent", f"fleet.{index}", settings, log_format, log_level) as observe:
-        run_agents(settings, access, (), Shard(int(index), int(count)), observe=observe)
+        run_agents(settings, access, (), Shard(index, count), observe=observe)
 
 
 def bridge(
