@@ -140,11 +140,12 @@ class CoordinatorCore:
             CoordinatorNumbers(
                 leading=election.leading,
                 term=election.term,
-                candidates=election.candidates(self._handled_s),
+                candidates=1 + len(list(election.living(self._handled_s))),
                 elections_total=election.won,
                 plans_in_force=self._in_force,
                 road_seconds=self.t_s,
             ),
+            self.service.numbers,
         )
 
     @property

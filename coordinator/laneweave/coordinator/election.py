@@ -122,11 +122,6 @@ class Election:
             self.won += 1
         return True
 
-    def candidates(self, now_s: float) -> int:
-        """Return how many count, this one included."""
-        heard = (peer.heard_s for peer in self._peers.values())
-        return 1 + sum(now_s < heard_s + self.election_s for heard_s in heard)
-
     def raise_term(self, above: int) -> None:
         """Take a term above one that was seen on a vehicle (L3)."""
         self.term = max(self.term, above + 1)

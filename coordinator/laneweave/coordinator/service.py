@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator
 from functools import partial
+from typing import ClassVar
 
 import attrs
 from attrs import define, field, frozen
@@ -29,6 +30,7 @@ from laneweave.coordinator.sharing import falls_to
 from laneweave.protocol.deployment import Service
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.node import Decline, Delegate, Effect
+from laneweave.protocol.numbers import told
 
 HANDED_OUT_AHEAD = 1
 """Jobs for each worker beside the one that it does, so that it need not wait for the next."""
@@ -38,30 +40,31 @@ HANDED_OUT_AHEAD = 1
 class ServiceNumbers:
     """What the service has done so far, and has in hand."""
 
-    taken_total: int = 0
-    """Requests that fell to this coordinator."""
-    left_total: int = 0
-    """Requests that were left to other coordinators."""
-    answered_total: int = 0
-    """Requests that were planned and answered."""
-    repeated_total: int = 0
-    """Requests that were answered with another one's answer, by their id."""
-    invalid_total: int = 0
-    """Refused: not valid."""
-    overloaded_total: int = 0
-    """Refused: too many in hand."""
-    late_total: int = 0
-    """Dropped: the deadline passed before a worker was free."""
-    failed_total: int = 0
-    """Planning failed."""
-    planning_seconds_total: float = 0.0
-    """Solvers' time."""
-    service_seconds_total: float = 0.0
-    """From a request's arrival to its answer, without the solver's time."""
-    waiting: int = 0
-    """Requests that wait for a worker."""
-    planning: int = 0
-    """Requests that workers have."""
+    ABOUT: ClassVar[str] = "service"
+
+    taken_total: int = field(default=0, metadata=told("Requests that fell to this coordinator"))
+    left_total: int = field(
+        default=0, metadata=told("Requests that were left to other coordinators")
+    )
+    answered_total: int = field(default=0, metadata=told("Requests that were planned and answered"))
+    repeated_total: int = field(
+        default=0,
+        metadata=told("Requests that were answered with another one's answer, by their id"),
+    )
+    invalid_total: int = field(default=0, metadata=told("Requests refused: not valid"))
+    overloaded_total: int = field(default=0, metadata=told("Requests refused: too many in hand"))
+    late_total: int = field(
+        default=0,
+        metadata=told("Requests dropped: the deadline passed before a worker was free"),
+    )
+    failed_total: int = field(default=0, metadata=told("Requests whose planning failed"))
+    planning_seconds_total: float = field(default=0.0, metadata=told("Solvers' time"))
+    service_seconds_total: float = field(
+        default=0.0,
+        metadata=told("Time from requests' arrivals to their answers, without the solvers' time"),
+    )
+    waiting: int = field(default=0, metadata=told("Requests that wait for a worker"))
+    planning: int = field(default=0, metadata=told("Requests that workers have"))
 
 
 @define
