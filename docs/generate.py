@@ -14,13 +14,19 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from laneweave.agents.numbers import AgentNumbers
 from laneweave.coordinator.leader_rules import LEADER_RULES, Phase
+from laneweave.coordinator.numbers import CoordinatorNumbers
+from laneweave.coordinator.service import ServiceNumbers
 from laneweave.launch.conflict_drawing import counts, draw_conflicts
 from laneweave.launch.evaluation.evidence import read_evidence
 from laneweave.launch.evaluation.tables import document_parts
+from laneweave.launch.metrics import PROCESS, PROCESS_MEANING
 from laneweave.launch.simulation.profiles import PROFILES
+from laneweave.protocol.numbers import NodeNumbers, RouterNumbers, Snapshot, metrics_of
 from laneweave.protocol.transitions import markdown_table, mermaid_diagram
 from laneweave.protocol.vehicle_rules import VEHICLE_RULES, Stage
+from laneweave.sim_bridge.numbers import BridgeNumbers
 
 DOCS = Path(__file__).resolve().parent
 FOUND = DOCS / "evidence" / "planted-bugs-found.json"
@@ -39,6 +45,15 @@ STREAM = DOCS / "evidence" / "stream.json"
 EVALUATED = DOCS / "evidence" / "evaluation.json"
 """What `benchmarks/evaluation.py` wrote."""
 CONFLICTS = DOCS / "images" / "conflict-table.png"
+SNAPSHOTS: dict[type[Snapshot], str] = {
+    NodeNumbers: "every role but the router",
+    CoordinatorNumbers: "coordinator",
+    ServiceNumbers: "coordinator",
+    AgentNumbers: "agent",
+    BridgeNumbers: "bridge",
+    RouterNumbers: "router",
+}
+"""What offers numbers, and whose they are."""
 
 
 def _diagram(text: str) -> str:
@@ -189,6 +204,21 @@ def _stream() -> str:
     return "\n".join(lines)
 
 
+def _metrics() -> str:
+    """Return all numbers that processes offer, as Prometheus knows them."""
+    lines = [
+        "| metric | kind | of | meaning |",
+        "|---|---|---|---|",
+        f"| `{PROCESS}{{role, name, realm}}` | gauge | every role | {PROCESS_MEANING} |",
+    ]
+    for kind, role in SNAPSHOTS.items():
+        for metric in metrics_of(kind):
+            label = f"{{{metric.label}}}" if metric.label else ""
+            counts = "counter" if metric.counts else "gauge"
+            lines.append(f"| `{metric.name}{label}` | {counts} | {role} | {metric.meaning} |")
+    return "\n".join(lines)
+
+
 @cache
 def parts() -> dict[str, str]:
     """Return each generated part by its name."""
@@ -205,6 +235,7 @@ def parts() -> dict[str, str]:
         "geometry": _geometry(),
         "closing": _closing(),
         "stream": _stream(),
+        "metrics": _metrics(),
         **document_parts(read_evidence(EVALUATED)),
     }
 

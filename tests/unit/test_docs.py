@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import attrs
 import numpy as np
@@ -26,6 +26,7 @@ from laneweave.coordinator.planning import PlanRequest
 from laneweave.launch.cli import app
 from laneweave.launch.faults import load_faults
 from laneweave.launch.plan_command import answer_request
+from laneweave.launch.status import SCHEMA, Status
 from laneweave.protocol import messages
 from laneweave.protocol.codec import KINDS, field_names
 from laneweave.protocol.lattice import Cell, footprint
@@ -297,6 +298,52 @@ def _motion(scenario: Scenario, cell: Cell, step: Cell, late: int) -> NDArray[np
     at = np.clip(np.arange(60) - late, 0, len(states) - 1)
     moved: NDArray[np.float64] = states[at] + np.array(cell_state(scenario.lattice, cell, 0.0))
     return moved
+
+
+# --- docs/DEPLOYMENT.md ---------------------------------------------------------------------------
+
+
+def _fields_of(kind: type, prefix: str = "") -> Iterator[str]:
+    hints = get_type_hints(kind)
+    for attribute in attrs.fields(kind):
+        parts = [hints[attribute.name], *get_args(hints[attribute.name])]
+        (inner,) = [part for part in parts if isinstance(part, type) and attrs.has(part)] or [None]
+        if inner is None or attribute.name in ("candidates", "road"):
+            yield f"{prefix}{attribute.name}"
+        if inner is not None:
+            yield from _fields_of(inner, f"{prefix}{attribute.name}.")
+
+
+def test_fields_of_a_status() -> None:
+    text = section(read("DEPLOYMENT.md"), "### Status").partition("`--json` prints")[2]
+    shown = [code(cells[0]) for cells in rows(text)]
+    assert shown == ["schema", *_fields_of(Status)]
+    assert f"`{SCHEMA}`" in text
+
+
+def test_all_numbers_are_documented() -> None:
+    """Every class that says what it is about has its rows in the table of metrics."""
+    shown = [code(cells[0]) for cells in rows(section(read("DEPLOYMENT.md"), "### Metrics"))]
+    subjects = [
+        subject
+        for path in ROOT.glob("*/laneweave/**/*.py")
+        for subject in re.findall(r'ABOUT: ClassVar\[str\] = "(\w+)"', path.read_text("utf-8"))
+    ]
+    assert len(subjects) >= 6
+    for subject in subjects:
+        assert any(name.startswith(f"laneweave_{subject}_") for name in shown), subject
+
+
+def test_logs_are_set_as_documented() -> None:
+    program: Any = typer.main.get_command(app)
+    for option, variable, *_ in rows(section(read("DEPLOYMENT.md"), "### Logs")):
+        for role in ("router", "coordinator", "agent", "bridge"):
+            (found,) = (
+                parameter
+                for parameter in program.commands[role].params
+                if code(option) in parameter.opts
+            )
+            assert found.envvar == code(variable)
 
 
 # --- everywhere ----------------------------------------------------------------------------------

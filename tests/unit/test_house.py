@@ -52,7 +52,8 @@ def test_constraints_hold_names_and_versions_only() -> None:
 
 BASE_INSTALL = """
 import sys
-for missing in ("osqp", "libsumo", "pyarrow", "matplotlib", "psutil", "distributed"):
+extras = "osqp libsumo pyarrow matplotlib psutil distributed prometheus_client"
+for missing in extras.split():
     sys.modules[missing] = None
 import laneweave.coordinator.process
 from laneweave.launch.cli import main
@@ -85,6 +86,14 @@ def test_a_base_install_says_what_a_run_needs() -> None:
     assert "not installed" in done.stderr
 
 
+def test_a_base_install_says_what_metrics_need() -> None:
+    done = run_base_install("router", "--endpoint", "tcp/127.0.0.1:1", "--metrics", "127.0.0.1:1")
+    assert (done.returncode, done.stdout) == (2, "")
+    (said,) = done.stderr.splitlines()
+    assert said.startswith("prometheus_client: not installed")
+    assert said.endswith("install laneweave[metrics]")
+
+
 def test_a_base_install_says_what_a_drawing_needs() -> None:
     done = run_base_install("plan", "docs/examples/case-study.json", "--draw", "plan.png")
     assert (done.returncode, done.stdout) == (2, "")
@@ -92,8 +101,15 @@ def test_a_base_install_says_what_a_drawing_needs() -> None:
 
 
 def services() -> dict[str, list[str]]:
+    """Return the commands of compose.yaml, and of its health checks, without the program."""
     compose = yaml.safe_load((ROOT / "compose.yaml").read_text(encoding="utf-8"))
-    return {name: service["command"] for name, service in compose["services"].items()}
+    found: dict[str, list[str]] = {}
+    for name, service in compose["services"].items():
+        found[name] = service["command"]
+        kind, program, *check = service["healthcheck"]["test"]
+        assert (kind, program) == ("CMD", "laneweave")
+        found[f"{name}: health"] = check
+    return found
 
 
 @pytest.mark.parametrize("service", sorted(services()))
@@ -102,4 +118,4 @@ def test_containers_run_commands_that_exist(service: str) -> None:
     command = get_command(app).commands[role]  # type: ignore[attr-defined]
     context = command.make_context(role, arguments)
     config = context.params["config"]
-    assert (ROOT / config.relative_to("/")).is_file()
+    assert config is None or (ROOT / config.relative_to("/")).is_file()
