@@ -307,7 +307,7 @@ def _fields_of(kind: type, prefix: str = "") -> Iterator[str]:
     hints = get_type_hints(kind)
     for attribute in attrs.fields(kind):
         parts = [hints[attribute.name], *get_args(hints[attribute.name])]
-        (inner,) = [part for part in parts if isinstance(part, type) and attrs.has(part)] or [None]
+        inner = next((part for part in parts if isinstance(part, type) and attrs.has(part)), None)
         if inner is None or attribute.name in ("candidates", "road"):
             yield f"{prefix}{attribute.name}"
         if inner is not None:
