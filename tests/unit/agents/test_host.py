@@ -9,6 +9,7 @@ from attrs import evolve
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.host import ALONE_S, AgentHost, Shard
+from laneweave.agents.numbers import AgentNumbers
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import (
     Announcement,
@@ -228,6 +229,21 @@ def test_ends_when_the_last_vehicle_has_left() -> None:
     assert hand(host, SENSE, A, sense(A, FRONT, 3)) == []
     effects = hand(host, SENSE, B, sense(B, FRONT, 2, left=True))
     assert effects.count(End()) == 1
+
+
+def test_what_agents_have_counted_stays_when_they_end() -> None:
+    host = make_host(A, B)
+    (before,) = host.numbers
+    assert before == AgentNumbers(
+        vehicles=2, vehicles_in_charge=0, solves_total=0, unusable_total=0
+    )
+    for name in (A, B):
+        hand(host, SENSE, name, sense(name, FRONT))
+    (driving,) = host.numbers
+    assert driving == evolve(before, vehicles_in_charge=2, solves_total=2)
+    hand(host, SENSE, A, sense(A, FRONT, 2, left=True))
+    (after,) = host.numbers
+    assert after == evolve(driving, vehicles=1, vehicles_in_charge=1)
 
 
 def test_nothing_follows_the_end() -> None:

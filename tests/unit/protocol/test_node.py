@@ -36,6 +36,7 @@ from laneweave.protocol.node import (
     Withdraw,
     run_job,
 )
+from laneweave.protocol.numbers import NodeNumbers
 from laneweave.protocol.topics import (
     CENSUS,
     CLOCK,
@@ -266,6 +267,17 @@ def test_a_report_gets_the_counters_of_the_node(bench: Bench) -> None:
     sent = decode(calls[-1][2], Report)
     assert sent == evolve(report, process=Name("n1"), published=4, rejected=4)
     assert bench.node.published == 4
+
+
+def test_a_node_tells_what_it_has_counted(bench: Bench) -> None:
+    node = bench.node
+    bench.core.effects = [Send(HEARTBEAT, BEAT, {"coordinator": "c1"})]
+    node.dispatch(Started(), 0.0)
+    node.deliver(Received(BEAT_KEY, encode(BEAT)), 1.0)
+    node.deliver(Received(BEAT_KEY, b"nonsense"), 1.0)
+    node.deliver(LinkDown(), 1.0)
+    (found,) = node.numbers()
+    assert found == NodeNumbers(1, {"heartbeat": 1}, 1, 3, 0.0)
 
 
 def test_end_closes_the_transport_and_nothing_is_handled_any_more(bench: Bench) -> None:
