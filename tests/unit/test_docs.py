@@ -134,7 +134,9 @@ def _default(attribute: attrs.Attribute[Any]) -> str:
     if value is None:
         return "not set"
     if isinstance(value, tuple):
-        return f"`{list(value)}`"
+        return f"`{json.dumps(list(value))}`"
+    if isinstance(value, attrs.Factory(dict).__class__):
+        return "`{}`"
     return f"`{json.dumps(value)}`"
 
 
@@ -162,6 +164,8 @@ def _allowed(attribute: attrs.Attribute[Any]) -> str:
     rules = {
         "key_part": NAME_RULE,
         "host_port": HOST_PORT_RULE,
+        "key_parts": f"list of names: {NAME_RULE}",
+        "_fleets": "table of shards `I/N` or lists of vehicles, by name",
         "_conflict_kinds": "any of " + ", ".join(f"`{kind}`" for kind in CONFLICT_KINDS),
     }
     return rules[getattr(attribute.validator, "__name__", "")]
@@ -395,6 +399,9 @@ def test_commands_exist(path: Path) -> None:
             continue
         assert words[0] in subcommands, command
         subcommand = subcommands[words[0]]
+        if words[1:] and words[1] in getattr(subcommand, "commands", {}):
+            subcommand = subcommand.commands[words[1]]
+            del words[0]
         known = {option for parameter in subcommand.params for option in parameter.opts}
         options = {word.partition("=")[0] for word in words if word.startswith("--")}
         assert options <= known | {"--help"}, command

@@ -52,7 +52,7 @@ def test_constraints_hold_names_and_versions_only() -> None:
 
 BASE_INSTALL = """
 import sys
-extras = "osqp libsumo pyarrow matplotlib psutil distributed prometheus_client"
+extras = "osqp libsumo pyarrow matplotlib psutil distributed prometheus_client cryptography"
 for missing in extras.split():
     sys.modules[missing] = None
 import laneweave.coordinator.process
@@ -98,6 +98,20 @@ def test_a_base_install_says_what_a_drawing_needs() -> None:
     done = run_base_install("plan", "docs/examples/case-study.json", "--draw", "plan.png")
     assert (done.returncode, done.stdout) == (2, "")
     assert "not installed" in done.stderr
+
+
+def test_a_base_install_says_what_certificates_need(tmp_path: Path) -> None:
+    done = run_base_install("certs", "init", str(tmp_path / "certs"))
+    assert (done.returncode, done.stdout) == (2, "")
+    assert len(done.stderr.splitlines()) == 1
+    assert "laneweave[certs]" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_base_install_checks_a_configuration() -> None:
+    done = run_base_install("config", "check", "scenarios/compose.toml", "--role", "bridge")
+    assert done.returncode == 0
+    assert "tcp/router:7447" in done.stdout
 
 
 def services() -> dict[str, list[str]]:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable, Iterable
-
-from attrs import frozen
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.numbers import AgentNumbers
+from laneweave.protocol.fleets import Shard
 from laneweave.protocol.messages import Census, Motion, Name, VehicleState
 from laneweave.protocol.node import (
     Arrived,
@@ -29,18 +27,6 @@ from laneweave.protocol.topics import BRIDGE_ALIVE, CENSUS, MOTION, STATE, Topic
 
 ALONE_S = 60.0
 """Agents end when no bridge has been there for this long (node clock)."""
-
-
-@frozen
-class Shard:
-    """Which of the announced vehicles a host takes: those whose name falls to `index`."""
-
-    index: int
-    count: int
-
-    def takes(self, vehicle: str) -> bool:
-        """Tell whether a vehicle belongs to this shard, alike in every process."""
-        return zlib.crc32(vehicle.encode()) % self.count == self.index
 
 
 class AgentHost:

@@ -7,9 +7,10 @@ from itertools import product
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.driver import TrackingDriver
-from laneweave.agents.host import AgentHost, Shard
+from laneweave.agents.host import AgentHost
 from laneweave.protocol.access import Access
 from laneweave.protocol.faulty_core import Wrap, bare
+from laneweave.protocol.fleets import Shard
 from laneweave.protocol.incarnations import Incarnations
 from laneweave.protocol.messages import Name, Sense
 from laneweave.protocol.motion import cell_state

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
+from laneweave.launch import certs_commands, config_commands
 from laneweave.launch.logs import log_to_terminal
 from laneweave.launch.many_runs_commands import report, sweep
 from laneweave.launch.option_values import check_jobs, parse_seeds
@@ -45,10 +46,12 @@ app = typer.Typer(
 TYPER_INTERRUPTED = 130
 """What typer makes of Ctrl-C."""
 MISSING_SIM = "the simulation packages: install laneweave[sim]"
-MISSING_OTHERS = {
+MISSING = {
     "distributed": "Dask: install laneweave[dask]",
+    "cryptography": "what makes certificates: install laneweave[certs]",
     "prometheus_client": "the package for metrics: install laneweave[metrics]",
 }
+"""What to install, by the package that is not there; else it is `MISSING_SIM`."""
 
 
 class TransportChoice(StrEnum):
@@ -172,7 +175,8 @@ def _run_formations(
 ) -> Outcome:
     from laneweave.agents.trajectory import check_moves
     from laneweave.launch.faults import load_faults
-    from laneweave.launch.local_run import LocalRun, coordinator_names
+    from laneweave.launch.local_run import LocalRun
+    from laneweave.protocol.identities import coordinator_names
     from laneweave.sim_bridge.demand import arrivals
 
     check_moves(settings)
@@ -236,6 +240,8 @@ def plan(
     )
 
 
+app.add_typer(certs_commands.app, name="certs")
+app.add_typer(config_commands.app, name="config")
 for command in (router, ping, coordinator, agent, bridge, status, sweep, report):
     app.command()(command)
 
@@ -359,7 +365,7 @@ def _status(arguments: list[str]) -> int:
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("laneweave"):
             raise
-        missing = MISSING_OTHERS.get(error.name or "", MISSING_SIM)
+        missing = MISSING.get(error.name or "", MISSING_SIM)
         return _refuse(f"{error.name}: not installed; allowed: {missing}")
     if result == TYPER_INTERRUPTED:
         sys.stderr.write("interrupted\n")

@@ -28,7 +28,9 @@ from laneweave.launch.progress import RunProgress
 from laneweave.launch.role_processes import ROUTER, Order, RoleEnd, RoleProcesses
 from laneweave.launch.roles import fork_server
 from laneweave.protocol.access import access_of
+from laneweave.protocol.deployment import Security
 from laneweave.protocol.errors import BadInputError, CommandFailedError
+from laneweave.protocol.identities import coordinator_names
 from laneweave.protocol.scenario import Scenario, to_tables
 from laneweave.protocol.topics import Keys
 from laneweave.protocol.zenoh_transport import ZenohTransport
@@ -110,9 +112,12 @@ class LocalRun:
             RunProgress(self.scenario, show=self.show_progress) as progress,
         ):
             network = attrs.evolve(
-                self.scenario.network, endpoint=f"unixsock-stream/{temporary}/router.sock"
+                self.scenario.network,
+                endpoint=f"unixsock-stream/{temporary}/router.sock",
+                listen=(),
             )
-            self.scenario = attrs.evolve(self.scenario, network=network)
+            # A socket in a folder of its own: nobody else gets at it.
+            self.scenario = attrs.evolve(self.scenario, network=network, security=Security())
             self._options = {
                 "folder": str(self.folder),
                 "temporary": temporary,
@@ -265,8 +270,3 @@ def check_temporary_folder() -> None:
     folder = tempfile.gettempdir()
     if len(os.fsencode(folder)) > MAX_TEMPORARY_BYTES:
         raise BadInputError("TMPDIR", folder, f"a path of at most {MAX_TEMPORARY_BYTES} bytes")
-
-
-def coordinator_names(scenario: Scenario) -> tuple[str, ...]:
-    """Return the names of a scenario's coordinator candidates, best-ranked first."""
-    return tuple(f"c{index + 1}" for index in range(scenario.runtime.coordinators))

@@ -64,12 +64,15 @@ def router(
     log_level: LevelOption = None,
 ) -> None:
     """Run the Zenoh router of a deployment."""
+    from laneweave.protocol.access_rules import guard_of
     from laneweave.protocol.zenoh_transport import run_router
 
     settings = _deployment(config, endpoint, metrics)
-    network = settings.network
+    network, guard = settings.network, guard_of(settings)
     with _as_role("router", "router", settings, log_format, log_level) as observe:
-        run_router(network.listen or (network.endpoint,), network.lease_s, observe=observe)
+        run_router(
+            network.listen or (network.endpoint,), network.lease_s, guard=guard, observe=observe
+        )
 
 
 def ping(config: ConfigOption = None, endpoint: RealmEndpoint = None) -> None:
@@ -106,32 +109,28 @@ def agent(
     config: ConfigOption = None,
     endpoint: RealmEndpoint = None,
     shard: Annotated[
-        str, typer.Option("--shard", metavar="I/N", help="Take every N-th announced vehicle.")
-    ] = "0/1",
+        str | None,
+        typer.Option("--shard", metavar="I/N", help="Take every N-th announced vehicle."),
+    ] = None,
+    fleet: Annotated[
+        str | None,
+        typer.Option("--fleet", metavar="NAME", help="Take those of a fleet in security.fleets."),
+    ] = None,
     metrics: MetricsOption = None,
     log_format: LogOption = LogFormat.text,
     log_level: LevelOption = None,
 ) -> None:
     """Run the agents of named vehicles, or of all that are announced."""
-    from laneweave.agents.host import Shard
     from laneweave.agents.process import run_agents
     from laneweave.agents.trajectory import check_moves
-    from laneweave.protocol.topics import NAME_PATTERN, NAME_RULE
+    from laneweave.launch.crews import crew_of
 
-    for vehicle in vehicles or ():
-        if not NAME_PATTERN.fullmatch(vehicle):
-            raise BadInputError("VEHICLE", vehicle, NAME_RULE)
     settings = _deployment(config, endpoint, metrics)
     check_moves(settings)
-    if vehicles:
-        access = access_of(settings, f"vehicle.{vehicles[0]}")
-        with _as_role("agent", vehicles[0], settings, log_format, log_level) as observe:
-            run_agents(settings, access, vehicles, observe=observe)
-        return
-    index, count = parse_shard(shard)
-    access = access_of(settings, f"fleet.{index}")
-    with _as_role("agent", f"fleet.{index}", settings, log_format, log_level) as observe:
-        run_agents(settings, access, (), Shard(index, count), observe=observe)
+    crew = crew_of(settings.security, vehicles or (), shard, fleet)
+    access = access_of(settings, crew.identity)
+    with _as_role("agent", crew.identity, settings, log_format, log_level) as observe:
+        run_agents(settings, access, crew.vehicles, crew.shard, observe=observe)
 
 
 def bridge(

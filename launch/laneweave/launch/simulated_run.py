@@ -14,11 +14,11 @@ from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.launch.faults import Faults
-from laneweave.launch.local_run import coordinator_names
 from laneweave.launch.observer import TOPICS, View
 from laneweave.launch.outcome import Outcome, complete_summary
 from laneweave.launch.progress import RunProgress
 from laneweave.launch.simulated_faults import SimulatedFaults, SimulatedRoles, check_simulated
+from laneweave.protocol.identities import coordinator_names
 from laneweave.protocol.messages import Name
 from laneweave.protocol.node import Arrived, Core, Effect, Event, Listen, Started
 from laneweave.protocol.scenario import Scenario

@@ -6,9 +6,15 @@ these is what docs/DEPLOYMENT.md calls a DEPLOYMENT.toml.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
+import attrs
 from attrs import field, frozen
 
-from laneweave.protocol.ranges import host_port, key_part, one_of, within
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.fleets import FleetMembers, parse_shard
+from laneweave.protocol.ranges import host_port, key_part, key_parts, one_of, within
 
 
 @frozen
@@ -31,6 +37,16 @@ class Network:
     """PREPARE and PLAN are sent again after this time without an answer."""
 
 
+def _fleets(_: object, attribute: attrs.Attribute[Any], value: Mapping[str, FleetMembers]) -> None:
+    for name, members in value.items():
+        field_name = f"{attribute.name}[{name}]"
+        if isinstance(members, str):
+            parse_shard(members, field_name)
+        elif not members:
+            raise BadInputError(field_name, [], "a shard I/N, or a list of vehicles")
+        key_parts(None, attribute, (name, *(() if isinstance(members, str) else members)))
+
+
 @frozen
 class Security:
     """Who may do what on the network; off on one host, one switch for deployments."""
@@ -39,6 +55,14 @@ class Security:
     """`mtls`: every process shows a certificate, and the router lets it do what its name allows."""
     folder: str = "certs"
     """Where the certificates are, as `laneweave certs init` makes them; relative to the file."""
+    fleets: Mapping[str, FleetMembers] = field(factory=dict, validator=_fleets, hash=False)
+    """Agent processes that drive several vehicles: a shard `I/N`, or the vehicles' names."""
+    vehicles: tuple[str, ...] = field(default=(), validator=key_parts)
+    """Vehicles that may have a process of their own; empty: all that may arrive in the demand."""
+    clients: tuple[str, ...] = field(default=("plan",), validator=key_parts)
+    """Who may ask the planning service."""
+    observers: tuple[str, ...] = field(default=("ping", "status", "watch"), validator=key_parts)
+    """Who may look on."""
 
 
 @frozen

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import attrs
@@ -60,3 +60,12 @@ def host_port(_: object, attribute: attrs.Attribute[Any], value: str) -> None:
     """Check that a value is HOST:PORT, or empty."""
     if value:
         host_and_port(attribute.name, value)
+
+
+def key_parts(_: object, attribute: attrs.Attribute[Any], value: Sequence[str]) -> None:
+    """Check that values can be parts of keys, and that none is there twice."""
+    for one in value:
+        if not NAME_PATTERN.fullmatch(one):
+            raise BadInputError(attribute.name, one, NAME_RULE)
+        if value.count(one) > 1:
+            raise BadInputError(attribute.name, one, "each name once")

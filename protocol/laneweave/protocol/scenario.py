@@ -338,6 +338,7 @@ def load_scenario(path: Path | None, **overrides: object) -> Scenario:
     data: dict[str, Any] = {}
     if path is not None:
         data = read_toml(path)
+        _resolve_folder(data, path)
     for name, value in overrides.items():
         if value is None:
             continue
@@ -349,6 +350,15 @@ def load_scenario(path: Path | None, **overrides: object) -> Scenario:
                 raise BadInputError(table, target, "a table")
         target[key] = value
     return parse_scenario(data)
+
+
+def _resolve_folder(data: dict[str, Any], path: Path) -> None:
+    """Make the folder of certificates one that does not depend on where a role is started."""
+    security = data.get("security")
+    if isinstance(security, dict):
+        folder = security.get("folder", Security().folder)
+        if isinstance(folder, str):
+            security["folder"] = str(path.parent / folder)
 
 
 def read_toml(path: Path) -> dict[str, Any]:

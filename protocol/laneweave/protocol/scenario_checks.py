@@ -5,7 +5,10 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from laneweave.protocol.endpoints import is_tls
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.fleets import most_vehicles
+from laneweave.protocol.identities import LONGEST_COMMON_NAME, identities_of
 
 if TYPE_CHECKING:
     from laneweave.protocol.scenario import Scenario
@@ -15,6 +18,8 @@ LEAST_GAP_M = 1.0
 """Between bumpers of neighbouring cells: bodies turn to change lanes, and track with some error."""
 LEAST_SIDE_M = 0.5
 """Between bodies side by side, for the same reasons."""
+MOST_SECURED_VEHICLES = 5000
+"""Vehicles of a demand for which a router has rules."""
 
 
 def check_scenario(scenario: Scenario) -> None:
@@ -29,6 +34,7 @@ def check_scenario(scenario: Scenario) -> None:
     _check_timing(scenario)
     _check_braking(scenario)
     _check_settling(scenario)
+    _check_security(scenario)
 
 
 def _require(ok: bool, name: str, value: object, allowed: str) -> None:
@@ -211,3 +217,36 @@ def _check_settling(scenario: Scenario) -> None:
         f"at least {math.ceil(10.0 * least_s) / 10.0:g}: whoever enters up to {way_m:g} m beside "
         "its cell settles there within the vehicle's limits",
     )
+
+
+def _check_security(scenario: Scenario) -> None:
+    network, security = scenario.network, scenario.security
+    secured = security.mode == "mtls"
+    endpoints = [("network.endpoint", network.endpoint)] if network.endpoint else []
+    endpoints += [("network.listen", endpoint) for endpoint in network.listen]
+    for name, endpoint in endpoints:
+        if secured:
+            _require(
+                is_tls(endpoint), name, endpoint, "tls/HOST:PORT only, as security.mode is mtls"
+            )
+        else:
+            _require(not is_tls(endpoint), "security.mode", "off", f"mtls, as {name} is {endpoint}")
+    if not secured:
+        return
+    _require(bool(security.folder), "security.folder", "", "the folder of the certificates")
+    count = most_vehicles(scenario.demand, scenario.road.lanes)
+    _require(
+        count <= MOST_SECURED_VEHICLES,
+        "demand.duration_s",
+        scenario.demand.duration_s,
+        f"a demand of at most {MOST_SECURED_VEHICLES} vehicles where security.mode is mtls, this "
+        f"one may have {count}: the router has rules for each of them",
+    )
+    for identity in identities_of(scenario):
+        name = identity.common_name
+        _require(
+            len(name) <= LONGEST_COMMON_NAME,
+            f"security.{identity.party}s",
+            name,
+            f"at most {LONGEST_COMMON_NAME} characters: it is the common name of a certificate",
+        )

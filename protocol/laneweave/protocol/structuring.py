@@ -8,6 +8,7 @@ that names the field by its path.
 from __future__ import annotations
 
 import sys
+from collections import abc
 from collections.abc import Callable, Mapping, Sequence
 from itertools import cycle
 from typing import Any, TypeVar, get_args, get_origin
@@ -28,6 +29,8 @@ T = TypeVar("T")
 Hook = Callable[[Any, Any], Any]
 NumberOrRange = float | tuple[float, float]
 """A number, or the range from which one is drawn."""
+TextOrTexts = str | tuple[str, ...]
+"""A text, or a list of them."""
 
 
 def _exactly(kind: type, name: str) -> Hook:
@@ -56,6 +59,14 @@ def _number_or_range(value: object, _: type) -> NumberOrRange:
     return _number(value[0], float), _number(value[1], float)
 
 
+def _text_or_texts(value: object, _: type) -> TextOrTexts:
+    if isinstance(value, str):
+        return value
+    if isinstance(value, (list, tuple)) and all(type(one) is str for one in value):
+        return tuple(value)
+    raise BadInputError("", value, "a string or a list of strings")
+
+
 def strict_converter(*, detailed: bool) -> Converter:
     """Return a converter that coerces nothing; `detailed` collects paths for error messages."""
     converter = Converter(forbid_extra_keys=True, detailed_validation=detailed)
@@ -65,11 +76,12 @@ def strict_converter(*, detailed: bool) -> Converter:
     converter.register_structure_hook(bytes, _exactly(bytes, "bytes"))
     converter.register_structure_hook(float, _number)
     converter.register_structure_hook(NumberOrRange, _number_or_range)
+    converter.register_structure_hook(TextOrTexts, _text_or_texts)
     converter.register_structure_hook_factory(
         lambda kind: _origin(kind) is tuple, lambda kind: _tuple_hook(kind, converter)
     )
     converter.register_structure_hook_factory(
-        lambda kind: _origin(kind) is dict, lambda kind: _dict_hook(kind, converter)
+        lambda kind: _origin(kind) in (dict, abc.Mapping), lambda kind: _dict_hook(kind, converter)
     )
     converter.register_structure_hook_factory(attrs.has, lambda kind: _class_hook(kind, converter))
     return converter

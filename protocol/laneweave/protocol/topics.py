@@ -2,8 +2,8 @@
 
     laneweave/{realm}/{topic}/...
 
-`TOPICS` is the one table from which keys are built, received keys are understood, and
-docs/PROTOCOL.md is checked.
+`TOPICS` is the one table from which keys are built, received keys are understood, the rights of
+those who take part are granted (`access_rules.py`), and docs/PROTOCOL.md is checked.
 """
 
 from __future__ import annotations
@@ -35,9 +35,24 @@ class Quality(Enum):
     """As ASSURED, before everything else: ticks and their answers."""
 
 
+class Exchange(Enum):
+    """What goes on under a topic's keys."""
+
+    MESSAGES = "messages"
+    """The sender publishes; readers subscribe."""
+    TOKENS = "tokens"
+    """The sender shows a liveliness token; readers watch it."""
+    QUESTIONS = "questions"
+    """The sender asks; readers serve, and answer."""
+
+
 @frozen
 class Topic:
-    """One kind of key."""
+    """One kind of key, and who does what with it.
+
+    Senders and readers are kinds of processes, `Party` of `identities.py` by its value. What a
+    router lets them do (`access_rules.py`) follows from these fields and from nothing else.
+    """
 
     name: str
     pattern: str
@@ -45,7 +60,16 @@ class Topic:
     kind: type | None
     """Message class; None for tokens and the planning service."""
     sender: str
+    """Whoever the key names, where it names one of this kind. `any`: vehicles, coordinators and
+    the bridge, each under its own {role} and {name}."""
     quality: Quality
+    readers: tuple[str, ...] = ()
+    """They read all keys of the topic."""
+    addressee: str = ""
+    """Likewise only the keys that name it."""
+    deputy: str = ""
+    """It sends in the sender's place, whoever that is."""
+    exchange: Exchange = Exchange.MESSAGES
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -53,28 +77,67 @@ class Topic:
         return tuple(re.findall(r"{(\w+)}", self.pattern))
 
 
-CLOCK = Topic("clock", "clock", messages.RoadClock, "bridge", Quality.LATEST)
-CENSUS = Topic("census", "census", messages.Census, "bridge", Quality.LATEST)
-SENSE = Topic("sense", "sense/{vehicle}", messages.Sense, "bridge", Quality.LOCKSTEP)
-COMMAND = Topic("command", "command/{vehicle}", messages.Command, "vehicle", Quality.LOCKSTEP)
+CLOCK = Topic(
+    "clock", "clock", messages.RoadClock, "bridge", Quality.LATEST,
+    readers=("coordinator", "observer"),
+)  # fmt: skip
+CENSUS = Topic(
+    "census", "census", messages.Census, "bridge", Quality.LATEST,
+    readers=("coordinator", "fleet", "observer"),
+)  # fmt: skip
+SENSE = Topic(
+    "sense", "sense/{vehicle}", messages.Sense, "bridge", Quality.LOCKSTEP, addressee="vehicle"
+)
+COMMAND = Topic(
+    "command", "command/{vehicle}", messages.Command, "vehicle", Quality.LOCKSTEP,
+    readers=("bridge",),
+)  # fmt: skip
+# Vehicles read each other's: who waits for somebody has to see that it has left its cell. Where
+# nobody attends a vehicle, its caretaker, a part of the bridge, speaks for it.
 STATE = Topic(
-    "state", "state/{formation}/{vehicle}", messages.VehicleState, "vehicle", Quality.LATEST
-)
-MOTION = Topic("motion", "motion/{formation}/{vehicle}", messages.Motion, "vehicle", Quality.LATEST)
-PREPARE = Topic("prepare", "prepare/{vehicle}", messages.Prepare, "coordinator", Quality.ASSURED)
-PLAN = Topic("plan", "plan/{vehicle}", messages.Plan, "coordinator", Quality.ASSURED)
+    "state", "state/{formation}/{vehicle}", messages.VehicleState, "vehicle", Quality.LATEST,
+    readers=("coordinator", "vehicle", "observer"), deputy="bridge",
+)  # fmt: skip
+MOTION = Topic(
+    "motion", "motion/{formation}/{vehicle}", messages.Motion, "vehicle", Quality.LATEST,
+    readers=("vehicle", "observer"),
+)  # fmt: skip
+PREPARE = Topic(
+    "prepare", "prepare/{vehicle}", messages.Prepare, "coordinator", Quality.ASSURED,
+    addressee="vehicle", readers=("bridge",),
+)  # fmt: skip
+PLAN = Topic(
+    "plan", "plan/{vehicle}", messages.Plan, "coordinator", Quality.ASSURED,
+    addressee="vehicle", readers=("bridge", "observer"),
+)  # fmt: skip
 HEARTBEAT = Topic(
-    "heartbeat", "heartbeat/{coordinator}", messages.Heartbeat, "coordinator", Quality.LATEST
-)
-REPORT = Topic("report", "report/{role}/{name}", messages.Report, "any", Quality.ASSURED)
-EVENT = Topic("event", "event/{role}/{name}", messages.LogEvent, "any", Quality.ASSURED)
+    "heartbeat", "heartbeat/{coordinator}", messages.Heartbeat, "coordinator", Quality.LATEST,
+    readers=("coordinator", "bridge", "observer"),
+)  # fmt: skip
+REPORT = Topic(
+    "report", "report/{role}/{name}", messages.Report, "any", Quality.ASSURED,
+    readers=("bridge", "observer"),
+)  # fmt: skip
+EVENT = Topic(
+    "event", "event/{role}/{name}", messages.LogEvent, "any", Quality.ASSURED,
+    readers=("bridge", "observer"),
+)  # fmt: skip
 COORDINATOR_ALIVE = Topic(
     "coordinator-alive", "alive/coordinator/{coordinator}/{incarnation}", None, "coordinator",
-    Quality.ASSURED,
+    Quality.ASSURED, readers=("coordinator", "observer"), exchange=Exchange.TOKENS,
 )  # fmt: skip
-VEHICLE_ALIVE = Topic("vehicle-alive", "alive/vehicle/{vehicle}", None, "vehicle", Quality.ASSURED)
-BRIDGE_ALIVE = Topic("bridge-alive", "alive/bridge/{incarnation}", None, "bridge", Quality.ASSURED)
-SERVICE = Topic("service", "service/plan", None, "client", Quality.ASSURED)
+VEHICLE_ALIVE = Topic(
+    "vehicle-alive", "alive/vehicle/{vehicle}", None, "vehicle", Quality.ASSURED,
+    readers=("bridge", "observer"), exchange=Exchange.TOKENS,
+)  # fmt: skip
+BRIDGE_ALIVE = Topic(
+    "bridge-alive", "alive/bridge/{incarnation}", None, "bridge", Quality.ASSURED,
+    readers=("coordinator", "vehicle", "observer"), exchange=Exchange.TOKENS,
+)  # fmt: skip
+SERVICE = Topic(
+    "service", "service/plan", None, "client", Quality.ASSURED,
+    readers=("coordinator",), exchange=Exchange.QUESTIONS,
+)  # fmt: skip
 
 TOPICS = (
     CLOCK,

@@ -7,6 +7,7 @@ the settings of each topic and why they are so.
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import json
 import os
@@ -22,9 +23,13 @@ from typing import TYPE_CHECKING, Any
 import structlog
 import zenoh
 
-from laneweave.protocol.access import Access
+from laneweave.protocol.access import Access, Credentials
+from laneweave.protocol.access_rules import RouterGuard
+from laneweave.protocol.certificates import check_credentials
 from laneweave.protocol.codec import MAX_BYTES
+from laneweave.protocol.endpoints import check_endpoint
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.identities import Party
 from laneweave.protocol.messages import Name
 from laneweave.protocol.node import (
     Compute,
@@ -105,18 +110,25 @@ def _config(mode: str, lease_s: float) -> zenoh.Config:
     return config
 
 
-def check_endpoint(endpoint: str) -> str:
-    """Return the endpoint.
-
-    Raises:
-        BadInputError: it is not of a kind that the Zenoh wheel carries.
-    """
-    kind, _, address = endpoint.partition("/")
-    if kind not in ("unixsock-stream", "tcp", "tls") or not address:
-        raise BadInputError(
-            "network.endpoint", endpoint, "unixsock-stream/PATH, tcp/HOST:PORT or tls/HOST:PORT"
-        )
-    return endpoint
+def _set_credentials(config: zenoh.Config, credentials: Credentials, *, side: str) -> None:
+    """Have a session show credentials; `side` is `listen` for a router, else `connect`."""
+    settings: dict[str, Any] = {
+        "root_ca_certificate": credentials.ca,
+        f"{side}_certificate": credentials.certificate,
+        # Both sides show certificates, and believe none beyond its end.
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+        "close_link_on_expiration": True,
+    }
+    if credentials.private_key_pem:
+        encoded = base64.b64encode(credentials.private_key_pem.encode()).decode()
+        settings[f"{side}_private_key_base64"] = encoded
+    else:
+        settings[f"{side}_private_key"] = credentials.private_key
+    for name, value in settings.items():
+        config.insert_json5(f"transport/link/tls/{name}", json.dumps(value))
+    # Nothing else is spoken, whatever an endpoint says.
+    config.insert_json5("transport/link/protocols", json.dumps(["tls"]))
 
 
 class ZenohTransport:
@@ -130,7 +142,8 @@ class ZenohTransport:
             deliver: called from Zenoh's threads with each delivery; must return at once.
 
         Raises:
-            BadInputError: the endpoint is malformed or nobody answers there.
+            BadInputError: the endpoint is malformed or nobody answers there, or the credentials
+                are not in order.
         """
         endpoint = check_endpoint(access.endpoint)
         config = _config("client", access.lease_s)
@@ -138,12 +151,17 @@ class ZenohTransport:
             "connect/retry",
             json.dumps({"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 1.5}),
         )
+        who = ""
+        if access.credentials is not None:
+            check_credentials(access.credentials, access.identity)
+            _set_credentials(config, access.credentials, side="connect")
+            who = f" whose certificates and this process's ({access.identity}) are of one authority"
         try:
             config.insert_json5("connect/endpoints", json.dumps([endpoint]))
             self._session = zenoh.open(config)
         except zenoh.ZError as error:
             raise BadInputError(
-                "network.endpoint", endpoint, "the endpoint of a running router"
+                "network.endpoint", endpoint, f"the endpoint of a running router{who}"
             ) from error
         self._deliver = deliver
         self._subscriptions: dict[str, Any] = {}
@@ -439,6 +457,7 @@ def run_router(
     listen: Sequence[str],
     lease_s: float,
     ready: Callable[[], None] | None = None,
+    guard: RouterGuard | None = None,
     observe: Observe = unobserved,
 ) -> None:
     """Run a Zenoh router until SIGINT or SIGTERM.
@@ -447,13 +466,19 @@ def run_router(
         listen: endpoints where it listens. A socket file that a killed router left is replaced.
         lease_s: after this time of silence the others give the router up.
         ready: called when it listens.
+        guard: who may do what; None: anybody anything.
         observe: is told where its numbers come from, when it listens.
 
     Raises:
-        BadInputError: it cannot listen at an endpoint.
+        BadInputError: it cannot listen at an endpoint, or its credentials are not in order.
     """
-    endpoints = [check_endpoint(endpoint) for endpoint in listen]
+    endpoints = [check_endpoint(endpoint, "network.listen") for endpoint in listen]
     config = _config("router", lease_s)
+    if guard is not None:
+        check_credentials(guard.credentials, str(Party.ROUTER), guard.host)
+        _set_credentials(config, guard.credentials, side="listen")
+        config.insert_json5("access_control", json.dumps(guard.access_control))
+        config.insert_json5("low_pass_filter", json.dumps(guard.size_limits))
     stop: queue.SimpleQueue[bool] = queue.SimpleQueue()
     with _stop_signals(lambda: stop.put(True)):
         try:

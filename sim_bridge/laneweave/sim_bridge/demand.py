@@ -18,6 +18,7 @@ import numpy as np
 from attrs import frozen
 from numpy.random import Generator, SeedSequence, default_rng
 
+from laneweave.protocol.fleets import vehicle_name
 from laneweave.protocol.scenario import Scenario
 
 _HEADWAYS, _PREFERENCES = 0, 1
@@ -52,7 +53,7 @@ def arrivals(scenario: Scenario) -> tuple[Arrival, ...]:
         for t_s, preferred in _arrivals_on(lane, scenario)
     )
     return tuple(
-        Arrival(f"v{number:04d}", lane, preferred, t_s)
+        Arrival(vehicle_name(number), lane, preferred, t_s)
         for number, (t_s, lane, preferred) in enumerate(drawn, start=1)
     )
 

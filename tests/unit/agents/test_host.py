@@ -8,8 +8,9 @@ import pytest
 from attrs import evolve
 
 from laneweave.agents.core import AgentCore
-from laneweave.agents.host import ALONE_S, AgentHost, Shard
+from laneweave.agents.host import ALONE_S, AgentHost
 from laneweave.agents.numbers import AgentNumbers
+from laneweave.protocol.fleets import Shard
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import (
     Announcement,

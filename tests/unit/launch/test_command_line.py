@@ -11,10 +11,10 @@ from laneweave.launch import role_commands, run_folder
 from laneweave.launch.local_run import (
     MAX_TEMPORARY_BYTES,
     check_temporary_folder,
-    coordinator_names,
 )
 from laneweave.launch.logs import last_error
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.identities import coordinator_names
 from laneweave.protocol.scenario import Scenario, load_scenario
 
 

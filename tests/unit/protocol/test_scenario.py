@@ -103,6 +103,7 @@ LEAVES = [
     for table in TABLES
     for attribute in attrs.fields(type(getattr(Scenario(), table)))
 ]
+TABLE_BY_NAME = type(attrs.Factory(dict))
 NOT_NUMBERS: tuple[Any, ...] = ("1", True, None, [], [1], {}, math.nan, math.inf, -math.inf)
 
 
@@ -125,6 +126,8 @@ def test_every_wrong_type_of_every_field_is_refused_by_name(field: str, default:
         wrongs: tuple[Any, ...] = (1, True, None, [], {}, 1.5)
     elif isinstance(default, tuple):
         wrongs = (1, True, None, "node", {}, {"a": 1}, [True], [[]], [None], [math.nan], [{}])
+    elif isinstance(default, TABLE_BY_NAME):
+        wrongs = (1, True, None, [], "x", 1.5, {"a": 1}, {"a": []}, {"a": "x"}, {"a": [1]})
     elif default is None:
         wrongs = ("1", True, 1.0, [], {}, math.nan)
     elif isinstance(default, bool):

@@ -13,9 +13,10 @@ import numpy as np
 from attrs import define, field, fields
 
 from laneweave.agents.core import AgentCore
-from laneweave.agents.host import AgentHost, Shard
+from laneweave.agents.host import AgentHost
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.protocol.codec import encode
+from laneweave.protocol.fleets import Shard
 from laneweave.protocol.lattice import Cell, Move, territory
 from laneweave.protocol.messages import Ballot, Command, Name, Plan, Prepare, Report, Sense
 from laneweave.protocol.motion import State
