@@ -1,0 +1,416 @@
+"""Who may do what on a secured network, tried out against a real router.
+
+Each test tries something that is not allowed, and the same thing by whoever may do it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from laneweave.launch.authority import issue, load_authority, make_authority
+from laneweave.protocol.access_rules import REQUEST_MARGIN_BYTES
+from laneweave.protocol.codec import MAX_BYTES
+from laneweave.protocol.fleets import Shard
+from laneweave.protocol.identities import parse_identity
+from laneweave.protocol.scenario import Scenario, load_scenario
+from laneweave.protocol.topics import (
+    BRIDGE_ALIVE,
+    CENSUS,
+    CLOCK,
+    COMMAND,
+    COORDINATOR_ALIVE,
+    EVENT,
+    HEARTBEAT,
+    MOTION,
+    PLAN,
+    PREPARE,
+    REPORT,
+    SENSE,
+    SERVICE,
+    STATE,
+    VEHICLE_ALIVE,
+    Topic,
+)
+from system.harness import END_S, RUN_S, Lab, check_safe_and_complete, trips
+from system.secured import (
+    KEYS,
+    QUIET_S,
+    Member,
+    Network,
+    answer_to,
+    deployment,
+    free_port,
+    laboratory,
+    opens,
+    until,
+    until_heard,
+)
+
+A, B = "v0001", "v0002"
+FLEETS = {vehicle: f"fleet.agents-{1 if Shard(0, 2).takes(vehicle) else 2}" for vehicle in (A, B)}
+STRANGERS = ("client.stranger", "vehicle.stranger")
+"""They have certificates of the right authority, but the deployment does not know them."""
+MEMBERS = ("bridge", "coordinator.c1", "coordinator.c3", f"vehicle.{A}", f"vehicle.{B}",
+           "fleet.agents-1", "fleet.agents-2", "client.plan", "observer.watch",
+           *STRANGERS)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def secured(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Scenario]]:
+    """Run one router for the whole module; give its folder of certificates, and the scenario."""
+    folder = tmp_path_factory.mktemp("secured")
+    with laboratory(folder) as lab:
+        config = deployment(lab, free_port())
+        init = ("certs", "init", "certs", "--config", config)
+        vehicles = ("--vehicle", A, "--vehicle", B, "--vehicle", "stranger")
+        assert lab.run(*init, *vehicles, "--client", "stranger").status == 0
+        network = Network(folder / "certs", load_scenario(config))
+        router = lab.start("router", "--config", config)
+        lab.wait_until(
+            lambda: router.poll() is not None or opens(network.access("observer.ping")), END_S
+        )
+        yield network.folder, network.scenario
+        router.send_signal(signal.SIGTERM)
+        assert lab.finish(router, END_S).status == 0
+
+
+@pytest.fixture
+def network(secured: tuple[Path, Scenario]) -> Iterator[Network]:
+    """The router of this module, and sessions that are closed at the test's end."""
+    with contextlib.closing(Network(*secured)) as network:
+        yield network
+
+
+# --- what is published ----------------------------------------------------------------------------
+
+PUBLISHED: tuple[tuple[str, Topic, dict[str, object], str, tuple[str, ...]], ...] = (
+    ("bridge", CLOCK, {}, "coordinator.c2", ()),
+    ("bridge", CENSUS, {}, "coordinator.c2", ()),
+    ("bridge", SENSE, {"vehicle": B}, f"vehicle.{B}", ()),
+    ("coordinator.c1", PREPARE, {"vehicle": B}, f"vehicle.{B}", ("coordinator.c3",)),
+    ("coordinator.c1", PLAN, {"vehicle": B}, f"vehicle.{B}", ("coordinator.c3",)),
+    ("coordinator.c1", HEARTBEAT, {"coordinator": "c1"}, "coordinator.c2", ()),
+    ("coordinator.c1", EVENT, {"role": "coordinator", "name": "c1"}, "bridge", ()),
+    (f"vehicle.{B}", COMMAND, {"vehicle": B}, "bridge", (FLEETS[B],)),
+    # A vehicle's caretaker is a part of the bridge.
+    (f"vehicle.{B}", STATE, {"formation": 3, "vehicle": B}, f"vehicle.{A}", (FLEETS[B], "bridge")),
+    (f"vehicle.{B}", MOTION, {"formation": -3, "vehicle": B}, f"vehicle.{A}", (FLEETS[B],)),
+    (f"vehicle.{B}", REPORT, {"role": "agent", "name": B}, "observer.watch", (FLEETS[B],)),
+)
+"""Who publishes what, who reads it, and who may publish it, too."""
+
+
+def test_nobody_publishes_what_is_somebody_elses(network: Network) -> None:
+    rightful = {owner: network.join(owner) for owner in {row[0] for row in PUBLISHED}}
+    readers = {reader: network.join(reader) for reader in {row[3] for row in PUBLISHED}}
+    for owner, topic, parameters, reader, _ in PUBLISHED:
+        until_heard(rightful[owner], readers[reader], topic, **parameters)
+
+    for who in MEMBERS:
+        forger = network.join(who)
+        for _, topic, parameters, _, _ in PUBLISHED:
+            forger.publish(topic, who.encode(), **parameters)
+    time.sleep(QUIET_S)
+
+    for owner, topic, parameters, reader, others in PUBLISHED:
+        rightful[owner].publish(topic, b"last", **parameters)
+        allowed = {who.encode() for who in (owner, *others)} | {b"last"}
+        until(lambda r=reader, t=topic: b"last" in readers[r].heard(t), topic.name)  # type: ignore[misc]
+        assert readers[reader].heard(topic, b"first") == allowed, topic.name
+
+
+def test_other_ways_of_naming_a_key_are_no_ways_around(network: Network) -> None:
+    rightful, reader = network.join(f"vehicle.{A}"), network.join("coordinator.c2")
+    until_heard(rightful, reader, STATE, formation=1, vehicle=A)
+    key = KEYS.key(STATE, formation=1, vehicle=A)
+    for who in (f"vehicle.{B}", FLEETS[A], "coordinator.c1", "observer.watch"):
+        session = network.join(who).transport._session
+        for wild in ("laneweave/test/state/1/*", "laneweave/test/**", "laneweave/*/state/1/*"):
+            session.put(wild, b"wild")
+        if who != FLEETS[A]:
+            session.put(session.declare_keyexpr(key), b"declared")
+            session.declare_publisher(key).put(b"by a publisher")
+            session.delete(key)
+    time.sleep(QUIET_S)
+    rightful.publish(STATE, b"last", formation=1, vehicle=A)
+    until(lambda: b"last" in reader.heard(STATE))
+    assert {payload for _, payload in reader.received()} == {b"first", b"last"}
+
+
+# --- what is read ---------------------------------------------------------------------------------
+
+EVERYTHING = ("**", "laneweave/**", "laneweave/test/**", "laneweave/*/*/*", "laneweave/test/*/*",
+              "laneweave/test/plan/*", "laneweave/test/plan/v$*")  # fmt: skip
+MAY_READ: dict[str, tuple[str, ...]] = {
+    f"vehicle.{A}": ("state",),
+    "fleet.agents-1": ("state", "census"),
+    "coordinator.c3": ("state", "census"),
+    "client.plan": (),
+    "observer.watch": ("state", "census", f"plan/{B}"),
+    "client.stranger": (),
+    "vehicle.stranger": (),
+}
+"""What each may read of what is sent here, by the beginning of its key."""
+
+
+def test_nobody_reads_what_is_for_somebody_else(network: Network) -> None:
+    bridge, leader = network.join("bridge"), network.join("coordinator.c1")
+    vehicle = network.join(f"vehicle.{B}")
+    sent: tuple[tuple[Member, Member, Topic, dict[str, object]], ...] = (
+        (leader, vehicle, PLAN, {"vehicle": B}),
+        (leader, vehicle, PREPARE, {"vehicle": B}),
+        (bridge, vehicle, SENSE, {"vehicle": B}),
+        (vehicle, bridge, COMMAND, {"vehicle": B}),
+        (vehicle, leader, STATE, {"formation": 1, "vehicle": B}),
+        (bridge, leader, CENSUS, {}),
+    )
+    snoopers = {who: network.join(who) for who in MAY_READ if who != FLEETS[B]}
+    for snooper in snoopers.values():
+        for expression in EVERYTHING:
+            snooper.transport.subscribe(expression)
+        for _, _, topic, parameters in sent:
+            snooper.transport.subscribe(KEYS.key(topic, **parameters))
+    for sender, reader, topic, parameters in sent:
+        until_heard(sender, reader, topic, **parameters)
+    time.sleep(QUIET_S)
+
+    for sender, reader, topic, parameters in sent:
+        sender.publish(topic, b"last", **parameters)
+        until(lambda r=reader, t=topic: b"last" in r.heard(t), topic.name)  # type: ignore[misc]
+    time.sleep(QUIET_S)
+    for who, snooper in snoopers.items():
+        read = {key.removeprefix("laneweave/test/") for key, _ in snooper.received()}
+        allowed = MAY_READ[who]
+        assert {key for key in read if not key.startswith(allowed or "-")} == set(), who
+        assert len(read) == len(allowed), f"{who} should read {allowed}"
+
+
+def test_a_vehicle_reads_its_own_plan_and_nobody_elses(network: Network) -> None:
+    leader = network.join("coordinator.c1")
+    first, second = network.join(f"vehicle.{A}"), network.join(f"vehicle.{B}")
+    first.transport.subscribe(KEYS.key(PLAN, vehicle=B))
+    until_heard(leader, second, PLAN, vehicle=B)
+    until_heard(leader, first, PLAN, vehicle=A)
+    assert {key for key, _ in first.received()} == {KEYS.key(PLAN, vehicle=A)}
+
+
+# --- tokens ---------------------------------------------------------------------------------------
+
+
+def test_nobody_shows_somebody_elses_token(network: Network) -> None:
+    bridge, leader = network.join("bridge"), network.join("coordinator.c2")
+    shown = {
+        KEYS.key(VEHICLE_ALIVE, vehicle=B): f"vehicle.{B}",
+        KEYS.key(COORDINATOR_ALIVE, coordinator="c1", incarnation=7): "coordinator.c1",
+        KEYS.key(BRIDGE_ALIVE, incarnation=8): "bridge",
+    }
+    bridge.transport.watch(KEYS.all_of(VEHICLE_ALIVE))
+    leader.transport.watch(KEYS.all_of(COORDINATOR_ALIVE))
+    leader.transport.watch(KEYS.all_of(BRIDGE_ALIVE))
+    snooper = network.join("client.plan")
+    for expression in ("**", *EVERYTHING, KEYS.all_of(VEHICLE_ALIVE), *shown):
+        snooper.transport.watch(expression)
+
+    for who in MEMBERS:
+        forger = network.join(who)
+        for key, owner in shown.items():
+            if who not in (owner, FLEETS[B]):
+                forger.transport.announce(key)
+    time.sleep(QUIET_S)
+    assert bridge.tokens() | leader.tokens() == set()
+
+    for key, owner in shown.items():
+        network.join(owner).transport.announce(key)
+    until(lambda: bridge.tokens() | leader.tokens() == set(shown))
+    assert snooper.tokens() == set()
+
+
+# --- the planning service -------------------------------------------------------------------------
+
+
+def test_only_coordinators_serve_and_only_clients_ask(network: Network) -> None:
+    key = KEYS.key(SERVICE)
+    client = network.join("client.other")
+    for who in MEMBERS:
+        if not who.startswith("coordinator."):
+            for expression in (key, "laneweave/test/**", "**"):
+                network.serve(who, expression)
+    time.sleep(QUIET_S)
+    assert answer_to(client, key) == b""
+
+    network.serve("coordinator.c1", key)
+    until(lambda: answer_to(client, key) == b"coordinator.c1")
+    for who in ("bridge", f"vehicle.{A}", "fleet.agents-1", "observer.watch", *STRANGERS):
+        assert answer_to(network.join(who), key, timeout_s=0.1) == b""
+    assert answer_to(client, key) == b"coordinator.c1"
+
+
+def test_what_is_too_long_does_not_come_in(network: Network) -> None:
+    key, most_bytes = KEYS.key(SERVICE), network.scenario.service.max_request_bytes
+    client = network.join("client.plan")
+    network.serve("coordinator.c1", key)
+    until(lambda: answer_to(client, key, bytes(most_bytes)))
+    assert answer_to(client, key, bytes(most_bytes + REQUEST_MARGIN_BYTES + 1), 0.2) == b""
+    assert answer_to(client, key, bytes(most_bytes))
+
+    bridge, reader = network.join("bridge"), network.join("coordinator.c2")
+    until_heard(bridge, reader, CENSUS)
+    for size in (MAX_BYTES + 1, MAX_BYTES):
+        bridge.publish(CENSUS, bytes(size))
+    until(lambda: reader.heard(CENSUS, b"first"))
+    assert reader.heard(CENSUS) == {b"first", bytes(MAX_BYTES)}
+
+
+# --- who gets in at all ---------------------------------------------------------------------------
+
+
+def connects(endpoint: str, **tls: object) -> bool:
+    """Tell whether a client with these settings gets to the router, whatever they are."""
+    config = zenoh.Config()
+    settings = {
+        "mode": "client",
+        "scouting/multicast/enabled": False,
+        "connect/endpoints": [endpoint],
+        **{f"transport/link/tls/{name}": str(value) for name, value in tls.items()},
+    }
+    for name, value in settings.items():
+        config.insert_json5(name, json.dumps(value))
+    if "connect_certificate" in tls:
+        config.insert_json5("transport/link/tls/enable_mtls", "true")
+    try:
+        with zenoh.open(config) as session:
+            return bool(session.info.routers_zid())
+    except zenoh.ZError:
+        return False
+
+
+def shown(folder: Path, name: str) -> dict[str, object]:
+    """Return the settings of a client that shows a certificate."""
+    return {
+        "connect_certificate": folder / f"{name}.pem",
+        "connect_private_key": folder / f"{name}.key",
+    }
+
+
+def test_outsiders_do_not_get_in(network: Network, tmp_path: Path) -> None:
+    endpoint, ours = network.scenario.network.endpoint, network.folder
+    ca = {"root_ca_certificate": ours / "ca.pem"}
+    theirs, expired, name = tmp_path / "theirs", tmp_path / "expired", "coordinator.c1"
+    issue(make_authority(theirs), theirs, parse_identity(name), days=30.0)
+    expired.mkdir()
+    issue(load_authority(ours), expired, parse_identity(name), days=-1.0)
+
+    assert connects(endpoint, **ca, **shown(ours, name))
+    assert not connects(endpoint, **ca), "no certificate"
+    assert not connects(endpoint.replace("tls/", "tcp/")), "plain tcp"
+    assert not connects(endpoint, **ca, **shown(theirs, name)), "wrong authority"
+    assert not connects(endpoint, **ca, **shown(expired, name)), "expired"
+    assert not connects(endpoint, **ca, **shown(ours, "router")), "not for clients"
+    # And the other way round: this router is none that others would believe.
+    assert not connects(endpoint, root_ca_certificate=theirs / "ca.pem", **shown(ours, name))
+    assert not connects(endpoint.replace("127.0.0.1", "127.0.0.2"), **ca, **shown(ours, name))
+    assert connects(endpoint, **ca, **shown(ours, name))
+
+
+@pytest.mark.parametrize("name", ["router", "vehicle.v0001", "bridge", "coordinator.c1"])
+def test_nobody_else_passes_for_the_router(network: Network, name: str) -> None:
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    config = zenoh.Config()
+    folder = network.folder
+    settings: dict[str, Any] = {
+        "mode": "router",
+        "scouting/multicast/enabled": False,
+        "scouting/delay": 0,
+        "listen/endpoints": [endpoint],
+        "transport/link/tls/root_ca_certificate": str(folder / "ca.pem"),
+        "transport/link/tls/listen_certificate": str(folder / f"{name}.pem"),
+        "transport/link/tls/listen_private_key": str(folder / f"{name}.key"),
+    }
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    with zenoh.open(config):
+        client = {"root_ca_certificate": folder / "ca.pem", **shown(folder, "coordinator.c2")}
+        assert connects(endpoint, **client) == (name == "router")
+
+
+def test_a_role_says_in_one_line_what_is_wrong_with_its_certificate(
+    network: Network, lab: Lab
+) -> None:
+    config = deployment(lab, int(network.scenario.network.endpoint.rpartition(":")[2]))
+    ours, theirs = network.folder, lab.folder / "theirs"
+    name = "observer.ping"
+    issue(make_authority(theirs), theirs, parse_identity(name), days=30.0)
+    cases: tuple[tuple[dict[str, str], str], ...] = (
+        ({}, "certificate authority"),
+        ({"LANEWEAVE_CA_FILE": str(ours / "ca.pem")}, "certificate"),
+        (
+            {
+                "LANEWEAVE_CA_FILE": str(ours / "ca.pem"),
+                "LANEWEAVE_CERTIFICATE_FILE": str(theirs / f"{name}.pem"),
+                "LANEWEAVE_PRIVATE_KEY_FILE": str(theirs / f"{name}.key"),
+            },
+            "certificate",
+        ),
+        # All is well among these, but the router is another authority's.
+        (
+            {
+                "LANEWEAVE_CA_FILE": str(theirs / "ca.pem"),
+                "LANEWEAVE_CERTIFICATE_FILE": str(theirs / f"{name}.pem"),
+                "LANEWEAVE_PRIVATE_KEY_FILE": str(theirs / f"{name}.key"),
+            },
+            "network.endpoint",
+        ),
+    )
+    for environment, field in cases:
+        ended = lab.run("ping", "--config", config, within_s=END_S, **environment)
+        assert (ended.status, ended.out) == (2, ""), ended
+        assert len(ended.err.splitlines()) == 1
+        assert ended.err.startswith(f"{field}: "), ended.err
+    # The key may come as text.
+    good = {
+        "LANEWEAVE_CA_FILE": str(ours / "ca.pem"),
+        "LANEWEAVE_CERTIFICATE_FILE": str(ours / f"{name}.pem"),
+        "LANEWEAVE_PRIVATE_KEY": (ours / f"{name}.key").read_text(encoding="ascii"),
+    }
+    ended = lab.run("ping", "--config", config, within_s=END_S, **good)
+    assert (ended.status, ended.out, ended.err) == (0, "", "")
+
+
+# --- a whole deployment ---------------------------------------------------------------------------
+
+
+def test_a_secured_deployment_runs_to_its_end(lab: Lab) -> None:
+    config = deployment(lab, free_port())
+    assert lab.run("certs", "init", "certs", "--config", config).status == 0
+    network = Network(lab.folder / "certs", load_scenario(config))
+    router = lab.start("router", "--config", config)
+    lab.wait_until(lambda: opens(network.access("observer.ping")), END_S)
+    roles = [
+        lab.start("coordinator", "--config", config, "--name", "c1"),
+        lab.start("coordinator", "--config", config, "--name", "c2"),
+        lab.start("agent", "--config", config, "--fleet", "agents-1"),
+        lab.start("agent", "--config", config, "--shard", "1/2"),
+    ]
+    with contextlib.closing(network):
+        observer = network.join("observer.status")
+        observer.transport.subscribe(KEYS.all_of(HEARTBEAT))
+        lab.wait_until(lambda: len({key for key, _ in observer.received()}) == 2, END_S)
+        bridge = lab.start("bridge", "--config", config, "--pace", "20", "--out", "out")
+        ended = lab.finish(bridge, RUN_S)
+    assert (ended.status, ended.err) == (0, "")
+    for process in (*roles, router):
+        process.send_signal(signal.SIGTERM)
+        assert lab.finish(process, END_S).status == 0
+    check_safe_and_complete(lab.folder / "out")
+    for vehicle, trip in trips(lab.folder / "out").items():
+        assert trip["final_lane"] == trip["preferred_lane"], vehicle
+    lab.check_nothing_left()
