@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import shutil
 import socket
 import tempfile
@@ -10,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import zenoh
 from attrs import define, field
 
 from laneweave.protocol.access import Access, access_of
@@ -17,7 +19,7 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.topics import Keys, Quality, Topic
 from laneweave.protocol.transport import Delivery, Question, Received, TokenUp
-from laneweave.protocol.zenoh_transport import ZenohTransport, transport_ask
+from laneweave.protocol.zenoh_transport import ZenohTransport
 from system.harness import ROAD, Lab
 
 KEYS = Keys("test")
@@ -134,9 +136,10 @@ class Network:
 def answer_to(member: Member, key: str, payload: bytes = b"plan", timeout_s: float = 5.0) -> bytes:
     """Ask a service; empty when nobody answers."""
     try:
-        return transport_ask(member.transport, key, payload, timeout_s)[0]
-    except (BadInputError, TimeoutError):
+        answer = member.transport.ask(key, payload, timeout_s).result()
+    except TimeoutError:
         return b""
+    return answer.payload if answer is not None else b""
 
 
 def opens(access: Access) -> bool:
@@ -164,3 +167,31 @@ def until_heard(sender: Member, reader: Member, topic: Topic, **parameters: obje
         assert time.monotonic() < give_up, f"{topic.name} is not heard"
         sender.publish(topic, b"first", **parameters)
         time.sleep(0.01)
+
+
+def connects(endpoint: str, **tls: object) -> bool:
+    """Tell whether a client with these settings gets to the router, whatever they are."""
+    config = zenoh.Config()
+    settings = {
+        "mode": "client",
+        "scouting/multicast/enabled": False,
+        "connect/endpoints": [endpoint],
+        **{f"transport/link/tls/{name}": str(value) for name, value in tls.items()},
+    }
+    for name, value in settings.items():
+        config.insert_json5(name, json.dumps(value))
+    if "connect_certificate" in tls:
+        config.insert_json5("transport/link/tls/enable_mtls", "true")
+    try:
+        with zenoh.open(config) as session:
+            return bool(session.info.routers_zid())
+    except zenoh.ZError:
+        return False
+
+
+def shown_by(folder: Path, name: str) -> dict[str, object]:
+    """Return the settings of a client that shows a certificate."""
+    return {
+        "connect_certificate": folder / f"{name}.pem",
+        "connect_private_key": folder / f"{name}.key",
+    }

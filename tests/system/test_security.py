@@ -17,7 +17,7 @@ import pytest
 import zenoh
 
 from laneweave.launch.authority import issue, load_authority, make_authority
-from laneweave.protocol.access_rules import REQUEST_MARGIN_BYTES
+from laneweave.protocol.access_rules import REQUEST_MARGIN
 from laneweave.protocol.codec import MAX_BYTES
 from laneweave.protocol.fleets import Shard
 from laneweave.protocol.identities import parse_identity
@@ -47,10 +47,12 @@ from system.secured import (
     Member,
     Network,
     answer_to,
+    connects,
     deployment,
     free_port,
     laboratory,
     opens,
+    shown_by,
     until,
     until_heard,
 )
@@ -259,7 +261,7 @@ def test_what_is_too_long_does_not_come_in(network: Network) -> None:
     client = network.join("client.plan")
     network.serve("coordinator.c1", key)
     until(lambda: answer_to(client, key, bytes(most_bytes)))
-    assert answer_to(client, key, bytes(most_bytes + REQUEST_MARGIN_BYTES + 1), 0.2) == b""
+    assert answer_to(client, key, bytes(REQUEST_MARGIN * most_bytes + 1), 0.2) == b""
     assert answer_to(client, key, bytes(most_bytes))
 
     bridge, reader = network.join("bridge"), network.join("coordinator.c2")
@@ -273,34 +275,6 @@ def test_what_is_too_long_does_not_come_in(network: Network) -> None:
 # --- who gets in at all ---------------------------------------------------------------------------
 
 
-def connects(endpoint: str, **tls: object) -> bool:
-    """Tell whether a client with these settings gets to the router, whatever they are."""
-    config = zenoh.Config()
-    settings = {
-        "mode": "client",
-        "scouting/multicast/enabled": False,
-        "connect/endpoints": [endpoint],
-        **{f"transport/link/tls/{name}": str(value) for name, value in tls.items()},
-    }
-    for name, value in settings.items():
-        config.insert_json5(name, json.dumps(value))
-    if "connect_certificate" in tls:
-        config.insert_json5("transport/link/tls/enable_mtls", "true")
-    try:
-        with zenoh.open(config) as session:
-            return bool(session.info.routers_zid())
-    except zenoh.ZError:
-        return False
-
-
-def shown(folder: Path, name: str) -> dict[str, object]:
-    """Return the settings of a client that shows a certificate."""
-    return {
-        "connect_certificate": folder / f"{name}.pem",
-        "connect_private_key": folder / f"{name}.key",
-    }
-
-
 def test_outsiders_do_not_get_in(network: Network, tmp_path: Path) -> None:
     endpoint, ours = network.scenario.network.endpoint, network.folder
     ca = {"root_ca_certificate": ours / "ca.pem"}
@@ -309,16 +283,16 @@ def test_outsiders_do_not_get_in(network: Network, tmp_path: Path) -> None:
     expired.mkdir()
     issue(load_authority(ours), expired, parse_identity(name), days=-1.0)
 
-    assert connects(endpoint, **ca, **shown(ours, name))
+    assert connects(endpoint, **ca, **shown_by(ours, name))
     assert not connects(endpoint, **ca), "no certificate"
     assert not connects(endpoint.replace("tls/", "tcp/")), "plain tcp"
-    assert not connects(endpoint, **ca, **shown(theirs, name)), "wrong authority"
-    assert not connects(endpoint, **ca, **shown(expired, name)), "expired"
-    assert not connects(endpoint, **ca, **shown(ours, "router")), "not for clients"
+    assert not connects(endpoint, **ca, **shown_by(theirs, name)), "wrong authority"
+    assert not connects(endpoint, **ca, **shown_by(expired, name)), "expired"
+    assert not connects(endpoint, **ca, **shown_by(ours, "router")), "not for clients"
     # And the other way round: this router is none that others would believe.
-    assert not connects(endpoint, root_ca_certificate=theirs / "ca.pem", **shown(ours, name))
-    assert not connects(endpoint.replace("127.0.0.1", "127.0.0.2"), **ca, **shown(ours, name))
-    assert connects(endpoint, **ca, **shown(ours, name))
+    assert not connects(endpoint, root_ca_certificate=theirs / "ca.pem", **shown_by(ours, name))
+    assert not connects(endpoint.replace("127.0.0.1", "127.0.0.2"), **ca, **shown_by(ours, name))
+    assert connects(endpoint, **ca, **shown_by(ours, name))
 
 
 @pytest.mark.parametrize("name", ["router", "vehicle.v0001", "bridge", "coordinator.c1"])
@@ -338,7 +312,7 @@ def test_nobody_else_passes_for_the_router(network: Network, name: str) -> None:
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     with zenoh.open(config):
-        client = {"root_ca_certificate": folder / "ca.pem", **shown(folder, "coordinator.c2")}
+        client = {"root_ca_certificate": folder / "ca.pem", **shown_by(folder, "coordinator.c2")}
         assert connects(endpoint, **client) == (name == "router")
 
 

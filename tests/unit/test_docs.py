@@ -453,7 +453,7 @@ def test_example_requests_are_valid(path: Path) -> None:
 
 
 def test_the_answer_to_the_case_study_is_the_one_shown(capsys: pytest.CaptureFixture[str]) -> None:
-    answer_request(DOCS / "examples/case-study.json", None, None, "default", "tappa", as_table=True)
+    answer_request(DOCS / "examples/case-study.json", None, None, "tappa", as_table=True)
     assert capsys.readouterr().out in fences(read("PLANNING.md"), "text")
 
 

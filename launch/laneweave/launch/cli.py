@@ -213,6 +213,13 @@ def plan(
     wait: Annotated[
         float, typer.Option("--wait", help="Seconds to wait for a router and a coordinator there.")
     ] = 0.0,
+    config: Annotated[
+        Path | None,
+        typer.Option("--config", metavar="DEPLOYMENT.toml", help="Ask a coordinator of it."),
+    ] = None,
+    client: Annotated[
+        str, typer.Option("--client", metavar="NAME", help="As whom, where it is secured.")
+    ] = "plan",
     output: Annotated[OutputFormat, typer.Option("--format")] = OutputFormat.json,
     solver: Annotated[
         SolverChoice, typer.Option("--solver", help="How to plan here: see docs/PLANNING.md.")
@@ -225,18 +232,12 @@ def plan(
     ] = None,
 ) -> None:
     """Plan one request here, or ask a running coordinator."""
-    from laneweave.launch.plan_command import answer_request
+    from laneweave.launch.plan_command import access_for, answer_request
 
+    access = access_for(connect, realm, config, client)
     as_table = output is OutputFormat.table
     answer_request(
-        request,
-        deadline,
-        connect,
-        realm,
-        solver.value,
-        as_table=as_table,
-        drawing=draw,
-        wait_s=wait,
+        request, deadline, access, solver.value, as_table=as_table, drawing=draw, wait_s=wait
     )
 
 

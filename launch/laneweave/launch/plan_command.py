@@ -18,8 +18,10 @@ from laneweave.coordinator.client import (
 from laneweave.coordinator.inquiry import ABSENT_S
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan
 from laneweave.coordinator.planning.facade import Solver
-from laneweave.protocol.access import Access
+from laneweave.protocol.access import Access, access_of
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
+from laneweave.protocol.identities import Identity, Party
+from laneweave.protocol.scenario import load_scenario
 
 CONNECT_AGAIN_S = 0.2
 MOST_WAIT_S = 3600.0
@@ -27,11 +29,30 @@ ANSWER_MARGIN_S = 5.0
 """A coordinator gets this much longer than the request's deadline."""
 
 
+def access_for(endpoint: str | None, realm: str, config: Path | None, client: str) -> Access | None:
+    """Return how to get to a coordinator; None: none is to be asked.
+
+    Args:
+        endpoint: of the router; goes before that of the configuration.
+        realm: of the coordinators, where there is no configuration.
+        config: of the deployment.
+        client: as whom, where the deployment is secured.
+
+    Raises:
+        BadInputError: the configuration is not valid or names no router.
+    """
+    if config is None:
+        return None if endpoint is None else Access(endpoint, realm)
+    scenario = load_scenario(config, network__endpoint=endpoint)
+    if not scenario.network.endpoint:
+        raise BadInputError("network.endpoint", "", "an endpoint, there or with --connect")
+    return access_of(scenario, Identity(Party.CLIENT, client).common_name)
+
+
 def answer_request(
     path: Path,
     deadline_s: float | None,
-    endpoint: str | None,
-    realm: str,
+    access: Access | None,
     solver: Solver,
     *,
     as_table: bool,
@@ -40,7 +61,8 @@ def answer_request(
 ) -> None:
     """Read a request, have it planned, print the answer and draw it.
 
-    `solver` plans it here; at `endpoint` it is waited `wait_s` for somebody who does.
+    Without `access` it is planned here, by `solver`; there it is waited `wait_s` for somebody who
+    does.
 
     Raises:
         BadInputError: the request cannot be read or is not valid, nobody is at the endpoint, or
@@ -56,10 +78,10 @@ def answer_request(
     if deadline_s is not None:
         data["deadline_s"] = deadline_s
     request = PlanRequest.from_dict(data)
-    if endpoint is None:
+    if access is None:
         response = checked_plan(request, solver=solver)
     else:
-        response = _ask(Access(endpoint, realm), request, wait_s)
+        response = _ask(access, request, wait_s)
     if as_table:
         sys.stdout.write(_table(request, response))
     else:

@@ -23,8 +23,8 @@ from laneweave.protocol.identities import Identity, Party, identities_of
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.topics import TOPICS, Exchange, Keys, Topic
 
-REQUEST_MARGIN_BYTES = 1024
-"""The service itself refuses requests that are a little too long, and says why."""
+REQUEST_MARGIN = 2
+"""Requests up to so many times the longest come in: the service refuses them, and says why."""
 
 EVERYWHERE = ("0.0.0.0", "::")  # noqa: S104 (compared with, not listened at)
 """Hosts at which a router listens and nobody looks for it."""
@@ -181,7 +181,7 @@ def size_limits(scenario: Scenario) -> list[dict[str, Any]]:
     keys = Keys(scenario.network.realm)
     questions = [keys.all_of(topic) for topic in TOPICS if topic.exchange is Exchange.QUESTIONS]
     messages = [keys.all_of(topic) for topic in TOPICS if topic.exchange is Exchange.MESSAGES]
-    request_bytes = scenario.service.max_request_bytes + REQUEST_MARGIN_BYTES
+    request_bytes = REQUEST_MARGIN * scenario.service.max_request_bytes
     return [
         _size_limit("requests", "query", questions, request_bytes),
         _size_limit("messages", "put", messages, MAX_BYTES),

@@ -7,7 +7,6 @@ the settings of each topic and why they are so.
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import json
 import os
@@ -16,14 +15,14 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, InvalidStateError
 from typing import TYPE_CHECKING, Any
 
 import structlog
 import zenoh
 
-from laneweave.protocol.access import Access, Credentials
+from laneweave.protocol.access import Access
 from laneweave.protocol.access_rules import RouterGuard
 from laneweave.protocol.certificates import check_credentials
 from laneweave.protocol.codec import MAX_BYTES
@@ -56,6 +55,7 @@ from laneweave.protocol.transport import (
     TokenUp,
     learn,
 )
+from laneweave.protocol.zenoh_settings import Setting, client_settings, router_settings
 
 if TYPE_CHECKING:
     from laneweave.protocol.worker_pool import WorkerPool
@@ -83,7 +83,6 @@ _QUALITY: dict[Quality, dict[str, Any]] = {
 }
 
 
-DROP_AFTER_US = 50
 MAX_QUESTIONS = 4096
 """Open questions beyond which more are left to others."""
 TOO_LONG = bytes(MAX_BYTES + 1)
@@ -92,43 +91,16 @@ QUESTION_WAITS_S = 0.02
 """A question is taken at least so often, however much else there is to do."""
 
 
-def _config(mode: str, lease_s: float) -> zenoh.Config:
+def _open(settings: Iterable[Setting]) -> zenoh.Session:
+    """Open a session.
+
+    Raises:
+        zenoh.ZError: nobody answers, or it cannot listen.
+    """
     config = zenoh.Config()
-    congestion = "transport/link/tx/queue/congestion_control"
-    for path, value in (
-        ("mode", mode),
-        ("scouting/multicast/enabled", False),
-        ("scouting/gossip/enabled", False),
-        ("transport/link/tx/lease", int(lease_s * 1000)),
-        ("transport/shared_memory/enabled", False),
-        # A client that hangs fills its buffers. Whoever waits for room in them waits for less than
-        # a lease, or everybody would give everybody up; who may drop, drops at once.
-        (f"{congestion}/block/wait_before_close", int(lease_s * 1e6 / 3)),
-        (f"{congestion}/drop/wait_before_drop", DROP_AFTER_US),
-    ):
+    for path, value in settings:
         config.insert_json5(path, json.dumps(value))
-    return config
-
-
-def _set_credentials(config: zenoh.Config, credentials: Credentials, *, side: str) -> None:
-    """Have a session show credentials; `side` is `listen` for a router, else `connect`."""
-    settings: dict[str, Any] = {
-        "root_ca_certificate": credentials.ca,
-        f"{side}_certificate": credentials.certificate,
-        # Both sides show certificates, and believe none beyond its end.
-        "enable_mtls": True,
-        "verify_name_on_connect": True,
-        "close_link_on_expiration": True,
-    }
-    if credentials.private_key_pem:
-        encoded = base64.b64encode(credentials.private_key_pem.encode()).decode()
-        settings[f"{side}_private_key_base64"] = encoded
-    else:
-        settings[f"{side}_private_key"] = credentials.private_key
-    for name, value in settings.items():
-        config.insert_json5(f"transport/link/tls/{name}", json.dumps(value))
-    # Nothing else is spoken, whatever an endpoint says.
-    config.insert_json5("transport/link/protocols", json.dumps(["tls"]))
+    return zenoh.open(config)
 
 
 class ZenohTransport:
@@ -146,22 +118,15 @@ class ZenohTransport:
                 are not in order.
         """
         endpoint = check_endpoint(access.endpoint)
-        config = _config("client", access.lease_s)
-        config.insert_json5(
-            "connect/retry",
-            json.dumps({"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 1.5}),
-        )
-        who = ""
+        whose = ""
         if access.credentials is not None:
             check_credentials(access.credentials, access.identity)
-            _set_credentials(config, access.credentials, side="connect")
-            who = f" whose certificates and this process's ({access.identity}) are of one authority"
+            whose = f", of the authority that vouches for {access.identity}"
         try:
-            config.insert_json5("connect/endpoints", json.dumps([endpoint]))
-            self._session = zenoh.open(config)
+            self._session = _open(client_settings(access))
         except zenoh.ZError as error:
             raise BadInputError(
-                "network.endpoint", endpoint, f"the endpoint of a running router{who}"
+                "network.endpoint", endpoint, f"the endpoint of a running router{whose}"
             ) from error
         self._deliver = deliver
         self._subscriptions: dict[str, Any] = {}
@@ -473,17 +438,12 @@ def run_router(
         BadInputError: it cannot listen at an endpoint, or its credentials are not in order.
     """
     endpoints = [check_endpoint(endpoint, "network.listen") for endpoint in listen]
-    config = _config("router", lease_s)
     if guard is not None:
         check_credentials(guard.credentials, str(Party.ROUTER), guard.host)
-        _set_credentials(config, guard.credentials, side="listen")
-        config.insert_json5("access_control", json.dumps(guard.access_control))
-        config.insert_json5("low_pass_filter", json.dumps(guard.size_limits))
     stop: queue.SimpleQueue[bool] = queue.SimpleQueue()
     with _stop_signals(lambda: stop.put(True)):
         try:
-            config.insert_json5("listen/endpoints", json.dumps(endpoints))
-            session = zenoh.open(config)
+            session = _open(router_settings(endpoints, lease_s, guard))
         except zenoh.ZError as error:
             raise BadInputError(
                 "network.listen", ", ".join(endpoints), "endpoints that are free to listen at"

@@ -254,5 +254,5 @@ def test_without_draw_nothing_is_drawn(monkeypatch: pytest.MonkeyPatch, tmp_path
     monkeypatch.setattr(plan_command, "checked_plan", lambda *_, **__: PLAN)
     monkeypatch.setattr(plan_drawing, "draw_plan", None)
     monkeypatch.chdir(tmp_path)
-    answer_request(CASE_STUDY, None, None, "default", "tappa", as_table=True)
+    answer_request(CASE_STUDY, None, None, "tappa", as_table=True)
     assert list(tmp_path.iterdir()) == []

@@ -103,7 +103,7 @@ LEAVES = [
     for table in TABLES
     for attribute in attrs.fields(type(getattr(Scenario(), table)))
 ]
-TABLE_BY_NAME = type(attrs.Factory(dict))
+TABLE_BY_NAME: type = type(attrs.Factory(dict))
 NOT_NUMBERS: tuple[Any, ...] = ("1", True, None, [], [1], {}, math.nan, math.inf, -math.inf)
 
 
