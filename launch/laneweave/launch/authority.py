@@ -132,8 +132,7 @@ def issue(
         )
     )
     if serves:
-        names = [_general_name(host) for host in dict.fromkeys((*hosts, *LOCAL_HOSTS))]
-        builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
+        builder = builder.add_extension(host_names((*hosts, *LOCAL_HOSTS)), critical=False)
     _write(path, builder.sign(authority.key, hashes.SHA256()), key_path(folder, name), key)
 
 
@@ -175,6 +174,15 @@ def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:
         encipher_only=False,
         decipher_only=False,
     )
+
+
+def host_names(hosts: Sequence[str]) -> x509.SubjectAlternativeName:
+    """Return hosts as they stand in a certificate.
+
+    Raises:
+        BadInputError: one of them is no host.
+    """
+    return x509.SubjectAlternativeName([_general_name(host) for host in dict.fromkeys(hosts)])
 
 
 def _general_name(host: str) -> x509.GeneralName:

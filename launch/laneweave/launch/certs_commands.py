@@ -46,12 +46,13 @@ def init(
     force: Force = False,
 ) -> None:
     """Make a test authority, and a certificate for each process of a deployment."""
-    from laneweave.launch.authority import CA_DAYS, issue, make_authority
+    from laneweave.launch.authority import CA_DAYS, host_names, issue, make_authority
 
     _check_days(days)
     settings = load_scenario(config)
     identities = list(dict.fromkeys(_wanted(settings, client or [], vehicle or [])))
     hosts = [*(host or ()), *_hosts(settings)]
+    host_names(hosts)  # before anything is written
     authority = make_authority(folder, days=max(CA_DAYS, days), replace=force)
     for identity in identities:
         issue(authority, folder, identity, days=days, hosts=hosts, replace=force)
