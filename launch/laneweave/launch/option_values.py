@@ -44,16 +44,3 @@ def check_jobs(jobs: int | None) -> int:
     if not 1 <= jobs <= MOST_JOBS:
         raise BadInputError("--jobs", jobs, f"[1, {MOST_JOBS}]")
     return jobs
-
-
-def parse_shard(text: str) -> tuple[int, int]:
-    """Return I and N of `I/N`.
-
-    Raises:
-        BadInputError: it is no such pair.
-    """
-    index, _, count = text.partition("/")
-    digits = index.isdecimal() and count.isdecimal() and len(text) < 20
-    if not digits or int(index) >= int(count):
-        raise BadInputError("--shard", text, "I/N with 0 <= I < N")
-    return int(index), int(count)

@@ -15,7 +15,6 @@ import typer
 from rich.console import Console
 
 from laneweave.launch.logs import LogFormat, LogLevel, log_role
-from laneweave.launch.option_values import parse_shard
 from laneweave.launch.run_folder import draw_own, new_folder
 from laneweave.protocol.access import access_of
 from laneweave.protocol.errors import BadInputError

@@ -15,12 +15,12 @@ from rich.console import Console
 from rich.table import Table
 
 from laneweave.launch.observer import Observer
-from laneweave.launch.option_values import parse_shard
 from laneweave.launch.role_health import AGENT, BRIDGE, COORDINATOR, RoleHealth
 from laneweave.launch.status import Candidate, Status, status_of
 from laneweave.launch.tally import HEARD, TOKENS, Tally
 from laneweave.protocol.access import access_of
 from laneweave.protocol.errors import BadInputError, CommandFailedError
+from laneweave.protocol.fleets import parse_shard
 from laneweave.protocol.scenario import Scenario, load_scenario
 from laneweave.protocol.topics import NAME_PATTERN, NAME_RULE, Keys
 
@@ -80,9 +80,7 @@ def _role_health(role: Role | None, name: str | None, shard: str | None) -> Role
     if shard is not None:
         if role is not Role.agent or name is not None:
             raise BadInputError("--shard", shard, "only --role agent, and no --name")
-        from laneweave.agents.host import Shard
-
-        return RoleHealth(AGENT, shard, Shard(*parse_shard(shard)).takes, is_shard=True)
+        return RoleHealth(AGENT, shard, parse_shard(shard, "--shard").takes, is_shard=True)
     if name is not None and (role in (None, Role.bridge) or not NAME_PATTERN.fullmatch(name)):
         raise BadInputError("--name", name, f"with --role coordinator or agent: {NAME_RULE}")
     if name is None and role in (Role.coordinator, Role.agent):

@@ -9,7 +9,7 @@ from laneweave.protocol.deployment import Security
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.fleets import Shard
 
-FLEETS = {"even": "0/2", "odd": "1/2", "two": ("a", "b")}
+FLEETS: dict[str, str | tuple[str, ...]] = {"even": "0/2", "odd": "1/2", "two": ("a", "b")}
 OPEN, SECURED = Security(fleets=FLEETS), Security(mode="mtls", fleets=FLEETS)
 
 
