@@ -23,6 +23,7 @@ from laneweave.launch.evaluation.evidence import read_evidence
 from laneweave.launch.evaluation.tables import document_parts
 from laneweave.launch.metrics import PROCESS, PROCESS_MEANING
 from laneweave.launch.simulation.profiles import PROFILES
+from laneweave.protocol.access_rules import rights_table
 from laneweave.protocol.numbers import NodeNumbers, RouterNumbers, Snapshot, metrics_of
 from laneweave.protocol.transitions import markdown_table, mermaid_diagram
 from laneweave.protocol.vehicle_rules import VEHICLE_RULES, Stage
@@ -236,6 +237,7 @@ def parts() -> dict[str, str]:
         "closing": _closing(),
         "stream": _stream(),
         "metrics": _metrics(),
+        "rights": rights_table(),
         **document_parts(read_evidence(EVALUATED)),
     }
 

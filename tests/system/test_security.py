@@ -378,6 +378,9 @@ def test_a_secured_deployment_runs_to_its_end(lab: Lab) -> None:
         observer = network.join("observer.status")
         observer.transport.subscribe(KEYS.all_of(HEARTBEAT))
         lab.wait_until(lambda: len({key for key, _ in observer.received()}) == 2, END_S)
+        request = Path(__file__).parents[2] / "docs/examples/case-study.json"
+        asked = lab.finish(lab.start("plan", request, "--config", config), END_S)
+        assert (asked.status, json.loads(asked.out)["cost"]) == (0, 7)
         bridge = lab.start("bridge", "--config", config, "--pace", "20", "--out", "out")
         ended = lab.finish(bridge, RUN_S)
     assert (ended.status, ended.err) == (0, "")

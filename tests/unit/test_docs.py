@@ -209,21 +209,20 @@ def test_endings_of_runs() -> None:
 
 
 def test_table_of_topics() -> None:
-    shown = [
-        [code(cell) for cell in cells[:5]]
-        for cells in rows(section(read("PROTOCOL.md"), "## Keys"))
-    ]
+    shown = [cells[:6] for cells in rows(section(read("PROTOCOL.md"), "## Keys"))]
     expected = [
         [
-            topic.name,
-            topic.pattern,
-            "none" if topic.kind is None else topic.kind.__name__,
-            topic.sender,
-            topic.quality.name,
+            f"`{topic.name}`",
+            f"`{topic.pattern}`",
+            "none" if topic.kind is None else f"`{topic.kind.__name__}`",
+            f"{topic.sender}, {topic.deputy} in its place" if topic.deputy else topic.sender,
+            f"`{topic.quality.name}`",
+            ", ".join([*filter(None, [topic.addressee and f"own {topic.addressee}"]),
+                       *topic.readers]),
         ]
         for topic in TOPICS
-    ]
-    table = "\n".join(line([f"`{cell}`" for cell in cells]) for cells in expected)
+    ]  # fmt: skip
+    table = "\n".join(line(cells) for cells in expected)
     assert shown == expected, f"the table in PROTOCOL.md should begin with\n\n{table}\n"
 
 
