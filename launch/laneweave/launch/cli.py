@@ -27,6 +27,7 @@ from laneweave.launch.role_commands import (
     coordinator,
     ping,
     router,
+    watch,
 )
 from laneweave.launch.run_folder import draw_own, new_folder
 from laneweave.launch.status_command import status
@@ -46,10 +47,14 @@ app = typer.Typer(
 TYPER_INTERRUPTED = 130
 """What typer makes of Ctrl-C."""
 MISSING_SIM = "the simulation packages: install laneweave[sim]"
+MISSING_WATCH = "the web server: install laneweave[watch]"
 MISSING = {
     "distributed": "Dask: install laneweave[dask]",
     "cryptography": "what makes certificates: install laneweave[certs]",
     "prometheus_client": "the package for metrics: install laneweave[metrics]",
+    "starlette": MISSING_WATCH,
+    "uvicorn": MISSING_WATCH,
+    "websockets": MISSING_WATCH,
 }
 """What to install, by the package that is not there; else it is `MISSING_SIM`."""
 
@@ -243,7 +248,7 @@ def plan(
 
 app.add_typer(certs_commands.app, name="certs")
 app.add_typer(config_commands.app, name="config")
-for command in (router, ping, coordinator, agent, bridge, status, sweep, report):
+for command in (router, ping, coordinator, agent, bridge, watch, status, sweep, report):
     app.command()(command)
 
 
@@ -366,7 +371,7 @@ def _status(arguments: list[str]) -> int:
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("laneweave"):
             raise
-        missing = MISSING.get(error.name or "", MISSING_SIM)
+        missing = MISSING.get((error.name or "").partition(".")[0], MISSING_SIM)
         return _refuse(f"{error.name}: not installed; allowed: {missing}")
     if result == TYPER_INTERRUPTED:
         sys.stderr.write("interrupted\n")

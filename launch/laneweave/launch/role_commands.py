@@ -1,4 +1,4 @@
-"""The commands that run one role each: `router`, `ping`, `coordinator`, `agent`, `bridge`.
+"""The commands that run one role each: `router`, `ping`, `coordinator`, `agent`, `bridge`, `watch`.
 
 Each imports what it needs when it runs: an agent starts without SUMO, a coordinator without OSQP.
 """
@@ -159,6 +159,29 @@ def bridge(
     asked_to_end = outcome.summary is not None and outcome.summary["ending"] == "interrupted"
     broken = outcome.summary is None or outcome.summary["safety"]["overlaps"]
     raise typer.Exit(1 if broken else 0 if asked_to_end else outcome.exit_status)
+
+
+def watch(
+    folder: Annotated[
+        Path | None,
+        typer.Argument(metavar="[DIR]", help="A run's folder; default: the deployment."),
+    ] = None,
+    config: ConfigOption = None,
+    endpoint: RealmEndpoint = None,
+    listen: Annotated[
+        str, typer.Option("--listen", metavar="HOST:PORT", help="Port 0: any that is free.")
+    ] = "127.0.0.1:8080",
+) -> None:
+    """Serve a page that shows a deployment's road live, or a recorded run, until Ctrl-C."""
+    from laneweave.launch.watch.process import watch_live, watch_recorded
+
+    if folder is None:
+        watch_live(_deployment(config, endpoint), listen, typer.echo)
+        return
+    for option, value in (("--config", config), ("--endpoint", endpoint)):
+        if value is not None:
+            raise BadInputError(option, value, "nothing beside DIR, which needs no network")
+    watch_recorded(folder, listen, typer.echo)
 
 
 def check_pace(pace: float | None) -> None:

@@ -11,6 +11,12 @@ import numpy as np
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from laneweave.launch.colours import (
+    SHADE_STRENGTH,
+    SPEED_SPAN_MPS,
+    lane_colours,
+    lane_names,
+)
 from laneweave.launch.drawing import DPI, FAINT_INK, INK, new_figure, save, scenario_of
 from laneweave.protocol.scenario import Scenario
 
@@ -20,26 +26,11 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-_THREE_LANES = ("#2f6fc4", "#3f9b4f", "#cf3f3a")
-"""Right to left: blue, green, red, the paper's colours."""
-_MORE_LANES = (
-    "#2f6fc4",
-    "#e08b27",
-    "#3f9b4f",
-    "#8a5bb5",
-    "#cf3f3a",
-    "#7a5c4d",
-    "#d46fae",
-    "#808080",
-)
 _ASPHALT, _BLOCK, _PAINT = "#e9eaec", "#dcdfe3", "#ffffff"
 _ACROSS_SCALE = 1.8
 """Roads are drawn this much wider than they are, or their lanes would be threads."""
 _HEADROOM_M = 4.5
 """Room above the road for the numbers of formations."""
-SPEED_SPAN_MPS = 5.0
-"""Speeds this far below or above the lattice's have the darkest and lightest shade."""
-SHADE_STRENGTH = 0.45
 
 
 @attrs.frozen
@@ -124,13 +115,6 @@ def road_snapshots(
     strips[-1].set_xlabel("position on the road (m)")
     _draw_legend(figure, scenario)
     save(figure, out, dpi)
-
-
-def lane_colours(lanes: int) -> tuple[str, ...]:
-    """Return one colour for each lane, from the right."""
-    if lanes <= 3:
-        return _THREE_LANES[:1] + _THREE_LANES[3 - lanes + 1 :]
-    return tuple(_MORE_LANES[lane % len(_MORE_LANES)] for lane in range(lanes))
 
 
 def _draw_road(axes: Axes, scenario: Scenario, stretch_m: tuple[float, float]) -> None:
@@ -243,17 +227,6 @@ def _draw_legend(figure: Figure, scenario: Scenario) -> None:
         handlelength=1.6,
         columnspacing=1.6,
     )
-
-
-def lane_names(lanes: int) -> tuple[str, ...]:
-    """Return what people call the lanes, from the right."""
-    if lanes == 1:
-        return ("the lane",)
-    if lanes == 2:
-        return ("right", "left")
-    if lanes == 3:
-        return ("right", "middle", "left")
-    return tuple(f"lane {lane}" for lane in range(lanes))
 
 
 def _shade(colour: str, over_mps: float) -> tuple[float, float, float]:

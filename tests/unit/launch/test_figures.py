@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from laneweave.launch.colours import lane_colours
 from laneweave.launch.figures import speed_heatmap, travel_time_boxplot
-from laneweave.launch.snapshots import lane_colours, road_snapshots
+from laneweave.launch.snapshots import road_snapshots
 from laneweave.protocol.scenario import parse_scenario
 from laneweave.sim_bridge.demand import Arrival
 from laneweave.sim_bridge.recorder import Recorder

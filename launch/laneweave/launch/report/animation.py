@@ -16,9 +16,9 @@ import numpy as np
 import pyarrow.parquet as pq
 from attrs import frozen
 
+from laneweave.launch.colours import SHADE_STRENGTH, SPEED_SPAN_MPS, lane_colours
 from laneweave.launch.report.runs import Run
 from laneweave.launch.report.tracks import Floats, Tracks
-from laneweave.launch.snapshots import SHADE_STRENGTH, SPEED_SPAN_MPS, lane_colours
 
 FORMAT: Final = "laneweave.animation/1"
 KINDS: Final = {"s_m": "<u2", "y_m": "<u2", "speed_mps": "u1"}

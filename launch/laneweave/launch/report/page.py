@@ -13,7 +13,8 @@ from typing import Any, Final
 
 from attrs import field, frozen
 
-from laneweave.launch.snapshots import lane_names
+from laneweave.launch.colours import lane_names
+from laneweave.launch.web import road_script
 
 PAGE_FILE: Final = "report.html"
 _TEMPLATES = files("laneweave.launch.report") / "templates"
@@ -64,7 +65,7 @@ def write_page(page: Page, folder: Path) -> Path:
         navigation=navigation,
         sections=sections,
         data=data,
-        script=_template("player.js") + _template("stage.js") if page.animations else "",
+        script=_script() if page.animations else "",
     )
     path = folder / PAGE_FILE
     unfinished = path.with_suffix(".part")
@@ -117,6 +118,11 @@ def _animation_id(number: int) -> str:
 def _inert(data: Mapping[str, Any]) -> str:
     """Return JSON that cannot end the script element that it is in."""
     return json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+
+
+def _script() -> str:
+    # "use strict" stands in two of them; the second time it is a text that does nothing.
+    return road_script() + _template("player.js") + _template("stage.js")
 
 
 def _template(name: str) -> str:

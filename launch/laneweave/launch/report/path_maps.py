@@ -15,10 +15,10 @@ import pyarrow.parquet as pq
 from attrs import frozen
 
 from laneweave.coordinator.planning.path_map import RelativePathMap
+from laneweave.launch.colours import lane_colours
 from laneweave.launch.drawing import FAINT_INK, INK, new_figure, save
 from laneweave.launch.report.runs import Run
 from laneweave.launch.report.tracks import OFF_LATTICE, Floats, Ints, Tracks
-from laneweave.launch.snapshots import lane_colours
 from laneweave.protocol.errors import BadInputError
 
 if TYPE_CHECKING:

@@ -20,6 +20,7 @@ from laneweave.launch.report.animation import KINDS, animation_data
 from laneweave.launch.report.runs import Run, single_run
 from laneweave.launch.report.tracks import Tracks, read_tracks
 from laneweave.launch.snapshots import _shade
+from laneweave.launch.web import road_script
 
 NODE = shutil.which("node")
 needs_node = pytest.mark.skipif(
@@ -94,7 +95,8 @@ def test_a_run_without_vehicles(run: Run, tracks: Tracks) -> None:
 
 def in_node(expression: str, data: dict[str, Any]) -> Any:  # noqa: ANN401 - any JSON
     """Return the value of an expression in which `run` is the decoded data."""
-    script = (files("laneweave.launch.report") / "templates" / "player.js").read_text("utf-8")
+    player = (files("laneweave.launch.report") / "templates" / "player.js").read_text("utf-8")
+    script = road_script() + player
     program = (
         f"{script}\nconst run = laneweave.decode(JSON.parse(require('fs').readFileSync(0)));\n"
         f"console.log(JSON.stringify({expression}));"
@@ -179,7 +181,9 @@ def test_the_player_shades_as_the_pictures_do(run: Run, tracks: Tracks) -> None:
     data = animation_data(run, tracks, "")
     for over_mps in (-9.0, -2.5, 0.0, 1.0, 7.0):
         shade = data["shade"]
-        call = f"laneweave.shade('#2f6fc4', {over_mps}, {shade['span_mps']}, {shade['strength']})"
+        call = (
+            f"laneweaveRoad.shade('#2f6fc4', {over_mps}, {shade['span_mps']}, {shade['strength']})"
+        )
         shown = in_node(call, data)
         expected = ",".join(str(round(255 * part)) for part in _shade("#2f6fc4", over_mps))
         assert shown == f"rgb({expected})"

@@ -1,5 +1,6 @@
 "use strict";
 // The moving road. Data: laneweave/launch/report/animation.py. Times in s, lengths in m.
+// It is drawn by laneweave/launch/web/road.js.
 
 const laneweave = (() => {
   /** Whole numbers of `bytes` bytes each, little-endian, from base64. */
@@ -57,18 +58,6 @@ const laneweave = (() => {
     return found;
   }
 
-  /** A colour, darker below the lattice's speed and lighter above it. */
-  function shade(colour, over, span, strength) {
-    const share = Math.max(-1, Math.min(1, over / span));
-    const end = share > 0 ? 255 : 0;
-    const part = strength * Math.abs(share);
-    const mixed = [1, 3, 5].map((i) => {
-      const value = parseInt(colour.slice(i, i + 2), 16);
-      return Math.round((1 - part) * value + part * end);
-    });
-    return `rgb(${mixed.join(",")})`;
-  }
-
   /** Middle of a formation's block of columns at a time, on the road or not. */
   function blockCentre(run, formation, t) {
     const width = run.lattice.block_columns;
@@ -79,17 +68,12 @@ const laneweave = (() => {
   /** Stretches [from, to] of road that are shown below each other; `follow` null: the whole road. */
   function stretches(run, follow, t, windowLength) {
     const length = run.road.length_m;
-    if (follow === null) {
-      const count = Math.max(1, Math.min(6, Math.round(length / 250)));
-      return Array.from({ length: count }, (_, i) => [(length * i) / count, (length * (i + 1)) / count]);
-    }
+    if (follow === null) return laneweaveRoad.wholeRoad(length);
     const state = follow.vehicle ? stateAt(run, follow.vehicle, t) : null;
     const first = follow.vehicle ? follow.vehicle.first * run.step_s : 0;
     let centre = state ? state.s : t < first ? 0 : length;
     if (!follow.vehicle) centre = blockCentre(run, follow.formation, t);
-    const half = Math.min(windowLength, length) / 2;
-    const middle = Math.max(half, Math.min(length - half, centre));
-    return [[middle - half, middle + half]];
+    return [laneweaveRoad.windowAround(length, centre, windowLength)];
   }
 
   /** What can be followed: formations, or vehicles where there are none. */
@@ -112,5 +96,5 @@ const laneweave = (() => {
     return Math.max(0, Math.min(run.end_s, ahead / run.lattice.speed_mps));
   }
 
-  return { unpack, decode, stateAt, allAt, shade, blockCentre, stretches, followable, arrivalTime };
+  return { unpack, decode, stateAt, allAt, blockCentre, stretches, followable, arrivalTime };
 })();

@@ -1,0 +1,256 @@
+"""`laneweave watch` as a process: the socket, the signals, and the thread that listens.
+
+The thread takes in what Zenoh delivers and makes frames; the event loop serves browsers. Between
+them go whole frames, one way.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import structlog
+import uvicorn
+
+from laneweave.launch.observer import Observer
+from laneweave.launch.watch.frames import Film, compact, scene_of
+from laneweave.launch.watch.live_road import TOPICS, LiveRoad
+from laneweave.launch.watch.ring import Ring
+from laneweave.launch.watch.server import Audience, Health, make_app
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.topics import Keys
+from laneweave.protocol.transport import Deliver, Delivery
+from laneweave.protocol.zenoh_transport import ZenohTransport
+
+log = structlog.get_logger(__name__)
+
+STEP_S: Final = 0.1
+"""Time between two frames; wall clock."""
+SLACK_S: Final = 0.01
+"""A frame may come so much early: ticks are not quite regular, and each shall have its own."""
+IDLE_S: Final = 1.0
+"""A frame comes at least this often, to say that nothing has changed."""
+POLL_S: Final = 0.02
+MOST_WAITING: Final = 20_000
+"""Messages that wait to be taken in; more are not taken."""
+END_S: Final = 1.0
+"""How long browsers may take to end."""
+LISTEN_RULE: Final = "HOST:PORT, an address of this machine; port 0: any free one"
+
+
+def watch_live(scenario: Scenario, listen: str, ready: Callable[[str], None]) -> None:
+    """Serve the page of a deployment until SIGINT or SIGTERM.
+
+    Args:
+        scenario: road and network; the same that the roles have.
+        listen: HOST:PORT.
+        ready: called with the page's address when it can be asked for.
+
+    Raises:
+        BadInputError: nobody answers at the endpoint, or the address cannot be listened at.
+    """
+    with contextlib.closing(open_socket(listen)) as listener, _Eye(scenario) as eye:
+        _serve(listener, eye.ring, eye.audience, eye.health, ready, eye.start)
+        eye.check()
+
+
+def watch_recorded(folder: Path, listen: str, ready: Callable[[str], None]) -> None:
+    """Serve the page of a recorded run until SIGINT or SIGTERM.
+
+    Raises:
+        BadInputError: it is not the folder of a finished run, or the address cannot be listened at.
+    """
+    from laneweave.launch.watch.recorded import Recording  # noqa: PLC0415 (needs pyarrow)
+
+    recording = Recording(folder)
+
+    def health() -> tuple[bool, dict[str, Any]]:
+        return True, {"recorded": str(folder)}
+
+    with contextlib.closing(open_socket(listen)) as listener:
+        _serve(listener, recording, Audience(), health, ready)
+
+
+def open_socket(listen: str) -> socket.socket:
+    """Return a socket that listens at an address.
+
+    Raises:
+        BadInputError: it is no address, or nobody can listen there.
+    """
+    host, colon, port = listen.rpartition(":")
+    host = host.removeprefix("[").removesuffix("]")
+    if not colon or not host or not port.isdecimal() or int(port) > 65535:
+        raise BadInputError("--listen", listen, LISTEN_RULE)
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, int(port)), family=family)
+    except (OSError, UnicodeError) as error:
+        allowed = f"{LISTEN_RULE} ({getattr(error, 'strerror', None) or error})"
+        raise BadInputError("--listen", listen, allowed) from error
+
+
+def connect(scenario: Scenario, deliver: Deliver) -> ZenohTransport:
+    """Return a connection to a deployment's router.
+
+    Raises:
+        BadInputError: nobody answers there.
+    """
+    network = scenario.network
+    return ZenohTransport(network.endpoint, deliver, network.lease_s)
+
+
+class _Eye:
+    """Listens to a deployment in a thread of its own and makes frames."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Connect; see `connect`."""
+        self.audience = Audience()
+        self.ring = Ring(scene_of(scenario, "live", scenario.network.realm, STEP_S))
+        self._observer = Observer(Keys(scenario.network.realm), topics=TOPICS)
+        self._transport = connect(scenario, self._deliver)
+        # Seconds that do not jump when somebody sets the clock.
+        self._offset_s = time.time() - time.monotonic()
+        self._road = LiveRoad(scenario, self._wall_s())
+        self._made_s = self._wall_s()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="watch", daemon=True)
+        self._failure: BaseException | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._give_up: Callable[[], None] = lambda: None
+
+    def __enter__(self) -> _Eye:
+        """Use it as a context manager: it leaves the network at the end."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop listening."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join(END_S)
+        self._transport.close()
+
+    def start(self, give_up: Callable[[], None]) -> None:
+        """Begin to listen, from the event loop; `give_up` ends the process."""
+        self._loop, self._give_up = asyncio.get_running_loop(), give_up
+        self._observer.subscribe(self._transport)
+        self._thread.start()
+
+    def check(self) -> None:
+        """Raise what has ended the thread, if something has."""
+        if self._failure is not None:
+            raise self._failure
+
+    def health(self) -> tuple[bool, dict[str, Any]]:
+        """Return whether the observer is connected and at work."""
+        age_s = self._wall_s() - self._made_s
+        connected = self._road.connected
+        facts = {"connected": connected, "runs": self._road.run, "frame_age_s": round(age_s, 3)}
+        return connected and age_s < 3.0 * IDLE_S, facts
+
+    def _wall_s(self) -> float:
+        return time.monotonic() + self._offset_s
+
+    def _deliver(self, delivery: Delivery) -> None:
+        inbox = self._observer.inbox
+        if inbox.qsize() < MOST_WAITING:
+            inbox.put(delivery)
+
+    def _run(self) -> None:
+        try:
+            while not self._stop.is_set():
+                for news in self._observer.news(POLL_S):
+                    self._road.take(news, self._wall_s())
+                self._show()
+        except Exception as error:  # noqa: BLE001 (reported by the main thread, which ends)
+            self._failure = error
+            self._call(self._give_up)
+
+    def _show(self) -> None:
+        wall_s = self._wall_s()
+        age_s = wall_s - self._made_s
+        due = age_s >= STEP_S - SLACK_S and self._road.changed(wall_s)
+        if due or age_s >= IDLE_S:
+            self._made_s = wall_s
+            frame = self._road.frame(self._number, wall_s)
+            self._number += 1
+            self._call(self._publish, compact(frame))
+
+    _number = 0
+    """Of the next frame."""
+
+    def _publish(self, frame: str) -> None:
+        """Hand a frame out, in the event loop."""
+        self.ring.append(frame)
+        self.audience.offer(frame)
+
+    def _call(self, function: Callable[..., None], *arguments: object) -> None:
+        assert self._loop is not None  # noqa: S101 (set before the thread starts)
+        # The loop is closed when the process ends at this very moment.
+        with contextlib.suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(function, *arguments)
+
+
+class _Server(uvicorn.Server):
+    """A server that leaves signals to whoever runs it."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Capture none: the library's own way would end the process by the signal."""
+        yield
+
+
+def _serve(
+    listener: socket.socket,
+    film: Film,
+    audience: Audience,
+    health: Health,
+    ready: Callable[[str], None],
+    start: Callable[[Callable[[], None]], None] = lambda _: None,
+) -> None:
+    config = uvicorn.Config(
+        make_app(film, audience, health),
+        log_config=None,
+        # What it says about browsers that come and go is of no interest on a terminal.
+        log_level="critical",
+        access_log=False,
+        lifespan="off",
+        server_header=False,
+        timeout_graceful_shutdown=int(END_S),
+        ws="websockets-sansio",
+        ws_max_size=4096,
+        ws_max_queue=4,
+        ws_ping_interval=5.0,
+        ws_ping_timeout=10.0,
+        # Costs more time than it saves on a local network.
+        ws_per_message_deflate=False,
+    )
+    server = _Server(config)
+
+    def end() -> None:
+        server.should_exit = True
+
+    async def main() -> None:
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            # What is ignored stays ignored.
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                loop.add_signal_handler(number, end)
+        start(end)
+        ready(address_of(listener))
+        await server.serve(sockets=[listener])
+
+    asyncio.run(main())
+
+
+def address_of(listener: socket.socket) -> str:
+    """Return the address of the page."""
+    host, port = listener.getsockname()[:2]
+    return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"

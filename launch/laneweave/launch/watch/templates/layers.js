@@ -1,0 +1,135 @@
+"use strict";
+// What is drawn between the road and the vehicles: blocks of formations, cells, targets.
+
+const laneweaveLayers = (() => {
+  const ROUND_PX = 3;
+
+  /** Corners on the canvas of a cell: [x, y, width, height]. */
+  function cellBox(painter, [column, lane], t) {
+    const { scene } = painter;
+    const [rear, front] = laneweaveRoad.columnsAt(scene, column, column, t);
+    const width = scene.road.lane_width_m;
+    const [left, right] = [painter.x(rear), painter.x(front)];
+    const [top, bottom] = [painter.y((lane + 1) * width), painter.y(lane * width)];
+    return [left, top, right - left, bottom - top];
+  }
+
+  function onStrip(painter, column, t) {
+    return painter.shows(...laneweaveRoad.columnsAt(painter.scene, column, column, t));
+  }
+
+  function rounded(pen, [x, y, width, height], inset) {
+    pen.beginPath();
+    pen.roundRect(x + inset, y + inset, width - 2 * inset, height - 2 * inset, ROUND_PX);
+  }
+
+  function ownColour(painter, body) {
+    const { colours } = painter.scene;
+    return body.lane < 0 ? painter.theme.faint : colours[body.lane % colours.length];
+  }
+
+  /** Cells that vehicles hold, framed, and the others that they own, in their colour. */
+  function cells(bodies, t) {
+    return (painter) => {
+      const { pen } = painter;
+      for (const body of bodies) {
+        pen.fillStyle = pen.strokeStyle = ownColour(painter, body);
+        pen.globalAlpha = 0.09;
+        for (const cell of body.estate) {
+          if (!onStrip(painter, cell[0], t)) continue;
+          rounded(pen, cellBox(painter, cell, t), 1.5);
+          pen.fill();
+        }
+        pen.globalAlpha = 0.2;
+        if (body.hold && onStrip(painter, body.hold[0], t)) {
+          rounded(pen, cellBox(painter, body.hold, t), 1.5);
+          pen.fill();
+          pen.globalAlpha = 0.65;
+          pen.lineWidth = 1;
+          pen.stroke();
+        }
+      }
+      pen.globalAlpha = 1;
+    };
+  }
+
+  /** Groups of formations that are on the road: [[number, ...], ...]. */
+  function groups(bodies, joined) {
+    const numbers = new Set(bodies.map((body) => body.formation).filter((number) => number >= 0));
+    const groupOf = new Map();
+    for (const group of joined) for (const number of group) groupOf.set(number, group);
+    const found = new Set();
+    for (const number of numbers) found.add((groupOf.get(number) || [number]).join("+"));
+    return [...found].map((text) => text.split("+").map(Number)).sort((a, b) => a[0] - b[0]);
+  }
+
+  /** Blocks of columns that formations own, every other one shaded, with their numbers above. */
+  function blocks(bodies, joined, t) {
+    return (painter) => {
+      const { pen, theme, scene } = painter;
+      const width = scene.lattice.block_columns;
+      for (const numbers of groups(bodies, joined)) {
+        const [first, last] = [numbers[0], numbers[numbers.length - 1]];
+        const rear = -(last + 1) * width + 1;
+        const [from, to] = laneweaveRoad.columnsAt(scene, rear, -first * width, t);
+        if (!painter.shows(from, to)) continue;
+        const [left, right] = [painter.x(from), painter.x(to)];
+        pen.fillStyle = theme.faint;
+        pen.globalAlpha = first % 2 ? 0.2 : 0.07;
+        pen.fillRect(left, 0, right - left, painter.roadPx);
+        pen.globalAlpha = 1;
+        const [begin, end] = [Math.max(left, 0), Math.min(right, painter.width)];
+        if (end - begin < 70) continue;
+        pen.font = "11px system-ui, sans-serif";
+        pen.textAlign = "center";
+        pen.textBaseline = "bottom";
+        pen.fillText(`formation ${numbers.join("+")}`, (begin + end) / 2, -1);
+      }
+    };
+  }
+
+  /** Where plans lead: a line from each vehicle to a ring in its target, unless it is there. */
+  function targets(bodies, t) {
+    return (painter) => {
+      const { pen, scene } = painter;
+      const { pitch_m: pitch, speed_mps: speed } = scene.lattice;
+      const width = scene.road.lane_width_m;
+      pen.lineWidth = 1.5;
+      for (const body of bodies) {
+        const target = body.target || body.hold;
+        if (!target || body.faint) continue;
+        const [s, y] = [speed * t + target[0] * pitch, (target[1] + 0.5) * width];
+        if (Math.abs(s - body.s) < 0.4 * pitch && Math.abs(y - body.y) < 0.25 * width) continue;
+        if (!painter.shows(Math.min(s, body.s) - scene.body_m[0], Math.max(s, body.s))) continue;
+        const half = scene.body_m[0] / 2;
+        const [x1, y1] = [painter.x(s - half), painter.y(y)];
+        pen.strokeStyle = pen.fillStyle = ownColour(painter, body);
+        laneweaveRoad.line(pen, painter.x(body.s - half), painter.y(body.y), x1, y1);
+        pen.beginPath();
+        pen.arc(x1, y1, 4, 0, 2 * Math.PI);
+        pen.fillStyle = painter.theme.asphalt;
+        pen.fill();
+        pen.stroke();
+      }
+    };
+  }
+
+  /** Marks around vehicles of which something is out of the ordinary. */
+  function marks(bodies) {
+    const odd = laneweaveFilm.UNATTENDED | laneweaveFilm.OVERDUE;
+    return (painter) => {
+      const { pen, scene } = painter;
+      pen.strokeStyle = "#e08b27";
+      pen.lineWidth = 2;
+      for (const body of bodies) {
+        if (!(body.flags & odd) || !painter.shows(body.s - scene.body_m[0], body.s)) continue;
+        const radius = Math.max(7, 0.75 * scene.body_m[0] * painter.scale);
+        pen.beginPath();
+        pen.arc(painter.x(body.s - scene.body_m[0] / 2), painter.y(body.y), radius, 0, 2 * Math.PI);
+        pen.stroke();
+      }
+    };
+  }
+
+  return { cells, groups, blocks, targets, marks };
+})();

@@ -1,0 +1,420 @@
+"use strict";
+// The page: connection, controls, numbers. `window.laneweaveWatch` tells tests what it has done.
+
+const PAINT_MS = 28; // between two pictures, at least
+const NUMBERS_MS = 200; // between two updates of the numbers beside the road
+const WINDOW_M = 150; // of road that is shown when something is followed
+const AHEAD = 40; // frames that are fetched before they are needed
+const RETRY_MS = [300, 600, 1200, 2500];
+const PACES = [0.5, 1, 2, 5, 10];
+const CALM = matchMedia("(prefers-reduced-motion: reduce)");
+const NIGHT = matchMedia("(prefers-color-scheme: dark)");
+
+const part = (id) => document.getElementById(id);
+const clockTime = (seconds) => new Date(seconds * 1000).toLocaleTimeString([], { hour12: false });
+
+class Watch {
+  constructor() {
+    this.film = new laneweaveFilm.Film();
+    this.painter = null;
+    this.follow = null; // {vehicle} or {formation}
+    this.place = null; // number of the frame that is shown, with a fraction; null: the newest
+    this.playing = false; // recorded only
+    this.pace = 1;
+    this.stale = true; // something but the time has changed since the last picture
+    this.painted = 0;
+    this.counted = 0;
+    this.tries = 0;
+    this.offlineSince = null;
+    this.arrived = 0;
+    this.stats = { frames: 0, shown: 0, paints: 0, firstFrameMs: null };
+    this.lastShown = null;
+    this.wire();
+    this.connect();
+    requestAnimationFrame((now) => this.turn(now));
+  }
+
+  get live() {
+    return this.film.scene !== null && this.film.scene.kind === "live";
+  }
+
+  // --- the connection ---------------------------------------------------------------------------
+
+  connect() {
+    const socket = new WebSocket(`${location.origin.replace(/^http/, "ws")}/stream`);
+    this.socket = socket;
+    socket.onmessage = (event) => this.take(event.data);
+    socket.onclose = () => {
+      this.offlineSince ??= Date.now() / 1000;
+      this.film.waiting = false;
+      this.showStatus();
+      const delay = RETRY_MS[Math.min(this.tries, RETRY_MS.length - 1)];
+      this.tries += 1;
+      setTimeout(() => this.connect(), delay);
+    };
+  }
+
+  take(text) {
+    const what = this.film.take(text);
+    if (what === "scene") {
+      this.tries = 0;
+      this.offlineSince = null;
+      this.begin();
+    } else if (what === "frame") {
+      const now = performance.now();
+      this.interval = Math.min(250, Math.max(40, now - this.arrived));
+      this.arrived = now;
+      this.stats.frames += 1;
+    }
+    this.stale = true;
+  }
+
+  ask(ahead) {
+    const wish = this.place === null ? null : this.film.wish(this.place, ahead);
+    if (wish && this.socket.readyState === WebSocket.OPEN) {
+      this.socket.send(JSON.stringify({ want: wish }));
+    } else if (wish) {
+      this.film.waiting = false;
+    }
+  }
+
+  // --- controls ---------------------------------------------------------------------------------
+
+  begin() {
+    const { scene } = this.film;
+    this.painter = new laneweaveRoad.Painter(part("road"), scene, this.theme());
+    document.title = `${scene.title} · laneweave`;
+    part("title").textContent = scene.title;
+    part("cells-name").textContent = this.live || !scene.rolling ? "cells" : "held cells";
+    part("paces").hidden = this.live;
+    if (!this.live && this.place === null) {
+      this.place = this.film.first;
+      this.playing = !CALM.matches;
+    }
+    if (this.live && this.place !== null && this.place > this.film.last) this.place = null;
+    this.showLegend();
+    this.showButton();
+  }
+
+  wire() {
+    part("pause").addEventListener("click", () => this.toggle());
+    part("slider").addEventListener("input", (event) => {
+      this.place = Number(event.target.value);
+      if (this.live && this.place >= this.film.last) this.place = null;
+      this.showButton();
+      this.stale = true;
+    });
+    const pace = part("pace");
+    for (const one of PACES) pace.add(new Option(`${one}x`, one, one === 1, one === 1));
+    pace.addEventListener("change", () => (this.pace = Number(pace.value)));
+    const view = part("view");
+    for (const event of ["pointerdown", "focus"]) view.addEventListener(event, () => this.offer());
+    view.addEventListener("change", () => this.look(view.value));
+    for (const box of ["cells", "targets"]) {
+      part(box).addEventListener("change", () => (this.stale = true));
+    }
+    part("road").addEventListener("click", (event) => this.pick(event));
+    document.addEventListener("keydown", (event) => {
+      const typing = event.target.closest?.("button, select, input[type=checkbox]");
+      if (event.key === " " && !typing) {
+        event.preventDefault();
+        this.toggle();
+      } else if (event.key === "Escape") {
+        this.look("");
+      }
+    });
+    new ResizeObserver(() => (this.stale = true)).observe(part("road"));
+    NIGHT.addEventListener("change", () => {
+      if (this.painter) this.painter.theme = this.theme();
+      this.stale = true;
+    });
+  }
+
+  theme() {
+    return NIGHT.matches ? laneweaveRoad.DARK : laneweaveRoad.LIGHT;
+  }
+
+  toggle() {
+    if (this.live) {
+      this.place = this.place === null ? this.film.last : null;
+    } else {
+      if (!this.playing && this.place >= this.film.last) this.place = this.film.first;
+      this.playing = !this.playing;
+    }
+    this.stale = true;
+    this.showButton();
+  }
+
+  showButton() {
+    const running = this.live ? this.place === null : this.playing;
+    part("pause").textContent = running ? "Pause" : this.live ? "Go live" : "Play";
+  }
+
+  /** What can be followed now, as options of the view. */
+  offer() {
+    const { bodies } = this.picture ?? { bodies: [] };
+    const formations = laneweaveLayers.groups(bodies, []).map(([number]) => `formation ${number}`);
+    const names = [...formations, ...bodies.map((body) => body.name).sort()];
+    const view = part("view");
+    const chosen = view.value;
+    if (chosen && !names.includes(chosen)) names.unshift(chosen);
+    const options = names.map((name) => new Option(`follow ${name}`, name));
+    view.replaceChildren(new Option("whole road", ""), ...options);
+    view.value = chosen;
+  }
+
+  look(name) {
+    const formation = /^formation (\d+)$/.exec(name);
+    this.follow = formation ? { formation: Number(formation[1]) } : name ? { vehicle: name } : null;
+    const view = part("view");
+    view.value = name;
+    if (view.value !== name) {
+      this.offer();
+      view.add(new Option(`follow ${name}`, name));
+      view.value = name;
+    }
+    this.stale = true;
+  }
+
+  /** Follow the vehicle that was clicked on. */
+  pick(event) {
+    const place = this.painter?.placeAt(event.offsetX, event.offsetY);
+    if (!place || !this.picture) return;
+    const [length, width] = this.film.scene.body_m;
+    const hit = this.picture.bodies.find(
+      (body) => Math.abs(place.s - body.s + length / 2) < length && Math.abs(place.y - body.y) < width,
+    );
+    if (hit) this.look(hit.name);
+  }
+
+  // --- the picture ------------------------------------------------------------------------------
+
+  /** What is to be shown: [frame, next frame, share of the way]; null: nothing yet. */
+  moment(now) {
+    const { film } = this;
+    if (this.place === null) {
+      if (!film.newest) return null;
+      if (!film.before || CALM.matches) return [film.newest, null, 0];
+      const share = Math.min(1, (now - this.arrived) / this.interval);
+      return [film.before, film.newest, share];
+    }
+    const from = Math.floor(this.place);
+    const frame = film.get(from) ?? film.get(from - 1);
+    return frame ? [frame, film.get(from + 1), this.place - from] : null;
+  }
+
+  turn(now) {
+    requestAnimationFrame((next) => this.turn(next));
+    if (!this.painter || now - this.painted < PAINT_MS) return;
+    if (this.playing) this.advance((now - this.painted) / 1000);
+    this.painted = now;
+    if (this.place !== null) this.ask(this.playing ? AHEAD : 1);
+    const moment = this.moment(now);
+    if (!moment) return;
+    const settled = moment[2] >= 1 || moment[2] === 0;
+    if (!this.stale && settled && !this.playing && this.settled) return;
+    this.settled = settled;
+    this.stale = false;
+    this.paint(moment);
+    if (now - this.counted > NUMBERS_MS || this.place !== null) {
+      this.counted = now;
+      this.showNumbers(this.current);
+    }
+  }
+
+  /** Play on, unless the frames are not here yet. */
+  advance(seconds) {
+    const { film } = this;
+    const next = this.place + (this.pace * Math.min(seconds, 0.2)) / film.scene.step_s;
+    const there = Math.min(film.last, Math.floor(next) + 1);
+    if (film.get(there) === null) return;
+    this.place = Math.min(film.last, next);
+    if (this.place >= film.last) {
+      this.playing = false;
+      this.showButton();
+    }
+    this.stale = true;
+  }
+
+  paint([frame, next, share]) {
+    const { painter } = this;
+    const { scene } = this.film;
+    this.current = next && share >= 0.5 ? next : frame;
+    const picture = laneweaveFilm.between(frame, next, share);
+    this.picture = picture;
+    const { t, bodies } = picture;
+    const layers = [];
+    if (t !== null) {
+      if (!scene.rolling) layers.push(laneweaveLayers.blocks(bodies, this.current.joined, t));
+      if (part("cells").checked) layers.push(laneweaveLayers.cells(bodies, t));
+      if (part("targets").checked) layers.push(laneweaveLayers.targets(bodies, t));
+      layers.push(laneweaveLayers.marks(bodies));
+    }
+    painter.paint(this.strips(scene, picture), bodies, layers);
+    this.stats.paints += 1;
+    const shown = next ? next.n : frame.n;
+    if (shown !== this.lastShown) {
+      this.lastShown = shown;
+      this.stats.shown += 1;
+      this.stats.firstFrameMs ??= Math.round(performance.now());
+    }
+  }
+
+  strips(scene, { t, bodies }) {
+    const length = scene.road.length_m;
+    if (!this.follow || t === null) return laneweaveRoad.wholeRoad(length);
+    if (this.follow.vehicle) {
+      const body = bodies.find((one) => one.name === this.follow.vehicle);
+      this.centre = body ? body.s : (this.centre ?? length);
+    } else {
+      const width = scene.lattice.block_columns;
+      const front = -this.follow.formation * width;
+      const [rear, end] = laneweaveRoad.columnsAt(scene, front - width + 1, front, t);
+      this.centre = (rear + end) / 2;
+    }
+    return [laneweaveRoad.windowAround(length, this.centre, WINDOW_M)];
+  }
+
+  // --- numbers ----------------------------------------------------------------------------------
+
+  showNumbers(frame) {
+    const { film } = this;
+    const { scene } = film;
+    const { onLane, knownLane, speed } = laneweaveFilm.facts(scene, this.picture.bodies);
+    const say = (id, text) => {
+      const element = part(id);
+      if (element.textContent !== text) element.textContent = text;
+    };
+    say("time", frame.t === null ? "–" : `${frame.t.toFixed(1)} s`);
+    say("run", frame.run > 1 ? `run ${frame.run} since this page's server began` : "");
+    const [demanded, entered, , left] = frame.counts ?? [0, 0, 0, 0];
+    say("count", frame.counts ? `${this.picture.bodies.length}` : "–");
+    say("counts", frame.counts ? `${entered} of ${demanded} entered, ${left} left` : "");
+    say("sorted", knownLane ? `${Math.round((100 * onLane) / knownLane)} %` : "–");
+    say("speed", speed === null ? "" : `${onLane} of ${knownLane}; mean ${speed.toFixed(1)} m/s`);
+    say("leader", frame.leader ? `${frame.leader[0]}, term ${frame.leader[1]}` : "none");
+    part("leader").classList.toggle("bad", !frame.leader);
+    this.showCandidates(frame.candidates);
+    this.showLoss(frame.loss, scene.losses, say);
+    const [plannedAt, planned, took] = frame.plan ?? [];
+    say("plan", frame.plan ? `${took.toFixed(1)} ms` : "–");
+    say("planned", frame.plan ? `${planned} vehicles, at ${plannedAt.toFixed(1)} s` : "");
+    this.showNews(frame.news);
+    this.showTime(frame, say);
+    this.showStatus();
+  }
+
+  showCandidates(candidates) {
+    const key = JSON.stringify(candidates);
+    if (key === this.candidatesKey) return;
+    this.candidatesKey = key;
+    const chips = candidates.map(([name, term, leading, silent]) => {
+      const chip = document.createElement("span");
+      chip.className = `chip${leading ? " leading" : ""}${silent ? " silent" : ""}`;
+      chip.textContent = name;
+      chip.title = `${silent ? "not heard now; " : leading ? "leads; " : "stands by; "}term ${term}`;
+      return chip;
+    });
+    part("candidates").replaceChildren(...chips);
+  }
+
+  showLoss(loss, losses, say) {
+    if (losses) {
+      const { published, dropped_by_faults: dropped } = losses;
+      say("loss", published ? `${((100 * dropped) / published).toFixed(2)} %` : "–");
+      say("losses", published ? `${dropped} dropped by faults, ${published} published` : "");
+      return;
+    }
+    say("loss", loss ? `${((100 * loss[1]) / loss[0]).toFixed(2)} %` : "–");
+    say("losses", loss ? `${loss[1]} of ${loss[0]} states` : "no states expected yet");
+    part("loss").classList.toggle("bad", loss !== null && loss[1] > 0.05 * loss[0]);
+  }
+
+  showNews(news) {
+    const key = JSON.stringify(news);
+    if (key === this.newsKey) return;
+    this.newsKey = key;
+    const items = [...news].reverse().map(([t, who, what, details]) => {
+      const item = document.createElement("li");
+      const when = document.createElement("b");
+      when.textContent = `${t.toFixed(1)} s`;
+      item.append(when, ` ${who}: ${what.replaceAll("-", " ")}${details ? ` (${details})` : ""}`);
+      return item;
+    });
+    part("news").replaceChildren(...items);
+  }
+
+  showTime(frame, say) {
+    const { film } = this;
+    const slider = part("slider");
+    slider.min = film.first;
+    slider.max = Math.max(film.first, film.last);
+    slider.value = this.place ?? film.last;
+    const road = frame.t === null ? "no road" : `${frame.t.toFixed(1)} s`;
+    let text = road;
+    if (this.live && this.place !== null && film.newest) {
+      text = `${road}, ${(film.newest.w - frame.w).toFixed(1)} s ago`;
+    } else if (!this.live) {
+      text = `${road} of ${(film.last * film.scene.step_s).toFixed(1)} s`;
+    }
+    say("now", text);
+    slider.setAttribute("aria-valuetext", text);
+  }
+
+  showStatus() {
+    const frame = this.film.newest;
+    let [pill, words] = ["connecting", ""];
+    if (this.offlineSince !== null) {
+      pill = "offline";
+      words = `This page has lost its server, since ${clockTime(this.offlineSince)}. Trying again.`;
+    } else if (this.film.scene && !this.live) {
+      pill = "recorded";
+    } else if (frame) {
+      pill = frame.status;
+      const since = clockTime(frame.since);
+      words = {
+        lost: `Connection to the router lost, since ${since}. Trying again.`,
+        waiting: "Connected. There is no road yet: waiting for a bridge.",
+        still: `The road's clock stands still, since ${since}.`,
+        ended: `The run has ended, at ${since}. Waiting for the next one.`,
+        live: "",
+      }[pill];
+    }
+    const paused = this.live && this.place !== null && pill === "live";
+    const shown = { waiting: "no road", lost: "connection lost", still: "standing still" }[pill];
+    part("pill").textContent = paused ? "paused" : (shown ?? pill);
+    part("pill").dataset.status = paused ? "paused" : pill;
+    const banner = part("banner");
+    banner.hidden = !words;
+    if (banner.textContent !== words) banner.textContent = words;
+    banner.dataset.status = pill;
+  }
+
+  showLegend() {
+    const { colours, names, lattice, rolling } = this.film.scene;
+    const entry = (style, words) => {
+      const span = document.createElement("span");
+      if (style) {
+        const sample = document.createElement("i");
+        sample.className = style.kind;
+        if (style.colour) sample.style.setProperty("--own", style.colour);
+        span.append(sample);
+      }
+      span.append(words);
+      return span;
+    };
+    const own = names.map((name, lane) => entry({ kind: "car", colour: colours[lane] }, `prefers ${name}`));
+    const rest = [
+      entry(null, `darker: slower than ${lattice.speed_mps} m/s; lighter: faster`),
+      entry({ kind: "cell" }, this.live && rolling ? "cells that a vehicle owns; framed: holds" : "cell that a vehicle holds"),
+      entry({ kind: "target" }, "where it is going"),
+    ];
+    if (this.live) {
+      rest.push(entry({ kind: "ghost" }, "not heard: where it should be"));
+      rest.push(entry({ kind: "odd" }, "without agent, or overdue"));
+    }
+    part("legend").replaceChildren(...own.reverse(), ...rest);
+  }
+}
+
+window.laneweaveWatch = new Watch();

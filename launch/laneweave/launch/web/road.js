@@ -1,0 +1,243 @@
+"use strict";
+// How a road is drawn on a canvas, in reports and on the live page. Lengths in m, speeds in m/s.
+//
+// A scene has `road` {length_m, lanes, lane_width_m, sorting_start_m}, `body_m` [length, width],
+// `lattice` {speed_mps, pitch_m, block_columns}, `shade` {span_mps, strength}, and `colours`, one for
+// each lane. A body has `name`, `lane` (its colour; -1: none), `s`, `y`, `v`, `slope`, and may be
+// `faint`: drawn as an outline only.
+
+const laneweaveRoad = (() => {
+  const ACROSS = 1.8; // roads are drawn this much wider than they are
+  const ABOVE_PX = 13; // for names of vehicles on the left lane
+  const GAP_PX = 30; // between two stretches, for the numbers of metres
+  const NAMED_FROM = 6; // pixels for each metre
+  const UNKNOWN = "#8a8f96";
+  const LIGHT = {
+    asphalt: "#e9eaec",
+    paint: "#ffffff",
+    edge: "#9aa0a8",
+    ink: "#30343a",
+    faint: "#6a7078",
+    glass: "rgba(255,255,255,.7)",
+  };
+  const DARK = {
+    asphalt: "#2b3037",
+    paint: "#4d545e",
+    edge: "#6d747e",
+    ink: "#e6e8eb",
+    faint: "#a3abb6",
+    glass: "rgba(255,255,255,.75)",
+  };
+
+  /** A colour, darker below the lattice's speed and lighter above it. */
+  function shade(colour, over, span, strength) {
+    const share = Math.max(-1, Math.min(1, over / span));
+    const end = share > 0 ? 255 : 0;
+    const part = strength * Math.abs(share);
+    const mixed = [1, 3, 5].map((i) => {
+      const value = parseInt(colour.slice(i, i + 2), 16);
+      return Math.round((1 - part) * value + part * end);
+    });
+    return `rgb(${mixed.join(",")})`;
+  }
+
+  /** Stretches [from, to] of a whole road that are shown below each other. */
+  function wholeRoad(length) {
+    const count = Math.max(1, Math.min(6, Math.round(length / 250)));
+    return Array.from({ length: count }, (_, i) => [(length * i) / count, (length * (i + 1)) / count]);
+  }
+
+  /** A stretch of a road around a place, which may be near an end or beyond it. */
+  function windowAround(length, centre, size) {
+    const half = Math.min(size, length) / 2;
+    const middle = Math.max(half, Math.min(length - half, centre));
+    return [middle - half, middle + half];
+  }
+
+  /** Rear and front of a block of columns at a time, half of the gap around it included. */
+  function columnsAt(scene, rear, front, t) {
+    const { pitch_m: pitch, speed_mps: speed } = scene.lattice;
+    const margin = (pitch - scene.body_m[0]) / 2;
+    const place = (column) => speed * t + column * pitch;
+    return [place(rear) - scene.body_m[0] - margin, place(front) + margin];
+  }
+
+  function line(pen, fromX, fromY, toX, toY) {
+    pen.beginPath();
+    pen.moveTo(fromX, fromY);
+    pen.lineTo(toX, toY);
+    pen.stroke();
+  }
+
+  class Painter {
+    constructor(canvas, scene, theme = LIGHT) {
+      this.canvas = canvas;
+      this.scene = scene;
+      this.theme = theme;
+    }
+
+    /** Draw bodies on stretches of the road; `layers` are drawn below them, one after the other. */
+    paint(strips, bodies, layers = []) {
+      const { canvas, scene } = this;
+      const width = canvas.clientWidth;
+      if (width === 0) return;
+      this.scale = width / (strips[0][1] - strips[0][0]);
+      this.width = width;
+      this.roadPx = scene.road.lanes * scene.road.lane_width_m * this.scale * ACROSS;
+      this.strips = strips;
+      const height = Math.ceil(strips.length * (this.roadPx + GAP_PX) + ABOVE_PX);
+      const ratio = window.devicePixelRatio || 1;
+      const [wide, high] = [Math.round(width * ratio), Math.round(height * ratio)];
+      if (canvas.width !== wide || canvas.height !== high) {
+        canvas.width = wide;
+        canvas.height = high;
+        canvas.style.height = `${height}px`;
+      }
+      const pen = canvas.getContext("2d");
+      pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+      pen.clearRect(0, 0, width, height);
+      this.pen = pen;
+      strips.forEach((stretch, number) => {
+        pen.save();
+        pen.translate(0, this.top(number));
+        this.stretch(stretch, bodies, layers);
+        pen.restore();
+      });
+    }
+
+    /** Where a stretch begins on the canvas. */
+    top(number) {
+      return ABOVE_PX + number * (this.roadPx + GAP_PX);
+    }
+
+    /** Place on the canvas of a place along the road. */
+    x(s) {
+      return (s - this.from) * this.scale;
+    }
+
+    /** Place below the left edge of the road. */
+    y(place) {
+      return this.roadPx - place * this.scale * ACROSS;
+    }
+
+    /** Whether some of [rear, front] is on the stretch that is being drawn. */
+    shows(rear, front) {
+      return front >= this.from && rear <= this.to;
+    }
+
+    /** What is at a place of the canvas: {s, y} in m, null between two stretches. */
+    placeAt(canvasX, canvasY) {
+      if (!this.strips) return null;
+      for (let number = 0; number < this.strips.length; number += 1) {
+        const down = canvasY - this.top(number);
+        if (down >= 0 && down <= this.roadPx) {
+          return {
+            s: this.strips[number][0] + canvasX / this.scale,
+            y: (this.roadPx - down) / (this.scale * ACROSS),
+          };
+        }
+      }
+      return null;
+    }
+
+    stretch([from, to], bodies, layers) {
+      this.from = from;
+      this.to = to;
+      this.surface();
+      this.metres();
+      const { pen } = this;
+      pen.beginPath();
+      pen.rect(0, -ABOVE_PX, this.width, this.roadPx + ABOVE_PX);
+      pen.clip();
+      for (const layer of layers) layer(this);
+      for (const body of bodies) {
+        if (this.shows(body.s - this.scene.body_m[0], body.s)) this.body(body);
+      }
+    }
+
+    surface() {
+      const { pen, theme, width, roadPx, scale, from, to } = this;
+      const { road } = this.scene;
+      pen.fillStyle = theme.asphalt;
+      pen.fillRect(0, 0, width, roadPx);
+      pen.strokeStyle = theme.paint;
+      pen.lineWidth = 2;
+      // Dashes belong to the road: they move with it.
+      pen.setLineDash([6 * scale, 6 * scale]);
+      pen.lineDashOffset = from * scale;
+      for (let lane = 1; lane < road.lanes; lane += 1) {
+        line(pen, 0, this.y(lane * road.lane_width_m), width, this.y(lane * road.lane_width_m));
+      }
+      pen.setLineDash([]);
+      pen.strokeStyle = theme.edge;
+      line(pen, 0, 1, width, 1);
+      line(pen, 0, roadPx - 1, width, roadPx - 1);
+      if (road.sorting_start_m > from && road.sorting_start_m < to) {
+        const x = this.x(road.sorting_start_m);
+        pen.strokeStyle = theme.ink;
+        pen.setLineDash([3, 3]);
+        pen.lineDashOffset = 0;
+        line(pen, x, 0, x, roadPx);
+        pen.setLineDash([]);
+      }
+    }
+
+    metres() {
+      const { pen, theme, from, to, roadPx } = this;
+      const every = to - from > 400 ? 100 : to - from > 200 ? 50 : 20;
+      pen.fillStyle = theme.faint;
+      pen.font = "11px system-ui, sans-serif";
+      pen.textBaseline = "top";
+      for (let mark = Math.ceil(from / every) * every; mark <= to; mark += every) {
+        pen.fillRect(this.x(mark) - 0.5, roadPx, 1, 4);
+        pen.textAlign = mark - from < 10 ? "left" : to - mark < 10 ? "right" : "center";
+        pen.fillText(`${mark} m`, this.x(mark), roadPx + 6);
+      }
+    }
+
+    /** A vehicle's colour at a speed. */
+    colour(lane, speed) {
+      const { colours, shade: how, lattice } = this.scene;
+      const own = lane < 0 ? UNKNOWN : colours[lane % colours.length];
+      return shade(own, speed - lattice.speed_mps, how.span_mps, how.strength);
+    }
+
+    body(body) {
+      const { pen, theme, scale } = this;
+      const [length, width] = this.scene.body_m;
+      const heading = Math.atan(body.slope);
+      const [along, across] = [Math.cos(heading), Math.sin(heading)];
+      const [centreS, centreY] = [body.s - 0.5 * length * along, body.y];
+      const path = (rear, front, half) => {
+        pen.beginPath();
+        for (const [u, v] of [[rear, -half], [front, -half], [front, half], [rear, half]]) {
+          const [a, b] = [u * length, v * width];
+          pen.lineTo(this.x(centreS + a * along - b * across), this.y(centreY + a * across + b * along));
+        }
+        pen.closePath();
+      };
+      pen.fillStyle = this.colour(body.lane, body.v);
+      pen.strokeStyle = body.faint ? pen.fillStyle : "#30343a";
+      pen.lineWidth = body.faint ? 1.4 : 0.8;
+      path(-0.5, 0.5, 0.5);
+      if (body.faint) pen.setLineDash([3, 2]);
+      else pen.fill();
+      pen.stroke();
+      pen.setLineDash([]);
+      if (!body.faint) {
+        pen.fillStyle = theme.glass;
+        path(0.12, 0.3, 0.36);
+        pen.fill();
+      }
+      if (scale > NAMED_FROM) {
+        pen.fillStyle = theme.ink;
+        pen.font = "10px system-ui, sans-serif";
+        pen.textAlign = "center";
+        pen.textBaseline = "bottom";
+        pen.fillText(body.name, this.x(centreS), this.y(centreY + 0.5 * width) - 2);
+      }
+    }
+  }
+
+  return { ACROSS, LIGHT, DARK, shade, wholeRoad, windowAround, columnsAt, line, Painter };
+})();
