@@ -109,7 +109,7 @@ class LiveRoad:
         """Tell whether news are not those of an earlier road; a newer one begins anew."""
         if bridge > self._bridge:
             self._bridge, self._road = bridge, self._new_road()
-            self._plan = None
+            self._plan, self._news = None, Newest()
             self._targets.clear()
             self.run += 1
         return bridge == self._bridge

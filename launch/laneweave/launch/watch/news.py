@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Mapping
 from typing import Any
@@ -11,6 +10,7 @@ from attrs import define, field
 
 MOST_NEWS = 8
 MOST_CHARACTERS = 90
+MOST_NUMBER = 1e12
 FREQUENT = ("stream-planned", "plan-made", "plan-in-force", "entered", "left")
 """Events that would leave no room for others."""
 PLANNED = ("stream-planned", "plan-made")
@@ -55,7 +55,7 @@ def plan_facts(t_s: float, kind: str, data: Mapping[str, Any]) -> list[float] | 
 
 
 def _number(value: object) -> float:
-    """Return a finite number; 0 for whatever else a sender says."""
-    if isinstance(value, (int, float)) and math.isfinite(value):
-        return round(value, 2)
-    return 0
+    """Return a number that can be shown; 0 for whatever else a sender says."""
+    if isinstance(value, (int, float)) and abs(value) < MOST_NUMBER:
+        return round(float(value), 2)
+    return 0.0

@@ -66,7 +66,8 @@ class Recording:
         self._step_s = stride * tick_s
         self._numbers, self._rows = _frames_of(self._tracks, tick_s, stride)
         self.first = 0
-        self.last = int(self._numbers[-1]) if len(self._numbers) else 0
+        # One more than there are: then all have left.
+        self.last = int(self._numbers[-1]) + 1 if len(self._numbers) else 0
         demands_s = [float(trip["demanded_s"]) for trip in self._trips.values()]
         self._demands_s = np.sort(np.array(demands_s, dtype=np.float64))
         self._times_s = [moment.t_s for moment in self._moments]

@@ -208,6 +208,7 @@ class Watch {
     if (!this.painter || now - this.painted < PAINT_MS) return;
     if (this.playing) this.advance((now - this.painted) / 1000);
     this.painted = now;
+    if (this.place !== null) this.place = Math.max(this.place, this.film.first);
     if (this.place !== null) this.ask(this.playing ? AHEAD : 1);
     const moment = this.moment(now);
     if (!moment) return;

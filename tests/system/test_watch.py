@@ -1,0 +1,296 @@
+"""The live page: a real server on a real network, seen in a real Chromium."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import subprocess
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from attrs import define, field
+from websockets.sync.client import connect
+
+from convoy import Convoy
+from laneweave.launch.report.tracks import read_tracks
+from laneweave.protocol.codec import encode
+from laneweave.protocol.topics import Keys
+from laneweave.protocol.zenoh_transport import ZenohTransport
+from system.chromium import Page, needs_chromium, new_page
+from system.conftest import FinishedRun
+from system.harness import END_S, RUN_S, Ended, Lab, summary
+from system.test_deployment import deployment, free_tcp, start_router, stop
+
+REALM = "test"
+VEHICLES = 90
+MEASURED_S = 5.0
+SHORT = """\
+schema = "laneweave.scenario/1"
+[road]
+s2_m = 60.0
+s3_m = 240.0
+[demand]
+volume_veh_per_lane_h = 1600.0
+duration_s = 8.0
+[network]
+realm = "test"
+endpoint = "unixsock-stream/router.sock"
+"""
+FIRST_PAINT = "performance.getEntriesByName('first-contentful-paint')[0]?.startTime"
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    """Return a page that the tests here use one after the other."""
+    yield from new_page(tmp_path_factory.mktemp("chromium"))
+
+
+@define
+class Traffic:
+    """Publishes the messages of a convoy at ten ticks a second, as a deployment would."""
+
+    endpoint: str
+    convoy: Convoy
+    tick: int
+    _stop: threading.Event = field(factory=threading.Event)
+    _thread: threading.Thread | None = None
+
+    @contextlib.contextmanager
+    def flowing(self) -> Iterator[Traffic]:
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+        try:
+            yield self
+        finally:
+            self._stop.set()
+            self._thread.join(END_S)
+
+    def _run(self) -> None:
+        keys = Keys(REALM)
+        with contextlib.closing(ZenohTransport(self.endpoint, lambda _: None, 1.0)) as transport:
+            due_s = time.monotonic()
+            while not self._stop.is_set():
+                for send in self.convoy.messages(self.tick):
+                    key = keys.key(send.topic, **send.parameters)
+                    transport.publish(key, encode(send.message), send.topic.quality)
+                self.tick += 1
+                due_s += 0.1
+                self._stop.wait(max(0.0, due_s - time.monotonic()))
+
+
+def traffic(endpoint: str, count: int = VEHICLES, bridge: int = 1) -> Traffic:
+    convoy = Convoy(count, bridge)
+    return Traffic(endpoint, convoy, convoy.first_tick)
+
+
+def start_watch(lab: Lab, *arguments: object) -> tuple[subprocess.Popen[str], str]:
+    """Start the page's server; return it and the page's address."""
+    watch = lab.start("watch", *arguments, "--listen", "127.0.0.1:0")
+    assert watch.stdout is not None
+    address = watch.stdout.readline().strip()
+    assert address.startswith("http://127.0.0.1:"), lab.finish(watch, END_S)
+    return watch, address
+
+
+def health(address: str) -> tuple[int, dict[str, Any]]:
+    try:
+        with urllib.request.urlopen(f"{address}healthz", timeout=END_S) as answer:  # noqa: S310
+            return answer.status, json.load(answer)
+    except urllib.error.HTTPError as error:
+        return error.code, json.load(error)
+
+
+@needs_chromium
+def test_90_vehicles_are_shown_ten_times_a_second(lab: Lab, page: Page) -> None:
+    endpoint = free_tcp()
+    config = deployment(lab, endpoint)
+    router = start_router(lab, config)
+    watch, address = start_watch(lab, "--config", config)
+    with traffic(endpoint).flowing():
+        page.open(address)
+        page.wait_until(lambda: page.text("count") == str(VEHICLES))
+        page.wait_until(lambda: page.text("loss") == "0.00 %")
+
+        before = page.run("laneweaveWatch.stats")
+        began = time.monotonic()
+        time.sleep(MEASURED_S)
+        after = page.run("laneweaveWatch.stats")
+        took_s = time.monotonic() - began
+
+        # What it is meant to do is 10 a second and 1 s: docs/evidence/watch.json. Not here, where
+        # other tests run at the same time.
+        assert after["frames"] - before["frames"] >= 8.0 * took_s
+        assert after["shown"] - before["shown"] >= 6.0 * took_s
+        assert page.run(FIRST_PAINT) < 3000.0
+        assert page.text("leader") == "c1, term 3"
+        assert page.text("candidates") == "c1c2"
+        assert page.text("pill") == "live"
+        _check_pause_and_slider(page)
+    assert page.complaints() == []
+    stop(lab, watch, router)
+    lab.check_nothing_left()
+
+
+def _check_pause_and_slider(page: Page) -> None:
+    page.click("pause")
+    page.wait_until(lambda: page.text("pill") == "paused")
+    paused_at, frames = page.text("time"), page.run("laneweaveWatch.stats.frames")
+    page.wait_until(lambda: page.run("laneweaveWatch.stats.frames") > frames + 5)
+    assert page.text("time") == paused_at
+    # From before this page was opened: the server has it.
+    page.run("(s => { s.value = 0; s.dispatchEvent(new Event('input')); })(slider)")
+    page.wait_until(lambda: "s ago" in page.text("now") and page.text("time") != paused_at)
+    page.click("pause")
+    page.wait_until(lambda: page.text("pill") == "live" and page.text("time") > paused_at)
+
+
+@needs_chromium
+def test_what_fails_is_shown_and_recovered_from(lab: Lab, page: Page) -> None:
+    endpoint = free_tcp()
+    config = deployment(lab, endpoint)
+    router = start_router(lab, config)
+    watch, address = start_watch(lab, "--endpoint", endpoint, "--config", config)
+    page.open(address)
+    page.wait_until(lambda: page.text("pill") == "no road")
+    assert health(address)[0] == 200
+    with traffic(endpoint, 6).flowing():
+        page.wait_until(lambda: page.text("pill") == "live")
+        page.wait_until(lambda: page.text("count") == "6")
+
+        router.kill()
+        lab.finish(router, END_S)
+        page.wait_until(lambda: page.text("pill") == "connection lost")
+        assert "lost, since" in page.text("banner")
+        status, facts = health(address)
+        assert (status, facts["ok"], facts["connected"]) == (503, False, False)
+
+        router = start_router(lab, config)
+        page.wait_until(lambda: page.text("pill") == "live")
+        assert page.run("banner.hidden")
+        assert health(address)[0] == 200
+    page.wait_until(lambda: page.text("pill") == "standing still")
+    # Another bridge is another road.
+    with traffic(endpoint, 4, bridge=2).flowing():
+        page.wait_until(lambda: page.text("count") == "4")
+        page.wait_until(lambda: page.text("run").startswith("run 2"))
+
+    # An open page does not hold its server up.
+    began = time.monotonic()
+    stop(lab, watch)
+    assert time.monotonic() - began < 8.0
+    page.wait_until(lambda: page.text("pill") == "offline")
+    stop(lab, router)
+    lab.check_nothing_left()
+
+
+@needs_chromium
+def test_a_recorded_run_is_played(finished_run: FinishedRun, lab: Lab, page: Page) -> None:
+    folder = finished_run("simulated")
+    watch, address = start_watch(lab, folder)
+    assert health(address) == (200, {"ok": True, "recorded": str(folder), "browsers": 0})
+    page.open(address)
+    page.wait_until(lambda: page.run("laneweaveWatch.stats.shown") > 5)
+    assert page.text("pill") == "recorded"
+    page.click("pause")
+    page.wait_until(lambda: page.text("pause") == "Play")
+
+    tracks = read_tracks(folder)
+    for number in (60, 110):
+        script = f"s.value = {number}; s.dispatchEvent(new Event('input'));"
+        page.run(f"(s => {{ {script} }})(slider)")
+        t_s = 0.2 * number
+        shown = f"{t_s:.1f} s"
+        page.wait_until(partial(_says, page, "time", shown))
+        there = int(np.count_nonzero(np.abs(tracks.t_s - t_s) < 1e-6))
+        assert there > 3
+        assert page.text("count") == str(there)
+    page.run("(v => { v.value = '10'; v.dispatchEvent(new Event('change')); })(pace)")
+    page.click("pause")
+    page.wait_until(lambda: page.text("pause") == "Play")
+    last_s = float(tracks.t_s.max())
+    assert 0.0 <= float(page.text("time").removesuffix(" s")) - last_s <= 0.4
+    assert page.text("counts").endswith(f"{summary(folder)['vehicles']['left']} left")
+    assert page.complaints() == []
+    stop(lab, watch)
+    lab.check_nothing_left()
+
+
+def _says(page: Page, identity: str, words: str) -> bool:
+    return page.text(identity) == words
+
+
+def test_a_deployment_is_shown_as_it_is(lab: Lab) -> None:
+    config = lab.path("short.toml", SHORT)
+    router = start_router(lab, config)
+    roles = [lab.start("coordinator", "--config", config), lab.start("agent", "--config", config)]
+    watch, address = start_watch(lab, "--config", config)
+    with connect(address.replace("http", "ws") + "stream", open_timeout=END_S) as browser:
+        scene = json.loads(browser.recv(timeout=END_S))["scene"]
+        while not _has_a_leader(json.loads(browser.recv(timeout=END_S))):
+            pass
+        bridge = lab.start("bridge", "--config", config, "--pace", "8", "--out", "out")
+        frames: list[dict[str, Any]] = []
+        while not frames or frames[-1]["status"] != "ended":
+            frames.append(json.loads(browser.recv(timeout=RUN_S)))
+    ended = lab.finish(bridge, RUN_S)
+    assert (ended.status, ended.err) == (0, "")
+    stop(lab, watch, *roles, router)
+    lab.check_nothing_left()
+
+    assert (scene["kind"], scene["title"]) == ("live", REALM)
+    assert frames[-1]["counts"][3] == summary(lab.folder / "out")["vehicles"]["left"] > 0
+    assert frames[-1]["leader"] == ["c1", 1]
+    assert any(row[7] for frame in frames for row in frame["vehicles"]), "no target of a plan"
+    assert any(row[9] for frame in frames for row in frame["vehicles"]), "no cells that are owned"
+    lost = [frame["loss"] for frame in frames if frame["loss"]]
+    assert lost
+    assert sum(loss[1] for loss in lost) <= 0.02 * sum(loss[0] for loss in lost)
+    _check_places(frames, lab.folder / "out")
+
+
+def _has_a_leader(frame: dict[str, Any]) -> bool:
+    return frame.get("leader") is not None
+
+
+def _check_places(frames: list[dict[str, Any]], folder: Path) -> None:
+    """Check that vehicles were shown where they were, up to errors of measurement."""
+    tracks = read_tracks(folder)
+    checked = 0
+    for number, name in enumerate(tracks.names):
+        rows = tracks.rows(number)
+        t_s = tracks.t_s[rows]
+        for frame in frames:
+            for row in frame["vehicles"]:
+                if row[0] == name and not row[8] & 4 and t_s[0] <= frame["t"] <= t_s[-1]:
+                    s_m, y_m = (
+                        float(np.interp(frame["t"], t_s, values[rows]))
+                        for values in (tracks.s_m, tracks.y_m)
+                    )
+                    # A state may be a tick old: it is driven on along the road, not across.
+                    assert abs(row[1] - s_m) < 1.0
+                    assert abs(row[2] - y_m) < 0.6
+                    checked += 1
+    assert checked > 100
+
+
+def test_it_ends_at_ctrl_c(finished_run: FinishedRun, lab: Lab) -> None:
+    watch, address = start_watch(lab, finished_run("simulated"))
+    with connect(address.replace("http", "ws") + "stream", open_timeout=END_S):
+        watch.send_signal(signal.SIGINT)
+        assert lab.finish(watch, END_S) == Ended(0, "", "")
+    lab.check_nothing_left()
+
+
+def test_without_a_router_there_is_nothing_to_watch(lab: Lab) -> None:
+    ended = lab.finish(lab.start("watch", "--endpoint", free_tcp(), "--listen", "[::1]:0"), END_S)
+    assert (ended.status, ended.out, len(ended.err.splitlines())) == (2, "", 1)
+    assert "network.endpoint" in ended.err

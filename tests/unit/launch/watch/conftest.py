@@ -1,0 +1,22 @@
+"""A short recorded run, which the tests of the live page share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from laneweave.launch.cli import app
+
+
+@pytest.fixture(scope="session")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a run in virtual time."""
+    folder = tmp_path_factory.mktemp("watch")
+    scenario = folder / "road.toml"
+    scenario.write_text('schema = "laneweave.scenario/1"\n[road]\ns2_m = 60.0\ns3_m = 240.0\n')
+    options = ["--transport", "simulated", "--volume", "1600", "--duration", "12", "--no-progress"]
+    assert not app(
+        ["run", str(scenario), *options, "--out", str(folder / "run")], standalone_mode=False
+    )
+    return folder / "run"

@@ -1,0 +1,132 @@
+"""The part of the page that needs no browser, run by node."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from typing import Any
+
+import pytest
+
+from laneweave.launch.watch.frames import scene_of
+from laneweave.launch.web import road_script, text_of
+from laneweave.protocol.scenario import Scenario
+
+NODE = shutil.which("node")
+pytestmark = pytest.mark.skipif(
+    NODE is None, reason="node is not installed: nothing here can run the page's script"
+)
+PAGE = "laneweave.launch.watch"
+BEGIN = "const film = new laneweaveFilm.Film();"
+
+
+def in_node(program: str, data: object = None) -> Any:  # noqa: ANN401 - any JSON
+    """Return what a program returns; `data` is there, and the page's scripts are."""
+    scripts = [road_script(), *(text_of(PAGE, f"templates/{name}.js") for name in PARTS)]
+    whole = "\n".join(scripts) + (
+        "\nconst data = JSON.parse(require('fs').readFileSync(0));"
+        f"\nconsole.log(JSON.stringify((() => {{ {program} }})()));"
+    )
+    done = subprocess.run(
+        [str(NODE), "-e", whole],
+        input=json.dumps(data),
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+PARTS = ("film", "layers")
+
+
+def scene(kind: str, first: int, last: int, session: str = "a") -> str:
+    body = scene_of(Scenario(), kind, "here", 0.1)
+    return json.dumps({"scene": body | {"first": first, "last": last, "session": session}})
+
+
+def frame(number: int, t_s: float = 0.0, run: int = 1, vehicles: object = ()) -> str:
+    return json.dumps({"n": number, "t": t_s, "run": run, "vehicles": vehicles})
+
+
+def reel(first: int, last: int, begin: int, end: int) -> str:
+    frames = [json.loads(frame(number)) for number in range(begin, end + 1)]
+    return json.dumps({"reel": [begin, end], "first": first, "last": last, "frames": frames})
+
+
+def test_frames_that_are_pushed_are_kept_and_bounded() -> None:
+    messages = [scene("live", 0, -1), *(frame(number) for number in range(3100))]
+    found = in_node(
+        f"{BEGIN} for (const one of data) film.take(one);"
+        "return [film.first, film.last, film.texts.size, film.newest.n, film.before.n,"
+        " film.get(99), film.get(100).n];",
+        messages,
+    )
+    assert found == [100, 3099, 3000, 3099, 3098, None, 100]
+
+
+def test_what_is_missing_is_asked_for_once() -> None:
+    messages = [scene("recorded", 0, 500), reel(0, 500, 0, 49), reel(0, 500, 60, 70)]
+    found = in_node(
+        f"{BEGIN} film.take(data[0]); const wishes = [film.wish(3.5, 10), film.wish(3.5, 10)];"
+        "film.take(data[1]); wishes.push(film.wish(3.5, 10), film.wish(45, 10));"
+        "film.take(data[2]); wishes.push(film.wish(60, 5), film.wish(499.5, 40));"
+        "return wishes;",
+        messages,
+    )
+    assert found == [[3, 52], None, None, [50, 99], None, [499, 500]]
+
+
+def test_another_server_has_other_frames() -> None:
+    messages = [scene("live", 0, 9), frame(9), scene("live", 0, 12), scene("live", 0, 2, "b")]
+    found = in_node(
+        f"{BEGIN} return data.map((one) => {{ film.take(one);"
+        " return [film.first, film.last, film.texts.size]; });",
+        messages,
+    )
+    assert found == [[0, 9, 0], [0, 9, 1], [0, 12, 1], [0, 2, 0]]
+
+
+def row(name: str, s_m: float, y_m: float, flags: int = 1) -> list[Any]:
+    return [name, s_m, y_m, 15.0, 1, -1, [-3, 1], 0, flags, [-4, 1, -5, 1]]
+
+
+def test_between_two_frames_vehicles_are_on_their_way() -> None:
+    one = json.loads(frame(1, 10.0, vehicles=[row("a", 100.0, 5.0), row("gone", 999.0, 5.0)]))
+    two = json.loads(frame(2, 10.2, vehicles=[row("a", 103.0, 5.3), row("new", 0.0, 5.0)]))
+    between = "return laneweaveFilm.between(data[0], data[1], 0.5);"
+    shown = in_node(between, [one, two])
+    assert shown["t"] == pytest.approx(10.1)
+    assert [body["name"] for body in shown["bodies"]] == ["a", "new"]
+    body = shown["bodies"][0]
+    assert (body["s"], body["y"], body["slope"]) == pytest.approx((101.5, 5.15, 0.1))
+    assert (body["hold"], body["target"], body["estate"]) == ([-3, 1], None, [[-4, 1], [-5, 1]])
+    # Who drives straight on is drawn so, whatever the errors of measurement; another run is
+    # another road; nobody jumps.
+    two["vehicles"][0][8] = 0
+    assert in_node(between, [one, two])["bodies"][0]["slope"] == 0
+    two["vehicles"][0][1] = 500.0
+    assert in_node(between, [one, two])["bodies"][0]["s"] == 500.0
+    other = json.loads(frame(2, 0.1, run=2, vehicles=[row("a", 5.0, 5.3)]))
+    assert in_node(between, [one, other])["bodies"][0]["s"] == 100.0
+    assert in_node(between, [one, None])["t"] == 10.0
+
+
+def test_formations_that_plan_together_are_one_block() -> None:
+    bodies = [{"formation": number} for number in (3, 1, 1, 2, -1, 5)]
+    found = in_node("return laneweaveLayers.groups(data, [[2, 3], [7, 8]]);", bodies)
+    assert found == [[1], [2, 3], [5]]
+
+
+def test_numbers_beside_the_road() -> None:
+    bodies = [
+        {"lane": 1, "y": 5.0, "v": 10.0, "faint": False},
+        {"lane": 0, "y": 5.0, "v": 20.0, "faint": False},
+        {"lane": -1, "y": 5.0, "v": 99.0, "faint": True},
+    ]
+    data = {"scene": {"road": {"lane_width_m": 3.5}}, "bodies": bodies}
+    found = in_node("return laneweaveFilm.facts(data.scene, data.bodies);", data)
+    assert found == {"onLane": 1, "knownLane": 2, "speed": 15.0}

@@ -1,0 +1,237 @@
+"""The live road: frames from messages."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+from attrs import evolve
+
+from convoy import BALLOT, Convoy
+from laneweave.launch.watch.frames import UNATTENDED, UNHEARD, compact
+from laneweave.launch.watch.live_road import STILL_S, LiveRoad
+from laneweave.protocol.codec import decode, encode
+from laneweave.protocol.messages import Heartbeat, LogEvent, Name
+from laneweave.protocol.scenario import Scenario, parse_scenario
+from laneweave.protocol.transport import LinkDown, LinkUp
+
+CONVOY = Convoy(9)
+START = CONVOY.first_tick
+PAPER: Scenario = parse_scenario({"formation": {"operation": "paper"}})
+
+
+def watched(ticks: int = 21, convoy: Convoy = CONVOY) -> LiveRoad:
+    """Return a road that has been watched for some ticks, from wall-clock time 0 on."""
+    road = LiveRoad(convoy.scenario, wall_s=0.0)
+    for tick in range(START, START + ticks):
+        hear(road, convoy, tick)
+    return road
+
+
+def hear(road: LiveRoad, convoy: Convoy, tick: int) -> None:
+    if tick == START:
+        road.take(convoy.clock(tick), 0.0)
+        road.take(convoy.census(tick), 0.0)
+        road.take(convoy.plan(tick), 0.0)
+    for send in convoy.messages(tick):
+        road.take(decode(encode(send.message)), (tick - START) / 10)
+
+
+def shown(road: LiveRoad, wall_s: float = 2.0) -> dict[str, Any]:
+    frame: dict[str, Any] = json.loads(compact(road.frame(7, wall_s)))
+    return frame
+
+
+def test_before_anything_is_heard() -> None:
+    road = LiveRoad(Scenario(), wall_s=5.0)
+    frame = shown(road, 6.0)
+    assert (frame["n"], frame["run"], frame["t"], frame["w"]) == (7, 0, None, 6.0)
+    assert (frame["status"], frame["since"]) == ("waiting", 5.0)
+    assert (frame["vehicles"], frame["leader"], frame["candidates"]) == ([], None, [])
+    assert (frame["loss"], frame["counts"], frame["plan"]) == (None, None, None)
+
+
+def test_everybody_is_where_they_show_that_they_are() -> None:
+    frame = shown(watched())
+    assert (frame["status"], frame["t"]) == ("live", round((START + 20) / 10, 3))
+    assert frame["counts"] == [9, 9, 9, 0]
+    assert frame["loss"] == [15 * 9, 0]
+    assert len(frame["vehicles"]) == 9
+    for number, row in enumerate(frame["vehicles"]):
+        state, (column, lane) = CONVOY.state(number, START + 20), CONVOY.cell(number)
+        assert row[:4] == [f"v{number:04}", *(round(x, 2) for x in (state.s_m, state.y_m, 15.0))]
+        assert row[4:7] == [number % 3, -1, [column, lane]]
+        assert row[8:] == [0, [column - 100, lane]]
+
+
+def test_targets_are_those_of_accepted_plans() -> None:
+    road = watched()
+    targets = [row[7] for row in shown(road)["vehicles"]]
+    assert targets == [[1, 0], *[0] * 8]
+    done = CONVOY.state(0, START + 20)
+    changes: tuple[dict[str, Any], ...] = (
+        {"done": True},
+        {"accepted": False},
+        {"promised": BALLOT._replace(seq=6)},
+    )
+    for changed in changes:
+        hear(road, CONVOY, START + 20)
+        road.take(evolve(done, **changed), 2.0)
+        assert shown(road)["vehicles"][0][7] == 0
+
+
+def test_between_two_states_vehicles_drive_on() -> None:
+    road = watched()
+    before = shown(road)["vehicles"][0][1]
+    road.take(CONVOY.clock(START + 22), 2.0)
+    assert shown(road)["vehicles"][0][1] == pytest.approx(before + 0.2 * 15.0)
+
+
+def test_who_is_not_heard_is_shown_in_its_cell_and_marked() -> None:
+    road = watched()
+    for tick in range(START + 21, START + 40):
+        road.take(CONVOY.clock(tick), 2.0)
+        for number in range(1, 9):
+            road.take(CONVOY.state(number, tick), 2.0)
+    rows = shown(road)["vehicles"]
+    assert [row[8] for row in rows] == [UNHEARD, *[0] * 8]
+    assert rows[0][1] == pytest.approx(CONVOY.state(0, START + 39).s_m, abs=0.01)
+    assert rows[0][7] == 0
+    # Never heard at all: the cell in which it entered is all that is known.
+    silent = LiveRoad(Scenario(), wall_s=0.0)
+    silent.take(CONVOY.clock(START), 0.0)
+    silent.take(CONVOY.census(START), 0.0)
+    assert {row[8] for row in shown(silent)["vehicles"]} == {UNHEARD}
+
+
+def test_a_vehicle_without_an_agent_is_marked() -> None:
+    road = watched()
+    road.take(evolve(CONVOY.state(3, START + 20), attended=False), 2.0)
+    assert [row[8] for row in shown(road)["vehicles"]] == [0, 0, 0, UNATTENDED, 0, 0, 0, 0, 0]
+
+
+def test_who_has_left_is_gone() -> None:
+    road = watched()
+    road.take(CONVOY.clock(START + 21), 2.0)
+    road.take(CONVOY.census(START + 21, without=frozenset(CONVOY.names[:4])), 2.0)
+    assert [row[0] for row in shown(road)["vehicles"]] == CONVOY.names[4:]
+
+
+def test_who_is_heard_before_it_is_listed_is_shown_without_a_lane() -> None:
+    road, more = watched(), Convoy(10)
+    road.take(CONVOY.clock(START + 21), 2.0)
+    road.take(more.state(9, START + 21), 2.0)
+    assert shown(road)["vehicles"][-1][:1] == ["v0009"]
+    assert shown(road)["vehicles"][-1][4] == -1
+
+
+def test_formations_and_those_that_are_joined() -> None:
+    convoy = Convoy(24, scenario=PAPER)
+    road = watched(convoy=convoy)
+    assert [row[5] for row in shown(road)["vehicles"]] == [0] * 24
+    for number, joined in ((0, (0, 1)), (1, (1, 2)), (2, (5, 6)), (3, (4,))):
+        road.take(evolve(convoy.state(number, START + 20), joined=joined), 2.0)
+    assert shown(road)["joined"] == [[0, 1, 2], [5, 6]]
+    unheard = LiveRoad(PAPER, wall_s=0.0)
+    unheard.take(convoy.clock(START), 0.0)
+    unheard.take(convoy.census(START), 0.0)
+    assert [row[5] for row in shown(unheard)["vehicles"]] == [0] * 12 + [1] * 12
+
+
+def test_leader_and_candidates() -> None:
+    road = watched()
+    frame = shown(road)
+    assert frame["leader"] == ["c1", 3]
+    assert frame["candidates"] == [["c1", 3, True, False], ["c2", 3, False, False]]
+    # A new leader; the old one has fallen silent.
+    road.take(Heartbeat(Name("c2"), 18, 4, True, 0), 10.0)
+    frame = shown(road, 10.1)
+    assert frame["leader"] == ["c2", 4]
+    assert frame["candidates"] == [["c1", 3, False, True], ["c2", 4, True, False]]
+    # Later than that nobody is heard, and after a while nobody is remembered.
+    assert shown(road, 30.0)["leader"] is None
+    assert shown(road, 100.0)["candidates"] == []
+
+
+def test_another_road_begins_anew() -> None:
+    road, later = watched(), Convoy(4, bridge=2)
+    road.take(later.clock(1), 3.0)
+    road.take(later.census(1), 3.0)
+    # What is still under way from the earlier road is not mistaken for the new one's.
+    road.take(CONVOY.clock(START + 21), 3.0)
+    road.take(CONVOY.census(START + 21), 3.0)
+    road.take(CONVOY.state(0, START + 100), 3.0)
+    frame = shown(road, 3.0)
+    assert (frame["run"], frame["t"], frame["loss"]) == (2, 0.1, None)
+    assert [row[0] for row in frame["vehicles"]] == later.names
+    assert {row[8] for row in frame["vehicles"]} == {UNHEARD}
+
+
+def test_the_status_and_since_when() -> None:
+    road = watched()
+
+    def status(wall_s: float) -> list[Any]:
+        frame = shown(road, wall_s)
+        return [frame["status"], frame["since"]]
+
+    assert status(2.0) == ["live", 2.0]
+    assert status(2.5) == ["live", 2.0]
+    assert status(2.1 + STILL_S) == ["still", 2.0]
+    road.take(LinkDown(), 5.0)
+    assert status(5.0) == ["lost", 5.0]
+    assert status(9.0) == ["lost", 5.0]
+    road.take(LinkUp(), 10.0)
+    road.take(CONVOY.clock(START + 30), 10.0)
+    assert status(10.0) == ["live", 10.0]
+    road.take(CONVOY.clock(START + 31, ended=True), 11.0)
+    assert status(20.0) == ["ended", 20.0]
+
+
+def test_frames_are_made_when_something_has_changed() -> None:
+    road = watched()
+    assert road.changed(2.0)
+    road.frame(0, 2.0)
+    assert not road.changed(2.0)
+    assert road.changed(2.1 + STILL_S)
+    road.take(CONVOY.state(0, START + 20), 2.0)
+    assert not road.changed(2.0)
+    road.take(CONVOY.clock(START + 21), 2.1)
+    assert road.changed(2.1)
+
+
+def test_news_and_plans() -> None:
+    road = watched()
+    data = {"slot": 3, "vehicles": 9, "moves": 2, "solve_ms": 4.25, "status": "feasible"}
+    for kind, more in (
+        ("stream-planned", data),
+        ("formations-joined", {"formations": [1, 2], "why": "x" * 500}),
+        ("plan-in-force", {"slot": 3}),
+    ):
+        road.take(LogEvent(Name("coordinator"), Name("c1"), 12.0, Name(kind), dict(more)), 2.0)
+    frame = shown(road)
+    assert frame["plan"] == [12.0, 9, 4.25]
+    ((t_s, who, what, details),) = frame["news"]
+    assert (t_s, who, what) == (12.0, "c1", "formations-joined")
+    assert details.startswith("formations 1 2, why xxx")
+    assert len(details) <= 90
+
+
+@pytest.mark.parametrize(
+    "value", ["a", None, [1], {"b": 2}, True, -(2**63), 10**400], ids=lambda value: str(value)[:20]
+)
+def test_nonsense_in_events_does_no_harm(value: object) -> None:
+    road = watched()
+    data = {"vehicles": value, "solve_ms": value}
+    for kind in ("plan-made", "odd"):
+        road.take(LogEvent(Name("x"), Name("y"), 1.0, Name(kind), dict(data)), 2.0)
+    shown(road)
+
+
+def test_a_frame_of_90_vehicles_is_small() -> None:
+    convoy = Convoy(90)
+    road = LiveRoad(convoy.scenario, 0.0)
+    for tick in range(400, 411):
+        for send in convoy.messages(tick):
+            road.take(send.message, 1.0)
+    assert len(compact(road.frame(0, 1.0))) < 9000
