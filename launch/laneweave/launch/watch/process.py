@@ -34,7 +34,7 @@ log = structlog.get_logger(__name__)
 
 STEP_S: Final = 0.1
 """Time between two frames; wall clock."""
-SLACK_S: Final = 0.01
+SLACK_S: Final = 0.02
 """A frame may come so much early: ticks are not quite regular, and each shall have its own."""
 IDLE_S: Final = 1.0
 """A frame comes at least this often, to say that nothing has changed."""

@@ -102,7 +102,7 @@ def test_between_two_frames_vehicles_are_on_their_way() -> None:
     assert shown["t"] == pytest.approx(10.1)
     assert [body["name"] for body in shown["bodies"]] == ["a", "new"]
     body = shown["bodies"][0]
-    assert (body["s"], body["y"], body["slope"]) == pytest.approx((101.5, 5.15, 0.1))
+    assert (body["s"], body["y"], body["slope"]) == pytest.approx((101.5, 5.15, 0.25 / 3.0))
     assert (body["hold"], body["target"], body["estate"]) == ([-3, 1], None, [[-4, 1], [-5, 1]])
     # Who drives straight on is drawn so, whatever the errors of measurement; another run is
     # another road; nobody jumps.

@@ -7,6 +7,7 @@ const laneweaveFilm = (() => {
   const PARSED = 16; // of them, ready to be drawn
   const BATCH = 50; // frames in one answer of the server
   const JUMP_M = 40; // nobody drives so far between two frames
+  const UNSURE_M = 0.05; // across the road: no more than errors of measurement
   const [MOVING, UNATTENDED, UNHEARD, OVERDUE] = [1, 2, 4, 8];
 
   class Film {
@@ -112,8 +113,9 @@ const laneweaveFilm = (() => {
       const ds = from ? found.s - from[1] : 0;
       if (!from || Math.abs(ds) > JUMP_M) return found;
       // Errors of measurement would turn those who drive straight on.
-      const turns = ds > 0.05 && (found.flags & MOVING) !== 0;
-      found.slope = turns ? (found.y - from[2]) / ds : 0;
+      const dy = found.flags & MOVING ? found.y - from[2] : 0;
+      const beyond = Math.max(0, Math.abs(dy) - UNSURE_M);
+      found.slope = ds > 0.05 ? (Math.sign(dy) * beyond) / ds : 0;
       found.s = mix(from[1], found.s);
       found.y = mix(from[2], found.y);
       found.v = mix(from[3], found.v);

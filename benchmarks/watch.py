@@ -1,0 +1,197 @@
+"""The live page at 90 vehicles: `python benchmarks/watch.py [--json FILE] [--picture PNG]`.
+
+A deployment of its own on this machine: router, three coordinators, two agent processes, bridge in
+real time, `laneweave watch`, and Debian's Chromium. When as many vehicles are on the road the page
+is opened and looked at for some seconds, several times:
+
+    first_paint_ms     first contentful paint, as the browser measures it
+    first_frame_ms     the first picture of the road
+    ticks_per_s        of the road: there is no more to show than these
+    updates_per_s      frames that arrived
+    drawn_per_s        frames that were drawn
+    server_cpu_share   CPU time of the page's server, of one core
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import platform
+import shutil
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+from attrs import define, field
+from selenium import webdriver
+from selenium.webdriver.chrome.service import Service
+
+LANEWEAVE = str(Path(sys.executable).with_name("laneweave"))
+ROUNDS = 5
+LOOK_S = 5.0
+TICK_S = 0.1
+START_S = 30.0
+FILL_S = 240.0
+FIRST_PAINT = "return performance.getEntriesByName('first-contentful-paint')[0].startTime"
+STATS = "return {...laneweaveWatch.stats, t: laneweaveWatch.film.newest?.t}"
+DEPLOYMENT = """\
+schema = "laneweave.scenario/1"
+[demand]
+volume_veh_per_lane_h = {volume}
+duration_s = 600.0
+[network]
+realm = "demo"
+endpoint = "unixsock-stream/router.sock"
+"""
+
+
+@define
+class Deployment:
+    """The processes of a deployment, in a folder of their own."""
+
+    folder: Path
+    _processes: list[subprocess.Popen[str]] = field(factory=list)
+
+    def start(self, *arguments: str) -> subprocess.Popen[str]:
+        """Start a role."""
+        process = subprocess.Popen(  # noqa: S603
+            [LANEWEAVE, *arguments, "--config", "deployment.toml"],
+            cwd=self.folder,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self._processes.append(process)
+        return process
+
+    def end(self) -> None:
+        """End all roles, those that were started last first."""
+        for process in reversed(self._processes):
+            process.send_signal(signal.SIGTERM)
+        for process in self._processes:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.communicate(timeout=START_S)
+            process.kill()
+
+    def answers(self) -> bool:
+        """Return whether the router answers."""
+        ping = [LANEWEAVE, "ping", "--config", "deployment.toml"]
+        done = subprocess.run(ping, cwd=self.folder, capture_output=True, check=False)  # noqa: S603
+        return done.returncode == 0
+
+
+def wait_until(condition: Any, within_s: float) -> None:  # noqa: ANN401 - any callable
+    """Wait for something to happen."""
+    give_up = time.monotonic() + within_s
+    while not condition():
+        if time.monotonic() > give_up:
+            message = f"not within {within_s:g} s"
+            raise TimeoutError(message)
+        time.sleep(0.1)
+
+
+@contextlib.contextmanager
+def chromium() -> Iterator[webdriver.Chrome]:
+    """Yield a browser."""
+    options = webdriver.ChromeOptions()
+    options.binary_location = str(shutil.which("chromium"))
+    for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage"):
+        options.add_argument(argument)
+    options.add_argument("--window-size=1400,1050")
+    options.add_argument("--hide-scrollbars")
+    driver = webdriver.Chrome(options=options, service=Service(shutil.which("chromedriver")))
+    try:
+        yield driver
+    finally:
+        driver.quit()
+
+
+def measure(driver: webdriver.Chrome, address: str, server: psutil.Process) -> dict[str, float]:
+    """Open the page and look at it."""
+    driver.get("about:blank")
+    driver.get(address)
+    wait_until(lambda: driver.execute_script(STATS)["shown"] > 2, START_S)
+    cpu, began, before = server.cpu_times(), time.monotonic(), driver.execute_script(STATS)
+    time.sleep(LOOK_S)
+    after, took_s = driver.execute_script(STATS), time.monotonic() - began
+    spent = server.cpu_times()
+    vehicles = int(driver.execute_script("return document.getElementById('count').textContent"))
+    return {
+        "vehicles": vehicles,
+        "first_paint_ms": round(float(driver.execute_script(FIRST_PAINT)), 1),
+        "first_frame_ms": round(float(after["firstFrameMs"]), 1),
+        "ticks_per_s": round((after["t"] - before["t"]) / TICK_S / took_s, 2),
+        "updates_per_s": round((after["frames"] - before["frames"]) / took_s, 2),
+        "drawn_per_s": round((after["shown"] - before["shown"]) / took_s, 2),
+        "server_cpu_share": round((spent.user + spent.system - cpu.user - cpu.system) / took_s, 3),
+    }
+
+
+def run(vehicles: int, picture: Path | None) -> dict[str, Any]:
+    """Fill a road, look at it, and return what was measured."""
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lw-")))
+        # A vehicle needs 67 s for the road's 1000 m: so many are on it at this volume.
+        volume = 1.06 * vehicles * 3600.0 / (3 * 67.0)
+        (folder / "deployment.toml").write_text(DEPLOYMENT.format(volume=round(volume, 1)))
+        deployment = Deployment(folder)
+        stack.callback(deployment.end)
+        deployment.start("router")
+        wait_until(deployment.answers, START_S)
+        for name in ("c1", "c2", "c3"):
+            deployment.start("coordinator", "--name", name)
+        for shard in ("0/2", "1/2"):
+            deployment.start("agent", "--shard", shard)
+        watch = deployment.start("watch", "--listen", "127.0.0.1:0")
+        assert watch.stdout is not None  # noqa: S101 (a pipe)
+        address = watch.stdout.readline().strip()
+        driver = stack.enter_context(chromium())
+        driver.get(address)
+        wait_until(lambda: _text(driver, "leader")[:1] == "c", START_S)
+        deployment.start("bridge", "--pace", "1", "--out", "out")
+        wait_until(lambda: _text(driver, "count").isdecimal(), START_S)
+        wait_until(lambda: int(_text(driver, "count")) >= vehicles, FILL_S)
+        process = psutil.Process(watch.pid)
+        rounds = [measure(driver, address, process) for _ in range(ROUNDS)]
+        if picture is not None:
+            height = driver.execute_script("return document.body.scrollHeight")
+            size = {"width": 1400, "height": height, "deviceScaleFactor": 1, "mobile": False}
+            driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+            time.sleep(1.0)
+            driver.save_screenshot(str(picture))
+        return {
+            "machine": {"cores": psutil.cpu_count(), "python": platform.python_version()},
+            "browser": f"Chromium {driver.capabilities['browserVersion']}, headless",
+            "load_average_1min": round(psutil.getloadavg()[0], 2),
+            "rounds": rounds,
+            "median": {name: statistics.median(one[name] for one in rounds) for name in rounds[0]},
+        }
+
+
+def _text(driver: webdriver.Chrome, identity: str) -> str:
+    script = f"return document.getElementById('{identity}').textContent"
+    return str(driver.execute_script(script))
+
+
+def main() -> None:
+    """Measure and print or write JSON."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--vehicles", type=int, default=90)
+    parser.add_argument("--json", type=Path, help="write the result here")
+    parser.add_argument("--picture", type=Path, help="write a screenshot here")
+    options = parser.parse_args()
+    text = json.dumps(run(options.vehicles, options.picture), indent=2)
+    if options.json is not None:
+        options.json.write_text(text + "\n", encoding="utf-8")
+    sys.stdout.write(text + "\n")
+
+
+if __name__ == "__main__":
+    main()
