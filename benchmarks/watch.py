@@ -164,7 +164,8 @@ def run(vehicles: int, picture: Path | None) -> dict[str, Any]:
             height = driver.execute_script("return document.body.scrollHeight")
             size = {"width": 1400, "height": height, "deviceScaleFactor": 1, "mobile": False}
             driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-            time.sleep(1.0)
+            # In the middle of a slot many are under way.
+            wait_until(lambda: 1.7 < driver.execute_script(STATS)["t"] % 4.0 < 2.4, START_S)
             driver.save_screenshot(str(picture))
         return {
             "machine": {"cores": psutil.cpu_count(), "python": platform.python_version()},

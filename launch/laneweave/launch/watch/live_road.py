@@ -109,7 +109,9 @@ class LiveRoad:
         """Tell whether news are not those of an earlier road; a newer one begins anew."""
         if bridge > self._bridge:
             self._bridge, self._road = bridge, self._new_road()
-            self._plan, self._news = None, Newest()
+            self._plan = None
+            if self.run:  # what was heard before the first road is about it, too
+                self._news = Newest()
             self._targets.clear()
             self.run += 1
         return bridge == self._bridge
