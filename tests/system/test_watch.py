@@ -22,6 +22,7 @@ from websockets.sync.client import connect
 
 from convoy import Convoy
 from laneweave.launch.report.tracks import read_tracks
+from laneweave.protocol.access import Access
 from laneweave.protocol.codec import encode
 from laneweave.protocol.topics import Keys
 from laneweave.protocol.zenoh_transport import ZenohTransport
@@ -76,7 +77,9 @@ class Traffic:
 
     def _run(self) -> None:
         keys = Keys(REALM)
-        with contextlib.closing(ZenohTransport(self.endpoint, lambda _: None, 1.0)) as transport:
+        with contextlib.closing(
+            ZenohTransport(Access(self.endpoint, REALM), lambda _: None)
+        ) as transport:
             due_s = time.monotonic()
             while not self._stop.is_set():
                 for send in self.convoy.messages(self.tick):

@@ -101,9 +101,25 @@ def test_a_base_install_says_what_a_drawing_needs() -> None:
     assert "not installed" in done.stderr
 
 
-extras = "osqp libsumo pyarrow matplotlib psutil distributed prometheus_client cryptography"
-extras += " starlette uvicorn websockets"
-for missing in extras.split():
+def test_a_base_install_says_what_certificates_need(tmp_path: Path) -> None:
+    done = run_base_install("certs", "init", str(tmp_path / "certs"))
+    assert (done.returncode, done.stdout) == (2, "")
+    assert len(done.stderr.splitlines()) == 1
+    assert "laneweave[certs]" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_base_install_checks_a_configuration() -> None:
+    done = run_base_install("config", "check", "scenarios/compose.toml", "--role", "bridge")
+    assert done.returncode == 0
+    assert "tcp/router:7447" in done.stdout
+
+
+def test_a_base_install_says_what_the_live_page_needs() -> None:
+    done = run_base_install("watch", "--endpoint", "tcp/127.0.0.1:1")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert len(done.stderr.splitlines()) == 1
+    assert "laneweave[watch]" in done.stderr
 
 
 def services() -> dict[str, list[str]]:

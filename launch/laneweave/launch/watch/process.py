@@ -13,6 +13,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,7 +25,9 @@ from laneweave.launch.watch.frames import Film, compact, scene_of
 from laneweave.launch.watch.live_road import TOPICS, LiveRoad
 from laneweave.launch.watch.ring import Ring
 from laneweave.launch.watch.server import Audience, Health, make_app
+from laneweave.protocol.access import access_of
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.node import Arrived
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.topics import Keys
 from laneweave.protocol.transport import Deliver, Delivery
@@ -39,6 +42,10 @@ SLACK_S: Final = 0.02
 IDLE_S: Final = 1.0
 """A frame comes at least this often, to say that nothing has changed."""
 POLL_S: Final = 0.02
+MOST_AT_A_TIME: Final = 5_000
+"""News that are taken in before anything else is looked at."""
+IDENTITY: Final = "observer.watch"
+"""In the process's certificate, where the network is secured."""
 MOST_WAITING: Final = 20_000
 """Messages that wait to be taken in; more are not taken."""
 END_S: Final = 1.0
@@ -103,8 +110,7 @@ def connect(scenario: Scenario, deliver: Deliver) -> ZenohTransport:
     Raises:
         BadInputError: nobody answers there.
     """
-    network = scenario.network
-    return ZenohTransport(network.endpoint, deliver, network.lease_s)
+    return ZenohTransport(access_of(scenario, IDENTITY), deliver)
 
 
 class _Eye:
@@ -166,8 +172,9 @@ class _Eye:
     def _run(self) -> None:
         try:
             while not self._stop.is_set():
-                for news in self._observer.news(POLL_S):
-                    self._road.take(news, self._wall_s())
+                for news in islice(self._observer.news(POLL_S), MOST_AT_A_TIME):
+                    message = news.message if isinstance(news, Arrived) else news
+                    self._road.take(message, self._wall_s())
                 self._show()
         except Exception as error:  # noqa: BLE001 (reported by the main thread, which ends)
             self._failure = error
