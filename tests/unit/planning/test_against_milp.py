@@ -2,6 +2,7 @@
 
 import json
 from collections import Counter
+from collections.abc import Iterator
 from itertools import product
 from typing import Any
 
@@ -23,6 +24,7 @@ from oracles.instances import (
     variant,
 )
 from oracles.path_rules import check_paths
+from oracles.proven import Oracle, by_oracle
 
 INSTANCES = 200
 MORE_INSTANCES = 1_600
@@ -31,10 +33,6 @@ LARGE_INSTANCES = 100
 CLOSING_INSTANCES = 60
 LARGE_DEADLINE_S = 4.0
 CHUNK = 10
-
-# Costs that the oracle needs 4 to 20 seconds each to prove, written down once.
-RECORDED_COSTS = {11: 22, 40: 34, 63: 20, 112: 25, 133: 29}
-
 
 SOLVERS: tuple[Solver, ...] = ("tappa", "branching")
 
@@ -57,18 +55,23 @@ def _faults(request: dict[str, Any], cost: int | None, solver: Solver) -> list[s
     return check_paths(request, response)
 
 
-FEW = range(0, INSTANCES, CHUNK)
-MANY = range(INSTANCES, INSTANCES + MORE_INSTANCES, CHUNK)
+@by_oracle
+@pytest.mark.parametrize("first", range(0, INSTANCES, CHUNK))
+def test_planner_agrees_with_the_oracle(first: int, oracle: Oracle) -> None:
+    _agree_on_random(first, oracle)
 
 
-@pytest.mark.parametrize(
-    "first", [*FEW, *(pytest.param(first, marks=pytest.mark.full) for first in MANY)]
-)
-def test_planner_agrees_with_the_oracle(first: int) -> None:
+@pytest.mark.full
+@pytest.mark.parametrize("first", range(INSTANCES, INSTANCES + MORE_INSTANCES, CHUNK))
+def test_planner_agrees_with_the_oracle_on_many_more(first: int) -> None:
+    _agree_on_random(first, milp_oracle.optimal_cost)
+
+
+def _agree_on_random(first: int, oracle: Oracle) -> None:
     wrong = []
     for seed in range(first, first + CHUNK):
         request = random_request(seed)
-        cost = RECORDED_COSTS.get(seed) or milp_oracle.optimal_cost(request)
+        cost = oracle(request)
         wrong += [
             f"seed {seed}, {solver}: {fault}: {json.dumps(request)}"
             for solver in SOLVERS
@@ -84,29 +87,44 @@ FORMATIONS: tuple[tuple[Mode, tuple[str, ...]], ...] = (
 )
 
 
+def _formation(seed: int) -> dict[str, Any]:
+    mode, conflicts = FORMATIONS[seed % len(FORMATIONS)]
+    size = 7 + seed % 6 if mode == 1 else 7
+    return formation_request(seed, vehicles=size, mode=mode, conflicts=conflicts).to_dict()
+
+
+@by_oracle
 @pytest.mark.parametrize("first", range(0, FORMATION_INSTANCES, CHUNK))
-def test_planner_agrees_with_the_oracle_on_formations_beyond_six(first: int) -> None:
+def test_planner_agrees_with_the_oracle_on_formations_beyond_six(
+    first: int, oracle: Oracle
+) -> None:
     wrong = []
     for seed in range(first, first + CHUNK):
-        mode, conflicts = FORMATIONS[seed % len(FORMATIONS)]
-        size = 7 + seed % 6 if mode == 1 else 7
-        request = formation_request(seed, vehicles=size, mode=mode, conflicts=conflicts).to_dict()
-        cost = milp_oracle.optimal_cost(request)
+        request = _formation(seed)
+        cost = oracle(request)
         assert cost is not None
         wrong += [f"seed {seed}: {fault}" for fault in _faults(request, cost, "branching")]
     assert not wrong, "\n".join(wrong)
 
 
+def _closing(seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return a request in which nobody may close up, and the same in which everybody may."""
+    mode, conflicts = CLOSING[seed // 2 % len(CLOSING)]
+    make = meeting_request if seed % 2 else random_request
+    request = make(seed, (mode, conflicts))
+    return request, {**request, "conflicts": [kind for kind in conflicts if kind != "closing"]}
+
+
+@by_oracle
 @pytest.mark.parametrize("first", range(0, CLOSING_INSTANCES, CHUNK))
-def test_planner_agrees_with_the_oracle_where_nobody_may_close_up(first: int) -> None:
+def test_planner_agrees_with_the_oracle_where_nobody_may_close_up(
+    first: int, oracle: Oracle
+) -> None:
     wrong, dearer = [], 0
     for seed in range(first, first + CHUNK):
-        mode, conflicts = CLOSING[seed // 2 % len(CLOSING)]
-        make = meeting_request if seed % 2 else random_request
-        request = make(seed, (mode, conflicts))
-        cost = milp_oracle.optimal_cost(request)
-        free = {**request, "conflicts": [kind for kind in conflicts if kind != "closing"]}
-        dearer += cost != milp_oracle.optimal_cost(free)
+        request, free = _closing(seed)
+        cost = oracle(request)
+        dearer += cost != oracle(free)
         wrong += [
             f"seed {seed}, {solver}: {fault}: {json.dumps(request)}"
             for solver in SOLVERS
@@ -114,6 +132,14 @@ def test_planner_agrees_with_the_oracle_where_nobody_may_close_up(first: int) ->
         ]
     assert not wrong, "\n".join(wrong)
     assert dearer, "than where two may close up"
+
+
+def compared() -> Iterator[dict[str, Any]]:
+    """Return the requests whose costs `proven` may know."""
+    yield from map(random_request, range(INSTANCES))
+    yield from map(_formation, range(FORMATION_INSTANCES))
+    for seed in range(CLOSING_INSTANCES):
+        yield from _closing(seed)
 
 
 @pytest.mark.full

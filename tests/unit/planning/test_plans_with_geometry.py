@@ -1,6 +1,7 @@
 """Plans whose conflicts are computed from geometry: exact, and far enough apart when driven."""
 
 import json
+from collections.abc import Iterator
 from functools import cache
 from itertools import product
 from random import Random
@@ -20,10 +21,11 @@ from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.reachability import explore
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario import Scenario
-from oracles import joint_search, milp_oracle
+from oracles import joint_search
 from oracles.instances import random_request, small_request
 from oracles.moving_bodies import Bodies, Profile, drive, least_gap_of_plan_m
 from oracles.path_rules import check_paths
+from oracles.proven import Oracle, by_oracle
 
 ON_TIME = {"lateness_s": 0.0}
 LATE = {"lateness_s": 0.5}
@@ -54,9 +56,6 @@ SOLVERS: tuple[Solver, ...] = ("tappa", "branching")
 INSTANCES = 60
 CHUNK = 10
 
-# Costs that the oracle needs 4 to 40 seconds each to prove, written down once.
-RECORDED_COSTS = {0: 15, 3: 12, 7: 21, 11: 23, 12: 22, 30: 22, 34: 18, 40: 34, 48: 22}
-
 
 def faults(request: dict[str, Any], cost: int | None, solver: Solver, seed: int) -> list[str]:
     """What is wrong with a plan, by what it claims, by its paths, and by driving it."""
@@ -74,15 +73,25 @@ def faults(request: dict[str, Any], cost: int | None, solver: Solver, seed: int)
     return found
 
 
+def _request(seed: int) -> dict[str, Any]:
+    geometry = GEOMETRIES[seed % len(GEOMETRIES)]
+    kinds = KINDS[seed // len(GEOMETRIES) % len(KINDS)]
+    return {**random_request(seed), "conflicts": kinds, "geometry": geometry}
+
+
+def compared() -> Iterator[dict[str, Any]]:
+    """Return the requests whose costs `proven` may know."""
+    yield from map(_request, range(INSTANCES))
+
+
+@by_oracle
 @pytest.mark.parametrize("first", range(0, INSTANCES, CHUNK))
-def test_planner_agrees_with_the_oracle(first: int) -> None:
+def test_planner_agrees_with_the_oracle(first: int, oracle: Oracle) -> None:
     """The oracle computes conflicts by simulating bodies."""
     wrong = []
     for seed in range(first, first + CHUNK):
-        geometry = GEOMETRIES[seed % len(GEOMETRIES)]
-        kinds = KINDS[seed // len(GEOMETRIES) % len(KINDS)]
-        request = {**random_request(seed), "conflicts": kinds, "geometry": geometry}
-        cost = RECORDED_COSTS.get(seed) or milp_oracle.optimal_cost(request)
+        request = _request(seed)
+        cost = oracle(request)
         wrong += [
             f"seed {seed}, {solver}: {fault}: {json.dumps(request)}"
             for solver in SOLVERS
