@@ -12,43 +12,52 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 
 import pytest
 
 from laneweave.launch.simulation.profiles import PROFILES
 from laneweave.launch.simulation.search import replay_command
 from laneweave.launch.simulation.setup import SLOT_S
-from laneweave.launch.simulation.world import Totals, World
+from laneweave.launch.simulation.world import Outcome, Totals, World
 
+SEEDS = 300
 BATCH = 20
 DIGESTS = 100
-_PRINT_DIGESTS = f"""
-import json
+_PRINT_DIGESTS = """
+import json, sys
 from laneweave.launch.simulation.profiles import PROFILES
 from laneweave.launch.simulation.search import quiet_logs, run_seeds
 quiet_logs()
-outcomes = run_seeds(range({DIGESTS}), PROFILES["mixed"], digest=True)
+outcomes = run_seeds(range(*map(int, sys.argv[1:])), PROFILES["mixed"], digest=True)
 print(json.dumps([outcome.digest for outcome in outcomes]))
 """
 
 
 def search(profile: str, seeds: range) -> Totals:
     """Run seeds and return what they consisted of."""
-    totals = Totals()
+    return sum((outcome.totals for outcome in outcomes(profile, seeds)), Totals())
+
+
+def outcomes(profile: str, seeds: range, *, digest: bool = False) -> Iterator[Outcome]:
+    """Run seeds, in each of which no rule must be broken."""
     for seed in seeds:
-        outcome = World(seed, PROFILES[profile]).run()
+        outcome = World(seed, PROFILES[profile], digest=digest).run()
         told = "\n".join(map(str, outcome.violations))
         assert not told, f"{told}\n{replay_command(seed, PROFILES[profile])}"
-        totals += outcome.totals
-    return totals
+        yield outcome
 
 
-@pytest.mark.parametrize("first", range(0, 300, BATCH))
-def test_no_rule_is_broken_and_everybody_arrives(first: int) -> None:
-    totals = search("mixed", range(first, first + BATCH))
-    assert totals.motions > 5 * BATCH  # the search is not idle
+def check_something_happens(totals: Totals) -> None:
+    """Check that a search of a batch is not idle."""
+    assert totals.motions > 5 * BATCH
     assert totals.plans > 3 * BATCH
     assert totals.dropped > 1000
+
+
+@pytest.mark.parametrize("first", range(DIGESTS, SEEDS, BATCH))
+def test_no_rule_is_broken_and_everybody_arrives(first: int) -> None:
+    check_something_happens(search("mixed", range(first, first + BATCH)))
 
 
 @pytest.mark.full
@@ -109,17 +118,21 @@ def test_without_faults_the_last_plan_is_not_late(seed: int) -> None:
     assert outcome.totals.dropped == 0
 
 
-def test_equal_seeds_give_equal_runs_under_any_hash_seed() -> None:
-    first, second = (_digests(hash_seed) for hash_seed in ("0", "4711"))
-    assert len(first) == len(set(first)) == DIGESTS
-    equal = sum(one == other for one, other in zip(first, second, strict=True))
-    assert equal == DIGESTS
+@pytest.mark.parametrize("first", range(0, DIGESTS, BATCH))
+def test_no_rule_is_broken_and_equal_seeds_give_equal_runs_under_any_hash_seed(first: int) -> None:
+    seeds = range(first, first + BATCH)
+    found = list(outcomes("mixed", seeds, digest=True))
+    check_something_happens(sum((outcome.totals for outcome in found), Totals()))
+    digests = [outcome.digest for outcome in found]
+    assert len(set(digests)) == BATCH
+    assert _digests(seeds, other_than=os.environ.get("PYTHONHASHSEED")) == digests
 
 
-def _digests(hash_seed: str) -> list[str]:
+def _digests(seeds: range, other_than: str | None) -> list[str]:
+    """Return the digests in a process with a hash seed that is surely another one than here."""
     done = subprocess.run(
-        [sys.executable, "-c", _PRINT_DIGESTS],
-        env=os.environ | {"PYTHONHASHSEED": hash_seed},
+        [sys.executable, "-c", _PRINT_DIGESTS, str(seeds.start), str(seeds.stop)],
+        env=os.environ | {"PYTHONHASHSEED": "0" if other_than == "4711" else "4711"},
         capture_output=True,
         text=True,
         timeout=240,
