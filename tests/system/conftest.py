@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
-import fcntl
-import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
 
+from sharing import made_once
 from system.harness import DEMAND, ROAD, Lab
+from system.loaded import Loaded
+
+
+@pytest.fixture(scope="session")
+def loaded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Loaded]:
+    """What runs commands without loading the package each time."""
+    process = Loaded(tmp_path_factory.mktemp("loaded"))
+    yield process
+    process.close()
 
 
 @pytest.fixture
-def lab(tmp_path: Path) -> Iterator[Lab]:
+def lab(tmp_path: Path, loaded: Loaded) -> Iterator[Lab]:
     """Processes of this test; whatever is left of them at its end is an error."""
     sockets = Path(tempfile.mkdtemp(prefix="lw-"))
-    laboratory = Lab(tmp_path, sockets)
+    laboratory = Lab(tmp_path, sockets, loaded)
     try:
         yield laboratory
     finally:
@@ -45,20 +54,11 @@ _RUNS: dict[str, tuple[str, ...]] = {
 @pytest.fixture
 def finished_run(lab: Lab, road: Path, tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
     """Return the folder of a run of `road` that all tests share; the first one who asks runs it."""
-    base = tmp_path_factory.getbasetemp()
-    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
-    def folder_of(name: str) -> Path:
-        folder = shared / f"run-{name}"
-        with (shared / f"run-{name}.lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            if not folder.exists():
-                unfinished = lab.folder / name
-                ended = lab.run("run", road, *DEMAND, *_RUNS[name], "--out", unfinished)
-                assert ended.status == 0, ended
-                (unfinished / "stdout.txt").write_text(ended.out, encoding="utf-8")
-                (unfinished / "stderr.txt").write_text(ended.err, encoding="utf-8")
-                unfinished.rename(folder)
-        return folder
+    def run(name: str, folder: Path) -> None:
+        ended = lab.run("run", road, *DEMAND, *_RUNS[name], "--out", folder)
+        assert ended.status == 0, ended
+        (folder / "stdout.txt").write_text(ended.out, encoding="utf-8")
+        (folder / "stderr.txt").write_text(ended.err, encoding="utf-8")
 
-    return folder_of
+    return lambda name: made_once(tmp_path_factory, f"run-{name}", partial(run, name))

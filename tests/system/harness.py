@@ -23,6 +23,8 @@ import psutil
 import pyarrow.parquet as pq
 from attrs import define, field, frozen
 
+from system.loaded import Loaded
+
 LANEWEAVE = str(Path(sys.executable).with_name("laneweave"))
 MARK = "LANEWEAVE_TEST_MARK"
 RUN_S = 240.0
@@ -57,6 +59,7 @@ class Lab:
     folder: Path
     sockets: Path
     """Temporary folder of the processes; its path is short, since sockets are made in it."""
+    loaded: Loaded
     mark: str = field(factory=lambda: uuid.uuid4().hex)
     _started: list[subprocess.Popen[str]] = field(factory=list)
 
@@ -94,6 +97,16 @@ class Lab:
     def run(self, *arguments: object, within_s: float = RUN_S, **environment: str) -> Ended:
         """Run `laneweave ARGUMENTS` to its end; nothing may be left of it."""
         ended = self.finish(self.start(*arguments, **environment), within_s)
+        self.check_nothing_left()
+        return ended
+
+    def run_loaded(self, *arguments: object, within_s: float = END_S, **environment: str) -> Ended:
+        """As `run`, in a process that need not load the package."""
+        ended = Ended(
+            *self.loaded.run(
+                list(map(str, arguments)), self.folder, self.environment | environment, within_s
+            )
+        )
         self.check_nothing_left()
         return ended
 

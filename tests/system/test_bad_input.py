@@ -23,9 +23,18 @@ REQUEST: dict[str, Any] = {
 }
 
 
-def refused(lab: Lab, *arguments: object, **environment: str) -> str:
+def refused(lab: Lab, *arguments: object) -> str:
     """Run a command that must be refused, and return its one line."""
-    ended: Ended = lab.run(*arguments, within_s=END_S, **environment)
+    return the_line(lab.run_loaded(*arguments))
+
+
+def refused_afresh(lab: Lab, *arguments: object, **environment: str) -> str:
+    """As `refused`, in a process that loads what it needs."""
+    return the_line(lab.run(*arguments, within_s=END_S, **environment))
+
+
+def the_line(ended: Ended) -> str:
+    """Return the one line of a command that must have been refused."""
     assert ended.status == 2, ended
     assert ended.out == ""
     lines = ended.err.splitlines()
@@ -211,7 +220,7 @@ def test_nobody_is_there(lab: Lab, role: str) -> None:
         "plan": [request, "--connect", NOBODY],
         "bridge": ["--endpoint", NOBODY, "--out", "out"],
     }
-    line = refused(lab, role, *options.get(role, ["--endpoint", NOBODY]))
+    line = refused_afresh(lab, role, *options.get(role, ["--endpoint", NOBODY]))
     assert NOBODY in line
 
 
@@ -238,8 +247,10 @@ def silent_server() -> Iterator[str]:
 
 
 def test_somebody_else_is_there(lab: Lab, silent_server: str) -> None:
-    assert silent_server in refused(lab, "ping", "--endpoint", silent_server)
-    assert silent_server in refused(lab, "router", "--endpoint", silent_server)
+    started = [lab.start(role, "--endpoint", silent_server) for role in ("ping", "router")]
+    for process in started:
+        assert silent_server in the_line(lab.finish(process, END_S))
+    lab.check_nothing_left()
 
 
 def _full(folder: Path) -> None:
@@ -262,11 +273,13 @@ def test_folders_that_cannot_be_written(lab: Lab, make: Callable[[Path], None], 
 def test_the_temporary_folder_is_too_deep_for_sockets(lab: Lab) -> None:
     deep = lab.folder / ("d" * 100)
     deep.mkdir()
-    assert "TMPDIR" in refused(lab, "run", "--duration", "1", "--out", "out", TMPDIR=str(deep))
+    assert "TMPDIR" in refused_afresh(
+        lab, "run", "--duration", "1", "--out", "out", TMPDIR=str(deep)
+    )
 
 
 def test_a_folder_that_is_no_run(lab: Lab) -> None:
     folder = lab.folder / "torn"
     folder.mkdir()
     (folder / "trajectories.parquet").write_bytes(b"PAR1 torn")
-    assert "DIR: got 'torn'" in refused(lab, "report", "torn")
+    assert "DIR: got 'torn'" in refused_afresh(lab, "report", "torn")

@@ -91,15 +91,17 @@ def report(*arguments: object) -> int:
     return cli._status(["report", *map(str, arguments)])
 
 
-def test_of_a_sweep(swept: Path) -> None:
-    assert report(swept) == 0
-    assert {path.name for path in (swept / "figures").iterdir()} == FIGURES
+def test_of_a_sweep(swept: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "a <b> & 'c'"  # a name that needs escaping
+    shutil.copytree(swept, folder)
+    assert report(folder) == 0
+    assert {path.name for path in (folder / "figures").iterdir()} == FIGURES
     for name in FIGURES:
-        with Image.open(swept / "figures" / name) as image:
+        with Image.open(folder / "figures" / name) as image:
             assert image.info["dpi"] == pytest.approx((300, 300), abs=1)
-    reader = check_page(swept / "report.html", len(FIGURES))
+    reader = check_page(folder / "report.html", len(FIGURES))
     assert "laneweave: a <b> & 'c'" in reader.texts
-    assert (swept / "report.html").stat().st_size < 6_000_000
+    assert (folder / "report.html").stat().st_size < 6_000_000
     assert [one["title"] for one in reader.data] == ["formation, 1600 veh/(lane·h), seed 1"]
 
 
