@@ -36,7 +36,9 @@ s2_m = 20.0
 s3_m = 110.0
 
 [runtime]
+agent_start_s = 1.0
 agent_silent_s = 1.0
+tick_deadline_s = 0.1
 """
 """Short: when nobody answers, a road second takes a second."""
 QUICK_TICKS = """
