@@ -39,6 +39,14 @@ schema = "laneweave.scenario/1"
 s2_m = 100.0
 s3_m = 450.0
 """
+SHORT_ROAD = """\
+schema = "laneweave.scenario/1"
+
+[road]
+s2_m = 60.0
+s3_m = 240.0
+"""
+"""Room for a few moves."""
 DEMAND = ("--volume", "1300", "--duration", "14", "--seed", "1")
 """With `ROAD`: lane sorting begins while vehicles still arrive."""
 

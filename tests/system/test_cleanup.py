@@ -11,7 +11,16 @@ import psutil
 import pyarrow.parquet as pq
 import pytest
 
-from system.harness import DEMAND, END_S, Lab, check_safe_and_complete, events, interrupt, summary
+from system.harness import (
+    DEMAND,
+    END_S,
+    SHORT_ROAD,
+    Lab,
+    check_safe_and_complete,
+    events,
+    interrupt,
+    summary,
+)
 
 FEW_PROCESSES = ("--vehicles-per-process", "4", "--coordinators", "2")
 
@@ -125,7 +134,8 @@ def test_a_run_ends_with_its_bridge_and_its_router(
         check_files(lab.folder / "out")
 
 
-def test_vehicles_arrive_though_an_agent_is_killed(lab: Lab, road: Path) -> None:
+def test_vehicles_arrive_though_an_agent_is_killed(lab: Lab) -> None:
+    road = lab.path("short.toml", SHORT_ROAD)
     process = start_and_wait(lab, road, "--duration", "14")
     agent = next(name for name in sorted(lab.roles()) if name.startswith("agent-"))
 

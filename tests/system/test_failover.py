@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from pathlib import Path
 
 from system.conftest import FinishedRun
@@ -58,25 +56,3 @@ def test_a_named_coordinator_is_killed_and_nobody_notices(
     assert ended.status == 0, ended
     check_safe_and_complete(folder)
     assert final_lanes(folder) == final_lanes(finished_run("simulated"))
-
-
-def test_a_frozen_leader_does_not_hold_up_the_others(
-    finished_run: FinishedRun, lab: Lab, road: Path
-) -> None:
-    """Its buffers fill while it sleeps; nobody may wait for it, and it comes back as a zombie."""
-    folder = lab.folder / "out"
-    running = lab.start("run", road, *DEMAND, "--pace", "4", "--out", folder)
-    lab.wait_until(lambda: (folder / "events.jsonl").exists() and bool(plans(folder)))
-    leader = lab.roles()["c1"]
-
-    os.kill(leader, signal.SIGSTOP)
-    lab.wait_until(lambda: len(events(folder, "leader")) > 1)
-    os.kill(leader, signal.SIGCONT)
-    ended = lab.finish(running)
-
-    assert ended.status == 0, ended
-    check_safe_and_complete(folder)
-    assert final_lanes(folder) == final_lanes(finished_run("simulated"))
-    assert events(folder, "agent-silent") == []
-    # To another one and back again, once.
-    assert summary(folder)["failover"]["leader_changes"] <= 2

@@ -12,6 +12,7 @@ from system.conftest import FinishedRun
 from system.harness import (
     DEMAND,
     END_S,
+    SHORT_ROAD,
     Lab,
     check_safe_and_complete,
     events,
@@ -20,14 +21,6 @@ from system.harness import (
     summary,
 )
 
-SHORT_ROAD = """\
-schema = "laneweave.scenario/1"
-
-[road]
-s2_m = 60.0
-s3_m = 240.0
-"""
-"""Room for a few moves."""
 BLACKOUT_ROAD = """\
 schema = "laneweave.scenario/1"
 
@@ -117,6 +110,7 @@ def test_an_agent_that_stays_dead_is_no_failure_of_the_run(lab: Lab, short: Path
 def test_a_leader_that_is_paused_is_replaced_and_comes_back(
     finished_run: FinishedRun, lab: Lab, road: Path
 ) -> None:
+    """Its buffers fill while it sleeps; nobody may wait for it, and it comes back as a zombie."""
     faults = lab.path("faults.toml", "[[pause]]\nat_s = 12\nfor_s = 2.5\n")
 
     found = run_with(lab, road, faults, "--pace", "5")
@@ -126,6 +120,9 @@ def test_a_leader_that_is_paused_is_replaced_and_comes_back(
     assert recovery_s > 0.0
     leaders = [event["coordinator"] for event in events(lab.folder / "out", "leader")]
     assert len(set(leaders)) > 1
+    # To another one and back again, once.
+    assert found["failover"]["leader_changes"] <= 2
+    assert events(lab.folder / "out", "agent-silent") == []
     assert final_lanes(lab.folder / "out") == final_lanes(finished_run("simulated"))
 
 
