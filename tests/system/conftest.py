@@ -27,7 +27,7 @@ def loaded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Loaded]:
 def lab(tmp_path: Path, loaded: Loaded) -> Iterator[Lab]:
     """Processes of this test; whatever is left of them at its end is an error."""
     sockets = Path(tempfile.mkdtemp(prefix="lw-"))
-    laboratory = Lab(tmp_path, sockets, loaded)
+    laboratory = Lab(tmp_path, sockets, loaded=loaded)
     try:
         yield laboratory
     finally:

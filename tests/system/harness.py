@@ -67,8 +67,8 @@ class Lab:
     folder: Path
     sockets: Path
     """Temporary folder of the processes; its path is short, since sockets are made in it."""
-    loaded: Loaded
     mark: str = field(factory=lambda: uuid.uuid4().hex)
+    loaded: Loaded | None = None
     _started: list[subprocess.Popen[str]] = field(factory=list)
 
     def start(self, *arguments: object, **environment: str) -> subprocess.Popen[str]:
@@ -110,6 +110,7 @@ class Lab:
 
     def run_loaded(self, *arguments: object, within_s: float = END_S, **environment: str) -> Ended:
         """As `run`, in a process that need not load the package."""
+        assert self.loaded is not None
         ended = Ended(
             *self.loaded.run(
                 list(map(str, arguments)), self.folder, self.environment | environment, within_s
