@@ -67,7 +67,7 @@ class ServiceNumbers:
     planning: int = field(default=0, metadata=told("Requests that workers have"))
 
 
-@define
+@define(eq=False)
 class _Entry:
     """A request in hand, or one that was answered."""
 

@@ -10,7 +10,7 @@ import msgpack
 from attrs import frozen
 
 from laneweave.coordinator.planning import PlanResponse
-from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.errors import BadInputError, one_line
 from laneweave.protocol.node import Reply
 
 JSON_TYPE: Final = "application/json"
@@ -45,7 +45,10 @@ class Refusal:
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Refusal:
         """Read an error reply; one without a code is of the kind that its field tells."""
-        field, message = str(data.get("field", "")), str(data.get("message", ""))
+        field, message = (
+            one_line(str(data.get("field", ""))),
+            one_line(str(data.get("message", ""))),
+        )
         return cls(str(data.get("code", INVALID if field else FAILED)), message, field)
 
 

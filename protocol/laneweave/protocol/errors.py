@@ -30,7 +30,8 @@ class BadInputError(ValueError):
             shown = _SHORT.repr(self.value)
         except ValueError:  # an integer of thousands of digits
             shown = f"a huge {type(self.value).__name__}"
-        return f"{_line(self.field, 120)}: got {_line(shown, 80)}; allowed: {_line(self.allowed)}"
+        field, value, allowed = one_line(self.field, 120), one_line(shown, 80), self.allowed
+        return f"{field}: got {value}; allowed: {one_line(allowed)}"
 
     def within(self, parent: str) -> BadInputError:
         """Return the same error with `parent` put before the field's name."""
@@ -38,8 +39,8 @@ class BadInputError(ValueError):
         return BadInputError(f"{parent}{separator}{self.field}", self.value, self.allowed)
 
 
-def _line(text: str, length: int = 500) -> str:
-    """Return text as part of one readable line."""
+def one_line(text: str, length: int = 500) -> str:
+    """Return text as one readable line, or as part of one."""
     words = "".join(char if char.isprintable() else " " for char in text).split()
     line = " ".join(words)
     return line if len(line) <= length else line[: length - 3] + "..."

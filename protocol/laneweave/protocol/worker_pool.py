@@ -8,6 +8,7 @@ whole when a worker is killed while it waits for work.)
 
 from __future__ import annotations
 
+import contextlib
 import math
 import multiprocessing
 import queue
@@ -108,8 +109,9 @@ class _Worker:
         """Kill the process, and have the thread end."""
         with self._lock:
             self._ending.set()
-            if self._process is not None:
-                self._process.kill()
+            process = self._process  # the thread may let go of it meanwhile
+            if process is not None:
+                process.kill()
 
     def _look_after(self) -> None:
         self._begin()
@@ -131,7 +133,11 @@ class _Worker:
         self._forget()
 
     def _begin(self) -> Connection | None:
-        """Start a process in the place of the one that was; None: the pool is ending."""
+        """Start a process in the place of the one that was.
+
+        Returns:
+            The connection to it. None: the pool is ending, or the machine gives no process.
+        """
         self._forget()
         if time.monotonic() < self._begun_s + PAUSE_S:
             self._ending.wait(PAUSE_S)
@@ -139,14 +145,11 @@ class _Worker:
             if self._ending.is_set():
                 return None
             self._begun_s = time.monotonic()
-            ours, theirs = _CONTEXT.Pipe()
-            self._process = _CONTEXT.Process(
-                target=_work, args=(theirs, self._warm_up), name="worker", daemon=True
-            )
-            self._process.start()
-            theirs.close()
-            self._connection = ours
-            return ours
+            try:
+                self._process, self._connection = _start(self._warm_up)
+            except OSError as error:
+                log.warning("a worker cannot be started", reason=str(error))
+            return self._connection
 
     def _forget(self) -> None:
         """Let go of a process that is dead, or is to die."""
@@ -181,9 +184,25 @@ class _Worker:
                 return Computed(job.job, result, error)
         except (EOFError, OSError):
             return None
+        except Exception as error:
+            # It cannot be pickled. The pipe carries whole messages, so nothing of it is left there.
+            log.exception("a job or its result cannot be handed over", job=job.job)
+            return Computed(job.job, None, _described(error))
         self._forget()
         log.warning("a worker was stopped: it went on too long", job=job.job)
         return Computed(job.job, None, "the worker was stopped: it went on too long")
+
+
+def _start(warm_up: Callable[[], None] | None) -> tuple[SpawnProcess, Connection]:
+    ours, theirs = _CONTEXT.Pipe()
+    with theirs:
+        process = _CONTEXT.Process(target=_work, args=(theirs, warm_up), name="worker", daemon=True)
+        try:
+            process.start()
+        except OSError:
+            ours.close()
+            raise
+    return process, ours
 
 
 def _work(connection: Connection, warm_up: Callable[[], None] | None) -> None:
@@ -194,12 +213,25 @@ def _work(connection: Connection, warm_up: Callable[[], None] | None) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if warm_up is not None:
         warm_up()
-    while True:
-        try:
-            work, deadline_s = connection.recv()
-        except (EOFError, OSError):
-            return
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            _do_next(connection)
+
+
+def _do_next(connection: Connection) -> None:
+    """Do a job.
+
+    Raises:
+        EOFError, OSError: the other end is closed.
+    """
+    try:
+        work, deadline_s = connection.recv()
         connection.send(_result(work, deadline_s))
+    except (EOFError, OSError):
+        raise
+    except Exception as error:  # it cannot be pickled
+        log.exception("a job or its result cannot be handed over")
+        connection.send((None, _described(error)))
 
 
 def _result(work: Callable[[float], Any], deadline_s: float) -> tuple[Any, str]:
@@ -210,4 +242,8 @@ def _result(work: Callable[[float], Any], deadline_s: float) -> tuple[Any, str]:
         return None, str(error)
     except Exception as error:
         log.exception("computation failed")
-        return None, f"{type(error).__name__}: {error}"
+        return None, _described(error)
+
+
+def _described(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"
