@@ -11,6 +11,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator
 from functools import partial
+from hashlib import blake2b
+from itertools import islice
 from typing import ClassVar
 
 import attrs
@@ -20,7 +22,9 @@ from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_pl
 from laneweave.coordinator.service_format import (
     FAILED,
     INVALID,
+    JSON,
     LATE,
+    MSGPACK,
     OVERLOADED,
     Format,
     Refusal,
@@ -34,6 +38,8 @@ from laneweave.protocol.numbers import told
 
 HANDED_OUT_AHEAD = 1
 """Jobs for each worker beside the one that it does, so that it need not wait for the next."""
+CACHE_BYTES = 1 << 26
+"""Answers that are kept are not longer, all together."""
 
 
 @frozen
@@ -69,19 +75,29 @@ class ServiceNumbers:
 
 @define(eq=False)
 class _Entry:
-    """A request in hand, or one that was answered."""
+    """A request in hand."""
 
     request: PlanRequest
     came_s: float
     job: int
     askers: list[tuple[int, Format]] = field(factory=list)
     """Who waits for the answer, and in which format."""
-    answer: PlanResponse | Refusal | None = None
-    answered_s: float = 0.0
+    dropped: bool = False
+    """It has been answered before its computation ended."""
 
     @property
     def deadline_s(self) -> float:
         return self.came_s + self.request.deadline_s
+
+
+@frozen
+class _Kept:
+    """An answer that was given. Packed, since a request in Python is twenty times its bytes."""
+
+    request: bytes
+    """Digest."""
+    answer: bytes
+    answered_s: float
 
 
 class PlanningService:
@@ -97,13 +113,14 @@ class PlanningService:
         """
         self._name = name
         self._settings = settings
-        self._most_planning = workers * (1 + HANDED_OUT_AHEAD)
+        self._workers = workers
         self._waiting: deque[_Entry] = deque()
         self._planning: dict[int, _Entry] = {}
         self._in_hand: dict[str, _Entry] = {}
         """Requests that wait or are planned, by id; those without one are not here."""
-        self._answers: dict[str, _Entry] = {}
-        """Requests that were answered, by id, in order of their time."""
+        self._answers: dict[str, _Kept] = {}
+        """Answers by the request's id, in order of their time."""
+        self._kept_bytes = 0
         self._numbers = ServiceNumbers()
 
     @property
@@ -114,7 +131,13 @@ class PlanningService:
     @property
     def wakeup_s(self) -> float | None:
         """When the deadline of a request that waits passes."""
-        return min((entry.deadline_s for entry in self._waiting), default=None)
+        return min((entry.deadline_s for entry in self._not_begun()), default=None)
+
+    def _not_begun(self) -> Iterator[_Entry]:
+        """Yield what no worker has begun: they take what is handed out in its order."""
+        ahead = islice(self._planning.values(), self._workers, None)
+        yield from (entry for entry in ahead if not entry.dropped)
+        yield from self._waiting
 
     # --- questions ----------------------------------------------------------------------------
 
@@ -145,14 +168,19 @@ class PlanningService:
         form = format_of(payload, encoding)
         try:
             request = self._read(form, payload)
-            known = self._known(request, now_s)
+            self._forget_old(now_s)
+            entry, kept = self._known(request)
         except BadInputError as error:
             self._count("invalid_total")
             yield form.refuse(token, Refusal(INVALID, str(error), error.field))
             return
-        if known is not None:
+        if entry is not None:
             self._count("repeated_total")
-            yield from self._ask_again(known, token, form)
+            entry.askers.append((token, form))
+            return
+        if kept is not None:
+            self._count("repeated_total")
+            yield form.reply(token, PlanResponse.from_dict(MSGPACK.read(kept.answer)))
             return
         if len(self._waiting) + len(self._planning) >= self._settings.queue_limit:
             self._count("overloaded_total")
@@ -174,20 +202,15 @@ class PlanningService:
             raise BadInputError("deadline_s", request.deadline_s, allowed)
         return request
 
-    def _known(self, request: PlanRequest, now_s: float) -> _Entry | None:
+    def _known(self, request: PlanRequest) -> tuple[_Entry | None, _Kept | None]:
         """Return what is known of a request that was asked before."""
-        self._forget_old(now_s)
-        known = self._in_hand.get(request.id) or self._answers.get(request.id)
-        if known is not None and known.request != request:
+        entry, kept = self._in_hand.get(request.id), self._answers.get(request.id)
+        another = (entry is not None and entry.request != request) or (
+            kept is not None and kept.request != _digest(request)
+        )
+        if another:
             raise BadInputError("id", request.id, "an id that no other request has had of late")
-        return known
-
-    @staticmethod
-    def _ask_again(known: _Entry, token: int, form: Format) -> Iterator[Effect]:
-        if known.answer is None:
-            known.askers.append((token, form))
-        else:
-            yield form.reply(token, known.answer)
+        return entry, kept
 
     def _overloaded(self) -> Refusal:
         limit = self._settings.queue_limit
@@ -204,7 +227,8 @@ class PlanningService:
 
     def _hand_out(self, now_s: float) -> Iterator[Effect]:
         """Give workers what waits, in the order of its coming."""
-        while self._waiting and len(self._planning) < self._most_planning:
+        most_planning = self._workers * (1 + HANDED_OUT_AHEAD)
+        while self._waiting and len(self._planning) < most_planning:
             entry = self._waiting.popleft()
             if entry.deadline_s <= now_s:
                 yield from self._end(entry, self._late(entry, now_s), now_s)
@@ -215,22 +239,28 @@ class PlanningService:
     def finish(self, job: int, result: object, error: str, now_s: float) -> Iterator[Effect]:
         """Answer a request whose computation has ended."""
         entry = self._planning.pop(job)
-        answer: PlanResponse | Refusal
-        if isinstance(result, PlanResponse):
-            answer = result
-        elif now_s >= entry.deadline_s:
-            answer = self._late(entry, now_s)
-        else:
-            self._count("failed_total")
-            answer = Refusal(FAILED, f"planning failed: {error}", "")
-        yield from self._end(entry, answer, now_s)
+        if not entry.dropped:
+            yield from self._end(entry, self._outcome(entry, result, error, now_s), now_s)
         yield from self._hand_out(now_s)
+
+    def _outcome(
+        self, entry: _Entry, result: object, error: str, now_s: float
+    ) -> PlanResponse | Refusal:
+        if isinstance(result, PlanResponse):
+            return result
+        if now_s >= entry.deadline_s:
+            return self._late(entry, now_s)
+        self._count("failed_total")
+        return Refusal(FAILED, f"planning failed: {error}", "")
 
     def drop_late(self, now_s: float) -> Iterator[Effect]:
         """Drop what has waited until its deadline."""
-        late = [entry for entry in self._waiting if entry.deadline_s <= now_s]
+        late = [entry for entry in self._not_begun() if entry.deadline_s <= now_s]
         for entry in late:
-            self._waiting.remove(entry)
+            if entry.job in self._planning:
+                entry.dropped = True
+            else:
+                self._waiting.remove(entry)
             yield from self._end(entry, self._late(entry, now_s), now_s)
 
     def _late(self, entry: _Entry, now_s: float) -> Refusal:
@@ -251,27 +281,31 @@ class PlanningService:
             self._count("service_seconds_total", max(0.0, now_s - entry.came_s - planned_s))
         for token, form in entry.askers:
             yield form.reply(token, answer)
-        if self._in_hand.pop(entry.request.id, None) is not None and isinstance(
-            answer, PlanResponse
-        ):
-            entry.answer, entry.answered_s = answer, now_s
-            entry.askers.clear()
-            self._answers[entry.request.id] = entry
+        if self._in_hand.pop(entry.request.id, None) and isinstance(answer, PlanResponse):
+            kept = _Kept(_digest(entry.request), MSGPACK.write(answer.to_dict()), now_s)
+            self._answers[entry.request.id] = kept
+            self._kept_bytes += len(kept.answer)
             self._forget_old(now_s)
 
     def _forget_old(self, now_s: float) -> None:
-        """Let answers go that are too many, or too old."""
+        """Let answers go that are too many, too long together, or too old."""
         answers, settings = self._answers, self._settings
         while answers:
             oldest = next(iter(answers))
             old = answers[oldest].answered_s <= now_s - settings.cache_s
-            if len(answers) <= settings.cache_entries and not old:
+            many = len(answers) > settings.cache_entries or self._kept_bytes > CACHE_BYTES
+            if not many and not old:
                 return
-            del answers[oldest]
+            self._kept_bytes -= len(answers.pop(oldest).answer)
 
     def _count(self, name: str, by: float = 1) -> None:
         counted = getattr(self._numbers, name) + by
         self._numbers = attrs.evolve(self._numbers, **{name: counted})
+
+
+def _digest(request: PlanRequest) -> bytes:
+    # MessagePack does not write every text that JSON reads.
+    return blake2b(JSON.write(request.to_dict()), digest_size=16).digest()
 
 
 def plan_in_time(request: PlanRequest, left_s: float) -> PlanResponse:

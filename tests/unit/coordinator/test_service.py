@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -12,6 +13,7 @@ from attrs import define, field
 from hypothesis import given
 from hypothesis import strategies as st
 
+from laneweave.coordinator import service
 from laneweave.coordinator.service import PlanningService, ServiceNumbers
 from laneweave.coordinator.service_format import FAILED, INVALID, LATE, OVERLOADED
 from laneweave.coordinator.sharing import falls_to
@@ -140,6 +142,9 @@ def spoiled(*path: str | int, value: object) -> dict[str, Any]:
     ("data", "name"),
     [
         ({}, "schema"),
+        (spoiled("", value=1), "''"),
+        (spoiled("a\nb", value=1), "a b"),
+        (spoiled("grid", "\n", value=1), "grid.'\\n'"),
         (spoiled("schema", value="x"), "schema"),
         (spoiled("id", value=7), "id"),
         (spoiled("id", value="x" * 101), "id"),
@@ -236,7 +241,34 @@ def test_what_waits_until_its_deadline_is_dropped(desk: Desk) -> None:
     desk.wait(0.2)
     assert desk.answer(token)["code"] == LATE
     assert desk.service.numbers.waiting == 0
+    assert desk.service.wakeup_s == desk.now_s - 5.1 + 50.0  # of the one that is handed out ahead
+
+
+def test_what_was_handed_out_ahead_is_dropped_at_its_deadline(desk: Desk) -> None:
+    busy = desk.ask(REQUEST | {"deadline_s": 50.0})
+    ahead = desk.ask(named("ahead", deadline_s=5.0))
+    assert len(desk.orders) == 2
+    assert desk.service.wakeup_s == desk.now_s + 5.0
+    desk.wait(5.1)
+    assert desk.answer(ahead)["code"] == LATE
+    assert busy not in desk.replies
     assert desk.service.wakeup_s is None
+    # Asked again, it is another request; what the worker says of the first one is nobody's.
+    again = desk.ask(named("ahead", deadline_s=5.0))
+    for _ in range(3):
+        desk.work()
+    assert desk.answer(busy)["status"] == desk.answer(again)["status"] == "optimal"
+    assert desk.service.numbers.late_total == 1
+
+
+def test_what_is_being_planned_is_not_dropped_at_its_deadline(desk: Desk) -> None:
+    token = desk.ask(REQUEST | {"deadline_s": 5.0})
+    (order,) = desk.orders
+    done = run_delegated(order, lambda: desk.now_s)
+    desk.wait(5.1)
+    assert token not in desk.replies
+    desk.end(done)
+    assert desk.answer(token)["status"] == "optimal"
 
 
 def test_a_failed_computation_is_an_error_reply(desk: Desk) -> None:
@@ -292,6 +324,13 @@ def test_a_repeated_request_waits_for_the_plan_under_way(desk: Desk) -> None:
     assert desk.service.numbers.repeated_total == 2
 
 
+def test_any_text_may_be_an_id(desk: Desk) -> None:
+    first = desk.ask(named("\ud800"))
+    desk.work()
+    again = desk.ask(named("\ud800"))
+    assert desk.answer(first) == desk.answer(again)
+
+
 def test_a_failure_is_not_kept(desk: Desk) -> None:
     desk.ask(named("r"))
     desk.end(Computed(desk.orders.pop().job, None, "broken"))
@@ -337,6 +376,40 @@ def test_no_answers_are_kept_where_none_may_be() -> None:
         desk.ask(named("r"))
         desk.work()
     assert desk.service.numbers.answered_total == 2
+
+
+def test_answers_are_forgotten_when_they_are_long(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(3):
+        desk.ask(named(str(number)))
+        desk.work()
+    monkeypatch.setattr(service, "CACHE_BYTES", 300)
+    desk.ask(named("3"))
+    desk.work()
+    desk.ask(named("3"))
+    assert not desk.orders
+    desk.ask(named("0"))
+    assert desk.orders
+
+
+def test_large_requests_leave_little_behind() -> None:
+    grid = {
+        "columns": 100,
+        "lanes": 16,
+        "blocked": [[c, n] for c in range(3, 100) for n in range(16)],
+    }
+    desk = Desk(PlanningService("c1", Service(), workers=1))
+    tracemalloc.start()
+    try:
+        for number in range(20):
+            desk.ask(named(str(number), grid=grid))
+            desk.work()
+        desk.replies.clear()
+        kept_bytes, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert kept_bytes < 1_500_000
 
 
 # --- shared load ------------------------------------------------------------------------------

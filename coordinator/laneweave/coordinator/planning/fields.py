@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from laneweave.coordinator.planning.grid import Cell
-from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.errors import BadInputError, one_line
 
 
 def as_mapping(field: str, value: object, known: Sequence[str]) -> Mapping[str, Any]:
@@ -15,7 +15,8 @@ def as_mapping(field: str, value: object, known: Sequence[str]) -> Mapping[str, 
         raise BadInputError(field, value, "an object")
     for key in value:
         if key not in known:
-            name = f"{field}.{key}" if field != "request" else str(key)
+            shown = one_line(str(key), 80) or repr(key)
+            name = f"{field}.{shown}" if field != "request" else shown
             raise BadInputError(name, value[key], "only the keys " + ", ".join(known))
     return value
 
