@@ -50,6 +50,8 @@ __all__ = [
 ]
 
 DEFAULT_TIMEOUT_S = 10.0
+LONGEST_ATTEMPT_S = 86_400.0
+"""Zenoh takes no timeouts of centuries."""
 
 
 class _Connection:
@@ -69,6 +71,7 @@ class _Connection:
         self._patience_s = patience_s
         self._key = Keys(access.realm).key(SERVICE)
         self._transport = ZenohTransport(access, lambda _: None)
+        self._closed = False
 
     def _begin(self, request: PlanRequest, timeout_s: float) -> Inquiry:
         if not request.id:
@@ -76,9 +79,15 @@ class _Connection:
         return Inquiry(request, timeout_s, time.monotonic(), patience_s=self._patience_s)
 
     def _ask(self, inquiry: Inquiry) -> Future[Answer | None]:
-        left_s = max(0.0, inquiry.left_s(time.monotonic()))
+        if self._closed:
+            raise ServiceUnavailableError("this client is closed")
+        left_s = min(max(0.0, inquiry.left_s(time.monotonic())), LONGEST_ATTEMPT_S)
         encoding = inquiry.form.encoding
         return self._transport.ask(self._key, inquiry.payload, left_s, encoding)
+
+    def _close(self) -> None:
+        self._closed = True
+        self._transport.close()
 
 
 class PlanClient(_Connection):
@@ -93,7 +102,7 @@ class PlanClient(_Connection):
 
         Raises:
             RequestRefusedError: the request is not valid.
-            ServiceUnavailableError: there is no coordinator.
+            ServiceUnavailableError: there is no coordinator, or this client is closed.
             ServiceOverloadedError: the coordinators had too much to do, all the time.
             DeadlinePassedError: it was not begun before its deadline.
             PlanningFailedError: the service made an error.
@@ -108,8 +117,8 @@ class PlanClient(_Connection):
             time.sleep(outcome.pause_s)
 
     def close(self) -> None:
-        """Leave the network."""
-        self._transport.close()
+        """Leave the network; whoever waits for a plan is told that there is no service."""
+        self._close()
 
     def __enter__(self) -> Self:
         """Return the client."""
@@ -141,8 +150,8 @@ class AsyncPlanClient(_Connection):
             await asyncio.sleep(outcome.pause_s)
 
     async def close(self) -> None:
-        """Leave the network."""
-        await asyncio.to_thread(self._transport.close)
+        """Leave the network; whoever awaits a plan is told that there is no service."""
+        await asyncio.to_thread(self._close)
 
     async def __aenter__(self) -> Self:
         """Return the client."""

@@ -227,14 +227,17 @@ class ZenohTransport:
 
         # Without consolidation each reply is handed over as it comes: one server that hangs must
         # not hold back the answers of the others.
-        self._session.get(
-            key,
-            zenoh.handlers.Callback(take, lambda: _settle(first, None)),
-            payload=payload,
-            encoding=encoding or None,
-            timeout=timeout_s,
-            consolidation=zenoh.ConsolidationMode.NONE,
-        )
+        try:
+            self._session.get(
+                key,
+                zenoh.handlers.Callback(take, lambda: _settle(first, None)),
+                payload=payload,
+                encoding=encoding or None,
+                timeout=timeout_s,
+                consolidation=zenoh.ConsolidationMode.NONE,
+            )
+        except zenoh.ZError:  # the session is closed
+            _settle(first, None)
         return first
 
     def close(self) -> None:

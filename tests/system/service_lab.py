@@ -1,0 +1,184 @@
+"""A router and coordinators that plan for others, and who asks them."""
+
+from __future__ import annotations
+
+import json
+import queue
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import psutil
+from attrs import define, field
+
+from laneweave.coordinator.client import PlanClient
+from laneweave.coordinator.planning import PlanRequest
+from laneweave.coordinator.service_format import JSON
+from laneweave.coordinator.sharing import falls_to
+from laneweave.protocol.access import Access
+from laneweave.protocol.topics import COORDINATOR_ALIVE, Keys
+from laneweave.protocol.transport import Delivery, TokenDown, TokenUp
+from laneweave.protocol.zenoh_transport import ZenohTransport
+from system.harness import END_S, Ended, Lab
+
+REALM = "default"
+LEASE_S = 1.0
+
+
+def free_tcp() -> str:
+    """Return an endpoint on a port that was free a moment ago."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return f"tcp/127.0.0.1:{server.getsockname()[1]}"
+
+
+def request(name: str = "", vehicles: int = 3, **changes: object) -> dict[str, Any]:
+    """Return a request that is planned within milliseconds."""
+    named = {"id": name} if name else {}
+    return {
+        "schema": "laneweave.plan.request/1",
+        **named,
+        "grid": {"columns": 6, "lanes": 3},
+        "vehicles": [
+            {"id": f"v{i}", "cell": [i // 3, i % 3], "lane": (i + 1) % 3} for i in range(vehicles)
+        ],
+        "targets": [[column, lane] for column in range(2, 6) for lane in range(3)],
+        "deadline_s": 20.0,
+        **changes,
+    }
+
+
+def slow_request(name: str, deadline_s: float) -> dict[str, Any]:
+    """Return a request that takes as long as it may."""
+    return {
+        "schema": "laneweave.plan.request/1",
+        "id": name,
+        "grid": {"columns": 12, "lanes": 4},
+        "vehicles": [
+            {"id": f"v{i}", "cell": [i // 4 * 2, i % 4], "lane": 3 - i % 4} for i in range(20)
+        ],
+        "targets": [[column, lane] for column in range(12) for lane in range(4)],
+        "deadline_s": deadline_s,
+    }
+
+
+@define
+class ServiceLab:
+    """Coordinators with one worker each; those that a test kills are started again."""
+
+    lab: Lab
+    names: tuple[str, ...]
+    limits: str = ""
+    endpoint: str = field(factory=free_tcp)
+    coordinators: dict[str, subprocess.Popen[str]] = field(factory=dict)
+    ended: list[Ended] = field(factory=list)
+    """What became of coordinators that were killed."""
+    _news: queue.SimpleQueue[Delivery] = field(factory=queue.SimpleQueue)
+    _alive: set[str] = field(factory=set)
+
+    @contextmanager
+    def running(self) -> Iterator[ServiceLab]:
+        """Run the router and all coordinators; they must end in good order."""
+        config = f"""schema = "laneweave.scenario/1"
+[network]
+realm = "{REALM}"
+endpoint = "{self.endpoint}"
+lease_s = {LEASE_S}
+[service]
+workers = 1
+{self.limits}"""
+        self.lab.path("deployment.toml", config)
+        router = self.lab.start("router", "--config", "deployment.toml")
+        watcher = self._watcher()
+        keys = Keys(REALM)
+        watcher.watch(keys.all_of(COORDINATOR_ALIVE))
+        try:
+            self.revive()
+            yield self
+        finally:
+            watcher.close()
+        for name in self.names:
+            self.stop(name)
+        router.terminate()
+        assert self.lab.finish(router, END_S) == Ended(0, "", "")
+        self.lab.check_nothing_left()
+
+    def _watcher(self) -> ZenohTransport:
+        give_up = time.monotonic() + END_S
+        while True:
+            try:
+                return ZenohTransport(self.access, self._news.put)
+            except ValueError:
+                assert time.monotonic() < give_up
+                time.sleep(0.05)
+
+    @property
+    def access(self) -> Access:
+        """How tests get onto the network."""
+        return Access(self.endpoint, REALM, LEASE_S)
+
+    @property
+    def alive(self) -> set[str]:
+        """Names of the coordinators that the network shows."""
+        while not self._news.empty():
+            news = self._news.get()
+            if isinstance(news, TokenUp | TokenDown):
+                name = news.key.split("/")[-2]
+                (self._alive.add if isinstance(news, TokenUp) else self._alive.discard)(name)
+        return self._alive
+
+    def revive(self) -> None:
+        """Start the coordinators that do not run, and wait until each has planned something."""
+        missing = [name for name in self.names if name not in self.coordinators]
+        for name in missing:
+            self.coordinators[name] = self.lab.start(
+                "coordinator", "--config", "deployment.toml", "--name", name
+            )
+        self.lab.wait_until(lambda: self.alive == set(self.names), END_S)
+        with PlanClient(self.access) as client:
+            for name in missing:
+                client.plan(PlanRequest.from_dict(self.for_one(name, request())), END_S)
+
+    def for_one(self, name: str, data: dict[str, Any]) -> dict[str, Any]:
+        """Return a request like this one, under an id with which it falls to a coordinator."""
+        others = [other for other in self.names if other != name]
+        number = 0
+        while True:
+            number += 1
+            named = data | {"id": f"{data.get('id', '')}-{name}-{number}-{time.monotonic_ns()}"}
+            # As the client writes it.
+            payload = JSON.write(PlanRequest.from_dict(named).to_dict())
+            if falls_to(name, others, payload):
+                result: dict[str, Any] = json.loads(payload)
+                return result
+
+    def kill(self, name: str) -> float:
+        """SIGKILL a coordinator; returns when."""
+        process = self.coordinators.pop(name)
+        process.kill()
+        killed_s = time.monotonic()
+        self.ended.append(self.lab.finish(process, END_S))
+        return killed_s
+
+    def stop(self, name: str) -> float:
+        """Ask a coordinator to end, which it must do in good order; returns the seconds it took."""
+        process = self.coordinators.pop(name)
+        asked_s = time.monotonic()
+        process.terminate()
+        ended = self.lab.finish(process, END_S)
+        took_s = time.monotonic() - asked_s
+        assert (ended.status, ended.out) == (0, "")
+        assert "Traceback" not in ended.err
+        return took_s
+
+    def workers(self, name: str) -> list[int]:
+        """Return the ids of a coordinator's workers."""
+        children = psutil.Process(self.coordinators[name].pid).children()
+        return [child.pid for child in children if any("spawn_main" in w for w in child.cmdline())]
+
+    def rss_mb(self, name: str) -> float:
+        """Return the memory of a coordinator's own process."""
+        rss: int = psutil.Process(self.coordinators[name].pid).memory_info().rss
+        return rss / 1e6
