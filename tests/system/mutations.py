@@ -6,11 +6,23 @@ import copy
 import json
 import math
 import random
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from typing import Any
 
 import msgpack
 from attrs import frozen
+
+from laneweave.coordinator.service_format import CODES, FAILED, OVERLOADED
+from laneweave.protocol.access import Access
+from laneweave.protocol.topics import SERVICE, Keys
+from laneweave.protocol.transport import Answer
+from laneweave.protocol.zenoh_transport import ZenohTransport
+
+IN_FLIGHT = 48
+"""Below the limit of a service, which stays out of this."""
+ANSWER_S = 30.0
 
 Tree = dict[str, Any]
 
@@ -171,3 +183,44 @@ def _places(node: Any) -> Iterator[tuple[Any, Any]]:  # noqa: ANN401 (JSON)
     for key, value in items:
         yield node, key
         yield from _places(value)
+
+
+# --- what becomes of them ---------------------------------------------------------------------
+
+
+def verdict(mutant: Mutant, answer: Answer | None) -> str:
+    """Return what a mutant was answered, which must be a plan or an error that names the field."""
+    said = f"{mutant.kind} {mutant.encoding!r} {mutant.payload[:300]!r}: {answer}"
+    assert answer is not None, f"not answered: {said}"
+    unpack = json.loads if answer.encoding.startswith("application/json") else msgpack.unpackb
+    data = unpack(answer.payload)
+    if answer.ok:
+        assert data["schema"] == "laneweave.plan.response/1", said
+        return str(data["status"])
+    assert set(data) == {"field", "message", "code"}, said
+    assert data["code"] in CODES, said
+    assert data["code"] not in (FAILED, OVERLOADED), said
+    assert data["field"], said
+    assert data["message"].isprintable(), said
+    assert 10 < len(data["message"]) < 800, said
+    return str(data["code"])
+
+
+def ask_all(access: Access, asked: Iterator[Mutant]) -> Counter[str]:
+    """Ask many at a time; returns how often what was answered."""
+    key = Keys(access.realm).key(SERVICE)
+    verdicts: Counter[str] = Counter()
+    waiting: deque[tuple[Mutant, Future[Answer | None]]] = deque()
+    transport = ZenohTransport(access, lambda _: None)
+    try:
+        for mutant in asked:
+            if len(waiting) == IN_FLIGHT:
+                first, answer = waiting.popleft()
+                verdicts[verdict(first, answer.result(ANSWER_S))] += 1
+            asking = transport.ask(key, mutant.payload, ANSWER_S, mutant.encoding)
+            waiting.append((mutant, asking))
+        for mutant, answer in waiting:
+            verdicts[verdict(mutant, answer.result(ANSWER_S))] += 1
+    finally:
+        transport.close()
+    return verdicts

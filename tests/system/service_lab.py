@@ -6,16 +6,17 @@ import json
 import queue
 import socket
 import subprocess
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Self
 
 import psutil
 from attrs import define, field
 
-from laneweave.coordinator.client import PlanClient
-from laneweave.coordinator.planning import PlanRequest
+from laneweave.coordinator.client import PlanClient, PlanError
+from laneweave.coordinator.planning import PlanRequest, PlanResponse
 from laneweave.coordinator.service_format import JSON
 from laneweave.coordinator.sharing import falls_to
 from laneweave.protocol.access import Access
@@ -99,7 +100,7 @@ workers = 1
             yield self
         finally:
             watcher.close()
-        for name in self.names:
+        for name in tuple(self.coordinators):
             self.stop(name)
         router.terminate()
         assert self.lab.finish(router, END_S) == Ended(0, "", "")
@@ -129,21 +130,27 @@ workers = 1
                 (self._alive.add if isinstance(news, TokenUp) else self._alive.discard)(name)
         return self._alive
 
-    def revive(self) -> None:
-        """Start the coordinators that do not run, and wait until each has planned something."""
+    def revive(self, least: int = 0) -> None:
+        """Start the coordinators that do not run, and wait until each has planned something.
+
+        Args:
+            least: so many are enough; 0: all.
+        """
         missing = [name for name in self.names if name not in self.coordinators]
+        if 0 < least <= len(self.coordinators):
+            missing = []
         for name in missing:
             self.coordinators[name] = self.lab.start(
                 "coordinator", "--config", "deployment.toml", "--name", name
             )
-        self.lab.wait_until(lambda: self.alive == set(self.names), END_S)
+        self.lab.wait_until(lambda: self.alive == set(self.coordinators), END_S)
         with PlanClient(self.access) as client:
             for name in missing:
                 client.plan(PlanRequest.from_dict(self.for_one(name, request())), END_S)
 
     def for_one(self, name: str, data: dict[str, Any]) -> dict[str, Any]:
         """Return a request like this one, under an id with which it falls to a coordinator."""
-        others = [other for other in self.names if other != name]
+        others = [other for other in self.coordinators if other != name]
         number = 0
         while True:
             number += 1
@@ -182,3 +189,68 @@ workers = 1
         """Return the memory of a coordinator's own process."""
         rss: int = psutil.Process(self.coordinators[name].pid).memory_info().rss
         return rss / 1e6
+
+
+@define
+class Load:
+    """Requests that are asked in turn until it is over, by threads or by tasks."""
+
+    plan: Callable[..., Any]
+    threads: int = 0
+    make: Callable[[], dict[str, Any]] = request
+    over: threading.Event = field(factory=threading.Event)
+    failures: list[Exception] = field(factory=list)
+    outcomes: list[str] = field(factory=list)
+    """Of each request: the plan's status, or the error's kind."""
+    _answered: list[tuple[float, float, float]] = field(factory=list)
+    """When each was asked and answered, and for how long it was planned, in s."""
+    _running: list[threading.Thread] = field(factory=list)
+
+    def __enter__(self) -> Self:
+        """Begin."""
+        for _ in range(self.threads):
+            thread = threading.Thread(target=self._ask_in_turn, daemon=True)
+            thread.start()
+            self._running.append(thread)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End, when all that was asked has been answered."""
+        self.over.set()
+        for thread in self._running:
+            thread.join(END_S)
+            assert not thread.is_alive()
+
+    def _ask_in_turn(self) -> None:
+        while not self.over.is_set():
+            made, asked_s = PlanRequest.from_dict(self.make()), time.monotonic()
+            try:
+                self._note(asked_s, self.plan(made, END_S))
+            except (PlanError, TimeoutError) as error:
+                self._fail(error)
+
+    async def ask_in_turn(self) -> None:
+        """Ask as a task."""
+        while not self.over.is_set():
+            made, asked_s = PlanRequest.from_dict(self.make()), time.monotonic()
+            try:
+                self._note(asked_s, await self.plan(made, END_S))
+            except (PlanError, TimeoutError) as error:
+                self._fail(error)
+
+    def _note(self, asked_s: float, response: PlanResponse) -> None:
+        self.outcomes.append(response.status)
+        self._answered.append((asked_s, time.monotonic(), response.solve_ms / 1e3))
+
+    def _fail(self, error: Exception) -> None:
+        self.outcomes.append(type(error).__name__)
+        self.failures.append(error)
+        self.over.set()
+
+    def added_s(self, fault_s: float | None) -> list[float]:
+        """Return what was added to the planning of requests: of those in flight then, or of all."""
+        return [
+            answered_s - asked_s - planned_s
+            for asked_s, answered_s, planned_s in self._answered
+            if fault_s is None or asked_s < fault_s < answered_s
+        ]

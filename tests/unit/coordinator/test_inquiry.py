@@ -152,6 +152,13 @@ def test_where_nobody_answers_for_long_there_is_no_service() -> None:
     assert ABSENT_S <= given_up_s(caught.value) <= ABSENT_S + LONGEST_PAUSE_S + 0.01
 
 
+def test_whoever_has_patience_waits_longer_for_a_service() -> None:
+    patient = Inquiry(REQUEST, 60.0, START_S, patience_s=20.0)
+    with pytest.raises(ServiceUnavailableError) as caught:
+        after_pauses(patient, [None])
+    assert 20.0 <= given_up_s(caught.value) <= 20.0 + LONGEST_PAUSE_S + 0.02
+
+
 def test_an_answer_shows_that_there_is_a_service() -> None:
     # Silence, an answer, silence: absence counts from the last one.
     with pytest.raises(ServiceUnavailableError) as caught:

@@ -105,8 +105,8 @@ class PlanResponse:
 
 
 def _milliseconds(field: str, value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise BadInputError(field, value, "a number")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= _MOST:
+        raise BadInputError(field, value, f"a number from 0 to {_MOST}")
     return float(value)
 
 

@@ -1,0 +1,361 @@
+"""The planning service over a real network: coordinators that share it, and die while they do."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import psutil
+import pytest
+
+from laneweave.coordinator.client import (
+    AsyncPlanClient,
+    PlanClient,
+    RequestRefusedError,
+    ServiceUnavailableError,
+)
+from laneweave.coordinator.planning import PlanRequest
+from laneweave.coordinator.service_format import LATE, OVERLOADED
+from laneweave.coordinator.sharing import falls_to
+from laneweave.protocol.topics import SERVICE, Keys
+from laneweave.protocol.transport import Answer
+from laneweave.protocol.zenoh_transport import ZenohTransport
+from system.harness import END_S, Lab
+from system.mutations import ask_all, mutants
+from system.service_lab import LEASE_S, REALM, Load, ServiceLab, request, slow_request
+
+pytestmark = pytest.mark.xdist_group("service")  # they share its processes
+
+QUEUE_LIMIT = 64
+FLAT_MB = 20.0
+KEY = Keys(REALM).key(SERVICE)
+NAMES = ("c1", "c2", "c3")
+
+
+def start(folder: Path, names: tuple[str, ...]) -> Iterator[ServiceLab]:
+    sockets = Path(tempfile.mkdtemp(prefix="lw-"))
+    lab = Lab(folder, sockets)
+    try:
+        with ServiceLab(lab, names, f"queue_limit = {QUEUE_LIMIT}").running() as running:
+            yield running
+    finally:
+        left = lab.kill_rest()
+        shutil.rmtree(sockets, ignore_errors=True)
+    assert not left
+
+
+@pytest.fixture(scope="module")
+def processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServiceLab]:
+    yield from start(tmp_path_factory.mktemp("service"), NAMES)
+
+
+@pytest.fixture
+def service(processes: ServiceLab) -> ServiceLab:
+    """Three coordinators, whatever became of them in the test before."""
+    processes.revive()
+    return processes
+
+
+@pytest.fixture
+def client(service: ServiceLab) -> Iterator[PlanClient]:
+    with PlanClient(service.access) as client:
+        yield client
+
+
+@pytest.fixture
+def transport(service: ServiceLab) -> Iterator[ZenohTransport]:
+    transport = ZenohTransport(service.access, lambda _: None)
+    yield transport
+    transport.close()
+
+
+def asked(transport: ZenohTransport, payload: bytes, encoding: str = "") -> Answer:
+    answer = transport.ask(KEY, payload, END_S, encoding).result()
+    assert answer is not None
+    return answer
+
+
+# --- malformed requests -----------------------------------------------------------------------
+
+
+def check_malformed(service: ServiceLab, seed: int, count: int) -> None:
+    begun_s = time.monotonic()
+    verdicts = ask_all(service.access, mutants(seed, 1000))
+    before_mb = {name: service.rss_mb(name) for name in service.names}
+    verdicts += ask_all(service.access, mutants(seed + 1, count - 1000))
+    grown_mb = {name: service.rss_mb(name) - before_mb[name] for name in service.names}
+    took_s = time.monotonic() - begun_s
+    grown = ", ".join(f"{name} {by:+.1f} MB" for name, by in grown_mb.items())
+    print(f"{dict(verdicts)} in {took_s:.1f} s; {grown}")  # noqa: T201 (a figure that is reported)
+    assert verdicts.total() >= count
+    assert verdicts["invalid"] > 0.7 * count
+    assert verdicts["optimal"] > 0
+    assert max(grown_mb.values()) < FLAT_MB
+    with PlanClient(service.access) as client:
+        for name in service.names:
+            valid = PlanRequest.from_dict(service.for_one(name, request()))
+            assert client.plan(valid).status == "optimal"
+
+
+def test_malformed_requests(service: ServiceLab) -> None:
+    check_malformed(service, seed=1, count=2000)
+
+
+@pytest.mark.full
+def test_ten_thousand_malformed_requests(service: ServiceLab) -> None:
+    check_malformed(service, seed=100, count=10_000)
+
+
+@pytest.mark.full
+def test_ten_thousand_malformed_requests_to_one(tmp_path: Path) -> None:
+    for one in start(tmp_path, ("c1",)):
+        check_malformed(one, seed=200, count=10_000)
+
+
+# --- encodings, ids, clients ------------------------------------------------------------------
+
+
+def pack(data: Any) -> bytes:  # noqa: ANN401 (JSON)
+    packed = msgpack.packb(data)
+    assert isinstance(packed, bytes)
+    return packed
+
+
+@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize(
+    ("write", "read", "encoding"),
+    [
+        (lambda data: json.dumps(data).encode(), json.loads, "application/json"),
+        (pack, msgpack.unpackb, "application/msgpack"),
+    ],
+    ids=["JSON", "MessagePack"],
+)
+def test_an_id_that_is_repeated_gets_the_same_plan(
+    transport: ZenohTransport,
+    write: Callable[[Any], bytes],
+    read: Callable[[bytes], Any],
+    encoding: str,
+    *,
+    told: bool,
+) -> None:
+    payload = write(request(f"again-{encoding}-{told}"))
+    asking = [transport.ask(KEY, payload, END_S, encoding if told else "") for _ in range(5)]
+    answers = {answer.result() for answer in asking}
+    answers.add(asked(transport, payload, encoding if told else ""))
+    # To the last digit of the time that planning took.
+    (answer,) = answers
+    assert answer is not None
+    assert (answer.ok, answer.encoding) == (True, encoding)
+    assert read(answer.payload)["status"] == "optimal"
+
+
+def test_an_id_names_one_request(service: ServiceLab, transport: ZenohTransport) -> None:
+    # Each coordinator knows those that fell to it; these fall to one.
+    found = []
+    for number in range(100):
+        payload = json.dumps(request("taken", deadline_s=10.0 + number)).encode()
+        if falls_to("c1", ("c2", "c3"), payload):
+            found.append(payload)
+    first, second = found[:2]
+    assert asked(transport, first).ok
+    refused = asked(transport, second)
+    assert not refused.ok
+    assert json.loads(refused.payload)["field"] == "id"
+    assert asked(transport, first).ok
+    assert service.alive == set(NAMES)
+
+
+PLAIN = """
+import json, sys, zenoh
+config = zenoh.Config()
+config.insert_json5("mode", '"client"')
+config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
+config.insert_json5("scouting/multicast/enabled", "false")
+with zenoh.open(config) as session:
+    for selector in ("laneweave/default/service/plan", "laneweave/*/service/*", "laneweave/**"):
+        for request in sys.argv[2:]:
+            (reply,) = session.get(selector, payload=request, timeout=20.0)
+            answer = reply.ok or reply.err
+            print(bool(reply.ok), answer.encoding, answer.payload.to_string())
+"""
+
+
+def test_zenoh_and_json_are_enough(service: ServiceLab) -> None:
+    bodies = [json.dumps(data) for data in (request(), request(mode=3))]
+    run = subprocess.run(
+        [sys.executable, "-c", PLAIN, service.endpoint, *bodies],
+        capture_output=True,
+        text=True,
+        timeout=END_S,
+        check=False,
+    )
+    assert run.stderr == ""
+    lines = [line.split(" ", 2) for line in run.stdout.splitlines()]
+    assert len(lines) == 6
+    for ok, encoding, text in lines:
+        assert encoding == "application/json"
+        assert json.loads(text).get("status" if ok == "True" else "field") in ("optimal", "mode")
+    assert Counter(ok for ok, _, _ in lines) == {"True": 3, "False": 3}
+
+
+def test_a_refusal_names_the_field(transport: ZenohTransport, client: PlanClient) -> None:
+    # What a client cannot send of itself: it is checked when it is made.
+    refused = asked(transport, json.dumps(request(deadline_s=601.0)).encode())
+    assert json.loads(refused.payload)["field"] == "deadline_s"
+    with pytest.raises(RequestRefusedError, match="at this service") as caught:
+        client.plan(PlanRequest.from_dict(request(deadline_s=601.0)))
+    assert caught.value.field == "deadline_s"
+
+
+def test_a_client_waits_no_longer_than_it_was_told(client: PlanClient) -> None:
+    slow = PlanRequest.from_dict(slow_request("slow", 1.0))
+    for timeout_s in (0.2, 0.0, -1.0, float("nan")):
+        with pytest.raises(TimeoutError):
+            client.plan(slow, timeout_s)
+    for timeout_s in (1e30, float("inf")):
+        assert client.plan(PlanRequest.from_dict(request()), timeout_s).status == "optimal"
+
+
+def test_a_client_that_is_closed_says_so(service: ServiceLab) -> None:
+    client = PlanClient(service.access)
+    with Load(client.plan, threads=1, make=lambda: slow_request("", 1.0)) as load:
+        time.sleep(0.3)
+        client.close()
+    (outcome,) = load.failures
+    assert isinstance(outcome, ServiceUnavailableError)
+    with pytest.raises(ServiceUnavailableError, match="closed"):
+        client.plan(PlanRequest.from_dict(request()))
+
+
+# --- limits -----------------------------------------------------------------------------------
+
+
+def test_a_queue_that_is_full_refuses_and_drops_what_is_late(
+    service: ServiceLab, transport: ZenohTransport, client: PlanClient
+) -> None:
+    def ask() -> Future[Answer | None]:
+        data = service.for_one("c1", slow_request("", 1.5))
+        return transport.ask(KEY, json.dumps(data).encode(), END_S)
+
+    begun_s = time.monotonic()
+    asking = [ask() for _ in range(QUEUE_LIMIT + 6)]
+    # A client asks again until there is room.
+    patient = PlanRequest.from_dict(service.for_one("c1", request()))
+    assert client.plan(patient, END_S).status == "optimal"
+
+    codes: Counter[str] = Counter()
+    for answer in (future.result() for future in asking):
+        assert answer is not None
+        data = json.loads(answer.payload)
+        codes[data["status"] if answer.ok else data["code"]] += 1
+        assert answer.ok or len(data["message"].splitlines()) == 1
+    assert codes[OVERLOADED] >= 1
+    assert codes[LATE] >= QUEUE_LIMIT / 2
+    assert set(codes) <= {OVERLOADED, LATE, "feasible", "optimal", "timeout"}
+    # Nobody is told so when a worker comes to it at last.
+    assert time.monotonic() < begun_s + 15.0
+
+
+# --- death ------------------------------------------------------------------------------------
+
+
+def check_load(load: Load, what: str, fault_s: float, most_s: float) -> None:
+    """Check that all were answered, those that were in flight at a fault soon enough."""
+    assert load.failures == []
+    affected = sorted(load.added_s(fault_s))
+    others = sorted(load.added_s(None))
+    # So few that the 99th percentile is the slowest.
+    print(  # noqa: T201 (a figure that is reported)
+        f"{what}: {len(others)} answered, {len(affected)} in flight at the fault: added "
+        f"p50 {affected[len(affected) // 2]:.3f} s, p99 {affected[-1]:.3f} s; "
+        f"all: p50 {others[len(others) // 2]:.4f} s, p99 {others[int(0.99 * len(others))]:.3f} s"
+    )
+    assert len(affected) >= 3
+    assert affected[-1] < most_s
+    assert others[-1] < most_s
+
+
+def test_a_coordinator_that_hangs(service: ServiceLab, client: PlanClient) -> None:
+    process = service.coordinators["c3"]
+    with Load(client.plan, threads=12) as load:
+        time.sleep(0.5)
+        process.send_signal(signal.SIGSTOP)
+        stopped_s = time.monotonic()
+        time.sleep(2.0 * LEASE_S)
+        process.send_signal(signal.SIGCONT)
+        time.sleep(0.3)
+    check_load(load, "SIGSTOP of a coordinator", stopped_s, LEASE_S + 4.0)
+    service.lab.wait_until(lambda: service.alive == set(NAMES), END_S)
+
+
+def test_workers_that_are_killed(service: ServiceLab, client: PlanClient) -> None:
+    with Load(client.plan, threads=12) as load:
+        time.sleep(0.3)
+        killed_s = time.monotonic()
+        killed = [pid for name in NAMES for pid in service.workers(name)]
+        for process_id in killed:
+            os.kill(process_id, signal.SIGKILL)
+        time.sleep(0.5)
+    check_load(load, "SIGKILL of all workers", killed_s, 15.0)
+    assert len(killed) == 3
+    after = [pid for name in NAMES for pid in service.workers(name)]
+    assert len(after) == 3
+    assert not set(after) & set(killed)
+
+
+def test_a_coordinator_that_is_killed(service: ServiceLab, client: PlanClient) -> None:
+    killed_s = 0.0
+
+    async def ask_and_kill() -> Load:
+        async with AsyncPlanClient(service.access) as tasks_client:
+            load = Load(tasks_client.plan)
+            tasks = [asyncio.create_task(load.ask_in_turn()) for _ in range(12)]
+            await asyncio.sleep(0.7)
+            nonlocal killed_s
+            killed_s = await asyncio.to_thread(service.kill, "c2")
+            await asyncio.sleep(1.0)
+            load.over.set()
+            await asyncio.gather(*tasks)
+        return load
+
+    with Load(client.plan, threads=12) as of_threads:
+        of_tasks = asyncio.run(ask_and_kill())
+    check_load(of_threads, "SIGKILL of a coordinator, threads", killed_s, 5.0)
+    check_load(of_tasks, "SIGKILL of a coordinator, tasks", killed_s, 5.0)
+
+
+def test_an_end_while_requests_are_in_flight(processes: ServiceLab) -> None:
+    processes.revive(least=2)
+    name = max(processes.coordinators)
+
+    def slow() -> dict[str, Any]:
+        return processes.for_one(name, slow_request("", 1.5))
+
+    children = psutil.Process(processes.coordinators[name].pid).children(recursive=True)
+    with (
+        PlanClient(processes.access) as client,
+        Load(client.plan, threads=3, make=slow) as load,
+    ):
+        time.sleep(0.5)
+        load.over.set()
+        took_s = processes.stop(name)
+    # The others have answered: a plan, or that the deadline passed first.
+    print(f"SIGTERM: ended in {took_s:.2f} s; {load.outcomes}")  # noqa: T201
+    assert took_s < 10.0
+    assert len(load.outcomes) == 3
+    assert set(load.outcomes) <= {"feasible", "optimal", "timeout", "DeadlinePassedError"}
+    assert load.outcomes.count("DeadlinePassedError") < 3
+    processes.lab.wait_until(lambda: not any(child.is_running() for child in children), END_S)
