@@ -88,7 +88,9 @@ MAX_QUESTIONS = 4096
 TOO_LONG = bytes(MAX_BYTES + 1)
 """Stands for each question that is too long: nobody looks at it."""
 QUESTION_WAITS_S = 0.02
-"""A question is taken at least so often, however much else there is to do."""
+"""A question is taken at least so often, however much else there is to do,"""
+QUESTION_SHARE = 0.1
+"""unless questions have taken a larger part of the time than this."""
 
 
 def _open(settings: Iterable[Setting]) -> zenoh.Session:
@@ -329,8 +331,8 @@ class _Inbox:
     def __init__(self) -> None:
         self._items: queue.SimpleQueue[_Item | None] = queue.SimpleQueue()
         self._questions: deque[Question] = deque()
-        self._asked_s = 0.0
-        """When a question was last taken."""
+        self._next_question_s = 0.0
+        """When the next question is taken, however much else there is to do."""
 
     def put(self, item: _Item) -> None:
         if isinstance(item, Question):
@@ -346,9 +348,10 @@ class _Inbox:
             if item is not None:
                 yield item
         now_s = time.monotonic()
-        if self._questions and (self._items.empty() or now_s > self._asked_s + QUESTION_WAITS_S):
-            self._asked_s = now_s
+        if self._questions and (self._items.empty() or now_s > self._next_question_s):
             yield self._questions.popleft()
+            took_s = time.monotonic() - now_s
+            self._next_question_s = now_s + max(QUESTION_WAITS_S, took_s / QUESTION_SHARE)
 
 
 def _step(node: Node, inbox: _Inbox) -> None:
