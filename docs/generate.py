@@ -43,6 +43,8 @@ CLOSING = DOCS / "evidence" / "closing.json"
 """What `benchmarks/closing.py` wrote."""
 STREAM = DOCS / "evidence" / "stream.json"
 """What `benchmarks/stream.py` wrote."""
+HOSTS = DOCS / "evidence" / "hosts.json"
+"""What `benchmarks/hosts.py` wrote."""
 EVALUATED = DOCS / "evidence" / "evaluation.json"
 """What `benchmarks/evaluation.py` wrote."""
 CONFLICTS = DOCS / "images" / "conflict-table.png"
@@ -220,6 +222,29 @@ def _metrics() -> str:
     return "\n".join(lines)
 
 
+def _hosts() -> str:
+    """Return the table of what a deployment on several hosts survives."""
+    measured = json.loads(HOSTS.read_text(encoding="utf-8"))
+    calm_s = measured["undisturbed"]["travel_time_s"]
+    lines = [
+        (
+            "| what happens at 40 s | left | on their lane | overlaps | least gap | travel time "
+            "| leader changes | caretakers |"
+        ),
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for run in measured.values():
+        ended = "" if run["ending"] == "complete" and not run["ended_badly"] else ", not complete"
+        time_s = run["travel_time_s"]
+        lines.append(
+            f"| {run['text']} | {run['left']} of {run['demanded']}{ended} "
+            f"| {run['on_lane_percent']:.1f} % | {run['overlaps']} | {run['min_gap_m']:.2f} m "
+            f"| {time_s:.2f} s ({time_s / calm_s:.3f}x) | {run['leader_changes']} "
+            f"| {run['caretakers']} |"
+        )
+    return "\n".join(lines)
+
+
 @cache
 def parts() -> dict[str, str]:
     """Return each generated part by its name."""
@@ -238,6 +263,7 @@ def parts() -> dict[str, str]:
         "stream": _stream(),
         "metrics": _metrics(),
         "rights": rights_table(),
+        "hosts": _hosts(),
         **document_parts(read_evidence(EVALUATED)),
     }
 

@@ -203,3 +203,41 @@ def test_roles_end_while_the_router_is_away(lab: Lab) -> None:
     stop(lab, coordinator, agent)
     lab.finish(router, END_S)
     lab.check_nothing_left()
+
+
+def test_roles_wait_for_their_router(lab: Lab) -> None:
+    config = deployment(lab, free_tcp())
+    text = config.read_text(encoding="utf-8")
+    config.write_text(f"{text}connect_timeout_s = 60.0\n", encoding="utf-8")
+    impatient = lab.path("impatient.toml", f"{text}connect_timeout_s = 0.5\n")
+    coordinator, agent = lab.start("coordinator", "--config", config), _agent(lab, config)
+    # Who has waited for as long as it was told to gives up, in one line.
+    gave_up = lab.finish(_agent(lab, impatient), END_S)
+    assert (gave_up.status, len(gave_up.err.splitlines())) == (2, 2)
+    for process in (coordinator, agent):
+        assert process.stderr is not None
+        assert "waiting for the router" in process.stderr.readline()
+
+    # Who is asked to end meanwhile ends.
+    stop(lab, agent)
+    router = start_router(lab, config)
+    lab.wait_until(lambda: _ask(lab, config, REQUEST).status == 0, END_S)
+
+    stop(lab, coordinator, router)
+    lab.check_nothing_left()
+
+
+def _agent(lab: Lab, config: Path) -> subprocess.Popen[str]:
+    return lab.start("agent", "--config", config)
+
+
+def test_a_coordinator_ends_while_it_compiles(lab: Lab) -> None:
+    cache = lab.folder / "cache"
+    config = deployment(lab, free_tcp())
+    coordinator = lab.start("coordinator", "--config", config, NUMBA_CACHE_DIR=str(cache))
+    lab.wait_until(lambda: next(cache.rglob("*.nbi"), None) is not None, END_S)
+
+    coordinator.terminate()
+
+    assert lab.finish(coordinator, END_S) == Ended(-signal.SIGTERM, "", "")
+    lab.check_nothing_left()

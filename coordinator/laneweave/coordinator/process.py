@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
+from collections.abc import Iterator
 
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.planning import warm_up
@@ -39,10 +41,24 @@ def run_coordinator(
     Raises:
         BadInputError: nobody answers at the scenario's endpoint.
     """
-    warm_up()
+    with _ends_at_once():
+        warm_up()
     workers = scenario.service.workers or max(1, len(os.sched_getaffinity(0)) - 1)
     core = CoordinatorCore(Name(name), Incarnations()(), scenario, workers=workers)
     with contextlib.closing(WorkerPool(workers, warm_up)) as pool:
         if workers_at_once:
             pool.start()
         run_core(wrap(core), access_of(scenario, f"coordinator.{name}"), pool, observe)
+
+
+@contextlib.contextmanager
+def _ends_at_once() -> Iterator[None]:
+    """Have SIGTERM end the process, which has nothing to complete yet.
+
+    Compilers call back: an exception that a handler raises in there is printed and forgotten.
+    """
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -44,16 +44,36 @@ def init(
         typer.Option("--vehicle", metavar="NAME", help="A vehicle with a process of its own."),
     ] = None,
     force: Force = False,
+    keep: Annotated[
+        bool, typer.Option("--keep", help="Leave what is there, and make what is missing.")
+    ] = False,
 ) -> None:
     """Make a test authority, and a certificate for each process of a deployment."""
-    from laneweave.launch.authority import CA_DAYS, host_names, issue, make_authority
+    from laneweave.launch.authority import (
+        CA_DAYS,
+        host_names,
+        issue,
+        load_authority,
+        make_authority,
+    )
+    from laneweave.protocol.access import ca_path, certificate_path
 
     _check_days(days)
+    if keep and force:
+        raise BadInputError("--keep", "true", "not with --force")
     settings = load_scenario(config)
     identities = list(dict.fromkeys(_wanted(settings, client or [], vehicle or [])))
     hosts = [*(host or ()), *_hosts(settings)]
     host_names(hosts)  # before anything is written
-    authority = make_authority(folder, days=max(CA_DAYS, days), replace=force)
+    if keep and ca_path(folder).exists():
+        authority = load_authority(folder)
+        identities = [
+            identity
+            for identity in identities
+            if not certificate_path(folder, identity.common_name).exists()
+        ]
+    else:
+        authority = make_authority(folder, days=max(CA_DAYS, days), replace=force)
     for identity in identities:
         issue(authority, folder, identity, days=days, hosts=hosts, replace=force)
     typer.echo(f"{folder}: a test authority and {len(identities)} certificates:")

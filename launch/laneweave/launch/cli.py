@@ -50,6 +50,7 @@ MISSING_SIM = "the simulation packages: install laneweave[sim]"
 MISSING_WATCH = "the web server: install laneweave[watch]"
 MISSING = {
     "distributed": "Dask: install laneweave[dask]",
+    "osqp": "the solver of agents: install laneweave[agent]",
     "cryptography": "what makes certificates: install laneweave[certs]",
     "prometheus_client": "the package for metrics: install laneweave[metrics]",
     "starlette": MISSING_WATCH,

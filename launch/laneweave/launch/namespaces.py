@@ -1,9 +1,10 @@
 """Groups of processes in network namespaces of their own, so that partitions are real ones.
 
-The namespaces form a star. The router lives in the hub, each group is joined to it by one pair of
-virtual Ethernet devices (veth), and taking the hub's end down cuts the group off: its packets
-vanish, its connections run into their leases, and it sees everybody else's tokens go. The
-supervisor talks to the router through a Unix socket, which no namespace concerns.
+The namespaces form a star. The router lives in the hub, which has one address for all; each group
+is joined to it by one pair of virtual Ethernet devices (veth), and taking the hub's end down cuts
+the group off: its packets vanish, its connections run into their leases, and it sees everybody
+else's tokens go. The supervisor of a run talks to the router through a Unix socket, which no
+namespace concerns.
 
 Each namespace is held by a process of the run and has no name. The kernel removes it, with its
 devices and addresses, when the last process in it has ended, however the run ends: nothing outside
@@ -26,6 +27,8 @@ from pathlib import Path
 from attrs import define, field
 
 PORT = 7447
+HUB_ADDRESS = "10.77.255.1"
+"""Of the hub, whichever link leads there: all groups can read the same configuration."""
 ANSWER_S = 10.0
 """How long a namespace may take to be made, or a command in it to be done."""
 HUB = "hub"
@@ -153,6 +156,7 @@ class GroupNetwork:
                 namespace = self._namespaces[name] = _Namespace.make(self.context, name)
                 namespace.check_answer()
                 namespace.ip("link", "set", "lo", "up")
+            self._namespaces[HUB].ip("addr", "add", f"{HUB_ADDRESS}/32", "dev", "lo")
             for group in self.groups:
                 self._link(group)
         except NamespacesUnavailableError:
@@ -166,6 +170,7 @@ class GroupNetwork:
         for namespace, device, last in ((hub, group, 1), (leaf, _UPLINK, 2)):
             namespace.ip("addr", "add", f"{self._network(group)}.{last}/30", "dev", device)
             namespace.ip("link", "set", "dev", device, "up")
+        leaf.ip("route", "add", "default", "via", f"{self._network(group)}.1")
 
     def _network(self, group: str) -> str:
         """Return the first three parts of the addresses of a group's link."""
@@ -180,9 +185,10 @@ class GroupNetwork:
         """Zenoh endpoint at which the router listens to the groups."""
         return f"tcp/0.0.0.0:{PORT}"
 
-    def endpoint(self, group: str) -> str:
-        """Return the Zenoh endpoint of the router, as a group sees it."""
-        return f"tcp/{self._network(group)}.1:{PORT}"
+    @property
+    def endpoint(self) -> str:
+        """Zenoh endpoint of the router, as every group sees it."""
+        return f"tcp/{HUB_ADDRESS}:{PORT}"
 
     def cut_off(self, groups: Collection[str]) -> set[str]:
         """Take exactly these groups' links down, and return those of which that is news.

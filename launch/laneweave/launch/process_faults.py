@@ -74,7 +74,7 @@ class ProcessFaults:
             group = _GROUP_OF_SENDER[sender]
             if network is not None and group in network.groups:
                 options["namespace"] = network.process_id(group)
-                tables["network"] = tables["network"] | {"endpoint": network.endpoint(group)}
+                tables["network"] = tables["network"] | {"endpoint": network.endpoint}
             options["faults"] = self._message_faults(order, sender)
         return tables, options
 

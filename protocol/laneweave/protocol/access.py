@@ -46,6 +46,8 @@ class Access:
     """None: the network is not secured."""
     identity: str = ""
     """The process's name in its certificate."""
+    connect_timeout_s: float = 0.0
+    """How long a role tries to connect; 0: once."""
 
 
 def access_of(
@@ -68,6 +70,7 @@ def access_of(
         network.lease_s,
         credentials_of(scenario, identity, environment),
         identity,
+        network.connect_timeout_s,
     )
 
 

@@ -29,6 +29,9 @@ class Network:
     """Where the router listens; empty: at `endpoint`."""
     lease_s: float = field(default=1.0, validator=within(0.1, 60.0))
     """A silent session is given up after this time (Zenoh's transport lease)."""
+    connect_timeout_s: float = field(default=0.0, validator=within(0.0, 86_400.0))
+    """How long a role tries to connect before it gives up: whoever starts the roles need not start
+    the router first. 0: once."""
     heartbeat_s: float = field(default=0.1, validator=within(0.01, 10.0))
     election_s: float = field(default=0.7, validator=within(0.05, 60.0))
     """A candidate leads when it has been the best-ranked one for this long. A process that dies is

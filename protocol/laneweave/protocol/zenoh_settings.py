@@ -13,6 +13,9 @@ from laneweave.protocol.access import Access, Credentials
 from laneweave.protocol.access_rules import RouterGuard
 
 DROP_AFTER_US = 50
+OPEN_MS = 2000
+"""How long one attempt to connect may take. Over a link that is cut, packets vanish: an attempt
+that goes on for long is still waiting when the link is back."""
 Setting = tuple[str, Any]
 
 
@@ -47,6 +50,7 @@ def _common_settings(mode: str, lease_s: float) -> Iterator[Setting]:
     yield "scouting/multicast/enabled", False
     yield "scouting/gossip/enabled", False
     yield "transport/link/tx/lease", int(lease_s * 1000)
+    yield "transport/unicast/open_timeout", OPEN_MS
     yield "transport/shared_memory/enabled", False
     # A client that hangs fills its buffers. Whoever waits for room in them waits for less than
     # a lease, or everybody would give everybody up; who may drop, drops at once.

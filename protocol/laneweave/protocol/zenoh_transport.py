@@ -91,6 +91,8 @@ QUESTION_WAITS_S = 0.02
 """A question is taken at least so often, however much else there is to do,"""
 QUESTION_SHARE = 0.1
 """unless questions have taken a larger part of the time than this."""
+CONNECT_AGAIN_S = 0.5
+"""Between two attempts of a role that waits for its router."""
 
 
 def _open(settings: Iterable[Setting]) -> zenoh.Session:
@@ -294,11 +296,11 @@ def run_core(
     of node and core come from.
 
     Raises:
-        BadInputError: the realm is malformed or nobody answers at the endpoint.
+        BadInputError: the realm is malformed, or nobody has answered at the endpoint for
+            `connect_timeout_s`.
     """
     keys = Keys(access.realm)
     inbox = _Inbox()
-    transport = ZenohTransport(access, inbox.put)
     worker = _Worker(inbox.put)
 
     def order(job: Compute | Delegate) -> None:
@@ -309,9 +311,13 @@ def run_core(
         else:
             inbox.put(Computed(job.job, None, "this process has no workers"))
 
-    node = Node(core, transport, keys, order, Name(f"{os.getpid()}-{time.time_ns()}"))
-    observe(looking(inbox.put))
     with _stop_signals(lambda: inbox.put(Stopping())):
+        # Nothing else can be in there before: nobody is connected.
+        transport = connect(access, inbox.put, lambda wait_s: any(inbox.take(wait_s)))
+        if transport is None:
+            return
+        node = Node(core, transport, keys, order, Name(f"{os.getpid()}-{time.time_ns()}"))
+        observe(looking(inbox.put))
         try:
             node.dispatch(Started(), time.monotonic())
             while not node.ended:
@@ -352,6 +358,38 @@ class _Inbox:
             yield self._questions.popleft()
             took_s = time.monotonic() - now_s
             self._next_question_s = now_s + max(QUESTION_WAITS_S, took_s / QUESTION_SHARE)
+
+
+def connect(
+    access: Access, deliver: Deliver, stopped: Callable[[float], object] = time.sleep
+) -> ZenohTransport | None:
+    """Connect to a router, however late it comes: for `connect_timeout_s`.
+
+    Args:
+        access: where the router is, and as whom to get there.
+        deliver: see `ZenohTransport`.
+        stopped: waits for so many seconds and tells whether the process was asked to end.
+
+    Returns:
+        The session; None: the process was asked to end meanwhile.
+
+    Raises:
+        BadInputError: the endpoint is malformed, or nobody has answered there in time.
+    """
+    check_endpoint(access.endpoint)
+    give_up_s = time.monotonic() + access.connect_timeout_s
+    waiting = False
+    while True:
+        try:
+            return ZenohTransport(access, deliver)
+        except BadInputError as error:
+            if error.field != "network.endpoint" or time.monotonic() >= give_up_s:
+                raise
+        if not waiting:
+            waiting = True
+            log.warning("waiting for the router", endpoint=access.endpoint)
+        if stopped(CONNECT_AGAIN_S):
+            return None
 
 
 def _step(node: Node, inbox: _Inbox) -> None:

@@ -118,7 +118,7 @@ def test_with_namespaces_groups_find_the_router_over_their_link(tmp_path: Path) 
 
     assert (router["namespace"], router["listen"]) == (11, ("tcp/0.0.0.0:7447",))
     assert coordinator["namespace"] == 12
-    assert tables["network"]["endpoint"] == "tcp/10.77.0.1:7447"
+    assert tables["network"]["endpoint"] == "tcp/10.77.255.1:7447"
     assert "namespace" not in bridge
     assert bridge_tables == to_tables(Scenario())
     # The pair cannot be cut by a link: its rules are there, the other partition's are not.

@@ -1,0 +1,174 @@
+"""What a deployment on several hosts survives: the table of docs/FAULTS.md, "On several hosts".
+
+    python benchmarks/hosts.py [--only NAME ...] [--short] [--pace P] [--out FOLDER]
+
+Each experiment is one run of the deployment of compose.yaml, as processes on hosts that are network
+namespaces (tests/system/hosts.py): a link is cut, or a service is killed and started again by the
+same command. Roles start before their router. Figures are read from the run's folder and written to
+FOLDER/hosts.json. Experiments that are there already are kept, unless `--only` names them. The exit
+status is 1 if two vehicles touched or a run did not come to its end. It takes the right to make
+network namespaces. `--short`: vehicles arrive for 20 s instead of 90 s.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import signal
+import statistics
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+from attrs import frozen
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+from system.hosts import Hosts, compose, lasts, open_hosts
+
+LONGEST_S = 600.0
+"""No run takes as long, in wall-clock seconds."""
+DURATION_S, SHORT_S = 90.0, 20.0
+"""For how long vehicles arrive."""
+BEGIN_S = 40.0
+"""Road time of the fault: vehicles enter, sort themselves, and none has left yet."""
+AWAY_S = 3.0
+"""Wall-clock time until a service that was killed is started again."""
+SERVICES = tuple(name for name, service in compose()["services"].items() if lasts(service))
+
+
+@frozen
+class Experiment:
+    """One run."""
+
+    name: str
+    text: str
+    """What happens, for the table."""
+    disturb: Callable[[Hosts], None]
+
+
+def nothing(_: Hosts) -> None:
+    """Leave the deployment alone."""
+
+
+def cut(host: str, for_s: float) -> Experiment:
+    """Return an experiment that cuts a host's link."""
+
+    def disturb(hosts: Hosts) -> None:
+        hosts.partition(host, for_s)
+
+    return Experiment(
+        f"{host}-cut-{for_s:g}-s", f"link of the {host} host cut for {for_s:g} s", disturb
+    )
+
+
+def killed(name: str) -> Experiment:
+    """Return an experiment that kills a service and starts it again."""
+
+    def disturb(hosts: Hosts) -> None:
+        hosts.kill(name)
+        time.sleep(AWAY_S)
+        hosts.start(name)
+
+    return Experiment(
+        f"{name}-killed", f"{name} killed, and started again after {AWAY_S:g} s", disturb
+    )
+
+
+EXPERIMENTS = (
+    Experiment("undisturbed", "nothing", nothing),
+    *(
+        cut(host, for_s)
+        for for_s in (5.0, 30.0)
+        for host in ("vehicles", "coordinators", "simulation")
+    ),
+    *(killed(name) for name in SERVICES),
+)
+
+
+def run(experiment: Experiment, folder: Path, duration_s: float, pace: float) -> dict[str, Any]:
+    """Run an experiment and return its figures."""
+    folder.mkdir(parents=True)
+    with open_hosts(folder, pace=pace, demand={"duration_s": duration_s}) as hosts:
+        hosts.start_all()
+        hosts.wait_road(BEGIN_S)
+        began = time.monotonic()
+        experiment.disturb(hosts)
+        lasted_s = time.monotonic() - began
+        bridge = hosts.finish("bridge", LONGEST_S)
+        # Whoever still runs goes when it is asked to; -9 and the like are processes that died.
+        statuses = hosts.stop(*[name for name in hosts.running if name != "router"], "router")
+        (*_, last) = hosts.runs
+    found = figures(last)
+    return {
+        "text": experiment.text,
+        "bridge_status": bridge,
+        "ended_badly": sorted(name for name, status in statuses.items() if status != 0),
+        "disturbed_s": round(lasted_s, 1),
+    } | found
+
+
+def figures(folder: Path) -> dict[str, Any]:
+    """Return what a run's folder says about its promises."""
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    trips = pq.read_table(folder / "trips.parquet").to_pylist()
+    times = [trip["travel_time_s"] for trip in trips if trip["left_s"] is not None]
+    events = (folder / "events.jsonl").read_text(encoding="utf-8").splitlines()
+    kinds = Counter(json.loads(line)["kind"] for line in events)
+    vehicles, safety = summary["vehicles"], summary["safety"]
+    return {
+        "ending": summary["ending"],
+        "overlaps": safety["overlaps"],
+        "sumo_collisions": safety["sumo_collisions"],
+        "min_gap_m": safety["min_gap_m"],
+        "demanded": vehicles["demanded"],
+        "left": vehicles["left"],
+        "on_lane_percent": 100.0 * vehicles["on_preferred_lane"] / max(1, vehicles["left"]),
+        "travel_time_s": statistics.fmean(times) if times else None,
+        "leader_changes": summary["failover"]["leader_changes"],
+        "caretakers": kinds["caretaker-took-over"],
+        "real_time_factor": summary["runtime"]["real_time_factor"],
+    }
+
+
+def kept_promises(found: dict[str, Any]) -> bool:
+    """Tell whether nobody touched and everybody arrived."""
+    touched = found["overlaps"] or found["sumo_collisions"]
+    complete = found["ending"] == "complete" and found["left"] == found["demanded"] > 0
+    return complete and not touched and found["bridge_status"] == 0 and not found["ended_badly"]
+
+
+def main() -> int:
+    """Run what is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    names = [experiment.name for experiment in EXPERIMENTS]
+    parser.add_argument("--only", nargs="+", choices=names)
+    parser.add_argument("--short", action="store_true")
+    parser.add_argument("--pace", type=float, default=3.0)
+    parser.add_argument("--out", type=Path, default=Path("runs/hosts"))
+    arguments = parser.parse_args()
+    # Whatever ends this programme, it ends what it has started.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    base: Path = arguments.out
+    base.mkdir(parents=True, exist_ok=True)
+    record = base / "hosts.json"
+    known = json.loads(record.read_text(encoding="utf-8")) if record.exists() else {}
+    chosen = arguments.only or [name for name in names if name not in known]
+    duration_s = SHORT_S if arguments.short else DURATION_S
+    for experiment in EXPERIMENTS:
+        if experiment.name in chosen:
+            folder = base.resolve() / experiment.name
+            shutil.rmtree(folder, ignore_errors=True)
+            known[experiment.name] = run(experiment, folder, duration_s, arguments.pace)
+            ordered = {name: known[name] for name in names if name in known}
+            record.write_text(json.dumps(ordered, indent=1) + "\n", encoding="utf-8")
+            print(experiment.name, json.dumps(known[experiment.name]), flush=True)  # noqa: T201
+    return 0 if all(kept_promises(known[name]) for name in chosen) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
