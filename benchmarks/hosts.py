@@ -1,13 +1,15 @@
 """What a deployment on several hosts survives: the table of docs/FAULTS.md, "On several hosts".
 
-    python benchmarks/hosts.py [--only NAME ...] [--short] [--pace P] [--out FOLDER]
+    python benchmarks/hosts.py [--only NAME ...] [--plain] [--short] [--pace P]
+                               [--out FOLDER]
 
 Each experiment is one run of the deployment of compose.yaml, as processes on hosts that are network
 namespaces (tests/system/hosts.py): a link is cut, or a service is killed and started again by the
 same command. Roles start before their router. Figures are read from the run's folder and written to
 FOLDER/hosts.json. Experiments that are there already are kept, unless `--only` names them. The exit
 status is 1 if two vehicles touched or a run did not come to its end. It takes the right to make
-network namespaces. `--short`: vehicles arrive for 20 s instead of 90 s.
+network namespaces. `--plain`: without certificates, over TCP. `--short`: vehicles arrive for 20 s
+instead of 90 s.
 """
 
 from __future__ import annotations
@@ -90,10 +92,13 @@ EXPERIMENTS = (
 )
 
 
-def run(experiment: Experiment, folder: Path, duration_s: float, pace: float) -> dict[str, Any]:
+def run(
+    experiment: Experiment, folder: Path, duration_s: float, pace: float, *, secured: bool
+) -> dict[str, Any]:
     """Run an experiment and return its figures."""
     folder.mkdir(parents=True)
-    with open_hosts(folder, pace=pace, demand={"duration_s": duration_s}) as hosts:
+    demand = {"duration_s": duration_s}
+    with open_hosts(folder, pace=pace, secured=secured, demand=demand) as hosts:
         hosts.start_all()
         hosts.wait_road(BEGIN_S)
         began = time.monotonic()
@@ -106,6 +111,7 @@ def run(experiment: Experiment, folder: Path, duration_s: float, pace: float) ->
     found = figures(last)
     return {
         "text": experiment.text,
+        "secured": secured,
         "bridge_status": bridge,
         "ended_badly": sorted(name for name, status in statuses.items() if status != 0),
         "disturbed_s": round(lasted_s, 1),
@@ -147,6 +153,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     names = [experiment.name for experiment in EXPERIMENTS]
     parser.add_argument("--only", nargs="+", choices=names)
+    parser.add_argument("--plain", action="store_true")
     parser.add_argument("--short", action="store_true")
     parser.add_argument("--pace", type=float, default=3.0)
     parser.add_argument("--out", type=Path, default=Path("runs/hosts"))
@@ -163,7 +170,9 @@ def main() -> int:
         if experiment.name in chosen:
             folder = base.resolve() / experiment.name
             shutil.rmtree(folder, ignore_errors=True)
-            known[experiment.name] = run(experiment, folder, duration_s, arguments.pace)
+            known[experiment.name] = run(
+                experiment, folder, duration_s, arguments.pace, secured=not arguments.plain
+            )
             ordered = {name: known[name] for name in names if name in known}
             record.write_text(json.dumps(ordered, indent=1) + "\n", encoding="utf-8")
             print(experiment.name, json.dumps(known[experiment.name]), flush=True)  # noqa: T201

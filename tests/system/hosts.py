@@ -32,6 +32,8 @@ from laneweave.launch.namespaces import (
 from laneweave.launch.roles import fork_server
 
 ROOT = Path(__file__).resolve().parents[2]
+CERTIFICATES = "/certs"
+"""Where containers have them."""
 LANEWEAVE = str(Path(sys.executable).with_name("laneweave"))
 LINKS = ("vehicles", "coordinators", "simulation")
 """Hosts beside the hub, each at the end of a link."""
@@ -40,6 +42,7 @@ END_S = 30.0
 READY_S = 90.0
 """How long services may take to be healthy; numba's code may have to be compiled."""
 _HOST_OF = {
+    "certs": HUB,
     "router": HUB,
     "coordinator": "coordinators",
     "agents": "vehicles",
@@ -108,8 +111,6 @@ class Hosts:
 
     def healthy(self, name: str) -> bool:
         """Run a service's health check."""
-        if "healthcheck" not in self.services[name]:
-            return self.running[name].poll() is None
         check = self.services[name]["healthcheck"]["test"]
         assert check[:2] == ["CMD", "laneweave"]
         done = subprocess.run(
@@ -153,7 +154,8 @@ class Hosts:
         return [*enter, "sh", "-c", _ENTER, str(self.folder / "hosts"), *inside]
 
     def _path(self, word: str) -> str:
-        return str(self.folder / "deployment.toml") if word == "/scenarios/compose.toml" else word
+        name = {"/scenarios/compose.toml": "deployment.toml", CERTIFICATES: "certs"}.get(word)
+        return word if name is None else str(self.folder / name)
 
     # --- links --------------------------------------------------------------------------------
 
@@ -198,6 +200,7 @@ def open_hosts(
     folder: Path,
     *,
     pace: float,
+    secured: bool = True,
     environment: Mapping[str, str] | None = None,
     **tables: Mapping[str, object],
 ) -> Iterator[Hosts]:
@@ -206,6 +209,7 @@ def open_hosts(
     Args:
         folder: a new one.
         pace: road seconds per second.
+        secured: with certificates, as compose.yaml does; else anybody may do anything.
         environment: of the services; none: this process's.
         **tables: entries of scenarios/compose.toml that are to be different, by table.
 
@@ -215,19 +219,31 @@ def open_hosts(
     for program in ("nsenter", "unshare", "mount"):
         if shutil.which(program) is None:
             raise NamespacesUnavailableError(f"there is no program `{program}`")
-    (folder / "deployment.toml").write_text(_configuration(tables), encoding="utf-8")
+    text = _configuration(_security(folder, secured=secured) | tables)
+    (folder / "deployment.toml").write_text(text, encoding="utf-8")
     (folder / "hosts").write_text(f"127.0.0.1 localhost\n{HUB_ADDRESS} router\n", encoding="utf-8")
     network = GroupNetwork(fork_server(), LINKS)
     network.open()
     services = compose()["services"]
     hosts = Hosts(folder, network, services, pace, environment or os.environ)
     try:
+        for name in [name for name in services if secured and not lasts(services[name])]:
+            hosts.start(name)
+            if hosts.finish(name, END_S) != 0:
+                raise RuntimeError((folder / f"{name}.log").read_text(encoding="utf-8"))
         yield hosts
     finally:
         for process in hosts.running.values():
             process.kill()
             process.wait(END_S)
         network.close()
+
+
+def _security(folder: Path, *, secured: bool) -> dict[str, Mapping[str, object]]:
+    if secured:
+        return {"security": {"folder": str(folder / "certs")}}
+    addresses = {"endpoint": "tcp/router:7447", "listen": ["tcp/0.0.0.0:7447"]}
+    return {"security": {"mode": "off"}, "network": addresses}
 
 
 def _configuration(changes: Mapping[str, Mapping[str, object]]) -> str:
@@ -242,6 +258,13 @@ def _configuration(changes: Mapping[str, Mapping[str, object]]) -> str:
         if isinstance(table, dict):
             lines += [
                 f"[{name}]",
-                *(f"{key} = {json.dumps(value)}" for key, value in table.items()),
+                *(f"{key} = {_value(value)}" for key, value in table.items()),
             ]
     return "\n".join(lines) + "\n"
+
+
+def _value(value: object) -> str:
+    """Return a value as TOML has it."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {_value(one)}" for key, one in value.items()) + " }"
+    return json.dumps(value)

@@ -91,6 +91,10 @@ QUESTION_WAITS_S = 0.02
 """A question is taken at least so often, however much else there is to do,"""
 QUESTION_SHARE = 0.1
 """unless questions have taken a larger part of the time than this."""
+ROUTER_RUNTIME = "(rx: (worker_threads: 64))"
+"""Zenoh's default are two threads that receive. Each connection that has run into its lease holds
+one of them while it is closed, for up to 10 s (the linger of its socket): with two of them gone,
+nobody's messages go on. So many processes may vanish with a host at one time."""
 CONNECT_AGAIN_S = 0.5
 """Between two attempts of a role that waits for its router."""
 
@@ -485,6 +489,8 @@ def run_router(
     if guard is not None:
         check_credentials(guard.credentials, str(Party.ROUTER), guard.host)
     stop: queue.SimpleQueue[bool] = queue.SimpleQueue()
+    # Read when the first session of a process is opened.
+    os.environ.setdefault("ZENOH_RUNTIME", ROUTER_RUNTIME)
     with _stop_signals(lambda: stop.put(True)):
         try:
             session = _open(router_settings(endpoints, lease_s, guard))

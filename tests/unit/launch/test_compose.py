@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[3]
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "compose.yaml").read_text(encoding="utf-8"))
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
 CONTAINERFILE = (ROOT / "Containerfile").read_text(encoding="utf-8")
-NEEDS = {"agent": "agent", "bridge": "sim"}
+NEEDS = {"agent": "agent", "bridge": "sim", "certs": "certs"}
 """The extra that a role does not run without."""
 WRITABLE = re.compile(r"^[\w.-]+:(?P<target>/[\w/.-]+)$")
 """A named volume that may be written to."""
@@ -139,13 +139,36 @@ def test_the_router_is_found_by_its_service_name_whenever_it_comes() -> None:
     assert network.connect_timeout_s > 10.0
 
 
-def test_every_agent_of_the_fleets_has_one_container() -> None:
-    shards = [
-        parameters(service["command"])["shard"]
+def test_every_fleet_has_one_container_that_looks_at_its_own_health() -> None:
+    fleets = configuration().security.fleets
+    agents = {
+        parameters(service["command"])["fleet"]: service
         for name, service in SERVICES.items()
         if role(name) == "agent"
-    ]
-    assert sorted(shards) == [f"{index}/{len(shards)}" for index in range(len(shards))]
+    }
+    assert agents.keys() == fleets.keys()
+    for fleet, service in agents.items():
+        assert parameters(service["healthcheck"]["test"][2:])["shard"] == fleets[fleet]
+    shards = sorted(str(shard) for shard in fleets.values())
+    assert shards == [f"{index}/{len(shards)}" for index in range(len(shards))]
+
+
+def test_every_coordinator_has_one_container_that_looks_at_its_own_health() -> None:
+    names = []
+    for name, service in SERVICES.items():
+        if role(name) == "coordinator":
+            names.append(parameters(service["command"])["name"])
+            assert parameters(service["healthcheck"]["test"][2:])["name"] == names[-1]
+    assert names == [f"c{number + 1}" for number in range(configuration().runtime.coordinators)]
+
+
+def test_certificates_are_made_by_one_and_read_by_all() -> None:
+    security = configuration().security
+    assert security.mode == "mtls"
+    for name, service in SERVICES.items():
+        (volume,) = [one for one in service["volumes"] if one.startswith("certs:")]
+        rest = "" if role(name) == "certs" else ":ro"
+        assert volume == f"certs:{security.folder}{rest}"
 
 
 def test_the_image_is_made_of_files_that_exist() -> None:
