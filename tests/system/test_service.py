@@ -37,7 +37,6 @@ from system.harness import END_S, Lab
 from system.mutations import ask_all, mutants
 from system.service_lab import LEASE_S, REALM, Load, ServiceLab, request, slow_request
 
-
 QUEUE_LIMIT = 64
 FLAT_MB = 20.0
 KEY = Keys(REALM).key(SERVICE)
