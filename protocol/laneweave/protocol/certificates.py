@@ -13,6 +13,7 @@ import ssl
 import stat
 import time
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -55,8 +56,14 @@ def check_credentials(credentials: Credentials, identity: str, host: str = "") -
     """
     found = examine(credentials, identity, host)
     for warning in found.warnings:
-        log.warning("certificate", identity=identity, warning=warning)
+        _warn(identity, warning)
     return found
+
+
+@cache
+def _warn(identity: str, warning: str) -> None:
+    """Log a warning once, however often somebody tries to connect."""
+    log.warning("certificate", identity=identity, warning=warning)
 
 
 def examine(credentials: Credentials, identity: str, host: str = "") -> Findings:

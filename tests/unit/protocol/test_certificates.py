@@ -7,10 +7,11 @@ from pathlib import Path
 
 import attrs
 import pytest
+import structlog
 
 from laneweave.launch.authority import issue, load_authority, make_authority
 from laneweave.protocol.access import Credentials
-from laneweave.protocol.certificates import examine
+from laneweave.protocol.certificates import check_credentials, examine
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.identities import parse_identity
 
@@ -115,6 +116,11 @@ def test_what_ends_soon_or_lies_open_is_warned_of(folder: Path, tmp_path: Path) 
     first, second = examine(credentials(tmp_path), NAME).warnings
     assert "expires in 3.0 days" in first
     assert "may be read by others" in second
+    # A role that waits for its router asks again and again.
+    with structlog.testing.capture_logs() as logged:
+        for _ in range(3):
+            check_credentials(credentials(tmp_path), NAME)
+    assert len(logged) == 2
 
 
 def test_the_router_is_where_clients_look_for_it(folder: Path) -> None:
