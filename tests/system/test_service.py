@@ -108,11 +108,6 @@ def check_malformed(service: ServiceLab, seed: int, count: int) -> None:
             assert client.plan(valid).status == "optimal"
 
 
-def test_malformed_requests(service: ServiceLab) -> None:
-    check_malformed(service, seed=1, count=2000)
-
-
-@pytest.mark.full
 def test_ten_thousand_malformed_requests(service: ServiceLab) -> None:
     check_malformed(service, seed=100, count=10_000)
 
@@ -302,9 +297,9 @@ def test_a_coordinator_that_hangs(service: ServiceLab, client: PlanClient) -> No
 def test_a_worker_that_is_killed(service: ServiceLab, client: PlanClient) -> None:
     with Load(client.plan, threads=12) as load:
         time.sleep(0.3)
-        killed_s = time.monotonic()
         (killed,) = service.workers("c1")
         os.kill(killed, signal.SIGKILL)
+        killed_s = time.monotonic()
         time.sleep(0.5)
     check_load(load, "SIGKILL of a worker", killed_s, 15.0)
     (after,) = service.workers("c1")

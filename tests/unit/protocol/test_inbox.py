@@ -48,7 +48,8 @@ def test_questions_that_take_long_get_a_small_part_of_the_time() -> None:
     for _ in range(4):
         inbox.put(QUESTION)
     long_s = 0.01
-    begun_s, ended_s = [], []
+    begun_s: list[float] = []
+    ended_s: list[float] = []
     while len(begun_s) < 4:
         inbox.put(MESSAGE)
         inbox.put(MESSAGE)
