@@ -225,9 +225,8 @@ def test_the_answer_is_printed_and_drawn(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    answer = json.dumps(PLAN.to_dict()).encode()
     monkeypatch.setattr(plan_command, "checked_plan", lambda *_, **__: PLAN)
-    monkeypatch.setattr(plan_command, "ask", lambda *_: (answer, True))
+    monkeypatch.setattr(plan_command, "_ask", lambda *_: PLAN)
     arguments = ["plan", str(CASE_STUDY), "--draw", str(tmp_path / "plan.png")]
     arguments += [] if endpoint is None else ["--connect", endpoint]
     assert cli._status(arguments) == 0
