@@ -9,6 +9,7 @@ from laneweave.agents.core import AgentCore
 from laneweave.agents.driver import TrackingDriver
 from laneweave.agents.host import AgentHost
 from laneweave.protocol.access import Access
+from laneweave.protocol.core_runner import run_core
 from laneweave.protocol.faulty_core import Wrap, bare
 from laneweave.protocol.fleets import Shard
 from laneweave.protocol.incarnations import Incarnations
@@ -16,7 +17,6 @@ from laneweave.protocol.messages import Name, Sense
 from laneweave.protocol.motion import cell_state
 from laneweave.protocol.numbers import Observe, unobserved
 from laneweave.protocol.scenario import Scenario
-from laneweave.protocol.zenoh_transport import run_core
 
 
 def warm_up(scenario: Scenario) -> None:

@@ -10,13 +10,13 @@ from collections.abc import Iterator
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.planning import warm_up
 from laneweave.protocol.access import access_of
+from laneweave.protocol.core_runner import run_core
 from laneweave.protocol.faulty_core import Wrap, bare
 from laneweave.protocol.incarnations import Incarnations
 from laneweave.protocol.messages import Name
 from laneweave.protocol.numbers import Observe, unobserved
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.worker_pool import WorkerPool
-from laneweave.protocol.zenoh_transport import run_core
 
 
 def run_coordinator(

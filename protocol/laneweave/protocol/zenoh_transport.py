@@ -11,13 +11,11 @@ import contextlib
 import json
 import os
 import queue
-import signal
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, InvalidStateError
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import structlog
 import zenoh
@@ -29,24 +27,12 @@ from laneweave.protocol.codec import MAX_BYTES
 from laneweave.protocol.endpoints import check_endpoint
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.identities import Party
-from laneweave.protocol.messages import Name
-from laneweave.protocol.node import (
-    Compute,
-    Computed,
-    Core,
-    Delegate,
-    Node,
-    Started,
-    Stopping,
-    Wakeup,
-    run_job,
-)
-from laneweave.protocol.numbers import Look, Observe, RouterNumbers, looking, unobserved
-from laneweave.protocol.topics import Keys, Quality
+from laneweave.protocol.numbers import Observe, RouterNumbers, unobserved
+from laneweave.protocol.processes import stop_signals
+from laneweave.protocol.topics import Quality
 from laneweave.protocol.transport import (
     Answer,
     Deliver,
-    Delivery,
     LinkDown,
     LinkUp,
     Question,
@@ -56,9 +42,6 @@ from laneweave.protocol.transport import (
     learn,
 )
 from laneweave.protocol.zenoh_settings import Setting, client_settings, router_settings
-
-if TYPE_CHECKING:
-    from laneweave.protocol.worker_pool import WorkerPool
 
 log = structlog.get_logger(__name__)
 
@@ -87,10 +70,6 @@ MAX_QUESTIONS = 4096
 """Open questions beyond which more are left to others."""
 TOO_LONG = bytes(MAX_BYTES + 1)
 """Stands for each question that is too long: nobody looks at it."""
-QUESTION_WAITS_S = 0.02
-"""A question is taken at least so often, however much else there is to do,"""
-QUESTION_SHARE = 0.1
-"""unless questions have taken a larger part of the time than this."""
 ROUTER_RUNTIME = "(rx: (worker_threads: 64))"
 """Zenoh's default are two threads that receive. Each connection that has run into its lease holds
 one of them while it is closed, for up to 10 s (the linger of its socket): with two of them gone,
@@ -283,87 +262,6 @@ class ZenohTransport:
         self._deliver(Question(str(query.key_expr), payload, token, encoding))
 
 
-_Item = Delivery | Computed | Look | Stopping
-"""What a process has to do next."""
-
-
-def run_core(
-    core: Core,
-    access: Access,
-    pool: WorkerPool | None = None,
-    observe: Observe = unobserved,
-) -> None:
-    """Drive a core over Zenoh until it ends or the process gets SIGINT or SIGTERM.
-
-    To be called from the main thread. Computations run in a thread of their own, those that are
-    delegated in `pool`, which only a core that delegates needs. `observe` is told where the numbers
-    of node and core come from.
-
-    Raises:
-        BadInputError: the realm is malformed, or nobody has answered at the endpoint for
-            `connect_timeout_s`.
-    """
-    keys = Keys(access.realm)
-    inbox = _Inbox()
-    worker = _Worker(inbox.put)
-
-    def order(job: Compute | Delegate) -> None:
-        if isinstance(job, Compute):
-            worker.order(job)
-        elif pool is not None:
-            pool.order(job, inbox.put)
-        else:
-            inbox.put(Computed(job.job, None, "this process has no workers"))
-
-    with _stop_signals(lambda: inbox.put(Stopping())):
-        # Nothing else can be in there before: nobody is connected.
-        transport = connect(access, inbox.put, lambda wait_s: any(inbox.take(wait_s)))
-        if transport is None:
-            return
-        node = Node(core, transport, keys, order, Name(f"{os.getpid()}-{time.time_ns()}"))
-        observe(looking(inbox.put))
-        try:
-            node.dispatch(Started(), time.monotonic())
-            while not node.ended:
-                _step(node, inbox)
-        finally:
-            transport.close()
-
-
-class _Inbox:
-    """What waits for a node.
-
-    Questions of others wait until there is nothing else to do, or long enough: a flood of them must
-    not keep a leader from leading. `put` may be called from callbacks and signal handlers:
-    `SimpleQueue.put` is reentrant.
-    """
-
-    def __init__(self) -> None:
-        self._items: queue.SimpleQueue[_Item | None] = queue.SimpleQueue()
-        self._questions: deque[Question] = deque()
-        self._next_question_s = 0.0
-        """When the next question is taken, however much else there is to do."""
-
-    def put(self, item: _Item) -> None:
-        if isinstance(item, Question):
-            self._questions.append(item)
-            self._items.put(None)  # wakes who waits
-        else:
-            self._items.put(item)
-
-    def take(self, timeout_s: float) -> Iterator[_Item]:
-        """Yield what is next, after at most this time: nothing, an item, an item and a question."""
-        with contextlib.suppress(queue.Empty):
-            item = self._items.get(timeout=0.0 if self._questions else timeout_s)
-            if item is not None:
-                yield item
-        now_s = time.monotonic()
-        if self._questions and (self._items.empty() or now_s > self._next_question_s):
-            yield self._questions.popleft()
-            took_s = time.monotonic() - now_s
-            self._next_question_s = now_s + max(QUESTION_WAITS_S, took_s / QUESTION_SHARE)
-
-
 def connect(
     access: Access, deliver: Deliver, stopped: Callable[[float], object] = time.sleep
 ) -> ZenohTransport | None:
@@ -396,76 +294,6 @@ def connect(
             return None
 
 
-def _step(node: Node, inbox: _Inbox) -> None:
-    wakeup_s = node.core.wakeup_s
-    timeout_s = 1.0 if wakeup_s is None else min(1.0, max(0.0, wakeup_s - time.monotonic()))
-    for item in inbox.take(timeout_s):
-        _hand_over(node, item)
-    now_s = time.monotonic()
-    wakeup_s = node.core.wakeup_s
-    if wakeup_s is not None and wakeup_s <= now_s:
-        node.dispatch(Wakeup(), now_s)
-        node.handling_s += time.monotonic() - now_s
-
-
-def _hand_over(node: Node, item: _Item) -> None:
-    now_s = time.monotonic()
-    if isinstance(item, Stopping):
-        log.info("stopping")
-        node.dispatch(item, now_s)
-        node.ended = True
-    elif isinstance(item, Look):
-        item.answer(node.numbers())
-    elif isinstance(item, Computed):
-        node.dispatch(item, now_s)
-    else:
-        node.deliver(item, now_s)
-    node.handling_s += time.monotonic() - now_s
-
-
-class _Worker:
-    """A thread that computes.
-
-    Started when first needed, and a daemon: a process that is asked to end does not wait for it.
-    """
-
-    def __init__(self, done: Callable[[Computed], None]) -> None:
-        """Prepare; `done` is called from the thread."""
-        self._done = done
-        self._jobs: queue.SimpleQueue[Compute] | None = None
-
-    def order(self, job: Compute) -> None:
-        """Have a job computed after those that were ordered before it."""
-        if self._jobs is None:
-            self._jobs = queue.SimpleQueue()
-            threading.Thread(target=self._work, args=(self._jobs,), daemon=True).start()
-        self._jobs.put(job)
-
-    def _work(self, jobs: queue.SimpleQueue[Compute]) -> None:
-        while True:
-            self._done(run_job(jobs.get()))
-
-
-@contextlib.contextmanager
-def _stop_signals(stop: Callable[[], None]) -> Iterator[None]:
-    # A handler may interrupt anything, a thread that holds a lock too: `stop` takes none, and
-    # whoever it wakes writes the log.
-    def on_signal(_number: int, _frame: object) -> None:
-        stop()
-
-    before = {
-        number: signal.signal(number, on_signal)
-        for number in (signal.SIGINT, signal.SIGTERM)
-        # What is ignored stays ignored: a supervisor takes Ctrl-C for all its processes.
-        if signal.getsignal(number) is not signal.SIG_IGN
-    }
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
 def run_router(
     listen: Sequence[str],
     lease_s: float,
@@ -491,7 +319,7 @@ def run_router(
     stop: queue.SimpleQueue[bool] = queue.SimpleQueue()
     # Read when the first session of a process is opened.
     os.environ.setdefault("ZENOH_RUNTIME", ROUTER_RUNTIME)
-    with _stop_signals(lambda: stop.put(True)):
+    with stop_signals(lambda: stop.put(True)):
         try:
             session = _open(router_settings(endpoints, lease_s, guard))
         except zenoh.ZError as error:

@@ -7,11 +7,11 @@ import time
 from pathlib import Path
 
 from laneweave.protocol.access import access_of
+from laneweave.protocol.core_runner import run_core
 from laneweave.protocol.faulty_core import Wrap, bare
 from laneweave.protocol.incarnations import Incarnations
 from laneweave.protocol.numbers import Observe, unobserved
 from laneweave.protocol.scenario import Scenario
-from laneweave.protocol.zenoh_transport import run_core
 from laneweave.sim_bridge.core import BridgeCore
 from laneweave.sim_bridge.run_record import Ending, RunRecord
 from laneweave.sim_bridge.sumo_world import SumoWorld

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import time
 
+from laneweave.protocol.inbox import QUESTION_SHARE, QUESTION_WAITS_S, Inbox
 from laneweave.protocol.node import Stopping
 from laneweave.protocol.transport import Question, Received
-from laneweave.protocol.zenoh_transport import QUESTION_SHARE, QUESTION_WAITS_S, _Inbox
 
 MESSAGE = Received("k", b"")
 QUESTION = Question("k", b"", 1)
 
 
 def test_what_came_first_is_taken_first_and_questions_last() -> None:
-    inbox = _Inbox()
+    inbox = Inbox()
     for item in (QUESTION, MESSAGE, Stopping()):
         inbox.put(item)
     taken = list(inbox.take(0.0))
@@ -24,7 +24,7 @@ def test_what_came_first_is_taken_first_and_questions_last() -> None:
 
 
 def test_a_question_is_taken_at_once_when_there_is_nothing_else() -> None:
-    inbox = _Inbox()
+    inbox = Inbox()
     for _ in range(3):
         inbox.put(QUESTION)
     taken = [item for _ in range(6) for item in inbox.take(0.0)]
@@ -32,7 +32,7 @@ def test_a_question_is_taken_at_once_when_there_is_nothing_else() -> None:
 
 
 def test_a_question_is_taken_at_times_whatever_else_there_is() -> None:
-    inbox = _Inbox()
+    inbox = Inbox()
     inbox.put(QUESTION)
     begun_s = time.monotonic()
     taken: list[object] = []
@@ -44,7 +44,7 @@ def test_a_question_is_taken_at_times_whatever_else_there_is() -> None:
 
 
 def test_questions_that_take_long_get_a_small_part_of_the_time() -> None:
-    inbox = _Inbox()
+    inbox = Inbox()
     for _ in range(4):
         inbox.put(QUESTION)
     long_s = 0.01

@@ -15,6 +15,7 @@ from attrs import define, field
 
 from laneweave.protocol.access import Access
 from laneweave.protocol.codec import encode
+from laneweave.protocol.core_runner import run_core
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.messages import Heartbeat, Name
 from laneweave.protocol.node import (
@@ -50,7 +51,7 @@ from laneweave.protocol.transport import (
     TokenUp,
     Transport,
 )
-from laneweave.protocol.zenoh_transport import ZenohTransport, run_core
+from laneweave.protocol.zenoh_transport import ZenohTransport
 
 REALM = "r"
 KEYS = Keys(REALM)
