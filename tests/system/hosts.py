@@ -16,6 +16,7 @@ import sys
 import time
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,7 @@ ROOT = Path(__file__).resolve().parents[2]
 CERTIFICATES = "/certs"
 """Where containers have them."""
 LANEWEAVE = str(Path(sys.executable).with_name("laneweave"))
+PROGRAMS = {"laneweave": LANEWEAVE, "python": sys.executable}
 LINKS = ("vehicles", "coordinators", "simulation")
 """Hosts beside the hub, each at the end of a link."""
 END_S = 30.0
@@ -101,20 +103,19 @@ class Hosts:
                 )
 
     def start_all(self) -> None:
-        """Start everything, the router after those who need it, and the bridge when all is well."""
+        """Start everything, the router after those who need it, the bridge when all is well."""
         names = [name for name, service in self.services.items() if lasts(service)]
-        first = [name for name in names if name not in ("router", "bridge")]
-        self.start(*first)
+        self.start(*(name for name in names if name not in ("router", "bridge")))
         self.start("router")
-        self.wait_healthy("router", *first)
+        self.wait_healthy(*self.services["bridge"]["depends_on"])
         self.start("bridge")
 
     def healthy(self, name: str) -> bool:
         """Run a service's health check."""
-        check = self.services[name]["healthcheck"]["test"]
-        assert check[:2] == ["CMD", "laneweave"]
+        kind, program, *words = self.services[name]["healthcheck"]["test"]
+        assert kind == "CMD"
         done = subprocess.run(
-            self._words(name, [LANEWEAVE, *check[2:]]),
+            self._words(name, [PROGRAMS[program], *words]),
             cwd=self.folder,
             env=dict(self.environment),
             capture_output=True,
@@ -125,8 +126,13 @@ class Hosts:
 
     def wait_healthy(self, *names: str) -> None:
         """Wait until services are healthy."""
-        for name in names:
-            self.wait_until(lambda name=name: self.healthy(name), READY_S)  # type: ignore[misc]
+
+        def wait(name: str) -> None:
+            self.wait_until(lambda: self.healthy(name), READY_S)
+
+        # At the same time: most of a check is the start of an interpreter.
+        with ThreadPoolExecutor() as pool:
+            list(pool.map(wait, names))
 
     def kill(self, *names: str) -> None:
         """Kill services with SIGKILL, all at once."""

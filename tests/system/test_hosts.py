@@ -92,6 +92,7 @@ def test_a_link_is_cut(make_hosts: MakeHosts, link: str) -> None:
 def test_everybody_is_killed_once(make_hosts: MakeHosts) -> None:
     hosts = make_hosts(pace=2.0)
     hosts.start_all()
+    hosts.wait_healthy(*(name for name in hosts.running if name != "bridge"))
     hosts.wait_road(5.0)
     for name in [name for name, service in hosts.services.items() if lasts(service)]:
         if name != "bridge":

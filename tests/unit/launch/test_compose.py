@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[3]
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "compose.yaml").read_text(encoding="utf-8"))
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
 CONTAINERFILE = (ROOT / "Containerfile").read_text(encoding="utf-8")
-NEEDS = {"agent": "agent", "bridge": "sim", "certs": "certs"}
+NEEDS = {"agent": "agent", "bridge": "sim", "certs": "certs", "watch": "watch"}
 """The extra that a role does not run without."""
 WRITABLE = re.compile(r"^[\w.-]+:(?P<target>/[\w/.-]+)$")
 """A named volume that may be written to."""
@@ -36,8 +36,23 @@ def extras(service: str) -> list[str]:
     return text.split(",") if text else []
 
 
+def port_of(service: str) -> str:
+    """Return the port at which the live page is served, for containers and for this host alike."""
+    listen: str = parameters(SERVICES[service]["command"]).get("listen", "")
+    _, _, port = listen.rpartition(":")
+    assert SERVICES[service].get("ports", []) == ([f"127.0.0.1:{port}:{port}"] if port else [])
+    return port
+
+
 def once(service: str) -> bool:
     return SERVICES[service].get("restart") == "no"
+
+
+def check(service: str) -> list[str]:
+    """Return the words of a health check, if it is one of the program's own."""
+    kind, program, *words = SERVICES[service].get("healthcheck", {"test": ["CMD", "none"]})["test"]
+    assert kind == "CMD"
+    return words if program == "laneweave" else []
 
 
 def parameters(words: list[str]) -> dict[str, Any]:
@@ -57,10 +72,7 @@ def configuration() -> Scenario:
 
 @each_service
 def test_commands_exist_and_read_the_one_configuration(service: str) -> None:
-    for words in (
-        SERVICES[service]["command"],
-        SERVICES[service].get("healthcheck", {"test": ["CMD", "laneweave", "ping"]})["test"][2:],
-    ):
+    for words in filter(None, (SERVICES[service]["command"], check(service))):
         config = parameters(words).get("config")
         if config is not None:
             assert (ROOT / config.relative_to("/")).is_file()
@@ -74,7 +86,8 @@ def test_whoever_lasts_shows_its_health_and_is_started_again(service: str) -> No
     found = SERVICES[service]
     # The bridge is done when all vehicles have left.
     assert found["restart"] == ("on-failure:3" if service == "bridge" else "unless-stopped")
-    assert found["healthcheck"]["test"][:2] == ["CMD", "laneweave"]
+    asks_itself = f"127.0.0.1:{port_of(service)}" in found["healthcheck"]["test"][-1]
+    assert asks_itself if service == "watch" else check(service)
 
 
 @each_service

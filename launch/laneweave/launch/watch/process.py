@@ -25,6 +25,7 @@ from laneweave.launch.watch.frames import Film, compact, scene_of
 from laneweave.launch.watch.live_road import TOPICS, LiveRoad
 from laneweave.launch.watch.ring import Ring
 from laneweave.launch.watch.server import Audience, Health, make_app
+from laneweave.protocol import zenoh_transport
 from laneweave.protocol.access import access_of
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.node import Arrived
@@ -105,12 +106,14 @@ def open_socket(listen: str) -> socket.socket:
 
 
 def connect(scenario: Scenario, deliver: Deliver) -> ZenohTransport:
-    """Return a connection to a deployment's router.
+    """Return a connection to a deployment's router, which may come late.
 
     Raises:
         BadInputError: nobody answers there.
     """
-    return ZenohTransport(access_of(scenario, IDENTITY), deliver)
+    transport = zenoh_transport.connect(access_of(scenario, IDENTITY), deliver)
+    assert transport is not None  # noqa: S101 (only who can be stopped while waiting gets none)
+    return transport
 
 
 class _Eye:
