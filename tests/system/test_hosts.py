@@ -29,7 +29,7 @@ def make_hosts(lab: Lab) -> Iterator[MakeHosts]:
     """Make hosts on which nothing runs yet; whatever runs on them at last is ended."""
     with ExitStack() as stack:
 
-        def make(pace: float = 4.0) -> Hosts:
+        def make(pace: float = 6.0) -> Hosts:
             try:
                 return stack.enter_context(
                     open_hosts(
