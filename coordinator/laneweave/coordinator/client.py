@@ -6,6 +6,10 @@
     async with AsyncPlanClient("tcp/127.0.0.1:7447") as client:
         response = await client.plan(request, timeout_s=10.0)
 
+On a network that is described by a file, secured or not, a client is named:
+
+    PlanClient(client_access(Path("deployment.toml"), "dispatch"))
+
 A client may be used by many threads, or tasks, at a time. A request is asked again, under its id,
 when the coordinator that had it dies.
 """
@@ -16,6 +20,7 @@ import asyncio
 import time
 import uuid
 from concurrent.futures import Future
+from pathlib import Path
 from types import TracebackType
 from typing import Self
 
@@ -33,10 +38,13 @@ from laneweave.coordinator.inquiry import (
     ServiceUnavailableError,
 )
 from laneweave.coordinator.planning import PlanRequest, PlanResponse
-from laneweave.protocol.access import Access
+from laneweave.protocol.access import Access, access_of
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.identities import Identity, Party
+from laneweave.protocol.scenario import load_scenario
 from laneweave.protocol.topics import SERVICE, Keys
 from laneweave.protocol.transport import Answer
-from laneweave.protocol.zenoh_transport import ZenohTransport
+from laneweave.protocol.zenoh_transport import connect_patiently
 
 __all__ = [
     "AsyncPlanClient",
@@ -47,11 +55,29 @@ __all__ = [
     "RequestRefusedError",
     "ServiceOverloadedError",
     "ServiceUnavailableError",
+    "client_access",
 ]
 
 DEFAULT_TIMEOUT_S = 10.0
 LONGEST_ATTEMPT_S = 86_400.0
 """Zenoh takes no timeouts of centuries."""
+
+
+def client_access(config: Path, name: str = "plan", endpoint: str | None = None) -> Access:
+    """Return how a client gets onto the network of a deployment, secured or not.
+
+    Args:
+        config: the DEPLOYMENT.toml.
+        name: of the client, whose certificate is `client.NAME` where the deployment is secured.
+        endpoint: of the router; goes before that of the file.
+
+    Raises:
+        BadInputError: the file is not valid, or there is no endpoint.
+    """
+    scenario = load_scenario(config, network__endpoint=endpoint)
+    if not scenario.network.endpoint:
+        raise BadInputError("network.endpoint", "", "an endpoint, in the file or beside it")
+    return access_of(scenario, Identity(Party.CLIENT, name).common_name)
 
 
 class _Connection:
@@ -70,7 +96,7 @@ class _Connection:
         access = Access(access) if isinstance(access, str) else access
         self._patience_s = patience_s
         self._key = Keys(access.realm).key(SERVICE)
-        self._transport = ZenohTransport(access, lambda _: None)
+        self._transport = connect_patiently(access, lambda _: None)
         self._closed = False
 
     def _begin(self, request: PlanRequest, timeout_s: float) -> Inquiry:

@@ -4,26 +4,25 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+import attrs
 
 from laneweave.coordinator.client import (
     PlanClient,
     PlanError,
     RequestRefusedError,
     ServiceUnavailableError,
+    client_access,
 )
 from laneweave.coordinator.inquiry import ABSENT_S
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan
 from laneweave.coordinator.planning.facade import Solver
-from laneweave.protocol.access import Access, access_of
+from laneweave.protocol.access import Access
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
-from laneweave.protocol.identities import Identity, Party
-from laneweave.protocol.scenario import load_scenario
 
-CONNECT_AGAIN_S = 0.2
 MOST_WAIT_S = 3600.0
 ANSWER_MARGIN_S = 5.0
 """A coordinator gets this much longer than the request's deadline."""
@@ -43,10 +42,7 @@ def access_for(endpoint: str | None, realm: str, config: Path | None, client: st
     """
     if config is None:
         return None if endpoint is None else Access(endpoint, realm)
-    scenario = load_scenario(config, network__endpoint=endpoint)
-    if not scenario.network.endpoint:
-        raise BadInputError("network.endpoint", "", "an endpoint, there or with --connect")
-    return access_of(scenario, Identity(Party.CLIENT, client).common_name)
+    return client_access(config, client, endpoint)
 
 
 def answer_request(
@@ -126,22 +122,11 @@ def _read(path: Path) -> dict[str, Any]:
     return data
 
 
-def _connected(access: Access, give_up_s: float) -> PlanClient:
-    """Return a client, as soon as there is a router."""
-    while True:
-        try:
-            return PlanClient(access, max(ABSENT_S, give_up_s - time.monotonic()))
-        except BadInputError:
-            if time.monotonic() > give_up_s:
-                raise
-            time.sleep(CONNECT_AGAIN_S)
-
-
 def _ask(access: Access, request: PlanRequest, wait_s: float) -> PlanResponse:
-    give_up_s = time.monotonic() + wait_s
     timeout_s = request.deadline_s + ANSWER_MARGIN_S + wait_s
+    patient = attrs.evolve(access, connect_timeout_s=max(wait_s, access.connect_timeout_s))
     try:
-        with _connected(access, give_up_s) as client:
+        with PlanClient(patient, max(ABSENT_S, wait_s)) as client:
             return client.plan(request, timeout_s)
     except RequestRefusedError as error:
         raise RefusedError(str(error)) from error

@@ -263,7 +263,7 @@ class ZenohTransport:
 
 
 def connect(
-    access: Access, deliver: Deliver, stopped: Callable[[float], object] = time.sleep
+    access: Access, deliver: Deliver, stopped: Callable[[float], object]
 ) -> ZenohTransport | None:
     """Connect to a router, however late it comes: for `connect_timeout_s`.
 
@@ -292,6 +292,17 @@ def connect(
             log.warning("waiting for the router", endpoint=access.endpoint)
         if stopped(CONNECT_AGAIN_S):
             return None
+
+
+def connect_patiently(access: Access, deliver: Deliver) -> ZenohTransport:
+    """Connect as `connect` does, for who is not asked to end meanwhile.
+
+    Raises:
+        BadInputError: as `connect`.
+    """
+    transport = connect(access, deliver, time.sleep)
+    assert transport is not None  # noqa: S101 (nobody asks `sleep` to end)
+    return transport
 
 
 def run_router(

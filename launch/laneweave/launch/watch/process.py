@@ -25,14 +25,13 @@ from laneweave.launch.watch.frames import Film, compact, scene_of
 from laneweave.launch.watch.live_road import TOPICS, LiveRoad
 from laneweave.launch.watch.ring import Ring
 from laneweave.launch.watch.server import Audience, Health, make_app
-from laneweave.protocol import zenoh_transport
 from laneweave.protocol.access import access_of
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.node import Arrived
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.topics import Keys
-from laneweave.protocol.transport import Deliver, Delivery
-from laneweave.protocol.zenoh_transport import ZenohTransport
+from laneweave.protocol.transport import Delivery
+from laneweave.protocol.zenoh_transport import connect_patiently
 
 log = structlog.get_logger(__name__)
 
@@ -105,26 +104,19 @@ def open_socket(listen: str) -> socket.socket:
         raise BadInputError("--listen", listen, allowed) from error
 
 
-def connect(scenario: Scenario, deliver: Deliver) -> ZenohTransport:
-    """Return a connection to a deployment's router, which may come late.
-
-    Raises:
-        BadInputError: nobody answers there.
-    """
-    transport = zenoh_transport.connect(access_of(scenario, IDENTITY), deliver)
-    assert transport is not None  # noqa: S101 (only who can be stopped while waiting gets none)
-    return transport
-
-
 class _Eye:
     """Listens to a deployment in a thread of its own and makes frames."""
 
     def __init__(self, scenario: Scenario) -> None:
-        """Connect; see `connect`."""
+        """Connect; the router may come late.
+
+        Raises:
+            BadInputError: nobody answers there.
+        """
         self.audience = Audience()
         self.ring = Ring(scene_of(scenario, "live", scenario.network.realm, STEP_S))
         self._observer = Observer(Keys(scenario.network.realm), topics=TOPICS)
-        self._transport = connect(scenario, self._deliver)
+        self._transport = connect_patiently(access_of(scenario, IDENTITY), self._deliver)
         # Seconds that do not jump when somebody sets the clock.
         self._offset_s = time.time() - time.monotonic()
         self._road = LiveRoad(scenario, self._wall_s())
