@@ -309,6 +309,7 @@ def run_router(
     listen: Sequence[str],
     lease_s: float,
     ready: Callable[[], None] | None = None,
+    told_by: str = "network.endpoint",
     guard: RouterGuard | None = None,
     observe: Observe = unobserved,
 ) -> None:
@@ -318,13 +319,14 @@ def run_router(
         listen: endpoints where it listens. A socket file that a killed router left is replaced.
         lease_s: after this time of silence the others give the router up.
         ready: called when it listens.
+        told_by: the field that says where it listens, for errors.
         guard: who may do what; None: anybody anything.
         observe: is told where its numbers come from, when it listens.
 
     Raises:
         BadInputError: it cannot listen at an endpoint, or its credentials are not in order.
     """
-    endpoints = [check_endpoint(endpoint, "network.listen") for endpoint in listen]
+    endpoints = [check_endpoint(endpoint, told_by) for endpoint in listen]
     if guard is not None:
         check_credentials(guard.credentials, str(Party.ROUTER), guard.host)
     stop: queue.SimpleQueue[bool] = queue.SimpleQueue()
@@ -335,7 +337,7 @@ def run_router(
             session = _open(router_settings(endpoints, lease_s, guard))
         except zenoh.ZError as error:
             raise BadInputError(
-                "network.listen", ", ".join(endpoints), "endpoints that are free to listen at"
+                told_by, ", ".join(endpoints), "endpoints that are free to listen at"
             ) from error
         try:
             observe(lambda: [RouterNumbers(len(session.info.transports()))])
