@@ -81,6 +81,22 @@ def test_an_authority_is_not_replaced_unless_told(run: Cli, tmp_path: Path) -> N
     assert (folder / "ca.pem").read_bytes() != before
 
 
+def test_what_is_missing_is_made_and_what_is_there_kept(run: Cli, config: Path) -> None:
+    folder = config.parent / "certs"
+    init = ("certs", "init", folder, "--config", config)
+    assert run(*init, "--keep")[0] == 0
+    made = {path.name: path.read_bytes() for path in folder.iterdir()}
+    (folder / "bridge.pem").unlink()
+    status, out, errors = run(*init, "--keep")
+    assert (status, errors) == (0, [])
+    assert "1 certificates" in out
+    changed = {path.name for path in folder.iterdir() if path.read_bytes() != made[path.name]}
+    assert changed == {"bridge.pem", "bridge.key"}
+    status, _, errors = run("config", "check", config, "--role", "bridge")
+    assert (status, errors) == (0, [])
+    assert run(*init, "--keep", "--force")[0] == 2
+
+
 def test_one_more_certificate(run: Cli, tmp_path: Path) -> None:
     folder = tmp_path / "certs"
     assert run("certs", "init", folder)[0] == 0
