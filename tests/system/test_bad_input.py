@@ -209,8 +209,8 @@ def test_deadlines_on_the_command_line(lab: Lab) -> None:
     ],
 )
 def test_endpoints_that_cannot_be(lab: Lab, endpoint: str) -> None:
-    for role in ("router", "ping"):
-        assert "network.endpoint" in refused(lab, role, "--endpoint", endpoint)
+    for role, named in (("router", "network.listen"), ("ping", "network.endpoint")):
+        assert f"{named}: got '{endpoint}'" in refused(lab, role, "--endpoint", endpoint)
 
 
 @pytest.mark.parametrize("role", ["coordinator", "agent", "bridge", "ping", "plan"])
