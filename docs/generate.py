@@ -45,6 +45,8 @@ STREAM = DOCS / "evidence" / "stream.json"
 """What `benchmarks/stream.py` wrote."""
 HOSTS = DOCS / "evidence" / "hosts.json"
 """What `benchmarks/hosts.py` wrote."""
+SERVICE = DOCS / "evidence" / "service.json"
+"""What `benchmarks/service.py` wrote."""
 EVALUATED = DOCS / "evidence" / "evaluation.json"
 """What `benchmarks/evaluation.py` wrote."""
 CONFLICTS = DOCS / "images" / "conflict-table.png"
@@ -245,6 +247,57 @@ def _hosts() -> str:
     return "\n".join(lines)
 
 
+def _service() -> str:
+    """Return the tables of what `benchmarks/service.py` measured."""
+    measured = json.loads(SERVICE.read_text(encoding="utf-8"))
+    return "\n\n".join(
+        "\n".join(table)
+        for table in (
+            _service_load(measured["load"]),
+            _service_added(measured["half"]),
+            _service_loss(measured["loss"]),
+        )
+    )
+
+
+def _service_load(runs: list[dict[str, Any]]) -> Iterator[str]:
+    yield "| 200 requests in flight | answered | with two plans | rate | solver's | solving |"
+    yield "|---|---|---|---|---|---|"
+    for run in runs:
+        yield (
+            f"| {run['clients']} clients, {_workers(run)} | {run['answered']} "
+            f"| {run['answered_differently']} | {run['rate_per_s']:.2f} per s "
+            f"| {run['of_solvers_rate']:.2f}x | {100 * run['of_workers_time']:.1f} % |"
+        )
+
+
+def _service_added(runs: list[dict[str, Any]]) -> Iterator[str]:
+    yield "| at half load | requests | solving p50 / p99 | added p50 / p95 / p99 |"
+    yield "|---|---|---|---|"
+    for run in runs:
+        solve, added = run["solve_ms"], run["added_ms"]
+        yield (
+            f"| {run['sizes'][0]} to {run['sizes'][1]} vehicles, {_workers(run)} "
+            f"| {run['requests']} | {solve['p50']:.1f} / {solve['p99']:.1f} ms "
+            f"| {added['p50']:.1f} / {added['p95']:.1f} / {added['p99']:.1f} ms |"
+        )
+
+
+def _service_loss(loss: dict[str, Any]) -> Iterator[str]:
+    beyond = loss["beyond_solving_ms"]
+    yield "| one of three killed | requests | answered | hit | beyond solving p50 / p99 / max |"
+    yield "|---|---|---|---|---|"
+    yield (
+        f"| {loss['killed']} times, {loss['rate_per_s']:.0f} requests per s | {loss['requests']} "
+        f"| {loss['answered']} | {loss['around_the_kills']} "
+        f"| {beyond['p50']:.0f} / {beyond['p99']:.0f} / {beyond['max']:.0f} ms |"
+    )
+
+
+def _workers(run: dict[str, Any]) -> str:
+    return "1 worker" if run["workers"] == 1 else f"{run['workers']} workers"
+
+
 @cache
 def parts() -> dict[str, str]:
     """Return each generated part by its name."""
@@ -260,6 +313,7 @@ def parts() -> dict[str, str]:
         "conflict counts": _conflicts(),
         "geometry": _geometry(),
         "closing": _closing(),
+        "service": _service(),
         "stream": _stream(),
         "metrics": _metrics(),
         "rights": rights_table(),

@@ -5,7 +5,10 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import threading
 from collections.abc import Iterator
+
+import structlog
 
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.planning import warm_up
@@ -17,6 +20,11 @@ from laneweave.protocol.messages import Name
 from laneweave.protocol.numbers import Observe, unobserved
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.worker_pool import WorkerPool
+
+log = structlog.get_logger(__name__)
+
+LONG_S = 8.0
+"""Loading takes a second or two, compiling most of a minute."""
 
 
 def run_coordinator(
@@ -41,7 +49,7 @@ def run_coordinator(
     Raises:
         BadInputError: nobody answers at the scenario's endpoint.
     """
-    with _ends_at_once():
+    with _ends_at_once(), _told_when_long():
         warm_up()
     workers = scenario.service.workers or max(1, len(os.sched_getaffinity(0)) - 1)
     core = CoordinatorCore(Name(name), Incarnations()(), scenario, workers=workers)
@@ -53,12 +61,37 @@ def run_coordinator(
 
 @contextlib.contextmanager
 def _ends_at_once() -> Iterator[None]:
-    """Have SIGTERM end the process, which has nothing to complete yet.
+    """Have SIGTERM end the process with status 0: it has nothing to complete yet.
 
-    Compilers call back: an exception that a handler raises in there is printed and forgotten.
+    Compilers call back: an exception that a handler raises in there is printed and forgotten. So a
+    thread waits for the byte that Python writes where a signal comes.
     """
-    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    handler = signal.signal(signal.SIGTERM, lambda *_: None)
+    descriptor = signal.set_wakeup_fd(writer)
+
+    def wait() -> None:
+        if os.read(reader, 1):
+            os._exit(0)
+        os.close(reader)
+
+    threading.Thread(target=wait, name="end", daemon=True).start()
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        signal.set_wakeup_fd(descriptor)
+        signal.signal(signal.SIGTERM, handler)
+        os.close(writer)  # the thread reads nothing, and ends
+
+
+@contextlib.contextmanager
+def _told_when_long() -> Iterator[None]:
+    """Say so when the planner is not only loaded but compiled."""
+    timer = threading.Timer(LONG_S, log.warning, ("compiling the planner: once, for a minute",))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()

@@ -33,7 +33,7 @@ from laneweave.coordinator.service_format import (
 from laneweave.coordinator.sharing import falls_to
 from laneweave.protocol.deployment import Service
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.node import Decline, Delegate, Effect
+from laneweave.protocol.node import TOO_LATE, Decline, Delegate, Effect
 from laneweave.protocol.numbers import told
 
 HANDED_OUT_AHEAD = 1
@@ -248,7 +248,7 @@ class PlanningService:
     ) -> PlanResponse | Refusal:
         if isinstance(result, PlanResponse):
             return result
-        if now_s >= entry.deadline_s:
+        if error.endswith(TOO_LATE):
             return self._late(entry, now_s)
         self._count("failed_total")
         return Refusal(FAILED, f"planning failed: {error}", "")

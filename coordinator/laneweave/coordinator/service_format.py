@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 from collections.abc import Callable
 from typing import Any, Final
@@ -104,4 +105,6 @@ def format_of(payload: bytes, encoding: str) -> Format:
     for form in (JSON, MSGPACK):
         if kind == form.encoding:
             return form
-    return JSON if payload[:64].lstrip()[:1] == b"{" else MSGPACK
+    # A map in MessagePack begins with a byte that no text in JSON begins with, but for a mark.
+    looks_packed = payload[:1] >= b"\x80" and not payload.startswith(codecs.BOM_UTF8)
+    return MSGPACK if looks_packed else JSON

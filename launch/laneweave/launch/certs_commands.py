@@ -59,6 +59,8 @@ def init(
     from laneweave.protocol.access import ca_path, certificate_path
 
     _check_days(days)
+    if folder == Path():
+        raise BadInputError("DIR", "", "the name of a folder")
     if keep and force:
         raise BadInputError("--keep", "true", "not with --force")
     settings = load_scenario(config)

@@ -215,7 +215,9 @@ def plan(
     connect: Annotated[
         str | None, typer.Option("--connect", metavar="ENDPOINT", help="Ask a coordinator there.")
     ] = None,
-    realm: Annotated[str, typer.Option("--realm", help="Realm of that coordinator.")] = "default",
+    realm: Annotated[
+        str | None, typer.Option("--realm", help="Realm of that coordinator; default: default.")
+    ] = None,
     wait: Annotated[
         float, typer.Option("--wait", help="Seconds to wait for a router and a coordinator there.")
     ] = 0.0,
@@ -224,12 +226,18 @@ def plan(
         typer.Option("--config", metavar="DEPLOYMENT.toml", help="Ask a coordinator of it."),
     ] = None,
     client: Annotated[
-        str, typer.Option("--client", metavar="NAME", help="As whom, where it is secured.")
-    ] = "plan",
+        str | None,
+        typer.Option(
+            "--client", metavar="NAME", help="As whom, where it is secured; default: plan."
+        ),
+    ] = None,
     output: Annotated[OutputFormat, typer.Option("--format")] = OutputFormat.json,
     solver: Annotated[
-        SolverChoice, typer.Option("--solver", help="How to plan here: see docs/PLANNING.md.")
-    ] = SolverChoice.branching,
+        SolverChoice | None,
+        typer.Option(
+            "--solver", help="How to plan here (default: branching); see docs/PLANNING.md."
+        ),
+    ] = None,
     draw: Annotated[
         Path | None,
         typer.Option(
@@ -241,9 +249,19 @@ def plan(
     from laneweave.launch.plan_command import access_for, answer_request
 
     access = access_for(connect, realm, config, client)
-    as_table = output is OutputFormat.table
+    # What would have no effect is a mistake of whoever asks.
+    if access is None and wait:
+        raise BadInputError("--wait", wait, "only with --connect or --config")
+    if access is not None and solver is not None:
+        raise BadInputError("--solver", solver.value, "nothing: a coordinator plans its own way")
     answer_request(
-        request, deadline, access, solver.value, as_table=as_table, drawing=draw, wait_s=wait
+        request,
+        deadline,
+        access,
+        (solver or SolverChoice.branching).value,
+        as_table=output is OutputFormat.table,
+        drawing=draw,
+        wait_s=wait,
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import logging
 import sys
@@ -9,7 +11,7 @@ import threading
 from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO, cast
 
 import structlog
 from structlog.typing import EventDict, Processor
@@ -36,7 +38,7 @@ def log_role(role: str, name: str, form: LogFormat, level: LogLevel | None) -> N
     if form is LogFormat.text:
         log_to_terminal(level or LogLevel.warning)
         return
-    _log_json(lambda *_: structlog.PrintLogger(sys.stderr), role, name, level or LogLevel.info)
+    _log_json(lambda *_: _stderr_logger(), role, name, level or LogLevel.info)
     log = structlog.get_logger(__name__)
 
     def on_failure(kind: type[BaseException], error: BaseException | None, trace: Any) -> None:  # noqa: ANN401 (a traceback)
@@ -60,7 +62,7 @@ def log_to_terminal(level: LogLevel = LogLevel.warning) -> None:
         ],
         wrapper_class=structlog.make_filtering_bound_logger(_number(level)),
         # Whatever stderr is by then.
-        logger_factory=lambda *_: structlog.PrintLogger(sys.stderr),
+        logger_factory=lambda *_: _stderr_logger(),
         cache_logger_on_first_use=False,
     )
 
@@ -84,7 +86,37 @@ def log_to_file(path: Path, role: str, name: str) -> None:
     """Append JSON lines to a file that all processes of a run share."""
     # Unbuffered appends of whole lines do not mix, whoever writes them.
     stream = path.open("a", buffering=1, encoding="utf-8")
-    _log_json(structlog.WriteLoggerFactory(stream), role, name, LogLevel.info)
+    _log_json(lambda *_: structlog.WriteLogger(_patient(stream)), role, name, LogLevel.info)
+
+
+class _Patient(io.TextIOBase):
+    """A stream that loses what cannot be written.
+
+    A full disk, or a collector that has gone, must not end a role that has something to say.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        """Write to `stream`."""
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write, or lose it."""
+        with contextlib.suppress(OSError, ValueError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush, or lose it."""
+        with contextlib.suppress(OSError, ValueError):
+            self._stream.flush()
+
+
+def _patient(stream: TextIO) -> TextIO:
+    return cast("TextIO", _Patient(stream))
+
+
+def _stderr_logger() -> structlog.PrintLogger:
+    return structlog.PrintLogger(_patient(sys.stderr))
 
 
 def _log_json(make_logger: Callable[..., Any], role: str, name: str, level: LogLevel) -> None:

@@ -24,25 +24,37 @@ from laneweave.protocol.access import Access
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
 
 MOST_WAIT_S = 3600.0
-ANSWER_MARGIN_S = 5.0
-"""A coordinator gets this much longer than the request's deadline."""
+ANSWER_MARGIN_S = 8.0
+"""A coordinator gets this much longer than the request's deadline, so that it can tell of a worker
+that hangs (`worker_pool.OVERDUE_S`)."""
 
 
-def access_for(endpoint: str | None, realm: str, config: Path | None, client: str) -> Access | None:
+def access_for(
+    endpoint: str | None, realm: str | None, config: Path | None, client: str | None
+) -> Access | None:
     """Return how to get to a coordinator; None: none is to be asked.
 
     Args:
         endpoint: of the router; goes before that of the configuration.
-        realm: of the coordinators, where there is no configuration.
+        realm: of the coordinators, where there is no configuration; None: the default one.
         config: of the deployment.
-        client: as whom, where the deployment is secured.
+        client: as whom, where the deployment is secured; None: as `plan`.
 
     Raises:
-        BadInputError: the configuration is not valid or names no router.
+        BadInputError: the configuration is not valid or names no router, or something is given
+            that would have no effect.
     """
-    if config is None:
-        return None if endpoint is None else Access(endpoint, realm)
-    return client_access(config, client, endpoint)
+    if config is not None:
+        if realm is not None:
+            raise BadInputError("--realm", realm, "nothing, as --config has network.realm")
+        return client_access(config, client or "plan", endpoint)
+    if client is not None:
+        raise BadInputError("--client", client, "only with --config")
+    if endpoint is not None:
+        return Access(endpoint) if realm is None else Access(endpoint, realm)
+    if realm is not None:
+        raise BadInputError("--realm", realm, "only with --connect")
+    return None
 
 
 def answer_request(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
 import attrs
@@ -128,7 +129,7 @@ def status_of(
     leader = claims[0] if claims else None
     road = _road(tally.road)
     listened_s = now_s - tally.began_s
-    problem = _problem(tally, len(candidates), leader, listened_s)
+    problem = _problem(tally, candidates, leader, listened_s, election_s)
     return Status(
         healthy=problem is None,
         problem=problem,
@@ -167,13 +168,27 @@ def road_problem(tally: Tally, listened_s: float) -> str | None:
 
 
 def _problem(
-    tally: Tally, candidates: int, leader: Candidate | None, listened_s: float
+    tally: Tally,
+    candidates: list[Candidate],
+    leader: Candidate | None,
+    listened_s: float,
+    election_s: float,
 ) -> str | None:
     if not tally.linked:
         return "the connection to the router was lost"
     if leader is None:
-        there = f"{candidates} coordinators are there" if candidates != 1 else "one is there"
-        return f"nobody leads: {there if candidates else 'no coordinator is there'}"
+        count = len(candidates)
+        there = f"{count} coordinators are there" if count != 1 else "one is there"
+        return f"nobody leads: {there if count else 'no coordinator is there'}"
+    # One that was killed is silent, however long its token stays.
+    heard = Counter(
+        one.coordinator
+        for one in candidates
+        if one.heard_s_ago is not None and one.heard_s_ago < election_s
+    )
+    for name, processes in heard.items():
+        if processes > 1:
+            return f"{processes} coordinators are called {name}: names must differ"
     return road_problem(tally, listened_s)
 
 

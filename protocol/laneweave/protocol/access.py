@@ -9,7 +9,7 @@ from pathlib import Path
 from attrs import field, frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.identities import parse_identity
+from laneweave.protocol.identities import identities_of, parse_identity
 from laneweave.protocol.scenario import Scenario
 
 CA_FILE = "LANEWEAVE_CA_FILE"
@@ -17,6 +17,11 @@ CERTIFICATE_FILE = "LANEWEAVE_CERTIFICATE_FILE"
 PRIVATE_KEY_FILE = "LANEWEAVE_PRIVATE_KEY_FILE"
 PRIVATE_KEY = "LANEWEAVE_PRIVATE_KEY"
 """Environment variables that go before the files in `security.folder`."""
+KNOWN_RULE = (
+    "somebody whom this configuration knows: runtime.coordinators, security.fleets, "
+    "security.vehicles, security.clients, security.observers"
+)
+"""Whoever else comes gets a session and may do nothing in it, without a word from anybody."""
 
 
 @frozen
@@ -84,7 +89,10 @@ def credentials_of(
     """
     if scenario.security.mode == "off":
         return None
-    name = parse_identity(identity).common_name
+    known = parse_identity(identity)
+    if known not in set(identities_of(scenario)):
+        raise BadInputError("identity", identity, KNOWN_RULE)
+    name = known.common_name
     folder = Path(scenario.security.folder)
     key_pem, key_file = environment.get(PRIVATE_KEY, ""), environment.get(PRIVATE_KEY_FILE, "")
     if key_pem and key_file:

@@ -34,6 +34,9 @@ from laneweave.protocol.transport import (
 
 log = structlog.get_logger(__name__)
 
+TOO_LATE = "the deadline passed before it began"
+"""Why a delegated computation was not begun."""
+
 
 @frozen
 class Started:
@@ -419,5 +422,5 @@ def in_time(work: Callable[[float], Any], deadline_s: float, now_s: Callable[[],
     """
     left_s = deadline_s - now_s()
     if left_s <= 0:
-        raise TimeoutError("the deadline has passed")
+        raise TimeoutError(TOO_LATE)
     return work(left_s)

@@ -125,7 +125,13 @@ class _Worker:
             if order is None:
                 break
             job, done = order
-            result = self._do(job)
+            try:
+                result = self._do(job)
+            except Exception as error:
+                # Whatever it is, the thread goes on: without it a share of the requests would wait.
+                log.exception("a worker is given up", job=job.job)
+                self._forget()
+                result = Computed(job.job, None, _described(error))
             if not self._ending.is_set():
                 done(result)
                 if self._connection is None:

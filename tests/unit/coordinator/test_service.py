@@ -190,15 +190,18 @@ def test_a_malformed_request_is_refused_with_the_fields_name(
         msgpack.packb({1: 2}),
         b"x" * (SETTINGS.max_request_bytes + 1),
         b"{" + b" " * SETTINGS.max_request_bytes + b"}",
+        b"[]",
+        b"\xef\xbb\xbf[]",
     ],
     ids=[
         "empty", "open brace", "deep", "not UTF-8", "not MessagePack", "deep MessagePack", "list",
-        "text", "number as key", "too long", "too long JSON",
+        "text", "number as key", "too long", "too long JSON", "JSON list", "JSON list after a mark",
     ],
 )  # fmt: skip
 def test_what_is_not_a_map_is_refused(desk: Desk, payload: bytes) -> None:
     reply = desk.replies[desk.ask(payload)]
-    unpack: Unpack = json.loads if payload.lstrip()[:1] == b"{" else msgpack.unpackb
+    packed = payload[:1] >= b"\x80" and payload[:1] != b"\xef"
+    unpack: Unpack = msgpack.unpackb if packed else json.loads
     assert not reply.ok
     assert unpack(reply.payload)["field"]
 
@@ -269,6 +272,15 @@ def test_what_is_being_planned_is_not_dropped_at_its_deadline(desk: Desk) -> Non
     assert token not in desk.replies
     desk.end(done)
     assert desk.answer(token)["status"] == "optimal"
+
+
+def test_a_worker_that_hangs_has_failed_and_is_not_called_late(desk: Desk) -> None:
+    token = desk.ask(REQUEST | {"deadline_s": 5.0})
+    desk.wait(10.1)
+    desk.end(Computed(desk.orders.pop().job, None, "the worker was stopped: it went on too long"))
+    refusal = desk.answer(token)
+    assert refusal["code"] == FAILED
+    assert "went on too long" in refusal["message"]
 
 
 def test_a_failed_computation_is_an_error_reply(desk: Desk) -> None:

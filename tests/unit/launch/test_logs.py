@@ -65,3 +65,24 @@ def test_json_lines() -> None:
 def test_levels(arguments: tuple[str, ...], said: set[str]) -> None:
     err = run(*arguments).stderr
     assert {one for one in ("detail", "begun", "from a thread") if one in err} == said
+
+
+@pytest.mark.parametrize("form", ["text", "json"])
+def test_a_log_that_cannot_be_written_ends_nobody(form: str) -> None:
+    program = """
+import sys, structlog
+from laneweave.launch.logs import LogFormat, log_role
+log_role("coordinator", "c1", LogFormat(sys.argv[1]), None)
+structlog.get_logger().warning("into a full disk")
+print("goes on")
+"""
+    with open("/dev/full", "w", encoding="utf-8") as full:  # noqa: PTH123 (a device)
+        done = subprocess.run(
+            [sys.executable, "-c", program, form],
+            stdout=subprocess.PIPE,
+            stderr=full,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+    assert done.stdout == "goes on\n"

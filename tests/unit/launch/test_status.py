@@ -62,8 +62,10 @@ class Ear:
 
     tally: Tally = field(factory=lambda: Tally(0.0))
 
-    def heartbeat(self, name: str, term: int, now_s: float, *, leading: bool = False) -> None:
-        message = Heartbeat(Name(name), 1, term, leading=leading, formations=2)
+    def heartbeat(
+        self, name: str, term: int, now_s: float, *, leading: bool = False, incarnation: int = 1
+    ) -> None:
+        message = Heartbeat(Name(name), incarnation, term, leading=leading, formations=2)
         self.tally.take(Arrived(HEARTBEAT, {"coordinator": name}, message), now_s)
 
     def coordinator(self, name: str, *, up: bool = True) -> None:
@@ -159,6 +161,18 @@ def test_two_who_claim_to_lead_are_shown(ear: Ear) -> None:
     assert (found.leader, found.term, found.claims) == ("c2", 4, ("c2", "c1"))
     assert found.healthy
     assert not any(one.token for one in found.candidates)
+
+
+def test_two_of_one_name_are_a_problem(ear: Ear) -> None:
+    ear.heartbeat("c1", 3, 1.9, leading=True)
+    ear.heartbeat("c1", 3, 1.9, leading=True, incarnation=2)
+    assert ear.status().problem == "2 coordinators are called c1: names must differ"
+
+
+def test_one_that_was_killed_and_started_again_is_none(ear: Ear) -> None:
+    ear.heartbeat("c1", 3, 0.9)
+    ear.heartbeat("c1", 3, 1.9, leading=True, incarnation=2)
+    assert ear.status().healthy
 
 
 def test_who_is_gone_is_no_candidate(ear: Ear) -> None:

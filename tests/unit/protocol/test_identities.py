@@ -201,5 +201,14 @@ def test_only_identities_have_credentials() -> None:
     assert refusal(lambda: access_of(SECURED, "somebody", {})).field == "identity"
 
 
+@pytest.mark.parametrize("identity", ["coordinator.c9", "client.nobody", "fleet.none"])
+def test_whom_the_configuration_does_not_know_is_refused(identity: str) -> None:
+    # The router would let it in, and let it do nothing.
+    error = refusal(lambda: access_of(SECURED, identity, {}))
+    assert error.field == "identity"
+    assert "security.clients" in str(error)
+    assert access_of(load_scenario(None), identity, {}).credentials is None
+
+
 def test_the_parties_are_the_words_of_the_table_of_topics() -> None:
     assert Identity(Party.VEHICLE, "a").common_name == "vehicle.a"

@@ -113,7 +113,7 @@ def test_a_job_whose_deadline_has_passed_is_not_begun(
     one: Bench, tmp_path: Path, within_s: float
 ) -> None:
     computed = one.do(partial(jobs.note, tmp_path / "begun"), within_s)
-    assert (computed.result, computed.error) == (None, "the deadline has passed")
+    assert (computed.result, computed.error) == (None, "the deadline passed before it began")
     assert not jobs.noted(tmp_path / "begun")
 
 
@@ -122,7 +122,9 @@ def test_a_deadline_that_passes_while_the_job_waits_counts(one: Bench, tmp_path:
     first = one.order(partial(jobs.sleep, 0.2))
     second = one.order(partial(jobs.note, tmp_path / "begun"), within_s=0.1)
     assert one.done.get(timeout=WAIT_S) == Computed(first, 0.2)
-    assert one.done.get(timeout=WAIT_S) == Computed(second, None, "the deadline has passed")
+    assert one.done.get(timeout=WAIT_S) == Computed(
+        second, None, "the deadline passed before it began"
+    )
     assert not jobs.noted(tmp_path / "begun")
 
 
