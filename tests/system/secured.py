@@ -14,7 +14,13 @@ from pathlib import Path
 import zenoh
 from attrs import define, field
 
-from laneweave.protocol.access import Access, access_of
+from laneweave.protocol.access import (
+    Access,
+    Credentials,
+    ca_path,
+    certificate_path,
+    key_path,
+)
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.topics import Keys, Quality, Topic
@@ -125,8 +131,19 @@ class Network:
         member.transport.serve(key)
 
     def access(self, identity: str) -> Access:
-        """Return how somebody gets onto the network."""
-        return access_of(self.scenario, identity, {})
+        """Return how somebody gets onto the network, whether the deployment knows it or not."""
+        network = self.scenario.network
+        return Access(
+            network.endpoint,
+            network.realm,
+            network.lease_s,
+            Credentials(
+                str(ca_path(self.folder)),
+                str(certificate_path(self.folder, identity)),
+                str(key_path(self.folder, identity)),
+            ),
+            identity,
+        )
 
     def close(self) -> None:
         """Close all sessions."""
