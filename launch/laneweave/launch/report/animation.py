@@ -16,9 +16,9 @@ import numpy as np
 import pyarrow.parquet as pq
 from attrs import frozen
 
-from laneweave.launch.colours import SHADE_STRENGTH, SPEED_SPAN_MPS, lane_colours
 from laneweave.launch.report.runs import Run
 from laneweave.launch.report.tracks import Floats, Tracks
+from laneweave.launch.road_scene import road_scene
 
 FORMAT: Final = "laneweave.animation/1"
 KINDS: Final = {"s_m": "<u2", "y_m": "<u2", "speed_mps": "u1"}
@@ -49,20 +49,7 @@ def animation_data(run: Run, tracks: Tracks, title: str) -> dict[str, Any]:
         "step_s": samples.step_s,
         "end_s": round(samples.end_s, 3),
         "start_s": round(_busy_s(run, samples.end_s), 3),
-        "road": {
-            "length_m": road.length_m,
-            "lanes": road.lanes,
-            "lane_width_m": road.lane_width_m,
-            "sorting_start_m": road.sorting_start_m,
-        },
-        "body_m": [scenario.vehicle.length_m, scenario.vehicle.width_m],
-        "lattice": {
-            "speed_mps": scenario.formation.speed_mps,
-            "pitch_m": scenario.formation.gap_m,
-            "block_columns": scenario.formation.block_columns,
-        },
-        "shade": {"span_mps": SPEED_SPAN_MPS, "strength": SHADE_STRENGTH},
-        "colours": list(lane_colours(road.lanes)),
+        **road_scene(scenario),
         "vehicles": samples.vehicles,
         "units": units,
         "columns": {

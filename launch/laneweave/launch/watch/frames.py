@@ -54,7 +54,8 @@ from typing import Any, Final, Protocol
 
 from attrs import frozen
 
-from laneweave.launch.colours import SHADE_STRENGTH, SPEED_SPAN_MPS, lane_colours, lane_names
+from laneweave.launch.colours import lane_names
+from laneweave.launch.road_scene import road_scene
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario import Scenario
 
@@ -117,27 +118,13 @@ class Row:
 
 def scene_of(scenario: Scenario, kind: str, title: str, step_s: float) -> dict[str, Any]:
     """Return the scene of a scenario, without the frames that there are."""
-    road = scenario.road
     return {
         "format": FORMAT,
         "kind": kind,
         "title": title,
         "step_s": step_s,
-        "road": {
-            "length_m": road.length_m,
-            "lanes": road.lanes,
-            "lane_width_m": road.lane_width_m,
-            "sorting_start_m": road.sorting_start_m,
-        },
-        "body_m": [scenario.vehicle.length_m, scenario.vehicle.width_m],
-        "lattice": {
-            "speed_mps": scenario.formation.speed_mps,
-            "pitch_m": scenario.formation.gap_m,
-            "block_columns": scenario.formation.block_columns,
-        },
-        "shade": {"span_mps": SPEED_SPAN_MPS, "strength": SHADE_STRENGTH},
-        "colours": list(lane_colours(road.lanes)),
-        "names": list(lane_names(road.lanes)),
+        **road_scene(scenario),
+        "names": list(lane_names(scenario.road.lanes)),
         "rolling": scenario.formation.rolling,
         "losses": None,
     }
