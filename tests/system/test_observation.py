@@ -70,7 +70,7 @@ def test_status_of_a_deployment(lab: Lab) -> None:
     shards = [lab.start("agent", "--config", config, "--shard", f"{i}/2") for i in range(2)]
     lab.wait_until(lambda: seen(config, RoleHealth(COORDINATOR, "c2")).healthy, END_S)
     lab.wait_until(lambda: seen(config).leader == "c1", END_S)
-    bridge = lab.start("bridge", "--config", config, "--pace", "2", "--out", "out")
+    bridge = lab.start("bridge", "--config", config, "--pace", "5", "--out", "out")
     ended = status(lab, config, "--role", "coordinator", "--name", "c3")
     assert ended == Ended(1, "", "not healthy: coordinator c3 is not there\n")
 
