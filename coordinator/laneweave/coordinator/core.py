@@ -432,8 +432,8 @@ class CoordinatorCore:
 
     def _plan_wakeup(self, now_s: float) -> None:
         times = [self._heartbeat_s, self._report_s, self.election.next_change_s(now_s)]
-        if self.service.wakeup_s is not None:
-            times.append(self.service.wakeup_s)
+        if (service_s := self.service.wakeup_s) is not None:
+            times.append(service_s)
         if not self.election.leading:
             times.append(self.election.started_s + self.election.election_s)
         elif self._stream is not None:

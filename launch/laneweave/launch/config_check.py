@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 
 from attrs import define, field
 
-from laneweave.protocol.access import credentials_of
+from laneweave.protocol.access import KNOWN_RULE, credentials_of
 from laneweave.protocol.access_rules import EVERYWHERE, rules_of
 from laneweave.protocol.certificates import examine
 from laneweave.protocol.endpoints import check_endpoint, host_of
@@ -66,7 +66,7 @@ def _check_network(scenario: Scenario, report: Report) -> None:
     report.facts += [
         ("realm", network.realm),
         ("router at", network.endpoint),
-        ("listens at", ", ".join(network.listen or (network.endpoint,))),
+        ("listens at", ", ".join(network.listens_at)),
         ("given up after", f"{network.lease_s:g} s"),
         ("security", scenario.security.mode),
     ]
@@ -85,8 +85,7 @@ def _check_moves(scenario: Scenario, report: Report) -> None:
 
 
 def _leaves_the_host(scenario: Scenario) -> bool:
-    endpoints = scenario.network.listen or (scenario.network.endpoint,)
-    hosts = [host_of(endpoint) for endpoint in endpoints]
+    hosts = [host_of(endpoint) for endpoint in scenario.network.listens_at]
     return any(host and host not in ("127.0.0.1", "::1", "localhost") for host in hosts)
 
 
@@ -113,9 +112,7 @@ def _check_role(
     if scenario.security.mode == "off":
         return
     if identity not in set(identities_of(scenario)):
-        report.problems.append(
-            str(BadInputError("--name", name, "somebody whom this configuration knows"))
-        )
+        report.problems.append(str(BadInputError("--name", name, KNOWN_RULE)))
         return
     if identity.party is not Party.ROUTER:
         count = sum(len(rule.keys) for rule in rules_of(identity, scenario))

@@ -70,7 +70,7 @@ def router(
     network, guard = settings.network, guard_of(settings)
     with _as_role("router", "router", settings, log_format, log_level) as observe:
         run_router(
-            network.listen or (network.endpoint,),
+            network.listens_at,
             network.lease_s,
             told_by="network.listen" if network.listen else "network.endpoint",
             guard=guard,

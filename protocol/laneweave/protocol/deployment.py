@@ -39,6 +39,11 @@ class Network:
     resend_s: float = field(default=0.2, validator=within(0.01, 10.0))
     """PREPARE and PLAN are sent again after this time without an answer."""
 
+    @property
+    def listens_at(self) -> tuple[str, ...]:
+        """Endpoints at which the router listens."""
+        return self.listen or (self.endpoint,)
+
 
 def _fleets(_: object, attribute: attrs.Attribute[Any], value: Mapping[str, FleetMembers]) -> None:
     for name, members in value.items():
