@@ -33,7 +33,7 @@ from laneweave.coordinator.service_format import (
 from laneweave.coordinator.sharing import falls_to
 from laneweave.protocol.deployment import Service
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.node import TOO_LATE, Decline, Delegate, Effect
+from laneweave.protocol.node import TOO_LATE, Decline, Delegate, Effect, Reply
 from laneweave.protocol.numbers import told
 
 HANDED_OUT_AHEAD = 1
@@ -180,7 +180,7 @@ class PlanningService:
             return
         if kept is not None:
             self._count("repeated_total")
-            yield form.reply(token, PlanResponse.from_dict(MSGPACK.read(kept.answer)))
+            yield Reply(token, form.write(MSGPACK.read(kept.answer)), encoding=form.encoding)
             return
         if len(self._waiting) + len(self._planning) >= self._settings.queue_limit:
             self._count("overloaded_total")

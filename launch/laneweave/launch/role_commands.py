@@ -14,12 +14,13 @@ import structlog
 import typer
 from rich.console import Console
 
+from laneweave.launch.deployments import load_deployment
 from laneweave.launch.logs import LogFormat, LogLevel, log_role
 from laneweave.launch.run_folder import draw_own, new_folder
 from laneweave.protocol.access import access_of
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.numbers import Observe, unobserved
-from laneweave.protocol.scenario import Scenario, load_scenario
+from laneweave.protocol.scenario import Scenario
 
 log = structlog.get_logger(__name__)
 
@@ -66,7 +67,7 @@ def router(
     from laneweave.protocol.access_rules import guard_of
     from laneweave.protocol.zenoh_transport import run_router
 
-    settings = _deployment(config, endpoint, metrics)
+    settings = load_deployment(config, endpoint, observation__metrics=metrics)
     network, guard = settings.network, guard_of(settings)
     with _as_role("router", "router", settings, log_format, log_level) as observe:
         run_router(
@@ -82,7 +83,7 @@ def ping(config: ConfigOption = None, endpoint: RealmEndpoint = None) -> None:
     """Open a session at a router and close it: the health check of a deployment."""
     from laneweave.protocol.zenoh_transport import ZenohTransport
 
-    access = access_of(_deployment(config, endpoint), "observer.ping")
+    access = access_of(load_deployment(config, endpoint), "observer.ping")
     ZenohTransport(access, lambda _: None).close()
 
 
@@ -100,7 +101,7 @@ def coordinator(
 
     if not NAME_PATTERN.fullmatch(name):
         raise BadInputError("--name", name, NAME_RULE)
-    settings = _deployment(config, endpoint, metrics)
+    settings = load_deployment(config, endpoint, observation__metrics=metrics)
     with _as_role("coordinator", name, settings, log_format, log_level) as observe:
         run_coordinator(settings, name, observe=observe, workers_at_once=True)
 
@@ -128,7 +129,7 @@ def agent(
     from laneweave.agents.trajectory import check_moves
     from laneweave.launch.crews import crew_of
 
-    settings = _deployment(config, endpoint, metrics)
+    settings = load_deployment(config, endpoint, observation__metrics=metrics)
     check_moves(settings)
     crew = crew_of(settings.security, vehicles or (), shard, fleet)
     access = access_of(settings, crew.identity)
@@ -152,7 +153,7 @@ def bridge(
     from laneweave.sim_bridge.process import run_bridge
 
     check_pace(pace)
-    settings = _deployment(config, endpoint, metrics)
+    settings = load_deployment(config, endpoint, observation__metrics=metrics)
     with _as_role("bridge", "bridge", settings, log_format, log_level) as observe:
         folder = new_folder(out, settings, METHOD)
         run_bridge(settings, folder, METHOD, pace, observe=observe)
@@ -180,7 +181,7 @@ def watch(
     from laneweave.launch.watch.process import watch_live, watch_recorded
 
     if folder is None:
-        watch_live(_deployment(config, endpoint), listen, typer.echo)
+        watch_live(load_deployment(config, endpoint), listen, typer.echo)
         return
     for option, value in (("--config", config), ("--endpoint", endpoint)):
         if value is not None:
@@ -213,12 +214,3 @@ def _as_role(
 
     with shown_metrics(address, role=role, name=name, realm=network.realm) as observe:
         yield observe
-
-
-def _deployment(config: Path | None, endpoint: str | None, metrics: str | None = None) -> Scenario:
-    settings = load_scenario(config, network__endpoint=endpoint, observation__metrics=metrics)
-    if not settings.network.endpoint:
-        raise BadInputError(
-            "network.endpoint", "", "an endpoint, in the configuration or with --endpoint"
-        )
-    return settings

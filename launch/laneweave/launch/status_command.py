@@ -14,6 +14,7 @@ from attrs import evolve
 from rich.console import Console
 from rich.table import Table
 
+from laneweave.launch.deployments import load_deployment
 from laneweave.launch.observer import Observer
 from laneweave.launch.role_health import AGENT, BRIDGE, COORDINATOR, RoleHealth
 from laneweave.launch.status import Candidate, Status, status_of
@@ -21,7 +22,7 @@ from laneweave.launch.tally import HEARD, TOKENS, Tally
 from laneweave.protocol.access import access_of
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.fleets import parse_shard
-from laneweave.protocol.scenario import Scenario, load_scenario
+from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.topics import NAME_PATTERN, NAME_RULE, Keys
 
 WAIT_S = 0.1
@@ -60,10 +61,7 @@ def status(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Listen to a deployment and tell how it is; status 1: it is not well."""
-    settings = load_scenario(config, network__endpoint=endpoint, network__realm=realm)
-    if not settings.network.endpoint:
-        allowed = "an endpoint, in the configuration or with --endpoint"
-        raise BadInputError("network.endpoint", "", allowed)
+    settings = load_deployment(config, endpoint, network__realm=realm)
     health = _role_health(role, name, shard)
     found = listen(settings, seconds, health)
     if as_json:
