@@ -311,7 +311,7 @@ class Road:
             start_cells=cells,
             moves=moves,
             t0_s=start_s,
-            slot_s=scenario.formation.cycle_s,
+            slot_s=scenario.cycles_s[0],
             territory=tuple(sorted(territory(cells.values(), every))),
         )
 

@@ -20,7 +20,7 @@ from attrs import evolve
 from laneweave.agents.driver import Course, Driver, Effort, TrackingDriver
 from laneweave.protocol.execution import PlanExecution
 from laneweave.protocol.incarnations import above
-from laneweave.protocol.lattice import Move
+from laneweave.protocol.lattice import Move, stretch_of
 from laneweave.protocol.messages import (
     Command,
     Motion,
@@ -57,9 +57,6 @@ from laneweave.protocol.topics import (
 from laneweave.protocol.transitions import RuleBook
 from laneweave.protocol.vehicle_rules import VEHICLE_RULES
 
-OVERDUE_SLOTS = 1.5
-"""A move due for this many slots is reported as overdue."""
-
 
 class AgentCore:
     """State machine of one vehicle's agent; see `Core` for how it is driven."""
@@ -93,13 +90,13 @@ class AgentCore:
         self._rules = rules
         self._formation: int | None = None
         self.wanted_motions: tuple[int, ...] = ()
-        """Formations whose vehicles may come near this one; none while it is not in charge."""
+        """Stretches of columns whose vehicles may come near; none while it is not in charge."""
         self.wanted_states: tuple[int, ...] = ()
         """Formations whose states matter to this vehicle now."""
-        self._near: tuple[int, ...] = ()
-        """Its own formation and the next ones."""
         self._move: Move | None = None
         """The newest move that it has begun."""
+        self._move_ticks = 0
+        """How long that takes."""
         self._sense: Sense | None = None
         self._command: Command | None = None
         self._own = {"vehicle": vehicle}
@@ -207,7 +204,7 @@ class AgentCore:
     def _act(self, sense: Sense, *, in_charge: bool) -> list[Effect]:
         execution = self.execution
         assert execution is not None  # noqa: S101 (met the vehicle)
-        self.wanted_motions = self._near if in_charge else ()
+        self.wanted_motions = _stretches_near(execution.hold_cell[0]) if in_charge else ()
         if in_charge:
             execution.on_joined(sense.joined)
             execution.on_noted(sense.accepted)
@@ -221,6 +218,7 @@ class AgentCore:
             hold_cell=execution.hold_cell,
             motion_end_tick=drive.motion_end_tick,
             motion_origin=drive.motion_origin,
+            motion_ticks=drive.motion_ticks,
             jerks=drive.jerks,
             joined=execution.wanted_joined,
             accepted=execution.wanted_accepted,
@@ -264,7 +262,6 @@ class AgentCore:
     def _meet_vehicle(self, sense: Sense) -> None:
         """V1: take over what the motion controller is doing."""
         self._formation, self._move = sense.formation, None
-        self._near = (sense.formation - 1, sense.formation, sense.formation + 1)
         self._shown_by = {"formation": sense.formation, "vehicle": self.vehicle}
         self._driver.take_over(sense)
         self.execution = PlanExecution(
@@ -272,7 +269,6 @@ class AgentCore:
             incarnation=self._incarnation,
             hold_cell=sense.hold_cell,
             lattice=self._scenario.lattice,
-            overdue_s=OVERDUE_SLOTS * self._scenario.formation.cycle_s,
             joined=sense.joined,
             moving=not self._driver.at_rest(sense),
             rules=self._rules,
@@ -283,14 +279,15 @@ class AgentCore:
         """V5 to V7."""
         if execution.moving and self._move is not None and sense.hold_cell != self._move[2]:
             # The motion controller has not heard of the move, so the body is still at its origin:
-            # a trajectory that began earlier would have run away from it.
-            self._driver.begin(self._move, sense.tick)
+            # a trajectory that began earlier would have run away from it. Its plan may be gone.
+            self._driver.begin(self._move, sense.tick, self._move_ticks)
         if execution.moving and self._driver.at_rest(sense):
             execution.end_motion()
         move = execution.tick(sense.t_s)
-        if move is not None:
+        if move is not None and execution.plan is not None:
             self._move = move
-            self._driver.begin(move, sense.tick)
+            self._move_ticks = self._scenario.move_ticks(execution.plan.slot_s)
+            self._driver.begin(move, sense.tick, self._move_ticks)
 
     # --- what others see ----------------------------------------------------------------------
 
@@ -305,13 +302,14 @@ class AgentCore:
         motion = Motion(
             vehicle=self.vehicle,
             incarnation=self._incarnation,
-            formation=self._formation or 0,
+            stretch=stretch_of(course.origin[0]),
             origin=course.origin,
             target=course.target,
             begin_tick=course.begin_tick,
+            ticks=course.ticks,
             tick=tick,
         )
-        return Send(MOTION, motion, self._shown_by)
+        return Send(MOTION, motion, {"stretch": motion.stretch, "vehicle": self.vehicle})
 
     def leave(self) -> list[Effect]:
         """End: the vehicle is not on the road any more."""
@@ -334,3 +332,8 @@ class AgentCore:
             solve_ms=effort.solve_ms,
         )
         return Send(REPORT, report, {"role": "agent", "name": self.vehicle})
+
+
+def _stretches_near(column: int) -> tuple[int, int, int]:
+    stretch = stretch_of(column)
+    return stretch - 1, stretch, stretch + 1

@@ -33,6 +33,8 @@ class Drive:
     motion_end_tick: int
     """End of the motion under way; 0 when the vehicle holds."""
     motion_origin: Cell
+    motion_ticks: int
+    """How long the move takes; 0: it settles in its cell, or holds."""
     jerks: bytes
     """Little-endian float32 pairs (along, across) in m/s3, one for each tick of the horizon; none
     when there is nothing better than what is being played."""
@@ -45,6 +47,7 @@ class Course:
     origin: Cell
     target: Cell
     begin_tick: int
+    ticks: int
 
 
 @frozen
@@ -63,8 +66,8 @@ class Driver(Protocol):
     def take_over(self, sense: Sense) -> None:
         """Go on with what the motion controller is doing."""
 
-    def begin(self, move: Move, tick: int) -> None:
-        """Begin a move at this tick."""
+    def begin(self, move: Move, tick: int, ticks: int) -> None:
+        """Begin a move at this tick; it takes `ticks` of them."""
 
     def at_rest(self, sense: Sense) -> bool:
         """Tell whether the motion under way has ended."""
@@ -94,6 +97,9 @@ class TrackingDriver:
         self._tracker = make_tracker(scenario)
         self._reference: Reference | None = None
         self._goal: Cell = (0, 0)
+        self._durations = scenario.move_durations
+        self._ticks = 0
+        """How long the newest move takes."""
         self._lattice = scenario.lattice
         self._vehicle = scenario.vehicle
         self._speed_mps = scenario.lattice.speed_mps
@@ -118,18 +124,22 @@ class TrackingDriver:
             self._reference = Reference.settling(
                 scenario, sense.hold_cell, state, sense.tick, sense.motion_end_tick
             )
-        elif sense.motion_end_tick > sense.tick and sense.motion_origin != sense.hold_cell:
-            ticks = round(scenario.formation.move_s / scenario.runtime.tick_s)
+        elif sense.motion_end_tick > sense.tick and sense.motion_ticks in self._durations:
+            self._ticks = sense.motion_ticks
             self._reference = Reference.move(
-                scenario, sense.motion_origin, sense.hold_cell, sense.motion_end_tick - ticks
+                scenario,
+                sense.motion_origin,
+                sense.hold_cell,
+                sense.motion_end_tick - self._ticks,
+                self._ticks,
             )
         else:
             self._reference = Reference.hold(scenario, sense.hold_cell)
 
-    def begin(self, move: Move, tick: int) -> None:
-        """Begin a move at this tick."""
-        self._goal = move[2]
-        self._reference = Reference.move(self._scenario, move[1], move[2], tick)
+    def begin(self, move: Move, tick: int, ticks: int) -> None:
+        """Begin a move at this tick; it takes `ticks` of them."""
+        self._goal, self._ticks = move[2], ticks
+        self._reference = Reference.move(self._scenario, move[1], move[2], tick, ticks)
 
     def at_rest(self, sense: Sense) -> bool:
         """Tell whether the motion's time is over and the body is at its target.
@@ -157,6 +167,7 @@ class TrackingDriver:
             # Past its time but not there yet: still moving, for whoever takes the vehicle over.
             motion_end_tick=max(reference.end_tick, tick + 1) if moving else 0,
             motion_origin=reference.origin,
+            motion_ticks=self._ticks if reference.origin != self._goal else 0,
             jerks=result.jerk.astype(_FLOAT32).tobytes() if result.usable else b"",
         )
 
@@ -167,7 +178,7 @@ class TrackingDriver:
             return None
         if tick >= path.end_tick or (tick - path.start_tick) % REPEAT_TICKS:
             return None
-        return Course(path.origin, self._goal, path.start_tick)
+        return Course(path.origin, self._goal, path.start_tick, self._ticks)
 
     def hear(self, motion: Motion) -> None:
         """Reckon with another vehicle's motion."""

@@ -43,12 +43,12 @@ class AgentHost:
         self._shard = shard
         self._agents: dict[Name, AgentCore] = {name: make_agent(name) for name in vehicles}
         self._seen: set[Name] = set(self._agents)
-        self._formations: dict[Topic, set[int]] = {MOTION: set(), STATE: set()}
-        """Those whose messages of a topic it listens to."""
+        self._heard: dict[Topic, set[int]] = {MOTION: set(), STATE: set()}
+        """Stretches and blocks whose messages it listens to."""
         self._near: list[tuple[int, ...]] = []
-        """Formations whose motions each vehicle wants, when that was looked at last."""
+        """Stretches whose motions each vehicle wants, when that was looked at last."""
         self._awaited: list[tuple[int, ...]] = []
-        """Likewise of states."""
+        """Blocks whose states each vehicle wants."""
         self._census_s = 0.0
         self._bridge = -1
         """Incarnation of the newest bridge."""
@@ -88,7 +88,7 @@ class AgentHost:
             effects = self._on_message(event, now_s)
         else:
             effects = self._on_event(event, now_s)
-            self._listen_to_formations(effects)
+            self._listen_nearby(effects)
         if hosted and not self._agents and self._shard is None:
             effects.append(End())  # last: nothing can be undone on a network that the node has left
         return effects
@@ -121,18 +121,18 @@ class AgentHost:
             for agent in self._agents.values():
                 if message.formation in agent.wanted_states:
                     effects += agent.handle(event, now_s)
-            self._listen_to_formations(effects)
+            self._listen_nearby(effects)
             return effects
         if isinstance(message, Census):
             effects = self._on_census(message, now_s)
-            self._listen_to_formations(effects)
+            self._listen_nearby(effects)
             return effects
         name = event.parameters.get("vehicle")
         return self._hand_on(event, Name(name), now_s) if name in self._agents else []
 
     def _on_motion(self, motion: Motion) -> None:
         for name, agent in self._agents.items():
-            if name != motion.vehicle and motion.formation in agent.wanted_motions:
+            if name != motion.vehicle and motion.stretch in agent.wanted_motions:
                 agent.hear(motion)
 
     def _hand_to_all(self, event: Event, now_s: float) -> list[Effect]:
@@ -171,7 +171,7 @@ class AgentHost:
             self._part_with(name)
         # Not after every message: a host of many would look at all of them for each of them.
         if agent.ended or wanted != (agent.wanted_motions, agent.wanted_states):
-            self._listen_to_formations(effects)
+            self._listen_nearby(effects)
         return effects
 
     def _on_census(self, census: Census, now_s: float) -> list[Effect]:
@@ -194,7 +194,7 @@ class AgentHost:
         self._seen = set(listed)
         return effects
 
-    def _listen_to_formations(self, effects: list[Effect]) -> None:
+    def _listen_nearby(self, effects: list[Effect]) -> None:
         """Subscribe to the motions and states that matter now, and only to those.
 
         States are most of the traffic, and most of the time nobody waits for anybody.
@@ -211,9 +211,10 @@ class AgentHost:
             effects += self._listen(STATE, awaited)
 
     def _listen(self, topic: Topic, numbers: Iterable[Iterable[int]]) -> list[Effect]:
-        before, wanted = self._formations[topic], {one for each in numbers for one in each}
-        self._formations[topic] = wanted
+        before, wanted = self._heard[topic], {one for each in numbers for one in each}
+        self._heard[topic] = wanted
+        where = topic.parameters[0]
         return [
-            *(Unlisten(topic, {"formation": number}) for number in sorted(before - wanted)),
-            *(Listen(topic, {"formation": number}) for number in sorted(wanted - before)),
+            *(Unlisten(topic, {where: number}) for number in sorted(before - wanted)),
+            *(Listen(topic, {where: number}) for number in sorted(wanted - before)),
         ]

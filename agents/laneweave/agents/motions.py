@@ -32,7 +32,9 @@ it this much later."""
 
 @frozen(eq=False)
 class _Kind:
-    """All moves by as many columns and lanes: their trajectory from each tick on."""
+    """All moves by as many columns and lanes in as many ticks: their trajectory from each tick."""
+
+    ticks: int
 
     along_m: list[float]
     """Way along the road so far, relative to the lattice, by tick."""
@@ -46,10 +48,9 @@ class _Kind:
     """Tick from which on it does not touch the lane any more from which it came."""
 
     @classmethod
-    def of(cls, scenario: Scenario, dx: int, dy: int) -> _Kind:
+    def of(cls, scenario: Scenario, dx: int, dy: int, ticks: int) -> _Kind:
         """Lay a kind of move out for a horizon."""
-        n, states = scenario.tracking.horizon_ticks, move_profile(scenario, dx, dy).states
-        ticks = len(states) - 1
+        n, states = scenario.horizon_ticks, move_profile(scenario, dx, dy, ticks).states
         along = np.concatenate([states[:, 0], np.full(n, states[-1, 0])])
         starts = np.arange(ticks)[:, None]
         advance_m = scenario.formation.speed_mps * scenario.runtime.tick_s
@@ -57,6 +58,7 @@ class _Kind:
         aside, half_m = np.abs(states[:, 3]), scenario.road.lane_width_m / 2.0
         # Without a change of lanes it is in both, which are one, all the time.
         return cls(
+            ticks,
             along[:ticks].tolist(),
             (states[:ticks, 1] + scenario.formation.speed_mps).tolist(),
             along[starts + np.arange(n + 1)] - along[starts] + advance_m * np.arange(n + 1),
@@ -90,8 +92,8 @@ class Motions:
         self._pitch_m = formation.gap_m
         self._oblique = formation.mode != 1
         self._advance_m = formation.speed_mps * scenario.runtime.tick_s
-        self._ticks = round(formation.move_s / scenario.runtime.tick_s)
-        self._kinds: dict[tuple[int, int], _Kind] = {}
+        self._durations = scenario.move_durations
+        self._kinds: dict[tuple[int, int, int], _Kind] = {}
         self.heard: dict[Name, _Heard] = {}
         """By vehicle; some may count no more."""
         self._places: list[tuple[float, float, _Heard]] | None = None
@@ -112,11 +114,14 @@ class Motions:
                 return
         (column, lane), (to_column, to_lane) = motion.origin, motion.target
         dx, dy = to_column - column, to_lane - lane
+        ticks = motion.ticks
         if max(abs(dx), abs(dy)) != 1 or (dx and dy and not self._oblique):
             return  # no move of this scenario, whoever said so
-        kind = self._kinds.get((dx, dy))
+        if ticks not in self._durations:
+            return  # likewise
+        kind = self._kinds.get((dx, dy, ticks))
         if kind is None:
-            kind = self._kinds[dx, dy] = _Kind.of(self._scenario, dx, dy)
+            kind = self._kinds[dx, dy, ticks] = _Kind.of(self._scenario, dx, dy, ticks)
         start_m, end_m = column * self._pitch_m, to_column * self._pitch_m
         low_m, high_m = min(start_m, end_m) - NEAR_M, max(start_m, end_m) + NEAR_M
         self.heard[motion.vehicle] = _Heard(motion, kind, motion.tick, start_m, low_m, high_m)
@@ -134,7 +139,7 @@ class Motions:
         gone = [
             name
             for name, heard in self.heard.items()
-            if not -FRESH_TICKS <= tick - heard.motion.begin_tick < self._ticks
+            if not -FRESH_TICKS <= tick - heard.motion.begin_tick < heard.kind.ticks
             or tick > heard.tick + FRESH_TICKS
         ]
         for name in gone:
@@ -142,7 +147,7 @@ class Motions:
         self._places = None
         self._forget_tick = min(
             (
-                min(heard.motion.begin_tick + self._ticks, heard.tick + FRESH_TICKS + 1)
+                min(heard.motion.begin_tick + heard.kind.ticks, heard.tick + FRESH_TICKS + 1)
                 for heard in self.heard.values()
             ),
             default=tick,

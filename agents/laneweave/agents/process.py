@@ -23,9 +23,9 @@ def warm_up(scenario: Scenario) -> None:
     """Plan all moves and drive a tick of one, so that processes forked from this one need not."""
     driver = TrackingDriver(scenario)
     column, lane = cell = (0, 1)
-    for step in product((-1, 0, 1), repeat=2):
-        if step != (0, 0):
-            driver.begin((0, cell, (column + step[0], lane + step[1])), tick=0)
+    for (dx, dy), ticks in product(product((-1, 0, 1), repeat=2), scenario.move_durations):
+        if (dx, dy) != (0, 0) and (scenario.formation.mode == 2 or not (dx and dy)):
+            driver.begin((0, cell, (column + dx, lane + dy)), 0, ticks)
     sense = Sense(
         vehicle=Name("warm-up"),
         tick=0,

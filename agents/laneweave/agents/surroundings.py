@@ -87,7 +87,7 @@ class Surroundings:
         # What this vehicle can gain or lose in the time of prediction, beside its speed.
         self._gain_m = limits.max_accel_mps2 * SENSED_S**2 / 2.0
         self._loss_m = -limits.min_accel_mps2 * SENSED_S**2 / 2.0
-        self._times_s = np.arange(scenario.tracking.horizon_ticks + 1) * scenario.runtime.tick_s
+        self._times_s = np.arange(scenario.horizon_ticks + 1) * scenario.runtime.tick_s
         self._beyond = self._times_s > SENSED_S + 1e-9
 
     def hear(self, motion: Motion) -> None:

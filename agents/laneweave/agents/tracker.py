@@ -124,7 +124,7 @@ class Tracker:
             scenario: horizon, tick, limits.
             fast_path: whether OSQP rests where the solution without rows keeps all of them.
         """
-        n = self._n = scenario.tracking.horizon_ticks
+        n = self._n = scenario.horizon_ticks
         self._tick_s = scenario.runtime.tick_s
         self._axis = axis_matrices(self._tick_s)
         self._limits = scenario.vehicle

@@ -189,9 +189,15 @@ def plan_trajectory(
     return trajectory
 
 
-@lru_cache(maxsize=64)
-def move_profile(scenario: Scenario, dx: int, dy: int) -> Trajectory:
+@lru_cache(maxsize=256)
+def move_profile(scenario: Scenario, dx: int, dy: int, ticks: int | None = None) -> Trajectory:
     """Return the move by `dx` columns and `dy` lanes, from the origin; cached per process.
+
+    Args:
+        scenario: limits, tick, lattice.
+        dx: columns, at most one either way.
+        dy: lanes, likewise.
+        ticks: how long it takes; None: as long as in the scenario's shortest T_F.
 
     Raises:
         InfeasibleTrajectoryError: the move cannot be driven within the limits.
@@ -199,7 +205,8 @@ def move_profile(scenario: Scenario, dx: int, dy: int) -> Trajectory:
     """
     if abs(dx) > 1 or abs(dy) > 1:
         raise ValueError(f"({dx}, {dy}) does not lead to a neighbouring cell")
-    ticks = round(scenario.formation.move_s / scenario.runtime.tick_s)
+    if ticks is None:
+        ticks = scenario.move_ticks(scenario.cycles_s[0])
     along_m, across_m = dx * scenario.formation.gap_m, dy * scenario.road.lane_width_m
     beyond_m = 2.0 * scenario.formation.gap_m - scenario.vehicle.length_m
     return plan_trajectory(
@@ -210,23 +217,26 @@ def move_profile(scenario: Scenario, dx: int, dy: int) -> Trajectory:
 
 
 def check_moves(scenario: Scenario) -> None:
-    """Check that every move of the scenario's mode can be driven within the vehicle's limits.
+    """Check that every move of the scenario can be driven within the vehicle's limits.
+
+    All of them are planned, for every T_F that a plan may have, and stay in the cache.
 
     Raises:
         BadInputError: one cannot.
     """
-    for dx, dy in ((1, 0), (-1, 0), (0, 1), (1, 1), (-1, 1)):
-        if dx and dy and scenario.formation.mode == 1:
-            continue
-        try:
-            move_profile(scenario, dx, dy)
-        except InfeasibleTrajectoryError as error:
-            raise BadInputError(
-                "formation.move_s",
-                scenario.formation.move_s,
-                f"long enough for a move by {dx} columns and {dy} lanes ({error}), or change "
-                + ("formation.gap_m or the table braking" if dx > 0 else "the table vehicle"),
-            ) from error
+    for slot_s in scenario.slots_s:
+        for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1)):
+            if dx and dy and scenario.formation.mode == 1:
+                continue
+            try:
+                move_profile(scenario, dx, dy, scenario.move_ticks(slot_s))
+            except InfeasibleTrajectoryError as error:
+                raise BadInputError(
+                    "formation.move_s",
+                    slot_s - scenario.formation.slack_s,
+                    f"long enough for a move by {dx} columns and {dy} lanes ({error}), or change "
+                    + ("formation.gap_m or the table braking" if dx > 0 else "the table vehicle"),
+                ) from error
 
 
 class Reference:
@@ -243,7 +253,7 @@ class Reference:
         Raises:
             ValueError: legs overlap in time.
         """
-        n = scenario.tracking.horizon_ticks
+        n = scenario.horizon_ticks
         self._horizon = n
         self._advance_m = scenario.formation.speed_mps * scenario.runtime.tick_s
         self.origin = origin
@@ -288,20 +298,38 @@ class Reference:
         return cls(scenario, cell)
 
     @classmethod
-    def move(cls, scenario: Scenario, origin: Cell, target: Cell, start_tick: int) -> Reference:
+    def move(
+        cls,
+        scenario: Scenario,
+        origin: Cell,
+        target: Cell,
+        start_tick: int,
+        ticks: int | None = None,
+    ) -> Reference:
         """Return the reference of one move: `origin`, from `start_tick` on the move, `target`.
+
+        Args:
+            scenario: lattice, tick and horizon.
+            origin: where it begins.
+            target: a neighbouring cell.
+            start_tick: when it begins.
+            ticks: how long it takes; see `move_profile`.
 
         Raises:
             InfeasibleTrajectoryError: the move cannot be driven within the limits.
             ValueError: the cells are not neighbours.
         """
-        return cls.moves(scenario, origin, [(start_tick, target)])
+        return cls.moves(scenario, origin, [(start_tick, target)], ticks)
 
     @classmethod
     def moves(
-        cls, scenario: Scenario, origin: Cell, moves: Sequence[tuple[int, Cell]]
+        cls,
+        scenario: Scenario,
+        origin: Cell,
+        moves: Sequence[tuple[int, Cell]],
+        ticks: int | None = None,
     ) -> Reference:
-        """Return the reference of several moves, each (start tick, target cell).
+        """Return the reference of several moves, each (start tick, target cell), all as long.
 
         Raises:
             InfeasibleTrajectoryError: a move cannot be driven within the limits.
@@ -309,7 +337,7 @@ class Reference:
         """
         legs, cell = [], origin
         for start_tick, target in moves:
-            profile = move_profile(scenario, target[0] - cell[0], target[1] - cell[1])
+            profile = move_profile(scenario, target[0] - cell[0], target[1] - cell[1], ticks)
             offset = (
                 (cell[0] - origin[0]) * scenario.formation.gap_m,
                 0.0,

@@ -24,7 +24,7 @@ def steps_of(plan: Plan) -> int:
     return max((1 + step for moves in plan.moves.values() for step, _, _ in moves), default=0)
 
 
-def kept_apart(plan: Plan, others: Iterable[Plan], move_s: float, most_steps: int) -> Plan:
+def kept_apart(plan: Plan, others: Iterable[Plan], slack_s: float, most_steps: int) -> Plan:
     """Return a plan with pauses, so that none of its moves closes up with one of other plans.
 
     Everybody pauses, so the order of moves stays as it was planned.
@@ -32,12 +32,12 @@ def kept_apart(plan: Plan, others: Iterable[Plan], move_s: float, most_steps: in
     Args:
         plan: the new one.
         others: of neighbouring formations; they stay as they are.
-        move_s: how long a move takes [s].
+        slack_s: how much shorter a move is than the slot of its plan [s].
         most_steps: how many slots there are. What still closes up when they are used up is left to
             the brake: better late than on a wrong lane.
     """
     theirs = [
-        (other.t0_s + step * other.slot_s, (origin, target))
+        (other.t0_s + step * other.slot_s, other.slot_s - slack_s, (origin, target))
         for other in others
         for moves in other.moves.values()
         for step, origin, target in moves
@@ -46,9 +46,10 @@ def kept_apart(plan: Plan, others: Iterable[Plan], move_s: float, most_steps: in
     def closes_up(step: int, move: Move) -> bool:
         begin_s = plan.t0_s + step * plan.slot_s
         return any(
-            abs(begin_s - other_s) < move_s - TIME_TOLERANCE_S
+            begin_s < other_s + other_lasts_s - TIME_TOLERANCE_S
+            and other_s < begin_s + plan.slot_s - slack_s - TIME_TOLERANCE_S
             and _MODEL.kind(move, other) is not None
-            for other_s, other in theirs
+            for other_s, other_lasts_s, other in theirs
         )
 
     while steps_of(plan) < most_steps:

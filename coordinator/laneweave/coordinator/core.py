@@ -8,11 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 import structlog
 
 from laneweave.coordinator.election import Election
-from laneweave.coordinator.formation import (
-    Formation,
-    closed_formations,
-    closing_time_s,
-)
+from laneweave.coordinator.formation import Formation, closed_formations
 from laneweave.coordinator.formation_planner import FormationPlanner, Note
 from laneweave.coordinator.groups import Groups
 from laneweave.coordinator.leader import FormationControl
@@ -293,7 +289,7 @@ class CoordinatorCore:
         issuing = control.phase is Phase.ISSUING
         control.on_state(state, now_s)
         if issuing and control.phase is Phase.WATCHING:
-            closed_s = closing_time_s(group, self.scenario)
+            closed_s = control.formation.closed_s
             yield self._log("plan-in-force", formation=group[0], closed_s=closed_s)
 
     def _on_computed(self, computed: Computed, now_s: float) -> Iterator[Effect]:
@@ -374,7 +370,7 @@ class CoordinatorCore:
         return Send(topic, message, {"vehicle": vehicle})
 
     def _update_members(self, census: Census, now_s: float) -> None:
-        formations = closed_formations(census, self.t_s, self.scenario, self._groups)
+        formations = closed_formations(census, self.scenario, self._groups)
         for number in set(self.controls) - set(formations):
             del self.controls[number]
         for number, formation in formations.items():
@@ -393,7 +389,7 @@ class CoordinatorCore:
             self._rules,
         )
         # A formation that has just closed before this leader's eyes has no plan to be adopted.
-        age_s = self.t_s - closing_time_s(formation.numbers, self.scenario)
+        age_s = self.t_s - formation.closed_s
         watched = now_s >= self._awake_since_s + self.election.election_s
         control.begin(now_s, observe=not watched or age_s > JUST_CLOSED_S)
         return control

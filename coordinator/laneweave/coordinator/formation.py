@@ -1,18 +1,19 @@
-"""Formation building out of the stream of arrivals.
+"""Formations as the census tells of them, and the time that they have on the road.
 
-Vehicles enter in interlaced structure; those whose entry cells lie in the same block of columns
-form a formation (paper, Section 5.2.1: interlaced for driving, parallel after lane sorting). A
-formation is *closed* when its whole block has passed the start of the road: nobody can join it any
-more, so its roster is known from the census.
+The roadside builds formations out of the stream of arrivals and says which blocks of columns are
+whose. A formation is *closed* when nobody can enter in its blocks any more: its roster is known for
+certain from that census on.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 
 from attrs import frozen
 
 from laneweave.coordinator.groups import Groups, Numbers
+from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import Census, CensusEntry, Name
 from laneweave.protocol.scenario import Scenario
 
@@ -22,7 +23,12 @@ class Formation:
     """A closed formation, or joined ones, and the members on the road, in order of their names."""
 
     numbers: Numbers
+    """Of their blocks, ascending."""
     members: tuple[CensusEntry, ...]
+    closed_s: float = 0.0
+    """Road time at which the last of them was closed."""
+    joined: int = 1
+    """How many formations these are."""
 
     @property
     def roster(self) -> tuple[Name, ...]:
@@ -30,53 +36,61 @@ class Formation:
         return tuple(member.vehicle for member in self.members)
 
 
-def closed_formations(
-    census: Census, t_s: float, scenario: Scenario, groups: Groups
-) -> dict[int, Formation]:
-    """Return the formations that are complete and on the road at road time `t_s`.
+def closed_formations(census: Census, scenario: Scenario, groups: Groups) -> dict[int, Formation]:
+    """Return the formations that are complete and on the road.
 
-    The census must be at least as new as the moment at which the block passed; an older one could
-    lack a member, and its formation is left out, together with all that are joined with it.
+    Formations with a block that the census does not know as closed are left out: it could lack a
+    member of theirs.
+
+    Args:
+        census: who is on the road, and which blocks are whose.
+        scenario: the lattice.
+        groups: which blocks plan together; the blocks of each closed formation are added.
 
     Returns:
         Each formation under its least number.
     """
     lattice = scenario.lattice
-    known_s = min(t_s, census.t_s)
+    closed_s: dict[int, list[float]] = {}
+    for closed in census.formations:
+        groups.join(closed.blocks)
+    for closed in census.formations:
+        closed_s.setdefault(groups.of(closed.first_block)[0], []).append(closed.closed_s)
     members: dict[int, list[CensusEntry]] = {}
     for entry in census.on_road:
         first = groups.of(lattice.block_of(entry.cell[0]))[0]
         members.setdefault(first, []).append(entry)
     return {
-        first: Formation(groups.of(first), tuple(sorted(each, key=lambda entry: entry.vehicle)))
+        first: Formation(
+            groups.of(first),
+            tuple(sorted(each, key=lambda entry: entry.vehicle)),
+            max(closed_s.get(first, [0.0])),
+            len(closed_s.get(first, [0.0])),
+        )
         for first, each in sorted(members.items())
-        if closing_time_s(groups.of(first), scenario) < known_s
+        if groups.of(first)[-1] <= census.closed_to
     }
 
 
-def closing_time_s(numbers: Numbers, scenario: Scenario) -> float:
-    """Return the road time from which on nobody can enter the last block any more."""
-    lattice = scenario.lattice
-    passing_s = lattice.passing_time_s(lattice.block_range(numbers[-1])[0])
-    return passing_s + scenario.formation.entry_spread_s
+def start_time_s(cells: Collection[Cell], not_before_s: float, scenario: Scenario) -> float:
+    """Return the road time at which vehicles in these cells may begin to change lanes, on a tick.
 
-
-def start_time_s(numbers: Numbers, not_before_s: float, scenario: Scenario) -> float:
-    """Return the road time at which formations may begin to change lanes, on a tick.
-
-    That is when their rearmost body is in S3, and never before `not_before_s`.
+    That is when the rearmost body is in S3, and never before `not_before_s`.
     """
     lattice, road = scenario.lattice, scenario.road
-    rear_column = lattice.block_range(numbers[-1])[0]
     in_sorting_s = lattice.passing_time_s(
-        rear_column, road.sorting_start_m + scenario.vehicle.length_m
+        min(column for column, _ in cells), road.sorting_start_m + scenario.vehicle.length_m
     )
     tick_s = scenario.runtime.tick_s
     return math.ceil(max(in_sorting_s, not_before_s) / tick_s - 1e-6) * tick_s
 
 
-def steps_left(numbers: Numbers, t_s: float, scenario: Scenario) -> int:
-    """Return how many whole steps fit in before the front column reaches the end of the road."""
-    lattice = scenario.lattice
-    end_s = lattice.passing_time_s(lattice.block_range(numbers[0])[-1], scenario.road.length_m)
-    return max(0, math.floor((end_s - t_s) / scenario.formation.cycle_s + 1e-6))
+def time_left_s(cells: Collection[Cell], t_s: float, scenario: Scenario) -> float:
+    """Return how long it takes from `t_s` until the foremost cell reaches the end of the road."""
+    front = max(column for column, _ in cells)
+    return scenario.lattice.passing_time_s(front, scenario.road.length_m) - t_s
+
+
+def steps_left(cells: Collection[Cell], t_s: float, slot_s: float, scenario: Scenario) -> int:
+    """Return how many whole steps fit in before the foremost cell reaches the end of the road."""
+    return max(0, math.floor(time_left_s(cells, t_s, scenario) / slot_s + 1e-6))

@@ -6,20 +6,20 @@ turned into plans, into failures, or into formations that are joined because one
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from functools import partial
 from typing import Any
 
-from attrs import field, frozen
+from attrs import evolve, field, frozen
 
 from laneweave.coordinator.borders import kept_apart, steps_of
-from laneweave.coordinator.formation import closing_time_s, start_time_s, steps_left
+from laneweave.coordinator.formation import start_time_s, steps_left, time_left_s
 from laneweave.coordinator.groups import Groups, Numbers
 from laneweave.coordinator.leader import FormationControl
 from laneweave.coordinator.leader_rules import Phase
 from laneweave.coordinator.planning import PlanResponse, Weights
 from laneweave.coordinator.sorting import Sorting, SortingTask, sort_lanes
-from laneweave.protocol.lattice import territory
+from laneweave.protocol.lattice import Cell, territory
 from laneweave.protocol.messages import Ballot, Plan
 from laneweave.protocol.node import Compute, Computed
 from laneweave.protocol.plans import plan_problems
@@ -29,6 +29,10 @@ START_MARGIN_S = 0.5
 """A plan made late starts this much road time after it is ready."""
 ROOM_S = 2.5
 """A formation that lacks room waits at most so long for the next one to close (road time)."""
+RESERVE_S = 4.0
+"""Slots are no longer than leaves so much road time behind the last one, for lost messages."""
+SHORTEST_DEADLINE_S = 1.0
+"""For planning, where the first move could begin at once."""
 MOST_DOUBLINGS = 4
 """The bound on search nodes doubles with each failed planning, this often."""
 
@@ -73,7 +77,9 @@ class FormationPlanner:
         """
         numbers, ballot = control.formation.numbers, control.ballot
         assert ballot is not None  # noqa: S101 (set before planning begins)
-        if steps_left(numbers, self._start_s(numbers, t_s), self._scenario) == 0:
+        cells, scenario = control.hold_cells.values(), self._scenario
+        start_s = self._start_s(cells, t_s)
+        if steps_left(cells, start_s, scenario.cycles_s[0], scenario) == 0:
             control.settle(now_s)
             yield Note("formation-too-late", {"formation": numbers[0]})
             return
@@ -82,14 +88,18 @@ class FormationPlanner:
             control.hold_cells,
             {member.vehicle: member.preferred_lane for member in control.formation.members},
             control.unattended,
-            self._scenario,
+            scenario,
+            min(
+                scenario.formation.planning_deadline_s,
+                max(start_s - t_s, SHORTEST_DEADLINE_S),
+            ),
         )
         # What was ordered under an earlier ballot is not waited for any more.
         for other, (number, _) in list(self._ordered.items()):
             if number == numbers[0]:
                 del self._ordered[other]
         self._ordered[job] = (numbers[0], ballot)
-        nodes = self._scenario.formation.max_nodes * 2 ** min(control.failures, MOST_DOUBLINGS)
+        nodes = scenario.formation.max_nodes * 2 ** min(control.failures, MOST_DOUBLINGS)
         # In the job: promises that cannot be planned from fail there, as any failed planning does.
         yield Compute(job, partial(self._sort, job, task, nodes))
 
@@ -132,7 +142,7 @@ class FormationPlanner:
                 return
             if result.solved:
                 planned = self._plan(control, result, t_s)
-                plan = self._kept_apart(planned, controls)
+                plan = self._paced(planned, controls)
                 problems = plan_problems(plan)
                 if not problems:
                     control.on_plan(plan, now_s, result.out_of_reach)
@@ -154,12 +164,18 @@ class FormationPlanner:
         for other in self._neighbours(numbers, controls):
             if other.phase is Phase.SETTLED:
                 continue
-            union = tuple(sorted({*numbers, *other.formation.numbers}))
-            if len(union) > most:
+            if control.formation.joined + other.formation.joined > most:
                 continue
-            if steps_left(union, self._start_s(union, t_s), self._scenario) > 0:
+            union = (*numbers, *other.formation.numbers)
+            if self._steps_left_in(union, t_s) > 0:
                 return self._groups.join(union)
         return False
+
+    def _steps_left_in(self, numbers: Numbers, t_s: float) -> int:
+        """Return how many steps fit in for all cells of some blocks."""
+        lattice, scenario = self._scenario.lattice, self._scenario
+        cells = [cell for number in numbers for cell in lattice.block_cells(number)]
+        return steps_left(cells, self._start_s(cells, t_s), scenario.cycles_s[0], scenario)
 
     def _neighbours(
         self, numbers: Numbers, controls: Mapping[int, FormationControl]
@@ -172,9 +188,11 @@ class FormationPlanner:
 
     def _room_is_coming(self, numbers: Numbers, t_s: float) -> bool:
         """Tell whether the next formation, which may be joined, is closed in a moment."""
-        if len(numbers) >= self._scenario.formation.max_joined:
+        formation, lattice = self._scenario.formation, self._scenario.lattice
+        if formation.closes_by_vehicles or len(numbers) >= formation.max_joined:
             return False
-        closes_s = closing_time_s((numbers[-1] + 1,), self._scenario)
+        rear = lattice.block_range(numbers[-1] + 1)[0]
+        closes_s = lattice.passing_time_s(rear) + formation.entry_spread_s
         return closes_s - ROOM_S < t_s <= closes_s + START_MARGIN_S
 
     def _plan(self, control: FormationControl, sorting: Sorting, t_s: float) -> Plan:
@@ -188,17 +206,31 @@ class FormationPlanner:
             incarnations=control.incarnations,
             start_cells=hold_cells,
             moves=sorting.moves,
-            t0_s=self._start_s(numbers, t_s),
-            slot_s=self._scenario.formation.cycle_s,
+            t0_s=self._start_s(hold_cells.values(), t_s),
+            slot_s=self._scenario.cycles_s[0],
             territory=tuple(sorted(territory(hold_cells.values(), all_moves))),
         )
 
-    def _kept_apart(self, plan: Plan, controls: Mapping[int, FormationControl]) -> Plan:
-        """Return a plan with pauses for the plans of the neighbours that this leader has made."""
-        formation = self._scenario.formation
-        if "closing" not in formation.conflict_kinds:
-            return plan
-        others = [
+    def _paced(self, plan: Plan, controls: Mapping[int, FormationControl]) -> Plan:
+        """Return a plan in the longest slots in which it ends in time.
+
+        With pauses for the plans of the neighbours that this leader has made.
+        """
+        scenario, others = self._scenario, self._plans_beside(plan, controls)
+        cells = {*plan.start_cells.values(), *plan.territory}
+        left_s = time_left_s(cells, plan.t0_s, scenario)
+        for slot_s in reversed(scenario.slots_s):
+            slower = evolve(plan, slot_s=slot_s)
+            paused = kept_apart(slower, others, scenario.formation.slack_s, int(left_s / slot_s))
+            if steps_of(paused) * slot_s <= left_s - RESERVE_S:
+                return paused
+        return paused
+
+    def _plans_beside(self, plan: Plan, controls: Mapping[int, FormationControl]) -> list[Plan]:
+        """Return the plans of the neighbours that this leader has made, and that are driven."""
+        if "closing" not in self._scenario.formation.conflict_kinds:
+            return []
+        return [
             neighbour.plan
             for neighbour in self._neighbours(plan.formations, controls)
             # In other phases it has been outbid, or given up, and is not what is driven.
@@ -206,11 +238,9 @@ class FormationPlanner:
             and neighbour.plan.ballot == neighbour.ballot
             and neighbour.phase in (Phase.ISSUING, Phase.WATCHING)
         ]
-        most_steps = steps_left(plan.formations, plan.t0_s, self._scenario)
-        return kept_apart(plan, others, formation.move_s, most_steps)
 
-    def _start_s(self, numbers: Numbers, t_s: float) -> float:
-        return start_time_s(numbers, t_s + START_MARGIN_S, self._scenario)
+    def _start_s(self, cells: Collection[Cell], t_s: float) -> float:
+        return start_time_s(cells, t_s + START_MARGIN_S, self._scenario)
 
 
 def _notes(number: int, sorting: Sorting, pauses: int) -> Iterator[Note]:

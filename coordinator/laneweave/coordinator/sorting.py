@@ -32,7 +32,9 @@ class SortingTask:
     unattended: Collection[Name]
     """Members that hold whatever is planned."""
     scenario: Scenario
-    """Mode, conflict kinds, deadline, lattice."""
+    """Mode, conflict kinds, lattice."""
+    deadline_s: float
+    """For each planning."""
 
     @property
     def columns(self) -> range:
@@ -124,7 +126,7 @@ def plan_request(task: SortingTask, dropped: Name | None = None) -> PlanRequest:
             "conflicts": list(formation.conflict_kinds),
             "vehicles": vehicles,
             "targets": [list(target) for target in targets.cells],
-            "deadline_s": formation.planning_deadline_s,
+            "deadline_s": task.deadline_s,
         }
     )
 

@@ -78,7 +78,7 @@ class StreamControl:
         self._scenario = scenario
         self._new_ballot = new_ballot
         self._planner = planner
-        self._slot_s = scenario.formation.cycle_s
+        self._slot_s = scenario.cycles_s[0]
         self.shown = Shown()
         self.handovers: list[Handover] = []
         self._of: dict[Name, Handover] = {}

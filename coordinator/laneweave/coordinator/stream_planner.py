@@ -74,7 +74,7 @@ def stream_road(scenario: Scenario) -> StreamRoad:
     return StreamRoad(
         lanes=road.lanes,
         pitch_m=formation.gap_m,
-        advance_m=formation.speed_mps * formation.cycle_s,
+        advance_m=formation.speed_mps * scenario.cycles_s[0],
         sorting_m=(scenario.moves_from_m, road.length_m),
         length_m=road.length_m,
         body_m=scenario.vehicle.length_m,

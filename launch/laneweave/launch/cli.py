@@ -76,8 +76,9 @@ class Method(StrEnum):
 
 
 class Operation(StrEnum):
-    """How formation control runs a stream."""
+    """How formation control runs a stream; `paper`: formations as in the paper's simulation."""
 
+    formations = "formations"
     paper = "paper"
     rolling = "rolling"
 

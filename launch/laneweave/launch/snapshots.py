@@ -277,7 +277,7 @@ def _instants(
     inside = (s_m >= stretch_m[0]) & (s_m <= stretch_m[1])
     ticks = np.rint(t_s / tick_s).astype(np.int64)
     seen = np.bincount(ticks, weights=inside * (off_centre + 1e-3))
-    slot = round(scenario.formation.cycle_s / tick_s)
+    slot = round(scenario.cycles_s[0] / tick_s)
     padded = np.pad(seen, (0, 3 * slot))
     sums = sum(padded[number * slot : number * slot + len(seen)] for number in range(4))
     start = int(np.argmax(sums))

@@ -166,7 +166,7 @@ def record(scenario: Scenario, *, instances: int, seed: int) -> Recording:
 def _drive(scenario: Scenario, episode: _Episode, rng: random.Random) -> Iterator[Problem]:
     """Close the loop with the exact plant, from the reference's first state."""
     tick_s = scenario.runtime.tick_s
-    ahead_s = np.array([tick_s * k for k in range(scenario.tracking.horizon_ticks + 1)])
+    ahead_s = np.array([tick_s * k for k in range(scenario.horizon_ticks + 1)])
     tracker = Tracker(scenario, fast_path=False)
     body = _row(episode.reference.window(0).states[0])
     for tick in range(episode.ticks):

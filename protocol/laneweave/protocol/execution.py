@@ -31,6 +31,9 @@ from laneweave.protocol.vehicle_rules import (
 )
 
 TIME_TOLERANCE_S = 1e-6
+OVERDUE_SLOTS = 1.5
+OVERDUE_S = 2.0
+"""A move is overdue when it has been due for 1.5 slots, or for a slot and 2 s if that is less."""
 
 
 @define
@@ -44,8 +47,6 @@ class PlanExecution:
     incarnation: int
     hold_cell: Cell
     lattice: Lattice
-    overdue_s: float
-    """A move due for longer than this is reported as overdue."""
     joined: tuple[int, ...]
     """Formations whose blocks plans may use, as the motion controller has confirmed; ascending."""
     moving: bool = False
@@ -101,6 +102,7 @@ class PlanExecution:
         if formations == self.joined or set(formations) <= set(self.joined):
             return False
         self.joined = tuple(sorted({*self.joined, *formations}))
+        self.wanted_joined = tuple(sorted({*self.joined, *self.wanted_joined}))
         return True
 
     def on_estate(self, sense: Sense) -> bool:
@@ -173,7 +175,10 @@ class PlanExecution:
 
     def overdue(self, t_s: float) -> bool:
         """Tell whether the next move has been due for too long."""
-        return self.accepted and not self.moving and self.is_due(t_s - self.overdue_s)
+        plan = self.plan
+        if plan is None or self.moving or not self.accepted:
+            return False
+        return self.is_due(t_s - min(OVERDUE_SLOTS * plan.slot_s, plan.slot_s + OVERDUE_S))
 
     def is_due(self, t_s: float) -> bool:
         """Tell whether the time of the next move has come."""

@@ -20,6 +20,9 @@ from attrs import frozen
 Cell = tuple[int, int]
 """(column, lane)."""
 
+STRETCH_COLUMNS = 8
+"""Columns of a stretch: as many as the longest formation of six has, and one more."""
+
 Move = tuple[int, Cell, Cell]
 """(step, from, to): in this step of its plan the vehicle moves to a neighbouring cell."""
 
@@ -42,12 +45,23 @@ def territory(start_cells: Iterable[Cell], moves: Iterable[Move]) -> frozenset[C
     return frozenset(cells)
 
 
+def stretch_of(column: int) -> int:
+    """Return the number of the stretch of columns that a column lies in.
+
+    Stretches bound who needs to hear of a vehicle's motion: those in its own stretch and in the two
+    next to it.
+    """
+    return -column // STRETCH_COLUMNS
+
+
 @frozen
 class Lattice:
-    """Geometry of the moving lattice and of the column blocks that formations own.
+    """Geometry of the moving lattice and of its blocks of columns, which formations own.
 
-    Formation number b owns the columns -(b + 1) W + 1 .. -b W for block width W. The number is a
-    pure function of the column and columns are never used twice, so formations never meet.
+    Block number b has the columns -(b + 1) W + 1 .. -b W for block width W. The number is a pure
+    function of the column, and columns are never used twice. A formation owns one block, or, where
+    its length follows the traffic, a run of blocks of one column each; its number is that of its
+    foremost block.
     """
 
     pitch_m: float
@@ -77,7 +91,7 @@ class Lattice:
         return (s_m - column * self.pitch_m) / self.speed_mps
 
     def block_of(self, column: int) -> int:
-        """Return the number of the formation that owns a column."""
+        """Return the number of the block that a column lies in."""
         return -column // self.block_columns
 
     def block_range(self, block: int) -> range:
@@ -85,7 +99,7 @@ class Lattice:
         return range(-(block + 1) * self.block_columns + 1, -block * self.block_columns + 1)
 
     def block_cells(self, block: int) -> frozenset[Cell]:
-        """Return all cells of a block: the territory that its formation may use."""
+        """Return all cells of a block."""
         return frozenset(
             (column, lane) for column in self.block_range(block) for lane in range(self.lanes)
         )

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, NewType
 
 from attrs import field, frozen
 
-from laneweave.protocol.lattice import Cell, Move
+from laneweave.protocol.lattice import Cell, Lattice, Move
 
 Name = NewType("Name", str)
 """Name of a vehicle, coordinator or role: letters, digits, `_`, `-`, `.`; at most 64."""
@@ -154,7 +154,7 @@ class VehicleState:
 
 @frozen
 class Motion:
-    """Vehicle to those of its formation and of the two next to it: the motion that is under way.
+    """Vehicle to those in its stretch of columns and in the two next to it: its motion under way.
 
     When the motion begins and every ten ticks while it lasts; who holds says nothing, since its
     speed is constant. Its trajectory is not sent: all vehicles share the scenario, from which it
@@ -164,11 +164,13 @@ class Motion:
 
     vehicle: Name
     incarnation: int
-    formation: int
-    """In whose block it entered."""
+    stretch: int
+    """Number of the stretch of columns in which the motion began."""
     origin: Cell
     target: Cell
     begin_tick: int
+    ticks: int
+    """How long it takes."""
     tick: int
     """When this was sent."""
 
@@ -216,6 +218,8 @@ class Sense:
     """In whose block the vehicle entered."""
     attendant: int = 0
     """Incarnation of the process that is in charge of the vehicle; 0: none yet."""
+    motion_ticks: int = 0
+    """How many ticks the move under way was to take; 0: it settles in its cell, or holds."""
     caretaker: bool = False
     """The one in charge is the vehicle's caretaker, because its agent died or fell silent."""
     joined: tuple[int, ...] = ()
@@ -251,6 +255,8 @@ class Command:
     motion_origin: Cell
     jerks: bytes
     """Little-endian float32 pairs (j_s, j_y) in m/s3, one for each tick of the horizon."""
+    motion_ticks: int = 0
+    """How many ticks the move under way was to take; 0: it settles in its cell, or holds."""
     joined: tuple[int, ...] = ()
     """Formations that the controller should note as joined, beside those that it knows."""
     accepted: Ballot | None = None
@@ -270,6 +276,28 @@ class CensusEntry:
     """The cell in which it entered; its column tells its formation."""
     preferred_lane: int
     entered_s: float
+
+
+@frozen
+class ClosedFormation:
+    """Which blocks of columns are a formation's; nobody enters in them any more."""
+
+    first_block: int
+    """Number of its foremost block, which is the formation's number, too."""
+    last_block: int
+    closed_s: float
+    """Road time at which it was closed."""
+
+    @property
+    def blocks(self) -> tuple[int, ...]:
+        """Numbers of its blocks, ascending."""
+        return tuple(range(self.first_block, self.last_block + 1))
+
+    def columns(self, lattice: Lattice) -> range:
+        """Return its columns in ascending order."""
+        return range(
+            lattice.block_range(self.last_block).start, lattice.block_range(self.first_block).stop
+        )
 
 
 @frozen
@@ -293,6 +321,11 @@ class Census:
     t_s: float
     on_road: tuple[CensusEntry, ...]
     announced: tuple[Announcement, ...]
+    formations: tuple[ClosedFormation, ...] = ()
+    """The closed formations with a vehicle on the road, foremost first. What is said of one never
+    changes, and no block is in two. Empty in the rolling operation."""
+    closed_to: int = -1
+    """All blocks up to this number are closed: whoever entered in them is listed, or has left."""
     bridge: int = 0
     """Incarnation of the bridge, which tells this road from an earlier one; 0: not told."""
 

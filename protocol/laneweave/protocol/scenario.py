@@ -10,21 +10,36 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import attrs
 from attrs import field, frozen
+from attrs.validators import optional
 
 from laneweave.protocol.deployment import Network, Observation, Security, Service
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Lattice
 from laneweave.protocol.ranges import one_of, within
-from laneweave.protocol.scenario_checks import check_scenario
+from laneweave.protocol.scenario_checks import check_effects, check_scenario
 from laneweave.protocol.structuring import structure
 
 SCHEMA = "laneweave.scenario/1"
 
 BASE_CONFLICTS = ("node", "edge", "special-1")
+SHORTEST_CYCLE_S, LONGEST_CYCLE_S = 4.0, 7.0
+"""Range of T_F where `formation.cycle_s` leaves it open: from the paper's value on."""
+CYCLE_STEP_S = 0.5
+"""Few values of T_F are in use, so that trajectories of moves are planned once."""
+SLACK_S = 0.2
+"""Part of T_F in which nothing moves, unless `formation.move_s` says otherwise."""
+
+PAPERS_FORMATIONS: Mapping[str, object] = MappingProxyType(
+    {"entry": "interlaced", "close": "columns", "cycle_s": 4.0}
+)
+"""Fields of the table `formation` that make it the paper's: what `operation = "paper"` stands for
+where a file, a recording or an option says so."""
+
 CONFLICT_KINDS = (
     "node",
     "edge",
@@ -79,15 +94,22 @@ class Demand:
 class FormationSettings:
     """Formation control parameters d_F, T_F, v_F and the planner's choices."""
 
-    operation: str = field(default="rolling", validator=one_of("rolling", "paper"))
-    """`rolling`: every cell may be entered, and the whole stream is planned anew in each slot.
-    `paper`: closed formations in blocks, planned once."""
+    operation: str = field(default="formations", validator=one_of("formations", "rolling"))
+    """`formations`: closed formations, each sorted by one plan (the paper's operation).
+    `rolling`: no formations; the whole stream is planned anew in each slot."""
+    entry: str = field(default="free", validator=one_of("free", "interlaced"))
+    """Formations: the cells that vehicles may enter, all or those of the interlaced structure."""
+    close: str = field(default="vehicles", validator=one_of("vehicles", "columns"))
+    """Formations: a formation ends at `max_vehicles` vehicles, or at `max_columns` columns; or
+    every formation has `block_columns` columns, as the paper's."""
     gap_m: float = field(default=15.0, validator=within(1.0, 200.0))
     """d_F, the column pitch."""
-    cycle_s: float = field(default=4.0, validator=within(0.5, 60.0))
-    """T_F, the time slot of a step."""
-    move_s: float = field(default=3.8, validator=within(0.5, 60.0))
-    """Time that a move takes within its slot; the rest is slack for lost messages."""
+    cycle_s: float | None = field(default=None, validator=optional(within(0.5, 60.0)))
+    """T_F, the time slot of a step. None: formations take 4 to 7 s, as long as their road allows;
+    the rolling operation chooses by volume (`Scenario.cycles_s`)."""
+    move_s: float | None = field(default=None, validator=optional(within(0.5, 60.0)))
+    """Time that a move takes within its slot; the rest is slack for lost messages. None: 0.2 s
+    less than T_F."""
     speed_mps: float = field(default=15.0, validator=within(1.0, 60.0))
     """v_F, the speed of the lattice."""
     settle_s: float = field(default=10.0, validator=within(1.0, 60.0))
@@ -97,7 +119,10 @@ class FormationSettings:
     reward_drift: bool = False
     """Rolling operation: moving ahead of v_F counts as a gain where it costs nobody else."""
     block_columns: int = field(default=4, validator=within(1, 24))
-    """Width of a formation's block; the interlaced structure puts half of its cells to use."""
+    """Columns of a formation where `close` is `columns`; the interlaced structure uses half of
+    its cells."""
+    max_columns: int = field(default=7, validator=within(1, 24))
+    """Greatest length of a formation where `close` is `vehicles`."""
     max_vehicles: int = field(default=6, validator=within(1, 36))
     """Largest formation (the paper: six)."""
     max_joined: int = field(default=1, validator=within(1, 4))
@@ -120,19 +145,46 @@ class FormationSettings:
         return self.operation == "rolling"
 
     @property
+    def interlaced(self) -> bool:
+        """Whether only the cells of the interlaced structure may be entered."""
+        return not self.rolling and self.entry == "interlaced"
+
+    @property
+    def closes_by_vehicles(self) -> bool:
+        """Whether the lengths of formations follow the traffic."""
+        return not self.rolling and self.close == "vehicles"
+
+    @property
+    def block_width(self) -> int:
+        """Columns of a block, the unit of which formations own one or several."""
+        return 1 if self.closes_by_vehicles else self.block_columns
+
+    @property
+    def greatest_length(self) -> int:
+        """Most columns of a formation."""
+        return self.max_columns if self.closes_by_vehicles else self.block_columns
+
+    @property
+    def slack_s(self) -> float:
+        """Part of T_F in which nothing moves."""
+        if self.cycle_s is None or self.move_s is None:
+            return SLACK_S
+        return self.cycle_s - self.move_s
+
+    @property
     def entry_spacing_s(self) -> float:
         """Time between two cells of a lane that may be entered."""
-        return (1.0 if self.rolling else 2.0) * self.gap_m / self.speed_mps
+        return (2.0 if self.interlaced else 1.0) * self.gap_m / self.speed_mps
 
     @property
     def entry_spread_s(self) -> float:
         """Most time between a vehicle and its cell as they pass the start of the road.
 
-        Rolling operation: half of what lies between two cells, so nobody waits who is not too close
-        behind another. Interlaced entry: half as much again, so that cells are caught up with that
-        nobody took, and queues end sooner.
+        Half of what lies between two cells, so that a vehicle waits only when it is too close
+        behind another one. Interlaced entry: half as much again, so that vehicles catch up with
+        cells that stayed empty, and queues end sooner.
         """
-        return (0.5 if self.rolling else 0.75) * self.entry_spacing_s
+        return (0.75 if self.interlaced else 0.5) * self.entry_spacing_s
 
     @property
     def oblique_steps(self) -> int:
@@ -210,7 +262,8 @@ class Braking:
 class Tracking:
     """The tracking controller of the lower level."""
 
-    horizon_ticks: int = field(default=40, validator=within(10, 100))
+    horizon_ticks: int | None = field(default=None, validator=optional(within(10, 200)))
+    """Ticks that the tracker looks ahead; None: the longest T_F."""
     min_gap_m: float = field(default=3.0, validator=within(0.0, 100.0))
     """Net gap to the vehicle ahead that the tracker gives up its reference for."""
 
@@ -305,8 +358,45 @@ class Scenario:
             speed_mps=self.formation.speed_mps,
             lane_width_m=self.road.lane_width_m,
             lanes=self.road.lanes,
-            block_columns=self.formation.block_columns,
+            block_columns=self.formation.block_width,
         )
+
+    @property
+    def cycles_s(self) -> tuple[float, float]:
+        """Shortest and longest T_F [s]; the same in the rolling operation, which has one slot."""
+        cycle_s = self.formation.cycle_s
+        if cycle_s is not None:
+            return cycle_s, cycle_s
+        if self.formation.rolling:
+            return SHORTEST_CYCLE_S, SHORTEST_CYCLE_S
+        return SHORTEST_CYCLE_S, LONGEST_CYCLE_S
+
+    @property
+    def slots_s(self) -> tuple[float, ...]:
+        """T_F that plans may have [s], ascending: every `CYCLE_STEP_S` from shortest to longest."""
+        shortest_s, longest_s = self.cycles_s
+        count = round((longest_s - shortest_s) / CYCLE_STEP_S)
+        return tuple(shortest_s + CYCLE_STEP_S * number for number in range(count + 1))
+
+    @property
+    def horizon_ticks(self) -> int:
+        """Ticks that the tracker looks ahead."""
+        ticks = self.tracking.horizon_ticks
+        return round(self.cycles_s[1] / self.runtime.tick_s) if ticks is None else ticks
+
+    @property
+    def move_s(self) -> float:
+        """Time that a move takes in the shortest T_F [s]."""
+        return self.cycles_s[0] - self.formation.slack_s
+
+    def move_ticks(self, slot_s: float) -> int:
+        """Return how many ticks a move takes in slots of this length."""
+        return round((slot_s - self.formation.slack_s) / self.runtime.tick_s)
+
+    @property
+    def move_durations(self) -> frozenset[int]:
+        """Ticks that a move may take: in each T_F that plans may have."""
+        return frozenset(map(self.move_ticks, self.slots_s))
 
     @property
     def moves_from_m(self) -> float:
@@ -328,17 +418,19 @@ def load_scenario(path: Path | None, **overrides: object) -> Scenario:
     """Read a scenario and apply overrides such as `seed=3` or `demand__volume_veh_per_lane_h=1600`.
 
     Args:
-        path: a TOML file; None takes the defaults: the paper's road in the rolling operation.
+        path: a TOML file; None takes the defaults: the paper's road, and formations of six.
         **overrides: values that replace those of the file; `None` leaves the file's value.
             `table__field` names a field of a table.
 
     Raises:
-        BadInputError: the file cannot be read, is not TOML, or a value is not acceptable.
+        BadInputError: the file cannot be read, is not TOML, a value is not acceptable, or has no
+            effect beside the file's other values.
     """
     data: dict[str, Any] = {}
     if path is not None:
         data = read_toml(path)
         _resolve_folder(data, path)
+        check_effects(data, parse_scenario(data))
     for name, value in overrides.items():
         if value is None:
             continue
@@ -382,9 +474,17 @@ def parse_scenario(data: Mapping[str, Any]) -> Scenario:
     Raises:
         BadInputError: a field is unknown, of the wrong type, out of range, or does not fit others.
     """
-    scenario = structure(data, Scenario)
+    scenario = structure(_with_current_names(data), Scenario)
     check_scenario(scenario)
     return scenario
+
+
+def _with_current_names(data: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the tables with `operation = "paper"`, an earlier name, in today's terms."""
+    formation = data.get("formation") if isinstance(data, Mapping) else None
+    if not isinstance(formation, Mapping) or formation.get("operation") != "paper":
+        return data
+    return {**data, "formation": {**PAPERS_FORMATIONS, **formation, "operation": "formations"}}
 
 
 def to_tables(scenario: Scenario) -> dict[str, Any]:

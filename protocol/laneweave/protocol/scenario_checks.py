@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 from laneweave.protocol.endpoints import is_tls
 from laneweave.protocol.errors import BadInputError
@@ -18,8 +19,27 @@ LEAST_GAP_M = 1.0
 """Between bumpers of neighbouring cells: bodies turn to change lanes, and track with some error."""
 LEAST_SIDE_M = 0.5
 """Between bodies side by side, for the same reasons."""
+MOST_TICKS = 200
+"""Of the tracker's horizon."""
 MOST_SECURED_VEHICLES = 5000
 """Vehicles of a demand for which a router has rules."""
+
+
+ROLLING_ONLY = ("sort_in_s2", "reward_drift")
+"""Fields of `formation` that only the rolling operation reads."""
+FORMATIONS_ONLY = (
+    "entry",
+    "close",
+    "max_vehicles",
+    "max_columns",
+    "max_joined",
+    "solver",
+    "weight_straight",
+    "weight_oblique",
+    "planning_deadline_s",
+    "max_nodes",
+)
+"""Fields of `formation` that the rolling operation does not read."""
 
 
 def check_scenario(scenario: Scenario) -> None:
@@ -35,6 +55,35 @@ def check_scenario(scenario: Scenario) -> None:
     _check_braking(scenario)
     _check_settling(scenario)
     _check_security(scenario)
+
+
+def check_effects(data: Mapping[str, Any], scenario: Scenario) -> None:
+    """Check that every value that a file sets has an effect beside the file's other values.
+
+    Args:
+        data: the tables of the file.
+        scenario: what they mean.
+
+    Raises:
+        BadInputError: names the first field that has none.
+    """
+    formation, given = scenario.formation, data.get("formation", {})
+    for fields, has_effect, allowed in (
+        (ROLLING_ONLY, formation.rolling, 'none, unless formation.operation is "rolling"'),
+        (FORMATIONS_ONLY, not formation.rolling, 'none where formation.operation is "rolling"'),
+        (
+            ("max_columns",),
+            formation.closes_by_vehicles,
+            'none, unless formation.close is "vehicles"',
+        ),
+        (
+            ("block_columns",),
+            not formation.closes_by_vehicles,
+            'none, unless formation.close is "columns"',
+        ),
+    ):
+        for name in fields:
+            _require(name not in given or has_effect, f"formation.{name}", given.get(name), allowed)
 
 
 def _require(ok: bool, name: str, value: object, allowed: str) -> None:
@@ -83,12 +132,16 @@ def _check_motion(scenario: Scenario) -> None:
         f"at least {least_pitch_m:g}: vehicle.length_m = {vehicle.length_m:g} and between two "
         f"bumpers tracking.min_gap_m = {min_gap_m:g}, at least {LEAST_GAP_M:g}",
     )
-    _require(
-        formation.move_s <= formation.cycle_s,
-        "formation.move_s",
-        formation.move_s,
-        f"at most formation.cycle_s = {formation.cycle_s:g}",
-    )
+    cycle_s, move_s = formation.cycle_s, formation.move_s
+    if move_s is not None:
+        _require(
+            cycle_s is not None and move_s <= cycle_s,
+            "formation.move_s",
+            move_s,
+            "none without formation.cycle_s"
+            if cycle_s is None
+            else f"at most formation.cycle_s = {cycle_s:g}",
+        )
     _require(
         formation.speed_mps < vehicle.max_speed_mps,
         "formation.speed_mps",
@@ -101,8 +154,8 @@ def _check_motion(scenario: Scenario) -> None:
         formation.weight_oblique,
         "at most 1 in mode 2 (an oblique edge is one step), at most 2 in mode 1",
     )
-    block_m = (formation.block_columns - 1) * formation.gap_m
-    needed_m = block_m + vehicle.length_m + formation.speed_mps * formation.cycle_s
+    block_m = (formation.greatest_length - 1) * formation.gap_m
+    needed_m = block_m + vehicle.length_m + formation.speed_mps * scenario.cycles_s[0]
     _require(
         road.s3_m >= needed_m,
         "road.s3_m",
@@ -136,7 +189,12 @@ def _check_timing(scenario: Scenario) -> None:
         network.lease_s,
         f"more than network.heartbeat_s = {network.heartbeat_s:g}",
     )
-    for name, value in (("cycle_s", formation.cycle_s), ("move_s", formation.move_s)):
+    shortest_s, longest_s = scenario.cycles_s
+    for name, value in (
+        ("cycle_s", shortest_s),
+        ("cycle_s", longest_s),
+        ("move_s", shortest_s - formation.slack_s),
+    ):
         ticks = value / runtime.tick_s
         _require(
             ticks >= 2 and abs(ticks - round(ticks)) < 1e-6,
@@ -144,11 +202,18 @@ def _check_timing(scenario: Scenario) -> None:
             value,
             f"a multiple of runtime.tick_s = {runtime.tick_s:g}, at least twice it",
         )
+    longest_move_s = longest_s - formation.slack_s
     _require(
-        scenario.tracking.horizon_ticks * runtime.tick_s >= formation.move_s,
+        scenario.horizon_ticks * runtime.tick_s >= longest_move_s - 1e-6,
         "tracking.horizon_ticks",
-        scenario.tracking.horizon_ticks,
-        f"long enough to hold a whole move of {formation.move_s:g} s",
+        scenario.horizon_ticks,
+        f"long enough to hold a whole move of {longest_move_s:g} s, at most {MOST_TICKS}",
+    )
+    _require(
+        scenario.horizon_ticks <= MOST_TICKS,
+        "runtime.tick_s" if scenario.tracking.horizon_ticks is None else "tracking.horizon_ticks",
+        runtime.tick_s,
+        f"long enough for the longest T_F, {longest_s:g} s, to have at most {MOST_TICKS} ticks",
     )
     _require(
         runtime.tick_resend_s < runtime.tick_deadline_s,

@@ -99,7 +99,7 @@ STATE = Topic(
     readers=("coordinator", "vehicle", "observer"), deputy="bridge",
 )  # fmt: skip
 MOTION = Topic(
-    "motion", "motion/{formation}/{vehicle}", messages.Motion, "vehicle", Quality.LATEST,
+    "motion", "motion/{stretch}/{vehicle}", messages.Motion, "vehicle", Quality.LATEST,
     readers=("vehicle", "observer"),
 )  # fmt: skip
 PREPARE = Topic(

@@ -107,8 +107,8 @@ def _keeps_to_its_blocks(me: PlanExecution, plan: Plan) -> bool:
 
 
 def _has_joined(me: PlanExecution, plan: Plan) -> bool:
-    """My controller has confirmed that its formations are joined."""
-    return me.estate is not None or set(plan.formations) <= set(me.joined)
+    """My controller has confirmed its formations as joined with mine, these and no others."""
+    return me.estate is not None or set(plan.formations) == set(me.joined)
 
 
 def _keeps_to_its_estates(me: PlanExecution, plan: Plan) -> bool:

@@ -11,8 +11,6 @@ and holds. The caretaker gives way as soon as an agent claims the vehicle with a
 
 from __future__ import annotations
 
-import math
-
 from laneweave.protocol.execution import PlanExecution
 from laneweave.protocol.messages import Plan, Prepare, VehicleState
 from laneweave.sim_bridge.traffic import RoadVehicle
@@ -40,7 +38,6 @@ class Caretaker:
             incarnation=incarnation,
             hold_cell=controller.hold_cell,
             lattice=controller.lattice,
-            overdue_s=math.inf,
             joined=controller.joined,
             moving=controller.moving(tick),
             estate=frozenset(controller.estate) if controller.rolling else None,
@@ -76,4 +73,4 @@ class Caretaker:
         if execution.moving and not vehicle.controller.moving(tick):
             execution.end_motion()
         sense = vehicle.sense(tick, caretaker=True)
-        return execution.state(sense, vehicle.formation, attended=False)
+        return execution.state(sense, vehicle.block, attended=False)

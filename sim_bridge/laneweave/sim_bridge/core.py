@@ -290,6 +290,7 @@ class BridgeCore:
 
     def _begin_tick(self, now_s: float) -> Iterator[Effect]:
         self._let_enter()
+        self._close_formations()
         self._roadside.hand_out(self.vehicles)
         yield from self._roadside.news(self.tick, self.t_s, self.vehicles.values())
         yield from self._take_care(now_s)
@@ -312,6 +313,14 @@ class BridgeCore:
                 # Where one did not come, the next are not worth a long wait, until one does.
                 self._patience_s = self.scenario.network.resend_s
         self._at_entrance.clear()
+
+    def _close_formations(self) -> None:
+        for closed in self._roadside.close_formations(self.t_s):
+            blocks = range(closed.first_block, closed.last_block + 1)
+            members = [vehicle for vehicle in self.vehicles.values() if vehicle.block in blocks]
+            for vehicle in members:
+                vehicle.join(closed)
+            self._record.on_closed(closed, [vehicle.name for vehicle in members])
 
     def _take_care(self, now_s: float) -> Iterator[Effect]:
         """Put caretakers in charge of vehicles whose agents are silent or not there."""

@@ -2,17 +2,11 @@
 
 A vehicle enters at s = 0 with the lattice speed v_F. Its cell is the first free one on its lane,
 behind its lane predecessor, that passes s = 0 at most `spread_s` before or after the vehicle; from
-there it settles in its cell on the first stretch of road. In the paper's operation only every other
-cell may be entered (interlaced, "checkerboard"). Vehicles of a lane enter in order of arrival, at
-least a column's time apart.
+there it settles in its cell on the first stretch of road. With interlaced entry only every other
+cell may be entered ("checkerboard", the paper's structure for driving). Vehicles of a lane enter in
+order of arrival, at least a column's time apart.
 
-In the paper's operation a block of columns becomes one formation, so two rules bound what it takes:
-
-- at most `max_vehicles` vehicles, the paper's largest formation;
-- at most as many vehicles that prefer one lane as that lane has cells in the block. **This refines
-  the paper's operation**, which groups vehicles without looking at their preferences and so now
-  and then forms a group that wants more places on a lane than there are. Here a formation can
-  always satisfy every preference; the price is that a vehicle sometimes waits for the next block.
+Where there are formations, `formation_building` says whether a formation takes a vehicle.
 
 Decisions are causal: they are taken in the order of time, and at one moment the lanes from the
 right, so nothing depends on arrivals that are still to come.
@@ -22,12 +16,12 @@ from __future__ import annotations
 
 import math
 from bisect import insort
-from collections import Counter
 
 from attrs import frozen
 
 from laneweave.protocol.lattice import Cell, Lattice
 from laneweave.sim_bridge.demand import Arrival
+from laneweave.sim_bridge.formation_building import FormationBuilder
 
 TIME_TOLERANCE_S = 1e-9
 """Ticks and passing times are the same instants computed in two ways."""
@@ -51,21 +45,21 @@ class EntryMeter:
     def __init__(
         self,
         lattice: Lattice,
-        max_vehicles: int,
         spread_s: float = 0.0,
+        builder: FormationBuilder | None = None,
         *,
-        interlaced: bool = True,
+        interlaced: bool = False,
     ) -> None:
         """Start with an empty road at road time 0.
 
         Args:
             lattice: the lattice whose cells are given out.
-            max_vehicles: most vehicles in one block, where entry is interlaced.
             spread_s: most time between a vehicle and its cell at s = 0.
-            interlaced: whether only every other cell may be entered, and blocks are metered.
+            builder: builds formations of those who enter; None: there are none.
+            interlaced: whether only every other cell may be entered.
         """
         self._lattice = lattice
-        self._max_vehicles = max_vehicles
+        self._builder = builder
         self._spread_s = spread_s
         self._interlaced = interlaced
         self._queues: list[list[Arrival]] = [[] for _ in range(lattice.lanes)]
@@ -74,9 +68,6 @@ class EntryMeter:
         """The next column of each lane that may be entered."""
         self._free_s = [-math.inf] * lattice.lanes
         """When the next vehicle of each lane may follow the one before."""
-        self._taken: Counter[int] = Counter()
-        """How many each block took, and (block, lane) how many of them prefer a lane."""
-        self._preferring: Counter[tuple[int, int]] = Counter()
 
     @property
     def waiting(self) -> tuple[Arrival, ...]:
@@ -118,9 +109,9 @@ class EntryMeter:
             t_s, lane = min((self._entry_s(lane), lane) for lane in range(self._lattice.lanes))
             if t_s > until_s + TIME_TOLERANCE_S:
                 break
-            arrival = self._takes((self._columns[lane], lane))
+            cell = (self._columns[lane], lane)
+            arrival = self._takes(cell, t_s)
             if arrival is not None:
-                cell = (self._columns[lane], lane)
                 late_s = self._lattice.passing_time_s(cell[0]) - t_s
                 offset_m = late_s * self._lattice.speed_mps
                 admissions.append(Admission(arrival, cell, t_s, offset_m))
@@ -143,24 +134,18 @@ class EntryMeter:
     def _skip(self, lane: int, t_s: float) -> None:
         """Go on to the first column of a lane that can still be entered at a time."""
         lattice, column = self._lattice, self._columns[lane]
+        if self._builder is not None:
+            column = int(min(column, self._builder.first_open_column))
         while lattice.passing_time_s(column) + self._spread_s < t_s or (
             self._interlaced and not lattice.interlaced((column, lane))
         ):
             column -= 1
         self._columns[lane] = column
 
-    def _takes(self, cell: Cell) -> Arrival | None:
-        """Return the first of the queue, if its block takes it."""
-        column, lane = cell
-        queue = self._queues[lane]
-        if self._interlaced:
-            block, preferred = self._lattice.block_of(column), queue[0].preferred_lane
-            if (
-                self._taken[block] >= self._max_vehicles
-                or self._preferring[block, preferred] >= self._lattice.block_columns
-            ):
-                return None
-            self._taken[block] += 1
-            self._preferring[block, preferred] += 1
+    def _takes(self, cell: Cell, t_s: float) -> Arrival | None:
+        """Return the first of the queue, if a formation takes it, or there are none."""
+        builder, queue = self._builder, self._queues[cell[1]]
+        if builder is not None and not builder.takes(cell, queue[0].preferred_lane, t_s):
+            return None
         self._names.discard(queue[0].vehicle)
         return queue.pop(0)

@@ -88,6 +88,8 @@ class MotionController:
     """Cells that the roadside has given and that no plan has mentioned yet."""
     motion_origin: Cell = field(init=False)
     motion_end_tick: int = 0
+    motion_ticks: int = 0
+    """How many ticks the move under way was to take; 0: it settles, or holds."""
     command_tick: int = -1
     """Tick of the newest command; -1: none yet."""
     rung: Rung = Rung.HOLD
@@ -109,6 +111,7 @@ class MotionController:
         """Begin with nothing to play, in the formation of the cell."""
         self.lattice = self._scenario.lattice
         self.tick_s = self._scenario.runtime.tick_s
+        # Its formation's other blocks are not known before that is closed.
         self.joined = (self.lattice.block_of(self.hold_cell[0]),)
         self.motion_origin = self.hold_cell
         self.rung_ticks = dict.fromkeys(Rung, 0)
@@ -165,6 +168,7 @@ class MotionController:
             self.hold_cell = command.hold_cell
             self.motion_origin = command.motion_origin
             self.motion_end_tick = command.motion_end_tick
+            self.motion_ticks = command.motion_ticks
         return True
 
     def hand_over(self, incarnation: int) -> None:

@@ -170,6 +170,10 @@ class Recorder:
         trip = self._trips[vehicle]
         trip.entered_s, trip.formation = t_s, formation
 
+    def assign(self, vehicle: str, formation: int) -> None:
+        """Record in whose formation a vehicle is; it has entered."""
+        self._trips[vehicle].formation = formation
+
     def left(self, vehicle: str, t_s: float, lane: int) -> None:
         """Record that a vehicle left the road.
 

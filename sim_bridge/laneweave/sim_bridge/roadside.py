@@ -12,12 +12,20 @@ from itertools import chain
 from attrs import frozen
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.messages import Announcement, Census, CensusEntry, Name, RoadClock
+from laneweave.protocol.messages import (
+    Announcement,
+    Census,
+    CensusEntry,
+    ClosedFormation,
+    Name,
+    RoadClock,
+)
 from laneweave.protocol.node import Effect, Send
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.topics import CENSUS, CLOCK
 from laneweave.sim_bridge.demand import Arrival, arrivals
 from laneweave.sim_bridge.entry import TIME_TOLERANCE_S, Admission, EntryMeter
+from laneweave.sim_bridge.formation_building import formation_builder
 from laneweave.sim_bridge.traffic import RoadVehicle
 
 CENSUS_EVERY_TICKS = 10
@@ -64,9 +72,13 @@ class Roadside:
         self._announced_per_lane = math.ceil(ahead_s / formation.entry_spacing_s) + 1
         self._rolling = formation.rolling
         self._spread_s = formation.entry_spread_s
+        self._builder = formation_builder(scenario)
         self._meter = EntryMeter(
-            lattice, formation.max_vehicles, self._spread_s, interlaced=not self._rolling
+            lattice, self._spread_s, self._builder, interlaced=formation.interlaced
         )
+        self._closed: list[ClosedFormation] = []
+        """All that have been closed, as long as one of their vehicles is on the road."""
+        self._closed_to = -1
         self._recent: list[tuple[int, int, Name]] = []
         """Column, lane and name of those who have entered, as far as they are near."""
         self._next: list[list[tuple[int, Name]]] = [[] for _ in range(self._lanes)]
@@ -86,9 +98,6 @@ class Roadside:
         self._census_sent_tick = -CENSUS_EVERY_TICKS
         self._census_changed = True
         """Somebody entered or left since the last census, or a block has closed."""
-        self._lattice = lattice
-        self._closing_block = 0
-        """The next block whose last column passes the start of the road."""
 
     def newly_demanded(self, t_s: float) -> tuple[Arrival, ...]:
         """Return the vehicles that arrived since the last call."""
@@ -116,6 +125,20 @@ class Roadside:
         self._entered += len(admissions)
         self._census_changed |= bool(admissions)
         return admissions
+
+    def close_formations(self, t_s: float) -> list[ClosedFormation]:
+        """Return the formations that have been closed since the last call.
+
+        Call it after `admit`, which decides who is in them.
+        """
+        if self._builder is None:
+            return []
+        closed = self._builder.closed(t_s)
+        self._closed += closed
+        if self._builder.closed_to > self._closed_to:
+            self._closed_to = self._builder.closed_to
+            self._census_changed = True
+        return closed
 
     def hand_out(self, vehicles: Mapping[Name, RoadVehicle]) -> None:
         """Give empty cells at the entrance to vehicles near them.
@@ -169,7 +192,7 @@ class Roadside:
     ) -> Iterator[Effect]:
         """Send the clock, and the census on every change, every 10 ticks, and at the end.
 
-        That a block has closed is a change, too: now its roster is known.
+        That a formation has closed is a change, too: now its roster is known.
 
         Args:
             tick: number of the tick that begins.
@@ -181,20 +204,10 @@ class Roadside:
         yield Send(CLOCK, counts.clock(tick, t_s, ended=ended, bridge=self._bridge))
         due = ended or tick >= self._census_sent_tick + CENSUS_EVERY_TICKS
         announced = self.announcements_changed(t_s)
-        self._note_closed_blocks(t_s)
         if announced or due or self._census_changed:
             self._census_changed = False
             self._census_sent_tick = tick
             yield Send(CENSUS, self.census(t_s, on_road))
-
-    def _note_closed_blocks(self, t_s: float) -> None:
-        lattice = self._lattice
-        while (
-            lattice.passing_time_s(lattice.block_range(self._closing_block)[0]) + self._spread_s
-            < t_s
-        ):
-            self._closing_block += 1
-            self._census_changed = True
 
     def counts(self, on_road: int) -> Counts:
         """Return the counts."""
@@ -215,7 +228,10 @@ class Roadside:
         return self._announced != before
 
     def census(self, t_s: float, on_road: Iterable[RoadVehicle]) -> Census:
-        """Return who is on the road and who was announced last."""
+        """Return who is on the road, who was announced last, and which formations are closed."""
+        vehicles = tuple(on_road)
+        present = {vehicle.formation for vehicle in vehicles}
+        self._closed = [closed for closed in self._closed if closed.first_block in present]
         return Census(
             t_s=t_s,
             on_road=tuple(
@@ -225,9 +241,11 @@ class Roadside:
                     preferred_lane=vehicle.admission.arrival.preferred_lane,
                     entered_s=vehicle.admission.t_s,
                 )
-                for vehicle in on_road
+                for vehicle in vehicles
             ),
             announced=self._announced,
+            formations=tuple(self._closed),
+            closed_to=self._closed_to,
             bridge=self._bridge,
         )
 

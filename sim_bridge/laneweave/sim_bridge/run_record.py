@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from enum import Enum
 from pathlib import Path
 from typing import Any, Protocol
@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from attrs import define, field
 from numpy.typing import NDArray
 
-from laneweave.protocol.messages import Heartbeat, LogEvent, Name, Report
+from laneweave.protocol.messages import ClosedFormation, Heartbeat, LogEvent, Name, Report
 from laneweave.protocol.motion import State
 from laneweave.protocol.scenario import Scenario
 from laneweave.sim_bridge.demand import Arrival
@@ -134,6 +134,19 @@ class RunRecord:
             lane=vehicle.arrival.lane,
             preferred_lane=vehicle.arrival.preferred_lane,
             formation=vehicle.formation,
+        )
+
+    def on_closed(self, closed: ClosedFormation, members: Sequence[Name]) -> None:
+        """A formation was closed."""
+        number, columns = closed.first_block, closed.columns(self._scenario.lattice)
+        for vehicle in members:
+            self._recorder.assign(vehicle, number)
+        self.note(
+            closed.closed_s,
+            "formation-closed",
+            formation=number,
+            vehicles=list(members),
+            columns=[columns[0], columns[-1]],
         )
 
     def on_left(self, vehicle: RecordedVehicle, t_s: float, *, attended: bool) -> None:

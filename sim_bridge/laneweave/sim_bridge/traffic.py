@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from attrs import define
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.messages import Name, Sense
+from laneweave.protocol.messages import ClosedFormation, Name, Sense
 from laneweave.protocol.motion import State, cell_state
 from laneweave.protocol.scenario import Scenario
 from laneweave.sim_bridge.demand import Arrival
@@ -30,6 +30,8 @@ class RoadVehicle:
     controller: MotionController
     sensors: Sensors | None = None
     """None: it knows itself exactly, and sees nobody."""
+    formation: int | None = None
+    """Number of its formation, of its block in the rolling operation; None: not known yet."""
 
     @classmethod
     def entering(cls, admission: Admission, t_s: float, scenario: Scenario) -> RoadVehicle:
@@ -48,7 +50,8 @@ class RoadVehicle:
             controller.motion_end_tick = round((t_s + scenario.formation.settle_s) / tick_s)
         if scenario.formation.rolling:
             controller.own(admission.cell)
-        return cls(name, admission, controller, Sensors(scenario, name))
+        formation = None if scenario.formation.closes_by_vehicles else controller.joined[0]
+        return cls(name, admission, controller, Sensors(scenario, name), formation)
 
     @property
     def state(self) -> State:
@@ -56,9 +59,14 @@ class RoadVehicle:
         return self.controller.plant.state
 
     @property
-    def formation(self) -> int:
-        """Number of the formation in whose block it entered."""
+    def block(self) -> int:
+        """Number of the block in which it entered."""
         return self.controller.lattice.block_of(self.admission.cell[0])
+
+    def join(self, closed: ClosedFormation) -> None:
+        """Take note that its formation is closed: plans must be for all of its blocks."""
+        self.formation = closed.first_block
+        self.controller.join(closed.blocks)
 
     @property
     def arrival(self) -> Arrival:
@@ -108,11 +116,12 @@ class RoadVehicle:
             hold_cell=controller.hold_cell,
             motion_end_tick=controller.motion_end_tick,
             motion_origin=controller.motion_origin,
+            motion_ticks=controller.motion_ticks,
             preferred_lane=self.admission.arrival.preferred_lane,
             ahead=around.ahead,
             behind=around.behind,
             setpoint=controller.plant.setpoint,
-            formation=self.formation,
+            formation=self.block,
             attendant=controller.attendant,
             caretaker=caretaker,
             joined=controller.joined,

@@ -34,7 +34,7 @@ MakeDriver = Callable[[Scenario], Driver]
 
 SCENARIO = PAPER
 LATTICE, TICK_S = SCENARIO.lattice, SCENARIO.runtime.tick_s
-MOVE_TICKS = round(SCENARIO.formation.move_s / TICK_S)
+MOVE_TICKS = round(SCENARIO.move_s / TICK_S)
 ME, OTHER = Name("me"), Name("other")
 HOME: Cell = (-1, 1)
 BALLOT = Ballot(1, Name("c1"), 1, 1)
@@ -197,7 +197,7 @@ def make_plan(
         start_cells=cells,
         moves=moves,
         t0_s=t0_s,
-        slot_s=SCENARIO.formation.cycle_s,
+        slot_s=SCENARIO.cycles_s[0],
         territory=tuple(territory(cells.values(), every_move)),
     )
 

@@ -22,7 +22,7 @@ from laneweave.sim_bridge.plant import Plant
 SCENARIO = Scenario()
 LIMITS, LATTICE, TICK_S = SCENARIO.vehicle, SCENARIO.lattice, SCENARIO.runtime.tick_s
 V_F = LATTICE.speed_mps
-SLOT_TICKS = round(SCENARIO.formation.cycle_s / TICK_S)
+SLOT_TICKS = round(SCENARIO.cycles_s[0] / TICK_S)
 MOVES = [(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
 BRAKE = EmergencyBrake(SCENARIO)
 PROMISED_M = ERROR_SIGMAS * spare_error_m(SCENARIO, 1.5 * V_F) + _TRACKING_ERROR_M

@@ -197,7 +197,7 @@ def test_two_moves_in_their_slots() -> None:
     rig = up_and_running()
     t0_tick = rig.tick + 5
     rig.accept((0, HOME, (-1, 2)), (1, (-1, 2), (-2, 2)), t0_tick=t0_tick)
-    slot = round(SCENARIO.formation.cycle_s / TICK_S)
+    slot = round(SCENARIO.cycles_s[0] / TICK_S)
     begun = []
     for _ in range(2 * slot + 5):
         moving = rig.shown[-1].moving
@@ -233,7 +233,7 @@ def test_overdue_is_shown() -> None:
         {ME: ((0, HOME, (-1, 2)),), OTHER: ()}, {ME: HOME, OTHER: (0, 0)}, {ME: 1, OTHER: 1}
     )
     rig.confirm(rig.hand(PLAN, plan))
-    patience = round(OVERDUE_SLOTS * SCENARIO.formation.cycle_s / TICK_S)
+    patience = round(OVERDUE_SLOTS * SCENARIO.cycles_s[0] / TICK_S)
     assert not rig.run(patience - rig.tick).overdue
     assert rig.run().overdue
 

@@ -39,7 +39,7 @@ from unit.agents.agent_rig import (
     up_and_running,
 )
 
-N = SCENARIO.tracking.horizon_ticks
+N = SCENARIO.horizon_ticks
 MOVE: Move = (0, HOME, (-1, 2))
 
 

@@ -21,7 +21,7 @@ from laneweave.protocol.scenario import Scenario
 
 SCENARIO = Scenario()
 LIMITS, LATTICE, TICK_S = SCENARIO.vehicle, SCENARIO.lattice, SCENARIO.runtime.tick_s
-N = SCENARIO.tracking.horizon_ticks
+N = SCENARIO.horizon_ticks
 TIMES_S = TICK_S * np.arange(N + 1)
 MOVES = [(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
 SPREAD = (0.25, 0.2, 0.3, 0.08, 0.08, 0.1)

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 OTHER = Name("other")
 N, LENGTH_M, LEAST_M = (
-    SCENARIO.tracking.horizon_ticks,
+    SCENARIO.horizon_ticks,
     SCENARIO.vehicle.length_m,
     SCENARIO.tracking.min_gap_m,
 )

@@ -19,7 +19,7 @@ SCENARIO = Scenario()
 LIMITS, LATTICE, TICK_S = SCENARIO.vehicle, SCENARIO.lattice, SCENARIO.runtime.tick_s
 V_F, LAG_S = LATTICE.speed_mps, LIMITS.actuator_lag_s
 LEAST_M = SCENARIO.tracking.min_gap_m
-N = SCENARIO.tracking.horizon_ticks
+N = SCENARIO.horizon_ticks
 TIMES_S = TICK_S * np.arange(N + 1)
 KNOWN = TIMES_S <= SENSED_S + 1e-9
 HOME: Cell = (0, 1)

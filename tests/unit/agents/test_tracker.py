@@ -23,7 +23,7 @@ SCENARIO = Scenario()
 LIMITS = SCENARIO.vehicle
 LATTICE = SCENARIO.lattice
 TICK_S = SCENARIO.runtime.tick_s
-N = SCENARIO.tracking.horizon_ticks
+N = SCENARIO.horizon_ticks
 MOVES = [(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1) if (dx, dy) != (0, 0)]
 TIMES_S = TICK_S * np.arange(N + 1)
 

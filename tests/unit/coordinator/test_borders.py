@@ -29,7 +29,7 @@ from unit.coordinator.desk import (
     state,
 )
 
-SLOT_S, MOVE_S = SCENARIO.formation.cycle_s, SCENARIO.formation.move_s
+SLOT_S, MOVE_S = SCENARIO.cycles_s[0], SCENARIO.move_s
 CLOSING = ConflictModel(("closing",))
 T0_S = 30.0
 MOST_STEPS = 9

@@ -205,7 +205,7 @@ def driven() -> Profile:
     scenario = Scenario()
     states = {step: move_profile(scenario, *step).states for step in displacements(2)}
     return Profile(
-        scenario.formation.move_s,
+        scenario.move_s,
         {step: array[:, [0, 3]] for step, array in states.items()},
         {step: array[:, [1, 4]] for step, array in states.items()},
     )

@@ -216,7 +216,7 @@ def moving_back(before_s: float) -> Motion:
     """Hold the cell two columns ahead, then move into the next one, as a plan may ask for."""
 
     def motion(t_s: float) -> tuple[float, float]:
-        move_s = SCENARIO.formation.move_s
+        move_s = SCENARIO.move_s
         share = min(max((t_s - before_s) / move_s, 0.0), 1.0)
         way = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
         speed = 30.0 * share**2 * (1.0 - share) ** 2 / move_s

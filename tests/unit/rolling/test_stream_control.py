@@ -32,7 +32,7 @@ from unit.rolling.road import ROLLING
 from unit.rolling.samples import state
 
 A, B, C, D = (Name(letter) for letter in "ABCD")
-SLOT_S = ROLLING.formation.cycle_s
+SLOT_S = ROLLING.cycles_s[0]
 SLOT = 5
 BEGUN_S = SLOT * SLOT_S
 LOOK_S = BEGUN_S + SHOWN_S + 0.1

@@ -190,7 +190,7 @@ class Desk:
             "hold_cell": controller.hold_cell,
             "motion_end_tick": 0,
             "motion_origin": controller.hold_cell,
-            "jerks": jerks((0.0, 0.0), ticks=self.scenario.tracking.horizon_ticks),
+            "jerks": jerks((0.0, 0.0), ticks=self.scenario.horizon_ticks),
         }
         return Command(**(known | changes))
 
@@ -375,7 +375,7 @@ class Street:
             start_cells={name: start},
             moves={name: (move,)},
             t0_s=t0_s,
-            slot_s=self.scenario.formation.cycle_s,
+            slot_s=self.scenario.cycles_s[0],
             territory=tuple(sorted(territory([start], [move]))),
         )
         prepare = Prepare(ballot, (block,), (name,))

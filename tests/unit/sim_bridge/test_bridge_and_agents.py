@@ -32,7 +32,7 @@ MOVE_TICK = 70
 SILENT_S = LONG_ROAD.runtime.agent_silent_s
 MISSES = round(SILENT_S / LONG_ROAD.runtime.tick_deadline_s)
 """Deadlines that an agent misses before it is silent."""
-MOVE_TICKS = round(LONG_ROAD.formation.move_s / TICK_S)
+MOVE_TICKS = round(LONG_ROAD.move_s / TICK_S)
 PACE = 5.0
 """A tick takes 20 ms, if everybody answers: hardly more than one that was missed."""
 PLAY_M = 0.5

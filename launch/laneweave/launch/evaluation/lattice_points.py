@@ -75,11 +75,12 @@ def _settled(tracks: Tracks, ticks: Ints, scenario: Scenario) -> Bools:
     changed = np.zeros(len(ticks), dtype=np.bool_)
     changed[1:] = (np.diff(tracks.column) != 0) | (np.diff(tracks.lane) != 0)
     changed &= ~first
-    period = round(formation.cycle_s / tick_s)
+    shortest_s, longest_s = scenario.cycles_s
+    period = round(shortest_s / tick_s)
     at_end: Bools = ticks % period == _slot_phase(ticks[changed], period)
     on_road_s = tracks.t_s - _since(tracks.t_s, first)
     held_s = tracks.t_s - _since(tracks.t_s, first | changed)
-    rests: Bools = held_s >= formation.move_s - 0.5 * tick_s
+    rests: Bools = held_s >= longest_s - formation.slack_s - 0.5 * tick_s
     rests &= on_road_s >= formation.settle_s - 0.5 * tick_s
     rests &= tracks.column != OFF_LATTICE
     return rests & at_end

@@ -105,10 +105,10 @@ def _map_of(
     if any((tracks.column[part] == OFF_LATTICE).any() for part in parts):
         return None
     changes_s = [t_s for part in parts for t_s in _change_times(tracks, part)]
-    slot_s, tick_s = run.scenario.formation.cycle_s, run.scenario.runtime.tick_s
+    slot_s, tick_s = run.scenario.cycles_s[0], run.scenario.runtime.tick_s
     entered_s = max(float(tracks.t_s[part.start]) for part in parts)
     # The first one to move may be late already, by no more than the slack of a slot.
-    slack_s = max(slot_s - run.scenario.formation.move_s, 0.0) + 0.5 * tick_s
+    slack_s = max(slot_s - run.scenario.move_s, 0.0) + 0.5 * tick_s
     start_s = min(changes_s, default=entered_s + slack_s + tick_s) - slack_s
     last_s = max(changes_s, default=start_s)
     steps = max(0, int(np.ceil((last_s - start_s) / slot_s)))

@@ -19,10 +19,9 @@ class LightDriver:
     def __init__(self, scenario: Scenario) -> None:
         """Make a driver that knows nothing of its vehicle yet."""
         self._lattice = scenario.lattice
-        self._move_ticks = round(scenario.formation.move_s / scenario.runtime.tick_s)
         self._origin: Cell = (0, 0)
         self._goal: Cell = (0, 0)
-        self._end_tick = 0
+        self._end_tick = self._ticks = 0
 
     @property
     def effort(self) -> Effort:
@@ -32,12 +31,12 @@ class LightDriver:
     def take_over(self, sense: Sense) -> None:
         """Go on with what the motion controller is doing."""
         self._origin, self._goal = sense.motion_origin, sense.hold_cell
-        self._end_tick = sense.motion_end_tick
+        self._end_tick, self._ticks = sense.motion_end_tick, sense.motion_ticks
 
-    def begin(self, move: Move, tick: int) -> None:
-        """Begin a move at this tick."""
+    def begin(self, move: Move, tick: int, ticks: int) -> None:
+        """Begin a move at this tick; it takes `ticks` of them."""
         _, self._origin, self._goal = move
-        self._end_tick = tick + self._move_ticks
+        self._end_tick, self._ticks = tick + ticks, ticks
 
     def at_rest(self, sense: Sense) -> bool:
         """Tell whether the motion's time is over and the body is at its target."""
@@ -48,7 +47,7 @@ class LightDriver:
     def drive(self, sense: Sense, *, moving: bool) -> Drive:
         """Return when the motion under way ends, without jerks."""
         end_tick = max(self._end_tick, sense.tick + 1) if moving else 0
-        return Drive(end_tick, self._origin, b"")
+        return Drive(end_tick, self._origin, self._ticks, b"")
 
     def motion(self, tick: int) -> None:
         """Tell others nothing: nobody here has trajectories, and events are what a search costs."""

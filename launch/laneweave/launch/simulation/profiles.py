@@ -33,6 +33,8 @@ class Profile:
     vehicles: Span = (2, 16)
     blocks: Span = (1, 4)
     lanes: Span = (2, 4)
+    growing: float = 0.5
+    """Share of runs in which formations have different lengths."""
     max_joined: Span = (1, 2)
     crowding: float = 0.5
     """Share of runs in which more vehicles may want a lane of a block than it has cells."""

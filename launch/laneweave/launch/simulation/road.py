@@ -19,6 +19,7 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import (
     Census,
     CensusEntry,
+    ClosedFormation,
     Command,
     Deed,
     Name,
@@ -53,6 +54,8 @@ from laneweave.sim_bridge.traffic import RoadVehicle
 CLOCK_EVERY_TICKS = 2
 AGENT_START_S = 1.0
 """How long after its entrance a vehicle waits for its agent before its caretaker takes charge."""
+NONE_CLOSED = -(2**31)
+"""Below the number of every block."""
 SYNC_S = 1.0
 """A vehicle's clock is set anew this often; in between it drifts."""
 
@@ -200,6 +203,7 @@ class LightRoad:
         new_incarnation: Callable[[], int],
         move_lasts_s: Callable[[], float],
         lost: Callable[[], bool],
+        formations: Iterable[ClosedFormation] = (),
         grants: Iterable[Grant] = (),
     ) -> None:
         """Make a road without vehicles; they enter when their time comes.
@@ -212,6 +216,7 @@ class LightRoad:
             new_incarnation: numbers for caretakers.
             move_lasts_s: draws how long the next motion takes.
             lost: draws whether the next SENSE or COMMAND is lost beside what the network loses.
+            formations: which blocks are whose, and when each formation closes.
             grants: which empty cells are whose, and from when on.
         """
         self.tick = -1
@@ -224,6 +229,9 @@ class LightRoad:
         self._tick_s = scenario.runtime.tick_s
         self._visits = sorted(visits, key=lambda visit: (visit.enters_s, visit.vehicle))
         self._grants = sorted(grants, key=lambda grant: (grant.t_s, grant.cell))
+        self._open = sorted(formations, key=lambda closed: closed.first_block)
+        self._closed: list[ClosedFormation] = []
+        self._closed_to = NONE_CLOSED
         self._preferred_lanes = preferred_lanes
         self._watcher = watcher
         self._move_lasts_s = move_lasts_s
@@ -291,6 +299,7 @@ class LightRoad:
         t_s = self.tick * self._tick_s
         self._watcher.advance(now_s)
         self._let_enter(now_s)
+        self._close_formations(t_s)
         self._hand_out(now_s)
         yield from self._let_leave(now_s)
         for vehicle in self.vehicles.values():
@@ -314,6 +323,16 @@ class LightRoad:
             self.vehicles[visit.vehicle] = LightVehicle(visit, lane, self._scenario)
             self._watcher.enter(now_s, visit.vehicle, visit.cell)
             self._show_estate(visit.vehicle, now_s)
+            self._census_due_tick = 0
+
+    def _close_formations(self, t_s: float) -> None:
+        while self._open and self._open[0].closed_s <= t_s + 1e-6:
+            closed = self._open.pop(0)
+            self._closed.append(closed)
+            self._closed_to = closed.last_block
+            for vehicle in self.vehicles.values():
+                if vehicle.block in closed.blocks:
+                    vehicle.join(closed)
             self._census_due_tick = 0
 
     def _hand_out(self, now_s: float) -> None:
@@ -361,4 +380,6 @@ class LightRoad:
                 CensusEntry(name, each.admission.cell, each.preferred_lane, each.admission.t_s)
                 for name, each in self.vehicles.items()
             )
-            yield Send(CENSUS, Census(t_s, entries, ()))
+            on_road = {each.formation for each in self.vehicles.values()}
+            formations = tuple(one for one in self._closed if one.first_block in on_road)
+            yield Send(CENSUS, Census(t_s, entries, (), formations, self._closed_to))

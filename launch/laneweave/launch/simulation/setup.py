@@ -13,13 +13,18 @@ from laneweave.launch.simulation.road import Grant, Visit
 from laneweave.launch.simulation.rolling import Stretch, grants, make_rolling_scenario
 from laneweave.protocol.deployment import Network
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.messages import Name
+from laneweave.protocol.messages import ClosedFormation, Name
 from laneweave.protocol.scenario import FormationSettings, Road, Runtime, Scenario
 
 SLOT_S, MOVE_S, TICK_S = 1.0, 0.8, 0.1
-LAST_BLOCKS = (-1, -1, 0, 1)
-"""Number of the rearmost formation. Those below 0 are on the road at the start; others enter cell
-by cell: formation 0 is closed after 3 s, formation 1 after 7 s."""
+LAST_COLUMNS = (1, 1, -3, -7)
+"""Rear column of the rearmost formation. Columns above 0 are on the road at the start; the others
+enter cell by cell, so that it is closed after 3 or 7 s."""
+BLOCK_COLUMNS = 4
+LENGTHS = (2, 7)
+"""Columns of formations whose lengths differ."""
+GAPS = (0, 0, 1)
+"""Columns of no formation between two of these."""
 LEAVES_S = (2.0, 9.0)
 THOROUGH = 0.05
 """Share of runs of the rolling operation with the stream planner; it costs ten times the rest."""
@@ -29,12 +34,20 @@ LARGEST_JOINED = 10
 """In two formations that may be joined: more are too much work for the planner, often."""
 
 
-def make_scenario(lanes: int, max_joined: int) -> Scenario:
-    """Return the scenario of a run: a long road, and short times so that seeds are cheap."""
+def make_scenario(lanes: int, max_joined: int, *, growing: bool = False) -> Scenario:
+    """Return the scenario of a run: a long road, and short times so that seeds are cheap.
+
+    Args:
+        lanes: of the road.
+        max_joined: most formations that plan together.
+        growing: whether formations have different lengths.
+    """
     return Scenario(
         road=Road(lanes=lanes, s1_m=0.0, s2_m=0.0, s3_m=20_000.0),
         formation=FormationSettings(
-            operation="paper",
+            operation="formations",
+            close="vehicles" if growing else "columns",
+            block_columns=BLOCK_COLUMNS,
             cycle_s=SLOT_S,
             move_s=MOVE_S,
             max_joined=max_joined,
@@ -53,8 +66,8 @@ class Setup:
 
     scenario: Scenario
     mix: Mix
-    blocks: tuple[int, ...]
-    """Numbers of the formations, ascending."""
+    formations: tuple[ClosedFormation, ...]
+    """Foremost first."""
     visits: tuple[Visit, ...]
     crowded: bool
     """Now and then more vehicles want a lane of a block than it has cells."""
@@ -71,12 +84,12 @@ class Setup:
         lanes = rng.randint(*profile.lanes)
         if profile.rolling:
             return cls._drawn_rolling(profile, lanes, rng)
-        scenario = make_scenario(lanes, rng.randint(*profile.max_joined))
-        last, number = rng.choice(LAST_BLOCKS), rng.randint(*profile.blocks)
-        blocks = tuple(range(last - number + 1, last + 1))
+        growing = rng.random() < profile.growing
+        scenario = make_scenario(lanes, rng.randint(*profile.max_joined), growing=growing)
+        formations = tuple(_draw_formations(profile, scenario, rng))
         mix = Mix.drawn(profile, rng)
-        visits = tuple(_draw_visits(profile, scenario, blocks, mix, rng))
-        return cls(scenario, mix, blocks, visits, rng.random() < profile.crowding)
+        visits = tuple(_draw_visits(profile, scenario, formations, mix, rng))
+        return cls(scenario, mix, formations, visits, rng.random() < profile.crowding)
 
     @classmethod
     def _drawn_rolling(cls, profile: Profile, lanes: int, rng: random.Random) -> Setup:
@@ -104,27 +117,32 @@ class Setup:
         The last wishes can be fulfilled: in each block at most as many vehicles want a lane as it
         has cells there. Where two formations may be joined, that holds for both together.
         """
-        lanes, columns = self.scenario.road.lanes, self.scenario.formation.block_columns
+        lanes, columns = (
+            self.scenario.road.lanes,
+            [len(self._columns(one)) for one in self.formations],
+        )
         if self.scenario.formation.rolling:
             room = [self.stretch_columns] * lanes
             weights = [6.0 if self.crowded and lane == 0 else 1.0 for lane in range(lanes)]
             vehicles = [visit.vehicle for visit in self.visits]
             return _draw_lanes(vehicles, room, weights, rng)
-        may_join = len(self.blocks) == 2 and self.scenario.formation.max_joined >= 2
+        may_join = len(self.formations) == 2 and self.scenario.formation.max_joined >= 2
         if self.crowded and (may_join or not last):
             # One lane that everybody likes best.
-            room = [columns * len(self.blocks)] * lanes if last else [99] * lanes
+            room = [sum(columns)] * lanes if last else [99] * lanes
             favourite = rng.randrange(lanes)
             weights = [6.0 if lane == favourite else 1.0 for lane in range(lanes)]
             return _draw_lanes([visit.vehicle for visit in self.visits], room, weights, rng)
         wishes: dict[Name, int] = {}
-        for block in self.blocks:
-            members = [visit.vehicle for visit in self.visits if self._block(visit) == block]
-            wishes |= _draw_lanes(members, [columns] * lanes, [1.0] * lanes, rng)
+        lattice = self.scenario.lattice
+        for formation, length in zip(self.formations, columns, strict=True):
+            members = [
+                visit.vehicle
+                for visit in self.visits
+                if lattice.block_of(visit.cell[0]) in formation.blocks
+            ]
+            wishes |= _draw_lanes(members, [length] * lanes, [1.0] * lanes, rng)
         return wishes
-
-    def _block(self, visit: Visit) -> int:
-        return self.scenario.lattice.block_of(visit.cell[0])
 
 
 def _draw_lanes(
@@ -141,29 +159,48 @@ def _draw_lanes(
     return wishes
 
 
+def _draw_formations(
+    profile: Profile, scenario: Scenario, rng: random.Random
+) -> list[ClosedFormation]:
+    """Draw which columns are whose, from the rearmost formation to the foremost one."""
+    lattice, growing = scenario.lattice, scenario.formation.closes_by_vehicles
+    rear, formations = rng.choice(LAST_COLUMNS), []
+    for _ in range(rng.randint(*profile.blocks)):
+        length = rng.randint(*LENGTHS) if growing else BLOCK_COLUMNS
+        front, closed_s = rear + length - 1, max(0.0, lattice.passing_time_s(rear))
+        blocks = lattice.block_of(front), lattice.block_of(rear)
+        formations.append(ClosedFormation(*blocks, closed_s))
+        rear = front + 1 + (rng.choice(GAPS) if growing else 0)
+    return formations[::-1]
+
+
 def _draw_visits(
     profile: Profile,
     scenario: Scenario,
-    blocks: tuple[int, ...],
+    formations: tuple[ClosedFormation, ...],
     mix: Mix,
     rng: random.Random,
 ) -> Iterator[Visit]:
-    """Draw who is in which cell: in each block at least one, in no block more than half full."""
+    """Draw who is in which cell: in each formation at least one, in none more than half full."""
     lattice = scenario.lattice
-    half = min(scenario.formation.block_columns * lattice.lanes // 2, LARGEST)
-    room = dict.fromkeys(blocks, half)
+    cells = [
+        [(column, lane) for column in one.columns(lattice) for lane in range(lattice.lanes)]
+        for one in formations
+    ]
+    blocks = range(len(formations))
+    room = [min(len(each) // 2, LARGEST) for each in cells]
     if scenario.formation.max_joined > 1:
         # Every other one is small.
-        room |= dict.fromkeys(blocks[rng.randrange(2) :: 2], min(half, LARGEST_JOINED - half))
+        for block in blocks[rng.randrange(2) :: 2]:
+            room[block] = min(room[block], LARGEST_JOINED - LARGEST)
     least, most = profile.vehicles
-    wanted = min(max(rng.randint(least, most), len(blocks)), sum(room.values()))
-    counts = dict.fromkeys(blocks, 1)
-    while sum(counts.values()) < wanted:
+    wanted = min(max(rng.randint(least, most), len(blocks)), sum(room))
+    counts = [1] * len(blocks)
+    while sum(counts) < wanted:
         counts[rng.choice([block for block in blocks if counts[block] < room[block]])] += 1
     number = 0
     for block in blocks:
-        cells = rng.sample(sorted(lattice.block_cells(block)), counts[block])
-        for index, cell in enumerate(cells):
+        for index, cell in enumerate(rng.sample(cells[block], counts[block])):
             number += 1
             # The first one stays: without anybody a formation is gone, and so is its room.
             leaves = index > 0 and rng.random() < profile.leavers

@@ -174,6 +174,7 @@ class World:
             self._incarnations.__next__,
             self._move_lasts_s,
             self._loses_command,
+            self.setup.formations,
             self.setup.grants,
         )
         self._set_clocks()
@@ -279,9 +280,9 @@ class World:
     def _move_lasts_s(self) -> float:
         rng = self._rng
         if not self.injector.healed and rng.random() < self.setup.mix.slow_moves:
-            slot_s = self.setup.scenario.formation.cycle_s
+            slot_s = self.setup.scenario.cycles_s[0]
             return rng.uniform(slot_s, SLOWEST_SLOTS * slot_s)
-        return self.setup.scenario.formation.move_s
+        return self.setup.scenario.move_s
 
     def _loses_command(self) -> bool:
         share = self.setup.mix.command_loss
@@ -319,7 +320,7 @@ class World:
     def _patience_s(self) -> float:
         scenario = self.setup.scenario
         if scenario.formation.rolling:
-            return SLOTS_WHOLE * scenario.formation.cycle_s
+            return SLOTS_WHOLE * scenario.cycles_s[0]
         return PATIENCE_S
 
     def _astray(self) -> list[Name]:
