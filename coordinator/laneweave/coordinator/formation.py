@@ -81,8 +81,13 @@ def start_time_s(cells: Collection[Cell], not_before_s: float, scenario: Scenari
     in_sorting_s = lattice.passing_time_s(
         min(column for column, _ in cells), road.sorting_start_m + scenario.vehicle.length_m
     )
+    return on_tick(max(in_sorting_s, not_before_s), scenario)
+
+
+def on_tick(t_s: float, scenario: Scenario) -> float:
+    """Return the first tick at or after a road time."""
     tick_s = scenario.runtime.tick_s
-    return math.ceil(max(in_sorting_s, not_before_s) / tick_s - 1e-6) * tick_s
+    return math.ceil(t_s / tick_s - 1e-6) * tick_s
 
 
 def time_left_s(cells: Collection[Cell], t_s: float, scenario: Scenario) -> float:

@@ -10,13 +10,14 @@ from collections.abc import Collection, Iterator, Mapping
 from functools import partial
 from typing import Any
 
-from attrs import evolve, field, frozen
+from attrs import field, frozen
 
-from laneweave.coordinator.borders import kept_apart, steps_of
+from laneweave.coordinator.borders import steps_of
 from laneweave.coordinator.formation import start_time_s, steps_left, time_left_s
 from laneweave.coordinator.groups import Groups, Numbers
 from laneweave.coordinator.leader import FormationControl
 from laneweave.coordinator.leader_rules import Phase
+from laneweave.coordinator.pacing import comfortable_steps, paced
 from laneweave.coordinator.planning import PlanResponse, Weights
 from laneweave.coordinator.sorting import Sorting, SortingTask, sort_lanes
 from laneweave.protocol.lattice import Cell, territory
@@ -29,8 +30,6 @@ START_MARGIN_S = 0.5
 """A plan made late starts this much road time after it is ready."""
 ROOM_S = 2.5
 """A formation that lacks room waits at most so long for the next one to close (road time)."""
-RESERVE_S = 4.0
-"""Slots are no longer than leaves so much road time behind the last one, for lost messages."""
 SHORTEST_DEADLINE_S = 1.0
 """For planning, where the first move could begin at once."""
 MOST_DOUBLINGS = 4
@@ -93,6 +92,7 @@ class FormationPlanner:
                 scenario.formation.planning_deadline_s,
                 max(start_s - t_s, SHORTEST_DEADLINE_S),
             ),
+            comfortable_steps(start_s, self._end_s(numbers), scenario),
         )
         # What was ordered under an earlier ballot is not waited for any more.
         for other, (number, _) in list(self._ordered.items()):
@@ -102,6 +102,11 @@ class FormationPlanner:
         nodes = scenario.formation.max_nodes * 2 ** min(control.failures, MOST_DOUBLINGS)
         # In the job: promises that cannot be planned from fail there, as any failed planning does.
         yield Compute(job, partial(self._sort, job, task, nodes))
+
+    def _end_s(self, numbers: Numbers) -> float:
+        """Return the road time at which the foremost column of some blocks leaves the road."""
+        front = self._scenario.lattice.block_range(numbers[0])[-1]
+        return time_left_s([(front, 0)], 0.0, self._scenario)
 
     def _sort(self, job: int, task: SortingTask, nodes: int) -> Sorting | None:
         """Do the work, unless nobody waits for it any more when its turn comes."""
@@ -142,11 +147,12 @@ class FormationPlanner:
                 return
             if result.solved:
                 planned = self._plan(control, result, t_s)
-                plan = self._paced(planned, controls)
+                plan = self._paced(planned, controls, t_s)
                 problems = plan_problems(plan)
                 if not problems:
                     control.on_plan(plan, now_s, result.out_of_reach)
-                    yield from _notes(number, result, steps_of(plan) - steps_of(planned))
+                    pauses = steps_of(plan) - steps_of(planned)
+                    yield from _notes(number, result, pauses, plan)
                     return
                 error = "; ".join(problems)
         control.on_planning_failed(now_s)
@@ -211,20 +217,13 @@ class FormationPlanner:
             territory=tuple(sorted(territory(hold_cells.values(), all_moves))),
         )
 
-    def _paced(self, plan: Plan, controls: Mapping[int, FormationControl]) -> Plan:
-        """Return a plan in the longest slots in which it ends in time.
-
-        With pauses for the plans of the neighbours that this leader has made.
-        """
-        scenario, others = self._scenario, self._plans_beside(plan, controls)
-        cells = {*plan.start_cells.values(), *plan.territory}
-        left_s = time_left_s(cells, plan.t0_s, scenario)
-        for slot_s in reversed(scenario.slots_s):
-            slower = evolve(plan, slot_s=slot_s)
-            paused = kept_apart(slower, others, scenario.formation.slack_s, int(left_s / slot_s))
-            if steps_of(paused) * slot_s <= left_s - RESERVE_S:
-                return paused
-        return paused
+    def _paced(self, plan: Plan, controls: Mapping[int, FormationControl], t_s: float) -> Plan:
+        """Choose the slots of a plan; it begins when its vehicles have settled in their cells."""
+        scenario = self._scenario
+        rear, formation = min(column for column, _ in plan.start_cells.values()), scenario.formation
+        settled_s = scenario.lattice.passing_time_s(rear) + formation.entry_spread_s
+        not_before_s = max(settled_s + formation.settle_s, t_s + START_MARGIN_S)
+        return paced(plan, self._plans_beside(plan, controls), not_before_s, scenario)
 
     def _plans_beside(self, plan: Plan, controls: Mapping[int, FormationControl]) -> list[Plan]:
         """Return the plans of the neighbours that this leader has made, and that are driven."""
@@ -243,9 +242,10 @@ class FormationPlanner:
         return start_time_s(cells, t_s + START_MARGIN_S, self._scenario)
 
 
-def _notes(number: int, sorting: Sorting, pauses: int) -> Iterator[Note]:
+def _notes(number: int, sorting: Sorting, pauses: int, plan: Plan) -> Iterator[Note]:
     if sorting.response is not None:
-        yield Note("plan-made", _facts(number, sorting.response))
+        timing = {"t0_s": plan.t0_s, "slot_s": plan.slot_s}
+        yield Note("plan-made", _facts(number, sorting.response) | timing)
     if pauses:
         yield Note("neighbours-awaited", {"formation": number, "slots": pauses})
     if sorting.out_of_reach:

@@ -7,16 +7,21 @@ that one vehicle in a corner does not keep all others from theirs.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator, Mapping
+from itertools import islice
 
 from attrs import frozen
 
 from laneweave.coordinator.groups import Numbers
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, Weights, checked_plan
-from laneweave.coordinator.targets import place
+from laneweave.coordinator.targets import Targets, placements
 from laneweave.protocol.lattice import Cell, Move
 from laneweave.protocol.messages import Name
 from laneweave.protocol.scenario import Scenario
+
+MOST_PLACEMENTS = 6
+"""Structures that are tried where the first one takes too many steps."""
 
 
 @frozen
@@ -35,6 +40,8 @@ class SortingTask:
     """Mode, conflict kinds, lattice."""
     deadline_s: float
     """For each planning."""
+    steps: int = 1_000_000
+    """How many steps the road has room for; where a plan has more, other targets are tried."""
 
     @property
     def columns(self) -> range:
@@ -89,20 +96,32 @@ class Sorting:
         return self.response is None or bool(self.response.paths)
 
 
-def plan_request(task: SortingTask, dropped: Name | None = None) -> PlanRequest:
-    """Return the request for a sorting.
+def plan_requests(task: SortingTask, dropped: Name | None = None) -> Iterator[PlanRequest]:
+    """Yield the requests for a sorting, one for each placement of the targets, the best first.
 
     Args:
         task: with at least one vehicle that can be moved.
-        dropped: somebody who need not get to its lane.
+        dropped: a vehicle that need not get to its lane.
     """
-    scenario, columns = task.scenario, len(task.columns)
-    movers, blocked = task.movers, task.blocked
+    scenario = task.scenario
     wanted = {
         name: cell[1] if name == dropped else task.preferred_lanes[name]
-        for name, cell in movers.items()
+        for name, cell in task.movers.items()
     }
-    targets = place(movers, wanted, columns, scenario.road.lanes, blocked)
+    for targets in placements(
+        task.movers,
+        wanted,
+        len(task.columns),
+        scenario.road.lanes,
+        task.blocked,
+        ahead=scenario.formation.closes_by_vehicles,
+    ):
+        yield _plan_request(task, wanted, targets)
+
+
+def _plan_request(task: SortingTask, wanted: Mapping[Name, int], targets: Targets) -> PlanRequest:
+    scenario, columns = task.scenario, len(task.columns)
+    movers, blocked = task.movers, task.blocked
     index = {cell: number for number, cell in enumerate(targets.cells)}
     vehicles = [
         {"id": name, "cell": list(cell)}
@@ -141,13 +160,22 @@ def sort_lanes(task: SortingTask, max_nodes: int, weights: Weights) -> Sorting:
     """
     if not task.movers:
         return _sorting(task, None)
-    response: PlanResponse | None = None
     for dropped in _attempts(task):
-        request = plan_request(task, dropped)
-        response = checked_plan(request, max_nodes=max_nodes, weights=weights)
-        if response.status != "infeasible":
+        best: PlanResponse | None = None
+        for request in islice(plan_requests(task, dropped), MOST_PLACEMENTS):
+            response = checked_plan(request, max_nodes=max_nodes, weights=weights)
+            if best is None or _steps(response) < _steps(best):
+                best = response
+            if _steps(best) <= task.steps or response.status == "infeasible":
+                break
+        if best is not None and best.status != "infeasible":
             break
-    return _sorting(task, response)
+    return _sorting(task, best)
+
+
+def _steps(response: PlanResponse) -> float:
+    """Return how many steps a plan takes; infinite: there is none."""
+    return math.inf if response.steps is None else response.steps
 
 
 def _attempts(task: SortingTask) -> Iterator[Name | None]:

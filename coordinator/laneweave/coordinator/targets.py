@@ -1,13 +1,14 @@
 """Targets of a formation: the parallel structure after lane sorting (paper, Section 5.2.1).
 
-Each lane offers as many neighbouring cells as vehicles need it, placed where their ways are
-shortest. A vehicle that nobody drives keeps its cell, and the others sort themselves around it.
-When a lane has fewer free cells than vehicles that need it, those with the longest way stay out.
+Each lane offers as many neighbouring cells as vehicles need it, placed where their paths are
+shortest. A vehicle without an agent keeps its cell, and the others sort themselves around it.
+When a lane has fewer free cells than vehicles that need it, those with the longest path stay out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+import heapq
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import numpy as np
 from attrs import frozen
@@ -33,8 +34,23 @@ def place(
     columns: int,
     lanes: int,
     blocked: Collection[Cell] = (),
+    *,
+    ahead: bool = False,
 ) -> Targets:
-    """Place the targets of vehicles on a grid.
+    """Place the targets of vehicles where their paths are shortest; see `placements`."""
+    return next(placements(cells, preferred_lanes, columns, lanes, blocked, ahead=ahead))
+
+
+def placements(
+    cells: Mapping[Name, Cell],
+    preferred_lanes: Mapping[Name, int],
+    columns: int,
+    lanes: int,
+    blocked: Collection[Cell] = (),
+    *,
+    ahead: bool = False,
+) -> Iterator[Targets]:
+    """Yield all parallel structures on a grid, those with the shortest paths first.
 
     Args:
         cells: where each vehicle is.
@@ -42,23 +58,48 @@ def place(
         columns: columns of the grid.
         lanes: lanes of the grid.
         blocked: cells that cannot be targets.
+        ahead: which of two placements with equal paths comes first: the one further ahead, or the
+            one nearer to the middle of the grid.
     """
-    targets: list[Cell] = []
+    choices: list[list[tuple[float, list[Cell]]]] = []
     left_over: list[Name] = []
     for lane in range(lanes):
         free = [column for column in range(columns) if (column, lane) not in blocked]
         wanting = [name for name in cells if preferred_lanes[name] == lane]
         if len(wanting) > len(free):
-            # Who is furthest away has the least chance; by name where it makes no difference.
+            # Those furthest away stay out; by name where it makes no difference.
             wanting.sort(key=lambda name: (abs(cells[name][1] - lane), name))
             left_over += wanting[len(free) :]
             wanting = wanting[: len(free)]
-        targets += parallel_targets(lane, [cells[name] for name in wanting], columns, free)
-    own: dict[Name, Cell] = {}
-    for name in left_over:
-        own[name] = _nearest_free(cells[name], columns, lanes, {*blocked, *targets})
-        targets.append(own[name])
-    return Targets(tuple(targets), own)
+        starts = [cells[name] for name in wanting]
+        choices.append(_ranked_targets(lane, starts, columns, free, ahead=ahead))
+    for chosen in _combinations(choices):
+        targets = list(chosen)
+        own: dict[Name, Cell] = {}
+        for name in left_over:
+            own[name] = _nearest_free(cells[name], columns, lanes, {*blocked, *targets})
+            targets.append(own[name])
+        yield Targets(tuple(targets), own)
+
+
+def _combinations(choices: Sequence[Sequence[tuple[float, list[Cell]]]]) -> Iterator[list[Cell]]:
+    """Yield one choice of each lane, joined, in ascending order of the sum of their ranks."""
+
+    def total(indices: tuple[int, ...]) -> float:
+        return sum(lane[index][0] for lane, index in zip(choices, indices, strict=True))
+
+    first = (0,) * len(choices)
+    heap, seen = [(total(first), first)], {first}
+    while heap:
+        _, indices = heapq.heappop(heap)
+        yield [
+            cell for lane, index in zip(choices, indices, strict=True) for cell in lane[index][1]
+        ]
+        for place, index in enumerate(indices):
+            following = (*indices[:place], index + 1, *indices[place + 1 :])
+            if index + 1 < len(choices[place]) and following not in seen:
+                seen.add(following)
+                heapq.heappush(heap, (total(following), following))
 
 
 def parallel_targets(
@@ -67,7 +108,7 @@ def parallel_targets(
     """Return neighbouring target cells on a lane for the vehicles that need it.
 
     As many as there are vehicles, without gaps but for blocked cells, placed where the vehicles
-    have the shortest way, so that lane sorting moves nobody ahead or back on average.
+    have the shortest paths.
 
     Args:
         lane: the lane that all of them need.
@@ -75,26 +116,38 @@ def parallel_targets(
         columns: columns of the grid.
         free: columns in which the lane's cells may be targets; None: all.
     """
+    return _ranked_targets(lane, cells, columns, free, ahead=False)[0][1]
+
+
+def _ranked_targets(
+    lane: int,
+    cells: Sequence[Cell],
+    columns: int,
+    free: Sequence[int] | None,
+    *,
+    ahead: bool,
+) -> list[tuple[float, list[Cell]]]:
+    """Return all runs of neighbouring cells on a lane, each with its rank, the best one first."""
     free = range(columns) if free is None else free
     count = min(len(cells), len(free))
     if count == 0:
-        return []
-    best: tuple[float, int] | None = None
+        return [(0.0, [])]
+    ranked: list[tuple[float, list[Cell]]] = []
     for first in range(len(free) - count + 1):
         chosen = free[first : first + count]
-        ways = np.array(
+        paths = np.array(
             [
                 [abs(column - target) + abs(own_lane - lane) for target in chosen]
                 for column, own_lane in cells
             ]
         )
-        rows, places = linear_sum_assignment(ways)
-        # Equal ways: the place nearest to the middle of the block.
-        off_middle = abs(sum(chosen) / count - (columns - 1) / 2)
-        rank = (float(ways[rows, places].sum()) + off_middle / (10 * columns), first)
-        best = rank if best is None else min(best, rank)
-    assert best is not None  # noqa: S101 (count >= 1 leaves at least one place)
-    return [(column, lane) for column in free[best[1] : best[1] + count]]
+        rows, places = linear_sum_assignment(paths)
+        # Paths of equal length are told apart by less than one step.
+        middle = sum(chosen) / count
+        off = columns - 1 - middle if ahead else abs(middle - (columns - 1) / 2)
+        rank = float(paths[rows, places].sum()) + off / (10 * columns)
+        ranked.append((rank, [(column, lane) for column in chosen]))
+    return sorted(ranked)
 
 
 def _nearest_free(cell: Cell, columns: int, lanes: int, taken: Collection[Cell]) -> Cell:

@@ -7,6 +7,7 @@ fit together, and raises `BadInputError` with the field, the value and what is a
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -29,7 +30,9 @@ SCHEMA = "laneweave.scenario/1"
 BASE_CONFLICTS = ("node", "edge", "special-1")
 SHORTEST_CYCLE_S, LONGEST_CYCLE_S = 4.0, 7.0
 """Range of T_F where `formation.cycle_s` leaves it open: from the paper's value on."""
-CYCLE_STEP_S = 0.5
+COMFORT_MPS2 = 3.0
+"""Accelerations up to this are comfortable, along and across."""
+CYCLE_STEP_S = 0.2
 """Few values of T_F are in use, so that trajectories of moves are planned once."""
 SLACK_S = 0.2
 """Part of T_F in which nothing moves, unless `formation.move_s` says otherwise."""
@@ -181,10 +184,10 @@ class FormationSettings:
         """Most time between a vehicle and its cell as they pass the start of the road.
 
         Half of what lies between two cells, so that a vehicle waits only when it is too close
-        behind another one. Interlaced entry: half as much again, so that vehicles catch up with
-        cells that stayed empty, and queues end sooner.
+        behind another one. Formations: half as much again, so that vehicles catch up with cells
+        that stayed empty, and queues end sooner.
         """
-        return (0.75 if self.interlaced else 0.5) * self.entry_spacing_s
+        return (0.5 if self.rolling else 0.75) * self.entry_spacing_s
 
     @property
     def oblique_steps(self) -> int:
@@ -377,6 +380,15 @@ class Scenario:
         shortest_s, longest_s = self.cycles_s
         count = round((longest_s - shortest_s) / CYCLE_STEP_S)
         return tuple(shortest_s + CYCLE_STEP_S * number for number in range(count + 1))
+
+    @property
+    def comfortable_cycle_s(self) -> float:
+        """Shortest T_F in which no move needs more than `COMFORT_MPS2` [s].
+
+        A move of least jerk by d in T needs an acceleration of 10 / sqrt(3) d / T^2.
+        """
+        formation = self.formation
+        return formation.slack_s + math.sqrt(10.0 / math.sqrt(3.0) * formation.gap_m / COMFORT_MPS2)
 
     @property
     def horizon_ticks(self) -> int:

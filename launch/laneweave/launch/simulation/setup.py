@@ -119,7 +119,7 @@ class Setup:
         """
         lanes, columns = (
             self.scenario.road.lanes,
-            [len(self._columns(one)) for one in self.formations],
+            [len(one.columns(self.scenario.lattice)) for one in self.formations],
         )
         if self.scenario.formation.rolling:
             room = [self.stretch_columns] * lanes

@@ -1,0 +1,74 @@
+"""When the steps of a plan are driven: its first slot, and the length of all of its slots.
+
+Lanes are changed in S3 only (paper, Section 5.2.1). Where the scenario leaves T_F open, the slots
+of a plan are as long as its road allows, and a plan begins as soon as none of its lane changes
+comes before S3: moves along the road, and moves of vehicles ahead, may come earlier.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from attrs import evolve
+
+from laneweave.coordinator.borders import kept_apart, steps_of
+from laneweave.coordinator.formation import on_tick, start_time_s, time_left_s
+from laneweave.protocol.messages import Plan
+from laneweave.protocol.scenario import Scenario
+
+RESERVE_S = 3.0
+"""Road time behind the last slot that is left for lost messages."""
+LEAST_RESERVE_S = 1.0
+"""The same where moves would not be comfortable otherwise."""
+
+
+def comfortable_steps(start_s: float, end_s: float, scenario: Scenario) -> int:
+    """Return how many steps fit in between two road times without haste.
+
+    Where T_F is given, as many as fit in.
+    """
+    shortest_s, longest_s = scenario.cycles_s
+    if shortest_s == longest_s:
+        return int((end_s - start_s) / longest_s)
+    slot_s = min(scenario.comfortable_cycle_s, longest_s)
+    return max(1, int((end_s - start_s - RESERVE_S) / slot_s))
+
+
+def paced(plan: Plan, others: Sequence[Plan], not_before_s: float, scenario: Scenario) -> Plan:
+    """Return a plan in the longest slots in which it ends in time.
+
+    It pauses for slots in which it would come too close to plans of its neighbours.
+
+    Args:
+        plan: as it was planned; it begins when all of its vehicles are in S3.
+        others: plans of neighbouring formations; they stay as they are.
+        not_before_s: road time before which it cannot begin.
+        scenario: road, lattice, T_F.
+    """
+    slots_s, slack_s = scenario.slots_s, scenario.formation.slack_s
+    cells = {*plan.start_cells.values(), *plan.territory}
+    left_s = time_left_s(cells, 0.0, scenario)
+    best = plan
+    for reserve_s in (RESERVE_S, LEAST_RESERVE_S):
+        for slot_s in reversed(slots_s):
+            t0_s = (
+                plan.t0_s if len(slots_s) == 1 else _start_s(plan, slot_s, not_before_s, scenario)
+            )
+            most_steps = int((left_s - t0_s) / slot_s)
+            best = kept_apart(evolve(plan, t0_s=t0_s, slot_s=slot_s), others, slack_s, most_steps)
+            if t0_s + steps_of(best) * slot_s <= left_s - reserve_s:
+                return best
+            if slot_s < scenario.comfortable_cycle_s and reserve_s == RESERVE_S:
+                break  # rather less reserve
+    return best
+
+
+def _start_s(plan: Plan, slot_s: float, not_before_s: float, scenario: Scenario) -> float:
+    """Return the first road time at which no lane change comes before S3."""
+    in_time = [
+        start_time_s([origin], 0.0, scenario) - step * slot_s
+        for moves in plan.moves.values()
+        for step, origin, target in moves
+        if origin[1] != target[1]
+    ]
+    return min(plan.t0_s, on_tick(max([not_before_s, *in_time]), scenario))
