@@ -31,13 +31,20 @@ from laneweave.coordinator.planning.stream import (
 )
 from laneweave.coordinator.planning.stream_validate import problems_of_ways
 from laneweave.coordinator.stream_planner import REWARD, stream_road
-from laneweave.protocol.scenario import load_scenario
+from laneweave.protocol.scenario import Scenario, load_scenario
 from laneweave.sim_bridge.demand import arrivals
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "evidence" / "stream.json"
 VOLUMES = (1000, 1600, 1800, 2000, 2200, 2400, 2500, 2600)
 DURATION_S, NOT_COUNTED_S = 600.0, 60.0
-SCENARIO = load_scenario(None)
+
+
+def _rolling(**more: object) -> Scenario:
+    """Return the scenario of the rolling operation; see `load_scenario`."""
+    return load_scenario(None, formation__operation="rolling", **more)
+
+
+SCENARIO = _rolling(formation__cycle_s=4.0)
 SPEED_MPS, ROAD = SCENARIO.formation.speed_mps, stream_road(SCENARIO)
 PITCH_M, LENGTH_M = ROAD.pitch_m, ROAD.length_m
 
@@ -53,7 +60,13 @@ class Variant:
 
 VARIANTS = {
     "default": Variant(volumes=VOLUMES),
-    "S2 too": Variant(stream_road(load_scenario(None, formation__sort_in_s2=True))),
+    **{
+        f"T_F {cycle_s:g} s": Variant(
+            stream_road(_rolling(formation__cycle_s=cycle_s)), volumes=(2000, 2200, 2400)
+        )
+        for cycle_s in (4.6, 5.0, 5.6, 6.0)
+    },
+    "S2 too": Variant(stream_road(_rolling(formation__cycle_s=4.0, formation__sort_in_s2=True))),
     "drift rewarded": Variant(costs=StreamCosts(forward=REWARD)),
     "drift costs": Variant(costs=StreamCosts(forward=2.0)),
     "trains": Variant(attrs.evolve(ROAD, model=ConflictModel(("node", "edge", "closing")))),
