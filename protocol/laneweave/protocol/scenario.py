@@ -213,6 +213,9 @@ class Tracking:
     horizon_ticks: int = field(default=40, validator=within(10, 100))
     min_gap_m: float = field(default=3.0, validator=within(0.0, 100.0))
     """Net gap to the vehicle ahead that the tracker gives up its reference for."""
+    always_solve: bool = False
+    """Solve the quadratic program with OSQP in every tick, also where its solution without the
+    inequalities is known to satisfy them all."""
 
 
 @frozen
