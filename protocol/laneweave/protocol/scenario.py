@@ -125,6 +125,15 @@ class FormationSettings:
         return (1.0 if self.rolling else 2.0) * self.gap_m / self.speed_mps
 
     @property
+    def bound_veh_per_lane_h(self) -> float:
+        """Most vehicles that may enter a lane in an hour: one for each cell that may be entered.
+
+        V_u = 3600 v_F / (2 d_F) with interlaced entry (paper, Section 5.2.3), twice as many
+        where every cell may be entered.
+        """
+        return 3600.0 / self.entry_spacing_s
+
+    @property
     def entry_spread_s(self) -> float:
         """Most time between a vehicle and its cell as they pass the start of the road.
 
