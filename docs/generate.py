@@ -149,8 +149,20 @@ def _planner() -> str:
 
 def _conflicts() -> str:
     """Return the table of how many pairs of moves are forbidden."""
-    lines = ["| `geometric` | pairs in mode 1 | pairs in mode 2 |", "|---|---|---|"]
+    lines = ["| conflicts | pairs in mode 1 | pairs in mode 2 |", "|---|---|---|"]
     lines += [f"| {name} | {one} | {two} |" for name, one, two in counts()]
+    return "\n".join(lines)
+
+
+def _distances() -> str:
+    """Return the table of how near bodies come that may move, by `benchmarks/geometry.py`."""
+    table = json.loads(GEOMETRY.read_text(encoding="utf-8"))["nearest_m"]
+    late = list(table[0])[1:]
+    columns = " | ".join(f"one up to {name} late" if name != "0 s" else "on time" for name in late)
+    lines = [f"| conflicts | {columns} |", "|---" * (len(late) + 1) + "|"]
+    for row in table:
+        gaps = " | ".join(f"{row[name]:.2f} m" for name in late)
+        lines.append(f"| {row['conflicts']} | {gaps} |")
     return "\n".join(lines)
 
 
@@ -311,6 +323,7 @@ def parts() -> dict[str, str]:
         "resilience": _resilience(),
         "planner": _planner(),
         "conflict counts": _conflicts(),
+        "conflict distances": _distances(),
         "geometry": _geometry(),
         "closing": _closing(),
         "service": _service(),

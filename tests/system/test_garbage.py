@@ -131,6 +131,7 @@ def messages(vehicle: Name, *, number: int, real: float) -> dict[type, Any]:
             number,
             number,
             number,
+            number,
             b"\x00\x00\xc0\x7f" * 9,
         ),
         LogEvent(

@@ -56,6 +56,8 @@ SUMMARY: dict[str, Any] = {
     },
     "tracking": {
         "solves": COUNT,
+        "osqp_solves": COUNT,
+        "unconstrained_steps": COUNT,
         "unusable": COUNT,
         "solve_ms": dict.fromkeys(("p50", "p99"), NUMBER),
     },

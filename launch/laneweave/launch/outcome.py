@@ -124,7 +124,7 @@ def _traffic_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _control_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
-    planning, runtime = summary["planning"], summary["runtime"]
+    planning, tracking, runtime = summary["planning"], summary["tracking"], summary["runtime"]
     failover, largest = summary["failover"], planning["largest_formation"]
     recoveries = ", ".join(f"{seconds:.3f} s" for seconds in failover["recovery_s"])
     return [
@@ -137,9 +137,10 @@ def _control_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
             _join(planning["solve_ms"], "p50", "p95", "max", unit=" ms"),
         ),
         (
-            "tracking CPU p50 / p99",
-            _join(summary["tracking"]["solve_ms"], "p50", "p99", unit=" ms"),
+            "tracking by OSQP / unconstrained",
+            f"{tracking['osqp_solves']:,} / {tracking['unconstrained_steps']:,} ticks",
         ),
+        ("tracking CPU p50 / p99", _join(tracking["solve_ms"], "p50", "p99", unit=" ms")),
         ("tick p50 / p99", _join(runtime["tick_ms"], "p50", "p99", unit=" ms")),
         (
             "real-time factor",

@@ -180,6 +180,15 @@ class FormationSettings:
         return (2.0 if self.interlaced else 1.0) * self.gap_m / self.speed_mps
 
     @property
+    def bound_veh_per_lane_h(self) -> float:
+        """Most vehicles that may enter a lane in an hour: one for each cell that may be entered.
+
+        V_u = 3600 v_F / (2 d_F) with interlaced entry (paper, Section 5.2.3), twice as many
+        where every cell may be entered.
+        """
+        return 3600.0 / self.entry_spacing_s
+
+    @property
     def entry_spread_s(self) -> float:
         """Most time between a vehicle and its cell as they pass the start of the road.
 
@@ -269,6 +278,9 @@ class Tracking:
     """Ticks that the tracker looks ahead; None: the longest T_F."""
     min_gap_m: float = field(default=3.0, validator=within(0.0, 100.0))
     """Net gap to the vehicle ahead that the tracker gives up its reference for."""
+    always_solve: bool = False
+    """Solve the quadratic program with OSQP in every tick, also where its solution without the
+    inequalities is known to satisfy them all."""
 
 
 @frozen

@@ -293,6 +293,8 @@ class RunRecord:
         wall_s, ticks = self._stopwatch() - self._began, self._rung_ticks
         reports = self._reports.values()
         solve_ms = _milliseconds(report.solve_ms for report in reports)
+        solves = sum(report.solves for report in reports)
+        osqp_solves = sum(report.osqp_solves for report in reports)
         plan_ms = np.array([_number(plan.get("solve_ms")) for plan in self._plans])
         return {
             "planning": {
@@ -304,7 +306,9 @@ class RunRecord:
                 "solve_ms": spread(plan_ms, 50, 95, largest=True),
             },
             "tracking": {
-                "solves": sum(report.solves for report in reports),
+                "solves": solves,
+                "osqp_solves": osqp_solves,
+                "unconstrained_steps": solves - osqp_solves,
                 "unusable": sum(report.unusable for report in reports),
                 "hold_law_ticks": ticks[Rung.HOLD] + ticks[Rung.GIVE_WAY],
                 "emergency_ticks": ticks[Rung.EMERGENCY],

@@ -69,7 +69,7 @@ SAMPLES: tuple[object, ...] = (
     Command(V1, 11, 130, (0, 1), 140, (0, 0), b"\0" * 16, (-1, 0), BALLOT, BALLOT, DEED),
     Census(13.0, (CensusEntry(V1, (0, 1), 2, 5.0),), (Announcement(V2, 0, 1, 20.0),)),
     RoadClock(130, 13.0, demanded=5, entered=4, on_road=3, left=1, ended=False),
-    Report(Name("agent"), V1, Name("17-4"), 10, 3, 5, 1, b"\0\0\0\0"),
+    Report(Name("agent"), V1, Name("17-4"), 10, 3, 5, 1, 2, b"\0\0\0\0"),
     LogEvent(Name("bridge"), Name("b"), 13.0, Name("overlap"), {"n": 1, "pair": ["v1", "v2"]}),
     Motion(V1, 11, -1, (0, 0), (0, 1), begin_tick=120, tick=130),
 )  # fmt: skip

@@ -78,6 +78,22 @@ def test_defaults_are_the_table_of_the_paper() -> None:
     assert scenario.lane_shares == pytest.approx((1 / 3,) * 3)
 
 
+@pytest.mark.parametrize(
+    ("formation", "bound"),
+    [
+        ({"operation": "paper"}, 1800.0),
+        ({"operation": "paper", "gap_m": 20.0}, 1350.0),
+        ({"operation": "rolling"}, 3600.0),
+    ],
+)
+def test_bound_of_the_road(formation: dict[str, Any], bound: float) -> None:
+    """V_u = 3600 v_F / (2 d_F) of the paper, for interlaced entry."""
+    settings = parse_scenario({"formation": formation}).formation
+    assert settings.bound_veh_per_lane_h == pytest.approx(bound)
+    share = 2.0 if settings.operation == "paper" else 1.0
+    assert bound == pytest.approx(3600.0 * settings.speed_mps / (share * settings.gap_m))
+
+
 def test_the_file_of_the_paper_holds_the_defaults_but_for_the_operation() -> None:
     explicit = ("node", "edge", "special-1", "closing")
     default = Scenario()

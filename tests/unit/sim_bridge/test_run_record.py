@@ -121,10 +121,13 @@ def test_messages_are_counted_once_per_process(record: RunRecord, tmp_path: Path
 def test_the_newest_report_of_a_sender_counts(record: RunRecord, tmp_path: Path) -> None:
     record.on_report(Report(Name("agent"), Name("A"), solves=5, solve_ms=floats(9.0)))
     record.on_report(Report(Name("agent"), Name("A"), solves=7, unusable=1, solve_ms=floats(1.0)))
-    record.on_report(Report(Name("agent"), Name("B"), solves=2, solve_ms=floats(3.0)))
+    record.on_report(
+        Report(Name("agent"), Name("B"), solves=2, osqp_solves=1, solve_ms=floats(3.0))
+    )
     record.close(1.0, Ending.COMPLETE)
     tracking = read_summary(tmp_path)["tracking"]
     assert (tracking["solves"], tracking["unusable"]) == (9, 1)
+    assert (tracking["osqp_solves"], tracking["unconstrained_steps"]) == (1, 8)
     assert tracking["solve_ms"]["p50"] == 2.0
 
 

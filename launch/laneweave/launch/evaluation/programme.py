@@ -7,6 +7,7 @@ from typing import Final
 from attrs import frozen
 
 from laneweave.launch.option_values import KeepTrajectories
+from laneweave.launch.sweep.methods import METHODS
 from laneweave.launch.sweep.points import Point, plan_points
 from laneweave.protocol.scenario import Scenario
 
@@ -15,7 +16,7 @@ DURATION_S: Final = 600.0
 """Vehicles arrive for this long at each point."""
 VOLUMES: Final = (1000.0, 1150.0, 1300.0, 1450.0, 1600.0, 1750.0, 2000.0, 2200.0, 2400.0)
 """In vehicles/(lane h): the paper's, and beyond them."""
-PAPER_BOUND: Final = 1800.0
+PAPER_BOUND: Final = METHODS["paper-12"].settings(Scenario()).formation.bound_veh_per_lane_h
 """Most vehicles/(lane h) that interlaced formations can carry (the paper's V_u)."""
 
 
@@ -91,7 +92,7 @@ GOALS: Final = (
     *(Goal(volume, 67.5, 66.8, 100.0) for volume in (1000.0, 1150.0, 1300.0, 1450.0)),
     Goal(1600.0, 69.5, 66.8, 100.0),
     Goal(1750.0, 73.0, 67.0, 100.0),
-    Goal(1800.0, None, 67.0, 100.0),
+    Goal(PAPER_BOUND, None, 67.0, 100.0),
     Goal(2000.0, None, 67.5, 99.95),
     Goal(2200.0, None, 67.5, 99.95),
     Goal(2400.0, None, 68.0, 99.9),

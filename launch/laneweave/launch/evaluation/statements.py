@@ -194,7 +194,7 @@ class _Judge:
         return Statement(text, "not repeated; at 1000: " + ", ".join(times), OTHERWISE)
 
     def _bound(self) -> Statement:
-        text = "At most 1800 veh/(lane h) can be carried (3600 v_F / 2 d_F)"
+        text = f"At most {PAPER_BOUND:g} veh/(lane h) can be carried (3600 v_F / 2 d_F)"
         row, beyond = self._row("paper-12", 1750.0), self._row("rolling", 2400.0)
         if row is None or row.throughput_veh_per_lane_h is None:
             return Statement(text, MISSING, "")

@@ -13,6 +13,7 @@ from laneweave.launch.evaluation.programme import (
     FORMATIONS,
     GOALS,
     LABELS,
+    PAPER_BOUND,
     PARTS,
     ROLLING_VOLUMES,
     VOLUMES,
@@ -123,7 +124,7 @@ def test_the_programme_is_what_the_tables_show() -> None:
     assert {(point.label, point.volume_veh_per_lane_h) for point in points} == {
         (label, volume) for label in LABELS for volume in ROLLING_VOLUMES if planned(label, volume)
     }
-    assert {goal.volume_veh_per_lane_h for goal in GOALS} == {*VOLUMES, 1800.0}
+    assert {goal.volume_veh_per_lane_h for goal in GOALS} == {*VOLUMES, PAPER_BOUND}
     for goal in GOALS:
         volume = goal.volume_veh_per_lane_h
         assert planned("rolling", volume)
