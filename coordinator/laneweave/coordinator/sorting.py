@@ -125,6 +125,7 @@ def plan_request(task: SortingTask, dropped: Name | None = None) -> PlanRequest:
             "vehicles": vehicles,
             "targets": [list(target) for target in targets.cells],
             "deadline_s": formation.planning_deadline_s,
+            "solver": formation.solver,
         }
     )
 

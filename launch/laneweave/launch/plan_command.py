@@ -19,7 +19,6 @@ from laneweave.coordinator.client import (
 )
 from laneweave.coordinator.inquiry import ABSENT_S
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan
-from laneweave.coordinator.planning.facade import Solver
 from laneweave.protocol.access import Access
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
 
@@ -61,7 +60,7 @@ def answer_request(
     path: Path,
     deadline_s: float | None,
     access: Access | None,
-    solver: Solver,
+    solver: str | None,
     *,
     as_table: bool,
     drawing: Path | None = None,
@@ -69,8 +68,8 @@ def answer_request(
 ) -> None:
     """Read a request, have it planned, print the answer and draw it.
 
-    Without `access` it is planned here, by `solver`; there it is waited `wait_s` for somebody who
-    does.
+    Without `access` it is planned here; with it, a coordinator is waited for up to `wait_s`. A
+    deadline and a solver replace those of the request.
 
     Raises:
         BadInputError: the request cannot be read or is not valid, nobody is at the endpoint, or
@@ -85,11 +84,10 @@ def answer_request(
     data = _read(path)
     if deadline_s is not None:
         data["deadline_s"] = deadline_s
+    if solver is not None:
+        data["solver"] = solver
     request = PlanRequest.from_dict(data)
-    if access is None:
-        response = checked_plan(request, solver=solver)
-    else:
-        response = _ask(access, request, wait_s)
+    response = checked_plan(request) if access is None else _ask(access, request, wait_s)
     if as_table:
         sys.stdout.write(_table(request, response))
     else:
@@ -116,7 +114,8 @@ def _table(request: PlanRequest, response: PlanResponse) -> str:
     verdict = f"{response.status}, cost {response.cost}, lower bound {response.lower_bound}"
     if not response.paths:
         return f"{response.status}, lower bound {response.lower_bound}\n"
-    return f"{verdict}, {response.steps} steps\n\n{response.path_map(request)}\n"
+    by = f"{response.solver}{' (fallback)' if response.fallback else ''}"
+    return f"{verdict}, {response.steps} steps, planned by {by}\n\n{response.path_map(request)}\n"
 
 
 def _read(path: Path) -> dict[str, Any]:

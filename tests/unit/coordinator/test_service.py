@@ -118,6 +118,24 @@ def test_an_answer_has_the_encoding_of_its_request(
     assert unpack(reply.payload)["status"] == "optimal"
 
 
+@pytest.mark.parametrize(
+    ("setting", "asked", "planned"),
+    [
+        ("tappa", None, "tappa"),
+        ("branching", None, "branching"),
+        ("branching", "tappa", "tappa"),
+        ("tappa", "branching", "branching"),
+    ],
+)
+def test_a_request_without_a_solver_gets_the_coordinators(
+    setting: str, asked: str | None, planned: str
+) -> None:
+    desk = Desk(PlanningService("c1", SETTINGS, 1, setting))
+    token = desk.ask(REQUEST | ({} if asked is None else {"solver": asked}))
+    desk.work()
+    assert desk.answer(token)["solver"] == planned
+
+
 def test_white_space_before_json_is_fine(desk: Desk) -> None:
     desk.ask(b"\n  " + json.dumps(REQUEST).encode())
     assert desk.orders

@@ -26,6 +26,7 @@ from laneweave.coordinator.planning.geometry import Geometry
 from laneweave.coordinator.planning.grid import Cell, Grid, Mode
 from laneweave.coordinator.planning.preference import eligible_targets
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.solvers import SOLVERS
 
 REQUEST_SCHEMA: Final = "laneweave.plan.request/1"
 DEFAULT_DEADLINE_S: Final = 4.0
@@ -47,6 +48,7 @@ _KEYS: Final = (
     "targets",
     "deadline_s",
     "geometry",
+    "solver",
 )
 
 
@@ -65,6 +67,7 @@ class PlanRequest:
     """Vehicles, targets and rules of one planning problem; checked when it is made.
 
     geometry: what `geometric` is computed from; None: footprints.
+    solver: one of `SOLVERS`; None: the default of whoever plans.
     id: names the request where it is asked again: a service answers it as before. Empty: no name.
     """
 
@@ -76,6 +79,7 @@ class PlanRequest:
     deadline_s: float = DEFAULT_DEADLINE_S
     geometry: Geometry | None = None
     id: str = ""
+    solver: str | None = None
 
     def __attrs_post_init__(self) -> None:
         """Reject what is inconsistent, however the request was made."""
@@ -86,6 +90,8 @@ class PlanRequest:
         if self.geometry is not None and "geometric" not in self.conflicts:
             allowed = "none, unless geometric is among conflicts"
             raise BadInputError("geometry", self.geometry.to_dict(), allowed)
+        if self.solver is not None:
+            checked_solver(self.solver)
         _check_targets(self)
         _check_vehicles(self)
         if len(self.id) > MAX_ID_LENGTH:
@@ -126,6 +132,7 @@ class PlanRequest:
             deadline_s=_read_deadline(fields.get("deadline_s", DEFAULT_DEADLINE_S)),
             geometry=Geometry.from_dict(fields["geometry"]) if "geometry" in fields else None,
             id=as_text("id", fields.get("id", "")),
+            solver=as_text("solver", fields["solver"]) if "solver" in fields else None,
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -145,7 +152,19 @@ class PlanRequest:
             "targets": [list(target) for target in self.targets],
             "deadline_s": self.deadline_s,
             **geometry,
+            **({} if self.solver is None else {"solver": self.solver}),
         }
+
+
+def checked_solver(name: str, field: str = "solver") -> str:
+    """Return the name of a solver.
+
+    Raises:
+        BadInputError: there is none of this name.
+    """
+    if name not in SOLVERS:
+        raise BadInputError(field, name, "one of " + ", ".join(SOLVERS))
+    return name
 
 
 def _read_mode(value: object) -> Mode:
