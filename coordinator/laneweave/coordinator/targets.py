@@ -9,10 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 
-import numpy as np
 from attrs import frozen
-from scipy.optimize import linear_sum_assignment
 
+from laneweave.coordinator.planning.structures import nearest_run
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import Name
 
@@ -76,25 +75,10 @@ def parallel_targets(
         free: columns in which the lane's cells may be targets; None: all.
     """
     free = range(columns) if free is None else free
-    count = min(len(cells), len(free))
-    if count == 0:
-        return []
-    best: tuple[float, int] | None = None
-    for first in range(len(free) - count + 1):
-        chosen = free[first : first + count]
-        ways = np.array(
-            [
-                [abs(column - target) + abs(own_lane - lane) for target in chosen]
-                for column, own_lane in cells
-            ]
-        )
-        rows, places = linear_sum_assignment(ways)
-        # Equal ways: the place nearest to the middle of the block.
-        off_middle = abs(sum(chosen) / count - (columns - 1) / 2)
-        rank = (float(ways[rows, places].sum()) + off_middle / (10 * columns), first)
-        best = rank if best is None else min(best, rank)
-    assert best is not None  # noqa: S101 (count >= 1 leaves at least one place)
-    return [(column, lane) for column in free[best[1] : best[1] + count]]
+    if not cells or len(cells) >= len(free):
+        return [(column, lane) for column in free] if cells else []
+    _, first = nearest_run([column for column, _ in cells], free, columns)
+    return [(column, lane) for column in free[first : first + len(cells)]]
 
 
 def _nearest_free(cell: Cell, columns: int, lanes: int, taken: Collection[Cell]) -> Cell:

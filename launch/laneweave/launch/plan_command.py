@@ -92,6 +92,8 @@ def answer_request(
         sys.stdout.write(_table(request, response))
     else:
         sys.stdout.write(json.dumps(response.to_dict(), indent=2) + "\n")
+    if response.targets is not None:
+        request = request.with_targets(response.targets)
     if draw is not None:
         draw(request, response)
 

@@ -50,6 +50,17 @@ def test_the_table_names_the_solver(tmp_path: Path, capsys: pytest.CaptureFixtur
         assert capsys.readouterr().out.splitlines()[0].endswith(f"planned by {said}")
 
 
+@pytest.mark.parametrize(
+    "path", sorted(CASE_STUDY.parent.glob("*.json")), ids=lambda path: path.stem
+)
+def test_the_examples_are_planned_and_drawn(
+    path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli._status(["plan", str(path), "--draw", str(tmp_path / "plan.png")]) == 0
+    assert json.loads(capsys.readouterr().out)["status"] == "optimal"
+    assert (tmp_path / "plan.png").exists()
+
+
 def request_file(folder: Path, **changes: object) -> str:
     """Write the case study with some changes; a change to None removes a field."""
     request: dict[str, Any] = json.loads(CASE_STUDY.read_text(encoding="utf-8")) | changes

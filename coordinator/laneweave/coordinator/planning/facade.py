@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Final, Protocol
 
+import attrs
 import numpy as np
-from attrs import frozen
 
 from laneweave.coordinator.planning.assignments import assignments
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError, Clock
@@ -59,7 +59,7 @@ class Search(Protocol):
         """Search until the optimum is proven or the budget is spent."""
 
 
-@frozen
+@attrs.frozen
 class _Result:
     """What a solver found, without the memory of its search."""
 
@@ -99,6 +99,8 @@ def plan(
     if request.geometry is not None:
         close_pairs(request.geometry)  # the time for its table does not count for the request
     started = clock()
+    structured = request.structure is not None
+    request = request.settled()
     asked = checked_solver(solver or request.solver or DEFAULT_SOLVER)
     weights = (weights or Weights.for_mode(request.mode)).checked(request.mode)
     nodes = MAX_NODES if max_nodes is None else min(max_nodes, MAX_NODES)
@@ -127,7 +129,8 @@ def plan(
         results.append(_solve(name, problem, request, weights, budget))
         if results[-1].finished or not (results[-1].gave_up or shares):
             break
-    return _response(request, problem, asked, results, started, clock)
+    response = _response(request, problem, asked, results, started, clock)
+    return attrs.evolve(response, targets=request.targets) if structured else response
 
 
 def _order(asked: str, problem: Problem, *, fallback: bool) -> tuple[str, ...]:

@@ -38,7 +38,7 @@ _FIELDS: Final = (
     "assignments_tried",
     "nodes_expanded",
 )
-_OPTIONAL: Final = ("solver", "fallback", "waited_ms")
+_OPTIONAL: Final = ("solver", "fallback", "targets", "waited_ms")
 
 
 @attrs.frozen
@@ -53,6 +53,8 @@ class PlanResponse:
     solver: which one planned last; None: a response from before there was a choice.
     fallback: it took over, because the solver that was asked for reached its share of the deadline
         or of the nodes, or cannot treat such requests; `paths` are the cheapest of both.
+    targets: of the structure that the request named, in the order of `assignment`'s indices; None:
+        the request named its targets.
     waited_ms: at a service, how long the request waited for a worker; None: it was planned here.
     """
 
@@ -67,6 +69,7 @@ class PlanResponse:
     nodes_expanded: int
     solver: str | None = None
     fallback: bool = False
+    targets: tuple[Cell, ...] | None = None
     waited_ms: float | None = None
 
     def path_map(self, request: PlanRequest) -> RelativePathMap:
@@ -89,6 +92,11 @@ class PlanResponse:
             "nodes_expanded": self.nodes_expanded,
             **({} if self.solver is None else {"solver": self.solver}),
             **({"fallback": True} if self.fallback else {}),
+            **(
+                {}
+                if self.targets is None
+                else {"targets": [list(target) for target in self.targets]}
+            ),
             **({} if self.waited_ms is None else {"waited_ms": self.waited_ms}),
         }
 
@@ -116,6 +124,7 @@ class PlanResponse:
             nodes_expanded=as_int("nodes_expanded", fields["nodes_expanded"], 0, _MOST),
             solver=as_text("solver", fields["solver"]) if "solver" in fields else None,
             fallback=as_bool("fallback", fields.get("fallback", False)),
+            targets=_read_targets(fields["targets"]) if "targets" in fields else None,
             waited_ms=_milliseconds("waited_ms", fields["waited_ms"])
             if "waited_ms" in fields
             else None,
@@ -130,6 +139,11 @@ def _milliseconds(field: str, value: object) -> float:
 
 def _optional_int(field: str, value: object) -> int | None:
     return None if value is None else as_int(field, value, 0, _MOST)
+
+
+def _read_targets(value: object) -> tuple[Cell, ...]:
+    targets = as_list("targets", value, MAX_TARGETS)
+    return tuple(as_cell(f"targets[{j}]", target) for j, target in enumerate(targets))
 
 
 def _read_paths(value: object) -> tuple[tuple[Cell, ...], ...]:
