@@ -241,11 +241,22 @@ def plan(
             "--draw", metavar="FILE", help="Draw the answer: FILE.png, or FILE.gif that moves."
         ),
     ] = None,
+    draw_road: Annotated[
+        Path | None,
+        typer.Option(
+            "--draw-road",
+            metavar="FILE",
+            help="Draw how vehicles drive it: FILE.png or FILE.gif; road and vehicles: --config.",
+        ),
+    ] = None,
 ) -> None:
     """Plan one request here, or ask a running coordinator."""
     from laneweave.launch.plan_command import access_for, answer_request
 
-    access = access_for(connect, realm, config, client)
+    settings = load_scenario(config)
+    # A file that names no router describes the road alone.
+    only_road = draw_road is not None and not (connect or settings.network.endpoint)
+    access = access_for(connect, realm, None if only_road else config, client)
     # What would have no effect is a mistake of whoever asks.
     if access is None and wait:
         raise BadInputError("--wait", wait, "only with --connect or --config")
@@ -256,6 +267,8 @@ def plan(
         solver,
         as_table=output is OutputFormat.table,
         drawing=draw,
+        road_drawing=draw_road,
+        scenario=settings,
         wait_s=wait,
     )
 

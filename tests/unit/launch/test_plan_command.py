@@ -13,6 +13,12 @@ from laneweave.launch import cli
 CASE_STUDY = Path(__file__).parents[3] / "docs" / "examples" / "case-study.json"
 
 
+@pytest.fixture(autouse=True)
+def _logs_stay_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command would bind them to a stream that ends with the test."""
+    monkeypatch.setattr(cli, "log_to_terminal", lambda: None)
+
+
 @pytest.mark.parametrize(
     ("written", "option", "planned"),
     [
