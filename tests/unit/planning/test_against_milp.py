@@ -36,7 +36,9 @@ CHUNK = 10
 
 
 def _plan(request: dict[str, Any], solver: str = "tappa") -> dict[str, Any]:
-    response: dict[str, Any] = plan(PlanRequest.from_dict(request), solver=solver).to_dict()
+    """Return the answer of one solver, without the other one to fall back on."""
+    asked = PlanRequest.from_dict(request)
+    response: dict[str, Any] = plan(asked, solver=solver, fallback=False).to_dict()
     return response
 
 

@@ -58,7 +58,8 @@ CHUNK = 10
 
 def faults(request: dict[str, Any], cost: int | None, solver: str, seed: int) -> list[str]:
     """What is wrong with a plan, by what it claims, by its paths, and by driving it."""
-    response = checked_plan(PlanRequest.from_dict(request), solver=solver).to_dict()
+    asked = PlanRequest.from_dict(request)
+    response = checked_plan(asked, solver=solver, fallback=False).to_dict()
     claims = response["status"], response["cost"]
     if claims != ("infeasible" if cost is None else "optimal", cost):
         return [f"answers {claims}, the oracle {cost}"]
