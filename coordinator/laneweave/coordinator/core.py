@@ -119,7 +119,7 @@ class CoordinatorCore:
         self._incarnation = incarnation
         self._seq = 0
         self._rng = random.Random(f"{scenario.seed}/{name}/{incarnation}")  # noqa: S311
-        self.service = PlanningService(name, scenario.service, workers)
+        self.service = PlanningService(name, scenario.service, workers, scenario.formation.solver)
         self._next_job = 0
         self._bridge = -1
         """Incarnation of the newest bridge."""

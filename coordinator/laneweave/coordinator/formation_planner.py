@@ -264,4 +264,6 @@ def _facts(number: int, response: PlanResponse) -> dict[str, Any]:
         "solve_ms": response.solve_ms,
         "assignments_tried": response.assignments_tried,
         "nodes_expanded": response.nodes_expanded,
+        "solver": response.solver,
+        "fallback": response.fallback,
     }

@@ -146,6 +146,7 @@ def _plan_request(task: SortingTask, wanted: Mapping[Name, int], targets: Target
             "vehicles": vehicles,
             "targets": [list(target) for target in targets.cells],
             "deadline_s": task.deadline_s,
+            "solver": formation.solver,
         }
     )
 

@@ -132,6 +132,7 @@ def _control_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
             "plans, proven optimal",
             f"{planning['plans']}, {planning['optimal']}, up to {largest} vehicles",
         ),
+        ("plans by solver", _by_solver(planning)),
         (
             "planning time p50 / p95 / max",
             _join(planning["solve_ms"], "p50", "p95", "max", unit=" ms"),
@@ -151,6 +152,14 @@ def _control_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
             f"{failover['leader_changes']}" + (f" ({recoveries})" if recoveries else ""),
         ),
     ]
+
+
+def _by_solver(planning: dict[str, Any]) -> str:
+    """Return how many plans each solver made; summaries of earlier versions do not say."""
+    if "by_solver" not in planning:
+        return "-"
+    made = [f"{solver} {plans}" for solver, plans in planning["by_solver"].items() if plans]
+    return f"{', '.join(made) or '-'} ({planning['fallbacks']} fallbacks)"
 
 
 def _fault_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:

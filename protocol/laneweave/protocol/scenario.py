@@ -23,6 +23,7 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Lattice
 from laneweave.protocol.ranges import one_of, within
 from laneweave.protocol.scenario_checks import check_effects, check_scenario
+from laneweave.protocol.solvers import DEFAULT_SOLVER, SOLVERS
 from laneweave.protocol.structuring import structure
 
 SCHEMA = "laneweave.scenario/1"
@@ -138,7 +139,10 @@ class FormationSettings:
     """l_s of the formation relative distance."""
     weight_oblique: int | None = field(default=None, validator=one_of(None, 0, 1, 2))
     """l_o of the formation relative distance; none: the number of steps of an oblique edge."""
-    planning_deadline_s: float = field(default=4.0, validator=within(0.01, 3600.0))
+    solver: str = field(default=DEFAULT_SOLVER, validator=one_of(*SOLVERS))
+    """What plans formations, and requests to the planning service that name no solver."""
+    planning_deadline_s: float = field(default=10.0, validator=within(0.01, 3600.0))
+    """Outer bound on planning; on most machines `max_nodes` is reached before it."""
     max_nodes: int = field(default=20_000, validator=within(1, 100_000_000))
     """Bound on search nodes per plan: keeps equal seeds equal whatever the machine's speed."""
 

@@ -270,7 +270,8 @@ def test_prepare_promise_plan_acceptance() -> None:
     prepares = messages(desk.effects, Prepare)
     assert [(s.topic, s.parameters["vehicle"]) for s in prepares] == [(PREPARE, A), (PREPARE, B)]
     effects = desk.give(run_job(job))
-    assert "plan-made" in logged(effects)
+    (made,) = (s.message.data for s in messages(effects, LogEvent) if s.message.kind == "plan-made")
+    assert (made["solver"], made["fallback"]) == ("tappa", False)
     plans = messages(effects, Plan)
     assert [(s.topic, s.parameters["vehicle"]) for s in plans] == [(PLAN, A), (PLAN, B)]
     assert plans[0].message == plans[1].message

@@ -58,12 +58,15 @@ def test_the_request_is_in_the_blocks_own_columns_and_in_the_order_of_the_roster
 
 
 def test_the_request_follows_the_scenario() -> None:
-    scenario = evolve(SCENARIO, formation=evolve(FORMATIONS, mode=2, planning_deadline_s=1.5))
+    scenario = evolve(
+        SCENARIO, formation=evolve(FORMATIONS, mode=2, planning_deadline_s=1.5, solver="branching")
+    )
     request = plan_request(task({A: (0, 0)}, {A: 1}, scenario=scenario))
-    assert (request.mode, request.conflicts, request.deadline_s) == (
+    assert (request.mode, request.conflicts, request.deadline_s, request.solver) == (
         2,
         ("geometric", "closing"),
         1.5,
+        "branching",
     )
 
 

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from laneweave.launch.failover import Failover
-from laneweave.launch.outcome import Outcome, complete_summary, print_outcome
+from laneweave.launch.outcome import Outcome, complete_summary, print_outcome, summary_rows
 
 
 def summary(
@@ -140,3 +140,21 @@ def test_all_reasons_are_printed(tmp_path: Path) -> None:
         "FAILED: the run is not complete: limit",
         "FAILED: 1 of 5 vehicles did not leave the road",
     ]
+
+
+@pytest.mark.parametrize(
+    ("more", "shown"),
+    [
+        ({}, "-"),
+        ({"by_solver": {"tappa": 0, "branching": 0}, "fallbacks": 0}, "- (0 fallbacks)"),
+        (
+            {"by_solver": {"tappa": 7, "branching": 2, "rolling": 0}, "fallbacks": 2},
+            "tappa 7, branching 2 (2 fallbacks)",
+        ),
+    ],
+    ids=["old", "none", "some"],
+)
+def test_the_table_says_which_solvers_planned(more: dict[str, Any], shown: str) -> None:
+    found = summary()
+    found["planning"] |= more
+    assert dict(summary_rows(found))["plans by solver"] == shown

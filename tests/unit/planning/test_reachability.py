@@ -76,7 +76,7 @@ def test_a_crowded_block_gets_an_answer_long_before_the_trees_find_one() -> None
         ),
         ((2, 0), (3, 0), (1, 1), (2, 1), (3, 1), (3, 2)),
     )
-    response = plan(request, max_nodes=200, solver="tappa")
+    response = plan(request, max_nodes=200, solver="tappa", fallback=False)
     assert response.status == "feasible"
     assert response.cost is not None
     assert 25 <= response.cost <= 40

@@ -194,6 +194,8 @@ OUT_OF_RANGE: list[tuple[str, Any]] = [
     ("formation.weight_straight", 2),
     ("formation.weight_oblique", 3),
     ("formation.weight_oblique", -1),
+    ("formation.solver", "magic"),
+    ("formation.solver", None),
     ("formation.planning_deadline_s", 0),
     ("formation.max_nodes", 0),
     ("vehicle.length_m", 0.9),
