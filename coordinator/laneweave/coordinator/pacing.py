@@ -30,8 +30,7 @@ def comfortable_steps(start_s: float, end_s: float, scenario: Scenario) -> int:
     shortest_s, longest_s = scenario.cycles_s
     if shortest_s == longest_s:
         return int((end_s - start_s) / longest_s)
-    slot_s = min(scenario.comfortable_cycle_s, longest_s)
-    return max(1, int((end_s - start_s - RESERVE_S) / slot_s))
+    return max(1, int((end_s - start_s - RESERVE_S) / scenario.comfortable_cycle_s))
 
 
 def paced(plan: Plan, others: Sequence[Plan], not_before_s: float, scenario: Scenario) -> Plan:

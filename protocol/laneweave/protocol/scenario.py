@@ -33,6 +33,11 @@ SHORTEST_CYCLE_S, LONGEST_CYCLE_S = 4.0, 7.0
 """Range of T_F where `formation.cycle_s` leaves it open: from the paper's value on."""
 COMFORT_MPS2 = 3.0
 """Accelerations up to this are comfortable, along and across."""
+ROLLING_CYCLE_S = 6.0
+COMFORTABLE_VOLUME_VEH_PER_LANE_H = 2000.0
+"""T_F of the rolling operation up to this volume, where it is comfortable. Denser traffic needs more
+steps on the same road: at 2400 one vehicle of a hundred misses its lane with 6 s, none of a thousand
+with 4 s (`benchmarks/stream.py`)."""
 CYCLE_STEP_S = 0.2
 """Few values of T_F are in use, so that trajectories of moves are planned once."""
 SLACK_S = 0.2
@@ -387,7 +392,9 @@ class Scenario:
         if cycle_s is not None:
             return cycle_s, cycle_s
         if self.formation.rolling:
-            return SHORTEST_CYCLE_S, SHORTEST_CYCLE_S
+            dense = self.demand.volume_veh_per_lane_h > COMFORTABLE_VOLUME_VEH_PER_LANE_H
+            cycle_s = SHORTEST_CYCLE_S if dense else ROLLING_CYCLE_S
+            return cycle_s, cycle_s
         return SHORTEST_CYCLE_S, LONGEST_CYCLE_S
 
     @property
@@ -399,12 +406,15 @@ class Scenario:
 
     @property
     def comfortable_cycle_s(self) -> float:
-        """Shortest T_F in which no move needs more than `COMFORT_MPS2` [s].
+        """Shortest T_F that plans may have in which no move needs more than `COMFORT_MPS2` [s].
 
-        A move of least jerk by d in T needs an acceleration of 10 / sqrt(3) d / T^2.
+        A move of least jerk by d in T needs an acceleration of 10 / sqrt(3) d / T^2. If there is
+        none, the longest.
         """
         formation = self.formation
-        return formation.slack_s + math.sqrt(10.0 / math.sqrt(3.0) * formation.gap_m / COMFORT_MPS2)
+        least_s = math.sqrt(10.0 / math.sqrt(3.0) * formation.gap_m / COMFORT_MPS2)
+        comfortable = [slot_s for slot_s in self.slots_s if slot_s >= least_s + formation.slack_s]
+        return min(comfortable, default=self.slots_s[-1])
 
     @property
     def horizon_ticks(self) -> int:
