@@ -35,9 +35,9 @@ COMFORT_MPS2 = 3.0
 """Accelerations up to this are comfortable, along and across."""
 ROLLING_CYCLE_S = 6.0
 COMFORTABLE_VOLUME_VEH_PER_LANE_H = 2000.0
-"""T_F of the rolling operation up to this volume, where it is comfortable. Denser traffic needs more
-steps on the same road: at 2400 one vehicle of a hundred misses its lane with 6 s, none of a thousand
-with 4 s (`benchmarks/stream.py`)."""
+"""T_F of the rolling operation up to this volume, where it is comfortable. Denser traffic needs
+more steps on the same road: at 2400 one vehicle of a hundred misses its lane with 6 s, none of a
+thousand with 4 s (`benchmarks/stream.py`)."""
 CYCLE_STEP_S = 0.2
 """Few values of T_F are in use, so that trajectories of moves are planned once."""
 SLACK_S = 0.2
@@ -100,6 +100,17 @@ class Demand:
 
 
 @frozen
+class DrivingStructure:
+    """A geometric structure in which formations drive before they sort (paper, Section 2.2)."""
+
+    from_m: float = field(validator=within(0.0, 60_000.0))
+    """Position from which on they change to it, when their rear has passed it."""
+    structure: str = field(validator=one_of("parallel", "interlaced"))
+    lanes: tuple[int, ...] = ()
+    """Lanes that it uses; empty: all of the road."""
+
+
+@frozen
 class FormationSettings:
     """Formation control parameters d_F, T_F, v_F and the planner's choices."""
 
@@ -135,7 +146,13 @@ class FormationSettings:
     max_vehicles: int = field(default=6, validator=within(1, 36))
     """Largest formation (the paper: six)."""
     max_joined: int = field(default=1, validator=within(1, 4))
-    """Most neighbouring formations that one ballot may join, when one alone lacks room."""
+    """Most neighbouring formations that one ballot may join."""
+    join: str = field(default="needed", validator=one_of("needed", "room"))
+    """When neighbouring formations join: `needed`: when one alone lacks room for sorting; `room`:
+    also when the vehicles of both fit into one formation, `max_vehicles`."""
+    structures: tuple[DrivingStructure, ...] = ()
+    """Structures that formations take on one after the other before they sort in S3; empty: they
+    stay in the cells in which they entered."""
     mode: int = field(default=1, validator=one_of(1, 2))
     """Relative motion mode."""
     conflicts: tuple[str, ...] = field(default=(), validator=_conflict_kinds)
