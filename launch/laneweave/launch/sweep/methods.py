@@ -11,7 +11,6 @@ from laneweave.launch.role_commands import LC2013, METHOD, RULE
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario import Scenario, parse_scenario, to_tables
 
-
 LARGEST_OF_TAPPA: Final = 6
 """Larger formations are planned by branching."""
 
