@@ -13,8 +13,9 @@
 | CBSA, Algorithm 2 | `cbs`; as drawn in the case study: `conflict_tree` |
 | SPPA | `diagram` (all shortest paths), `sppa` (the choice among them) |
 | relative path map | `path_map` |
+| parallel and interlaced structure | `structures` |
 
-Beyond the paper: branch and bound with prices, the default (`branching`, `relaxation`, `rows`);
+Beyond the paper: branch and bound with prices, the fallback of TAPPA (`branching`, `relaxation`, `rows`);
 path sets by negotiation (`negotiation`, `repair`) and by joint search (`reachability`); conflicts
 computed from sizes and motions (`geometry`, `bodies`, `clearances`).
 
