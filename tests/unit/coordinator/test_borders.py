@@ -13,8 +13,8 @@ from laneweave.protocol.messages import Ballot, LogEvent, Name, Plan
 from laneweave.protocol.node import Compute, Effect, run_job
 from laneweave.protocol.plans import plan_problems
 from laneweave.protocol.scenario import Scenario
+from unit.coordinator.desk import SCENARIO as DESK_SCENARIO
 from unit.coordinator.desk import (
-    SCENARIO,
     A,
     B,
     C,
@@ -29,6 +29,8 @@ from unit.coordinator.desk import (
     state,
 )
 
+SCENARIO = evolve(DESK_SCENARIO, formation=evolve(DESK_SCENARIO.formation, solver="branching"))
+"""Of the plans with equal cost, those of branching close up across the border."""
 SLOT_S, MOVE_S = SCENARIO.cycles_s[0], SCENARIO.move_s
 CLOSING = ConflictModel(("closing",))
 T0_S = 30.0

@@ -13,10 +13,11 @@
 | CBSA, Algorithm 2 | `cbs`; as drawn in the case study: `conflict_tree` |
 | SPPA | `diagram` (all shortest paths), `sppa` (the choice among them) |
 | relative path map | `path_map` |
+| parallel and interlaced structure | `structures` |
 
-Beyond the paper: branch and bound with prices, the default (`branching`, `relaxation`, `rows`);
-path sets by negotiation (`negotiation`, `repair`) and by joint search (`reachability`); conflicts
-computed from sizes and motions (`geometry`, `bodies`, `clearances`).
+Beyond the paper: branch and bound with prices, the fallback of TAPPA (`branching`, `relaxation`,
+`rows`); path sets by negotiation (`negotiation`, `repair`) and by joint search (`reachability`);
+conflicts computed from sizes and motions (`geometry`, `bodies`, `clearances`).
 
 The package is pure: no I/O, no state between calls, and time only through the clock it is given.
 """

@@ -11,6 +11,9 @@ from laneweave.launch.role_commands import LC2013, METHOD, RULE
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario import Scenario, parse_scenario, to_tables
 
+LARGEST_OF_TAPPA: Final = 6
+"""Larger formations are planned by branching."""
+
 
 @frozen
 class LabelledMethod:
@@ -44,6 +47,8 @@ def _paper(max_vehicles: int, block_columns: int) -> LabelledMethod:
             "formation.operation": "paper",
             "formation.max_vehicles": max_vehicles,
             "formation.block_columns": block_columns,
+            # TAPPA is made for formations of the paper's size.
+            "formation.solver": "tappa" if max_vehicles <= LARGEST_OF_TAPPA else "branching",
         },
     )
 
