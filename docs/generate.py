@@ -49,6 +49,8 @@ SERVICE = DOCS / "evidence" / "service.json"
 """What `benchmarks/service.py` wrote."""
 EVALUATED = DOCS / "evidence" / "evaluation.json"
 """What `benchmarks/evaluation.py` wrote."""
+STABILITY = DOCS / "evidence" / "stability.json"
+"""What `benchmarks/stability.py` wrote."""
 CONFLICTS = DOCS / "images" / "conflict-table.png"
 SNAPSHOTS: dict[type[Snapshot], str] = {
     NodeNumbers: "every role but the router",
@@ -283,6 +285,29 @@ def _service_load(runs: list[dict[str, Any]]) -> Iterator[str]:
         )
 
 
+def _stability() -> str:
+    """Return the table of how a disturbance of speed travels, by `benchmarks/stability.py`."""
+    headings = (
+        "", "speed lost, messages lost", "disturbed one", "1st behind", "2nd behind", "last",
+        "amplification", "any behind", "the last", "braked", "least gap",
+    )  # fmt: skip
+    lines = [f"| {' | '.join(headings)} |", "|---" * len(headings) + "|"]
+    for row in json.loads(STABILITY.read_text(encoding="utf-8"))["rows"]:
+        of = f"of {row['runs']}"
+        cells = " | ".join(
+            " / ".join(f"{row[name][number]:.2f}" for name in ("speed_mps", "gap_m", "accel_mps2"))
+            for number in (0, 1, 2, -1)
+        )
+        ratios = [ratio for ratio in row["amplification"] if ratio is not None]
+        low_high = f"{min(ratios):.2f} to {max(ratios):.2f}" if ratios else "-"
+        lines.append(
+            f"| {row['formation']} | {row['drop_mps']:g} m/s, {100 * row['loss']:g} % | {cells} "
+            f"| {low_high} | {row['travelled']} {of} | {row['reached_last']} {of} "
+            f"| {row['braked']} | {row['least_gap_m']:.2f} m |"
+        )
+    return "\n".join(lines)
+
+
 def _service_added(runs: list[dict[str, Any]]) -> Iterator[str]:
     yield "| at half load | requests | solving p50 / p99 | added p50 / p95 / p99 |"
     yield "|---|---|---|---|"
@@ -327,6 +352,7 @@ def parts() -> dict[str, str]:
         "geometry": _geometry(),
         "closing": _closing(),
         "service": _service(),
+        "stability": _stability(),
         "stream": _stream(),
         "metrics": _metrics(),
         "rights": rights_table(),
