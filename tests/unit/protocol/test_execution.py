@@ -32,7 +32,7 @@ def vehicle(
     moving: bool = False,
     joined: tuple[int, ...] = (0,),
 ) -> PlanExecution:
-    return PlanExecution(name, 7, cell, LATTICE, OVERDUE_S, joined, moving=moving)
+    return PlanExecution(name, 7, cell, LATTICE, joined, moving=moving)
 
 
 def prepare(ballot: Ballot, *roster: Name, formations: tuple[int, ...] = (0,)) -> Prepare:
