@@ -251,10 +251,10 @@ def test_a_group_is_planned_only_once_its_later_block_has_closed_in_the_census()
     assert sorted(desk.core.controls) == [0]
     desk.tell(state(A, cells[A], joined=(0, 1)))
     assert desk.core.controls == {}
-    desk.tell(census(cells, t_s=late_s))
+    desk.tell(census(cells, t_s=late_s - 0.1))
     desk.tell(RoadClock(99, late_s + 5.0, 2, 2, 2, 0, ended=False))
     assert desk.core.controls == {}
-    desk.tell(census(cells, t_s=late_s + 0.1))
+    desk.tell(census(cells, t_s=late_s))
     assert desk.core.controls[0].formation.roster == (A, B)
 
 
