@@ -19,6 +19,7 @@ from laneweave.protocol.messages import (
     Ballot,
     Census,
     CensusEntry,
+    ClosedFormation,
     Command,
     Heartbeat,
     LogEvent,
@@ -100,7 +101,7 @@ def messages(vehicle: Name, *, number: int, real: float) -> dict[type, Any]:
             speed_mps=real,
             t_s=real,
         ),
-        Motion(vehicle, number, number, cell, (number, 0), number, number),
+        Motion(vehicle, number, number, cell, (number, 0), number, number, number),
         Sense(
             vehicle,
             number,
@@ -115,12 +116,22 @@ def messages(vehicle: Name, *, number: int, real: float) -> dict[type, Any]:
             (real, real),
         ),
         Command(
-            vehicle, number, number, cell, number, cell, b"\xff\xff\x7f\x7f" * 80, (number,) * 3
+            vehicle,
+            number,
+            number,
+            cell,
+            number,
+            cell,
+            b"\xff\xff\x7f\x7f" * 80,
+            number,
+            (number,) * 3,
         ),
         Census(
             real,
             (CensusEntry(vehicle, cell, number, real),),
             (Announcement(vehicle, number, number, real),),
+            (ClosedFormation(number, number, real),),
+            number,
         ),
         RoadClock(number, real, number, number, number, number, ended=True),
         Report(

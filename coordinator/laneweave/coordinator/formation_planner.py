@@ -83,8 +83,11 @@ class FormationPlanner:
         """
         numbers, ballot = control.formation.numbers, control.ballot
         assert ballot is not None  # noqa: S101 (set before planning begins)
-        cells, scenario = control.hold_cells.values(), self._scenario
-        formation = control.formation
+        formation, scenario = control.formation, self._scenario
+        block_of = scenario.lattice.block_of
+        # A promise of a cell elsewhere makes planning fail; it says nothing of the time left.
+        cells = [cell for cell in control.hold_cells.values() if block_of(cell[0]) in numbers]
+        cells = cells or self._block_cells(numbers)
         start_s, end_s = self._start_s(formation, cells, t_s), self._end_s(formation)
         if not formation.sorts and end_s < start_s + scenario.cycles_s[0]:
             control.on_planning_failed(now_s)
@@ -197,10 +200,13 @@ class FormationPlanner:
 
     def _steps_left_in(self, numbers: Numbers, t_s: float) -> int:
         """Return how many steps fit in for all cells of some blocks."""
-        lattice, scenario = self._scenario.lattice, self._scenario
-        cells = [cell for number in numbers for cell in lattice.block_cells(number)]
+        cells, scenario = self._block_cells(numbers), self._scenario
         start_s = start_time_s(cells, t_s + START_MARGIN_S, scenario)
         return steps_left(cells, start_s, scenario.cycles_s[0], scenario)
+
+    def _block_cells(self, numbers: Numbers) -> list[Cell]:
+        lattice = self._scenario.lattice
+        return [cell for number in numbers for cell in lattice.block_cells(number)]
 
     def _neighbours(
         self, numbers: Numbers, controls: Mapping[int, FormationControl]

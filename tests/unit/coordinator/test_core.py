@@ -472,7 +472,7 @@ def test_every_plan_is_executable_and_serves_all_preferences(
     assert set(plan.territory) <= LATTICE.block_cells(0)
     assert plan.slot_s == SCENARIO.cycles_s[0]
     now_s = max(t_s, T_S)
-    assert plan.t0_s == start_time_s((0,), now_s + START_MARGIN_S, SCENARIO) > now_s
+    assert plan.t0_s == start_time_s(cells.values(), now_s + START_MARGIN_S, SCENARIO) > now_s
     for name, moves in plan.moves.items():
         end = moves[-1][2] if moves else cells[name]
         assert end[1] == lanes[name]

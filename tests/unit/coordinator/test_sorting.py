@@ -30,7 +30,8 @@ def task(
     numbers: Numbers = (0,),
     scenario: Scenario = SCENARIO,
 ) -> SortingTask:
-    return SortingTask(numbers, cells, lanes, unattended, scenario)
+    deadline_s = scenario.formation.planning_deadline_s
+    return SortingTask(numbers, cells, lanes, unattended, scenario, deadline_s)
 
 
 def sort(order: SortingTask) -> Sorting:

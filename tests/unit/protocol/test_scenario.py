@@ -61,7 +61,7 @@ def test_defaults_are_the_table_of_the_paper() -> None:
     scenario = load_scenario(None)
     formation, vehicle, road = scenario.formation, scenario.vehicle, scenario.road
     assert formation.gap_m == 15.0
-    assert formation.cycle_s == 4.0
+    assert scenario.cycles_s == (4.0, 7.0)
     assert formation.speed_mps == 15.0
     assert vehicle.max_speed_mps == 25.0
     assert vehicle.min_accel_mps2 == -10.0
@@ -83,6 +83,7 @@ def test_defaults_are_the_table_of_the_paper() -> None:
     [
         ({"operation": "paper"}, 1800.0),
         ({"operation": "paper", "gap_m": 20.0}, 1350.0),
+        ({}, 3600.0),
         ({"operation": "rolling"}, 3600.0),
     ],
 )
@@ -90,14 +91,21 @@ def test_bound_of_the_road(formation: dict[str, Any], bound: float) -> None:
     """V_u = 3600 v_F / (2 d_F) of the paper, for interlaced entry."""
     settings = parse_scenario({"formation": formation}).formation
     assert settings.bound_veh_per_lane_h == pytest.approx(bound)
-    share = 2.0 if settings.operation == "paper" else 1.0
+    share = 2.0 if settings.interlaced else 1.0
     assert bound == pytest.approx(3600.0 * settings.speed_mps / (share * settings.gap_m))
 
 
-def test_the_file_of_the_paper_holds_the_defaults_but_for_the_operation() -> None:
+def test_the_file_of_the_paper_holds_the_defaults_but_for_its_formations() -> None:
     explicit = ("node", "edge", "special-1", "closing")
     default = Scenario()
-    formation = attrs.evolve(default.formation, operation="paper", conflicts=explicit)
+    formation = attrs.evolve(
+        default.formation,
+        entry="interlaced",
+        close="columns",
+        cycle_s=4.0,
+        move_s=3.8,
+        conflicts=explicit,
+    )
     assert load_scenario(FOLDER / "paper.toml") == attrs.evolve(default, formation=formation)
 
 
@@ -107,8 +115,10 @@ def test_every_scenario_of_the_repository_loads(path: Path) -> None:
 
 
 def test_the_lattice_is_that_of_the_tables() -> None:
-    lattice = parse_scenario({"road": {"lanes": 2}, "formation": {"block_columns": 6}}).lattice
+    formation = {"close": "columns", "block_columns": 6}
+    lattice = parse_scenario({"road": {"lanes": 2}, "formation": formation}).lattice
     assert (lattice.lanes, lattice.block_columns) == (2, 6)
+    assert Scenario().lattice.block_columns == 1
     assert (lattice.pitch_m, lattice.speed_mps, lattice.lane_width_m) == (15.0, 15.0, 3.5)
 
 
@@ -144,6 +154,8 @@ def test_every_wrong_type_of_every_field_is_refused_by_name(field: str, default:
         wrongs = (1, True, None, "node", {}, {"a": 1}, [True], [[]], [None], [math.nan], [{}])
     elif isinstance(default, TABLE_BY_NAME):
         wrongs = (1, True, None, [], "x", 1.5, {"a": 1}, {"a": []}, {"a": "x"}, {"a": [1]})
+    elif field == "formation.cycle_s":
+        wrongs = tuple(wrong for wrong in NOT_NUMBERS if wrong is not None)
     elif default is None:
         wrongs = ("1", True, 1.0, [], {}, math.nan)
     elif isinstance(default, bool):
@@ -210,7 +222,7 @@ OUT_OF_RANGE: list[tuple[str, Any]] = [
     ("vehicle.max_slip_ratio", 0),
     ("vehicle.max_slip_ratio", 1.01),
     ("tracking.horizon_ticks", 9),
-    ("tracking.horizon_ticks", 101),
+    ("tracking.horizon_ticks", 201),
     ("tracking.min_gap_m", -1),
     ("network.realm", ""),
     ("network.realm", "a/b"),
@@ -245,6 +257,7 @@ def test_a_value_out_of_range_is_refused_by_name(field: str, value: object) -> N
 # --- fields that do not fit together ----------------------------------------------------------
 
 LATE = {"reaction_s": 0.4}
+FOUR = {"cycle_s": 4.0}
 MISFITS: list[tuple[str, dict[str, Any]]] = [
     ("formation.settle_s", {"formation": {"settle_s": 3.1}}),
     ("formation.settle_s", {"formation": {"settle_s": 5.0, "operation": "paper"}}),
@@ -265,8 +278,10 @@ MISFITS: list[tuple[str, dict[str, Any]]] = [
     ("demand.volume_veh_per_lane_h", {"demand": {"min_headway_s": 60}}),
     ("formation.gap_m", {"formation": {"gap_m": 5.0}}),
     ("formation.gap_m", {"vehicle": {"length_m": 30.0}}),
-    ("formation.move_s", {"formation": {"move_s": 4.1}}),
-    ("formation.move_s", {"formation": {"cycle_s": 3.0}}),
+    ("formation.move_s", {"formation": {"move_s": 3.8}}),
+    ("formation.move_s", {"formation": {"cycle_s": 4.0, "move_s": 4.1}}),
+    ("formation.move_s", {"formation": {"cycle_s": 3.0, "move_s": 3.8}}),
+    ("formation.move_s", {"formation": {"operation": "rolling", "move_s": 3.8}}),
     ("formation.speed_mps", {"formation": {"speed_mps": 25.0}}),
     ("formation.speed_mps", {"vehicle": {"max_speed_mps": 10.0}}),
     (
@@ -274,7 +289,8 @@ MISFITS: list[tuple[str, dict[str, Any]]] = [
         {"formation": {"mode": 2, "weight_oblique": 2}},
     ),
     ("road.s3_m", {"road": {"s3_m": 100.0}}),
-    ("road.s3_m", {"formation": {"block_columns": 24, "gap_m": 100.0}}),
+    ("road.s3_m", {"formation": {"close": "columns", "block_columns": 24, "gap_m": 30.0}}),
+    ("road.s3_m", {"formation": {"max_columns": 24, "gap_m": 30.0}}),
     ("formation.conflicts", {"formation": {"conflicts": ["node"]}}),
     ("formation.conflicts", {"formation": {"conflicts": ["node", "edge"]}}),
     (
@@ -288,11 +304,13 @@ MISFITS: list[tuple[str, dict[str, Any]]] = [
         {"network": {"lease_s": 0.5, "heartbeat_s": 0.5, "election_s": 2.0}},
     ),
     ("formation.cycle_s", {"formation": {"cycle_s": 4.05}}),
-    ("formation.move_s", {"formation": {"move_s": 3.85}}),
+    ("formation.move_s", {"formation": {"cycle_s": 4.0, "move_s": 3.85}}),
     ("formation.cycle_s", {"runtime": {"tick_s": 0.3}}),
     ("formation.move_s", {"runtime": {"tick_s": 1.0}}),
     ("formation.cycle_s", {"formation": {"cycle_s": 1.0, "move_s": 1.0}, "runtime": {"tick_s": 1}}),
-    ("tracking.horizon_ticks", {"tracking": {"horizon_ticks": 37}}),
+    ("tracking.horizon_ticks", {"tracking": {"horizon_ticks": 67}}),
+    ("tracking.horizon_ticks", {"tracking": {"horizon_ticks": 37}, "formation": FOUR}),
+    ("runtime.tick_s", {"runtime": {"tick_s": 0.01}, "tracking": {}}),
     ("network.lease_s", {"network": {"lease_s": 3.1}}),
     ("network.lease_s", {"runtime": {"agent_silent_s": 0.9}}),
     ("runtime.tick_resend_s", {"runtime": {"tick_resend_s": 0.3}}),
@@ -331,16 +349,21 @@ def test_fields_that_do_not_fit_are_refused_by_name(field: str, data: dict[str, 
     [
         {"demand": {"lane_shares": [1, 0, 0]}},
         {"demand": {"volume_veh_per_lane_h": 3600, "min_headway_s": 1.0}},
-        {"formation": {"move_s": 4.0}},
+        {"formation": FOUR | {"move_s": 4.0}},
+        {"formation": {"cycle_s": 3.9}},
+        {"formation": {"operation": "rolling", "cycle_s": 6.0}},
         {"formation": {"mode": 2}},
         {"formation": {"mode": 2, "weight_oblique": 1}},
         {"formation": {"conflicts": ["geometric"]}},
         {"road": {"lanes": 1}},
-        {"tracking": {"horizon_ticks": 38}},
+        {"tracking": {"horizon_ticks": 68}},
+        {"tracking": {"horizon_ticks": 38}, "formation": FOUR},
+        {"tracking": {"horizon_ticks": 38}, "formation": {"operation": "paper"}},
+        {"tracking": {"horizon_ticks": 38}, "formation": {"operation": "rolling"}},
         {"network": {"lease_s": 3.0}},
         {"runtime": {"tick_deadline_s": 3.0}},
         {"runtime": {"tick_resend_s": 0.29}},
-        {"runtime": {"tick_s": 0.05}, "tracking": {"horizon_ticks": 76}},
+        {"runtime": {"tick_s": 0.05}, "tracking": {"horizon_ticks": 136}},
         {"runtime": {"tick_s": 0.2}, "braking": {"reaction_s": 0.2}},
         {"formation": {"gap_m": 8.0}},
         {"braking": {"reaction_s": 0.5}},

@@ -117,10 +117,8 @@ class Setup:
         The last wishes can be fulfilled: in each block at most as many vehicles want a lane as it
         has cells there. Where two formations may be joined, that holds for both together.
         """
-        lanes, columns = (
-            self.scenario.road.lanes,
-            [len(one.columns(self.scenario.lattice)) for one in self.formations],
-        )
+        lanes, lattice = self.scenario.road.lanes, self.scenario.lattice
+        columns = [len(one.columns(lattice)) for one in self.formations]
         if self.scenario.formation.rolling:
             room = [self.stretch_columns] * lanes
             weights = [6.0 if self.crowded and lane == 0 else 1.0 for lane in range(lanes)]
@@ -134,7 +132,6 @@ class Setup:
             weights = [6.0 if lane == favourite else 1.0 for lane in range(lanes)]
             return _draw_lanes([visit.vehicle for visit in self.visits], room, weights, rng)
         wishes: dict[Name, int] = {}
-        lattice = self.scenario.lattice
         for formation, length in zip(self.formations, columns, strict=True):
             members = [
                 visit.vehicle
