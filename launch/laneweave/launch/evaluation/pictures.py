@@ -74,7 +74,7 @@ def _snapshots(label: str, what: str) -> _Plan:
     picture = Picture(
         f"evaluation-road-{label}.png",
         f"Four strips of road from 500 to 800 m, {label}",
-        f"The road from 500 to 800 m at 1600 veh/(lane h), {what}: four instants, a slot apart. "
+        f"The road from 500 to 800 m at 1600 veh/(lane h), {what}: four instants, 4 s apart. "
         "Colours are preferred lanes; the faster, the lighter.",
     )
     return _Plan(picture, (label,), (SHOWN_VOLUME,), _draw_snapshots, traced=True)

@@ -11,7 +11,9 @@ from attrs import define, field
 MOST_NEWS = 8
 MOST_CHARACTERS = 90
 MOST_NUMBER = 1e12
-FREQUENT = ("stream-planned", "plan-made", "plan-in-force", "entered", "left")
+FREQUENT = (
+    "stream-planned", "plan-made", "plan-in-force", "formation-closed", "entered", "left",
+)  # fmt: skip
 """Events that would leave no room for others."""
 PLANNED = ("stream-planned", "plan-made")
 
