@@ -5,11 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
+import attrs
 from attrs import field, frozen
 
 from laneweave.launch.role_commands import LC2013, METHOD, RULE
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario import Scenario, parse_scenario, to_tables
+from laneweave.protocol.scenario import (
+    FormationSettings,
+    Scenario,
+    parse_scenario,
+    to_tables,
+)
 
 
 @frozen
@@ -35,21 +41,50 @@ class LabelledMethod:
         return parse_scenario(tables)
 
 
+_FORMATIONS: Final = FormationSettings()
+_MOST_SEARCHED: Final = 6
+"""Vehicles of a formation up to which TAPPA plans; larger ones take it too long."""
+
+
+def _default() -> LabelledMethod:
+    """Return formations as they are by default, whatever the scenario says of them."""
+    names = ("operation", "entry", "close", "cycle_s", "move_s", "max_vehicles", "max_columns")
+    return LabelledMethod(
+        METHOD,
+        f"formations of at most {_FORMATIONS.max_vehicles} vehicles, as long as traffic makes them",
+        {f"formation.{name}": getattr(_FORMATIONS, name) for name in names}
+        | _solver(_FORMATIONS.max_vehicles),
+    )
+
+
 def _paper(max_vehicles: int, block_columns: int) -> LabelledMethod:
     """Return the paper's formations, of at most so many vehicles in so many columns."""
     return LabelledMethod(
         METHOD,
-        f"formations of at most {max_vehicles} vehicles in {block_columns} columns",
+        f"the paper's formations, of at most {max_vehicles} vehicles in {block_columns} columns",
         {
-            "formation.operation": "paper",
+            "formation.operation": "formations",
+            "formation.entry": "interlaced",
+            "formation.close": "columns",
+            "formation.cycle_s": 4.0,
+            "formation.move_s": 3.8,
             "formation.max_vehicles": max_vehicles,
             "formation.block_columns": block_columns,
-        },
+        }
+        | _solver(max_vehicles),
     )
+
+
+def _solver(max_vehicles: int) -> dict[str, object]:
+    """Return what chooses the planner of formations of at most so many vehicles."""
+    solver = "tappa" if max_vehicles <= _MOST_SEARCHED else "branching"
+    known = any(one.name == "solver" for one in attrs.fields(FormationSettings))
+    return {"formation.solver": solver} if known else {}
 
 
 METHODS: Final[dict[str, LabelledMethod]] = {
     "formation": LabelledMethod(METHOD, "formation control as the scenario says"),
+    "formations": _default(),
     "rolling": LabelledMethod(
         METHOD, "the whole stream, planned anew in each slot", {"formation.operation": "rolling"}
     ),
