@@ -103,7 +103,7 @@ def nearest() -> list[dict[str, Any]]:
     The moves are those that agents of the default scenario drive, without errors of tracking; gaps
     are bumper to bumper between the turned bodies, negative where they overlap.
     """
-    tick_s, move_s = Scenario().runtime.tick_s, Scenario().formation.move_s
+    tick_s, move_s = Scenario().runtime.tick_s, Scenario().move_s
     ticks_late = {f"{late_s:g} s": round(late_s / tick_s) for late_s in (0.0, 0.5, move_s)}
     gaps_m = {
         pair: _gaps_m(pair, max(ticks_late.values()))

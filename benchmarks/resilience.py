@@ -43,7 +43,7 @@ REAL_TIME = ("--pace", "1")
 SHORT_TICKS = "short-ticks.toml"
 
 
-def demand(volume: int, duration_s: int, operation: str = "paper") -> tuple[str, ...]:
+def demand(volume: int, duration_s: int, operation: str = "formations") -> tuple[str, ...]:
     """Return the options for vehicles per lane and hour that arrive for some time."""
     flow = ("--volume", f"{volume}", "--seed", "1", "--duration", f"{duration_s}")
     return ("--operation", operation, *flow)

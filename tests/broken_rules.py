@@ -276,8 +276,10 @@ def forget_incarnation(patch: pytest.MonkeyPatch) -> None:
 def close_at_once(patch: pytest.MonkeyPatch) -> None:
     closed_formations = formation_module.closed_formations
 
-    def mutant(census: Census, scenario: Scenario, groups: Groups) -> dict[int, Formation]:
-        return closed_formations(evolve(census, closed_to=FAR_BEHIND), scenario, groups)
+    def mutant(
+        census: Census, t_s: float, scenario: Scenario, groups: Groups
+    ) -> dict[int, Formation]:
+        return closed_formations(evolve(census, closed_to=FAR_BEHIND), t_s, scenario, groups)
 
     patch.setattr(coordinator_core, "closed_formations", mutant)
 

@@ -124,8 +124,9 @@ class Ideal:
             self._tick = tick
             self._reference = Reference.hold(scenario, target)
             if origin != target:
-                self._tick = controller.motion_end_tick - round(scenario.formation.move_s / tick_s)
-                self._reference = Reference.move(scenario, origin, target, self._tick)
+                ticks = controller.motion_ticks
+                self._tick = controller.motion_end_tick - ticks
+                self._reference = Reference.move(scenario, origin, target, self._tick, ticks)
             start = cell_state(scenario.lattice, origin, self._tick * tick_s)
             self._plant = Plant(start, scenario.vehicle, tick_s)
         while self._tick < tick:

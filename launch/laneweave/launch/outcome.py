@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from laneweave.launch.failover import Failover
+from laneweave.protocol.scenario import COMFORT_MPS2
 from laneweave.sim_bridge.run_record import write_summary
 
 
@@ -119,8 +120,16 @@ def _traffic_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
         ("ticks of emergency braking", f"{summary['tracking']['emergency_ticks']}"),
         ("overlaps", f"{safety['overlaps']} (SUMO reports {safety['sumo_collisions']})"),
         ("least gap, least headway", f"{gap} m, {headway} s"),
-        ("acceleration", f"{low} to {high} m/s2"),
+        ("acceleration", f"{low} to {high} m/s2{_discomfort(safety)}"),
     ]
+
+
+def _discomfort(safety: dict[str, Any]) -> str:
+    """Return what is to be said of accelerations that are not comfortable; empty: nothing."""
+    found = (safety["min_accel_mps2"], safety["max_accel_mps2"])
+    if all(value is None or round(abs(value), 2) <= COMFORT_MPS2 for value in found):
+        return ""
+    return f", beyond comfort ({COMFORT_MPS2:g} m/s2)"
 
 
 def _control_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:

@@ -22,7 +22,6 @@ def road_scene(scenario: Scenario) -> dict[str, Any]:
         "lattice": {
             "speed_mps": formation.speed_mps,
             "pitch_m": formation.gap_m,
-            "block_columns": formation.block_columns,
         },
         "shade": {"span_mps": SPEED_SPAN_MPS, "strength": SHADE_STRENGTH},
         "colours": list(lane_colours(road.lanes)),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +18,7 @@ from laneweave.launch.colours import (
     lane_names,
 )
 from laneweave.launch.drawing import DPI, FAINT_INK, INK, new_figure, save, scenario_of
+from laneweave.launch.formations import Formations, recorded_formations
 from laneweave.protocol.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -26,7 +27,9 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-_ASPHALT, _BLOCK, _PAINT = "#e9eaec", "#dcdfe3", "#ffffff"
+_ASPHALT, _PAINT = "#eeeff1", "#ffffff"
+_OWNED = ("#e2e4e8", "#d5d8dd")
+"""Columns of formations, by turns."""
 _ACROSS_SCALE = 1.8
 """Roads are drawn this much wider than they are, or their lanes would be threads."""
 _HEADROOM_M = 4.5
@@ -67,14 +70,14 @@ def road_snapshots(
     """Draw the same stretch of road at some instants, one strip below the other.
 
     Vehicles have the colour of the lane that they prefer; the faster, the lighter. Left lanes are
-    on top, traffic goes to the right. Blocks of formations have alternating shades of grey, and
-    their numbers above the road.
+    on top, traffic goes to the right. The columns of formations have alternating shades of grey,
+    and the formations' numbers above the road.
 
     Args:
         folder: a run's folder.
         out: the picture to write; its suffix says the format.
-        times: road times in s; none: the four instants, a slot T_F apart, at which most vehicles
-            are between two lanes.
+        times: road times in s; none: the four instants, the shortest T_F apart, at which most
+            vehicles are between two lanes.
         stretch_m: the stretch of road from and to; none: 20 m before lane sorting begins and the
             300 m behind that point.
         dpi: resolution in dots per inch.
@@ -87,13 +90,11 @@ def road_snapshots(
     tracks = _tracks(folder)
     if not times:
         times = _instants(tracks, scenario, stretch_m)
-    trips = pq.read_table(
-        folder / "trips.parquet", columns=["vehicle", "preferred_lane", "formation"]
-    ).to_pylist()
-    preferred = {trip["vehicle"]: int(trip["preferred_lane"]) for trip in trips}
-    formations = {int(trip["formation"]) for trip in trips if trip["formation"] is not None}
-    if scenario.formation.rolling:
-        formations = set()  # the stream has none
+    trips = pq.read_table(folder / "trips.parquet", columns=["vehicle", "preferred_lane"])
+    preferred = {trip["vehicle"]: int(trip["preferred_lane"]) for trip in trips.to_pylist()}
+    formations = Formations(())
+    if not scenario.formation.rolling:  # the stream has none
+        formations = recorded_formations(folder, scenario.lattice)
     width_in = 9.6
     strip_in = (
         _ACROSS_SCALE
@@ -105,7 +106,7 @@ def road_snapshots(
     strips = figure.subplots(len(times), 1, sharex=True, squeeze=False)[:, 0]
     for axes, t_s in zip(strips, times, strict=True):
         _draw_road(axes, scenario, stretch_m)
-        _draw_blocks(axes, scenario, stretch_m, formations, t_s)
+        _draw_formations(axes, scenario, stretch_m, formations, t_s)
         axes.set_ylabel(f"{t_s:g} s", rotation=0, ha="right", va="center", color=INK)
         for vehicle, track in tracks.items():
             pose = track.at(t_s)
@@ -142,31 +143,29 @@ def _draw_road(axes: Axes, scenario: Scenario, stretch_m: tuple[float, float]) -
         spine.set_visible(False)
 
 
-def _draw_blocks(
+def _draw_formations(
     axes: Axes,
     scenario: Scenario,
     stretch_m: tuple[float, float],
-    formations: Iterable[int],
+    formations: Formations,
     t_s: float,
 ) -> None:
-    """Shade every other formation's block of columns, and number the blocks."""
+    """Shade the columns of formations, and write their numbers above."""
     lattice = scenario.lattice
     width_m = lattice.lanes * lattice.lane_width_m
     margin_m = 0.5 * (lattice.pitch_m - scenario.vehicle.length_m)
-    for number in formations:
-        columns = lattice.block_range(number)
-        rear_m = lattice.cell_s_m(columns[0], t_s) - scenario.vehicle.length_m - margin_m
-        front_m = lattice.cell_s_m(columns[-1], t_s) + margin_m
+    for place, formation in enumerate(formations.listed):
+        rear_m = lattice.cell_s_m(formation.rear, t_s) - scenario.vehicle.length_m - margin_m
+        front_m = lattice.cell_s_m(formation.front, t_s) + margin_m
         shown = (max(rear_m, stretch_m[0]), min(front_m, stretch_m[1]))
         if shown[0] >= shown[1]:
             continue
-        if number % 2:
-            axes.fill_between(shown, 0.0, width_m, color=_BLOCK, linewidth=0.0, zorder=0.5)
+        axes.fill_between(shown, 0.0, width_m, color=_OWNED[place % 2], linewidth=0.0, zorder=0.5)
         if shown[1] - shown[0] > 0.3 * (front_m - rear_m):
             axes.text(
                 0.5 * (shown[0] + shown[1]),
                 width_m + 0.35,
-                f"formation {number}",
+                f"formation {formation.number}",
                 ha="center",
                 va="bottom",
                 fontsize=6.5,
@@ -262,7 +261,7 @@ def _tracks(folder: Path) -> dict[str, _Track]:
 def _instants(
     tracks: Mapping[str, _Track], scenario: Scenario, stretch_m: tuple[float, float]
 ) -> list[float]:
-    """Return the four times, a slot T_F apart, at which most vehicles are between two lanes.
+    """Return the four times, the shortest T_F apart, at which most vehicles are between two lanes.
 
     Vehicles count by their distance from the nearest lane centre and a little for being there.
     """

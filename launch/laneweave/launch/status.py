@@ -36,10 +36,11 @@ class Plans:
     in_force: int
     """As the leader says."""
     operation: str | None
-    """`rolling` or `paper`, by what vehicles show; None: they show too little."""
+    """`formations` or `rolling`, by what vehicles show; None: they show too little."""
     formations: int | None
-    """Formations on the road, in the paper's operation."""
+    """Closed formations on the road, as the census lists them; None: there is no such list."""
     formations_with_plan: int | None
+    """Those of them of which a vehicle shows that it has accepted a plan."""
 
 
 @frozen
@@ -221,9 +222,14 @@ def _plans(road: RoadTally, leader: Candidate | None) -> Plans:
     # Only in the rolling operation vehicles own cells, or have deeds.
     if any(state.estate or state.deed for state in states):
         return Plans(in_force, "rolling", None, None)
-    formations = {state.formation for state in states}
-    planned = {state.formation for state in states if state.accepted}
-    return Plans(in_force, "paper", len(formations), len(planned))
+    if road.census is None:
+        return Plans(in_force, "formations", None, None)
+    closed = road.census.formations
+    accepted = {state.formation for state in states if state.accepted}
+    planned = sum(
+        any(one.first_block <= block <= one.last_block for block in accepted) for one in closed
+    )
+    return Plans(in_force, "formations", len(closed), planned)
 
 
 def _road(road: RoadTally) -> Road | None:

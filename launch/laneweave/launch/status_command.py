@@ -145,7 +145,7 @@ def _rows(found: Status) -> list[tuple[str, str]]:
     if plans.operation is not None:
         in_force += f", {plans.operation} operation"
     if plans.formations is not None:
-        in_force += f", {plans.formations_with_plan} of {plans.formations} formations have one"
+        in_force += f", {plans.formations_with_plan} of {plans.formations} closed ones have one"
     rows = [
         ("health", "healthy" if found.healthy else "not healthy"),
         ("realm", f"{found.realm} at {found.endpoint}, {found.listened_s:.1f} s"),

@@ -28,6 +28,7 @@ GROWING = Scenario()
 LATTICE = SCENARIO.lattice
 CLOSES_S = closing_time_s(0)
 """A column and a half after the rear one of block 0 passes the start of the road, at 3 s."""
+NOW_S = 50.0
 
 
 def entries_of(**cells: Cell) -> tuple[CensusEntry, ...]:
@@ -41,7 +42,7 @@ def census(t_s: float, **cells: Cell) -> Census:
 
 
 def closed(seen: Census, groups: Groups | None = None) -> dict[int, Formation]:
-    return closed_formations(seen, SCENARIO, groups or Groups())
+    return closed_formations(seen, NOW_S, SCENARIO, groups or Groups())
 
 
 def joined(*numbers: int) -> Groups:
@@ -105,30 +106,32 @@ def test_a_formation_has_all_of_its_blocks_and_is_planned_only_as_a_whole() -> N
     """The census says which blocks are whose."""
     formations = (ClosedFormation(0, 3, 3.0), ClosedFormation(4, 6, 9.0))
     seen = Census(9.0, entries_of(d=(-6, 1), a=(0, 0), c=(-4, 2), b=(-2, 2)), (), formations, 6)
-    assert closed_formations(seen, GROWING, Groups()) == {
+    assert closed_formations(seen, NOW_S, GROWING, Groups()) == {
         0: Formation((0, 1, 2, 3), entries_of(a=(0, 0), b=(-2, 2)), 3.0),
         4: Formation((4, 5, 6), entries_of(c=(-4, 2), d=(-6, 1)), 9.0),
     }
-    assert list(closed_formations(evolve(seen, closed_to=5), GROWING, Groups())) == [0]
+    assert list(closed_formations(evolve(seen, closed_to=5), NOW_S, GROWING, Groups())) == [0]
 
 
 def test_joined_formations_have_the_blocks_of_all_and_the_latest_closing() -> None:
     """Also when a vehicle has told only that two of their blocks are joined."""
     formations = (ClosedFormation(0, 3, 3.0), ClosedFormation(4, 6, 9.0))
     seen = Census(9.0, entries_of(a=(0, 0), c=(-4, 2)), (), formations, 6)
-    assert closed_formations(seen, GROWING, joined(3, 4)) == {
+    assert closed_formations(seen, NOW_S, GROWING, joined(3, 4)) == {
         0: Formation(tuple(range(7)), entries_of(a=(0, 0), c=(-4, 2)), 9.0, joined=2)
     }
-    assert closed_formations(evolve(seen, closed_to=5), GROWING, joined(3, 4)) == {}
+    assert closed_formations(evolve(seen, closed_to=5), NOW_S, GROWING, joined(3, 4)) == {}
 
 
 def test_what_the_census_has_told_of_a_formation_is_remembered() -> None:
     """It stays joined with another one that has left, as its vehicles know."""
     groups, both = Groups(), (ClosedFormation(0, 1, 3.0), ClosedFormation(2, 3, 5.0))
-    closed_formations(Census(5.0, entries_of(a=(0, 0), b=(-2, 0)), (), both, 3), GROWING, groups)
+    closed_formations(
+        Census(5.0, entries_of(a=(0, 0), b=(-2, 0)), (), both, 3), NOW_S, GROWING, groups
+    )
     groups.join((1, 2))
     later = Census(50.0, entries_of(b=(-2, 0)), (), both[1:], 3)
-    assert closed_formations(later, GROWING, groups) == {
+    assert closed_formations(later, NOW_S, GROWING, groups) == {
         0: Formation((0, 1, 2, 3), entries_of(b=(-2, 0)), 5.0)
     }
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Final
 
 from laneweave.launch.evaluation.evidence import Evidence
 from laneweave.launch.evaluation.markdown import HOLDS, MISSED, MISSING, markdown, number
@@ -14,10 +13,8 @@ from laneweave.launch.evaluation.programme import (
     LEAST_FACTORS,
     MOST_COST_RATIO,
     SEEDS,
+    Goal,
 )
-
-_PAPER: Final = "paper-12"
-_ROLLING: Final = "rolling"
 
 
 def goals_table(evidence: Evidence) -> str:
@@ -27,42 +24,55 @@ def goals_table(evidence: Evidence) -> str:
 
 
 def _traffic(evidence: Evidence) -> Iterator[tuple[str, str, str, str]]:
-    """Yield the goals for travel times and lanes."""
-    found = evidence.by_key
+    """Yield the goals for travel times and lanes, accelerations and planning."""
     for goal in GOALS:
-        asked_for = ((_PAPER, goal.paper_s), (_ROLLING, goal.rolling_s))
-        for label, most_s in asked_for:
-            if most_s is None:
-                continue
-            volume = goal.volume_veh_per_lane_h
-            row = found.get((label, volume))
-            share = goal.on_lane_percent
-            at_least = "" if share == 100.0 else "at least "
-            yield (
-                f"`{label}`, {volume:g} veh/(lane h)",
-                f"at most {most_s:g} s, {at_least}{share:g} % on their lane",
-                MISSING if row is None else _measured(row),
-                "" if row is None else _verdict(meets(row, most_s, share)),
-            )
+        row = evidence.by_key.get((goal.label, goal.volume_veh_per_lane_h))
+        yield (
+            f"`{goal.label}`, {goal.volume_veh_per_lane_h:g} veh/(lane h)",
+            ", ".join(_asked_for(goal)),
+            MISSING if row is None else _measured(row, goal),
+            "" if row is None else _verdict(meets(row, goal)),
+        )
 
 
-def meets(row: PointRow, most_s: float, share_percent: float) -> bool:
-    """Tell whether a point meets a goal.
-
-    Args:
-        row: the point.
-        most_s: greatest mean travel time.
-        share_percent: of all vehicles, that leave on their preferred lane.
-    """
-    on_time = row.travel_s is not None and row.travel_s <= most_s
-    return on_time and 100.0 * row.on_preferred_lane >= share_percent * row.demanded > 0.0
+def _asked_for(goal: Goal) -> Iterator[str]:
+    at_least = "" if goal.on_lane_percent == 100.0 else "at least "
+    yield f"at most {goal.travel_s:g} s"
+    yield f"{at_least}{goal.on_lane_percent:g} % on their lane"
+    if goal.accel_mps2 is not None:
+        yield f"within {goal.accel_mps2:g} m/s2"
+    if goal.fallback_percent is not None:
+        yield f"at most {goal.fallback_percent:g} % fallbacks"
 
 
-def _measured(row: PointRow) -> str:
+def meets(row: PointRow, goal: Goal) -> bool:
+    """Tell whether a point meets a goal, which is for its label and volume."""
+    kept = [
+        row.travel_s is not None and row.travel_s <= goal.travel_s,
+        100.0 * row.on_preferred_lane >= goal.on_lane_percent * row.demanded > 0.0,
+    ]
+    if goal.accel_mps2 is not None:
+        # As accelerations are shown.
+        found = (row.min_accel_mps2, row.max_accel_mps2)
+        kept += [a is not None and round(abs(a), 2) <= goal.accel_mps2 for a in found]
+    if goal.fallback_percent is not None:
+        kept.append(100.0 * row.fallbacks <= goal.fallback_percent * row.plans)
+    return all(kept)
+
+
+def _measured(row: PointRow, goal: Goal) -> str:
     off = row.demanded - row.on_preferred_lane
-    lanes = f"{off} of {row.demanded:,} not on their lane" if off else "100 %"
+    parts = [
+        f"{number(row.travel_s, 2)} s",
+        f"{off} of {row.demanded:,} not on their lane" if off else "100 %",
+    ]
+    if goal.accel_mps2 is not None:
+        low, high = number(row.min_accel_mps2, 2), number(row.max_accel_mps2, 2)
+        parts.append(f"{low} to {high} m/s2")
+    if goal.fallback_percent is not None:
+        parts.append(f"{row.fallbacks} of {row.plans:,} plans")
     few = "" if len(row.seeds) >= len(SEEDS) else f" ({len(row.seeds)} of {len(SEEDS)} seeds)"
-    return f"{number(row.travel_s, 2)} s, {lanes}{few}"
+    return ", ".join(parts) + few
 
 
 def _safety(evidence: Evidence) -> Iterator[tuple[str, str, str, str]]:

@@ -1,12 +1,14 @@
 """How far apart vehicles are at the lattice's fixed time points, from a run's trajectories.
 
-At the end of each slot whoever moved in it is at rest in a cell, and two vehicles of one lane are
-d_F or more apart, front to front. Between those points they may be nearer, by design: who falls
-back into a cell and who leaves it are under way at the same time.
+At the end of each slot vehicles that moved in it are at rest in a cell, and two vehicles of a lane
+are d_F or more apart, front to front. Between those points they may be nearer, by design: one falls
+back into a cell while another leaves it.
 
-Looked at are *settled* vehicles: on the road for `formation.settle_s` or longer, and holding the
-same cell for at least the time of a move. Lanes and distances are those of the bodies, not of
-the cells that they should be in, so that a body in the wrong place is seen.
+Each plan has its own slots. Looked at are the ticks before a vehicle begins a move, and one tick of
+each shortest T_F; and of the vehicles those that are at rest then: on the road for
+`formation.settle_s` or longer, and either about to begin a move or in the same cell for at least
+the longest time of a move. Lanes and distances are those of the bodies, not of the cells that they
+should be in, so that a body in the wrong place is seen.
 """
 
 from __future__ import annotations
@@ -68,19 +70,22 @@ def lattice_spacing(tracks: Tracks, scenario: Scenario) -> LatticeSpacing:
 
 
 def _settled(tracks: Tracks, ticks: Ints, scenario: Scenario) -> Bools:
-    """Return whether each row is a lattice point of a vehicle that rests in a cell."""
+    """Return whether each row is a lattice point of a vehicle at rest in a cell."""
     formation, tick_s = scenario.formation, scenario.runtime.tick_s
     first = np.zeros(len(ticks), dtype=np.bool_)
     first[tracks.starts[:-1][np.diff(tracks.starts) > 0]] = True
     changed = np.zeros(len(ticks), dtype=np.bool_)
     changed[1:] = (np.diff(tracks.column) != 0) | (np.diff(tracks.lane) != 0)
     changed &= ~first
+    about_to_move = np.append(changed[1:], False)[: len(ticks)]
     shortest_s, longest_s = scenario.cycles_s
     period = round(shortest_s / tick_s)
     at_end: Bools = ticks % period == _slot_phase(ticks[changed], period)
+    at_end |= np.isin(ticks, ticks[about_to_move])
     on_road_s = tracks.t_s - _since(tracks.t_s, first)
     held_s = tracks.t_s - _since(tracks.t_s, first | changed)
-    rests: Bools = held_s >= longest_s - formation.slack_s - 0.5 * tick_s
+    least_s = np.where(about_to_move, shortest_s, longest_s) - formation.slack_s
+    rests: Bools = held_s >= least_s - 0.5 * tick_s
     rests &= on_road_s >= formation.settle_s - 0.5 * tick_s
     rests &= tracks.column != OFF_LATTICE
     return rests & at_end

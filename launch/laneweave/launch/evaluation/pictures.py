@@ -9,7 +9,7 @@ from typing import Final
 from attrs import frozen
 
 from laneweave.launch.evaluation.evidence import Picture
-from laneweave.launch.evaluation.programme import LABELS, ROLLING_VOLUMES
+from laneweave.launch.evaluation.programme import LABELS, VOLUMES
 from laneweave.launch.evaluation.statements import PAPER_STRETCH_M, PAPER_VOLUMES
 from laneweave.launch.report.comparison_figures import draw_flows, draw_speeds, draw_travel_times
 from laneweave.launch.report.distribution_figures import draw_spacings
@@ -74,7 +74,7 @@ def _snapshots(label: str, what: str) -> _Plan:
     picture = Picture(
         f"evaluation-road-{label}.png",
         f"Four strips of road from 500 to 800 m, {label}",
-        f"The road from 500 to 800 m at 1600 veh/(lane h), {what}: four instants, a slot apart. "
+        f"The road from 500 to 800 m at 1600 veh/(lane h), {what}: four instants, 4 s apart. "
         "Colours are preferred lanes; the faster, the lighter.",
     )
     return _Plan(picture, (label,), (SHOWN_VOLUME,), _draw_snapshots, traced=True)
@@ -85,10 +85,11 @@ _PLANS: Final = (
         Picture(
             "evaluation-paper.png",
             "Box plots of travel times at the paper's volumes",
-            "Travel times at the paper's volumes: its formations of at most six beside two "
-            "readings of its rules. Boxes: quartiles over the vehicles of all seeds; lines: means.",
+            "Travel times at the paper's volumes: the default formations and the paper's, both of "
+            "at most six, beside two readings of its rules. Boxes: quartiles over the vehicles of "
+            "all seeds; lines: means. The axis is broken where a method jams.",
         ),
-        ("paper-6", "rule", "rule-net"),
+        ("formations", "paper-6", "rule", "rule-net"),
         PAPER_VOLUMES,
         draw_travel_times,
     ),
@@ -98,8 +99,8 @@ _PLANS: Final = (
             "Box plots of travel times at all volumes",
             "Travel times up to 2400 veh/(lane h), of the methods that do not congest.",
         ),
-        ("rolling", "paper-12", "lc2013"),
-        ROLLING_VOLUMES,
+        ("formations", "paper-12", "rolling", "lc2013"),
+        VOLUMES,
         draw_travel_times,
     ),
     _Plan(
@@ -109,7 +110,7 @@ _PLANS: Final = (
             "Throughput and share on the preferred lane. Dots are runs, bars standard deviations.",
         ),
         LABELS,
-        ROLLING_VOLUMES,
+        VOLUMES,
         draw_flows,
     ),
     _Plan(
@@ -118,12 +119,13 @@ _PLANS: Final = (
             "Heat maps of mean speed over time and position",
             "Mean speed over space and time, seed 1. Dashed: lane sorting begins.",
         ),
-        ("rolling", "paper-6", "rule", "rule-net"),
+        ("formations", "paper-6", "rule", "rule-net"),
         PAPER_VOLUMES[1:],
         draw_speeds,
         traced=True,
     ),
-    _snapshots("paper-6", "formations of at most six"),
+    _snapshots("formations", "formations of at most six"),
+    _snapshots("paper-6", "the paper's formations of at most six"),
     _snapshots("rule", "the rules, d_R front to front"),
     _snapshots("rule-net", "the rules, d_R as a net gap"),
     _Plan(
@@ -133,7 +135,7 @@ _PLANS: Final = (
             "Spacing and time headway at 1600 veh/(lane h), front bumper to front bumper. Dashed: "
             "d_F, and the time that it takes at v_F.",
         ),
-        ("rolling", "paper-12", "rule", "lc2013"),
+        ("formations", "rolling", "rule", "lc2013"),
         (SHOWN_VOLUME,),
         _draw_spacings,
         traced=True,

@@ -9,6 +9,7 @@ import numpy as np
 from attrs import frozen
 
 from laneweave.launch.evaluation.lattice_points import lattice_spacing
+from laneweave.launch.formations import PLANNED, read_events
 from laneweave.launch.report.runs import Run
 from laneweave.launch.report.tracks import Tracks, read_tracks
 from laneweave.protocol.errors import BadInputError
@@ -20,6 +21,10 @@ SLOW_SHARE: Final = 0.5
 """Where traffic is slower than this share of v_F on average, it is congested."""
 LIMIT_ERROR: Final = 0.001
 """Summaries are rounded to this."""
+STREAM_PLANNED: Final = "stream-planned"
+"""Event of a plan of the rolling operation."""
+SOLVER: Final = {PLANNED: "branching", STREAM_PLANNED: "stream"}
+"""What has planned, by the kind of event, where the event does not say it."""
 Key = tuple[str, float]
 """(label, volume in vehicles/(lane h))."""
 
@@ -40,6 +45,17 @@ class Traced:
     """Congested stretch of road, from and to: mean speed below half of v_F; None: nowhere."""
     slowest_mps: float | None
     """Least mean speed of a bin of the road; None: nobody drove."""
+
+
+@frozen
+class PlanningTimes:
+    """How long a solver has taken, over the plans of all seeds."""
+
+    solver: str
+    plans: int
+    p50_ms: float
+    p95_ms: float
+    max_ms: float
 
 
 @frozen
@@ -78,6 +94,11 @@ class PointRow:
     """Worst over the seeds."""
     traced: Traced | None
     """What the trajectories say; None: none were kept."""
+    plans: int = 0
+    """Over all seeds, as the next ones."""
+    fallbacks: int = 0
+    """Plans of the fallback planner."""
+    planning: tuple[PlanningTimes, ...] = ()
 
     @property
     def on_lane_percent(self) -> float | None:
@@ -156,7 +177,35 @@ def _row(key: Key, runs: Sequence[Run]) -> PointRow:
         largest_formation=int(max(values("planning", "largest_formation"), default=0)),
         planning_p95_ms=max(values("planning", "solve_ms", "p95"), default=None),
         traced=_traced([run for run in complete if run.has_trajectories]),
+        plans=int(sum(values("planning", "plans"))),
+        fallbacks=int(sum(values("planning", "fallbacks"))),
+        planning=planning_times(complete),
     )
+
+
+def planning_times(runs: Iterable[Run]) -> tuple[PlanningTimes, ...]:
+    """Return how long each solver has taken in some runs, by their events.
+
+    Raises:
+        OSError, ValueError, TypeError: events cannot be read.
+    """
+    found: dict[str, list[float]] = {}
+    for run in runs:
+        for event in read_events(run.folder, *SOLVER):
+            solve_ms = event.get("solve_ms")
+            if event.get("role") == "coordinator" and isinstance(solve_ms, (int, float)):
+                solver = str(event.get("solver") or SOLVER[event["kind"]])
+                found.setdefault(solver, []).append(float(solve_ms))
+    return tuple(
+        PlanningTimes(solver, len(times_ms), *(round(float(one), 2) for one in _spread(times_ms)))
+        for solver, times_ms in sorted(found.items())
+    )
+
+
+def _spread(values: Sequence[float]) -> tuple[float, float, float]:
+    """Return the median, the 95th percentile and the greatest value."""
+    p50, p95 = np.percentile(values, [50.0, 95.0])
+    return float(p50), float(p95), max(values)
 
 
 def within_limits(low: float | None, high: float | None, scenario: Scenario) -> bool:

@@ -7,25 +7,30 @@ from typing import Final
 from attrs import frozen
 
 from laneweave.launch.option_values import KeepTrajectories
-from laneweave.launch.sweep.methods import METHODS
 from laneweave.launch.sweep.points import Point, plan_points
 from laneweave.protocol.scenario import Scenario
 
 SEEDS: Final = range(1, 6)
 DURATION_S: Final = 600.0
 """Vehicles arrive for this long at each point."""
-VOLUMES: Final = (1000.0, 1150.0, 1300.0, 1450.0, 1600.0, 1750.0, 2000.0, 2200.0, 2400.0)
-"""In vehicles/(lane h): the paper's, and beyond them."""
-PAPER_BOUND: Final = METHODS["paper-12"].settings(Scenario()).formation.bound_veh_per_lane_h
-"""Most vehicles/(lane h) that interlaced formations can carry (the paper's V_u)."""
+VOLUMES: Final = (
+    500.0, 750.0, 1000.0, 1150.0, 1300.0, 1450.0, 1600.0, 1750.0, 1800.0, 2000.0, 2200.0, 2400.0
+)  # fmt: skip
+"""In vehicles/(lane h): the paper's, below and beyond them."""
+
+
+def paper_bound(speed_mps: float, pitch_m: float) -> float:
+    """Return the most vehicles/(lane h) that interlaced formations can carry (the paper's V_u).
+
+    Args:
+        speed_mps: v_F.
+        pitch_m: d_F.
+    """
+    return 3600.0 * speed_mps / (2.0 * pitch_m)
 
 
 def _up_to(most_veh_per_lane_h: float) -> tuple[float, ...]:
     return tuple(volume for volume in VOLUMES if volume <= most_veh_per_lane_h)
-
-
-WITHIN_BOUND: Final = _up_to(PAPER_BOUND)
-ROLLING_VOLUMES: Final = tuple(sorted({*VOLUMES, PAPER_BOUND}))
 
 
 @frozen
@@ -39,19 +44,21 @@ class Part:
 
 
 PARTS: Final = (
-    Part(("rolling",), ROLLING_VOLUMES, KeepTrajectories.all),
-    Part(("paper-6", "paper-12"), WITHIN_BOUND, KeepTrajectories.all),
-    Part(("lc2013", "lc2013-4s"), VOLUMES, KeepTrajectories.first_seed),
-    # Not far beyond their jams: those only grow, and cost more time than all the rest.
-    Part(("rule", "rule-yielding"), _up_to(2200.0), KeepTrajectories.first_seed),
+    Part(("rolling",), VOLUMES, KeepTrajectories.all),
+    Part(("formations",), _up_to(2000.0), KeepTrajectories.all),
+    Part(("paper-6", "paper-12"), _up_to(1800.0), KeepTrajectories.all),
+    # Jams only grow with the volume, and cost more time than all the rest.
+    Part(("rule", "rule-yielding"), _up_to(1800.0), KeepTrajectories.first_seed),
     Part(("rule-net",), _up_to(1600.0), KeepTrajectories.first_seed),
+    Part(("lc2013", "lc2013-4s"), _up_to(1800.0), KeepTrajectories.first_seed),
 )
-"""The dear ones first: short runs fill the gaps at the end."""
+"""Most expensive first: short runs fill the gaps at the end."""
 LABELS: Final = (
-    "rolling", "paper-6", "paper-12", "rule", "rule-net", "rule-yielding", "lc2013", "lc2013-4s"
+    "formations", "paper-6", "paper-12", "rolling",
+    "rule", "rule-net", "rule-yielding", "lc2013", "lc2013-4s",
 )  # fmt: skip
 """In the order of tables."""
-FORMATIONS: Final = ("rolling", "paper-6", "paper-12")
+FORMATIONS: Final = ("formations", "paper-6", "paper-12", "rolling")
 """Labels of formation control: these have promises to keep."""
 
 
@@ -77,25 +84,35 @@ def _keep(part: Part, seed: int) -> KeepTrajectories:
 
 @frozen
 class Goal:
-    """What is asked at a volume; travel times are means over the seeds."""
+    """What is asked of a label at a volume; travel times are means over the seeds."""
 
+    label: str
     volume_veh_per_lane_h: float
-    paper_s: float | None
-    """Travel time of the paper's operation with at most 12 vehicles; None: nothing is asked."""
-    rolling_s: float
-    """Travel time of the rolling operation."""
-    on_lane_percent: float
-    """Share that leaves on its preferred lane, of either."""
+    travel_s: float
+    """Greatest travel time."""
+    on_lane_percent: float = 100.0
+    """Smallest share that leaves on its preferred lane."""
+    accel_mps2: float | None = None
+    """Greatest acceleration or braking; None: only the vehicles' limits."""
+    fallback_percent: float | None = None
+    """Greatest share of plans of the fallback planner; None: nothing is asked."""
 
 
 GOALS: Final = (
-    *(Goal(volume, 67.5, 66.8, 100.0) for volume in (1000.0, 1150.0, 1300.0, 1450.0)),
-    Goal(1600.0, 69.5, 66.8, 100.0),
-    Goal(1750.0, 73.0, 67.0, 100.0),
-    Goal(PAPER_BOUND, None, 67.0, 100.0),
-    Goal(2000.0, None, 67.5, 99.95),
-    Goal(2200.0, None, 67.5, 99.95),
-    Goal(2400.0, None, 68.0, 99.9),
+    Goal("formations", 1000.0, 66.7, fallback_percent=1.0),
+    Goal("formations", 1600.0, 66.9, accel_mps2=3.5, fallback_percent=1.0),
+    Goal("formations", 1750.0, 67.0, fallback_percent=2.0),
+    Goal("formations", 2000.0, 67.5, fallback_percent=5.0),
+    *(Goal("paper-12", volume, 67.5) for volume in (1000.0, 1150.0, 1300.0, 1450.0)),
+    Goal("paper-12", 1600.0, 69.5),
+    Goal("paper-12", 1750.0, 73.0),
+    *(
+        Goal("rolling", volume, 66.8, accel_mps2=3.0)
+        for volume in (1000.0, 1150.0, 1300.0, 1450.0, 1600.0)
+    ),
+    *(Goal("rolling", volume, 67.0, accel_mps2=3.0) for volume in (1750.0, 1800.0, 2000.0)),
+    Goal("rolling", 2200.0, 67.0, 99.95),
+    Goal("rolling", 2400.0, 67.0, 99.9),
 )
 LEAST_FACTORS: Final = {"zenoh": 2.0, "zenoh-50": 5.0, "simulated": 6.0}
 """Real-time factors asked for at 1600 vehicles/(lane h), by trial."""

@@ -13,7 +13,7 @@ from attrs import frozen
 from laneweave.launch.evaluation.evidence import Evidence
 from laneweave.launch.evaluation.markdown import HOLDS, MISSING, markdown, number
 from laneweave.launch.evaluation.points import PointRow
-from laneweave.launch.evaluation.programme import PAPER_BOUND, ROLLING_VOLUMES, SEEDS, planned
+from laneweave.launch.evaluation.programme import SEEDS, VOLUMES, paper_bound, planned
 
 PAPER_VOLUMES: Final = (1000.0, 1150.0, 1300.0, 1450.0, 1600.0)
 """At which the paper compares, in vehicles/(lane h)."""
@@ -21,6 +21,10 @@ READINGS: Final = ("rule", "rule-net", "rule-yielding")
 """The readings of its rules."""
 OWN: Final = "paper-6"
 """Formation control as the paper runs it: at most six vehicles."""
+CLOSED: Final = ("formations", OWN, "paper-12")
+"""Closed formations: the default ones, and the paper's."""
+ALIKE_S: Final = 1.0
+"""Methods are alike where their mean travel times differ by no more."""
 STABLE: Final = 1.05
 """Travel times are stable if they grow by no more than this factor from 1000 to 1600."""
 CONGESTED: Final = 1.25
@@ -85,7 +89,7 @@ class _Judge:
         text = "The travel time of formation control stays stable from 1000 to 1600 veh/(lane h)"
         parts: list[str] = []
         kept: list[bool | None] = []
-        for label in (OWN, "paper-12"):
+        for label in CLOSED:
             low_s, high_s = (self._travel_s(label, volume) for volume in (1000.0, 1600.0))
             if low_s is None or high_s is None:
                 parts.append(f"`{label}` {MISSING}")
@@ -127,7 +131,7 @@ class _Judge:
         rows = [
             self._row(label, volume)
             for label in labels
-            for volume in ROLLING_VOLUMES
+            for volume in VOLUMES
             if planned(label, volume)
         ]
         return [row for row in rows if row is not None], [None for row in rows if row is None]
@@ -136,7 +140,7 @@ class _Judge:
         text = "Severe congestion under the rules at 1450 and 1600, none with formation control"
         parts: list[str] = []
         kept: list[bool | None] = []
-        for label in (*READINGS, OWN, "lc2013"):
+        for label in (*READINGS, *CLOSED, "lc2013"):
             first, below = self._congested_from(label)
             if label in READINGS:
                 known = self._row(label, 1450.0) is not None
@@ -190,26 +194,40 @@ class _Judge:
 
     def _alike_below(self) -> Statement:
         text = "Below 1000 the methods are alike"
-        times = [f"`{one}` {number(self._travel_s(one, 1000.0), 1)} s" for one in (OWN, *READINGS)]
-        return Statement(text, "not repeated; at 1000: " + ", ".join(times), OTHERWISE)
+        parts: list[str] = []
+        kept: list[bool | None] = []
+        for volume in (500.0, 750.0):
+            times = [self._travel_s(label, volume) for label in (OWN, *READINGS)]
+            known = [t_s for t_s in times if t_s is not None]
+            parts.append(f"at {volume:g}: {_series([number(t_s, 1) for t_s in times], known)}")
+            whole = len(known) == len(times)
+            kept.append(max(known) - min(known) <= ALIKE_S if whole else None)
+        whose = ", ".join(f"`{label}`" for label in (OWN, *READINGS))
+        return Statement(text, f"{whose} {'; '.join(parts)}", _all(kept))
 
     def _bound(self) -> Statement:
-        text = f"At most {PAPER_BOUND:g} veh/(lane h) can be carried (3600 v_F / 2 d_F)"
-        row, beyond = self._row("paper-12", 1750.0), self._row("rolling", 2400.0)
-        if row is None or row.throughput_veh_per_lane_h is None:
+        row, setting = self._row("paper-12", 1750.0), self.evidence.setting
+        text = "At most 3600 v_F / 2 d_F can be carried"
+        if row is None or row.throughput_veh_per_lane_h is None or setting is None:
             return Statement(text, MISSING, "")
+        bound = paper_bound(setting.speed_mps, setting.pitch_m)
+        text += f", here {bound:g} veh/(lane h)"
         rate = row.throughput_veh_per_lane_h
         measured = f"`paper-12` carries {rate:.0f} of 1750"
-        if beyond is not None and (beyond.throughput_veh_per_lane_h or 0.0) > PAPER_BOUND:
-            measured += (
-                "; the bound is one of the interlaced entry, not of the lattice: `rolling` "
-                f"carries {beyond.throughput_veh_per_lane_h:.0f} of 2400"
-            )
+        beyond = [
+            f"`{label}` carries {found.throughput_veh_per_lane_h:.0f} of {volume:g}"
+            for label, volume in (("formations", 2000.0), ("rolling", 2400.0))
+            for found in (self._row(label, volume),)
+            if found is not None and (found.throughput_veh_per_lane_h or 0.0) > bound
+        ]
+        if beyond:
+            measured += "; the bound is one of the interlaced entry, not of the lattice: "
+            measured += ", ".join(beyond)
         return Statement(text, measured, _all([rate >= CARRIED * 1750.0]))
 
     def _safe(self) -> Statement:
         text = "Formation control plans ways without collisions, to the preferred lanes"
-        rows, missing = self._rows(OWN, "paper-12")
+        rows, missing = self._rows(*CLOSED)
         if not rows:
             return Statement(text, MISSING, "")
         off = sum(row.demanded - row.on_preferred_lane for row in rows)
@@ -243,7 +261,7 @@ class _Judge:
     def _six(self) -> Statement:
         text = "Formations have at most six vehicles, for computational reasons"
         parts = []
-        for label in (OWN, "paper-12"):
+        for label in CLOSED:
             row = self._row(label, 1600.0)
             found = None if row is None else row.planning_p95_ms
             parts.append(f"`{label}` {MISSING if found is None else f'{found:.0f} ms'}")

@@ -8,7 +8,7 @@ from laneweave.launch.evaluation.evidence import Evidence
 from laneweave.launch.evaluation.goals import goals_table
 from laneweave.launch.evaluation.markdown import MISSING, NOT_RUN, markdown, number
 from laneweave.launch.evaluation.points import PointRow
-from laneweave.launch.evaluation.programme import LABELS, ROLLING_VOLUMES, SEEDS, planned
+from laneweave.launch.evaluation.programme import FORMATIONS, LABELS, SEEDS, VOLUMES, planned
 from laneweave.launch.evaluation.statements import statements_table
 
 
@@ -21,6 +21,7 @@ def document_parts(evidence: Evidence) -> dict[str, str]:
         "evaluation margins": _by_volume(evidence, _margins),
         "evaluation brakes": _by_volume(evidence, _brakes),
         "evaluation throughput": _by_volume(evidence, _throughput),
+        "evaluation planning": _planning(evidence),
         "evaluation lattice": _lattice(evidence),
         "evaluation statements": statements_table(evidence),
         "evaluation goals": goals_table(evidence),
@@ -39,7 +40,7 @@ def _by_volume(evidence: Evidence, text: Callable[[PointRow], str]) -> str:
             f"{volume:g}",
             *(_cell(label, volume, found.get((label, volume)), text) for label in LABELS),
         ]
-        for volume in ROLLING_VOLUMES
+        for volume in VOLUMES
     ]
     return markdown(["veh/(lane h)", *(f"`{label}`" for label in LABELS)], rows)
 
@@ -92,6 +93,27 @@ def _brakes(row: PointRow) -> str:
 
 def _throughput(row: PointRow) -> str:
     return number(row.throughput_veh_per_lane_h, 0)
+
+
+def _planning(evidence: Evidence) -> str:
+    """Return the table of planning times by label, volume and solver."""
+    rows = [
+        [
+            f"`{row.label}`",
+            f"{row.volume_veh_per_lane_h:g}",
+            f"`{one.solver}`",
+            f"{one.plans:,}",
+            *(number(value, 1) for value in (one.p50_ms, one.p95_ms, one.max_ms)),
+            f"{row.fallbacks} of {row.plans:,}",
+        ]
+        for row in evidence.points
+        if row.label in FORMATIONS
+        for one in row.planning
+    ]
+    headings = [
+        "", "veh/(lane h)", "solver", "plans", "p50 (ms)", "p95 (ms)", "max (ms)", "fallbacks",
+    ]  # fmt: skip
+    return markdown(headings, rows)
 
 
 def _lattice(evidence: Evidence) -> str:

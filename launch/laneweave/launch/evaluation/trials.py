@@ -28,7 +28,7 @@ from laneweave.launch.sweep.execution import StoppedError, follow
 from laneweave.launch.sweep.folder import read_summary
 from laneweave.protocol.errors import CommandFailedError
 
-ZENOH_VOLUMES: Final = (1000, 1600, 2400)
+ZENOH_VOLUMES: Final = (1000, 1600, 2000)
 """Those that are repeated over Zenoh, in vehicles/(lane h)."""
 TIMEOUT_S: Final = 3600.0
 """A run that takes longer is ended."""
@@ -93,9 +93,8 @@ class CostRow:
     """Time per vehicle and tick, everything included."""
 
 
-def _rolling(volume: int, duration_s: int, *more: str) -> tuple[str, ...]:
-    demand = ("--volume", f"{volume}", "--seed", "1", "--duration", f"{duration_s}")
-    return ("--operation", "rolling", *demand, *more)
+def _demand(volume: int, duration_s: int, *more: str) -> tuple[str, ...]:
+    return ("--volume", f"{volume}", "--seed", "1", "--duration", f"{duration_s}", *more)
 
 
 SIMULATED: Final = ("--transport", "simulated")
@@ -104,16 +103,16 @@ TRIALS: Final = (
         trial
         for volume in ZENOH_VOLUMES
         for trial in (
-            Trial("zenoh", f"zenoh-{volume}", _rolling(volume, 120)),
-            Trial("zenoh", f"simulated-{volume}", _rolling(volume, 120, *SIMULATED), shares=True),
+            Trial("zenoh", f"zenoh-{volume}", _demand(volume, 120)),
+            Trial("zenoh", f"simulated-{volume}", _demand(volume, 120, *SIMULATED), shares=True),
         )
     ),
-    Trial("speed", "zenoh", _rolling(1600, 300)),
-    Trial("speed", "zenoh-50", _rolling(1600, 300, "--vehicles-per-process", "50")),
-    Trial("speed", "simulated", _rolling(1600, 300, *SIMULATED)),
+    Trial("speed", "zenoh", _demand(1600, 300)),
+    Trial("speed", "zenoh-50", _demand(1600, 300, "--vehicles-per-process", "50")),
+    Trial("speed", "simulated", _demand(1600, 300, *SIMULATED)),
     # Ended when the road has been full for a while: nobody has to wait until it is empty again.
     Trial("length", "long", ("benchmarks/long-road.toml", *SIMULATED), ending="limit"),
-    Trial("length", "short", _rolling(1800, 600, *SIMULATED)),
+    Trial("length", "short", _demand(1800, 600, "--operation", "rolling", *SIMULATED)),
 )
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow.parquet as pq
 from attrs import frozen
 
+from laneweave.launch.formations import Formations, recorded_formations
 from laneweave.launch.report.runs import Run
 from laneweave.launch.report.tracks import Floats, Tracks
 from laneweave.launch.road_scene import road_scene
@@ -37,7 +38,10 @@ def animation_data(run: Run, tracks: Tracks, title: str) -> dict[str, Any]:
         title: what the run is called on the page.
     """
     scenario, road = run.scenario, run.scenario.road
-    samples = _sample(run, tracks)
+    formations = Formations(())
+    if not scenario.formation.rolling:  # the stream has none
+        formations = recorded_formations(run.folder, scenario.lattice)
+    samples = _sample(run, tracks, formations)
     units = {
         "s_m": max(0.02, float(tracks.s_m.max(initial=0.0)) / 65_000),
         "y_m": road.lanes * road.lane_width_m / 65_000,
@@ -50,6 +54,7 @@ def animation_data(run: Run, tracks: Tracks, title: str) -> dict[str, Any]:
         "end_s": round(samples.end_s, 3),
         "start_s": round(_busy_s(run, samples.end_s), 3),
         **road_scene(scenario),
+        "formations": [[one.number, one.rear, one.front] for one in reversed(formations.listed)],
         "vehicles": samples.vehicles,
         "units": units,
         "columns": {
@@ -69,13 +74,13 @@ class _Samples:
     """For each vehicle an array of shape (its samples,)."""
 
 
-def _sample(run: Run, tracks: Tracks) -> _Samples:
+def _sample(run: Run, tracks: Tracks, formations: Formations) -> _Samples:
     """Sample all vehicles on a common grid of times."""
     trips = pq.read_table(
         run.folder / "trips.parquet", columns=["vehicle", "preferred_lane", "formation"]
     ).to_pylist()
     trip_of = {trip["vehicle"]: trip for trip in trips}
-    rolling = run.scenario.formation.rolling
+    known = formations.by_number
     driven_s = len(tracks.t_s) * run.scenario.runtime.tick_s
     step_s = next((step for step in STEPS_S if driven_s / step <= MOST_SAMPLES), STEPS_S[-1])
     end_s = float(tracks.t_s.max(initial=0.0))
@@ -102,7 +107,7 @@ def _sample(run: Run, tracks: Tracks) -> _Samples:
             {
                 "name": tracks.names[int(number)],
                 "lane": int(trip.get("preferred_lane") or 0),
-                "formation": None if rolling else trip.get("formation"),
+                "formation": trip["formation"] if trip.get("formation") in known else None,
                 "first": first,
                 "count": count,
             }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,19 +26,107 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
+JAMMED = 1.25
+"""A box belongs to a jam where its upper quartile is so many times the lowest of all medians."""
+LOWER_SHARE = 0.66
+"""Part of the height below the break, where the methods are that do not jam."""
+
+
 def draw_travel_times(comparison: Comparison, out: Path, dpi: int) -> None:
-    """Draw boxes of the counted vehicles' travel times, all seeds together, by volume."""
+    """Draw boxes of the counted vehicles' travel times, all seeds together, by volume.
+
+    Where a method jams, the axis is broken: jams last for several times what others differ by.
+    """
     from matplotlib.patches import Patch  # noqa: PLC0415 - lazily
 
     labels, volumes = comparison.labels, comparison.volumes
     colours = label_colours(labels)
-    figure = new_figure(max(5.6, 1.6 + 0.3 * len(volumes) * (len(labels) + 0.8)), 3.9)
-    axes = figure.subplots()
-    _draw_free_flow(axes, comparison)
-    width = 0.8 / len(labels)
+    times = {
+        label: [_travel_times(comparison.at(label, volume)) for volume in volumes]
+        for label in labels
+    }
+    figure = new_figure(max(5.6, 1.6 + 0.3 * len(volumes) * (len(labels) + 0.8)), 4.4)
+    break_s = _break(one for found in times.values() for one in found)
+    if break_s is None:
+        lower = figure.subplots()
+        panels = [lower]
+    else:
+        shares = (1.0 - LOWER_SHARE, LOWER_SHARE)
+        upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=shares)
+        panels = [upper, lower]
+    for axes in panels:
+        _draw_boxes(axes, times, colours)
+        plain(axes, grid="y")
+    _draw_free_flow(lower, comparison)
+    if break_s is not None:
+        _break_axis(upper, lower, break_s)
     for number, label in enumerate(labels):
-        times = [_travel_times(comparison.at(label, volume)) for volume in volumes]
-        places = np.arange(len(volumes)) + (number - 0.5 * (len(labels) - 1)) * width
+        for place, one in zip(_places(number, labels, volumes), times[label], strict=True):
+            if not len(one):
+                lower.text(
+                    place,
+                    0.03,
+                    "no vehicle",
+                    transform=lower.get_xaxis_transform(),
+                    rotation=90,
+                    ha="center",
+                    va="bottom",
+                    fontsize=7,
+                    color=FAINT_INK,
+                )
+    lower.set_xticks(range(len(volumes)), labels=[f"{volume:g}" for volume in volumes])
+    lower.set_xlim(-0.6, len(volumes) - 0.4)
+    lower.set_xlabel("traffic volume (veh/(lane·h))")
+    lower.set_ylabel("travel time (s)")
+    handles = [Patch(facecolor=colours[one] + "55", edgecolor=colours[one]) for one in labels]
+    legend_above(figure, handles, labels)
+    save(figure, out, dpi)
+
+
+def _break(times_s: Iterable[Floats]) -> float | None:
+    """Return the travel time at which the axis is broken; None: there is no jam, or only jams."""
+    quartiles = [np.percentile(one, [50.0, 75.0, 99.0]) for one in times_s if len(one)]
+    if not quartiles:
+        return None
+    most_s = JAMMED * min(median for median, _, _ in quartiles)
+    ends_s = [end for _, upper, end in quartiles if upper <= most_s]
+    if len(ends_s) == len(quartiles) or not ends_s:
+        return None
+    return float(
+        max(
+            1.01 * min(max(ends_s), most_s),
+            *(upper for _, upper, _ in quartiles if upper <= most_s),
+        )
+    )
+
+
+def _break_axis(upper: Axes, lower: Axes, break_s: float) -> None:
+    """Show what is above the break on the upper axes, with its own scale, and the rest below."""
+    bottom_s, top_s = lower.get_ylim()
+    lower.set_ylim(bottom_s, break_s)
+    upper.set_ylim(break_s, top_s)
+    upper.spines["bottom"].set_visible(False)
+    upper.tick_params(axis="x", bottom=False, labelbottom=False)
+    upper.set_ylabel("jams (s)")
+    for axes, y in ((upper, 0.0), (lower, 1.0)):
+        mark = {"marker": [(-1.0, -0.5), (1.0, 0.5)], "markersize": 9, "linestyle": "none"}
+        axes.plot([0.0], [y], transform=axes.transAxes, color=INK, clip_on=False, **mark)
+
+
+def _places(number: int, labels: Sequence[str], volumes: Sequence[float]) -> Floats:
+    """Return where the boxes of a label are along the axis."""
+    width = 0.8 / len(labels)
+    return np.arange(len(volumes)) + (number - 0.5 * (len(labels) - 1)) * width
+
+
+def _draw_boxes(
+    axes: Axes, times_s: Mapping[str, Sequence[Floats]], colours: Mapping[str, str]
+) -> None:
+    """Draw the boxes of each label, one for each volume, and a line through their means."""
+    labels = list(times_s)
+    width = 0.8 / len(labels)
+    for number, (label, times) in enumerate(times_s.items()):
+        places = _places(number, labels, range(len(times)))
         axes.boxplot(
             times,
             positions=places,
@@ -55,27 +143,6 @@ def draw_travel_times(comparison: Comparison, out: Path, dpi: int) -> None:
         axes.plot(
             places, means, color=colours[label], marker="o", markersize=3.5, linewidth=1.3, zorder=3
         )
-        for place, one in zip(places, times, strict=True):
-            if not len(one):
-                axes.text(
-                    place,
-                    0.03,
-                    "no vehicle",
-                    transform=axes.get_xaxis_transform(),
-                    rotation=90,
-                    ha="center",
-                    va="bottom",
-                    fontsize=7,
-                    color=FAINT_INK,
-                )
-    axes.set_xticks(range(len(volumes)), labels=[f"{volume:g}" for volume in volumes])
-    axes.set_xlim(-0.6, len(volumes) - 0.4)
-    axes.set_xlabel("traffic volume (veh/(lane·h))")
-    axes.set_ylabel("travel time (s)")
-    plain(axes, grid="y")
-    handles = [Patch(facecolor=colours[one] + "55", edgecolor=colours[one]) for one in labels]
-    legend_above(figure, handles, labels)
-    save(figure, out, dpi)
 
 
 def _draw_free_flow(axes: Axes, comparison: Comparison) -> None:

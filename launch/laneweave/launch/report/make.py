@@ -91,8 +91,8 @@ def report_run(run: Run, *, formation: int | None = None, dpi: int = DPI) -> Pat
         "Snapshots",
         "road.png",
         lambda out: road_snapshots(folder, out, dpi=dpi),
-        "The same stretch of road at four instants, a slot apart. Colours are the lanes that "
-        "vehicles prefer; the faster, the lighter.",
+        "The same stretch of road at four instants, the shortest T_F apart. Colours are the lanes "
+        "that vehicles prefer; the faster, the lighter.",
         "Four strips of road with vehicles coloured by preferred lane",
     )
     report.add_picture(
@@ -186,7 +186,7 @@ def _add_shown(
         length_m = run.scenario.road.length_m
         stretch_m = PAPER_STRETCH_M if length_m >= PAPER_STRETCH_M[1] else None
         road_snapshots(run.folder, path, stretch_m=stretch_m, dpi=report.dpi)
-        caption = f"{title}. Four instants, a slot apart; colours are preferred lanes."
+        caption = f"{title}. Four instants, the shortest T_F apart; colours are preferred lanes."
         alt = f"Four strips of road with vehicles coloured by preferred lane, {run.label}"
         bodies.append(picture(path, report.dpi, caption, alt))
     report.sections.append(Section("Snapshots", "\n".join(bodies)))

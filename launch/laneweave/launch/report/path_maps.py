@@ -1,8 +1,9 @@
 """The relative path map (paper, Section 3.3) of a formation as it was driven, and its figure.
 
-One row per vehicle, one column per fixed time point, T_F apart, the first just before anybody
-moves. A vehicle's cell is the one that it holds or, while it moves, the one that it moves to: at
-the end of each slot that is where it is.
+One row per vehicle, one column per fixed time point, T_F apart. The first one is the start of the
+plan that was driven, T_F is that plan's; recordings that do not say them begin with the first move,
+and have one T_F. A vehicle's cell is the one that it holds or, while it moves, the one that it
+moves to: at the end of each slot that is where it is.
 """
 
 from __future__ import annotations
@@ -17,6 +18,13 @@ from attrs import frozen
 from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.launch.colours import lane_colours
 from laneweave.launch.drawing import FAINT_INK, INK, new_figure, save
+from laneweave.launch.formations import (
+    JOINED,
+    PLANNED,
+    FormationColumns,
+    read_events,
+    recorded_formations,
+)
 from laneweave.launch.report.runs import Run
 from laneweave.launch.report.tracks import OFF_LATTICE, Floats, Ints, Tracks
 from laneweave.protocol.errors import BadInputError
@@ -25,6 +33,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _LONGEST_NAME = 9
+_MOST_NAMED = 8
 
 
 @frozen
@@ -35,7 +44,7 @@ class DrivenMap:
     rolling: bool
     """There were no formations: these vehicles entered in the columns of one block."""
     path_map: RelativePathMap
-    """Columns count from the block's first one."""
+    """Columns count from the formation's rearmost one."""
     preferred_lanes: tuple[int, ...]
     """Of the vehicles, in the order of rows."""
     start_s: float
@@ -69,7 +78,9 @@ def driven_map(run: Run, tracks: Tracks, formation: int | None) -> DrivenMap | N
 
     Raises:
         BadInputError: the run has no such formation.
+        OSError, ValueError, KeyError, TypeError: a file of the run cannot be read.
     """
+    columns = recorded_formations(run.folder, run.scenario.lattice).by_number
     trips = pq.read_table(
         run.folder / "trips.parquet", columns=["vehicle", "preferred_lane", "formation"]
     ).to_pylist()
@@ -85,9 +96,12 @@ def driven_map(run: Run, tracks: Tracks, formation: int | None) -> DrivenMap | N
         moves = _moves(tracks)
         formation = max(members, key=lambda one: sum(moves[number] for number, _ in members[one]))
     if formation not in members:
-        known = f"{min(members)} to {max(members)}" if members else "none: it has no formations"
+        near = sorted(sorted(members, key=lambda one: abs(one - formation))[:_MOST_NAMED])
+        known = ", ".join(map(str, near)) if members else "none: it has no formations"
+        if len(members) > len(near):
+            known += f" and {len(members) - len(near)} others"
         raise BadInputError("--formation", formation, f"a formation of {run.folder}: {known}")
-    return _map_of(formation, members[formation], tracks, run)
+    return _map_of(columns[formation], members[formation], tracks, run)
 
 
 def _moves(tracks: Tracks) -> Ints:
@@ -99,24 +113,22 @@ def _moves(tracks: Tracks) -> Ints:
 
 
 def _map_of(
-    formation: int, members: list[tuple[int, int]], tracks: Tracks, run: Run
+    formation: FormationColumns, members: list[tuple[int, int]], tracks: Tracks, run: Run
 ) -> DrivenMap | None:
     parts = [tracks.rows(number) for number, _ in members]
     if any((tracks.column[part] == OFF_LATTICE).any() for part in parts):
         return None
     changes_s = [t_s for part in parts for t_s in _change_times(tracks, part)]
-    slot_s, tick_s = run.scenario.cycles_s[0], run.scenario.runtime.tick_s
+    tick_s = run.scenario.runtime.tick_s
     entered_s = max(float(tracks.t_s[part.start]) for part in parts)
-    # The first one to move may be late already, by no more than the slack of a slot.
-    slack_s = max(slot_s - run.scenario.move_s, 0.0) + 0.5 * tick_s
-    start_s = min(changes_s, default=entered_s + slack_s + tick_s) - slack_s
-    last_s = max(changes_s, default=start_s)
-    steps = max(0, int(np.ceil((last_s - start_s) / slot_s)))
-    times_s = start_s + slot_s * np.arange(steps + 1, dtype=np.float64)
-    first = run.scenario.lattice.block_range(formation)[0]
+    last_s = max(changes_s, default=entered_s)
+    start_s, slot_s = _driven_slots(run, formation.number, entered_s, changes_s)
+    steps = max(0, int(np.ceil((last_s - start_s + 0.5 * tick_s) / slot_s)))
+    # Moves begin with a tick, and show their target from that tick on.
+    times_s = start_s - 0.5 * tick_s + slot_s * np.arange(steps + 1, dtype=np.float64)
     rows = [
         tuple(
-            (int(tracks.column[part][place]) - first, int(tracks.lane[part][place]))
+            (int(tracks.column[part][place]) - formation.rear, int(tracks.lane[part][place]))
             for place in _places(tracks, part, times_s)
         )
         for part in parts
@@ -124,17 +136,48 @@ def _map_of(
     # As in the paper's table: from the front backwards, and from the right.
     order = sorted(range(len(rows)), key=lambda row: (-rows[row][0][0], rows[row][0][1]))
     return DrivenMap(
-        formation,
+        formation.number,
         run.scenario.formation.rolling,
         RelativePathMap(
             tuple(tracks.names[members[row][0]] for row in order),
             tuple(rows[row] for row in order),
         ),
         tuple(members[row][1] for row in order),
-        start_s + slack_s,
+        start_s,
         slot_s,
         run.scenario.road.lanes,
     )
+
+
+def _driven_slots(
+    run: Run, formation: int, entered_s: float, changes_s: list[float]
+) -> tuple[float, float]:
+    """Return when the slots of a formation begin (road time), and how long each is.
+
+    They are those of the last of its plans that was begun before the last move.
+
+    Args:
+        run: the run.
+        formation: number of the formation.
+        entered_s: when its last vehicle entered.
+        changes_s: times at which its vehicles began to move to other cells.
+    """
+    tick_s, slot_s = run.scenario.runtime.tick_s, run.scenario.cycles_s[0]
+    last_s = max(changes_s, default=entered_s) + 0.5 * tick_s
+    together, found = {formation}, None
+    for event in read_events(run.folder, JOINED, PLANNED):
+        if event.get("role") != "coordinator":
+            continue
+        if event["kind"] == JOINED and formation in event["formations"]:
+            together.update(event["formations"])
+        if event["kind"] == PLANNED and event["formation"] in together and "t0_s" in event:
+            slots = float(event["t0_s"]), float(event["slot_s"])
+            found = slots if slots[0] <= last_s and slots[1] > 0.0 else found
+    if found is not None:
+        return found
+    # The first one to move may be late already, by no more than the slack of a slot.
+    slack_s = run.scenario.formation.slack_s
+    return min(changes_s, default=entered_s + slack_s + tick_s) - slack_s, slot_s
 
 
 def _change_times(tracks: Tracks, part: slice) -> list[float]:

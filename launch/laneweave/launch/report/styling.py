@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 _PALETTE: Final = (
     "#2f6fc4",
+    "#12438c",
     "#7db4e6",
     "#1f9e89",
     "#e0992f",
@@ -23,6 +24,7 @@ _PALETTE: Final = (
     "#7a5c4d",
     "#d46fae",
     "#808890",
+    "#a8a13a",
 )
 GRID: Final = "#e4e6e9"
 MOST_COLUMNS: Final = 6

@@ -9,7 +9,12 @@ from attrs import field, frozen
 
 from laneweave.launch.role_commands import LC2013, METHOD, RULE
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario import Scenario, parse_scenario, to_tables
+from laneweave.protocol.scenario import (
+    FormationSettings,
+    Scenario,
+    parse_scenario,
+    to_tables,
+)
 
 LARGEST_OF_TAPPA: Final = 6
 """Larger formations are planned by branching."""
@@ -38,23 +43,46 @@ class LabelledMethod:
         return parse_scenario(tables)
 
 
+_FORMATIONS: Final = FormationSettings()
+
+
+def _default() -> LabelledMethod:
+    """Return formations as they are by default, whatever the scenario says of them."""
+    names = ("operation", "entry", "close", "cycle_s", "move_s", "max_vehicles", "max_columns")
+    return LabelledMethod(
+        METHOD,
+        f"formations of at most {_FORMATIONS.max_vehicles} vehicles, as long as traffic makes them",
+        {f"formation.{name}": getattr(_FORMATIONS, name) for name in names}
+        | _solver(_FORMATIONS.max_vehicles),
+    )
+
+
 def _paper(max_vehicles: int, block_columns: int) -> LabelledMethod:
     """Return the paper's formations, of at most so many vehicles in so many columns."""
     return LabelledMethod(
         METHOD,
-        f"formations of at most {max_vehicles} vehicles in {block_columns} columns",
+        f"the paper's formations, of at most {max_vehicles} vehicles in {block_columns} columns",
         {
-            "formation.operation": "paper",
+            "formation.operation": "formations",
+            "formation.entry": "interlaced",
+            "formation.close": "columns",
+            "formation.cycle_s": 4.0,
+            "formation.move_s": 3.8,
             "formation.max_vehicles": max_vehicles,
             "formation.block_columns": block_columns,
-            # TAPPA is made for formations of the paper's size.
-            "formation.solver": "tappa" if max_vehicles <= LARGEST_OF_TAPPA else "branching",
-        },
+        }
+        | _solver(max_vehicles),
     )
+
+
+def _solver(max_vehicles: int) -> dict[str, object]:
+    """Return what chooses the planner of formations of at most so many vehicles."""
+    return {"formation.solver": "tappa" if max_vehicles <= LARGEST_OF_TAPPA else "branching"}
 
 
 METHODS: Final[dict[str, LabelledMethod]] = {
     "formation": LabelledMethod(METHOD, "formation control as the scenario says"),
+    "formations": _default(),
     "rolling": LabelledMethod(
         METHOD, "the whole stream, planned anew in each slot", {"formation.operation": "rolling"}
     ),

@@ -14,7 +14,7 @@ complete in itself, so that any of them may be left out.
 | `step_s` | time between two frames: on the wall clock if live, road time if recorded |
 | `first`, `last` | numbers of the frames that can be asked for now; `last` < `first`: none |
 | `road`, `body_m`, `lattice`, `shade`, `colours`, `names` | what it takes to draw the road |
-| `rolling` | vehicles own cells; otherwise formations own blocks |
+| `rolling` | vehicles own cells; otherwise formations own columns |
 | `losses` | recorded: what the summary says of messages; live: null |
 
 **Frame**: pushed if live, whenever something has changed, at most every `step_s`; asked for if
@@ -33,14 +33,15 @@ recorded, as are earlier frames if live.
 | `loss` | [expected, lost] states of the last 100 ticks, or null |
 | `plan` | [t, vehicles, solve ms, solver or null, fallback] of the newest plan, or null |
 | `news` | the newest events, oldest first: [t, who, what, details] |
-| `joined` | formations that plan together: lists of their numbers |
+| `formations` | those on the road that are closed: [number, rear column, front column] each |
+| `joined` | formations that plan together, at least two: lists of their numbers |
 | `vehicles` | one row each, below |
 
 **Row** of a vehicle: `[name, s, y, speed, lane, formation, hold, target, flags, estate]`: front
-bumper and body centre, preferred lane (-1: not known), formation (-1: none), hold cell and target
-cell as [column, lane] or 0, flags (1 moves, 2 has no agent, 4 is not heard, 8 is overdue), and the
-other cells that it owns, column and lane by turns. The *target* is the last cell of the plan that
-the vehicle has accepted and not completed, else 0.
+bumper and body centre, preferred lane (-1: not known), number of its formation (-1: none, or not
+closed yet), hold cell and target cell as [column, lane] or 0, flags (1 moves, 2 has no agent, 4 is
+not heard, 8 is overdue), and the other cells that it owns, column and lane by turns. The *target*
+is the last cell of the plan that the vehicle has accepted and not completed, else 0.
 
 **From the page**: `{"want": [from, to]}`, numbers of frames, at most `MOST_WANTED` of them. The
 answer is `{"reel": [from, to], "first": n, "last": n, "frames": [...]}` with those that there are.

@@ -14,6 +14,7 @@ from typing import Any
 
 from attrs import define, field
 
+from laneweave.launch.formations import Formations
 from laneweave.launch.watch.candidates import Candidates, leader_of
 from laneweave.launch.watch.frames import MOVING, OVERDUE, UNATTENDED, UNHEARD, Row
 from laneweave.launch.watch.loss import LossMeter
@@ -151,6 +152,8 @@ class LiveRoad:
         road, candidates = self._road, self._candidates.now(wall_s)
         leader, clock = leader_of(candidates), road.clock
         self._forget_who_left()
+        formations = self._formations()
+        rows = self._rows(clock.t_s, formations) if clock is not None else ()
         return {
             "n": number,
             "run": self.run,
@@ -164,8 +167,11 @@ class LiveRoad:
             "loss": [road.loss.expected, road.loss.lost] if road.loss.expected else None,
             "plan": self._plan,
             "news": self._news.rows,
-            "joined": self._joined(),
-            "vehicles": [row.compact() for row in self._rows(clock.t_s)] if clock else [],
+            "formations": [[one.number, one.rear, one.front] for one in formations.listed],
+            "joined": formations.joined(
+                {state.joined for state in road.states.values()}, self.scenario.lattice
+            ),
+            "vehicles": [row.compact() for row in rows],
         }
 
     def _identity(self, wall_s: float) -> tuple[int, str, int]:
@@ -200,25 +206,36 @@ class LiveRoad:
             if name in listed or state.t_s > road.census.t_s
         }
 
-    def _rows(self, t_s: float) -> Iterator[Row]:
+    def _formations(self) -> Formations:
+        """Return the closed formations on the road; none in the rolling operation."""
+        census = self._road.census
+        if census is None or self.scenario.formation.rolling:
+            return Formations(())
+        return Formations.of_census(census.formations, self.scenario.lattice)
+
+    def _rows(self, t_s: float, formations: Formations) -> Iterator[Row]:
         census, states = self._road.census, self._road.states
         listed = {entry.vehicle: entry for entry in census.on_road} if census is not None else {}
         for name, entry in listed.items():
-            yield self._row(name, t_s, entry, states.get(name))
+            yield self._row(name, t_s, entry, states.get(name), formations)
         for name, state in states.items():
             if name not in listed:
-                yield self._row(name, t_s, None, state)
+                yield self._row(name, t_s, None, state, formations)
 
     def _row(
-        self, name: Name, t_s: float, entry: CensusEntry | None, state: VehicleState | None
+        self,
+        name: Name,
+        t_s: float,
+        entry: CensusEntry | None,
+        state: VehicleState | None,
+        formations: Formations,
     ) -> Row:
-        lattice = self.scenario.lattice
-        formation = -1
-        if not self.scenario.formation.rolling:
-            if state is not None:
-                formation = state.formation
-            elif entry is not None:
-                formation = lattice.block_of(entry.cell[0])
+        lattice, owner = self.scenario.lattice, None
+        if entry is not None:
+            owner = formations.at(entry.cell[0])
+        elif state is not None:
+            owner = formations.at(lattice.block_range(state.formation).start)
+        formation = -1 if owner is None else owner.number
         preferred = entry.preferred_lane if entry is not None else -1
         if state is not None and abs(t_s - state.t_s) <= UNHEARD_S:
             flags = MOVING * state.moving | UNATTENDED * (not state.attended)
@@ -252,13 +269,3 @@ class LiveRoad:
         if state.promised is None or not state.accepted or state.done:
             return None
         return self._targets.get(state.promised, {}).get(state.vehicle)
-
-    def _joined(self) -> list[list[int]]:
-        """Return the formations that plan together, in groups."""
-        groups: list[set[int]] = []
-        for together in {state.joined for state in self._road.states.values()}:
-            if len(together) > 1:
-                apart = [group for group in groups if group.isdisjoint(together)]
-                touched = [group for group in groups if not group.isdisjoint(together)]
-                groups = [*apart, set(together).union(*touched)]
-        return sorted(sorted(group) for group in groups)

@@ -13,7 +13,9 @@ from laneweave.protocol.solvers import STREAM_PLANNED, solver_of_event
 MOST_NEWS = 8
 MOST_CHARACTERS = 90
 MOST_NUMBER = 1e12
-FREQUENT = (STREAM_PLANNED, "plan-made", "plan-in-force", "entered", "left")
+FREQUENT = (
+    STREAM_PLANNED, "plan-made", "plan-in-force", "formation-closed", "entered", "left",
+)  # fmt: skip
 """Events that would leave no room for others."""
 PLANNED = (STREAM_PLANNED, "plan-made")
 

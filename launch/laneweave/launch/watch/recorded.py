@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 from attrs import frozen
 from numpy.typing import NDArray
 
+from laneweave.launch.formations import JOINED, Formations, recorded_formations
 from laneweave.launch.report.runs import Run, single_run
 from laneweave.launch.report.tracks import OFF_LATTICE, Tracks, read_tracks
 from laneweave.launch.watch.frames import MOVING, Row, compact, scene_of
@@ -41,6 +42,8 @@ class _Moment:
     news: tuple[list[Any], ...] = ()
     entered: int = 0
     left: int = 0
+    joined: tuple[tuple[int, ...], ...] = ()
+    """Groups of blocks that plan together."""
 
 
 class Recording:
@@ -57,10 +60,13 @@ class Recording:
             self._tracks = read_tracks(folder)
             self._trips = _trips(folder)
             self._moments = list(_moments(folder))
+            formations = recorded_formations(folder, run.scenario.lattice)
         except (OSError, ValueError, KeyError, TypeError) as error:
             allowed = f"the folder of a finished run ({error})"
             raise BadInputError("DIR", str(folder), allowed) from error
         self._run = run
+        rolling = run.scenario.formation.rolling or run.label != "formation"
+        self._formations = (Formations(()) if rolling else formations).by_number
         tick_s = run.scenario.runtime.tick_s
         stride = max(1, round(STEP_S / tick_s))
         self._step_s = stride * tick_s
@@ -75,7 +81,7 @@ class Recording:
         title += f"{run.scenario.seed}"
         self.scene = scene_of(run.scenario, "recorded", title, self._step_s) | {
             "losses": _losses(run),
-            "rolling": run.scenario.formation.rolling or run.label != "formation",
+            "rolling": rolling,
         }
 
     def frames(self, begin: int, end: int) -> list[str]:
@@ -87,7 +93,9 @@ class Recording:
         """Return one frame; see `frames`."""
         t_s = number * self._step_s
         moment = self._moments[max(0, bisect_right(self._times_s, t_s + 1e-6) - 1)]
-        rows = [row.compact() for row in self._vehicles(number, t_s)]
+        rows = list(self._vehicles(number, t_s))
+        present = {row.formation for row in rows}
+        shown = Formations(one for one in self._formations.values() if one.number in present)
         return {
             "n": number,
             "run": 1,
@@ -101,8 +109,9 @@ class Recording:
             "loss": None,
             "plan": moment.plan,
             "news": list(moment.news),
-            "joined": [],
-            "vehicles": rows,
+            "formations": [[one.number, one.rear, one.front] for one in shown.listed],
+            "joined": shown.joined(moment.joined, self._run.scenario.lattice),
+            "vehicles": [row.compact() for row in rows],
         }
 
     def _vehicles(self, number: int, t_s: float) -> Iterator[Row]:
@@ -115,7 +124,8 @@ class Recording:
             trip = self._trips.get(name, {})
             column, lane = int(tracks.column[place]), int(tracks.lane[place])
             cell: Cell | None = None if column == OFF_LATTICE else (column, lane)
-            y_m, formation = float(tracks.y_m[place]), trip.get("formation")
+            y_m = float(tracks.y_m[place])
+            formation = self._formations.get(trip.get("formation", -1))
             moving = abs(y_m - (lane + 0.5) * width_m) > STILL_M
             if cell is not None:
                 ahead_m = scenario.lattice.cell_s_m(column, t_s) - float(tracks.s_m[place])
@@ -126,7 +136,7 @@ class Recording:
                 y_m=y_m,
                 speed_mps=float(tracks.speed_mps[place]),
                 preferred_lane=int(trip.get("preferred_lane", -1)),
-                formation=-1 if self.scene["rolling"] or formation is None else int(formation),
+                formation=formation.number if formation and formation.closed_s <= t_s else -1,
                 hold=cell,
                 target=None,
                 flags=MOVING * moving,
@@ -164,6 +174,7 @@ def _moments(folder: Path) -> Iterator[_Moment]:
     leader: tuple[str, int] | None = None
     plan: list[Any] | None = None
     newest, entered, left = Newest(), 0, 0
+    joined: tuple[tuple[int, ...], ...] = ()
     for t_s, kind, data in sorted(events, key=lambda event: event[0]):
         role = data.pop("role", "")
         who = str(data.pop("name", role))
@@ -172,8 +183,10 @@ def _moments(folder: Path) -> Iterator[_Moment]:
         plan = plan_facts(t_s, kind, data) or plan
         entered += kind == "entered"
         left += kind == "left"
+        if kind == JOINED and role == "coordinator":
+            joined = (*joined, tuple(map(int, data["formations"])))
         newest.add(t_s, who, kind, data)
-        yield _Moment(t_s, leader, plan, tuple(newest.rows), entered, left)
+        yield _Moment(t_s, leader, plan, tuple(newest.rows), entered, left, joined)
 
 
 def _losses(run: Run) -> dict[str, int]:

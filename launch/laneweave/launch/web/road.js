@@ -2,8 +2,7 @@
 // How a road is drawn on a canvas, in reports and on the live page. Lengths in m, speeds in m/s.
 //
 // A scene has `road` {length_m, lanes, lane_width_m, sorting_start_m}, `body_m` [length, width],
-// `lattice` {speed_mps, pitch_m, block_columns}, `shade` {span_mps, strength}, and `colours`, one for
-// each lane. A body has `name`, `lane` (its colour; -1: none), `s`, `y`, `v`, `slope`, and may be
+// `lattice` {speed_mps, pitch_m}, `shade` {span_mps, strength}, and `colours`, one for each lane. A body has `name`, `lane` (its colour; -1: none), `s`, `y`, `v`, `slope`, and may be
 // `faint`: drawn as an outline only.
 
 const laneweaveRoad = (() => {
@@ -54,7 +53,7 @@ const laneweaveRoad = (() => {
     return [middle - half, middle + half];
   }
 
-  /** Rear and front of a block of columns at a time, half of the gap around it included. */
+  /** Rear and front of some columns at a time, half of the gap around them included. */
   function columnsAt(scene, rear, front, t) {
     const { pitch_m: pitch, speed_mps: speed } = scene.lattice;
     const margin = (pitch - scene.body_m[0]) / 2;

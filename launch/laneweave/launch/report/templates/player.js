@@ -58,10 +58,10 @@ const laneweave = (() => {
     return found;
   }
 
-  /** Middle of a formation's block of columns at a time, on the road or not. */
-  function blockCentre(run, formation, t) {
-    const width = run.lattice.block_columns;
-    const column = -formation * width - (width - 1) / 2;
+  /** Middle of a formation's columns at a time, on the road or not. */
+  function formationCentre(run, formation, t) {
+    const [, rear, front] = run.formations.find(([number]) => number === formation);
+    const column = (rear + front) / 2;
     return run.lattice.speed_mps * t + column * run.lattice.pitch_m - run.body_m[0] / 2;
   }
 
@@ -72,17 +72,16 @@ const laneweave = (() => {
     const state = follow.vehicle ? stateAt(run, follow.vehicle, t) : null;
     const first = follow.vehicle ? follow.vehicle.first * run.step_s : 0;
     let centre = state ? state.s : t < first ? 0 : length;
-    if (!follow.vehicle) centre = blockCentre(run, follow.formation, t);
+    if (!follow.vehicle) centre = formationCentre(run, follow.formation, t);
     return [laneweaveRoad.windowAround(length, centre, windowLength)];
   }
 
   /** What can be followed: formations, or vehicles where there are none. */
   function followable(run, most) {
-    const numbers = new Set(run.vehicles.map((vehicle) => vehicle.formation));
-    numbers.delete(null);
-    if (numbers.size > 0) {
-      return [...numbers]
-        .sort((a, b) => a - b)
+    const shown = new Set(run.vehicles.map((vehicle) => vehicle.formation));
+    const formations = run.formations.map(([number]) => number).filter((number) => shown.has(number));
+    if (formations.length > 0) {
+      return formations
         .slice(0, most)
         .map((formation) => ({ name: `formation ${formation}`, formation }));
     }
@@ -92,9 +91,9 @@ const laneweave = (() => {
   /** When what is followed is at the middle of the window as lane sorting begins. */
   function arrivalTime(run, follow) {
     if (follow.vehicle) return follow.vehicle.first * run.step_s;
-    const ahead = run.road.sorting_start_m - 20 - blockCentre(run, follow.formation, 0);
+    const ahead = run.road.sorting_start_m - 20 - formationCentre(run, follow.formation, 0);
     return Math.max(0, Math.min(run.end_s, ahead / run.lattice.speed_mps));
   }
 
-  return { unpack, decode, stateAt, allAt, blockCentre, stretches, followable, arrivalTime };
+  return { unpack, decode, stateAt, allAt, formationCentre, stretches, followable, arrivalTime };
 })();

@@ -1,5 +1,5 @@
 "use strict";
-// What is drawn between the road and the vehicles: blocks of formations, cells, targets.
+// What is drawn between the road and the vehicles: columns of formations, cells, targets.
 
 const laneweaveLayers = (() => {
   const ROUND_PX = 3;
@@ -53,37 +53,45 @@ const laneweaveLayers = (() => {
     };
   }
 
-  /** Groups of formations that are on the road: [[number, ...], ...]. */
-  function groups(bodies, joined) {
-    const numbers = new Set(bodies.map((body) => body.formation).filter((number) => number >= 0));
+  /** Formations with their columns, {numbers, rear, front}; those that plan together are one. */
+  function groups(formations, joined) {
     const groupOf = new Map();
-    for (const group of joined) for (const number of group) groupOf.set(number, group);
-    const found = new Set();
-    for (const number of numbers) found.add((groupOf.get(number) || [number]).join("+"));
-    return [...found].map((text) => text.split("+").map(Number)).sort((a, b) => a[0] - b[0]);
+    for (const group of joined) for (const number of group) groupOf.set(number, group[0]);
+    const found = new Map();
+    for (const [number, rear, front] of formations) {
+      const key = groupOf.get(number) ?? number;
+      const one = found.get(key) ?? { numbers: [], rear, front };
+      one.numbers = [...one.numbers, number].sort((a, b) => a - b);
+      one.rear = Math.min(one.rear, rear);
+      one.front = Math.max(one.front, front);
+      found.set(key, one);
+    }
+    return [...found.values()].sort((a, b) => b.front - a.front);
   }
 
-  /** Blocks of columns that formations own, every other one shaded, with their numbers above. */
-  function blocks(bodies, joined, t) {
+  /** Columns that formations own, framed, with their numbers above. */
+  function blocks(formations, joined, t) {
     return (painter) => {
       const { pen, theme, scene } = painter;
-      const width = scene.lattice.block_columns;
-      for (const numbers of groups(bodies, joined)) {
-        const [first, last] = [numbers[0], numbers[numbers.length - 1]];
-        const rear = -(last + 1) * width + 1;
-        const [from, to] = laneweaveRoad.columnsAt(scene, rear, -first * width, t);
+      for (const { numbers, rear, front } of groups(formations, joined)) {
+        const [from, to] = laneweaveRoad.columnsAt(scene, rear, front, t);
         if (!painter.shows(from, to)) continue;
         const [left, right] = [painter.x(from), painter.x(to)];
-        pen.fillStyle = theme.faint;
-        pen.globalAlpha = first % 2 ? 0.2 : 0.07;
-        pen.fillRect(left, 0, right - left, painter.roadPx);
+        pen.fillStyle = pen.strokeStyle = theme.faint;
+        pen.globalAlpha = 0.13;
+        rounded(pen, [left, 0, right - left, painter.roadPx], 1);
+        pen.fill();
+        pen.globalAlpha = 0.55;
+        pen.lineWidth = 1;
+        pen.stroke();
         pen.globalAlpha = 1;
         const [begin, end] = [Math.max(left, 0), Math.min(right, painter.width)];
-        if (end - begin < 70) continue;
+        const name = `formation ${numbers.join("+")}`;
         pen.font = "11px system-ui, sans-serif";
+        if (pen.measureText(name).width > end - begin) continue;
         pen.textAlign = "center";
         pen.textBaseline = "bottom";
-        pen.fillText(`formation ${numbers.join("+")}`, (begin + end) / 2, -1);
+        pen.fillText(name, (begin + end) / 2, -1);
       }
     };
   }

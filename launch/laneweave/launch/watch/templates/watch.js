@@ -153,7 +153,8 @@ class Watch {
   /** What can be followed now, as options of the view. */
   offer() {
     const { bodies } = this.picture ?? { bodies: [] };
-    const formations = laneweaveLayers.groups(bodies, []).map(([number]) => `formation ${number}`);
+    const shown = laneweaveLayers.groups(this.current?.formations ?? [], []);
+    const formations = shown.map(({ numbers }) => `formation ${numbers[0]}`);
     const names = [...formations, ...bodies.map((body) => body.name).sort()];
     const view = part("view");
     const chosen = view.value;
@@ -166,6 +167,7 @@ class Watch {
   look(name) {
     const formation = /^formation (\d+)$/.exec(name);
     this.follow = formation ? { formation: Number(formation[1]) } : name ? { vehicle: name } : null;
+    this.columns = null; // of the formation that is followed, once it was seen
     const view = part("view");
     view.value = name;
     if (view.value !== name) {
@@ -246,7 +248,8 @@ class Watch {
     const { t, bodies } = picture;
     const layers = [];
     if (t !== null) {
-      if (!scene.rolling) layers.push(laneweaveLayers.blocks(bodies, this.current.joined, t));
+      const { formations, joined } = this.current;
+      layers.push(laneweaveLayers.blocks(formations, joined, t));
       if (part("cells").checked) layers.push(laneweaveLayers.cells(bodies, t));
       if (part("targets").checked) layers.push(laneweaveLayers.targets(bodies, t));
       layers.push(laneweaveLayers.marks(bodies));
@@ -268,10 +271,11 @@ class Watch {
       const body = bodies.find((one) => one.name === this.follow.vehicle);
       this.centre = body ? body.s : (this.centre ?? length);
     } else {
-      const width = scene.lattice.block_columns;
-      const front = -this.follow.formation * width;
-      const [rear, end] = laneweaveRoad.columnsAt(scene, front - width + 1, front, t);
-      this.centre = (rear + end) / 2;
+      const found = this.current.formations.find(([number]) => number === this.follow.formation);
+      if (found) this.columns = found.slice(1);
+      if (!this.columns) return laneweaveRoad.wholeRoad(length);
+      const [rear, front] = laneweaveRoad.columnsAt(scene, ...this.columns, t);
+      this.centre = (rear + front) / 2;
     }
     return [laneweaveRoad.windowAround(length, this.centre, WINDOW_M)];
   }
