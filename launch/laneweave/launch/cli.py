@@ -244,11 +244,24 @@ def plan(
             "--draw", metavar="FILE", help="Draw the answer: FILE.png, or FILE.gif that moves."
         ),
     ] = None,
+    explained: Annotated[
+        bool,
+        typer.Option(
+            "--explain", help="Print what TAPPA does: assignments and constraint trees (--draw too)."
+        ),
+    ] = False,
 ) -> None:
     """Plan one request here, or ask a running coordinator."""
-    from laneweave.launch.plan_command import access_for, answer_request
+    from laneweave.launch.plan_command import access_for, answer_request, explain_request
 
     access = access_for(connect, realm, config, client)
+    if explained:
+        if access is not None:
+            raise BadInputError("--explain", "set", "only without --connect and --config")
+        if solver is SolverChoice.branching:
+            raise BadInputError("--solver", solver.value, "tappa, for --explain")
+        explain_request(request, deadline, draw)
+        return
     # What would have no effect is a mistake of whoever asks.
     if access is None and wait:
         raise BadInputError("--wait", wait, "only with --connect or --config")

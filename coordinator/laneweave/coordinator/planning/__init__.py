@@ -10,11 +10,13 @@
 | preference matrix P | `preference` |
 | assignments in non-decreasing order of cost | `assignments` |
 | TAPPA, Algorithm 1 | `tappa` |
-| CBSA, Algorithm 2 | `cbs`; as drawn in the case study: `conflict_tree` |
+| CBSA, Algorithm 2 | `cbs` |
+| conflicts and constraints of the tree | `constraints` |
 | SPPA | `diagram` (all shortest paths), `sppa` (the choice among them) |
 | relative path map | `path_map` |
 
-Beyond the paper: branch and bound with prices, the default (`branching`, `relaxation`, `rows`);
+Beyond the paper: what makes TAPPA fast, with a switch for each (`improvements`, `splits`, `joint`);
+what it did (`explanation`); branch and bound with prices (`branching`, `relaxation`, `rows`);
 path sets by negotiation (`negotiation`, `repair`) and by joint search (`reachability`); conflicts
 computed from sizes and motions (`geometry`, `bodies`, `clearances`).
 

@@ -37,7 +37,7 @@ from laneweave.coordinator.planning.arrays import UNREACHABLE, Floats, Ints, lat
 from laneweave.coordinator.planning.branching_kernel import FULL, STUCK, search
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
 from laneweave.coordinator.planning.grid import Grid
-from laneweave.coordinator.planning.incumbent import Solution, tidied
+from laneweave.coordinator.planning.solution import Solution, tidied
 from laneweave.coordinator.planning.negotiation import Negotiation
 from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.reachability import explore

@@ -15,7 +15,8 @@ from laneweave.coordinator.planning.budget import Budget, BudgetSpentError, Cloc
 from laneweave.coordinator.planning.clearances import close_pairs
 from laneweave.coordinator.planning.frd import IntMatrix, Weights, cost_matrix
 from laneweave.coordinator.planning.grid import Cell
-from laneweave.coordinator.planning.incumbent import Solution, tidied
+from laneweave.coordinator.planning.solution import Solution, tidied
+from laneweave.coordinator.planning.improvements import Improvements
 from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.coordinator.planning.preference import BoolMatrix, preference_matrix
 from laneweave.coordinator.planning.problem import Problem
@@ -77,13 +78,7 @@ def plan(
     weights = (weights or Weights.for_mode(request.mode)).checked(request.mode)
     nodes = MAX_NODES if max_nodes is None else min(max_nodes, MAX_NODES)
     budget = Budget(deadline=started + request.deadline_s, max_nodes=nodes, clock=clock)
-    problem = Problem(
-        request.grid,
-        request.mode,
-        request.conflict_model,
-        [vehicle.cell for vehicle in request.vehicles],
-        request.targets,
-    )
+    problem = problem_of(request)
     choices = request.choices()
     searches: list[Search] = []
     with suppress(BudgetSpentError):
@@ -145,8 +140,29 @@ def _searches(
 
         if not vehicles_share_cells(problem.table.model):
             yield Branching(problem, choices, budget)
+    yield new_tappa(problem, request, weights, budget)
+
+
+def new_tappa(
+    problem: Problem,
+    request: PlanRequest,
+    weights: Weights,
+    budget: Budget,
+    improvements: Improvements | None = None,
+    *,
+    record: bool = False,
+) -> Tappa:
+    """Return Algorithm 1, ready to run; see `Tappa`."""
+    choices = request.choices()
     costs, allowed = matrices(request, weights, choices, budget)
-    yield Tappa(problem, assignments(costs, allowed, budget), choices, budget)
+    candidates = assignments(costs, allowed, budget)
+    return Tappa(problem, candidates, choices, budget, improvements, record=record)
+
+
+def problem_of(request: PlanRequest) -> Problem:
+    """Return the problem of a request."""
+    cells = [vehicle.cell for vehicle in request.vehicles]
+    return Problem(request.grid, request.mode, request.conflict_model, cells, request.targets)
 
 
 def _status(*, found: bool, finished: bool) -> Status:

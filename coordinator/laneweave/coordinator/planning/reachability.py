@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 import attrs
 
 from laneweave.coordinator.planning.budget import Budget
-from laneweave.coordinator.planning.incumbent import Solution
+from laneweave.coordinator.planning.solution import Solution
 from laneweave.coordinator.planning.moves import MoveTable, bits
 from laneweave.coordinator.planning.problem import Problem
 
