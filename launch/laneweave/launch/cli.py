@@ -247,7 +247,8 @@ def plan(
     explained: Annotated[
         bool,
         typer.Option(
-            "--explain", help="Print what TAPPA does: assignments and constraint trees (--draw too)."
+            "--explain",
+            help="Print what TAPPA does: assignments and constraint trees (--draw too).",
         ),
     ] = False,
 ) -> None:
@@ -339,7 +340,10 @@ def bench(
         float, typer.Option("--seconds", min=5.0, max=3600.0, help="runtime: road time measured.")
     ] = 60.0,
     families: Annotated[
-        str, typer.Option("--families", help="planner: of node-edge, following, geometric, block.")
+        str,
+        typer.Option(
+            "--families", help="planner: of node-edge, following, geometric, block, traffic."
+        ),
     ] = "node-edge,following,geometric",
     instances: Annotated[
         int,

@@ -102,7 +102,9 @@ def _draw_chain(
         box = (x - 0.62, y + _RADIUS_IN + 0.3)
         _box(axes, box, 1.24, 0.3, _PATHS, edge=_BEST if is_best else INK, bold=is_best)
         _write(axes, x, box[1] + 0.16, label, size=_SMALL, centred=True)
-        _write(axes, x, box[1] + 0.45, vector(one.targets), size=6.5, colour=FAINT_INK, centred=True)
+        _write(
+            axes, x, box[1] + 0.45, vector(one.targets), size=6.5, colour=FAINT_INK, centred=True
+        )
     last = centres[-1]
     axes.add_patch(Circle((last, y), _RADIUS_IN, facecolor="white", edgecolor=INK, linestyle="--"))
     k = len(explanation.assignments) + 1
@@ -112,7 +114,9 @@ def _draw_chain(
         _write(axes, last, y, "end", size=_SMALL, centred=True)
     else:
         _write(axes, last, y - 0.08, f"A_{k}", centred=True)
-        _write(axes, last, y + 0.12, f"C_{k} = {explanation.next_cost:g}", size=_SMALL, centred=True)
+        _write(
+            axes, last, y + 0.12, f"C_{k} = {explanation.next_cost:g}", size=_SMALL, centred=True
+        )
 
 
 @attrs.frozen
@@ -221,7 +225,16 @@ def _draw_maps(axes: Axes, nodes: Sequence[ExplainedNode], top_in: float) -> Non
         size = min(7.5, 72 * (pitch_in - 0.3) / (0.62 * widest))
         for row, line in enumerate(lines, start=1):
             y = top_in + 0.06 + row * _LINE_IN
-            axes.text(left, y, line, size=size, family="monospace", va="center", color=INK, parse_math=False)
+            axes.text(
+                left,
+                y,
+                line,
+                size=size,
+                family="monospace",
+                va="center",
+                color=INK,
+                parse_math=False,
+            )
 
 
 def _box(
@@ -262,5 +275,3 @@ def _write(
     where = "center" if centred else "right" if right else "left"
     # Names come from anywhere; a dollar sign must not begin a formula.
     axes.text(x, y, text, size=size, color=colour, ha=where, va="center", parse_math=False)
-
-

@@ -23,13 +23,17 @@ IMPROVED = (
     "two children for one conflict, CBSA ends at C'*"
 )
 
+_COUNTING = (
+    "Targets, steps and nodes count from 1 as in the paper, cells (column, lane) from 0 as in "
+    "requests."
+)
+
 
 def explanation_text(explanation: Explanation) -> str:
     """Return all assignments in a table, why there are no more, and their trees."""
     lines = [
         f"TAPPA with {trees_shown(explanation)}.",
-        "Targets, steps and nodes count from 1 as in the paper, cells (column, lane) from 0 as in "
-        "requests.",
+        _COUNTING,
         "",
         *_assignments(explanation.assignments),
         "",

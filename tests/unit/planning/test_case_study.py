@@ -81,11 +81,13 @@ def test_root_has_a_node_conflict_of_2_and_5_and_an_edge_conflict_of_2_and_3(
 
 
 def test_n2_and_n4_are_feasible_with_cost_7_and_n3_and_n5_have_conflicts(problem: Problem) -> None:
-    n1, n2, n3, n4, n5, *others = _nodes(problem)
+    n1, n2, n3, n4, n5 = _nodes(problem)
     assert [node.parent for node in (n2, n3, n4, n5)] == [1, 1, 1, 1]
     constraints = [node.constraints[0] for node in (n2, n3, n4, n5)]
     names = ["1", "2", "3", "4", "5"]
-    assert [c.notation(problem.table, names[c.vehicle]) for c in constraints] == _entries(problem, n1)
+    assert [c.notation(problem.table, names[c.vehicle]) for c in constraints] == _entries(
+        problem, n1
+    )
     assert n2.conflicts == ()
     assert n4.conflicts == ()
     assert n2.cost == n4.cost == 7

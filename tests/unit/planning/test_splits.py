@@ -105,7 +105,9 @@ def _in_child(case: Case, solution: tuple[Path, Path], constraints: tuple[Constr
 
 @settings(max_examples=80, deadline=None)
 @given(pairs())
-def test_each_solution_is_in_exactly_one_disjoint_child_and_in_one_of_the_papers(case: Case) -> None:
+def test_each_solution_is_in_exactly_one_disjoint_child_and_in_one_of_the_papers(
+    case: Case,
+) -> None:
     table, diagrams, (p, q) = case
     conflict = _first_conflict(case)
     assume(conflict is not None)
@@ -129,7 +131,10 @@ def test_neither_child_keeps_the_conflicting_pair_of_moves(case: Case) -> None:
         _move(paths[0], diagrams[0].target, conflict.step),
         _move(paths[1], diagrams[1].target, conflict.step),
     )
-    for make in (disjoint_constraints(table, conflict, moves, diagrams), constraints_of(table, conflict, moves)):
+    for make in (
+        disjoint_constraints(table, conflict, moves, diagrams),
+        constraints_of(table, conflict, moves),
+    ):
         for constraint in make:
             assert not _in_child(case, paths, (constraint,))
 

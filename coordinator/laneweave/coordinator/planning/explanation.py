@@ -25,7 +25,7 @@ from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.solution import Solution
 from laneweave.coordinator.planning.tappa import Attempt, Tappa
 
-MAX_LITERAL_NODES: Final = 400
+MAX_LITERAL_NODES: Final = 150
 """Nodes taken from literal trees before the improved ones are shown instead."""
 MAX_NODES: Final = 50_000
 """The same for improved trees; then the run is shown as far as it came."""
@@ -166,9 +166,7 @@ def _assignment(
     tree = attempt.tree
     nodes = tuple(_node(problem, names, tree, node) for node in tree.nodes or ())
     assignment = attempt.assignment
-    return ExplainedAssignment(
-        assignment.targets, assignment.cost, attempt.best_cost, best, nodes
-    )
+    return ExplainedAssignment(assignment.targets, assignment.cost, attempt.best_cost, best, nodes)
 
 
 def _node(
@@ -181,7 +179,9 @@ def _node(
     return ExplainedNode(
         number=node.number,
         parent=node.parent,
-        constraint="" if constraint is None else constraint.notation(table, names[constraint.vehicle]),
+        constraint=""
+        if constraint is None
+        else constraint.notation(table, names[constraint.vehicle]),
         conflicts=tuple(dict.fromkeys(entries(table, node, names))),
         path_map=RelativePathMap.padded(names, cells),
         cost=node.cost,

@@ -15,7 +15,6 @@ from laneweave.coordinator.planning.budget import Budget, BudgetSpentError, Cloc
 from laneweave.coordinator.planning.clearances import close_pairs
 from laneweave.coordinator.planning.frd import IntMatrix, Weights, cost_matrix
 from laneweave.coordinator.planning.grid import Cell
-from laneweave.coordinator.planning.solution import Solution, tidied
 from laneweave.coordinator.planning.improvements import Improvements
 from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.coordinator.planning.preference import BoolMatrix, preference_matrix
@@ -23,6 +22,7 @@ from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse, Status
 from laneweave.coordinator.planning.rows import vehicles_share_cells
+from laneweave.coordinator.planning.solution import Solution, tidied
 from laneweave.coordinator.planning.tappa import Tappa
 from laneweave.coordinator.planning.validate import problems_of_response
 

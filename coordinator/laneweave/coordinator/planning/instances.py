@@ -19,6 +19,7 @@ from laneweave.coordinator.planning.conflicts import DEFAULT_KINDS
 from laneweave.coordinator.planning.grid import Cell, Grid, Mode
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.targets import place
+from laneweave.protocol.messages import Name
 
 _SPARE_COLUMNS = (2, 4)
 
@@ -28,7 +29,7 @@ _TRAFFIC_VOLUMES = (1000, 2000)
 """veh/(lane h)"""
 _MIN_HEADWAY_S = 1.0
 _WARM_UP_FORMATIONS = 2
-_TRAFFIC_LANES, _TRAFFIC_VEHICLES, _TRAFFIC_COLUMNS = 3, 6, (3, 7)
+_TRAFFIC_LANES, _TRAFFIC_COLUMNS = 3, (3, 7)
 
 
 def block_request(
@@ -68,26 +69,31 @@ def formation_request(
 
 
 def traffic_request(
-    seed: int, *, conflicts: Sequence[str] | None = None, deadline_s: float = 4.0
+    seed: int,
+    *,
+    vehicles: int = 6,
+    mode: Mode = 1,
+    conflicts: Sequence[str] = TRAFFIC_KINDS,
+    deadline_s: float = 4.0,
 ) -> PlanRequest:
-    """Return a formation of at most six vehicles as traffic fills one on three lanes.
+    """Return a formation of at most so many vehicles as traffic fills one on three lanes.
 
     The volume is between 1000 and 2000 veh/(lane h). A formation has 3 to 7 columns: it ends with
-    its sixth vehicle, or before a column that would bring more, or with its seventh column. The
-    second formation of the stream is the first one that is taken.
+    its last vehicle, or before a column that would bring too many, or with its seventh column. The
+    second formation of the stream is the one that is taken.
     """
     rng = random.Random(seed)  # noqa: S311
-    stream = _Arrivals(rng, rng.uniform(*_TRAFFIC_VOLUMES))
+    stream = _Arrivals(rng, rng.uniform(*_TRAFFIC_VOLUMES), vehicles)
     for _ in range(_WARM_UP_FORMATIONS - 1):
         stream.formation()
-    columns, vehicles = stream.formation()
-    cells = {f"v{i + 1}": cell for i, (cell, _) in enumerate(vehicles)}
-    wishes = {f"v{i + 1}": lane for i, (_, lane) in enumerate(vehicles)}
+    columns, entered = stream.formation()
+    cells = {Name(f"v{i + 1}"): cell for i, (cell, _) in enumerate(entered)}
+    wishes = {Name(f"v{i + 1}"): lane for i, (_, lane) in enumerate(entered)}
     targets = place(cells, wishes, columns, _TRAFFIC_LANES)
     return PlanRequest(
         Grid(columns, _TRAFFIC_LANES),
-        1,
-        TRAFFIC_KINDS if conflicts is None else tuple(conflicts),
+        mode,
+        tuple(conflicts),
         tuple(VehicleRequest(name, cells[name], lane=wishes[name]) for name in cells),
         targets.cells,
         deadline_s,
@@ -108,8 +114,9 @@ class _Arrivals:
     Headways are 1 s and an exponentially distributed rest.
     """
 
-    def __init__(self, rng: random.Random, volume: float) -> None:
+    def __init__(self, rng: random.Random, volume: float, most: int) -> None:
         self._rng = rng
+        self._most = most
         self._mean_rest_s = 3600.0 / volume - _MIN_HEADWAY_S
         self._column = 0
         self._waiting: list[deque[_Vehicle]] = [deque() for _ in range(_TRAFFIC_LANES)]
@@ -133,7 +140,7 @@ class _Arrivals:
         self._column = max(self._column, math.ceil(min(q[0].arrival_s for q in self._filled())))
         entered: list[tuple[int, int, int]] = []
         columns = 0
-        while columns < longest and (len(entered) < _TRAFFIC_VEHICLES or columns < shortest):
+        while columns < longest and (len(entered) < self._most or columns < shortest):
             room = max(shortest, columns + 1)
             wishes = [wish for _, _, wish in entered]
             entering = []
@@ -142,11 +149,12 @@ class _Arrivals:
                 if wishes.count(vehicle.wish) < room:
                     wishes.append(vehicle.wish)
                     entering.append(lane)
-            most = _TRAFFIC_VEHICLES - len(entered)
-            if len(entering) > most and columns >= shortest:
+            room_left = self._most - len(entered)
+            if len(entering) > room_left and columns >= shortest:
                 break
-            for lane in entering[:most]:
-                entered.append((columns, lane, self._waiting[lane].popleft().wish))
+            entered += [
+                (columns, lane, self._waiting[lane].popleft().wish) for lane in entering[:room_left]
+            ]
             columns += 1
             self._column += 1
         return columns, [((columns - 1 - back, lane), wish) for back, lane, wish in entered]

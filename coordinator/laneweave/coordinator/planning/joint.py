@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from itertools import combinations
 from operator import itemgetter
 
@@ -69,7 +69,10 @@ class JointSearch:
         self._start = tuple(problem.starts[v] for v in self._vehicles)
         self._start_labels = tuple(labels[v] for v in self._vehicles)
         self._distance = [
-            _distances(problem, [s for s, label in zip(problem.starts, labels, strict=True) if label == own])
+            _distances(
+                problem,
+                [s for s, label in zip(problem.starts, labels, strict=True) if label == own],
+            )
             for own in range(1, 2 * len(teams), 2)
         ]
         self._active: dict[Labels, int] = {}

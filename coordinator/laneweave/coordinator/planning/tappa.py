@@ -27,7 +27,7 @@ from laneweave.coordinator.planning.solution import Solution
 _JOINT_AFTER = 32
 """So many nodes come before the joint search begins."""
 _JOINT_MOVES_PER_NODE = 1
-"""After n nodes, n times as many joint moves: the share of the joint search grows with the trees."""
+"""A node among n nodes lets the joint search make n times as many moves: its share grows."""
 
 
 @attrs.frozen
