@@ -25,7 +25,8 @@ from laneweave.coordinator.planning.improvements import Improvements
 from laneweave.coordinator.planning.instances import TRAFFIC_KINDS, block_request, traffic_request
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "evidence" / "planner-switches.json"
-INSTANCES = 200
+INSTANCES, FEWER_INSTANCES = 200, 60
+"""With all improvements, and without some."""
 DEADLINE_S = 4.0
 
 
@@ -89,13 +90,13 @@ def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", type=Path, default=OUT, metavar="FILE")
-    parser.add_argument("--instances", type=int, default=INSTANCES)
     options = parser.parse_args()
     warm_up()
     rows = []
     for family in FAMILIES:
         for name, improvements in switch_settings():
-            rows.append(measured(family, name, improvements, options.instances))
+            instances = INSTANCES if improvements == Improvements() else FEWER_INSTANCES
+            rows.append(measured(family, name, improvements, instances))
             sys.stdout.write(json.dumps(rows[-1]) + "\n")
             sys.stdout.flush()
     options.json.write_text(
