@@ -59,7 +59,8 @@ CHUNK = 10
 
 def faults(request: dict[str, Any], cost: int | None, solver: Solver, seed: int) -> list[str]:
     """What is wrong with a plan, by what it claims, by its paths, and by driving it."""
-    response = checked_plan(PlanRequest.from_dict(request), solver=solver).to_dict()
+    patient = {"deadline_s": 60.0, **request}
+    response = checked_plan(PlanRequest.from_dict(patient), solver=solver).to_dict()
     claims = response["status"], response["cost"]
     if claims != ("infeasible" if cost is None else "optimal", cost):
         return [f"answers {claims}, the oracle {cost}"]
