@@ -1,7 +1,8 @@
 """Writes the parts of the documents that follow from the code: `python docs/generate.py`.
 
 In a document a generated part stands between `<!-- begin NAME -->` and `<!-- end NAME -->`; a test
-compares it with what this script would write. The picture of the conflict table is drawn, too.
+compares it with what this script would write. The pictures of the conflict table and of how
+the case study is solved are drawn, too.
 """
 
 from __future__ import annotations
@@ -17,10 +18,13 @@ from typing import Any
 from laneweave.agents.numbers import AgentNumbers
 from laneweave.coordinator.leader_rules import LEADER_RULES, Phase
 from laneweave.coordinator.numbers import CoordinatorNumbers
+from laneweave.coordinator.planning import PlanRequest
+from laneweave.coordinator.planning.explanation import explain
 from laneweave.coordinator.service import ServiceNumbers
 from laneweave.launch.conflict_drawing import counts, draw_conflicts
 from laneweave.launch.evaluation.evidence import read_evidence
 from laneweave.launch.evaluation.tables import document_parts
+from laneweave.launch.explanation_drawing import draw_explanation
 from laneweave.launch.metrics import PROCESS, PROCESS_MEANING
 from laneweave.launch.simulation.profiles import PROFILES
 from laneweave.protocol.access_rules import rights_table
@@ -37,6 +41,8 @@ MEASURED = DOCS / "evidence" / "resilience.json"
 PLANNED = DOCS / "evidence" / "planner.json"
 """What `laneweave bench planner --json` printed."""
 
+SWITCHES = DOCS / "evidence" / "planner-switches.json"
+"""What `benchmarks/planner_switches.py` wrote."""
 GEOMETRY = DOCS / "evidence" / "geometry.json"
 """What `benchmarks/geometry.py` wrote."""
 CLOSING = DOCS / "evidence" / "closing.json"
@@ -52,6 +58,8 @@ EVALUATED = DOCS / "evidence" / "evaluation.json"
 STABILITY = DOCS / "evidence" / "stability.json"
 """What `benchmarks/stability.py` wrote."""
 CONFLICTS = DOCS / "images" / "conflict-table.png"
+CASE = DOCS / "examples" / "case-study.json"
+SOLVING = DOCS / "images" / "solving-process.png"
 SNAPSHOTS: dict[type[Snapshot], str] = {
     NodeNumbers: "every role but the router",
     CoordinatorNumbers: "coordinator",
@@ -146,6 +154,19 @@ def _planner() -> str:
             f"| {cpu['p50']:.1f} / {cpu['p95']:.1f} | {gap['p50']:.1f} / {gap['max']:.1f} % "
             f"| {row['answered_in_100_ms']} {of} |"
         )
+    return "\n".join(lines)
+
+
+def _switches() -> str:
+    """Return the table of what improvements of TAPPA are worth."""
+    lines = [
+        "| family | improvements | proven in 4 s | CPU ms p50 / p95 / max |",
+        "|---|---|---|---|",
+    ]
+    for row in json.loads(SWITCHES.read_text(encoding="utf-8"))["results"]:
+        times = " / ".join(f"{row[f'cpu_ms_{name}']:.1f}" for name in ("p50", "p95", "max"))
+        solved = f"{row['solved']} of {row['instances']}"
+        lines.append(f"| {row['family']} | {row['improvements']} | {solved} | {times} |")
     return "\n".join(lines)
 
 
@@ -347,6 +368,7 @@ def parts() -> dict[str, str]:
         "profiles": _profiles(),
         "resilience": _resilience(),
         "planner": _planner(),
+        "planner switches": _switches(),
         "conflict counts": _conflicts(),
         "conflict distances": _distances(),
         "geometry": _geometry(),
@@ -376,3 +398,4 @@ if __name__ == "__main__":
     for path in sorted(DOCS.glob("*.md")):
         path.write_text(rewritten(path.read_text(encoding="utf-8")), encoding="utf-8")
     draw_conflicts(CONFLICTS)
+    draw_explanation(explain(PlanRequest.from_dict(json.loads(CASE.read_text("utf-8")))), SOLVING)

@@ -250,14 +250,30 @@ def plan(
             help="Draw how vehicles drive it: FILE.png or FILE.gif; road and vehicles: --config.",
         ),
     ] = None,
+    explained: Annotated[
+        bool,
+        typer.Option(
+            "--explain",
+            help="Print what TAPPA does: assignments and constraint trees (--draw too).",
+        ),
+    ] = False,
 ) -> None:
     """Plan one request here, or ask a running coordinator."""
-    from laneweave.launch.plan_command import access_for, answer_request
+    from laneweave.launch.plan_command import access_for, answer_request, explain_request
 
     settings = load_scenario(config)
     # A file that names no router describes the road alone.
     only_road = draw_road is not None and not (connect or settings.network.endpoint)
     access = access_for(connect, realm, None if only_road else config, client)
+    if explained:
+        if access is not None:
+            raise BadInputError("--explain", "set", "only without --connect and --config")
+        if solver not in (None, "tappa"):
+            raise BadInputError("--solver", solver, "tappa, for --explain")
+        if draw_road is not None:
+            raise BadInputError("--draw-road", str(draw_road), "only without --explain")
+        explain_request(request, deadline, draw)
+        return
     # What would have no effect is a mistake of whoever asks.
     if access is None and wait:
         raise BadInputError("--wait", wait, "only with --connect or --config")
@@ -335,7 +351,10 @@ def bench(
         float, typer.Option("--seconds", min=5.0, max=3600.0, help="runtime: road time measured.")
     ] = 60.0,
     families: Annotated[
-        str, typer.Option("--families", help="planner: of node-edge, following, geometric, block.")
+        str,
+        typer.Option(
+            "--families", help="planner: of node-edge, following, geometric, block, traffic."
+        ),
     ] = "node-edge,following,geometric",
     instances: Annotated[
         int,

@@ -19,6 +19,8 @@ from laneweave.coordinator.client import (
 )
 from laneweave.coordinator.inquiry import ABSENT_S
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan
+from laneweave.coordinator.planning.explanation import explain
+from laneweave.launch.explanation_text import explanation_text
 from laneweave.protocol.access import Access
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
 from laneweave.protocol.scenario import Scenario
@@ -85,12 +87,7 @@ def answer_request(
     """
     if not 0 <= wait_s <= MOST_WAIT_S:
         raise BadInputError("--wait", wait_s, f"[0, {MOST_WAIT_S:g}]")
-    data = _read(path)
-    if deadline_s is not None:
-        data["deadline_s"] = deadline_s
-    if solver is not None:
-        data["solver"] = solver
-    request = PlanRequest.from_dict(data)
+    request = _request(path, deadline_s, solver)
     drawers = []
     if drawing is not None:
         drawers.append(_checked_drawer(drawing))
@@ -108,6 +105,40 @@ def answer_request(
             draw(request, response)
         except OSError as error:
             raise CommandFailedError(f"{out}: not drawn: {error}") from error
+
+
+def explain_request(path: Path, deadline_s: float | None, drawing: Path | None = None) -> None:
+    """Read a request, run TAPPA on it here, print what it did and draw it.
+
+    Raises:
+        BadInputError: the request cannot be read or is not valid, or the drawing is no picture
+            or cannot be written.
+        CommandFailedError: the drawing could not be written after all.
+    """
+    if drawing is not None:
+        from laneweave.launch.plan_drawing import check_drawing  # noqa: PLC0415 - an extra
+
+        if drawing.suffix.lower() != ".png":
+            raise BadInputError("--draw", str(drawing), "a file that ends with .png, for --explain")
+        check_drawing(drawing)
+    explanation = explain(_request(path, deadline_s).settled())
+    sys.stdout.write(explanation_text(explanation))
+    if drawing is not None:
+        from laneweave.launch.explanation_drawing import draw_explanation  # noqa: PLC0415
+
+        try:
+            draw_explanation(explanation, drawing)
+        except OSError as error:
+            raise CommandFailedError(f"{drawing}: not drawn: {error}") from error
+
+
+def _request(path: Path, deadline_s: float | None, solver: str | None = None) -> PlanRequest:
+    data = _read(path)
+    if deadline_s is not None:
+        data["deadline_s"] = deadline_s
+    if solver is not None:
+        data["solver"] = solver
+    return PlanRequest.from_dict(data)
 
 
 _Drawer = tuple[Callable[[PlanRequest, PlanResponse], None], Path]

@@ -58,7 +58,7 @@ CHUNK = 10
 
 def faults(request: dict[str, Any], cost: int | None, solver: str, seed: int) -> list[str]:
     """What is wrong with a plan, by what it claims, by its paths, and by driving it."""
-    asked = PlanRequest.from_dict(request)
+    asked = PlanRequest.from_dict({"deadline_s": 60.0, **request})
     response = checked_plan(asked, solver=solver, fallback=False).to_dict()
     claims = response["status"], response["cost"]
     if claims != ("infeasible" if cost is None else "optimal", cost):

@@ -16,13 +16,14 @@ from laneweave.coordinator.planning.budget import Budget, BudgetSpentError, Cloc
 from laneweave.coordinator.planning.clearances import close_pairs
 from laneweave.coordinator.planning.frd import IntMatrix, Weights, cost_matrix
 from laneweave.coordinator.planning.grid import Cell
-from laneweave.coordinator.planning.incumbent import Solution, tidied
+from laneweave.coordinator.planning.improvements import Improvements
 from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.coordinator.planning.preference import BoolMatrix, preference_matrix
 from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.request import PlanRequest, checked_solver
 from laneweave.coordinator.planning.response import PlanResponse, Status
 from laneweave.coordinator.planning.rows import vehicles_share_cells
+from laneweave.coordinator.planning.solution import Solution, tidied
 from laneweave.coordinator.planning.tappa import Tappa
 from laneweave.coordinator.planning.validate import problems_of_response
 from laneweave.protocol.solvers import DEFAULT_SOLVER
@@ -104,13 +105,7 @@ def plan(
     asked = checked_solver(solver or request.solver or DEFAULT_SOLVER)
     weights = (weights or Weights.for_mode(request.mode)).checked(request.mode)
     nodes = MAX_NODES if max_nodes is None else min(max_nodes, MAX_NODES)
-    problem = Problem(
-        request.grid,
-        request.mode,
-        request.conflict_model,
-        [vehicle.cell for vehicle in request.vehicles],
-        request.targets,
-    )
+    problem = problem_of(request)
     order = _order(asked, problem, fallback=fallback)
     results: list[_Result] = []
     for name in order:
@@ -167,13 +162,11 @@ def _solve(
 def _search(
     solver: str, problem: Problem, request: PlanRequest, weights: Weights, budget: Budget
 ) -> Search:
-    choices = request.choices()
     if solver == "branching":
         from laneweave.coordinator.planning.branching import Branching  # noqa: PLC0415
 
-        return Branching(problem, choices, budget)
-    costs, allowed = matrices(request, weights, choices, budget)
-    return Tappa(problem, assignments(costs, allowed, budget), choices, budget)
+        return Branching(problem, request.choices(), budget)
+    return new_tappa(problem, request, weights, budget)
 
 
 def _response(
@@ -226,6 +219,28 @@ def _warm_up_branching() -> None:
     from laneweave.coordinator.planning import branching  # noqa: PLC0415
 
     branching.warm_up()
+
+
+def new_tappa(
+    problem: Problem,
+    request: PlanRequest,
+    weights: Weights,
+    budget: Budget,
+    improvements: Improvements | None = None,
+    *,
+    record: bool = False,
+) -> Tappa:
+    """Return Algorithm 1, ready to run; see `Tappa`."""
+    choices = request.choices()
+    costs, allowed = matrices(request, weights, choices, budget)
+    candidates = assignments(costs, allowed, budget)
+    return Tappa(problem, candidates, choices, budget, improvements, record=record)
+
+
+def problem_of(request: PlanRequest) -> Problem:
+    """Return the problem of a request."""
+    cells = [vehicle.cell for vehicle in request.vehicles]
+    return Problem(request.grid, request.mode, request.conflict_model, cells, request.targets)
 
 
 def _status(*, found: bool, finished: bool) -> Status:
