@@ -213,7 +213,7 @@ def prepare_the_same(me: FormationControl, _: object) -> None:
         me.promises = {
             name: promise
             for name, promise in me.promises.items()
-            if me.states[name].incarnation == known[name]
+            if name in me.states and me.states[name].incarnation == known[name]
         }
     me.plan, me.accepted, me.failures, me.due_s = None, set(), 0, me.now_s
 

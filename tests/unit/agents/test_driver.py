@@ -10,7 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from driving import Road
-from laneweave.agents.driver import Drive, Effort, TrackingDriver
+from laneweave.agents.driver import Course, Drive, Effort, TrackingDriver
+from laneweave.agents.motions import REPEAT_TICKS
 from laneweave.agents.surroundings import NOBODY, Gaps
 from laneweave.agents.tracker import Tracker, TrackResult
 from laneweave.agents.trajectory import Window
@@ -168,6 +169,40 @@ def test_a_motion_whose_time_is_over_is_taken_over_as_a_hold(end_tick: int) -> N
     made.take_over(sense(end_tick=end_tick, origin=(-2, 1), ticks=MOVE_TICKS))
     assert made.at_rest(sense())
     assert made.drive(sense(), moving=False).motion_origin == HOME
+
+
+@pytest.mark.parametrize("ticks", [43, 68])
+def test_a_long_move_is_taken_over_with_the_time_that_it_takes(ticks: int) -> None:
+    """A new process knows no plan: the motion controller has kept how long the move takes."""
+    scenario = Scenario()
+    made = TrackingDriver(scenario)
+    made.take_over(sense())
+    made.begin(MOVE, 10, ticks)
+    plant = Plant(sense().state, scenario.vehicle, TICK_S)
+    for tick in range(10, 30):
+        felt = attrs.evolve(sense(tick), state=plant.state, setpoint=plant.setpoint)
+        drive = made.drive(felt, moving=True)
+        plant.step(*jerks(drive)[0].tolist())
+    assert (drive.motion_end_tick, drive.motion_ticks) == (10 + ticks, ticks)
+    felt = attrs.evolve(
+        sense(30, MOVE[2], end_tick=10 + ticks, origin=HOME, ticks=ticks),
+        state=plant.state,
+        setpoint=plant.setpoint,
+    )
+    heir = TrackingDriver(scenario)
+    heir.take_over(felt)
+    theirs, mine = made.drive(felt, moving=True), heir.drive(felt, moving=True)
+    assert (mine.motion_end_tick, mine.motion_ticks) == (10 + ticks, ticks)
+    assert jerks(mine) == pytest.approx(jerks(theirs), abs=1e-3)
+    assert heir.motion(10 + 2 * REPEAT_TICKS) == Course(HOME, MOVE[2], 10, ticks)
+
+
+@pytest.mark.parametrize("ticks", [0, MOVE_TICKS - 1, 2**63 - 1, -1])
+def test_a_move_of_an_impossible_duration_is_taken_over_as_a_hold(ticks: int) -> None:
+    heir = TrackingDriver(SCENARIO)
+    heir.take_over(sense(25, MOVE[2], end_tick=48, origin=HOME, ticks=ticks))
+    drive = heir.drive(sense(25, MOVE[2]), moving=False)
+    assert (drive.motion_origin, drive.motion_ticks) == (MOVE[2], 0)
 
 
 # --- the end of a motion ----------------------------------------------------------------------

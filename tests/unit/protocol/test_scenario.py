@@ -442,6 +442,109 @@ def test_an_empty_file_is_the_default(tmp_path: Path) -> None:
     assert load_scenario(path) == Scenario()
 
 
+# --- values of a file that would have no effect -----------------------------------------------
+
+INERT = [
+    ("formation.sort_in_s2", 'operation = "formations"\nsort_in_s2 = false'),
+    ("formation.reward_drift", "reward_drift = true"),
+    ("formation.reward_drift", 'operation = "paper"\nreward_drift = true'),
+    ("formation.entry", 'operation = "rolling"\nentry = "free"'),
+    ("formation.close", 'operation = "rolling"\nclose = "columns"'),
+    ("formation.max_vehicles", 'operation = "rolling"\nmax_vehicles = 6'),
+    ("formation.max_columns", 'operation = "rolling"\nmax_columns = 7'),
+    ("formation.max_joined", 'operation = "rolling"\nmax_joined = 2'),
+    ("formation.weight_straight", 'operation = "rolling"\nweight_straight = 1'),
+    ("formation.planning_deadline_s", 'operation = "rolling"\nplanning_deadline_s = 2.0'),
+    ("formation.max_nodes", 'operation = "rolling"\nmax_nodes = 10'),
+    ("formation.block_columns", 'operation = "rolling"\nclose = "columns"\nblock_columns = 4'),
+    ("formation.block_columns", "block_columns = 4"),
+    ("formation.max_columns", 'close = "columns"\nmax_columns = 7'),
+    ("formation.max_columns", 'operation = "paper"\nmax_columns = 7'),
+]
+
+
+@pytest.mark.parametrize(("field", "lines"), INERT)
+def test_a_file_s_value_without_effect_is_refused_by_name(
+    tmp_path: Path, field: str, lines: str
+) -> None:
+    path = tmp_path / "x.toml"
+    path.write_text(f"[formation]\n{lines}\n", encoding="utf-8")
+    error = file_refusal(path)
+    if 'rolling"\nclose' in lines:
+        assert error.field == "formation.close"  # the first one
+    else:
+        assert error.field == field
+    assert error.allowed.startswith("none")
+
+
+def test_values_with_an_effect_are_taken_and_those_of_options_and_recordings_too(
+    tmp_path: Path,
+) -> None:
+    """An option may change what a file's values do; a recording holds all fields."""
+    path = tmp_path / "x.toml"
+    path.write_text("[formation]\nmax_vehicles = 5\nmax_columns = 6\n", encoding="utf-8")
+    assert load_scenario(path, formation__operation="rolling").formation.rolling
+    path.write_text('[formation]\noperation = "rolling"\nsort_in_s2 = true\n', encoding="utf-8")
+    assert load_scenario(path).formation.sort_in_s2
+    path.write_text('[formation]\nclose = "columns"\nblock_columns = 6\n', encoding="utf-8")
+    assert load_scenario(path).lattice.block_columns == 6
+    for formation in ({"operation": "rolling"}, {"close": "columns"}, {"operation": "paper"}):
+        scenario = parse_scenario({"formation": formation})
+        assert parse_scenario(to_tables(scenario)) == scenario
+
+
+# --- an earlier name, and the lengths of slots --------------------------------------------------
+
+
+def test_paper_stands_for_interlaced_blocks_of_columns_and_slots_of_four_seconds(
+    tmp_path: Path,
+) -> None:
+    meant = FormationSettings(
+        operation="formations", entry="interlaced", close="columns", cycle_s=4.0
+    )
+    assert parse_scenario({"formation": {"operation": "paper"}}).formation == meant
+    assert load_scenario(None, formation__operation="paper").formation == meant
+    path = tmp_path / "x.toml"
+    path.write_text('[formation]\noperation = "paper"\n', encoding="utf-8")
+    assert load_scenario(path).formation == meant
+    # What else is said counts.
+    said = {"operation": "paper", "cycle_s": 6.0, "move_s": 5.0, "entry": "free"}
+    assert parse_scenario({"formation": said}).formation == attrs.evolve(
+        meant, cycle_s=6.0, move_s=5.0, entry="free"
+    )
+    assert refusal({"formation": {"operation": "papers"}}).field == "formation.operation"
+
+
+def test_a_recording_of_the_paper_s_operation_under_its_earlier_name_is_read() -> None:
+    tables = to_tables(load_scenario(FOLDER / "paper.toml"))
+    earlier = {"operation": "paper", "cycle_s": 4.0, "move_s": 3.8, "block_columns": 4}
+    kept = {
+        name: value
+        for name, value in tables["formation"].items()
+        if name not in ("entry", "close", "max_columns")
+    }
+    recording = tables | {"formation": kept | earlier, "tracking": {"horizon_ticks": 40}}
+    expected = load_scenario(FOLDER / "paper.toml")
+    tracking = attrs.evolve(expected.tracking, horizon_ticks=40)
+    assert parse_scenario(recording) == attrs.evolve(expected, tracking=tracking)
+
+
+def test_slots_are_from_four_to_seven_seconds_unless_they_are_given() -> None:
+    scenario = Scenario()
+    assert scenario.slots_s == (4.0, 4.5, 5.0, 5.5, 6.0, 6.5, 7.0)
+    assert scenario.move_durations == {38, 43, 48, 53, 58, 63, 68}
+    assert (scenario.move_s, scenario.horizon_ticks) == (3.8, 70)
+    given = parse_scenario({"formation": {"cycle_s": 5.0}})
+    assert (given.slots_s, given.horizon_ticks, given.move_s) == ((5.0,), 50, 4.8)
+    assert given.move_durations == {48}
+    slower = parse_scenario({"formation": {"cycle_s": 5.0, "move_s": 4.0}})
+    assert slower.move_durations == {40}
+    rolling = parse_scenario({"formation": {"operation": "rolling"}})
+    assert (rolling.slots_s, rolling.horizon_ticks) == ((4.0,), 40)
+    long = parse_scenario({"tracking": {"horizon_ticks": 80}})
+    assert long.horizon_ticks == 80
+
+
 # --- round trip and overrides -----------------------------------------------------------------
 
 SCENARIOS = st.builds(

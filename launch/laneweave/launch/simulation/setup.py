@@ -78,6 +78,14 @@ class Setup:
     thorough: bool = False
     """The stream planner plans, not the light one (rolling operation)."""
 
+    @property
+    def adjoin(self) -> bool:
+        """Whether there are two formations, with no column between them: these can be joined."""
+        if len(self.formations) != 2:
+            return False
+        ahead, behind = self.formations
+        return behind.first_block == ahead.last_block + 1
+
     @classmethod
     def drawn(cls, profile: Profile, rng: random.Random) -> Setup:
         """Draw from a profile."""
@@ -124,7 +132,7 @@ class Setup:
             weights = [6.0 if self.crowded and lane == 0 else 1.0 for lane in range(lanes)]
             vehicles = [visit.vehicle for visit in self.visits]
             return _draw_lanes(vehicles, room, weights, rng)
-        may_join = len(self.formations) == 2 and self.scenario.formation.max_joined >= 2
+        may_join = self.adjoin and self.scenario.formation.max_joined >= 2
         if self.crowded and (may_join or not last):
             # One lane that everybody likes best.
             room = [sum(columns)] * lanes if last else [99] * lanes
