@@ -83,7 +83,7 @@ class Convoy:
             for number, name in enumerate(self.names)
             if name not in without
         )
-        return Census(tick * self.scenario.runtime.tick_s, entries, (), self.bridge)
+        return Census(tick * self.scenario.runtime.tick_s, entries, (), bridge=self.bridge)
 
     def state(self, number: int, tick: int) -> VehicleState:
         """Return what a vehicle shows in a tick."""
