@@ -85,19 +85,12 @@ def draw_travel_times(comparison: Comparison, out: Path, dpi: int) -> None:
 
 def _break(times_s: Iterable[Floats]) -> float | None:
     """Return the travel time at which the axis is broken; None: there is no jam, or only jams."""
-    quartiles = [np.percentile(one, [50.0, 75.0, 99.0]) for one in times_s if len(one)]
-    if not quartiles:
+    shapes = [np.percentile(one, [50.0, 75.0, 99.0]) for one in times_s if len(one)]
+    most_s = JAMMED * min((median_s for median_s, _, _ in shapes), default=0.0)
+    ends_s = [end_s for _, upper_s, end_s in shapes if upper_s <= most_s]
+    if len(ends_s) in (0, len(shapes)):
         return None
-    most_s = JAMMED * min(median for median, _, _ in quartiles)
-    ends_s = [end for _, upper, end in quartiles if upper <= most_s]
-    if len(ends_s) == len(quartiles) or not ends_s:
-        return None
-    return float(
-        max(
-            1.01 * min(max(ends_s), most_s),
-            *(upper for _, upper, _ in quartiles if upper <= most_s),
-        )
-    )
+    return float(min(most_s, 1.01 * max(ends_s)))
 
 
 def _break_axis(upper: Axes, lower: Axes, break_s: float) -> None:
@@ -109,14 +102,23 @@ def _break_axis(upper: Axes, lower: Axes, break_s: float) -> None:
     upper.tick_params(axis="x", bottom=False, labelbottom=False)
     upper.set_ylabel("jams (s)")
     for axes, y in ((upper, 0.0), (lower, 1.0)):
-        mark = {"marker": [(-1.0, -0.5), (1.0, 0.5)], "markersize": 9, "linestyle": "none"}
-        axes.plot([0.0], [y], transform=axes.transAxes, color=INK, clip_on=False, **mark)
+        axes.plot(
+            [0.0],
+            [y],
+            transform=axes.transAxes,
+            color=INK,
+            clip_on=False,
+            marker=[(-1.0, -0.5), (1.0, 0.5)],
+            markersize=9,
+            linestyle="none",
+        )
 
 
 def _places(number: int, labels: Sequence[str], volumes: Sequence[float]) -> Floats:
     """Return where the boxes of a label are along the axis."""
     width = 0.8 / len(labels)
-    return np.arange(len(volumes)) + (number - 0.5 * (len(labels) - 1)) * width
+    shift = (number - 0.5 * (len(labels) - 1)) * width
+    return np.arange(len(volumes), dtype=np.float64) + shift
 
 
 def _draw_boxes(

@@ -20,7 +20,7 @@ from laneweave.launch.sweep.execution import Ended, Job, run_in_process
 from laneweave.protocol.errors import BadInputError
 
 CONNECT_S = 10.0
-RETURNED = ("summary.json", "trips.parquet", "log.txt")
+RETURNED = ("summary.json", "trips.parquet", "events.jsonl", "log.txt")
 
 
 @frozen

@@ -5,7 +5,7 @@
     LABEL-VOLUME-SEED/      one folder for each of them
         point.json          its settings, and what became of it
         summary.json        as of any run
-        trips.parquet
+        trips.parquet, events.jsonl
         trajectories.parquet    where it is kept
         log.txt                 of failed ones
     unfinished/             what is running
@@ -36,7 +36,7 @@ MARK_FILE, POINT_FILE, RESULTS_FILE = "sweep.json", "point.json", "results.parqu
 MARK = {"schema": "laneweave.sweep/1"}
 POINT_SCHEMA = "laneweave.sweep.point/1"
 DONE, FAILED = "done", "failed"
-_ALWAYS_KEPT = ("summary.json", "trips.parquet")
+_ALWAYS_KEPT = ("summary.json", "trips.parquet", "events.jsonl")
 _TRAJECTORIES = "trajectories.parquet"
 
 

@@ -144,15 +144,17 @@ def test_the_player_shows_everybody_where_they_were(run: Run, tracks: Tracks) ->
 
 
 @needs_node
-def test_the_player_follows_blocks_of_the_lattice(run: Run, tracks: Tracks) -> None:
+@pytest.mark.parametrize("longer", [False, True], ids=["blocks", "lengths"])
+def test_the_player_follows_formations(run: Run, tracks: Tracks, *, longer: bool) -> None:
     data = animation_data(run, tracks, "")
     lattice = run.scenario.lattice
-    centres = in_node("[0, 3].map((f) => laneweave.blockCentre(run, f, 20))", data)
-    for number, centre_m in zip((0, 3), centres, strict=True):
-        columns = lattice.block_range(number)
-        fronts_m = [lattice.cell_s_m(one, 20.0) for one in (columns[0], columns[-1])]
-        rear_m = fronts_m[0] - run.scenario.vehicle.length_m
-        assert centre_m == pytest.approx(0.5 * (rear_m + fronts_m[1]))
+    assert data["formations"][:2] == [[0, -3, 0], [1, -7, -4]]
+    if longer:
+        data["formations"] = [[0, -4, 0], [1, -7, -5], *data["formations"][2:]]
+    centres = in_node("[0, 1].map((f) => laneweave.formationCentre(run, f, 20))", data)
+    for (_, rear, front), centre_m in zip(data["formations"][:2], centres, strict=True):
+        rear_m = lattice.cell_s_m(rear, 20.0) - run.scenario.vehicle.length_m
+        assert centre_m == pytest.approx(0.5 * (rear_m + lattice.cell_s_m(front, 20.0)))
     names = in_node("laneweave.followable(run, 3).map((one) => one.name)", data)
     assert names == ["formation 0", "formation 1", "formation 2"]
 

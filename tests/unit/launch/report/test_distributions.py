@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from numpy.typing import ArrayLike
@@ -22,11 +24,12 @@ from laneweave.launch.report.distributions import (
     count,
 )
 from laneweave.launch.report.path_maps import driven_map
-from laneweave.launch.report.runs import single_run
+from laneweave.launch.report.runs import Run, single_run
 from laneweave.launch.report.styling import label_colours, spread_evenly
 from laneweave.launch.report.tracks import Tracks, read_tracks
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario import load_scenario
+from unit.launch.older import older_recording
 
 T_S = 0.1 * np.arange(101)
 SHORT = load_scenario(None, demand__duration_s=10.0)
@@ -129,6 +132,89 @@ def test_path_maps_are_what_was_driven(swept: Path) -> None:
     assert most is not None
     with pytest.raises(BadInputError, match="--formation: got -1"):
         driven_map(run, driven_tracks, -1)
+
+
+def formations_of_two_lengths(folder: Path) -> tuple[Run, Tracks]:
+    """Return a recording of two formations: columns 0 to -2, and columns -3 to -7.
+
+    In each two vehicles change places: one leaves its column, then both change lanes.
+    """
+    cells = {
+        # Slots of 5 s from 20 s on.
+        "a": (0, [(0, 0), (0, 0), (0, 1)], 20.0, 5.0),
+        "b": (0, [(-1, 1), (-2, 1), (-2, 0)], 20.0, 5.0),
+        # Slots of 6.2 s from 30 s on.
+        "c": (3, [(-3, 0), (-3, 0), (-3, 1)], 30.0, 6.2),
+        "d": (3, [(-7, 1), (-6, 1), (-6, 0)], 30.0, 6.2),
+    }
+    t_s = 0.1 * np.arange(600)
+    columns, lanes = [], []
+    for _, path, start_s, slot_s in cells.values():
+        slot = np.clip(np.floor((t_s - start_s) / slot_s + 1e-6) + 1, 0, 2).astype(int)
+        columns.append(np.array([column for column, _ in path])[slot])
+        lanes.append(np.array([lane for _, lane in path])[slot])
+    rows = len(t_s) * len(cells)
+    driven = Tracks(
+        names=tuple(cells),
+        starts=len(t_s) * np.arange(len(cells) + 1),
+        t_s=np.tile(t_s, len(cells)),
+        s_m=np.zeros(rows),
+        y_m=np.zeros(rows),
+        speed_mps=np.zeros(rows),
+        accel_mps2=np.zeros(rows),
+        column=np.concatenate(columns),
+        lane=np.concatenate(lanes),
+    )
+    trips = {
+        "vehicle": list(cells),
+        "preferred_lane": [path[-1][1] for _, path, _, _ in cells.values()],
+        "formation": [number for number, *_ in cells.values()],
+    }
+    pq.write_table(pa.table(trips), folder / "trips.parquet")
+    closed = [(0, [-2, 0]), (3, [-7, -3])]
+    plans = [(0, 8.0, 4.0), (0, 20.0, 5.0), (0, 90.0, 7.0), (3, 30.0, 6.2)]
+    events = [
+        *({"kind": "formation-closed", "formation": n, "columns": c} for n, c in closed),
+        *({"kind": "plan-made", "formation": n, "t0_s": t, "slot_s": s} for n, t, s in plans),
+    ]
+    with (folder / "events.jsonl").open("w") as lines:
+        for event in events:
+            role = "bridge" if event["kind"] == "formation-closed" else "coordinator"
+            lines.write(json.dumps({"t_s": 5.0, "role": role} | event) + "\n")
+        # Who is no bridge says nothing about formations.
+        forged = {"kind": "formation-closed", "formation": 0, "columns": [-9, 0]}
+        lines.write(json.dumps({"t_s": 5.0, "role": "agent"} | forged) + "\n")
+    return Run(folder, "formation", load_scenario(None), {}), driven
+
+
+def test_path_maps_of_formations_of_different_lengths(tmp_path: Path) -> None:
+    run, driven_tracks = formations_of_two_lengths(tmp_path)
+    short, long = (driven_map(run, driven_tracks, number) for number in (0, 3))
+    assert short is not None
+    assert long is not None
+    # The last plan of which a move was driven says when slots begin, and how long they are.
+    assert (short.start_s, short.slot_s) == (20.0, 5.0)
+    assert (long.start_s, long.slot_s) == (30.0, 6.2)
+    # Columns count from the formation's own rear: three of them, and five.
+    assert short.path_map.rows == (((2, 0), (2, 0), (2, 1)), ((1, 1), (0, 1), (0, 0)))
+    assert long.path_map.rows == (((4, 0), (4, 0), (4, 1)), ((0, 1), (1, 1), (1, 0)))
+    with pytest.raises(BadInputError, match=r"--formation: got 2; allowed: .*: 0, 3$"):
+        driven_map(run, driven_tracks, 2)
+
+
+def test_the_path_map_of_an_older_recording(swept: Path, tmp_path: Path) -> None:
+    newer = single_run(swept / "formation-1600-1")
+    older = single_run(older_recording(newer.folder, tmp_path / "run"))
+    shown = driven_map(older, read_tracks(older.folder), 2)
+    expected = driven_map(newer, read_tracks(newer.folder), 2)
+    assert shown is not None
+    assert expected is not None
+    assert shown.path_map.ids == expected.path_map.ids
+    assert [row[-1] for row in shown.path_map.rows] == [
+        row[-1] for row in expected.path_map.rows
+    ]  # fmt: skip
+    assert shown.path_map.cost() <= expected.path_map.cost()
+    assert shown.slot_s == 4.0
 
 
 def test_colours_of_labels_stay_whatever_is_beside_them() -> None:

@@ -49,7 +49,7 @@ def test_what_a_sweep_leaves(whole: Path) -> None:
         assert row["planning_solve_ms_p95"] == summary["planning"]["solve_ms"]["p95"]
         assert row["travel_time_s_mean"] is summary["travel_time_s"]["mean"] is None
         assert row["wall_s"] > row["runtime_wall_s"] > 0.0
-        kept = {"point.json", "summary.json", "trips.parquet"}
+        kept = {"point.json", "summary.json", "trips.parquet", "events.jsonl"}
         if row["seed"] == 1:
             kept.add("trajectories.parquet")
         assert {path.name for path in folder.iterdir()} == kept

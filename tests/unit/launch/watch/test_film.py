@@ -115,10 +115,14 @@ def test_between_two_frames_vehicles_are_on_their_way() -> None:
     assert in_node(between, [one, None])["t"] == 10.0
 
 
-def test_formations_that_plan_together_are_one_block() -> None:
-    bodies = [{"formation": number} for number in (3, 1, 1, 2, -1, 5)]
-    found = in_node("return laneweaveLayers.groups(data, [[2, 3], [7, 8]]);", bodies)
-    assert found == [[1], [2, 3], [5]]
+def test_formations_that_plan_together_are_one() -> None:
+    formations = [[12, -15, -12], [7, -11, -7], [3, -6, -4], [0, -2, 0]]
+    found = in_node("return laneweaveLayers.groups(data, [[7, 12], [20, 21]]);", formations)
+    assert [(one["numbers"], one["rear"], one["front"]) for one in found] == [
+        ([0], -2, 0),
+        ([3], -6, -4),
+        ([7, 12], -15, -7),
+    ]
 
 
 def test_numbers_beside_the_road() -> None:

@@ -12,13 +12,15 @@ from convoy import BALLOT, Convoy
 from laneweave.launch.watch.frames import UNATTENDED, UNHEARD, compact
 from laneweave.launch.watch.live_road import STILL_S, LiveRoad
 from laneweave.protocol.codec import decode, encode
-from laneweave.protocol.messages import Heartbeat, LogEvent, Name
+from laneweave.protocol.messages import ClosedFormation, Heartbeat, LogEvent, Name
 from laneweave.protocol.scenario import Scenario, parse_scenario
 from laneweave.protocol.transport import LinkDown, LinkUp
 
-CONVOY = Convoy(9)
+ROLLING: Scenario = parse_scenario({"formation": {"operation": "rolling"}})
+FORMATIONS: Scenario = parse_scenario({})
+BLOCKS: Scenario = parse_scenario({"formation": {"operation": "paper"}})
+CONVOY = Convoy(9, scenario=ROLLING)
 START = CONVOY.first_tick
-PAPER: Scenario = parse_scenario({"formation": {"operation": "paper"}})
 
 
 def watched(ticks: int = 21, convoy: Convoy = CONVOY) -> LiveRoad:
@@ -99,7 +101,7 @@ def test_who_is_not_heard_is_shown_in_its_cell_and_marked() -> None:
     assert rows[0][1] == pytest.approx(CONVOY.state(0, START + 39).s_m, abs=0.01)
     assert rows[0][7] == 0
     # Never heard at all: the cell in which it entered is all that is known.
-    silent = LiveRoad(Scenario(), wall_s=0.0)
+    silent = LiveRoad(ROLLING, wall_s=0.0)
     silent.take(CONVOY.clock(START), 0.0)
     silent.take(CONVOY.census(START), 0.0)
     assert {row[8] for row in shown(silent)["vehicles"]} == {UNHEARD}
@@ -119,24 +121,64 @@ def test_who_has_left_is_gone() -> None:
 
 
 def test_who_is_heard_before_it_is_listed_is_shown_without_a_lane() -> None:
-    road, more = watched(), Convoy(10)
+    road, more = watched(), Convoy(10, scenario=ROLLING)
     road.take(CONVOY.clock(START + 21), 2.0)
     road.take(more.state(9, START + 21), 2.0)
     assert shown(road)["vehicles"][-1][:1] == ["v0009"]
     assert shown(road)["vehicles"][-1][4] == -1
 
 
-def test_formations_and_those_that_are_joined() -> None:
-    convoy = Convoy(24, scenario=PAPER)
+def with_formations(
+    scenario: Scenario, count: int, *closed: ClosedFormation
+) -> tuple[LiveRoad, Convoy]:
+    """Return a road with a convoy, and the formations that its census lists."""
+    convoy = Convoy(count, scenario=scenario)
     road = watched(convoy=convoy)
-    assert [row[5] for row in shown(road)["vehicles"]] == [0] * 24
-    for number, joined in ((0, (0, 1)), (1, (1, 2)), (2, (5, 6)), (3, (4,))):
-        road.take(evolve(convoy.state(number, START + 20), joined=joined), 2.0)
+    census = convoy.census(START + 21)
+    road.take(convoy.clock(START + 21), 2.0)
+    road.take(evolve(census, formations=closed, closed_to=closed[-1].last_block), 2.0)
+    return road, convoy
+
+
+def test_formations_of_different_lengths() -> None:
+    """27 vehicles, three in a column: columns 0 to -2 and -3 to -7 are closed, -8 is not."""
+    closed = (ClosedFormation(0, 2, 5.0), ClosedFormation(3, 7, 9.0))
+    road, convoy = with_formations(FORMATIONS, 27, *closed)
+    frame = shown(road)
+    assert frame["formations"] == [[3, -7, -3], [0, -2, 0]]
+    assert [row[5] for row in frame["vehicles"]] == [0] * 9 + [3] * 15 + [-1] * 3
+    # All blocks of one formation are one; only several formations are joined.
+    for number, blocks in ((0, (0, 1, 2)), (9, (3, 4, 5, 6, 7)), (24, (8,))):
+        road.take(evolve(convoy.state(number, START + 21), joined=blocks), 2.0)
+    assert shown(road)["joined"] == []
+    road.take(evolve(convoy.state(1, START + 21), joined=tuple(range(8))), 2.0)
+    assert shown(road)["joined"] == [[0, 3]]
+
+
+def test_formations_of_equal_length_and_those_that_are_joined() -> None:
+    closed = tuple(ClosedFormation(block, block, 5.0) for block in range(7))
+    road, convoy = with_formations(BLOCKS, 24, *closed)
+    frame = shown(road)
+    assert frame["formations"][-2:] == [[1, -7, -4], [0, -3, 0]]
+    assert [row[5] for row in frame["vehicles"]] == [0] * 12 + [1] * 12
+    for number, joined in ((0, (0, 1)), (1, (1, 2)), (2, (5, 6)), (3, (4,)), (4, (6, 9))):
+        road.take(evolve(convoy.state(number, START + 21), joined=joined), 2.0)
     assert shown(road)["joined"] == [[0, 1, 2], [5, 6]]
-    unheard = LiveRoad(PAPER, wall_s=0.0)
-    unheard.take(convoy.clock(START), 0.0)
-    unheard.take(convoy.census(START), 0.0)
-    assert [row[5] for row in shown(unheard)["vehicles"]] == [0] * 12 + [1] * 12
+
+
+def test_who_is_not_listed_yet_is_in_the_formation_of_its_block() -> None:
+    road, _ = with_formations(FORMATIONS, 9, ClosedFormation(0, 2, 5.0))
+    entering = Convoy(10, scenario=FORMATIONS).state(9, START + 22)
+    for block, formation in ((2, 0), (3, -1)):
+        road.take(evolve(entering, formation=block), 2.0)
+        row = shown(road)["vehicles"][-1]
+        assert (row[0], row[5]) == ("v0009", formation)
+
+
+def test_the_rolling_operation_has_no_formations() -> None:
+    frame = shown(watched())
+    assert (frame["formations"], frame["joined"]) == ([], [])
+    assert {row[5] for row in frame["vehicles"]} == {-1}
 
 
 def test_leader_and_candidates() -> None:
@@ -155,7 +197,7 @@ def test_leader_and_candidates() -> None:
 
 
 def test_another_road_begins_anew() -> None:
-    road, later = watched(), Convoy(4, bridge=2)
+    road, later = watched(), Convoy(4, bridge=2, scenario=ROLLING)
     road.take(later.clock(1), 3.0)
     road.take(later.census(1), 3.0)
     # What is still under way from the earlier road is not mistaken for the new one's.

@@ -16,6 +16,7 @@ from laneweave.launch.report.tracks import read_tracks
 from laneweave.launch.watch.frames import MOVING
 from laneweave.launch.watch.recorded import Recording
 from laneweave.protocol.errors import BadInputError
+from unit.launch.older import older_recording
 
 
 def frames(recording: Recording) -> list[dict[str, Any]]:
@@ -56,6 +57,52 @@ def test_counts_lanes_and_leaders_are_those_of_the_run(recorded: Path) -> None:
     assert recording.scene["losses"]["published"] == summary["messages"]["published"]
     lanes = {row[0]: row[4] for frame in frames(recording) for row in frame["vehicles"]}
     assert set(lanes.values()) == {0, 1, 2}
+
+
+def test_formations_are_shown_from_their_closing_on(recorded: Path) -> None:
+    closed = [
+        event for event in map(json.loads, (recorded / "events.jsonl").read_text().splitlines())
+        if event["kind"] == "formation-closed"
+    ]  # fmt: skip
+    assert len({rear - front for event in closed for rear, front in [event["columns"]]}) > 1
+    seen: set[int] = set()
+    for frame in frames(Recording(recorded)):
+        there = {row[0] for row in frame["vehicles"]}
+        known = [event for event in closed if event["t_s"] <= frame["t"]]
+        assert sorted(frame["formations"], key=lambda one: one[0]) == [
+            [event["formation"], *event["columns"]]
+            for event in known
+            if there.intersection(event["vehicles"])
+        ]
+        number = {name: event["formation"] for event in known for name in event["vehicles"]}
+        assert {row[0]: row[5] for row in frame["vehicles"]} == {
+            name: number.get(name, -1) for name in there
+        }
+        seen.update(one[0] for one in frame["formations"])
+    assert seen == {event["formation"] for event in closed}
+
+
+def test_an_older_recording_has_formations_of_equal_length(recorded: Path, tmp_path: Path) -> None:
+    folder = older_recording(recorded, tmp_path / "run")
+    shown = frames(Recording(folder))
+    assert {one[2] - one[1] for frame in shown for one in frame["formations"]} == {3}
+    assert all(one[2] == -4 * one[0] for frame in shown for one in frame["formations"])
+    # When a block was closed is not known: its vehicles are shown in it from the beginning.
+    assert all(row[5] >= 0 for frame in shown for row in frame["vehicles"])
+
+
+def test_formations_that_plan_together(recorded: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(recorded, folder)
+    first, second = Recording(folder).frame(100)["formations"][::-1][:2]
+    event = {"t_s": 15.0, "kind": "formations-joined", "role": "coordinator", "name": "c1"}
+    blocks = list(range(-first[2], -second[1] + 1))
+    with (folder / "events.jsonl").open("a") as events:
+        events.write(json.dumps(event | {"formations": blocks}) + "\n")
+        events.write(json.dumps(event | {"role": "agent", "formations": "all"}) + "\n")
+    recording = Recording(folder)
+    assert recording.frame(70)["joined"] == []
+    assert recording.frame(100)["joined"] == [[first[0], second[0]]]
 
 
 def test_nothing_before_and_after(recorded: Path) -> None:

@@ -78,11 +78,11 @@ const laneweaveLayers = (() => {
         if (!painter.shows(from, to)) continue;
         const [left, right] = [painter.x(from), painter.x(to)];
         pen.fillStyle = pen.strokeStyle = theme.faint;
-        pen.globalAlpha = 0.13;
-        rounded(pen, [left, 0, right - left, painter.roadPx], 1);
+        pen.globalAlpha = 0.1;
+        rounded(pen, [left, 0, right - left, painter.roadPx], 2.5);
         pen.fill();
-        pen.globalAlpha = 0.55;
-        pen.lineWidth = 1;
+        pen.globalAlpha = 0.85;
+        pen.lineWidth = 1.5;
         pen.stroke();
         pen.globalAlpha = 1;
         const [begin, end] = [Math.max(left, 0), Math.min(right, painter.width)];

@@ -414,6 +414,7 @@ class Watch {
       entry(null, `darker: slower than ${lattice.speed_mps} m/s; lighter: faster`),
       entry({ kind: "cell" }, this.live && rolling ? "cells that a vehicle owns; framed: holds" : "cell that a vehicle holds"),
       entry({ kind: "target" }, "where it is going"),
+      ...(rolling ? [] : [entry({ kind: "block" }, "columns of a formation")]),
     ];
     if (this.live) {
       rest.push(entry({ kind: "ghost" }, "not heard: where it should be"));
