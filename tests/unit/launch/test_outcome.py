@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from laneweave.launch.failover import Failover
-from laneweave.launch.outcome import Outcome, complete_summary, print_outcome
+from laneweave.launch.outcome import Outcome, complete_summary, print_outcome, summary_rows
 
 
 def summary(
@@ -134,3 +134,20 @@ def test_all_reasons_are_printed(tmp_path: Path) -> None:
         "FAILED: the run is not complete: limit",
         "FAILED: 1 of 5 vehicles did not leave the road",
     ]
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "said"),
+    [
+        (-3.004, 3.0, "-3.00 to 3.00 m/s2"),
+        (-3.01, 2.0, "-3.01 to 2.00 m/s2, beyond comfort (3 m/s2)"),
+        (-1.0, 4.8, "-1.00 to 4.80 m/s2, beyond comfort (3 m/s2)"),
+        (None, None, "- to - m/s2"),
+    ],
+)
+def test_accelerations_that_are_not_comfortable(
+    low: float | None, high: float | None, said: str
+) -> None:
+    found = summary()
+    found["safety"] |= {"min_accel_mps2": low, "max_accel_mps2": high}
+    assert dict(summary_rows(found))["acceleration"] == said
