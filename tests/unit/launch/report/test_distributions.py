@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from numpy.typing import ArrayLike
 
+from laneweave.launch.formations import read_events
 from laneweave.launch.report.comparison_figures import _break
 from laneweave.launch.report.distributions import (
     DECELERATION,
@@ -108,12 +109,17 @@ def test_path_maps_are_what_was_driven(swept: Path) -> None:
     driven_tracks = read_tracks(run.folder)
     trips = {row["vehicle"]: row for row in pq.read_table(run.folder / "trips.parquet").to_pylist()}
     formations = sorted({trip["formation"] for trip in trips.values()})
+    plans = {event["formation"]: event for event in read_events(run.folder, "plan-made")}
     moved = 0
     for formation in formations:
         driven = driven_map(run, driven_tracks, formation)
         assert driven is not None
         path_map = driven.path_map
         moved += path_map.cost()
+        if formation in plans:
+            plan = plans[formation]
+            assert (driven.start_s, driven.slot_s) == (plan["t0_s"], plan["slot_s"])
+            assert path_map.cost() == plan["cost"]
         members = {name for name, trip in trips.items() if trip["formation"] == formation}
         assert set(path_map.ids) == members
         for name, row, lane in zip(
