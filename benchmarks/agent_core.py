@@ -38,7 +38,7 @@ from laneweave.protocol.lattice import territory
 from laneweave.protocol.messages import Ballot, Command, Name, Plan, Prepare, Sense
 from laneweave.protocol.motion import State
 from laneweave.protocol.node import Node, Started, read_message
-from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.scenario import FormationSettings, Scenario
 from laneweave.protocol.topics import (
     PLAN,
     PREPARE,
@@ -297,11 +297,16 @@ class Road:
         }
         cells = {name: vehicle.controller.hold_cell for name, vehicle in members.items()}
         wishes = {name: each.admission.arrival.preferred_lane for name, each in members.items()}
-        start_s = start_time_s((block,), self.tick * scenario.runtime.tick_s, scenario)
-        task = SortingTask((block,), cells, wishes, (), scenario)
+        start_s = start_time_s(cells.values(), self.tick * scenario.runtime.tick_s, scenario)
+        task = SortingTask(
+            (block,), cells, wishes, (), scenario, scenario.formation.planning_deadline_s
+        )
         moves = sort_lanes(task, scenario.formation.max_nodes, WEIGHTS).moves
         every = [move for each in moves.values() for move in each]
-        if max(step for step, _, _ in every) >= steps_left((block,), start_s, scenario):
+        slot_s = scenario.cycles_s[0]
+        if max(step for step, _, _ in every) >= steps_left(
+            cells.values(), start_s, slot_s, scenario
+        ):
             raise RuntimeError("the road is too short for the plan")
         return Plan(
             ballot=Ballot(1, Name("c1"), 1, block),
@@ -311,7 +316,7 @@ class Road:
             start_cells=cells,
             moves=moves,
             t0_s=start_s,
-            slot_s=scenario.cycles_s[0],
+            slot_s=slot_s,
             territory=tuple(sorted(territory(cells.values(), every))),
         )
 
@@ -331,7 +336,7 @@ def measured() -> dict[str, float]:
     # As in processes that come from the fork server: what has been loaded is not collected.
     gc.collect()
     gc.freeze()
-    road = Road(Scenario())
+    road = Road(Scenario(formation=FormationSettings(entry="interlaced", close="columns")))
     road.drive()
     reading, writing = Clock(), Clock()
     reading.call(_each, lambda sense: read_message(KEYS, *sense), road.senses)

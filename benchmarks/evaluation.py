@@ -3,12 +3,13 @@
     python benchmarks/evaluation.py [--only PART ...] [--seeds A:B] [--budget MINUTES]
                                     [--jobs N] [--duration S] [--sweeps DIR ...] [--out DIR]
 
-zenoh    three points of the sweep over Zenoh with a process per vehicle, and simulated
-speed    real-time factors of three deployments
-length   what a vehicle costs on 1 km and on 10 km of road
-sweep    every method at every volume, seed after seed
-report   docs/evidence/evaluation.json, figures in docs/images, tables in docs/EVALUATION.md
-faults   benchmarks/resilience.py, over an hour; only where it is asked for
+zenoh      three points of the sweep over Zenoh with a process per vehicle, and simulated
+speed      real-time factors of three deployments
+length     what a vehicle costs on 1 km and on 10 km of road
+stability  how a disturbance of speed travels: benchmarks/stability.py
+sweep      every method at every volume, seed after seed
+report     docs/evidence/evaluation.json, figures in docs/images, tables in docs/EVALUATION.md
+faults     benchmarks/resilience.py, over an hour; only where it is asked for
 
 What is finished is kept: the same command goes on where it was. With --budget no seed of the sweep
 is begun that would not be finished in time. The exit status is 1 if a run of formation control has
@@ -34,7 +35,7 @@ from laneweave.protocol.errors import BadInputError, CommandFailedError
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
-PARTS = ("zenoh", "speed", "length", "sweep", "report", "faults")
+PARTS = ("zenoh", "speed", "length", "stability", "sweep", "report", "faults")
 """In the order in which they are run: the sweep takes the time that is left."""
 APART = ("faults",)
 REPORT_S = 300.0
@@ -80,9 +81,8 @@ def run_faults(out: Path) -> bool:
     return done.returncode == 0
 
 
-def write_documents() -> bool:
-    """Write the generated parts of all documents; return whether that could be done."""
-    script = DOCS / "generate.py"
+def run_script(script: Path) -> bool:
+    """Run a script of this repository without options; return whether it came to its end."""
     return subprocess.run([sys.executable, str(script)], check=False).returncode == 0  # noqa: S603
 
 
@@ -111,10 +111,13 @@ def run(arguments: argparse.Namespace) -> bool:
         elif part == "report":
             say("report")
             refresh(out, arguments.sweeps, DOCS)
-            good &= write_documents()
+            good &= run_script(DOCS / "generate.py")
+        elif part == "stability":
+            say("stability")
+            good &= run_script(Path(__file__).with_name("stability.py"))
         elif part == "faults":
             say("faults")
-            good &= run_faults(out) and write_documents()
+            good &= run_faults(out) and run_script(DOCS / "generate.py")
         else:
             good &= run_trials(part, out, ROOT, rounds.jobs)
     return good

@@ -58,7 +58,7 @@ START_S = 60.0
 def instance(seed: int, sizes: Sequence[int]) -> PlanRequest:
     """Return a formation; sizes take turns."""
     request = formation_request(seed, vehicles=sizes[seed % len(sizes)], deadline_s=DEADLINE_S)
-    return attrs.evolve(request, id=f"request-{seed}")
+    return attrs.evolve(request, id=f"request-{seed}", solver="branching")
 
 
 @define

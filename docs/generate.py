@@ -1,7 +1,8 @@
 """Writes the parts of the documents that follow from the code: `python docs/generate.py`.
 
 In a document a generated part stands between `<!-- begin NAME -->` and `<!-- end NAME -->`; a test
-compares it with what this script would write. The picture of the conflict table is drawn, too.
+compares it with what this script would write. The pictures of the conflict table and of how
+the case study is solved are drawn, too.
 """
 
 from __future__ import annotations
@@ -17,10 +18,13 @@ from typing import Any
 from laneweave.agents.numbers import AgentNumbers
 from laneweave.coordinator.leader_rules import LEADER_RULES, Phase
 from laneweave.coordinator.numbers import CoordinatorNumbers
+from laneweave.coordinator.planning import PlanRequest
+from laneweave.coordinator.planning.explanation import explain
 from laneweave.coordinator.service import ServiceNumbers
 from laneweave.launch.conflict_drawing import counts, draw_conflicts
 from laneweave.launch.evaluation.evidence import read_evidence
 from laneweave.launch.evaluation.tables import document_parts
+from laneweave.launch.explanation_drawing import draw_explanation
 from laneweave.launch.metrics import PROCESS, PROCESS_MEANING
 from laneweave.launch.simulation.profiles import PROFILES
 from laneweave.protocol.access_rules import rights_table
@@ -37,6 +41,8 @@ MEASURED = DOCS / "evidence" / "resilience.json"
 PLANNED = DOCS / "evidence" / "planner.json"
 """What `laneweave bench planner --json` printed."""
 
+SWITCHES = DOCS / "evidence" / "planner-switches.json"
+"""What `benchmarks/planner_switches.py` wrote."""
 GEOMETRY = DOCS / "evidence" / "geometry.json"
 """What `benchmarks/geometry.py` wrote."""
 CLOSING = DOCS / "evidence" / "closing.json"
@@ -49,7 +55,11 @@ SERVICE = DOCS / "evidence" / "service.json"
 """What `benchmarks/service.py` wrote."""
 EVALUATED = DOCS / "evidence" / "evaluation.json"
 """What `benchmarks/evaluation.py` wrote."""
+STABILITY = DOCS / "evidence" / "stability.json"
+"""What `benchmarks/stability.py` wrote."""
 CONFLICTS = DOCS / "images" / "conflict-table.png"
+CASE = DOCS / "examples" / "case-study.json"
+SOLVING = DOCS / "images" / "solving-process.png"
 SNAPSHOTS: dict[type[Snapshot], str] = {
     NodeNumbers: "every role but the router",
     CoordinatorNumbers: "coordinator",
@@ -147,10 +157,35 @@ def _planner() -> str:
     return "\n".join(lines)
 
 
+def _switches() -> str:
+    """Return the table of what improvements of TAPPA are worth."""
+    lines = [
+        "| family | improvements | proven in 4 s | CPU ms p50 / p95 / max |",
+        "|---|---|---|---|",
+    ]
+    for row in json.loads(SWITCHES.read_text(encoding="utf-8"))["results"]:
+        times = " / ".join(f"{row[f'cpu_ms_{name}']:.1f}" for name in ("p50", "p95", "max"))
+        solved = f"{row['solved']} of {row['instances']}"
+        lines.append(f"| {row['family']} | {row['improvements']} | {solved} | {times} |")
+    return "\n".join(lines)
+
+
 def _conflicts() -> str:
     """Return the table of how many pairs of moves are forbidden."""
-    lines = ["| `geometric` | pairs in mode 1 | pairs in mode 2 |", "|---|---|---|"]
+    lines = ["| conflicts | pairs in mode 1 | pairs in mode 2 |", "|---|---|---|"]
     lines += [f"| {name} | {one} | {two} |" for name, one, two in counts()]
+    return "\n".join(lines)
+
+
+def _distances() -> str:
+    """Return the table of how near bodies come that may move, by `benchmarks/geometry.py`."""
+    table = json.loads(GEOMETRY.read_text(encoding="utf-8"))["nearest_m"]
+    late = list(table[0])[1:]
+    columns = " | ".join(f"one up to {name} late" if name != "0 s" else "on time" for name in late)
+    lines = [f"| conflicts | {columns} |", "|---" * (len(late) + 1) + "|"]
+    for row in table:
+        gaps = " | ".join(f"{row[name]:.2f} m" for name in late)
+        lines.append(f"| {row['conflicts']} | {gaps} |")
     return "\n".join(lines)
 
 
@@ -271,6 +306,29 @@ def _service_load(runs: list[dict[str, Any]]) -> Iterator[str]:
         )
 
 
+def _stability() -> str:
+    """Return the table of how a disturbance of speed travels, by `benchmarks/stability.py`."""
+    headings = (
+        "", "speed lost, messages lost", "disturbed one", "1st behind", "2nd behind", "last",
+        "amplification", "any behind", "the last", "braked", "least gap",
+    )  # fmt: skip
+    lines = [f"| {' | '.join(headings)} |", "|---" * len(headings) + "|"]
+    for row in json.loads(STABILITY.read_text(encoding="utf-8"))["rows"]:
+        of = f"of {row['runs']}"
+        cells = " | ".join(
+            " / ".join(f"{row[name][number]:.2f}" for name in ("speed_mps", "gap_m", "accel_mps2"))
+            for number in (0, 1, 2, -1)
+        )
+        ratios = [ratio for ratio in row["amplification"] if ratio is not None]
+        low_high = f"{min(ratios):.2f} to {max(ratios):.2f}" if ratios else "-"
+        lines.append(
+            f"| {row['formation']} | {row['drop_mps']:g} m/s, {100 * row['loss']:g} % | {cells} "
+            f"| {low_high} | {row['travelled']} {of} | {row['reached_last']} {of} "
+            f"| {row['braked']} | {row['least_gap_m']:.2f} m |"
+        )
+    return "\n".join(lines)
+
+
 def _service_added(runs: list[dict[str, Any]]) -> Iterator[str]:
     yield "| at half load | requests | solving p50 / p99 | added p50 / p95 / p99 |"
     yield "|---|---|---|---|"
@@ -310,10 +368,13 @@ def parts() -> dict[str, str]:
         "profiles": _profiles(),
         "resilience": _resilience(),
         "planner": _planner(),
+        "planner switches": _switches(),
         "conflict counts": _conflicts(),
+        "conflict distances": _distances(),
         "geometry": _geometry(),
         "closing": _closing(),
         "service": _service(),
+        "stability": _stability(),
         "stream": _stream(),
         "metrics": _metrics(),
         "rights": rights_table(),
@@ -337,3 +398,4 @@ if __name__ == "__main__":
     for path in sorted(DOCS.glob("*.md")):
         path.write_text(rewritten(path.read_text(encoding="utf-8")), encoding="utf-8")
     draw_conflicts(CONFLICTS)
+    draw_explanation(explain(PlanRequest.from_dict(json.loads(CASE.read_text("utf-8")))), SOLVING)

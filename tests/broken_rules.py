@@ -13,13 +13,16 @@ from laneweave.coordinator import core as coordinator_core
 from laneweave.coordinator import formation as formation_module
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.election import Election
+from laneweave.coordinator.formation import Formation
 from laneweave.coordinator.groups import Groups
 from laneweave.coordinator.leader import FormationControl
 from laneweave.coordinator.leader_rules import Phase
+from laneweave.launch.simulation.road import LightRoad
 from laneweave.protocol.execution import PlanExecution
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import (
     Ballot,
+    Census,
     Command,
     Heartbeat,
     Name,
@@ -29,12 +32,18 @@ from laneweave.protocol.messages import (
 )
 from laneweave.protocol.node import Effect
 from laneweave.protocol.plans import Needs, dependencies
+from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.transitions import Transition
 from laneweave.protocol.vehicle_rules import PLAN, Stage
 from laneweave.sim_bridge.caretaker import Caretaker
+from laneweave.sim_bridge.formation_building import ColumnBlocks
 from laneweave.sim_bridge.motion_controller import MotionController
 
 LEASE_S = 2.0
+FAR_BEHIND = 2**31
+"""A block that nobody ever reaches."""
+EARLY_S = 4.0
+"""About as long as a block of columns takes to enter."""
 
 
 def always(*_: object) -> bool:
@@ -65,6 +74,10 @@ def accept_anew(me: PlanExecution, plan: Plan) -> None:
 
 def keep_count(me: PlanExecution, _: object) -> None:
     me.plan, me.needs, me.moving_in_plan = None, (), False
+
+
+def plans_for_some_of_its_blocks(me: PlanExecution, plan: Plan) -> bool:
+    return set(plan.formations) <= set(me.joined)
 
 
 def promise_without_joining(me: PlanExecution, prepare: Prepare) -> None:
@@ -200,7 +213,7 @@ def prepare_the_same(me: FormationControl, _: object) -> None:
         me.promises = {
             name: promise
             for name, promise in me.promises.items()
-            if me.states[name].incarnation == known[name]
+            if name in me.states and me.states[name].incarnation == known[name]
         }
     me.plan, me.accepted, me.failures, me.due_s = None, set(), 0, me.now_s
 
@@ -261,11 +274,27 @@ def forget_incarnation(patch: pytest.MonkeyPatch) -> None:
 
 
 def close_at_once(patch: pytest.MonkeyPatch) -> None:
-    def mutant(*_: object) -> float:
-        return -1e9
+    closed_formations = formation_module.closed_formations
 
-    for module in (coordinator_core, formation_module):
-        patch.setattr(module, "closing_time_s", mutant)
+    def mutant(
+        census: Census, t_s: float, scenario: Scenario, groups: Groups
+    ) -> dict[int, Formation]:
+        return closed_formations(evolve(census, closed_to=FAR_BEHIND), t_s, scenario, groups)
+
+    patch.setattr(coordinator_core, "closed_formations", mutant)
+
+
+def close_early(patch: pytest.MonkeyPatch) -> None:
+    closing_s, close_formations = ColumnBlocks._closing_s, LightRoad._close_formations
+
+    def block_mutant(self: ColumnBlocks, block: int) -> float:
+        return closing_s(self, block) - EARLY_S
+
+    def light_mutant(self: LightRoad, t_s: float) -> None:
+        close_formations(self, t_s + EARLY_S)
+
+    patch.setattr(ColumnBlocks, "_closing_s", block_mutant)
+    patch.setattr(LightRoad, "_close_formations", light_mutant)
 
 
 def join_nothing(patch: pytest.MonkeyPatch) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from attrs import field, frozen
+from attrs import frozen
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import (
@@ -19,11 +19,12 @@ from laneweave.protocol.messages import (
     VehicleState,
 )
 from laneweave.protocol.node import Send
-from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.scenario import FormationSettings, Scenario
 from laneweave.protocol.topics import CENSUS, CLOCK, HEARTBEAT, PLAN, STATE
 from states import holding
 
 BALLOT = Ballot(3, Name("c1"), 17, 5)
+ROLLING = Scenario(formation=FormationSettings(operation="rolling"))
 
 
 @frozen
@@ -32,7 +33,7 @@ class Convoy:
 
     count: int
     bridge: int = 1
-    scenario: Scenario = field(factory=Scenario)
+    scenario: Scenario = ROLLING
 
     @property
     def names(self) -> list[Name]:

@@ -15,7 +15,7 @@ from attrs import define, field, frozen
 from numpy.typing import NDArray
 
 from laneweave.agents.driver import TrackingDriver
-from laneweave.protocol.lattice import Cell, Move
+from laneweave.protocol.lattice import Cell, Move, stretch_of
 from laneweave.protocol.messages import Command, Motion, Name
 from laneweave.protocol.motion import State, cell_state
 from laneweave.protocol.scenario import Scenario, load_scenario
@@ -70,6 +70,8 @@ class Road:
     def __init__(self, scenario: Scenario, cells: Mapping[Name, Cell]) -> None:
         """Put vehicles into cells; `scenario.road.lanes` must be enough for them."""
         self.scenario = scenario
+        self.move_ticks = scenario.move_ticks(scenario.cycles_s[0])
+        """How long each move takes."""
         self.tick = 0
         self.messages = True
         """Whether drivers hear and are heard; if not, motion controllers go on with what they have.
@@ -134,7 +136,7 @@ class Road:
         one.moving = one.moving and not one.driver.at_rest(sense)
         if move is not None:
             self.late += one.moving
-            one.driver.begin(move, self.tick)
+            one.driver.begin(move, self.tick, self.move_ticks)
             one.moving, one.hold_cell = True, move[2]
         drive = one.driver.drive(sense, moving=one.moving)
         command = Command(
@@ -144,6 +146,7 @@ class Road:
             hold_cell=one.hold_cell,
             motion_end_tick=drive.motion_end_tick,
             motion_origin=drive.motion_origin,
+            motion_ticks=drive.motion_ticks,
             jerks=drive.jerks,
         )
         if not one.vehicle.controller.take(command):
@@ -156,8 +159,8 @@ class Road:
             if course is None:
                 continue
             motion = Motion(
-                name, 1, one.vehicle.formation, course.origin, course.target,
-                course.begin_tick, self.tick,
+                name, 1, stretch_of(course.origin[0]), course.origin, course.target,
+                course.begin_tick, course.ticks, self.tick,
             )  # fmt: skip
             for other, listener in self.driven.items():
                 if other != name:

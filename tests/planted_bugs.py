@@ -21,7 +21,7 @@ from laneweave.protocol.vehicle_rules import VEHICLE_RULES
 ROWS_OF_OTHERS = {
     "L1": "election: coordinator.election",
     "L3": "ballots: CoordinatorCore",
-    "census": "which formations are closed: coordinator.formation",
+    "census": "which formations are closed: roadside, coordinator.formation",
     "joining": "which formations are joined: coordinator.groups",
     "charge": "who acts for a vehicle: AgentCore, MotionController",
     "caretaker": "who acts for a vehicle without agent: sim_bridge.caretaker",
@@ -135,6 +135,10 @@ BUGS: tuple[PlantedBug, ...] = (
     PlantedBug(
         "joined-not-checked", "V3", "A plan for formations that were not joined is accepted.",
         "planner_claims_another_block", vehicle={"has_joined": broken.always},
+    ),
+    PlantedBug(
+        "part-of-blocks-accepted", "V3", "A plan for some of the joined blocks is accepted.",
+        "planner_leaves_a_block_out", vehicle={"has_joined": broken.plans_for_some_of_its_blocks},
     ),
     # --- V4, V5: news and the start gate
     PlantedBug(
@@ -252,7 +256,12 @@ BUGS: tuple[PlantedBug, ...] = (
     ),
     PlantedBug(
         "joined-ignored", "L4", "A promise counts whatever its vehicle has joined.",
+        "joint_ballot_needs_all", collides=False, leader={"has_joined": broken.always},
+    ),
+    PlantedBug(
+        "part-of-blocks-planned", "L4", "Leaders plan for some of the joined blocks; all accept.",
         "joint_ballot_needs_all", leader={"has_joined": broken.always},
+        vehicle={"has_joined": broken.plans_for_some_of_its_blocks}, plant=broken.join_nothing,
     ),
     PlantedBug(
         "void-promise-counted", "L4", "The promise of a process that has gone is kept.",
@@ -324,6 +333,10 @@ BUGS: tuple[PlantedBug, ...] = (
     PlantedBug(
         "planned-before-closed", "census", "A formation is planned while vehicles may still enter.",
         "formation_closes", plant=broken.close_at_once,
+    ),
+    PlantedBug(
+        "closed-before-all-entered", "census", "A formation closes while vehicles may still enter.",
+        "formation_closes", plant=broken.close_early,
     ),
     PlantedBug(
         "joined-not-learned", "joining", "A leader does not learn which formations are joined.",

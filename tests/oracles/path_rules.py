@@ -78,8 +78,17 @@ def _special_1(a: Move, b: Move) -> bool:
 
 
 def _triangle(a: Move, b: Move) -> bool:
-    """Oblique `a` and the cells of `b` make three cells of one two-by-two square."""
-    return is_oblique(a) and set(b) <= footprint(a) and len({*a, *b}) == 3
+    """Oblique `a` and one cell of `b` have their right angle at that cell, one step long each way.
+
+    The two sides of the angle lie along the road and across it.
+    """
+    return is_oblique(a) and any(
+        _is_one_step(cell, a[0]) and _is_one_step(cell, a[1]) for cell in b
+    )
+
+
+def _is_one_step(cell: Cell, other: Cell) -> bool:
+    return abs(cell[0] - other[0]) + abs(cell[1] - other[1]) == 1
 
 
 def _special_2(a: Move, b: Move) -> bool:

@@ -68,8 +68,10 @@ CASE_STUDY: dict[str, Any] = {
         # beside an oblique move: staying, leaving, coming
         (DIAGONAL, ((1, 0), (1, 0)), "special-4 geometric"),
         (DIAGONAL, ((0, 1), (0, 1)), "special-4 geometric"),
-        (DIAGONAL, ((1, 0), (2, 0)), "geometric"),
-        (DIAGONAL, ((2, 0), (1, 0)), "geometric"),
+        (DIAGONAL, ((1, 0), (2, 0)), "special-2 geometric"),
+        (DIAGONAL, ((2, 0), (1, 0)), "special-2 geometric"),
+        (DIAGONAL, ((1, 0), (1, -1)), "special-3 geometric"),
+        (DIAGONAL, ((1, -1), (1, 0)), "special-3 geometric"),
         (DIAGONAL, ((1, 0), (2, 1)), "geometric"),
         (DIAGONAL, ((1, 0), (2, -1)), "geometric"),
         # side by side, and apart

@@ -39,6 +39,7 @@ written term/coordinator/incarnation/seq, the higher one wins. Time is in second
 | `L1 plans A@0>0,2 B@1>0,1` | planning succeeds: A moves in step 0 to 0,2, B in step 1 to 0,1 |
 | `L1 plans A:0,1@0>0,2` | the same by a planner that takes A to be in 0,1 |
 | `L1 plans A@0>-4,0 in blocks 0 1` | the same by one that claims the blocks of formations 0 and 1 |
+| `L1 plans C@0>-4,1 in blocks 1 for C` | the same by one that plans for C and block 1 only |
 | `L1 fails to plan` | planning fails |
 | `L1 census A B` | the census shows who is on the road |
 | `L1 restarts` | it is another process now, elected anew for the same vehicles |

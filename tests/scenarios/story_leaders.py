@@ -26,7 +26,7 @@ from laneweave.protocol.messages import (
 from laneweave.protocol.node import Arrived, Compute, Effect, Event, Send, Started, Wakeup, run_job
 from laneweave.protocol.topics import CENSUS, HEARTBEAT, STATE, Topic
 from laneweave.protocol.transitions import RuleBook
-from paper import PAPER
+from paper import PAPER, closed_blocks
 from scenarios.story_road import SCENARIO, SLOT_S, Vehicle
 from scenarios.story_text import cell_of, shown, written
 
@@ -139,7 +139,8 @@ class Candidate:
         yield from self.get(topic, what, mail, now_s)
 
     def census(self, on_road: Iterable[Vehicle], mail: Mail, now_s: float) -> Iterator[str]:
-        census = Census(now_s, tuple(map(entry_of, on_road)), ())
+        entries = tuple(map(entry_of, on_road))
+        census = Census(now_s, entries, (), *closed_blocks(entries, now_s, SCENARIO))
         yield from self.get(CENSUS, census, mail, now_s)
 
     def get(self, topic: Topic, message: object, mail: Mail, now_s: float) -> Iterator[str]:
@@ -226,11 +227,14 @@ def written_plan(text: str, control: FormationControl, ballot: Ballot) -> Plan:
 
     Args:
         text: `A@0>0,2 B@1>0,1`; with `A:0,1@0>0,2` the leader takes A to be in (0, 1), with
-            `A@0>0,2 in blocks 0 1` it claims the blocks of these formations.
+            `A@0>0,2 in blocks 0 1` it claims the blocks of these formations, and with
+            `A@0>0,2 in blocks 0 for A B` it plans for A and B only.
         control: that has all promises.
         ballot: of the control.
     """
-    cells = control.hold_cells
+    text, _, roster = text.partition(" for ")
+    members = frozenset(roster.split()) or frozenset(control.hold_cells)
+    cells = {name: cell for name, cell in control.hold_cells.items() if name in members}
     moves: dict[Name, tuple[Move, ...]] = dict.fromkeys(cells, ())
     at = dict(cells)
     text, _, blocks = text.partition(" in blocks ")
@@ -247,7 +251,7 @@ def written_plan(text: str, control: FormationControl, ballot: Ballot) -> Plan:
         ballot=ballot,
         formations=tuple(map(int, blocks.split())) or control.formation.numbers,
         roster=tuple(cells),
-        incarnations=control.incarnations,
+        incarnations={name: control.incarnations[name] for name in cells},
         start_cells=cells,
         moves=moves,
         t0_s=0.0,

@@ -34,7 +34,9 @@ SCENARIO = Scenario(
     road=Road(s1_m=0.0, s2_m=0.0, s3_m=20_000.0),
     # The bound on nodes ends a search; the clock of a busy machine must not.
     formation=FormationSettings(
-        operation="paper",
+        operation="formations",
+        entry="interlaced",
+        close="columns",
         cycle_s=SLOT_S,
         move_s=0.8,
         max_joined=2,
@@ -59,19 +61,22 @@ class StoryDriver:
         self._lattice: Lattice = scenario.lattice
         self._origin: Cell = (0, 0)
         self._goal: Cell = (0, 0)
+        self._ticks = 0
 
     def take_over(self, sense: Sense) -> None:
         self._origin, self._goal = sense.motion_origin, sense.hold_cell
+        self._ticks = sense.motion_ticks
 
-    def begin(self, move: Move, tick: int) -> None:
+    def begin(self, move: Move, tick: int, ticks: int) -> None:
         del tick
+        self._ticks = ticks
         _, self._origin, self._goal = move
 
     def at_rest(self, sense: Sense) -> bool:
         return at_rest_in_cell(sense.state, self._lattice, self._goal, sense.t_s)
 
     def drive(self, sense: Sense, *, moving: bool) -> Drive:
-        return Drive(sense.tick + 1 if moving else 0, self._origin, b"")
+        return Drive(sense.tick + 1 if moving else 0, self._origin, self._ticks, b"")
 
     def motion(self, tick: int) -> None:
         """Tell others nothing: there are no trajectories."""

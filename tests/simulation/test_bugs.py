@@ -13,10 +13,10 @@ from simulation.search_bugs import SEEDS, bug_named, first_catch
 SOON = {
     "lower-ballot-promised": "monotone",
     "no-gate": "interleaved",
-    "need-minus-one": "cell",
-    "old-motion-counts": "motion",
+    "old-motion-counts": "cell",
     "second-plan-under-one-ballot": "two-plans",
-    "promise-keeps-plan": "stuck",
+    "promise-keeps-plan": "motion",
+    "joined-not-learned": "stuck",
 }
 """Bugs that a few seeds show, and as what; one for each kind of violation but `overlap`."""
 SOON_ROLLING = {
@@ -48,6 +48,8 @@ FOUND = (
     "counted-at-the-start",
     "old-motion-counts",
     "second-plan-under-one-ballot",
+    "joined-not-learned",
+    "part-of-blocks-planned",
     "possession-not-taken",
     "moves-off-its-estate",
     "possession-without-gate",

@@ -124,7 +124,7 @@ def test_the_planning_service(lab: Lab) -> None:
     router = start_router(lab, config)
     # A network without a coordinator is told from a network that is not there.
     assert _ask(lab, config, REQUEST).status == 2
-    coordinator = lab.start("coordinator", "--config", config)
+    coordinator = lab.start("coordinator", "--config", config, "--solver", "branching")
     lab.wait_until(lambda: _ask(lab, config, REQUEST).status == 0, END_S)
 
     there = json.loads(_ask(lab, config, REQUEST).out)
@@ -132,7 +132,9 @@ def test_the_planning_service(lab: Lab) -> None:
     assert there["schema"] == "laneweave.plan.response/1"
     assert there["status"] == here["status"] == "optimal"
     assert there["cost"] == here["cost"] == here["lower_bound"]
-    table = _ask(lab, config, REQUEST, "--format", "table").out
+    assert (there["solver"], here["solver"]) == ("branching", "tappa")
+    table = _ask(lab, config, REQUEST, "--format", "table", "--solver", "tappa").out
+    assert "planned by tappa" in table
     assert (
         table
         == lab.finish(

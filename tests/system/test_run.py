@@ -52,10 +52,14 @@ SUMMARY: dict[str, Any] = {
         "plans": COUNT,
         "optimal": COUNT,
         "largest_formation": COUNT,
+        "by_solver": dict.fromkeys(("tappa", "branching"), COUNT),
+        "fallbacks": COUNT,
         "solve_ms": dict.fromkeys(("p50", "p95", "max"), NUMBER),
     },
     "tracking": {
         "solves": COUNT,
+        "osqp_solves": COUNT,
+        "unconstrained_steps": COUNT,
         "unusable": COUNT,
         "solve_ms": dict.fromkeys(("p50", "p99"), NUMBER),
     },
@@ -97,6 +101,7 @@ def test_a_run_keeps_its_promises(finished_run: FinishedRun, name: str) -> None:
     assert found["safety"]["max_accel_mps2"] <= 5
     assert found["safety"]["min_gap_m"] > 0
     assert found["planning"]["plans"] > 1
+    assert sum(found["planning"]["by_solver"].values()) == found["planning"]["plans"]
     assert found["ending"] == "complete"
     assert found["tracking"]["unusable"] == 0
     assert found["messages"]["rejected"] == 0

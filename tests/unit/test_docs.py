@@ -155,7 +155,9 @@ def _allowed(attribute: attrs.Attribute[Any]) -> str:
             "bool": "`true`, `false`",
         }
         return kinds[kind]
-    found = inspect.getclosurevars(attribute.validator).nonlocals
+    # Of a field that may be unset, the rule for what is set.
+    rule = getattr(attribute.validator, "validator", attribute.validator)
+    found = inspect.getclosurevars(rule).nonlocals
     if "choices" in found:
         return ", ".join(f"`{json.dumps(one)}`" for one in found["choices"] if one is not None)
     if "low" in found:
@@ -226,7 +228,13 @@ def test_table_of_topics() -> None:
     assert shown == expected, f"the table in PROTOCOL.md should begin with\n\n{table}\n"
 
 
-PARTS = (messages.Neighbour, messages.CensusEntry, messages.Announcement, messages.Deed)
+PARTS = (
+    messages.Neighbour,
+    messages.CensusEntry,
+    messages.ClosedFormation,
+    messages.Announcement,
+    messages.Deed,
+)
 
 
 @pytest.mark.parametrize("kind", [*KINDS.values(), *PARTS], ids=lambda kind: kind.__name__)

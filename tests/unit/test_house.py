@@ -97,6 +97,14 @@ def test_a_base_install_says_what_a_drawing_needs() -> None:
     assert "not installed" in done.stderr
 
 
+def test_a_base_install_says_what_a_drawing_of_the_road_needs() -> None:
+    done = run_base_install("plan", "docs/examples/case-study.json", "--draw-road", "road.png")
+    assert (done.returncode, done.stdout) == (2, "")
+    (said,) = done.stderr.splitlines()
+    assert said.startswith("--draw-road: got 'road.png'")
+    assert "laneweave[agent] and laneweave[sim]" in said
+
+
 def test_a_base_install_says_what_certificates_need(tmp_path: Path) -> None:
     done = run_base_install("certs", "init", str(tmp_path / "certs"))
     assert (done.returncode, done.stdout) == (2, "")

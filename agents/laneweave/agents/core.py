@@ -329,6 +329,7 @@ class AgentCore:
             name=self.vehicle,
             solves=effort.solves,
             unusable=effort.unusable,
+            osqp_solves=effort.osqp_solves,
             solve_ms=effort.solve_ms,
         )
         return Send(REPORT, report, {"role": "agent", "name": self.vehicle})

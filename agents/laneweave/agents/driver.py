@@ -56,6 +56,8 @@ class Effort:
 
     solves: int = 0
     unusable: int = 0
+    osqp_solves: int = 0
+    """Of the solves, those for which OSQP ran."""
     solve_ms: bytes = b""
     """Little-endian float32 CPU milliseconds, one for each solve."""
 
@@ -105,13 +107,13 @@ class TrackingDriver:
         self._speed_mps = scenario.lattice.speed_mps
         self._surroundings = Surroundings(scenario)
         self._solve_ms: list[float] = []
-        self._unusable = 0
+        self._unusable = self._osqp_solves = 0
 
     @property
     def effort(self) -> Effort:
         """What it has cost so far."""
         solve_ms = np.array(self._solve_ms, dtype="<f4").tobytes()
-        return Effort(len(self._solve_ms), self._unusable, solve_ms)
+        return Effort(len(self._solve_ms), self._unusable, self._osqp_solves, solve_ms)
 
     def take_over(self, sense: Sense) -> None:
         """Go on with what the motion controller is doing."""
@@ -163,6 +165,7 @@ class TrackingDriver:
             result = self._tracker.solve(state, reference.window(tick), gaps)
         self._solve_ms.append(result.solve_ms)
         self._unusable += not result.usable
+        self._osqp_solves += result.iterations > 0
         return Drive(
             # Past its time but not there yet: still moving, for whoever takes the vehicle over.
             motion_end_tick=max(reference.end_tick, tick + 1) if moving else 0,

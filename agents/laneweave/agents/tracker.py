@@ -14,7 +14,8 @@ of the actuators is compensated), and u = (j_s, j_y):
 c is zero for a reference that obeys the dynamics. S is the cost to go of the unlimited problem,
 so without active rows this is the infinite-horizon linear-quadratic regulator: w_k = -K e_k. **The
 fast path** is that regulator: the solution without rows is one precomputed matrix times e_0, and
-so are all rows. Where it keeps every row it *is* the solution, and OSQP does not run.
+so are all rows. Where it keeps every row it *is* the solution, and OSQP does not run, unless
+`tracking.always_solve` asks for it.
 
 On the reference the solution is zero, which the solver's tolerance cannot spoil; in absolute
 coordinates it leaves 1.6 m/s3 of noise on the jerk. The slack g is quadratic: an exact (linear)
@@ -117,12 +118,11 @@ class _Path:
 class Tracker:
     """Tracks references; see the module for the program. One object per vehicle."""
 
-    def __init__(self, scenario: Scenario, *, fast_path: bool = True) -> None:
+    def __init__(self, scenario: Scenario) -> None:
         """Set the program up.
 
         Args:
-            scenario: horizon, tick, limits.
-            fast_path: whether OSQP rests where the solution without rows keeps all of them.
+            scenario: horizon, tick, limits; `tracking.always_solve` turns the fast path off.
         """
         n = self._n = scenario.horizon_ticks
         self._tick_s = scenario.runtime.tick_s
@@ -143,8 +143,9 @@ class Tracker:
         self._kept_low_jerk, self._kept_high_jerk = kept[10 * n :].reshape(2, n, 2)
         self._stale = False
         """Whether the fast path was taken since OSQP ran."""
+        always_solve = scenario.tracking.always_solve
         self._regulator = (
-            _regulator(n, self._tick_s, self._limits.max_slip_ratio) if fast_path else None
+            None if always_solve else _regulator(n, self._tick_s, self._limits.max_slip_ratio)
         )
         self.harmless = (
             self._regulator.harmless(self._limits, scenario.formation.speed_mps)
@@ -155,7 +156,7 @@ class Tracker:
         self._cost = _cost(n, self._tick_s)
         self._rows = _rows(n, self._tick_s, self._limits.max_slip_ratio)
         self._settings = SETTINGS
-        self._qp: QuadraticProgram | None = None if fast_path else self._set_up()
+        self._qp: QuadraticProgram | None = self._set_up() if always_solve else None
         """None until it is needed: most vehicles never leave the fast path, and to set it up takes
         as long as hundreds of ticks."""
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 import structlog
 
 from laneweave.coordinator.election import Election
-from laneweave.coordinator.formation import Formation, closed_formations
+from laneweave.coordinator.formation import Formation, closed_formations, with_room
 from laneweave.coordinator.formation_planner import FormationPlanner, Note
 from laneweave.coordinator.groups import Groups
 from laneweave.coordinator.leader import FormationControl
@@ -119,7 +119,7 @@ class CoordinatorCore:
         self._incarnation = incarnation
         self._seq = 0
         self._rng = random.Random(f"{scenario.seed}/{name}/{incarnation}")  # noqa: S311
-        self.service = PlanningService(name, scenario.service, workers)
+        self.service = PlanningService(name, scenario.service, workers, scenario.formation.solver)
         self._next_job = 0
         self._bridge = -1
         """Incarnation of the newest bridge."""
@@ -344,7 +344,7 @@ class CoordinatorCore:
             return
         if self._road_changed:
             self._road_changed = False
-            self._update_members(self.census, now_s)
+            yield from self._update_members(self.census, now_s)
         for control in self.controls.values():
             if control.wakeup_s is None or control.wakeup_s > now_s:
                 continue
@@ -369,8 +369,12 @@ class CoordinatorCore:
         topic = PLAN if isinstance(message, Plan) else PREPARE
         return Send(topic, message, {"vehicle": vehicle})
 
-    def _update_members(self, census: Census, now_s: float) -> None:
-        formations = closed_formations(census, self.scenario, self._groups)
+    def _update_members(self, census: Census, now_s: float) -> Iterator[Effect]:
+        formations = closed_formations(census, self.t_s, self.scenario, self._groups)
+        for numbers in with_room(formations, self.t_s, self.scenario):
+            self._groups.join(numbers)
+            yield self._log("formations-joined", formations=list(numbers), why="room")
+            formations = closed_formations(census, self.t_s, self.scenario, self._groups)
         for number in set(self.controls) - set(formations):
             del self.controls[number]
         for number, formation in formations.items():

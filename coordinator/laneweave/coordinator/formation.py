@@ -8,7 +8,8 @@ certain from that census on.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Iterator, Mapping
+from itertools import pairwise
 
 from attrs import frozen
 
@@ -16,6 +17,9 @@ from laneweave.coordinator.groups import Groups, Numbers
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import Census, CensusEntry, Name
 from laneweave.protocol.scenario import Scenario
+
+STAGE_LEAD_S = 8.0
+"""How long before a change of structure its plan is made: longer than planning takes."""
 
 
 @frozen
@@ -29,6 +33,10 @@ class Formation:
     """Road time at which the last of them was closed."""
     joined: int = 1
     """How many formations these are."""
+    stage: int = 0
+    """Which of the scenario's structures it is to take on now."""
+    sorts: bool = True
+    """There is none left: it sorts."""
 
     @property
     def roster(self) -> tuple[Name, ...]:
@@ -36,7 +44,9 @@ class Formation:
         return tuple(member.vehicle for member in self.members)
 
 
-def closed_formations(census: Census, scenario: Scenario, groups: Groups) -> dict[int, Formation]:
+def closed_formations(
+    census: Census, t_s: float, scenario: Scenario, groups: Groups
+) -> dict[int, Formation]:
     """Return the formations that are complete and on the road.
 
     Formations with a block that the census does not know as closed are left out: it could lack a
@@ -44,6 +54,7 @@ def closed_formations(census: Census, scenario: Scenario, groups: Groups) -> dic
 
     Args:
         census: who is on the road, and which blocks are whose.
+        t_s: road time.
         scenario: the lattice.
         groups: which blocks plan together; the blocks of each closed formation are added.
 
@@ -66,10 +77,56 @@ def closed_formations(census: Census, scenario: Scenario, groups: Groups) -> dic
             tuple(sorted(each, key=lambda entry: entry.vehicle)),
             max(closed_s.get(first, [0.0])),
             len(closed_s.get(first, [0.0])),
+            stage := stage_at(groups.of(first), t_s, scenario),
+            stage == len(scenario.formation.structures),
         )
         for first, each in sorted(members.items())
         if groups.of(first)[-1] <= census.closed_to
     }
+
+
+def stage_at(numbers: Numbers, t_s: float, scenario: Scenario) -> int:
+    """Return which structure the formation in some blocks should plan for at a road time.
+
+    The first one at once; each later one, and the sorting behind the last one, `STAGE_LEAD_S`
+    before the rear gets there.
+    """
+    structures = scenario.formation.structures
+    later = range(1, len(structures) + 1)
+    return sum(stage_begin_s(numbers, stage, scenario) - STAGE_LEAD_S <= t_s for stage in later)
+
+
+def stage_begin_s(numbers: Numbers, stage: int, scenario: Scenario) -> float:
+    """Return the road time at which all bodies in some blocks are where a stage begins."""
+    structures, lattice = scenario.formation.structures, scenario.lattice
+    sorts = stage == len(structures)
+    from_m = scenario.road.sorting_start_m if sorts else structures[stage].from_m
+    rear = lattice.block_range(numbers[-1])[0]
+    return lattice.passing_time_s(rear, from_m + scenario.vehicle.length_m)
+
+
+def with_room(
+    formations: Mapping[int, Formation], t_s: float, scenario: Scenario
+) -> Iterator[Numbers]:
+    """Yield the blocks of neighbouring formations whose vehicles fit into one (paper, Fig. 2b).
+
+    Where the scenario lets them join for that; not when the one ahead may sort already.
+    """
+    formation = scenario.formation
+    if formation.join != "room":
+        return
+    taken: set[int] = set()
+    for ahead, behind in pairwise(sorted(formations)):
+        front, rear = formations[ahead], formations[behind]
+        if (
+            ahead not in taken
+            and front.numbers[-1] + 1 == rear.numbers[0]
+            and front.joined + rear.joined <= formation.max_joined
+            and len(front.members) + len(rear.members) <= formation.max_vehicles
+            and t_s < stage_begin_s(front.numbers, len(formation.structures), scenario)
+        ):
+            taken |= {ahead, behind}
+            yield (*front.numbers, *rear.numbers)
 
 
 def start_time_s(cells: Collection[Cell], not_before_s: float, scenario: Scenario) -> float:

@@ -13,7 +13,14 @@ from typing import Any
 from attrs import field, frozen
 
 from laneweave.coordinator.borders import steps_of
-from laneweave.coordinator.formation import start_time_s, steps_left, time_left_s
+from laneweave.coordinator.formation import (
+    Formation,
+    on_tick,
+    stage_begin_s,
+    start_time_s,
+    steps_left,
+    time_left_s,
+)
 from laneweave.coordinator.groups import Groups, Numbers
 from laneweave.coordinator.leader import FormationControl
 from laneweave.coordinator.leader_rules import Phase
@@ -76,8 +83,16 @@ class FormationPlanner:
         """
         numbers, ballot = control.formation.numbers, control.ballot
         assert ballot is not None  # noqa: S101 (set before planning begins)
-        cells, scenario = control.hold_cells.values(), self._scenario
-        start_s = self._start_s(cells, t_s)
+        formation, scenario = control.formation, self._scenario
+        block_of = scenario.lattice.block_of
+        # A promise of a cell elsewhere makes planning fail; it says nothing of the time left.
+        cells = [cell for cell in control.hold_cells.values() if block_of(cell[0]) in numbers]
+        cells = cells or self._block_cells(numbers)
+        start_s, end_s = self._start_s(formation, cells, t_s), self._end_s(formation)
+        if not formation.sorts and end_s < start_s + scenario.cycles_s[0]:
+            control.on_planning_failed(now_s)
+            yield Note("structure-too-late", {"formation": numbers[0], "stage": formation.stage})
+            return
         if steps_left(cells, start_s, scenario.cycles_s[0], scenario) == 0:
             control.settle(now_s)
             yield Note("formation-too-late", {"formation": numbers[0]})
@@ -92,7 +107,8 @@ class FormationPlanner:
                 scenario.formation.planning_deadline_s,
                 max(start_s - t_s, SHORTEST_DEADLINE_S),
             ),
-            comfortable_steps(start_s, self._end_s(numbers), scenario),
+            comfortable_steps(start_s, end_s, scenario),
+            None if formation.sorts else scenario.formation.structures[formation.stage],
         )
         # What was ordered under an earlier ballot is not waited for any more.
         for other, (number, _) in list(self._ordered.items()):
@@ -103,9 +119,14 @@ class FormationPlanner:
         # In the job: promises that cannot be planned from fail there, as any failed planning does.
         yield Compute(job, partial(self._sort, job, task, nodes))
 
-    def _end_s(self, numbers: Numbers) -> float:
-        """Return the road time at which the foremost column of some blocks leaves the road."""
-        front = self._scenario.lattice.block_range(numbers[0])[-1]
+    def _end_s(self, formation: Formation) -> float:
+        """Return the road time by which a formation should have done what it does now.
+
+        That is when it is to begin something else, or when its foremost column leaves the road.
+        """
+        if not formation.sorts:
+            return stage_begin_s(formation.numbers, formation.stage + 1, self._scenario)
+        front = self._scenario.lattice.block_range(formation.numbers[0])[-1]
         return time_left_s([(front, 0)], 0.0, self._scenario)
 
     def _sort(self, job: int, task: SortingTask, nodes: int) -> Sorting | None:
@@ -147,7 +168,7 @@ class FormationPlanner:
                 return
             if result.solved:
                 planned = self._plan(control, result, t_s)
-                plan = self._paced(planned, controls, t_s)
+                plan = self._paced(planned, control, controls, t_s)
                 problems = plan_problems(plan)
                 if not problems:
                     control.on_plan(plan, now_s, result.out_of_reach)
@@ -179,9 +200,13 @@ class FormationPlanner:
 
     def _steps_left_in(self, numbers: Numbers, t_s: float) -> int:
         """Return how many steps fit in for all cells of some blocks."""
-        lattice, scenario = self._scenario.lattice, self._scenario
-        cells = [cell for number in numbers for cell in lattice.block_cells(number)]
-        return steps_left(cells, self._start_s(cells, t_s), scenario.cycles_s[0], scenario)
+        cells, scenario = self._block_cells(numbers), self._scenario
+        start_s = start_time_s(cells, t_s + START_MARGIN_S, scenario)
+        return steps_left(cells, start_s, scenario.cycles_s[0], scenario)
+
+    def _block_cells(self, numbers: Numbers) -> list[Cell]:
+        lattice = self._scenario.lattice
+        return [cell for number in numbers for cell in lattice.block_cells(number)]
 
     def _neighbours(
         self, numbers: Numbers, controls: Mapping[int, FormationControl]
@@ -212,18 +237,26 @@ class FormationPlanner:
             incarnations=control.incarnations,
             start_cells=hold_cells,
             moves=sorting.moves,
-            t0_s=self._start_s(hold_cells.values(), t_s),
+            t0_s=self._start_s(control.formation, hold_cells.values(), t_s),
             slot_s=self._scenario.cycles_s[0],
             territory=tuple(sorted(territory(hold_cells.values(), all_moves))),
         )
 
-    def _paced(self, plan: Plan, controls: Mapping[int, FormationControl], t_s: float) -> Plan:
+    def _paced(
+        self,
+        plan: Plan,
+        control: FormationControl,
+        controls: Mapping[int, FormationControl],
+        t_s: float,
+    ) -> Plan:
         """Choose the slots of a plan; it begins when its vehicles have settled in their cells."""
-        scenario = self._scenario
-        rear, formation = min(column for column, _ in plan.start_cells.values()), scenario.formation
-        settled_s = scenario.lattice.passing_time_s(rear) + formation.entry_spread_s
-        not_before_s = max(settled_s + formation.settle_s, t_s + START_MARGIN_S)
-        return paced(plan, self._plans_beside(plan, controls), not_before_s, scenario)
+        formation, cells = control.formation, plan.start_cells.values()
+        others = self._plans_beside(plan, controls)
+        if not formation.sorts:
+            return paced(plan, others, plan.t0_s, self._end_s(formation), self._scenario)
+        end_s = time_left_s({*cells, *plan.territory}, 0.0, self._scenario)
+        not_before_s = max(self._settled_s(cells), t_s + START_MARGIN_S)
+        return paced(plan, others, not_before_s, end_s, self._scenario)
 
     def _plans_beside(self, plan: Plan, controls: Mapping[int, FormationControl]) -> list[Plan]:
         """Return the plans of the neighbours that this leader has made, and that are driven."""
@@ -238,8 +271,18 @@ class FormationPlanner:
             and neighbour.phase in (Phase.ISSUING, Phase.WATCHING)
         ]
 
-    def _start_s(self, cells: Collection[Cell], t_s: float) -> float:
-        return start_time_s(cells, t_s + START_MARGIN_S, self._scenario)
+    def _start_s(self, formation: Formation, cells: Collection[Cell], t_s: float) -> float:
+        """Return the road time at which a formation may begin to move."""
+        if formation.sorts:
+            return start_time_s(cells, t_s + START_MARGIN_S, self._scenario)
+        begin_s = stage_begin_s(formation.numbers, formation.stage, self._scenario)
+        return on_tick(max(begin_s, self._settled_s(cells), t_s + START_MARGIN_S), self._scenario)
+
+    def _settled_s(self, cells: Collection[Cell]) -> float:
+        """Return the road time at which vehicles that entered in some cells rest in them."""
+        formation, lattice = self._scenario.formation, self._scenario.lattice
+        rear = min(column for column, _ in cells)
+        return lattice.passing_time_s(rear) + formation.entry_spread_s + formation.settle_s
 
 
 def _notes(number: int, sorting: Sorting, pauses: int, plan: Plan) -> Iterator[Note]:
@@ -264,4 +307,6 @@ def _facts(number: int, response: PlanResponse) -> dict[str, Any]:
         "solve_ms": response.solve_ms,
         "assignments_tried": response.assignments_tried,
         "nodes_expanded": response.nodes_expanded,
+        "solver": response.solver,
+        "fallback": response.fallback,
     }

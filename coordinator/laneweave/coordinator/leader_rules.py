@@ -222,7 +222,8 @@ def _is_astray(me: FormationControl, state: VehicleState) -> bool:
     An adopted plan may have been made for targets that this leader never saw.
     """
     return (
-        state.done
+        me.formation.sorts
+        and state.done
         and state.attended
         and state.vehicle not in me.out_of_reach
         and any(
@@ -233,8 +234,10 @@ def _is_astray(me: FormationControl, state: VehicleState) -> bool:
 
 
 def _has_new_targets(me: FormationControl, formation: Formation) -> bool:
-    """There are new targets, or new members."""
-    return not set(formation.members) <= set(me.formation.members)
+    """There are new targets, new members, or another structure to take on."""
+    return formation.stage != me.formation.stage or not (
+        set(formation.members) <= set(me.formation.members)
+    )
 
 
 _UNFINISHED = (Phase.PREPARING, Phase.PLANNING, Phase.ISSUING)

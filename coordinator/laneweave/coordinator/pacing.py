@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from attrs import evolve
 
 from laneweave.coordinator.borders import kept_apart, steps_of
-from laneweave.coordinator.formation import on_tick, start_time_s, time_left_s
+from laneweave.coordinator.formation import on_tick, start_time_s
 from laneweave.protocol.messages import Plan
 from laneweave.protocol.scenario import Scenario
 
@@ -30,33 +30,33 @@ def comfortable_steps(start_s: float, end_s: float, scenario: Scenario) -> int:
     shortest_s, longest_s = scenario.cycles_s
     if shortest_s == longest_s:
         return int((end_s - start_s) / longest_s)
-    slot_s = min(scenario.comfortable_cycle_s, longest_s)
-    return max(1, int((end_s - start_s - RESERVE_S) / slot_s))
+    return max(1, int((end_s - start_s - RESERVE_S) / scenario.comfortable_cycle_s))
 
 
-def paced(plan: Plan, others: Sequence[Plan], not_before_s: float, scenario: Scenario) -> Plan:
+def paced(
+    plan: Plan, others: Sequence[Plan], not_before_s: float, end_s: float, scenario: Scenario
+) -> Plan:
     """Return a plan in the longest slots in which it ends in time.
 
     It pauses for slots in which it would come too close to plans of its neighbours.
 
     Args:
-        plan: as it was planned; it begins when all of its vehicles are in S3.
+        plan: as it was planned; it begins when all of its vehicles are where they may change lanes.
         others: plans of neighbouring formations; they stay as they are.
         not_before_s: road time before which it cannot begin.
+        end_s: road time by which it should have ended.
         scenario: road, lattice, T_F.
     """
     slots_s, slack_s = scenario.slots_s, scenario.formation.slack_s
-    cells = {*plan.start_cells.values(), *plan.territory}
-    left_s = time_left_s(cells, 0.0, scenario)
     best = plan
     for reserve_s in (RESERVE_S, LEAST_RESERVE_S):
         for slot_s in reversed(slots_s):
             t0_s = (
                 plan.t0_s if len(slots_s) == 1 else _start_s(plan, slot_s, not_before_s, scenario)
             )
-            most_steps = int((left_s - t0_s) / slot_s)
+            most_steps = max(0, int((end_s - t0_s) / slot_s))
             best = kept_apart(evolve(plan, t0_s=t0_s, slot_s=slot_s), others, slack_s, most_steps)
-            if t0_s + steps_of(best) * slot_s <= left_s - reserve_s:
+            if t0_s + steps_of(best) * slot_s <= end_s - reserve_s:
                 return best
             if slot_s < scenario.comfortable_cycle_s and reserve_s == RESERVE_S:
                 break  # rather less reserve

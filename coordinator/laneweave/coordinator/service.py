@@ -35,6 +35,7 @@ from laneweave.protocol.deployment import Service
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.node import TOO_LATE, Decline, Delegate, Effect, Reply
 from laneweave.protocol.numbers import told
+from laneweave.protocol.solvers import DEFAULT_SOLVER
 
 HANDED_OUT_AHEAD = 1
 """Jobs for each worker beside the one that it does, so that it need not wait for the next."""
@@ -103,15 +104,19 @@ class _Kept:
 class PlanningService:
     """Pure core of the service; its coordinator hands it questions, results and the time."""
 
-    def __init__(self, name: str, settings: Service, workers: int) -> None:
+    def __init__(
+        self, name: str, settings: Service, workers: int, solver: str = DEFAULT_SOLVER
+    ) -> None:
         """Make a service that has nothing in hand.
 
         Args:
             name: of the coordinator, among those who share the load.
             settings: limits.
             workers: how many requests are planned at a time.
+            solver: plans requests that name none.
         """
         self._name = name
+        self._solver = solver
         self._settings = settings
         self._workers = workers
         self._waiting: deque[_Entry] = deque()
@@ -234,7 +239,8 @@ class PlanningService:
                 yield from self._end(entry, self._late(entry, now_s), now_s)
                 continue
             self._planning[entry.job] = entry
-            yield Delegate(entry.job, partial(plan_in_time, entry.request), entry.deadline_s)
+            job = partial(plan_in_time, entry.request, self._solver)
+            yield Delegate(entry.job, job, entry.deadline_s)
 
     def finish(self, job: int, result: object, error: str, now_s: float) -> Iterator[Effect]:
         """Answer a request whose computation has ended."""
@@ -308,9 +314,13 @@ def _digest(request: PlanRequest) -> bytes:
     return blake2b(JSON.write(request.to_dict()), digest_size=16).digest()
 
 
-def plan_in_time(request: PlanRequest, left_s: float) -> PlanResponse:
-    """Plan a request in the time that is left of its deadline; see `checked_plan`."""
+def plan_in_time(request: PlanRequest, solver: str, left_s: float) -> PlanResponse:
+    """Plan a request in the time that is left of its deadline; see `checked_plan`.
+
+    `solver` plans where the request names none.
+    """
     left_s = min(left_s, request.deadline_s)
-    response = checked_plan(attrs.evolve(request, deadline_s=left_s))
+    hurried = attrs.evolve(request, deadline_s=left_s)
+    response = checked_plan(hurried, solver=request.solver or solver)
     waited_ms = round(1e3 * (request.deadline_s - left_s), 3)
     return attrs.evolve(response, waited_ms=waited_ms)

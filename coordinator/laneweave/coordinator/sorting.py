@@ -1,5 +1,7 @@
 """Lane sorting of one formation, or of joined ones: from promises to moves.
 
+Before it sorts, a formation may take on other structures; then any vehicle may have any place.
+
 The grid is the blocks of the formations. Vehicles that no agent drives block their cells. When the
 whole sorting is impossible, it is tried with one vehicle less that gets its lane, each in turn, so
 that one vehicle in a corner does not keep all others from theirs.
@@ -10,15 +12,16 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator, Mapping
 from itertools import islice
+from typing import Any
 
 from attrs import frozen
 
 from laneweave.coordinator.groups import Numbers
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, Weights, checked_plan
-from laneweave.coordinator.targets import Targets, placements
+from laneweave.coordinator.targets import placements
 from laneweave.protocol.lattice import Cell, Move
 from laneweave.protocol.messages import Name
-from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.scenario import DrivingStructure, Scenario
 
 MOST_PLACEMENTS = 6
 """Structures that are tried where the first one takes too many steps."""
@@ -42,6 +45,8 @@ class SortingTask:
     """For each planning."""
     steps: int = 1_000_000
     """How many steps the road has room for; where a plan has more, other targets are tried."""
+    structure: DrivingStructure | None = None
+    """What the vehicles should form, wherever each of them is in it; None: they sort."""
 
     @property
     def columns(self) -> range:
@@ -103,7 +108,12 @@ def plan_requests(task: SortingTask, dropped: Name | None = None) -> Iterator[Pl
         task: with at least one vehicle that can be moved.
         dropped: a vehicle that need not get to its lane.
     """
-    scenario = task.scenario
+    scenario, structure = task.scenario, task.structure
+    if structure is not None:
+        members = [{"id": name, "cell": list(cell)} for name, cell in task.movers.items()]
+        lanes = {"lanes": list(structure.lanes)} if structure.lanes else {}
+        yield _plan_request(task, members, {"structure": structure.structure} | lanes)
+        return
     wanted = {
         name: cell[1] if name == dropped else task.preferred_lanes[name]
         for name, cell in task.movers.items()
@@ -116,36 +126,37 @@ def plan_requests(task: SortingTask, dropped: Name | None = None) -> Iterator[Pl
         task.blocked,
         ahead=scenario.formation.closes_by_vehicles,
     ):
-        yield _plan_request(task, wanted, targets)
+        index = {cell: number for number, cell in enumerate(targets.cells)}
+        vehicles: list[dict[str, Any]] = [
+            {"id": name, "cell": list(cell)}
+            | (
+                {"eligible": [index[targets.own[name]]]}
+                if name in targets.own
+                else {"lane": wanted[name]}
+            )
+            for name, cell in task.movers.items()
+        ]
+        yield _plan_request(task, vehicles, {"targets": [list(cell) for cell in targets.cells]})
 
 
-def _plan_request(task: SortingTask, wanted: Mapping[Name, int], targets: Targets) -> PlanRequest:
-    scenario, columns = task.scenario, len(task.columns)
-    movers, blocked = task.movers, task.blocked
-    index = {cell: number for number, cell in enumerate(targets.cells)}
-    vehicles = [
-        {"id": name, "cell": list(cell)}
-        | (
-            {"eligible": [index[targets.own[name]]]}
-            if name in targets.own
-            else {"lane": wanted[name]}
-        )
-        for name, cell in movers.items()
-    ]
-    formation = scenario.formation
+def _plan_request(
+    task: SortingTask, vehicles: list[dict[str, Any]], goal: Mapping[str, Any]
+) -> PlanRequest:
+    scenario, formation = task.scenario, task.scenario.formation
     return PlanRequest.from_dict(
         {
             "schema": "laneweave.plan.request/1",
             "grid": {
-                "columns": columns,
+                "columns": len(task.columns),
                 "lanes": scenario.road.lanes,
-                "blocked": [list(cell) for cell in blocked],
+                "blocked": [list(cell) for cell in task.blocked],
             },
             "mode": formation.mode,
             "conflicts": list(formation.conflict_kinds),
             "vehicles": vehicles,
-            "targets": [list(target) for target in targets.cells],
+            **goal,
             "deadline_s": task.deadline_s,
+            "solver": formation.solver,
         }
     )
 
@@ -166,7 +177,7 @@ def sort_lanes(task: SortingTask, max_nodes: int, weights: Weights) -> Sorting:
             response = checked_plan(request, max_nodes=max_nodes, weights=weights)
             if best is None or _steps(response) < _steps(best):
                 best = response
-            if _steps(best) <= task.steps or response.status == "infeasible":
+            if _steps(best) <= task.steps or not response.paths:
                 break
         if best is not None and best.status != "infeasible":
             break
@@ -196,7 +207,9 @@ def _sorting(task: SortingTask, response: PlanResponse | None) -> Sorting:
             if cells[step] != cells[step + 1]
         )
         ends[name] = cells[-1]
-    missed = tuple(name for name, cell in ends.items() if cell[1] != task.preferred_lanes[name])
+    missed: tuple[Name, ...] = ()
+    if task.structure is None:
+        missed = tuple(name for name, cell in ends.items() if cell[1] != task.preferred_lanes[name])
     # Without a result in time nothing is known of the room; with more blocks it would take longer.
     known = response is not None and response.status != "timeout"
     short_of_room = known and any(name not in task.unattended for name in missed)

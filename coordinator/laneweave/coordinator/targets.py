@@ -10,10 +10,9 @@ from __future__ import annotations
 import heapq
 from collections.abc import Collection, Iterator, Mapping, Sequence
 
-import numpy as np
 from attrs import frozen
-from scipy.optimize import linear_sum_assignment
 
+from laneweave.coordinator.planning.structures import ranked_runs
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import Name
 
@@ -132,22 +131,10 @@ def _ranked_targets(
     count = min(len(cells), len(free))
     if count == 0:
         return [(0.0, [])]
-    ranked: list[tuple[float, list[Cell]]] = []
-    for first in range(len(free) - count + 1):
-        chosen = free[first : first + count]
-        paths = np.array(
-            [
-                [abs(column - target) + abs(own_lane - lane) for target in chosen]
-                for column, own_lane in cells
-            ]
-        )
-        rows, places = linear_sum_assignment(paths)
-        # Paths of equal length are told apart by less than one step.
-        middle = sum(chosen) / count
-        off = columns - 1 - middle if ahead else abs(middle - (columns - 1) / 2)
-        rank = float(paths[rows, places].sum()) + off / (10 * columns)
-        ranked.append((rank, [(column, lane) for column in chosen]))
-    return sorted(ranked)
+    runs = ranked_runs([column for column, _ in cells][:count], free, columns, ahead=ahead)
+    return [
+        (rank, [(column, lane) for column in free[first : first + count]]) for rank, first in runs
+    ]
 
 
 def _nearest_free(cell: Cell, columns: int, lanes: int, taken: Collection[Cell]) -> Cell:

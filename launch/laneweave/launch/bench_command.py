@@ -11,7 +11,7 @@ from attrs import frozen
 from rich.console import Console
 from rich.table import Table
 
-from laneweave.coordinator.planning.facade import Solver
+from laneweave.coordinator.planning.request import checked_solver
 from laneweave.launch import planner_bench, tracker_bench
 from laneweave.launch.bench import bench_runtime, machine, runtime_table
 from laneweave.protocol.errors import BadInputError
@@ -46,13 +46,14 @@ def measure_planner(
     instances: int,
     seed: int,
     deadline_s: float,
-    solver: Solver,
+    solver: str,
 ) -> Report:
     """Measure plans for formations of some families and numbers of vehicles.
 
     Raises:
-        BadInputError: a family or a number is not known.
+        BadInputError: a family, a number or a solver is not known.
     """
+    checked_solver(solver, "--solver")
     sizes = _counts(_PLANNER_SIZES if vehicles is None else vehicles)
     chosen = families.split(",")
     if not set(chosen) <= set(planner_bench.FAMILIES):

@@ -21,6 +21,8 @@ from laneweave.launch.many_runs_commands import report, sweep
 from laneweave.launch.option_values import check_jobs, parse_seeds
 from laneweave.launch.role_commands import (
     METHOD,
+    SOLVER_NAMES,
+    SolverOption,
     agent,
     bridge,
     check_pace,
@@ -91,13 +93,6 @@ class Benchmark(StrEnum):
     tracker = "tracker"
 
 
-class SolverChoice(StrEnum):
-    """How a request is planned here."""
-
-    tappa = "tappa"
-    branching = "branching"
-
-
 class OutputFormat(StrEnum):
     """How a plan is printed."""
 
@@ -124,6 +119,7 @@ def run(
         Operation | None,
         typer.Option("--operation", help="Default: formation.operation of the scenario."),
     ] = None,
+    solver: SolverOption = None,
     vehicles_per_process: Annotated[
         int | None, typer.Option("--vehicles-per-process", help="Agents that share a process.")
     ] = None,
@@ -151,6 +147,7 @@ def run(
         demand__volume_veh_per_lane_h=volume,
         demand__duration_s=duration,
         formation__operation=operation.value if operation is not None else None,
+        formation__solver=solver,
         runtime__vehicles_per_process=vehicles_per_process,
         runtime__coordinators=coordinators,
     )
@@ -234,9 +231,9 @@ def plan(
     ] = None,
     output: Annotated[OutputFormat, typer.Option("--format")] = OutputFormat.json,
     solver: Annotated[
-        SolverChoice | None,
+        str | None,
         typer.Option(
-            "--solver", help="How to plan here (default: branching); see docs/PLANNING.md."
+            "--solver", metavar="NAME", help=f"{SOLVER_NAMES}; overrides the request's solver."
         ),
     ] = None,
     draw: Annotated[
@@ -245,23 +242,50 @@ def plan(
             "--draw", metavar="FILE", help="Draw the answer: FILE.png, or FILE.gif that moves."
         ),
     ] = None,
+    draw_road: Annotated[
+        Path | None,
+        typer.Option(
+            "--draw-road",
+            metavar="FILE",
+            help="Draw how vehicles drive it: FILE.png or FILE.gif; road and vehicles: --config.",
+        ),
+    ] = None,
+    explained: Annotated[
+        bool,
+        typer.Option(
+            "--explain",
+            help="Print what TAPPA does: assignments and constraint trees (--draw too).",
+        ),
+    ] = False,
 ) -> None:
     """Plan one request here, or ask a running coordinator."""
-    from laneweave.launch.plan_command import access_for, answer_request
+    from laneweave.launch.plan_command import access_for, answer_request, explain_request
 
-    access = access_for(connect, realm, config, client)
+    settings = load_scenario(config)
+    # A file that names no router describes the road alone.
+    only_road = draw_road is not None and not (connect or settings.network.endpoint)
+    access = access_for(connect, realm, None if only_road else config, client)
+    if explained:
+        if access is not None:
+            raise BadInputError("--explain", "set", "only without --connect and --config")
+        if solver not in (None, "tappa"):
+            raise BadInputError("--solver", solver, "tappa, for --explain")
+        if draw_road is not None:
+            raise BadInputError("--draw-road", str(draw_road), "only without --explain")
+        explain_request(request, deadline, draw)
+        return
     # What would have no effect is a mistake of whoever asks.
     if access is None and wait:
         raise BadInputError("--wait", wait, "only with --connect or --config")
-    if access is not None and solver is not None:
-        raise BadInputError("--solver", solver.value, "nothing: a coordinator plans its own way")
     answer_request(
         request,
         deadline,
         access,
-        (solver or SolverChoice.branching).value,
+        solver,
         as_table=output is OutputFormat.table,
         drawing=draw,
+        road_drawing=draw_road,
+        scenario=settings,
         wait_s=wait,
     )
 
@@ -327,7 +351,10 @@ def bench(
         float, typer.Option("--seconds", min=5.0, max=3600.0, help="runtime: road time measured.")
     ] = 60.0,
     families: Annotated[
-        str, typer.Option("--families", help="planner: of node-edge, following, geometric, block.")
+        str,
+        typer.Option(
+            "--families", help="planner: of node-edge, following, geometric, block, traffic."
+        ),
     ] = "node-edge,following,geometric",
     instances: Annotated[
         int,
@@ -342,8 +369,8 @@ def bench(
         float, typer.Option("--deadline", min=0.01, max=3600.0, help="planner: s per instance.")
     ] = 4.0,
     solver: Annotated[
-        SolverChoice, typer.Option("--solver", help="planner: see docs/PLANNING.md.")
-    ] = SolverChoice.branching,
+        str, typer.Option("--solver", metavar="NAME", help=f"planner: {SOLVER_NAMES}, alone.")
+    ] = "branching",
     seed: Annotated[int, typer.Option("--seed", min=0)] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
@@ -352,7 +379,7 @@ def bench(
 
     if what is Benchmark.planner:
         report = bench_command.measure_planner(
-            vehicles, families, instances, seed, deadline, solver.value
+            vehicles, families, instances, seed, deadline, solver
         )
     elif what is Benchmark.tracker:
         report = bench_command.measure_tracker(instances, seed)

@@ -9,6 +9,7 @@ This module needs matplotlib: import it only to draw.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from enum import Enum
 from itertools import product
 from pathlib import Path
@@ -22,7 +23,7 @@ from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch, Rectangl
 from matplotlib.patheffects import withStroke
 
 from laneweave.coordinator.planning.clearances import FARTHEST, Pair, close_pairs
-from laneweave.coordinator.planning.conflicts import footprint
+from laneweave.coordinator.planning.conflicts import PAPER_KINDS, ConflictModel, footprint
 from laneweave.coordinator.planning.geometry import Geometry
 from laneweave.coordinator.planning.grid import Cell, displacements
 from laneweave.launch.drawing import FAINT_INK, INK, new_figure, save
@@ -131,14 +132,14 @@ class Judge:
         ):
             if pair in table:
                 return verdict
-        return Verdict.FOOTPRINT if footprints_meet(pair) else Verdict.NEVER
+        return Verdict.FOOTPRINT if conflict(pair, "geometric") else Verdict.NEVER
 
 
-def footprints_meet(pair: Pair) -> bool:
-    """Tell whether the cells that the execution protocol reserves for two moves meet."""
+def conflict(pair: Pair, *kinds: str) -> bool:
+    """Tell whether two moves are a conflict of one of these kinds, without a geometry."""
     offset, a, b = pair
-    other = footprint((offset, (offset[0] + b[0], offset[1] + b[1])))
-    return not footprint(((0, 0), a)).isdisjoint(other)
+    other = offset, (offset[0] + b[0], offset[1] + b[1])
+    return ConflictModel(kinds).kind(((0, 0), a), other) is not None
 
 
 def counts() -> list[tuple[str, int, int]]:
@@ -149,21 +150,27 @@ def counts() -> list[tuple[str, int, int]]:
     judge = Judge.of(Geometry())
     near = range(-FARTHEST, FARTHEST + 1)
     offsets = [offset for offset in product(near, near) if offset != (0, 0)]
+    steps = displacements(2)
+    pairs = list(product(offsets, steps, steps))
 
-    def row(name: str, table: frozenset[Pair]) -> tuple[str, int, int]:
+    def row(name: str, table: Iterable[Pair]) -> tuple[str, int, int]:
+        known = frozenset(table)
         one, two = (
-            len(table.intersection(product(offsets, displacements(mode), displacements(mode))))
+            len(known.intersection(product(offsets, displacements(mode), displacements(mode))))
             for mode in (1, 2)
         )
         return name, one, two
 
-    steps = displacements(2)
-    meeting = frozenset(pair for pair in product(offsets, steps, steps) if footprints_meet(pair))
+    def of_kinds(*kinds: str) -> Iterator[Pair]:
+        return (pair for pair in pairs if conflict(pair, *kinds))
+
     return [
-        row("footprints (without `geometry`)", meeting),
-        row("`geometry`, any delay", judge.any_delay),
-        row(f"`geometry`, at most {LATENESS_S:g} s late", judge.late),
-        row("`geometry`, on time", judge.on_time),
+        row("node, edge, special-1", of_kinds("node", "edge", "special-1")),
+        row("node, edge, special-1 to special-4", of_kinds(*PAPER_KINDS)),
+        row("geometric: footprints", of_kinds("geometric")),
+        row("geometric with `geometry`, any delay", judge.any_delay),
+        row(f"geometric with `geometry`, at most {LATENESS_S:g} s late", judge.late),
+        row("geometric with `geometry`, on time", judge.on_time),
     ]
 
 

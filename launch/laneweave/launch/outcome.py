@@ -133,7 +133,7 @@ def _discomfort(safety: dict[str, Any]) -> str:
 
 
 def _control_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
-    planning, runtime = summary["planning"], summary["runtime"]
+    planning, tracking, runtime = summary["planning"], summary["tracking"], summary["runtime"]
     failover, largest = summary["failover"], planning["largest_formation"]
     recoveries = ", ".join(f"{seconds:.3f} s" for seconds in failover["recovery_s"])
     return [
@@ -141,14 +141,16 @@ def _control_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
             "plans, proven optimal",
             f"{planning['plans']}, {planning['optimal']}, up to {largest} vehicles",
         ),
+        ("plans by solver", _by_solver(planning)),
         (
             "planning time p50 / p95 / max",
             _join(planning["solve_ms"], "p50", "p95", "max", unit=" ms"),
         ),
         (
-            "tracking CPU p50 / p99",
-            _join(summary["tracking"]["solve_ms"], "p50", "p99", unit=" ms"),
+            "tracking by OSQP / unconstrained",
+            f"{tracking['osqp_solves']:,} / {tracking['unconstrained_steps']:,} ticks",
         ),
+        ("tracking CPU p50 / p99", _join(tracking["solve_ms"], "p50", "p99", unit=" ms")),
         ("tick p50 / p99", _join(runtime["tick_ms"], "p50", "p99", unit=" ms")),
         (
             "real-time factor",
@@ -159,6 +161,14 @@ def _control_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
             f"{failover['leader_changes']}" + (f" ({recoveries})" if recoveries else ""),
         ),
     ]
+
+
+def _by_solver(planning: dict[str, Any]) -> str:
+    """Return how many plans each solver made; summaries of earlier versions do not say."""
+    if "by_solver" not in planning:
+        return "-"
+    made = [f"{solver} {plans}" for solver, plans in planning["by_solver"].items() if plans]
+    return f"{', '.join(made) or '-'} ({planning['fallbacks']} fallbacks)"
 
 
 def _fault_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:

@@ -19,9 +19,11 @@ from laneweave.coordinator.client import (
 )
 from laneweave.coordinator.inquiry import ABSENT_S
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan
-from laneweave.coordinator.planning.facade import Solver
+from laneweave.coordinator.planning.explanation import explain
+from laneweave.launch.explanation_text import explanation_text
 from laneweave.protocol.access import Access
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
+from laneweave.protocol.scenario import Scenario
 
 MOST_WAIT_S = 3600.0
 ANSWER_MARGIN_S = 8.0
@@ -61,16 +63,20 @@ def answer_request(
     path: Path,
     deadline_s: float | None,
     access: Access | None,
-    solver: Solver,
+    solver: str | None,
     *,
     as_table: bool,
     drawing: Path | None = None,
+    road_drawing: Path | None = None,
+    scenario: Scenario | None = None,
     wait_s: float = 0.0,
 ) -> None:
     """Read a request, have it planned, print the answer and draw it.
 
-    Without `access` it is planned here, by `solver`; there it is waited `wait_s` for somebody who
-    does.
+    `drawing` shows the relative coordinate system, `road_drawing` the road of `scenario`.
+
+    Without `access` it is planned here; with it, a coordinator is waited for up to `wait_s`. A
+    deadline and a solver replace those of the request.
 
     Raises:
         BadInputError: the request cannot be read or is not valid, nobody is at the endpoint, or
@@ -81,42 +87,93 @@ def answer_request(
     """
     if not 0 <= wait_s <= MOST_WAIT_S:
         raise BadInputError("--wait", wait_s, f"[0, {MOST_WAIT_S:g}]")
-    draw = None if drawing is None else _checked_drawer(drawing)
-    data = _read(path)
-    if deadline_s is not None:
-        data["deadline_s"] = deadline_s
-    request = PlanRequest.from_dict(data)
-    if access is None:
-        response = checked_plan(request, solver=solver)
-    else:
-        response = _ask(access, request, wait_s)
+    request = _request(path, deadline_s, solver)
+    drawers = []
+    if drawing is not None:
+        drawers.append(_checked_drawer(drawing))
+    if road_drawing is not None:
+        drawers.append(_checked_road_drawer(road_drawing, scenario or Scenario(), request.mode))
+    response = checked_plan(request) if access is None else _ask(access, request, wait_s)
     if as_table:
         sys.stdout.write(_table(request, response))
     else:
         sys.stdout.write(json.dumps(response.to_dict(), indent=2) + "\n")
-    if draw is not None:
-        draw(request, response)
-
-
-def _checked_drawer(out: Path) -> Callable[[PlanRequest, PlanResponse], None]:
-    from laneweave.launch.plan_drawing import check_drawing, draw_plan  # noqa: PLC0415 - an extra
-
-    check_drawing(out)
-
-    def draw(request: PlanRequest, response: PlanResponse) -> None:
+    if response.targets is not None:
+        request = request.with_targets(response.targets)
+    for draw, out in drawers:
         try:
-            draw_plan(request, response, out)
+            draw(request, response)
         except OSError as error:
             raise CommandFailedError(f"{out}: not drawn: {error}") from error
 
-    return draw
+
+def explain_request(path: Path, deadline_s: float | None, drawing: Path | None = None) -> None:
+    """Read a request, run TAPPA on it here, print what it did and draw it.
+
+    Raises:
+        BadInputError: the request cannot be read or is not valid, or the drawing is no picture
+            or cannot be written.
+        CommandFailedError: the drawing could not be written after all.
+    """
+    if drawing is not None:
+        from laneweave.launch.plan_drawing import check_drawing  # noqa: PLC0415 - an extra
+
+        if drawing.suffix.lower() != ".png":
+            raise BadInputError("--draw", str(drawing), "a file that ends with .png, for --explain")
+        check_drawing(drawing)
+    explanation = explain(_request(path, deadline_s).settled())
+    sys.stdout.write(explanation_text(explanation))
+    if drawing is not None:
+        from laneweave.launch.explanation_drawing import draw_explanation  # noqa: PLC0415
+
+        try:
+            draw_explanation(explanation, drawing)
+        except OSError as error:
+            raise CommandFailedError(f"{drawing}: not drawn: {error}") from error
+
+
+def _request(path: Path, deadline_s: float | None, solver: str | None = None) -> PlanRequest:
+    data = _read(path)
+    if deadline_s is not None:
+        data["deadline_s"] = deadline_s
+    if solver is not None:
+        data["solver"] = solver
+    return PlanRequest.from_dict(data)
+
+
+_Drawer = tuple[Callable[[PlanRequest, PlanResponse], None], Path]
+"""What draws an answer, and where."""
+
+
+def _checked_drawer(out: Path) -> _Drawer:
+    from laneweave.launch import plan_drawing  # noqa: PLC0415 - an extra
+
+    plan_drawing.check_drawing(out)
+    return lambda request, response: plan_drawing.draw_plan(request, response, out), out
+
+
+def _checked_road_drawer(out: Path, scenario: Scenario, mode: int) -> _Drawer:
+    try:
+        from laneweave.launch import plan_drawing, road_drawing  # noqa: PLC0415 - two extras
+        from laneweave.launch.plan_driving import scenario_in_mode  # noqa: PLC0415
+    except ModuleNotFoundError as error:
+        allowed = f"only with laneweave[agent] and laneweave[sim] ({error.name} is not installed)"
+        raise BadInputError("--draw-road", str(out), allowed) from error
+    plan_drawing.check_drawing(out, "--draw-road")
+    scenario = scenario_in_mode(scenario, mode)
+
+    def draw(request: PlanRequest, response: PlanResponse) -> None:
+        road_drawing.draw_road(request, response, scenario, out)
+
+    return draw, out
 
 
 def _table(request: PlanRequest, response: PlanResponse) -> str:
     verdict = f"{response.status}, cost {response.cost}, lower bound {response.lower_bound}"
     if not response.paths:
         return f"{response.status}, lower bound {response.lower_bound}\n"
-    return f"{verdict}, {response.steps} steps\n\n{response.path_map(request)}\n"
+    by = f"{response.solver}{' (fallback)' if response.fallback else ''}"
+    return f"{verdict}, {response.steps} steps, planned by {by}\n\n{response.path_map(request)}\n"
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -52,17 +52,21 @@ _MAX_LABEL_LENGTH = 6
 _NOTE = "front to the right, left lane on top; outlines are targets in the colours of their teams"
 
 
-def check_drawing(out: Path) -> None:
+def check_drawing(out: Path, option: str = "--draw") -> None:
     """Check that a drawing can be written.
+
+    Args:
+        out: the file.
+        option: that names it, for errors.
 
     Raises:
         BadInputError: the ending is unknown, or nothing can be written there.
     """
     if out.suffix.lower() not in ENDINGS:
-        raise BadInputError("--draw", str(out), "a file that ends with " + " or ".join(ENDINGS))
+        raise BadInputError(option, str(out), "a file that ends with " + " or ".join(ENDINGS))
     try:
         if not out.parent.is_dir():
-            raise BadInputError("--draw", str(out), "a file in a folder that exists")
+            raise BadInputError(option, str(out), "a file in a folder that exists")
         existed = out.exists()
         with out.open("ab"):
             pass
@@ -70,7 +74,7 @@ def check_drawing(out: Path) -> None:
             out.unlink()
     except OSError as error:
         allowed = f"a file that can be written ({error.strerror})"
-        raise BadInputError("--draw", str(out), allowed) from error
+        raise BadInputError(option, str(out), allowed) from error
 
 
 def draw_plan(request: PlanRequest, response: PlanResponse, out: Path) -> None:
@@ -199,7 +203,7 @@ class _Vehicles:
     @classmethod
     def draw(cls, axes: Axes, request: PlanRequest, layout: _Layout) -> _Vehicles:
         """Draw the vehicles on their start cells."""
-        names = [_label(vehicle.id) for vehicle in request.vehicles]
+        names = [short_name(vehicle.id) for vehicle in request.vehicles]
         size_pt, colours = layout.font_size(names), team_colours(request)
         drawn = cls([], [])
         for vehicle, name, choice in zip(request.vehicles, names, request.choices(), strict=True):
@@ -355,7 +359,7 @@ def _text(axes: Axes, text: str, size_pt: float, ink: str) -> Text:
     )
 
 
-def _label(name: str) -> str:
+def short_name(name: str) -> str:
     """Return a short name; where one is too long, its end tells more than its beginning."""
     plain = "".join(char if char.isprintable() else "?" for char in name)
     return plain if len(plain) <= _MAX_LABEL_LENGTH else "…" + plain[1 - _MAX_LABEL_LENGTH :]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final
 
 import attrs
@@ -16,24 +16,27 @@ import numpy as np
 from rich.table import Table
 
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan, warm_up
-from laneweave.coordinator.planning.facade import Solver
 from laneweave.coordinator.planning.grid import Mode
-from laneweave.coordinator.planning.instances import block_request, formation_request
+from laneweave.coordinator.planning.instances import (
+    TRAFFIC_KINDS,
+    block_request,
+    formation_request,
+    traffic_request,
+)
 from laneweave.protocol.errors import BadInputError
 from laneweave.sim_bridge.run_record import spread
 
 
 @attrs.frozen
 class Family:
-    """A motion mode with conflicts, and how much room there is.
+    """A motion mode with conflicts, and where the formations come from.
 
-    in_block: in a block of four columns without spare ones, as coordinators plan; else with two to
-        four spare columns in front and behind.
+    make: one of `instances`, called with a seed.
     """
 
     mode: Mode
     conflicts: tuple[str, ...]
-    in_block: bool = False
+    make: Callable[..., PlanRequest] = formation_request
 
     def request(self, seed: int, vehicles: int, deadline_s: float) -> PlanRequest:
         """Return an instance.
@@ -41,9 +44,8 @@ class Family:
         Raises:
             BadInputError: so many vehicles do not fit into a block.
         """
-        make = block_request if self.in_block else formation_request
         try:
-            return make(
+            return self.make(
                 seed,
                 vehicles=vehicles,
                 mode=self.mode,
@@ -58,7 +60,8 @@ FAMILIES: Final[dict[str, Family]] = {
     "node-edge": Family(1, ("node", "edge")),
     "following": Family(1, ("node", "edge", "special-1")),
     "geometric": Family(2, ("geometric",)),
-    "block": Family(1, ("node", "edge", "special-1"), in_block=True),
+    "block": Family(1, ("node", "edge", "special-1"), block_request),
+    "traffic": Family(1, TRAFFIC_KINDS, traffic_request),
 }
 FIRST_ANSWER_S = 0.1
 """Who decides quickly what to do has a path set by then, though perhaps not the best."""
@@ -71,7 +74,7 @@ def bench_planner(
     instances: int,
     seed: int,
     deadline_s: float,
-    solver: Solver,
+    solver: str,
 ) -> Iterator[dict[str, Any]]:
     """Measure the planner.
 
@@ -81,7 +84,7 @@ def bench_planner(
         instances: how many of each size and family.
         seed: of the first of them.
         deadline_s: of each request.
-        solver: see `plan`.
+        solver: plans alone, without another one to fall back on; see `plan`.
 
     Yields:
         One row per family and size.
@@ -103,19 +106,19 @@ def bench_planner(
             }
 
 
-def _measured(requests: Sequence[PlanRequest], solver: Solver) -> dict[str, Any]:
+def _measured(requests: Sequence[PlanRequest], solver: str) -> dict[str, Any]:
     times_ms, late_ms, gaps, answered = [], [], [], 0
     statuses: list[str] = []
     for request in requests:
         began, wall_s = time.thread_time(), time.perf_counter()
-        response = checked_plan(request, solver=solver)
+        response = checked_plan(request, solver=solver, fallback=False)
         times_ms.append((time.thread_time() - began) * 1e3)
         late_ms.append((time.perf_counter() - wall_s - request.deadline_s) * 1e3)
         statuses.append(response.status)
         gaps.append(gap_percent(response))
         if times_ms[-1] > FIRST_ANSWER_S * 1e3:
             hurried = attrs.evolve(request, deadline_s=FIRST_ANSWER_S)
-            response = checked_plan(hurried, solver=solver)
+            response = checked_plan(hurried, solver=solver, fallback=False)
         answered += response.cost is not None
     known = np.array([gap for gap in gaps if math.isfinite(gap)])
     return {

@@ -21,6 +21,7 @@ from laneweave.protocol.access import access_of
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.numbers import Observe, unobserved
 from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.solvers import SOLVERS
 
 log = structlog.get_logger(__name__)
 
@@ -42,6 +43,11 @@ MetricsOption = Annotated[
         metavar="HOST:PORT",
         help="Show metrics over HTTP there; overrides the configuration.",
     ),
+]
+SOLVER_NAMES = " or ".join(SOLVERS)
+SolverOption = Annotated[
+    str | None,
+    typer.Option("--solver", metavar="NAME", help=f"{SOLVER_NAMES}; default: formation.solver."),
 ]
 LogOption = Annotated[
     LogFormat, typer.Option("--log", envvar="LANEWEAVE_LOG", help="How to log to stderr.")
@@ -91,6 +97,7 @@ def coordinator(
     config: ConfigOption = None,
     endpoint: RealmEndpoint = None,
     name: Annotated[str, typer.Option("--name", help="Rank: the lowest name leads.")] = "c1",
+    solver: SolverOption = None,
     metrics: MetricsOption = None,
     log_format: LogOption = LogFormat.text,
     log_level: LevelOption = None,
@@ -101,7 +108,9 @@ def coordinator(
 
     if not NAME_PATTERN.fullmatch(name):
         raise BadInputError("--name", name, NAME_RULE)
-    settings = load_deployment(config, endpoint, observation__metrics=metrics)
+    settings = load_deployment(
+        config, endpoint, observation__metrics=metrics, formation__solver=solver
+    )
     with _as_role("coordinator", name, settings, log_format, log_level) as observe:
         run_coordinator(settings, name, observe=observe, workers_at_once=True)
 

@@ -4,7 +4,7 @@ All solvers get the same recorded problems (`tracker_problems`), the ticks of an
 order, since most of them start from the solution of the tick before:
 
     tracker     the whole call of the tracker
-    no-shortcut the same without the fast path: OSQP runs at every tick
+    no-shortcut the same with `tracking.always_solve`: OSQP runs at every tick
     osqp        its program alone: bounds replaced, solved, answer checked
     daqp        the same program without its states, by a dual active-set method
     lq          the same program without its inequalities, a matrix times a vector: the floor
@@ -21,7 +21,7 @@ from importlib import import_module
 from typing import Any, Final, Protocol
 
 import numpy as np
-from attrs import frozen
+from attrs import evolve, frozen
 from numpy.typing import NDArray
 from rich import box
 from rich.table import Table
@@ -265,9 +265,10 @@ def solvers(scenario: Scenario, parts: Parts) -> dict[str, Solver | None]:
         daqp = DaqpSolver(parts, condensed)
     except ModuleNotFoundError:
         daqp = None
+    always = evolve(scenario, tracking=evolve(scenario.tracking, always_solve=True))
     return {
         "tracker": TrackerSolver(lambda: Tracker(scenario)),
-        "no-shortcut": TrackerSolver(lambda: Tracker(scenario, fast_path=False)),
+        "no-shortcut": TrackerSolver(lambda: Tracker(always)),
         "osqp": OsqpSolver(parts),
         "daqp": daqp,
         "lq": LqSolver(parts, condensed),

@@ -367,6 +367,8 @@ class Report:
     """Messages so far that were not well formed."""
     solves: int = 0
     unusable: int = 0
+    osqp_solves: int = 0
+    """Of the solves, those for which OSQP ran."""
     solve_ms: bytes = b""
     """Little-endian float32 CPU milliseconds, one for each tracking solve."""
 

@@ -23,6 +23,7 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Lattice
 from laneweave.protocol.ranges import one_of, within
 from laneweave.protocol.scenario_checks import check_effects, check_scenario
+from laneweave.protocol.solvers import DEFAULT_SOLVER, SOLVERS
 from laneweave.protocol.structuring import structure
 
 SCHEMA = "laneweave.scenario/1"
@@ -32,6 +33,11 @@ SHORTEST_CYCLE_S, LONGEST_CYCLE_S = 4.0, 7.0
 """Range of T_F where `formation.cycle_s` leaves it open: from the paper's value on."""
 COMFORT_MPS2 = 3.0
 """Accelerations up to this are comfortable, along and across."""
+ROLLING_CYCLE_S = 6.0
+COMFORTABLE_VOLUME_VEH_PER_LANE_H = 2000.0
+"""T_F of the rolling operation up to this volume, where it is comfortable. Denser traffic needs
+more steps on the same road: at 2400 one vehicle of a hundred misses its lane with 6 s, none of a
+thousand with 4 s (`benchmarks/stream.py`)."""
 CYCLE_STEP_S = 0.2
 """Few values of T_F are in use, so that trajectories of moves are planned once."""
 SLACK_S = 0.2
@@ -94,6 +100,17 @@ class Demand:
 
 
 @frozen
+class DrivingStructure:
+    """A geometric structure in which formations drive before they sort (paper, Section 2.2)."""
+
+    from_m: float = field(validator=within(0.0, 60_000.0))
+    """Position from which on they change to it, when their rear has passed it."""
+    structure: str = field(validator=one_of("parallel", "interlaced"))
+    lanes: tuple[int, ...] = ()
+    """Lanes that it uses; empty: all of the road."""
+
+
+@frozen
 class FormationSettings:
     """Formation control parameters d_F, T_F, v_F and the planner's choices."""
 
@@ -129,7 +146,13 @@ class FormationSettings:
     max_vehicles: int = field(default=6, validator=within(1, 36))
     """Largest formation (the paper: six)."""
     max_joined: int = field(default=1, validator=within(1, 4))
-    """Most neighbouring formations that one ballot may join, when one alone lacks room."""
+    """Most neighbouring formations that one ballot may join."""
+    join: str = field(default="needed", validator=one_of("needed", "room"))
+    """When neighbouring formations join: `needed`: when one alone lacks room for sorting; `room`:
+    also when the vehicles of both fit into one formation, `max_vehicles`."""
+    structures: tuple[DrivingStructure, ...] = ()
+    """Structures that formations take on one after the other before they sort in S3; empty: they
+    stay in the cells in which they entered."""
     mode: int = field(default=1, validator=one_of(1, 2))
     """Relative motion mode."""
     conflicts: tuple[str, ...] = field(default=(), validator=_conflict_kinds)
@@ -138,7 +161,10 @@ class FormationSettings:
     """l_s of the formation relative distance."""
     weight_oblique: int | None = field(default=None, validator=one_of(None, 0, 1, 2))
     """l_o of the formation relative distance; none: the number of steps of an oblique edge."""
-    planning_deadline_s: float = field(default=4.0, validator=within(0.01, 3600.0))
+    solver: str = field(default=DEFAULT_SOLVER, validator=one_of(*SOLVERS))
+    """What plans formations, and requests to the planning service that name no solver."""
+    planning_deadline_s: float = field(default=10.0, validator=within(0.01, 3600.0))
+    """Outer bound on planning; on most machines `max_nodes` is reached before it."""
     max_nodes: int = field(default=20_000, validator=within(1, 100_000_000))
     """Bound on search nodes per plan: keeps equal seeds equal whatever the machine's speed."""
 
@@ -178,6 +204,15 @@ class FormationSettings:
     def entry_spacing_s(self) -> float:
         """Time between two cells of a lane that may be entered."""
         return (2.0 if self.interlaced else 1.0) * self.gap_m / self.speed_mps
+
+    @property
+    def bound_veh_per_lane_h(self) -> float:
+        """Most vehicles that may enter a lane in an hour: one for each cell that may be entered.
+
+        V_u = 3600 v_F / (2 d_F) with interlaced entry (paper, Section 5.2.3), twice as many
+        where every cell may be entered.
+        """
+        return 3600.0 / self.entry_spacing_s
 
     @property
     def entry_spread_s(self) -> float:
@@ -269,6 +304,9 @@ class Tracking:
     """Ticks that the tracker looks ahead; None: the longest T_F."""
     min_gap_m: float = field(default=3.0, validator=within(0.0, 100.0))
     """Net gap to the vehicle ahead that the tracker gives up its reference for."""
+    always_solve: bool = False
+    """Solve the quadratic program with OSQP in every tick, also where its solution without the
+    inequalities is known to satisfy them all."""
 
 
 @frozen
@@ -371,7 +409,9 @@ class Scenario:
         if cycle_s is not None:
             return cycle_s, cycle_s
         if self.formation.rolling:
-            return SHORTEST_CYCLE_S, SHORTEST_CYCLE_S
+            dense = self.demand.volume_veh_per_lane_h > COMFORTABLE_VOLUME_VEH_PER_LANE_H
+            cycle_s = SHORTEST_CYCLE_S if dense else ROLLING_CYCLE_S
+            return cycle_s, cycle_s
         return SHORTEST_CYCLE_S, LONGEST_CYCLE_S
 
     @property
@@ -383,12 +423,15 @@ class Scenario:
 
     @property
     def comfortable_cycle_s(self) -> float:
-        """Shortest T_F in which no move needs more than `COMFORT_MPS2` [s].
+        """Shortest T_F that plans may have in which no move needs more than `COMFORT_MPS2` [s].
 
-        A move of least jerk by d in T needs an acceleration of 10 / sqrt(3) d / T^2.
+        A move of least jerk by d in T needs an acceleration of 10 / sqrt(3) d / T^2. If there is
+        none, the longest.
         """
         formation = self.formation
-        return formation.slack_s + math.sqrt(10.0 / math.sqrt(3.0) * formation.gap_m / COMFORT_MPS2)
+        least_s = math.sqrt(10.0 / math.sqrt(3.0) * formation.gap_m / COMFORT_MPS2)
+        comfortable = [slot_s for slot_s in self.slots_s if slot_s >= least_s + formation.slack_s]
+        return min(comfortable, default=self.slots_s[-1])
 
     @property
     def horizon_ticks(self) -> int:

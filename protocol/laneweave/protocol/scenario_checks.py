@@ -33,6 +33,8 @@ FORMATIONS_ONLY = (
     "max_vehicles",
     "max_columns",
     "max_joined",
+    "join",
+    "structures",
     "solver",
     "weight_straight",
     "weight_oblique",
@@ -51,6 +53,7 @@ def check_scenario(scenario: Scenario) -> None:
     _check_lanes(scenario)
     _check_motion(scenario)
     _check_conflicts(scenario)
+    _check_structures(scenario)
     _check_timing(scenario)
     _check_braking(scenario)
     _check_settling(scenario)
@@ -76,6 +79,7 @@ def check_effects(data: Mapping[str, Any], scenario: Scenario) -> None:
             formation.closes_by_vehicles,
             'none, unless formation.close is "vehicles"',
         ),
+        (("join",), formation.max_joined > 1, "none, unless formation.max_joined is above 1"),
         (
             ("block_columns",),
             not formation.closes_by_vehicles,
@@ -162,6 +166,27 @@ def _check_motion(scenario: Scenario) -> None:
         road.s3_m,
         f"at least {needed_m:g}: a whole formation and one step fit in",
     )
+
+
+def _check_structures(scenario: Scenario) -> None:
+    """Check that structures follow one another on the road before S3, on lanes that it has."""
+    road, before_m = scenario.road, -1.0
+    for number, structure in enumerate(scenario.formation.structures):
+        name = f"formation.structures[{number}]"
+        _require(
+            before_m < structure.from_m < road.sorting_start_m,
+            f"{name}.from_m",
+            structure.from_m,
+            f"ascending, and less than road.s1_m + road.s2_m = {road.sorting_start_m:g}",
+        )
+        before_m = structure.from_m
+        lanes = structure.lanes
+        _require(
+            len(set(lanes)) == len(lanes) and set(lanes) <= set(range(road.lanes)),
+            f"{name}.lanes",
+            list(lanes),
+            f"some of 0 to {road.lanes - 1}, each once",
+        )
 
 
 def _check_conflicts(scenario: Scenario) -> None:

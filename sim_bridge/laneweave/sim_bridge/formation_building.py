@@ -133,8 +133,7 @@ class GrowingFormations:
         if column > self.first_open_column:
             return False
         if self._front is None:
-            # A vehicle of another lane may still enter a column further ahead.
-            self._front = int(min(self.first_open_column, column + 1))
+            self._front = int(min(self.first_open_column, column + self._columns_ahead))
             self._rear = column
         self._rear = min(self._rear, column)
         self._taken += 1
@@ -163,7 +162,7 @@ class GrowingFormations:
         if self._front is None:
             return
         length = max(
-            self._front - last_column + 1,
+            self._front - min(last_column, self._rear) + 1,
             self._length_for(self._taken),
             *self._preferring.values(),
         )
@@ -173,6 +172,12 @@ class GrowingFormations:
         self.first_open_column = rear - 1
         self._front, self._taken = None, 0
         self._preferring.clear()
+
+    @property
+    def _columns_ahead(self) -> int:
+        """How far ahead of one that has just been entered a column may still be entered."""
+        spread_m = self.spread_s * self.lattice.speed_mps
+        return math.floor(2.0 * spread_m / self.lattice.pitch_m + 1e-6)
 
     def _length_for(self, vehicles: int) -> int:
         """Return how many columns hold so many vehicles and one free column's worth of cells."""

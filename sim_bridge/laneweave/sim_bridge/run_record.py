@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from enum import Enum
 from pathlib import Path
@@ -18,12 +19,13 @@ from numpy.typing import NDArray
 from laneweave.protocol.messages import ClosedFormation, Heartbeat, LogEvent, Name, Report
 from laneweave.protocol.motion import State
 from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.solvers import SOLVERS, STREAM_PLANNED, solver_of_event
 from laneweave.sim_bridge.demand import Arrival
 from laneweave.sim_bridge.motion_controller import Rung
 from laneweave.sim_bridge.overlap import LeastGaps
 from laneweave.sim_bridge.recorder import Recorder
 
-PLANNED = ("plan-made", "stream-planned")
+PLANNED = ("plan-made", STREAM_PLANNED)
 """Events that tell of a plan: of a formation, or of the whole stream."""
 
 
@@ -104,6 +106,7 @@ class RunRecord:
         self._leadership = _Leadership()
         self._reports: dict[tuple[Name, Name], Report] = {}
         self._plans: list[dict[str, Any]] = []
+        self._plans_by_solver = Counter(dict.fromkeys(SOLVERS, 0))
         self._ticks: list[tuple[float, int, float]] = []
         self._rung_ticks = dict.fromkeys(Rung, 0)
         self._missed_ticks = 0
@@ -234,6 +237,9 @@ class RunRecord:
         self._recorder.event(event.t_s, event.kind, **data)
         if event.kind in PLANNED:
             self._plans.append(event.data)
+            solver = solver_of_event(event.kind, event.data)
+            if solver is not None:
+                self._plans_by_solver[solver] += 1
 
     def on_report(self, report: Report) -> None:
         """A role reported its counters; the newest of a sender counts."""
@@ -293,6 +299,8 @@ class RunRecord:
         wall_s, ticks = self._stopwatch() - self._began, self._rung_ticks
         reports = self._reports.values()
         solve_ms = _milliseconds(report.solve_ms for report in reports)
+        solves = sum(report.solves for report in reports)
+        osqp_solves = sum(report.osqp_solves for report in reports)
         plan_ms = np.array([_number(plan.get("solve_ms")) for plan in self._plans])
         return {
             "planning": {
@@ -301,10 +309,14 @@ class RunRecord:
                 "largest_formation": max(
                     (int(_number(plan.get("vehicles"))) for plan in self._plans), default=0
                 ),
+                "by_solver": dict(self._plans_by_solver),
+                "fallbacks": sum(plan.get("fallback") is True for plan in self._plans),
                 "solve_ms": spread(plan_ms, 50, 95, largest=True),
             },
             "tracking": {
-                "solves": sum(report.solves for report in reports),
+                "solves": solves,
+                "osqp_solves": osqp_solves,
+                "unconstrained_steps": solves - osqp_solves,
                 "unusable": sum(report.unusable for report in reports),
                 "hold_law_ticks": ticks[Rung.HOLD] + ticks[Rung.GIVE_WAY],
                 "emergency_ticks": ticks[Rung.EMERGENCY],

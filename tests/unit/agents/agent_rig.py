@@ -51,6 +51,7 @@ class Rig:
         self.tick = 0
         self.plant = Plant(cell_state(LATTICE, HOME, 0.0), SCENARIO.vehicle, TICK_S)
         self.hold_cell, self.motion_origin, self.motion_end_tick = HOME, HOME, 0
+        self.motion_ticks = 0
         self.attendant, self.caretaker = 0, False
         self.formation, self.joined = 0, tuple[int, ...]((0,))
         self.accepted: Ballot | None = None
@@ -85,6 +86,7 @@ class Rig:
             hold_cell=self.hold_cell,
             motion_end_tick=self.motion_end_tick,
             motion_origin=self.motion_origin,
+            motion_ticks=self.motion_ticks,
             preferred_lane=0,
             ahead=self.ahead,
             formation=self.formation,
@@ -133,6 +135,7 @@ class Rig:
             self.hold_cell = command.hold_cell
             self.motion_end_tick = command.motion_end_tick
             self.motion_origin = command.motion_origin
+            self.motion_ticks = command.motion_ticks
 
     def _note(self, command: Command) -> None:
         assert command.incarnation == self.attendant

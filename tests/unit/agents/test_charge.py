@@ -51,8 +51,8 @@ class Passenger:
     def take_over(self, sense: Sense) -> None:
         self.taken_over.append(sense.tick)
 
-    def begin(self, move: Move, tick: int) -> None:
-        del tick
+    def begin(self, move: Move, tick: int, ticks: int) -> None:
+        del tick, ticks
         self.begun.append(move)
 
     def at_rest(self, sense: Sense) -> bool:
@@ -60,7 +60,7 @@ class Passenger:
         return self.resting
 
     def drive(self, sense: Sense, *, moving: bool) -> Drive:
-        return Drive(sense.tick + 1 if moving else 0, HOME, b"")
+        return Drive(sense.tick + 1 if moving else 0, HOME, 0, b"")
 
     def motion(self, tick: int) -> None:
         """Tell others nothing."""

@@ -101,7 +101,7 @@ def test_a_move_of_least_jerk_alone_would_not_leave_it() -> None:
     [
         ({"braking": {"lead_lag_s": 0.0}}, ("formation.gap_m", "braking")),
         ({"braking": {"margin_m": 3.0}}, ("formation.gap_m", "braking")),
-        ({"formation": {"move_s": 3.0}}, ("formation.gap_m", "braking")),
+        ({"formation": {"cycle_s": 4.0, "move_s": 3.0}}, ("formation.gap_m", "braking")),
         ({"vehicle": {"max_lateral_accel_mps2": 0.3}}, ("table vehicle",)),
     ],
 )

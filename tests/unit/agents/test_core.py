@@ -5,7 +5,8 @@ from __future__ import annotations
 import attrs
 import pytest
 
-from laneweave.agents.core import OVERDUE_SLOTS, AgentCore
+from laneweave.agents.core import AgentCore
+from laneweave.protocol.execution import OVERDUE_SLOTS
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import Command, Neighbour, Prepare, Report, VehicleState
 from laneweave.protocol.motion import ARRIVED_ACROSS_M, ARRIVED_ALONG_M

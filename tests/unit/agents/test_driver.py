@@ -10,7 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from driving import Road
-from laneweave.agents.driver import Drive, Effort, TrackingDriver
+from laneweave.agents.driver import Course, Drive, Effort, TrackingDriver
+from laneweave.agents.motions import REPEAT_TICKS
 from laneweave.agents.surroundings import NOBODY, Gaps
 from laneweave.agents.tracker import Tracker, TrackResult
 from laneweave.agents.trajectory import Window
@@ -72,6 +73,7 @@ def sense(
     *,
     end_tick: int = 0,
     origin: Cell | None = None,
+    ticks: int = 0,
     off: tuple[float, float] = (0.0, 0.0),
     ahead: tuple[Neighbour, ...] = (),
     behind: tuple[Neighbour, ...] = (),
@@ -80,7 +82,9 @@ def sense(
     t_s = tick * TICK_S
     s, v, a, y, v_y, a_y = cell_state(LATTICE, cell, t_s)
     state = (s + off[0], v, a, y + off[1], v_y, a_y)
-    return Sense(ME, tick, t_s, state, cell, end_tick, origin or cell, 0, ahead, behind)
+    return Sense(
+        ME, tick, t_s, state, cell, end_tick, origin or cell, 0, ahead, behind, motion_ticks=ticks
+    )
 
 
 def driver(make_tracker: Callable[[Scenario], Tracker] = Tracker) -> TrackingDriver:
@@ -124,7 +128,7 @@ def test_holding_has_no_end_and_a_whole_horizon_to_play() -> None:
 
 def test_a_move_ends_after_its_time_and_its_horizon_ends_in_the_target() -> None:
     made = driver()
-    made.begin(MOVE, 10)
+    made.begin(MOVE, 10, MOVE_TICKS)
     drive = made.drive(sense(), moving=True)
     assert (drive.motion_end_tick, drive.motion_origin) == (10 + MOVE_TICKS, HOME)
     end = play(sense().state, drive)
@@ -133,14 +137,20 @@ def test_a_move_ends_after_its_time_and_its_horizon_ends_in_the_target() -> None
 
 def test_a_motion_under_way_is_taken_over_where_it_is() -> None:
     made = driver()
-    made.begin(MOVE, 10)
+    made.begin(MOVE, 10, MOVE_TICKS)
     plant = Plant(sense().state, SCENARIO.vehicle, TICK_S)
     for tick in range(10, 25):
         felt = attrs.evolve(sense(tick), state=plant.state, setpoint=plant.setpoint)
         drive = made.drive(felt, moving=True)
         plant.step(*jerks(drive)[0].tolist())
     felt = attrs.evolve(
-        sense(25, MOVE[2], end_tick=drive.motion_end_tick, origin=drive.motion_origin),
+        sense(
+            25,
+            MOVE[2],
+            end_tick=drive.motion_end_tick,
+            origin=drive.motion_origin,
+            ticks=drive.motion_ticks,
+        ),
         state=plant.state,
         setpoint=plant.setpoint,
     )
@@ -149,15 +159,50 @@ def test_a_motion_under_way_is_taken_over_where_it_is() -> None:
     assert not heir.at_rest(felt)
     theirs, mine = made.drive(felt, moving=True), heir.drive(felt, moving=True)
     assert (mine.motion_end_tick, mine.motion_origin) == (10 + MOVE_TICKS, HOME)
+    assert mine.motion_ticks == MOVE_TICKS
     assert jerks(mine) == pytest.approx(jerks(theirs), abs=1e-3)
 
 
 @pytest.mark.parametrize("end_tick", [0, 9, 10])
 def test_a_motion_whose_time_is_over_is_taken_over_as_a_hold(end_tick: int) -> None:
     made = TrackingDriver(SCENARIO)
-    made.take_over(sense(end_tick=end_tick, origin=(-2, 1)))
+    made.take_over(sense(end_tick=end_tick, origin=(-2, 1), ticks=MOVE_TICKS))
     assert made.at_rest(sense())
     assert made.drive(sense(), moving=False).motion_origin == HOME
+
+
+@pytest.mark.parametrize("ticks", [43, 68])
+def test_a_long_move_is_taken_over_with_the_time_that_it_takes(ticks: int) -> None:
+    """A new process knows no plan: the motion controller has kept how long the move takes."""
+    scenario = Scenario()
+    made = TrackingDriver(scenario)
+    made.take_over(sense())
+    made.begin(MOVE, 10, ticks)
+    plant = Plant(sense().state, scenario.vehicle, TICK_S)
+    for tick in range(10, 30):
+        felt = attrs.evolve(sense(tick), state=plant.state, setpoint=plant.setpoint)
+        drive = made.drive(felt, moving=True)
+        plant.step(*jerks(drive)[0].tolist())
+    assert (drive.motion_end_tick, drive.motion_ticks) == (10 + ticks, ticks)
+    felt = attrs.evolve(
+        sense(30, MOVE[2], end_tick=10 + ticks, origin=HOME, ticks=ticks),
+        state=plant.state,
+        setpoint=plant.setpoint,
+    )
+    heir = TrackingDriver(scenario)
+    heir.take_over(felt)
+    theirs, mine = made.drive(felt, moving=True), heir.drive(felt, moving=True)
+    assert (mine.motion_end_tick, mine.motion_ticks) == (10 + ticks, ticks)
+    assert jerks(mine) == pytest.approx(jerks(theirs), abs=1e-3)
+    assert heir.motion(10 + 2 * REPEAT_TICKS) == Course(HOME, MOVE[2], 10, ticks)
+
+
+@pytest.mark.parametrize("ticks", [0, MOVE_TICKS - 1, 2**63 - 1, -1])
+def test_a_move_of_an_impossible_duration_is_taken_over_as_a_hold(ticks: int) -> None:
+    heir = TrackingDriver(SCENARIO)
+    heir.take_over(sense(25, MOVE[2], end_tick=48, origin=HOME, ticks=ticks))
+    drive = heir.drive(sense(25, MOVE[2]), moving=False)
+    assert (drive.motion_origin, drive.motion_ticks) == (MOVE[2], 0)
 
 
 # --- the end of a motion ----------------------------------------------------------------------
@@ -179,20 +224,20 @@ def test_a_motion_ends_when_its_time_is_over_and_the_body_is_there(
     tick: int, off: tuple[float, float], rests: bool
 ) -> None:
     made = driver()
-    made.begin(MOVE, 10)
+    made.begin(MOVE, 10, MOVE_TICKS)
     assert made.at_rest(sense(tick, MOVE[2], off=off)) is rests
 
 
 def test_at_rest_is_meant_for_the_target_and_not_for_where_it_came_from() -> None:
     made = driver()
-    made.begin(MOVE, 10)
+    made.begin(MOVE, 10, MOVE_TICKS)
     assert not made.at_rest(sense(10 + MOVE_TICKS, HOME))
 
 
 def test_a_late_motion_says_that_it_goes_on() -> None:
     """Whoever takes the vehicle over must not take the time's end for the motion's end."""
     made = driver()
-    made.begin(MOVE, 10)
+    made.begin(MOVE, 10, MOVE_TICKS)
     tick = 10 + MOVE_TICKS + 5
     late = sense(tick, MOVE[2], off=(-2.0, 0.0))
     assert made.drive(late, moving=True).motion_end_tick == tick + 1
@@ -241,7 +286,7 @@ def test_who_holds_minds_its_own_lane(ahead: tuple[Neighbour, ...], gap_m: float
 
 def test_who_changes_lanes_minds_the_lane_that_it_enters_from_the_start() -> None:
     made, probe = probed()
-    made.begin(MOVE, 10)
+    made.begin(MOVE, 10, MOVE_TICKS)
     felt = sense(ahead=(Neighbour(0, 3.0, 15.0), Neighbour(1, 4.5, 15.0), Neighbour(2, 4.0, 15.0)))
     made.drive(felt, moving=True)
     assert probe.gaps.latest is not None
@@ -253,12 +298,12 @@ def test_who_changes_lanes_minds_the_lane_that_it_enters_from_the_start() -> Non
 
 def test_an_unusable_answer_leaves_what_is_being_played() -> None:
     made, probe = probed()
-    made.begin(MOVE, 10)
+    made.begin(MOVE, 10, MOVE_TICKS)
     assert len(jerks(made.drive(sense(), moving=True))) == N
     probe.broken = True
     for ticks in (3, 4, 20):
         drive = made.drive(sense(10 + ticks), moving=True)
-        assert drive == Drive(10 + MOVE_TICKS, HOME, b"")
+        assert drive == Drive(10 + MOVE_TICKS, HOME, MOVE_TICKS, b"")
 
 
 def test_a_usable_answer_ends_the_silence() -> None:

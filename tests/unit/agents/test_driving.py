@@ -40,6 +40,30 @@ def test_equal_seeds_give_equal_switches() -> None:
     assert one != switches.switch_result(4, 5, vehicles=(3, 3))
 
 
+# --- OSQP -----------------------------------------------------------------------------------------
+
+
+def test_osqp_in_every_tick_drives_the_same_trajectories() -> None:
+    """`tracking.always_solve` changes where the answer comes from, not the answer."""
+    always = attrs.evolve(SCENARIO, tracking=attrs.evolve(SCENARIO.tracking, always_solve=True))
+    moves: dict[int, dict[Name, Move]] = {
+        20: {ME: (1, (0, 1), (0, 0))},
+        80: {OTHER: (1, (1, 1), (0, 1))},
+    }
+    driven = []
+    for scenario in (SCENARIO, always):
+        road = Road(scenario, {ME: (0, 1), OTHER: (1, 1)})
+        for tick in range(150):
+            road.step(moves.get(tick))
+        efforts = [one.driver.effort for one in road.driven.values()]
+        assert [effort.solves for effort in efforts] == [150, 150]
+        expected = 150 if scenario.tracking.always_solve else 0
+        assert [effort.osqp_solves for effort in efforts] == [expected, expected]
+        driven.append(np.array(road.record.states))
+    # OSQP's tolerance is 6e-3 m/s3.
+    assert np.abs(driven[0] - driven[1]).max() < 5e-3
+
+
 # --- emergencies ----------------------------------------------------------------------------------
 
 EMERGENCIES = 20

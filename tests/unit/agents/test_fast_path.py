@@ -22,6 +22,7 @@ from laneweave.protocol.scenario import Scenario
 SCENARIO = Scenario()
 LIMITS, LATTICE, TICK_S = SCENARIO.vehicle, SCENARIO.lattice, SCENARIO.runtime.tick_s
 N = SCENARIO.horizon_ticks
+ALWAYS = evolve(SCENARIO, tracking=evolve(SCENARIO.tracking, always_solve=True))
 TIMES_S = TICK_S * np.arange(N + 1)
 MOVES = [(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
 SPREAD = (0.25, 0.2, 0.3, 0.08, 0.08, 0.1)
@@ -64,7 +65,7 @@ def exact(monkeypatch: pytest.MonkeyPatch) -> Tracker:
     """Return a tracker that always runs OSQP, with tight tolerances."""
     tight = evolve(tracker_module.SETTINGS, eps_abs=1e-7, max_iter=20_000, row_tolerance=1e-3)
     monkeypatch.setattr(tracker_module, "SETTINGS", tight)
-    return Tracker(SCENARIO, fast_path=False)
+    return Tracker(ALWAYS)
 
 
 def states_of(problem: Problem, result: TrackResult) -> np.ndarray:
@@ -136,7 +137,7 @@ def test_the_fast_path_gives_the_programs_solution_and_only_where_no_row_is_in_t
 
 
 def test_without_the_fast_path_osqp_gives_nearly_the_same() -> None:
-    fast, slow = Tracker(SCENARIO), Tracker(SCENARIO, fast_path=False)
+    fast, slow = Tracker(SCENARIO), Tracker(ALWAYS)
     for problem in problems(60, seed=3):
         result = fast.solve(problem.state, problem.window, problem.gaps)
         other = slow.solve(problem.state, problem.window, problem.gaps)
@@ -211,7 +212,7 @@ def test_both_are_kept_where_there_is_room() -> None:
 
 def test_rows_of_those_behind_leave_nothing_behind() -> None:
     state, window = at_rest()
-    used = Tracker(SCENARIO, fast_path=False)
+    used = Tracker(ALWAYS)
     assert used.solve(state, window, Gaps(earliest=window.states[:, 0] + 0.9)).jerk[0, 0] > 0.2
     for _ in range(20):
         result = used.solve(state, window)

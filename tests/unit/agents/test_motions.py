@@ -14,7 +14,7 @@ from laneweave.agents.motions import FRESH_TICKS, REPEAT_TICKS, Motions
 from laneweave.agents.surroundings import SENSED_S, Gaps, Surroundings
 from laneweave.agents.trajectory import Reference
 from laneweave.launch.simulation.driver import LightDriver
-from laneweave.protocol.lattice import Cell
+from laneweave.protocol.lattice import STRETCH_COLUMNS, Cell
 from laneweave.protocol.messages import Motion, Name, Neighbour, Sense
 from laneweave.protocol.motion import cell_state
 from laneweave.protocol.node import Arrived, Effect, Listen, Send, Unlisten
@@ -59,7 +59,7 @@ def test_a_motion_is_told_when_it_begins_and_every_ten_ticks_while_it_lasts() ->
     begin = rig.tick
     motions = told(rig, MOVE_TICKS + 15)
     assert motions == [
-        Motion(ME, 1, 0, HOME, (-1, 2), begin, tick)
+        Motion(ME, 1, 0, HOME, (-1, 2), begin, MOVE_TICKS, tick)
         for tick in range(begin, begin + MOVE_TICKS, REPEAT_TICKS)
     ]
     assert len(motions) == 4
@@ -71,7 +71,7 @@ def test_the_motion_goes_out_after_command_and_state_on_a_key_of_its_own() -> No
     rig.accept((0, HOME, (-1, 2)))
     effects = [e for e in rig.hand(SENSE, rig.sense()) if isinstance(e, Send)]
     assert [effect.topic.name for effect in effects] == ["command", "state", "motion"]
-    assert effects[-1].parameters == {"formation": 0, "vehicle": ME}
+    assert effects[-1].parameters == {"stretch": 0, "vehicle": ME}
 
 
 def test_who_holds_tells_nothing() -> None:
@@ -125,32 +125,32 @@ def host_of(*vehicles: Name) -> AgentHost:
 
 
 def put(
-    host: AgentHost, vehicle: Name, formation: int, tick: int = 1, *, charge: int = 1
+    host: AgentHost, vehicle: Name, stretch: int, tick: int = 1, *, charge: int = 1
 ) -> list[Effect]:
-    """Let a vehicle sense that it is in a formation, and which process is in charge."""
-    cell = (-formation * SCENARIO.formation.block_columns, 0)
+    """Let a vehicle sense that it is in a stretch, and which process is in charge."""
+    cell = (-stretch * STRETCH_COLUMNS, 0)
     t_s = tick * TICK_S
     felt = Sense(
         vehicle, tick, t_s, cell_state(SCENARIO.lattice, cell, t_s), cell, 0, cell, 0, (),
-        formation=formation, attendant=charge,
+        formation=SCENARIO.lattice.block_of(cell[0]), attendant=charge,
     )  # fmt: skip
     return list(host.handle(Arrived(SENSE, {"vehicle": vehicle}, felt), 0.0))
 
 
 def of_motions(effects: list[Effect]) -> list[tuple[type, int]]:
     return [
-        (type(effect), effect.parameters["formation"])
+        (type(effect), effect.parameters["stretch"])
         for effect in effects
         if isinstance(effect, (Listen, Unlisten)) and effect.topic is MOTION
     ]
 
 
-def tell(host: AgentHost, vehicle: Name, formation: int) -> None:
-    motion = Motion(vehicle, 1, formation, *BACK, BEGIN, BEGIN)
-    list(host.handle(Arrived(MOTION, {"formation": str(formation), "vehicle": vehicle}, motion), 0))
+def tell(host: AgentHost, vehicle: Name, stretch: int) -> None:
+    motion = Motion(vehicle, 1, stretch, *BACK, BEGIN, MOVE_TICKS, BEGIN)
+    list(host.handle(Arrived(MOTION, {"stretch": str(stretch), "vehicle": vehicle}, motion), 0))
 
 
-def test_listens_to_the_formations_around_its_vehicles_while_they_are_in_charge() -> None:
+def test_listens_to_the_stretches_around_its_vehicles_while_they_are_in_charge() -> None:
     host = host_of(A, B)
     assert of_motions(put(host, A, 4, charge=0)) == []
     assert of_motions(put(host, A, 4, 2)) == [(Listen, 3), (Listen, 4), (Listen, 5)]
@@ -167,10 +167,10 @@ def test_who_has_left_wants_nothing_any_more() -> None:
     assert not rig.agent.wanted_motions
 
 
-def test_hands_motions_to_all_but_the_sender_whose_formations_are_near() -> None:
+def test_hands_motions_to_all_but_the_sender_whose_stretches_are_near() -> None:
     host = host_of(A, B, C)
-    for vehicle, formation in ((A, 4), (B, 5), (C, 6)):
-        put(host, vehicle, formation)
+    for vehicle, stretch in ((A, 4), (B, 5), (C, 6)):
+        put(host, vehicle, stretch)
     tell(host, B, 5)
     tell(host, A, 4)
     tell(host, Name("D"), 7)
@@ -192,7 +192,7 @@ def test_who_is_not_in_charge_hears_nothing() -> None:
 def motion(
     cells: tuple[Cell, Cell] = BACK, *, name: Name = OTHER, incarnation: int = 1, tick: int = BEGIN
 ) -> Motion:
-    return Motion(name, incarnation, 0, *cells, BEGIN, tick)
+    return Motion(name, incarnation, 0, *cells, BEGIN, MOVE_TICKS, tick)
 
 
 def path(tick: int, cells: tuple[Cell, Cell] = BACK) -> Array:
@@ -355,6 +355,10 @@ def test_a_motion_counts_while_its_body_touches_a_lane_that_counts() -> None:
         motion(((1, 1), (3, 1))),
         motion(((1, 1), (0, 2))),  # oblique, which mode 1 does not know
         motion(((2**63 - 1, 2**63 - 1), (-(2**63), 0))),
+        attrs.evolve(motion(), ticks=MOVE_TICKS - 1),  # no slot of this scenario lasts so long
+        attrs.evolve(motion(), ticks=0),
+        attrs.evolve(motion(), ticks=2**63 - 1),
+        attrs.evolve(motion(), ticks=-(2**63)),
         attrs.evolve(motion(), begin_tick=2**63 - 1, tick=-(2**63)),
         attrs.evolve(motion(), begin_tick=-(2**63), tick=2**63 - 1),
     ],

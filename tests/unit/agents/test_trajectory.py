@@ -23,7 +23,7 @@ from laneweave.protocol.scenario import Scenario, parse_scenario
 
 SCENARIO = Scenario()
 MOVES = [(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
-TICK_S = SCENARIO.runtime.tick_s
+TICK_S, N = SCENARIO.runtime.tick_s, SCENARIO.horizon_ticks
 MARGIN = 0.97
 """Trajectories use 96 % of each limit; the tests allow a little more."""
 
@@ -90,7 +90,7 @@ def test_move_beyond_the_neighbouring_cell_is_refused() -> None:
     "table",
     [
         {"formation": {"gap_m": 30.0}},
-        {"formation": {"move_s": 2.0}},
+        {"formation": {"cycle_s": 4.0, "move_s": 2.0}},
         {"vehicle": {"max_jerk_mps3": 5.0}},
         {"vehicle": {"max_speed_mps": 16.0}, "formation": {"settle_s": 15.0}},
     ],
@@ -101,7 +101,7 @@ def test_impossible_moves_raise(table: dict[str, dict[str, float]]) -> None:
 
 
 def test_the_papers_slot_of_four_seconds_is_less_harsh() -> None:
-    slow = move_profile(parse_scenario({"formation": {"move_s": 4.0}}), 1, 1)
+    slow = move_profile(parse_scenario({"formation": {"cycle_s": 4.0, "move_s": 4.0}}), 1, 1)
     fast = move_profile(SCENARIO, 1, 1)
     assert np.square(slow.jerks).sum() < np.square(fast.jerks).sum()
 
@@ -153,16 +153,19 @@ def test_reference_before_during_and_after_a_move() -> None:
     assert (reference.start_tick, reference.end_tick) == (100, 138)
     profile = move_profile(SCENARIO, 1, 1)
     lattice = SCENARIO.lattice
-    for tick in (0, 59, 60, 61, 99, 100, 101, 119, 137, 138, 139, 500, 100_000):
+    n_before = start - N
+    for tick in (
+        0, n_before - 1, n_before, n_before + 1, 99, 100, 101, 119, 137, 138, 139, 500, 100_000
+    ):  # fmt: skip
         window = reference.window(tick)
-        assert window.states.shape == (41, 6)
-        assert window.jerks.shape == (40, 2)
-        for k in range(41):
+        assert window.states.shape == (N + 1, 6)
+        assert window.jerks.shape == (N, 2)
+        for k in range(N + 1):
             n = tick + k
             expected = np.array(cell_state(lattice, origin, n * TICK_S))
             expected += profile.states[min(max(n - start, 0), 38)]
             np.testing.assert_allclose(window.states[k], expected, atol=1e-6)
-            if k < 40:
+            if k < N:
                 inside = start <= n < start + 38
                 jerk = profile.jerks[n - start] if inside else (0.0, 0.0)
                 np.testing.assert_array_equal(window.jerks[k], jerk)

@@ -12,7 +12,7 @@ from laneweave.protocol.messages import Ballot, Census, CensusEntry, LogEvent, N
 from laneweave.protocol.node import Arrived, Compute, Effect, Send, Started, Wakeup
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.topics import CENSUS
-from paper import PAPER
+from paper import PAPER, closed_blocks
 from states import holding
 
 SCENARIO = PAPER
@@ -84,13 +84,10 @@ class Desk:
 
 
 def census(cells: Cells, lanes: dict[Name, int] | None = None, t_s: float = T_S) -> Census:
-    return Census(
-        t_s,
-        tuple(
-            CensusEntry(name, cell, (lanes or {}).get(name, 0), 0.0) for name, cell in cells.items()
-        ),
-        (),
+    entries = tuple(
+        CensusEntry(name, cell, (lanes or {}).get(name, 0), 0.0) for name, cell in cells.items()
     )
+    return Census(t_s, entries, (), *closed_blocks(entries, t_s))
 
 
 def state(

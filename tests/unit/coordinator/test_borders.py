@@ -13,8 +13,8 @@ from laneweave.protocol.messages import Ballot, LogEvent, Name, Plan
 from laneweave.protocol.node import Compute, Effect, run_job
 from laneweave.protocol.plans import plan_problems
 from laneweave.protocol.scenario import Scenario
+from unit.coordinator.desk import SCENARIO as DESK_SCENARIO
 from unit.coordinator.desk import (
-    SCENARIO,
     A,
     B,
     C,
@@ -29,7 +29,10 @@ from unit.coordinator.desk import (
     state,
 )
 
+SCENARIO = evolve(DESK_SCENARIO, formation=evolve(DESK_SCENARIO.formation, solver="branching"))
+"""Of the plans with equal cost, those of branching close up across the border."""
 SLOT_S, MOVE_S = SCENARIO.cycles_s[0], SCENARIO.move_s
+SLACK_S = SCENARIO.formation.slack_s
 CLOSING = ConflictModel(("closing",))
 T0_S = 30.0
 MOST_STEPS = 9
@@ -83,7 +86,7 @@ def steps(plan: Plan) -> list[list[int]]:
 
 def test_all_pause_before_the_slot_in_which_two_would_close_up() -> None:
     assert closing_pairs(UP, back(1))
-    plan = kept_apart(UP, [back(1)], MOVE_S, MOST_STEPS)
+    plan = kept_apart(UP, [back(1)], SLACK_S, MOST_STEPS)
     assert closing_pairs(plan, back(1)) == []
     assert steps(plan) == [[0, 2, 3], [0, 3]]
     cells = [[move[1:] for move in moves] for moves in plan.moves.values()]
@@ -92,35 +95,35 @@ def test_all_pause_before_the_slot_in_which_two_would_close_up() -> None:
 
 
 def test_the_plan_of_the_block_ahead_pauses_too_if_it_is_the_later_one() -> None:
-    assert steps(kept_apart(back(1), [UP], MOVE_S, MOST_STEPS)) == [[2]]
+    assert steps(kept_apart(back(1), [UP], SLACK_S, MOST_STEPS)) == [[2]]
 
 
 def test_it_pauses_again_while_others_come_back() -> None:
     others = [back(1), back(2), back(4)]
-    assert steps(kept_apart(UP, others, MOVE_S, MOST_STEPS)) == [[0, 3, 4], [0, 4]]
+    assert steps(kept_apart(UP, others, SLACK_S, MOST_STEPS)) == [[0, 3, 4], [0, 4]]
 
 
 @pytest.mark.parametrize("other", [back(0), back(2), back(1, lane=2), back(1, t0_s=T0_S + SLOT_S)])
 def test_nobody_pauses_for_moves_at_other_times_or_on_other_lanes(other: Plan) -> None:
-    assert kept_apart(UP, [other], MOVE_S, MOST_STEPS) == UP
+    assert kept_apart(UP, [other], SLACK_S, MOST_STEPS) == UP
 
 
 @pytest.mark.parametrize(("late_s", "expected"), [(-2.0, 2), (2.0, 3), (0.3, 3), (-0.3, 2)])
 def test_slots_that_overlap_count(late_s: float, expected: int) -> None:
     """Blocks need not pass S3 a whole number of slots apart."""
-    plan = kept_apart(UP, [back(1, t0_s=T0_S + late_s)], MOVE_S, MOST_STEPS)
+    plan = kept_apart(UP, [back(1, t0_s=T0_S + late_s)], SLACK_S, MOST_STEPS)
     assert closing_pairs(plan, back(1, t0_s=T0_S + late_s)) == []
     assert steps(plan)[0] == [0, expected, expected + 1]
 
 
 def test_a_plan_does_not_outlast_the_road() -> None:
-    assert kept_apart(UP, [back(1)], MOVE_S, 3) == UP
+    assert kept_apart(UP, [back(1)], SLACK_S, 3) == UP
 
 
 def test_without_moves_there_is_nothing_to_keep_apart() -> None:
     nobody = plan_of()
     assert steps_of(nobody) == 0
-    assert kept_apart(nobody, [UP], MOVE_S, MOST_STEPS) == nobody
+    assert kept_apart(nobody, [UP], SLACK_S, MOST_STEPS) == nobody
 
 
 # --- the leader -----------------------------------------------------------------------------------

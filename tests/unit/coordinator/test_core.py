@@ -270,7 +270,8 @@ def test_prepare_promise_plan_acceptance() -> None:
     prepares = messages(desk.effects, Prepare)
     assert [(s.topic, s.parameters["vehicle"]) for s in prepares] == [(PREPARE, A), (PREPARE, B)]
     effects = desk.give(run_job(job))
-    assert "plan-made" in logged(effects)
+    (made,) = (s.message.data for s in messages(effects, LogEvent) if s.message.kind == "plan-made")
+    assert (made["solver"], made["fallback"]) == ("tappa", False)
     plans = messages(effects, Plan)
     assert [(s.topic, s.parameters["vehicle"]) for s in plans] == [(PLAN, A), (PLAN, B)]
     assert plans[0].message == plans[1].message
@@ -430,7 +431,7 @@ def test_too_late_for_any_step_settles() -> None:
 
 def test_failed_planning_searches_further_each_time() -> None:
     """The bound on nodes doubles, so that what is hard is solved in the end."""
-    few = evolve(SCENARIO, formation=evolve(SCENARIO.formation, max_nodes=1))
+    few = evolve(SCENARIO, formation=evolve(SCENARIO.formation, solver="branching", max_nodes=1))
     desk = Desk(scenario=few)
     cells: Cells = {A: (0, 0), B: (-1, 1), C: (-2, 0), D: (-3, 1), E: (0, 2), F: (-2, 2)}
     effects = desk.collect_promises(cells, dict(zip(cells, (2, 2, 1, 0, 0, 1), strict=True)))
@@ -471,7 +472,7 @@ def test_every_plan_is_executable_and_serves_all_preferences(
     assert set(plan.territory) <= LATTICE.block_cells(0)
     assert plan.slot_s == SCENARIO.cycles_s[0]
     now_s = max(t_s, T_S)
-    assert plan.t0_s == start_time_s((0,), now_s + START_MARGIN_S, SCENARIO) > now_s
+    assert plan.t0_s == start_time_s(cells.values(), now_s + START_MARGIN_S, SCENARIO) > now_s
     for name, moves in plan.moves.items():
         end = moves[-1][2] if moves else cells[name]
         assert end[1] == lanes[name]

@@ -5,13 +5,13 @@ from __future__ import annotations
 from attrs import evolve
 
 from laneweave.coordinator.core import JUST_CLOSED_S
-from laneweave.coordinator.formation import closing_time_s
 from laneweave.coordinator.leader_rules import Phase
 from laneweave.protocol.messages import Ballot, LogEvent, Name, Plan, Prepare, RoadClock
 from laneweave.protocol.node import Compute, Effect, PeerUp, run_job
 from laneweave.protocol.plans import plan_problems
 from laneweave.protocol.scenario import Scenario
 from laneweave.protocol.topics import BRIDGE_ALIVE
+from paper import closing_time_s
 from unit.coordinator.desk import (
     ELECTION_S,
     LATTICE,
@@ -246,15 +246,15 @@ def test_a_group_is_planned_only_once_its_later_block_has_closed_in_the_census()
     desk = Desk()
     desk.lead()
     cells: Cells = {A: (0, 0), B: (-4, 0)}
-    late_s = closing_time_s((1,), SCENARIO)
+    late_s = closing_time_s(1)
     desk.tell(census({A: cells[A]}, t_s=late_s - 3.0))
     assert sorted(desk.core.controls) == [0]
     desk.tell(state(A, cells[A], joined=(0, 1)))
     assert desk.core.controls == {}
-    desk.tell(census(cells, t_s=late_s))
+    desk.tell(census(cells, t_s=late_s - 0.1))
     desk.tell(RoadClock(99, late_s + 5.0, 2, 2, 2, 0, ended=False))
     assert desk.core.controls == {}
-    desk.tell(census(cells, t_s=late_s + 0.1))
+    desk.tell(census(cells, t_s=late_s))
     assert desk.core.controls[0].formation.roster == (A, B)
 
 
@@ -284,7 +284,7 @@ def test_another_road_has_other_groups() -> None:
 
 
 def just_closed(number: int = 0) -> float:
-    return closing_time_s((number,), SCENARIO) + 0.1
+    return closing_time_s(number) + 0.1
 
 
 def test_a_formation_that_closes_before_the_leaders_eyes_is_prepared_at_once() -> None:
@@ -299,7 +299,7 @@ def test_a_formation_that_closed_before_the_leader_saw_it_is_observed() -> None:
     desk = Desk()
     desk.lead()
     desk.watch(ELECTION_S + 0.1)
-    seen_s = closing_time_s((0,), SCENARIO) + JUST_CLOSED_S + 0.1
+    seen_s = closing_time_s(0) + JUST_CLOSED_S + 0.1
     assert messages(desk.tell(census({A: (0, 0)}, t_s=seen_s)), Prepare) == []
     theirs = Ballot(4, Name("c0"), 3, 2)
     desk.tell(state(A, (0, 0), theirs, accepted=True))
@@ -337,9 +337,7 @@ def test_a_plan_in_force_is_logged_with_the_time_at_which_its_formation_had_clos
     for name, cell in cells.items():
         told += desk.tell(state(name, cell, desk.ballot, accepted=True, t_s=2.0))
         told += desk.tell(state(name, cell, desk.ballot, accepted=True, t_s=2.1))
-    assert notes(told, "plan-in-force") == [
-        {"formation": 0, "closed_s": closing_time_s((0,), SCENARIO)}
-    ]
+    assert notes(told, "plan-in-force") == [{"formation": 0, "closed_s": closing_time_s(0)}]
 
 
 # --- members without agents -------------------------------------------------------------------

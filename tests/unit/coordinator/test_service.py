@@ -118,6 +118,45 @@ def test_an_answer_has_the_encoding_of_its_request(
     assert unpack(reply.payload)["status"] == "optimal"
 
 
+@pytest.mark.parametrize(
+    ("setting", "asked", "planned"),
+    [
+        ("tappa", None, "tappa"),
+        ("branching", None, "branching"),
+        ("branching", "tappa", "tappa"),
+        ("tappa", "branching", "branching"),
+    ],
+)
+def test_a_request_without_a_solver_gets_the_coordinators(
+    setting: str, asked: str | None, planned: str
+) -> None:
+    desk = Desk(PlanningService("c1", SETTINGS, 1, setting))
+    token = desk.ask(REQUEST | ({} if asked is None else {"solver": asked}))
+    desk.work()
+    assert desk.answer(token)["solver"] == planned
+
+
+@CODECS
+def test_a_structure_is_answered_with_its_targets(
+    desk: Desk, pack: Pack, unpack: Unpack, encoding: str
+) -> None:
+    request = {name: value for name, value in REQUEST.items() if name != "targets"}
+    vehicles = [
+        {name: value for name, value in vehicle.items() if name != "eligible"}
+        for vehicle in REQUEST["vehicles"]
+    ]
+    request |= {"vehicles": vehicles, "structure": "parallel"}
+    token = desk.ask(pack(request), encoding=encoding)
+    desk.work()
+    answer = unpack(desk.replies[token].payload)
+    assert answer["status"] == "optimal"
+    assert [path[-1] for path in answer["paths"]] == [
+        answer["targets"][target] for target in answer["assignment"]
+    ]
+    twice = desk.ask(pack(request | {"targets": []}), encoding=encoding)
+    assert unpack(desk.replies[twice].payload)["field"] == "structure"
+
+
 def test_white_space_before_json_is_fine(desk: Desk) -> None:
     desk.ask(b"\n  " + json.dumps(REQUEST).encode())
     assert desk.orders

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from laneweave.coordinator.groups import Numbers
 from laneweave.coordinator.planning import PlanResponse, Weights, checked_plan
-from laneweave.coordinator.sorting import Sorting, SortingTask, plan_request, sort_lanes
+from laneweave.coordinator.sorting import Sorting, SortingTask, plan_requests, sort_lanes
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.messages import Name
@@ -30,7 +30,8 @@ def task(
     numbers: Numbers = (0,),
     scenario: Scenario = SCENARIO,
 ) -> SortingTask:
-    return SortingTask(numbers, cells, lanes, unattended, scenario)
+    deadline_s = scenario.formation.planning_deadline_s
+    return SortingTask(numbers, cells, lanes, unattended, scenario, deadline_s)
 
 
 def sort(order: SortingTask) -> Sorting:
@@ -49,7 +50,7 @@ def ends(order: SortingTask, sorting: Sorting) -> dict[Name, Cell]:
 
 def test_the_request_is_in_the_blocks_own_columns_and_in_the_order_of_the_roster() -> None:
     order = task({B: (-4, 0), A: (-7, 1)}, {A: 0, B: 2}, numbers=(1,))
-    request = plan_request(order)
+    request = next(plan_requests(order))
     assert [(v.id, v.cell, v.lane) for v in request.vehicles] == [(B, (3, 0), 2), (A, (0, 1), 0)]
     assert (request.grid.columns, request.grid.lanes) == (4, 3)
     assert sorted(lane for _, lane in request.targets) == [0, 2]
@@ -58,12 +59,15 @@ def test_the_request_is_in_the_blocks_own_columns_and_in_the_order_of_the_roster
 
 
 def test_the_request_follows_the_scenario() -> None:
-    scenario = evolve(SCENARIO, formation=evolve(FORMATIONS, mode=2, planning_deadline_s=1.5))
-    request = plan_request(task({A: (0, 0)}, {A: 1}, scenario=scenario))
-    assert (request.mode, request.conflicts, request.deadline_s) == (
+    scenario = evolve(
+        SCENARIO, formation=evolve(FORMATIONS, mode=2, planning_deadline_s=1.5, solver="branching")
+    )
+    request = next(plan_requests(task({A: (0, 0)}, {A: 1}, scenario=scenario)))
+    assert (request.mode, request.conflicts, request.deadline_s, request.solver) == (
         2,
         ("geometric", "closing"),
         1.5,
+        "branching",
     )
 
 
@@ -85,7 +89,7 @@ def test_blocks_between_joined_formations_are_blocked() -> None:
 
 def test_who_has_no_agent_blocks_its_cell_and_is_no_vehicle_of_the_request() -> None:
     order = task({A: (0, 0), B: (-1, 1), C: (-2, 0)}, {A: 1, B: 0, C: 0}, B)
-    request = plan_request(order)
+    request = next(plan_requests(order))
     assert request.grid.blocked == {(2, 1)}
     assert [vehicle.id for vehicle in request.vehicles] == [A, C]
     assert (2, 1) not in request.targets
@@ -93,7 +97,7 @@ def test_who_has_no_agent_blocks_its_cell_and_is_no_vehicle_of_the_request() -> 
 
 def test_who_gets_no_place_on_its_lane_is_sent_to_its_own_target() -> None:
     cells: dict[Name, Cell] = {A: (0, 0), B: (-1, 0), C: (-2, 0), D: (-3, 0), E: (0, 2)}
-    request = plan_request(task(cells, dict.fromkeys(cells, 0)))
+    request = next(plan_requests(task(cells, dict.fromkeys(cells, 0))))
     for vehicle in request.vehicles:
         if vehicle.id == E:
             assert [request.targets[index] for index in vehicle.eligible or ()] == [(3, 2)]
@@ -103,7 +107,7 @@ def test_who_gets_no_place_on_its_lane_is_sent_to_its_own_target() -> None:
 
 def test_who_is_dropped_keeps_to_the_lane_that_it_is_on() -> None:
     order = task({A: (0, 0), B: (-1, 1)}, {A: 2, B: 2})
-    lanes = [vehicle.lane for vehicle in plan_request(order, A).vehicles]
+    lanes = [vehicle.lane for vehicle in next(plan_requests(order, A)).vehicles]
     assert lanes == [0, 2]
 
 
@@ -172,7 +176,7 @@ def walled_in() -> SortingTask:
 
 def test_one_in_a_corner_does_not_keep_the_others_from_their_lanes() -> None:
     order = walled_in()
-    whole = plan_request(order)
+    whole = next(plan_requests(order))
     assert checked_plan(whole, max_nodes=NODES, weights=WEIGHTS).status == "infeasible"
     sorting = sort(order)
     assert sorting.solved

@@ -43,6 +43,8 @@ def summary(
             "solve_ms": dict.fromkeys(("p50", "p95", "max"), measured),
         },
         "tracking": {
+            "osqp_solves": 17,
+            "unconstrained_steps": 50_383,
             "hold_law_ticks": 0,
             "emergency_ticks": 0,
             "solve_ms": dict.fromkeys(("p50", "p99"), measured),
@@ -77,6 +79,10 @@ def test_the_number_of_processes_is_unknown_where_nobody_says_it(tmp_path: Path)
     assert outcome.summary is not None
     assert outcome.summary["runtime"]["processes"] is None
     assert "(? processes)" in printed(outcome)
+
+
+def test_ticks_solved_by_osqp_are_told_apart(tmp_path: Path) -> None:
+    assert "17 / 50,383 ticks" in printed(judge(tmp_path, summary()))
 
 
 def test_recoveries_seen_by_the_launcher_count(tmp_path: Path) -> None:
@@ -134,6 +140,24 @@ def test_all_reasons_are_printed(tmp_path: Path) -> None:
         "FAILED: the run is not complete: limit",
         "FAILED: 1 of 5 vehicles did not leave the road",
     ]
+
+
+@pytest.mark.parametrize(
+    ("more", "shown"),
+    [
+        ({}, "-"),
+        ({"by_solver": {"tappa": 0, "branching": 0}, "fallbacks": 0}, "- (0 fallbacks)"),
+        (
+            {"by_solver": {"tappa": 7, "branching": 2, "rolling": 0}, "fallbacks": 2},
+            "tappa 7, branching 2 (2 fallbacks)",
+        ),
+    ],
+    ids=["old", "none", "some"],
+)
+def test_the_table_says_which_solvers_planned(more: dict[str, Any], shown: str) -> None:
+    found = summary()
+    found["planning"] |= more
+    assert dict(summary_rows(found))["plans by solver"] == shown
 
 
 @pytest.mark.parametrize(

@@ -173,7 +173,7 @@ def test_vehicles_move_gently_between_cells() -> None:
 
 def test_names_are_short_and_harmless() -> None:
     names = ("v1", "vehicle-000123", "a\nb", "\ud800")
-    assert [plan_drawing._label(name) for name in names] == ["v1", "…00123", "a?b", "?"]
+    assert [plan_drawing.short_name(name) for name in names] == ["v1", "…00123", "a?b", "?"]
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ def test_twelve_vehicles_are_planned_at_least_cost(seed: int, cost: int) -> None
 @settings(max_examples=60, deadline=None)
 @given(requests())
 def test_both_solvers_agree(request: PlanRequest) -> None:
-    by_tree, by_branching = plan(request, solver="tappa"), solved(request)
+    by_tree, by_branching = plan(request, solver="tappa", fallback=False), solved(request)
     assert (by_branching.status, by_branching.cost) == (by_tree.status, by_tree.cost)
 
 
@@ -50,12 +50,14 @@ def test_both_solvers_agree_on_formations(
     seed: int, size: int, mode: Mode, conflicts: tuple[str, ...] | None
 ) -> None:
     request = formation_request(seed, vehicles=size, mode=mode, conflicts=conflicts)
-    branching, tappa = solved(request), plan(request, solver="tappa", max_nodes=3_000)
+    branching = solved(request)
+    tappa = plan(request, solver="tappa", max_nodes=300, fallback=False)
     assert branching.status == "optimal"
     assert branching.cost is not None
-    assert tappa.cost is not None
     assert tappa.lower_bound is not None
-    assert tappa.lower_bound <= branching.cost <= tappa.cost
+    assert tappa.lower_bound <= branching.cost
+    assert tappa.status == "timeout" or tappa.cost is not None
+    assert tappa.cost is None or branching.cost <= tappa.cost
     assert tappa.status != "optimal" or tappa.cost == branching.cost
 
 

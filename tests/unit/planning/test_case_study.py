@@ -4,18 +4,24 @@ The figure is not in the source; this instance reproduces the text. Cells here c
 names of vehicles, targets and nodes from 1 as in the paper.
 """
 
+import math
+
 import pytest
 
 from laneweave.coordinator.planning import PlanRequest, VehicleRequest, plan, problems_of_response
 from laneweave.coordinator.planning.assignments import Assignment, assignments
 from laneweave.coordinator.planning.budget import Budget
-from laneweave.coordinator.planning.cbs import ConflictTree
-from laneweave.coordinator.planning.conflict_tree import expand_all, root
+from laneweave.coordinator.planning.cbs import ConstraintTree, Node
 from laneweave.coordinator.planning.conflicts import ConflictModel
+from laneweave.coordinator.planning.explanation import entries
+from laneweave.coordinator.planning.facade import cells_of
 from laneweave.coordinator.planning.frd import Weights, cost_matrix
 from laneweave.coordinator.planning.grid import Grid
+from laneweave.coordinator.planning.improvements import Improvements
+from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.coordinator.planning.preference import preference_matrix
 from laneweave.coordinator.planning.problem import Problem
+from laneweave.coordinator.planning.solution import Solution
 
 CELLS = ((0, 0), (0, 2), (1, 1), (2, 0), (2, 2))
 VEHICLE_GROUPS = (1, 1, 2, 2, 3)
@@ -37,10 +43,20 @@ def _assignments() -> list[Assignment]:
     return list(assignments(costs, preference_matrix([frozenset(c) for c in CHOICES], 5)))
 
 
-def _best_cost(problem: Problem, assignment: Assignment) -> int:
-    node = ConflictTree(problem, assignment.targets, Budget()).search(below=99, nodes=10_000)
-    assert node is not None
-    return node.cost
+def _searched(problem: Problem, assignment: Assignment, switches: Improvements) -> ConstraintTree:
+    tree = ConstraintTree(problem, assignment.targets, Budget(), switches, record=True)
+    tree.search(lambda: math.inf)
+    return tree
+
+
+def _nodes(problem: Problem) -> list[Node]:
+    nodes = _searched(problem, _assignments()[0], Improvements.none()).nodes
+    assert nodes is not None
+    return nodes
+
+
+def _entries(problem: Problem, node: Node) -> list[str]:
+    return list(entries(problem.table, node, ["1", "2", "3", "4", "5"]))
 
 
 def test_assignments() -> None:
@@ -53,11 +69,10 @@ def test_assignments() -> None:
 def test_root_has_a_node_conflict_of_2_and_5_and_an_edge_conflict_of_2_and_3(
     problem: Problem,
 ) -> None:
-    n1 = root(problem, _assignments()[0].targets)
-    assert n1 is not None
+    n1 = _nodes(problem)[0]
     assert n1.cost == 6
     assert n1.constraints == ()
-    assert [str(entry) for entry in n1.conflicts] == [
+    assert _entries(problem, n1) == [
         "{N | (1,1), 1, 2}",
         "{N | (1,1), 1, 5}",
         "{E | (0,2), (1,1), 1, 2}",
@@ -66,29 +81,34 @@ def test_root_has_a_node_conflict_of_2_and_5_and_an_edge_conflict_of_2_and_3(
 
 
 def test_n2_and_n4_are_feasible_with_cost_7_and_n3_and_n5_have_conflicts(problem: Problem) -> None:
-    a1 = _assignments()[0].targets
-    n1 = root(problem, a1)
-    assert n1 is not None
-    n2, n3, n4, n5 = expand_all(problem, a1, n1)
-    assert [node.constraints for node in (n2, n3, n4, n5)] == [(e,) for e in n1.conflicts]
+    n1, n2, n3, n4, n5 = _nodes(problem)
+    assert [node.parent for node in (n2, n3, n4, n5)] == [1, 1, 1, 1]
+    constraints = [node.constraints[0] for node in (n2, n3, n4, n5)]
+    names = ["1", "2", "3", "4", "5"]
+    assert [c.notation(problem.table, names[c.vehicle]) for c in constraints] == _entries(
+        problem, n1
+    )
     assert n2.conflicts == ()
     assert n4.conflicts == ()
     assert n2.cost == n4.cost == 7
     assert n3.conflicts != ()
     assert n5.conflicts != ()
-    assert len(expand_all(problem, a1, n3)) == len(n3.conflicts)
 
 
-def test_best_path_sets_of_both_assignments(problem: Problem) -> None:
-    first, second = _assignments()[:2]
-    assert _best_cost(problem, first) == 7
-    assert _best_cost(problem, second) == 8
+@pytest.mark.parametrize("switches", [Improvements.none(), Improvements()], ids=["literal", "fast"])
+def test_best_path_sets_of_both_assignments(problem: Problem, switches: Improvements) -> None:
+    costs = []
+    for assignment in _assignments()[:2]:
+        solution = _searched(problem, assignment, switches).solution
+        assert solution is not None
+        costs.append(solution.cost)
+    assert costs == [7, 8]
 
 
 def test_relative_path_map_of_the_root(problem: Problem) -> None:
-    n1 = root(problem, _assignments()[0].targets)
-    assert n1 is not None
-    assert str(n1.path_map).splitlines() == [
+    n1 = _nodes(problem)[0]
+    cells = cells_of(problem, Solution(_assignments()[0].targets, n1.paths))
+    assert str(RelativePathMap.padded(["1", "2", "3", "4", "5"], cells)).splitlines() == [
         "Vehicle ID  step 1  step 2  step 3",
         "1           (0,0)   (0,0)   (0,0)",
         "2           (0,2)   (1,1)   (2,0)",

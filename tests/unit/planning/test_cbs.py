@@ -1,99 +1,92 @@
-"""CBSA against a search over all joint states, for one assignment."""
+"""CBSA against a search over all joint states, for one assignment and with every switch."""
 
 import math
 
+import attrs
+import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning import PlanRequest, problems_of_paths
-from laneweave.coordinator.planning.budget import Budget
-from laneweave.coordinator.planning.cbs import ConflictTree, Node, least_cover
-from laneweave.coordinator.planning.facade import cells_of
-from laneweave.coordinator.planning.incumbent import Solution
+from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
+from laneweave.coordinator.planning.cbs import ConstraintTree, Node
+from laneweave.coordinator.planning.facade import cells_of, problem_of
+from laneweave.coordinator.planning.improvements import Improvements
 from laneweave.coordinator.planning.path_map import RelativePathMap
-from laneweave.coordinator.planning.problem import Problem
+from laneweave.coordinator.planning.solution import Solution
 from unit.planning.planning_oracles import cheapest_plan, requests
 
 ENOUGH = 600
-
-
-def _problem(request: PlanRequest) -> Problem:
-    cells = [vehicle.cell for vehicle in request.vehicles]
-    model = request.conflict_model
-    return Problem(request.grid, request.mode, model, cells, request.targets)
+EVERY_SWITCH = st.builds(Improvements, cardinal=st.booleans(), bicliques=st.booleans())
 
 
 def _assignment(request: PlanRequest) -> tuple[int, ...]:
     return tuple(range(len(request.vehicles)))
 
 
-def _anyone_anywhere(request: PlanRequest) -> bool:
-    return all(vehicle.eligible is None for vehicle in request.vehicles)
+def _tree(request: PlanRequest, switches: Improvements, nodes: int = ENOUGH) -> ConstraintTree:
+    budget = Budget(max_nodes=nodes)
+    return ConstraintTree(problem_of(request), _assignment(request), budget, switches, record=True)
 
 
-def _check(request: PlanRequest, problem: Problem, node: Node) -> None:
-    solution = Solution(_assignment(request), node.paths)
-    cells = cells_of(problem, solution)
-    path_map = RelativePathMap.padded(["" for _ in cells], cells)
-    assert problems_of_paths(request, solution.assignment, path_map.rows) == []
-    assert path_map.cost() == node.cost
+def _search(tree: ConstraintTree, limit: float = math.inf) -> Node | None:
+    """Search until the end or until the nodes are spent."""
+    try:
+        return tree.search(lambda: limit)
+    except BudgetSpentError:
+        return None
 
 
-@settings(max_examples=60, deadline=None)
-@given(requests())
-def test_cost_is_that_of_the_joint_search(request: PlanRequest) -> None:
-    assume(_anyone_anywhere(request))
-    problem, assignment = _problem(request), _assignment(request)
-    tree = ConflictTree(problem, assignment, Budget())
-    node = tree.search(below=math.inf, nodes=ENOUGH)
-    expected = cheapest_plan(request, fixed=assignment)
+@settings(max_examples=80, deadline=None)
+@given(requests(), EVERY_SWITCH)
+def test_cost_is_that_of_the_joint_search(request: PlanRequest, switches: Improvements) -> None:
+    assume(all(vehicle.eligible is None for vehicle in request.vehicles))
+    tree = _tree(request, switches)
+    node = _search(tree)
+    expected = cheapest_plan(request, fixed=_assignment(request))
     if node is None:
         assert expected is None or tree.lower_bound <= expected
-    else:
-        assert node.cost == expected
-        _check(request, problem, node)
-
-
-@settings(max_examples=40, deadline=None)
-@given(requests(most_vehicles=4, most_cells=12), st.integers(1, 3))
-def test_interrupted_search_gives_the_same_answer(request: PlanRequest, nodes: int) -> None:
-    problem, assignment = _problem(request), _assignment(request)
-    whole = ConflictTree(problem, assignment, Budget())
-    expected = whole.search(below=math.inf, nodes=300)
-    tree = ConflictTree(problem, assignment, Budget())
-    found, bounds = None, [tree.lower_bound]
-    while found is None and tree.lower_bound < math.inf and tree.expanded < whole.expanded:
-        found = tree.search(below=math.inf, nodes=min(nodes, whole.expanded - tree.expanded))
-        bounds.append(tree.lower_bound)
-    assert (found and found.paths) == (expected and expected.paths)
-    assert bounds == sorted(bounds)
+        return
+    assert node.cost == expected
+    problem = problem_of(request)
+    cells = cells_of(problem, Solution(_assignment(request), node.paths))
+    path_map = RelativePathMap.padded(["" for _ in cells], cells)
+    assert problems_of_paths(request, _assignment(request), path_map.rows) == []
+    assert path_map.cost() == node.cost
 
 
 @settings(max_examples=40, deadline=None)
 @given(requests(), st.integers(-1, 2))
-def test_a_bound_from_elsewhere_hides_exactly_what_is_no_better(
-    request: PlanRequest, margin: int
-) -> None:
-    problem, assignment = _problem(request), _assignment(request)
-    best = ConflictTree(problem, assignment, Budget()).search(below=math.inf, nodes=300)
+def test_a_limit_hides_exactly_what_is_no_better(request: PlanRequest, margin: int) -> None:
+    best = _search(_tree(request, Improvements(), 300))
     assume(best is not None)
     assert best is not None
-    tree = ConflictTree(problem, assignment, Budget())
-    node = tree.search(below=best.cost + margin, nodes=1000)
-    if margin > 0:
-        assert node is not None
-        assert node.cost == best.cost
-    else:
-        assert node is None
-        assert tree.lower_bound >= best.cost + margin
+    node = _search(_tree(request, Improvements(), 1000), best.cost + margin)
+    assert (None if node is None else node.cost) == (best.cost if margin > 0 else None)
 
 
-@settings(deadline=None)
-@given(st.sets(st.tuples(st.integers(0, 4), st.integers(5, 8)), max_size=9))
-def test_least_cover(edges: set[tuple[int, int]]) -> None:
-    expected = min(
-        chosen.bit_count()
-        for chosen in range(1 << 9)
-        if all(chosen >> a & 1 or chosen >> b & 1 for a, b in edges)
-    )
-    assert least_cover(sorted(edges)) == expected
+@settings(max_examples=40, deadline=None)
+@given(requests(most_vehicles=4, most_cells=12))
+def test_a_literal_node_has_a_child_for_each_entry_of_its_conflict_list(
+    request: PlanRequest,
+) -> None:
+    tree = _tree(request, Improvements.none(), 40)
+    _search(tree)
+    assert tree.nodes is not None
+    for node in tree.nodes:
+        children = [child for child in tree.nodes if child.parent == node.number]
+        if not node.expanded:
+            assert children == []
+            continue
+        assert len(children) <= 2 * len(node.conflicts)
+        for child in children:
+            assert child.constraints[:-1] == node.constraints
+            assert child.cost >= node.cost
+        added = [child.constraints[-1] for child in children]
+        assert {c.vehicle for c in added} <= {v for c in node.conflicts for v in c[2:]}
+
+
+@pytest.mark.parametrize("name", [field.name for field in attrs.fields(Improvements)])
+def test_without_improvements_every_switch_is_off(name: str) -> None:
+    assert getattr(Improvements(), name) is True
+    assert getattr(Improvements.none(), name) is False

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.conflicts import ConflictModel
-from laneweave.coordinator.planning.diagram import Bans, Diagram, compatible, shortest_paths
+from laneweave.coordinator.planning.diagram import Bans, Diagram, shortest_paths
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.moves import MoveTable, bits
 from laneweave.coordinator.planning.sppa import Path, choose_path, conflicting_moves
@@ -94,34 +94,6 @@ def test_diagram_holds_all_shortest_paths(case: tuple[MoveTable, int, int, Bans]
         assert expected == []
     elif diagram.cost < HORIZON:
         assert _listed(table, diagram) == set(expected)
-
-
-@settings(max_examples=60, deadline=None)
-@given(problems(), problems())
-def test_compatible_means_two_shortest_paths_without_conflict(
-    one: tuple[MoveTable, int, int, Bans], other: tuple[MoveTable, int, int, Bans]
-) -> None:
-    table, start, target, bans = one
-    a = shortest_paths(table, start, target, bans)
-    cells = list(bits(table.cells))
-    ends = cells[other[1] % len(cells)], cells[other[2] % len(cells)]
-    b = shortest_paths(table, *ends, Bans())
-    if a is None or b is None or a.cost > 4:
-        return
-    length = max(a.cost, b.cost)
-
-    def padded(path: Path, target: int) -> Path:
-        return path + (target,) * (length - len(path))
-
-    expected = any(
-        not any(
-            table.conflicts[x] >> y & 1
-            for x, y in zip(padded(p, a.target), padded(q, b.target), strict=True)
-        )
-        for p in _listed(table, a)
-        for q in _listed(table, b)
-    )
-    assert compatible(table, a, b) == expected
 
 
 @settings(max_examples=100, deadline=None)

@@ -4,7 +4,11 @@ import pytest
 
 from laneweave.coordinator.planning import plan
 from laneweave.coordinator.planning.conflicts import ConflictModel
-from laneweave.coordinator.planning.instances import block_request, formation_request
+from laneweave.coordinator.planning.instances import (
+    block_request,
+    formation_request,
+    traffic_request,
+)
 from laneweave.coordinator.planning.path_map import FoundConflict, RelativePathMap, final_arrival
 
 
@@ -82,3 +86,20 @@ class TestInstances:
     def test_vehicles_that_do_not_fit_are_rejected(self) -> None:
         with pytest.raises(ValueError, match="do not fit"):
             block_request(0, vehicles=7)
+
+
+def test_traffic_fills_formations_of_every_length() -> None:
+    requests = [traffic_request(seed) for seed in range(200)]
+    assert {request.grid.columns for request in requests} == {3, 4, 5, 6, 7}
+    assert {len(request.vehicles) for request in requests} <= {3, 4, 5, 6}
+    for request in requests:
+        cells = [vehicle.cell for vehicle in request.vehicles]
+        lanes = [vehicle.lane for vehicle in request.vehicles]
+        assert len(set(cells)) == len(cells)
+        assert all(lanes.count(lane) <= request.grid.columns for lane in lanes)
+        assert sorted(lane for _, lane in request.targets) == sorted(
+            lane for lane in lanes if lane is not None
+        )
+        # A formation that is not full is as long as it may be, or has no room for the next column.
+        assert len(cells) >= 4 or request.grid.columns == 7
+    assert traffic_request(7) == requests[7]

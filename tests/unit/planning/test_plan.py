@@ -23,7 +23,6 @@ from laneweave.coordinator.planning import (
     problems_of_response,
 )
 from laneweave.coordinator.planning.conflicts import KINDS
-from laneweave.coordinator.planning.facade import Solver
 from laneweave.coordinator.planning.grid import Cell, Grid, Mode
 from laneweave.coordinator.planning.instances import block_request, formation_request
 from laneweave.coordinator.planning.path_map import RelativePathMap, final_arrival
@@ -187,7 +186,7 @@ class TestInfeasible:
     ("mode", "kinds"), [(1, ("node", "edge", "special-1")), (2, ("geometric",))]
 )
 def test_who_would_close_up_goes_one_after_the_other(
-    solver: Solver, mode: Mode, kinds: tuple[str, ...]
+    solver: str, mode: Mode, kinds: tuple[str, ...]
 ) -> None:
     vehicles = VehicleRequest("a", (0, 0), eligible=(0,)), VehicleRequest("b", (3, 0), lane=0)
     targets = ((1, 0), (2, 0))
@@ -207,7 +206,7 @@ class TestDeadline:
             *(("branching", looks) for looks in (2, 5, 8, 12)),
         ],
     )
-    def test_deadline_is_kept_and_the_bound_holds(self, solver: Solver, looks: int) -> None:
+    def test_deadline_is_kept_and_the_bound_holds(self, solver: str, looks: int) -> None:
         whole = block_request(25, deadline_s=3600.0)
         optimum = plan(whole).cost
         assert optimum is not None

@@ -13,7 +13,6 @@ import pytest
 from laneweave.agents.trajectory import move_profile
 from laneweave.coordinator.planning import PlanRequest, checked_plan, plan, problems_of_paths
 from laneweave.coordinator.planning.budget import Budget
-from laneweave.coordinator.planning.facade import Solver
 from laneweave.coordinator.planning.geometry import Geometry
 from laneweave.coordinator.planning.grid import Mode, displacements
 from laneweave.coordinator.planning.instances import formation_request
@@ -21,6 +20,7 @@ from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.reachability import explore
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.solvers import SOLVERS
 from oracles import joint_search
 from oracles.instances import random_request, small_request
 from oracles.moving_bodies import Bodies, Profile, drive, least_gap_of_plan_m
@@ -51,15 +51,15 @@ TIGHT = {
 }
 """So little that vehicles may follow each other round corners."""
 KINDS = (["geometric"], ["geometric"], ["node", "geometric"], ["special-1", "geometric"])
-SOLVERS: tuple[Solver, ...] = ("tappa", "branching")
 
 INSTANCES = 60
 CHUNK = 10
 
 
-def faults(request: dict[str, Any], cost: int | None, solver: Solver, seed: int) -> list[str]:
+def faults(request: dict[str, Any], cost: int | None, solver: str, seed: int) -> list[str]:
     """What is wrong with a plan, by what it claims, by its paths, and by driving it."""
-    response = checked_plan(PlanRequest.from_dict(request), solver=solver).to_dict()
+    asked = PlanRequest.from_dict({"deadline_s": 60.0, **request})
+    response = checked_plan(asked, solver=solver, fallback=False).to_dict()
     claims = response["status"], response["cost"]
     if claims != ("infeasible" if cost is None else "optimal", cost):
         return [f"answers {claims}, the oracle {cost}"]

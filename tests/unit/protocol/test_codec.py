@@ -20,6 +20,7 @@ from laneweave.protocol.messages import (
     Ballot,
     Census,
     CensusEntry,
+    ClosedFormation,
     Command,
     Deed,
     Heartbeat,
@@ -66,16 +67,19 @@ SAMPLES: tuple[object, ...] = (
         (0.25, -0.5), formation=-1, attendant=11, caretaker=True, joined=(-1, 0),
         estate=((0, 1),), promised=BALLOT, deed=Deed(BALLOT, open=True),
     ),
-    Command(V1, 11, 130, (0, 1), 140, (0, 0), b"\0" * 16, (-1, 0), BALLOT, BALLOT, DEED),
-    Census(13.0, (CensusEntry(V1, (0, 1), 2, 5.0),), (Announcement(V2, 0, 1, 20.0),)),
+    Command(V1, 11, 130, (0, 1), 140, (0, 0), b"\0" * 16, 38, (-1, 0), BALLOT, BALLOT, DEED),
+    Census(
+        13.0, (CensusEntry(V1, (0, 1), 2, 5.0),), (Announcement(V2, 0, 1, 20.0),),
+        (ClosedFormation(-1, 0, 12.0),), 0,
+    ),
     RoadClock(130, 13.0, demanded=5, entered=4, on_road=3, left=1, ended=False),
-    Report(Name("agent"), V1, Name("17-4"), 10, 3, 5, 1, b"\0\0\0\0"),
+    Report(Name("agent"), V1, Name("17-4"), 10, 3, 5, 1, 2, b"\0\0\0\0"),
     LogEvent(Name("bridge"), Name("b"), 13.0, Name("overlap"), {"n": 1, "pair": ["v1", "v2"]}),
-    Motion(V1, 11, -1, (0, 0), (0, 1), begin_tick=120, tick=130),
+    Motion(V1, 11, -1, (0, 0), (0, 1), begin_tick=120, ticks=38, tick=130),
 )  # fmt: skip
 NAMES_NOT_ALLOWED = ("a/b", "a*", "", "x" * 65, "a b", "a#", "$", "a?", "é", "a\n", "v1\n", "\0")
 
-PARTS = (Neighbour, CensusEntry, Announcement, Deed)
+PARTS = (Neighbour, CensusEntry, Announcement, ClosedFormation, Deed)
 HINTS = {kind: get_type_hints(kind) for kind in (*KINDS.values(), *PARTS)}
 
 Body = dict[Any, Any]

@@ -32,7 +32,7 @@ def vehicle(
     moving: bool = False,
     joined: tuple[int, ...] = (0,),
 ) -> PlanExecution:
-    return PlanExecution(name, 7, cell, LATTICE, OVERDUE_S, joined, moving=moving)
+    return PlanExecution(name, 7, cell, LATTICE, joined, moving=moving)
 
 
 def prepare(ballot: Ballot, *roster: Name, formations: tuple[int, ...] = (0,)) -> Prepare:
@@ -328,7 +328,7 @@ def test_v3_ignores_a_plan_that_does_not_fit(spoiled: Plan) -> None:
 @pytest.mark.parametrize("beyond", [(-8, 0), (1, 0), (-4, 3), (-4, -1), (-20, 0)])
 def test_v3_the_territory_stays_within_the_blocks_of_the_plan(beyond: Cell) -> None:
     """Plans of other formations run at the same time; only the blocks keep them apart."""
-    execution = vehicle(joined=(0, 1, 2))  # whatever has been joined: this plan names block 0
+    execution = vehicle()
     execution.on_prepare(prepare(MID))
     plan = make_plan()
     assert not execution.on_plan(evolve(plan, territory=(*plan.territory, beyond)))
@@ -344,8 +344,20 @@ def test_v3_a_joint_plan_waits_until_the_controller_has_confirmed_its_formations
     for joined in ((0,), (1,), (), (0, 2)):
         execution.joined = joined
         assert not execution.on_plan(joint)
-    execution.joined = (0, 1, 2)
+    execution.joined = (0, 1)
     assert execution.on_plan(joint)
+
+
+@pytest.mark.parametrize("formations", [(0,), (1,), (0, 1), (1, 2), (0, 2)])
+def test_v3_ignores_a_plan_for_some_of_the_blocks_that_are_joined(
+    formations: tuple[int, ...],
+) -> None:
+    """Vehicles of the other blocks may be in any of them."""
+    execution = vehicle(joined=(0, 1, 2))
+    execution.on_prepare(prepare(MID, formations=(0, 1, 2)))
+    cells: dict[Name, Cell] = {A: (-4, 0)}
+    assert not execution.on_plan(make_plan(cells=cells, formations=formations))
+    assert execution.on_plan(make_plan(cells=cells, formations=(0, 1, 2)))
 
 
 def waits(execution: PlanExecution) -> bool:
@@ -596,6 +608,15 @@ def test_overdue_runs_from_the_moment_the_next_move_is_due() -> None:
     assert not execution.overdue(due_s + 100.0)  # done
     execution.on_prepare(prepare(HIGH))
     assert not execution.overdue(due_s + 100.0)  # no plan
+
+
+@pytest.mark.parametrize(("slot_s", "patience_s"), [(1.0, 1.5), (4.0, 6.0), (7.0, 9.0)])
+def test_how_long_a_move_may_be_due_follows_the_slots_of_its_plan(
+    slot_s: float, patience_s: float
+) -> None:
+    execution = accepted(evolve(make_plan(), slot_s=slot_s))
+    assert not execution.overdue(T0_S + patience_s - 0.01)
+    assert execution.overdue(T0_S + patience_s)
 
 
 @pytest.mark.parametrize("attended", [True, False])

@@ -61,7 +61,7 @@ def test_defaults_are_the_table_of_the_paper() -> None:
     scenario = load_scenario(None)
     formation, vehicle, road = scenario.formation, scenario.vehicle, scenario.road
     assert formation.gap_m == 15.0
-    assert formation.cycle_s == 4.0
+    assert scenario.cycles_s == (4.0, 7.0)
     assert formation.speed_mps == 15.0
     assert vehicle.max_speed_mps == 25.0
     assert vehicle.min_accel_mps2 == -10.0
@@ -78,10 +78,34 @@ def test_defaults_are_the_table_of_the_paper() -> None:
     assert scenario.lane_shares == pytest.approx((1 / 3,) * 3)
 
 
-def test_the_file_of_the_paper_holds_the_defaults_but_for_the_operation() -> None:
+@pytest.mark.parametrize(
+    ("formation", "bound"),
+    [
+        ({"operation": "paper"}, 1800.0),
+        ({"operation": "paper", "gap_m": 20.0}, 1350.0),
+        ({}, 3600.0),
+        ({"operation": "rolling"}, 3600.0),
+    ],
+)
+def test_bound_of_the_road(formation: dict[str, Any], bound: float) -> None:
+    """V_u = 3600 v_F / (2 d_F) of the paper, for interlaced entry."""
+    settings = parse_scenario({"formation": formation}).formation
+    assert settings.bound_veh_per_lane_h == pytest.approx(bound)
+    share = 2.0 if settings.interlaced else 1.0
+    assert bound == pytest.approx(3600.0 * settings.speed_mps / (share * settings.gap_m))
+
+
+def test_the_file_of_the_paper_holds_the_defaults_but_for_its_formations() -> None:
     explicit = ("node", "edge", "special-1", "closing")
     default = Scenario()
-    formation = attrs.evolve(default.formation, operation="paper", conflicts=explicit)
+    formation = attrs.evolve(
+        default.formation,
+        entry="interlaced",
+        close="columns",
+        cycle_s=4.0,
+        move_s=3.8,
+        conflicts=explicit,
+    )
     assert load_scenario(FOLDER / "paper.toml") == attrs.evolve(default, formation=formation)
 
 
@@ -91,8 +115,10 @@ def test_every_scenario_of_the_repository_loads(path: Path) -> None:
 
 
 def test_the_lattice_is_that_of_the_tables() -> None:
-    lattice = parse_scenario({"road": {"lanes": 2}, "formation": {"block_columns": 6}}).lattice
+    formation = {"close": "columns", "block_columns": 6}
+    lattice = parse_scenario({"road": {"lanes": 2}, "formation": formation}).lattice
     assert (lattice.lanes, lattice.block_columns) == (2, 6)
+    assert Scenario().lattice.block_columns == 1
     assert (lattice.pitch_m, lattice.speed_mps, lattice.lane_width_m) == (15.0, 15.0, 3.5)
 
 
@@ -128,6 +154,8 @@ def test_every_wrong_type_of_every_field_is_refused_by_name(field: str, default:
         wrongs = (1, True, None, "node", {}, {"a": 1}, [True], [[]], [None], [math.nan], [{}])
     elif isinstance(default, TABLE_BY_NAME):
         wrongs = (1, True, None, [], "x", 1.5, {"a": 1}, {"a": []}, {"a": "x"}, {"a": [1]})
+    elif field == "formation.cycle_s":
+        wrongs = tuple(wrong for wrong in NOT_NUMBERS if wrong is not None)
     elif default is None:
         wrongs = ("1", True, 1.0, [], {}, math.nan)
     elif isinstance(default, bool):
@@ -178,6 +206,8 @@ OUT_OF_RANGE: list[tuple[str, Any]] = [
     ("formation.weight_straight", 2),
     ("formation.weight_oblique", 3),
     ("formation.weight_oblique", -1),
+    ("formation.solver", "magic"),
+    ("formation.solver", None),
     ("formation.planning_deadline_s", 0),
     ("formation.max_nodes", 0),
     ("vehicle.length_m", 0.9),
@@ -192,7 +222,7 @@ OUT_OF_RANGE: list[tuple[str, Any]] = [
     ("vehicle.max_slip_ratio", 0),
     ("vehicle.max_slip_ratio", 1.01),
     ("tracking.horizon_ticks", 9),
-    ("tracking.horizon_ticks", 101),
+    ("tracking.horizon_ticks", 201),
     ("tracking.min_gap_m", -1),
     ("network.realm", ""),
     ("network.realm", "a/b"),
@@ -227,6 +257,7 @@ def test_a_value_out_of_range_is_refused_by_name(field: str, value: object) -> N
 # --- fields that do not fit together ----------------------------------------------------------
 
 LATE = {"reaction_s": 0.4}
+FOUR = {"cycle_s": 4.0}
 MISFITS: list[tuple[str, dict[str, Any]]] = [
     ("formation.settle_s", {"formation": {"settle_s": 3.1}}),
     ("formation.settle_s", {"formation": {"settle_s": 5.0, "operation": "paper"}}),
@@ -247,8 +278,10 @@ MISFITS: list[tuple[str, dict[str, Any]]] = [
     ("demand.volume_veh_per_lane_h", {"demand": {"min_headway_s": 60}}),
     ("formation.gap_m", {"formation": {"gap_m": 5.0}}),
     ("formation.gap_m", {"vehicle": {"length_m": 30.0}}),
-    ("formation.move_s", {"formation": {"move_s": 4.1}}),
-    ("formation.move_s", {"formation": {"cycle_s": 3.0}}),
+    ("formation.move_s", {"formation": {"move_s": 3.8}}),
+    ("formation.move_s", {"formation": {"cycle_s": 4.0, "move_s": 4.1}}),
+    ("formation.move_s", {"formation": {"cycle_s": 3.0, "move_s": 3.8}}),
+    ("formation.move_s", {"formation": {"operation": "rolling", "move_s": 3.8}}),
     ("formation.speed_mps", {"formation": {"speed_mps": 25.0}}),
     ("formation.speed_mps", {"vehicle": {"max_speed_mps": 10.0}}),
     (
@@ -256,7 +289,8 @@ MISFITS: list[tuple[str, dict[str, Any]]] = [
         {"formation": {"mode": 2, "weight_oblique": 2}},
     ),
     ("road.s3_m", {"road": {"s3_m": 100.0}}),
-    ("road.s3_m", {"formation": {"block_columns": 24, "gap_m": 100.0}}),
+    ("road.s3_m", {"formation": {"close": "columns", "block_columns": 24, "gap_m": 30.0}}),
+    ("road.s3_m", {"formation": {"max_columns": 24, "gap_m": 30.0}}),
     ("formation.conflicts", {"formation": {"conflicts": ["node"]}}),
     ("formation.conflicts", {"formation": {"conflicts": ["node", "edge"]}}),
     (
@@ -270,11 +304,13 @@ MISFITS: list[tuple[str, dict[str, Any]]] = [
         {"network": {"lease_s": 0.5, "heartbeat_s": 0.5, "election_s": 2.0}},
     ),
     ("formation.cycle_s", {"formation": {"cycle_s": 4.05}}),
-    ("formation.move_s", {"formation": {"move_s": 3.85}}),
+    ("formation.move_s", {"formation": {"cycle_s": 4.0, "move_s": 3.85}}),
     ("formation.cycle_s", {"runtime": {"tick_s": 0.3}}),
     ("formation.move_s", {"runtime": {"tick_s": 1.0}}),
     ("formation.cycle_s", {"formation": {"cycle_s": 1.0, "move_s": 1.0}, "runtime": {"tick_s": 1}}),
-    ("tracking.horizon_ticks", {"tracking": {"horizon_ticks": 37}}),
+    ("tracking.horizon_ticks", {"tracking": {"horizon_ticks": 67}}),
+    ("tracking.horizon_ticks", {"tracking": {"horizon_ticks": 37}, "formation": FOUR}),
+    ("runtime.tick_s", {"runtime": {"tick_s": 0.01}, "tracking": {}}),
     ("network.lease_s", {"network": {"lease_s": 3.1}}),
     ("network.lease_s", {"runtime": {"agent_silent_s": 0.9}}),
     ("runtime.tick_resend_s", {"runtime": {"tick_resend_s": 0.3}}),
@@ -296,11 +332,15 @@ MISFITS: list[tuple[str, dict[str, Any]]] = [
 
 
 def test_there_is_time_to_settle() -> None:
-    """The longest way is half a column, or one and a half in the paper's operation."""
-    for settling in ({"settle_s": 3.2}, {"settle_s": 5.2, "operation": "paper"}):
+    """The longest way is three quarters of a column, or twice as much with interlaced entry."""
+    for settling in (
+        {"settle_s": 3.7},
+        {"settle_s": 5.2, "operation": "paper"},
+        {"settle_s": 3.2, "operation": "rolling"},
+    ):
         parse_scenario({"formation": settling})
     slow = {"max_speed_mps": 15.5}
-    parse_scenario({"vehicle": slow, "formation": {"settle_s": 28.2}})
+    parse_scenario({"vehicle": slow, "formation": {"settle_s": 28.2, "operation": "rolling"}})
 
 
 @pytest.mark.parametrize(("field", "data"), MISFITS)
@@ -313,16 +353,21 @@ def test_fields_that_do_not_fit_are_refused_by_name(field: str, data: dict[str, 
     [
         {"demand": {"lane_shares": [1, 0, 0]}},
         {"demand": {"volume_veh_per_lane_h": 3600, "min_headway_s": 1.0}},
-        {"formation": {"move_s": 4.0}},
+        {"formation": FOUR | {"move_s": 4.0}},
+        {"formation": {"cycle_s": 3.9}},
+        {"formation": {"operation": "rolling", "cycle_s": 6.0}},
         {"formation": {"mode": 2}},
         {"formation": {"mode": 2, "weight_oblique": 1}},
         {"formation": {"conflicts": ["geometric"]}},
         {"road": {"lanes": 1}},
-        {"tracking": {"horizon_ticks": 38}},
+        {"tracking": {"horizon_ticks": 68}},
+        {"tracking": {"horizon_ticks": 38}, "formation": FOUR},
+        {"tracking": {"horizon_ticks": 38}, "formation": {"operation": "paper"}},
+        {"tracking": {"horizon_ticks": 58}, "formation": {"operation": "rolling"}},
         {"network": {"lease_s": 3.0}},
         {"runtime": {"tick_deadline_s": 3.0}},
         {"runtime": {"tick_resend_s": 0.29}},
-        {"runtime": {"tick_s": 0.05}, "tracking": {"horizon_ticks": 76}},
+        {"runtime": {"tick_s": 0.05}, "tracking": {"horizon_ticks": 136}},
         {"runtime": {"tick_s": 0.2}, "braking": {"reaction_s": 0.2}},
         {"formation": {"gap_m": 8.0}},
         {"braking": {"reaction_s": 0.5}},
@@ -399,6 +444,113 @@ def test_an_empty_file_is_the_default(tmp_path: Path) -> None:
     path = tmp_path / "x.toml"
     path.write_text("", encoding="utf-8")
     assert load_scenario(path) == Scenario()
+
+
+# --- values of a file that would have no effect -----------------------------------------------
+
+INERT = [
+    ("formation.sort_in_s2", 'operation = "formations"\nsort_in_s2 = false'),
+    ("formation.reward_drift", "reward_drift = true"),
+    ("formation.reward_drift", 'operation = "paper"\nreward_drift = true'),
+    ("formation.entry", 'operation = "rolling"\nentry = "free"'),
+    ("formation.close", 'operation = "rolling"\nclose = "columns"'),
+    ("formation.max_vehicles", 'operation = "rolling"\nmax_vehicles = 6'),
+    ("formation.max_columns", 'operation = "rolling"\nmax_columns = 7'),
+    ("formation.max_joined", 'operation = "rolling"\nmax_joined = 2'),
+    ("formation.weight_straight", 'operation = "rolling"\nweight_straight = 1'),
+    ("formation.planning_deadline_s", 'operation = "rolling"\nplanning_deadline_s = 2.0'),
+    ("formation.max_nodes", 'operation = "rolling"\nmax_nodes = 10'),
+    ("formation.block_columns", 'operation = "rolling"\nclose = "columns"\nblock_columns = 4'),
+    ("formation.block_columns", "block_columns = 4"),
+    ("formation.max_columns", 'close = "columns"\nmax_columns = 7'),
+    ("formation.max_columns", 'operation = "paper"\nmax_columns = 7'),
+]
+
+
+@pytest.mark.parametrize(("field", "lines"), INERT)
+def test_a_file_s_value_without_effect_is_refused_by_name(
+    tmp_path: Path, field: str, lines: str
+) -> None:
+    path = tmp_path / "x.toml"
+    path.write_text(f"[formation]\n{lines}\n", encoding="utf-8")
+    error = file_refusal(path)
+    if 'rolling"\nclose' in lines:
+        assert error.field == "formation.close"  # the first one
+    else:
+        assert error.field == field
+    assert error.allowed.startswith("none")
+
+
+def test_values_with_an_effect_are_taken_and_those_of_options_and_recordings_too(
+    tmp_path: Path,
+) -> None:
+    """An option may change what a file's values do; a recording holds all fields."""
+    path = tmp_path / "x.toml"
+    path.write_text("[formation]\nmax_vehicles = 5\nmax_columns = 6\n", encoding="utf-8")
+    assert load_scenario(path, formation__operation="rolling").formation.rolling
+    path.write_text('[formation]\noperation = "rolling"\nsort_in_s2 = true\n', encoding="utf-8")
+    assert load_scenario(path).formation.sort_in_s2
+    path.write_text('[formation]\nclose = "columns"\nblock_columns = 6\n', encoding="utf-8")
+    assert load_scenario(path).lattice.block_columns == 6
+    for formation in ({"operation": "rolling"}, {"close": "columns"}, {"operation": "paper"}):
+        scenario = parse_scenario({"formation": formation})
+        assert parse_scenario(to_tables(scenario)) == scenario
+
+
+# --- an earlier name, and the lengths of slots --------------------------------------------------
+
+
+def test_paper_stands_for_interlaced_blocks_of_columns_and_slots_of_four_seconds(
+    tmp_path: Path,
+) -> None:
+    meant = FormationSettings(
+        operation="formations", entry="interlaced", close="columns", cycle_s=4.0
+    )
+    assert parse_scenario({"formation": {"operation": "paper"}}).formation == meant
+    assert load_scenario(None, formation__operation="paper").formation == meant
+    path = tmp_path / "x.toml"
+    path.write_text('[formation]\noperation = "paper"\n', encoding="utf-8")
+    assert load_scenario(path).formation == meant
+    # What else is said counts.
+    said = {"operation": "paper", "cycle_s": 6.0, "move_s": 5.0, "entry": "free"}
+    assert parse_scenario({"formation": said}).formation == attrs.evolve(
+        meant, cycle_s=6.0, move_s=5.0, entry="free"
+    )
+    assert refusal({"formation": {"operation": "papers"}}).field == "formation.operation"
+
+
+def test_a_recording_of_the_paper_s_operation_under_its_earlier_name_is_read() -> None:
+    tables = to_tables(load_scenario(FOLDER / "paper.toml"))
+    earlier = {"operation": "paper", "cycle_s": 4.0, "move_s": 3.8, "block_columns": 4}
+    kept = {
+        name: value
+        for name, value in tables["formation"].items()
+        if name not in ("entry", "close", "max_columns")
+    }
+    recording = tables | {"formation": kept | earlier, "tracking": {"horizon_ticks": 40}}
+    expected = load_scenario(FOLDER / "paper.toml")
+    tracking = attrs.evolve(expected.tracking, horizon_ticks=40)
+    assert parse_scenario(recording) == attrs.evolve(expected, tracking=tracking)
+
+
+def test_slots_are_from_four_to_seven_seconds_unless_they_are_given() -> None:
+    scenario = Scenario()
+    assert scenario.slots_s == pytest.approx([4.0 + 0.2 * number for number in range(16)])
+    assert scenario.move_durations == set(range(38, 70, 2))
+    assert (scenario.move_s, scenario.horizon_ticks) == (3.8, 70)
+    given = parse_scenario({"formation": {"cycle_s": 5.0}})
+    assert (given.slots_s, given.horizon_ticks, given.move_s) == ((5.0,), 50, 4.8)
+    assert given.move_durations == {48}
+    slower = parse_scenario({"formation": {"cycle_s": 5.0, "move_s": 4.0}})
+    assert slower.move_durations == {40}
+    rolling = parse_scenario({"formation": {"operation": "rolling"}})
+    assert (rolling.slots_s, rolling.horizon_ticks) == ((6.0,), 60)
+    dense = parse_scenario(
+        {"formation": {"operation": "rolling"}, "demand": {"volume_veh_per_lane_h": 2001.0}}
+    )
+    assert (dense.slots_s, dense.horizon_ticks) == ((4.0,), 40)
+    long = parse_scenario({"tracking": {"horizon_ticks": 80}})
+    assert long.horizon_ticks == 80
 
 
 # --- round trip and overrides -----------------------------------------------------------------

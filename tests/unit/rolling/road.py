@@ -89,7 +89,6 @@ class Car:
             incarnation=self.controller.attendant,
             hold_cell=self.controller.hold_cell,
             lattice=LATTICE,
-            overdue_s=6.0,
             joined=(),
             moving=self.under_way,
             rules=self.rules,

@@ -14,6 +14,7 @@ from laneweave.protocol.messages import Name
 from laneweave.protocol.scenario import Scenario, parse_scenario
 from laneweave.sim_bridge.demand import Arrival, arrivals
 from laneweave.sim_bridge.entry import Admission, EntryMeter
+from laneweave.sim_bridge.formation_building import ColumnBlocks
 from laneweave.sim_bridge.roadside import MOST_EMPTY, Roadside
 from laneweave.sim_bridge.traffic import RoadVehicle
 
@@ -48,7 +49,7 @@ def admitted(meter: EntryMeter, stream: list[Arrival], tick_s: float = 0.1) -> l
 
 
 def rolling_meter() -> EntryMeter:
-    return EntryMeter(LATTICE, 6, COLUMN_S / 2, interlaced=False)
+    return EntryMeter(LATTICE, COLUMN_S / 2)
 
 
 # --- the meter --------------------------------------------------------------------------------
@@ -60,7 +61,8 @@ def test_nobody_is_far_from_its_cell_or_close_to_another(
     stream: list[Arrival], how: tuple[float, bool]
 ) -> None:
     spread_s, interlaced = how
-    meter = EntryMeter(LATTICE, 6, spread_s, interlaced=interlaced)
+    builder = ColumnBlocks(LATTICE, 6, spread_s) if interlaced else None
+    meter = EntryMeter(LATTICE, spread_s, builder, interlaced=interlaced)
     admissions = admitted(meter, stream)
     assert {admission.arrival for admission in admissions} == set(stream)
     assert len({admission.cell for admission in admissions}) == len(admissions)

@@ -297,6 +297,8 @@ class Street:
     arrivals: Iterable[Arrival] | None = None
     conditions: Conditions = field(factory=Conditions)
     pace: float = 1.0
+    seed: int = 1
+    """Of the network."""
     network: SimulatedNetwork = field(init=False)
     bridge: BridgeCore = field(init=False)
     world: PlainWorld = field(init=False)
@@ -307,7 +309,7 @@ class Street:
 
     def __attrs_post_init__(self) -> None:
         """Start the bridge."""
-        self.network = SimulatedNetwork(1, self.conditions)
+        self.network = SimulatedNetwork(self.seed, self.conditions)
         self.start_bridge("bridge", self.folder)
 
     def start_bridge(self, name: str, folder: Path) -> None:

@@ -371,7 +371,10 @@ def test_everybody_starts_afresh_with_the_next_bridge(tmp_path: Path, end_of_fir
     check_complete(street, tmp_path / "second")
     check_all_gone(street)
     summary = read_summary(tmp_path / "second")
-    assert summary["planning"]["plans"] > 0
+    planning = summary["planning"]
+    assert planning["plans"] > 0
+    assert planning["by_solver"] == {"tappa": planning["plans"], "branching": 0}
+    assert planning["fallbacks"] == 0
     assert summary["vehicles"]["on_preferred_lane"] == len(MANY)
     assert summary["tracking"]["hold_law_ticks"] == 0
     assert read_events(tmp_path / "second", "agent-missing") == []

@@ -120,7 +120,7 @@ def test_the_first_agent_is_in_charge_with_its_first_command(desk: Desk) -> None
 
 
 def test_what_the_controller_has_joined_is_confirmed(attended: Desk) -> None:
-    block = attended.core.vehicles[B].formation
+    block = attended.core.vehicles[B].block
     attended.answer(B, incarnation=AGENT, joined=(block + 1,))
     next_tick(attended, A)
     assert sensed(attended, B).joined == (block, block + 1)
@@ -165,7 +165,7 @@ BALLOT = Ballot(1, Name("c1"), 7, 1)
 
 
 def test_what_is_new_to_the_controller_is_confirmed_at_once(attended: Desk) -> None:
-    block, tick = attended.core.vehicles[B].formation, attended.core.tick
+    block, tick = attended.core.vehicles[B].block, attended.core.tick
     effects = attended.answer(B, incarnation=AGENT, joined=(block + 1,), accepted=BALLOT)
     sense = sense_of(effects, B, tick)
     assert (sense.joined, sense.accepted) == ((block, block + 1), BALLOT)

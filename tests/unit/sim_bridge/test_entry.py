@@ -12,6 +12,7 @@ from laneweave.protocol.lattice import Lattice
 from laneweave.protocol.scenario import parse_scenario
 from laneweave.sim_bridge.demand import Arrival, arrivals
 from laneweave.sim_bridge.entry import Admission, EntryMeter
+from laneweave.sim_bridge.formation_building import ColumnBlocks
 
 
 def lattice(lanes: int = 3, block_columns: int = 4) -> Lattice:
@@ -34,6 +35,11 @@ def demands(draw: st.DrawFn) -> tuple[Lattice, int, list[Arrival]]:
         for number, (t_s, lane, preferred) in enumerate(sorted(drawn), start=1)
     ]
     return grid, draw(st.integers(1, 12)), stream
+
+
+def interlaced_meter(grid: Lattice, most: int = 6, spread_s: float = 0.0) -> EntryMeter:
+    """Return the meter of the paper's operation."""
+    return EntryMeter(grid, spread_s, ColumnBlocks(grid, most, spread_s), interlaced=True)
 
 
 def check(grid: Lattice, most: int, admissions: list[Admission]) -> None:
@@ -65,7 +71,7 @@ def check(grid: Lattice, most: int, admissions: list[Admission]) -> None:
 @settings(max_examples=150, deadline=None)
 def test_rules_hold_and_everyone_enters(case: tuple[Lattice, int, list[Arrival]]) -> None:
     grid, most, stream = case
-    meter = EntryMeter(grid, most)
+    meter = interlaced_meter(grid, most)
     for arrival in stream:
         meter.demand(arrival)
     admissions = meter.admit(60.0 + 10.0 * grid.block_columns * len(stream) + 10.0)
@@ -80,7 +86,7 @@ def test_decisions_need_no_knowledge_of_the_future(
     case: tuple[Lattice, int, list[Arrival]], tick_s: float
 ) -> None:
     grid, most, stream = case
-    whole, stepwise = EntryMeter(grid, most), EntryMeter(grid, most)
+    whole, stepwise = interlaced_meter(grid, most), interlaced_meter(grid, most)
     for arrival in stream:
         whole.demand(arrival)
     end_s = 120.0
@@ -96,7 +102,7 @@ def test_decisions_need_no_knowledge_of_the_future(
 
 
 def test_a_vehicle_takes_the_first_interlaced_cell_that_it_can_reach() -> None:
-    meter = EntryMeter(lattice(), 6)
+    meter = interlaced_meter(lattice())
     meter.demand(Arrival("early", 0, 0, 0.0))
     meter.demand(Arrival("later", 1, 0, 0.2))
     meter.demand(Arrival("behind", 0, 0, 0.1))
@@ -110,7 +116,7 @@ def test_a_vehicle_takes_the_first_interlaced_cell_that_it_can_reach() -> None:
 
 def test_a_block_takes_no_more_than_can_reach_their_lane() -> None:
     # Five vehicles want lane 1, which has four cells in a block.
-    meter = EntryMeter(lattice(), 6)
+    meter = interlaced_meter(lattice())
     for number in range(2):
         for lane in range(3):
             meter.demand(Arrival(f"{number}-{lane}", lane, 1, 0.0))
@@ -119,7 +125,7 @@ def test_a_block_takes_no_more_than_can_reach_their_lane() -> None:
 
 
 def test_a_block_takes_no_more_than_the_largest_formation() -> None:
-    meter = EntryMeter(lattice(block_columns=8), 5)
+    meter = interlaced_meter(lattice(block_columns=8), 5)
     for number in range(4):
         for lane in range(3):
             meter.demand(Arrival(f"{number}-{lane}", lane, lane, 0.0))
@@ -135,7 +141,7 @@ def test_the_paper_s_blocks_hold_six() -> None:
 
 
 def test_a_late_demand_takes_no_column_that_has_passed() -> None:
-    meter = EntryMeter(lattice(), 6)
+    meter = interlaced_meter(lattice())
     assert meter.admit(5.0) == []
     meter.demand(Arrival("late", 0, 0, 1.0))
     (admission,) = meter.admit(20.0)
@@ -144,7 +150,7 @@ def test_a_late_demand_takes_no_column_that_has_passed() -> None:
 
 
 def test_impossible_demands_are_refused() -> None:
-    meter = EntryMeter(lattice(), 6)
+    meter = interlaced_meter(lattice())
     meter.demand(Arrival("twice", 0, 0, 0.0))
     with pytest.raises(ValueError, match="waiting already"):
         meter.demand(Arrival("twice", 1, 0, 0.0))
@@ -156,8 +162,9 @@ def test_impossible_demands_are_refused() -> None:
 
 @pytest.mark.parametrize(("volume", "most_s"), [(1000.0, 1.5), (1450.0, 2.5), (1600.0, 4.0)])
 def test_delay_stays_small_below_capacity(volume: float, most_s: float) -> None:
-    scenario = parse_scenario({"demand": {"volume_veh_per_lane_h": volume, "duration_s": 600.0}})
-    meter = EntryMeter(scenario.lattice, scenario.formation.max_vehicles)
+    demand = {"volume_veh_per_lane_h": volume, "duration_s": 600.0}
+    scenario = parse_scenario({"demand": demand, "formation": {"operation": "paper"}})
+    meter = interlaced_meter(scenario.lattice, scenario.formation.max_vehicles)
     stream = arrivals(scenario)
     for arrival in stream:
         meter.demand(arrival)

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import Any
 
 import pytest
+from attrs import define, field
 
-from laneweave.protocol.messages import Census, RoadClock
+from laneweave.protocol.messages import Census, ClosedFormation, Name, RoadClock
 from laneweave.protocol.node import Send
 from laneweave.protocol.scenario import Scenario, load_scenario, parse_scenario
 from laneweave.protocol.structuring import structure
 from laneweave.sim_bridge.entry import Admission
 from laneweave.sim_bridge.roadside import Counts, Roadside
 from laneweave.sim_bridge.traffic import RoadVehicle
+from paper import closing_time_s, paper
 
 
 def crowded(operation: str = "paper", **runtime: Any) -> Scenario:  # noqa: ANN401 (fields)
@@ -189,20 +192,100 @@ def test_is_not_exhausted_while_somebody_is_still_to_come() -> None:
 
 def test_a_census_tells_at_once_that_a_block_has_closed() -> None:
     """Who leads need not wait for the next second to know a roster for certain."""
-    scenario = load_scenario(None, seed=1, demand__duration_s=0.001)
+    scenario = paper(load_scenario(None, seed=1, demand__duration_s=0.001))
     roadside = Roadside(scenario)
-    tick_s = scenario.runtime.tick_s
-    censuses = [
-        tick
-        for tick in range(100)
-        for effect in roadside.news(tick, tick * tick_s, [])
-        if isinstance(effect, Send) and isinstance(effect.message, Census)
-    ]
-    lattice = scenario.lattice
-    closing = [
-        lattice.passing_time_s(lattice.block_range(block)[0]) + scenario.formation.entry_spread_s
-        for block in range(2)
-    ]
-    first_later = [min(n for n in range(100) if n * tick_s > closes_s) for closes_s in closing]
-    assert set(first_later) <= set(censuses)
-    assert len(censuses) < 20
+    tick_s, told = scenario.runtime.tick_s, {}
+    for tick in range(100):
+        roadside.close_formations(tick * tick_s)
+        for effect in roadside.news(tick, tick * tick_s, []):
+            if isinstance(effect, Send) and isinstance(effect.message, Census):
+                told[tick] = effect.message.closed_to
+    for block in range(2):
+        first = min(tick for tick in told if told[tick] >= block)
+        assert first == math.ceil(closing_time_s(block, scenario) / tick_s - 1e-6)
+    assert len(told) < 20
+
+
+@define
+class CensusWatch:
+    """Lets vehicles in and out, and checks what each census tells of formations."""
+
+    scenario: Scenario
+    vehicles: dict[Name, RoadVehicle] = field(factory=dict)
+    told: dict[int, ClosedFormation] = field(factory=dict)
+    """What censuses have told, by number."""
+    closed_to: int = -1
+    left: int = 0
+
+    def run(self, end_s: float) -> None:
+        roadside, tick_s = Roadside(self.scenario), self.scenario.runtime.tick_s
+        for tick in range(round(end_s / tick_s)):
+            self._tick(roadside, tick, tick * tick_s)
+
+    def _tick(self, roadside: Roadside, tick: int, t_s: float) -> None:
+        for admission in roadside.admit(t_s):
+            vehicle = RoadVehicle.entering(admission, t_s, self.scenario)
+            self.vehicles[vehicle.name] = vehicle
+            assert vehicle.block > self.closed_to, "a census said that nobody would"
+            assert vehicle.formation is None
+            assert vehicle.controller.joined == (vehicle.block,)
+        closed = roadside.close_formations(t_s)
+        for formation in closed:
+            for vehicle in self.vehicles.values():
+                if vehicle.block in formation.blocks:
+                    vehicle.join(formation)
+        lasts_s = self.scenario.road.length_m / self.scenario.formation.speed_mps
+        for name, vehicle in list(self.vehicles.items()):
+            if t_s > vehicle.admission.t_s + lasts_s:
+                del self.vehicles[name]
+                self.left += 1
+        censuses = [
+            effect.message
+            for effect in roadside.news(tick, t_s, self.vehicles.values())
+            if isinstance(effect, Send) and isinstance(effect.message, Census)
+        ]
+        assert censuses or not closed, "a formation has closed, and nobody is told"
+        for census in censuses:
+            self._check(census)
+
+    def _check(self, census: Census) -> None:
+        assert census.closed_to >= self.closed_to
+        self.closed_to = census.closed_to
+        for one, other in pairwise(census.formations):
+            assert one.last_block < other.first_block
+        for formation in census.formations:
+            assert formation.closed_s <= census.t_s
+            assert formation.last_block <= census.closed_to
+            assert self.told.setdefault(formation.first_block, formation) == formation
+        present = set()
+        for vehicle in self.vehicles.values():
+            if vehicle.block > census.closed_to:
+                assert vehicle.formation is None
+                continue
+            (mine,) = (one for one in census.formations if vehicle.block in one.blocks)
+            assert vehicle.formation == mine.first_block
+            assert vehicle.controller.joined == mine.blocks
+            present.add(mine)
+        assert set(census.formations) == present
+
+
+@pytest.mark.parametrize("volume", [30.0, 1000.0, 2000.0])
+def test_a_census_tells_whose_the_columns_are_and_which_are_closed(volume: float) -> None:
+    scenario = load_scenario(
+        None, seed=3, demand__duration_s=200.0, demand__volume_veh_per_lane_h=volume
+    )
+    watch = CensusWatch(scenario)
+    watch.run(300.0)
+    assert watch.left > 0
+    assert not watch.vehicles
+    used = [block for formation in watch.told.values() for block in formation.blocks]
+    assert len(set(used)) == len(used), "a column has two formations"
+
+
+def test_a_census_of_the_rolling_operation_tells_of_no_formations() -> None:
+    roadside = Roadside(load_scenario(None, formation__operation="rolling"))
+    for tick in range(600):
+        roadside.admit(0.1 * tick)
+        assert roadside.close_formations(0.1 * tick) == []
+    census = roadside.census(60.0, ())
+    assert (census.formations, census.closed_to) == ((), -1)

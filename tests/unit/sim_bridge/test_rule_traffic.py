@@ -179,7 +179,10 @@ def test_nobody_slides_sideways() -> None:
     [
         ({"rule": {"stop_distance_m": 600.0}}, "rule.stop_distance_m"),
         ({"rule": {"stop_distance_m": 20.0}}, "rule.stop_distance_m"),
-        ({"road": {"s3_m": 150.0}}, "rule.stop_distance_m"),
+        (
+            {"road": {"s3_m": 150.0}, "formation": {"operation": "paper"}},
+            "rule.stop_distance_m",
+        ),
         ({"road": {"lanes": 8}, "rule": {"lane_change_s": 5.0}}, "rule.lane_change_s"),
     ],
 )

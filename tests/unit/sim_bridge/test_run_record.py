@@ -121,10 +121,13 @@ def test_messages_are_counted_once_per_process(record: RunRecord, tmp_path: Path
 def test_the_newest_report_of_a_sender_counts(record: RunRecord, tmp_path: Path) -> None:
     record.on_report(Report(Name("agent"), Name("A"), solves=5, solve_ms=floats(9.0)))
     record.on_report(Report(Name("agent"), Name("A"), solves=7, unusable=1, solve_ms=floats(1.0)))
-    record.on_report(Report(Name("agent"), Name("B"), solves=2, solve_ms=floats(3.0)))
+    record.on_report(
+        Report(Name("agent"), Name("B"), solves=2, osqp_solves=1, solve_ms=floats(3.0))
+    )
     record.close(1.0, Ending.COMPLETE)
     tracking = read_summary(tmp_path)["tracking"]
     assert (tracking["solves"], tracking["unusable"]) == (9, 1)
+    assert (tracking["osqp_solves"], tracking["unconstrained_steps"]) == (1, 8)
     assert tracking["solve_ms"]["p50"] == 2.0
 
 
@@ -141,18 +144,23 @@ def test_durations_that_are_none_are_left_out(
 def test_plans_are_counted_from_events(record: RunRecord, tmp_path: Path) -> None:
     coordinator = (Name("coordinator"), Name("c0"))
     made: tuple[dict[str, Any], ...] = (
-        {"status": "optimal", "vehicles": 4, "solve_ms": 10.0},
+        {"status": "optimal", "vehicles": 4, "solve_ms": 10.0, "solver": "tappa"},
         {"status": "bounded", "vehicles": 6, "solve_ms": 30.0},
         {"status": [], "vehicles": "many", "solve_ms": None, "name": "somebody-else"},
+        {"status": "optimal", "solver": "branching", "fallback": True},
+        {"status": "optimal", "solver": ["tappa"], "fallback": "yes"},
     )
-    for kind, data in zip(("plan-made", "stream-planned", "plan-made"), made, strict=True):
+    kinds = ("plan-made", "stream-planned", *("plan-made",) * 3)
+    for kind, data in zip(kinds, made, strict=True):
         record.on_event(LogEvent(*coordinator, 5.0, Name(kind), data))
     record.on_event(LogEvent(*coordinator, 6.0, Name("leader-elected"), {"term": 3}))
     record.close(9.0, Ending.COMPLETE)
     planning = read_summary(tmp_path)["planning"]
-    assert (planning["plans"], planning["optimal"], planning["largest_formation"]) == (3, 1, 6)
+    assert (planning["plans"], planning["optimal"], planning["largest_formation"]) == (5, 3, 6)
+    assert planning["by_solver"] == {"tappa": 1, "branching": 1, "rolling": 1}
+    assert planning["fallbacks"] == 1
     assert planning["solve_ms"]["max"] == 30.0
-    assert [event["name"] for event in read_events(tmp_path, "plan-made")] == ["c0"] * 2
+    assert [event["name"] for event in read_events(tmp_path, "plan-made")] == ["c0"] * 4
     assert read_events(tmp_path, "leader-elected")[0]["term"] == 3
 
 

@@ -10,13 +10,16 @@
 | preference matrix P | `preference` |
 | assignments in non-decreasing order of cost | `assignments` |
 | TAPPA, Algorithm 1 | `tappa` |
-| CBSA, Algorithm 2 | `cbs`; as drawn in the case study: `conflict_tree` |
+| CBSA, Algorithm 2 | `cbs` |
+| conflicts and constraints of the tree | `constraints` |
 | SPPA | `diagram` (all shortest paths), `sppa` (the choice among them) |
 | relative path map | `path_map` |
+| parallel and interlaced structure | `structures` |
 
-Beyond the paper: branch and bound with prices, the default (`branching`, `relaxation`, `rows`);
-path sets by negotiation (`negotiation`, `repair`) and by joint search (`reachability`); conflicts
-computed from sizes and motions (`geometry`, `bodies`, `clearances`).
+Beyond the paper: what makes TAPPA fast, with a switch for each (`improvements`, `splits`, `joint`);
+what it did (`explanation`); branch and bound, the fallback of TAPPA (`branching`, `relaxation`,
+`rows`); path sets by negotiation (`negotiation`, `repair`) and by joint search (`reachability`);
+conflicts computed from sizes and motions (`geometry`, `bodies`, `clearances`).
 
 The package is pure: no I/O, no state between calls, and time only through the clock it is given.
 """

@@ -37,7 +37,6 @@ from laneweave.coordinator.planning.arrays import UNREACHABLE, Floats, Ints, lat
 from laneweave.coordinator.planning.branching_kernel import FULL, STUCK, search
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
 from laneweave.coordinator.planning.grid import Grid
-from laneweave.coordinator.planning.incumbent import Solution, tidied
 from laneweave.coordinator.planning.negotiation import Negotiation
 from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.reachability import explore
@@ -52,6 +51,7 @@ from laneweave.coordinator.planning.relaxation_kernel import (
 )
 from laneweave.coordinator.planning.repair import Repair
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
+from laneweave.coordinator.planning.solution import Solution, tidied
 from laneweave.coordinator.planning.trial import trial
 
 _SPARE_STEPS, _MORE_STEPS = 8, 6

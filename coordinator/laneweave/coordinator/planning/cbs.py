@@ -1,22 +1,20 @@
 """CBSA, the conflict-based searching algorithm (paper, Algorithm 2), for one assignment.
 
-The conflict tree is searched in order of cost. A node has the paper's four attributes:
-constraints, conflicts, path set and cost. What differs from the paper keeps the result exact:
+A node N_i of the constraint tree T has the paper's four attributes: constraints, conflicts, path
+set M_i and cost L_i. With all improvements off the tree is the paper's: one child for each entry of
+a node's conflict list. Improvements (`improvements`) change which constraints the children of a
+node get (`splits`), and end the search early (`limit`).
 
-- a node is split at one conflict, not at all of them (see `conflict_tree` for the paper's way);
-- the two bans of a conflict are grown to sets of moves, and the two children exclude each other
-  (see `constraints`);
-- the conflict that raises the cost most is taken first, and pairs of vehicles that cannot both
-  keep their cost raise the lower bound of a node;
-- a child that costs no more and has fewer conflicts replaces its parent's paths ("bypass");
-- the search can be interrupted and continued, and is told the best cost found elsewhere.
+Among the shortest paths of a vehicle, SPPA chooses one with the fewest conflicts with the paths of
+the other vehicles (`sppa`); about that the paper says nothing. In the root, paths are planned
+without regard to others.
 """
 
 from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import attrs
 
@@ -24,185 +22,209 @@ from laneweave.coordinator.planning.budget import Budget
 from laneweave.coordinator.planning.constraints import (
     Conflict,
     Constraint,
-    Split,
     bans_for,
-    rises,
-    split_by_cost,
-    split_by_moves,
+    constraints_of,
+    is_at_node,
 )
 from laneweave.coordinator.planning.diagram import Diagram, shortest_paths
+from laneweave.coordinator.planning.improvements import Improvements
 from laneweave.coordinator.planning.problem import Problem
+from laneweave.coordinator.planning.splits import CARDINAL, disjoint_constraints, rises
 from laneweave.coordinator.planning.sppa import Path, choose_path, conflicting_moves
 
-_EXACT_COVER_EDGES = 16
-
-UNBOUNDED = math.inf
-BOTH = 2
-"""Both children of a split cost more."""
+Limit = Callable[[], float]
+"""Returns the cost that a path set must be below to be of use; asked before each node."""
 
 
 @attrs.define(eq=False)
 class Node:
-    """A node of the conflict tree.
+    """A node N_i of the constraint tree.
 
-    constraints: of this node and all nodes above it.
-    diagrams: all shortest paths of each vehicle under its constraints.
-    paths: the path set, chosen from the diagrams.
+    constraints: of this node and of all nodes above it.
+    paths: the path set M_i.
     conflicts: of the path set.
-    bound: a lower bound on the cost of every solution below this node.
+    diagrams: all shortest paths of each vehicle under the constraints; M_i is chosen from them.
+    number: i; nodes count from 1 in the order in which they are made.
+    parent: number of the parent; 0: none.
+    expanded: whether it has got its children.
     """
 
     constraints: tuple[Constraint, ...]
-    diagrams: tuple[Diagram, ...]
     paths: tuple[Path, ...]
     conflicts: tuple[Conflict, ...]
-    bound: int
-    evaluated: bool = False
+    diagrams: tuple[Diagram, ...]
+    number: int = 1
+    parent: int = 0
+    expanded: bool = False
 
     @property
     def cost(self) -> int:
-        """Return the cost of the path set."""
+        """Return the cost L_i of the path set."""
         return sum(len(path) for path in self.paths)
 
+    def moves(self, conflict: Conflict) -> tuple[int, int]:
+        """Return the conflicting moves of both vehicles."""
+        step = conflict.step
+        first, second = (
+            self.paths[v][step] if step < len(self.paths[v]) else self.diagrams[v].target
+            for v in (conflict.first, conflict.second)
+        )
+        return first, second
 
-class ConflictTree:
-    """The conflict tree of one assignment, searched best first."""
 
-    def __init__(self, problem: Problem, assignment: Sequence[int], budget: Budget) -> None:
-        """Create the tree with its root node N_1."""
-        self.problem = problem
+class ConstraintTree:
+    """The constraint tree T of one assignment.
+
+    nodes: all nodes, if they are recorded.
+    solution: the node that ended the search, if there is one.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        assignment: Sequence[int],
+        budget: Budget,
+        improvements: Improvements,
+        *,
+        record: bool = False,
+    ) -> None:
+        """Prepare the search."""
         self.assignment = tuple(assignment)
         self.solution: Node | None = None
-        self.expanded = 0
+        self.nodes: list[Node] | None = [] if record else None
+        self._problem = problem
         self._budget = budget
-        self._serial = 0
+        self._improvements = improvements
+        self._count = 0
         self._open: list[tuple[int, int, int, Node]] = []
-        root = self._root()
-        if root is not None:
-            self._push(root)
 
     @property
     def lower_bound(self) -> float:
-        """Return a bound on all solutions that are not found yet; infinite if there are none."""
-        return self._open[0][0] if self._open else UNBOUNDED
+        """Return the least L_i in T; infinite: T is empty."""
+        return self._open[0][0] if self._open else math.inf
 
-    def search(self, *, below: float, nodes: int) -> Node | None:
-        """Expand up to `nodes` nodes; return a solution that costs less than `below`, if found.
+    def search(self, limit: Limit) -> Node | None:
+        """Apply Algorithm 2; return the node with the optimal path set, or None.
 
-        `below` must not grow between calls: nodes that cost as much are dropped. The first
-        solution found is the best one of this assignment, and ends the tree.
+        None: there is no path set, or none that costs less than the limit. Nodes that cost as much
+        are not kept, so the limit must not grow.
+
+        Raises:
+            BudgetSpentError: the deadline has passed or too many nodes were taken from T.
         """
-        last = self.expanded + nodes
-        while self._open and self._open[0][0] < below and self.expanded < last:
+        root = self._root()  # lines 1 to 4
+        if root is not None:
+            self._add(root)  # line 5
+        while self._open:  # line 6
+            bound = limit()
+            if self.lower_bound >= bound:
+                return None
             self._budget.take_node()
-            bound, _, _, node = self._open[0]
-            if not node.evaluated:
-                self._raise_bound(node)
-                if node.bound > bound:
-                    heapq.heappop(self._open)
-                    self._push(node)
-                    continue
-            self.expanded += 1
-            if not node.conflicts:
-                self._open.clear()
-                self.solution = node
+            node = heapq.heappop(self._open)[-1]  # lines 7 and 8: the minimum L_i
+            if not node.conflicts:  # line 9
+                self.solution = node  # lines 10 and 11
                 return node
-            children = self._children(node)
-            heapq.heappop(self._open)
-            for child in children:
-                if child.bound < below:
-                    self._push(child)
+            node.expanded = True
+            for added in self._constraints(node):  # lines 13, 15 and 16
+                child = self._child(node, added)  # lines 14, 17 and 18
+                if child is not None and child.cost < bound:
+                    self._add(child)  # line 19, where the paper prints N_i for N_c
         return None
 
-    def _push(self, node: Node) -> None:
-        self._serial += 1
-        heapq.heappush(self._open, (node.bound, len(node.conflicts), self._serial, node))
+    def _add(self, node: Node) -> None:
+        """Add a node to T; among equal L_i the one with the fewest conflicts is taken first."""
+        self._count += 1
+        node.number = self._count
+        heapq.heappush(self._open, (node.cost, len(node.conflicts), node.number, node))
+        if self.nodes is not None:
+            self.nodes.append(node)
 
     def _root(self) -> Node | None:
-        problem = self.problem
-        diagrams: list[Diagram] = []
-        paths: list[Path] = []
+        """Return N_1; None: a target cannot be reached."""
+        problem, table = self._problem, self._problem.table
+        diagrams = []
         for vehicle, target in enumerate(self.assignment):
             self._budget.check_time()
             diagram = problem.free_paths(vehicle, target)
             if diagram is None:
                 return None
-            others = [(p, d.target) for p, d in zip(paths, diagrams, strict=True)]
-            taken = conflicting_moves(problem.table, others, diagram.cost)
-            paths.append(choose_path(problem.table, diagram, taken))
             diagrams.append(diagram)
-        cost = sum(len(path) for path in paths)
-        conflicts = self._all_conflicts(diagrams, paths)
-        return Node((), tuple(diagrams), tuple(paths), conflicts, cost)
+        paths = tuple(choose_path(table, diagram, [0] * diagram.cost) for diagram in diagrams)
+        conflicts: set[Conflict] = set()
+        for vehicle in range(len(paths)):
+            self._budget.check_time()
+            conflicts.update(self._conflicts_of(vehicle, diagrams, paths))
+        return Node((), paths, tuple(sorted(conflicts)), tuple(diagrams))
 
-    def _children(self, node: Node) -> list[Node]:
-        """Return the children of a node, after bypassing conflicts that cost nothing."""
-        while True:
-            split = self._choose_split(node)
-            children = []
-            for constraint in (split.without, split.using):
-                child = self._child(node, constraint)
-                if child is None:
-                    continue
-                if child.cost == node.cost and len(child.conflicts) < len(node.conflicts):
-                    node.paths = child.paths
-                    node.conflicts = child.conflicts
-                    break
-                children.append(child)
-            else:
-                return children
-            if not node.conflicts:
-                return [node]
+    def _constraints(self, node: Node) -> Iterator[Constraint]:
+        """Yield the constraint that each child of a node adds."""
+        table = self._problem.table
+        if not self._improvements.cardinal:
+            # A vehicle in conflict with two others at one node has one entry.
+            yield from dict.fromkeys(
+                constraint
+                for conflict in node.conflicts
+                for constraint in constraints_of(table, conflict, node.moves(conflict))
+            )
+            return
+        conflict = self._most_expensive(node)
+        moves = node.moves(conflict)
+        if self._improvements.bicliques:
+            yield from disjoint_constraints(table, conflict, moves, node.diagrams)
+        else:
+            yield from constraints_of(table, conflict, moves)
 
-    def _child(self, node: Node, added: Sequence[Constraint]) -> Node | None:
-        """Return the node with these constraints added, or None if some vehicle has no path."""
-        problem, table = self.problem, self.problem.table
-        constraints = (*node.constraints, *added)
-        diagrams = list(node.diagrams)
-        changed = []
+    def _most_expensive(self, node: Node) -> Conflict:
+        """Return the conflict that raises the cost of most children; of equal ones the first."""
+        table = self._problem.table
+        best, most = node.conflicts[0], -1
+        for conflict in node.conflicts:
+            rising = rises(table, conflict, node.moves(conflict), node.diagrams)
+            if rising > most:
+                best, most = conflict, rising
+            if most == CARDINAL:
+                break
+        return best
+
+    def _child(self, node: Node, added: Constraint) -> Node | None:
+        """Apply SPPA under one more constraint; None: a vehicle has no path."""
+        problem, table = self._problem, self._problem.table
+        constraints = (*node.constraints, added)
+        diagrams, paths = list(node.diagrams), list(node.paths)
+        rerouted = []
         for vehicle, diagram in enumerate(node.diagrams):
-            if all(constraint.spares(vehicle, diagram) for constraint in added):
+            if added.spares(vehicle, diagram):
                 continue
             self._budget.check_time()
             bans = bans_for(vehicle, constraints)
-            narrowed = shortest_paths(table, problem.starts[vehicle], diagram.target, bans)
-            if narrowed is None:
+            shortest = shortest_paths(table, problem.starts[vehicle], diagram.target, bans)
+            if shortest is None:
                 return None
-            diagrams[vehicle] = narrowed
-            changed.append(vehicle)
-        paths = list(node.paths)
-        rerouted = [v for v in changed if not respects(paths[v], diagrams[v])]
+            diagrams[vehicle] = shortest
+            if not _is_among(paths[vehicle], shortest):
+                rerouted.append(vehicle)
         for vehicle in rerouted:
-            diagram = diagrams[vehicle]
             others = [
                 (path, other.target)
                 for i, (path, other) in enumerate(zip(paths, diagrams, strict=True))
                 if i != vehicle
             ]
-            self._budget.check_time()
+            diagram = diagrams[vehicle]
             taken = conflicting_moves(table, others, diagram.cost)
             paths[vehicle] = choose_path(table, diagram, taken)
         conflicts = set(node.conflicts)
         for vehicle in rerouted:
             conflicts = {c for c in conflicts if vehicle not in (c.first, c.second)}
             conflicts.update(self._conflicts_of(vehicle, diagrams, paths))
-        bound = max(sum(len(path) for path in paths), node.bound)
-        return Node(constraints, tuple(diagrams), tuple(paths), tuple(sorted(conflicts)), bound)
-
-    def _all_conflicts(
-        self, diagrams: Sequence[Diagram], paths: Sequence[Path]
-    ) -> tuple[Conflict, ...]:
-        found = []
-        for vehicle in range(len(paths)):
-            self._budget.check_time()
-            found += self._conflicts_of(vehicle, diagrams[: vehicle + 1], paths[: vehicle + 1])
-        return tuple(sorted(found))
+        listed = tuple(sorted(conflicts)) if rerouted else node.conflicts
+        return Node(constraints, tuple(paths), listed, tuple(diagrams), parent=node.number)
 
     def _conflicts_of(
         self, vehicle: int, diagrams: Sequence[Diagram], paths: Sequence[Path]
     ) -> list[Conflict]:
         """Return the conflicts between one vehicle and all others."""
-        conflicts = self.problem.table.conflicts
+        table = self._problem.table
+        conflicts = table.conflicts
         own, own_target = paths[vehicle], diagrams[vehicle].target
         found = []
         for other, path in enumerate(paths):
@@ -215,60 +237,12 @@ class ConflictTree:
                 theirs = path[step] if step < arrived else target
                 if conflicts[mine] >> theirs & 1:
                     pair = (vehicle, other) if vehicle < other else (other, vehicle)
-                    found.append(Conflict(step, *pair))
+                    found.append(Conflict(step, not is_at_node(table, mine, theirs), *pair))
         return found
 
-    def _choose_split(self, node: Node) -> Split:
-        """Return the split whose children cost most; among equal ones the earliest."""
-        table, diagrams = self.problem.table, node.diagrams
-        best, most = node.conflicts[0], -1
-        for conflict in node.conflicts:
-            rising = rises(table, conflict, _moves(node, conflict), diagrams)
-            if rising > most:
-                best, most = conflict, rising
-            if most == BOTH:
-                return split_by_moves(table, best, _moves(node, best), diagrams)
-        for conflict in node.conflicts:
-            if not self.problem.compatible(diagrams[conflict.first], diagrams[conflict.second]):
-                return split_by_cost(table, conflict, diagrams)
-        return split_by_moves(table, best, _moves(node, best), diagrams)
 
-    def _raise_bound(self, node: Node) -> None:
-        """Add what pairs of vehicles that cannot both keep their cost must pay at least."""
-        node.evaluated = True
-        pairs = sorted({(c.first, c.second) for c in node.conflicts})
-        edges = [
-            pair
-            for pair in pairs
-            if not self.problem.compatible(node.diagrams[pair[0]], node.diagrams[pair[1]])
-        ]
-        node.bound = max(node.bound, node.cost + least_cover(edges))
-
-
-def least_cover(edges: Sequence[tuple[int, int]]) -> int:
-    """Return the least number of vertices that touch all edges (a lower bound if many edges)."""
-    if not edges:
-        return 0
-    a, b = edges[0]
-    without_a = [e for e in edges if a not in e]
-    without_b = [e for e in edges if b not in e]
-    if len(edges) > _EXACT_COVER_EDGES:
-        return 1 + least_cover([e for e in without_a if b not in e])
-    return 1 + min(least_cover(without_a), least_cover(without_b))
-
-
-def respects(path: Path, diagram: Diagram) -> bool:
+def _is_among(path: Path, diagram: Diagram) -> bool:
     """Tell whether a path is one of the diagram's."""
     return len(path) == diagram.cost and all(
         layer >> move & 1 for layer, move in zip(diagram.layers, path, strict=True)
     )
-
-
-def _moves(node: Node, conflict: Conflict) -> tuple[int, int]:
-    """Return the conflicting moves of both vehicles."""
-    step = conflict.step
-    first, second = (
-        node.paths[v][step] if step < len(node.paths[v]) else node.diagrams[v].target
-        for v in (conflict.first, conflict.second)
-    )
-    return first, second

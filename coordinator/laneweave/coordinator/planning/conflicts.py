@@ -20,16 +20,9 @@ from laneweave.coordinator.planning.clearances import FARTHEST, close_pairs
 from laneweave.coordinator.planning.geometry import Geometry
 from laneweave.coordinator.planning.grid import Cell, Mode, Move
 
-KINDS: Final = (
-    "node",
-    "edge",
-    "special-1",
-    "special-2",
-    "special-3",
-    "special-4",
-    "geometric",
-    "closing",
-)
+PAPER_KINDS: Final = ("node", "edge", "special-1", "special-2", "special-3", "special-4")
+
+KINDS: Final = (*PAPER_KINDS, "geometric", "closing")
 
 DEFAULT_KINDS: Final[dict[Mode, tuple[str, ...]]] = {
     1: ("node", "edge", "special-1"),
@@ -89,20 +82,24 @@ def _special_1(a: Move, b: Move) -> bool:
 
 
 def _triangle(a: Move, b: Move) -> bool:
-    """A is oblique, B lies within A's square, and three cells form a right triangle."""
-    return frozenset(b) <= footprint(a) and len(frozenset(a + b)) == 3
+    """A is oblique, and B starts or ends at a corner of the square between A's cells.
+
+    The corner and A's cells are a right triangle. B's other cell may lie outside of the square: a
+    vehicle that enters or leaves the corner is as much in A's way as one that stays (ADR 27).
+    """
+    return is_oblique(a) and not corners(a).isdisjoint(b)
 
 
 def _special_2(a: Move, b: Move) -> bool:
-    return is_oblique(a) and is_longitudinal(b) and _triangle(a, b)
+    return is_longitudinal(b) and _triangle(a, b)
 
 
 def _special_3(a: Move, b: Move) -> bool:
-    return is_oblique(a) and is_lateral(b) and _triangle(a, b)
+    return is_lateral(b) and _triangle(a, b)
 
 
 def _special_4(a: Move, b: Move) -> bool:
-    return is_oblique(a) and is_wait(b) and _triangle(a, b)
+    return is_wait(b) and _triangle(a, b)
 
 
 def _geometric(a: Move, b: Move) -> bool:
@@ -157,8 +154,9 @@ class ConflictModel:
     edge: the two paths cross or overlap: a swap, or crossing diagonals.
     special-1: A moves into B's current cell while B moves to another one; this forbids trains of
         vehicles in the same direction, too.
-    special-2, special-3, special-4: A moves obliquely and B moves longitudinally, moves laterally
-        or stays, and their initial and target cells form a right triangle.
+    special-2, special-3, special-4: A moves obliquely, B moves longitudinally, moves laterally or
+        stays, and three of their initial and target cells form a right triangle: B leaves, enters
+        or stays at a corner of the square between A's cells.
     geometric: without a geometry, the footprints intersect. The footprint of a move is its two
         cells and, if it is oblique, both corner cells of its square; that of a wait is its cell.
         This is what the execution protocol reserves, whatever is late. It contains all kinds above

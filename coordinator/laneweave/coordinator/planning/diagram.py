@@ -2,9 +2,8 @@
 
 Space-time A* with an exact heuristic visits the states on shortest paths. Here they are found for
 all cells of a step at once, as sets of moves (see `moves`): forwards from the start until the
-target can be kept for good, then backwards to drop the moves that do not lead there. The result,
-known in the literature as a multi-valued decision diagram, also says which conflicts cannot be
-avoided without a longer path: those that meet every move of a step.
+target can be kept for good, then backwards to drop the moves that do not lead there. The result is
+known in the literature as a multi-valued decision diagram.
 """
 
 from __future__ import annotations
@@ -81,33 +80,3 @@ def shortest_paths(table: MoveTable, start: int, target: int, bans: Bans) -> Dia
         layers[step] &= table.leading_to(cells)
         cells = table.starts(layers[step])
     return Diagram(tuple(layers), target)
-
-
-def compatible(table: MoveTable, a: Diagram, b: Diagram) -> bool:
-    """Tell whether some shortest path of `a` and some shortest path of `b` do not conflict.
-
-    Both diagrams are walked together: for each cell of the first vehicle, the set of cells in
-    which the second may be at the same time.
-    """
-    conflicts = table.conflicts
-    start = table.starts(a.layer(0))
-    together = {start.bit_length() - 1: table.starts(b.layer(0))}
-    for step in range(max(a.cost, b.cost)):
-        first_layer, second_layer = a.layer(step), b.layer(step)
-        moves_into: dict[int, int] = {}
-        for cell, partners in together.items():
-            options = table.starting_in(partners) & second_layer
-            mine = first_layer >> cell & table.every
-            d = 0
-            while mine:
-                if mine & 1:
-                    possible = options & ~conflicts[cell + d]
-                    if possible:
-                        to = cell + table.shifts[d]
-                        moves_into[to] = moves_into.get(to, 0) | possible
-                mine >>= 1
-                d += 1
-        if not moves_into:
-            return False
-        together = {to: table.ends(moves) for to, moves in moves_into.items()}
-    return True

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Sequence
 from contextlib import suppress
-from typing import Final, Literal, Protocol
+from typing import Final, Protocol
 
+import attrs
 import numpy as np
 
 from laneweave.coordinator.planning.assignments import assignments
@@ -15,20 +16,24 @@ from laneweave.coordinator.planning.budget import Budget, BudgetSpentError, Cloc
 from laneweave.coordinator.planning.clearances import close_pairs
 from laneweave.coordinator.planning.frd import IntMatrix, Weights, cost_matrix
 from laneweave.coordinator.planning.grid import Cell
-from laneweave.coordinator.planning.incumbent import Solution, tidied
+from laneweave.coordinator.planning.improvements import Improvements
 from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.coordinator.planning.preference import BoolMatrix, preference_matrix
 from laneweave.coordinator.planning.problem import Problem
-from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.request import PlanRequest, checked_solver
 from laneweave.coordinator.planning.response import PlanResponse, Status
 from laneweave.coordinator.planning.rows import vehicles_share_cells
+from laneweave.coordinator.planning.solution import Solution, tidied
 from laneweave.coordinator.planning.tappa import Tappa
 from laneweave.coordinator.planning.validate import problems_of_response
+from laneweave.protocol.solvers import DEFAULT_SOLVER
 
-Solver = Literal["tappa", "branching"]
-"""`tappa`: the paper's algorithm. `branching`: branch and bound with prices, for large formations;
-what it cannot do, because vehicles may share a cell or tables get too large, `tappa` does."""
+TAPPA_SHARE: Final = 0.75
+"""Share of the deadline, and of the node limit, after which branching plans in place of TAPPA.
 
+15,000 of the 20,000 nodes of a scenario take TAPPA 3 to 5 s of CPU for six to eight vehicles;
+branching needs 0.1 s for such formations (95th percentile), 0.6 s at most.
+"""
 MAX_NODES: Final = 500_000
 """Bounds the memory to about 1 GB; it takes minutes to get there."""
 
@@ -55,52 +60,135 @@ class Search(Protocol):
         """Search until the optimum is proven or the budget is spent."""
 
 
+@attrs.frozen
+class _Result:
+    """What a solver found, without the memory of its search."""
+
+    solver: str
+    nodes: int
+    best: Solution | None = None
+    lower_bound: float = 0
+    finished: bool = False
+    gave_up: bool = False
+    has_fewest_moves: bool = False
+    tried: int = 0
+
+
 def plan(
     request: PlanRequest,
     *,
     max_nodes: int | None = None,
     weights: Weights | None = None,
-    solver: Solver = "branching",
+    solver: str | None = None,
+    fallback: bool = True,
     clock: Clock = time.monotonic,
 ) -> PlanResponse:
     """Plan one request.
 
-    Equal requests get equal plans unless the deadline passes first; `max_nodes` limits the search
-    in a repeatable way, and is never above `MAX_NODES`. `weights` of the formation relative
-    distance must give a lower bound.
+    Equal requests get equal plans unless the deadline passes first.
+
+    Args:
+        request: what to plan.
+        max_nodes: limit on search nodes, which is repeatable; at most `MAX_NODES`.
+        weights: of the formation relative distance; they must give a lower bound.
+        solver: one of `SOLVERS`, instead of the request's; if neither names one, the default.
+        fallback: branching goes on when TAPPA has spent `TAPPA_SHARE`, and the cheaper of both
+            path sets is returned; False: TAPPA may spend all. A solver that cannot treat the
+            request at all is always replaced by the other one.
+        clock: tells the time in s.
     """
-    if solver == "branching":
-        _warm_up_branching()  # not on the request's time
     if request.geometry is not None:
-        close_pairs(request.geometry)  # nor is its table
+        close_pairs(request.geometry)  # the time for its table does not count for the request
     started = clock()
+    structured = request.structure is not None
+    request = request.settled()
+    asked = checked_solver(solver or request.solver or DEFAULT_SOLVER)
     weights = (weights or Weights.for_mode(request.mode)).checked(request.mode)
     nodes = MAX_NODES if max_nodes is None else min(max_nodes, MAX_NODES)
-    budget = Budget(deadline=started + request.deadline_s, max_nodes=nodes, clock=clock)
-    problem = Problem(
-        request.grid,
-        request.mode,
-        request.conflict_model,
-        [vehicle.cell for vehicle in request.vehicles],
-        request.targets,
-    )
-    choices = request.choices()
-    searches: list[Search] = []
+    problem = problem_of(request)
+    order = _order(asked, problem, fallback=fallback)
+    results: list[_Result] = []
+    for name in order:
+        if name == "branching":
+            began = clock()
+            _warm_up_branching()
+            started += clock() - began  # nor does the time for loading it
+        shares = name == "tappa" and order[-1] != name
+        share = TAPPA_SHARE if shares else 1.0
+        left = nodes - sum(result.nodes for result in results)
+        budget = Budget(
+            deadline=started + share * request.deadline_s,
+            max_nodes=math.ceil(share * left),
+            clock=clock,
+        )
+        results.append(_solve(name, problem, request, weights, budget))
+        if results[-1].finished or not (results[-1].gave_up or shares):
+            break
+    response = _response(request, problem, asked, results, started, clock)
+    return attrs.evolve(response, targets=request.targets) if structured else response
+
+
+def _order(asked: str, problem: Problem, *, fallback: bool) -> tuple[str, ...]:
+    """Return which solvers plan, one after the other."""
+    if vehicles_share_cells(problem.table.model):
+        return ("tappa",)
+    if asked == "tappa":
+        return ("tappa", "branching") if fallback else ("tappa",)
+    return (asked, "tappa")
+
+
+def _solve(
+    solver: str, problem: Problem, request: PlanRequest, weights: Weights, budget: Budget
+) -> _Result:
+    """Let one solver search until it has finished, gives up or has spent its budget."""
+    search: Search | None = None
     with suppress(BudgetSpentError):
-        for search in _searches(solver, problem, request, weights, choices, budget):
-            searches.append(search)
-            search.run()
-            if not search.gave_up:
-                break
-    found = [search.best for search in searches if search.best is not None]
+        search = _search(solver, problem, request, weights, budget)
+        search.run()
+    if search is None:
+        return _Result(solver, budget.nodes)
+    return _Result(
+        solver,
+        budget.nodes,
+        search.best,
+        search.lower_bound,
+        search.finished,
+        search.gave_up,
+        search.has_fewest_moves,
+        search.tried,
+    )
+
+
+def _search(
+    solver: str, problem: Problem, request: PlanRequest, weights: Weights, budget: Budget
+) -> Search:
+    if solver == "branching":
+        from laneweave.coordinator.planning.branching import Branching  # noqa: PLC0415
+
+        return Branching(problem, request.choices(), budget)
+    return new_tappa(problem, request, weights, budget)
+
+
+def _response(
+    request: PlanRequest,
+    problem: Problem,
+    asked: str,
+    results: Sequence[_Result],
+    started: float,
+    clock: Clock,
+) -> PlanResponse:
+    """Combine what the solvers found: the cheapest path set and the highest lower bound."""
+    found = [result.best for result in reversed(results) if result.best is not None]
     best = min(found, key=lambda solution: solution.cost, default=None)
-    if best is not None and not any(search.has_fewest_moves for search in searches):
+    if best is not None and not any(result.has_fewest_moves for result in results):
+        budget = Budget(deadline=started + request.deadline_s, clock=clock)
         best = tidied(problem, best, budget)
     cells = [] if best is None else cells_of(problem, best)
     path_map = RelativePathMap.padded([v.id for v in request.vehicles][: len(cells)], cells)
-    bound = max((search.lower_bound for search in searches), default=0)
+    bound = max(result.lower_bound for result in results)
     cost = None if best is None else best.cost
-    finished = any(search.finished for search in searches) or cost == bound
+    finished = any(result.finished for result in results) or cost == bound
+    last = results[-1].solver
     return PlanResponse(
         status=_status(found=best is not None, finished=finished),
         cost=cost,
@@ -109,8 +197,10 @@ def plan(
         assignment=() if best is None else best.assignment,
         paths=path_map.rows,
         solve_ms=round(1e3 * (clock() - started), 3),
-        assignments_tried=sum(search.tried for search in searches),
-        nodes_expanded=budget.nodes,
+        assignments_tried=sum(result.tried for result in results),
+        nodes_expanded=sum(result.nodes for result in results),
+        solver=last,
+        fallback=last != asked,
     )
 
 
@@ -131,22 +221,26 @@ def _warm_up_branching() -> None:
     branching.warm_up()
 
 
-def _searches(
-    solver: Solver,
+def new_tappa(
     problem: Problem,
     request: PlanRequest,
     weights: Weights,
-    choices: list[frozenset[int]],
     budget: Budget,
-) -> Iterator[Search]:
-    """Yield what to search with; the next one where one gives up."""
-    if solver == "branching":
-        from laneweave.coordinator.planning.branching import Branching  # noqa: PLC0415
-
-        if not vehicles_share_cells(problem.table.model):
-            yield Branching(problem, choices, budget)
+    improvements: Improvements | None = None,
+    *,
+    record: bool = False,
+) -> Tappa:
+    """Return Algorithm 1, ready to run; see `Tappa`."""
+    choices = request.choices()
     costs, allowed = matrices(request, weights, choices, budget)
-    yield Tappa(problem, assignments(costs, allowed, budget), choices, budget)
+    candidates = assignments(costs, allowed, budget)
+    return Tappa(problem, candidates, choices, budget, improvements, record=record)
+
+
+def problem_of(request: PlanRequest) -> Problem:
+    """Return the problem of a request."""
+    cells = [vehicle.cell for vehicle in request.vehicles]
+    return Problem(request.grid, request.mode, request.conflict_model, cells, request.targets)
 
 
 def _status(*, found: bool, finished: bool) -> Status:
@@ -169,14 +263,15 @@ def checked_plan(
     *,
     max_nodes: int | None = None,
     weights: Weights | None = None,
-    solver: Solver = "branching",
+    solver: str | None = None,
+    fallback: bool = True,
 ) -> PlanResponse:
     """Plan one request and check the answer against it; see `plan`.
 
     Raises:
         RuntimeError: the answer is wrong, which would be an error in the planner.
     """
-    response = plan(request, max_nodes=max_nodes, weights=weights, solver=solver)
+    response = plan(request, max_nodes=max_nodes, weights=weights, solver=solver, fallback=fallback)
     problems = problems_of_response(request, response)
     if problems:
         raise RuntimeError("the planner made a wrong plan: " + "; ".join(problems))

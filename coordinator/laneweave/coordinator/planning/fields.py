@@ -44,6 +44,13 @@ def as_int(field: str, value: object, least: int, most: int) -> int:
     return value
 
 
+def as_bool(field: str, value: object) -> bool:
+    """Return true or false."""
+    if not isinstance(value, bool):
+        raise BadInputError(field, value, "true or false")
+    return value
+
+
 def as_text(field: str, value: object) -> str:
     """Return a string."""
     if not isinstance(value, str):

@@ -1,19 +1,35 @@
 """Seeded families of requests for tests and for `laneweave bench planner`.
 
-In both, vehicles start interlaced (on a checkerboard), prefer a random lane, and the targets are
-parallel: as many on each lane as vehicles prefer it, in the middle columns.
+Vehicles prefer a random lane, and the targets are parallel: as many on each lane as vehicles prefer
+it. In `block_request` and `formation_request` vehicles start interlaced (on a checkerboard) and the
+targets are in the middle columns; in `traffic_request` vehicles start where traffic puts them, and
+`targets.place` chooses as it does for a formation on the road.
 """
 
 from __future__ import annotations
 
+import math
 import random
+from collections import deque
 from collections.abc import Sequence
+
+import attrs
 
 from laneweave.coordinator.planning.conflicts import DEFAULT_KINDS
 from laneweave.coordinator.planning.grid import Cell, Grid, Mode
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
+from laneweave.coordinator.targets import place
+from laneweave.protocol.messages import Name
 
 _SPARE_COLUMNS = (2, 4)
+
+TRAFFIC_KINDS = ("node", "edge", "special-1", "closing")
+"""The conflict kinds of a scenario's formations in mode 1."""
+_TRAFFIC_VOLUMES = (1000, 2000)
+"""veh/(lane h)"""
+_MIN_HEADWAY_S = 1.0
+_WARM_UP_FORMATIONS = 2
+_TRAFFIC_LANES, _TRAFFIC_COLUMNS = 3, (3, 7)
 
 
 def block_request(
@@ -50,6 +66,103 @@ def formation_request(
     starts = _checkerboard(vehicles, columns, lanes, first_column=behind)
     wishes = _wishes(rng, vehicles, lanes, most=columns)
     return _request(Grid(columns, lanes), starts, wishes, mode, conflicts, deadline_s)
+
+
+def traffic_request(
+    seed: int,
+    *,
+    vehicles: int = 6,
+    mode: Mode = 1,
+    conflicts: Sequence[str] = TRAFFIC_KINDS,
+    deadline_s: float = 4.0,
+) -> PlanRequest:
+    """Return a formation of at most so many vehicles as traffic fills one on three lanes.
+
+    The volume is between 1000 and 2000 veh/(lane h). A formation has 3 to 7 columns: it ends with
+    its last vehicle, or before a column that would bring too many, or with its seventh column. The
+    second formation of the stream is the one that is taken.
+    """
+    rng = random.Random(seed)  # noqa: S311
+    stream = _Arrivals(rng, rng.uniform(*_TRAFFIC_VOLUMES), vehicles)
+    for _ in range(_WARM_UP_FORMATIONS - 1):
+        stream.formation()
+    columns, entered = stream.formation()
+    cells = {Name(f"v{i + 1}"): cell for i, (cell, _) in enumerate(entered)}
+    wishes = {Name(f"v{i + 1}"): lane for i, (_, lane) in enumerate(entered)}
+    targets = place(cells, wishes, columns, _TRAFFIC_LANES)
+    return PlanRequest(
+        Grid(columns, _TRAFFIC_LANES),
+        mode,
+        tuple(conflicts),
+        tuple(VehicleRequest(name, cells[name], lane=wishes[name]) for name in cells),
+        targets.cells,
+        deadline_s,
+    )
+
+
+@attrs.define
+class _Vehicle:
+    """A vehicle that arrives on a lane at a time [s] and prefers a lane."""
+
+    arrival_s: float
+    wish: int
+
+
+class _Arrivals:
+    """Vehicles that arrive on each lane while one column of cells passes in a second.
+
+    Headways are 1 s and an exponentially distributed rest.
+    """
+
+    def __init__(self, rng: random.Random, volume: float, most: int) -> None:
+        self._rng = rng
+        self._most = most
+        self._mean_rest_s = 3600.0 / volume - _MIN_HEADWAY_S
+        self._column = 0
+        self._waiting: list[deque[_Vehicle]] = [deque() for _ in range(_TRAFFIC_LANES)]
+        self._last_s = [0.0] * _TRAFFIC_LANES
+
+    def _heads(self) -> list[tuple[int, _Vehicle]]:
+        """Return lane and vehicle of those that may enter the next column, first come first."""
+        heads = []
+        for lane, queue in enumerate(self._waiting):
+            while not queue or self._last_s[lane] <= self._column:
+                headway_s = _MIN_HEADWAY_S + self._rng.expovariate(1.0 / self._mean_rest_s)
+                self._last_s[lane] += headway_s
+                queue.append(_Vehicle(self._last_s[lane], self._rng.randrange(_TRAFFIC_LANES)))
+            if queue[0].arrival_s <= self._column:
+                heads.append((lane, queue[0]))
+        return sorted(heads, key=lambda head: (head[1].arrival_s, head[0]))
+
+    def formation(self) -> tuple[int, list[tuple[Cell, int]]]:
+        """Return the columns of the next formation, and cell and preferred lane of its vehicles."""
+        shortest, longest = _TRAFFIC_COLUMNS
+        self._column = max(self._column, math.ceil(min(q[0].arrival_s for q in self._filled())))
+        entered: list[tuple[int, int, int]] = []
+        columns = 0
+        while columns < longest and (len(entered) < self._most or columns < shortest):
+            room = max(shortest, columns + 1)
+            wishes = [wish for _, _, wish in entered]
+            entering = []
+            for lane, vehicle in self._heads():
+                # A vehicle for whose lane the formation is too short waits.
+                if wishes.count(vehicle.wish) < room:
+                    wishes.append(vehicle.wish)
+                    entering.append(lane)
+            room_left = self._most - len(entered)
+            if len(entering) > room_left and columns >= shortest:
+                break
+            entered += [
+                (columns, lane, self._waiting[lane].popleft().wish) for lane in entering[:room_left]
+            ]
+            columns += 1
+            self._column += 1
+        return columns, [((columns - 1 - back, lane), wish) for back, lane, wish in entered]
+
+    def _filled(self) -> list[deque[_Vehicle]]:
+        """Return the queues, each with at least one vehicle."""
+        self._heads()
+        return self._waiting
 
 
 def _checkerboard(vehicles: int, columns: int, lanes: int, first_column: int) -> list[Cell]:

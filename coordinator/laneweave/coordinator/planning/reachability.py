@@ -15,9 +15,9 @@ from collections.abc import Iterator, Sequence
 import attrs
 
 from laneweave.coordinator.planning.budget import Budget
-from laneweave.coordinator.planning.incumbent import Solution
 from laneweave.coordinator.planning.moves import MoveTable, bits
 from laneweave.coordinator.planning.problem import Problem
+from laneweave.coordinator.planning.solution import Solution
 
 State = tuple[int, ...]
 """The cells of all vehicles, team by team, sorted within a team."""

@@ -25,7 +25,9 @@ from laneweave.coordinator.planning.fields import (
 from laneweave.coordinator.planning.geometry import Geometry
 from laneweave.coordinator.planning.grid import Cell, Grid, Mode
 from laneweave.coordinator.planning.preference import eligible_targets
+from laneweave.coordinator.planning.structures import STRUCTURES, shortage, structure_targets
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.solvers import SOLVERS
 
 REQUEST_SCHEMA: Final = "laneweave.plan.request/1"
 DEFAULT_DEADLINE_S: Final = 4.0
@@ -37,6 +39,7 @@ MAX_TARGETS: Final = 400
 MAX_ID_LENGTH: Final = 100
 MAX_DEADLINE_S: Final = 3600.0
 
+_NOT_BOTH: Final = "structure or targets, not both"
 _KEYS: Final = (
     "schema",
     "id",
@@ -47,6 +50,9 @@ _KEYS: Final = (
     "targets",
     "deadline_s",
     "geometry",
+    "solver",
+    "structure",
+    "lanes",
 )
 
 
@@ -64,7 +70,11 @@ class VehicleRequest:
 class PlanRequest:
     """Vehicles, targets and rules of one planning problem; checked when it is made.
 
+    targets: none where a structure is given.
+    structure: one of `STRUCTURES`, whose cells are the targets; see `structures`.
+    lanes: lanes that the structure uses; None: all.
     geometry: what `geometric` is computed from; None: footprints.
+    solver: one of `SOLVERS`; None: the default of whoever plans.
     id: names the request where it is asked again: a service answers it as before. Empty: no name.
     """
 
@@ -72,10 +82,13 @@ class PlanRequest:
     mode: Mode
     conflicts: tuple[str, ...]
     vehicles: tuple[VehicleRequest, ...]
-    targets: tuple[Cell, ...]
+    targets: tuple[Cell, ...] = ()
     deadline_s: float = DEFAULT_DEADLINE_S
     geometry: Geometry | None = None
     id: str = ""
+    solver: str | None = None
+    structure: str | None = None
+    lanes: tuple[int, ...] | None = None
 
     def __attrs_post_init__(self) -> None:
         """Reject what is inconsistent, however the request was made."""
@@ -86,8 +99,12 @@ class PlanRequest:
         if self.geometry is not None and "geometric" not in self.conflicts:
             allowed = "none, unless geometric is among conflicts"
             raise BadInputError("geometry", self.geometry.to_dict(), allowed)
-        _check_targets(self)
+        if self.solver is not None:
+            checked_solver(self.solver)
+        if self.structure is None:
+            _check_targets(self)
         _check_vehicles(self)
+        _check_structure(self)
         if len(self.id) > MAX_ID_LENGTH:
             raise BadInputError("id", self.id, f"at most {MAX_ID_LENGTH} characters")
         if not (math.isfinite(self.deadline_s) and 0 < self.deadline_s <= MAX_DEADLINE_S):
@@ -103,11 +120,32 @@ class PlanRequest:
         """Return, per vehicle, the indices of the targets it may be assigned to."""
         return [eligible_targets(self.targets, v.lane, v.eligible) for v in self.vehicles]
 
+    def _targets_to_dict(self) -> dict[str, Any]:
+        if self.structure is None:
+            return {"targets": [list(target) for target in self.targets]}
+        lanes = {} if self.lanes is None else {"lanes": list(self.lanes)}
+        return {"structure": self.structure, **lanes}
+
+    def settled(self) -> PlanRequest:
+        """Return the request with the targets of its structure; itself if it names targets."""
+        if self.structure is None:
+            return self
+        lanes, cells = _lanes_of(self), [vehicle.cell for vehicle in self.vehicles]
+        preferred = [vehicle.lane for vehicle in self.vehicles]
+        return self.with_targets(
+            structure_targets(self.structure, lanes, self.grid, cells, preferred)
+        )
+
+    def with_targets(self, targets: Sequence[Cell]) -> PlanRequest:
+        """Return the request with these targets instead of its own, or of its structure."""
+        return attrs.evolve(self, targets=tuple(targets), structure=None, lanes=None)
+
     @classmethod
     def from_dict(cls, data: object) -> PlanRequest:
         """Read the JSON form."""
         fields = as_mapping("request", data, _KEYS)
-        require(fields, "", ("schema", "grid", "vehicles", "targets"))
+        named = () if "structure" in fields else ("targets",)
+        require(fields, "", ("schema", "grid", "vehicles", *named))
         if fields["schema"] != REQUEST_SCHEMA:
             raise BadInputError("schema", fields["schema"], repr(REQUEST_SCHEMA))
         mode = _read_mode(fields.get("mode", 1))
@@ -116,7 +154,10 @@ class PlanRequest:
             names = as_list("conflicts", fields["conflicts"], len(KINDS))
             conflicts = tuple(as_text(f"conflicts[{i}]", name) for i, name in enumerate(names))
         vehicles = as_list("vehicles", fields["vehicles"], MAX_VEHICLES)
-        targets = as_list("targets", fields["targets"], MAX_TARGETS)
+        targets = as_list("targets", fields.get("targets", ()), MAX_TARGETS)
+        if "structure" in fields and "targets" in fields:
+            raise BadInputError("structure", fields["structure"], _NOT_BOTH)
+        lanes = as_list("lanes", fields["lanes"], MAX_LANES) if "lanes" in fields else None
         return cls(
             grid=_read_grid(fields["grid"]),
             mode=mode,
@@ -126,6 +167,9 @@ class PlanRequest:
             deadline_s=_read_deadline(fields.get("deadline_s", DEFAULT_DEADLINE_S)),
             geometry=Geometry.from_dict(fields["geometry"]) if "geometry" in fields else None,
             id=as_text("id", fields.get("id", "")),
+            solver=as_text("solver", fields["solver"]) if "solver" in fields else None,
+            structure=as_text("structure", fields["structure"]) if "structure" in fields else None,
+            lanes=None if lanes is None else tuple(lanes),
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -142,10 +186,22 @@ class PlanRequest:
             "mode": self.mode,
             "conflicts": list(self.conflicts),
             "vehicles": [_write_vehicle(vehicle) for vehicle in self.vehicles],
-            "targets": [list(target) for target in self.targets],
+            **self._targets_to_dict(),
             "deadline_s": self.deadline_s,
             **geometry,
+            **({} if self.solver is None else {"solver": self.solver}),
         }
+
+
+def checked_solver(name: str, field: str = "solver") -> str:
+    """Return the name of a solver.
+
+    Raises:
+        BadInputError: there is none of this name.
+    """
+    if name not in SOLVERS:
+        raise BadInputError(field, name, "one of " + ", ".join(SOLVERS))
+    return name
 
 
 def _read_mode(value: object) -> Mode:
@@ -239,6 +295,42 @@ def _check_targets(request: PlanRequest) -> None:
         seen[target] = i
 
 
+def _lanes_of(request: PlanRequest) -> Sequence[int]:
+    """Return the lanes of a structure."""
+    return range(request.grid.lanes) if request.lanes is None else request.lanes
+
+
+def _check_structure(request: PlanRequest) -> None:
+    structure = request.structure
+    if structure is None:
+        if request.lanes is not None:
+            raise BadInputError("lanes", request.lanes, "none, unless a structure is given")
+        return
+    if structure not in STRUCTURES:
+        raise BadInputError("structure", structure, "one of " + ", ".join(STRUCTURES))
+    if request.targets:
+        raise BadInputError("structure", structure, _NOT_BOTH)
+    lanes = _lanes_of(request)
+    if not lanes:
+        raise BadInputError("lanes", lanes, "at least one lane")
+    for i, lane in enumerate(lanes):
+        as_int(f"lanes[{i}]", lane, 0, request.grid.lanes - 1)
+        if lane in lanes[:i]:
+            raise BadInputError(f"lanes[{i}]", lane, "each lane once")
+    for i, vehicle in enumerate(request.vehicles):
+        if vehicle.eligible is not None:
+            allowed = "lane, or neither: a structure's targets have no numbers yet"
+            raise BadInputError(f"vehicles[{i}].eligible", vehicle.eligible, allowed)
+        if vehicle.lane is not None and vehicle.lane not in lanes:
+            allowed = "one of the structure's lanes " + ", ".join(map(str, lanes))
+            raise BadInputError(f"vehicles[{i}].lane", vehicle.lane, allowed)
+    preferred = [vehicle.lane for vehicle in request.vehicles]
+    lacking = shortage(structure, lanes, request.grid, preferred)
+    if lacking is not None:
+        allowed = f"a structure with a free cell for each vehicle; {lacking}"
+        raise BadInputError("structure", structure, allowed)
+
+
 def _check_vehicles(request: PlanRequest) -> None:
     if not 1 <= len(request.vehicles) <= MAX_VEHICLES:
         raise BadInputError("vehicles", len(request.vehicles), f"1 to {MAX_VEHICLES} vehicles")
@@ -266,7 +358,8 @@ def _check_preference(field: str, vehicle: VehicleRequest, request: PlanRequest)
         as_int(f"{field}.lane", vehicle.lane, 0, request.grid.lanes - 1)
     seen: set[int] = set()
     for k, target in enumerate(vehicle.eligible or ()):
-        as_int(f"{field}.eligible[{k}]", target, 0, len(request.targets) - 1)
+        if request.structure is None:
+            as_int(f"{field}.eligible[{k}]", target, 0, len(request.targets) - 1)
         if target in seen:
             raise BadInputError(f"{field}.eligible[{k}]", target, "each target once")
         seen.add(target)

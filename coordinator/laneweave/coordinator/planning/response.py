@@ -6,7 +6,15 @@ from typing import Any, Final, Literal
 
 import attrs
 
-from laneweave.coordinator.planning.fields import as_cell, as_int, as_list, as_mapping, require
+from laneweave.coordinator.planning.fields import (
+    as_bool,
+    as_cell,
+    as_int,
+    as_list,
+    as_mapping,
+    as_text,
+    require,
+)
 from laneweave.coordinator.planning.grid import Cell
 from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.coordinator.planning.request import MAX_TARGETS, MAX_VEHICLES, PlanRequest
@@ -30,6 +38,7 @@ _FIELDS: Final = (
     "assignments_tried",
     "nodes_expanded",
 )
+_OPTIONAL: Final = ("solver", "fallback", "targets", "waited_ms")
 
 
 @attrs.frozen
@@ -41,6 +50,11 @@ class PlanResponse:
     cost, steps: None without a plan. lower_bound: proven; None if infeasible.
     assignment: per vehicle, the index of its target; empty without a plan.
     paths: per vehicle, its cells at all `steps` + 1 time points; empty without a plan.
+    solver: which one planned last; None: a response from before there was a choice.
+    fallback: it took over, because the solver that was asked for reached its share of the deadline
+        or of the nodes, or cannot treat such requests; `paths` are the cheapest of both.
+    targets: of the structure that the request named, in the order of `assignment`'s indices; None:
+        the request named its targets.
     waited_ms: at a service, how long the request waited for a worker; None: it was planned here.
     """
 
@@ -53,6 +67,9 @@ class PlanResponse:
     solve_ms: float
     assignments_tried: int
     nodes_expanded: int
+    solver: str | None = None
+    fallback: bool = False
+    targets: tuple[Cell, ...] | None = None
     waited_ms: float | None = None
 
     def path_map(self, request: PlanRequest) -> RelativePathMap:
@@ -73,13 +90,20 @@ class PlanResponse:
             "solve_ms": self.solve_ms,
             "assignments_tried": self.assignments_tried,
             "nodes_expanded": self.nodes_expanded,
+            **({} if self.solver is None else {"solver": self.solver}),
+            **({"fallback": True} if self.fallback else {}),
+            **(
+                {}
+                if self.targets is None
+                else {"targets": [list(target) for target in self.targets]}
+            ),
             **({} if self.waited_ms is None else {"waited_ms": self.waited_ms}),
         }
 
     @classmethod
     def from_dict(cls, data: object) -> PlanResponse:
         """Read the JSON form."""
-        fields = as_mapping("response", data, (*_FIELDS, "waited_ms"))
+        fields = as_mapping("response", data, (*_FIELDS, *_OPTIONAL))
         require(fields, "", _FIELDS)
         if fields["schema"] != RESPONSE_SCHEMA:
             raise BadInputError("schema", fields["schema"], repr(RESPONSE_SCHEMA))
@@ -98,6 +122,9 @@ class PlanResponse:
             solve_ms=_milliseconds("solve_ms", fields["solve_ms"]),
             assignments_tried=as_int("assignments_tried", fields["assignments_tried"], 0, _MOST),
             nodes_expanded=as_int("nodes_expanded", fields["nodes_expanded"], 0, _MOST),
+            solver=as_text("solver", fields["solver"]) if "solver" in fields else None,
+            fallback=as_bool("fallback", fields.get("fallback", False)),
+            targets=_read_targets(fields["targets"]) if "targets" in fields else None,
             waited_ms=_milliseconds("waited_ms", fields["waited_ms"])
             if "waited_ms" in fields
             else None,
@@ -112,6 +139,11 @@ def _milliseconds(field: str, value: object) -> float:
 
 def _optional_int(field: str, value: object) -> int | None:
     return None if value is None else as_int(field, value, 0, _MOST)
+
+
+def _read_targets(value: object) -> tuple[Cell, ...]:
+    targets = as_list("targets", value, MAX_TARGETS)
+    return tuple(as_cell(f"targets[{j}]", target) for j, target in enumerate(targets))
 
 
 def _read_paths(value: object) -> tuple[tuple[Cell, ...], ...]:

@@ -1,10 +1,12 @@
 """TAPPA, the target assignment and path planning algorithm (paper, Algorithm 1).
 
-The paper applies CBSA to one assignment after the other and stops when the next assignment costs
-no less than the best path set. Here the conflict trees of all assignments stay open side by side,
-so that an assignment without a solution cannot hold up the others, and a tree is left alone once
-its lower bound exceeds that of another tree or the cost of the next assignment. "Optimal" is
-claimed when no open tree and no later assignment can be cheaper.
+Assignments A_1, A_2, ... are taken in order of their cost C_k. CBSA finds the best path set P_k of
+each, with cost C'_k (`cbs`). As soon as the next assignment costs no less than C'*, the cost of the
+best path set so far, that path set P* is optimal.
+
+Two improvements (`improvements`) end CBSA and the sequence of assignments earlier: CBSA looks only
+for path sets that cost less than C'*; and a search over the cells of all vehicles together
+(`joint`), which goes on beside large constraint trees, has a lower bound for every C'_k.
 """
 
 from __future__ import annotations
@@ -12,21 +14,34 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
+import attrs
+
 from laneweave.coordinator.planning.assignments import Assignment
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
-from laneweave.coordinator.planning.cbs import ConflictTree
-from laneweave.coordinator.planning.incumbent import Incumbent, Solution
+from laneweave.coordinator.planning.cbs import ConstraintTree
+from laneweave.coordinator.planning.improvements import Improvements
+from laneweave.coordinator.planning.joint import JointSearch
 from laneweave.coordinator.planning.problem import Problem
-from laneweave.coordinator.planning.reachability import explore
+from laneweave.coordinator.planning.solution import Solution
 
-_SLICE = 4
-"""Nodes expanded in one tree before the order of trees is looked at again."""
+_JOINT_AFTER = 32
+"""So many nodes come before the joint search begins."""
+_JOINT_MOVES_PER_NODE = 1
+"""A node among n nodes lets the joint search make n times as many moves: its share grows."""
 
-_EXPLORE_AFTER = 128
-_EXPLORE_MOVES = 20_000
-_EXPLORE_GROWTH = 8
-_EXPLORE_TIMES = 3
-"""After so many nodes without a path set, so many joint moves are tried; then more of both."""
+
+@attrs.frozen
+class Attempt:
+    """What was recorded of one assignment.
+
+    assignment: A_k with its cost C_k.
+    tree: the constraint tree of CBSA.
+    best_cost: C'_k; None: CBSA ended without a path set that costs less than C'*.
+    """
+
+    assignment: Assignment
+    tree: ConstraintTree
+    best_cost: int | None
 
 
 class Tappa:
@@ -36,7 +51,9 @@ class Tappa:
     lower_bound: no path set costs less.
     finished: the search is complete; `best` is optimal, or nothing exists.
     gave_up, has_fewest_moves: never.
-    tried: the assignments A_1 ... A_k whose trees were opened.
+    tried: k, the number of assignments to which CBSA was applied.
+    attempts: what CBSA did for each of them, if that is recorded.
+    next_cost: C_{k+1}, if it was looked at last.
     """
 
     def __init__(
@@ -45,86 +62,91 @@ class Tappa:
         candidates: Iterator[Assignment],
         choices: Sequence[frozenset[int]],
         budget: Budget,
+        improvements: Improvements | None = None,
+        *,
+        record: bool = False,
     ) -> None:
-        """Prepare the search; `candidates` are the assignments in order of cost."""
+        """Prepare the search.
+
+        Args:
+            problem: vehicles and targets.
+            candidates: the assignments in order of cost.
+            choices: eligible targets of each vehicle.
+            budget: deadline and limit on nodes.
+            improvements: what is added to the paper's algorithms; None: everything.
+            record: whether to keep all constraint trees.
+        """
+        self.best: Solution | None = None
         self.lower_bound: float = 0
         self.finished = False
         self.gave_up = self.has_fewest_moves = False
         self.tried = 0
+        self.attempts: list[Attempt] | None = [] if record else None
+        self.next_cost: float | None = None
         self._problem = problem
         self._candidates = candidates
         self._budget = budget
-        self._trees: list[ConflictTree] = []
-        self._incumbent = Incumbent(problem, choices, budget)
-        self._choices = choices
-        self._explored = 0
-
-    @property
-    def best(self) -> Solution | None:
-        """Return the best path set so far."""
-        return self._incumbent.best
+        self._improvements = improvements or Improvements()
+        self._joint = JointSearch(problem, choices, budget) if self._improvements.joint else None
 
     @property
     def best_cost(self) -> float:
         """Return C'*, which is infinite until a path set is found."""
         return math.inf if self.best is None else self.best.cost
 
+    @property
+    def joint_bound(self) -> float:
+        """Return what the joint search has found to be a lower bound of every C'_k."""
+        return 0 if self._joint is None else self._joint.lower_bound
+
     def run(self) -> None:
         """Search until the optimum is proven or the budget is spent."""
         try:
             self._search()
         except BudgetSpentError:
-            self.lower_bound = min(self.lower_bound, self.best_cost)
+            self.lower_bound = min(max(self.lower_bound, self.joint_bound), self.best_cost)
+        else:
+            self.lower_bound = self.best_cost
+            self.finished = True
 
     def _search(self) -> None:
-        upcoming = next(self._candidates, None)
-        while True:
-            tree = self._most_promising_tree()
-            tree_bound = math.inf if tree is None else tree.lower_bound
-            next_cost = math.inf if upcoming is None else upcoming.cost
-            self.lower_bound = min(next_cost, tree_bound, self.best_cost)
-            if self.best_cost <= self.lower_bound:
-                self.finished = True
-                return
-            if upcoming is not None and self._is_turn_of_assignment(next_cost, tree):
-                self.tried += 1
-                self._trees.append(ConflictTree(self._problem, upcoming.targets, self._budget))
-                upcoming = next(self._candidates, None)
-            elif tree is not None:
-                self._apply_cbsa(tree)
-            if self.best is None and self._is_impossible():
-                self.lower_bound = math.inf
-                self.finished = True
-                return
+        """Apply Algorithm 1; k is `tried`."""
+        assignment = next(self._candidates, None)  # lines 2 and 3
+        while assignment is not None:  # line 4
+            self.tried += 1  # line 14
+            self.lower_bound = min(assignment.cost, self.best_cost)
+            self._offer(self._cbsa(assignment))  # lines 5 to 8, and 16 to 19 for the last one
+            assignment = next(self._candidates, None)  # line 9
+            self.next_cost = None if assignment is None else assignment.cost
+            if self.next_cost is not None and self.best_cost <= self._bound(self.next_cost):
+                return  # lines 10 to 13
 
-    def _most_promising_tree(self) -> ConflictTree | None:
-        """Close the trees that cannot improve C'*; return the one with the least lower bound."""
-        self._trees = [tree for tree in self._trees if tree.lower_bound < self.best_cost]
-        return min(self._trees, key=lambda tree: (tree.lower_bound, tree.expanded), default=None)
+    def _bound(self, cost: float) -> float:
+        """Return a lower bound of the path sets of assignments that cost at least so much."""
+        return max(cost, self.joint_bound)
 
-    def _is_turn_of_assignment(self, next_cost: float, tree: ConflictTree | None) -> bool:
-        """Tell whether to open the tree of A_{k+1} before going on with an open tree.
+    def _offer(self, solution: Solution | None) -> None:
+        """Set P* and C'* if a path set is better (lines 6 to 8)."""
+        if solution is not None and solution.cost < self.best_cost:
+            self.best = solution
 
-        At equal cost, the more trees are open the more nodes each of them gets first.
-        """
-        if tree is None:
-            return True
-        return (next_cost, _SLICE * len(self._trees)) <= (tree.lower_bound, tree.expanded)
+    def _cbsa(self, assignment: Assignment) -> Solution | None:
+        """Apply CBSA to A_k; return P_k, or None if it cannot cost less than C'*."""
+        record = self.attempts is not None
+        tree = ConstraintTree(
+            self._problem, assignment.targets, self._budget, self._improvements, record=record
+        )
+        node = tree.search(self._limit)
+        if self.attempts is not None:
+            self.attempts.append(Attempt(assignment, tree, None if node is None else node.cost))
+        return None if node is None else Solution(assignment.targets, node.paths)
 
-    def _apply_cbsa(self, tree: ConflictTree) -> None:
-        """Continue one tree for a while; then look for path sets elsewhere, too."""
-        node = tree.search(below=self.best_cost, nodes=_SLICE)
-        if node is not None:
-            self._incumbent.offer(Solution(tree.assignment, node.paths))
-        self._incumbent.work(self._budget.nodes, [tree.assignment for tree in self._trees])
-
-    def _is_impossible(self) -> bool:
-        """Now and then, look whether the vehicles can reach their targets at all."""
-        growth = _EXPLORE_GROWTH**self._explored
-        if self._explored == _EXPLORE_TIMES or self._budget.nodes < _EXPLORE_AFTER * growth:
-            return False
-        self._explored += 1
-        verdict = explore(self._problem, self._choices, self._budget, _EXPLORE_MOVES * growth)
-        if verdict.solution is not None:
-            self._incumbent.begin_with(verdict.solution)
-        return verdict.impossible
+    def _limit(self) -> float:
+        """Return the cost below which a path set is of use, after some work for it."""
+        joint = self._joint
+        if joint is not None and not joint.ended and self._budget.nodes >= _JOINT_AFTER:
+            joint.work(_JOINT_MOVES_PER_NODE * self._budget.nodes)
+            self._offer(joint.solution)
+        if self.best_cost <= self.joint_bound:
+            return -math.inf
+        return self.best_cost if self._improvements.cutoff else math.inf

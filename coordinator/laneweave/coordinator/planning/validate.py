@@ -19,6 +19,11 @@ _FAR_APART = 4
 
 def problems_of_response(request: PlanRequest, response: PlanResponse) -> list[str]:
     """Return what is wrong with a response; nothing is wrong with one that holds no plan."""
+    if request.structure is not None:
+        problems = list(_problems_of_targets(request, response.targets or ()))
+        if problems:
+            return problems
+        request = request.with_targets(response.targets or ())
     if response.status in ("infeasible", "timeout"):
         empty = not response.paths and not response.assignment and response.cost is None
         return [] if empty else [f"a plan although the status is {response.status}"]
@@ -51,6 +56,20 @@ def problems_of_paths(
             ids = f"{request.vehicles[i].id} and {request.vehicles[j].id}"
             problems.append(f"{ids} are both assigned to target {assignment[i]}")
     return problems + list(_conflicts(request, paths))
+
+
+def _problems_of_targets(request: PlanRequest, targets: Sequence[Cell]) -> Iterator[str]:
+    """Yield how targets differ from the structure that was asked for."""
+    lanes = range(request.grid.lanes) if request.lanes is None else request.lanes
+    if len(targets) != len(request.vehicles) or len(set(targets)) != len(targets):
+        yield f"{len(set(targets))} targets for {len(request.vehicles)} vehicles"
+    for cell in targets:
+        if not request.grid.contains(cell) or not request.grid.is_free(cell):
+            yield f"target {cell} is blocked or outside the grid"
+        if cell[1] not in lanes:
+            yield f"target {cell} is not on a lane of the structure"
+    if request.structure == "interlaced" and len({sum(cell) % 2 for cell in targets}) > 1:
+        yield "targets of an interlaced structure have even and odd column + lane"
 
 
 def _problems_of_shape(

@@ -148,6 +148,7 @@ _ALL = (
         vehicles=(12, 12),
         blocks=(2, 2),
         lanes=(4, 4),
+        growing=0.0,
         max_joined=(1, 1),
     ),
     evolve(

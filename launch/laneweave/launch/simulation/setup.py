@@ -78,6 +78,14 @@ class Setup:
     thorough: bool = False
     """The stream planner plans, not the light one (rolling operation)."""
 
+    @property
+    def adjoin(self) -> bool:
+        """Whether there are two formations, with no column between them: these can be joined."""
+        if len(self.formations) != 2:
+            return False
+        ahead, behind = self.formations
+        return behind.first_block == ahead.last_block + 1
+
     @classmethod
     def drawn(cls, profile: Profile, rng: random.Random) -> Setup:
         """Draw from a profile."""
@@ -117,16 +125,14 @@ class Setup:
         The last wishes can be fulfilled: in each block at most as many vehicles want a lane as it
         has cells there. Where two formations may be joined, that holds for both together.
         """
-        lanes, columns = (
-            self.scenario.road.lanes,
-            [len(one.columns(self.scenario.lattice)) for one in self.formations],
-        )
+        lanes, lattice = self.scenario.road.lanes, self.scenario.lattice
+        columns = [len(one.columns(lattice)) for one in self.formations]
         if self.scenario.formation.rolling:
             room = [self.stretch_columns] * lanes
             weights = [6.0 if self.crowded and lane == 0 else 1.0 for lane in range(lanes)]
             vehicles = [visit.vehicle for visit in self.visits]
             return _draw_lanes(vehicles, room, weights, rng)
-        may_join = len(self.formations) == 2 and self.scenario.formation.max_joined >= 2
+        may_join = self.adjoin and self.scenario.formation.max_joined >= 2
         if self.crowded and (may_join or not last):
             # One lane that everybody likes best.
             room = [sum(columns)] * lanes if last else [99] * lanes
@@ -134,7 +140,6 @@ class Setup:
             weights = [6.0 if lane == favourite else 1.0 for lane in range(lanes)]
             return _draw_lanes([visit.vehicle for visit in self.visits], room, weights, rng)
         wishes: dict[Name, int] = {}
-        lattice = self.scenario.lattice
         for formation, length in zip(self.formations, columns, strict=True):
             members = [
                 visit.vehicle

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-import attrs
 from attrs import field, frozen
 
 from laneweave.launch.role_commands import LC2013, METHOD, RULE
@@ -16,6 +15,9 @@ from laneweave.protocol.scenario import (
     parse_scenario,
     to_tables,
 )
+
+LARGEST_OF_TAPPA: Final = 6
+"""Larger formations are planned by branching."""
 
 
 @frozen
@@ -42,8 +44,6 @@ class LabelledMethod:
 
 
 _FORMATIONS: Final = FormationSettings()
-_MOST_SEARCHED: Final = 6
-"""Vehicles of a formation up to which TAPPA plans; larger ones take it too long."""
 
 
 def _default() -> LabelledMethod:
@@ -77,9 +77,7 @@ def _paper(max_vehicles: int, block_columns: int) -> LabelledMethod:
 
 def _solver(max_vehicles: int) -> dict[str, object]:
     """Return what chooses the planner of formations of at most so many vehicles."""
-    solver = "tappa" if max_vehicles <= _MOST_SEARCHED else "branching"
-    known = any(one.name == "solver" for one in attrs.fields(FormationSettings))
-    return {"formation.solver": solver} if known else {}
+    return {"formation.solver": "tappa" if max_vehicles <= LARGEST_OF_TAPPA else "branching"}
 
 
 METHODS: Final[dict[str, LabelledMethod]] = {

@@ -31,7 +31,7 @@ recorded, as are earlier frames if live.
 | `candidates` | [name, term, leading, silent] each |
 | `counts` | [demanded, entered, on the road, left], or null |
 | `loss` | [expected, lost] states of the last 100 ticks, or null |
-| `plan` | [t, vehicles, solve ms] of the newest plan, or null |
+| `plan` | [t, vehicles, solve ms, solver or null, fallback] of the newest plan, or null |
 | `news` | the newest events, oldest first: [t, who, what, details] |
 | `formations` | those on the road that are closed: [number, rear column, front column] each |
 | `joined` | formations that plan together, at least two: lists of their numbers |

@@ -73,7 +73,7 @@ class LiveRoad:
         self._targets: dict[Ballot, dict[Name, Cell]] = {}
         """Of each plan the last cells of those who move."""
         self._news = Newest()
-        self._plan: list[float] | None = None
+        self._plan: list[Any] | None = None
         self._status, self._since_s = "waiting", wall_s
         self._shown: tuple[int, str, int] | None = None
         """Run, status and tick of the last frame."""

@@ -8,14 +8,16 @@ from typing import Any
 
 from attrs import define, field
 
+from laneweave.protocol.solvers import STREAM_PLANNED, solver_of_event
+
 MOST_NEWS = 8
 MOST_CHARACTERS = 90
 MOST_NUMBER = 1e12
 FREQUENT = (
-    "stream-planned", "plan-made", "plan-in-force", "formation-closed", "entered", "left",
+    STREAM_PLANNED, "plan-made", "plan-in-force", "formation-closed", "entered", "left",
 )  # fmt: skip
 """Events that would leave no room for others."""
-PLANNED = ("stream-planned", "plan-made")
+PLANNED = (STREAM_PLANNED, "plan-made")
 
 
 @define
@@ -49,11 +51,17 @@ def _brief(value: object) -> str:
     return str(value)
 
 
-def plan_facts(t_s: float, kind: str, data: Mapping[str, Any]) -> list[float] | None:
-    """Return [t, vehicles, solve ms] of an event that tells of a plan, None of any other."""
+def plan_facts(t_s: float, kind: str, data: Mapping[str, Any]) -> list[Any] | None:
+    """Return what a frame says of a plan, by an event that tells of one; None of any other."""
     if kind not in PLANNED:
         return None
-    return [round(t_s, 1), _number(data.get("vehicles")), _number(data.get("solve_ms"))]
+    return [
+        round(t_s, 1),
+        _number(data.get("vehicles")),
+        _number(data.get("solve_ms")),
+        solver_of_event(kind, data),
+        data.get("fallback") is True,
+    ]
 
 
 def _number(value: object) -> float:

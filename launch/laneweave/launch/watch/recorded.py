@@ -38,7 +38,7 @@ class _Moment:
 
     t_s: float
     leader: tuple[str, int] | None = None
-    plan: list[float] | None = None
+    plan: list[Any] | None = None
     news: tuple[list[Any], ...] = ()
     entered: int = 0
     left: int = 0
@@ -172,7 +172,7 @@ def _moments(folder: Path) -> Iterator[_Moment]:
         event = json.loads(line)
         events.append((float(event.pop("t_s")), str(event.pop("kind")), event))
     leader: tuple[str, int] | None = None
-    plan: list[float] | None = None
+    plan: list[Any] | None = None
     newest, entered, left = Newest(), 0, 0
     joined: tuple[tuple[int, ...], ...] = ()
     for t_s, kind, data in sorted(events, key=lambda event: event[0]):

@@ -7,7 +7,7 @@ from typing import Any
 
 from laneweave.launch.watch.frames import MOST_WANTED, compact, opening, reel, scene_of
 from laneweave.launch.watch.ring import Ring
-from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.scenario import parse_scenario
 
 
 def ring(count: int, most_frames: int = 10, most_characters: int = 10**6) -> Ring:
@@ -51,7 +51,8 @@ def test_an_answer_is_one_message_of_bounded_size() -> None:
 
 def test_the_scene_says_what_there_is() -> None:
     film = ring(25)
-    film.scene |= scene_of(Scenario(), "live", "here", 0.1)
+    rolling = parse_scenario({"formation": {"operation": "rolling"}})
+    film.scene |= scene_of(rolling, "live", "here", 0.1)
     scene = json.loads(opening(film, "this server"))["scene"]
     assert (scene["first"], scene["last"], scene["session"]) == (15, 24, "this server")
     assert (scene["kind"], scene["title"], scene["rolling"]) == ("live", "here", False)

@@ -252,7 +252,10 @@ def test_news_and_plans() -> None:
     ):
         road.take(LogEvent(Name("coordinator"), Name("c1"), 12.0, Name(kind), dict(more)), 2.0)
     frame = shown(road)
-    assert frame["plan"] == [12.0, 9, 4.25]
+    assert frame["plan"] == [12.0, 9, 4.25, "rolling", False]
+    made = {"vehicles": 6, "solve_ms": 2.5, "solver": "branching", "fallback": True}
+    road.take(LogEvent(Name("coordinator"), Name("c1"), 13.0, Name("plan-made"), made), 2.0)
+    assert shown(road)["plan"] == [13.0, 6, 2.5, "branching", True]
     ((t_s, who, what, details),) = frame["news"]
     assert (t_s, who, what) == (12.0, "c1", "formations-joined")
     assert details.startswith("formations 1 2, why xxx")
@@ -264,7 +267,7 @@ def test_news_and_plans() -> None:
 )
 def test_nonsense_in_events_does_no_harm(value: object) -> None:
     road = watched()
-    data = {"vehicles": value, "solve_ms": value}
+    data = {"vehicles": value, "solve_ms": value, "solver": value, "fallback": value}
     for kind in ("plan-made", "odd"):
         road.take(LogEvent(Name("x"), Name("y"), 1.0, Name(kind), dict(data)), 2.0)
     shown(road)

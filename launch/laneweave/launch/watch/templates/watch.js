@@ -301,9 +301,10 @@ class Watch {
     part("leader").classList.toggle("bad", !frame.leader);
     this.showCandidates(frame.candidates);
     this.showLoss(frame.loss, scene.losses, say);
-    const [plannedAt, planned, took] = frame.plan ?? [];
+    const [plannedAt, planned, took, solver, fallback] = frame.plan ?? [];
+    const by = solver ? ` by ${solver}${fallback ? " (fallback)" : ""}` : "";
     say("plan", frame.plan ? `${took.toFixed(1)} ms` : "–");
-    say("planned", frame.plan ? `${planned} vehicles, at ${plannedAt.toFixed(1)} s` : "");
+    say("planned", frame.plan ? `${planned} vehicles${by}, at ${plannedAt.toFixed(1)} s` : "");
     this.showNews(frame.news);
     this.showTime(frame, say);
     this.showStatus();

@@ -1,4 +1,4 @@
-"""Splitting a node must neither lose a solution nor look for it twice."""
+"""The children of a node lose no solution; those of `splits` have each of them only once."""
 
 import itertools
 from collections.abc import Iterator
@@ -12,13 +12,13 @@ from laneweave.coordinator.planning.constraints import (
     Conflict,
     Constraint,
     bans_for,
-    rises,
-    split_by_cost,
-    split_by_moves,
+    constraints_of,
+    is_at_node,
 )
-from laneweave.coordinator.planning.diagram import Bans, Diagram, compatible, shortest_paths
+from laneweave.coordinator.planning.diagram import Bans, Diagram, shortest_paths
 from laneweave.coordinator.planning.grid import Grid, Mode
 from laneweave.coordinator.planning.moves import MoveTable, bits
+from laneweave.coordinator.planning.splits import disjoint_constraints, rises
 from laneweave.coordinator.planning.sppa import Path, choose_path
 
 STEPS = 3
@@ -52,8 +52,9 @@ def _move(path: Path, target: int, step: int) -> int:
 def _first_conflict(case: Case) -> Conflict | None:
     table, (a, b), (p, q) = case
     for step in range(max(len(p), len(q))):
-        if table.conflicts[_move(p, a.target, step)] >> _move(q, b.target, step) & 1:
-            return Conflict(step, 0, 1)
+        moves = _move(p, a.target, step), _move(q, b.target, step)
+        if table.conflicts[moves[0]] >> moves[1] & 1:
+            return Conflict(step, not is_at_node(table, *moves), 0, 1)
     return None
 
 
@@ -104,19 +105,19 @@ def _in_child(case: Case, solution: tuple[Path, Path], constraints: tuple[Constr
 
 @settings(max_examples=80, deadline=None)
 @given(pairs())
-def test_each_solution_is_in_exactly_one_child(case: Case) -> None:
+def test_each_solution_is_in_exactly_one_disjoint_child_and_in_one_of_the_papers(
+    case: Case,
+) -> None:
     table, diagrams, (p, q) = case
     conflict = _first_conflict(case)
     assume(conflict is not None)
     assert conflict is not None
     moves = _move(p, diagrams[0].target, conflict.step), _move(q, diagrams[1].target, conflict.step)
-    splits = [split_by_moves(table, conflict, moves, diagrams)]
-    if not compatible(table, *diagrams):
-        splits.append(split_by_cost(table, conflict, diagrams))
+    disjoint = disjoint_constraints(table, conflict, moves, diagrams)
+    of_the_paper = constraints_of(table, conflict, moves)
     for solution in itertools.islice(_solutions(case), 200):
-        for split in splits:
-            children = [_in_child(case, solution, c) for c in (split.without, split.using)]
-            assert sorted(children) == [False, True]
+        assert sorted(_in_child(case, solution, (c,)) for c in disjoint) == [False, True]
+        assert any(_in_child(case, solution, (c,)) for c in of_the_paper)
 
 
 @settings(max_examples=60, deadline=None)
@@ -130,9 +131,12 @@ def test_neither_child_keeps_the_conflicting_pair_of_moves(case: Case) -> None:
         _move(paths[0], diagrams[0].target, conflict.step),
         _move(paths[1], diagrams[1].target, conflict.step),
     )
-    split = split_by_moves(table, conflict, moves, diagrams)
-    for constraints in (split.without, split.using):
-        assert not _in_child(case, paths, constraints)
+    for make in (
+        disjoint_constraints(table, conflict, moves, diagrams),
+        constraints_of(table, conflict, moves),
+    ):
+        for constraint in make:
+            assert not _in_child(case, paths, (constraint,))
 
 
 def _cost_of_child(
@@ -157,8 +161,8 @@ def test_children_cost_as_much_more_as_announced(case: Case) -> None:
     assume(conflict is not None)
     assert conflict is not None
     moves = _move(p, diagrams[0].target, conflict.step), _move(q, diagrams[1].target, conflict.step)
-    split = split_by_moves(table, conflict, moves, diagrams)
-    costs = [_cost_of_child(table, diagrams, c) for c in (split.without, split.using)]
+    children = disjoint_constraints(table, conflict, moves, diagrams)
+    costs = [_cost_of_child(table, diagrams, (c,)) for c in children]
     before = diagrams[0].cost + diagrams[1].cost
     rising = sum(cost is None or cost > before for cost in costs)
     assert rising >= rises(table, conflict, moves, diagrams)

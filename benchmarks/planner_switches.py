@@ -1,0 +1,108 @@
+"""What each improvement of TAPPA is worth: `python benchmarks/planner_switches.py [--json FILE]`.
+
+Formations as traffic fills them, and interlaced ones of 2 to 6 vehicles in blocks of four columns,
+are planned with all improvements, without each one of them, and by the literal algorithms. CPU time
+of one thread. What has all improvements is compared with branching.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+
+from laneweave.coordinator.planning import PlanRequest, Weights, plan, warm_up
+from laneweave.coordinator.planning.budget import Budget
+from laneweave.coordinator.planning.facade import MAX_NODES, new_tappa, problem_of
+from laneweave.coordinator.planning.improvements import Improvements
+from laneweave.coordinator.planning.instances import TRAFFIC_KINDS, block_request, traffic_request
+
+OUT = Path(__file__).resolve().parents[1] / "docs" / "evidence" / "planner-switches.json"
+INSTANCES, FEWER_INSTANCES = 200, 60
+"""With all improvements, and without some."""
+DEADLINE_S = 4.0
+
+
+def interlaced_request(seed: int) -> PlanRequest:
+    """Return an interlaced formation of 2 to 6 vehicles."""
+    return block_request(seed, vehicles=2 + seed % 5, conflicts=TRAFFIC_KINDS)
+
+
+FAMILIES: dict[str, Callable[[int], PlanRequest]] = {
+    "interlaced": interlaced_request,
+    "traffic": traffic_request,
+}
+
+
+def switch_settings() -> Iterator[tuple[str, Improvements]]:
+    """Yield names and settings."""
+    yield "all", Improvements()
+    for field in attrs.fields(Improvements):
+        yield f"without {field.name}", attrs.evolve(Improvements(), **{field.name: False})
+    yield "none", Improvements.none()
+
+
+def planned(request: PlanRequest, improvements: Improvements) -> tuple[float, int | None]:
+    """Return CPU time [ms] and cost; None: not proven within the deadline."""
+    began = time.thread_time()
+    budget = Budget(deadline=began + DEADLINE_S, max_nodes=MAX_NODES, clock=time.thread_time)
+    weights = Weights.for_mode(request.mode)
+    run = new_tappa(problem_of(request), request, weights, budget, improvements)
+    run.run()
+    took_ms = 1e3 * (time.thread_time() - began)
+    return took_ms, run.best.cost if run.finished and run.best is not None else None
+
+
+def measured(family: str, name: str, improvements: Improvements, instances: int) -> dict[str, Any]:
+    """Return one row.
+
+    Raises:
+        RuntimeError: a cost that was claimed to be optimal is not that of branching.
+    """
+    times_ms, solved = [], 0
+    for seed in range(instances):
+        request = FAMILIES[family](seed)
+        took_ms, cost = planned(request, improvements)
+        times_ms.append(took_ms)
+        solved += cost is not None
+        if cost is not None and cost != plan(request).cost:
+            raise RuntimeError(f"{family}, seed {seed}, {name}: {cost} is not optimal")
+    p50, p95, most = np.percentile(times_ms, [50, 95, 100]).tolist()
+    return {
+        "family": family,
+        "improvements": name,
+        "instances": instances,
+        "solved": solved,
+        "cpu_ms_p50": round(p50, 1),
+        "cpu_ms_p95": round(p95, 1),
+        "cpu_ms_max": round(most, 1),
+    }
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", type=Path, default=OUT, metavar="FILE")
+    options = parser.parse_args()
+    warm_up()
+    rows = []
+    for family in FAMILIES:
+        for name, improvements in switch_settings():
+            instances = INSTANCES if improvements == Improvements() else FEWER_INSTANCES
+            rows.append(measured(family, name, improvements, instances))
+            sys.stdout.write(json.dumps(rows[-1]) + "\n")
+            sys.stdout.flush()
+    options.json.write_text(
+        json.dumps({"deadline_s": DEADLINE_S, "results": rows}, indent=1) + "\n"
+    )
+
+
+if __name__ == "__main__":
+    main()

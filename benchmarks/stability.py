@@ -1,0 +1,162 @@
+"""How a disturbance of speed travels: `python benchmarks/stability.py [--json FILE]`.
+
+One vehicle brakes for 2 s whatever it is told, in a column that holds its cells and in formations
+that switch, with and without message loss (`tests/disturbances.py`). Writes peaks and amplification
+from vehicle to vehicle, a figure, and prints a table. The exit status is 1 if bodies overlap.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import structlog
+from attrs import evolve
+from numpy.typing import NDArray
+
+if __name__ == "__main__":  # run as a program: as `pythonpath` in pyproject.toml
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from disturbances import BRAKING_S, FORMATIONS, MEASURED_S, Case, Response, respond
+from laneweave.launch.drawing import new_figure, save
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+OUT = DOCS / "evidence" / "stability.json"
+FIGURE = DOCS / "images" / "stability.png"
+DROPS_MPS = {"column": (0.0, 2.0, 3.0, 4.0, 6.0), "switching": (0.0, 3.0, 6.0)}
+VEHICLES = {"column": 12, "switching": 18}
+LOSSES = (0.0, 0.5)
+SEEDS = 5
+DISTURBED_MPS = 0.5
+"""A vehicle counts as disturbed beyond this error of speed; undisturbed runs stay below 0.35."""
+QUANTITIES = ("speed_mps", "gap_m", "accel_mps2")
+SHOWN = (
+    Case("column", 3.0),
+    Case("column", 6.0, 0.5),
+    Case("switching", 3.0, 0.5, vehicles=VEHICLES["switching"]),
+)
+"""Panels over time."""
+COLOURS = ("#9aa0a6", "#56b4e9", "#0072b2", "#e69f00", "#d55e00")
+
+
+def cases() -> list[Case]:
+    """Return all cases with the first seed."""
+    return [
+        Case(formation, drop_mps, loss, vehicles=VEHICLES[formation])
+        for formation in FORMATIONS
+        for drop_mps in DROPS_MPS[formation]
+        for loss in LOSSES
+    ]
+
+
+def peaks(response: Response, quantity: str) -> NDArray[np.float64]:
+    """Return the largest absolute value of a quantity, by vehicle."""
+    values: NDArray[np.float64] = np.abs(getattr(response, quantity)).max(axis=0)
+    return values
+
+
+def row(case: Case, responses: Sequence[Response]) -> dict[str, Any]:
+    """Return figures of a case: the largest values of its runs, by vehicle where there are many."""
+    vehicles = min(response.speed_mps.shape[1] for response in responses)
+    found = {
+        name: np.array([peaks(one, name)[:vehicles] for one in responses]) for name in QUANTITIES
+    }
+    speeds = found["speed_mps"]
+    ratios = np.where(speeds[:, :-1] > DISTURBED_MPS, speeds[:, 1:] / speeds[:, :-1], np.nan)
+    in_line = case.formation == "column"
+    return {
+        "formation": case.formation,
+        "drop_mps": case.drop_mps,
+        "loss": case.loss,
+        "runs": len(responses),
+        **{name: values.max(axis=0).round(3).tolist() for name, values in found.items()},
+        "amplification": [
+            round(float(np.nanmax(column)), 3) if in_line and np.isfinite(column).any() else None
+            for column in ratios.T
+        ],
+        "travelled": int((speeds[:, 1:].max(axis=1) > DISTURBED_MPS).sum()),
+        "reached_last": int((speeds[:, -1] > DISTURBED_MPS).sum()),
+        "least_gap_m": round(min(one.least_gap_m for one in responses), 2),
+        "overlaps": sum(one.overlaps for one in responses),
+        "braked": sum(one.braked for one in responses),
+        "moves": sum(one.moves for one in responses),
+    }
+
+
+def draw(runs: Mapping[Case, Sequence[Response]], table: Sequence[dict[str, Any]]) -> None:
+    """Draw speeds over time for some cases, and the largest errors of all columns."""
+    figure = new_figure(10.0, 6.6)
+    *over_time, last = figure.subplots(2, 2).flat
+    for axes, shown in zip(over_time, SHOWN, strict=True):
+        response = runs[shown][0]
+        vehicles = response.speed_mps.shape[1]
+        for number in reversed(range(vehicles)):
+            colour = str(0.25 + 0.6 * number / vehicles) if number else "#d55e00"
+            axes.plot(response.times_s, response.speed_mps[:, number], color=colour, linewidth=1.3)
+        axes.axvspan(0.0, BRAKING_S, color="#f3e3d6", zorder=0)
+        axes.set_title(
+            f"{shown.formation}, {shown.drop_mps:g} m/s lost, "
+            f"{100 * shown.loss:g} % of messages lost, seed {shown.seed}"
+        )
+        axes.set_xlabel("time since the disturbance began (s)")
+        axes.set_ylabel("speed error (m/s)")
+        axes.set_xlim(0.0, MEASURED_S)
+    colours = dict(zip(DROPS_MPS["column"], COLOURS, strict=True))
+    for entry in table:
+        if entry["formation"] == "column":
+            last.plot(
+                entry["speed_mps"],
+                color=colours[entry["drop_mps"]],
+                marker="o" if entry["loss"] else "",
+                linestyle="none" if entry["loss"] else "-",
+                markersize=4,
+                label="" if entry["loss"] else f"{entry['drop_mps']:g} m/s lost",
+            )
+    last.set_title(f"column: largest speed error of {table[0]['runs']} runs")
+    last.set_xlabel("vehicles behind (points: 50 % of messages lost)")
+    last.set_ylabel("|speed error| (m/s)")
+    last.set_ylim(0.0, 9.0)
+    last.legend(fontsize=8, frameon=False, ncols=3, loc="upper right")
+    for axes in figure.axes:
+        axes.title.set_fontsize(10)
+        axes.grid(visible=True, color="#e6e8eb", linewidth=0.6)
+        axes.spines[["top", "right"]].set_visible(False)
+    save(figure, FIGURE, 110)
+
+
+def main() -> int:
+    """Drive, write, print, and return the exit status."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--json", type=Path, default=OUT, help="where to write")
+    parser.add_argument("--seeds", type=int, default=SEEDS, help="runs of each case")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
+    chosen = parser.parse_args()
+    quiet = structlog.make_filtering_bound_logger(logging.ERROR)
+    seeds = range(1, chosen.seeds + 1)
+    todo = [evolve(case, seed=seed) for case in cases() for seed in seeds]
+    with ProcessPoolExecutor(
+        chosen.jobs, initializer=structlog.configure, initargs=(None, quiet)
+    ) as pool:
+        found = list(pool.map(respond, todo))
+    runs = {
+        case: found[first : first + len(seeds)]
+        for case, first in zip(cases(), range(0, len(found), len(seeds)), strict=True)
+    }
+    table = [row(case, responses) for case, responses in runs.items()]
+    chosen.json.write_text(json.dumps({"rows": table}, indent=1) + "\n", encoding="utf-8")
+    draw(runs, table)
+    for entry in table:
+        sys.stdout.write(json.dumps(entry) + "\n")
+    return int(any(entry["overlaps"] for entry in table))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,189 @@
+"""The run of Algorithms 1 and 2 as data, for people: assignments, constraint trees, why it ended.
+
+The trees are the paper's literal ones while they are small; else those of the improved algorithms.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from typing import Final, Literal
+
+import attrs
+
+from laneweave.coordinator.planning.budget import Budget, Clock
+from laneweave.coordinator.planning.cbs import ConstraintTree, Node
+from laneweave.coordinator.planning.constraints import entry
+from laneweave.coordinator.planning.facade import cells_of, new_tappa, problem_of
+from laneweave.coordinator.planning.frd import Weights
+from laneweave.coordinator.planning.improvements import Improvements
+from laneweave.coordinator.planning.moves import MoveTable
+from laneweave.coordinator.planning.path_map import RelativePathMap
+from laneweave.coordinator.planning.problem import Problem
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.solution import Solution
+from laneweave.coordinator.planning.tappa import Attempt, Tappa
+
+MAX_LITERAL_NODES: Final = 150
+"""Nodes taken from literal trees before the improved ones are shown instead."""
+MAX_NODES: Final = 50_000
+"""The same for improved trees; then the run is shown as far as it came."""
+
+NodeStatus = Literal["expanded", "solution", "open"]
+"""open: still in T when the search ended."""
+
+
+@attrs.frozen
+class ExplainedNode:
+    """A node N_i of a constraint tree.
+
+    number, parent: i; 0: the root has no parent.
+    constraint: what it adds to the constraints of its parent; empty: the root.
+    conflicts: its conflict list in the paper's notation.
+    path_map: the relative path map of its path set M_i.
+    cost: L_i.
+    """
+
+    number: int
+    parent: int
+    constraint: str
+    conflicts: tuple[str, ...]
+    path_map: RelativePathMap
+    cost: int
+    status: NodeStatus
+
+
+@attrs.frozen
+class ExplainedAssignment:
+    """What was done for an assignment A_k.
+
+    targets: the assignment vector, targets counted from 0.
+    cost: C_k.
+    best_cost: C'_k; None: no path set that costs less than C'* was found.
+    best_so_far: C'* after it.
+    nodes: the constraint tree in the order in which its nodes were made.
+    """
+
+    targets: tuple[int, ...]
+    cost: int
+    best_cost: int | None
+    best_so_far: float
+    nodes: tuple[ExplainedNode, ...]
+
+
+@attrs.frozen
+class Explanation:
+    """The run of Algorithm 1.
+
+    literal: the trees are those of the paper, with all improvements off.
+    optimal: the optimum is proven, or that there is none.
+    joint_bound: what the joint search proved to be a lower bound; 0: nothing.
+    joint_cost: C'* came from the joint search; None: it did not.
+    next_cost: C_{k+1}; None: there is no further assignment, or it was not looked at.
+    """
+
+    literal: bool
+    assignments: tuple[ExplainedAssignment, ...]
+    best_cost: float
+    optimal: bool
+    joint_bound: float
+    joint_cost: int | None
+    next_cost: float | None
+
+    @property
+    def why_it_ended(self) -> str:
+        """Return in one line why no further assignment was tried."""
+        k = len(self.assignments)
+        best = "infinite" if math.isinf(self.best_cost) else f"{self.best_cost:g}"
+        if not self.optimal:
+            return f"deadline or node limit, C'* = {best} is not proven"
+        if self.joint_cost is not None:
+            return f"joint search: no path set costs less than C'* = {best}"
+        if self.next_cost is not None and self.best_cost <= self.next_cost:
+            return f"C_{k + 1} = {self.next_cost:g} >= C'* = {best}"
+        if self.best_cost <= self.joint_bound and not math.isinf(self.best_cost):
+            return f"joint search: no path set costs less than C'* = {best}"
+        return f"there is no further assignment, C'* = {best}"
+
+
+def explain(
+    request: PlanRequest, weights: Weights | None = None, clock: Clock = time.monotonic
+) -> Explanation:
+    """Run Algorithm 1 on a request and return what it did."""
+    deadline = clock() + request.deadline_s
+    run = _run(request, Improvements.none(), deadline, MAX_LITERAL_NODES, weights, clock)
+    literal = run.finished
+    if not literal:
+        run = _run(request, Improvements(), deadline, MAX_NODES, weights, clock)
+    names = [vehicle.id for vehicle in request.vehicles]
+    problem = problem_of(request)
+    best = math.inf
+    found = []
+    for attempt in run.attempts or ():
+        best = min(best, math.inf if attempt.best_cost is None else attempt.best_cost)
+        found.append(_assignment(problem, names, attempt, best))
+    by_tree = best == run.best_cost
+    return Explanation(
+        literal=literal,
+        assignments=tuple(found),
+        best_cost=run.best_cost,
+        optimal=run.finished,
+        joint_bound=run.joint_bound,
+        joint_cost=None if by_tree or run.best is None else run.best.cost,
+        next_cost=run.next_cost,
+    )
+
+
+def entries(table: MoveTable, node: Node, names: Sequence[str]) -> Iterator[str]:
+    """Yield the conflict list of a node: an entry C^f for each vehicle of a conflict."""
+    for conflict in node.conflicts:
+        pair = conflict.first, conflict.second
+        for vehicle, move in zip(pair, node.moves(conflict), strict=True):
+            at_node = not conflict.on_edge
+            yield entry(table, move, names[vehicle], conflict.step, at_node=at_node)
+
+
+def _run(
+    request: PlanRequest,
+    improvements: Improvements,
+    deadline: float,
+    max_nodes: int,
+    weights: Weights | None,
+    clock: Clock,
+) -> Tappa:
+    budget = Budget(deadline=deadline, max_nodes=max_nodes, clock=clock)
+    weights = (weights or Weights.for_mode(request.mode)).checked(request.mode)
+    problem = problem_of(request)
+    run = new_tappa(problem, request, weights, budget, improvements, record=True)
+    run.run()
+    return run
+
+
+def _assignment(
+    problem: Problem, names: Sequence[str], attempt: Attempt, best: float
+) -> ExplainedAssignment:
+    tree = attempt.tree
+    nodes = tuple(_node(problem, names, tree, node) for node in tree.nodes or ())
+    assignment = attempt.assignment
+    return ExplainedAssignment(assignment.targets, assignment.cost, attempt.best_cost, best, nodes)
+
+
+def _node(
+    problem: Problem, names: Sequence[str], tree: ConstraintTree, node: Node
+) -> ExplainedNode:
+    table = problem.table
+    constraint = node.constraints[-1] if node.constraints else None
+    cells = cells_of(problem, Solution(tree.assignment, node.paths))
+    status: NodeStatus = "expanded" if node.expanded else "open"
+    return ExplainedNode(
+        number=node.number,
+        parent=node.parent,
+        constraint=""
+        if constraint is None
+        else constraint.notation(table, names[constraint.vehicle]),
+        conflicts=tuple(dict.fromkeys(entries(table, node, names))),
+        path_map=RelativePathMap.padded(names, cells),
+        cost=node.cost,
+        status="solution" if node is tree.solution else status,
+    )

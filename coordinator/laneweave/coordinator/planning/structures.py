@@ -1,0 +1,193 @@
+"""Targets of the two formation structures: parallel and interlaced (paper, Sections 2.2 and 5.2.1).
+
+The cells of a structure are free cells of its lanes: all of them if it is parallel; those with even
+column + lane, or those with odd, if it is interlaced. A structure takes as many neighbouring cells
+on each lane as it has vehicles there, without gaps but for blocked cells:
+
+- Where every vehicle names its lane, the cells of each lane are where its vehicles have the
+  shortest total way.
+- Otherwise the structure is filled from a common front to the rear, column by column, and in each
+  column over its lanes from the right. A lane that vehicles name is filled until they have their
+  cells; whoever names none gets one of the other cells. The front is where the total way along the
+  road is shortest.
+
+Of the two interlaced structures the one with the shorter total way is taken, the even one if both
+are equal. Ties between positions go to the one nearest to the middle of the grid.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from laneweave.coordinator.planning.grid import Cell, Grid
+
+PARALLEL: Final = "parallel"
+INTERLACED: Final = "interlaced"
+STRUCTURES: Final = (PARALLEL, INTERLACED)
+
+_Columns = Mapping[int, Sequence[int]]
+"""Columns of a structure's cells, ascending, for each of its lanes."""
+_Placed = tuple[float, list[Cell]]
+"""Total way of the vehicles along the road, with a share of the distance from the middle; cells."""
+
+
+def structure_targets(
+    structure: str,
+    lanes: Sequence[int],
+    grid: Grid,
+    cells: Sequence[Cell],
+    preferred: Sequence[int | None],
+) -> tuple[Cell, ...]:
+    """Return the targets of a structure, one for each vehicle, by lane and column.
+
+    Args:
+        structure: one of `STRUCTURES`.
+        lanes: lanes that it uses.
+        grid: with cells that are blocked.
+        cells: where the vehicles are.
+        preferred: the lane that each of them names, which is one of `lanes`; None: any.
+
+    Raises:
+        ValueError: it has too few cells; see `shortage`.
+    """
+    placed = [
+        _place(columns, grid, cells, preferred)
+        for columns in _variants(structure, lanes, grid)
+        if _shortage(columns, preferred) is None
+    ]
+    if not placed:
+        raise ValueError(shortage(structure, lanes, grid, preferred))
+    _, targets = min(placed, key=lambda one: one[0])
+    return tuple(sorted(targets, key=lambda cell: (cell[1], cell[0])))
+
+
+def shortage(
+    structure: str, lanes: Sequence[int], grid: Grid, preferred: Sequence[int | None]
+) -> str | None:
+    """Return where a structure has too few cells for its vehicles; None: nowhere."""
+    found = [_shortage(columns, preferred) for columns in _variants(structure, lanes, grid)]
+    return None if None in found else found[0]
+
+
+def ranked_runs(
+    columns: Sequence[int], free: Sequence[int], width: int, *, ahead: bool = False
+) -> list[tuple[float, int]]:
+    """Return the runs of neighbouring cells of a lane, those nearest to its vehicles first.
+
+    Vehicles that take them in the order of their columns have the shortest total path.
+
+    Args:
+        columns: of the vehicles; at most as many as there are in `free`.
+        free: columns of the cells that may be taken, ascending.
+        width: columns of the grid.
+        ahead: which of two equal runs comes first: the one further ahead, or the one nearer to the
+            middle of the grid.
+
+    Returns:
+        For each run the total distance along the road, plus a small share that decides between
+        equal ones, and the index in `free` of its first cell.
+    """
+    runs = np.lib.stride_tricks.sliding_window_view(np.asarray(free), len(columns))
+    share = _off_front(runs, width) if ahead else _off_middle(runs, width)
+    totals = np.abs(runs - np.sort(columns)).sum(axis=1) + share
+    return [(float(totals[first]), int(first)) for first in np.argsort(totals, kind="stable")]
+
+
+def _variants(structure: str, lanes: Sequence[int], grid: Grid) -> list[_Columns]:
+    """Return the cells that a structure may take: once, or with even and with odd numbers."""
+    parities = ((0, 1),) if structure == PARALLEL else ((0,), (1,))
+    return [
+        {
+            lane: [
+                column
+                for column in range(grid.columns)
+                if (column + lane) % 2 in parity and grid.is_free((column, lane))
+            ]
+            for lane in lanes
+        }
+        for parity in parities
+    ]
+
+
+def _shortage(columns: _Columns, preferred: Sequence[int | None]) -> str | None:
+    for lane, count in sorted(_named(preferred).items()):
+        if count > len(columns[lane]):
+            return f"lane {lane} has {len(columns[lane])} such cells for {count} vehicles"
+    cells = sum(map(len, columns.values()))
+    if cells < len(preferred):
+        return f"its lanes have {cells} such cells for {len(preferred)} vehicles"
+    return None
+
+
+def _named(preferred: Sequence[int | None]) -> Counter[int]:
+    """Return how many vehicles name each lane."""
+    return Counter(lane for lane in preferred if lane is not None)
+
+
+def _place(
+    columns: _Columns, grid: Grid, cells: Sequence[Cell], preferred: Sequence[int | None]
+) -> _Placed:
+    if None in preferred:
+        return _filled(columns, grid, [column for column, _ in cells], preferred)
+    total, targets = 0.0, []
+    for lane in sorted(_named(preferred)):
+        wanting = [cell[0] for cell, own in zip(cells, preferred, strict=True) if own == lane]
+        way, first = ranked_runs(wanting, columns[lane], grid.columns)[0]
+        total += way
+        targets += [(column, lane) for column in columns[lane][first : first + len(wanting)]]
+    return total, targets
+
+
+def _filled(
+    columns: _Columns, grid: Grid, starts: Sequence[int], preferred: Sequence[int | None]
+) -> _Placed:
+    """Fill a structure from its front to its rear, for each front; return the nearest one."""
+    lanes_of: dict[int, list[int]] = {}
+    for lane in sorted(columns):
+        for column in columns[lane]:
+            lanes_of.setdefault(column, []).append(lane)
+    in_order = np.sort(starts)
+    found: list[_Placed] = []
+    for front in sorted(lanes_of):
+        targets = _fill(front, lanes_of, preferred)
+        if targets is not None:
+            places = np.sort([column for column, _ in targets])
+            way = float(np.abs(places - in_order).sum() + _off_middle(places, grid.columns))
+            found.append((way, targets))
+    return min(found, key=lambda one: one[0])
+
+
+def _fill(
+    front: int, lanes_of: Mapping[int, Sequence[int]], preferred: Sequence[int | None]
+) -> list[Cell] | None:
+    """Take cells from a front to the rear; None: there are too few of them."""
+    named = _named(preferred)
+    others = len(preferred) - named.total()
+    targets: list[Cell] = []
+    for column in range(front, min(lanes_of) - 1, -1):
+        for lane in lanes_of.get(column, ()):
+            if named[lane]:
+                named[lane] -= 1
+            elif others:
+                others -= 1
+            else:
+                continue
+            targets.append((column, lane))
+        if len(targets) == len(preferred):
+            return targets
+    return None
+
+
+def _off_middle(columns: NDArray[np.int64], width: int) -> NDArray[np.float64]:
+    """Return a share, below 0.06, that prefers the middle among equal ways."""
+    return np.asarray(np.abs(columns.mean(axis=-1) - (width - 1) / 2) / (10 * width))
+
+
+def _off_front(columns: NDArray[np.int64], width: int) -> NDArray[np.float64]:
+    """Return a share, below 0.1, that prefers the front among equal ways."""
+    return np.asarray((width - 1 - columns.mean(axis=-1)) / (10 * width))
