@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from attrs import evolve
 
-from convoy import BALLOT, Convoy
+from convoy import BALLOT, ROLLING, Convoy
 from laneweave.launch.watch.frames import UNATTENDED, UNHEARD, compact
 from laneweave.launch.watch.live_road import STILL_S, LiveRoad
 from laneweave.protocol.codec import decode, encode
@@ -44,7 +44,7 @@ def shown(road: LiveRoad, wall_s: float = 2.0) -> dict[str, Any]:
 
 
 def test_before_anything_is_heard() -> None:
-    road = LiveRoad(Scenario(), wall_s=5.0)
+    road = LiveRoad(ROLLING, wall_s=5.0)
     frame = shown(road, 6.0)
     assert (frame["n"], frame["run"], frame["t"], frame["w"]) == (7, 0, None, 6.0)
     assert (frame["status"], frame["since"]) == ("waiting", 5.0)
@@ -99,7 +99,7 @@ def test_who_is_not_heard_is_shown_in_its_cell_and_marked() -> None:
     assert rows[0][1] == pytest.approx(CONVOY.state(0, START + 39).s_m, abs=0.01)
     assert rows[0][7] == 0
     # Never heard at all: the cell in which it entered is all that is known.
-    silent = LiveRoad(Scenario(), wall_s=0.0)
+    silent = LiveRoad(ROLLING, wall_s=0.0)
     silent.take(CONVOY.clock(START), 0.0)
     silent.take(CONVOY.census(START), 0.0)
     assert {row[8] for row in shown(silent)["vehicles"]} == {UNHEARD}
