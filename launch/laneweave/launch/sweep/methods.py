@@ -9,7 +9,7 @@ from attrs import field, frozen
 
 from laneweave.launch.role_commands import LC2013, METHOD, RULE
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario import Scenario, parse_scenario, to_tables
+from laneweave.protocol.scenario import PAPERS_FORMATIONS, Scenario, parse_scenario, to_tables
 
 
 @frozen
@@ -41,7 +41,9 @@ def _paper(max_vehicles: int, block_columns: int) -> LabelledMethod:
         METHOD,
         f"formations of at most {max_vehicles} vehicles in {block_columns} columns",
         {
-            "formation.operation": "paper",
+            "formation.operation": "formations",
+            **{f"formation.{name}": value for name, value in PAPERS_FORMATIONS.items()},
+            "formation.move_s": None,
             "formation.max_vehicles": max_vehicles,
             "formation.block_columns": block_columns,
         },
