@@ -104,6 +104,16 @@ def test_a_label_that_does_not_fit_the_scenario() -> None:
         plan_points(base, ["paper-12"], [1000.0], range(1), KeepTrajectories.none)
 
 
+@pytest.mark.parametrize("base", [Scenario(), load_scenario(None, formation__operation="rolling")])
+def test_the_paper_s_formations_are_the_paper_s_whatever_the_scenario_is(base: Scenario) -> None:
+    (point,) = plan_points(base, ["paper-6"], [1000.0], range(1), KeepTrajectories.none)
+    formation = point.scenario.formation
+    assert (formation.operation, formation.cycle_s) == ("formations", 4.0)
+    assert formation.interlaced
+    assert not formation.closes_by_vehicles
+    assert (formation.block_columns, formation.max_vehicles) == (4, 6)
+
+
 def test_too_many_points() -> None:
     with pytest.raises(BadInputError, match="at most 100000 runs, not 200000"):
         plan_points(Scenario(), ["formation"], [1.0, 2.0], range(100_000), KeepTrajectories.none)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from attrs import evolve
 
-from convoy import BALLOT, Convoy
+from convoy import BALLOT, ROLLING, Convoy
 from laneweave.launch.watch.frames import UNATTENDED, UNHEARD, compact
 from laneweave.launch.watch.live_road import STILL_S, LiveRoad
 from laneweave.protocol.codec import decode, encode
@@ -46,7 +46,7 @@ def shown(road: LiveRoad, wall_s: float = 2.0) -> dict[str, Any]:
 
 
 def test_before_anything_is_heard() -> None:
-    road = LiveRoad(Scenario(), wall_s=5.0)
+    road = LiveRoad(ROLLING, wall_s=5.0)
     frame = shown(road, 6.0)
     assert (frame["n"], frame["run"], frame["t"], frame["w"]) == (7, 0, None, 6.0)
     assert (frame["status"], frame["since"]) == ("waiting", 5.0)
