@@ -55,5 +55,5 @@ def test_the_scene_says_what_there_is() -> None:
     film.scene |= scene_of(rolling, "live", "here", 0.1)
     scene = json.loads(opening(film, "this server"))["scene"]
     assert (scene["first"], scene["last"], scene["session"]) == (15, 24, "this server")
-    assert (scene["kind"], scene["title"], scene["rolling"]) == ("live", "here", False)
+    assert (scene["kind"], scene["title"], scene["rolling"]) == ("live", "here", True)
     assert len(scene["colours"]) == len(scene["names"]) == scene["road"]["lanes"] == 3
