@@ -249,7 +249,7 @@ def _title(response: PlanResponse, drive: Drive) -> str:
         return f"{response.status}: the start"
     title = (
         f"{response.status}, cost {response.cost}, {response.steps} steps of "
-        f"{formation.cycle_s:g} s at {formation.speed_mps:g} m/s, columns of {formation.gap_m:g} m"
+        f"{scenario.cycles_s[0]:g} s at {formation.speed_mps:g} m/s, columns of {formation.gap_m:g} m"
     )
     if drive.overlaps:
         pairs = ", ".join(f"{one} and {other}" for one, other in drive.overlaps)

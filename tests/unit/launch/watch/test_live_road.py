@@ -16,7 +16,6 @@ from laneweave.protocol.messages import ClosedFormation, Heartbeat, LogEvent, Na
 from laneweave.protocol.scenario import Scenario, parse_scenario
 from laneweave.protocol.transport import LinkDown, LinkUp
 
-ROLLING: Scenario = parse_scenario({"formation": {"operation": "rolling"}})
 FORMATIONS: Scenario = parse_scenario({})
 BLOCKS: Scenario = parse_scenario({"formation": {"operation": "paper"}})
 CONVOY = Convoy(9, scenario=ROLLING)
