@@ -19,7 +19,7 @@ from laneweave.launch.plan_driving import Drive, drive_plan
 from laneweave.launch.road_drawing import MAX_INSTANTS, _Picture, draw_road, road_figure
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.motion import cell_state
-from laneweave.protocol.scenario import load_scenario
+from laneweave.protocol.scenario import Scenario, load_scenario
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "docs" / "examples"
 CASE_STUDY = EXAMPLES / "case-study.json"
@@ -27,7 +27,7 @@ REQUEST = PlanRequest.from_dict(json.loads(CASE_STUDY.read_text(encoding="utf-8"
 NAMES = [vehicle.id for vehicle in REQUEST.vehicles]
 PLAN = checked_plan(REQUEST)
 NO_PLAN = PlanResponse("infeasible", None, None, None, (), (), 1.0, 1, 1)
-SCENARIO = load_scenario(None, formation__cycle_s=4.0)
+SCENARIO = Scenario()
 
 
 @pytest.fixture(autouse=True)
@@ -57,7 +57,7 @@ def errors_m(drive: Drive, paths: tuple[tuple[Cell, ...], ...]) -> NDArray[np.fl
 def test_everybody_is_in_its_cell_when_a_step_ends(driven: Drive) -> None:
     assert PLAN.steps is not None
     assert driven.states.shape == (5, PLAN.steps * driven.slot_ticks + 1, 6)
-    assert driven.time_s(driven.ticks) == pytest.approx(PLAN.steps * SCENARIO.comfortable_cycle_s)
+    assert driven.time_s(driven.ticks) == pytest.approx(PLAN.steps * SCENARIO.cycles_s[0])
     assert errors_m(driven, PLAN.paths).max() < 0.2
 
 
@@ -147,7 +147,7 @@ def test_an_animation_has_a_frame_for_each_tick(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("scenario", "shown"), [(None, "3 steps of 5.6 s"), ("[formation]\ncycle_s = 6.0", "of 6 s")]
+    ("scenario", "shown"), [(None, "3 steps of 4 s"), ("[formation]\ncycle_s = 6.0", "of 6 s")]
 )
 def test_the_road_is_drawn_beside_the_answer(
     scenario: str | None,
