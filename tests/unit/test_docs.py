@@ -146,15 +146,16 @@ def _unit(name: str) -> str:
 
 def _allowed(attribute: attrs.Attribute[Any]) -> str:
     if attribute.validator is None:
-        # Parsing any scenario resolves the annotations from text to types.
+        # Parsing any scenario resolves the annotations from text to types, with their modules.
         kind = attribute.type.__name__ if attribute.type in (str, bool) else str(attribute.type)
         kinds = {
             "str": "text",
             "tuple[float, ...]": "list of numbers",
             "tuple[str, ...]": "list of texts",
             "bool": "`true`, `false`",
+            "tuple[DrivingStructure, ...]": "list of tables",
         }
-        return kinds[kind]
+        return kinds[re.sub(r"[a-z]+\.", "", kind)]
     # Of a field that may be unset, the rule for what is set.
     rule = getattr(attribute.validator, "validator", attribute.validator)
     found = inspect.getclosurevars(rule).nonlocals
