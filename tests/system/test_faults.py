@@ -26,7 +26,7 @@ schema = "laneweave.scenario/1"
 
 [road]
 s2_m = 20.0
-s3_m = 110.0
+s3_m = 160.0
 
 [runtime]
 agent_start_s = 1.0

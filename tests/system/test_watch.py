@@ -21,6 +21,7 @@ from attrs import define, field
 from websockets.sync.client import connect
 
 from convoy import Convoy
+from laneweave.launch.formations import read_events
 from laneweave.launch.report.tracks import read_tracks
 from laneweave.protocol.access import Access
 from laneweave.protocol.codec import encode
@@ -253,7 +254,17 @@ def test_a_deployment_is_shown_as_it_is(lab: Lab) -> None:
     assert frames[-1]["counts"][3] == summary(lab.folder / "out")["vehicles"]["left"] > 0
     assert frames[-1]["leader"] == ["c1", 1]
     assert any(row[7] for frame in frames for row in frame["vehicles"]), "no target of a plan"
-    assert any(row[9] for frame in frames for row in frame["vehicles"]), "no cells that are owned"
+    closed = [
+        [event["formation"], *event["columns"]]
+        for event in read_events(lab.folder / "out", "formation-closed")
+    ]
+    assert closed
+    shown = [one for frame in frames for one in frame["formations"]]
+    assert sorted(map(tuple, closed)) == sorted(set(map(tuple, shown)))
+    assert {row[5] for frame in frames for row in frame["vehicles"]} == {
+        -1, *(number for number, *_ in closed)
+    }  # fmt: skip
+    assert not any(frame["joined"] for frame in frames)
     lost = [frame["loss"] for frame in frames if frame["loss"]]
     assert lost
     assert sum(loss[1] for loss in lost) <= 0.02 * sum(loss[0] for loss in lost)

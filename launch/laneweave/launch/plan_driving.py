@@ -72,7 +72,7 @@ def drive_plan(scenario: Scenario, names: Sequence[str], paths: Sequence[Sequenc
         names: of the vehicles.
         paths: cells of each vehicle at all time points; one time point: all hold.
     """
-    slot_ticks = round(scenario.comfortable_cycle_s / scenario.runtime.tick_s)
+    slot_ticks = round(scenario.cycles_s[0] / scenario.runtime.tick_s)
     ticks = slot_ticks * (len(paths[0]) - 1)
     states = np.array([_drive_vehicle(scenario, path, slot_ticks, ticks) for path in paths])
     overlaps: set[tuple[str, str]] = set()
@@ -95,9 +95,7 @@ def _drive_vehicle(
         for step in range(len(path) - 1)
         if path[step] != path[step + 1]
     ]
-    move_ticks = scenario.move_ticks(scenario.comfortable_cycle_s)
-    reference = Reference.moves(scenario, path[0], moves, move_ticks)
-    tracker = Tracker(scenario)
+    reference, tracker = Reference.moves(scenario, path[0], moves), Tracker(scenario)
     start = cell_state(scenario.lattice, path[0], 0.0)
     plant = Plant(start, scenario.vehicle, scenario.runtime.tick_s)
     states, speed_mps = [start], scenario.formation.speed_mps

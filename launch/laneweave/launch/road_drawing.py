@@ -244,12 +244,12 @@ def _name_places(
 
 def _title(response: PlanResponse, drive: Drive) -> str:
     """Return what is drawn, and how near bodies come."""
-    formation = drive.scenario.formation
+    formation, slot_s = drive.scenario.formation, drive.scenario.cycles_s[0]
     if not response.paths:
         return f"{response.status}: the start"
     title = (
         f"{response.status}, cost {response.cost}, {response.steps} steps of "
-        f"{formation.cycle_s:g} s at {formation.speed_mps:g} m/s, columns of {formation.gap_m:g} m"
+        f"{slot_s:g} s at {formation.speed_mps:g} m/s, columns of {formation.gap_m:g} m"
     )
     if drive.overlaps:
         pairs = ", ".join(f"{one} and {other}" for one, other in drive.overlaps)

@@ -171,7 +171,7 @@ def test_a_motion_whose_time_is_over_is_taken_over_as_a_hold(end_tick: int) -> N
     assert made.drive(sense(), moving=False).motion_origin == HOME
 
 
-@pytest.mark.parametrize("ticks", [43, 68])
+@pytest.mark.parametrize("ticks", [44, 68])
 def test_a_long_move_is_taken_over_with_the_time_that_it_takes(ticks: int) -> None:
     """A new process knows no plan: the motion controller has kept how long the move takes."""
     scenario = Scenario()

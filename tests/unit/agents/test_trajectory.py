@@ -92,7 +92,7 @@ def test_move_beyond_the_neighbouring_cell_is_refused() -> None:
         {"formation": {"gap_m": 30.0}},
         {"formation": {"cycle_s": 4.0, "move_s": 2.0}},
         {"vehicle": {"max_jerk_mps3": 5.0}},
-        {"vehicle": {"max_speed_mps": 16.0}, "formation": {"settle_s": 15.0}},
+        {"vehicle": {"max_speed_mps": 16.0}, "formation": {"settle_s": 25.0}},
     ],
 )
 def test_impossible_moves_raise(table: dict[str, dict[str, float]]) -> None:

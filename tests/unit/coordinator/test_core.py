@@ -431,7 +431,7 @@ def test_too_late_for_any_step_settles() -> None:
 
 def test_failed_planning_searches_further_each_time() -> None:
     """The bound on nodes doubles, so that what is hard is solved in the end."""
-    few = evolve(SCENARIO, formation=evolve(SCENARIO.formation, max_nodes=1))
+    few = evolve(SCENARIO, formation=evolve(SCENARIO.formation, solver="branching", max_nodes=1))
     desk = Desk(scenario=few)
     cells: Cells = {A: (0, 0), B: (-1, 1), C: (-2, 0), D: (-3, 1), E: (0, 2), F: (-2, 2)}
     effects = desk.collect_promises(cells, dict(zip(cells, (2, 2, 1, 0, 0, 1), strict=True)))

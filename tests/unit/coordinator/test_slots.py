@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 from attrs import evolve
 
+from laneweave.coordinator import pacing
 from laneweave.coordinator.borders import kept_apart, steps_of
 from laneweave.coordinator.formation import start_time_s, time_left_s
-from laneweave.coordinator.formation_planner import RESERVE_S, FormationPlanner
-from laneweave.coordinator.groups import Groups
+from laneweave.coordinator.pacing import LEAST_RESERVE_S, RESERVE_S
 from laneweave.protocol.lattice import Cell, Move
 from laneweave.protocol.messages import Ballot, Name, Plan
 from laneweave.protocol.scenario import FormationSettings, Scenario
@@ -37,8 +37,8 @@ def climbing(steps: int) -> Plan:
 
 
 def paced(plan: Plan, scenario: Scenario = SCENARIO) -> Plan:
-    planner = FormationPlanner(scenario, Groups())
-    return planner._paced(plan, {})
+    end_s = plan.t0_s + left_s(plan)
+    return pacing.paced(plan, [], plan.t0_s, end_s, scenario)
 
 
 def left_s(plan: Plan) -> float:
@@ -50,8 +50,15 @@ def test_slots_are_the_longest_that_leave_a_reserve(steps: int) -> None:
     plan = climbing(steps)
     chosen = paced(plan)
     assert chosen == evolve(plan, slot_s=chosen.slot_s)
-    fitting = [slot_s for slot_s in SCENARIO.slots_s if steps * slot_s <= left_s(plan) - RESERVE_S]
-    assert chosen.slot_s == max(fitting, default=SCENARIO.slots_s[0])
+    leisurely, hasty = (
+        max(
+            (s for s in SCENARIO.slots_s if steps * s <= left_s(plan) - reserve_s),
+            default=SCENARIO.slots_s[0],
+        )
+        for reserve_s in (RESERVE_S, LEAST_RESERVE_S)
+    )
+    comfortable = leisurely >= SCENARIO.comfortable_cycle_s
+    assert chosen.slot_s == pytest.approx(leisurely if comfortable else hasty)
 
 
 def test_more_steps_have_shorter_slots() -> None:
@@ -64,10 +71,35 @@ def test_more_steps_have_shorter_slots() -> None:
 
 def test_a_late_plan_has_shorter_slots() -> None:
     plan = climbing(4)
-    late = evolve(plan, t0_s=plan.t0_s + left_s(plan) - 4 * 5.0 - RESERVE_S)
-    assert paced(plan).slot_s == 7.0
-    assert paced(late).slot_s == 5.0
-    assert paced(evolve(late, t0_s=late.t0_s + 0.1)).slot_s == 4.5
+    late = evolve(plan, t0_s=plan.t0_s + left_s(plan) - 4 * 6.0 - RESERVE_S)
+    assert paced(plan).slot_s == pytest.approx(7.0)
+    assert paced(late).slot_s == pytest.approx(6.0)
+    assert paced(evolve(late, t0_s=late.t0_s + 0.1)).slot_s == pytest.approx(5.8)
+
+
+def test_haste_takes_of_the_reserve() -> None:
+    plan = climbing(6)
+    late = evolve(plan, t0_s=plan.t0_s + left_s(plan) - 6 * 5.0 - LEAST_RESERVE_S)
+    assert paced(late).slot_s == pytest.approx(5.0)
+
+
+def test_a_plan_begins_before_its_rear_is_in_s3_unless_a_lane_change_does() -> None:
+    along: tuple[Move, ...] = ((0, (-3, 0), (-2, 0)), (1, (-2, 0), (-2, 1)))
+    plan = evolve(
+        climbing(0),
+        start_cells={A: (-3, 0)},
+        moves={A: along},
+        t0_s=start_time_s([(-3, 0)], 0.0, SCENARIO),
+        territory=((-3, 0), (-2, 0), (-2, 1)),
+    )
+    end_s = time_left_s(plan.territory, 0.0, SCENARIO)
+    early = pacing.paced(plan, [], 0.0, end_s, SCENARIO)
+    changes_s = early.t0_s + early.slot_s
+    assert early.t0_s < plan.t0_s
+    assert changes_s == pytest.approx(start_time_s([(-2, 0)], 0.0, SCENARIO))
+    assert pacing.paced(plan, [], plan.t0_s - 1.0, end_s, SCENARIO).t0_s == pytest.approx(
+        plan.t0_s - 1.0
+    )
 
 
 def test_a_plan_without_moves_has_the_longest_slots() -> None:

@@ -158,3 +158,20 @@ def test_the_table_says_which_solvers_planned(more: dict[str, Any], shown: str) 
     found = summary()
     found["planning"] |= more
     assert dict(summary_rows(found))["plans by solver"] == shown
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "said"),
+    [
+        (-3.004, 3.0, "-3.00 to 3.00 m/s2"),
+        (-3.01, 2.0, "-3.01 to 2.00 m/s2, beyond comfort (3 m/s2)"),
+        (-1.0, 4.8, "-1.00 to 4.80 m/s2, beyond comfort (3 m/s2)"),
+        (None, None, "- to - m/s2"),
+    ],
+)
+def test_accelerations_that_are_not_comfortable(
+    low: float | None, high: float | None, said: str
+) -> None:
+    found = summary()
+    found["safety"] |= {"min_accel_mps2": low, "max_accel_mps2": high}
+    assert dict(summary_rows(found))["acceleration"] == said

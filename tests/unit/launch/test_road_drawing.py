@@ -57,7 +57,7 @@ def errors_m(drive: Drive, paths: tuple[tuple[Cell, ...], ...]) -> NDArray[np.fl
 def test_everybody_is_in_its_cell_when_a_step_ends(driven: Drive) -> None:
     assert PLAN.steps is not None
     assert driven.states.shape == (5, PLAN.steps * driven.slot_ticks + 1, 6)
-    assert driven.time_s(driven.ticks) == pytest.approx(PLAN.steps * SCENARIO.comfortable_cycle_s)
+    assert driven.time_s(driven.ticks) == pytest.approx(PLAN.steps * SCENARIO.cycles_s[0])
     assert errors_m(driven, PLAN.paths).max() < 0.2
 
 

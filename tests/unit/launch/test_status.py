@@ -9,12 +9,13 @@ import pytest
 from attrs import define, evolve, field
 
 from laneweave.launch.role_health import AGENT, BRIDGE, COORDINATOR, RoleHealth
-from laneweave.launch.status import Status, status_of
+from laneweave.launch.status import Plans, Status, status_of
 from laneweave.launch.tally import HEARD, Tally
 from laneweave.protocol.messages import (
     Ballot,
     Census,
     CensusEntry,
+    ClosedFormation,
     Heartbeat,
     Name,
     RoadClock,
@@ -86,9 +87,12 @@ class Ear:
         )  # fmt: skip
         self.tally.take(Arrived(CLOCK, {}, message), tick / 10)
 
-    def census(self, tick: int, **entered_s: float) -> None:
+    def census(
+        self, tick: int, closed: tuple[ClosedFormation, ...] = (), **entered_s: float
+    ) -> None:
         entries = tuple(CensusEntry(Name(one), (0, 0), 0, at) for one, at in entered_s.items())
-        self.tally.take(Arrived(CENSUS, {}, Census(tick / 10, entries, (), bridge=7)), tick / 10)
+        message = Census(tick / 10, entries, (), closed, bridge=7)
+        self.tally.take(Arrived(CENSUS, {}, message), tick / 10)
 
     def states(self, vehicle: str, ticks: Iterable[int], **changes: object) -> None:
         for tick in ticks:
@@ -136,7 +140,7 @@ def test_all_is_well(well: Ear) -> None:
     told = json.loads(json.dumps(found.to_dict()))
     assert told["schema"] == "laneweave.status/1"
     assert told["plans"] == {
-        "in_force": 2, "operation": "paper", "formations": 1, "formations_with_plan": 0,
+        "in_force": 2, "operation": "formations", "formations": 0, "formations_with_plan": 0,
     }  # fmt: skip
 
 
@@ -230,9 +234,25 @@ def test_who_speaks_for_vehicles(well: Ear) -> None:
     well.states("b", [112], attended=False, accepted=True, promised=Ballot(1, Name("c"), 1, 1))
     vehicles = well.status().vehicles
     assert (vehicles.attended, vehicles.unattended, vehicles.unheard) == (1, 1, 1)
-    assert well.status().plans.formations_with_plan == 1
     well.states("b", [113], estate=((0, 0),))
     assert well.status().plans.operation == "rolling"
+
+
+def test_formations_are_counted_not_their_columns(well: Ear) -> None:
+    assert well.status().plans == Plans(2, "formations", 0, 0)
+    closed = (ClosedFormation(0, 2, 3.0), ClosedFormation(3, 7, 9.0))
+    vehicles = dict.fromkeys("abcd", 1.0)
+    well.census(112, closed, **vehicles)
+    # Vehicles show the column in which they entered; the last one's formation is still open.
+    for name, column in zip(vehicles, (0, 2, 5, 8), strict=True):
+        well.states(name, [112], formation=column)
+    assert well.status().plans == Plans(2, "formations", 2, 0)
+    promised = Ballot(1, Name("c"), 1, 1)
+    for name, column in (("a", 0), ("b", 2), ("d", 8)):
+        well.states(name, [113], formation=column, accepted=True, promised=promised)
+    assert well.status().plans == Plans(2, "formations", 2, 1)
+    well.states("c", [113], formation=5, accepted=True, promised=promised)
+    assert well.status().plans == Plans(2, "formations", 2, 2)
 
 
 # --- loss ----------------------------------------------------------------------------------------

@@ -332,11 +332,15 @@ MISFITS: list[tuple[str, dict[str, Any]]] = [
 
 
 def test_there_is_time_to_settle() -> None:
-    """The longest way is half a column, or one and a half in the paper's operation."""
-    for settling in ({"settle_s": 3.2}, {"settle_s": 5.2, "operation": "paper"}):
+    """The longest way is three quarters of a column, or twice as much with interlaced entry."""
+    for settling in (
+        {"settle_s": 3.7},
+        {"settle_s": 5.2, "operation": "paper"},
+        {"settle_s": 3.2, "operation": "rolling"},
+    ):
         parse_scenario({"formation": settling})
     slow = {"max_speed_mps": 15.5}
-    parse_scenario({"vehicle": slow, "formation": {"settle_s": 28.2}})
+    parse_scenario({"vehicle": slow, "formation": {"settle_s": 28.2, "operation": "rolling"}})
 
 
 @pytest.mark.parametrize(("field", "data"), MISFITS)
@@ -359,7 +363,7 @@ def test_fields_that_do_not_fit_are_refused_by_name(field: str, data: dict[str, 
         {"tracking": {"horizon_ticks": 68}},
         {"tracking": {"horizon_ticks": 38}, "formation": FOUR},
         {"tracking": {"horizon_ticks": 38}, "formation": {"operation": "paper"}},
-        {"tracking": {"horizon_ticks": 38}, "formation": {"operation": "rolling"}},
+        {"tracking": {"horizon_ticks": 58}, "formation": {"operation": "rolling"}},
         {"network": {"lease_s": 3.0}},
         {"runtime": {"tick_deadline_s": 3.0}},
         {"runtime": {"tick_resend_s": 0.29}},
@@ -531,8 +535,8 @@ def test_a_recording_of_the_paper_s_operation_under_its_earlier_name_is_read() -
 
 def test_slots_are_from_four_to_seven_seconds_unless_they_are_given() -> None:
     scenario = Scenario()
-    assert scenario.slots_s == (4.0, 4.5, 5.0, 5.5, 6.0, 6.5, 7.0)
-    assert scenario.move_durations == {38, 43, 48, 53, 58, 63, 68}
+    assert scenario.slots_s == pytest.approx([4.0 + 0.2 * number for number in range(16)])
+    assert scenario.move_durations == set(range(38, 70, 2))
     assert (scenario.move_s, scenario.horizon_ticks) == (3.8, 70)
     given = parse_scenario({"formation": {"cycle_s": 5.0}})
     assert (given.slots_s, given.horizon_ticks, given.move_s) == ((5.0,), 50, 4.8)
@@ -540,7 +544,11 @@ def test_slots_are_from_four_to_seven_seconds_unless_they_are_given() -> None:
     slower = parse_scenario({"formation": {"cycle_s": 5.0, "move_s": 4.0}})
     assert slower.move_durations == {40}
     rolling = parse_scenario({"formation": {"operation": "rolling"}})
-    assert (rolling.slots_s, rolling.horizon_ticks) == ((4.0,), 40)
+    assert (rolling.slots_s, rolling.horizon_ticks) == ((6.0,), 60)
+    dense = parse_scenario(
+        {"formation": {"operation": "rolling"}, "demand": {"volume_veh_per_lane_h": 2001.0}}
+    )
+    assert (dense.slots_s, dense.horizon_ticks) == ((4.0,), 40)
     long = parse_scenario({"tracking": {"horizon_ticks": 80}})
     assert long.horizon_ticks == 80
 

@@ -137,7 +137,7 @@ def cases(draw: st.DrawFn) -> Case:
     shortest = math.ceil((vehicles + lanes) / lanes) if lanes > 1 else vehicles
     columns = draw(st.integers(shortest, 10))
     interlaced = draw(st.booleans())
-    spread_s = draw(st.sampled_from([0.0, 1.5] if interlaced else [0.0, 0.25, SPREAD_S]))
+    spread_s = draw(st.sampled_from([0.0, 1.5] if interlaced else [0.0, 0.25, SPREAD_S, 0.75]))
     return Case(lanes, vehicles, columns, spread_s, interlaced, stream)
 
 
@@ -332,7 +332,7 @@ def test_a_block_is_closed_when_its_last_column_has_passed() -> None:
 def test_the_scenario_says_who_builds() -> None:
     grows = formation_builder(Scenario())
     assert isinstance(grows, GrowingFormations)
-    assert (grows.max_vehicles, grows.max_columns, grows.spread_s) == (6, 7, SPREAD_S)
+    assert (grows.max_vehicles, grows.max_columns, grows.spread_s) == (6, 7, 0.75)
     blocks = formation_builder(PAPER)
     assert isinstance(blocks, ColumnBlocks)
     assert (blocks.max_vehicles, blocks.lattice.block_columns, blocks.spread_s) == (6, 4, 1.5)

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 JAMMED = 1.25
 """A box belongs to a jam where its upper quartile is so many times the lowest of all medians."""
+MARGIN = 0.04
+"""Share of the scale that is left free below the shortest travel time."""
 LOWER_SHARE = 0.66
 """Part of the height below the break, where the methods are that do not jam."""
 
@@ -61,8 +63,9 @@ def draw_travel_times(comparison: Comparison, out: Path, dpi: int) -> None:
     if break_s is not None:
         _break_axis(upper, lower, break_s)
     for number, label in enumerate(labels):
-        for place, one in zip(_places(number, labels, volumes), times[label], strict=True):
-            if not len(one):
+        places = _places(number, labels, volumes)
+        for place, volume, one in zip(places, volumes, times[label], strict=True):
+            if comparison.at(label, volume) and not len(one):
                 lower.text(
                     place,
                     0.03,
@@ -95,8 +98,8 @@ def _break(times_s: Iterable[Floats]) -> float | None:
 
 def _break_axis(upper: Axes, lower: Axes, break_s: float) -> None:
     """Show what is above the break on the upper axes, with its own scale, and the rest below."""
-    bottom_s, top_s = lower.get_ylim()
-    lower.set_ylim(bottom_s, break_s)
+    least_s, top_s = lower.dataLim.ymin, lower.get_ylim()[1]
+    lower.set_ylim(least_s - MARGIN * (break_s - least_s), break_s)
     upper.set_ylim(break_s, top_s)
     upper.spines["bottom"].set_visible(False)
     upper.tick_params(axis="x", bottom=False, labelbottom=False)

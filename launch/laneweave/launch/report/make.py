@@ -138,7 +138,12 @@ def report_comparison(
     # First of all: what may be refused.
     maps = (driven_map(run, tracks, formation) for run, tracks, _ in shown if _has_formations(run))
     driven = next(maps, None)
-    numbers = (tables.traffic_table, tables.safety_table, tables.failed_table)
+    numbers = (
+        tables.traffic_table,
+        tables.safety_table,
+        tables.planning_table,
+        tables.failed_table,
+    )
     body = "\n".join(make(comparison) for make in numbers)
     report.sections.append(Section("Numbers", body))
     report.add_picture(
@@ -146,7 +151,8 @@ def report_comparison(
         "travel_times.png",
         lambda path: comparison_figures.draw_travel_times(comparison, path, REPORT_DPI),
         "Travel times of the counted vehicles of all seeds: boxes from the lower to the upper "
-        "quartile with the median, whiskers up to 1.5 times as far; dots and lines are means.",
+        "quartile with the median, whiskers up to 1.5 times as far; dots and lines are means. "
+        "Where a method jams, the axis is broken.",
         "Box plots of travel times by method and traffic volume",
     )
     report.add_picture(

@@ -8,6 +8,7 @@ moves to: at the end of each slot that is where it is.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -154,7 +155,7 @@ def _driven_slots(
 ) -> tuple[float, float]:
     """Return when the slots of a formation begin (road time), and how long each is.
 
-    They are those of the last of its plans that was begun before the last move.
+    They are those of the last of its plans of which a move was driven, if any was.
 
     Args:
         run: the run.
@@ -163,7 +164,7 @@ def _driven_slots(
         changes_s: times at which its vehicles began to move to other cells.
     """
     tick_s, slot_s = run.scenario.runtime.tick_s, run.scenario.cycles_s[0]
-    last_s = max(changes_s, default=entered_s) + 0.5 * tick_s
+    last_s = max(changes_s, default=math.inf) + 0.5 * tick_s
     together, found = {formation}, None
     for event in read_events(run.folder, JOINED, PLANNED):
         if event.get("role") != "coordinator":

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
@@ -11,6 +12,9 @@ import numpy as np
 from laneweave.launch.outcome import summary_rows
 from laneweave.launch.report.comparison_figures import preferred_share
 from laneweave.launch.report.runs import Comparison, Run
+
+_Column = tuple[str, tuple[str, ...], Callable[[Iterable[float]], float], int]
+"""Heading, place in summary.json, how the values of several runs become one, digits."""
 
 _COLUMNS = (
     ("travel time mean (s)", ("travel_time_s", "mean"), 2),
@@ -23,10 +27,14 @@ _SAFETY = (
     ("emergency brakes", ("safety", "emergency_brakes"), sum, 0),
     ("overlaps", ("safety", "overlaps"), sum, 0),
 )
-_WORK = (
+_WORK = (("real-time factor", ("runtime", "real_time_factor"), min, 1),)
+_PLANNING = (
     ("largest formation", ("planning", "largest_formation"), max, 0),
-    ("planning p95 (ms)", ("planning", "solve_ms", "p95"), max, 1),
-    ("real-time factor", ("runtime", "real_time_factor"), min, 1),
+    ("plans", ("planning", "plans"), sum, 0),
+    ("fallbacks", ("planning", "fallbacks"), sum, 0),
+    ("p50 (ms)", ("planning", "solve_ms", "p50"), max, 1),
+    ("p95 (ms)", ("planning", "solve_ms", "p95"), max, 1),
+    ("max (ms)", ("planning", "solve_ms", "max"), max, 1),
 )
 
 
@@ -86,13 +94,35 @@ def safety_table(comparison: Comparison) -> str:
     headings = ("label", "veh/(lane·h)", *(name for name, *_ in (*_SAFETY, *_WORK)))
     rows = []
     for label, volume, runs in _groups(comparison):
-        cells = [label, f"{volume:g}"]
-        for _, way, combine, digits in (*_SAFETY, *_WORK):
-            values = [_number(run.summary, way) for run in runs]
-            known = [value for value in values if value is not None]
-            cells.append(f"{combine(known):.{digits}f}" if known else "-")
-        rows.append(cells)
+        rows.append([label, f"{volume:g}", *_extremes(runs, (*_SAFETY, *_WORK))])
     return table(headings, rows, "Extremes or sums over the seeds, not means.")
+
+
+def planning_table(comparison: Comparison) -> str:
+    """Return how long planning took, and which solver planned; empty without any plan."""
+    headings = ("label", "veh/(lane·h)", "solvers", *(name for name, *_ in _PLANNING))
+    rows = []
+    for label, volume, runs in _groups(comparison):
+        if not any(_number(run.summary, ("planning", "plans")) for run in runs):
+            continue
+        solvers: Counter[str] = Counter()
+        for run in runs:
+            solvers.update(run.summary["planning"].get("by_solver", {}))
+        named = ", ".join(f"{name} {plans}" for name, plans in sorted(solvers.items()) if plans)
+        cells = [label, f"{volume:g}", named or "-"]
+        rows.append([*cells, *_extremes(runs, _PLANNING)])
+    caption = "Planning: sums over the seeds, and the worst of them for sizes and times."
+    return table(headings, rows, caption, 1) if rows else ""
+
+
+def _extremes(runs: Sequence[Run], columns: Sequence[_Column]) -> list[str]:
+    """Return cells with what columns combine over some runs."""
+    cells = []
+    for _, way, combine, digits in columns:
+        values = [_number(run.summary, way) for run in runs]
+        known = [value for value in values if value is not None]
+        cells.append(f"{combine(known):.{digits}f}" if known else "-")
+    return cells
 
 
 def failed_table(comparison: Comparison) -> str:

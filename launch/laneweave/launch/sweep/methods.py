@@ -10,6 +10,7 @@ from attrs import field, frozen
 from laneweave.launch.role_commands import LC2013, METHOD, RULE
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario import (
+    PAPERS_FORMATIONS,
     FormationSettings,
     Scenario,
     parse_scenario,
@@ -64,10 +65,8 @@ def _paper(max_vehicles: int, block_columns: int) -> LabelledMethod:
         f"the paper's formations, of at most {max_vehicles} vehicles in {block_columns} columns",
         {
             "formation.operation": "formations",
-            "formation.entry": "interlaced",
-            "formation.close": "columns",
-            "formation.cycle_s": 4.0,
-            "formation.move_s": 3.8,
+            **{f"formation.{name}": value for name, value in PAPERS_FORMATIONS.items()},
+            "formation.move_s": None,
             "formation.max_vehicles": max_vehicles,
             "formation.block_columns": block_columns,
         }

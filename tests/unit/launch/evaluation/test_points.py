@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 from attrs import evolve
 
 from laneweave.launch.evaluation.agreement import agreement
-from laneweave.launch.evaluation.points import point_rows
+from laneweave.launch.evaluation.points import PlanningTimes, point_rows
 from laneweave.launch.evaluation.programme import (
     FORMATIONS,
     GOALS,
     LABELS,
-    PAPER_BOUND,
     PARTS,
-    ROLLING_VOLUMES,
     VOLUMES,
+    paper_bound,
     planned,
     points_of,
 )
@@ -122,13 +122,41 @@ def test_the_programme_is_what_the_tables_show() -> None:
     assert set(FORMATIONS) <= set(LABELS)
     points = points_of(BASE, 1)
     assert {(point.label, point.volume_veh_per_lane_h) for point in points} == {
-        (label, volume) for label in LABELS for volume in ROLLING_VOLUMES if planned(label, volume)
+        (label, volume) for label in LABELS for volume in VOLUMES if planned(label, volume)
     }
-    assert {goal.volume_veh_per_lane_h for goal in GOALS} == {*VOLUMES, PAPER_BOUND}
-    for goal in GOALS:
-        volume = goal.volume_veh_per_lane_h
-        assert planned("rolling", volume)
-        assert (goal.paper_s is not None) == planned("paper-12", volume)
+    assert all(planned(goal.label, goal.volume_veh_per_lane_h) for goal in GOALS)
+    for label in LABELS:
+        assert all(planned(label, volume) for volume in (500.0, 750.0, 1000.0, 1600.0))
+    greatest = {
+        label: max(volume for volume in VOLUMES if planned(label, volume)) for label in FORMATIONS
+    }
+    bound = paper_bound(BASE.formation.speed_mps, BASE.formation.gap_m)
+    assert greatest == {"formations": 2000, "paper-6": bound, "paper-12": bound, "rolling": 2400}
+
+
+def test_planning_times_are_those_of_each_solver(tmp_path: Path) -> None:
+    made = [("tappa", 1.0), ("tappa", 2.0), ("tappa", 9.0), ("branching", 5.0), (None, 7.0)]
+    events = [
+        {"kind": "plan-made", "role": "coordinator", "solve_ms": solve_ms}
+        | ({} if solver is None else {"solver": solver})
+        for solver, solve_ms in made
+    ]
+    events += [
+        {"kind": "stream-planned", "role": "coordinator", "solve_ms": 3.5},
+        {"kind": "plan-made", "role": "agent", "solve_ms": 1e9},
+        {"kind": "plan-made", "role": "coordinator", "solve_ms": "soon"},
+        {"kind": "left", "vehicle": "v0001"},
+    ]
+    (tmp_path / "events.jsonl").write_text("".join(json.dumps(one) + "\n" for one in events))
+    found = summary(70.0, planning={"plans": 6, "fallbacks": 2})
+    one = evolve(run("formations", 1000.0, 1, found), folder=tmp_path)
+    (row,) = point_rows([one, run("formations", 1000.0, 2, summary(70.0, planning={"plans": 4}))])
+    assert (row.plans, row.fallbacks) == (10, 2)
+    assert row.planning == (
+        PlanningTimes("branching", 2, 6.0, 6.9, 7.0),
+        PlanningTimes("stream", 1, 3.5, 3.5, 3.5),
+        PlanningTimes("tappa", 3, 2.0, 8.3, 9.0),
+    )
 
 
 def test_trajectories_of_formation_control_are_kept() -> None:
@@ -149,6 +177,6 @@ def test_only_whole_trials_with_the_same_options_count(tmp_path: Path) -> None:
     folder.mkdir(parents=True)
     (folder / "summary.json").write_text("{}")
     assert not is_finished(trial, tmp_path)
-    (folder / "command.json").write_text('["--operation", "paper"]')
+    (folder / "command.json").write_text('["--operation", "rolling"]')
     assert not is_finished(trial, tmp_path)
     assert agreement_rows(tmp_path) == []

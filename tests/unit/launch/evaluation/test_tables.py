@@ -18,7 +18,8 @@ from laneweave.launch.evaluation.evidence import (
     write_evidence,
 )
 from laneweave.launch.evaluation.goals import goals_table, meets
-from laneweave.launch.evaluation.programme import LABELS, ROLLING_VOLUMES, planned
+from laneweave.launch.evaluation.points import PlanningTimes
+from laneweave.launch.evaluation.programme import FORMATIONS, GOALS, LABELS, VOLUMES, Goal, planned
 from laneweave.launch.evaluation.statements import PAPER_VOLUMES, statements_table
 from laneweave.launch.evaluation.tables import document_parts
 from laneweave.launch.evaluation.trials import AgreementRow, CostRow, FactorRow
@@ -36,15 +37,22 @@ def cells(table: str, first: str) -> list[str]:
 
 def full() -> Evidence:
     """Return evidence with every point, formation control at its goals, rules that congest."""
-    times = {"rolling": 66.5, "paper-6": 67.4, "paper-12": 67.4, "lc2013": 67.5}
+    times = {"formations": 66.6, "rolling": 66.5, "paper-6": 67.4, "paper-12": 67.4, "lc2013": 67.5}
     rows = [
         point(label, volume, times.get(label, 45.0 + volume / 40.0))
         for label in LABELS
-        for volume in ROLLING_VOLUMES
+        for volume in VOLUMES
         if planned(label, volume)
     ]
     jam = evolve(TRACED, slow_m=(500.0, 800.0), slowest_mps=3.0)
     rows = [evolve(row, traced=jam) if row.label.startswith("rule") else row for row in rows]
+    times_ms = (PlanningTimes("tappa", 990, 1.5, 20.25, 800.0),)
+    rows = [
+        evolve(row, plans=1000, fallbacks=9, planning=times_ms)
+        if row.label == "formations"
+        else row
+        for row in rows
+    ]
     agreed = AgreementRow(1600.0, 1, 120.0, 0, 170, Agreement(160, 0, 0, 0, 0.0))
     return evolve(
         evidence(*rows),
@@ -64,8 +72,10 @@ def full() -> Evidence:
 def test_what_is_missing_says_so() -> None:
     parts = document_parts(Evidence())
     assert cells(parts["evaluation travel times"], "1600") == ["1600", *["missing"] * len(LABELS)]
-    assert cells(parts["evaluation travel times"], "1800")[1:] == ["missing", *["-"] * 7]
-    for name in ("lattice", "agreement", "factors", "costs"):
+    assert cells(parts["evaluation travel times"], "2000")[1:] == [
+        "missing" if label in ("formations", "rolling") else "-" for label in LABELS
+    ]
+    for name in ("planning", "lattice", "agreement", "factors", "costs"):
         assert "missing" in parts[f"evaluation {name}"]
     goals = parts["evaluation goals"].splitlines()[2:]
     assert all("missing" in line and line.endswith("|  |") for line in goals)
@@ -114,9 +124,19 @@ def test_a_point_whose_runs_all_failed() -> None:
 
 def test_goals() -> None:
     table = goals_table(full())
-    assert cells(table, "`rolling`, 2400")[2:] == ["66.50 s, 100 %", "holds"]
+    assert cells(table, "`rolling`, 2400")[1:] == [
+        "at most 67 s, at least 99.9 % on their lane", "66.50 s, 100 %", "holds",
+    ]  # fmt: skip
+    assert cells(table, "`formations`, 1600")[1:] == [
+        "at most 66.9 s, 100 % on their lane, within 3.5 m/s2, at most 1 % fallbacks",
+        "66.60 s, 100 %, -6.80 to 4.80 m/s2, 9 of 1,000 plans",
+        "**missed**",
+    ]
+    assert cells(table, "`formations`, 1000")[3] == "holds"
     assert cells(table, "`paper-12`, 1600")[3] == "holds"
-    assert cells(table, "spacing")[2:] == ["14.93 m, least of 440,000 in 110 runs", "holds"]
+    runs = sum(planned(label, volume) for label in FORMATIONS for volume in VOLUMES)
+    spacing = f"14.93 m, least of {20_000 * runs:,} in {5 * runs} runs"
+    assert cells(table, "spacing")[2:] == [spacing, "holds"]
     assert cells(table, "real-time factor at 1600, one process, s")[2:] == ["5.90", "**missed**"]
     assert cells(table, "cost")[2:] == ["1.10 times", "holds"]
     assert cells(table, "three points")[3] == "holds"
@@ -128,9 +148,26 @@ def test_goals() -> None:
 )
 def test_shares_are_of_all_who_came(on_lane: int, share_percent: float, *, met: bool) -> None:
     row = evolve(point("rolling", 2200.0, 67.5), on_preferred_lane=on_lane)
-    assert meets(row, 67.5, share_percent) is met
-    assert not meets(row, 67.4, share_percent)
-    assert not meets(evolve(row, travel_s=None), 67.5, share_percent)
+    goal = Goal("rolling", 2200.0, 67.5, share_percent)
+    assert meets(row, goal) is met
+    assert not meets(row, evolve(goal, travel_s=67.4))
+    assert not meets(evolve(row, travel_s=None), goal)
+
+
+def test_goals_for_accelerations_and_fallbacks() -> None:
+    row = evolve(point("formations", 1600.0, 66.0), plans=200, fallbacks=2)
+    row = evolve(row, min_accel_mps2=-3.504, max_accel_mps2=3.1)
+    goal = Goal("formations", 1600.0, 66.9, accel_mps2=3.5, fallback_percent=1.0)
+    assert goal in GOALS
+    assert meets(row, goal)
+    for worse in ({"fallbacks": 3}, {"min_accel_mps2": -3.51}, {"max_accel_mps2": None}):
+        assert not meets(evolve(row, **worse), goal)
+
+
+def test_planning_times() -> None:
+    lines = document_parts(full())["evaluation planning"].splitlines()
+    shown = "| `formations` | 1600 | `tappa` | 990 | 1.5 | 20.2 | 800.0 | 9 of 1,000 |"
+    assert lines.count(shown) == 1
 
 
 def test_a_broken_promise_is_a_goal_missed() -> None:
@@ -152,7 +189,12 @@ def test_statements_follow_the_data() -> None:
     assert "`rule` at 1600, not yet at 1450" in cells(table, "Severe congestion")[1]
     assert cells(table, "The congestion is at")[2] == "holds"
     assert cells(table, "Formation control is faster")[2] == "holds"
-    assert cells(table, "At most 1800")[2] == "holds"
+    bound = cells(table, "At most 3600 v_F / 2 d_F")
+    assert bound[0].endswith("here 1800 veh/(lane h)")
+    assert bound[2] == "holds"
+    assert "`formations` carries 2000 of 2000, `rolling` carries 2400 of 2400" in bound[1]
+    # At 500 and 750 the rules take 57.5 and 63.75 s, formations 67.4 s.
+    assert cells(table, "Below 1000")[2] == "**does not hold**"
 
 
 def test_readings_of_the_rules_may_differ() -> None:

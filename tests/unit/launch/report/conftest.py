@@ -20,7 +20,7 @@ def _sweep(out: Path) -> None:
     lists = ("--volumes", "1000,1600", "--seeds", "1:2", "--duration", 40)
     scenario = short_road(out.parent)
     # Long enough for everybody to settle, and to reach the preferred lane.
-    text = scenario.read_text().replace("s3_m = 120.0", "s3_m = 240.0")
+    text = scenario.read_text().replace("s3_m = 160.0", "s3_m = 240.0")
     text = text.replace("s2_m = 10.0", "s2_m = 180.0")
     scenario.write_text(text + '\n[formation]\noperation = "paper"\n')
     done = sweep(scenario, out, *lists)

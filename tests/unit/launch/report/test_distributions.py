@@ -13,6 +13,8 @@ import pyarrow.parquet as pq
 import pytest
 from numpy.typing import ArrayLike
 
+from laneweave.launch.formations import read_events
+from laneweave.launch.report.comparison_figures import _break
 from laneweave.launch.report.distributions import (
     DECELERATION,
     HEADWAY,
@@ -107,12 +109,17 @@ def test_path_maps_are_what_was_driven(swept: Path) -> None:
     driven_tracks = read_tracks(run.folder)
     trips = {row["vehicle"]: row for row in pq.read_table(run.folder / "trips.parquet").to_pylist()}
     formations = sorted({trip["formation"] for trip in trips.values()})
+    plans = {event["formation"]: event for event in read_events(run.folder, "plan-made")}
     moved = 0
     for formation in formations:
         driven = driven_map(run, driven_tracks, formation)
         assert driven is not None
         path_map = driven.path_map
         moved += path_map.cost()
+        if formation in plans:
+            plan = plans[formation]
+            assert (driven.start_s, driven.slot_s) == (plan["t0_s"], plan["slot_s"])
+            assert path_map.cost() == plan["cost"]
         members = {name for name, trip in trips.items() if trip["formation"] == formation}
         assert set(path_map.ids) == members
         for name, row, lane in zip(
@@ -227,3 +234,16 @@ def test_colours_of_labels_stay_whatever_is_beside_them() -> None:
 def test_volumes_that_fit_side_by_side() -> None:
     assert spread_evenly([1.0, 2.0]) == (1.0, 2.0)
     assert spread_evenly(list(map(float, range(11)))) == (0.0, 2.0, 4.0, 6.0, 8.0, 10.0)
+
+
+def test_the_axis_of_travel_times_is_broken_where_a_method_jams() -> None:
+    calm, slower = np.linspace(66.0, 70.0, 101), np.linspace(67.0, 76.0, 101)
+    jam = np.linspace(90.0, 300.0, 101)
+    assert _break([calm, slower, np.empty(0)]) is None
+    broken_s = _break([calm, slower, jam])
+    assert broken_s is not None
+    assert 76.0 <= broken_s <= 1.25 * 68.0
+    # A few very late vehicles do not stretch the part below the break.
+    late = np.concatenate([slower, [200.0] * 5])
+    assert _break([calm, late, jam]) == pytest.approx(1.25 * 68.0)
+    assert _break([]) is None

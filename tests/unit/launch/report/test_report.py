@@ -15,7 +15,13 @@ from PIL import Image
 
 from laneweave.launch import cli
 from laneweave.launch.report.runs import Comparison, runs_of
-from laneweave.launch.report.tables import failed_table, mean_and_spread, table, traffic_table
+from laneweave.launch.report.tables import (
+    failed_table,
+    mean_and_spread,
+    planning_table,
+    table,
+    traffic_table,
+)
 from laneweave.launch.sweep.folder import POINT_FILE
 
 FIGURES = {
@@ -198,3 +204,17 @@ def test_means_with_their_spread() -> None:
     assert mean_and_spread([1.0, 3.0, None], 2) == "2.00 ± 1.41"
     assert mean_and_spread([1.0], 1) == "1.0"
     assert mean_and_spread([None], 1) == "-"
+
+
+def test_planning_times_of_a_comparison(swept: Path) -> None:
+    comparison = Comparison.of(runs_of([swept]))
+    (run,) = comparison.at("formation", 1600.0)
+    planning = run.summary["planning"]
+    assert "by_solver" not in planning or planning["by_solver"]
+    planning |= {"by_solver": {"tappa": 4, "branching": 1, "none": 0}, "fallbacks": 1, "plans": 5}
+    text = planning_table(comparison)
+    cells = [f"<td>{value}</td>" for value in ("5", "1", f"{planning['solve_ms']['p50']:.1f}")]
+    assert "<td>branching 1, tappa 4</td>" in text
+    assert "".join(cells) in text
+    planning |= {"plans": 0}
+    assert text.count("<tr>") == planning_table(comparison).count("<tr>") + 1

@@ -15,7 +15,7 @@ SHORT_ROAD = """
 [road]
 s1_m = 10.0
 s2_m = 10.0
-s3_m = 120.0
+s3_m = 160.0
 
 [demand]
 duration_s = 8.0

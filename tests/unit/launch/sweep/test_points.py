@@ -13,6 +13,8 @@ from laneweave.launch.sweep.points import parse_volumes, plan_points
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario import Scenario, load_scenario
 
+ROOT = Path(__file__).resolve().parents[4]
+
 
 def test_points_are_named_by_label_volume_and_seed() -> None:
     points = plan_points(
@@ -41,7 +43,23 @@ def test_labels_bring_their_settings(label: str, columns: int, vehicles: int) ->
     base = load_scenario(None, formation__block_columns=6, formation__max_vehicles=4)
     formation = METHODS[label].settings(base).formation
     assert (formation.block_columns, formation.max_vehicles) == (columns, vehicles)
+    assert (formation.operation, formation.entry, formation.close) == (
+        "formations", "interlaced", "columns",
+    )  # fmt: skip
+    assert METHODS[label].settings(base).cycles_s == (4.0, 4.0)
+    assert METHODS[label].settings(base).move_s == pytest.approx(3.8)
     assert METHODS["formation"].settings(base) == base
+
+
+def test_formations_are_the_default_ones_whatever_the_scenario_says() -> None:
+    default, paper = load_scenario(None), load_scenario(ROOT / "scenarios" / "paper.toml")
+    found = METHODS["formations"].settings(paper)
+    assert found.cycles_s == default.cycles_s == (4.0, 7.0)
+    assert found.formation.closes_by_vehicles
+    assert not found.formation.interlaced
+    assert found.formation.max_vehicles == 6
+    # Road and demand stay the scenario's.
+    assert (found.road, found.demand) == (paper.road, paper.demand)
 
 
 def test_labels_are_sorted_as_in_their_table() -> None:
@@ -84,6 +102,16 @@ def test_a_label_that_does_not_fit_the_scenario() -> None:
     base = load_scenario(None, road__s3_m=160.0)
     with pytest.raises(BadInputError, match=r"road.s3_m \(paper-12\): got 160.0"):
         plan_points(base, ["paper-12"], [1000.0], range(1), KeepTrajectories.none)
+
+
+@pytest.mark.parametrize("base", [Scenario(), load_scenario(None, formation__operation="rolling")])
+def test_the_paper_s_formations_are_the_paper_s_whatever_the_scenario_is(base: Scenario) -> None:
+    (point,) = plan_points(base, ["paper-6"], [1000.0], range(1), KeepTrajectories.none)
+    formation = point.scenario.formation
+    assert (formation.operation, formation.cycle_s) == ("formations", 4.0)
+    assert formation.interlaced
+    assert not formation.closes_by_vehicles
+    assert (formation.block_columns, formation.max_vehicles) == (4, 6)
 
 
 def test_too_many_points() -> None:

@@ -51,8 +51,7 @@ def test_an_answer_is_one_message_of_bounded_size() -> None:
 
 def test_the_scene_says_what_there_is() -> None:
     film = ring(25)
-    rolling = parse_scenario({"formation": {"operation": "rolling"}})
-    film.scene |= scene_of(rolling, "live", "here", 0.1)
+    film.scene |= scene_of(parse_scenario({}), "live", "here", 0.1)
     scene = json.loads(opening(film, "this server"))["scene"]
     assert (scene["first"], scene["last"], scene["session"]) == (15, 24, "this server")
     assert (scene["kind"], scene["title"], scene["rolling"]) == ("live", "here", False)

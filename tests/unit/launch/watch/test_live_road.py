@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from attrs import evolve
 
-from convoy import BALLOT, Convoy
+from convoy import BALLOT, ROLLING, Convoy
 from laneweave.launch.watch.frames import UNATTENDED, UNHEARD, compact
 from laneweave.launch.watch.live_road import STILL_S, LiveRoad
 from laneweave.protocol.codec import decode, encode
@@ -16,7 +16,6 @@ from laneweave.protocol.messages import ClosedFormation, Heartbeat, LogEvent, Na
 from laneweave.protocol.scenario import Scenario, parse_scenario
 from laneweave.protocol.transport import LinkDown, LinkUp
 
-ROLLING: Scenario = parse_scenario({"formation": {"operation": "rolling"}})
 FORMATIONS: Scenario = parse_scenario({})
 BLOCKS: Scenario = parse_scenario({"formation": {"operation": "paper"}})
 CONVOY = Convoy(9, scenario=ROLLING)
@@ -46,7 +45,7 @@ def shown(road: LiveRoad, wall_s: float = 2.0) -> dict[str, Any]:
 
 
 def test_before_anything_is_heard() -> None:
-    road = LiveRoad(Scenario(), wall_s=5.0)
+    road = LiveRoad(ROLLING, wall_s=5.0)
     frame = shown(road, 6.0)
     assert (frame["n"], frame["run"], frame["t"], frame["w"]) == (7, 0, None, 6.0)
     assert (frame["status"], frame["since"]) == ("waiting", 5.0)
