@@ -37,8 +37,16 @@ def test_another_leader_takes_over(finished_run: FinishedRun, lab: Lab, road: Pa
     assert 0 < recoveries[0] < RUN_S
     assert summary(folder)["failover"]["leader_changes"] >= 1
     # It was killed in the middle of it.
-    planned_s = [event["t_s"] for event in plans(folder)]
+    made = plans(folder)
+    planned_s = [event["t_s"] for event in made]
     assert min(planned_s) < KILLED_AT_S < max(planned_s)
+    # Each of the two planned as the paper does, for formations, and every vehicle got its path.
+    makers = {event["name"] for event in made}
+    assert makers == set(leaders)
+    assert {event["kind"] for event in made} == {"plan-made"}
+    assert {(event["solver"], event["status"]) for event in made} == {("tappa", "optimal")}
+    assert sum(event["vehicles"] for event in made) >= summary(folder)["vehicles"]["entered"]
+    assert summary(folder)["planning"]["by_solver"]["tappa"] == len(made)
     assert [line for line in log_lines(folder) if line["level"] == "error"] == []
 
 

@@ -18,8 +18,9 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import Census, CensusEntry, Name
 from laneweave.protocol.scenario import Scenario
 
-STAGE_LEAD_S = 8.0
-"""How long before a change of structure its plan is made: longer than planning takes."""
+STAGE_LEAD_S = 5.0
+"""How long before a change of structure its plan is made: longer than planning takes. The plan
+before it has ended by then."""
 
 
 @frozen

@@ -14,6 +14,7 @@ from attrs import field, frozen
 
 from laneweave.coordinator.borders import steps_of
 from laneweave.coordinator.formation import (
+    STAGE_LEAD_S,
     Formation,
     on_tick,
     stage_begin_s,
@@ -122,10 +123,11 @@ class FormationPlanner:
     def _end_s(self, formation: Formation) -> float:
         """Return the road time by which a formation should have done what it does now.
 
-        That is when it is to begin something else, or when its foremost column leaves the road.
+        That is when its next plan is to be made, or when its foremost column leaves the road.
         """
         if not formation.sorts:
-            return stage_begin_s(formation.numbers, formation.stage + 1, self._scenario)
+            next_s = stage_begin_s(formation.numbers, formation.stage + 1, self._scenario)
+            return next_s - STAGE_LEAD_S
         front = self._scenario.lattice.block_range(formation.numbers[0])[-1]
         return time_left_s([(front, 0)], 0.0, self._scenario)
 

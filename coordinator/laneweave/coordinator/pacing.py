@@ -47,19 +47,21 @@ def paced(
         end_s: road time by which it should have ended.
         scenario: road, lattice, T_F.
     """
-    slots_s, slack_s = scenario.slots_s, scenario.formation.slack_s
+    slots_s, slack_s = scenario.slots_s[::-1], scenario.formation.slack_s
+    comfortable = [slot_s for slot_s in slots_s if slot_s >= scenario.comfortable_cycle_s]
     best = plan
-    for reserve_s in (RESERVE_S, LEAST_RESERVE_S):
-        for slot_s in reversed(slots_s):
-            t0_s = (
-                plan.t0_s if len(slots_s) == 1 else _start_s(plan, slot_s, not_before_s, scenario)
-            )
-            most_steps = max(0, int((end_s - t0_s) / slot_s))
-            best = kept_apart(evolve(plan, t0_s=t0_s, slot_s=slot_s), others, slack_s, most_steps)
-            if t0_s + steps_of(best) * slot_s <= end_s - reserve_s:
-                return best
-            if slot_s < scenario.comfortable_cycle_s and reserve_s == RESERVE_S:
-                break  # rather less reserve
+    # Rather less reserve than haste.
+    for slot_s, reserve_s in (
+        *((slot_s, RESERVE_S) for slot_s in comfortable),
+        *((slot_s, LEAST_RESERVE_S) for slot_s in slots_s),
+    ):
+        t0_s = plan.t0_s
+        if len(slots_s) > 1:
+            t0_s = _start_s(plan, slot_s, not_before_s, scenario)
+        most_steps = max(0, int((end_s - t0_s) / slot_s))
+        best = kept_apart(evolve(plan, t0_s=t0_s, slot_s=slot_s), others, slack_s, most_steps)
+        if t0_s + steps_of(best) * slot_s <= end_s - reserve_s:
+            return best
     return best
 
 
