@@ -258,6 +258,7 @@ class CoordinatorCore:
                 pass
             case RoadClock():
                 self.t_s = max(self.t_s, message.t_s)
+                self._planner.on_clock(self.t_s, now_s)
                 self._road_changed = True
             case Census():
                 if self.census is None or message.t_s >= self.census.t_s:

@@ -31,6 +31,8 @@ from laneweave.protocol.vehicle_rules import (
 )
 
 TIME_TOLERANCE_S = 1e-6
+LISTEN_S = 1.0
+"""How long before a move is due a vehicle listens to those for which it waits."""
 OVERDUE_SLOTS = 1.5
 OVERDUE_S = 2.0
 """A move is overdue when it has been due for 1.5 slots, or for a slot and 2 s if that is less."""
@@ -224,19 +226,15 @@ class PlanExecution:
     def needs_states(self, t_s: float) -> bool:
         """Tell whether what other vehicles show matters now.
 
-        It does until the gate is open, and from shortly before the plan's start on as long as a
-        move waits for somebody. What is missed in between is shown again: it stays true.
+        It does until the gate is open, and from shortly before the next move is due until that is
+        released. What is missed in between is shown again: it stays true.
         """
         plan = self.plan
         if plan is None:
             return False
         if self.phase is not Stage.GOING:
             return True
-        if t_s < plan.t0_s - plan.slot_s:
+        if self.next_move is None or not self.is_due(t_s + LISTEN_S):
             return False
-        heard = self.heard
-        for needs in self.needs[self.completed :]:
-            for other, count in needs.items():
-                if heard.get(other, -1) < count:
-                    return True
-        return False
+        needs = self.needs[self.completed]
+        return any(self.heard.get(other, -1) < count for other, count in needs.items())

@@ -20,8 +20,8 @@ from attrs import frozen
 Cell = tuple[int, int]
 """(column, lane)."""
 
-STRETCH_COLUMNS = 8
-"""Columns of a stretch: as many as the longest formation of six has, and one more."""
+STRETCH_COLUMNS = 4
+"""Columns of a stretch: a vehicle hears of the motions of all that are as near as that."""
 
 Move = tuple[int, Cell, Cell]
 """(step, from, to): in this step of its plan the vehicle moves to a neighbouring cell."""
