@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 from attrs import evolve
 
-from laneweave.protocol.execution import PlanExecution
+from laneweave.protocol.execution import LISTEN_S, PlanExecution
 from laneweave.protocol.lattice import Cell, Lattice, Move, territory
 from laneweave.protocol.messages import Ballot, Name, Plan, Prepare, Sense, VehicleState
 from laneweave.protocol.vehicle_rules import VEHICLE_RULES, Stage
@@ -590,8 +590,8 @@ def test_states_matter_until_the_gate_is_open_and_while_a_move_waits() -> None:
     execution = accepted(make_plan(moves=moves, cells={A: (-3, 0), B: (-4, 0)}), B)
     assert execution.needs_states(0.0)
     execution.on_state(shown(A, go=True))
-    assert not execution.needs_states(T0_S - SLOT_S - 0.1)
-    assert execution.needs_states(T0_S - SLOT_S)
+    assert not execution.needs_states(T0_S - LISTEN_S - 0.1)
+    assert execution.needs_states(T0_S - LISTEN_S)
     execution.on_state(shown(A, completed=1))
     assert not execution.needs_states(T0_S)
 
