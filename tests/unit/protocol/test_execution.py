@@ -590,10 +590,10 @@ def test_states_matter_until_the_gate_is_open_and_while_a_move_waits() -> None:
     execution = accepted(make_plan(moves=moves, cells={A: (-3, 0), B: (-4, 0)}), B)
     assert execution.needs_states(0.0)
     execution.on_state(shown(A, go=True))
-    assert not execution.needs_states(T0_S - LISTEN_S - 0.1)
-    assert execution.needs_states(T0_S - LISTEN_S)
+    assert not execution.needs_states(T0_S + SLOT_S - LISTEN_S - 0.1)
+    assert execution.needs_states(T0_S + SLOT_S - LISTEN_S)
     execution.on_state(shown(A, completed=1))
-    assert not execution.needs_states(T0_S)
+    assert not execution.needs_states(T0_S + SLOT_S)
 
 
 def test_overdue_runs_from_the_moment_the_next_move_is_due() -> None:
