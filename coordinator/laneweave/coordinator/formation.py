@@ -1,8 +1,8 @@
 """Formations as the census tells of them, and the time that they have on the road.
 
-The roadside builds formations out of the stream of arrivals and says which blocks of columns are
-whose. A formation is *closed* when nobody can enter in its blocks any more: its roster is known for
-certain from that census on.
+The roadside builds formations out of the stream of arrivals and says which blocks of columns belong
+to which formation. A formation is *closed* when no vehicle can enter its blocks any more: its
+roster is known for certain from that census on.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def closed_formations(
     member of theirs.
 
     Args:
-        census: who is on the road, and which blocks are whose.
+        census: the vehicles on the road, and the blocks of each formation.
         t_s: road time.
         scenario: the lattice.
         groups: which blocks plan together; the blocks of each closed formation are added.

@@ -280,7 +280,7 @@ class CensusEntry:
 
 @frozen
 class ClosedFormation:
-    """Which blocks of columns are a formation's; nobody enters in them any more."""
+    """The blocks of columns of a formation; no vehicle enters them any more."""
 
     first_block: int
     """Number of its foremost block, which is the formation's number, too."""
@@ -325,7 +325,7 @@ class Census:
     """The closed formations with a vehicle on the road, foremost first. What is said of one never
     changes, and no block is in two. Empty in the rolling operation."""
     closed_to: int = -1
-    """All blocks up to this number are closed: whoever entered in them is listed, or has left."""
+    """All blocks up to this number are closed: their vehicles are listed, or have left."""
     bridge: int = 0
     """Incarnation of the bridge, which tells this road from an earlier one; 0: not told."""
 

@@ -55,7 +55,7 @@ class EntryMeter:
         Args:
             lattice: the lattice whose cells are given out.
             spread_s: most time between a vehicle and its cell at s = 0.
-            builder: builds formations of those who enter; None: there are none.
+            builder: builds formations of the vehicles that enter; None: there are none.
             interlaced: whether only every other cell may be entered.
         """
         self._lattice = lattice

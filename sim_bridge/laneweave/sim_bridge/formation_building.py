@@ -1,10 +1,10 @@
 """Formation building at the entrance: which columns become one formation, and when it is closed.
 
-A formation is *closed* when nobody can enter in its columns any more, so its members are known for
+A formation is *closed* when no vehicle can enter its columns any more, so its members are known for
 certain. The roadside gives each column to at most one closed formation, and never again: that is
 what plans of different formations rely on.
 
-- `ColumnBlocks`, the paper's way: every formation has as many columns.
+- `ColumnBlocks`, as in the paper: all formations have the same number of columns.
 - `GrowingFormations`, the default: the length follows the traffic. A formation begins with the
   column of its first vehicle. It ends when it has its most vehicles, when another vehicle would ask
   for more places on a lane than the shortest formation has, or at its greatest length, so that few
@@ -54,7 +54,7 @@ class FormationBuilder(Protocol):
 
 @define
 class ColumnBlocks:
-    """Formations of equal length: block number b owns its columns, whoever enters."""
+    """Formations of equal length: a formation is a block of columns."""
 
     lattice: Lattice
     max_vehicles: int

@@ -129,7 +129,7 @@ class Roadside:
     def close_formations(self, t_s: float) -> list[ClosedFormation]:
         """Return the formations that have been closed since the last call.
 
-        Call it after `admit`, which decides who is in them.
+        Call it after `admit`, which decides on their members.
         """
         if self._builder is None:
             return []
@@ -228,7 +228,7 @@ class Roadside:
         return self._announced != before
 
     def census(self, t_s: float, on_road: Iterable[RoadVehicle]) -> Census:
-        """Return who is on the road, who was announced last, and which formations are closed."""
+        """Return the vehicles on the road, those announced, and the closed formations."""
         vehicles = tuple(on_road)
         present = {vehicle.formation for vehicle in vehicles}
         self._closed = [closed for closed in self._closed if closed.first_block in present]

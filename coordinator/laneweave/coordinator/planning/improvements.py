@@ -1,7 +1,7 @@
 """What is added to Algorithms 1 and 2 of the paper; without any of it they are literal.
 
 Each addition leaves the result exact. What each is worth is measured by
-`benchmarks/planner_switches.py` and told in docs/PLANNING.md.
+`benchmarks/planner_switches.py`; docs/PLANNING.md has the figures.
 """
 
 from __future__ import annotations

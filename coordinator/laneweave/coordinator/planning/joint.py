@@ -12,8 +12,8 @@ it pays one for each step from the start until it is not. Backwards, a vehicle b
 its first move, stays so, and pays for every step from there to the start: that is known exactly as
 soon as the number of steps is, which the heuristic uses.
 
-Which joint moves end in a set of occupied cells does not depend on who is where. They are made once
-for each set, as exchanges of labels; a label is a team and whether the vehicle is active.
+Which joint moves end in a set of occupied cells does not depend on which vehicle is where. They are
+made once for each set, as exchanges of labels; a label is a team and whether the vehicle is active.
 """
 
 from __future__ import annotations

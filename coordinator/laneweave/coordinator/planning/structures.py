@@ -5,14 +5,14 @@ column + lane, or those with odd, if it is interlaced. A structure takes as many
 on each lane as it has vehicles there, without gaps but for blocked cells:
 
 - Where every vehicle names its lane, the cells of each lane are where its vehicles have the
-  shortest total way.
+  shortest total distance.
 - Otherwise the structure is filled from a common front to the rear, column by column, and in each
   column over its lanes from the right. A lane that vehicles name is filled until they have their
-  cells; whoever names none gets one of the other cells. The front is where the total way along the
-  road is shortest.
+  cells; vehicles that name none get the other cells. The front is where the total distance along
+  the road is shortest.
 
-Of the two interlaced structures the one with the shorter total way is taken, the even one if both
-are equal. Ties between positions go to the one nearest to the middle of the grid.
+Of the two interlaced structures the one with the shorter total distance is taken, the even one if
+both are equal. Ties between positions go to the one nearest to the middle of the grid.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ STRUCTURES: Final = (PARALLEL, INTERLACED)
 _Columns = Mapping[int, Sequence[int]]
 """Columns of a structure's cells, ascending, for each of its lanes."""
 _Placed = tuple[float, list[Cell]]
-"""Total way of the vehicles along the road, with a share of the distance from the middle; cells."""
+"""Total distance along the road, with a share of the distance from the middle; cells."""
 
 
 def structure_targets(
@@ -137,8 +137,8 @@ def _place(
     total, targets = 0.0, []
     for lane in sorted(_named(preferred)):
         wanting = [cell[0] for cell, own in zip(cells, preferred, strict=True) if own == lane]
-        way, first = ranked_runs(wanting, columns[lane], grid.columns)[0]
-        total += way
+        distance, first = ranked_runs(wanting, columns[lane], grid.columns)[0]
+        total += distance
         targets += [(column, lane) for column in columns[lane][first : first + len(wanting)]]
     return total, targets
 
@@ -157,8 +157,8 @@ def _filled(
         targets = _fill(front, lanes_of, preferred)
         if targets is not None:
             places = np.sort([column for column, _ in targets])
-            way = float(np.abs(places - in_order).sum() + _off_middle(places, grid.columns))
-            found.append((way, targets))
+            distance = float(np.abs(places - in_order).sum() + _off_middle(places, grid.columns))
+            found.append((distance, targets))
     return min(found, key=lambda one: one[0])
 
 
@@ -184,10 +184,10 @@ def _fill(
 
 
 def _off_middle(columns: NDArray[np.int64], width: int) -> NDArray[np.float64]:
-    """Return a share, below 0.06, that prefers the middle among equal ways."""
+    """Return a share, below 0.06, that prefers the middle among equal distances."""
     return np.asarray(np.abs(columns.mean(axis=-1) - (width - 1) / 2) / (10 * width))
 
 
 def _off_front(columns: NDArray[np.int64], width: int) -> NDArray[np.float64]:
-    """Return a share, below 0.1, that prefers the front among equal ways."""
+    """Return a share, below 0.1, that prefers the front among equal distances."""
     return np.asarray((width - 1 - columns.mean(axis=-1)) / (10 * width))
