@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import product
 from typing import Any
 
@@ -10,7 +10,12 @@ import pytest
 
 from laneweave.coordinator.planning import PlanRequest, plan
 from laneweave.coordinator.planning.grid import Mode
-from laneweave.coordinator.planning.instances import formation_request
+from laneweave.coordinator.planning.instances import (
+    TRAFFIC_KINDS,
+    block_request,
+    formation_request,
+    traffic_request,
+)
 from laneweave.protocol.solvers import SOLVERS
 from oracles import joint_search, milp_oracle
 from oracles.instances import (
@@ -106,6 +111,30 @@ def test_planner_agrees_with_the_oracle_on_formations_beyond_six(
         cost = oracle(request)
         assert cost is not None
         wrong += [f"seed {seed}: {fault}" for fault in _faults(request, cost, "branching")]
+    assert not wrong, "\n".join(wrong)
+
+
+def _interlaced(seed: int) -> PlanRequest:
+    return block_request(seed, vehicles=2 + seed % 5, conflicts=TRAFFIC_KINDS)
+
+
+SIX: dict[str, Callable[[int], PlanRequest]] = {"interlaced": _interlaced, "free": traffic_request}
+"""Formations of at most six vehicles, as roads have them."""
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("first", range(0, INSTANCES, CHUNK))
+@pytest.mark.parametrize("family", SIX)
+def test_planner_agrees_with_the_oracle_on_formations_of_six(family: str, first: int) -> None:
+    wrong = []
+    for seed in range(first, first + CHUNK):
+        request = SIX[family](seed).to_dict()
+        cost = milp_oracle.optimal_cost(request)
+        wrong += [
+            f"seed {seed}, {solver}: {fault}"
+            for solver in SOLVERS
+            for fault in _faults({**request, "deadline_s": DEADLINE_S}, cost, solver)
+        ]
     assert not wrong, "\n".join(wrong)
 
 
