@@ -169,9 +169,9 @@ def messages(vehicle: Name, *, number: int, real: float) -> dict[type, Any]:
 
 def keys_of(topic: Topic, vehicle: str) -> Iterator[str]:
     """Return keys of a topic: of somebody who is there and of somebody who is not."""
-    there = {"vehicle": vehicle, "formation": 0, "coordinator": "c1", "role": "agent"}
-    there |= {"name": vehicle, "incarnation": 1}
-    nobody = dict.fromkeys(topic.parameters, "ghost") | {"formation": 99}
+    there = {"vehicle": vehicle, "formation": 0, "stretch": 0, "coordinator": "c1"}
+    there |= {"role": "agent", "name": vehicle, "incarnation": 1}
+    nobody = dict.fromkeys(topic.parameters, "ghost") | {"formation": 99, "stretch": 99}
     yield KEYS.key(topic, **there)
     yield KEYS.key(topic, **nobody)
 

@@ -105,7 +105,7 @@ PUBLISHED: tuple[tuple[str, Topic, dict[str, object], str, tuple[str, ...]], ...
     (f"vehicle.{B}", COMMAND, {"vehicle": B}, "bridge", (FLEETS[B],)),
     # A vehicle's caretaker is a part of the bridge.
     (f"vehicle.{B}", STATE, {"formation": 3, "vehicle": B}, f"vehicle.{A}", (FLEETS[B], "bridge")),
-    (f"vehicle.{B}", MOTION, {"formation": -3, "vehicle": B}, f"vehicle.{A}", (FLEETS[B],)),
+    (f"vehicle.{B}", MOTION, {"stretch": -3, "vehicle": B}, f"vehicle.{A}", (FLEETS[B],)),
     (f"vehicle.{B}", REPORT, {"role": "agent", "name": B}, "observer.watch", (FLEETS[B],)),
 )
 """Who publishes what, who reads it, and who may publish it, too."""

@@ -68,7 +68,7 @@ def test_responses_from_before_there_was_a_choice_can_be_read() -> None:
 
 def test_branching_goes_on_when_tappa_has_spent_its_nodes() -> None:
     alone = checked_plan(HARD, max_nodes=NODES, solver="tappa", fallback=False)
-    assert (alone.status, alone.solver, alone.fallback) == ("feasible", "tappa", False)
+    assert (alone.status, alone.solver, alone.fallback) == ("timeout", "tappa", False)
     response = checked_plan(HARD, max_nodes=NODES)
     best = checked_plan(HARD, solver="branching")
     assert (response.solver, response.fallback) == ("branching", True)
@@ -85,13 +85,11 @@ def test_a_fallback_by_nodes_is_repeatable() -> None:
 
 @pytest.mark.parametrize("nodes", [20, 40, 80])
 def test_the_cheaper_path_set_and_the_higher_bound_are_kept(nodes: int) -> None:
-    """Branching gets so few nodes that TAPPA may have found more."""
+    """Branching gets so few nodes that TAPPA may have found more, a path set or a bound."""
     alone = plan(HARD, max_nodes=math.ceil(TAPPA_SHARE * nodes), solver="tappa", fallback=False)
     both = plan(HARD, max_nodes=nodes)
     assert (both.solver, both.fallback) == ("branching", True)
-    assert alone.cost is not None
-    assert both.cost is not None
-    assert both.cost <= alone.cost
+    assert alone.cost is None or (both.cost is not None and both.cost <= alone.cost)
     assert (both.lower_bound or 0) >= (alone.lower_bound or 0)
 
 
