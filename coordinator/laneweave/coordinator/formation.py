@@ -34,6 +34,9 @@ class Formation:
     """Road time at which the last of them was closed."""
     joined: int = 1
     """How many formations these are."""
+    deserted: Numbers = ()
+    """Blocks of joined formations that have no vehicle on the road any more. Vehicles of others may
+    be there, with which this leader does not know them to be joined: plans keep out of them."""
     stage: int = 0
     """Which of the scenario's structures it is to take on now."""
     sorts: bool = True
@@ -72,12 +75,14 @@ def closed_formations(
     for entry in census.on_road:
         first = groups.of(lattice.block_of(entry.cell[0]))[0]
         members.setdefault(first, []).append(entry)
+    inhabited = {block for closed in census.formations for block in closed.blocks}
     return {
         first: Formation(
             groups.of(first),
             tuple(sorted(each, key=lambda entry: entry.vehicle)),
             max(closed_s.get(first, [0.0])),
             len(closed_s.get(first, [0.0])),
+            tuple(block for block in groups.of(first) if block not in inhabited),
             stage := stage_at(groups.of(first), t_s, scenario),
             stage == len(scenario.formation.structures),
         )

@@ -128,6 +128,7 @@ class FormationPlanner:
             scenario,
             self._deadline_s(start_s, t_s),
             comfortable_steps(start_s, end_s, scenario),
+            formation.deserted,
             None if formation.sorts else scenario.formation.structures[formation.stage],
         )
         # What was ordered under an earlier ballot is not waited for any more.

@@ -45,6 +45,8 @@ class SortingTask:
     """For each planning."""
     steps: int = 1_000_000
     """How many steps the road has room for; where a plan has more, other targets are tried."""
+    deserted: Numbers = ()
+    """Blocks of `numbers` in which only the cells that members hold may be used."""
     structure: DrivingStructure | None = None
     """What the vehicles should form, wherever each of them is in it; None: they sort."""
 
@@ -68,13 +70,15 @@ class SortingTask:
 
     @property
     def blocked(self) -> tuple[Cell, ...]:
-        """Grid cells that nobody may use: of members that hold, and between the blocks."""
+        """Grid cells out of use: of members that hold, between the blocks, and in deserted ones."""
         first, lattice = self.columns.start, self.scenario.lattice
+        usable, held_cells = {*self.numbers} - {*self.deserted}, set(self.hold_cells.values())
         foreign = [
             (column - first, lane)
             for column in self.columns
-            if lattice.block_of(column) not in self.numbers
+            if lattice.block_of(column) not in usable
             for lane in range(lattice.lanes)
+            if (column, lane) not in held_cells
         ]
         held = [
             (self.hold_cells[name][0] - first, self.hold_cells[name][1]) for name in self.unattended

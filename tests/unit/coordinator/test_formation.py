@@ -132,7 +132,7 @@ def test_what_the_census_has_told_of_a_formation_is_remembered() -> None:
     groups.join((1, 2))
     later = Census(50.0, entries_of(b=(-2, 0)), (), both[1:], 3)
     assert closed_formations(later, NOW_S, GROWING, groups) == {
-        0: Formation((0, 1, 2, 3), entries_of(b=(-2, 0)), 5.0)
+        0: Formation((0, 1, 2, 3), entries_of(b=(-2, 0)), 5.0, deserted=(0, 1))
     }
 
 

@@ -58,6 +58,20 @@ def test_the_request_is_in_the_blocks_own_columns_and_in_the_order_of_the_roster
     assert request.conflicts == SCENARIO.formation.conflict_kinds
 
 
+def test_of_blocks_without_vehicles_only_held_cells_are_used() -> None:
+    """Vehicles that this leader does not know of may be there."""
+    order = task({A: (-5, 0), B: (-1, 1)}, {A: 1, B: 2}, numbers=(0, 1))
+    kept_out = evolve(order, deserted=(1,))
+    first = order.columns.start
+    in_block = {(column - first, lane) for column, lane in LATTICE.block_cells(1)}
+    assert order.blocked == ()
+    assert set(kept_out.blocked) == in_block - {kept_out.movers[A]}
+    moves = sort(kept_out).moves
+    assert all(target[0] > -4 for each in moves.values() for _, _, target in each), (
+        "out of the block only"
+    )
+
+
 def test_the_request_follows_the_scenario() -> None:
     scenario = evolve(
         SCENARIO, formation=evolve(FORMATIONS, mode=2, planning_deadline_s=1.5, solver="branching")
