@@ -71,10 +71,12 @@ class Roadside:
         ahead_s = self._announce_s + self._tick_s
         self._announced_per_lane = math.ceil(ahead_s / formation.entry_spacing_s) + 1
         self._rolling = formation.rolling
-        self._spread_s = formation.entry_spread_s
         self._builder = formation_builder(scenario)
         self._meter = EntryMeter(
-            lattice, self._spread_s, self._builder, interlaced=formation.interlaced
+            lattice,
+            formation.entry_spread_s,
+            self._builder,
+            interlaced=formation.interlaced,
         )
         self._closed: list[ClosedFormation] = []
         """All that have been closed, as long as one of their vehicles is on the road."""
