@@ -23,6 +23,7 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import (
     Ballot,
     Census,
+    ClosedFormation,
     Command,
     Heartbeat,
     Name,
@@ -279,7 +280,10 @@ def close_at_once(patch: pytest.MonkeyPatch) -> None:
     def mutant(
         census: Census, t_s: float, scenario: Scenario, groups: Groups
     ) -> dict[int, Formation]:
-        return closed_formations(evolve(census, closed_to=FAR_BEHIND), t_s, scenario, groups)
+        blocks = sorted({scenario.lattice.block_of(entry.cell[0]) for entry in census.on_road})
+        closed = tuple(ClosedFormation(block, block, 0.0) for block in blocks)
+        early = evolve(census, formations=closed, closed_to=FAR_BEHIND)
+        return closed_formations(early, t_s, scenario, groups)
 
     patch.setattr(coordinator_core, "closed_formations", mutant)
 
