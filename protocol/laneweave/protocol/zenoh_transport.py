@@ -74,12 +74,24 @@ ROUTER_RUNTIME = "(rx: (worker_threads: 64))"
 """Zenoh's default are two threads that receive. Each connection that has run into its lease holds
 one of them while it is closed, for up to 10 s (the linger of its socket): with two of them gone,
 nobody's messages go on. So many processes may vanish with a host at one time."""
+_RUNTIME_VARIABLE = "ZENOH_RUNTIME"
+CLIENT_RUNTIME = (
+    "(app: (worker_threads: 1), acc: (handover: app), tx: (handover: app), rx: (handover: app), "
+    "net: (handover: app))"
+)
+"""One thread for all that a client does. With a process per vehicle, two cores spend a tenth of
+their time on waking up further threads for each message."""
 CONNECT_AGAIN_S = 0.5
 """Between two attempts of a role that waits for its router."""
 
 
-def _open(settings: Iterable[Setting]) -> zenoh.Session:
+def _open(settings: Iterable[Setting], runtime: str) -> zenoh.Session:
     """Open a session.
+
+    Args:
+        settings: of the session.
+        runtime: Zenoh's threads in this process, unless the environment says otherwise, or an
+            earlier session of the process has settled it.
 
     Raises:
         zenoh.ZError: nobody answers, or it cannot listen.
@@ -87,7 +99,14 @@ def _open(settings: Iterable[Setting]) -> zenoh.Session:
     config = zenoh.Config()
     for path, value in settings:
         config.insert_json5(path, json.dumps(value))
-    return zenoh.open(config)
+    if _RUNTIME_VARIABLE in os.environ:
+        return zenoh.open(config)
+    os.environ[_RUNTIME_VARIABLE] = runtime
+    try:
+        return zenoh.open(config)
+    finally:
+        # What is started from here may be of another role.
+        os.environ.pop(_RUNTIME_VARIABLE, None)
 
 
 class ZenohTransport:
@@ -110,7 +129,7 @@ class ZenohTransport:
             check_credentials(access.credentials, access.identity)
             whose = f", of the authority that vouches for {access.identity}"
         try:
-            self._session = _open(client_settings(access))
+            self._session = _open(client_settings(access), CLIENT_RUNTIME)
         except zenoh.ZError as error:
             raise BadInputError(
                 "network.endpoint", endpoint, f"the endpoint of a running router{whose}"
@@ -330,11 +349,9 @@ def run_router(
     if guard is not None:
         check_credentials(guard.credentials, str(Party.ROUTER), guard.host)
     stop: queue.SimpleQueue[bool] = queue.SimpleQueue()
-    # Read when the first session of a process is opened.
-    os.environ.setdefault("ZENOH_RUNTIME", ROUTER_RUNTIME)
     with stop_signals(lambda: stop.put(True)):
         try:
-            session = _open(router_settings(endpoints, lease_s, guard))
+            session = _open(router_settings(endpoints, lease_s, guard), ROUTER_RUNTIME)
         except zenoh.ZError as error:
             raise BadInputError(
                 told_by, ", ".join(endpoints), "endpoints that are free to listen at"
