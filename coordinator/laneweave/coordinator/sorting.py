@@ -10,14 +10,16 @@ that one vehicle in a corner does not keep all others from theirs.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Collection, Iterator, Mapping
 from itertools import islice
 from typing import Any
 
-from attrs import frozen
+from attrs import evolve, frozen
 
 from laneweave.coordinator.groups import Numbers
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, Weights, checked_plan
+from laneweave.coordinator.planning.budget import Clock
 from laneweave.coordinator.targets import placements
 from laneweave.protocol.lattice import Cell, Move
 from laneweave.protocol.messages import Name
@@ -25,6 +27,8 @@ from laneweave.protocol.scenario import DrivingStructure, Scenario
 
 MOST_PLACEMENTS = 6
 """Structures that are tried where the first one takes too many steps."""
+SHORTEST_S = 0.05
+"""What a planning is given at least."""
 
 
 @frozen
@@ -42,7 +46,7 @@ class SortingTask:
     scenario: Scenario
     """Mode, conflict kinds, lattice."""
     deadline_s: float
-    """For each planning."""
+    """For all plannings of it together."""
     steps: int = 1_000_000
     """How many steps the road has room for; where a plan has more, other targets are tried."""
     deserted: Numbers = ()
@@ -165,20 +169,28 @@ def _plan_request(
     )
 
 
-def sort_lanes(task: SortingTask, max_nodes: int, weights: Weights) -> Sorting:
+def sort_lanes(
+    task: SortingTask, max_nodes: int, weights: Weights, clock: Clock = time.monotonic
+) -> Sorting:
     """Plan a sorting; with as many members on their lanes as can be had.
 
     Args:
         task: what is to be sorted.
         max_nodes: bound on search nodes of each planning.
         weights: l_s and l_o of the formation relative distance.
+        clock: by which the deadline is kept, in seconds.
     """
     if not task.movers:
         return _sorting(task, None)
+    ends_s = clock() + task.deadline_s
     for dropped in _attempts(task):
         best: PlanResponse | None = None
         for request in islice(plan_requests(task, dropped), MOST_PLACEMENTS):
-            response = checked_plan(request, max_nodes=max_nodes, weights=weights)
+            left_s = ends_s - clock()
+            if best is not None and left_s <= SHORTEST_S:
+                break
+            hurried = evolve(request, deadline_s=max(left_s, SHORTEST_S))
+            response = checked_plan(hurried, max_nodes=max_nodes, weights=weights)
             if best is None or _steps(response) < _steps(best):
                 best = response
             if _steps(best) <= task.steps or not response.paths:

@@ -7,8 +7,9 @@ from attrs import evolve
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from laneweave.coordinator import sorting as sorting_module
 from laneweave.coordinator.groups import Numbers
-from laneweave.coordinator.planning import PlanResponse, Weights, checked_plan
+from laneweave.coordinator.planning import PlanRequest, PlanResponse, Weights, checked_plan
 from laneweave.coordinator.sorting import Sorting, SortingTask, plan_requests, sort_lanes
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, footprint
@@ -225,6 +226,24 @@ def test_a_search_that_ran_out_of_nodes_says_nothing_of_room() -> None:
     assert sorting.response.status == "timeout"
     assert (sorting.solved, sorting.short_of_room) == (False, False)
     assert sort(order).solved
+
+
+def test_all_placements_share_one_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each planning takes two of five seconds; none is short enough."""
+    asked, now_s = list[float](), [100.0]
+
+    def slow_plan(request: PlanRequest, *, max_nodes: int, weights: Weights) -> PlanResponse:
+        asked.append(request.deadline_s)
+        now_s[0] += 2.0
+        return checked_plan(request, max_nodes=max_nodes, weights=weights)
+
+    monkeypatch.setattr(sorting_module, "checked_plan", slow_plan)
+    cells = {A: (0, 0), B: (-1, 1), C: (-2, 0), D: (-3, 1), E: (0, 2), F: (-2, 2)}
+    order = task(cells, {A: 2, B: 2, C: 1, D: 0, E: 0, F: 1}, numbers=(0, 1))
+    hurried = evolve(order, deadline_s=5.0, steps=0)
+    assert len(list(plan_requests(hurried))) > 3
+    assert sort_lanes(hurried, NODES, WEIGHTS, lambda: now_s[0]).solved
+    assert asked == [5.0, 3.0, 1.0]
 
 
 @pytest.mark.parametrize("cell", [(1, 0), (-4, 0), (0, 3), (-1, 1)])
