@@ -101,23 +101,6 @@ def _combinations(choices: Sequence[Sequence[tuple[float, list[Cell]]]]) -> Iter
                 heapq.heappush(heap, (total(following), following))
 
 
-def parallel_targets(
-    lane: int, cells: Sequence[Cell], columns: int, free: Sequence[int] | None = None
-) -> list[Cell]:
-    """Return neighbouring target cells on a lane for the vehicles that need it.
-
-    As many as there are vehicles, without gaps but for blocked cells, placed where the vehicles
-    have the shortest paths.
-
-    Args:
-        lane: the lane that all of them need.
-        cells: where they are.
-        columns: columns of the grid.
-        free: columns in which the lane's cells may be targets; None: all.
-    """
-    return _ranked_targets(lane, cells, columns, free, ahead=False)[0][1]
-
-
 def _ranked_targets(
     lane: int,
     cells: Sequence[Cell],

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from laneweave.coordinator.targets import Targets, parallel_targets, place
+from laneweave.coordinator.targets import Targets, place
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.messages import Name
 
@@ -44,6 +44,17 @@ def place_all(
     cells: dict[Name, Cell], lanes: dict[Name, int], blocked: set[Cell] | None = None
 ) -> Targets:
     return place(cells, lanes, COLUMNS, LANES, blocked or set())
+
+
+def parallel_targets(
+    lane: int, cells: list[Cell], columns: int, free: list[int] | None = None
+) -> list[Cell]:
+    """Return the targets on a lane that all vehicles need."""
+    open_columns = range(columns) if free is None else free
+    blocked = {(column, lane) for column in range(columns) if column not in open_columns}
+    held = {Name(f"v{index}"): cell for index, cell in enumerate(cells)}
+    targets = place(held, dict.fromkeys(held, lane), columns, LANES, blocked)
+    return [cell for cell in targets.cells if cell not in targets.own.values()]
 
 
 # --- a whole formation ------------------------------------------------------------------------
