@@ -62,6 +62,8 @@ def the_line(ended: Ended) -> str:
         (["run", "--method", "rule", "--faults", "lossy10"], "--faults: got 'lossy10'"),
         (["run", "--transport", "pigeon"], "pigeon"),
         (["run", "--solver", "magic"], "formation.solver: got 'magic'"),
+        (["run", "--operation", "rolling", "--solver", "tappa"], "--solver: got 'tappa'; allowed"),
+        (["run", "--method", "rule", "--solver", "tappa"], "--solver: got 'tappa'; allowed: none"),
         (["run", "--pace", "0"], "--pace: got 0.0"),
         (["run", "--pace", "nan"], "--pace: got nan"),
         (["run", "missing.toml"], "missing.toml"),

@@ -152,6 +152,9 @@ def run(
         runtime__coordinators=coordinators,
     )
     check_pace(pace)
+    if solver is not None and (method is not Method.formation or settings.formation.rolling):
+        other = f"--method {method.value}" if method is not Method.formation else "rolling"
+        raise BadInputError("--solver", solver, f"none with {other}, which has no plans of it")
     show = not no_progress and sys.stderr.isatty()
     if method is Method.formation:
         outcome = _run_formations(settings, out, transport, faults, pace, show=show)
