@@ -27,6 +27,7 @@ from laneweave.coordinator.leader import FormationControl
 from laneweave.coordinator.leader_rules import Phase
 from laneweave.coordinator.pacing import comfortable_steps, paced
 from laneweave.coordinator.planning import PlanResponse, Weights
+from laneweave.coordinator.road_pace import RoadPace
 from laneweave.coordinator.sorting import Sorting, SortingTask, sort_lanes
 from laneweave.protocol.lattice import Cell, territory
 from laneweave.protocol.messages import Ballot, Plan
@@ -38,8 +39,6 @@ START_MARGIN_S = 0.5
 """A plan made late starts this much road time after it is ready."""
 ROOM_S = 2.5
 """A formation that lacks room waits at most so long for the next one to close (road time)."""
-PACE_EVERY_S = 2.0
-SLOWEST_PACE = 0.1
 SHORTEST_DEADLINE_S = 1.0
 """For planning, where the first move could begin at once."""
 MOST_DOUBLINGS = 4
@@ -63,10 +62,7 @@ class FormationPlanner:
         self._groups = groups
         self._ordered: dict[int, tuple[int, Ballot]] = {}
         """For each job the formation and the ballot that it was ordered for."""
-        self._pace = 1.0
-        """Road seconds per second of the node's clock, as measured last."""
-        self._measured: tuple[float, float] | None = None
-        """Road time and node clock when the measurement under way began."""
+        self._pace = RoadPace()
         formation = scenario.formation
         oblique = formation.weight_oblique
         self._weights = Weights(
@@ -78,20 +74,13 @@ class FormationPlanner:
         self._ordered.clear()
 
     def on_clock(self, t_s: float, now_s: float) -> None:
-        """Measure how fast road time goes: planning takes time of the node's clock."""
-        if self._measured is None or t_s < self._measured[0]:
-            self._measured = t_s, now_s
-            return
-        road_s, node_s = t_s - self._measured[0], now_s - self._measured[1]
-        if node_s >= PACE_EVERY_S:
-            self._pace = max(road_s / node_s, SLOWEST_PACE)
-            self._measured = t_s, now_s
+        """Take note of the road's clock, by which deadlines are set."""
+        self._pace.on_clock(t_s, now_s)
 
     def _deadline_s(self, start_s: float, t_s: float) -> float:
         """Return how long planning may take: until the first move, or as the scenario bounds it."""
-        until_start_s = (start_s - t_s) / self._pace
         longest_s = self._scenario.formation.planning_deadline_s
-        return min(longest_s, max(until_start_s, SHORTEST_DEADLINE_S))
+        return min(longest_s, max(self._pace.node_s(start_s - t_s), SHORTEST_DEADLINE_S))
 
     def order(
         self, job: int, control: FormationControl, t_s: float, now_s: float

@@ -1,0 +1,39 @@
+"""How fast road time goes, by the clock of this process: planning takes time of the latter."""
+
+from __future__ import annotations
+
+from attrs import define, field
+
+EVERY_S = 2.0
+"""Measured over so long (node clock)."""
+SLOWEST = 0.1
+"""A road that stands still may go on at any moment."""
+
+
+@define
+class RoadPace:
+    """Measures the pace of the road from the times at which its clock is heard."""
+
+    pace: float = field(default=1.0, init=False)
+    """Road seconds per second of the node's clock, as measured last."""
+    _since: tuple[float, float] | None = field(default=None, init=False)
+    """Road time and node clock when the measurement under way began."""
+
+    def on_clock(self, t_s: float, now_s: float) -> None:
+        """Take note of the road's clock.
+
+        Args:
+            t_s: road time; less than before: of another road.
+            now_s: node clock.
+        """
+        if self._since is None or t_s < self._since[0]:
+            self._since = t_s, now_s
+            return
+        road_s, node_s = t_s - self._since[0], now_s - self._since[1]
+        if node_s >= EVERY_S:
+            self.pace = max(road_s / node_s, SLOWEST)
+            self._since = t_s, now_s
+
+    def node_s(self, road_s: float) -> float:
+        """Return how long some road time takes by the node's clock, in seconds."""
+        return road_s / self.pace
