@@ -61,6 +61,7 @@ PLAN_TICK = 50
 REPEATS = 5
 KEYS = Keys("bench")
 WEIGHTS = Weights.for_mode(1)
+PLANNING_S = 15.0
 SHIFT = (1, 2, 0)
 """Lane that the vehicles of each lane prefer: all have to move."""
 
@@ -298,9 +299,7 @@ class Road:
         cells = {name: vehicle.controller.hold_cell for name, vehicle in members.items()}
         wishes = {name: each.admission.arrival.preferred_lane for name, each in members.items()}
         start_s = start_time_s(cells.values(), self.tick * scenario.runtime.tick_s, scenario)
-        task = SortingTask(
-            (block,), cells, wishes, (), scenario, scenario.formation.planning_deadline_s
-        )
+        task = SortingTask((block,), cells, wishes, (), scenario, PLANNING_S)
         moves = sort_lanes(task, scenario.formation.max_nodes, WEIGHTS).moves
         every = [move for each in moves.values() for move in each]
         slot_s = scenario.cycles_s[0]

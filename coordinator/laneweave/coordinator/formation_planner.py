@@ -41,6 +41,8 @@ ROOM_S = 2.5
 """A formation that lacks room waits at most so long for the next one to close (road time)."""
 SHORTEST_DEADLINE_S = 1.0
 """For planning, where the first move could begin at once."""
+LONGEST_DEADLINE_S = 15.0
+"""For planning, where the first move is far off: others wait for the planner, too."""
 MOST_DOUBLINGS = 4
 """The bound on search nodes doubles with each failed planning, this often."""
 
@@ -78,9 +80,12 @@ class FormationPlanner:
         self._pace.on_clock(t_s, now_s)
 
     def _deadline_s(self, start_s: float, t_s: float) -> float:
-        """Return how long planning may take: until the first move, or as the scenario bounds it."""
-        longest_s = self._scenario.formation.planning_deadline_s
-        return min(longest_s, max(self._pace.node_s(start_s - t_s), SHORTEST_DEADLINE_S))
+        """Return how long planning may take: as the scenario says, or until the first move."""
+        given_s = self._scenario.formation.planning_deadline_s
+        if given_s is not None:
+            return given_s
+        until_start_s = self._pace.node_s(start_s - t_s)
+        return min(max(until_start_s, SHORTEST_DEADLINE_S), LONGEST_DEADLINE_S)
 
     def order(
         self, job: int, control: FormationControl, t_s: float, now_s: float

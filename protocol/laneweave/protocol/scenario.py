@@ -163,8 +163,11 @@ class FormationSettings:
     """l_o of the formation relative distance; none: the number of steps of an oblique edge."""
     solver: str = field(default=DEFAULT_SOLVER, validator=one_of(*SOLVERS))
     """What plans formations, and requests to the planning service that name no solver."""
-    planning_deadline_s: float = field(default=15.0, validator=within(0.01, 3600.0))
-    """Outer bound on planning; on most machines `max_nodes` is reached before it."""
+    planning_deadline_s: float | None = field(
+        default=None, validator=optional(within(0.01, 3600.0))
+    )
+    """Outer bound on planning; none: until the first move could begin, 1 to 15 s. On most machines
+    `max_nodes` is reached before it."""
     max_nodes: int = field(default=20_000, validator=within(1, 100_000_000))
     """Bound on search nodes per plan: keeps equal seeds equal whatever the machine's speed."""
 

@@ -7,10 +7,12 @@ from attrs import evolve
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from laneweave.coordinator import formation_planner
 from laneweave.coordinator.formation import start_time_s
 from laneweave.coordinator.formation_planner import START_MARGIN_S
 from laneweave.coordinator.leader_rules import Phase
-from laneweave.coordinator.sorting import Sorting
+from laneweave.coordinator.planning import Weights
+from laneweave.coordinator.sorting import Sorting, SortingTask, sort_lanes
 from laneweave.protocol.lattice import Cell, Move
 from laneweave.protocol.messages import (
     Ballot,
@@ -476,6 +478,31 @@ def test_every_plan_is_executable_and_serves_all_preferences(
     for name, moves in plan.moves.items():
         end = moves[-1][2] if moves else cells[name]
         assert end[1] == lanes[name]
+
+
+@pytest.mark.parametrize(
+    ("t_s", "given_s", "deadline_s"),
+    [(8.0, None, 15.0), (T_S, None, 7.0), (40.0, None, 1.0), (T_S, 0.25, 0.25)],
+)
+def test_planning_may_last_until_the_first_move(
+    monkeypatch: pytest.MonkeyPatch, t_s: float, given_s: float | None, deadline_s: float
+) -> None:
+    asked = list[float]()
+
+    def record(task: SortingTask, max_nodes: int, weights: Weights) -> Sorting:
+        asked.append(task.deadline_s)
+        return sort_lanes(task, max_nodes, weights)
+
+    monkeypatch.setattr(formation_planner, "sort_lanes", record)
+    formation = evolve(SCENARIO.formation, planning_deadline_s=given_s)
+    desk = Desk(scenario=evolve(SCENARIO, formation=formation))
+    desk.core.t_s = t_s
+    desk.lead()
+    desk.tell(census({A: (0, 0)}, {A: 1}, t_s=t_s))
+    desk.tell(state(A, (0, 0)))
+    (job,) = jobs(desk.promise({A: (0, 0)}))
+    run_job(job)
+    assert asked == [pytest.approx(deadline_s)]  # the first move may begin at 27 s
 
 
 # --- ballots ----------------------------------------------------------------------------------

@@ -21,6 +21,7 @@ SCENARIO = PAPER
 LATTICE = SCENARIO.lattice
 WEIGHTS = Weights(1, 2)
 NODES = SCENARIO.formation.max_nodes
+DEADLINE_S = 60.0
 A, B, C, D, E, F = (Name(letter) for letter in "ABCDEF")
 
 
@@ -32,7 +33,7 @@ def task(
     scenario: Scenario = SCENARIO,
 ) -> SortingTask:
     deadline_s = scenario.formation.planning_deadline_s
-    return SortingTask(numbers, cells, lanes, unattended, scenario, deadline_s)
+    return SortingTask(numbers, cells, lanes, unattended, scenario, deadline_s or DEADLINE_S)
 
 
 def sort(order: SortingTask) -> Sorting:
