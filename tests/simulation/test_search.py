@@ -23,7 +23,7 @@ from laneweave.launch.simulation.world import Outcome, Totals, World
 
 SEEDS = 300
 BATCH = 20
-DIGESTS = 100
+DIGESTS = 60
 _PRINT_DIGESTS = """
 import json, sys
 from laneweave.launch.simulation.profiles import PROFILES
@@ -92,7 +92,7 @@ def test_formations_are_joined() -> None:
 
 
 def test_every_kind_of_fault_happens() -> None:
-    faults = search("mixed", range(300, 340)).faults
+    faults = search("mixed", range(300, 320)).faults
     mixed = PROFILES["mixed"]
     lasting = {
         "loss",
