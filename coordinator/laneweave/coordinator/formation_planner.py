@@ -189,7 +189,7 @@ class FormationPlanner:
                 if not problems:
                     control.on_plan(plan, now_s, result.out_of_reach)
                     pauses = steps_of(plan) - steps_of(planned)
-                    yield from _notes(number, result, pauses, plan)
+                    yield from _notes(control.formation, result, pauses, plan)
                     return
                 error = "; ".join(problems)
         control.on_planning_failed(now_s)
@@ -301,7 +301,11 @@ class FormationPlanner:
         return lattice.passing_time_s(rear) + formation.entry_spread_s + formation.settle_s
 
 
-def _notes(number: int, sorting: Sorting, pauses: int, plan: Plan) -> Iterator[Note]:
+def _notes(formation: Formation, sorting: Sorting, pauses: int, plan: Plan) -> Iterator[Note]:
+    number = formation.numbers[0]
+    if sorting.impossible:
+        data = {"formation": number, "stage": formation.stage, "why": sorting.impossible}
+        yield Note("structure-impossible", data)
     if sorting.response is not None:
         timing = {"t0_s": plan.t0_s, "slot_s": plan.slot_s}
         yield Note("plan-made", _facts(number, sorting.response) | timing)

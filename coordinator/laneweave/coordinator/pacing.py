@@ -2,7 +2,8 @@
 
 Lanes are changed in S3 only (paper, Section 5.2.1). Where the scenario leaves T_F open, the slots
 of a plan are as long as its road allows, and a plan begins as soon as none of its lane changes
-comes before S3: moves along the road, and moves of vehicles ahead, may come earlier.
+comes before S3: moves along the road, and lane changes of vehicles that are in S3 already, may
+come earlier than the last of its vehicles gets there.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ def comfortable_steps(start_s: float, end_s: float, scenario: Scenario) -> int:
 def paced(
     plan: Plan, others: Sequence[Plan], not_before_s: float, end_s: float, scenario: Scenario
 ) -> Plan:
-    """Return a plan in the longest slots in which it ends in time.
+    """Return a plan in the longest slots in which it ends in time; if none are, in the shortest.
 
     It pauses for slots in which it would come too close to plans of its neighbours.
 
@@ -50,7 +51,7 @@ def paced(
     slots_s, slack_s = scenario.slots_s[::-1], scenario.formation.slack_s
     comfortable = [slot_s for slot_s in slots_s if slot_s >= scenario.comfortable_cycle_s]
     best = plan
-    # Rather less reserve than haste.
+    # Prefer a smaller reserve to shorter slots.
     for slot_s, reserve_s in (
         *((slot_s, RESERVE_S) for slot_s in comfortable),
         *((slot_s, LEAST_RESERVE_S) for slot_s in slots_s),

@@ -5,9 +5,9 @@ from __future__ import annotations
 from attrs import define, field
 
 EVERY_S = 2.0
-"""Measured over so long (node clock)."""
+"""Measurement window (node clock)."""
 SLOWEST = 0.1
-"""A road that stands still may go on at any moment."""
+"""Least pace that is assumed: a road that stands still may go on at any moment."""
 
 
 @define

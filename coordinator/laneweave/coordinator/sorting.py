@@ -3,8 +3,8 @@
 Before it sorts, a formation may take on other structures; then any vehicle may have any place.
 
 The grid is the blocks of the formations. Vehicles that no agent drives block their cells. When the
-whole sorting is impossible, it is tried with one vehicle less that gets its lane, each in turn, so
-that one vehicle in a corner does not keep all others from theirs.
+whole sorting is impossible, one vehicle at a time is excused from reaching its lane, so that one
+vehicle in a corner does not keep all others from theirs.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from laneweave.coordinator.groups import Numbers
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, Weights, checked_plan
 from laneweave.coordinator.planning.budget import Clock
 from laneweave.coordinator.targets import placements
+from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, Move
 from laneweave.protocol.messages import Name
 from laneweave.protocol.scenario import DrivingStructure, Scenario
@@ -28,7 +29,7 @@ from laneweave.protocol.scenario import DrivingStructure, Scenario
 MOST_PLACEMENTS = 6
 """Structures that are tried where the first one takes too many steps."""
 SHORTEST_S = 0.05
-"""What a planning is given at least."""
+"""Least time for one attempt."""
 
 
 @frozen
@@ -46,7 +47,7 @@ class SortingTask:
     scenario: Scenario
     """Mode, conflict kinds, lattice."""
     deadline_s: float
-    """For all plannings of it together."""
+    """For all attempts together."""
     steps: int = 1_000_000
     """How many steps the road has room for; where a plan has more, other targets are tried."""
     deserted: Numbers = ()
@@ -92,7 +93,7 @@ class SortingTask:
 
 @frozen
 class Sorting:
-    """What came of it."""
+    """The result of a sorting."""
 
     response: PlanResponse | None
     """Of the planner; None: there is nobody to move."""
@@ -102,6 +103,8 @@ class Sorting:
     """Members that do not get to their lanes."""
     short_of_room: bool
     """Somebody who could be moved does not get to its lane: more blocks could help."""
+    impossible: str = ""
+    """Why the structure cannot be formed, whatever the paths; everybody stays then."""
 
     @property
     def solved(self) -> bool:
@@ -172,16 +175,23 @@ def _plan_request(
 def sort_lanes(
     task: SortingTask, max_nodes: int, weights: Weights, clock: Clock = time.monotonic
 ) -> Sorting:
-    """Plan a sorting; with as many members on their lanes as can be had.
+    """Plan a sorting; if that is impossible, with one member excused from reaching its lane.
 
     Args:
         task: what is to be sorted.
-        max_nodes: bound on search nodes of each planning.
+        max_nodes: bound on search nodes of each attempt.
         weights: l_s and l_o of the formation relative distance.
         clock: by which the deadline is kept, in seconds.
     """
     if not task.movers:
         return _sorting(task, None)
+    if task.structure is not None:
+        try:
+            next(plan_requests(task))
+        except BadInputError as error:
+            if error.field != "structure":
+                raise
+            return evolve(_sorting(task, None), impossible=error.allowed)
     ends_s = clock() + task.deadline_s
     for dropped in _attempts(task):
         best: PlanResponse | None = None
@@ -206,8 +216,10 @@ def _steps(response: PlanResponse) -> float:
 
 
 def _attempts(task: SortingTask) -> Iterator[Name | None]:
+    """Yield who is excused from its lane: first nobody, then each in turn."""
     yield None
-    yield from task.movers
+    if task.structure is None:
+        yield from task.movers
 
 
 def _sorting(task: SortingTask, response: PlanResponse | None) -> Sorting:

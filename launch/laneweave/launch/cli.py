@@ -152,6 +152,15 @@ def run(
         runtime__coordinators=coordinators,
     )
     check_pace(pace)
+    if method is not Method.formation:
+        for option, value in (
+            ("--operation", operation),
+            ("--vehicles-per-process", vehicles_per_process),
+            ("--coordinators", coordinators),
+        ):
+            if value is not None:
+                allowed = f"none with --method {method.value}, which has no agents"
+                raise BadInputError(option, str(value), allowed)
     if solver is not None and (method is not Method.formation or settings.formation.rolling):
         other = f"--method {method.value}" if method is not Method.formation else "rolling"
         raise BadInputError("--solver", solver, f"none with {other}, which has no plans of it")

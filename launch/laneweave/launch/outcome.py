@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import statistics
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,6 +16,9 @@ from rich.table import Table
 from laneweave.launch.failover import Failover
 from laneweave.protocol.scenario import COMFORT_MPS2
 from laneweave.sim_bridge.run_record import write_summary
+
+FEW = 5
+"""Times without a leader that are told one by one."""
 
 
 @frozen
@@ -135,7 +139,6 @@ def _discomfort(safety: dict[str, Any]) -> str:
 def _control_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
     planning, tracking, runtime = summary["planning"], summary["tracking"], summary["runtime"]
     failover, largest = summary["failover"], planning["largest_formation"]
-    recoveries = ", ".join(f"{seconds:.3f} s" for seconds in failover["recovery_s"])
     return [
         (
             "plans, proven optimal",
@@ -158,9 +161,18 @@ def _control_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
         ),
         (
             "leader changes",
-            f"{failover['leader_changes']}" + (f" ({recoveries})" if recoveries else ""),
+            f"{failover['leader_changes']}{_recoveries(failover['recovery_s'])}",
         ),
     ]
+
+
+def _recoveries(seconds: list[float]) -> str:
+    """Return how long the road was without a leader, in brackets; many times in two numbers."""
+    if not seconds:
+        return ""
+    if len(seconds) <= FEW:
+        return f" ({', '.join(f'{each:.3f} s' for each in seconds)})"
+    return f" (p50 {statistics.median(seconds):.3f}, max {max(seconds):.3f} s without)"
 
 
 def _by_solver(planning: dict[str, Any]) -> str:

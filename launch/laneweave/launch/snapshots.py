@@ -261,8 +261,9 @@ def _tracks(folder: Path) -> dict[str, _Track]:
 def _instants(
     tracks: Mapping[str, _Track], scenario: Scenario, stretch_m: tuple[float, float]
 ) -> list[float]:
-    """Return the four times, the shortest T_F apart, at which most vehicles are between two lanes.
+    """Return four times, the shortest T_F apart, at which most vehicles are between two lanes.
 
+    Fewer where the record ends before.
     Vehicles count by their distance from the nearest lane centre and a little for being there.
     """
     if not tracks:
@@ -280,4 +281,5 @@ def _instants(
     padded = np.pad(seen, (0, 3 * slot))
     sums = sum(padded[number * slot : number * slot + len(seen)] for number in range(4))
     start = int(np.argmax(sums))
-    return [round((start + number * slot) * tick_s, 3) for number in range(4)]
+    times = (start + number * slot for number in range(4))
+    return [round(tick * tick_s, 3) for tick in times if tick < len(seen)]

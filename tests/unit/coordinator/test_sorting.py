@@ -14,7 +14,7 @@ from laneweave.coordinator.sorting import Sorting, SortingTask, plan_requests, s
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.messages import Name
-from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.scenario import DrivingStructure, Scenario
 from paper import FORMATIONS, PAPER
 
 SCENARIO = PAPER
@@ -227,6 +227,36 @@ def test_a_search_that_ran_out_of_nodes_says_nothing_of_room() -> None:
     assert sorting.response.status == "timeout"
     assert (sorting.solved, sorting.short_of_room) == (False, False)
     assert sort(order).solved
+
+
+def test_a_structure_without_room_for_all_is_not_tried() -> None:
+    cells = {A: (0, 0), B: (-1, 1), C: (-2, 0)}
+    order = task(cells, dict.fromkeys(cells, 0))
+    one_lane = DrivingStructure(from_m=200.0, structure="interlaced", lanes=(0,))
+    sorting = sort(evolve(order, structure=one_lane))
+    assert "3 vehicles" in sorting.impossible
+    assert (sorting.solved, sorting.short_of_room, sorting.out_of_reach) == (True, False, ())
+    assert set(sorting.moves.values()) == {()}
+    two_lanes = evolve(one_lane, lanes=(0, 1))
+    assert sort(evolve(order, structure=two_lanes)).impossible == ""
+
+
+def test_a_structure_that_cannot_be_reached_is_planned_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nobody needs a lane of its own there, so there is nobody to excuse."""
+    asked = list[PlanRequest]()
+
+    def count(request: PlanRequest, *, max_nodes: int, weights: Weights) -> PlanResponse:
+        asked.append(request)
+        return checked_plan(request, max_nodes=max_nodes, weights=weights)
+
+    monkeypatch.setattr(sorting_module, "checked_plan", count)
+    held: dict[Name, Cell] = {C: (0, 1), D: (-1, 0), E: (-2, 0), F: (-3, 1)}
+    order = task({A: (0, 0), B: (-3, 0)} | held, dict.fromkeys([A, B, *held], 0), *held)
+    lane_2 = DrivingStructure(from_m=200.0, structure="parallel", lanes=(2,))
+    sorting = sort(evolve(order, structure=lane_2))
+    assert (sorting.solved, len(asked)) == (False, 1)
 
 
 def test_all_placements_share_one_deadline(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -90,6 +90,13 @@ def test_recoveries_seen_by_the_launcher_count(tmp_path: Path) -> None:
     assert outcome.summary is not None
     assert outcome.summary["failover"]["recovery_s"] == [0.25]
     assert outcome.summary["failover"]["plan_recovery_s"] == [0.5]
+    assert "(0.250 s)" in printed(outcome)
+
+
+def test_many_recoveries_are_two_numbers(tmp_path: Path) -> None:
+    times_s = [0.1, 0.2, 0.3, 0.4, 0.5, 0.9]
+    outcome = judge(tmp_path, summary(), failover=Failover(1.0, times_s, []))
+    assert "(p50 0.350, max 0.900 s without)" in printed(outcome)
 
 
 @pytest.mark.parametrize(
