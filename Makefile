@@ -6,9 +6,8 @@ STAMP  := $(VENV)/.installed
 RUN    ?= runs/demo
 BUDGET ?= 90
 
-# Three for two cores: system tests wait for processes and clocks much of their time. Who has nothing
-# left to do takes over half of what another still has.
-PYTEST := $(BIN)/pytest -n 3 --dist worksteal
+# Who has nothing left to do takes over half of what another still has.
+PYTEST := $(BIN)/pytest -n 2 --dist worksteal
 
 # Linear algebra stays on one thread: many processes share few cores.
 export OMP_NUM_THREADS := 1
