@@ -155,20 +155,18 @@ def run(
     if method is not Method.formation:
         for option, value in (
             ("--operation", operation),
+            ("--solver", solver),
             ("--vehicles-per-process", vehicles_per_process),
             ("--coordinators", coordinators),
+            ("--faults", faults),
         ):
             if value is not None:
-                allowed = f"none with --method {method.value}, which has no agents"
-                raise BadInputError(option, str(value), allowed)
-    if solver is not None and (method is not Method.formation or settings.formation.rolling):
-        other = f"--method {method.value}" if method is not Method.formation else "rolling"
-        raise BadInputError("--solver", solver, f"none with {other}, which has no plans of it")
+                raise BadInputError(option, str(value), f"none with --method {method.value}")
+    if solver is not None and settings.formation.rolling:
+        raise BadInputError("--solver", solver, "none with the rolling operation")
     show = not no_progress and sys.stderr.isatty()
     if method is Method.formation:
         outcome = _run_formations(settings, out, transport, faults, pace, show=show)
-    elif faults is not None:
-        raise BadInputError("--faults", faults, f"no faults with --method {method.value}")
     else:
         outcome = _run_reference(settings, out, method, show=show)
 
