@@ -31,6 +31,7 @@ from laneweave.agents.core import AgentCore
 from laneweave.agents.driver import Drive, TrackingDriver
 from laneweave.agents.host import AgentHost
 from laneweave.coordinator.formation import start_time_s, steps_left
+from laneweave.coordinator.formation_planner import LONGEST_DEADLINE_S
 from laneweave.coordinator.planning import Weights
 from laneweave.coordinator.sorting import SortingTask, sort_lanes
 from laneweave.protocol.codec import decode, encode
@@ -61,7 +62,6 @@ PLAN_TICK = 50
 REPEATS = 5
 KEYS = Keys("bench")
 WEIGHTS = Weights.for_mode(1)
-PLANNING_S = 15.0
 SHIFT = (1, 2, 0)
 """Lane that the vehicles of each lane prefer: all have to move."""
 
@@ -299,7 +299,7 @@ class Road:
         cells = {name: vehicle.controller.hold_cell for name, vehicle in members.items()}
         wishes = {name: each.admission.arrival.preferred_lane for name, each in members.items()}
         start_s = start_time_s(cells.values(), self.tick * scenario.runtime.tick_s, scenario)
-        task = SortingTask((block,), cells, wishes, (), scenario, PLANNING_S)
+        task = SortingTask((block,), cells, wishes, (), scenario, LONGEST_DEADLINE_S)
         moves = sort_lanes(task, scenario.formation.max_nodes, WEIGHTS).moves
         every = [move for each in moves.values() for move in each]
         slot_s = scenario.cycles_s[0]

@@ -29,7 +29,7 @@ from laneweave.protocol.scenario import DrivingStructure, Scenario
 MOST_PLACEMENTS = 6
 """Structures that are tried where the first one takes too many steps."""
 SHORTEST_S = 0.05
-"""Least time for one attempt."""
+"""Shortest deadline of one attempt."""
 
 
 @frozen
@@ -75,7 +75,11 @@ class SortingTask:
 
     @property
     def blocked(self) -> tuple[Cell, ...]:
-        """Grid cells out of use: of members that hold, between the blocks, and in deserted ones."""
+        """Grid cells that paths must avoid.
+
+        These are the cells of members without an agent, those between the blocks, and those of
+        deserted blocks.
+        """
         first, lattice = self.columns.start, self.scenario.lattice
         usable, held_cells = {*self.numbers} - {*self.deserted}, set(self.hold_cells.values())
         foreign = [
@@ -104,7 +108,7 @@ class Sorting:
     short_of_room: bool
     """Somebody who could be moved does not get to its lane: more blocks could help."""
     impossible: str = ""
-    """Why the structure cannot be formed, whatever the paths; everybody stays then."""
+    """Why the structure has too few cells; then no member moves. Empty: it has enough."""
 
     @property
     def solved(self) -> bool:
@@ -112,21 +116,16 @@ class Sorting:
         return self.response is None or bool(self.response.paths)
 
 
-def plan_requests(task: SortingTask, dropped: Name | None = None) -> Iterator[PlanRequest]:
+def plan_requests(task: SortingTask, excused: Name | None = None) -> Iterator[PlanRequest]:
     """Yield the requests for a sorting, one for each placement of the targets, the best first.
 
     Args:
         task: with at least one vehicle that can be moved.
-        dropped: a vehicle that need not get to its lane.
+        excused: a vehicle that need not get to its lane.
     """
-    scenario, structure = task.scenario, task.structure
-    if structure is not None:
-        members = [{"id": name, "cell": list(cell)} for name, cell in task.movers.items()]
-        lanes = {"lanes": list(structure.lanes)} if structure.lanes else {}
-        yield _plan_request(task, members, {"structure": structure.structure} | lanes)
-        return
+    scenario = task.scenario
     wanted = {
-        name: cell[1] if name == dropped else task.preferred_lanes[name]
+        name: cell[1] if name == excused else task.preferred_lanes[name]
         for name, cell in task.movers.items()
     }
     for targets in placements(
@@ -181,21 +180,16 @@ def sort_lanes(
         task: what is to be sorted.
         max_nodes: bound on search nodes of each attempt.
         weights: l_s and l_o of the formation relative distance.
-        clock: by which the deadline is kept, in seconds.
+        clock: returns the time, in seconds, for the deadline.
     """
     if not task.movers:
         return _sorting(task, None)
     if task.structure is not None:
-        try:
-            next(plan_requests(task))
-        except BadInputError as error:
-            if error.field != "structure":
-                raise
-            return evolve(_sorting(task, None), impossible=error.allowed)
+        return _form(task, task.structure, max_nodes, weights)
     ends_s = clock() + task.deadline_s
-    for dropped in _attempts(task):
+    for excused in (None, *task.movers):
         best: PlanResponse | None = None
-        for request in islice(plan_requests(task, dropped), MOST_PLACEMENTS):
+        for request in islice(plan_requests(task, excused), MOST_PLACEMENTS):
             left_s = ends_s - clock()
             if best is not None and left_s <= SHORTEST_S:
                 break
@@ -215,11 +209,19 @@ def _steps(response: PlanResponse) -> float:
     return math.inf if response.steps is None else response.steps
 
 
-def _attempts(task: SortingTask) -> Iterator[Name | None]:
-    """Yield who is excused from its lane: first nobody, then each in turn."""
-    yield None
-    if task.structure is None:
-        yield from task.movers
+def _form(
+    task: SortingTask, structure: DrivingStructure, max_nodes: int, weights: Weights
+) -> Sorting:
+    """Plan the paths into a structure; all members stay where they are if it has too few cells."""
+    members = [{"id": name, "cell": list(cell)} for name, cell in task.movers.items()]
+    lanes = {"lanes": list(structure.lanes)} if structure.lanes else {}
+    try:
+        request = _plan_request(task, members, {"structure": structure.structure} | lanes)
+    except BadInputError as error:
+        if error.field != "structure":
+            raise
+        return evolve(_sorting(task, None), impossible=error.allowed)
+    return _sorting(task, checked_plan(request, max_nodes=max_nodes, weights=weights))
 
 
 def _sorting(task: SortingTask, response: PlanResponse | None) -> Sorting:
