@@ -53,7 +53,7 @@ def enter(scenario: Scenario) -> tuple[list[float], list[int], list[int]]:
 
 
 def measure(volume: float, seeds: int, duration_s: float, operation: str) -> dict[str, Any]:
-    """Return the figures of one volume."""
+    """Return means over all seeds at one volume [vehicles/(lane h)]; see `HEADINGS`."""
     waits_s: list[float] = []
     columns: list[int] = []
     vehicles: list[int] = []

@@ -35,8 +35,8 @@ class Formation:
     joined: int = 1
     """How many formations these are."""
     deserted: Numbers = ()
-    """Blocks of joined formations that have no vehicle on the road any more. Vehicles of others may
-    be there, with which this leader does not know them to be joined: plans keep out of them."""
+    """Blocks of joined formations whose vehicles have all left the road. Plans avoid them: they may
+    hold vehicles of formations that joined under another leader."""
     stage: int = 0
     """Which of the scenario's structures it is to take on now."""
     sorts: bool = True

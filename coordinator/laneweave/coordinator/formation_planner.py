@@ -40,9 +40,9 @@ START_MARGIN_S = 0.5
 ROOM_S = 2.5
 """A formation that lacks room waits at most so long for the next one to close (road time)."""
 SHORTEST_DEADLINE_S = 1.0
-"""For planning, where the first move could begin at once."""
+"""Deadline of planning where the first move could begin at once."""
 LONGEST_DEADLINE_S = 15.0
-"""For planning, where the first move is far off: others wait for the planner, too."""
+"""Deadline of planning where the first move is far off: the other formations wait meanwhile."""
 MOST_DOUBLINGS = 4
 """The bound on search nodes doubles with each failed planning, this often."""
 
@@ -76,11 +76,11 @@ class FormationPlanner:
         self._ordered.clear()
 
     def on_clock(self, t_s: float, now_s: float) -> None:
-        """Take note of the road's clock, by which deadlines are set."""
+        """Measure the pace of the road, from which deadlines follow."""
         self._pace.on_clock(t_s, now_s)
 
     def _deadline_s(self, start_s: float, t_s: float) -> float:
-        """Return how long planning may take: as the scenario says, or until the first move."""
+        """Return the deadline: that of the scenario, or the time until the first move."""
         given_s = self._scenario.formation.planning_deadline_s
         if given_s is not None:
             return given_s

@@ -2,8 +2,8 @@
 
 Lanes are changed in S3 only (paper, Section 5.2.1). Where the scenario leaves T_F open, the slots
 of a plan are as long as its road allows, and a plan begins as soon as none of its lane changes
-comes before S3: moves along the road, and lane changes of vehicles that are in S3 already, may
-come earlier than the last of its vehicles gets there.
+comes before S3. Moves along the road may come earlier, and so may lane changes of vehicles that
+are in S3 while the rear of the formation is not.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How fast road time goes, by the clock of this process: planning takes time of the latter."""
+"""Ratio of road time to the clock of this process, for deadlines of planning."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from attrs import define, field
 EVERY_S = 2.0
 """Measurement window (node clock)."""
 SLOWEST = 0.1
-"""Least pace that is assumed: a road that stands still may go on at any moment."""
+"""Lowest pace returned, so that deadlines stay finite while the road stands still."""
 
 
 @define
 class RoadPace:
-    """Measures the pace of the road from the times at which its clock is heard."""
+    """Measures the pace of the road from the arrival times of its clock messages."""
 
     pace: float = field(default=1.0, init=False)
     """Road seconds per second of the node's clock, as measured last."""
@@ -20,10 +20,10 @@ class RoadPace:
     """Road time and node clock when the measurement under way began."""
 
     def on_clock(self, t_s: float, now_s: float) -> None:
-        """Take note of the road's clock.
+        """Process a clock message.
 
         Args:
-            t_s: road time; less than before: of another road.
+            t_s: road time; a smaller one than before restarts the measurement.
             now_s: node clock.
         """
         if self._since is None or t_s < self._since[0]:
@@ -35,5 +35,5 @@ class RoadPace:
             self._since = t_s, now_s
 
     def node_s(self, road_s: float) -> float:
-        """Return how long some road time takes by the node's clock, in seconds."""
+        """Convert a duration in road time to one of the node's clock, in seconds."""
         return road_s / self.pace

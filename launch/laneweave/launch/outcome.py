@@ -18,7 +18,7 @@ from laneweave.protocol.scenario import COMFORT_MPS2
 from laneweave.sim_bridge.run_record import write_summary
 
 FEW = 5
-"""Times without a leader that are told one by one."""
+"""Up to this number of recovery times are listed one by one."""
 
 
 @frozen
@@ -167,7 +167,7 @@ def _control_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _recoveries(seconds: list[float]) -> str:
-    """Return how long the road was without a leader, in brackets; many times in two numbers."""
+    """Return the times without a leader in brackets; median and maximum if there are many."""
     if not seconds:
         return ""
     if len(seconds) <= FEW:

@@ -263,8 +263,8 @@ def _instants(
 ) -> list[float]:
     """Return four times, the shortest T_F apart, at which most vehicles are between two lanes.
 
-    Fewer where the record ends before.
-    Vehicles count by their distance from the nearest lane centre and a little for being there.
+    There are fewer if the recording ends earlier. A vehicle counts by its distance from the nearest
+    lane centre, and a little for being on the stretch.
     """
     if not tracks:
         return [0.0]

@@ -32,7 +32,7 @@ from laneweave.protocol.vehicle_rules import (
 
 TIME_TOLERANCE_S = 1e-6
 LISTEN_S = 1.0
-"""How long before a move is due a vehicle listens to those for which it waits."""
+"""A vehicle receives the states of its predecessors from this time before a move is due."""
 OVERDUE_SLOTS = 1.5
 OVERDUE_S = 2.0
 """A move is overdue when it has been due for 1.5 slots, or for a slot and 2 s if that is less."""
@@ -224,10 +224,10 @@ class PlanExecution:
         )
 
     def needs_states(self, t_s: float) -> bool:
-        """Tell whether what other vehicles show matters now.
+        """Tell whether the states of other vehicles matter now.
 
-        It does until the gate is open, and from shortly before the next move is due until that is
-        released. What is missed in between is shown again: it stays true.
+        They do until the gate is open, and from `LISTEN_S` before the next move is due until that
+        is released. States missed in between do no harm: they are published again.
         """
         plan = self.plan
         if plan is None:

@@ -21,7 +21,7 @@ Cell = tuple[int, int]
 """(column, lane)."""
 
 STRETCH_COLUMNS = 4
-"""Columns of a stretch: a vehicle hears of the motions of all that are as near as that."""
+"""Columns of a stretch. A vehicle receives the motions of its own and both adjacent stretches."""
 
 Move = tuple[int, Cell, Cell]
 """(step, from, to): in this step of its plan the vehicle moves to a neighbouring cell."""

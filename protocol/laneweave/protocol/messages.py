@@ -325,7 +325,7 @@ class Census:
     """The closed formations with a vehicle on the road, foremost first. What is said of one never
     changes, and no block is in two. Empty in the rolling operation."""
     closed_to: int = -1
-    """All blocks up to this number are closed: their vehicles are listed, or have left."""
+    """All blocks up to this number are closed; their vehicles are listed here or have left."""
     bridge: int = 0
     """Incarnation of the bridge, which tells this road from an earlier one; 0: not told."""
 

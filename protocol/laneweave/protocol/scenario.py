@@ -166,8 +166,8 @@ class FormationSettings:
     planning_deadline_s: float | None = field(
         default=None, validator=optional(within(0.01, 3600.0))
     )
-    """Outer bound on planning; none: until the first move could begin, 1 to 15 s. On most machines
-    `max_nodes` is reached before it."""
+    """Upper bound on planning time; none: the time until the first move could begin, 1 to 15 s. On
+    most machines `max_nodes` is reached first."""
     max_nodes: int = field(default=20_000, validator=within(1, 100_000_000))
     """Bound on search nodes per plan: keeps equal seeds equal whatever the machine's speed."""
 

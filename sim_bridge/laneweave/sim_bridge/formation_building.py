@@ -54,7 +54,7 @@ class FormationBuilder(Protocol):
 
 @define
 class ColumnBlocks:
-    """Formations of equal length: a formation is a block of columns."""
+    """Formations of equal length: each is one block of `lattice.block_columns` columns."""
 
     lattice: Lattice
     max_vehicles: int

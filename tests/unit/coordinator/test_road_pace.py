@@ -8,7 +8,7 @@ from laneweave.coordinator.road_pace import EVERY_S, SLOWEST, RoadPace
 
 
 def heard(pace: float, ticks: int = 100, t_s: float = 0.0) -> RoadPace:
-    """Return what has heard the clock each tenth of a second of a road that is so fast."""
+    """Return a measurement from a clock message every 0.1 s of road time at this pace."""
     measure = RoadPace()
     for tick in range(ticks):
         measure.on_clock(t_s + 0.1 * tick, 50.0 + 0.1 * tick / pace)

@@ -61,7 +61,7 @@ def test_the_request_is_in_the_blocks_own_columns_and_in_the_order_of_the_roster
 
 
 def test_of_blocks_without_vehicles_only_held_cells_are_used() -> None:
-    """Vehicles that this leader does not know of may be there."""
+    """Deserted blocks may hold vehicles that the leader has not heard of."""
     order = task({A: (-5, 0), B: (-1, 1)}, {A: 1, B: 2}, numbers=(0, 1))
     kept_out = evolve(order, deserted=(1,))
     first = order.columns.start
@@ -244,7 +244,7 @@ def test_a_structure_without_room_for_all_is_not_tried() -> None:
 def test_a_structure_that_cannot_be_reached_is_planned_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Nobody needs a lane of its own there, so there is nobody to excuse."""
+    """Excusing one vehicle from its lane, as in a sorting, would plan the same request again."""
     asked = list[PlanRequest]()
 
     def count(request: PlanRequest, *, max_nodes: int, weights: Weights) -> PlanResponse:
@@ -260,7 +260,7 @@ def test_a_structure_that_cannot_be_reached_is_planned_once(
 
 
 def test_all_placements_share_one_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each planning takes two of five seconds; none is short enough."""
+    """Each attempt takes 2 s of a deadline of 5 s, and every plan has too many steps."""
     asked, now_s = list[float](), [100.0]
 
     def slow_plan(request: PlanRequest, *, max_nodes: int, weights: Weights) -> PlanResponse:

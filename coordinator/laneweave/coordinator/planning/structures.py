@@ -184,10 +184,10 @@ def _fill(
 
 
 def _off_middle(columns: NDArray[np.int64], width: int) -> NDArray[np.float64]:
-    """Return a share, below 0.06, that prefers the middle among equal distances."""
+    """Return a tie-breaker below 0.06: the smaller, the nearer to the middle."""
     return np.asarray(np.abs(columns.mean(axis=-1) - (width - 1) / 2) / (10 * width))
 
 
 def _off_front(columns: NDArray[np.int64], width: int) -> NDArray[np.float64]:
-    """Return a share, below 0.1, that prefers the front among equal distances."""
+    """Return a tie-breaker below 0.1: the smaller, the nearer to the front."""
     return np.asarray((width - 1 - columns.mean(axis=-1)) / (10 * width))

@@ -27,8 +27,9 @@ from laneweave.coordinator.planning.solution import Solution
 _JOINT_AFTER = 32
 """So many nodes come before the joint search begins."""
 _MOST_JOINT_MOVES_PER_NODE = 150
-"""The n-th node lets the joint search make n moves, at most so many: its share grows to about two
-thirds of the time. In crowded blocks it ends first, in others the trees do."""
+"""Upper bound on the joint moves made at a node; node n makes n of them below it. The joint search
+then takes up to about two thirds of the time. It ends first in crowded blocks, the trees end first
+in others."""
 
 
 @attrs.frozen
