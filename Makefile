@@ -50,10 +50,10 @@ test-full: $(STAMP) ## the long programmes too
 	$(PYTEST)
 
 evaluation: $(STAMP) ## run what docs/EVALUATION.md reports and write its tables (BUDGET=90 minutes on 2 cores)
-	$(BIN)/python benchmarks/evaluation.py --budget $(BUDGET)
+	$(BIN)/python benchmarks/evaluate.py --budget $(BUDGET)
 
 evaluation-faults: $(STAMP) ## the same for "Under faults": apart, since it takes an hour and a half
-	$(BIN)/python benchmarks/evaluation.py --only faults
+	$(BIN)/python benchmarks/evaluate.py --only faults
 
 docs: $(STAMP) ## write the generated parts of the documents
 	$(BIN)/python docs/generate.py

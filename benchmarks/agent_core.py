@@ -28,33 +28,26 @@ from typing import Any, cast
 from attrs import define, field
 
 from laneweave.agents.core import AgentCore
-from laneweave.agents.driver import Drive, TrackingDriver
+from laneweave.agents.driving.driver import Drive, TrackingDriver
 from laneweave.agents.host import AgentHost
-from laneweave.coordinator.formation import start_time_s, steps_left
-from laneweave.coordinator.formation_planner import LONGEST_DEADLINE_S
+from laneweave.coordinator.formations.planner import LONGEST_DEADLINE_S
+from laneweave.coordinator.formations.roster import start_time_s, steps_left
+from laneweave.coordinator.formations.sorting import SortingTask, sort_lanes
 from laneweave.coordinator.planning import Weights
-from laneweave.coordinator.sorting import SortingTask, sort_lanes
-from laneweave.protocol.codec import decode, encode
 from laneweave.protocol.lattice import territory
-from laneweave.protocol.messages import Ballot, Command, Name, Plan, Prepare, Sense
-from laneweave.protocol.motion import State
-from laneweave.protocol.node import Node, Started, read_message
-from laneweave.protocol.scenario import FormationSettings, Scenario
-from laneweave.protocol.topics import (
-    PLAN,
-    PREPARE,
-    SENSE,
-    Keys,
-    Quality,
-    matches_any,
-)
-from laneweave.protocol.transport import Received
-from laneweave.sim_bridge.demand import Arrival
-from laneweave.sim_bridge.entry import Admission
-from laneweave.sim_bridge.overlap import Pose, pose_of
-from laneweave.sim_bridge.run_record import RunRecord
-from laneweave.sim_bridge.traffic import RoadVehicle
-from laneweave.sim_bridge.world import show_bodies
+from laneweave.protocol.runtime.node import Node, Started, read_message
+from laneweave.protocol.runtime.transport import Received
+from laneweave.protocol.scenario.tables import FormationSettings, Scenario
+from laneweave.protocol.vehicle.motion import State
+from laneweave.protocol.wire.codec import decode, encode
+from laneweave.protocol.wire.messages import Ballot, Command, Name, Plan, Prepare, Sense
+from laneweave.protocol.wire.topics import PLAN, PREPARE, SENSE, Keys, Quality, matches_any
+from laneweave.sim_bridge.bodies.footprints import Pose, pose_of
+from laneweave.sim_bridge.recording.run_record import RunRecord
+from laneweave.sim_bridge.road.demand import Arrival
+from laneweave.sim_bridge.road.entry import Admission
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from laneweave.sim_bridge.road.world import show_bodies
 
 FORMATIONS = 3
 VEHICLES = 6

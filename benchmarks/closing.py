@@ -18,10 +18,10 @@ import attrs
 import numpy as np
 
 from laneweave.coordinator.planning import checked_plan, warm_up
-from laneweave.coordinator.planning.arrays import lattice
 from laneweave.coordinator.planning.conflicts import ConflictModel
+from laneweave.coordinator.planning.exact.arrays import lattice
 from laneweave.coordinator.planning.grid import Cell
-from laneweave.launch.planner_bench import FAMILIES
+from laneweave.launch.bench.planner import FAMILIES
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "evidence" / "closing.json"
 SIZES = {"block": (6,), "following": (6, 9, 12), "geometric": (6, 9, 12)}

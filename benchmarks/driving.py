@@ -3,10 +3,11 @@
     python benchmarks/driving.py switches [--count 1000] [--seed 0] [--json]
     python benchmarks/driving.py emergencies [--count 2000] [--seed 0] [--json]
 
-In closed loop without network and SUMO (`tests/driving.py`). `switches`: formation switches on the
-timetable, half in each mode, against lattice points, limits and gaps. `emergencies`: the vehicle
-ahead brakes to a stand while all messages stop; bodies must not touch. `--json` prints JSON;
-`--first N --count 1` plays one again. The exit status is 1 if a goal is missed.
+In closed loop without network and SUMO (`tests/support/driving.py`). `switches`: formation
+switches on the timetable, half in each mode, against lattice points, limits and gaps.
+`emergencies`: the vehicle ahead brakes to a stand while all messages stop; bodies must not touch.
+`--json` prints JSON; `--first N --count 1` plays one again. The exit status is 1 if a goal is
+missed.
 """
 
 from __future__ import annotations
@@ -24,8 +25,7 @@ from typing import Any, TypeVar
 if __name__ == "__main__":  # run as a program: as `pythonpath` in pyproject.toml
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-import emergencies
-import switches
+from support import emergencies, switches
 
 T = TypeVar("T")
 

@@ -14,11 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from laneweave.protocol.messages import ClosedFormation
-from laneweave.protocol.scenario import Scenario, load_scenario
-from laneweave.sim_bridge.demand import arrivals
-from laneweave.sim_bridge.entry import Admission, EntryMeter
-from laneweave.sim_bridge.formation_building import formation_builder
+from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.wire.messages import ClosedFormation
+from laneweave.sim_bridge.road.demand import arrivals
+from laneweave.sim_bridge.road.entry import Admission, EntryMeter
+from laneweave.sim_bridge.road.formation_building import formation_builder
 
 VOLUMES = (500, 1000, 1300, 1600, 1750, 1800, 2000, 2100, 2150, 2200, 2400)
 NOT_COUNTED_S, STEP_S, PATIENCE_S = 60.0, 0.5, 2000.0

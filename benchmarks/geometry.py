@@ -21,18 +21,18 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from laneweave.agents.trajectory import move_profile
+from laneweave.agents.driving.reference import move_profile
 from laneweave.coordinator.planning import PlanRequest, checked_plan, warm_up
-from laneweave.coordinator.planning.clearances import Pair, close_pairs
+from laneweave.coordinator.planning.conflict_cliques import row_patterns
 from laneweave.coordinator.planning.conflicts import PAPER_KINDS, ConflictModel
-from laneweave.coordinator.planning.geometry import Geometry
+from laneweave.coordinator.planning.geometry.conflict_table import Pair, close_pairs
+from laneweave.coordinator.planning.geometry.settings import Geometry
 from laneweave.coordinator.planning.grid import displacements
 from laneweave.coordinator.planning.instances import formation_request
-from laneweave.coordinator.planning.rows import row_patterns
-from laneweave.launch.conflict_drawing import conflict
-from laneweave.protocol.motion import cell_state
-from laneweave.protocol.scenario import Scenario
-from laneweave.sim_bridge.overlap import Bodies, pose_of
+from laneweave.launch.drawing.conflict_table import conflict
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.vehicle.motion import cell_state
+from laneweave.sim_bridge.bodies.footprints import Bodies, pose_of
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "evidence" / "geometry.json"
 MODELS: dict[str, Geometry | None] = {

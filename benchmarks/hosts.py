@@ -4,7 +4,7 @@
                                [--out FOLDER]
 
 Each experiment is one run of the deployment of compose.yaml, as processes on hosts that are network
-namespaces (tests/system/hosts.py): a link is cut, or a service is killed and started again by the
+namespaces (tests/support/hosts.py): a link is cut, or a service is killed and started again by the
 same command. Roles start before their router. Figures are read from the run's folder and written to
 FOLDER/hosts.json. Experiments that are there already are kept, unless `--only` names them. The exit
 status is 1 if two vehicles touched or a run did not come to its end. It takes the right to make
@@ -30,7 +30,7 @@ import pyarrow.parquet as pq
 from attrs import frozen
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from system.hosts import Hosts, compose, lasts, open_hosts
+from support.hosts import Hosts, compose, lasts, open_hosts
 
 LONGEST_S = 600.0
 """No run takes as long, in wall-clock seconds."""

@@ -21,8 +21,8 @@ import numpy as np
 from laneweave.coordinator.planning import PlanRequest, Weights, plan, warm_up
 from laneweave.coordinator.planning.budget import Budget
 from laneweave.coordinator.planning.facade import MAX_NODES, new_tappa, problem_of
-from laneweave.coordinator.planning.improvements import Improvements
 from laneweave.coordinator.planning.instances import TRAFFIC_KINDS, block_request, traffic_request
+from laneweave.coordinator.planning.paper.improvements import Improvements
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "evidence" / "planner-switches.json"
 INSTANCES, FEWER_INSTANCES = 200, 60

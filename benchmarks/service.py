@@ -39,9 +39,9 @@ from typing import Any
 import attrs
 from attrs import define, field, frozen
 
-from laneweave.coordinator.client import AsyncPlanClient, PlanClient, PlanError
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan, warm_up
 from laneweave.coordinator.planning.instances import formation_request
+from laneweave.coordinator.service.client import AsyncPlanClient, PlanClient, PlanError
 
 LANEWEAVE = str(Path(sys.executable).with_name("laneweave"))
 REQUESTS, CLIENTS = 200, 20

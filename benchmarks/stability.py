@@ -1,8 +1,9 @@
 """How a disturbance of speed travels: `python benchmarks/stability.py [--json FILE]`.
 
 One vehicle brakes for 2 s whatever it is told, in a column that holds its cells and in formations
-that switch, with and without message loss (`tests/disturbances.py`). Writes peaks and amplification
-from vehicle to vehicle, a figure, and prints a table. The exit status is 1 if bodies overlap.
+that switch, with and without message loss (`tests/support/disturbances.py`). Writes peaks and
+amplification from vehicle to vehicle, a figure, and prints a table. The exit status is 1 if bodies
+overlap.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from numpy.typing import NDArray
 if __name__ == "__main__":  # run as a program: as `pythonpath` in pyproject.toml
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from disturbances import BRAKING_S, FORMATIONS, MEASURED_S, Case, Response, respond
-from laneweave.launch.drawing import new_figure, save
+from laneweave.launch.drawing.figures import new_figure, save
+from support.disturbances import BRAKING_S, FORMATIONS, MEASURED_S, Case, Response, respond
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 OUT = DOCS / "evidence" / "stability.json"

@@ -30,18 +30,19 @@ from typing import Any
 import psutil
 from attrs import define, evolve, field
 
-from laneweave.launch.roles import fork_server, start_role
-from laneweave.protocol.access import Access
-from laneweave.protocol.codec import encode
+from laneweave.launch.run.roles import fork_server, start_role
+from laneweave.protocol.config.loading import to_tables
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.messages import Name, Sense
-from laneweave.protocol.scenario import Scenario, to_tables
-from laneweave.protocol.topics import COMMAND, SENSE, VEHICLE_ALIVE, Keys
-from laneweave.protocol.transport import Delivery, Received, TokenUp
-from laneweave.protocol.zenoh_transport import ZenohTransport
-from laneweave.sim_bridge.demand import Arrival
-from laneweave.sim_bridge.entry import Admission
-from laneweave.sim_bridge.traffic import RoadVehicle
+from laneweave.protocol.runtime.transport import Delivery, Received, TokenUp
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.security.access import Access
+from laneweave.protocol.transports.zenoh.transport import ZenohTransport
+from laneweave.protocol.wire.codec import encode
+from laneweave.protocol.wire.messages import Name, Sense
+from laneweave.protocol.wire.topics import COMMAND, SENSE, VEHICLE_ALIVE, Keys
+from laneweave.sim_bridge.road.demand import Arrival
+from laneweave.sim_bridge.road.entry import Admission
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 AGENTS = 20
 WAIT_S = 60.0

@@ -21,18 +21,19 @@ from attrs import field, frozen
 
 from laneweave.coordinator.planning import warm_up
 from laneweave.coordinator.planning.conflicts import ConflictModel
-from laneweave.coordinator.planning.geometry import Geometry
-from laneweave.coordinator.planning.stream import (
+from laneweave.coordinator.planning.geometry.settings import Geometry
+from laneweave.coordinator.planning.rolling.planner import (
     StreamCosts,
     StreamPlan,
     StreamPlanner,
     StreamRoad,
     StreamVehicle,
 )
-from laneweave.coordinator.planning.stream_validate import problems_of_ways
-from laneweave.coordinator.stream_planner import REWARD, stream_road
-from laneweave.protocol.scenario import Scenario, load_scenario
-from laneweave.sim_bridge.demand import arrivals
+from laneweave.coordinator.planning.rolling.validator import problems_of_ways
+from laneweave.coordinator.rolling.planner import REWARD, stream_road
+from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.sim_bridge.road.demand import arrivals
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "evidence" / "stream.json"
 VOLUMES = (1000, 1600, 1800, 2000, 2200, 2400, 2500, 2600)

@@ -15,23 +15,28 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from laneweave.agents.numbers import AgentNumbers
-from laneweave.coordinator.leader_rules import LEADER_RULES, Phase
-from laneweave.coordinator.numbers import CoordinatorNumbers
+if __name__ == "__main__":  # run as a program: as `pythonpath` in pyproject.toml
+    sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from evaluation.evidence import read_evidence
+from evaluation.tables import document_parts
+from laneweave.agents.metrics import AgentNumbers
+from laneweave.coordinator.formations.leader_rules import LEADER_RULES, Phase
+from laneweave.coordinator.metrics import CoordinatorNumbers
 from laneweave.coordinator.planning import PlanRequest
 from laneweave.coordinator.planning.explanation import explain
-from laneweave.coordinator.service import ServiceNumbers
-from laneweave.launch.conflict_drawing import counts, draw_conflicts
-from laneweave.launch.evaluation.evidence import read_evidence
-from laneweave.launch.evaluation.tables import document_parts
-from laneweave.launch.explanation_drawing import draw_explanation
-from laneweave.launch.metrics import PROCESS, PROCESS_MEANING
-from laneweave.launch.simulation.profiles import PROFILES
-from laneweave.protocol.access_rules import rights_table
-from laneweave.protocol.numbers import NodeNumbers, RouterNumbers, Snapshot, metrics_of
-from laneweave.protocol.transitions import markdown_table, mermaid_diagram
-from laneweave.protocol.vehicle_rules import VEHICLE_RULES, Stage
-from laneweave.sim_bridge.numbers import BridgeNumbers
+from laneweave.coordinator.service.server import ServiceNumbers
+from laneweave.launch.drawing.conflict_table import counts, draw_conflicts
+from laneweave.launch.drawing.tappa_process import draw_explanation
+from laneweave.launch.fault_search.profiles import PROFILES
+from laneweave.launch.observe.metrics_server import PROCESS, PROCESS_MEANING
+from laneweave.protocol.runtime.metrics import NodeNumbers, RouterNumbers, Snapshot, metrics_of
+from laneweave.protocol.security.rights import rights_table
+from laneweave.protocol.state_machine import markdown_table, mermaid_diagram
+from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES, Stage
+from laneweave.sim_bridge.metrics import BridgeNumbers
+from support.planted_bugs import BUGS
 
 DOCS = Path(__file__).resolve().parent
 FOUND = DOCS / "evidence" / "planted-bugs-found.json"
@@ -54,7 +59,7 @@ HOSTS = DOCS / "evidence" / "hosts.json"
 SERVICE = DOCS / "evidence" / "service.json"
 """What `benchmarks/service.py` wrote."""
 EVALUATED = DOCS / "evidence" / "evaluation.json"
-"""What `benchmarks/evaluation.py` wrote."""
+"""What `benchmarks/evaluate.py` wrote."""
 STABILITY = DOCS / "evidence" / "stability.json"
 """What `benchmarks/stability.py` wrote."""
 CONFLICTS = DOCS / "images" / "conflict-table.png"
@@ -76,10 +81,7 @@ def _diagram(text: str) -> str:
 
 
 def _planted_bugs() -> str:
-    """Return the table of planted bugs; the tests that use them are not a package."""
-    sys.path.insert(0, str(DOCS.parent / "tests"))
-    from planted_bugs import BUGS  # noqa: PLC0415
-
+    """Return the table of planted bugs."""
     found = json.loads(FOUND.read_text(encoding="utf-8"))
     lines = [
         "| planted bug | rule | what is broken | spoils the story | it ends with | random search |",

@@ -68,7 +68,7 @@ def prove(requests: Iterable[dict[str, Any]]) -> dict[str, int | None]:
 
 def main() -> None:
     """Write the file."""
-    from unit.planning import test_against_milp, test_plans_with_geometry  # noqa: PLC0415
+    from unit.coordinator.planning import test_against_milp, test_plans_with_geometry  # noqa: PLC0415
 
     costs = prove([*test_against_milp.compared(), *test_plans_with_geometry.compared()])
     FILE.write_text(json.dumps(costs, indent=0, sort_keys=True) + "\n", encoding="utf-8")

@@ -70,9 +70,9 @@ from pathlib import Path
 
 from attrs import frozen
 
-from laneweave.coordinator.leader_rules import LEADER_RULES
-from laneweave.protocol.transitions import RuleBook
-from laneweave.protocol.vehicle_rules import VEHICLE_RULES
+from laneweave.coordinator.formations.leader_rules import LEADER_RULES
+from laneweave.protocol.state_machine import RuleBook
+from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
 from scenarios.story_player import Player
 from scenarios.story_rolling import RollingPlayer, is_rolling
 from scenarios.story_text import CollisionError, StoryError

@@ -9,10 +9,21 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from attrs import define, field
 
 from laneweave.coordinator.core import CoordinatorCore
-from laneweave.coordinator.formation import Formation
-from laneweave.coordinator.leader import FormationControl
+from laneweave.coordinator.formations.control import FormationControl
+from laneweave.coordinator.formations.roster import Formation
 from laneweave.protocol.lattice import Move, territory
-from laneweave.protocol.messages import (
+from laneweave.protocol.runtime.node import (
+    Arrived,
+    Compute,
+    Effect,
+    Event,
+    Send,
+    Started,
+    Wakeup,
+    run_job,
+)
+from laneweave.protocol.state_machine import RuleBook
+from laneweave.protocol.wire.messages import (
     Ballot,
     Census,
     CensusEntry,
@@ -23,12 +34,10 @@ from laneweave.protocol.messages import (
     Prepare,
     VehicleState,
 )
-from laneweave.protocol.node import Arrived, Compute, Effect, Event, Send, Started, Wakeup, run_job
-from laneweave.protocol.topics import CENSUS, HEARTBEAT, STATE, Topic
-from laneweave.protocol.transitions import RuleBook
-from paper import PAPER, closed_blocks
+from laneweave.protocol.wire.topics import CENSUS, HEARTBEAT, STATE, Topic
 from scenarios.story_road import SCENARIO, SLOT_S, Vehicle
 from scenarios.story_text import cell_of, shown, written
+from support.paper import PAPER, closed_blocks
 
 Mail = dict[tuple[str, str, str], Prepare | Plan]
 """What has been sent: (PREPARE or PLAN, ballot, vehicle) to message."""

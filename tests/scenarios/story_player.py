@@ -7,16 +7,16 @@ from collections.abc import Callable, Iterator
 
 from attrs import frozen
 
-from laneweave.coordinator.leader import FormationControl
-from laneweave.coordinator.leader_rules import LEADER_RULES
-from laneweave.protocol.execution import PlanExecution
+from laneweave.coordinator.formations.control import FormationControl
+from laneweave.coordinator.formations.leader_rules import LEADER_RULES
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.messages import Heartbeat, Plan, VehicleState
-from laneweave.protocol.node import PeerDown, PeerUp
-from laneweave.protocol.topics import COORDINATOR_ALIVE
-from laneweave.protocol.transitions import RuleBook
-from laneweave.protocol.transport import LinkDown, LinkUp
-from laneweave.protocol.vehicle_rules import VEHICLE_RULES
+from laneweave.protocol.runtime.node import PeerDown, PeerUp
+from laneweave.protocol.runtime.transport import LinkDown, LinkUp
+from laneweave.protocol.state_machine import RuleBook
+from laneweave.protocol.vehicle.execution import PlanExecution
+from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
+from laneweave.protocol.wire.messages import Heartbeat, Plan, VehicleState
+from laneweave.protocol.wire.topics import COORDINATOR_ALIVE
 from scenarios.story_leaders import Candidate, Leader, Mail, formation_of
 from scenarios.story_road import TICK_S, Agent, CaretakerProcess, Process, Vehicle
 from scenarios.story_text import CollisionError, StoryError, cell_of, shown, told, written

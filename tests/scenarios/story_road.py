@@ -12,21 +12,29 @@ from itertools import count
 from attrs import define, evolve, field
 
 from laneweave.agents.core import AgentCore
-from laneweave.agents.driver import Drive, Effort
-from laneweave.protocol.deployment import Network
-from laneweave.protocol.execution import PlanExecution
+from laneweave.agents.driving.driver import Drive, Effort
 from laneweave.protocol.lattice import Cell, Lattice, Move
-from laneweave.protocol.messages import Command, Motion, Name, Plan, Prepare, Sense, VehicleState
-from laneweave.protocol.motion import at_rest_in_cell, cell_state
-from laneweave.protocol.node import Arrived, Effect, Send, Started
-from laneweave.protocol.scenario import FormationSettings, Road, Runtime, Scenario
-from laneweave.protocol.topics import PLAN, PREPARE, SENSE, STATE
-from laneweave.protocol.transitions import RuleBook
-from laneweave.sim_bridge.attendance import Attendance
-from laneweave.sim_bridge.demand import Arrival
-from laneweave.sim_bridge.entry import Admission
-from laneweave.sim_bridge.plant import Plant
-from laneweave.sim_bridge.traffic import RoadVehicle
+from laneweave.protocol.runtime.node import Arrived, Effect, Send, Started
+from laneweave.protocol.scenario.deployment import Network
+from laneweave.protocol.scenario.tables import FormationSettings, Road, Runtime, Scenario
+from laneweave.protocol.state_machine import RuleBook
+from laneweave.protocol.vehicle.execution import PlanExecution
+from laneweave.protocol.vehicle.motion import at_rest_in_cell, cell_state
+from laneweave.protocol.wire.messages import (
+    Command,
+    Motion,
+    Name,
+    Plan,
+    Prepare,
+    Sense,
+    VehicleState,
+)
+from laneweave.protocol.wire.topics import PLAN, PREPARE, SENSE, STATE
+from laneweave.sim_bridge.bodies.plant import Plant
+from laneweave.sim_bridge.road.attendance import Attendance
+from laneweave.sim_bridge.road.demand import Arrival
+from laneweave.sim_bridge.road.entry import Admission
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 SLOT_S = 1.0
 TICK_S = 0.01

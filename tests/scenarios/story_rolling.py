@@ -24,10 +24,10 @@ from collections.abc import Callable, Iterator
 
 from attrs import define, evolve, field
 
-from laneweave.coordinator.handover import Handover, Phase
-from laneweave.launch.simulation.estates import Estates
+from laneweave.coordinator.rolling.ballot import Handover, Phase
+from laneweave.launch.fault_search.cell_ownership import Estates
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.messages import Ballot, Command, Heartbeat, Name, VehicleState
+from laneweave.protocol.wire.messages import Ballot, Command, Heartbeat, Name, VehicleState
 from scenarios.story_leaders import RESEND_S, Mail, post
 from scenarios.story_player import Player
 from scenarios.story_road import ROLLING, SLOT_S, Agent, Vehicle

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.messages import Ballot, VehicleState
+from laneweave.protocol.wire.messages import Ballot, VehicleState
 
 
 class StoryError(AssertionError):

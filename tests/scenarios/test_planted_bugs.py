@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from laneweave.coordinator.leader_rules import LEADER_RULES
-from laneweave.protocol.vehicle_rules import VEHICLE_RULES
-from planted_bugs import BUGS, NOT_A_SAFETY_MATTER, ROWS_OF_OTHERS, PlantedBug
+from laneweave.coordinator.formations.leader_rules import LEADER_RULES
+from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
 from scenarios.stories import check_story, ends_in_collision, player_of
 from scenarios.story_text import StoryError
+from support.planted_bugs import BUGS, NOT_A_SAFETY_MATTER, ROWS_OF_OTHERS, PlantedBug
 
 HERE = Path(__file__).parent
 

@@ -20,10 +20,10 @@ from attrs import frozen
 if __name__ == "__main__":  # run as a program: as `pythonpath` in pyproject.toml
     sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from laneweave.launch.simulation.profiles import PROFILES
-from laneweave.launch.simulation.search import quiet_logs
-from laneweave.launch.simulation.world import World
-from planted_bugs import BUGS, PlantedBug
+from laneweave.launch.fault_search.profiles import PROFILES
+from laneweave.launch.fault_search.search import quiet_logs
+from laneweave.launch.fault_search.simulated_run import World
+from support.planted_bugs import BUGS, PlantedBug
 
 SEEDS = 500
 SEARCHED = ("mixed", "joint", "rolling")

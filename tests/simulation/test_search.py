@@ -1,6 +1,6 @@
 """Random search: whatever happens to network and processes, no rule of the checker is broken.
 
-Each seed draws roads, vehicles, wishes and faults (`laneweave.launch.simulation`). A failure is
+Each seed draws roads, vehicles, wishes and faults (`laneweave.launch.fault_search`). A failure is
 replayed by the command that is printed with it. The whole programme is
 
     laneweave simulate --seeds 0:20000
@@ -16,18 +16,18 @@ from collections.abc import Iterator
 
 import pytest
 
-from laneweave.launch.simulation.profiles import PROFILES
-from laneweave.launch.simulation.search import replay_command
-from laneweave.launch.simulation.setup import SLOT_S
-from laneweave.launch.simulation.world import Outcome, Totals, World
+from laneweave.launch.fault_search.profiles import PROFILES
+from laneweave.launch.fault_search.search import replay_command
+from laneweave.launch.fault_search.setup import SLOT_S
+from laneweave.launch.fault_search.simulated_run import Outcome, Totals, World
 
 SEEDS = 300
 BATCH = 20
 DIGESTS = 60
 _PRINT_DIGESTS = """
 import json, sys
-from laneweave.launch.simulation.profiles import PROFILES
-from laneweave.launch.simulation.search import quiet_logs, run_seeds
+from laneweave.launch.fault_search.profiles import PROFILES
+from laneweave.launch.fault_search.search import quiet_logs, run_seeds
 quiet_logs()
 outcomes = run_seeds(range(*map(int, sys.argv[1:])), PROFILES["mixed"], digest=True)
 print(json.dumps([outcome.digest for outcome in outcomes]))

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from sharing import made_once
-from system.harness import DEMAND, ROAD, Lab
-from system.loaded import Loaded
+from support.harness import DEMAND, ROAD, Lab
+from support.loaded import Loaded
+from support.sharing import made_once
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from system.harness import END_S, Ended, Lab
+from support.harness import END_S, Ended, Lab
 
 NOBODY = "unixsock-stream/nobody.sock"
 

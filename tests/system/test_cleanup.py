@@ -11,7 +11,7 @@ import psutil
 import pyarrow.parquet as pq
 import pytest
 
-from system.harness import (
+from support.harness import (
     DEMAND,
     END_S,
     SHORT_ROAD,

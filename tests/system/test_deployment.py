@@ -13,12 +13,11 @@ from typing import Any
 
 import pytest
 
-from laneweave.protocol.access import Access
-from laneweave.protocol.topics import BRIDGE_ALIVE, Keys
-from laneweave.protocol.transport import Delivery, TokenUp
-from laneweave.protocol.zenoh_transport import ZenohTransport
-from system.conftest import FinishedRun
-from system.harness import (
+from laneweave.protocol.runtime.transport import Delivery, TokenUp
+from laneweave.protocol.security.access import Access
+from laneweave.protocol.transports.zenoh.transport import ZenohTransport
+from laneweave.protocol.wire.topics import BRIDGE_ALIVE, Keys
+from support.harness import (
     END_S,
     ROAD,
     RUN_S,
@@ -29,6 +28,7 @@ from system.harness import (
     final_lanes,
     summary,
 )
+from system.conftest import FinishedRun
 
 REQUEST: dict[str, Any] = {
     "schema": "laneweave.plan.request/1",

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from system.harness import END_S, Lab
+from support.harness import END_S, Lab
 from system.test_deployment import REQUEST, _ask, deployment, free_tcp, start_router, stop
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

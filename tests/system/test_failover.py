@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from system.conftest import FinishedRun
-from system.harness import (
+from support.harness import (
     DEMAND,
     RUN_S,
     Lab,
@@ -16,6 +15,7 @@ from system.harness import (
     plans,
     summary,
 )
+from system.conftest import FinishedRun
 
 KILLED_AT_S = 13.0
 

@@ -8,8 +8,7 @@ from typing import Any
 import psutil
 import pytest
 
-from system.conftest import FinishedRun
-from system.harness import (
+from support.harness import (
     DEMAND,
     END_S,
     SHORT_ROAD,
@@ -20,6 +19,7 @@ from system.harness import (
     plans,
     summary,
 )
+from system.conftest import FinishedRun
 
 BLACKOUT_ROAD = """\
 schema = "laneweave.scenario/1"

@@ -12,9 +12,10 @@ import attrs
 import msgpack
 import pytest
 
-from laneweave.protocol.access import Access
-from laneweave.protocol.codec import MAX_BYTES, VERSION, encode
-from laneweave.protocol.messages import (
+from laneweave.protocol.security.access import Access
+from laneweave.protocol.transports.zenoh.transport import ZenohTransport
+from laneweave.protocol.wire.codec import MAX_BYTES, VERSION, encode
+from laneweave.protocol.wire.messages import (
     Announcement,
     Ballot,
     Census,
@@ -33,7 +34,7 @@ from laneweave.protocol.messages import (
     Sense,
     VehicleState,
 )
-from laneweave.protocol.topics import (
+from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
     COORDINATOR_ALIVE,
     SERVICE,
@@ -44,9 +45,7 @@ from laneweave.protocol.topics import (
     Quality,
     Topic,
 )
-from laneweave.protocol.zenoh_transport import ZenohTransport
-from system.conftest import FinishedRun
-from system.harness import (
+from support.harness import (
     DEMAND,
     END_S,
     Lab,
@@ -57,6 +56,7 @@ from system.harness import (
     plans,
     summary,
 )
+from system.conftest import FinishedRun
 
 KEYS = Keys("default")
 GHOST = Name("ghost")

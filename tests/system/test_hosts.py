@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from laneweave.launch.namespaces import NamespacesUnavailableError
-from system.harness import Lab, check_safe_and_complete, events, final_lanes, summary, trips
-from system.hosts import LINKS, Hosts, lasts, open_hosts
+from laneweave.launch.faults.network_namespaces import NamespacesUnavailableError
+from support.harness import Lab, check_safe_and_complete, events, final_lanes, summary, trips
+from support.hosts import LINKS, Hosts, lasts, open_hosts
 
 SHORT = {"s2_m": 100.0, "s3_m": 350.0}
 DEMAND = {"duration_s": 10.0}

@@ -11,11 +11,11 @@ from pathlib import Path
 
 from prometheus_client.parser import text_string_to_metric_families
 
-from laneweave.launch.role_health import BRIDGE, COORDINATOR, RoleHealth
-from laneweave.launch.status import Status
-from laneweave.launch.status_command import listen
-from laneweave.protocol.scenario import load_scenario
-from system.harness import END_S, Ended, Lab
+from laneweave.launch.cli.status_command import listen
+from laneweave.launch.observe.role_health import BRIDGE, COORDINATOR, RoleHealth
+from laneweave.launch.observe.status import Status
+from laneweave.protocol.config.loading import load_scenario
+from support.harness import END_S, Ended, Lab
 from system.test_deployment import deployment, free_tcp, start_router, stop
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "DEPLOYMENT.md"

@@ -8,8 +8,7 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
-from system.conftest import FinishedRun
-from system.harness import (
+from support.harness import (
     DEMAND,
     Lab,
     check_safe_and_complete,
@@ -21,6 +20,7 @@ from system.harness import (
     summary,
     trips,
 )
+from system.conftest import FinishedRun
 
 NUMBER, TEXT, COUNT = (int, float), (str,), (int,)
 MAYBE = (int, float, type(None))

@@ -16,13 +16,14 @@ from typing import Any
 import pytest
 import zenoh
 
-from laneweave.launch.authority import issue, load_authority, make_authority
-from laneweave.protocol.access_rules import REQUEST_MARGIN
-from laneweave.protocol.codec import MAX_BYTES
-from laneweave.protocol.fleets import Shard
-from laneweave.protocol.identities import parse_identity
-from laneweave.protocol.scenario import Scenario, load_scenario
-from laneweave.protocol.topics import (
+from laneweave.launch.deploy.certificate_authority import issue, load_authority, make_authority
+from laneweave.protocol.config.identities import parse_identity
+from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.scenario.deployment import Shard
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.security.rights import REQUEST_MARGIN
+from laneweave.protocol.wire.codec import MAX_BYTES
+from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
     CENSUS,
     CLOCK,
@@ -40,8 +41,8 @@ from laneweave.protocol.topics import (
     VEHICLE_ALIVE,
     Topic,
 )
-from system.harness import END_S, RUN_S, Ended, Lab, check_safe_and_complete, trips
-from system.secured import (
+from support.harness import END_S, RUN_S, Ended, Lab, check_safe_and_complete, trips
+from support.secured import (
     KEYS,
     QUIET_S,
     Member,

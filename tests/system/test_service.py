@@ -21,21 +21,21 @@ import msgpack
 import psutil
 import pytest
 
-from laneweave.coordinator.client import (
+from laneweave.coordinator.planning import PlanRequest
+from laneweave.coordinator.service.client import (
     AsyncPlanClient,
     PlanClient,
     RequestRefusedError,
     ServiceUnavailableError,
 )
-from laneweave.coordinator.planning import PlanRequest
-from laneweave.coordinator.service_format import LATE, OVERLOADED
-from laneweave.coordinator.sharing import falls_to
-from laneweave.protocol.topics import SERVICE, Keys
-from laneweave.protocol.transport import Answer
-from laneweave.protocol.zenoh_transport import ZenohTransport
-from system.harness import END_S, Lab
-from system.mutations import ask_all, mutants
-from system.service_lab import LEASE_S, REALM, Load, ServiceLab, request, slow_request
+from laneweave.coordinator.service.format import LATE, OVERLOADED
+from laneweave.coordinator.service.rendezvous import falls_to
+from laneweave.protocol.runtime.transport import Answer
+from laneweave.protocol.transports.zenoh.transport import ZenohTransport
+from laneweave.protocol.wire.topics import SERVICE, Keys
+from support.harness import END_S, Lab
+from support.mutations import ask_all, mutants
+from support.service_lab import LEASE_S, REALM, Load, ServiceLab, request, slow_request
 
 QUEUE_LIMIT = 64
 FLAT_MB = 20.0

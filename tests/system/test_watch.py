@@ -20,16 +20,16 @@ import pytest
 from attrs import define, field
 from websockets.sync.client import connect
 
-from convoy import Convoy
-from laneweave.launch.formations import read_events
-from laneweave.launch.report.tracks import read_tracks
-from laneweave.protocol.access import Access
-from laneweave.protocol.codec import encode
-from laneweave.protocol.topics import Keys
-from laneweave.protocol.zenoh_transport import ZenohTransport
-from system.chromium import Page, needs_chromium, new_page
+from laneweave.launch.observe.column_owners import read_events
+from laneweave.launch.report.trajectories import read_tracks
+from laneweave.protocol.security.access import Access
+from laneweave.protocol.transports.zenoh.transport import ZenohTransport
+from laneweave.protocol.wire.codec import encode
+from laneweave.protocol.wire.topics import Keys
+from support.chromium import Page, needs_chromium, new_page
+from support.convoy import Convoy
+from support.harness import END_S, RUN_S, Ended, Lab, summary
 from system.conftest import FinishedRun
-from system.harness import END_S, RUN_S, Ended, Lab, summary
 from system.test_deployment import deployment, free_tcp, start_router, stop
 
 REALM = "test"

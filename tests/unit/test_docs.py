@@ -21,21 +21,22 @@ import pytest
 import typer
 from numpy.typing import NDArray
 
-from laneweave.agents.trajectory import move_profile
+from laneweave.agents.driving.reference import move_profile
 from laneweave.coordinator.planning import PlanRequest
-from laneweave.launch.cli import app
-from laneweave.launch.faults import load_faults
-from laneweave.launch.plan_command import answer_request
-from laneweave.launch.status import SCHEMA, Status
-from laneweave.protocol import messages
-from laneweave.protocol.codec import KINDS, field_names
+from laneweave.launch.cli.main import app
+from laneweave.launch.cli.plan_command import answer_request
+from laneweave.launch.faults.specification import load_faults
+from laneweave.launch.observe.status import SCHEMA, Status
+from laneweave.protocol.config.loading import load_scenario, parse_scenario
 from laneweave.protocol.lattice import Cell, footprint
-from laneweave.protocol.motion import cell_state
-from laneweave.protocol.ranges import HOST_PORT_RULE
-from laneweave.protocol.scenario import CONFLICT_KINDS, Scenario, load_scenario, parse_scenario
-from laneweave.protocol.topics import NAME_RULE, TOPICS
-from laneweave.sim_bridge.overlap import Bodies, pose_of
-from laneweave.sim_bridge.run_record import Ending
+from laneweave.protocol.scenario.tables import CONFLICT_KINDS, Scenario
+from laneweave.protocol.scenario.validators import HOST_PORT_RULE
+from laneweave.protocol.vehicle.motion import cell_state
+from laneweave.protocol.wire import messages
+from laneweave.protocol.wire.codec import KINDS, field_names
+from laneweave.protocol.wire.topics import NAME_RULE, TOPICS
+from laneweave.sim_bridge.bodies.footprints import Bodies, pose_of
+from laneweave.sim_bridge.recording.run_record import Ending
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"

@@ -53,7 +53,7 @@ extras += " starlette uvicorn websockets"
 for missing in extras.split():
     sys.modules[missing] = None
 import laneweave.coordinator.process
-from laneweave.launch.cli import main
+from laneweave.launch.cli.main import main
 sys.argv = ["laneweave", *sys.argv[1:]]
 main()
 """

@@ -17,21 +17,9 @@ from collections.abc import Callable
 
 from attrs import evolve
 
-from laneweave.agents.driver import Course, Driver, Effort, TrackingDriver
-from laneweave.protocol.execution import PlanExecution
-from laneweave.protocol.incarnations import above
+from laneweave.agents.driving.driver import Course, Driver, Effort, TrackingDriver
 from laneweave.protocol.lattice import Move, stretch_of
-from laneweave.protocol.messages import (
-    Command,
-    Motion,
-    Name,
-    Plan,
-    Prepare,
-    Report,
-    Sense,
-    VehicleState,
-)
-from laneweave.protocol.node import (
+from laneweave.protocol.runtime.node import (
     Announce,
     Arrived,
     Effect,
@@ -43,8 +31,22 @@ from laneweave.protocol.node import (
     Unlisten,
     Withdraw,
 )
-from laneweave.protocol.scenario import Scenario
-from laneweave.protocol.topics import (
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.state_machine import RuleBook
+from laneweave.protocol.vehicle.execution import PlanExecution
+from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
+from laneweave.protocol.wire.incarnations import above
+from laneweave.protocol.wire.messages import (
+    Command,
+    Motion,
+    Name,
+    Plan,
+    Prepare,
+    Report,
+    Sense,
+    VehicleState,
+)
+from laneweave.protocol.wire.topics import (
     COMMAND,
     MOTION,
     PLAN,
@@ -54,8 +56,6 @@ from laneweave.protocol.topics import (
     STATE,
     VEHICLE_ALIVE,
 )
-from laneweave.protocol.transitions import RuleBook
-from laneweave.protocol.vehicle_rules import VEHICLE_RULES
 
 
 class AgentCore:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 from laneweave.agents.core import AgentCore
-from laneweave.agents.numbers import AgentNumbers
-from laneweave.protocol.fleets import Shard
-from laneweave.protocol.messages import Census, Motion, Name, VehicleState
-from laneweave.protocol.node import (
+from laneweave.agents.metrics import AgentNumbers
+from laneweave.protocol.runtime.metrics import Snapshot
+from laneweave.protocol.runtime.node import (
     Arrived,
     Effect,
     End,
@@ -22,8 +21,16 @@ from laneweave.protocol.node import (
     Wakeup,
     Watch,
 )
-from laneweave.protocol.numbers import Snapshot
-from laneweave.protocol.topics import BRIDGE_ALIVE, CENSUS, MOTION, STATE, Topic, incarnation_of
+from laneweave.protocol.scenario.deployment import Shard
+from laneweave.protocol.wire.messages import Census, Motion, Name, VehicleState
+from laneweave.protocol.wire.topics import (
+    BRIDGE_ALIVE,
+    CENSUS,
+    MOTION,
+    STATE,
+    Topic,
+    incarnation_of,
+)
 
 ALONE_S = 60.0
 """Agents end when no bridge has been there for this long (node clock)."""

@@ -6,17 +6,17 @@ from collections.abc import Iterable
 from itertools import product
 
 from laneweave.agents.core import AgentCore
-from laneweave.agents.driver import TrackingDriver
+from laneweave.agents.driving.driver import TrackingDriver
 from laneweave.agents.host import AgentHost
-from laneweave.protocol.access import Access
-from laneweave.protocol.core_runner import run_core
-from laneweave.protocol.faulty_core import Wrap, bare
-from laneweave.protocol.fleets import Shard
-from laneweave.protocol.incarnations import Incarnations
-from laneweave.protocol.messages import Name, Sense
-from laneweave.protocol.motion import cell_state
-from laneweave.protocol.numbers import Observe, unobserved
-from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.runtime.message_faults import Wrap, bare
+from laneweave.protocol.runtime.metrics import Observe, unobserved
+from laneweave.protocol.scenario.deployment import Shard
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.security.access import Access
+from laneweave.protocol.transports.zenoh.runner import run_core
+from laneweave.protocol.vehicle.motion import cell_state
+from laneweave.protocol.wire.incarnations import Incarnations
+from laneweave.protocol.wire.messages import Name, Sense
 
 
 def warm_up(scenario: Scenario) -> None:

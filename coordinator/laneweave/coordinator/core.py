@@ -8,29 +8,18 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 import structlog
 
 from laneweave.coordinator.election import Election
-from laneweave.coordinator.formation import Formation, closed_formations, with_room
-from laneweave.coordinator.formation_planner import FormationPlanner, Note
-from laneweave.coordinator.groups import Groups
-from laneweave.coordinator.leader import FormationControl
-from laneweave.coordinator.leader_rules import LEADER_RULES, Phase
-from laneweave.coordinator.numbers import CoordinatorNumbers
-from laneweave.coordinator.service import PlanningService
-from laneweave.coordinator.stream_control import Note as StreamNote
-from laneweave.coordinator.stream_control import StreamControl
-from laneweave.coordinator.stream_planner import Planner, stream_planner
-from laneweave.protocol.messages import (
-    Ballot,
-    Census,
-    Heartbeat,
-    LogEvent,
-    Name,
-    Plan,
-    Prepare,
-    Report,
-    RoadClock,
-    VehicleState,
-)
-from laneweave.protocol.node import (
+from laneweave.coordinator.formations.control import FormationControl
+from laneweave.coordinator.formations.groups import Groups
+from laneweave.coordinator.formations.leader_rules import LEADER_RULES, Phase
+from laneweave.coordinator.formations.planner import FormationPlanner, Note
+from laneweave.coordinator.formations.roster import Formation, closed_formations, with_room
+from laneweave.coordinator.metrics import CoordinatorNumbers
+from laneweave.coordinator.rolling.control import Note as StreamNote
+from laneweave.coordinator.rolling.control import StreamControl
+from laneweave.coordinator.rolling.planner import Planner, stream_planner
+from laneweave.coordinator.service.server import PlanningService
+from laneweave.protocol.runtime.metrics import Snapshot
+from laneweave.protocol.runtime.node import (
     Announce,
     Arrived,
     Asked,
@@ -48,9 +37,22 @@ from laneweave.protocol.node import (
     Unlisten,
     Watch,
 )
-from laneweave.protocol.numbers import Snapshot
-from laneweave.protocol.scenario import Scenario
-from laneweave.protocol.topics import (
+from laneweave.protocol.runtime.transport import LinkDown, LinkUp
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.state_machine import RuleBook
+from laneweave.protocol.wire.messages import (
+    Ballot,
+    Census,
+    Heartbeat,
+    LogEvent,
+    Name,
+    Plan,
+    Prepare,
+    Report,
+    RoadClock,
+    VehicleState,
+)
+from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
     CENSUS,
     CLOCK,
@@ -64,8 +66,6 @@ from laneweave.protocol.topics import (
     STATE,
     incarnation_of,
 )
-from laneweave.protocol.transitions import RuleBook
-from laneweave.protocol.transport import LinkDown, LinkUp
 
 log = structlog.get_logger(__name__)
 

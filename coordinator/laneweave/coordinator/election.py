@@ -12,7 +12,7 @@ from collections.abc import Iterator
 
 from attrs import define, field
 
-from laneweave.protocol.messages import Heartbeat, Name
+from laneweave.protocol.wire.messages import Heartbeat, Name
 
 NEWCOMER_SHARE = 1.5
 """A better-ranked newcomer is waited for by the leader for this many election times."""

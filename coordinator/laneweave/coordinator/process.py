@@ -12,14 +12,14 @@ import structlog
 
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.planning import warm_up
-from laneweave.protocol.access import access_of
-from laneweave.protocol.core_runner import run_core
-from laneweave.protocol.faulty_core import Wrap, bare
-from laneweave.protocol.incarnations import Incarnations
-from laneweave.protocol.messages import Name
-from laneweave.protocol.numbers import Observe, unobserved
-from laneweave.protocol.scenario import Scenario
-from laneweave.protocol.worker_pool import WorkerPool
+from laneweave.protocol.runtime.message_faults import Wrap, bare
+from laneweave.protocol.runtime.metrics import Observe, unobserved
+from laneweave.protocol.runtime.worker_pool import WorkerPool
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.security.access import access_of
+from laneweave.protocol.transports.zenoh.runner import run_core
+from laneweave.protocol.wire.incarnations import Incarnations
+from laneweave.protocol.wire.messages import Name
 
 log = structlog.get_logger(__name__)
 

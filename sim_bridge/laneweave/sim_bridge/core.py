@@ -16,16 +16,8 @@ from enum import Enum
 import structlog
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.messages import (
-    Command,
-    Heartbeat,
-    LogEvent,
-    Name,
-    Plan,
-    Prepare,
-    Report,
-)
-from laneweave.protocol.node import (
+from laneweave.protocol.runtime.metrics import Snapshot
+from laneweave.protocol.runtime.node import (
     Announce,
     Arrived,
     Effect,
@@ -40,9 +32,17 @@ from laneweave.protocol.node import (
     Wakeup,
     Watch,
 )
-from laneweave.protocol.numbers import Snapshot
-from laneweave.protocol.scenario import Scenario
-from laneweave.protocol.topics import (
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.wire.messages import (
+    Command,
+    Heartbeat,
+    LogEvent,
+    Name,
+    Plan,
+    Prepare,
+    Report,
+)
+from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
     COMMAND,
     EVENT,
@@ -51,13 +51,13 @@ from laneweave.protocol.topics import (
     SENSE,
     VEHICLE_ALIVE,
 )
-from laneweave.sim_bridge.attendance import Attendance
-from laneweave.sim_bridge.leaving import Leaving, tell_left
-from laneweave.sim_bridge.numbers import BridgeNumbers
-from laneweave.sim_bridge.roadside import Roadside
-from laneweave.sim_bridge.run_record import Ending, RunRecord
-from laneweave.sim_bridge.traffic import RoadVehicle
-from laneweave.sim_bridge.world import World, show_bodies
+from laneweave.sim_bridge.metrics import BridgeNumbers
+from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
+from laneweave.sim_bridge.road.attendance import Attendance
+from laneweave.sim_bridge.road.leaving import Leaving, tell_left
+from laneweave.sim_bridge.road.roadside import Roadside
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from laneweave.sim_bridge.road.world import World, show_bodies
 
 log = structlog.get_logger(__name__)
 

@@ -6,15 +6,15 @@ import tempfile
 import time
 from pathlib import Path
 
-from laneweave.protocol.access import access_of
-from laneweave.protocol.core_runner import run_core
-from laneweave.protocol.faulty_core import Wrap, bare
-from laneweave.protocol.incarnations import Incarnations
-from laneweave.protocol.numbers import Observe, unobserved
-from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.runtime.message_faults import Wrap, bare
+from laneweave.protocol.runtime.metrics import Observe, unobserved
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.security.access import access_of
+from laneweave.protocol.transports.zenoh.runner import run_core
+from laneweave.protocol.wire.incarnations import Incarnations
 from laneweave.sim_bridge.core import BridgeCore
-from laneweave.sim_bridge.run_record import Ending, RunRecord
-from laneweave.sim_bridge.sumo_world import SumoWorld
+from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
+from laneweave.sim_bridge.sumo.world import SumoWorld
 
 
 def run_bridge(

@@ -8,9 +8,12 @@ import pytest
 from attrs import evolve
 
 from laneweave.agents.core import AgentCore
-from laneweave.agents.driver import Drive, Effort
+from laneweave.agents.driving.driver import Drive, Effort
 from laneweave.protocol.lattice import Cell, Move
-from laneweave.protocol.messages import (
+from laneweave.protocol.runtime.node import Effect, Send, Wakeup
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.vehicle.motion import cell_state
+from laneweave.protocol.wire.messages import (
     Ballot,
     Command,
     Motion,
@@ -20,21 +23,8 @@ from laneweave.protocol.messages import (
     Sense,
     VehicleState,
 )
-from laneweave.protocol.motion import cell_state
-from laneweave.protocol.node import Effect, Send, Wakeup
-from laneweave.protocol.scenario import Scenario
-from laneweave.protocol.topics import PLAN, PREPARE, SENSE, STATE
-from unit.agents.agent_rig import (
-    BALLOT,
-    HOME,
-    LATTICE,
-    ME,
-    OTHER,
-    TICK_S,
-    Rig,
-    make_plan,
-    sent,
-)
+from laneweave.protocol.wire.topics import PLAN, PREPARE, SENSE, STATE
+from support.agent_rig import BALLOT, HOME, LATTICE, ME, OTHER, TICK_S, Rig, make_plan, sent
 
 
 class Passenger:

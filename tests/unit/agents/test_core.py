@@ -6,11 +6,8 @@ import attrs
 import pytest
 
 from laneweave.agents.core import AgentCore
-from laneweave.protocol.execution import OVERDUE_SLOTS
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.messages import Command, Neighbour, Prepare, Report, VehicleState
-from laneweave.protocol.motion import ARRIVED_ACROSS_M, ARRIVED_ALONG_M
-from laneweave.protocol.node import (
+from laneweave.protocol.runtime.node import (
     Announce,
     Listen,
     Send,
@@ -19,8 +16,19 @@ from laneweave.protocol.node import (
     Unlisten,
     Withdraw,
 )
-from laneweave.protocol.topics import COMMAND, PLAN, PREPARE, REPORT, SENSE, STATE, VEHICLE_ALIVE
-from unit.agents.agent_rig import (
+from laneweave.protocol.vehicle.execution import OVERDUE_SLOTS
+from laneweave.protocol.vehicle.motion import ARRIVED_ACROSS_M, ARRIVED_ALONG_M
+from laneweave.protocol.wire.messages import Command, Neighbour, Prepare, Report, VehicleState
+from laneweave.protocol.wire.topics import (
+    COMMAND,
+    PLAN,
+    PREPARE,
+    REPORT,
+    SENSE,
+    STATE,
+    VEHICLE_ALIVE,
+)
+from support.agent_rig import (
     BALLOT,
     HOME,
     ME,

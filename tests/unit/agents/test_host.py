@@ -9,24 +9,9 @@ from attrs import evolve
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.host import ALONE_S, AgentHost
-from laneweave.agents.numbers import AgentNumbers
-from laneweave.protocol.fleets import Shard
+from laneweave.agents.metrics import AgentNumbers
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.messages import (
-    Announcement,
-    Ballot,
-    Census,
-    CensusEntry,
-    Command,
-    Name,
-    Plan,
-    Prepare,
-    Report,
-    Sense,
-    VehicleState,
-)
-from laneweave.protocol.motion import cell_state
-from laneweave.protocol.node import (
+from laneweave.protocol.runtime.node import (
     Announce,
     Arrived,
     Effect,
@@ -43,7 +28,22 @@ from laneweave.protocol.node import (
     Watch,
     Withdraw,
 )
-from laneweave.protocol.topics import (
+from laneweave.protocol.scenario.deployment import Shard
+from laneweave.protocol.vehicle.motion import cell_state
+from laneweave.protocol.wire.messages import (
+    Announcement,
+    Ballot,
+    Census,
+    CensusEntry,
+    Command,
+    Name,
+    Plan,
+    Prepare,
+    Report,
+    Sense,
+    VehicleState,
+)
+from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
     CENSUS,
     MOTION,
@@ -54,7 +54,7 @@ from laneweave.protocol.topics import (
     VEHICLE_ALIVE,
     Topic,
 )
-from paper import PAPER
+from support.paper import PAPER
 
 SCENARIO = PAPER
 A, B, C = Name("A"), Name("B"), Name("C")

@@ -7,25 +7,14 @@ from attrs import evolve
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from laneweave.coordinator import formation_planner
-from laneweave.coordinator.formation import start_time_s
-from laneweave.coordinator.formation_planner import START_MARGIN_S
-from laneweave.coordinator.leader_rules import Phase
+from laneweave.coordinator.formations import planner as formation_planner
+from laneweave.coordinator.formations.leader_rules import Phase
+from laneweave.coordinator.formations.planner import START_MARGIN_S
+from laneweave.coordinator.formations.roster import start_time_s
+from laneweave.coordinator.formations.sorting import Sorting, SortingTask, sort_lanes
 from laneweave.coordinator.planning import Weights
-from laneweave.coordinator.sorting import Sorting, SortingTask, sort_lanes
 from laneweave.protocol.lattice import Cell, Move
-from laneweave.protocol.messages import (
-    Ballot,
-    Census,
-    Heartbeat,
-    LogEvent,
-    Name,
-    Plan,
-    Prepare,
-    Report,
-    RoadClock,
-)
-from laneweave.protocol.node import (
+from laneweave.protocol.runtime.node import (
     Announce,
     Asked,
     Computed,
@@ -44,8 +33,20 @@ from laneweave.protocol.node import (
     run_delegated,
     run_job,
 )
-from laneweave.protocol.plans import plan_problems
-from laneweave.protocol.topics import (
+from laneweave.protocol.runtime.transport import LinkDown, LinkUp
+from laneweave.protocol.vehicle.plans import plan_problems
+from laneweave.protocol.wire.messages import (
+    Ballot,
+    Census,
+    Heartbeat,
+    LogEvent,
+    Name,
+    Plan,
+    Prepare,
+    Report,
+    RoadClock,
+)
+from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
     CENSUS,
     CLOCK,
@@ -56,8 +57,7 @@ from laneweave.protocol.topics import (
     SERVICE,
     STATE,
 )
-from laneweave.protocol.transport import LinkDown, LinkUp
-from unit.coordinator.desk import (
+from support.service_desk import (
     ELECTION_S,
     LATTICE,
     SCENARIO,

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from laneweave.coordinator.election import NEWCOMER_SHARE, Election
-from laneweave.protocol.messages import Heartbeat, Name
+from laneweave.protocol.wire.messages import Heartbeat, Name
 
 ELECTION_S = 0.4
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from laneweave.protocol.codec import encode
-from laneweave.protocol.messages import Heartbeat, Name
-from laneweave.protocol.node import Arrived, Listen
-from laneweave.protocol.simulated_network import Conditions, Parcel, SimulatedNetwork
-from laneweave.protocol.topics import COMMAND, HEARTBEAT, Keys
-from unit.protocol.recorder import CALM, REALM, STORM, Recorder, at_start, beat, chatter
+from laneweave.protocol.runtime.node import Arrived, Listen
+from laneweave.protocol.transports.simulated.network import Conditions, Parcel, SimulatedNetwork
+from laneweave.protocol.wire.codec import encode
+from laneweave.protocol.wire.messages import Heartbeat, Name
+from laneweave.protocol.wire.topics import COMMAND, HEARTBEAT, Keys
+from support.node_recorder import CALM, REALM, STORM, Recorder, at_start, beat, chatter
 
 KEY = Keys(REALM).key(HEARTBEAT, coordinator="a")
 BEAT = Heartbeat(Name("a"), 1, 7, leading=False, formations=0)

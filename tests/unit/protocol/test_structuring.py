@@ -9,7 +9,7 @@ import pytest
 from attrs import field, frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.ranges import within
+from laneweave.protocol.scenario.validators import within
 from laneweave.protocol.structuring import NumberOrRange, structure
 
 

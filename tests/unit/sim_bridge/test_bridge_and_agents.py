@@ -8,18 +8,11 @@ import pytest
 
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.messages import Name
-from laneweave.protocol.simulated_network import Conditions
+from laneweave.protocol.transports.simulated.network import Conditions
+from laneweave.protocol.wire.messages import Name
+from laneweave.sim_bridge.bodies.motion_controller import Rung
 from laneweave.sim_bridge.core import Phase
-from laneweave.sim_bridge.motion_controller import Rung
-from unit.sim_bridge.bench import (
-    Sleeper,
-    Street,
-    arrival,
-    make_scenario,
-    read_events,
-    read_summary,
-)
+from support.bridge_bench import Sleeper, Street, arrival, make_scenario, read_events, read_summary
 
 LONG_ROAD = make_scenario(road={"lanes": 3, "s1_m": 20.0, "s2_m": 20.0, "s3_m": 400.0})
 SHORT_ROAD = make_scenario(sensing={})

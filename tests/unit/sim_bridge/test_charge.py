@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 from attrs import evolve
 
-from laneweave.protocol.incarnations import above
-from laneweave.protocol.messages import Ballot, Name, Plan, Prepare, Sense, VehicleState
-from laneweave.protocol.node import Arrived, Effect, Listen, Send, Stopping, Unlisten
-from laneweave.protocol.topics import COMMAND, PLAN, PREPARE, STATE
-from laneweave.protocol.transport import LinkDown, LinkUp
-from laneweave.sim_bridge.answers import LATE_SHARE
+from laneweave.protocol.runtime.node import Arrived, Effect, Listen, Send, Stopping, Unlisten
+from laneweave.protocol.runtime.transport import LinkDown, LinkUp
+from laneweave.protocol.wire.incarnations import above
+from laneweave.protocol.wire.messages import Ballot, Name, Plan, Prepare, Sense, VehicleState
+from laneweave.protocol.wire.topics import COMMAND, PLAN, PREPARE, STATE
 from laneweave.sim_bridge.core import Phase
-from unit.sim_bridge.bench import (
+from laneweave.sim_bridge.road.answers import LATE_SHARE
+from support.bridge_bench import (
     Desk,
     arrival,
     jerks,

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from laneweave.protocol.messages import Census, Command, Name, Report, RoadClock, Sense
-from laneweave.protocol.node import (
+from laneweave.protocol.runtime.node import (
     Announce,
     Arrived,
     Event,
@@ -18,8 +17,10 @@ from laneweave.protocol.node import (
     Wakeup,
     Watch,
 )
-from laneweave.protocol.scenario import Scenario
-from laneweave.protocol.topics import (
+from laneweave.protocol.runtime.transport import LinkDown, LinkUp
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.wire.messages import Census, Command, Name, Report, RoadClock, Sense
+from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
     COMMAND,
     COORDINATOR_ALIVE,
@@ -28,12 +29,11 @@ from laneweave.protocol.topics import (
     REPORT,
     VEHICLE_ALIVE,
 )
-from laneweave.protocol.transport import LinkDown, LinkUp
+from laneweave.sim_bridge.bodies.footprints import pose_of
+from laneweave.sim_bridge.bodies.motion_controller import Rung
 from laneweave.sim_bridge.core import WIND_UP_S, Phase
-from laneweave.sim_bridge.leaving import LEFT_REPEATS
-from laneweave.sim_bridge.motion_controller import Rung
-from laneweave.sim_bridge.overlap import pose_of
-from unit.sim_bridge.bench import (
+from laneweave.sim_bridge.road.leaving import LEFT_REPEATS
+from support.bridge_bench import (
     Desk,
     arrival,
     asked,

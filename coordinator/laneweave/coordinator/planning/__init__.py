@@ -26,10 +26,10 @@ The package is pure: no I/O, no state between calls, and time only through the c
 
 from laneweave.coordinator.planning.facade import checked_plan, plan, warm_up
 from laneweave.coordinator.planning.frd import Weights
-from laneweave.coordinator.planning.geometry import Geometry
+from laneweave.coordinator.planning.geometry.settings import Geometry
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanResponse
-from laneweave.coordinator.planning.validate import problems_of_paths, problems_of_response
+from laneweave.coordinator.planning.validator import problems_of_paths, problems_of_response
 
 __all__ = [
     "Geometry",

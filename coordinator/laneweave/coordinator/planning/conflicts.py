@@ -16,8 +16,8 @@ from typing import Final
 
 import attrs
 
-from laneweave.coordinator.planning.clearances import FARTHEST, close_pairs
-from laneweave.coordinator.planning.geometry import Geometry
+from laneweave.coordinator.planning.geometry.conflict_table import FARTHEST, close_pairs
+from laneweave.coordinator.planning.geometry.settings import Geometry
 from laneweave.coordinator.planning.grid import Cell, Mode, Move
 
 PAPER_KINDS: Final = ("node", "edge", "special-1", "special-2", "special-3", "special-4")

@@ -13,17 +13,17 @@ from typing import Final, Literal
 import attrs
 
 from laneweave.coordinator.planning.budget import Budget, Clock
-from laneweave.coordinator.planning.cbs import ConstraintTree, Node
-from laneweave.coordinator.planning.constraints import entry
 from laneweave.coordinator.planning.facade import cells_of, new_tappa, problem_of
 from laneweave.coordinator.planning.frd import Weights
-from laneweave.coordinator.planning.improvements import Improvements
 from laneweave.coordinator.planning.moves import MoveTable
+from laneweave.coordinator.planning.paper.cbs import ConstraintTree, Node
+from laneweave.coordinator.planning.paper.constraints import entry
+from laneweave.coordinator.planning.paper.improvements import Improvements
+from laneweave.coordinator.planning.paper.tappa import Attempt, Tappa
 from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.solution import Solution
-from laneweave.coordinator.planning.tappa import Attempt, Tappa
 
 MAX_LITERAL_NODES: Final = 150
 """Nodes taken from literal trees before the improved ones are shown instead."""

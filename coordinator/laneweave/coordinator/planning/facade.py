@@ -13,20 +13,20 @@ import numpy as np
 
 from laneweave.coordinator.planning.assignments import assignments
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError, Clock
-from laneweave.coordinator.planning.clearances import close_pairs
+from laneweave.coordinator.planning.conflict_cliques import vehicles_share_cells
 from laneweave.coordinator.planning.frd import IntMatrix, Weights, cost_matrix
+from laneweave.coordinator.planning.geometry.conflict_table import close_pairs
 from laneweave.coordinator.planning.grid import Cell
-from laneweave.coordinator.planning.improvements import Improvements
+from laneweave.coordinator.planning.paper.improvements import Improvements
+from laneweave.coordinator.planning.paper.tappa import Tappa
 from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.coordinator.planning.preference import BoolMatrix, preference_matrix
 from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.request import PlanRequest, checked_solver
 from laneweave.coordinator.planning.response import PlanResponse, Status
-from laneweave.coordinator.planning.rows import vehicles_share_cells
 from laneweave.coordinator.planning.solution import Solution, tidied
-from laneweave.coordinator.planning.tappa import Tappa
-from laneweave.coordinator.planning.validate import problems_of_response
-from laneweave.protocol.solvers import DEFAULT_SOLVER
+from laneweave.coordinator.planning.validator import problems_of_response
+from laneweave.protocol.scenario.solvers import DEFAULT_SOLVER
 
 TAPPA_SHARE: Final = 0.75
 """Share of the deadline, and of the node limit, after which branching plans in place of TAPPA.
@@ -163,7 +163,7 @@ def _search(
     solver: str, problem: Problem, request: PlanRequest, weights: Weights, budget: Budget
 ) -> Search:
     if solver == "branching":
-        from laneweave.coordinator.planning.branching import Branching  # noqa: PLC0415
+        from laneweave.coordinator.planning.exact.branching import Branching  # noqa: PLC0415
 
         return Branching(problem, request.choices(), budget)
     return new_tappa(problem, request, weights, budget)
@@ -209,14 +209,14 @@ def warm_up() -> None:
 
     Loading takes a second, compiling a minute.
     """
-    from laneweave.coordinator.planning import stream  # noqa: PLC0415 (numba is slow to load)
+    from laneweave.coordinator.planning.rolling import planner as stream  # noqa: PLC0415 (numba is slow to load)
 
     _warm_up_branching()
     stream.warm_up()
 
 
 def _warm_up_branching() -> None:
-    from laneweave.coordinator.planning import branching  # noqa: PLC0415
+    from laneweave.coordinator.planning.exact import branching  # noqa: PLC0415
 
     branching.warm_up()
 

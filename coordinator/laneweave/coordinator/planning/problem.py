@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from laneweave.coordinator.planning.conflicts import ConflictModel
-from laneweave.coordinator.planning.diagram import Bans, Diagram, shortest_paths
 from laneweave.coordinator.planning.grid import Cell, Grid, Mode
 from laneweave.coordinator.planning.moves import MoveTable
+from laneweave.coordinator.planning.paper.path_diagram import Bans, Diagram, shortest_paths
 
 
 class Problem:

@@ -14,7 +14,9 @@ from typing import Any, Final
 import attrs
 
 from laneweave.coordinator.planning.conflicts import DEFAULT_KINDS, KINDS, ConflictModel
-from laneweave.coordinator.planning.fields import (
+from laneweave.coordinator.planning.geometry.settings import Geometry
+from laneweave.coordinator.planning.grid import Cell, Grid, Mode
+from laneweave.coordinator.planning.json_fields import (
     as_cell,
     as_int,
     as_list,
@@ -22,12 +24,10 @@ from laneweave.coordinator.planning.fields import (
     as_text,
     require,
 )
-from laneweave.coordinator.planning.geometry import Geometry
-from laneweave.coordinator.planning.grid import Cell, Grid, Mode
 from laneweave.coordinator.planning.preference import eligible_targets
 from laneweave.coordinator.planning.structures import STRUCTURES, shortage, structure_targets
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.solvers import SOLVERS
+from laneweave.protocol.scenario.solvers import SOLVERS
 
 REQUEST_SCHEMA: Final = "laneweave.plan.request/1"
 DEFAULT_DEADLINE_S: Final = 4.0

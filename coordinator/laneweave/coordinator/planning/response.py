@@ -6,7 +6,8 @@ from typing import Any, Final, Literal
 
 import attrs
 
-from laneweave.coordinator.planning.fields import (
+from laneweave.coordinator.planning.grid import Cell
+from laneweave.coordinator.planning.json_fields import (
     as_bool,
     as_cell,
     as_int,
@@ -15,7 +16,6 @@ from laneweave.coordinator.planning.fields import (
     as_text,
     require,
 )
-from laneweave.coordinator.planning.grid import Cell
 from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.coordinator.planning.request import MAX_TARGETS, MAX_VEHICLES, PlanRequest
 from laneweave.protocol.errors import BadInputError

@@ -5,9 +5,9 @@ from __future__ import annotations
 import attrs
 
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
-from laneweave.coordinator.planning.diagram import Bans, shortest_paths
+from laneweave.coordinator.planning.paper.path_diagram import Bans, shortest_paths
+from laneweave.coordinator.planning.paper.sppa import Path, choose_path
 from laneweave.coordinator.planning.problem import Problem
-from laneweave.coordinator.planning.sppa import Path, choose_path
 
 
 @attrs.frozen

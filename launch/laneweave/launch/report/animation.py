@@ -16,10 +16,10 @@ import numpy as np
 import pyarrow.parquet as pq
 from attrs import frozen
 
-from laneweave.launch.formations import Formations, recorded_formations
+from laneweave.launch.drawing.road_scene import road_scene
+from laneweave.launch.observe.column_owners import Formations, recorded_formations
 from laneweave.launch.report.runs import Run
-from laneweave.launch.report.tracks import Floats, Tracks
-from laneweave.launch.road_scene import road_scene
+from laneweave.launch.report.trajectories import Floats, Tracks
 
 FORMAT: Final = "laneweave.animation/1"
 KINDS: Final = {"s_m": "<u2", "y_m": "<u2", "speed_mps": "u1"}

@@ -10,10 +10,10 @@ import numpy as np
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from laneweave.launch.drawing import FAINT_INK, INK, new_figure, save
-from laneweave.launch.figures import Floats, mean_speeds, speed_ceiling_mps
+from laneweave.launch.drawing.figures import FAINT_INK, INK, new_figure, save
+from laneweave.launch.report.figures import Floats, mean_speeds, speed_ceiling_mps
 from laneweave.launch.report.runs import Comparison, Run
-from laneweave.launch.report.styling import (
+from laneweave.launch.report.style import (
     label_colours,
     legend_above,
     note,

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from laneweave.launch.drawing import INK, new_figure, save
+from laneweave.launch.drawing.figures import INK, new_figure, save
 from laneweave.launch.report.distributions import (
     DECELERATION,
     HEADWAY,
@@ -16,7 +16,7 @@ from laneweave.launch.report.distributions import (
     Counts,
     Quantity,
 )
-from laneweave.launch.report.styling import (
+from laneweave.launch.report.style import (
     label_colours,
     legend_above,
     note,
@@ -24,7 +24,7 @@ from laneweave.launch.report.styling import (
     spread_evenly,
     volume_title,
 )
-from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.scenario.tables import Scenario
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

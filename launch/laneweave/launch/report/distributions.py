@@ -12,9 +12,9 @@ import numpy as np
 from attrs import field, frozen
 from numpy.typing import NDArray
 
-from laneweave.launch.report.tracks import Floats, Tracks
-from laneweave.protocol.scenario import Scenario
-from laneweave.sim_bridge.recorder import WARM_UP_S
+from laneweave.launch.report.trajectories import Floats, Tracks
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.sim_bridge.recording.recorder import WARM_UP_S
 
 Bools = NDArray[np.bool_]
 

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from attrs import field, frozen
 
-from laneweave.launch.colours import lane_names
+from laneweave.launch.drawing.colours import lane_names
 from laneweave.launch.web import road_script
 
 PAGE_FILE: Final = "report.html"

@@ -17,9 +17,9 @@ import pyarrow.parquet as pq
 from attrs import frozen
 
 from laneweave.coordinator.planning.path_map import RelativePathMap
-from laneweave.launch.colours import lane_colours
-from laneweave.launch.drawing import FAINT_INK, INK, new_figure, save
-from laneweave.launch.formations import (
+from laneweave.launch.drawing.colours import lane_colours
+from laneweave.launch.drawing.figures import FAINT_INK, INK, new_figure, save
+from laneweave.launch.observe.column_owners import (
     JOINED,
     PLANNED,
     FormationColumns,
@@ -27,7 +27,7 @@ from laneweave.launch.formations import (
     recorded_formations,
 )
 from laneweave.launch.report.runs import Run
-from laneweave.launch.report.tracks import OFF_LATTICE, Floats, Ints, Tracks
+from laneweave.launch.report.trajectories import OFF_LATTICE, Floats, Ints, Tracks
 from laneweave.protocol.errors import BadInputError
 
 if TYPE_CHECKING:

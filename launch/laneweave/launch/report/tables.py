@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from laneweave.launch.outcome import summary_rows
 from laneweave.launch.report.comparison_figures import preferred_share
 from laneweave.launch.report.runs import Comparison, Run
+from laneweave.launch.run.outcome import summary_rows
 
 _Column = tuple[str, tuple[str, ...], Callable[[Iterable[float]], float], int]
 """Heading, place in summary.json, how the values of several runs become one, digits."""

@@ -18,7 +18,7 @@ from typing import Any
 
 from attrs import asdict, frozen
 
-from laneweave.launch.roles import THREAD_LIMITS
+from laneweave.launch.run.roles import THREAD_LIMITS
 
 JOB_FILE, RESULT_FILE, LOG_FILE = "job.json", "result.json", "log.txt"
 POINT_PROCESS = "laneweave.launch.sweep.point_process"

@@ -29,8 +29,9 @@ from laneweave.launch.sweep.execution import LOG_FILE, Ended
 from laneweave.launch.sweep.methods import METHODS, has_a_say, rank
 from laneweave.launch.sweep.points import Point
 from laneweave.launch.sweep.results import Row, write_results
+from laneweave.protocol.config.loading import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError, CommandFailedError
-from laneweave.protocol.scenario import Scenario, parse_scenario, to_tables
+from laneweave.protocol.scenario.tables import Scenario
 
 MARK_FILE, POINT_FILE, RESULTS_FILE = "sweep.json", "point.json", "results.parquet"
 MARK = {"schema": "laneweave.sweep/1"}

@@ -7,15 +7,10 @@ from typing import Final
 
 from attrs import field, frozen
 
-from laneweave.launch.role_commands import LC2013, METHOD, RULE
+from laneweave.launch.cli.role_commands import LC2013, METHOD, RULE
+from laneweave.protocol.config.loading import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario import (
-    PAPERS_FORMATIONS,
-    FormationSettings,
-    Scenario,
-    parse_scenario,
-    to_tables,
-)
+from laneweave.protocol.scenario.tables import PAPERS_FORMATIONS, FormationSettings, Scenario
 
 LARGEST_OF_TAPPA: Final = 6
 """Larger formations are planned by branching."""

@@ -8,12 +8,12 @@ import signal
 import sys
 from pathlib import Path
 
-from laneweave.launch.garbage import collect_seldom
-from laneweave.launch.logs import log_to_terminal
+from laneweave.launch.run.garbage_collection import collect_seldom
+from laneweave.launch.run.logs import log_to_terminal
 from laneweave.launch.sweep.execution import JOB_FILE, RESULT_FILE
-from laneweave.launch.sweep.run_method import run_method
-from laneweave.protocol.processes import die_with_parent
-from laneweave.protocol.scenario import parse_scenario
+from laneweave.launch.sweep.run_point import run_method
+from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.runtime.processes import die_with_parent
 
 
 def main(folder: Path, parent: int) -> None:

@@ -6,11 +6,12 @@ from collections.abc import Iterator, Sequence
 
 from attrs import evolve, frozen
 
-from laneweave.agents.trajectory import check_moves
-from laneweave.launch.option_values import KeepTrajectories
+from laneweave.agents.driving.reference import check_moves
+from laneweave.launch.cli.options import KeepTrajectories
 from laneweave.launch.sweep.methods import METHODS
+from laneweave.protocol.config.loading import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario import Scenario, parse_scenario, to_tables
+from laneweave.protocol.scenario.tables import Scenario
 
 MOST_POINTS = 100_000
 

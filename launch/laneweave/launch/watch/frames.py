@@ -55,10 +55,10 @@ from typing import Any, Final, Protocol
 
 from attrs import frozen
 
-from laneweave.launch.colours import lane_names
-from laneweave.launch.road_scene import road_scene
+from laneweave.launch.drawing.colours import lane_names
+from laneweave.launch.drawing.road_scene import road_scene
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.scenario.tables import Scenario
 
 FORMAT: Final = "laneweave.watch/1"
 MOST_WANTED: Final = 50

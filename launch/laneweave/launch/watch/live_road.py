@@ -14,13 +14,15 @@ from typing import Any
 
 from attrs import define, field
 
-from laneweave.launch.formations import Formations
-from laneweave.launch.watch.candidates import Candidates, leader_of
+from laneweave.launch.observe.column_owners import Formations
+from laneweave.launch.watch.coordinators import Candidates, leader_of
+from laneweave.launch.watch.event_feed import Newest, plan_facts
 from laneweave.launch.watch.frames import MOVING, OVERDUE, UNATTENDED, UNHEARD, Row
-from laneweave.launch.watch.loss import LossMeter
-from laneweave.launch.watch.news import Newest, plan_facts
+from laneweave.launch.watch.message_loss import LossMeter
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.messages import (
+from laneweave.protocol.runtime.transport import LinkDown, LinkUp
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.wire.messages import (
     Ballot,
     Census,
     CensusEntry,
@@ -31,9 +33,7 @@ from laneweave.protocol.messages import (
     RoadClock,
     VehicleState,
 )
-from laneweave.protocol.scenario import Scenario
-from laneweave.protocol.topics import CENSUS, CLOCK, EVENT, HEARTBEAT, PLAN, STATE
-from laneweave.protocol.transport import LinkDown, LinkUp
+from laneweave.protocol.wire.topics import CENSUS, CLOCK, EVENT, HEARTBEAT, PLAN, STATE
 
 TOPICS = (STATE, CLOCK, CENSUS, HEARTBEAT, PLAN, EVENT)
 """What is subscribed to; the most frequent one first."""

@@ -20,18 +20,18 @@ from typing import Any, Final
 import structlog
 import uvicorn
 
-from laneweave.launch.observer import Observer
+from laneweave.launch.observe.observer import Observer
+from laneweave.launch.watch.frame_buffer import Ring
 from laneweave.launch.watch.frames import Film, compact, scene_of
 from laneweave.launch.watch.live_road import TOPICS, LiveRoad
-from laneweave.launch.watch.ring import Ring
 from laneweave.launch.watch.server import Audience, Health, make_app
-from laneweave.protocol.access import access_of
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.node import Arrived
-from laneweave.protocol.scenario import Scenario
-from laneweave.protocol.topics import Keys
-from laneweave.protocol.transport import Delivery
-from laneweave.protocol.zenoh_transport import connect_patiently
+from laneweave.protocol.runtime.node import Arrived
+from laneweave.protocol.runtime.transport import Delivery
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.security.access import access_of
+from laneweave.protocol.transports.zenoh.transport import connect_patiently
+from laneweave.protocol.wire.topics import Keys
 
 log = structlog.get_logger(__name__)
 
@@ -75,7 +75,7 @@ def watch_recorded(folder: Path, listen: str, ready: Callable[[str], None]) -> N
     Raises:
         BadInputError: it is not the folder of a finished run, or the address cannot be listened at.
     """
-    from laneweave.launch.watch.recorded import Recording  # noqa: PLC0415 (needs pyarrow)
+    from laneweave.launch.watch.recorded_run import Recording  # noqa: PLC0415 (needs pyarrow)
 
     recording = Recording(folder)
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 
-from laneweave.protocol.scenario import Scenario
-from laneweave.sim_bridge.demand import Arrival
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.sim_bridge.road.demand import Arrival
 
 
 class Entrance:

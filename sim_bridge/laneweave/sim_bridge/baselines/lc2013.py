@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Collection
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario import Scenario
+from laneweave.protocol.scenario.tables import Scenario
 from laneweave.sim_bridge.baselines.entrance import Entrance
 from laneweave.sim_bridge.baselines.vehicle import Vehicle
-from laneweave.sim_bridge.overlap import Pose
-from laneweave.sim_bridge.sumo_traffic import SumoTraffic
+from laneweave.sim_bridge.bodies.footprints import Pose
+from laneweave.sim_bridge.sumo.traffic import SumoTraffic
 
 
 class Lc2013Traffic:

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 from attrs import define
 
-from laneweave.protocol.motion import State
-from laneweave.sim_bridge.demand import Arrival
-from laneweave.sim_bridge.motion_controller import Rung
+from laneweave.protocol.vehicle.motion import State
+from laneweave.sim_bridge.bodies.motion_controller import Rung
+from laneweave.sim_bridge.road.demand import Arrival
 
 
 @define(eq=False)

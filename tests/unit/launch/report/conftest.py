@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from sharing import made_once
-from unit.launch.sweep.sweeping import short_road, sweep
+from support.sharing import made_once
+from support.sweeping import short_road, sweep
 
 
 @pytest.fixture(scope="session")

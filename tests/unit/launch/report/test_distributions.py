@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from numpy.typing import ArrayLike
 
-from laneweave.launch.formations import read_events
+from laneweave.launch.observe.column_owners import read_events
 from laneweave.launch.report.comparison_figures import _break
 from laneweave.launch.report.distributions import (
     DECELERATION,
@@ -27,11 +27,11 @@ from laneweave.launch.report.distributions import (
 )
 from laneweave.launch.report.path_maps import driven_map
 from laneweave.launch.report.runs import Run, single_run
-from laneweave.launch.report.styling import label_colours, spread_evenly
-from laneweave.launch.report.tracks import Tracks, read_tracks
+from laneweave.launch.report.style import label_colours, spread_evenly
+from laneweave.launch.report.trajectories import Tracks, read_tracks
+from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario import load_scenario
-from unit.launch.older import older_recording
+from support.older_recordings import older_recording
 
 T_S = 0.1 * np.arange(101)
 SHORT = load_scenario(None, demand__duration_s=10.0)

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
-from laneweave.launch import cli
+from laneweave.launch.cli import main as cli
 from laneweave.launch.report.runs import Comparison, runs_of
 from laneweave.launch.report.tables import (
     failed_table,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from unit.launch.sweep.sweeping import results, short_road, sweep
+from support.sweeping import results, short_road, sweep
 
 distributed = pytest.importorskip(
     "distributed", reason="the extra `dask` is not installed: there is no cluster to sweep on"

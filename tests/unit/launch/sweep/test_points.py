@@ -6,12 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from laneweave.launch import cli
-from laneweave.launch.option_values import KeepTrajectories
+from laneweave.launch.cli import main as cli
+from laneweave.launch.cli.options import KeepTrajectories
 from laneweave.launch.sweep.methods import METHODS, parse_methods, rank
 from laneweave.launch.sweep.points import parse_volumes, plan_points
+from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario import Scenario, load_scenario
+from laneweave.protocol.scenario.tables import Scenario
 
 ROOT = Path(__file__).resolve().parents[4]
 

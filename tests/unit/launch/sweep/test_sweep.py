@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from laneweave.launch.sweep.methods import has_a_say
-from unit.launch.sweep.sweeping import command, results, short_road, sweep
+from support.sweeping import command, results, short_road, sweep
 
 LISTS = ("--volumes", "1200,1600", "--seeds", "1:3")
 

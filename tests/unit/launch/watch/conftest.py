@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from laneweave.launch.cli import app
+from laneweave.launch.cli.main import app
 
 
 @pytest.fixture(scope="session")

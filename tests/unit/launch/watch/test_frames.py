@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from laneweave.launch.watch.frame_buffer import Ring
 from laneweave.launch.watch.frames import MOST_WANTED, compact, opening, reel, scene_of
-from laneweave.launch.watch.ring import Ring
-from laneweave.protocol.scenario import parse_scenario
+from laneweave.protocol.config.loading import parse_scenario
 
 
 def ring(count: int, most_frames: int = 10, most_characters: int = 10**6) -> Ring:

@@ -8,13 +8,14 @@ from typing import Any
 import pytest
 from attrs import evolve
 
-from convoy import BALLOT, ROLLING, Convoy
 from laneweave.launch.watch.frames import UNATTENDED, UNHEARD, compact
 from laneweave.launch.watch.live_road import STILL_S, LiveRoad
-from laneweave.protocol.codec import decode, encode
-from laneweave.protocol.messages import ClosedFormation, Heartbeat, LogEvent, Name
-from laneweave.protocol.scenario import Scenario, parse_scenario
-from laneweave.protocol.transport import LinkDown, LinkUp
+from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.runtime.transport import LinkDown, LinkUp
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.wire.codec import decode, encode
+from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, LogEvent, Name
+from support.convoy import BALLOT, ROLLING, Convoy
 
 FORMATIONS: Scenario = parse_scenario({})
 BLOCKS: Scenario = parse_scenario({"formation": {"operation": "paper"}})

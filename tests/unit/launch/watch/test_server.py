@@ -21,10 +21,10 @@ from attrs import define, field
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
+from laneweave.launch.watch.frame_buffer import Ring
 from laneweave.launch.watch.frames import MOST_WANTED, Film, compact
 from laneweave.launch.watch.process import open_socket
-from laneweave.launch.watch.recorded import Recording
-from laneweave.launch.watch.ring import Ring
+from laneweave.launch.watch.recorded_run import Recording
 from laneweave.launch.watch.server import Audience, Browser, make_app, wish_of
 from laneweave.protocol.errors import BadInputError
 

@@ -1,0 +1,23 @@
+"""What an agent process offers to whoever looks at it."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from attrs import field, frozen
+
+from laneweave.protocol.runtime.metrics import told
+
+
+@frozen
+class AgentNumbers:
+    """The vehicles of one process."""
+
+    ABOUT: ClassVar[str] = "agent"
+
+    vehicles: int = field(metadata=told("Vehicles that this process drives or waits for"))
+    vehicles_in_charge: int = field(
+        metadata=told("Vehicles on the road of which this process is in charge")
+    )
+    solves_total: int = field(metadata=told("Trajectories that were tracked, one for each tick"))
+    unusable_total: int = field(metadata=told("Solutions of the tracker that could not be used"))

@@ -1,0 +1,158 @@
+"""All that docs/EVALUATION.md reports: runs it, and brings the document up to date.
+
+    python benchmarks/evaluate.py [--only PART ...] [--seeds A:B] [--budget MINUTES]
+                                    [--jobs N] [--duration S] [--sweeps DIR ...] [--out DIR]
+
+zenoh      three points of the sweep over Zenoh with a process per vehicle, and simulated
+speed      real-time factors of three deployments
+length     what a vehicle costs on 1 km and on 10 km of road
+stability  how a disturbance of speed travels: benchmarks/stability.py
+sweep      every method at every volume, seed after seed
+report     docs/evidence/evaluation.json, figures in docs/images, tables in docs/EVALUATION.md
+faults     benchmarks/resilience.py, over an hour; only where it is asked for
+
+What is finished is kept: the same command goes on where it was. With --budget no seed of the sweep
+is begun that would not be finished in time. The exit status is 1 if a run of formation control has
+broken a promise or a run did not come to its end.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from evaluation.conduct import Rounds, refresh, run_trials, say
+from evaluation.programme import DURATION_S, SEEDS
+from laneweave.launch.cli.options import check_jobs, parse_seeds
+from laneweave.protocol.errors import BadInputError, CommandFailedError
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+PARTS = ("zenoh", "speed", "length", "stability", "sweep", "report", "faults")
+"""In the order in which they are run: the sweep takes the time that is left."""
+APART = ("faults",)
+REPORT_S = 300.0
+"""Kept of the budget for the report."""
+
+
+def parse_parts(names: Sequence[str] | None) -> tuple[str, ...]:
+    """Return the parts to run, in their order; None: all that are not to be asked for.
+
+    Raises:
+        BadInputError: there is no such part.
+    """
+    if names is None:
+        return tuple(part for part in PARTS if part not in APART)
+    for name in names:
+        if name not in PARTS:
+            raise BadInputError("--only", name, "some of " + ", ".join(PARTS))
+    return tuple(part for part in PARTS if part in names)
+
+
+def parse_positive(option: str, text: str, unit: str) -> float:
+    """Return a positive number.
+
+    Raises:
+        BadInputError: it is none.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise BadInputError(option, text, f"a positive number of {unit}")
+    return value
+
+
+def run_faults(out: Path) -> bool:
+    """Run the fault programme and record what came of it; return whether it came to its end."""
+    folder = out / "faults"
+    script = Path(__file__).with_name("resilience.py")
+    done = subprocess.run([sys.executable, str(script), "--out", str(folder)], check=False)  # noqa: S603
+    if done.returncode == 0:
+        shutil.copyfile(folder / "resilience.json", DOCS / "evidence" / "resilience.json")
+    return done.returncode == 0
+
+
+def run_script(script: Path) -> bool:
+    """Run a script of this repository without options; return whether it came to its end."""
+    return subprocess.run([sys.executable, str(script)], check=False).returncode == 0  # noqa: S603
+
+
+def run(arguments: argparse.Namespace) -> bool:
+    """Run what was asked for; return whether everything is as it should be.
+
+    Raises:
+        BadInputError: an option or a folder is not acceptable.
+        CommandFailedError: files or processes cannot be made.
+    """
+    parts, out = parse_parts(arguments.only), Path(arguments.out)
+    end_s = None
+    if arguments.budget is not None:
+        budget_s = 60.0 * parse_positive("--budget", arguments.budget, "minutes")
+        end_s = time.monotonic() + budget_s - REPORT_S
+    rounds = Rounds(
+        seeds=parse_seeds(arguments.seeds),
+        duration_s=parse_positive("--duration", arguments.duration, "seconds"),
+        jobs=check_jobs(arguments.jobs),
+        end_s=end_s,
+    )
+    good = True
+    for part in parts:
+        if part == "sweep":
+            good &= rounds.run(out)
+        elif part == "report":
+            say("report")
+            refresh(out, arguments.sweeps, DOCS)
+            good &= run_script(DOCS / "generate.py")
+        elif part == "stability":
+            say("stability")
+            good &= run_script(Path(__file__).with_name("stability.py"))
+        elif part == "faults":
+            say("faults")
+            good &= run_faults(out) and run_script(DOCS / "generate.py")
+        else:
+            good &= run_trials(part, out, ROOT, rounds.jobs)
+    return good
+
+
+def main() -> int:
+    """Run, and return the exit status."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--only", nargs="+", metavar="PART", help=", ".join(PARTS))
+    parser.add_argument("--seeds", default=f"{SEEDS[0]}:{SEEDS[-1] + 1}", help="of the sweep")
+    parser.add_argument("--duration", default=f"{DURATION_S:g}", help="s of arrivals at a point")
+    parser.add_argument(
+        "--jobs",
+        type=int,
+        help="processes at a time, of the sweep and of trials that share; default: all cores",
+    )
+    parser.add_argument("--budget", metavar="MINUTES", help="for everything; default: no limit")
+    parser.add_argument(
+        "--sweeps", nargs="+", type=Path, default=[], metavar="DIR",
+        help="report: folders of sweeps instead of OUT/sweep",
+    )  # fmt: skip
+    parser.add_argument("--out", default="runs/evaluation", metavar="DIR", help="where runs go")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        return 0 if run(parser.parse_args()) else 1
+    except BadInputError as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    except (CommandFailedError, OSError) as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted; the same command goes on\n")
+        return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

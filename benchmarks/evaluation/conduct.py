@@ -1,0 +1,172 @@
+"""The parts of the evaluation that take time: the sweep in rounds, the trials, the report."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+
+from attrs import frozen
+
+from evaluation.evidence import Evidence, read_evidence, setting_of, write_evidence
+from evaluation.pictures import draw_pictures
+from evaluation.points import point_rows
+from evaluation.programme import FORMATIONS, points_of
+from evaluation.trials import (
+    TRIALS,
+    Trial,
+    agreement_rows,
+    cost_rows,
+    factor_rows,
+    is_finished,
+    run_trial,
+)
+from laneweave.launch.report.runs import is_sweep, runs_of
+from laneweave.launch.sweep.execution import StoppedError
+from laneweave.launch.sweep.folder import FAILED, SweepFolder
+from laneweave.launch.sweep.local_workers import run_locally
+from laneweave.launch.sweep.sweep import conduct
+from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.errors import BadInputError, CommandFailedError
+
+SWEEP_FOLDER = "sweep"
+PICTURES = "evaluation-*.png"
+
+
+def say(text: str) -> None:
+    """Write a line about how far it is."""
+    sys.stderr.write(f"{time.strftime('%H:%M:%S')} {text}\n")
+    sys.stderr.flush()
+
+
+@frozen
+class Rounds:
+    """A sweep seed by seed: each round has every method at every volume."""
+
+    seeds: Sequence[int]
+    duration_s: float
+    """Vehicles arrive for this long at each point."""
+    jobs: int
+    """Processes at a time."""
+    end_s: float | None
+    """No round is begun that would last beyond this time (`time.monotonic`); None: no such time.
+    The first one is always run."""
+
+    def run(self, out: Path) -> bool:
+        """Run the rounds that are not finished; return whether formation control kept its promises.
+
+        Raises:
+            BadInputError: the folder is another sweep's.
+            CommandFailedError: files or processes cannot be made.
+        """
+        base = load_scenario(None, demand__duration_s=self.duration_s)
+        last_s, kept = 0.0, True
+        with SweepFolder(out / SWEEP_FOLDER) as folder:
+            folder.check_settings(base)
+            for seed in self.seeds:
+                points = points_of(base, seed)
+                if all(folder.is_finished(point) for point in points):
+                    continue
+                began_s = time.monotonic()
+                if self.end_s is not None and last_s and began_s + last_s > self.end_s:
+                    say(f"no time for seed {seed} and later ones; the next call goes on with them")
+                    break
+                say(f"sweep, seed {seed}")
+                conduct(points, folder, partial(run_locally, workers=self.jobs), show=True)
+                last_s = time.monotonic() - began_s
+                kept &= all(
+                    folder.records[point.name].status != FAILED
+                    for point in points
+                    if point.label in FORMATIONS
+                )
+        return kept
+
+
+def run_trials(part: str, out: Path, root: Path, jobs: int) -> bool:
+    """Run the trials of a part; return whether all came to their end.
+
+    Args:
+        part: `zenoh`, `speed` or `length`.
+        out: the evaluation's folder.
+        root: of the repository.
+        jobs: how many may run at a time, of those that share the machine.
+    """
+    stop = threading.Event()
+
+    def complete(trial: Trial) -> bool:
+        say(f"{part}: {trial.command}")
+        try:
+            run_trial(trial, out, root, stop.is_set)
+        except CommandFailedError as error:
+            say(f"FAILED: {error}")
+            return False
+        except StoppedError:
+            say(f"FAILED: {trial.command}: ended before it was over")
+            return False
+        return True
+
+    waiting = [trial for trial in TRIALS if trial.part == part and not is_finished(trial, out)]
+    ended = [complete(trial) for trial in waiting if not trial.shares]
+    with ThreadPoolExecutor(jobs) as pool:
+        try:
+            ended += pool.map(complete, [trial for trial in waiting if trial.shares])
+        finally:
+            stop.set()
+    return all(ended)
+
+
+def collect(out: Path, sweeps: Iterable[Path], images: Path) -> Evidence:
+    """Return what the runs that are there say, and draw their figures.
+
+    Args:
+        out: the evaluation's folder.
+        sweeps: folders of sweeps instead of its own; none: its own, if it has one.
+        images: where the figures go; earlier ones that were not drawn again are removed.
+
+    Raises:
+        BadInputError: a folder is not that of a sweep, or they do not go together.
+        OSError, ValueError, KeyError: a run's files cannot be read.
+    """
+    folders = list(sweeps) or [path for path in (out / SWEEP_FOLDER,) if is_sweep(path)]
+    for folder in folders:
+        if not is_sweep(folder):
+            raise BadInputError("--sweeps", str(folder), "folders of sweeps")
+    evidence = Evidence(
+        agreements=tuple(agreement_rows(out)),
+        factors=tuple(factor_rows(out)),
+        costs=tuple(cost_rows(out)),
+    )
+    if not folders:
+        return evidence
+    runs = list(runs_of(folders))
+    points = point_rows(runs)
+    pictures = draw_pictures(runs, images)
+    names = {picture.name for picture in pictures}
+    for path in images.glob(PICTURES):
+        if path.name not in names:
+            path.unlink()
+    return evidence.renewed(
+        Evidence(setting=setting_of(runs), points=tuple(points), pictures=pictures)
+    )
+
+
+def refresh(out: Path, sweeps: Iterable[Path], docs: Path) -> None:
+    """Bring docs/evidence/evaluation.json and the figures up to date.
+
+    What has no runs in the folders stays as it was recorded.
+
+    Args:
+        out: the evaluation's folder.
+        sweeps: as in `collect`.
+        docs: folder of the documents.
+
+    Raises:
+        BadInputError, OSError, ValueError, KeyError: as in `collect`.
+    """
+    path = docs / "evidence" / "evaluation.json"
+    recorded = read_evidence(path)
+    write_evidence(recorded.renewed(collect(out, sweeps, docs / "images")), path)

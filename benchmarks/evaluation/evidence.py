@@ -1,0 +1,116 @@
+"""docs/evidence/evaluation.json: all that the document's tables are made from."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from attrs import asdict, evolve, frozen
+
+from evaluation.points import Key, PointRow
+from evaluation.programme import FORMATIONS
+from evaluation.trials import AgreementRow, CostRow, FactorRow
+from laneweave.launch.report.runs import Run
+from laneweave.protocol.structuring import structure
+
+SCHEMA: Final = "laneweave.evaluation/1"
+
+
+@frozen
+class Setting:
+    """What all points of the sweep share."""
+
+    duration_s: float
+    """Vehicles arrive for this long."""
+    road_m: float
+    free_flow_s: float
+    """Time that the road takes at v_F."""
+    pitch_m: float
+    """d_F."""
+    speed_mps: float
+    """v_F."""
+    min_accel_mps2: float
+    max_accel_mps2: float
+
+
+@frozen
+class Picture:
+    """A figure of the document."""
+
+    name: str
+    """Of its file in docs/images."""
+    alt: str
+    caption: str
+
+
+@frozen
+class Evidence:
+    """What was measured; what is missing is empty."""
+
+    schema: str = SCHEMA
+    setting: Setting | None = None
+    points: tuple[PointRow, ...] = ()
+    pictures: tuple[Picture, ...] = ()
+    agreements: tuple[AgreementRow, ...] = ()
+    factors: tuple[FactorRow, ...] = ()
+    costs: tuple[CostRow, ...] = ()
+
+    @property
+    def by_key(self) -> dict[Key, PointRow]:
+        """The points by label and volume."""
+        return {(row.label, row.volume_veh_per_lane_h): row for row in self.points}
+
+    def renewed(self, new: Evidence) -> Evidence:
+        """Return this with every part replaced that is there anew.
+
+        Points, their setting and their pictures are one part: they come from the same runs.
+        """
+        kept = self
+        if new.points:
+            kept = evolve(kept, setting=new.setting, points=new.points, pictures=new.pictures)
+        return evolve(
+            kept,
+            agreements=new.agreements or kept.agreements,
+            factors=new.factors or kept.factors,
+            costs=new.costs or kept.costs,
+        )
+
+
+def setting_of(runs: Sequence[Run]) -> Setting:
+    """Return what some runs share; the first one of formation control speaks for all.
+
+    The reference methods do not read all of it.
+    """
+    scenario = next((run for run in runs if run.label in FORMATIONS), runs[0]).scenario
+    formation, vehicle = scenario.formation, scenario.vehicle
+    return Setting(
+        duration_s=scenario.demand.duration_s,
+        road_m=scenario.road.length_m,
+        free_flow_s=round(scenario.road.length_m / formation.speed_mps, 3),
+        pitch_m=formation.gap_m,
+        speed_mps=formation.speed_mps,
+        min_accel_mps2=vehicle.min_accel_mps2,
+        max_accel_mps2=vehicle.max_accel_mps2,
+    )
+
+
+def read_evidence(path: Path) -> Evidence:
+    """Return what is recorded; nothing, if there is no file.
+
+    Raises:
+        BadInputError: the file holds something else.
+        ValueError: it is not JSON.
+    """
+    if not path.is_file():
+        return Evidence()
+    return structure(json.loads(path.read_text(encoding="utf-8")), Evidence)
+
+
+def write_evidence(evidence: Evidence, path: Path) -> None:
+    """Write it whole or not at all."""
+    unfinished = path.with_suffix(".part")
+    text = json.dumps(asdict(evidence), indent=1)
+    unfinished.write_text(text + "\n", encoding="utf-8")
+    unfinished.replace(path)

@@ -1,0 +1,137 @@
+"""The goals, each with what was measured and whether it is met."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from evaluation.evidence import Evidence
+from evaluation.markdown import HOLDS, MISSED, MISSING, markdown, number
+from evaluation.points import PointRow
+from evaluation.programme import FORMATIONS, GOALS, LEAST_FACTORS, MOST_COST_RATIO, SEEDS, Goal
+
+
+def goals_table(evidence: Evidence) -> str:
+    """Return the table of all goals."""
+    rows = [*_traffic(evidence), *_safety(evidence), *_runtime(evidence)]
+    return markdown(["goal", "asked for", "measured", ""], rows)
+
+
+def _traffic(evidence: Evidence) -> Iterator[tuple[str, str, str, str]]:
+    """Yield the goals for travel times and lanes, accelerations and planning."""
+    for goal in GOALS:
+        row = evidence.by_key.get((goal.label, goal.volume_veh_per_lane_h))
+        yield (
+            f"`{goal.label}`, {goal.volume_veh_per_lane_h:g} veh/(lane h)",
+            ", ".join(_asked_for(goal)),
+            MISSING if row is None else _measured(row, goal),
+            "" if row is None else _verdict(meets(row, goal)),
+        )
+
+
+def _asked_for(goal: Goal) -> Iterator[str]:
+    at_least = "" if goal.on_lane_percent == 100.0 else "at least "
+    yield f"at most {goal.travel_s:g} s"
+    yield f"{at_least}{goal.on_lane_percent:g} % on their lane"
+    if goal.accel_mps2 is not None:
+        yield f"within {goal.accel_mps2:g} m/s2"
+    if goal.fallback_percent is not None:
+        yield f"at most {goal.fallback_percent:g} % fallbacks"
+
+
+def meets(row: PointRow, goal: Goal) -> bool:
+    """Tell whether a point meets a goal, which is for its label and volume."""
+    kept = [
+        row.travel_s is not None and row.travel_s <= goal.travel_s,
+        100.0 * row.on_preferred_lane >= goal.on_lane_percent * row.demanded > 0.0,
+    ]
+    if goal.accel_mps2 is not None:
+        # As accelerations are shown.
+        found = (row.min_accel_mps2, row.max_accel_mps2)
+        kept += [a is not None and round(abs(a), 2) <= goal.accel_mps2 for a in found]
+    if goal.fallback_percent is not None:
+        kept.append(100.0 * row.fallbacks <= goal.fallback_percent * row.plans)
+    return all(kept)
+
+
+def _measured(row: PointRow, goal: Goal) -> str:
+    off = row.demanded - row.on_preferred_lane
+    parts = [
+        f"{number(row.travel_s, 2)} s",
+        f"{off} of {row.demanded:,} not on their lane" if off else "100 %",
+    ]
+    if goal.accel_mps2 is not None:
+        low, high = number(row.min_accel_mps2, 2), number(row.max_accel_mps2, 2)
+        parts.append(f"{low} to {high} m/s2")
+    if goal.fallback_percent is not None:
+        parts.append(f"{row.fallbacks} of {row.plans:,} plans")
+    few = "" if len(row.seeds) >= len(SEEDS) else f" ({len(row.seeds)} of {len(SEEDS)} seeds)"
+    return ", ".join(parts) + few
+
+
+def _safety(evidence: Evidence) -> Iterator[tuple[str, str, str, str]]:
+    """Yield what every run of formation control has promised."""
+    rows = [row for row in evidence.points if row.label in FORMATIONS and row.seeds]
+    runs = f"{sum(len(row.seeds) for row in rows)} runs of formation control"
+    yield _one(
+        "overlaps", "none", f"{sum(row.overlaps for row in rows)} in {runs}",
+        [not row.overlaps for row in rows],
+    )  # fmt: skip
+    low = min((row.min_accel_mps2 for row in rows if row.min_accel_mps2 is not None), default=None)
+    high = max((row.max_accel_mps2 for row in rows if row.max_accel_mps2 is not None), default=None)
+    setting = evidence.setting
+    limits = (
+        f"{setting.min_accel_mps2:g} to {setting.max_accel_mps2:g} m/s2" if setting else "limits"
+    )
+    yield _one(
+        "accelerations", limits, f"{number(low, 2)} to {number(high, 2)} m/s2",
+        [row.within_limits for row in rows],
+    )  # fmt: skip
+    traced = [row.traced for row in rows if row.traced is not None]
+    least = [one.lattice_least_m for one in traced if one.lattice_least_m is not None]
+    looked_at = f"{sum(one.lattice_pairs for one in traced):,} in {sum(one.runs for one in traced)}"
+    yield _one(
+        "spacing at lattice points", "never below d_F",
+        f"{number(min(least, default=None), 2)} m, least of {looked_at} runs",
+        [one.lattice_kept for one in traced],
+    )  # fmt: skip
+
+
+def _runtime(evidence: Evidence) -> Iterator[tuple[str, str, str, str]]:
+    """Yield the goals for the network and for speed."""
+    agreements = evidence.agreements
+    differ = sum(not row.agreement.holds for row in agreements)
+    yield _one(
+        "three points over Zenoh, one process per vehicle", "as simulated: lanes, travel times",
+        f"{differ} of {len(agreements)} differ", [row.agreement.holds for row in agreements],
+    )  # fmt: skip
+    factors = {row.trial: row.real_time_factor for row in evidence.factors}
+    names = {
+        "zenoh": "one process per vehicle",
+        "zenoh-50": "50 vehicles per process",
+        "simulated": "one process, simulated network",
+    }
+    for trial, least in LEAST_FACTORS.items():
+        factor = factors.get(trial)
+        yield _one(
+            f"real-time factor at 1600, {names[trial]}", f"at least {least:g}",
+            number(factor, 2), [] if factor is None else [factor >= least],
+        )  # fmt: skip
+    cost_ms = {row.trial: row.cost_ms for row in evidence.costs}
+    known = "short" in cost_ms and "long" in cost_ms
+    ratio = cost_ms["long"] / cost_ms["short"] if known else 1.0
+    yield _one(
+        "cost of a vehicle on 10 km, 1,000 vehicles, against 1 km",
+        f"at most {MOST_COST_RATIO:g} times", f"{ratio:.2f} times",
+        [ratio <= MOST_COST_RATIO] if known else [],
+    )  # fmt: skip
+
+
+def _one(what: str, asked: str, measured: str, kept: Sequence[bool]) -> tuple[str, str, str, str]:
+    """Return a row; without anything that was looked at, one that says so."""
+    if not kept:
+        return what, asked, MISSING, ""
+    return what, asked, measured, _verdict(all(kept))
+
+
+def _verdict(met: bool) -> str:
+    return HOLDS if met else MISSED

@@ -1,0 +1,107 @@
+"""How far apart vehicles are at the lattice's fixed time points, from a run's trajectories.
+
+At the end of each slot vehicles that moved in it are at rest in a cell, and two vehicles of a lane
+are d_F or more apart, front to front. Between those points they may be nearer, by design: one falls
+back into a cell while another leaves it.
+
+Each plan has its own slots. Looked at are the ticks before a vehicle begins a move, and one tick of
+each shortest T_F; and of the vehicles those that are at rest then: on the road for
+`formation.settle_s` or longer, and either about to begin a move or in the same cell for at least
+the longest time of a move. Lanes and distances are those of the bodies, not of the cells that they
+should be in, so that a body in the wrong place is seen.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from attrs import frozen
+from numpy.typing import NDArray
+
+from laneweave.launch.report.trajectories import OFF_LATTICE, Floats, Ints, Tracks
+from laneweave.protocol.scenario.tables import Scenario
+
+Bools = NDArray[np.bool_]
+
+TOLERANCE_M: Final = 0.3
+"""Two bodies may be nearer than d_F by so much: each is tracked to within 0.1 m at lattice points
+with sensors that err by 0.05 m (standard deviation), and both may err towards each other."""
+
+
+@frozen
+class LatticeSpacing:
+    """What was found at the lattice points of one run or of several."""
+
+    least_m: float | None
+    """Least distance from front bumper to front bumper; None: never two on a lane."""
+    pairs: int
+    """How many distances were looked at."""
+    worst_off_m: float | None
+    """Greatest distance of a settled vehicle from its cell along the road."""
+
+    def keeps(self, pitch_m: float) -> bool:
+        """Tell whether no distance is below the pitch d_F, but for the tolerance."""
+        return self.least_m is None or self.least_m >= pitch_m - TOLERANCE_M
+
+
+def lattice_spacing(tracks: Tracks, scenario: Scenario) -> LatticeSpacing:
+    """Return how far apart settled vehicles are at the ends of slots.
+
+    Args:
+        tracks: the run's trajectories.
+        scenario: what was run.
+    """
+    lattice = scenario.lattice
+    ticks = np.rint(tracks.t_s / scenario.runtime.tick_s).astype(np.int64)
+    rows = np.flatnonzero(_settled(tracks, ticks, scenario))
+    lane = np.floor(tracks.y_m[rows] / lattice.lane_width_m).astype(np.int64)
+    order = np.lexsort((tracks.s_m[rows], lane, ticks[rows]))
+    rows, lane = rows[order], lane[order]
+    follows = (np.diff(ticks[rows]) == 0) & (np.diff(lane) == 0)
+    spacing_m = np.diff(tracks.s_m[rows])[follows]
+    rest_m = lattice.speed_mps * tracks.t_s[rows] + lattice.pitch_m * tracks.column[rows]
+    off_m = np.abs(tracks.s_m[rows] - rest_m)
+    return LatticeSpacing(
+        least_m=round(float(spacing_m.min()), 3) if len(spacing_m) else None,
+        pairs=len(spacing_m),
+        worst_off_m=round(float(off_m.max()), 3) if len(off_m) else None,
+    )
+
+
+def _settled(tracks: Tracks, ticks: Ints, scenario: Scenario) -> Bools:
+    """Return whether each row is a lattice point of a vehicle at rest in a cell."""
+    formation, tick_s = scenario.formation, scenario.runtime.tick_s
+    first = np.zeros(len(ticks), dtype=np.bool_)
+    first[tracks.starts[:-1][np.diff(tracks.starts) > 0]] = True
+    changed = np.zeros(len(ticks), dtype=np.bool_)
+    changed[1:] = (np.diff(tracks.column) != 0) | (np.diff(tracks.lane) != 0)
+    changed &= ~first
+    about_to_move = np.append(changed[1:], False)[: len(ticks)]
+    shortest_s, longest_s = scenario.cycles_s
+    period = round(shortest_s / tick_s)
+    at_end: Bools = ticks % period == _slot_phase(ticks[changed], period)
+    at_end |= np.isin(ticks, ticks[about_to_move])
+    on_road_s = tracks.t_s - _since(tracks.t_s, first)
+    held_s = tracks.t_s - _since(tracks.t_s, first | changed)
+    least_s = np.where(about_to_move, shortest_s, longest_s) - formation.slack_s
+    rests: Bools = held_s >= least_s - 0.5 * tick_s
+    rests &= on_road_s >= formation.settle_s - 0.5 * tick_s
+    rests &= tracks.column != OFF_LATTICE
+    return rests & at_end
+
+
+def _slot_phase(changes: Ints, period: int) -> int:
+    """Return at which tick of a period slots end: where most cells change in the tick after.
+
+    A vehicle shows its next cell in the first tick of its move.
+    """
+    if not len(changes):
+        return 0
+    return int(np.bincount((changes - 1) % period, minlength=period).argmax())
+
+
+def _since(t_s: Floats, marks: Bools) -> Floats:
+    """Return for each row the time of the last mark up to it; the first row is one."""
+    places = np.maximum.accumulate(np.where(marks, np.arange(len(t_s)), 0))
+    return np.asarray(t_s[places])

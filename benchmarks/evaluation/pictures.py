@@ -1,0 +1,143 @@
+"""The figures of docs/EVALUATION.md, from the runs of a sweep."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final
+
+from attrs import frozen
+
+from evaluation.evidence import Picture
+from evaluation.programme import LABELS, VOLUMES
+from evaluation.statements import PAPER_STRETCH_M, PAPER_VOLUMES
+from laneweave.launch.report.comparison_figures import draw_flows, draw_speeds, draw_travel_times
+from laneweave.launch.report.distribution_figures import draw_spacings
+from laneweave.launch.report.distributions import Counts, count
+from laneweave.launch.report.runs import Comparison, Run
+from laneweave.launch.report.snapshots import road_snapshots
+from laneweave.launch.report.trajectories import read_tracks
+
+DPI: Final = 110
+SHOWN_VOLUME: Final = 1600.0
+"""The paper's highest, in vehicles/(lane h)."""
+
+
+@frozen
+class _Plan:
+    """A figure and the runs that it shows."""
+
+    picture: Picture
+    labels: tuple[str, ...]
+    volumes: tuple[float, ...]
+    draw: Callable[[Comparison, Path, int], None]
+    traced: bool = False
+    """It needs trajectories."""
+
+
+def draw_pictures(runs: Sequence[Run], folder: Path) -> tuple[Picture, ...]:
+    """Draw every figure for which there are runs, and return those that were drawn.
+
+    Args:
+        runs: of the sweep; failed ones are left out.
+        folder: where the pictures go.
+    """
+    drawn = []
+    for plan in _PLANS:
+        chosen = Comparison.of(
+            run
+            for run in runs
+            if run.label in plan.labels
+            and run.volume_veh_per_lane_h in plan.volumes
+            and (run.has_trajectories or not plan.traced)
+        )
+        if chosen.runs:
+            plan.draw(chosen, folder / plan.picture.name, DPI)
+            drawn.append(plan.picture)
+    return tuple(drawn)
+
+
+def _draw_snapshots(comparison: Comparison, out: Path, dpi: int) -> None:
+    road_snapshots(comparison.runs[0].folder, out, stretch_m=PAPER_STRETCH_M, dpi=dpi)
+
+
+def _draw_spacings(comparison: Comparison, out: Path, dpi: int) -> None:
+    counted: dict[tuple[str, float], Counts] = {}
+    for label in comparison.labels:
+        run = comparison.shown(label, SHOWN_VOLUME)
+        if run is not None:
+            counted[label, SHOWN_VOLUME] = count(read_tracks(run.folder), run.scenario)
+    draw_spacings(counted, comparison.runs[0].scenario, out, dpi)
+
+
+def _snapshots(label: str, what: str) -> _Plan:
+    picture = Picture(
+        f"evaluation-road-{label}.png",
+        f"Four strips of road from 500 to 800 m, {label}",
+        f"The road from 500 to 800 m at 1600 veh/(lane h), {what}: four instants, 4 s apart. "
+        "Colours are preferred lanes; the faster, the lighter.",
+    )
+    return _Plan(picture, (label,), (SHOWN_VOLUME,), _draw_snapshots, traced=True)
+
+
+_PLANS: Final = (
+    _Plan(
+        Picture(
+            "evaluation-paper.png",
+            "Box plots of travel times at the paper's volumes",
+            "Travel times at the paper's volumes: the default formations and the paper's, both of "
+            "at most six, beside two readings of its rules. Boxes: quartiles over the vehicles of "
+            "all seeds; lines: means. The axis is broken where a method jams.",
+        ),
+        ("formations", "paper-6", "rule", "rule-net"),
+        PAPER_VOLUMES,
+        draw_travel_times,
+    ),
+    _Plan(
+        Picture(
+            "evaluation-all.png",
+            "Box plots of travel times at all volumes",
+            "Travel times up to 2400 veh/(lane h), of the methods that do not congest.",
+        ),
+        ("formations", "paper-12", "rolling", "lc2013"),
+        VOLUMES,
+        draw_travel_times,
+    ),
+    _Plan(
+        Picture(
+            "evaluation-flows.png",
+            "Throughput and share on the preferred lane against the demand",
+            "Throughput and share on the preferred lane. Dots are runs, bars standard deviations.",
+        ),
+        LABELS,
+        VOLUMES,
+        draw_flows,
+    ),
+    _Plan(
+        Picture(
+            "evaluation-speeds.png",
+            "Heat maps of mean speed over time and position",
+            "Mean speed over space and time, seed 1. Dashed: lane sorting begins.",
+        ),
+        ("formations", "paper-6", "rule", "rule-net"),
+        PAPER_VOLUMES[1:],
+        draw_speeds,
+        traced=True,
+    ),
+    _snapshots("formations", "formations of at most six"),
+    _snapshots("paper-6", "the paper's formations of at most six"),
+    _snapshots("rule", "the rules, d_R front to front"),
+    _snapshots("rule-net", "the rules, d_R as a net gap"),
+    _Plan(
+        Picture(
+            "evaluation-spacing.png",
+            "Distributions of spacing and time headway at 1600",
+            "Spacing and time headway at 1600 veh/(lane h), front bumper to front bumper. Dashed: "
+            "d_F, and the time that it takes at v_F.",
+        ),
+        ("formations", "rolling", "rule", "lc2013"),
+        (SHOWN_VOLUME,),
+        _draw_spacings,
+        traced=True,
+    ),
+)

@@ -1,0 +1,295 @@
+"""From the runs of a sweep to one row for each label and volume."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+from attrs import frozen
+
+from evaluation.lattice_points import lattice_spacing
+from laneweave.launch.observe.column_owners import PLANNED, read_events
+from laneweave.launch.report.runs import Run
+from laneweave.launch.report.trajectories import Tracks, read_tracks
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.sim_bridge.recording.recorder import WARM_UP_S
+
+SLOW_BIN_M: Final = 50.0
+SLOW_SHARE: Final = 0.5
+"""Where traffic is slower than this share of v_F on average, it is congested."""
+LIMIT_ERROR: Final = 0.001
+"""Summaries are rounded to this."""
+STREAM_PLANNED: Final = "stream-planned"
+"""Event of a plan of the rolling operation."""
+SOLVER: Final = {PLANNED: "branching", STREAM_PLANNED: "stream"}
+"""What has planned, by the kind of event, where the event does not say it."""
+Key = tuple[str, float]
+"""(label, volume in vehicles/(lane h))."""
+
+
+@frozen
+class Traced:
+    """What trajectories say, of one run or of several."""
+
+    runs: int
+    lattice_least_m: float | None
+    """Least spacing at lattice points; None: no lattice, or never two on a lane."""
+    lattice_pairs: int
+    lattice_worst_off_m: float | None
+    """Greatest distance from the own cell there."""
+    lattice_kept: bool
+    """Whether no spacing there is below the pitch, but for the tolerance."""
+    slow_m: tuple[float, float] | None
+    """Congested stretch of road, from and to: mean speed below half of v_F; None: nowhere."""
+    slowest_mps: float | None
+    """Least mean speed of a bin of the road; None: nobody drove."""
+
+
+@frozen
+class PlanningTimes:
+    """How long a solver has taken, over the plans of all seeds."""
+
+    solver: str
+    plans: int
+    p50_ms: float
+    p95_ms: float
+    max_ms: float
+
+
+@frozen
+class PointRow:
+    """A label at a volume, over all seeds that came to their end; None: it cannot be told."""
+
+    label: str
+    volume_veh_per_lane_h: float
+    seeds: tuple[int, ...]
+    """Of the runs whose vehicles have all left: the figures are theirs."""
+    failed: tuple[tuple[int, str], ...]
+    """(seed, why) of runs that failed; an overlap alone does not keep a run out of the figures."""
+    demanded: int
+    left: int
+    on_preferred_lane: int
+    travel_s: float | None
+    """Mean over the seeds of the mean travel time from the demanded arrival."""
+    travel_sd_s: float | None
+    """Standard deviation of that over the seeds."""
+    travel_p95_s: float | None
+    """Mean over the seeds of the 95th percentile."""
+    throughput_veh_per_lane_h: float | None
+    """Mean over the seeds."""
+    overlaps: int
+    """Pairs of bodies, over all seeds."""
+    emergency_brakes: int
+    """Over all seeds."""
+    min_gap_m: float | None
+    min_headway_s: float | None
+    min_accel_mps2: float | None
+    max_accel_mps2: float | None
+    within_limits: bool
+    """Whether all accelerations are within the vehicles' limits."""
+    largest_formation: int
+    planning_p95_ms: float | None
+    """Worst over the seeds."""
+    traced: Traced | None
+    """What the trajectories say; None: none were kept."""
+    plans: int = 0
+    """Over all seeds, as the next ones."""
+    fallbacks: int = 0
+    """Plans of the fallback planner."""
+    planning: tuple[PlanningTimes, ...] = ()
+
+    @property
+    def on_lane_percent(self) -> float | None:
+        """Share of those who left that left on their preferred lane."""
+        return 100.0 * self.on_preferred_lane / self.left if self.left else None
+
+
+def point_rows(runs: Iterable[Run]) -> list[PointRow]:
+    """Return the rows of all labels and volumes, in the order of labels.
+
+    Raises:
+        BadInputError: runs cannot stand side by side: other roads or demands, or one twice.
+        OSError, ValueError, KeyError: a run's files cannot be read.
+    """
+    listed = sorted(runs, key=lambda run: run.order)
+    check_comparable(listed)
+    groups: dict[Key, list[Run]] = {}
+    for run in listed:
+        groups.setdefault((run.label, run.volume_veh_per_lane_h), []).append(run)
+    return [_row(key, group) for key, group in groups.items()]
+
+
+def check_comparable(runs: Sequence[Run]) -> None:
+    """Check that runs have the same road and demand, but for volume and seed, each run once.
+
+    Raises:
+        BadInputError: they do not.
+    """
+    seen: set[tuple[str, float, int]] = set()
+    for run in runs:
+        first, own = runs[0].scenario, run.scenario
+        if own.road != first.road:
+            raise BadInputError(str(run.folder), own.road, f"{first.road}, as in the other runs")
+        if own.demand.duration_s != first.demand.duration_s:
+            raise BadInputError(
+                str(run.folder),
+                own.demand.duration_s,
+                f"demand.duration_s = {first.demand.duration_s:g}, as in the other runs",
+            )
+        key = (run.label, run.volume_veh_per_lane_h, own.seed)
+        if key in seen:
+            raise BadInputError(str(run.folder), key, "each label, volume and seed only once")
+        seen.add(key)
+
+
+def _row(key: Key, runs: Sequence[Run]) -> PointRow:
+    complete = [run for run in runs if run.summary.get("ending") == "complete"]
+    scenario = runs[0].scenario
+
+    def values(*way: str) -> list[float]:
+        found = (_number(run.summary, way) for run in complete)
+        return [value for value in found if value is not None]
+
+    times_s = values("travel_time_s", "mean")
+    low = min(values("safety", "min_accel_mps2"), default=None)
+    high = max(values("safety", "max_accel_mps2"), default=None)
+    return PointRow(
+        label=key[0],
+        volume_veh_per_lane_h=key[1],
+        seeds=tuple(run.scenario.seed for run in complete),
+        failed=tuple((run.scenario.seed, run.reason) for run in runs if run.reason),
+        demanded=int(sum(values("vehicles", "demanded"))),
+        left=int(sum(values("vehicles", "left"))),
+        on_preferred_lane=int(sum(values("vehicles", "on_preferred_lane"))),
+        travel_s=_mean(times_s),
+        travel_sd_s=round(float(np.std(times_s, ddof=1)), 3) if len(times_s) > 1 else None,
+        travel_p95_s=_mean(values("travel_time_s", "p95")),
+        throughput_veh_per_lane_h=_mean(values("throughput_veh_per_lane_h")),
+        overlaps=int(sum(values("safety", "overlaps"))),
+        emergency_brakes=int(sum(values("safety", "emergency_brakes"))),
+        min_gap_m=min(values("safety", "min_gap_m"), default=None),
+        min_headway_s=min(values("safety", "min_headway_s"), default=None),
+        min_accel_mps2=low,
+        max_accel_mps2=high,
+        within_limits=within_limits(low, high, scenario),
+        largest_formation=int(max(values("planning", "largest_formation"), default=0)),
+        planning_p95_ms=max(values("planning", "solve_ms", "p95"), default=None),
+        traced=_traced([run for run in complete if run.has_trajectories]),
+        plans=int(sum(values("planning", "plans"))),
+        fallbacks=int(sum(values("planning", "fallbacks"))),
+        planning=planning_times(complete),
+    )
+
+
+def planning_times(runs: Iterable[Run]) -> tuple[PlanningTimes, ...]:
+    """Return how long each solver has taken in some runs, by their events.
+
+    Raises:
+        OSError, ValueError, TypeError: events cannot be read.
+    """
+    found: dict[str, list[float]] = {}
+    for run in runs:
+        for event in read_events(run.folder, *SOLVER):
+            solve_ms = event.get("solve_ms")
+            if event.get("role") == "coordinator" and isinstance(solve_ms, (int, float)):
+                solver = str(event.get("solver") or SOLVER[event["kind"]])
+                found.setdefault(solver, []).append(float(solve_ms))
+    return tuple(
+        PlanningTimes(solver, len(times_ms), *(round(float(one), 2) for one in _spread(times_ms)))
+        for solver, times_ms in sorted(found.items())
+    )
+
+
+def _spread(values: Sequence[float]) -> tuple[float, float, float]:
+    """Return the median, the 95th percentile and the greatest value."""
+    p50, p95 = np.percentile(values, [50.0, 95.0])
+    return float(p50), float(p95), max(values)
+
+
+def within_limits(low: float | None, high: float | None, scenario: Scenario) -> bool:
+    """Tell whether accelerations are within the limits of the vehicles.
+
+    Args:
+        low: hardest braking in m/s2; None: nobody drove.
+        high: greatest acceleration in m/s2.
+        scenario: what was run.
+    """
+    vehicle = scenario.vehicle
+    return (low is None or low >= vehicle.min_accel_mps2 - LIMIT_ERROR) and (
+        high is None or high <= vehicle.max_accel_mps2 + LIMIT_ERROR
+    )
+
+
+def _traced(runs: Sequence[Run]) -> Traced | None:
+    """Return what the trajectories of some runs say together."""
+    found = [trace(read_tracks(run.folder), run.scenario) for run in runs]
+    if not found:
+        return None
+    spacings = [one.lattice_least_m for one in found if one.lattice_least_m is not None]
+    offs = [one.lattice_worst_off_m for one in found if one.lattice_worst_off_m is not None]
+    slow = [one.slow_m for one in found if one.slow_m is not None]
+    speeds = [one.slowest_mps for one in found]
+    return Traced(
+        runs=len(found),
+        lattice_least_m=min(spacings, default=None),
+        lattice_pairs=sum(one.lattice_pairs for one in found),
+        lattice_worst_off_m=max(offs, default=None),
+        lattice_kept=all(one.lattice_kept for one in found),
+        slow_m=(min(one[0] for one in slow), max(one[1] for one in slow)) if slow else None,
+        slowest_mps=min((mps for mps in speeds if mps is not None), default=None),
+    )
+
+
+def trace(tracks: Tracks, scenario: Scenario) -> Traced:
+    """Return what the trajectories of one run say.
+
+    Args:
+        tracks: its trajectories.
+        scenario: what was run.
+    """
+    spacing = lattice_spacing(tracks, scenario)
+    slow_m, slowest_mps = slow_stretch(tracks, scenario)
+    return Traced(
+        runs=1,
+        lattice_least_m=spacing.least_m,
+        lattice_pairs=spacing.pairs,
+        lattice_worst_off_m=spacing.worst_off_m,
+        lattice_kept=spacing.keeps(scenario.formation.gap_m),
+        slow_m=slow_m,
+        slowest_mps=slowest_mps,
+    )
+
+
+def slow_stretch(
+    tracks: Tracks, scenario: Scenario
+) -> tuple[tuple[float, float] | None, float | None]:
+    """Return the congested stretch of road (from m, to m) and the least mean speed in m/s.
+
+    Speeds are means over bins of the road, from the end of the warm-up to the last arrival.
+    """
+    steady = (tracks.t_s >= WARM_UP_S) & (tracks.t_s <= scenario.demand.duration_s)
+    bins = max(1, round(scenario.road.length_m / SLOW_BIN_M))
+    edges_m = np.linspace(0.0, scenario.road.length_m, bins + 1)
+    count, _ = np.histogram(tracks.s_m[steady], edges_m)
+    total, _ = np.histogram(tracks.s_m[steady], edges_m, weights=tracks.speed_mps[steady])
+    driven = np.flatnonzero(count)
+    if not len(driven):
+        return None, None
+    mean_mps = total[driven] / count[driven]
+    slow = driven[mean_mps < SLOW_SHARE * scenario.formation.speed_mps]
+    stretch = (float(edges_m[slow[0]]), float(edges_m[slow[-1] + 1])) if len(slow) else None
+    return stretch, round(float(mean_mps.min()), 2)
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return round(float(np.mean(values)), 3) if values else None
+
+
+def _number(summary: Mapping[str, Any], way: Sequence[str]) -> float | None:
+    """Return a number of a summary; None where a method has none."""
+    found: Any = summary
+    for key in way:
+        found = found.get(key) if isinstance(found, Mapping) else None
+    return float(found) if isinstance(found, (int, float)) else None

@@ -1,0 +1,199 @@
+"""The generated parts of docs/EVALUATION.md as Markdown; what is missing says so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from evaluation.evidence import Evidence
+from evaluation.goals import goals_table
+from evaluation.markdown import MISSING, NOT_RUN, markdown, number
+from evaluation.points import PointRow
+from evaluation.programme import FORMATIONS, LABELS, SEEDS, VOLUMES, planned
+from evaluation.statements import statements_table
+
+
+def document_parts(evidence: Evidence) -> dict[str, str]:
+    """Return each generated part of the document by its name."""
+    return {
+        "evaluation runs": _runs_table(evidence),
+        "evaluation travel times": _by_volume(evidence, _travel_time),
+        "evaluation lanes": _by_volume(evidence, _lanes),
+        "evaluation margins": _by_volume(evidence, _margins),
+        "evaluation brakes": _by_volume(evidence, _brakes),
+        "evaluation throughput": _by_volume(evidence, _throughput),
+        "evaluation planning": _planning(evidence),
+        "evaluation lattice": _lattice(evidence),
+        "evaluation statements": statements_table(evidence),
+        "evaluation goals": goals_table(evidence),
+        "evaluation agreement": _agreement(evidence),
+        "evaluation factors": _factors(evidence),
+        "evaluation costs": _costs(evidence),
+        "evaluation pictures": _pictures(evidence),
+    }
+
+
+def _by_volume(evidence: Evidence, text: Callable[[PointRow], str]) -> str:
+    """Return a table with a row for each volume and a column for each label."""
+    found = evidence.by_key
+    rows = [
+        [
+            f"{volume:g}",
+            *(_cell(label, volume, found.get((label, volume)), text) for label in LABELS),
+        ]
+        for volume in VOLUMES
+    ]
+    return markdown(["veh/(lane h)", *(f"`{label}`" for label in LABELS)], rows)
+
+
+def _runs_table(evidence: Evidence) -> str:
+    """Return how many runs there are, and how long they are."""
+    setting = evidence.setting
+    arrivals = MISSING if setting is None else f"{setting.duration_s:g} s"
+    return f"{_by_volume(evidence, _runs)}\n\nArrivals in each run: {arrivals}."
+
+
+def _cell(label: str, volume: float, row: PointRow | None, text: Callable[[PointRow], str]) -> str:
+    if row is None:
+        return MISSING if planned(label, volume) else NOT_RUN
+    if text is not _runs and not row.seeds:
+        return "failed"
+    return text(row)
+
+
+def _runs(row: PointRow) -> str:
+    count = f"{len(row.seeds)}"
+    if len(row.seeds) < len(SEEDS):
+        count += f" of {len(SEEDS)}"
+    return count + (f", {len(row.failed)} failed" if row.failed else "")
+
+
+def _travel_time(row: PointRow) -> str:
+    return f"{number(row.travel_s, 2)} ({number(row.travel_p95_s, 1)})"
+
+
+def _lanes(row: PointRow) -> str:
+    off = row.left - row.on_preferred_lane
+    share = "100" if not off else number(row.on_lane_percent, 3)
+    return f"{share} %" + (f" ({off} off)" if off else "")
+
+
+def _margins(row: PointRow) -> str:
+    figures = (
+        number(row.min_gap_m, 2),
+        number(row.min_headway_s, 2),
+        number(row.min_accel_mps2, 1),
+    )
+    text = " / ".join(figures)
+    return text + (f", **{row.overlaps} overlaps**" if row.overlaps else "")
+
+
+def _brakes(row: PointRow) -> str:
+    return number(100.0 * row.emergency_brakes / row.demanded, 1) if row.demanded else "-"
+
+
+def _throughput(row: PointRow) -> str:
+    return number(row.throughput_veh_per_lane_h, 0)
+
+
+def _planning(evidence: Evidence) -> str:
+    """Return the table of planning times by label, volume and solver."""
+    rows = [
+        [
+            f"`{row.label}`",
+            f"{row.volume_veh_per_lane_h:g}",
+            f"`{one.solver}`",
+            f"{one.plans:,}",
+            *(number(value, 1) for value in (one.p50_ms, one.p95_ms, one.max_ms)),
+            f"{row.fallbacks} of {row.plans:,}",
+        ]
+        for row in evidence.points
+        if row.label in FORMATIONS
+        for one in row.planning
+    ]
+    headings = [
+        "", "veh/(lane h)", "solver", "plans", "p50 (ms)", "p95 (ms)", "max (ms)", "fallbacks",
+    ]  # fmt: skip
+    return markdown(headings, rows)
+
+
+def _lattice(evidence: Evidence) -> str:
+    """Return the table of spacings at lattice points and of accelerations."""
+    rows = []
+    for row in evidence.points:
+        if row.traced is None or row.traced.lattice_least_m is None:
+            continue
+        traced = row.traced
+        rows.append(
+            [
+                f"`{row.label}`",
+                f"{row.volume_veh_per_lane_h:g}",
+                f"{traced.runs}",
+                f"{traced.lattice_pairs:,}",
+                f"{number(traced.lattice_least_m, 2)} m",
+                f"{number(traced.lattice_worst_off_m, 2)} m",
+                "holds" if traced.lattice_kept else "**broken**",
+                f"{number(row.min_accel_mps2, 2)} to {number(row.max_accel_mps2, 2)} m/s2",
+                "holds" if row.within_limits else "**broken**",
+            ]
+        )
+    headings = [
+        "", "veh/(lane h)", "runs looked at", "spacings", "least", "worst place in a cell", "d_F",
+        "accelerations of all runs", "limits",
+    ]  # fmt: skip
+    return markdown(headings, rows)
+
+
+def _agreement(evidence: Evidence) -> str:
+    rows = [
+        [
+            f"{row.volume_veh_per_lane_h:g}",
+            f"{row.duration_s:g} s",
+            "-" if row.processes is None else f"{row.processes}",
+            f"{row.agreement.vehicles}",
+            f"{row.agreement.missing}",
+            f"{row.agreement.other_lane}",
+            f"{row.agreement.worst_s:.3f} s",
+            f"{row.overlaps}",
+            "agrees" if row.agreement.holds else "**differs**",
+        ]
+        for row in evidence.agreements
+    ]
+    headings = [
+        "veh/(lane h)", "arrivals", "processes", "vehicles", "in one run only", "on another lane",
+        "travel times differ by at most", "overlaps", "",
+    ]  # fmt: skip
+    return markdown(headings, rows)
+
+
+def _factors(evidence: Evidence) -> str:
+    rows = [
+        [
+            f"`{row.command}`",
+            "-" if row.processes is None else f"{row.processes}",
+            f"{row.vehicles_peak}",
+            f"{row.real_time_factor:.2f}",
+            f"{number(row.tick_p50_ms, 1)} / {number(row.tick_p99_ms, 1)} ms",
+        ]
+        for row in evidence.factors
+    ]
+    headings = ["", "processes", "vehicles, at most", "real-time factor", "tick p50 / p99"]
+    return markdown(headings, rows)
+
+
+def _costs(evidence: Evidence) -> str:
+    rows = [
+        [
+            f"{row.road_m / 1000:g} km",
+            f"`{row.command}`",
+            f"{row.vehicles_peak}",
+            f"{row.cost_ms:.3f} ms",
+        ]
+        for row in evidence.costs
+    ]
+    headings = ["road", "", "vehicles, at most", "per vehicle and tick"]
+    return markdown(headings, rows)
+
+
+def _pictures(evidence: Evidence) -> str:
+    parts = [f"![{one.alt}](images/{one.name})\n\n{one.caption}" for one in evidence.pictures]
+    return "\n\n".join(parts) or "No figures have been drawn yet."

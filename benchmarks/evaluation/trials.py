@@ -1,0 +1,260 @@
+"""Single runs beside the sweep, each a `laneweave run` in processes of its own.
+
+zenoh     points of the sweep over Zenoh, one process per vehicle, each beside a simulated run
+speed     the same demand in three deployments, for real-time factors
+length    a short and a long road, for the cost of a vehicle
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from attrs import frozen
+
+from evaluation.agreement import Agreement, agreement, read_trips
+from laneweave.launch.drawing.figures import scenario_of
+from laneweave.launch.sweep.execution import StoppedError, follow
+from laneweave.launch.sweep.folder import read_summary
+from laneweave.protocol.errors import CommandFailedError
+
+ZENOH_VOLUMES: Final = (1000, 1600, 2000)
+"""Those that are repeated over Zenoh, in vehicles/(lane h)."""
+TIMEOUT_S: Final = 3600.0
+"""A run that takes longer is ended."""
+COMMAND_FILE: Final = "command.json"
+
+
+@frozen
+class Trial:
+    """One run."""
+
+    part: str
+    name: str
+    options: tuple[str, ...]
+    """Of `laneweave run`."""
+    ending: str = "complete"
+    """As in summary.json; a run with another one has failed."""
+    shares: bool = False
+    """It needs one core only, its times do not count, and others like it may run beside it."""
+
+    @property
+    def command(self) -> str:
+        """What a person would type, but for the folder."""
+        return shlex.join(("laneweave", "run", *self.options))
+
+
+@frozen
+class AgreementRow:
+    """A point over Zenoh beside the same point simulated."""
+
+    volume_veh_per_lane_h: float
+    seed: int
+    duration_s: float
+    overlaps: int
+    """Over Zenoh."""
+    processes: int | None
+    agreement: Agreement
+
+
+@frozen
+class FactorRow:
+    """How fast a deployment runs."""
+
+    trial: str
+    command: str
+    processes: int | None
+    vehicles_peak: int
+    real_time_factor: float
+    """Over the whole run, in which the road fills and empties."""
+    tick_p50_ms: float | None
+    tick_p99_ms: float | None
+
+
+@frozen
+class CostRow:
+    """What a vehicle costs on a road."""
+
+    trial: str
+    command: str
+    road_m: float
+    vehicles_peak: int
+    cost_ms: float
+    """Time per vehicle and tick, everything included."""
+
+
+def _demand(volume: int, duration_s: int, *more: str) -> tuple[str, ...]:
+    return ("--volume", f"{volume}", "--seed", "1", "--duration", f"{duration_s}", *more)
+
+
+SIMULATED: Final = ("--transport", "simulated")
+TRIALS: Final = (
+    *(
+        trial
+        for volume in ZENOH_VOLUMES
+        for trial in (
+            Trial("zenoh", f"zenoh-{volume}", _demand(volume, 120)),
+            Trial("zenoh", f"simulated-{volume}", _demand(volume, 120, *SIMULATED), shares=True),
+        )
+    ),
+    Trial("speed", "zenoh", _demand(1600, 300)),
+    Trial("speed", "zenoh-50", _demand(1600, 300, "--vehicles-per-process", "50")),
+    Trial("speed", "simulated", _demand(1600, 300, *SIMULATED)),
+    # Ended when the road has been full for a while: nobody has to wait until it is empty again.
+    Trial("length", "long", ("benchmarks/long-road.toml", *SIMULATED), ending="limit"),
+    Trial("length", "short", _demand(1800, 600, "--operation", "rolling", *SIMULATED)),
+)
+
+
+def run_trial(trial: Trial, out: Path, root: Path, stopped: Callable[[], bool]) -> None:
+    """Run a trial unless it is there already, whole and with the same options.
+
+    Args:
+        trial: the run.
+        out: the evaluation's folder.
+        root: where the names of scenario files begin.
+        stopped: whether the evaluation has been ended meanwhile.
+
+    Raises:
+        CommandFailedError: the run did not come to its end, or took too long and was ended.
+        StoppedError: the evaluation was ended, and the run with it.
+    """
+    folder = out.resolve() / trial.part / trial.name
+    if is_finished(trial, out):
+        return
+    if folder.exists():
+        shutil.rmtree(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    program = str(Path(sys.executable).with_name("laneweave"))
+    with tempfile.TemporaryFile() as words:
+        process = subprocess.Popen(  # noqa: S603 - this package, with options of its own
+            [program, "run", *trial.options, "--no-progress", "--out", str(folder)],
+            cwd=root,
+            stdin=subprocess.DEVNULL,
+            stdout=words,
+            stderr=words,
+            process_group=0,
+        )
+        end_s = time.monotonic() + TIMEOUT_S
+        try:
+            follow(process, trial.name, lambda: stopped() or time.monotonic() > end_s)
+        except StoppedError as error:
+            if stopped():
+                raise
+            late = f"{trial.command}: not over after {TIMEOUT_S:g} s"
+            raise CommandFailedError(late) from error
+        words.seek(0)
+        said = " ".join(words.read().decode(errors="replace").split())
+    summary = read_summary(folder) or {}
+    if summary.get("ending") != trial.ending:
+        raise CommandFailedError(f"{trial.command}: status {process.returncode}: {said[-400:]}")
+    (folder / COMMAND_FILE).write_text(json.dumps(trial.options), encoding="utf-8")
+
+
+def is_finished(trial: Trial, out: Path) -> bool:
+    """Tell whether a trial is there."""
+    path = out / trial.part / trial.name / COMMAND_FILE
+    try:
+        return tuple(json.loads(path.read_text(encoding="utf-8"))) == trial.options
+    except (OSError, ValueError):
+        return False
+
+
+def agreement_rows(out: Path) -> list[AgreementRow]:
+    """Return how far runs over Zenoh agree with simulated ones, of those that are there.
+
+    Raises:
+        OSError, ValueError, KeyError: a run's files cannot be read.
+    """
+    rows = []
+    for volume in ZENOH_VOLUMES:
+        names = (f"zenoh-{volume}", f"simulated-{volume}")
+        if not all(is_finished(_trial("zenoh", name), out) for name in names):
+            continue
+        real, simulated = (out / "zenoh" / name for name in names)
+        summary, scenario = _summary(real), scenario_of(real / "trips.parquet")
+        tick_s = scenario.runtime.tick_s
+        rows.append(
+            AgreementRow(
+                volume_veh_per_lane_h=float(volume),
+                seed=int(summary["seed"]),
+                duration_s=scenario.demand.duration_s,
+                overlaps=int(summary["safety"]["overlaps"]),
+                processes=summary["runtime"]["processes"],
+                agreement=agreement(read_trips(real), read_trips(simulated), tick_s),
+            )
+        )
+    return rows
+
+
+def factor_rows(out: Path) -> list[FactorRow]:
+    """Return how fast the deployments run, of those that are there.
+
+    Raises:
+        OSError, ValueError, KeyError: a run's files cannot be read.
+    """
+    rows = []
+    for trial in _finished("speed", out):
+        summary = _summary(out / trial.part / trial.name)
+        runtime = summary["runtime"]
+        rows.append(
+            FactorRow(
+                trial=trial.name,
+                command=trial.command,
+                processes=runtime["processes"],
+                vehicles_peak=int(summary["vehicles"]["peak"]),
+                real_time_factor=float(runtime["real_time_factor"]),
+                tick_p50_ms=runtime["tick_ms"]["p50"],
+                tick_p99_ms=runtime["tick_ms"]["p99"],
+            )
+        )
+    return rows
+
+
+def cost_rows(out: Path) -> list[CostRow]:
+    """Return what a vehicle costs on each road, of those that are there.
+
+    Raises:
+        OSError, ValueError, KeyError: a run's files cannot be read.
+    """
+    rows = []
+    for trial in _finished("length", out):
+        folder = out / trial.part / trial.name
+        summary = _summary(folder)
+        ticks = pq.read_table(folder / "ticks.parquet", columns=["on_road"])
+        driven = pc.sum(ticks["on_road"]).as_py() or 0
+        rows.append(
+            CostRow(
+                trial=trial.name,
+                command=trial.command,
+                road_m=float(summary["road_m"]),
+                vehicles_peak=int(summary["vehicles"]["peak"]),
+                cost_ms=round(1e3 * summary["runtime"]["wall_s"] / max(1, driven), 4),
+            )
+        )
+    return rows
+
+
+def _finished(part: str, out: Path) -> list[Trial]:
+    return [trial for trial in TRIALS if trial.part == part and is_finished(trial, out)]
+
+
+def _trial(part: str, name: str) -> Trial:
+    return next(trial for trial in TRIALS if (trial.part, trial.name) == (part, name))
+
+
+def _summary(folder: Path) -> dict[str, Any]:
+    summary = read_summary(folder)
+    if summary is None:
+        raise ValueError(f"{folder}: summary.json is missing or not whole")
+    return summary

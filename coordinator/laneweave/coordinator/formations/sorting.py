@@ -1,0 +1,246 @@
+"""Lane sorting of one formation, or of joined ones: from promises to moves.
+
+Before it sorts, a formation may take on other structures; then any vehicle may have any place.
+
+The grid is the blocks of the formations. Vehicles that no agent drives block their cells. When the
+whole sorting is impossible, one vehicle at a time is excused from reaching its lane, so that one
+vehicle in a corner does not keep all others from theirs.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Collection, Iterator, Mapping
+from itertools import islice
+from typing import Any
+
+from attrs import evolve, frozen
+
+from laneweave.coordinator.formations.groups import Numbers
+from laneweave.coordinator.formations.targets import placements
+from laneweave.coordinator.planning import PlanRequest, PlanResponse, Weights, checked_plan
+from laneweave.coordinator.planning.budget import Clock
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.lattice import Cell, Move
+from laneweave.protocol.scenario.tables import DrivingStructure, Scenario
+from laneweave.protocol.wire.messages import Name
+
+MOST_PLACEMENTS = 6
+"""Structures that are tried where the first one takes too many steps."""
+SHORTEST_S = 0.05
+"""Shortest deadline of one attempt."""
+
+
+@frozen
+class SortingTask:
+    """What is to be sorted."""
+
+    numbers: Numbers
+    """The formations whose blocks may be used."""
+    hold_cells: Mapping[Name, Cell]
+    """Lattice cell of each member, in the order of the answer."""
+    preferred_lanes: Mapping[Name, int]
+    """Lane that each member needs."""
+    unattended: Collection[Name]
+    """Members that hold whatever is planned."""
+    scenario: Scenario
+    """Mode, conflict kinds, lattice."""
+    deadline_s: float
+    """For all attempts together."""
+    steps: int = 1_000_000
+    """How many steps the road has room for; where a plan has more, other targets are tried."""
+    deserted: Numbers = ()
+    """Blocks of `numbers` in which only the cells that members hold may be used."""
+    structure: DrivingStructure | None = None
+    """What the vehicles should form, wherever each of them is in it; None: they sort."""
+
+    @property
+    def columns(self) -> range:
+        """Columns from the rear of the last block to the front of the first one."""
+        lattice = self.scenario.lattice
+        return range(
+            lattice.block_range(self.numbers[-1]).start, lattice.block_range(self.numbers[0]).stop
+        )
+
+    @property
+    def movers(self) -> dict[Name, Cell]:
+        """Grid cell of each member that can be moved."""
+        first = self.columns.start
+        return {
+            name: (column - first, lane)
+            for name, (column, lane) in self.hold_cells.items()
+            if name not in self.unattended
+        }
+
+    @property
+    def blocked(self) -> tuple[Cell, ...]:
+        """Grid cells that paths must avoid.
+
+        These are the cells of members without an agent, those between the blocks, and those of
+        deserted blocks.
+        """
+        first, lattice = self.columns.start, self.scenario.lattice
+        usable, held_cells = {*self.numbers} - {*self.deserted}, set(self.hold_cells.values())
+        foreign = [
+            (column - first, lane)
+            for column in self.columns
+            if lattice.block_of(column) not in usable
+            for lane in range(lattice.lanes)
+            if (column, lane) not in held_cells
+        ]
+        held = [
+            (self.hold_cells[name][0] - first, self.hold_cells[name][1]) for name in self.unattended
+        ]
+        return tuple(sorted({*foreign, *held}))
+
+
+@frozen
+class Sorting:
+    """The result of a sorting."""
+
+    response: PlanResponse | None
+    """Of the planner; None: there is nobody to move."""
+    moves: dict[Name, tuple[Move, ...]]
+    """Moves of every member, on the lattice."""
+    out_of_reach: tuple[Name, ...]
+    """Members that do not get to their lanes."""
+    short_of_room: bool
+    """Somebody who could be moved does not get to its lane: more blocks could help."""
+    impossible: str = ""
+    """Why the structure has too few cells; then no member moves. Empty: it has enough."""
+
+    @property
+    def solved(self) -> bool:
+        """Whether there is a plan."""
+        return self.response is None or bool(self.response.paths)
+
+
+def plan_requests(task: SortingTask, excused: Name | None = None) -> Iterator[PlanRequest]:
+    """Yield the requests for a sorting, one for each placement of the targets, the best first.
+
+    Args:
+        task: with at least one vehicle that can be moved.
+        excused: a vehicle that need not get to its lane.
+    """
+    scenario = task.scenario
+    wanted = {
+        name: cell[1] if name == excused else task.preferred_lanes[name]
+        for name, cell in task.movers.items()
+    }
+    for targets in placements(
+        task.movers,
+        wanted,
+        len(task.columns),
+        scenario.road.lanes,
+        task.blocked,
+        ahead=scenario.formation.closes_by_vehicles,
+    ):
+        index = {cell: number for number, cell in enumerate(targets.cells)}
+        vehicles: list[dict[str, Any]] = [
+            {"id": name, "cell": list(cell)}
+            | (
+                {"eligible": [index[targets.own[name]]]}
+                if name in targets.own
+                else {"lane": wanted[name]}
+            )
+            for name, cell in task.movers.items()
+        ]
+        yield _plan_request(task, vehicles, {"targets": [list(cell) for cell in targets.cells]})
+
+
+def _plan_request(
+    task: SortingTask, vehicles: list[dict[str, Any]], goal: Mapping[str, Any]
+) -> PlanRequest:
+    scenario, formation = task.scenario, task.scenario.formation
+    return PlanRequest.from_dict(
+        {
+            "schema": "laneweave.plan.request/1",
+            "grid": {
+                "columns": len(task.columns),
+                "lanes": scenario.road.lanes,
+                "blocked": [list(cell) for cell in task.blocked],
+            },
+            "mode": formation.mode,
+            "conflicts": list(formation.conflict_kinds),
+            "vehicles": vehicles,
+            **goal,
+            "deadline_s": task.deadline_s,
+            "solver": formation.solver,
+        }
+    )
+
+
+def sort_lanes(
+    task: SortingTask, max_nodes: int, weights: Weights, clock: Clock = time.monotonic
+) -> Sorting:
+    """Plan a sorting; if that is impossible, with one member excused from reaching its lane.
+
+    Args:
+        task: what is to be sorted.
+        max_nodes: bound on search nodes of each attempt.
+        weights: l_s and l_o of the formation relative distance.
+        clock: returns the time, in seconds, for the deadline.
+    """
+    if not task.movers:
+        return _sorting(task, None)
+    if task.structure is not None:
+        return _form(task, task.structure, max_nodes, weights)
+    ends_s = clock() + task.deadline_s
+    for excused in (None, *task.movers):
+        best: PlanResponse | None = None
+        for request in islice(plan_requests(task, excused), MOST_PLACEMENTS):
+            left_s = ends_s - clock()
+            if best is not None and left_s <= SHORTEST_S:
+                break
+            hurried = evolve(request, deadline_s=max(left_s, SHORTEST_S))
+            response = checked_plan(hurried, max_nodes=max_nodes, weights=weights)
+            if best is None or _steps(response) < _steps(best):
+                best = response
+            if _steps(best) <= task.steps or not response.paths:
+                break
+        if best is not None and best.status != "infeasible":
+            break
+    return _sorting(task, best)
+
+
+def _steps(response: PlanResponse) -> float:
+    """Return how many steps a plan takes; infinite: there is none."""
+    return math.inf if response.steps is None else response.steps
+
+
+def _form(
+    task: SortingTask, structure: DrivingStructure, max_nodes: int, weights: Weights
+) -> Sorting:
+    """Plan the paths into a structure; all members stay where they are if it has too few cells."""
+    members = [{"id": name, "cell": list(cell)} for name, cell in task.movers.items()]
+    lanes = {"lanes": list(structure.lanes)} if structure.lanes else {}
+    try:
+        request = _plan_request(task, members, {"structure": structure.structure} | lanes)
+    except BadInputError as error:
+        if error.field != "structure":
+            raise
+        return evolve(_sorting(task, None), impossible=error.allowed)
+    return _sorting(task, checked_plan(request, max_nodes=max_nodes, weights=weights))
+
+
+def _sorting(task: SortingTask, response: PlanResponse | None) -> Sorting:
+    first = task.columns.start
+    moves: dict[Name, tuple[Move, ...]] = dict.fromkeys(task.hold_cells, ())
+    ends = dict(task.hold_cells)
+    paths = response.paths if response is not None else ()
+    for name, path in zip(task.movers, paths, strict=False):
+        cells = [(column + first, lane) for column, lane in path]
+        moves[name] = tuple(
+            (step, cells[step], cells[step + 1])
+            for step in range(len(cells) - 1)
+            if cells[step] != cells[step + 1]
+        )
+        ends[name] = cells[-1]
+    missed: tuple[Name, ...] = ()
+    if task.structure is None:
+        missed = tuple(name for name, cell in ends.items() if cell[1] != task.preferred_lanes[name])
+    # Without a result in time nothing is known of the room; with more blocks it would take longer.
+    known = response is not None and response.status != "timeout"
+    short_of_room = known and any(name not in task.unattended for name in missed)
+    return Sorting(response, moves, missed, short_of_room)

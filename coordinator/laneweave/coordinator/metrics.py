@@ -1,0 +1,25 @@
+"""What a coordinator offers to whoever looks at it."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from attrs import field, frozen
+
+from laneweave.protocol.runtime.metrics import told
+
+
+@frozen
+class CoordinatorNumbers:
+    """The election and the plans as one candidate sees them."""
+
+    ABOUT: ClassVar[str] = "coordinator"
+
+    leading: bool = field(metadata=told("1 while this candidate leads, else 0"))
+    term: int = field(metadata=told("Highest term that it has seen; its own while it leads"))
+    candidates: int = field(metadata=told("Candidates that it hears, itself included"))
+    elections_total: int = field(metadata=told("Times that this process has begun to lead"))
+    plans_in_force: int = field(
+        metadata=told("Plans in force, of formations or of this slot, while it leads")
+    )
+    road_seconds: float = field(metadata=told("Newest road time that it has heard"))

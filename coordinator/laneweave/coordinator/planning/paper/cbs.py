@@ -1,0 +1,248 @@
+"""CBSA, the conflict-based searching algorithm (paper, Algorithm 2), for one assignment.
+
+A node N_i of the constraint tree T has the paper's four attributes: constraints, conflicts, path
+set M_i and cost L_i. With all improvements off the tree is the paper's: one child for each entry of
+a node's conflict list. Improvements (`improvements`) change which constraints the children of a
+node get (`splits`), and end the search early (`limit`).
+
+Among the shortest paths of a vehicle, SPPA chooses one with the fewest conflicts with the paths of
+the other vehicles (`sppa`); about that the paper says nothing. In the root, paths are planned
+without regard to others.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Callable, Iterator, Sequence
+
+import attrs
+
+from laneweave.coordinator.planning.budget import Budget
+from laneweave.coordinator.planning.paper.constraints import (
+    Conflict,
+    Constraint,
+    bans_for,
+    constraints_of,
+    is_at_node,
+)
+from laneweave.coordinator.planning.paper.improvements import Improvements
+from laneweave.coordinator.planning.paper.path_diagram import Diagram, shortest_paths
+from laneweave.coordinator.planning.paper.splits import CARDINAL, disjoint_constraints, rises
+from laneweave.coordinator.planning.paper.sppa import Path, choose_path, conflicting_moves
+from laneweave.coordinator.planning.problem import Problem
+
+Limit = Callable[[], float]
+"""Returns the cost that a path set must be below to be of use; asked before each node."""
+
+
+@attrs.define(eq=False)
+class Node:
+    """A node N_i of the constraint tree.
+
+    constraints: of this node and of all nodes above it.
+    paths: the path set M_i.
+    conflicts: of the path set.
+    diagrams: all shortest paths of each vehicle under the constraints; M_i is chosen from them.
+    number: i; nodes count from 1 in the order in which they are made.
+    parent: number of the parent; 0: none.
+    expanded: whether it has got its children.
+    """
+
+    constraints: tuple[Constraint, ...]
+    paths: tuple[Path, ...]
+    conflicts: tuple[Conflict, ...]
+    diagrams: tuple[Diagram, ...]
+    number: int = 1
+    parent: int = 0
+    expanded: bool = False
+
+    @property
+    def cost(self) -> int:
+        """Return the cost L_i of the path set."""
+        return sum(len(path) for path in self.paths)
+
+    def moves(self, conflict: Conflict) -> tuple[int, int]:
+        """Return the conflicting moves of both vehicles."""
+        step = conflict.step
+        first, second = (
+            self.paths[v][step] if step < len(self.paths[v]) else self.diagrams[v].target
+            for v in (conflict.first, conflict.second)
+        )
+        return first, second
+
+
+class ConstraintTree:
+    """The constraint tree T of one assignment.
+
+    nodes: all nodes, if they are recorded.
+    solution: the node that ended the search, if there is one.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        assignment: Sequence[int],
+        budget: Budget,
+        improvements: Improvements,
+        *,
+        record: bool = False,
+    ) -> None:
+        """Prepare the search."""
+        self.assignment = tuple(assignment)
+        self.solution: Node | None = None
+        self.nodes: list[Node] | None = [] if record else None
+        self._problem = problem
+        self._budget = budget
+        self._improvements = improvements
+        self._count = 0
+        self._open: list[tuple[int, int, int, Node]] = []
+
+    @property
+    def lower_bound(self) -> float:
+        """Return the least L_i in T; infinite: T is empty."""
+        return self._open[0][0] if self._open else math.inf
+
+    def search(self, limit: Limit) -> Node | None:
+        """Apply Algorithm 2; return the node with the optimal path set, or None.
+
+        None: there is no path set, or none that costs less than the limit. Nodes that cost as much
+        are not kept, so the limit must not grow.
+
+        Raises:
+            BudgetSpentError: the deadline has passed or too many nodes were taken from T.
+        """
+        root = self._root()  # lines 1 to 4
+        if root is not None:
+            self._add(root)  # line 5
+        while self._open:  # line 6
+            bound = limit()
+            if self.lower_bound >= bound:
+                return None
+            self._budget.take_node()
+            node = heapq.heappop(self._open)[-1]  # lines 7 and 8: the minimum L_i
+            if not node.conflicts:  # line 9
+                self.solution = node  # lines 10 and 11
+                return node
+            node.expanded = True
+            for added in self._constraints(node):  # lines 13, 15 and 16
+                child = self._child(node, added)  # lines 14, 17 and 18
+                if child is not None and child.cost < bound:
+                    self._add(child)  # line 19, where the paper prints N_i for N_c
+        return None
+
+    def _add(self, node: Node) -> None:
+        """Add a node to T; among equal L_i the one with the fewest conflicts is taken first."""
+        self._count += 1
+        node.number = self._count
+        heapq.heappush(self._open, (node.cost, len(node.conflicts), node.number, node))
+        if self.nodes is not None:
+            self.nodes.append(node)
+
+    def _root(self) -> Node | None:
+        """Return N_1; None: a target cannot be reached."""
+        problem, table = self._problem, self._problem.table
+        diagrams = []
+        for vehicle, target in enumerate(self.assignment):
+            self._budget.check_time()
+            diagram = problem.free_paths(vehicle, target)
+            if diagram is None:
+                return None
+            diagrams.append(diagram)
+        paths = tuple(choose_path(table, diagram, [0] * diagram.cost) for diagram in diagrams)
+        conflicts: set[Conflict] = set()
+        for vehicle in range(len(paths)):
+            self._budget.check_time()
+            conflicts.update(self._conflicts_of(vehicle, diagrams, paths))
+        return Node((), paths, tuple(sorted(conflicts)), tuple(diagrams))
+
+    def _constraints(self, node: Node) -> Iterator[Constraint]:
+        """Yield the constraint that each child of a node adds."""
+        table = self._problem.table
+        if not self._improvements.cardinal:
+            # A vehicle in conflict with two others at one node has one entry.
+            yield from dict.fromkeys(
+                constraint
+                for conflict in node.conflicts
+                for constraint in constraints_of(table, conflict, node.moves(conflict))
+            )
+            return
+        conflict = self._most_expensive(node)
+        moves = node.moves(conflict)
+        if self._improvements.bicliques:
+            yield from disjoint_constraints(table, conflict, moves, node.diagrams)
+        else:
+            yield from constraints_of(table, conflict, moves)
+
+    def _most_expensive(self, node: Node) -> Conflict:
+        """Return the conflict that raises the cost of most children; of equal ones the first."""
+        table = self._problem.table
+        best, most = node.conflicts[0], -1
+        for conflict in node.conflicts:
+            rising = rises(table, conflict, node.moves(conflict), node.diagrams)
+            if rising > most:
+                best, most = conflict, rising
+            if most == CARDINAL:
+                break
+        return best
+
+    def _child(self, node: Node, added: Constraint) -> Node | None:
+        """Apply SPPA under one more constraint; None: a vehicle has no path."""
+        problem, table = self._problem, self._problem.table
+        constraints = (*node.constraints, added)
+        diagrams, paths = list(node.diagrams), list(node.paths)
+        rerouted = []
+        for vehicle, diagram in enumerate(node.diagrams):
+            if added.spares(vehicle, diagram):
+                continue
+            self._budget.check_time()
+            bans = bans_for(vehicle, constraints)
+            shortest = shortest_paths(table, problem.starts[vehicle], diagram.target, bans)
+            if shortest is None:
+                return None
+            diagrams[vehicle] = shortest
+            if not _is_among(paths[vehicle], shortest):
+                rerouted.append(vehicle)
+        for vehicle in rerouted:
+            others = [
+                (path, other.target)
+                for i, (path, other) in enumerate(zip(paths, diagrams, strict=True))
+                if i != vehicle
+            ]
+            diagram = diagrams[vehicle]
+            taken = conflicting_moves(table, others, diagram.cost)
+            paths[vehicle] = choose_path(table, diagram, taken)
+        conflicts = set(node.conflicts)
+        for vehicle in rerouted:
+            conflicts = {c for c in conflicts if vehicle not in (c.first, c.second)}
+            conflicts.update(self._conflicts_of(vehicle, diagrams, paths))
+        listed = tuple(sorted(conflicts)) if rerouted else node.conflicts
+        return Node(constraints, tuple(paths), listed, tuple(diagrams), parent=node.number)
+
+    def _conflicts_of(
+        self, vehicle: int, diagrams: Sequence[Diagram], paths: Sequence[Path]
+    ) -> list[Conflict]:
+        """Return the conflicts between one vehicle and all others."""
+        table = self._problem.table
+        conflicts = table.conflicts
+        own, own_target = paths[vehicle], diagrams[vehicle].target
+        found = []
+        for other, path in enumerate(paths):
+            if other == vehicle:
+                continue
+            target = diagrams[other].target
+            arrived = len(path)
+            for step in range(max(len(own), arrived)):
+                mine = own[step] if step < len(own) else own_target
+                theirs = path[step] if step < arrived else target
+                if conflicts[mine] >> theirs & 1:
+                    pair = (vehicle, other) if vehicle < other else (other, vehicle)
+                    found.append(Conflict(step, not is_at_node(table, mine, theirs), *pair))
+        return found
+
+
+def _is_among(path: Path, diagram: Diagram) -> bool:
+    """Tell whether a path is one of the diagram's."""
+    return len(path) == diagram.cost and all(
+        layer >> move & 1 for layer, move in zip(diagram.layers, path, strict=True)
+    )

@@ -1,0 +1,241 @@
+"""Improvement of TAPPA: A* over the cells of all vehicles together.
+
+Where vehicles have little room, most path sets of least cost for single vehicles conflict, and
+constraint trees grow beyond all bounds; an unsolvable tree never ends. All vehicles planned
+together (one meta-agent of all, in the terms of Sharon et al., AIJ 219, 2015, section 7) make a
+finite state space, small in just these cases. Vehicles with the same eligible targets are a team
+and interchangeable, so one search stands for all assignments: its lower bound holds for every
+C'_k, and its path set is optimal.
+
+The search goes backwards from the targets. A vehicle is active in a state if it still has to move;
+it pays one for each step from the start until it is not. Backwards, a vehicle becomes active with
+its first move, stays so, and pays for every step from there to the start: that is known exactly as
+soon as the number of steps is, which the heuristic uses.
+
+Which joint moves end in a set of occupied cells does not depend on which vehicle is where. They are
+made once for each set, as exchanges of labels; a label is a team and whether the vehicle is active.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Callable, Sequence
+from itertools import combinations
+from operator import itemgetter
+
+from laneweave.coordinator.planning.budget import Budget
+from laneweave.coordinator.planning.conflict_cliques import vehicles_share_cells
+from laneweave.coordinator.planning.moves import bits
+from laneweave.coordinator.planning.problem import Problem
+from laneweave.coordinator.planning.solution import Solution
+
+Cells = tuple[int, ...]
+Labels = tuple[int, ...]
+"""2 * team + (1 if active), for each cell that is occupied."""
+State = tuple[Cells, Labels]
+
+_MOST_GOALS = 2_000
+_MOST_MOVES = 2_000_000
+"""Bounds of the memory, about 1 GB."""
+
+
+JointMove = tuple[Cells, Callable[[Labels], Labels]]
+"""The cells before it, sorted, and what picks their labels from those after it: first as they are
+after it, then once more as if all were active; who moves is active before."""
+
+
+class JointSearch:
+    """The search; it goes on as far as it is asked to.
+
+    lower_bound: no path set of any assignment costs less; infinite: there is none.
+    solution: the optimal path set, when it is found.
+    ended: there is nothing more to search, or the search has become too large.
+    """
+
+    def __init__(self, problem: Problem, choices: Sequence[frozenset[int]], budget: Budget) -> None:
+        """Prepare the search; `choices` are the eligible targets of each vehicle."""
+        self.lower_bound: float = 0
+        self.solution: Solution | None = None
+        self.ended = False
+        self._problem = problem
+        self._budget = budget
+        self._may_share = vehicles_share_cells(problem.table.model)
+        self._credit = 0
+        self._made = 0
+        teams = sorted(set(choices), key=sorted)
+        labels = [2 * teams.index(choice) + 1 for choice in choices]
+        self._vehicles = sorted(range(len(choices)), key=lambda v: (problem.starts[v], labels[v]))
+        self._start = tuple(problem.starts[v] for v in self._vehicles)
+        self._start_labels = tuple(labels[v] for v in self._vehicles)
+        self._distance = [
+            _distances(
+                problem,
+                [s for s, label in zip(problem.starts, labels, strict=True) if label == own],
+            )
+            for own in range(1, 2 * len(teams), 2)
+        ]
+        self._active: dict[Labels, int] = {}
+        self._into: dict[Cells, list[JointMove]] = {}
+        self._to: dict[int, list[tuple[int, int, int]]] = {}
+        self._cost: dict[State, int] = {}
+        self._next: dict[State, tuple[State, Callable[[Labels], Labels]]] = {}
+        self._open: list[tuple[int, int, State]] = []
+        sizes = [labels.count(2 * k + 1) for k in range(len(teams))]
+        self._add_goals(teams, sizes)
+
+    def work(self, moves: int) -> None:
+        """Go on until about so many more joint moves are made; what is too much is owed."""
+        self._credit += moves
+        while self._credit > 0 and not self.ended:
+            before = self._made
+            self._expand()
+            self._credit -= 1 + self._made - before
+
+    def _add_goals(self, teams: Sequence[frozenset[int]], sizes: Sequence[int]) -> None:
+        """Begin with every choice of targets for the teams."""
+        targets = self._problem.targets
+        goals: list[dict[int, int]] = [{}]
+        for k, (team, size) in enumerate(zip(teams, sizes, strict=True)):
+            goals = [
+                goal | dict.fromkeys(chosen, 2 * k)
+                for goal in goals
+                for chosen in combinations(sorted(team - goal.keys()), size)
+            ]
+            if len(goals) > _MOST_GOALS:
+                self.ended = True
+                return
+        for goal in goals:
+            placed = sorted((targets[j], label) for j, label in goal.items())
+            self._reach((tuple(c for c, _ in placed), tuple(label for _, label in placed)), 0)
+        if not self._open:
+            self.lower_bound, self.ended = math.inf, True
+
+    def _reach(self, state: State, cost: int) -> bool:
+        """Add a state to those that are open; return whether it can be reached from the start."""
+        steps = active = alone = 0
+        for cell, label in zip(*state, strict=True):
+            distance = self._distance[label >> 1].get(cell)
+            if distance is None:
+                return False
+            steps = max(steps, distance)
+            if label & 1:
+                active += 1
+            else:
+                alone += distance
+        self._cost[state] = cost
+        heapq.heappush(self._open, (cost + active * steps + alone, -cost, state))
+        return True
+
+    def _expand(self) -> None:
+        """Take the most promising state and make the joint moves that end in it."""
+        if not self._open:
+            self.lower_bound, self.ended = math.inf, True
+            return
+        bound, negative_cost, state = heapq.heappop(self._open)
+        if self._cost[state] < -negative_cost:
+            return
+        self.lower_bound = max(self.lower_bound, bound)
+        cells, labels = state
+        if cells == self._start and tuple(label | 1 for label in labels) == self._start_labels:
+            self.solution, self.ended = self._followed(state), True
+            return
+        both = labels + tuple(label | 1 for label in labels)
+        active, known = self._active, self._cost
+        moves = self._joint_moves_into(cells)
+        self._made += len(moves)
+        for cells_before, labels_before in moves:
+            before = labels_before(both)
+            if before not in active:
+                active[before] = sum(label & 1 for label in before)
+            cost = active[before] - negative_cost
+            reached = cells_before, before
+            if known.get(reached, math.inf) > cost and self._reach(reached, cost):
+                self._next[reached] = state, labels_before
+        if self._made > _MOST_MOVES:
+            self.ended = True
+
+    def _joint_moves_into(self, cells: Cells) -> list[JointMove]:
+        """Return all joint moves without conflicts that end in these cells."""
+        found = self._into.get(cells)
+        if found is not None:
+            return found
+        partial: list[tuple[Cells, int]] = [((), 0)]
+        for cell in cells:
+            self._budget.check_time()
+            partial = [
+                ((*starts, start), excluded | more)
+                for starts, excluded in partial
+                for move, start, more in self._moves_to(cell)
+                if not excluded & move
+            ]
+        found = self._into[cells] = []
+        count = len(cells)
+        for starts, _ in partial:
+            origins = [
+                i if start == cell else i + count
+                for i, (start, cell) in enumerate(zip(starts, cells, strict=True))
+            ]
+            before, picked = zip(*sorted(zip(starts, origins, strict=True)), strict=True)
+            found.append((before, _picker(picked)))
+        self._made += len(found)
+        return found
+
+    def _moves_to(self, cell: int) -> list[tuple[int, int, int]]:
+        """Return the moves that end in a cell: as a set, its start, and what it excludes."""
+        found = self._to.get(cell)
+        if found is None:
+            table = self._problem.table
+            found = self._to[cell] = []
+            for move in bits(table.leading_to(1 << cell)):
+                start = move - move % table.fan
+                same_start = 0 if self._may_share else table.starting_in(1 << start)
+                found.append((1 << move, start, table.conflicts[move] | same_start))
+        return found
+
+    def _followed(self, state: State) -> Solution:
+        """Follow the vehicles from the start to their targets."""
+        problem, table = self._problem, self._problem.table
+        count = len(self._vehicles)
+        places = list(range(count))
+        paths: list[list[int]] = [[] for _ in range(count)]
+        arrivals = [0] * count
+        cells = state[0]
+        step = self._next.get(state)
+        while step is not None:
+            state, labels_before = step
+            origin = labels_before(tuple(range(2 * count)))
+            places_after = [origin[place] % count for place in places]
+            for i, (place, after) in enumerate(zip(places, places_after, strict=True)):
+                here, there = cells[place], state[0][after]
+                paths[i].append(table.number((table.cell(here), table.cell(there))))
+                if here != there:
+                    arrivals[i] = len(paths[i])
+            places, cells = places_after, state[0]
+            step = self._next.get(state)
+        by_vehicle = sorted(zip(self._vehicles, places, paths, arrivals, strict=True))
+        return Solution(
+            tuple(problem.targets.index(cells[place]) for _, place, _, _ in by_vehicle),
+            tuple(tuple(path[:arrival]) for _, _, path, arrival in by_vehicle),
+        )
+
+
+def _picker(places: tuple[int, ...]) -> Callable[[Labels], Labels]:
+    """Return a function that picks the labels at these places."""
+    if len(places) == 1:
+        return lambda labels: (labels[places[0]],)
+    return itemgetter(*places)
+
+
+def _distances(problem: Problem, starts: Sequence[int]) -> dict[int, int]:
+    """Return the least number of steps to each cell from the nearest of some others."""
+    table = problem.table
+    found: dict[int, int] = {}
+    reached = cells = sum({1 << start for start in starts})
+    steps = 0
+    while cells:
+        found.update(dict.fromkeys(bits(cells), steps))
+        cells = table.ends(table.starting_in(cells)) & ~reached
+        reached |= cells
+        steps += 1
+    return found

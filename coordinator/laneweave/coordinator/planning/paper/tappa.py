@@ -1,0 +1,154 @@
+"""TAPPA, the target assignment and path planning algorithm (paper, Algorithm 1).
+
+Assignments A_1, A_2, ... are taken in order of their cost C_k. CBSA finds the best path set P_k of
+each, with cost C'_k (`cbs`). As soon as the next assignment costs no less than C'*, the cost of the
+best path set so far, that path set P* is optimal.
+
+Two improvements (`improvements`) end CBSA and the sequence of assignments earlier: CBSA looks only
+for path sets that cost less than C'*; and a search over the cells of all vehicles together
+(`joint`), which goes on beside large constraint trees, has a lower bound for every C'_k.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import attrs
+
+from laneweave.coordinator.planning.assignments import Assignment
+from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
+from laneweave.coordinator.planning.paper.cbs import ConstraintTree
+from laneweave.coordinator.planning.paper.improvements import Improvements
+from laneweave.coordinator.planning.paper.joint_search import JointSearch
+from laneweave.coordinator.planning.problem import Problem
+from laneweave.coordinator.planning.solution import Solution
+
+_JOINT_AFTER = 32
+"""So many nodes come before the joint search begins."""
+_MOST_JOINT_MOVES_PER_NODE = 150
+"""Upper bound on the joint moves made at a node; node n makes n of them below it. The joint search
+then takes up to about two thirds of the time. It ends first in crowded blocks, the trees end first
+in others."""
+
+
+@attrs.frozen
+class Attempt:
+    """What was recorded of one assignment.
+
+    assignment: A_k with its cost C_k.
+    tree: the constraint tree of CBSA.
+    best_cost: C'_k; None: CBSA ended without a path set that costs less than C'*.
+    """
+
+    assignment: Assignment
+    tree: ConstraintTree
+    best_cost: int | None
+
+
+class Tappa:
+    """The state of Algorithm 1.
+
+    best: the best path set P* so far; its cost is C'*.
+    lower_bound: no path set costs less.
+    finished: the search is complete; `best` is optimal, or nothing exists.
+    gave_up, has_fewest_moves: never.
+    tried: k, the number of assignments to which CBSA was applied.
+    attempts: what CBSA did for each of them, if that is recorded.
+    next_cost: C_{k+1}, if it was looked at last.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        candidates: Iterator[Assignment],
+        choices: Sequence[frozenset[int]],
+        budget: Budget,
+        improvements: Improvements | None = None,
+        *,
+        record: bool = False,
+    ) -> None:
+        """Prepare the search.
+
+        Args:
+            problem: vehicles and targets.
+            candidates: the assignments in order of cost.
+            choices: eligible targets of each vehicle.
+            budget: deadline and limit on nodes.
+            improvements: what is added to the paper's algorithms; None: everything.
+            record: whether to keep all constraint trees.
+        """
+        self.best: Solution | None = None
+        self.lower_bound: float = 0
+        self.finished = False
+        self.gave_up = self.has_fewest_moves = False
+        self.tried = 0
+        self.attempts: list[Attempt] | None = [] if record else None
+        self.next_cost: float | None = None
+        self._problem = problem
+        self._candidates = candidates
+        self._budget = budget
+        self._improvements = improvements or Improvements()
+        self._joint = JointSearch(problem, choices, budget) if self._improvements.joint else None
+
+    @property
+    def best_cost(self) -> float:
+        """Return C'*, which is infinite until a path set is found."""
+        return math.inf if self.best is None else self.best.cost
+
+    @property
+    def joint_bound(self) -> float:
+        """Return what the joint search has found to be a lower bound of every C'_k."""
+        return 0 if self._joint is None else self._joint.lower_bound
+
+    def run(self) -> None:
+        """Search until the optimum is proven or the budget is spent."""
+        try:
+            self._search()
+        except BudgetSpentError:
+            self.lower_bound = min(max(self.lower_bound, self.joint_bound), self.best_cost)
+        else:
+            self.lower_bound = self.best_cost
+            self.finished = True
+
+    def _search(self) -> None:
+        """Apply Algorithm 1; k is `tried`."""
+        assignment = next(self._candidates, None)  # lines 2 and 3
+        while assignment is not None:  # line 4
+            self.tried += 1  # line 14
+            self.lower_bound = min(assignment.cost, self.best_cost)
+            self._offer(self._cbsa(assignment))  # lines 5 to 8, and 16 to 19 for the last one
+            assignment = next(self._candidates, None)  # line 9
+            self.next_cost = None if assignment is None else assignment.cost
+            if self.next_cost is not None and self.best_cost <= self._bound(self.next_cost):
+                return  # lines 10 to 13
+
+    def _bound(self, cost: float) -> float:
+        """Return a lower bound of the path sets of assignments that cost at least so much."""
+        return max(cost, self.joint_bound)
+
+    def _offer(self, solution: Solution | None) -> None:
+        """Set P* and C'* if a path set is better (lines 6 to 8)."""
+        if solution is not None and solution.cost < self.best_cost:
+            self.best = solution
+
+    def _cbsa(self, assignment: Assignment) -> Solution | None:
+        """Apply CBSA to A_k; return P_k, or None if it cannot cost less than C'*."""
+        record = self.attempts is not None
+        tree = ConstraintTree(
+            self._problem, assignment.targets, self._budget, self._improvements, record=record
+        )
+        node = tree.search(self._limit)
+        if self.attempts is not None:
+            self.attempts.append(Attempt(assignment, tree, None if node is None else node.cost))
+        return None if node is None else Solution(assignment.targets, node.paths)
+
+    def _limit(self) -> float:
+        """Return the cost below which a path set is of use, after some work for it."""
+        joint = self._joint
+        if joint is not None and not joint.ended and self._budget.nodes >= _JOINT_AFTER:
+            joint.work(min(self._budget.nodes, _MOST_JOINT_MOVES_PER_NODE))
+            self._offer(joint.solution)
+        if self.best_cost <= self.joint_bound:
+            return -math.inf
+        return self.best_cost if self._improvements.cutoff else math.inf

@@ -1,0 +1,145 @@
+"""Planning of a whole stream at once: a complete way for every vehicle, planned anew each slot.
+
+The problem is that of the paper's Section 3, without formations: every vehicle on the road is
+planned for, from its cell to the end of the road, in one window of the lattice that moves with it.
+Each vehicle has a way without conflicts at any moment, so the table can be executed as it is; who
+cannot reach its lane stays in the stream, and is tried again with every slot.
+
+A way is laid by exact dynamic programming over (slot, column, lane) against all others. Where that
+leaves somebody off its lane, *chains of ejections* make room: the vehicle takes its way through
+others at a price, those that it hits are planned anew in turn, and the chain is kept if the sum of
+costs has fallen. In between, neighbours are taken out and put in again in another order (large
+neighbourhood search). Ways are carried over from slot to slot.
+
+What a move conflicts with is the `ConflictModel` of the other planners.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection, Mapping, Sequence
+from functools import cache
+from itertools import chain
+
+import numpy as np
+
+from laneweave.coordinator.planning.grid import Cell
+from laneweave.coordinator.planning.rolling import search_kernel as kernel
+from laneweave.coordinator.planning.rolling.arrays import Ints, Window, window
+from laneweave.coordinator.planning.rolling.problem import (
+    StreamCosts,
+    StreamPlan,
+    StreamRoad,
+    StreamVehicle,
+    Way,
+)
+
+__all__ = [
+    "StreamCosts",
+    "StreamPlan",
+    "StreamPlanner",
+    "StreamRoad",
+    "StreamVehicle",
+    "Way",
+    "warm_up",
+]
+
+
+@cache
+def warm_up() -> None:
+    """Load the compiled code; where there is none yet, compile it, which takes half a minute."""
+    road = StreamRoad(2, 15.0, 60.0, (0.0, 600.0), 600.0, 5.0)
+    # Two who change places.
+    vehicles = [StreamVehicle("a", (5, 0), 1), StreamVehicle("b", (5, 1), 0)]
+    StreamPlanner(road).plan(0, vehicles)
+
+
+class StreamPlanner:
+    """Plans a stream slot by slot; a plan depends on nothing but what it is planned from."""
+
+    def __init__(self, road: StreamRoad, costs: StreamCosts | None = None, seed: int = 0) -> None:
+        """Prepare; `seed` is that of all random choices."""
+        self.road = road
+        self.costs = costs or StreamCosts()
+        self._seed = seed
+
+    def plan(
+        self,
+        slot: int,
+        vehicles: Sequence[StreamVehicle],
+        before: StreamPlan | None = None,
+        blocked: Collection[Cell] = (),
+    ) -> StreamPlan:
+        """Return ways for all vehicles from the beginning of a slot on.
+
+        Args:
+            slot: number of the slot; the lattice begins at 0 with slot 0.
+            vehicles: all that are on the road, each in a cell of its own.
+            before: an earlier plan; ways that still hold are starting points.
+            blocked: cells that nobody may enter; who is in one may leave it.
+
+        Raises:
+            ValueError: two vehicles in one cell, or one beside the road.
+        """
+        began_s = time.monotonic()
+        _check(self.road, vehicles)
+        end = self.road.length_m - slot * self.road.advance_m
+        ways: dict[str, Way] = {v.vehicle: (v.cell,) for v in vehicles}
+        order = [v for v in vehicles if v.cell[0] * self.road.pitch_m <= end + 1e-6]
+        order.sort(key=lambda one: one.cell)
+        rounds = 0
+        if order:
+            arrays = window(self.road, self.costs, slot, order, blocked)
+            kept = _kept(slot, order, before, arrays.low)
+            # Mixed, so that the sequences of neighbouring slots have nothing in common.
+            rng = np.random.SeedSequence((self._seed, slot & 0xFFFFFFFF)).generate_state(1, "u8")
+            kernel.lay(arrays.table, arrays.ways, arrays.costs, *kept, rng, arrays.scratch)
+            if len(order) > 1:
+                rounds = kernel.improve(
+                    arrays.table,
+                    arrays.ways,
+                    arrays.costs,
+                    self.road.rounds,
+                    self.road.most_ways,
+                    rng,
+                    arrays.scratch,
+                )
+            ways |= _ways_of(order, arrays)
+        missed = tuple(v.vehicle for v in vehicles if ways[v.vehicle][-1][1] != v.lane)
+        solve_ms = round(1e3 * (time.monotonic() - began_s), 3)
+        return StreamPlan(slot, ways, missed, rounds, solve_ms)
+
+
+def _check(road: StreamRoad, vehicles: Sequence[StreamVehicle]) -> None:
+    taken: dict[Cell, str] = {}
+    for one in vehicles:
+        if not 0 <= one.cell[1] < road.lanes:
+            raise ValueError(f"{one.vehicle} in {one.cell}, but the road has {road.lanes} lanes")
+        if taken.setdefault(one.cell, one.vehicle) is not one.vehicle:
+            raise ValueError(f"{taken[one.cell]} and {one.vehicle} are both in {one.cell}")
+
+
+def _kept(
+    slot: int, vehicles: Sequence[StreamVehicle], before: StreamPlan | None, low: int
+) -> tuple[Ints, Ints]:
+    """Return the cells of all old ways from this slot on, and where those of each vehicle begin."""
+    ways: Mapping[str, Way] = {}
+    age = 0
+    if before is not None and before.slot <= slot:
+        ways, age = before.ways, slot - before.slot
+    old = [ways.get(vehicle.vehicle, ())[age:] for vehicle in vehicles]
+    first = np.cumsum([0, *map(len, old)])
+    flat = chain.from_iterable(chain.from_iterable(old))
+    cells = np.fromiter(flat, dtype=np.int64, count=2 * int(first[-1])).reshape(-1, 2)
+    cells[:, 0] -= low
+    return cells, first
+
+
+def _ways_of(vehicles: Sequence[StreamVehicle], arrays: Window) -> dict[str, Way]:
+    columns = (arrays.ways.column + arrays.low).tolist()
+    lanes = arrays.ways.lane.tolist()
+    lasts = arrays.ways.slots.tolist()
+    return {
+        vehicle.vehicle: tuple(zip(columns[v][: last + 1], lanes[v][: last + 1], strict=True))
+        for v, (vehicle, last) in enumerate(zip(vehicles, lasts, strict=True))
+    }

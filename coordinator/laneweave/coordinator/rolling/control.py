@@ -1,0 +1,327 @@
+"""The rolling operation under a leader: the whole stream is planned anew in each slot.
+
+Shortly after a slot has begun, everybody's hold cell at its end is known. From there the stream
+planner lays complete ways for all vehicles; what they do in the next slot is put into force by
+ballots over exactly the vehicles that it concerns (`handover`), while the moves of this slot are
+under way. Nobody stops for a replan: who is not reached holds, and is planned from there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from typing import Any
+
+from attrs import field, frozen
+
+from laneweave.coordinator.planning.rolling.planner import StreamPlan, StreamVehicle
+from laneweave.coordinator.rolling.ballot import Handover, Phase, partners, sure_of
+from laneweave.coordinator.rolling.observed import Shown
+from laneweave.coordinator.rolling.planner import Planner
+from laneweave.protocol.lattice import Cell, footprint
+from laneweave.protocol.runtime.node import Compute, Computed
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.wire.messages import Ballot, Census, Name, Plan, Prepare, VehicleState
+
+SHOWN_S = 0.5
+"""Who moves in a slot has begun, and shown it, this long after the slot has.
+
+Planned is from what was shown up to then, once road time has gone on and all of it has arrived: so
+plans do not depend on how fast messages are."""
+PATIENCE_S = 0.5
+"""A new leader listens for so long (node clock). One that leads only for a moment, because it has
+not heard another one, must not outbid what that one has begun."""
+LATEST_S = 1.0
+"""A plan that is ready later than this after its slot has begun is not put into force any more."""
+AHEAD_M = 600.0
+"""Vehicles are planned for from so far before the place where moves begin: as far as S3 is long, so
+that whoever can come near each other there is known in time."""
+BESIDE = 10
+"""Columns ahead of the foremost vehicle and behind the rearmost one that planning looks at."""
+
+
+@frozen
+class Note:
+    """Something worth a line in `events.jsonl`."""
+
+    kind: str
+    data: dict[str, Any] = field(factory=dict)
+
+
+@frozen
+class _Order:
+    """What is planned."""
+
+    slot: int
+    vehicles: tuple[StreamVehicle, ...]
+    blocked: frozenset[Cell]
+    before: StreamPlan | None
+
+
+class StreamControl:
+    """All vehicles under one leader."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        new_ballot: Callable[[Ballot | None], Ballot],
+        planner: Planner,
+    ) -> None:
+        """Begin with nothing known.
+
+        Args:
+            scenario: road, lattice, timing.
+            new_ballot: returns a ballot never used before and above the given one, if one is given.
+            planner: plans the stream.
+        """
+        self._scenario = scenario
+        self._new_ballot = new_ballot
+        self._planner = planner
+        self._slot_s = scenario.cycles_s[0]
+        self.shown = Shown()
+        self.handovers: list[Handover] = []
+        self._of: dict[Name, Handover] = {}
+        self._highest: Ballot | None = None
+        self._since: tuple[float, float] | None = None
+        """Since when states have been heard: road time, node clock."""
+        self._ordered: tuple[int, int] | None = None
+        """Number of the computation under way, and of the slot that it plans."""
+        self._newest_slot = -1
+        self._table: StreamPlan | None = None
+
+    # --- inputs -------------------------------------------------------------------------------
+
+    def forget(self) -> None:
+        """Begin anew: another road."""
+        self.shown.forget()
+        self.handovers.clear()
+        self._of.clear()
+        self._table = self._ordered = self._since = None
+        self._newest_slot = -1
+
+    def take_over(self) -> None:
+        """Lead, again or for the first time: listen for a while before anything is planned.
+
+        What vehicles have shown stays true of what they own, but not of where they are; what was
+        begun under an earlier lead is left alone.
+        """
+        self.handovers.clear()
+        self._of.clear()
+        self.shown.take_over()
+        self._ordered = self._since = None
+
+    def on_census(self, census: Census) -> None:
+        """Take note of who is on the road."""
+        for name in self.shown.on_census(census):
+            handover = self._of.pop(name, None)
+            if handover is not None:
+                handover.give_up(f"{name} has left")
+
+    def on_state(self, state: VehicleState) -> bool:
+        """Take a vehicle's state, unless a newer one is known.
+
+        Returns:
+            Whether a ballot under way waits for it: then `on_awaited` has to take it, too.
+        """
+        if not self.shown.on_state(state):
+            return False
+        if state.promised is not None:
+            self._highest = max(self._highest or state.promised, state.promised)
+        handover = self._of.get(state.vehicle)
+        return handover is not None and handover.wakeup_s is not None
+
+    def on_awaited(self, state: VehicleState) -> Iterator[Note]:
+        """Let the ballot under way of a vehicle go on with its newest state."""
+        handover = self._of[state.vehicle]
+        handover.on_state(state, self.shown.states)
+        if handover.phase is Phase.GIVEN_UP:
+            yield Note("handover-given-up", {"roster": list(handover.roster), "why": handover.why})
+        elif handover.phase is Phase.IN_FORCE and self.in_force == 1:
+            slot = round(handover.t0_s / self._slot_s)
+            begun_s = handover.t0_s - self._slot_s
+            yield Note("plan-in-force", {"slot": slot, "closed_s": begun_s + SHOWN_S})
+
+    # --- the slot -----------------------------------------------------------------------------
+
+    def order(self, job: Callable[[], int], t_s: float, now_s: float) -> Iterator[Compute]:
+        """Order the planning of the next slot when it is time for it.
+
+        Args:
+            job: returns the number of a new computation.
+            t_s: road time.
+            now_s: node clock.
+        """
+        census = self.shown.census
+        if census is None:
+            return
+        if self._since is None:
+            self._since = t_s, now_s
+        for handover in self.handovers:
+            if t_s > handover.t0_s + LATEST_S:
+                handover.give_up("its slot has begun")
+        if not census.on_road or self._ordered is not None:
+            return
+        slot = math.floor(t_s / self._slot_s + 1e-9)
+        look_s = slot * self._slot_s + SHOWN_S + 1e-6
+        if slot < self._newest_slot or t_s <= look_s or now_s < self._since[1] + PATIENCE_S:
+            return
+        if max(self._since[0], t_s - 1.5 * self._scenario.runtime.tick_s) > look_s:
+            look_s = t_s  # it could not look in time: the newest is the best
+        order = self._order(slot + 1, look_s)
+        self._newest_slot = slot + 1
+        number = job()
+        self._ordered = (number, slot + 1)
+        yield Compute(number, partial(self._plan, order))
+
+    def _plan(self, order: _Order) -> StreamPlan:
+        return self._planner.plan(order.slot, order.vehicles, order.before, order.blocked)
+
+    def _order(self, slot: int, look_s: float) -> _Order:
+        """Lay down what is to be planned: what was the case at a time, by now known."""
+        vehicles: dict[Cell, StreamVehicle] = {}
+        owned, taken = set[Cell](), set[Cell]()
+        # Where vehicles were in an earlier lead says nothing of where they are.
+        since_s = self._since[0] - 1e-6 if self._since is not None else 0.0
+        far_m = self._scenario.moves_from_m - AHEAD_M
+        then = self.shown.at(look_s)
+        # Whoever was not heard may be elsewhere by now, and somebody else in its cell.
+        for entry in sorted(
+            then.census.on_road, key=lambda entry: entry.vehicle not in then.states
+        ):
+            state = then.states.get(entry.vehicle)
+            column = entry.cell[0] if state is None else state.hold_cell[0]
+            if self._scenario.lattice.cell_s_m(column, (slot - 1) * self._slot_s) < far_m:
+                continue
+            if state is None:
+                unheard = StreamVehicle(entry.vehicle, entry.cell, entry.preferred_lane, held=True)
+                vehicles.setdefault(entry.cell, unheard)
+                continue
+            # Its move begins at any moment. Without an open gate it may never: who takes part in
+            # something newer is asked, and then it does not.
+            late = state.go and not state.done and not state.moving
+            owned |= sure_of(state, then.states, then.gone)
+            if late:
+                taken |= {*state.estate} - {state.hold_cell}
+            held = late or not state.attended or state.t_s < since_s
+            heard = StreamVehicle(entry.vehicle, state.hold_cell, entry.preferred_lane, held)
+            vehicles.setdefault(state.hold_cell, heard)
+        columns = [column for column, _ in vehicles] or [0]
+        blocked = {
+            (column, lane)
+            for column in range(min(columns) - BESIDE, max(columns) + BESIDE + 1)
+            for lane in range(self._scenario.road.lanes)
+            if (column, lane) not in owned or (column, lane) in taken
+        }
+        return _Order(slot, tuple(vehicles.values()), frozenset(blocked), self._table)
+
+    def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterator[Note]:
+        """Take a plan, and begin to put its first moves into force.
+
+        Args:
+            computed: the result of the newest computation, or of another one, which is ignored.
+            t_s: road time.
+            now_s: node clock.
+        """
+        if self._ordered is None or computed.job != self._ordered[0]:
+            return
+        slot = self._ordered[1]
+        self._ordered = None
+        for handover in self.handovers:
+            handover.give_up("the next slot is planned")
+        table = computed.result
+        if not isinstance(table, StreamPlan):
+            yield Note("planning-failed", {"slot": slot, "error": computed.error})
+            return
+        self._table = table
+        t0_s = slot * self._slot_s
+        if t_s > t0_s + LATEST_S:
+            yield Note("planning-late", {"slot": slot})
+            return
+        self.handovers = list(self._handovers(table, t0_s, now_s))
+        self._of = {name: each for each in self.handovers for name in each.roster}
+        yield Note("stream-planned", self._facts(table))
+
+    def _facts(self, table: StreamPlan) -> dict[str, Any]:
+        sizes = [len(handover.roster) for handover in self.handovers]
+        return {
+            "slot": table.slot,
+            "vehicles": len(table.ways),
+            "missed": len(table.missed),
+            "moves": sum(len(handover.moves) for handover in self.handovers),
+            "ballots": len(sizes),
+            "largest": max(sizes, default=0),
+            "status": "feasible",
+            "solve_ms": table.solve_ms,
+        }
+
+    def _handovers(self, table: StreamPlan, t0_s: float, now_s: float) -> Iterator[Handover]:
+        states, gone = self.shown.states, self.shown.gone
+        owner = {
+            cell: name for name, state in states.items() for cell in sure_of(state, states, gone)
+        }
+        moves: dict[Name, tuple[Cell, Cell]] = {}
+        concerned: dict[Name, set[Name]] = {}
+        for vehicle, way in table.ways.items():
+            if len(way) < 2 or way[0] == way[1]:
+                continue
+            name = Name(vehicle)
+            state = states.get(name)
+            if state is None or state.hold_cell != way[0]:
+                continue  # it has gone on meanwhile
+            cells = footprint(way[0], way[1])
+            if all(cell in owner for cell in cells):
+                moves[name] = (way[0], way[1])
+                concerned[name] = self._with_partners({owner[cell] for cell in cells} | {name})
+        for roster in _clusters(concerned.values()):
+            yield Handover(
+                ballot=self._new_ballot(self._highest),
+                roster=tuple(sorted(roster)),
+                moves={name: moves[name] for name in sorted(roster) if name in moves},
+                t0_s=t0_s,
+                slot_s=self._slot_s,
+                resend_s=self._scenario.network.resend_s,
+                due_s=now_s,
+                gone=gone,
+            )
+
+    def _with_partners(self, names: set[Name]) -> set[Name]:
+        """Add those without whose promises nobody could tell what some vehicles own."""
+        roster, waiting, states = set(names), sorted(names), self.shown.states
+        while waiting:
+            new = partners(states[waiting.pop()], states) - roster
+            roster |= new
+            waiting += sorted(new)
+        return roster
+
+    # --- outputs ------------------------------------------------------------------------------
+
+    def outgoing(self, now_s: float) -> Iterator[tuple[Name, Prepare | Plan]]:
+        """Return what has to be sent (again) now, and to whom."""
+        for handover in self.handovers:
+            yield from handover.outgoing(now_s)
+
+    @property
+    def wakeups(self) -> list[float]:
+        """When `outgoing` has something to send."""
+        return [each.wakeup_s for each in self.handovers if each.wakeup_s is not None]
+
+    @property
+    def in_force(self) -> int:
+        """Ballots of this slot that are in force."""
+        return sum(handover.phase is Phase.IN_FORCE for handover in self.handovers)
+
+
+def _clusters(groups: Iterable[set[Name]]) -> list[set[Name]]:
+    """Join groups that share a vehicle."""
+    clusters: list[set[Name]] = []
+    for group in groups:
+        joined = set(group)
+        apart = []
+        for cluster in clusters:
+            if cluster & joined:
+                joined |= cluster
+            else:
+                apart.append(cluster)
+        clusters = [*apart, joined]
+    return clusters

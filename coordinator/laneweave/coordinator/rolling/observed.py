@@ -1,0 +1,141 @@
+"""What vehicles have shown, and who the census has listed, as of now and of a moment ago.
+
+Plans are made from what was the case at one time, whatever has arrived since: so they do not
+depend on how fast messages are. It is enough to keep the newest state of each vehicle and the
+newest one with an earlier time, since that moment is no more than a tick ago.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import TypeVar
+
+from attrs import frozen
+
+from laneweave.protocol.wire.messages import Census, Name, VehicleState
+
+_News = TypeVar("_News", Census, VehicleState)
+
+
+@frozen
+class Snapshot:
+    """What was known at a time."""
+
+    census: Census
+    states: Mapping[Name, VehicleState]
+    """Of those who had shown themselves."""
+    gone: frozenset[Name]
+    """Who shared deeds with somebody and had left the road."""
+
+
+class Shown:
+    """The newest states and the newest census, and those before them."""
+
+    def __init__(self) -> None:
+        """Begin with nothing known."""
+        self.states: dict[Name, VehicleState] = {}
+        """The newest state of each vehicle on the road."""
+        self.census: Census | None = None
+        """The newest one."""
+        self._before: dict[Name, VehicleState] = {}
+        """The newest state with an earlier time."""
+        self._left: dict[Name, VehicleState] = {}
+        """The newest state of each that has left since it was looked at last."""
+        self._census_before: Census | None = None
+
+    def forget(self) -> None:
+        """Begin anew: another road."""
+        self.states.clear()
+        self.take_over()
+
+    def take_over(self) -> None:
+        """Forget what says where vehicles are; what they have shown of what they own stays true."""
+        self._before.clear()
+        self._left.clear()
+        self.census = self._census_before = None
+
+    def on_census(self, census: Census) -> list[Name]:
+        """Take note of who is on the road; return who has left it."""
+        if self.census is not None and census.t_s > self.census.t_s:
+            self._census_before = self.census
+        self.census = census
+        listed = {entry.vehicle for entry in census.on_road}
+        gone = [name for name in self.states if name not in listed]
+        for name in gone:
+            self._left[name] = self.states.pop(name)
+        return gone
+
+    def on_state(self, state: VehicleState) -> bool:
+        """Take a vehicle's state; return whether it is the newest of it."""
+        known = self.states.get(state.vehicle)
+        if known is not None and is_older(state, known):
+            if state.t_s < known.t_s:
+                self._keep_before(state)
+            return False
+        if known is not None and state.t_s > known.t_s:
+            self._keep_before(known)
+        self.states[state.vehicle] = state
+        return True
+
+    @property
+    def gone(self) -> frozenset[Name]:
+        """Who shares deeds with somebody and has left the road."""
+        return _gone(self.states.values(), self.census)
+
+    def at(self, t_s: float) -> Snapshot:
+        """Return what was known at a road time [s], and forget those who have left.
+
+        Raises:
+            ValueError: there has not been any census.
+        """
+        census = _at(t_s, self.census, self._census_before) or self.census
+        if census is None:
+            raise ValueError("no census yet")
+        states = {
+            entry.vehicle: state
+            for entry in census.on_road
+            if (state := self._state_at(t_s, entry.vehicle)) is not None
+        }
+        for name in self._left:
+            self._before.pop(name, None)
+        self._left.clear()
+        return Snapshot(census, states, _gone(states.values(), census))
+
+    def _state_at(self, t_s: float, name: Name) -> VehicleState | None:
+        newest = self.states.get(name) or self._left.get(name)
+        return _at(t_s, newest, self._before.get(name))
+
+    def _keep_before(self, state: VehicleState) -> None:
+        before = self._before.get(state.vehicle)
+        if before is None or is_older(before, state):
+            self._before[state.vehicle] = state
+
+
+def is_older(state: VehicleState, other: VehicleState) -> bool:
+    """Tell whether a state of a vehicle was sent before another one of it."""
+    if state.incarnation == other.incarnation and state.t_s != other.t_s:
+        return state.t_s < other.t_s
+    return _age(state) < _age(other)
+
+
+def _age(state: VehicleState) -> tuple[object, ...]:
+    deed = state.deed
+    return (
+        state.incarnation,
+        state.t_s,
+        state.promised or (),
+        bool(state.estate),
+        state.accepted,
+        (deed.ballot, deed.open) if deed is not None else (),
+    )
+
+
+def _at(t_s: float, newest: _News | None, before: _News | None) -> _News | None:
+    """Return what was known at a time (road time); None: nothing yet."""
+    return newest if newest is not None and newest.t_s <= t_s else before
+
+
+def _gone(states: Iterable[VehicleState], census: Census | None) -> frozenset[Name]:
+    listed = {entry.vehicle for entry in census.on_road} if census else set[Name]()
+    deeds = [state.deed for state in states if state.deed is not None]
+    return frozenset(name for deed in deeds for name in deed.roster if name not in listed)

@@ -1,0 +1,5 @@
+"""The planning service: plan requests from clients on the network.
+
+Entry points: `server.PlanningService`, `client.PlanClient` and `client.AsyncPlanClient`. Uses
+`planning` only; imported by `coordinator.core` and by launch.
+"""

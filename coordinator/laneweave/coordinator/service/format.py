@@ -1,0 +1,110 @@
+"""How requests and answers are written: JSON or MessagePack, the answer as the request."""
+
+from __future__ import annotations
+
+import codecs
+import json
+from collections.abc import Callable
+from typing import Any, Final
+
+import msgpack
+from attrs import frozen
+
+from laneweave.coordinator.planning import PlanResponse
+from laneweave.protocol.errors import BadInputError, one_line
+from laneweave.protocol.runtime.node import Reply
+
+JSON_TYPE: Final = "application/json"
+MSGPACK_TYPE: Final = "application/msgpack"
+
+INVALID: Final = "invalid"
+"""The request is not acceptable; asked again it will not be, either."""
+OVERLOADED: Final = "overloaded"
+"""Too many requests are in hand; asked again later it may be planned."""
+LATE: Final = "late"
+"""The deadline passed before a worker was free."""
+FAILED: Final = "failed"
+"""Planning failed: an error in the service."""
+CODES: Final = (INVALID, OVERLOADED, LATE, FAILED)
+
+
+@frozen
+class Refusal:
+    """Why there is no plan."""
+
+    code: str
+    """One of `CODES`."""
+    message: str
+    """One line for a person."""
+    field: str
+    """The field of the request that is not acceptable; empty: none is to blame."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the error reply as a map."""
+        return {"field": self.field, "message": self.message, "code": self.code}
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Refusal:
+        """Read an error reply; one without a code is of the kind that its field tells."""
+        field, message = (
+            one_line(str(data.get("field", ""))),
+            one_line(str(data.get("message", ""))),
+        )
+        return cls(str(data.get("code", INVALID if field else FAILED)), message, field)
+
+
+@frozen
+class Format:
+    """One of the two ways to write a map."""
+
+    encoding: str
+    """MIME type."""
+    write: Callable[[dict[str, Any]], bytes]
+    parse: Callable[[bytes], object]
+
+    def read(self, payload: bytes) -> dict[str, Any]:
+        """Return the map in a payload.
+
+        Raises:
+            BadInputError: there is none, whatever the bytes are.
+        """
+        try:
+            data = self.parse(payload)
+        except Exception as error:
+            # Whatever a parser makes of bytes: not text, too deep, too many digits, cut off.
+            raise BadInputError("request", payload[:16], f"a map in {self.encoding}") from error
+        if not isinstance(data, dict):
+            raise BadInputError("request", type(data).__name__, f"a map in {self.encoding}")
+        return data
+
+    def reply(self, token: int, answer: PlanResponse | Refusal) -> Reply:
+        """Return the effect that answers a question."""
+        if isinstance(answer, Refusal):
+            return self.refuse(token, answer)
+        return Reply(token, self.write(answer.to_dict()), encoding=self.encoding)
+
+    def refuse(self, token: int, refusal: Refusal) -> Reply:
+        """Return the effect that refuses a question."""
+        return Reply(token, self.write(refusal.to_dict()), ok=False, encoding=self.encoding)
+
+
+JSON: Final = Format(
+    JSON_TYPE,
+    lambda data: json.dumps(data).encode(),
+    json.loads,
+)
+MSGPACK: Final = Format(MSGPACK_TYPE, msgpack.packb, msgpack.unpackb)
+
+
+def format_of(payload: bytes, encoding: str) -> Format:
+    """Return how a payload is written: as its encoding says, or as it looks.
+
+    Zenoh's encoding of a payload that nobody gave one to says nothing about maps.
+    """
+    kind = encoding.partition(";")[0]
+    for form in (JSON, MSGPACK):
+        if kind == form.encoding:
+            return form
+    # A map in MessagePack begins with a byte that no text in JSON begins with, but for a mark.
+    looks_packed = payload[:1] >= b"\x80" and not payload.startswith(codecs.BOM_UTF8)
+    return MSGPACK if looks_packed else JSON

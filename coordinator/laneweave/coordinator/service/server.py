@@ -1,0 +1,326 @@
+"""The planning service: answers plan requests of anyone on the network.
+
+Every coordinator of a network gets every request and takes those that fall to it (`sharing`): so
+any number of them share the load, without a word between them. A request waits until a worker is
+free, at most until its deadline, and is planned in the time that is left then. Asked again by its
+id, it is answered as before, or with the plan that is under way.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+from functools import partial
+from hashlib import blake2b
+from itertools import islice
+from typing import ClassVar
+
+import attrs
+from attrs import define, field, frozen
+
+from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan
+from laneweave.coordinator.service.format import (
+    FAILED,
+    INVALID,
+    JSON,
+    LATE,
+    MSGPACK,
+    OVERLOADED,
+    Format,
+    Refusal,
+    format_of,
+)
+from laneweave.coordinator.service.rendezvous import falls_to
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.runtime.metrics import told
+from laneweave.protocol.runtime.node import TOO_LATE, Decline, Delegate, Effect, Reply
+from laneweave.protocol.scenario.deployment import Service
+from laneweave.protocol.scenario.solvers import DEFAULT_SOLVER
+
+HANDED_OUT_AHEAD = 1
+"""Jobs for each worker beside the one that it does, so that it need not wait for the next."""
+CACHE_BYTES = 1 << 26
+"""Answers that are kept are not longer, all together."""
+
+
+@frozen
+class ServiceNumbers:
+    """What the service has done so far, and has in hand."""
+
+    ABOUT: ClassVar[str] = "service"
+
+    taken_total: int = field(default=0, metadata=told("Requests that fell to this coordinator"))
+    left_total: int = field(
+        default=0, metadata=told("Requests that were left to other coordinators")
+    )
+    answered_total: int = field(default=0, metadata=told("Requests that were planned and answered"))
+    repeated_total: int = field(
+        default=0,
+        metadata=told("Requests that were answered with another one's answer, by their id"),
+    )
+    invalid_total: int = field(default=0, metadata=told("Requests refused: not valid"))
+    overloaded_total: int = field(default=0, metadata=told("Requests refused: too many in hand"))
+    late_total: int = field(
+        default=0,
+        metadata=told("Requests dropped: the deadline passed before a worker was free"),
+    )
+    failed_total: int = field(default=0, metadata=told("Requests whose planning failed"))
+    planning_seconds_total: float = field(default=0.0, metadata=told("Solvers' time"))
+    service_seconds_total: float = field(
+        default=0.0,
+        metadata=told("Time from requests' arrivals to their answers, without the solvers' time"),
+    )
+    waiting: int = field(default=0, metadata=told("Requests that wait for a worker"))
+    planning: int = field(default=0, metadata=told("Requests that workers have"))
+
+
+@define(eq=False)
+class _Entry:
+    """A request in hand."""
+
+    request: PlanRequest
+    came_s: float
+    job: int
+    askers: list[tuple[int, Format]] = field(factory=list)
+    """Who waits for the answer, and in which format."""
+    dropped: bool = False
+    """It has been answered before its computation ended."""
+
+    @property
+    def deadline_s(self) -> float:
+        return self.came_s + self.request.deadline_s
+
+
+@frozen
+class _Kept:
+    """An answer that was given. Packed, since a request in Python is twenty times its bytes."""
+
+    request: bytes
+    """Digest."""
+    answer: bytes
+    answered_s: float
+
+
+class PlanningService:
+    """Pure core of the service; its coordinator hands it questions, results and the time."""
+
+    def __init__(
+        self, name: str, settings: Service, workers: int, solver: str = DEFAULT_SOLVER
+    ) -> None:
+        """Make a service that has nothing in hand.
+
+        Args:
+            name: of the coordinator, among those who share the load.
+            settings: limits.
+            workers: how many requests are planned at a time.
+            solver: plans requests that name none.
+        """
+        self._name = name
+        self._solver = solver
+        self._settings = settings
+        self._workers = workers
+        self._waiting: deque[_Entry] = deque()
+        self._planning: dict[int, _Entry] = {}
+        self._in_hand: dict[str, _Entry] = {}
+        """Requests that wait or are planned, by id; those without one are not here."""
+        self._answers: dict[str, _Kept] = {}
+        """Answers by the request's id, in order of their time."""
+        self._kept_bytes = 0
+        self._numbers = ServiceNumbers()
+
+    @property
+    def numbers(self) -> ServiceNumbers:
+        """What has been done so far."""
+        return attrs.evolve(self._numbers, waiting=len(self._waiting), planning=len(self._planning))
+
+    @property
+    def wakeup_s(self) -> float | None:
+        """When the deadline of a request that waits passes."""
+        return min((entry.deadline_s for entry in self._not_begun()), default=None)
+
+    def _not_begun(self) -> Iterator[_Entry]:
+        """Yield what no worker has begun: they take what is handed out in its order."""
+        ahead = islice(self._planning.values(), self._workers, None)
+        yield from (entry for entry in ahead if not entry.dropped)
+        yield from self._waiting
+
+    # --- questions ----------------------------------------------------------------------------
+
+    def take(
+        self,
+        token: int,
+        payload: bytes,
+        encoding: str,
+        job: int,
+        others: Iterable[str],
+        now_s: float,
+    ) -> Iterator[Effect]:
+        """Take a request, leave it to another coordinator, or refuse it.
+
+        Args:
+            token: of the question.
+            payload: the request, in whatever form it came.
+            encoding: what the asker says of it.
+            job: number of the computation that this may become.
+            others: names of the other coordinators that live.
+            now_s: node clock.
+        """
+        if not falls_to(self._name, others, payload):
+            self._count("left_total")
+            yield Decline(token)
+            return
+        self._count("taken_total")
+        form = format_of(payload, encoding)
+        try:
+            request = self._read(form, payload)
+            self._forget_old(now_s)
+            entry, kept = self._known(request)
+        except BadInputError as error:
+            self._count("invalid_total")
+            yield form.refuse(token, Refusal(INVALID, str(error), error.field))
+            return
+        if entry is not None:
+            self._count("repeated_total")
+            entry.askers.append((token, form))
+            return
+        if kept is not None:
+            self._count("repeated_total")
+            yield Reply(token, form.write(MSGPACK.read(kept.answer)), encoding=form.encoding)
+            return
+        if len(self._waiting) + len(self._planning) >= self._settings.queue_limit:
+            self._count("overloaded_total")
+            yield form.refuse(token, self._overloaded())
+            return
+        entry = _Entry(request, now_s, job, [(token, form)])
+        if request.id:
+            self._in_hand[request.id] = entry
+        self._waiting.append(entry)
+        yield from self._hand_out(now_s)
+
+    def _read(self, form: Format, payload: bytes) -> PlanRequest:
+        most = self._settings.max_request_bytes
+        if len(payload) > most:
+            raise BadInputError("request", f"{len(payload)} bytes or more", f"at most {most} bytes")
+        request = PlanRequest.from_dict(form.read(payload))
+        if request.deadline_s > self._settings.max_deadline_s:
+            allowed = f"at most {self._settings.max_deadline_s:g} at this service"
+            raise BadInputError("deadline_s", request.deadline_s, allowed)
+        return request
+
+    def _known(self, request: PlanRequest) -> tuple[_Entry | None, _Kept | None]:
+        """Return what is known of a request that was asked before."""
+        entry, kept = self._in_hand.get(request.id), self._answers.get(request.id)
+        another = (entry is not None and entry.request != request) or (
+            kept is not None and kept.request != _digest(request)
+        )
+        if another:
+            raise BadInputError("id", request.id, "an id that no other request has had of late")
+        return entry, kept
+
+    def _overloaded(self) -> Refusal:
+        limit = self._settings.queue_limit
+        text = (
+            f"service.queue_limit: got {limit} requests in hand; allowed: {limit}; ask again later"
+        )
+        return Refusal(OVERLOADED, text, "")
+
+    # --- planning -----------------------------------------------------------------------------
+
+    def owns(self, job: int) -> bool:
+        """Tell whether a computation belongs to a request."""
+        return job in self._planning
+
+    def _hand_out(self, now_s: float) -> Iterator[Effect]:
+        """Give workers what waits, in the order of its coming."""
+        most_planning = self._workers * (1 + HANDED_OUT_AHEAD)
+        while self._waiting and len(self._planning) < most_planning:
+            entry = self._waiting.popleft()
+            if entry.deadline_s <= now_s:
+                yield from self._end(entry, self._late(entry, now_s), now_s)
+                continue
+            self._planning[entry.job] = entry
+            job = partial(plan_in_time, entry.request, self._solver)
+            yield Delegate(entry.job, job, entry.deadline_s)
+
+    def finish(self, job: int, result: object, error: str, now_s: float) -> Iterator[Effect]:
+        """Answer a request whose computation has ended."""
+        entry = self._planning.pop(job)
+        if not entry.dropped:
+            yield from self._end(entry, self._outcome(entry, result, error, now_s), now_s)
+        yield from self._hand_out(now_s)
+
+    def _outcome(
+        self, entry: _Entry, result: object, error: str, now_s: float
+    ) -> PlanResponse | Refusal:
+        if isinstance(result, PlanResponse):
+            return result
+        if error.endswith(TOO_LATE):
+            return self._late(entry, now_s)
+        self._count("failed_total")
+        return Refusal(FAILED, f"planning failed: {error}", "")
+
+    def drop_late(self, now_s: float) -> Iterator[Effect]:
+        """Drop what has waited until its deadline."""
+        late = [entry for entry in self._not_begun() if entry.deadline_s <= now_s]
+        for entry in late:
+            if entry.job in self._planning:
+                entry.dropped = True
+            else:
+                self._waiting.remove(entry)
+            yield from self._end(entry, self._late(entry, now_s), now_s)
+
+    def _late(self, entry: _Entry, now_s: float) -> Refusal:
+        self._count("late_total")
+        waited_s, deadline_s = now_s - entry.came_s, entry.request.deadline_s
+        text = (
+            f"deadline_s: got {deadline_s:g}; allowed: longer than the {waited_s:.3f} s that "
+            "requests wait for a worker at present"
+        )
+        return Refusal(LATE, text, "deadline_s")
+
+    def _end(self, entry: _Entry, answer: PlanResponse | Refusal, now_s: float) -> Iterator[Effect]:
+        """Answer all who have asked for it, and keep what is worth keeping."""
+        if isinstance(answer, PlanResponse):
+            self._count("answered_total")
+            planned_s = answer.solve_ms / 1e3
+            self._count("planning_seconds_total", planned_s)
+            self._count("service_seconds_total", max(0.0, now_s - entry.came_s - planned_s))
+        for token, form in entry.askers:
+            yield form.reply(token, answer)
+        if self._in_hand.pop(entry.request.id, None) and isinstance(answer, PlanResponse):
+            kept = _Kept(_digest(entry.request), MSGPACK.write(answer.to_dict()), now_s)
+            self._answers[entry.request.id] = kept
+            self._kept_bytes += len(kept.answer)
+            self._forget_old(now_s)
+
+    def _forget_old(self, now_s: float) -> None:
+        """Let answers go that are too many, too long together, or too old."""
+        answers, settings = self._answers, self._settings
+        while answers:
+            oldest = next(iter(answers))
+            old = answers[oldest].answered_s <= now_s - settings.cache_s
+            many = len(answers) > settings.cache_entries or self._kept_bytes > CACHE_BYTES
+            if not many and not old:
+                return
+            self._kept_bytes -= len(answers.pop(oldest).answer)
+
+    def _count(self, name: str, by: float = 1) -> None:
+        counted = getattr(self._numbers, name) + by
+        self._numbers = attrs.evolve(self._numbers, **{name: counted})
+
+
+def _digest(request: PlanRequest) -> bytes:
+    # MessagePack does not write every text that JSON reads.
+    return blake2b(JSON.write(request.to_dict()), digest_size=16).digest()
+
+
+def plan_in_time(request: PlanRequest, solver: str, left_s: float) -> PlanResponse:
+    """Plan a request in the time that is left of its deadline; see `checked_plan`.
+
+    `solver` plans where the request names none.
+    """
+    left_s = min(left_s, request.deadline_s)
+    hurried = attrs.evolve(request, deadline_s=left_s)
+    response = checked_plan(hurried, solver=request.solver or solver)
+    waited_ms = round(1e3 * (request.deadline_s - left_s), 3)
+    return attrs.evolve(response, waited_ms=waited_ms)

@@ -1,0 +1,164 @@
+"""`laneweave bench planner`: seeded formations of growing size (`instances`).
+
+CPU time of one thread, with the compiled parts loaded. What a size or a family costs is told by the
+median and the 95th percentile of its instances; those that reach the deadline count with it.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Final
+
+import attrs
+import numpy as np
+from rich.table import Table
+
+from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan, warm_up
+from laneweave.coordinator.planning.grid import Mode
+from laneweave.coordinator.planning.instances import (
+    TRAFFIC_KINDS,
+    block_request,
+    formation_request,
+    traffic_request,
+)
+from laneweave.protocol.errors import BadInputError
+from laneweave.sim_bridge.recording.run_record import spread
+
+
+@attrs.frozen
+class Family:
+    """A motion mode with conflicts, and where the formations come from.
+
+    make: one of `instances`, called with a seed.
+    """
+
+    mode: Mode
+    conflicts: tuple[str, ...]
+    make: Callable[..., PlanRequest] = formation_request
+
+    def request(self, seed: int, vehicles: int, deadline_s: float) -> PlanRequest:
+        """Return an instance.
+
+        Raises:
+            BadInputError: so many vehicles do not fit into a block.
+        """
+        try:
+            return self.make(
+                seed,
+                vehicles=vehicles,
+                mode=self.mode,
+                conflicts=self.conflicts,
+                deadline_s=deadline_s,
+            )
+        except ValueError as error:
+            raise BadInputError("--vehicles", vehicles, f"fewer ({error})") from error
+
+
+FAMILIES: Final[dict[str, Family]] = {
+    "node-edge": Family(1, ("node", "edge")),
+    "following": Family(1, ("node", "edge", "special-1")),
+    "geometric": Family(2, ("geometric",)),
+    "block": Family(1, ("node", "edge", "special-1"), block_request),
+    "traffic": Family(1, TRAFFIC_KINDS, traffic_request),
+}
+FIRST_ANSWER_S = 0.1
+"""Who decides quickly what to do has a path set by then, though perhaps not the best."""
+
+
+def bench_planner(
+    vehicles: Sequence[int],
+    families: Sequence[str],
+    *,
+    instances: int,
+    seed: int,
+    deadline_s: float,
+    solver: str,
+) -> Iterator[dict[str, Any]]:
+    """Measure the planner.
+
+    Args:
+        vehicles: formation sizes.
+        families: some of `FAMILIES`.
+        instances: how many of each size and family.
+        seed: of the first of them.
+        deadline_s: of each request.
+        solver: plans alone, without another one to fall back on; see `plan`.
+
+    Yields:
+        One row per family and size.
+    """
+    warm_up()
+    for family in families:
+        for size in vehicles:
+            requests = [
+                FAMILIES[family].request(seed + index, size, deadline_s)
+                for index in range(instances)
+            ]
+            yield {
+                "family": family,
+                "vehicles": size,
+                "instances": instances,
+                "solver": solver,
+                "deadline_s": deadline_s,
+                **_measured(requests, solver),
+            }
+
+
+def _measured(requests: Sequence[PlanRequest], solver: str) -> dict[str, Any]:
+    times_ms, late_ms, gaps, answered = [], [], [], 0
+    statuses: list[str] = []
+    for request in requests:
+        began, wall_s = time.thread_time(), time.perf_counter()
+        response = checked_plan(request, solver=solver, fallback=False)
+        times_ms.append((time.thread_time() - began) * 1e3)
+        late_ms.append((time.perf_counter() - wall_s - request.deadline_s) * 1e3)
+        statuses.append(response.status)
+        gaps.append(gap_percent(response))
+        if times_ms[-1] > FIRST_ANSWER_S * 1e3:
+            hurried = attrs.evolve(request, deadline_s=FIRST_ANSWER_S)
+            response = checked_plan(hurried, solver=solver, fallback=False)
+        answered += response.cost is not None
+    known = np.array([gap for gap in gaps if math.isfinite(gap)])
+    return {
+        "optimal": statuses.count("optimal"),
+        "feasible": statuses.count("feasible"),
+        "cpu_ms": spread(np.array(times_ms), 50, 95, largest=True),
+        "gap_percent": spread(known, 50, largest=True),
+        "answered_in_100_ms": answered,
+        "late_ms": round(max(0.0, *late_ms), 1),
+    }
+
+
+def gap_percent(response: PlanResponse) -> float:
+    """Return by how much the cost may be above the least one, relative to the lower bound."""
+    if response.cost is None or response.lower_bound is None:
+        return math.inf
+    return 100.0 * (response.cost - response.lower_bound) / max(response.lower_bound, 1)
+
+
+def planner_table(rows: Sequence[dict[str, Any]]) -> Table:
+    """Return the results of `bench_planner` as a table."""
+    table = Table(
+        "conflicts",
+        "vehicles",
+        "optimal",
+        "CPU ms p50",
+        "p95",
+        "max",
+        "gap % p50",
+        "max",
+        "by 0.1 s",
+    )
+    for row in rows:
+        cpu, gap = row["cpu_ms"], row["gap_percent"]
+        table.add_row(
+            row["family"],
+            str(row["vehicles"]),
+            f"{row['optimal']} of {row['instances']}",
+            *(f"{cpu[name]:.1f}" for name in ("p50", "p95", "max")),
+            *("-" if gap[name] is None else f"{gap[name]:.1f}" for name in ("p50", "max")),
+            f"{row['answered_in_100_ms']}",
+        )
+    return table

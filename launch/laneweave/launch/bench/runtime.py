@@ -1,0 +1,177 @@
+"""`laneweave bench runtime`: what a road full of processes costs.
+
+Machines differ and are noisy: medians, and rates within one run.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import platform
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pyarrow.parquet as pq
+from attrs import define, field
+from rich.table import Table
+
+from laneweave.launch.observe.observer import View
+from laneweave.launch.run.local_run import LocalRun
+from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.sim_bridge.recording.run_record import spread
+
+ROLES = ("router", "coordinator", "bridge", "agent")
+LOOK_EVERY_S = 0.3
+SETTLE_S = 10.0
+"""Road seconds after the road has filled before anything is measured."""
+
+
+@define
+class _Window:
+    """Processes seen at the beginning and the end of the measured part of a run."""
+
+    begin_s: float
+    end_s: float
+    seen: dict[str, tuple[psutil.Process, float]] = field(factory=dict)
+    """Each process, and its CPU time when it was last looked at."""
+    looked_s: float = 0.0
+    began: tuple[float, float] | None = None
+    ended: tuple[float, float] | None = None
+    cpu_s: dict[str, float] = field(factory=dict)
+    memory: dict[str, list[tuple[float, float]]] = field(factory=dict)
+
+    def watch(self, view: View, process_ids: Mapping[str, int]) -> None:
+        """Take measurements while the window is open."""
+        now_s = time.perf_counter()
+        if self.began is None and view.t_s >= self.begin_s:
+            self.began = (view.t_s, now_s)
+            self._look(process_ids, count=False)
+        elif self.began is not None and self.ended is None:
+            if view.t_s >= self.end_s:
+                self.ended = (view.t_s, now_s)
+                self._look(process_ids, count=True)
+                self._weigh(process_ids)
+            elif now_s >= self.looked_s + LOOK_EVERY_S:
+                # Vehicles leave, and their agents' accounts with them: look often.
+                self.looked_s = now_s
+                self._look(process_ids, count=True)
+
+    def _look(self, process_ids: Mapping[str, int], *, count: bool) -> None:
+        for name, process_id in process_ids.items():
+            with contextlib.suppress(psutil.Error):
+                process, before = self.seen.get(name) or (psutil.Process(process_id), 0.0)
+                cpu_s = _cpu_s(process)
+                self.seen[name] = (process, cpu_s)
+                if count:
+                    role = _role(name)
+                    self.cpu_s[role] = self.cpu_s.get(role, 0.0) + cpu_s - before
+
+    def _weigh(self, process_ids: Mapping[str, int]) -> None:
+        for name, process_id in process_ids.items():
+            with contextlib.suppress(psutil.Error):
+                info = psutil.Process(process_id).memory_full_info()
+                self.memory.setdefault(_role(name), []).append((info.pss / 2**20, info.uss / 2**20))
+
+
+def bench_runtime(vehicles: int, *, seconds: float, per_process: int, seed: int) -> dict[str, Any]:
+    """Measure a run with about `vehicles` on the road, one process for `per_process` of them.
+
+    Returns:
+        Real-time factor, tick time, CPU and memory per role, over `seconds` of road time.
+    """
+    base = load_scenario(None)
+    travel_s = base.road.length_m / base.formation.speed_mps
+    volume = vehicles / (travel_s * base.road.lanes) * 3600.0
+    begin_s = travel_s + SETTLE_S
+    scenario = load_scenario(
+        None,
+        seed=seed,
+        demand__volume_veh_per_lane_h=volume,
+        demand__duration_s=begin_s + seconds,
+        runtime__vehicles_per_process=per_process,
+    )
+    window = _Window(begin_s, begin_s + seconds)
+    with tempfile.TemporaryDirectory(prefix="laneweave-bench-") as folder:
+        run = LocalRun(scenario, Path(folder) / "run", show_progress=False, watch=window.watch)
+        outcome = run.run()
+        ticks = pq.read_table(Path(folder) / "run" / "ticks.parquet")
+    times_s = ticks.column("t_s").to_numpy()
+    measured = (times_s > window.begin_s) & (times_s <= window.end_s)
+    return {
+        "vehicles_wanted": vehicles,
+        "volume_veh_per_lane_h": round(volume, 1),
+        "vehicles_per_process": per_process,
+        "vehicles_on_road": round(float(ticks.column("on_road").to_numpy()[measured].mean()), 1),
+        "real_time_factor": _rate(window),
+        "tick_ms": spread(ticks.column("tick_ms").to_numpy()[measured], 50, 99),
+        "cpu_ms_per_tick": _per_tick(window, scenario),
+        "memory_mib": _memory(window),
+        "problems": list(outcome.problems),
+    }
+
+
+def machine() -> dict[str, Any]:
+    """Return what the figures depend on."""
+    return {
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+    }
+
+
+def runtime_table(rows: list[dict[str, Any]]) -> Table:
+    """Return the results of `bench_runtime` as a table."""
+    table = Table("vehicles", "per process", "real-time factor", "tick p50 / p99 ms")
+    for role in ROLES:
+        table.add_column(f"{role} CPU ms/tick")
+    table.add_column("agents' memory MiB (each)")
+    for row in rows:
+        cpu, memory = row["cpu_ms_per_tick"], row["memory_mib"].get("agent", {})
+        table.add_row(
+            f"{row['vehicles_on_road']:.0f}",
+            str(row["vehicles_per_process"]),
+            f"{row['real_time_factor']:.2f}",
+            f"{row['tick_ms']['p50']:.1f} / {row['tick_ms']['p99']:.1f}",
+            *(f"{cpu.get(role, 0.0):.2f}" for role in ROLES),
+            f"{memory.get('total', 0.0):.0f} ({memory.get('each', 0.0):.1f})",
+        )
+    return table
+
+
+def _role(name: str) -> str:
+    return "coordinator" if name.startswith("c") else name.partition("-")[0]
+
+
+def _cpu_s(process: psutil.Process) -> float:
+    times = process.cpu_times()
+    return float(times.user + times.system)
+
+
+def _rate(window: _Window) -> float:
+    if window.began is None or window.ended is None:
+        return 0.0
+    road_s, wall_s = (end - begin for begin, end in zip(window.began, window.ended, strict=True))
+    return round(road_s / wall_s, 3)
+
+
+def _per_tick(window: _Window, scenario: Scenario) -> dict[str, float]:
+    ticks = (window.end_s - window.begin_s) / scenario.runtime.tick_s
+    return {role: round(cpu * 1e3 / ticks, 3) for role, cpu in sorted(window.cpu_s.items())}
+
+
+def _memory(window: _Window) -> dict[str, dict[str, float]]:
+    return {
+        role: {
+            "processes": len(pairs),
+            "total": round(sum(pss for pss, _ in pairs), 1),
+            "each": round(float(np.median([pss for pss, _ in pairs])), 2),
+            "own_each": round(float(np.median([uss for _, uss in pairs])), 2),
+        }
+        for role, pairs in sorted(window.memory.items())
+    }

@@ -1,0 +1,134 @@
+"""`laneweave certs`: an authority and certificates to try a secured deployment with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from laneweave.protocol.config.endpoints import host_of
+from laneweave.protocol.config.identities import Identity, Party, coordinator_names, parse_identity
+from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.tables import Scenario
+
+app = typer.Typer(help="Make test certificates.", add_completion=False)
+
+DEFAULT_DAYS = 365.0
+MOST_DAYS = 3650.0
+
+Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the certificates.")]
+Hosts = Annotated[
+    list[str] | None,
+    typer.Option("--host", metavar="NAME_OR_IP", help="Where the router is found; repeatable."),
+]
+Days = Annotated[float, typer.Option("--days", metavar="N", help="How long they are valid.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace what is there.")]
+
+
+@app.command()
+def init(
+    folder: Folder,
+    config: Annotated[
+        Path | None,
+        typer.Option("--config", metavar="DEPLOYMENT.toml", help="Whose names are taken."),
+    ] = None,
+    host: Hosts = None,
+    days: Days = DEFAULT_DAYS,
+    client: Annotated[
+        list[str] | None, typer.Option("--client", metavar="NAME", help="One more client.")
+    ] = None,
+    vehicle: Annotated[
+        list[str] | None,
+        typer.Option("--vehicle", metavar="NAME", help="A vehicle with a process of its own."),
+    ] = None,
+    force: Force = False,
+    keep: Annotated[
+        bool, typer.Option("--keep", help="Leave what is there, and make what is missing.")
+    ] = False,
+) -> None:
+    """Make a test authority, and a certificate for each process of a deployment."""
+    from laneweave.launch.deploy.certificate_authority import (
+        CA_DAYS,
+        host_names,
+        issue,
+        load_authority,
+        make_authority,
+    )
+    from laneweave.protocol.security.access import ca_path, certificate_path
+
+    _check_days(days)
+    if folder == Path():
+        raise BadInputError("DIR", "", "the name of a folder")
+    if keep and force:
+        raise BadInputError("--keep", "true", "not with --force")
+    settings = load_scenario(config)
+    identities = list(dict.fromkeys(_wanted(settings, client or [], vehicle or [])))
+    hosts = [*(host or ()), *_hosts(settings)]
+    host_names(hosts)  # before anything is written
+    if keep and ca_path(folder).exists():
+        authority = load_authority(folder)
+        identities = [
+            identity
+            for identity in identities
+            if not certificate_path(folder, identity.common_name).exists()
+        ]
+    else:
+        authority = make_authority(folder, days=max(CA_DAYS, days), replace=force)
+    for identity in identities:
+        issue(authority, folder, identity, days=days, hosts=hosts, replace=force)
+    typer.echo(f"{folder}: a test authority and {len(identities)} certificates:")
+    for identity in identities:
+        typer.echo(f"  {identity.common_name}")
+    typer.echo(f"Keep {folder}/ca.key away from all hosts: whoever has it can be anybody.")
+
+
+@app.command()
+def add(
+    folder: Folder,
+    identity: Annotated[
+        str, typer.Argument(metavar="IDENTITY", help="Such as vehicle.v0001 or client.NAME.")
+    ],
+    host: Hosts = None,
+    days: Days = DEFAULT_DAYS,
+    force: Force = False,
+) -> None:
+    """Make one more certificate with the authority that is there."""
+    from laneweave.launch.deploy.certificate_authority import issue, load_authority
+
+    _check_days(days)
+    wanted = parse_identity(identity, "IDENTITY")
+    if host and wanted.party is not Party.ROUTER:
+        raise BadInputError("--host", host[0], "nothing, hosts are the router's only")
+    issue(load_authority(folder), folder, wanted, days=days, hosts=host or (), replace=force)
+    typer.echo(f"{folder}: a certificate of {wanted.common_name}")
+
+
+def _check_days(days: float) -> None:
+    if not 0.0 < days <= MOST_DAYS:
+        raise BadInputError("--days", days, f"(0, {MOST_DAYS:g}]")
+
+
+def _wanted(settings: Scenario, clients: list[str], vehicles: list[str]) -> Iterator[Identity]:
+    security = settings.security
+    yield Identity(Party.ROUTER)
+    yield Identity(Party.BRIDGE)
+    for party, names in (
+        (Party.COORDINATOR, coordinator_names(settings)),
+        (Party.FLEET, security.fleets),
+        (Party.CLIENT, (*security.clients, *clients)),
+        (Party.OBSERVER, security.observers),
+        (Party.VEHICLE, (*security.vehicles, *vehicles)),
+    ):
+        for name in names:
+            yield parse_identity(Identity(party, name).common_name, f"{party} NAME")
+
+
+def _hosts(settings: Scenario) -> Iterator[str]:
+    """Yield the hosts that a configuration's endpoints name."""
+    for endpoint in (settings.network.endpoint, *settings.network.listen):
+        host = host_of(endpoint)
+        if host:
+            yield host

@@ -1,0 +1,51 @@
+"""`laneweave config`: look at a configuration before somebody runs with it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from laneweave.launch.deploy.config_check import check_deployment
+from laneweave.protocol.config.identities import Identity, Party, parse_identity
+from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.errors import BadInputError
+
+app = typer.Typer(help="Look at a configuration.", add_completion=False)
+BAD_INPUT = 2
+
+
+@app.callback()
+def _group() -> None:
+    """Look at a configuration."""
+
+
+@app.command()
+def check(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A DEPLOYMENT.toml.")],
+    role: Annotated[
+        Party | None, typer.Option("--role", help="Whose certificate to look at, too.")
+    ] = None,
+    name: Annotated[str, typer.Option("--name", metavar="NAME", help="Name in that role.")] = "",
+) -> None:
+    """Check a configuration, and with --role the files that this role would use here."""
+    settings = load_scenario(file)
+    if name and role is None:
+        raise BadInputError("--name", name, "a name beside --role")
+    identity = None
+    if role is not None:
+        identity = parse_identity(Identity(role, name).common_name, "--role and --name")
+    report = check_deployment(settings, identity)
+    for line in report.warnings:
+        typer.echo(f"warning: {line}", err=True)
+    for line in report.problems:
+        typer.echo(" ".join(line.split()), err=True)
+    if report.problems:
+        raise typer.Exit(BAD_INPUT)
+    table = Table("what", str(file), show_lines=False)
+    for what, value in report.facts:
+        table.add_row(what, value)
+    Console().print(table)

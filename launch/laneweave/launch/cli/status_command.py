@@ -1,0 +1,185 @@
+"""`laneweave status`: what a deployment does, and whether it is well."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import time
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from attrs import evolve
+from rich.console import Console
+from rich.table import Table
+
+from laneweave.launch.deploy.deployments import load_deployment
+from laneweave.launch.observe.observer import Observer
+from laneweave.launch.observe.role_health import AGENT, BRIDGE, COORDINATOR, RoleHealth
+from laneweave.launch.observe.status import Candidate, Status, status_of
+from laneweave.launch.observe.tally import HEARD, TOKENS, Tally
+from laneweave.protocol.errors import BadInputError, CommandFailedError
+from laneweave.protocol.scenario.deployment import parse_shard
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.security.access import access_of
+from laneweave.protocol.wire.topics import NAME_PATTERN, NAME_RULE, Keys
+
+WAIT_S = 0.1
+"""Listening goes on in parts of this length."""
+
+
+class Role(StrEnum):
+    """Whose health is asked for."""
+
+    coordinator = COORDINATOR
+    bridge = BRIDGE
+    agent = AGENT
+
+
+def status(
+    config: Annotated[
+        Path | None,
+        typer.Option("--config", metavar="DEPLOYMENT.toml", help="Scenario and network."),
+    ] = None,
+    endpoint: Annotated[
+        str | None, typer.Option("--endpoint", help="Zenoh endpoint of the router.")
+    ] = None,
+    realm: Annotated[str | None, typer.Option("--realm", help="Realm to look at.")] = None,
+    seconds: Annotated[
+        float, typer.Option("--seconds", min=0.1, max=60.0, help="How long to listen.")
+    ] = 2.0,
+    role: Annotated[
+        Role | None, typer.Option("--role", help="Only whether one process is well.")
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option("--name", help="Of the coordinator, or of the agent's vehicle.")
+    ] = None,
+    shard: Annotated[
+        str | None, typer.Option("--shard", metavar="I/N", help="Of the agents.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Listen to a deployment and tell how it is; status 1: it is not well."""
+    settings = load_deployment(config, endpoint, network__realm=realm)
+    health = _role_health(role, name, shard)
+    found = listen(settings, seconds, health)
+    if as_json:
+        typer.echo(json.dumps(found.to_dict(), indent=2))
+    elif health is None:
+        show(found, Console())
+    elif found.healthy:
+        typer.echo("healthy")
+    if found.problem is not None:
+        raise CommandFailedError(f"not healthy: {found.problem}")
+
+
+def _role_health(role: Role | None, name: str | None, shard: str | None) -> RoleHealth | None:
+    if shard is not None:
+        if role is not Role.agent or name is not None:
+            raise BadInputError("--shard", shard, "only --role agent, and no --name")
+        return RoleHealth(AGENT, shard, parse_shard(shard, "--shard").takes, is_shard=True)
+    if name is not None and (role in (None, Role.bridge) or not NAME_PATTERN.fullmatch(name)):
+        raise BadInputError("--name", name, f"with --role coordinator or agent: {NAME_RULE}")
+    if name is None and role in (Role.coordinator, Role.agent):
+        also = ", or --shard I/N" if role is Role.agent else ""
+        raise BadInputError("--name", "", f"the name of the process to look at{also}")
+    return None if role is None else RoleHealth(role.value, name or "")
+
+
+def listen(settings: Scenario, seconds: float, health: RoleHealth | None = None) -> Status:
+    """Listen to a deployment and return how it is, or how one process of it is.
+
+    Args:
+        settings: the deployment.
+        seconds: how long; shorter where one process is found well before.
+        health: of one process; None: of the whole.
+
+    Raises:
+        BadInputError: nobody answers at the endpoint.
+    """
+    from laneweave.protocol.transports.zenoh.transport import ZenohTransport
+
+    network = settings.network
+    observer = Observer(Keys(network.realm), topics=HEARD, tokens=TOKENS)
+    access = access_of(settings, "observer.status")
+    with contextlib.closing(ZenohTransport(access, observer.inbox.put)) as transport:
+        tally = Tally(time.monotonic())
+        observer.subscribe(transport)
+        end_s = tally.began_s + seconds
+        now_s = tally.began_s
+        while now_s < end_s:
+            for news in observer.news(min(WAIT_S, end_s - now_s)):
+                now_s = time.monotonic()
+                tally.take(news, now_s)
+                if now_s >= end_s:
+                    break  # more than can be taken in must not keep it here
+            now_s = time.monotonic()
+            if (
+                health is not None
+                and health.may_end_early(tally)
+                and health.problem(tally, now_s, network.election_s) is None
+            ):
+                break
+    found = status_of(tally, now_s, network.election_s, network.endpoint, network.realm)
+    if health is None:
+        return found
+    problem = health.problem(tally, now_s, network.election_s)
+    return evolve(found, healthy=problem is None, problem=problem)
+
+
+def show(found: Status, console: Console) -> None:
+    """Print a status as a table."""
+    table = Table(show_header=False, box=None, pad_edge=False)
+    for row in _rows(found):
+        table.add_row(*row)
+    console.print(table)
+
+
+def _rows(found: Status) -> list[tuple[str, str]]:
+    plans, road, vehicles = found.plans, found.road, found.vehicles
+    leader = "nobody" if found.leader is None else f"{found.leader}, term {found.term}"
+    if len(found.claims) > 1:
+        leader += f"; {len(found.claims)} claim to lead: {', '.join(found.claims)}"
+    in_force = f"{plans.in_force} in force"
+    if plans.operation is not None:
+        in_force += f", {plans.operation} operation"
+    if plans.formations is not None:
+        in_force += f", {plans.formations_with_plan} of {plans.formations} closed ones have one"
+    rows = [
+        ("health", "healthy" if found.healthy else "not healthy"),
+        ("realm", f"{found.realm} at {found.endpoint}, {found.listened_s:.1f} s"),
+        ("leader", leader),
+        ("candidates", "; ".join(map(_candidate, found.candidates)) or "none"),
+        ("plans", in_force),
+    ]
+    if road is None:
+        rows.append(("road", "none"))
+    else:
+        pace = "ended" if road.ended else f"pace {road.pace or 0.0:.1f}"
+        counts = (
+            f"{road.on_road} on the road, {road.entered} entered, {road.left} left, "
+            f"{road.demanded} demanded"
+        )
+        who = (
+            f"{vehicles.attended} attended, {vehicles.unattended} unattended, "
+            f"{vehicles.unheard} not heard; {vehicles.agents} agents"
+        )
+        rows += [("road", f"{road.t_s:.1f} s, {pace}; {counts}"), ("vehicles", who)]
+    rates = ", ".join(f"{topic} {rate:.1f}" for topic, rate in found.messages_per_s.items())
+    rows.append(("messages/s", rates or "none"))
+    loss = found.loss
+    rows.append(("loss", f"clock {_percent(loss.clock)}, state {_percent(loss.state)}"))
+    return rows
+
+
+def _candidate(one: Candidate) -> str:
+    if one.heard_s_ago is None:
+        return f"{one.coordinator} not heard"
+    leads = ", claims to lead" if one.leading else ""
+    token = "" if one.token else ", without a token"
+    return f"{one.coordinator} term {one.term}, {one.heard_s_ago:.2f} s ago{leads}{token}"
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.1f} %"

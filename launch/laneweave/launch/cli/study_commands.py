@@ -1,0 +1,132 @@
+"""The commands about many runs: `sweep` makes them, `report` shows them."""
+
+from __future__ import annotations
+
+import sys
+import time
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from laneweave.launch.cli.options import KeepTrajectories, check_jobs, parse_seeds
+from laneweave.launch.sweep.methods import METHODS
+from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.errors import BadInputError
+
+VOLUMES = "1000,1150,1300,1450,1600"
+"""Those of the paper (Section 5.2.3), in vehicles/(lane h)."""
+
+
+def sweep(
+    scenario: Annotated[
+        Path | None, typer.Argument(metavar="[SCENARIO.toml]", help="Default: the paper's road.")
+    ] = None,
+    methods: Annotated[
+        str, typer.Option("--methods", metavar="LIST", help=f"Of {', '.join(METHODS)}.")
+    ] = "formation",
+    volumes: Annotated[
+        str, typer.Option("--volumes", metavar="LIST", help="Vehicles per lane and hour.")
+    ] = VOLUMES,
+    seeds: Annotated[
+        str, typer.Option("--seeds", metavar="A:B", help="Seeds to run; B is not included.")
+    ] = "1:4",
+    duration: Annotated[
+        float | None, typer.Option("--duration", help="Seconds during which vehicles arrive.")
+    ] = None,
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", metavar="N", help="Processes; default: all cores.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="DIR",
+            help="Default: a new folder in runs/. That of a sweep: goes on with it.",
+        ),
+    ] = None,
+    keep_trajectories: Annotated[
+        KeepTrajectories, typer.Option("--keep-trajectories", help="Of which runs.")
+    ] = KeepTrajectories.first_seed,
+    dask: Annotated[
+        str | None,
+        typer.Option("--dask", metavar="ADDRESS", help="Run on a Dask cluster: its scheduler."),
+    ] = None,
+    no_progress: Annotated[bool, typer.Option("--no-progress", help="Show no progress.")] = False,
+) -> None:
+    """Run methods x volumes x seeds in parallel, in virtual time; what is finished stays."""
+    from laneweave.launch.sweep.folder import SweepFolder
+    from laneweave.launch.sweep.local_workers import run_locally
+    from laneweave.launch.sweep.methods import parse_methods
+    from laneweave.launch.sweep.points import parse_volumes, plan_points
+    from laneweave.launch.sweep.sweep import Runner, conduct, print_results
+
+    base = load_scenario(scenario, demand__duration_s=duration)
+    points = plan_points(
+        base,
+        parse_methods(methods),
+        parse_volumes(volumes, base),
+        parse_seeds(seeds),
+        keep_trajectories,
+    )
+    run: Runner
+    if dask is None:
+        run = partial(run_locally, workers=check_jobs(jobs))
+    else:
+        if jobs is not None:
+            raise BadInputError("--jobs", jobs, "only without --dask; a cluster has workers")
+        from laneweave.launch.sweep.dask_workers import run_on_dask
+
+        run = partial(run_on_dask, address=dask)
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    with SweepFolder(out or Path("runs") / f"sweep-{stamp}") as folder:
+        folder.check_settings(base)
+        failed = conduct(points, folder, run, show=not no_progress)
+        print_results(points, folder, Console())
+    sys.stdout.flush()
+    raise typer.Exit(1 if failed else 0)
+
+
+def report(
+    folders: Annotated[
+        list[Path], typer.Argument(metavar="DIR...", help="Folders of runs and sweeps.")
+    ],
+    formation: Annotated[
+        int | None,
+        typer.Option("--formation", metavar="N", help="Whose path map; default: moves most."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="DIR",
+            help="Where several folders are compared; default: a new folder in runs/.",
+        ),
+    ] = None,
+) -> None:
+    """Draw finished runs: figures and one page for each run, or for a sweep as a whole."""
+    from laneweave.launch.report.build import REPORT_DPI, report_comparison, report_run
+    from laneweave.launch.report.runs import Comparison, is_sweep, runs_of, single_run
+
+    if out is not None and len(folders) == 1:
+        raise BadInputError("--out", str(out), "only with several folders")
+    runs = list(runs_of(folders))
+    try:
+        for folder in folders:
+            if not is_sweep(folder):
+                page = report_run(single_run(folder), formation=formation, dpi=REPORT_DPI)
+                Console().print(f"{page}: written", highlight=False, soft_wrap=True)
+        if len(folders) > 1 or is_sweep(folders[0]):
+            if len(folders) == 1:
+                out = folders[0]
+            place = out or Path("runs") / f"report-{time.strftime('%Y%m%d-%H%M%S')}"
+            title = "laneweave: " + ", ".join(folder.resolve().name for folder in folders)
+            page = report_comparison(Comparison.of(runs), place, title, formation=formation)
+            Console().print(f"{page}: written", highlight=False, soft_wrap=True)
+    except BadInputError:
+        raise
+    except (OSError, ValueError, KeyError) as error:
+        names = ", ".join(map(str, folders))
+        raise BadInputError("DIR", names, f"folders of finished runs ({error})") from error

@@ -1,0 +1,96 @@
+"""Which vehicles an agent process drives, and as whom: from what was given on the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from attrs import frozen
+
+from laneweave.protocol.config.identities import Identity, Party
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.deployment import FleetMembers, Security, Shard, parse_shard
+from laneweave.protocol.wire.topics import NAME_PATTERN, NAME_RULE
+
+EVERYBODY = "0/1"
+
+
+@frozen
+class Crew:
+    """Whom an agent process drives."""
+
+    identity: str
+    """As whom it takes part."""
+    vehicles: tuple[str, ...]
+    """By name; none: those of the shard, as they are announced."""
+    shard: Shard | None
+
+
+def crew_of(
+    security: Security, vehicles: Sequence[str], shard: str | None, fleet: str | None
+) -> Crew:
+    """Return whom an agent process drives.
+
+    Args:
+        security: knows the fleets.
+        vehicles: named on the command line.
+        shard: `--shard`.
+        fleet: `--fleet`.
+
+    Raises:
+        BadInputError: these contradict each other, or a secured deployment has no such fleet.
+    """
+    for vehicle in vehicles:
+        if not NAME_PATTERN.fullmatch(vehicle):
+            raise BadInputError("VEHICLE", vehicle, NAME_RULE)
+    if fleet is not None:
+        return _of_fleet(security, vehicles, shard, fleet)
+    if vehicles:
+        if len(vehicles) > 1 and security.mode != "off":
+            raise BadInputError(
+                "VEHICLE",
+                list(vehicles),
+                "one vehicle, or more of them with the --fleet as which they take part, as "
+                "security.mode is mtls",
+            )
+        return Crew(_vehicle(vehicles[0]), tuple(vehicles), None)
+    taken = parse_shard(shard or EVERYBODY, "--shard")
+    return Crew(_fleet(_fleet_of_shard(security, taken)), (), taken)
+
+
+def _of_fleet(security: Security, vehicles: Sequence[str], shard: str | None, fleet: str) -> Crew:
+    if shard is not None:
+        raise BadInputError("--shard", shard, "nothing beside --fleet")
+    members = security.fleets.get(fleet)
+    if members is None:
+        known = ", ".join(security.fleets) or "there are none"
+        raise BadInputError("--fleet", fleet, f"one of security.fleets: {known}")
+    taken = _shard(members)
+    for vehicle in vehicles:
+        if not (taken.takes(vehicle) if taken is not None else vehicle in members):
+            raise BadInputError("VEHICLE", vehicle, f"a vehicle of the fleet {fleet}")
+    if vehicles:
+        return Crew(_fleet(fleet), tuple(vehicles), None)
+    return Crew(_fleet(fleet), () if isinstance(members, str) else members, taken)
+
+
+def _fleet_of_shard(security: Security, shard: Shard) -> str:
+    """Return the name of the fleet that is a shard; any where that does not matter."""
+    for name, members in security.fleets.items():
+        if _shard(members) == shard:
+            return name
+    text = f"{shard.index}/{shard.count}"
+    if security.mode != "off":
+        raise BadInputError("--shard", text, "a shard of security.fleets, as security.mode is mtls")
+    return f"{shard.index}-of-{shard.count}"
+
+
+def _shard(members: FleetMembers) -> Shard | None:
+    return parse_shard(members, "security.fleets") if isinstance(members, str) else None
+
+
+def _vehicle(name: str) -> str:
+    return Identity(Party.VEHICLE, name).common_name
+
+
+def _fleet(name: str) -> str:
+    return Identity(Party.FLEET, name).common_name

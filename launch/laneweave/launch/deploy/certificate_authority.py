@@ -1,0 +1,221 @@
+"""A certificate authority for tests and first steps: X.509 with keys on P-256, as files in PEM.
+
+Whoever has its key can take part as anybody. It is made to try a deployment out, or for a test
+bed; where there is an authority already, use that one, with the same common names.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import ipaddress
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from attrs import frozen
+from cryptography import x509
+from cryptography.exceptions import UnsupportedAlgorithm
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from laneweave.protocol.config.identities import Identity, Party
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.security.access import ca_path, certificate_path, key_path
+
+CA_NAME = "laneweave test authority"
+CA_DAYS = 3650.0
+CLOCKS_APART = dt.timedelta(minutes=10)
+"""Certificates are valid from so long ago, since clocks of hosts differ."""
+LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
+
+
+@frozen
+class Authority:
+    """A certificate and the key that belongs to it."""
+
+    certificate: x509.Certificate
+    key: ec.EllipticCurvePrivateKey
+
+
+def make_authority(folder: Path, *, days: float = CA_DAYS, replace: bool = False) -> Authority:
+    """Make an authority and write its files.
+
+    Args:
+        folder: where; made if it is not there.
+        days: how long its certificate is valid.
+        replace: whether an authority that is there is replaced, with which all its certificates
+            are worth nothing.
+
+    Raises:
+        BadInputError: there is one already, or the files cannot be written.
+    """
+    if not replace and (ca_path(folder).exists() or authority_key_path(folder).exists()):
+        raise BadInputError("DIR", str(folder), "a folder without an authority, or --force")
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = _name(CA_NAME)
+    certificate = (
+        _builder(name, name, key.public_key(), days)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(_key_usage(signs_certificates=True), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    authority = Authority(certificate, key)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInputError("DIR", str(folder), f"a folder ({error.strerror})") from error
+    _write(ca_path(folder), certificate, authority_key_path(folder), key)
+    return authority
+
+
+def load_authority(folder: Path) -> Authority:
+    """Read the authority of a folder.
+
+    Raises:
+        BadInputError: there is none, or it cannot be read.
+    """
+    path = ca_path(folder)
+    try:
+        certificate = x509.load_pem_x509_certificate(path.read_bytes())
+        path = authority_key_path(folder)
+        key = serialization.load_pem_private_key(path.read_bytes(), password=None)
+    except OSError as error:
+        raise BadInputError("DIR", str(path), f"a file to read ({error.strerror})") from error
+    except (ValueError, TypeError, UnsupportedAlgorithm) as error:
+        raise BadInputError("DIR", str(path), "what `laneweave certs init` wrote") from error
+    if not isinstance(key, ec.EllipticCurvePrivateKey) or (
+        key.public_key() != certificate.public_key()
+    ):
+        raise BadInputError("DIR", str(path), f"the key of {ca_path(folder)}")
+    return Authority(certificate, key)
+
+
+def issue(
+    authority: Authority,
+    folder: Path,
+    identity: Identity,
+    *,
+    days: float,
+    hosts: Sequence[str] = (),
+    replace: bool = False,
+) -> None:
+    """Make a certificate and its key, and write their files.
+
+    Args:
+        authority: who signs it.
+        folder: where the files go.
+        identity: whose it is.
+        days: how long it is valid.
+        hosts: names and addresses under which a router is found; of no use for others.
+        replace: whether a certificate that is there is replaced.
+
+    Raises:
+        BadInputError: there is one already, or the files cannot be written.
+    """
+    name = identity.common_name
+    path = certificate_path(folder, name)
+    if path.exists() and not replace:
+        raise BadInputError("IDENTITY", name, f"one without a certificate in {folder}, or --force")
+    key = ec.generate_private_key(ec.SECP256R1())
+    builder = _builder(_name(name), authority.certificate.subject, key.public_key(), days)
+    # Nobody's certificate but the router's serves to be found under a host's name.
+    serves = identity.party is Party.ROUTER
+    usage = ExtendedKeyUsageOID.SERVER_AUTH if serves else ExtendedKeyUsageOID.CLIENT_AUTH
+    builder = (
+        builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(_key_usage(signs_certificates=False), critical=True)
+        .add_extension(x509.ExtendedKeyUsage([usage]), critical=False)
+        .add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key()),
+            critical=False,
+        )
+    )
+    if serves:
+        builder = builder.add_extension(host_names((*hosts, *LOCAL_HOSTS)), critical=False)
+    _write(path, builder.sign(authority.key, hashes.SHA256()), key_path(folder, name), key)
+
+
+def authority_key_path(folder: Path) -> Path:
+    """Return where a folder has its authority's key, which no role needs."""
+    return folder / "ca.key"
+
+
+def _builder(
+    subject: x509.Name, issuer: x509.Name, public_key: ec.EllipticCurvePublicKey, days: float
+) -> x509.CertificateBuilder:
+    now = dt.datetime.now(dt.UTC)
+    end = now + dt.timedelta(days=days)
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(public_key)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(min(now, end) - CLOCKS_APART)
+        .not_valid_after(end)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(public_key), critical=False)
+    )
+
+
+def _name(common_name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
+
+
+def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not signs_certificates,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        key_cert_sign=signs_certificates,
+        crl_sign=signs_certificates,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def host_names(hosts: Sequence[str]) -> x509.SubjectAlternativeName:
+    """Return hosts as they stand in a certificate.
+
+    Raises:
+        BadInputError: one of them is no host.
+    """
+    return x509.SubjectAlternativeName([_general_name(host) for host in dict.fromkeys(hosts)])
+
+
+def _general_name(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host))
+    except ValueError:
+        pass
+    try:
+        return x509.DNSName(host)
+    except ValueError as error:
+        raise BadInputError("--host", host, "a host's name or address") from error
+
+
+def _write(
+    certificate_file: Path,
+    certificate: x509.Certificate,
+    key_file: Path,
+    key: ec.EllipticCurvePrivateKey,
+) -> None:
+    secret = key.private_bytes(
+        serialization.Encoding.PEM,
+        serialization.PrivateFormat.PKCS8,
+        serialization.NoEncryption(),
+    )
+    public = certificate.public_bytes(serialization.Encoding.PEM)
+    try:
+        for path, content, mode in ((key_file, secret, 0o600), (certificate_file, public, 0o644)):
+            # Anew each time: a file that is there may have other rights.
+            path.unlink(missing_ok=True)
+            number = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+            with os.fdopen(number, "wb") as file:
+                file.write(content)
+    except OSError as error:
+        raise BadInputError(
+            "DIR", str(certificate_file.parent), f"a folder to write to ({error.strerror})"
+        ) from error

@@ -1,0 +1,143 @@
+"""What is wrong with a deployment's configuration, or odd, and what a role would do with it."""
+
+from __future__ import annotations
+
+import datetime as dt
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping
+
+from attrs import define, field
+
+from laneweave.protocol.config.endpoints import check_endpoint, host_of
+from laneweave.protocol.config.identities import Identity, Party, identities_of
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.fleets import demanded_vehicles, members_of
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.security.access import KNOWN_RULE, credentials_of
+from laneweave.protocol.security.certificates import examine
+from laneweave.protocol.security.rights import EVERYWHERE, rules_of
+
+
+@define
+class Report:
+    """What a check found; one line each."""
+
+    problems: list[str] = field(factory=list)
+    warnings: list[str] = field(factory=list)
+    facts: list[tuple[str, str]] = field(factory=list)
+    """What is used, and what it is."""
+
+
+def check_deployment(
+    scenario: Scenario, identity: Identity | None, environment: Mapping[str, str] = os.environ
+) -> Report:
+    """Check what loading a configuration does not.
+
+    Args:
+        scenario: the deployment.
+        identity: whose files are looked at, too; None: nobody's.
+        environment: where secrets may be.
+    """
+    report = Report()
+    _check_network(scenario, report)
+    _check_moves(scenario, report)
+    report.warnings += _shared_vehicles(scenario)
+    if identity is not None:
+        _check_role(scenario, identity, environment, report)
+    return report
+
+
+def _check_network(scenario: Scenario, report: Report) -> None:
+    network = scenario.network
+    endpoints = [("network.endpoint", network.endpoint)]
+    endpoints += [("network.listen", endpoint) for endpoint in network.listen]
+    for name, endpoint in endpoints:
+        try:
+            check_endpoint(endpoint, name)
+        except BadInputError as error:
+            report.problems.append(str(error))
+    if network.listen and host_of(network.endpoint) in EVERYWHERE:
+        report.warnings.append(
+            f"network.endpoint: {network.endpoint} is where nobody finds the router"
+        )
+    if scenario.security.mode == "off" and _leaves_the_host(scenario):
+        report.warnings.append("security.mode: off, anybody who reaches the router may do anything")
+    report.facts += [
+        ("realm", network.realm),
+        ("router at", network.endpoint),
+        ("listens at", ", ".join(network.listens_at)),
+        ("given up after", f"{network.lease_s:g} s"),
+        ("security", scenario.security.mode),
+    ]
+
+
+def _check_moves(scenario: Scenario, report: Report) -> None:
+    """Check what agents check when they start, where agents can start."""
+    try:
+        from laneweave.agents.driving.reference import check_moves  # noqa: PLC0415 (an extra)
+    except ModuleNotFoundError:
+        return
+    try:
+        check_moves(scenario)
+    except BadInputError as error:
+        report.problems.append(str(error))
+
+
+def _leaves_the_host(scenario: Scenario) -> bool:
+    hosts = [host_of(endpoint) for endpoint in scenario.network.listens_at]
+    return any(host and host not in ("127.0.0.1", "::1", "localhost") for host in hosts)
+
+
+def _shared_vehicles(scenario: Scenario) -> Iterator[str]:
+    """Yield a line for fleets that drive the same vehicles."""
+    fleets = scenario.security.fleets
+    everybody = demanded_vehicles(scenario) if fleets else ()
+    drivers = Counter(
+        vehicle for members in fleets.values() for vehicle in members_of(members, everybody)
+    )
+    shared = sorted(vehicle for vehicle, count in drivers.items() if count > 1)
+    if shared:
+        yield f"security.fleets: {len(shared)} vehicles are in several, {shared[0]} among them"
+
+
+def _check_role(
+    scenario: Scenario,
+    identity: Identity,
+    environment: Mapping[str, str],
+    report: Report,
+) -> None:
+    name = identity.common_name
+    report.facts.append(("takes part as", name))
+    if scenario.security.mode == "off":
+        return
+    if identity not in set(identities_of(scenario)):
+        report.problems.append(str(BadInputError("--name", name, KNOWN_RULE)))
+        return
+    if identity.party is not Party.ROUTER:
+        count = sum(len(rule.keys) for rule in rules_of(identity, scenario))
+        report.facts.append(("rights", f"{count}, see docs/DEPLOYMENT.md"))
+    _check_files(scenario, identity, environment, report)
+
+
+def _check_files(
+    scenario: Scenario,
+    identity: Identity,
+    environment: Mapping[str, str],
+    report: Report,
+) -> None:
+    host = host_of(scenario.network.endpoint)
+    try:
+        credentials = credentials_of(scenario, identity.common_name, environment)
+        assert credentials is not None  # noqa: S101 (the deployment is secured)
+        found = examine(credentials, identity.common_name, "" if host in EVERYWHERE else host)
+    except BadInputError as error:
+        report.problems.append(str(error))
+        return
+    until = dt.datetime.fromtimestamp(found.valid_until_s, dt.UTC)
+    report.warnings += found.warnings
+    report.facts += [
+        ("authority", credentials.ca),
+        ("certificate", f"{credentials.certificate}, valid until {until:%Y-%m-%d %H:%M} UTC"),
+        ("private key", credentials.private_key or "from the environment"),
+    ]

@@ -1,0 +1,268 @@
+"""The conflict table as a picture: what another vehicle may do, wherever it is.
+
+A panel for each kind of move of vehicle A; others follow by symmetry. Around A are the cells from
+which B may start, with an arrow for each of its moves and a dot for waiting, coloured by how late
+one of the two must be to come too close to the other.
+
+This module needs matplotlib: import it only to draw.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from enum import Enum
+from itertools import product
+from pathlib import Path
+from typing import Final
+
+import attrs
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch, Rectangle
+from matplotlib.patheffects import withStroke
+
+from laneweave.coordinator.planning.conflicts import PAPER_KINDS, ConflictModel, footprint
+from laneweave.coordinator.planning.geometry.conflict_table import FARTHEST, Pair, close_pairs
+from laneweave.coordinator.planning.geometry.settings import Geometry
+from laneweave.coordinator.planning.grid import Cell, displacements
+from laneweave.launch.drawing.figures import FAINT_INK, INK, new_figure, save
+
+LATENESS_S: Final = 0.5
+"""The margin that is told apart in the picture and in the table of counts."""
+
+PANELS: Final[dict[str, Cell]] = {
+    "A waits": (0, 0),
+    "A moves ahead": (1, 0),
+    "A moves to the left": (0, 1),
+    "A moves ahead and to the left": (1, 1),
+}
+
+
+class Verdict(Enum):
+    """When a pair of moves is too close; the value is its colour (Okabe and Ito)."""
+
+    ON_TIME = "#d55e00"
+    LATE = "#e69f00"
+    LATER = "#0072b2"
+    FOOTPRINT = "#cc79a7"
+    NEVER = "#c3c7cd"
+
+
+_MEANING: Final = {
+    Verdict.ON_TIME: "even if both are on time",
+    Verdict.LATE: f"if one is {LATENESS_S:g} s late",
+    Verdict.LATER: "only if one is later",
+    Verdict.FOOTPRINT: "never, though footprints meet",
+    Verdict.NEVER: "never",
+}
+_CELL, _BORDER, _OWN_CELL = "#f6f7f8", "#d3d6db", "#e4e7eb"
+_WIDTH_IN, _ACROSS = 10.0, 2
+_MARGIN_IN, _TITLE_IN, _LEGEND_IN = 0.12, 0.28, 0.5
+_LANE_HEIGHT, _BODY = 0.68, (0.5, 0.22)
+"""In lengths of a cell."""
+_ARROW, _DOT, _WAY = (0.14, 0.4), 0.045, 0.56
+"""Where an arrow begins and ends, the size of a dot, and where A's arrow ends, from the middle of
+a cell."""
+
+
+def draw_conflicts(out: Path, geometry: Geometry | None = None, dpi: int = 110) -> None:
+    """Write the picture of a geometry's table in mode 2."""
+    save(conflict_figure(geometry or Geometry()), out, dpi)
+
+
+def conflict_figure(geometry: Geometry) -> Figure:
+    """Return the figure."""
+    judge = Judge.of(geometry)
+    figure = new_figure(_WIDTH_IN, _LEGEND_IN + len(PANELS) // _ACROSS * _pitch_in()[1])
+    figure.set_layout_engine("none")
+    for number, (name, displacement) in enumerate(PANELS.items()):
+        axes = _new_panel(figure, *divmod(number, _ACROSS))
+        axes.set_title(name, fontsize=10, pad=4, color=INK)
+        _draw_panel(axes, displacement, judge)
+    handles = [
+        Line2D([], [], color=verdict.value, linewidth=3, label=text)
+        for verdict, text in _MEANING.items()
+    ]
+    figure.legend(
+        handles=handles,
+        loc="lower center",
+        bbox_to_anchor=(0.5, 0.022),
+        ncols=len(handles),
+        frameon=False,
+        fontsize=8.5,
+        labelcolor=INK,
+        handlelength=1.2,
+    )
+    figure.text(
+        0.5,
+        0.012,
+        "Where B may start, and where it moves (a dot: it waits); the colour tells when B comes "
+        "too close to A; front to the right, left lane on top",
+        ha="center",
+        fontsize=7.5,
+        color=FAINT_INK,
+    )
+    return figure
+
+
+@attrs.frozen
+class Judge:
+    """The tables of one geometry, for three degrees of lateness."""
+
+    on_time: frozenset[Pair]
+    late: frozenset[Pair]
+    any_delay: frozenset[Pair]
+
+    @classmethod
+    def of(cls, geometry: Geometry) -> Judge:
+        """Compute the tables."""
+        tables = (
+            close_pairs(attrs.evolve(geometry, lateness_s=late_s))
+            for late_s in (0.0, LATENESS_S, None)
+        )
+        return cls(*tables)
+
+    def verdict(self, pair: Pair) -> Verdict:
+        """Return when two moves are too close."""
+        for verdict, table in (
+            (Verdict.ON_TIME, self.on_time),
+            (Verdict.LATE, self.late),
+            (Verdict.LATER, self.any_delay),
+        ):
+            if pair in table:
+                return verdict
+        return Verdict.FOOTPRINT if conflict(pair, "geometric") else Verdict.NEVER
+
+
+def conflict(pair: Pair, *kinds: str) -> bool:
+    """Tell whether two moves are a conflict of one of these kinds, without a geometry."""
+    offset, a, b = pair
+    other = offset, (offset[0] + b[0], offset[1] + b[1])
+    return ConflictModel(kinds).kind(((0, 0), a), other) is not None
+
+
+def counts() -> list[tuple[str, int, int]]:
+    """Return how many pairs of moves each model forbids in mode 1 and in mode 2.
+
+    Of vehicles in different cells; each pair counts twice, as seen from either vehicle.
+    """
+    judge = Judge.of(Geometry())
+    near = range(-FARTHEST, FARTHEST + 1)
+    offsets = [offset for offset in product(near, near) if offset != (0, 0)]
+    steps = displacements(2)
+    pairs = list(product(offsets, steps, steps))
+
+    def row(name: str, table: Iterable[Pair]) -> tuple[str, int, int]:
+        known = frozenset(table)
+        one, two = (
+            len(known.intersection(product(offsets, displacements(mode), displacements(mode))))
+            for mode in (1, 2)
+        )
+        return name, one, two
+
+    def of_kinds(*kinds: str) -> Iterator[Pair]:
+        return (pair for pair in pairs if conflict(pair, *kinds))
+
+    return [
+        row("node, edge, special-1", of_kinds("node", "edge", "special-1")),
+        row("node, edge, special-1 to special-4", of_kinds(*PAPER_KINDS)),
+        row("geometric: footprints", of_kinds("geometric")),
+        row("geometric with `geometry`, any delay", judge.any_delay),
+        row(f"geometric with `geometry`, at most {LATENESS_S:g} s late", judge.late),
+        row("geometric with `geometry`, on time", judge.on_time),
+    ]
+
+
+def _pitch_in() -> tuple[float, float]:
+    """Return the distances between panels."""
+    across_in = (_WIDTH_IN - _MARGIN_IN) / _ACROSS
+    return across_in, (across_in - _MARGIN_IN) * _LANE_HEIGHT + _TITLE_IN
+
+
+def _new_panel(figure: Figure, row: int, column: int) -> Axes:
+    """Return empty axes whose unit is the length of a cell."""
+    (across_in, down_in), (width_in, height_in) = _pitch_in(), map(float, figure.get_size_inches())
+    left_in, bottom_in = _MARGIN_IN + column * across_in, height_in - (row + 1) * down_in
+    size_in = across_in - _MARGIN_IN, down_in - _TITLE_IN
+    return figure.add_axes(
+        (
+            left_in / width_in,
+            bottom_in / height_in,
+            size_in[0] / width_in,
+            size_in[1] / height_in,
+        )
+    )
+
+
+def _draw_panel(axes: Axes, a: Cell, judge: Judge) -> None:
+    reach = FARTHEST + 0.5
+    axes.set_xlim(-reach, reach)
+    axes.set_ylim(-reach * _LANE_HEIGHT, reach * _LANE_HEIGHT)
+    axes.set_facecolor(_CELL)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set(color=_BORDER, linewidth=0.8)
+    lines = [number - 0.5 for number in range(-FARTHEST + 1, FARTHEST + 1)]
+    axes.vlines(lines, -reach * _LANE_HEIGHT, reach * _LANE_HEIGHT, colors=_BORDER, linewidth=0.6)
+    axes.hlines(
+        [line * _LANE_HEIGHT for line in lines], -reach, reach, colors=_BORDER, linewidth=0.6
+    )
+    near = range(-FARTHEST, FARTHEST + 1)
+    for offset in product(near, near):
+        if offset == (0, 0):
+            continue
+        # What matters most is drawn last.
+        verdicts = [(judge.verdict((offset, a, b)), b) for b in displacements(2)]
+        order = list(Verdict)
+        for verdict, b in sorted(verdicts, key=lambda item: -order.index(item[0])):
+            _draw_move(axes, offset, b, verdict)
+    _draw_a(axes, a)
+
+
+def _draw_move(axes: Axes, cell: Cell, step: Cell, verdict: Verdict) -> None:
+    x, y = cell[0], cell[1] * _LANE_HEIGHT
+    plain = verdict is Verdict.NEVER
+    if step == (0, 0):
+        patch: Circle | FancyArrowPatch = Circle((x, y), _DOT, facecolor=verdict.value, linewidth=0)
+    else:
+        ends = [(x + share * step[0], y + share * step[1] * _LANE_HEIGHT) for share in _ARROW]
+        patch = FancyArrowPatch(
+            *ends,
+            arrowstyle="-|>",
+            mutation_scale=6 if plain else 8,
+            shrinkA=0,
+            shrinkB=0,
+            color=verdict.value,
+            linewidth=0.8 if plain else 1.7,
+        )
+    patch.set(label=verdict.name, zorder=2 if plain else 3)
+    axes.add_patch(patch)
+
+
+def _draw_a(axes: Axes, step: Cell) -> None:
+    """Draw A in the middle, the cells of its footprint, and its way."""
+    for column, lane in footprint(((0, 0), step)):
+        corner = (column - 0.5, (lane - 0.5) * _LANE_HEIGHT)
+        axes.add_patch(
+            Rectangle(corner, 1.0, _LANE_HEIGHT, facecolor=_OWN_CELL, linewidth=0, zorder=0.5)
+        )
+    length, width = _BODY
+    body = FancyBboxPatch(
+        (-length / 2, -width / 2),
+        length,
+        width,
+        boxstyle="round,pad=0,rounding_size=0.07",
+        facecolor=INK,
+        linewidth=0,
+        zorder=6,
+    )
+    axes.add_patch(body)
+    axes.text(0, 0, "A", color="white", size=10, ha="center", va="center_baseline", zorder=7)
+    if step != (0, 0):
+        ends = [(0.0, 0.0), (_WAY * step[0], _WAY * step[1] * _LANE_HEIGHT)]
+        way = FancyArrowPatch(*ends, arrowstyle="-|>", mutation_scale=15, shrinkA=0, shrinkB=0)
+        way.set(color=INK, linewidth=2.6, zorder=5)
+        way.set_path_effects([withStroke(linewidth=4.5, foreground="white")])
+        axes.add_patch(way)

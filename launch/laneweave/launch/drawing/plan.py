@@ -1,0 +1,387 @@
+"""Pictures of a planned formation switching: a panel for each time point, or an animation.
+
+This module needs matplotlib: import it only to draw.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Final
+
+import attrs
+from matplotlib.animation import PillowWriter
+from matplotlib.axes import Axes
+from matplotlib.colors import to_hex, to_rgb
+from matplotlib.figure import Figure
+from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Rectangle
+from matplotlib.patheffects import withStroke
+from matplotlib.text import Text
+
+from laneweave.coordinator.planning import PlanRequest, PlanResponse
+from laneweave.coordinator.planning.grid import Grid
+from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK, new_figure, save
+from laneweave.protocol.errors import BadInputError
+
+Place = tuple[float, float]
+"""Column and lane, between two cells while a vehicle moves."""
+
+ENDINGS: Final = (".png", ".gif")
+MAX_PANELS: Final = 120
+"""A longer plan is drawn up to here."""
+FRAMES_PER_STEP: Final = 10
+MAX_MOVING_FRAMES: Final = 300
+"""A longer plan moves in larger leaps: all frames are in memory at once."""
+FRAMES_PER_S: Final = 12
+HELD_FRAMES: Final = (4, 18)
+"""Additional frames for the start and for the end."""
+
+_PALETTE = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#f0e442")
+"""Okabe and Ito's colours, which colour-blind people can tell apart."""
+_SHADES = ((0.0, 0.0), (0.45, 0.0), (0.5, 1.0))
+"""The palette as it is, darker, lighter: how much is mixed in of which grey."""
+_CELL, _BORDER, _BLOCKED = "#f1f2f4", "#d3d6db", "#a3a9b1"
+_LANE_HEIGHT, _BODY_LENGTH, _BODY_WIDTH, _OUTLINE = 0.8, 0.68, 0.46, 0.9
+"""In lengths of a cell; the outline is a share of the cell."""
+_MAX_ACROSS, _MAX_WIDTH_IN, _MIN_WIDTH_IN = 4, 12.0, 5.6
+_CELL_RANGE_IN = (0.34, 0.62)
+_LEFT_IN, _ABOVE_IN, _BELOW_IN, _TITLE_IN, _NOTE_IN = 0.32, 0.26, 0.24, 0.4, 0.24
+_MAX_PIXELS, _MAX_FRAME_PIXELS, _MAX_SIDE_PIXELS = 3e7, 8e5, 3e4
+_MAX_LABEL_LENGTH = 6
+_NOTE = "front to the right, left lane on top; outlines are targets in the colours of their teams"
+
+
+def check_drawing(out: Path, option: str = "--draw") -> None:
+    """Check that a drawing can be written.
+
+    Args:
+        out: the file.
+        option: that names it, for errors.
+
+    Raises:
+        BadInputError: the ending is unknown, or nothing can be written there.
+    """
+    if out.suffix.lower() not in ENDINGS:
+        raise BadInputError(option, str(out), "a file that ends with " + " or ".join(ENDINGS))
+    try:
+        if not out.parent.is_dir():
+            raise BadInputError(option, str(out), "a file in a folder that exists")
+        existed = out.exists()
+        with out.open("ab"):
+            pass
+        if not existed:
+            out.unlink()
+    except OSError as error:
+        allowed = f"a file that can be written ({error.strerror})"
+        raise BadInputError(option, str(out), allowed) from error
+
+
+def draw_plan(request: PlanRequest, response: PlanResponse, out: Path) -> None:
+    """Write the kind of drawing that the ending of `out` tells."""
+    write = write_gif if out.suffix.lower() == ".gif" else write_png
+    write(request, response, out)
+
+
+def write_png(request: PlanRequest, response: PlanResponse, out: Path, dpi: int = DPI) -> None:
+    """Write a picture with one panel for each time point."""
+    figure = plan_figure(request, response)
+    save(figure, out, _affordable_dpi(figure, dpi, _MAX_PIXELS))
+
+
+def write_gif(request: PlanRequest, response: PlanResponse, out: Path, dpi: int = 100) -> None:
+    """Write an animation of the plan that begins again and again."""
+    layout = _Layout.of(request.grid, 1)
+    figure = layout.new_figure(response)
+    axes = layout.new_panel(figure, 0)
+    _draw_lattice(axes, request)
+    vehicles = _Vehicles.draw(axes, request, layout)
+    writer = PillowWriter(fps=FRAMES_PER_S)
+    with writer.saving(figure, str(out), _affordable_dpi(figure, dpi, _MAX_FRAME_PIXELS)):
+        for time in _frame_times(_steps(response)):
+            vehicles.move(_places(request, response, time))
+            _name_time(axes, math.floor(time))
+            writer.grab_frame()
+
+
+def plan_figure(request: PlanRequest, response: PlanResponse) -> Figure:
+    """Return a figure with one panel for each time point, with arrows for the moves made next.
+
+    Without a plan there is one panel, the start.
+    """
+    times = range(min(_steps(response) + 1, MAX_PANELS))
+    layout = _Layout.of(request.grid, len(times))
+    figure = layout.new_figure(response)
+    for time in times:
+        axes = layout.new_panel(figure, time)
+        _name_time(axes, time)
+        _draw_lattice(axes, request)
+        places = _places(request, response, time)
+        _Vehicles.draw(axes, request, layout).move(places)
+        _draw_moves(axes, places, _places(request, response, time + 1))
+    return figure
+
+
+def team_colours(request: PlanRequest) -> dict[frozenset[int], str]:
+    """Return the colour of each team: the vehicles with the same eligible targets."""
+    teams = dict.fromkeys(request.choices())
+    return {choice: _colour(number) for number, choice in enumerate(teams)}
+
+
+@attrs.frozen
+class _Layout:
+    """Where the panels are; they fill rows from the left."""
+
+    grid: Grid
+    across: int
+    rows: int
+    cell_in: float
+
+    @classmethod
+    def of(cls, grid: Grid, panels: int) -> _Layout:
+        least_in, most_in = _CELL_RANGE_IN
+        fitting = int(_MAX_WIDTH_IN / (grid.columns * least_in + _LEFT_IN))
+        rows = math.ceil(panels / max(1, min(_MAX_ACROSS, fitting)))
+        across = math.ceil(panels / rows)
+        room_in = (_MAX_WIDTH_IN / across - _LEFT_IN) / grid.columns
+        return cls(grid, across, rows, max(least_in, min(most_in, room_in)))
+
+    @property
+    def panel_in(self) -> tuple[float, float]:
+        """Return width and height of the cells of one panel."""
+        height_in = self.grid.lanes * _LANE_HEIGHT * self.cell_in
+        return self.grid.columns * self.cell_in, height_in
+
+    @property
+    def pitch_in(self) -> tuple[float, float]:
+        """Return the distances between panels."""
+        return self.panel_in[0] + _LEFT_IN, self.panel_in[1] + _ABOVE_IN + _BELOW_IN
+
+    @property
+    def size_in(self) -> tuple[float, float]:
+        """Return width and height of the figure."""
+        width_in = max(_MIN_WIDTH_IN, self.across * self.pitch_in[0] + _LEFT_IN)
+        return width_in, self.rows * self.pitch_in[1] + _TITLE_IN + _NOTE_IN
+
+    def new_figure(self, response: PlanResponse) -> Figure:
+        """Return a figure with a title and a note."""
+        width_in, height_in = self.size_in
+        figure = new_figure(width_in, height_in)
+        figure.set_layout_engine("none")
+        title_y, note_y = 1 - 0.16 / height_in, 0.1 / height_in
+        figure.suptitle(_title(response), y=title_y, va="top", fontsize=11, color=INK)
+        figure.text(0.5, note_y, _NOTE, ha="center", va="bottom", fontsize=7, color=FAINT_INK)
+        return figure
+
+    def new_panel(self, figure: Figure, number: int) -> Axes:
+        """Return empty axes whose unit is the length of a cell."""
+        row, place = divmod(number, self.across)
+        (width_in, height_in), (panel_in, tall_in) = self.size_in, self.panel_in
+        margin_in = (width_in - self.across * self.pitch_in[0] + _LEFT_IN) / 2
+        left_in = margin_in + place * self.pitch_in[0]
+        bottom_in = height_in - _TITLE_IN - (row + 1) * self.pitch_in[1] + _BELOW_IN
+        box_in = (left_in / width_in, bottom_in / height_in)
+        axes = figure.add_axes((*box_in, panel_in / width_in, tall_in / height_in))
+        axes.set_xlim(-0.5, self.grid.columns - 0.5)
+        axes.set_ylim(-0.5 * _LANE_HEIGHT, (self.grid.lanes - 0.5) * _LANE_HEIGHT)
+        return axes
+
+    def font_size(self, labels: Sequence[str]) -> float:
+        """Return the font size in points with which all labels fit into a vehicle."""
+        cell_pt = 72 * self.cell_in
+        longest = max(len(label) for label in labels)
+        return min(11.0, 0.3 * cell_pt, _BODY_LENGTH * cell_pt / (0.75 * longest))
+
+
+@attrs.frozen
+class _Vehicles:
+    """The vehicles of a panel, which can be moved."""
+
+    bodies: list[FancyBboxPatch]
+    labels: list[Text]
+
+    @classmethod
+    def draw(cls, axes: Axes, request: PlanRequest, layout: _Layout) -> _Vehicles:
+        """Draw the vehicles on their start cells."""
+        names = [short_name(vehicle.id) for vehicle in request.vehicles]
+        size_pt, colours = layout.font_size(names), team_colours(request)
+        drawn = cls([], [])
+        for vehicle, name, choice in zip(request.vehicles, names, request.choices(), strict=True):
+            body = _body(colours[choice])
+            body.set_label(vehicle.id)
+            axes.add_patch(body)
+            drawn.bodies.append(body)
+            ink = _ink_on(colours[choice])
+            drawn.labels.append(_text(axes, name, size_pt, ink))
+        drawn.move([vehicle.cell for vehicle in request.vehicles])
+        return drawn
+
+    def move(self, places: Sequence[Place]) -> None:
+        """Put each vehicle in its place."""
+        for body, label, place in zip(self.bodies, self.labels, places, strict=True):
+            x, y = _point(place)
+            body.set_x(x - _BODY_LENGTH / 2)
+            body.set_y(y - _BODY_WIDTH / 2)
+            label.set_position((x, y))
+
+
+def _steps(response: PlanResponse) -> int:
+    return len(response.paths[0]) - 1 if response.paths else 0
+
+
+def _places(request: PlanRequest, response: PlanResponse, time: float) -> list[Place]:
+    """Return the vehicles' places at a time in steps; from the end on they stay."""
+    if not response.paths:
+        return [vehicle.cell for vehicle in request.vehicles]
+    step = min(math.floor(time), _steps(response))
+    share = time - math.floor(time)
+    here = [path[step] for path in response.paths]
+    next_step = min(step + 1, _steps(response))
+    there = [path[next_step] for path in response.paths]
+    return [
+        (a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]))
+        for a, b in zip(here, there, strict=True)
+    ]
+
+
+def _frame_times(steps: int) -> Iterator[float]:
+    """Yield the time in steps of each frame; vehicles start and stop gently."""
+    if steps == 0:
+        yield 0.0
+        return
+    count = min(steps * FRAMES_PER_STEP, MAX_MOVING_FRAMES)
+    yield from [0.0] * HELD_FRAMES[0]
+    for number in range(count + 1):
+        whole, rest = divmod(number * steps, count)
+        share = rest / count
+        yield whole + share * share * (3 - 2 * share)
+    yield from [float(steps)] * HELD_FRAMES[1]
+
+
+def _title(response: PlanResponse) -> str:
+    bound = "" if response.lower_bound is None else f", lower bound {response.lower_bound}"
+    if not response.paths:
+        why = "there is no plan" if response.status == "infeasible" else "no plan was found"
+        return f"{response.status}: {why}{bound}"
+    steps = _steps(response)
+    title = f"{response.status}, cost {response.cost}{bound}, {steps} steps"
+    return title if steps < MAX_PANELS else f"{title}, the first {MAX_PANELS - 1} drawn"
+
+
+def _name_time(axes: Axes, steps: int) -> None:
+    name = "start" if steps == 0 else f"after {steps} step{'s' if steps > 1 else ''}"
+    axes.set_title(name, fontsize=8, pad=3.5, color=INK)
+
+
+def _draw_lattice(axes: Axes, request: PlanRequest) -> None:
+    """Draw cells, blocked cells and targets."""
+    grid = request.grid
+    axes.set_facecolor(_CELL)
+    columns = [column - 0.5 for column in range(1, grid.columns)]
+    axes.vlines(columns, *axes.get_ylim(), colors=_BORDER, linewidth=0.6, zorder=1)
+    lanes = [(lane - 0.5) * _LANE_HEIGHT for lane in range(1, grid.lanes)]
+    axes.hlines(lanes, *axes.get_xlim(), colors=_BORDER, linewidth=0.6, zorder=1)
+    _number_cells(axes, grid)
+    for cell in sorted(grid.blocked):
+        blocked = _rectangle(cell, 1.0, facecolor="#e1e3e7", edgecolor=_BLOCKED, hatch="////")
+        axes.add_patch(blocked).set(label="blocked", linewidth=0.0, zorder=1.5)
+    colours = team_colours(request)
+    for number, target in enumerate(request.targets):
+        _draw_target(axes, target, [colours[team] for team in colours if number in team])
+
+
+def _number_cells(axes: Axes, grid: Grid) -> None:
+    every = math.ceil(grid.columns / 20)
+    axes.set_xticks(range(0, grid.columns, every), labels=map(str, range(0, grid.columns, every)))
+    lanes = range(grid.lanes)
+    axes.set_yticks([lane * _LANE_HEIGHT for lane in lanes], labels=map(str, lanes))
+    axes.tick_params(length=0, pad=2, labelsize=6, labelcolor=FAINT_INK)
+    for spine in axes.spines.values():
+        spine.set(color=_BLOCKED, linewidth=0.8)
+
+
+def _draw_target(axes: Axes, cell: Place, colours: Sequence[str]) -> None:
+    """Outline a target; dashes take turns where it is one of several teams."""
+    for number, colour in enumerate(colours or [_BLOCKED]):
+        outline = _rectangle(cell, _OUTLINE, facecolor="none", edgecolor=colour)
+        outline.set(label="target", linewidth=1.8, zorder=2, capstyle="butt")
+        if len(colours) > 1:
+            dash, rest = 3.0, 3.0 * (len(colours) - 1)
+            outline.set_linestyle((dash * number, (dash, rest)))
+        axes.add_patch(outline)
+
+
+def _draw_moves(axes: Axes, here: Sequence[Place], there: Sequence[Place]) -> None:
+    """Draw arrows that leave the names of vehicles readable."""
+    for a, b in zip(here, there, strict=True):
+        if a == b:
+            continue
+        (x, y), (to_x, to_y) = _point(a), _point(b)
+        ends = [(x + share * (to_x - x), y + share * (to_y - y)) for share in (0.34, 0.74)]
+        arrow = FancyArrowPatch(*ends, arrowstyle="-|>", mutation_scale=8, shrinkA=0, shrinkB=0)
+        arrow.set(color=INK, linewidth=1.2, zorder=4)
+        arrow.set_path_effects([withStroke(linewidth=2.6, foreground="white")])
+        axes.add_patch(arrow)
+
+
+def _point(place: Place) -> tuple[float, float]:
+    return place[0], place[1] * _LANE_HEIGHT
+
+
+def _rectangle(
+    cell: Place, share: float, *, facecolor: str, edgecolor: str, hatch: str | None = None
+) -> Rectangle:
+    x, y = _point(cell)
+    width, height = share, share * _LANE_HEIGHT
+    corner = (x - width / 2, y - height / 2)
+    return Rectangle(corner, width, height, facecolor=facecolor, edgecolor=edgecolor, hatch=hatch)
+
+
+def _body(colour: str) -> FancyBboxPatch:
+    style = f"round,pad=0,rounding_size={0.3 * _BODY_WIDTH}"
+    return FancyBboxPatch(
+        (0, 0), _BODY_LENGTH, _BODY_WIDTH, boxstyle=style, fc=colour, ec=INK, lw=0.6, zorder=3
+    )
+
+
+def _text(axes: Axes, text: str, size_pt: float, ink: str) -> Text:
+    # Names come from anywhere; a dollar sign must not begin a formula.
+    return axes.text(
+        0,
+        0,
+        text,
+        size=size_pt,
+        color=ink,
+        ha="center",
+        va="center_baseline",
+        parse_math=False,
+        zorder=5,
+    )
+
+
+def short_name(name: str) -> str:
+    """Return a short name; where one is too long, its end tells more than its beginning."""
+    plain = "".join(char if char.isprintable() else "?" for char in name)
+    return plain if len(plain) <= _MAX_LABEL_LENGTH else "…" + plain[1 - _MAX_LABEL_LENGTH :]
+
+
+def _colour(team: int) -> str:
+    """Return a colour; there are 21."""
+    shade, number = divmod(team, len(_PALETTE))
+    strength, grey = _SHADES[shade % len(_SHADES)]
+    parts = to_rgb(_PALETTE[number])
+    mixed = [(1 - strength) * part + strength * grey for part in parts]
+    return to_hex((mixed[0], mixed[1], mixed[2]))
+
+
+def _ink_on(colour: str) -> str:
+    """Return what can be read on a colour."""
+    red, green, blue = to_rgb(colour)
+    return "#ffffff" if 0.3 * red + 0.59 * green + 0.11 * blue < 0.5 else "#000000"
+
+
+def _affordable_dpi(figure: Figure, dpi: float, most_pixels: float) -> float:
+    """Return a resolution with which the picture of the longest road stays within memory."""
+    width_in, height_in = map(float, figure.get_size_inches())
+    by_area = math.sqrt(most_pixels / (width_in * height_in))
+    return min(dpi, by_area, _MAX_SIDE_PIXELS / max(width_in, height_in))

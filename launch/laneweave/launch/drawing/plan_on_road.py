@@ -1,0 +1,279 @@
+"""Pictures of a plan on the road, as vehicles drive it: at successive instants, and over time.
+
+The upper panels show the road in the geodetic coordinate system after each step, with the way of
+each vehicle since the start; the lower ones the vehicles' positions over time, along the road
+relative to the moving formation, and across it. An animation shows the road alone.
+
+This module needs matplotlib and OSQP: import it only to draw.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import attrs
+import numpy as np
+from matplotlib.animation import PillowWriter
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+from matplotlib.patheffects import withStroke
+from matplotlib.text import Annotation
+from numpy.typing import NDArray
+
+from laneweave.coordinator.planning import PlanRequest, PlanResponse
+from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK, new_figure, save
+from laneweave.launch.drawing.plan import short_name, team_colours
+from laneweave.launch.drawing.plan_driving import Drive, drive_plan
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.sim_bridge.bodies.footprints import corners, pose_of
+
+MAX_INSTANTS: Final = 8
+"""Of a plan with more steps only some instants are drawn."""
+MAX_FRAMES: Final = 240
+GIF_DPI: Final = 90
+_HELD_FRAMES: Final = 8
+"""Additional frames for the start and for the end."""
+
+_WIDTH_IN, _LANE_IN, _ROAD_GAP_IN, _TIMES_IN = 11.0, 0.24, 0.24, 2.3
+_MARGIN_M = 10.0
+_NOTE = "front to the right, left lane on top, lanes drawn wider than they are"
+_ROAD, _MARKING = "#e3e5e8", "#ffffff"
+
+
+def draw_road(request: PlanRequest, response: PlanResponse, scenario: Scenario, out: Path) -> None:
+    """Drive a plan and draw it, as a picture or an animation by the ending of `out`.
+
+    Without a plan the start is drawn. `scenario` says how fast, how far and with which vehicles.
+    """
+    picture = _Picture.of(request, response, scenario)
+    if out.suffix.lower() == ".gif":
+        _write_gif(picture, out)
+    else:
+        save(road_figure(picture), out, DPI)
+
+
+@attrs.frozen(eq=False)
+class _Picture:
+    """What is drawn."""
+
+    drive: Drive
+    labels: list[str]
+    colours: list[str]
+    lanes: int
+    title: str
+
+    @classmethod
+    def of(cls, request: PlanRequest, response: PlanResponse, scenario: Scenario) -> _Picture:
+        names = [vehicle.id for vehicle in request.vehicles]
+        paths = response.paths or tuple((vehicle.cell,) for vehicle in request.vehicles)
+        drive = drive_plan(scenario, names, paths)
+        colours = team_colours(request)
+        return cls(
+            drive,
+            [short_name(name) for name in names],
+            [colours[choice] for choice in request.choices()],
+            request.grid.lanes,
+            _title(response, drive),
+        )
+
+    @property
+    def extent_m(self) -> tuple[float, float]:
+        """Part of the road that is drawn."""
+        along_m = self.drive.states[:, :, 0]
+        length_m = self.drive.scenario.vehicle.length_m
+        return float(along_m.min()) - length_m - _MARGIN_M, float(along_m.max()) + _MARGIN_M
+
+
+def road_figure(picture: _Picture) -> Figure:
+    """Return the road at successive instants, and positions over time below."""
+    drive = picture.drive
+    steps = drive.ticks // drive.slot_ticks
+    count = min(steps, MAX_INSTANTS - 1) + 1
+    instants = [round(number * steps / max(1, count - 1)) for number in range(count)]
+    road_in = picture.lanes * _LANE_IN
+    figure = new_figure(_WIDTH_IN, 0.75 + count * (road_in + _ROAD_GAP_IN) + 0.4 + _TIMES_IN)
+    figure.suptitle(picture.title, fontsize=10, color=INK)
+    heights_in = [count * (road_in + _ROAD_GAP_IN) + 0.4, _TIMES_IN]
+    roads, times = figure.subfigures(2, 1, squeeze=False, height_ratios=heights_in)[:, 0]
+    panels = list(roads.subplots(count, sharex=True, squeeze=False)[:, 0])
+    for axes, step in zip(panels, instants, strict=True):
+        _draw_instant(axes, picture, step * drive.slot_ticks)
+    _name_road(panels[-1])
+    along, across = times.subplots(1, 2)
+    _draw_along(along, picture)
+    _draw_across(across, picture)
+    return figure
+
+
+def _draw_instant(axes: Axes, picture: _Picture, tick: int) -> None:
+    """Draw the road at a tick, with the way of each vehicle since the start."""
+    _draw_empty_road(axes, picture)
+    _name_time(axes, picture.drive.time_s(tick))
+    for number, colour in enumerate(picture.colours):
+        along_m, _, _, across_m, _, _ = picture.drive.states[number, : tick + 1].T
+        axes.plot(along_m, across_m, color=colour, linewidth=1.0, alpha=0.55, zorder=2)
+        _Body.draw(axes, picture, number).move(picture.drive, number, tick)
+
+
+def _draw_empty_road(axes: Axes, picture: _Picture) -> None:
+    width_m = picture.drive.scenario.road.lane_width_m
+    axes.set_xlim(*picture.extent_m)
+    axes.set_ylim(-0.3, picture.lanes * width_m + 0.3)
+    axes.axhspan(0, picture.lanes * width_m, color=_ROAD, zorder=0)
+    for lane in range(1, picture.lanes):
+        axes.axhline(lane * width_m, color=_MARKING, linewidth=1.4, dashes=(5, 5), zorder=1)
+    axes.set_yticks([])
+    axes.tick_params(length=2, labelsize=7, labelcolor=FAINT_INK, bottom=False, labelbottom=False)
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+
+
+def _name_road(axes: Axes) -> None:
+    axes.set_xlabel(f"position on the road s (m); {_NOTE}", fontsize=8, color=INK)
+    axes.tick_params(labelbottom=True, bottom=True)
+
+
+def _name_time(axes: Axes, time_s: float) -> None:
+    axes.set_ylabel(f"{time_s:.1f} s", rotation=0, ha="right", va="center", fontsize=8, color=INK)
+
+
+@attrs.frozen(eq=False)
+class _Body:
+    """One vehicle on a drawing of the road."""
+
+    shape: Polygon
+    label: Annotation
+
+    @classmethod
+    def draw(cls, axes: Axes, picture: _Picture, number: int) -> _Body:
+        shape = Polygon(np.zeros((4, 2)), fc=picture.colours[number], ec=INK, lw=0.6, zorder=3)
+        axes.add_patch(shape)
+        label = axes.annotate(
+            picture.labels[number],
+            (0.0, 0.0),
+            xytext=(3, 0),
+            textcoords="offset points",
+            fontsize=7,
+            color=INK,
+            va="center_baseline",
+            parse_math=False,
+            path_effects=[withStroke(linewidth=2.0, foreground=_ROAD)],
+            zorder=4,
+        )
+        return cls(shape, label)
+
+    def move(self, drive: Drive, number: int, tick: int) -> None:
+        state, vehicle = drive.states[number, tick].tolist(), drive.scenario.vehicle
+        self.shape.set_xy(corners(pose_of(state), vehicle.length_m, vehicle.width_m))
+        self.label.xy = (state[0], state[3])
+
+
+def _draw_along(axes: Axes, picture: _Picture) -> None:
+    """Draw positions along the road, relative to the moving formation."""
+    drive = picture.drive
+    times_s = _times_s(axes, picture)
+    moved_m = drive.scenario.formation.speed_mps * times_s
+    _draw_lines(axes, picture, times_s, drive.states[:, :, 0] - moved_m)
+    axes.set_ylabel("s $-$ v$_F$ t (m)", fontsize=8, color=INK)
+
+
+def _draw_across(axes: Axes, picture: _Picture) -> None:
+    """Draw positions across the road, with the borders of the lanes."""
+    width_m = picture.drive.scenario.road.lane_width_m
+    _draw_lines(axes, picture, _times_s(axes, picture), picture.drive.states[:, :, 3])
+    for lane in range(picture.lanes + 1):
+        axes.axhline(lane * width_m, color=FAINT_INK, linewidth=0.5, dashes=(5, 5))
+    axes.set_ylabel("lateral position y (m)", fontsize=8, color=INK)
+
+
+def _times_s(axes: Axes, picture: _Picture) -> NDArray[np.float64]:
+    """Prepare an axis of time with a line for each step; return the times of all ticks."""
+    drive = picture.drive
+    steps = drive.ticks // drive.slot_ticks
+    every = math.ceil(max(1, steps) / 10)
+    axes.set_xticks([drive.time_s(step * drive.slot_ticks) for step in range(0, steps + 1, every)])
+    axes.grid(axis="x", color=_ROAD, linewidth=0.8)
+    axes.set_xlabel("time (s), a line for each step", fontsize=8, color=INK)
+    axes.tick_params(length=2, labelsize=7, labelcolor=FAINT_INK)
+    axes.spines[["top", "right"]].set_visible(False)
+    return drive.scenario.runtime.tick_s * np.arange(drive.ticks + 1, dtype=np.float64)
+
+
+def _draw_lines(
+    axes: Axes, picture: _Picture, times_s: NDArray[np.float64], values: NDArray[np.float64]
+) -> None:
+    """Draw a line for each vehicle, with its name where it begins and where it ends."""
+    for line, colour in zip(values, picture.colours, strict=True):
+        axes.plot(times_s, line, color=colour, linewidth=1.6)
+    axes.set_xlim(-0.02 * times_s[-1], 1.02 * times_s[-1] or 1.0)
+    _name_places(axes, picture.labels, times_s[0], values[:, 0].tolist(), (1, 3), "bottom")
+    if len(times_s) > 1:
+        _name_places(axes, picture.labels, times_s[-1], values[:, -1].tolist(), (6, 0), "center")
+
+
+def _name_places(
+    axes: Axes,
+    labels: Sequence[str],
+    time_s: float,
+    places: Sequence[float],
+    offset_pt: tuple[float, float],
+    alignment: str,
+) -> None:
+    """Write names beside places at a time; vehicles in the same place share a text."""
+    names: dict[int, list[str]] = {}
+    for name, place in zip(labels, places, strict=True):
+        names.setdefault(round(place), []).append(name)
+    where = {round(place): place for place in places}
+    for key, together in names.items():
+        axes.annotate(
+            ", ".join(together),
+            (time_s, where[key]),
+            xytext=offset_pt,
+            textcoords="offset points",
+            fontsize=7,
+            color=INK,
+            va=alignment,
+            parse_math=False,
+            annotation_clip=False,
+        )
+
+
+def _title(response: PlanResponse, drive: Drive) -> str:
+    """Return what is drawn, and how near bodies come."""
+    formation, slot_s = drive.scenario.formation, drive.scenario.cycles_s[0]
+    if not response.paths:
+        return f"{response.status}: the start"
+    title = (
+        f"{response.status}, cost {response.cost}, {response.steps} steps of "
+        f"{slot_s:g} s at {formation.speed_mps:g} m/s, columns of {formation.gap_m:g} m"
+    )
+    if drive.overlaps:
+        pairs = ", ".join(f"{one} and {other}" for one, other in drive.overlaps)
+        return f"{title}; bodies overlap, as its conflict kinds allow: {pairs}"
+    if math.isfinite(drive.min_gap_m):
+        return f"{title}; shortest gap {drive.min_gap_m:.1f} m"
+    return title
+
+
+def _write_gif(picture: _Picture, out: Path) -> None:
+    """Write an animation of the road that begins again and again."""
+    drive = picture.drive
+    figure = new_figure(_WIDTH_IN, 0.8 + 1.6 * picture.lanes * _LANE_IN)
+    figure.suptitle(picture.title, fontsize=9, color=INK)
+    axes = figure.subplots()
+    _draw_empty_road(axes, picture)
+    _name_road(axes)
+    bodies = [_Body.draw(axes, picture, number) for number in range(len(picture.labels))]
+    every = max(1, math.ceil(drive.ticks / MAX_FRAMES))
+    ticks = [*range(0, drive.ticks, every), drive.ticks]
+    writer = PillowWriter(fps=max(1, round(1.0 / (every * drive.scenario.runtime.tick_s))))
+    with writer.saving(figure, str(out), GIF_DPI):
+        for tick in [0] * _HELD_FRAMES + ticks + [ticks[-1]] * _HELD_FRAMES:
+            for number, body in enumerate(bodies):
+                body.move(drive, number, tick)
+            _name_time(axes, drive.time_s(tick))
+            writer.grab_frame()

@@ -1,0 +1,392 @@
+"""The light road: the bridge of a simulated run, without a world and without waiting.
+
+Ticks just happen. Every vehicle is told what it senses at each tick, a COMMAND counts whenever it
+arrives, and a body moves in a straight line to the cell that its motion controller was told to
+hold. Who may command a vehicle, what it has joined, who is silent and what a caretaker says are
+decided by the real `MotionController`, `Answers` and `Attendance`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Protocol
+
+import attrs
+from attrs import frozen
+
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.runtime.node import (
+    Announce,
+    Arrived,
+    Effect,
+    Event,
+    Listen,
+    Send,
+    Started,
+    Wakeup,
+    Watch,
+)
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.vehicle.motion import State
+from laneweave.protocol.wire.messages import (
+    Census,
+    CensusEntry,
+    ClosedFormation,
+    Command,
+    Deed,
+    Name,
+    Plan,
+    Prepare,
+    RoadClock,
+    Sense,
+)
+from laneweave.protocol.wire.topics import (
+    BRIDGE_ALIVE,
+    CENSUS,
+    CLOCK,
+    COMMAND,
+    SENSE,
+    VEHICLE_ALIVE,
+)
+from laneweave.sim_bridge.bodies.motion_controller import MotionController
+from laneweave.sim_bridge.bodies.plant import Plant
+from laneweave.sim_bridge.road.attendance import Absence, Attendance
+from laneweave.sim_bridge.road.demand import Arrival
+from laneweave.sim_bridge.road.entry import Admission
+from laneweave.sim_bridge.road.leaving import Leaving
+from laneweave.sim_bridge.road.roadside import CENSUS_EVERY_TICKS
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
+
+CLOCK_EVERY_TICKS = 2
+AGENT_START_S = 1.0
+"""How long after its entrance a vehicle waits for its agent before its caretaker takes charge."""
+NONE_CLOSED = -(2**31)
+"""Below the number of every block."""
+SYNC_S = 1.0
+"""A vehicle's clock is set anew this often; in between it drifts."""
+
+
+@frozen
+class Visit:
+    """One vehicle's visit to the road."""
+
+    vehicle: Name
+    cell: Cell
+    """In which it enters."""
+    enters_s: float
+    leaves_s: float | None
+    """None: it stays to the end."""
+    clock_offset_s: float = 0.0
+    clock_drift: float = 0.0
+    """Seconds that its clock gains in a second."""
+
+
+@frozen
+class Grant:
+    """An empty cell becomes somebody's, as the roadside does it (rolling operation)."""
+
+    t_s: float
+    owner: Name
+    cell: Cell
+
+
+class Watcher(Protocol):
+    """Is told what happens on the road; the checker is one."""
+
+    def own(self, t_s: float, vehicle: str, estate: tuple[Cell, ...], deed: Deed | None) -> None:
+        """A motion controller shows what its vehicle owns."""
+
+    def enter(self, t_s: float, vehicle: str, cell: Cell) -> None:
+        """A vehicle entered."""
+
+    def leave(self, t_s: float, vehicle: str) -> None:
+        """A vehicle left."""
+
+    def begin(
+        self, t_s: float, vehicle: str, incarnation: int, way: tuple[Cell, Cell], lasts_s: float
+    ) -> None:
+        """A body began to move."""
+
+    def advance(self, t_s: float) -> None:
+        """Time went on."""
+
+
+class LightBody(Plant):
+    """A body that moves in a straight line of the lattice, in the time that it is given."""
+
+    def __init__(self, scenario: Scenario, cell: Cell) -> None:
+        """Stand in a cell."""
+        super().__init__((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), scenario.vehicle, scenario.runtime.tick_s)
+        self.t_s = 0.0
+        """Time of the newest tick."""
+        self._lattice = scenario.lattice
+        self._origin: tuple[float, float] = cell
+        self._goal: Cell = cell
+        self._begin_s = self._end_s = 0.0
+
+    @property
+    def state(self) -> State:
+        """(s m, v m/s, a m/s2, y m, v_y m/s, a_y m/s2) at the newest tick."""
+        column, lane = self._place(self.t_s)
+        lattice = self._lattice
+        s_m = lattice.speed_mps * self.t_s + column * lattice.pitch_m
+        y_m = (lane + 0.5) * lattice.lane_width_m
+        return (s_m, lattice.speed_mps, 0.0, y_m, 0.0, 0.0)
+
+    def go(self, cell: Cell, now_s: float, lasts_s: float) -> None:
+        """Begin a motion to a cell from wherever it is."""
+        self._origin, self._goal = self._place(now_s), cell
+        self._begin_s, self._end_s = now_s, now_s + lasts_s
+
+    def has_arrived(self, now_s: float) -> bool:
+        """Tell whether it is in the middle of the cell to which it was sent."""
+        return now_s >= self._end_s
+
+    def _place(self, t_s: float) -> tuple[float, float]:
+        if t_s >= self._end_s:
+            return self._goal
+        share = (t_s - self._begin_s) / (self._end_s - self._begin_s)
+        (column, lane), (to_column, to_lane) = self._origin, self._goal
+        return (column + share * (to_column - column), lane + share * (to_lane - lane))
+
+
+class LightVehicle(RoadVehicle):
+    """A vehicle with a light body, a clock of its own, and wishes that change."""
+
+    def __init__(self, visit: Visit, preferred_lane: int, scenario: Scenario) -> None:
+        """Hold the cell of a visit."""
+        self.body = LightBody(scenario, visit.cell)
+        arrival = Arrival(visit.vehicle, visit.cell[1], preferred_lane, visit.enters_s)
+        super().__init__(
+            visit.vehicle,
+            Admission(arrival, visit.cell, visit.enters_s),
+            MotionController(self.body, scenario, visit.cell),
+        )
+        if scenario.formation.rolling:
+            self.controller.own(visit.cell)
+        self._visit = visit
+        self._speed_mps = scenario.lattice.speed_mps
+
+    @property
+    def preferred_lane(self) -> int:
+        """Where it wants to be in the end."""
+        return self.admission.arrival.preferred_lane
+
+    def leaves_by(self, t_s: float) -> bool:
+        """Tell whether it leaves the road at a time or before."""
+        return self._visit.leaves_s is not None and t_s >= self._visit.leaves_s
+
+    def prefer(self, lane: int) -> None:
+        """Change its mind."""
+        arrival = attrs.evolve(self.admission.arrival, preferred_lane=lane)
+        self.admission = attrs.evolve(self.admission, arrival=arrival)
+
+    def sense(self, tick: int, *, caretaker: bool, left: bool = False) -> Sense:
+        """Return what it knows, by its own clock.
+
+        Where it is in the lattice it knows from the vehicles around it: a wrong clock makes it late
+        or early with what it does, but does not shift its cell.
+        """
+        sense = super().sense(tick, caretaker=caretaker, left=left)
+        visit = self._visit
+        ahead_s = visit.clock_offset_s + visit.clock_drift * (sense.t_s % SYNC_S)
+        if ahead_s == 0.0:
+            return sense
+        s, v, a, y, v_y, a_y = sense.state
+        state = (s + self._speed_mps * ahead_s, v, a, y, v_y, a_y)
+        return attrs.evolve(sense, t_s=sense.t_s + ahead_s, state=state)
+
+
+class LightRoad:
+    """The core of the road's process."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        visits: Iterable[Visit],
+        preferred_lanes: dict[Name, int],
+        watcher: Watcher,
+        new_incarnation: Callable[[], int],
+        move_lasts_s: Callable[[], float],
+        lost: Callable[[], bool],
+        formations: Iterable[ClosedFormation] = (),
+        grants: Iterable[Grant] = (),
+    ) -> None:
+        """Make a road without vehicles; they enter when their time comes.
+
+        Args:
+            scenario: lattice and timing.
+            visits: who enters when.
+            preferred_lanes: of each vehicle; read when it enters.
+            watcher: is told of the bodies.
+            new_incarnation: numbers for caretakers.
+            move_lasts_s: draws how long the next motion takes.
+            lost: draws whether the next SENSE or COMMAND is lost beside what the network loses.
+            formations: which blocks are whose, and when each formation closes.
+            grants: which empty cells are whose, and from when on.
+        """
+        self.tick = -1
+        self.vehicles: dict[Name, LightVehicle] = {}
+        self.takeovers = 0
+        """Vehicles of which a caretaker has taken charge, each time counted."""
+        self.refused = 0
+        """COMMANDs that motion controllers have refused."""
+        self._scenario = scenario
+        self._tick_s = scenario.runtime.tick_s
+        self._visits = sorted(visits, key=lambda visit: (visit.enters_s, visit.vehicle))
+        self._grants = sorted(grants, key=lambda grant: (grant.t_s, grant.cell))
+        self._open = sorted(formations, key=lambda closed: closed.first_block)
+        self._closed: list[ClosedFormation] = []
+        self._closed_to = NONE_CLOSED
+        self._preferred_lanes = preferred_lanes
+        self._watcher = watcher
+        self._move_lasts_s = move_lasts_s
+        self._lost = lost
+        self._attendance = Attendance(scenario, new_incarnation)
+        self._leaving = Leaving()
+        self._census_due_tick = 0
+
+    @property
+    def wakeup_s(self) -> float:
+        """The next tick."""
+        return (self.tick + 1) * self._tick_s
+
+    def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
+        """Take an event; see `Core`."""
+        self._attendance.on_network(event, now_s)
+        match event:
+            case Arrived(_, _, Command() as command):
+                yield from self._on_command(command, now_s)
+            case Arrived(_, parameters, (Prepare() | Plan()) as message):
+                name = Name(parameters["vehicle"])
+                yield from self._attendance.on_message(name, message, self.tick)
+                if name in self.vehicles:
+                    self._show_estate(name, now_s)
+            case Wakeup() if now_s >= self.wakeup_s:
+                yield from self._on_tick(now_s)
+            case Started():
+                yield Listen(COMMAND)
+                yield Watch(VEHICLE_ALIVE)
+                yield Announce(BRIDGE_ALIVE, {"incarnation": 1})
+            case _:
+                pass
+
+    def prefer(self, preferred_lanes: dict[Name, int]) -> None:
+        """Vehicles change their minds."""
+        self._preferred_lanes = preferred_lanes
+        for vehicle in self.vehicles.values():
+            vehicle.prefer(preferred_lanes[vehicle.name])
+        self._census_due_tick = 0
+
+    def _on_command(self, command: Command, now_s: float) -> Iterator[Effect]:
+        vehicle = self.vehicles.get(command.vehicle)
+        if vehicle is None or self._lost():
+            return
+        controller = vehicle.controller
+        held = controller.hold_cell
+        if self._attendance.hear(vehicle, command) and not self._lost():
+            yield self._sense_of(command.vehicle, vehicle)
+        try:
+            taken = yield from self._attendance.take(vehicle, command)
+        except BadInputError:
+            taken = False
+        self.refused += not taken
+        self._show_estate(command.vehicle, now_s)
+        if controller.hold_cell != held:
+            lasts_s = self._move_lasts_s()
+            way = (held, controller.hold_cell)
+            self._watcher.begin(now_s, command.vehicle, command.incarnation, way, lasts_s)
+            vehicle.body.go(controller.hold_cell, now_s, lasts_s)
+
+    # --- the tick -----------------------------------------------------------------------------
+
+    def _on_tick(self, now_s: float) -> Iterator[Effect]:
+        self.tick += 1
+        t_s = self.tick * self._tick_s
+        self._watcher.advance(now_s)
+        self._let_enter(now_s)
+        self._close_formations(t_s)
+        self._hand_out(now_s)
+        yield from self._let_leave(now_s)
+        for vehicle in self.vehicles.values():
+            vehicle.body.t_s = t_s
+        yield from self._look_after(now_s)
+        self._attendance.ask(self.vehicles, now_s)
+        for name, vehicle in self.vehicles.items():
+            if not self._lost():
+                yield self._sense_of(name, vehicle)
+        yield from self._attendance.show(self.tick)
+        yield from self._tell_road(t_s)
+
+    def _sense_of(self, name: Name, vehicle: LightVehicle) -> Effect:
+        sense = vehicle.sense(self.tick, caretaker=name in self._attendance)
+        return Send(SENSE, sense, {"vehicle": name})
+
+    def _let_enter(self, now_s: float) -> None:
+        while self._visits and self._visits[0].enters_s <= now_s + 1e-6:
+            visit = self._visits.pop(0)
+            lane = self._preferred_lanes[visit.vehicle]
+            self.vehicles[visit.vehicle] = LightVehicle(visit, lane, self._scenario)
+            self._watcher.enter(now_s, visit.vehicle, visit.cell)
+            self._show_estate(visit.vehicle, now_s)
+            self._census_due_tick = 0
+
+    def _close_formations(self, t_s: float) -> None:
+        while self._open and self._open[0].closed_s <= t_s + 1e-6:
+            closed = self._open.pop(0)
+            self._closed.append(closed)
+            self._closed_to = closed.last_block
+            for vehicle in self.vehicles.values():
+                if vehicle.block in closed.blocks:
+                    vehicle.join(closed)
+            self._census_due_tick = 0
+
+    def _hand_out(self, now_s: float) -> None:
+        while self._grants and self._grants[0].t_s <= now_s + 1e-6:
+            grant = self._grants.pop(0)
+            owner = self.vehicles.get(grant.owner)
+            if owner is not None:
+                owner.controller.own(grant.cell)
+                self._show_estate(grant.owner, now_s)
+
+    def _show_estate(self, name: Name, now_s: float) -> None:
+        controller = self.vehicles[name].controller
+        self._watcher.own(now_s, name, controller.estate, controller.deed)
+
+    def _let_leave(self, now_s: float) -> Iterator[Effect]:
+        length_m = self._scenario.road.length_m
+        leaving = [
+            name
+            for name, each in self.vehicles.items()
+            if each.leaves_by(now_s) or each.body.state[0] > length_m
+        ]
+        for name in leaving:
+            self._leaving.add(self.vehicles.pop(name))
+            yield from self._attendance.forget(name)
+            self._watcher.leave(now_s, name)
+            self._census_due_tick = 0
+        yield from self._leaving.tell(self.tick, self._attendance.answers.up)
+
+    def _look_after(self, now_s: float) -> Iterator[Effect]:
+        """Let caretakers take charge of vehicles whose agents are gone or silent."""
+        self._attendance.answers.settle(now_s)
+        for vehicle, absence in self._attendance.unattended(self.vehicles, now_s):
+            if absence is Absence.ABSENT and now_s < vehicle.admission.t_s + AGENT_START_S:
+                continue
+            self.takeovers += 1
+            yield from self._attendance.take_charge(vehicle, self.tick)
+
+    def _tell_road(self, t_s: float) -> Iterator[Effect]:
+        count = len(self.vehicles)
+        if self.tick % CLOCK_EVERY_TICKS == 0:
+            yield Send(CLOCK, RoadClock(self.tick, t_s, count, count, count, 0, ended=False))
+        if self.tick >= self._census_due_tick:
+            self._census_due_tick = self.tick + CENSUS_EVERY_TICKS
+            entries = tuple(
+                CensusEntry(name, each.admission.cell, each.preferred_lane, each.admission.t_s)
+                for name, each in self.vehicles.items()
+            )
+            on_road = {each.formation for each in self.vehicles.values()}
+            formations = tuple(one for one in self._closed if one.first_block in on_road)
+            yield Send(CENSUS, Census(t_s, entries, (), formations, self._closed_to))

@@ -1,0 +1,209 @@
+"""The search: many seeds on all cores, and what is printed about them."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import multiprocessing
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from itertools import islice
+
+import structlog
+from attrs import field, frozen
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from laneweave.launch.fault_search.checker import Violation
+from laneweave.launch.fault_search.profiles import Profile
+from laneweave.launch.fault_search.simulated_run import Outcome, Totals, World
+from laneweave.launch.fault_search.story import Story
+from laneweave.launch.run.garbage_collection import collect_seldom
+from laneweave.launch.run.roles import die_with_supervisor
+from laneweave.protocol.errors import CommandFailedError
+
+BATCH = 20
+"""Seeds that a process takes at a time."""
+SHOWN_VIOLATIONS = 5
+"""Of one seed."""
+SHOWN_SEEDS = 20
+"""Failed seeds that are described; the others are only counted."""
+
+
+@frozen
+class Result:
+    """What the seeds of a search came to."""
+
+    totals: Totals = field(factory=Totals)
+    failed: tuple[Outcome, ...] = ()
+    """Outcomes of the seeds with violations, ascending."""
+    digests: dict[int, str] = field(factory=dict)
+    """Of each seed, if asked for."""
+
+    @property
+    def passed(self) -> int:
+        """Seeds without violations."""
+        return self.totals.runs - len(self.failed)
+
+    @property
+    def digest(self) -> str:
+        """One digest of all seeds."""
+        lines = "".join(f"{seed} {digest}\n" for seed, digest in sorted(self.digests.items()))
+        return hashlib.blake2b(lines.encode(), digest_size=16).hexdigest()
+
+
+def run_seeds(seeds: Sequence[int], profile: Profile, *, digest: bool = False) -> list[Outcome]:
+    """Run some seeds in this process; one that crashes is a failed one, too."""
+    return [_run_seed(seed, profile, digest=digest) for seed in seeds]
+
+
+def _run_seed(seed: int, profile: Profile, *, digest: bool) -> Outcome:
+    try:
+        return World(seed, profile, digest=digest).run()
+    except Exception as error:  # noqa: BLE001 (whatever a core does, the search goes on)
+        text = f"{type(error).__name__}: {error}"
+        return Outcome(seed, (Violation("crash", 0.0, (), text),), Totals(runs=1))
+
+
+def search(
+    seeds: range, profile: Profile, jobs: int, *, digest: bool = False, show: bool = False
+) -> Result:
+    """Run all seeds.
+
+    Args:
+        seeds: which.
+        profile: what they draw from.
+        jobs: processes to use.
+        digest: whether to make digests of what is delivered.
+        show: whether to show a progress bar.
+    """
+    result = Result()
+    bar = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=None),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[failed]} failed"),
+        TimeElapsedColumn(),
+        console=Console(stderr=True),
+        disable=not show,
+        transient=True,
+    )
+    with bar:
+        task = bar.add_task(profile.name, total=len(seeds), failed=0)
+        for outcomes in _batches(seeds, profile, jobs, digest=digest):
+            result = _with(result, outcomes)
+            bar.update(task, completed=result.totals.runs, failed=len(result.failed))
+    return result
+
+
+def _batches(seeds: range, profile: Profile, jobs: int, *, digest: bool) -> Iterator[list[Outcome]]:
+    batches = [seeds[first : first + BATCH] for first in range(0, len(seeds), BATCH)]
+    if jobs == 1 or len(batches) == 1:
+        collect_seldom()
+        for batch in batches:
+            yield run_seeds(batch, profile, digest=digest)
+        return
+    # Spawned: a fork would copy locks that the progress bar's thread holds.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(jobs, len(batches)), context, _quiet) as pool:
+        waiting = iter(batches)
+        running: set[Future[list[Outcome]]] = set()
+        try:
+            # Only a few batches at a time: a long search is soon under way, and soon ended.
+            for batch in islice(waiting, 2 * jobs):
+                running.add(pool.submit(run_seeds, batch, profile, digest=digest))
+            while running:
+                done, running = wait(running, return_when=FIRST_COMPLETED)
+                for batch in islice(waiting, len(done)):
+                    running.add(pool.submit(run_seeds, batch, profile, digest=digest))
+                for future in done:
+                    yield future.result()
+        except BrokenProcessPool as error:
+            raise CommandFailedError("a worker of the search was killed") from error
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
+
+
+def _quiet() -> None:
+    """In a worker: Ctrl-C is the parent's business, and expected warnings are nobody's.
+
+    A worker ends with its parent, however that ends.
+    """
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    die_with_supervisor()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    quiet_logs()
+    collect_seldom()
+
+
+def quiet_logs() -> None:
+    """Log errors only: refused messages and failing plannings are what a search consists of."""
+    structlog.configure(
+        wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL),
+        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+    )
+
+
+def _with(result: Result, outcomes: Sequence[Outcome]) -> Result:
+    failed = [*result.failed, *(outcome for outcome in outcomes if outcome.violations)]
+    return Result(
+        sum((outcome.totals for outcome in outcomes), result.totals),
+        tuple(sorted(failed, key=lambda outcome: outcome.seed)),
+        result.digests | {outcome.seed: outcome.digest for outcome in outcomes if outcome.digest},
+    )
+
+
+# --- what is printed ------------------------------------------------------------------------------
+
+
+def describe(result: Result, profile: Profile) -> Iterator[str]:
+    """Return the lines that tell what a search came to; the last one counts."""
+    for outcome in result.failed[:SHOWN_SEEDS]:
+        yield f"seed {outcome.seed} failed:"
+        for violation in outcome.violations[:SHOWN_VIOLATIONS]:
+            yield f"  {violation}"
+        yield f"  again: {replay_command(outcome.seed, profile)}"
+    if len(result.failed) > SHOWN_SEEDS:
+        others = [str(outcome.seed) for outcome in result.failed[SHOWN_SEEDS:]]
+        yield f"failed as well: seeds {' '.join(others[:200])}"
+    yield from describe_totals(result.totals)
+    yield f"{result.passed} passed, {len(result.failed)} failed"
+
+
+def replay_command(seed: int, profile: Profile) -> str:
+    """Return the command that runs one seed again and tells its story."""
+    return f"laneweave simulate --seeds {seed}:{seed + 1} --profile {profile.name} --verbose"
+
+
+def describe_totals(totals: Totals) -> Iterator[str]:
+    """Return lines from which one sees that a search was not idle."""
+    pace = totals.virtual_s / totals.cpu_s if totals.cpu_s else 0.0
+    yield (
+        f"{totals.runs} runs, {totals.virtual_s:.0f} s of virtual time in {totals.cpu_s:.0f} s of "
+        f"processor time: {pace:.0f} x real time on one core"
+    )
+    yield (
+        f"{totals.vehicles} vehicles, {totals.motions} motions, {totals.plans} plans, "
+        f"{totals.joint_plans} of them for joined formations"
+    )
+    yield (
+        f"{totals.delivered} messages delivered, {totals.dropped} lost, "
+        f"{totals.takeovers} times a caretaker took charge, "
+        f"longest healing {totals.longest_healing_s:.1f} s"
+    )
+    faults = ", ".join(f"{kind} {count}" for kind, count in sorted(totals.faults.items()))
+    yield f"faults: {faults or 'none'}"
+
+
+def tell_story(seed: int, profile: Profile) -> Iterator[str]:
+    """Run one seed again and return what happened around its first violation."""
+    story = Story()
+    outcome = World(seed, profile, story=story).run()
+    yield f"seed {seed}, profile {profile.name}:"
+    yield from story.around(outcome.violations)

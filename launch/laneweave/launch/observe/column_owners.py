@@ -1,0 +1,126 @@
+"""Which columns are whose: formations as the census lists them, and as a recorded run has them."""
+
+from __future__ import annotations
+
+import json
+import math
+from bisect import bisect_left
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+from attrs import field, frozen
+
+from laneweave.protocol.lattice import Lattice
+from laneweave.protocol.wire.messages import ClosedFormation
+
+CLOSED, JOINED, PLANNED = "formation-closed", "formations-joined", "plan-made"
+"""Events of a run that are about formations."""
+
+
+@frozen
+class FormationColumns:
+    """The columns of a formation on the lattice."""
+
+    number: int
+    rear: int
+    front: int
+    """Its first and its last column, both its own."""
+    closed_s: float = -math.inf
+    """Road time from which on this is known; recordings without such events: always."""
+
+    @classmethod
+    def of(cls, closed: ClosedFormation, lattice: Lattice) -> FormationColumns:
+        """Return the columns of a formation of the census."""
+        columns = closed.columns(lattice)
+        return cls(closed.first_block, columns.start, columns.stop - 1, closed.closed_s)
+
+
+def _rearmost_first(found: Iterable[FormationColumns]) -> tuple[FormationColumns, ...]:
+    return tuple(sorted(found, key=lambda one: one.front))
+
+
+@frozen
+class Formations:
+    """Formations, none of which has a column of another one."""
+
+    listed: tuple[FormationColumns, ...] = field(converter=_rearmost_first)
+    """The rearmost first."""
+    _fronts: list[int] = field(init=False)
+
+    @_fronts.default
+    def _sorted_fronts(self) -> list[int]:
+        return [one.front for one in self.listed]
+
+    @classmethod
+    def of_census(cls, closed: Iterable[ClosedFormation], lattice: Lattice) -> Formations:
+        """Return the formations that a census lists."""
+        return cls(FormationColumns.of(one, lattice) for one in closed)
+
+    @property
+    def by_number(self) -> dict[int, FormationColumns]:
+        """The formations by their numbers, the foremost first."""
+        return {one.number: one for one in reversed(self.listed)}
+
+    def at(self, column: int) -> FormationColumns | None:
+        """Return whose column it is; None: of none of these."""
+        place = bisect_left(self._fronts, column)
+        if place == len(self.listed) or self.listed[place].rear > column:
+            return None
+        return self.listed[place]
+
+    def joined(self, groups: Iterable[Collection[int]], lattice: Lattice) -> list[list[int]]:
+        """Return the numbers of formations that plan together, in groups of at least two.
+
+        Args:
+            groups: numbers of blocks whose vehicles plan together; groups may overlap.
+            lattice: whose blocks these are.
+        """
+        found: list[set[int]] = []
+        for blocks in groups:
+            owners = (self.at(lattice.block_range(block).start) for block in blocks)
+            together = {owner.number for owner in owners if owner is not None}
+            if len(together) > 1:
+                apart = [group for group in found if group.isdisjoint(together)]
+                touched = [group for group in found if not group.isdisjoint(together)]
+                found = [*apart, together.union(*touched)]
+        return sorted(sorted(group) for group in found)
+
+
+def read_events(folder: Path, *kinds: str) -> Iterator[Mapping[str, Any]]:
+    """Yield a recorded run's events of some kinds, in the order in which they were written.
+
+    Raises:
+        OSError, ValueError, TypeError: there are events that cannot be read.
+    """
+    path = folder / "events.jsonl"
+    if not path.is_file():
+        return
+    for line in path.read_text(encoding="utf-8").splitlines():
+        event = json.loads(line)
+        if event["kind"] in kinds:
+            yield event
+
+
+def recorded_formations(folder: Path, lattice: Lattice) -> Formations:
+    """Return the formations of a recorded run that had vehicles.
+
+    Recordings without events that say which columns are whose have one formation for each block
+    of the lattice; so have runs of the rolling operation, whose blocks are no formations.
+
+    Raises:
+        OSError, ValueError, KeyError, TypeError: a file of the run cannot be read.
+    """
+    found: dict[int, FormationColumns] = {}
+    for event in read_events(folder, CLOSED):
+        if event.get("role") == "bridge":
+            rear, front = event["columns"]
+            number = int(event["formation"])
+            found[number] = FormationColumns(number, int(rear), int(front), float(event["t_s"]))
+    trips = pq.read_table(folder / "trips.parquet", columns=["formation"])
+    numbers: set[int] = set(trips["formation"].drop_null().to_pylist())  # type: ignore[arg-type]
+    for number in numbers:
+        columns = lattice.block_range(number)
+        found.setdefault(number, FormationColumns(number, columns[0], columns[-1]))
+    return Formations(found.values())

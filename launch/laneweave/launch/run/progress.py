@@ -1,0 +1,69 @@
+"""The progress bar of a run."""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+from laneweave.launch.observe.observer import View
+from laneweave.protocol.scenario.tables import Scenario
+
+
+class RunProgress:
+    """Shows simulated time, vehicles on the road, the leader and its term, real-time factor."""
+
+    def __init__(self, scenario: Scenario, *, show: bool) -> None:
+        """Prepare a bar that ends when the last vehicle may leave; `show` false shows nothing."""
+        free_flow_s = scenario.road.length_m / scenario.formation.speed_mps
+        self._total_s = scenario.demand.duration_s + free_flow_s
+        self._bar = Progress(
+            TextColumn("{task.fields[now]}"),
+            BarColumn(bar_width=None),
+            TextColumn("{task.fields[road]}"),
+            TextColumn("{task.fields[leader]}"),
+            TextColumn("{task.fields[rate]}"),
+            TimeElapsedColumn(),
+            console=Console(stderr=True),
+            disable=not show,
+            transient=True,
+        )
+        self._task: TaskID = self._bar.add_task(
+            "run", total=self._total_s, now="starting", road="", leader="no leader", rate=""
+        )
+        self._began: tuple[float, float] | None = None
+
+    def __enter__(self) -> Self:
+        """Show the bar."""
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Take the bar away."""
+        self._bar.stop()
+
+    def update(self, view: View) -> None:
+        """Show what is known now."""
+        clock = view.clock
+        if clock is None:
+            return
+        now = time.monotonic()
+        if self._began is None:
+            self._began = (now, clock.t_s)
+        wall_s, road_s = now - self._began[0], clock.t_s - self._began[1]
+        self._bar.update(
+            self._task,
+            completed=min(clock.t_s, self._total_s),
+            now=f"{clock.t_s:6.1f} s",
+            road=f"{clock.on_road:3d} on the road, {clock.left}/{clock.demanded} left",
+            leader=f"leader {view.leader}, term {view.term}" if view.leader else "no leader",
+            rate=f"x{road_s / wall_s:.2f} real time" if wall_s > 1 else "",
+        )

@@ -1,0 +1,195 @@
+"""A recorded run as frames, made when somebody asks for them.
+
+The files of a run do not say who owned which cells, where plans led beyond the cell that a vehicle
+held or moved to, or which messages were lost; so neither do these frames. What the summary says of
+messages stands in the scene.
+"""
+
+from __future__ import annotations
+
+import json
+from bisect import bisect_right
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+from attrs import frozen
+from numpy.typing import NDArray
+
+from laneweave.launch.observe.column_owners import JOINED, Formations, recorded_formations
+from laneweave.launch.report.runs import Run, single_run
+from laneweave.launch.report.trajectories import OFF_LATTICE, Tracks, read_tracks
+from laneweave.launch.watch.event_feed import Newest, plan_facts
+from laneweave.launch.watch.frames import MOVING, Row, compact, scene_of
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.lattice import Cell
+
+STEP_S = 0.2
+"""Road time between two frames; the page draws what is between them."""
+STILL_M = 0.25
+"""Who is further across from the middle of its cell moves."""
+
+
+@frozen
+class _Moment:
+    """What events had told at some time."""
+
+    t_s: float
+    leader: tuple[str, int] | None = None
+    plan: list[Any] | None = None
+    news: tuple[list[Any], ...] = ()
+    entered: int = 0
+    left: int = 0
+    joined: tuple[tuple[int, ...], ...] = ()
+    """Groups of blocks that plan together."""
+
+
+class Recording:
+    """A finished run's folder; a `Film`."""
+
+    def __init__(self, folder: Path) -> None:
+        """Read a run's folder.
+
+        Raises:
+            BadInputError: it is not the folder of a finished run with trajectories.
+        """
+        run = single_run(folder)
+        try:
+            self._tracks = read_tracks(folder)
+            self._trips = _trips(folder)
+            self._moments = list(_moments(folder))
+            formations = recorded_formations(folder, run.scenario.lattice)
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            allowed = f"the folder of a finished run ({error})"
+            raise BadInputError("DIR", str(folder), allowed) from error
+        self._run = run
+        rolling = run.scenario.formation.rolling or run.label != "formation"
+        self._formations = (Formations(()) if rolling else formations).by_number
+        tick_s = run.scenario.runtime.tick_s
+        stride = max(1, round(STEP_S / tick_s))
+        self._step_s = stride * tick_s
+        self._numbers, self._rows = _frames_of(self._tracks, tick_s, stride)
+        self.first = 0
+        # One more than there are: then all have left.
+        self.last = int(self._numbers[-1]) + 1 if len(self._numbers) else 0
+        demands_s = [float(trip["demanded_s"]) for trip in self._trips.values()]
+        self._demands_s = np.sort(np.array(demands_s, dtype=np.float64))
+        self._times_s = [moment.t_s for moment in self._moments]
+        title = f"{run.label}, {run.volume_veh_per_lane_h:g} vehicles/(lane h), seed "
+        title += f"{run.scenario.seed}"
+        self.scene = scene_of(run.scenario, "recorded", title, self._step_s) | {
+            "losses": _losses(run),
+            "rolling": rolling,
+        }
+
+    def frames(self, begin: int, end: int) -> list[str]:
+        """Return the frames from `begin` to `end`, as far as the run goes."""
+        numbers = range(max(begin, self.first), min(end, self.last) + 1)
+        return [compact(self.frame(number)) for number in numbers]
+
+    def frame(self, number: int) -> dict[str, Any]:
+        """Return one frame; see `frames`."""
+        t_s = number * self._step_s
+        moment = self._moments[max(0, bisect_right(self._times_s, t_s + 1e-6) - 1)]
+        rows = list(self._vehicles(number, t_s))
+        present = {row.formation for row in rows}
+        shown = Formations(one for one in self._formations.values() if one.number in present)
+        return {
+            "n": number,
+            "run": 1,
+            "t": round(t_s, 3),
+            "w": None,
+            "status": "recorded",
+            "since": None,
+            "leader": list(moment.leader) if moment.leader is not None else None,
+            "candidates": [],
+            "counts": [self._demanded(t_s), moment.entered, len(rows), moment.left],
+            "loss": None,
+            "plan": moment.plan,
+            "news": list(moment.news),
+            "formations": [[one.number, one.rear, one.front] for one in shown.listed],
+            "joined": shown.joined(moment.joined, self._run.scenario.lattice),
+            "vehicles": [row.compact() for row in rows],
+        }
+
+    def _vehicles(self, number: int, t_s: float) -> Iterator[Row]:
+        tracks, scenario = self._tracks, self._run.scenario
+        width_m = scenario.road.lane_width_m
+        first = np.searchsorted(self._numbers, number)
+        last = np.searchsorted(self._numbers, number, side="right")
+        for place, vehicle in self._rows[first:last]:
+            name = tracks.names[vehicle]
+            trip = self._trips.get(name, {})
+            column, lane = int(tracks.column[place]), int(tracks.lane[place])
+            cell: Cell | None = None if column == OFF_LATTICE else (column, lane)
+            y_m = float(tracks.y_m[place])
+            formation = self._formations.get(trip.get("formation", -1))
+            moving = abs(y_m - (lane + 0.5) * width_m) > STILL_M
+            if cell is not None:
+                ahead_m = scenario.lattice.cell_s_m(column, t_s) - float(tracks.s_m[place])
+                moving |= abs(ahead_m) > 0.5 * scenario.formation.gap_m
+            yield Row(
+                name=name,
+                s_m=float(tracks.s_m[place]),
+                y_m=y_m,
+                speed_mps=float(tracks.speed_mps[place]),
+                preferred_lane=int(trip.get("preferred_lane", -1)),
+                formation=formation.number if formation and formation.closed_s <= t_s else -1,
+                hold=cell,
+                target=None,
+                flags=MOVING * moving,
+            )
+
+    def _demanded(self, t_s: float) -> int:
+        return int(np.searchsorted(self._demands_s, t_s, side="right"))
+
+
+def _frames_of(
+    tracks: Tracks, tick_s: float, stride: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the frame of each row that is shown, ascending, and (row, vehicle) pairs."""
+    ticks = np.rint(tracks.t_s / tick_s).astype(np.int64)
+    rows = np.flatnonzero(ticks % stride == 0)
+    numbers = ticks[rows] // stride
+    order = np.argsort(numbers, kind="stable")
+    pairs = np.column_stack([rows, tracks.vehicle[rows]])
+    return numbers[order], pairs[order]
+
+
+def _trips(folder: Path) -> dict[str, dict[str, Any]]:
+    columns = ["vehicle", "preferred_lane", "formation", "demanded_s"]
+    table = pq.read_table(folder / "trips.parquet", columns=columns)
+    return {str(trip["vehicle"]): trip for trip in table.to_pylist()}
+
+
+def _moments(folder: Path) -> Iterator[_Moment]:
+    """Yield what events had told, from nothing on, in order of time."""
+    yield _Moment(float("-inf"))
+    events = []
+    for line in (folder / "events.jsonl").read_text(encoding="utf-8").splitlines():
+        event = json.loads(line)
+        events.append((float(event.pop("t_s")), str(event.pop("kind")), event))
+    leader: tuple[str, int] | None = None
+    plan: list[Any] | None = None
+    newest, entered, left = Newest(), 0, 0
+    joined: tuple[tuple[int, ...], ...] = ()
+    for t_s, kind, data in sorted(events, key=lambda event: event[0]):
+        role = data.pop("role", "")
+        who = str(data.pop("name", role))
+        if kind == "leader":
+            leader = (str(data.get("coordinator")), int(data.get("term", 0)))
+        plan = plan_facts(t_s, kind, data) or plan
+        entered += kind == "entered"
+        left += kind == "left"
+        if kind == JOINED and role == "coordinator":
+            joined = (*joined, tuple(map(int, data["formations"])))
+        newest.add(t_s, who, kind, data)
+        yield _Moment(t_s, leader, plan, tuple(newest.rows), entered, left, joined)
+
+
+def _losses(run: Run) -> dict[str, int]:
+    """Return what a summary says of messages: published, and dropped by injected faults."""
+    messages = run.summary.get("messages") or {}
+    return {name: int(messages.get(name) or 0) for name in ("published", "dropped_by_faults")}

@@ -1,0 +1,339 @@
+"""How the fields of a scenario fit together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from laneweave.protocol.config.endpoints import is_tls
+from laneweave.protocol.config.identities import LONGEST_COMMON_NAME, identities_of
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.fleets import most_vehicles
+from laneweave.protocol.scenario.tables import Scenario
+
+LEAST_GAP_M = 1.0
+"""Between bumpers of neighbouring cells: bodies turn to change lanes, and track with some error."""
+LEAST_SIDE_M = 0.5
+"""Between bodies side by side, for the same reasons."""
+MOST_TICKS = 200
+"""Of the tracker's horizon."""
+MOST_SECURED_VEHICLES = 5000
+"""Vehicles of a demand for which a router has rules."""
+
+
+ROLLING_ONLY = ("sort_in_s2", "reward_drift")
+"""Fields of `formation` that only the rolling operation reads."""
+FORMATIONS_ONLY = (
+    "entry",
+    "close",
+    "max_vehicles",
+    "max_columns",
+    "max_joined",
+    "join",
+    "structures",
+    "solver",
+    "weight_straight",
+    "weight_oblique",
+    "planning_deadline_s",
+    "max_nodes",
+)
+"""Fields of `formation` that the rolling operation does not read."""
+
+
+def check_scenario(scenario: Scenario) -> None:
+    """Check how the fields fit together.
+
+    Raises:
+        BadInputError: names the first field that does not fit.
+    """
+    _check_lanes(scenario)
+    _check_motion(scenario)
+    _check_conflicts(scenario)
+    _check_structures(scenario)
+    _check_timing(scenario)
+    _check_braking(scenario)
+    _check_settling(scenario)
+    _check_security(scenario)
+
+
+def check_effects(data: Mapping[str, Any], scenario: Scenario) -> None:
+    """Check that every value that a file sets has an effect beside the file's other values.
+
+    Args:
+        data: the tables of the file.
+        scenario: what they mean.
+
+    Raises:
+        BadInputError: names the first field that has none.
+    """
+    formation, given = scenario.formation, data.get("formation", {})
+    for fields, has_effect, allowed in (
+        (ROLLING_ONLY, formation.rolling, 'none, unless formation.operation is "rolling"'),
+        (FORMATIONS_ONLY, not formation.rolling, 'none where formation.operation is "rolling"'),
+        (
+            ("max_columns",),
+            formation.closes_by_vehicles,
+            'none, unless formation.close is "vehicles"',
+        ),
+        (("join",), formation.max_joined > 1, "none, unless formation.max_joined is above 1"),
+        (
+            ("block_columns",),
+            not formation.closes_by_vehicles,
+            'none, unless formation.close is "columns"',
+        ),
+    ):
+        for name in fields:
+            _require(name not in given or has_effect, f"formation.{name}", given.get(name), allowed)
+
+
+def _require(ok: bool, name: str, value: object, allowed: str) -> None:
+    if not ok:
+        raise BadInputError(name, value, allowed)
+
+
+def _check_lanes(scenario: Scenario) -> None:
+    road, demand, vehicle = scenario.road, scenario.demand, scenario.vehicle
+    shares = demand.lane_shares
+    _require(
+        len(shares) in (0, road.lanes),
+        "demand.lane_shares",
+        list(shares),
+        f"one share for each of the {road.lanes} lanes of road.lanes, or none",
+    )
+    _require(
+        all(share >= 0 for share in shares) and (not shares or 0 < sum(shares) < math.inf),
+        "demand.lane_shares",
+        list(shares),
+        "numbers >= 0, not all 0, with a finite sum",
+    )
+    _require(
+        road.lane_width_m >= vehicle.width_m + LEAST_SIDE_M,
+        "road.lane_width_m",
+        road.lane_width_m,
+        f"at least {vehicle.width_m + LEAST_SIDE_M:g}: vehicle.width_m = {vehicle.width_m:g} and "
+        f"{LEAST_SIDE_M:g} between bodies side by side",
+    )
+    _require(
+        3600.0 / demand.volume_veh_per_lane_h >= demand.min_headway_s,
+        "demand.volume_veh_per_lane_h",
+        demand.volume_veh_per_lane_h,
+        f"at most 3600 / demand.min_headway_s = {3600.0 / max(demand.min_headway_s, 1e-9):g}",
+    )
+
+
+def _check_motion(scenario: Scenario) -> None:
+    formation, vehicle, road = scenario.formation, scenario.vehicle, scenario.road
+    min_gap_m = scenario.tracking.min_gap_m
+    least_pitch_m = vehicle.length_m + max(min_gap_m, LEAST_GAP_M)
+    _require(
+        formation.gap_m >= least_pitch_m,
+        "formation.gap_m",
+        formation.gap_m,
+        f"at least {least_pitch_m:g}: vehicle.length_m = {vehicle.length_m:g} and between two "
+        f"bumpers tracking.min_gap_m = {min_gap_m:g}, at least {LEAST_GAP_M:g}",
+    )
+    cycle_s, move_s = formation.cycle_s, formation.move_s
+    if move_s is not None:
+        _require(
+            cycle_s is not None and move_s <= cycle_s,
+            "formation.move_s",
+            move_s,
+            "none without formation.cycle_s"
+            if cycle_s is None
+            else f"at most formation.cycle_s = {cycle_s:g}",
+        )
+    _require(
+        formation.speed_mps < vehicle.max_speed_mps,
+        "formation.speed_mps",
+        formation.speed_mps,
+        f"below vehicle.max_speed_mps = {vehicle.max_speed_mps:g}",
+    )
+    _require(
+        (formation.weight_oblique or 0) <= formation.oblique_steps,
+        "formation.weight_oblique",
+        formation.weight_oblique,
+        "at most 1 in mode 2 (an oblique edge is one step), at most 2 in mode 1",
+    )
+    block_m = (formation.greatest_length - 1) * formation.gap_m
+    needed_m = block_m + vehicle.length_m + formation.speed_mps * scenario.cycles_s[0]
+    _require(
+        road.s3_m >= needed_m,
+        "road.s3_m",
+        road.s3_m,
+        f"at least {needed_m:g}: a whole formation and one step fit in",
+    )
+
+
+def _check_structures(scenario: Scenario) -> None:
+    """Check that structures follow one another on the road before S3, on lanes that it has."""
+    road, before_m = scenario.road, -1.0
+    for number, structure in enumerate(scenario.formation.structures):
+        name = f"formation.structures[{number}]"
+        _require(
+            before_m < structure.from_m < road.sorting_start_m,
+            f"{name}.from_m",
+            structure.from_m,
+            f"ascending, and less than road.s1_m + road.s2_m = {road.sorting_start_m:g}",
+        )
+        before_m = structure.from_m
+        lanes = structure.lanes
+        _require(
+            len(set(lanes)) == len(lanes) and set(lanes) <= set(range(road.lanes)),
+            f"{name}.lanes",
+            list(lanes),
+            f"some of 0 to {road.lanes - 1}, each once",
+        )
+
+
+def _check_conflicts(scenario: Scenario) -> None:
+    formation = scenario.formation
+    _require(
+        formation.executable,
+        "formation.conflicts",
+        sorted(formation.conflict_kinds),
+        "geometric, or in mode 1 node, edge and special-1: moves of one step must have disjoint "
+        "footprints to be executed without a timetable",
+    )
+
+
+def _check_timing(scenario: Scenario) -> None:
+    network, runtime, formation = scenario.network, scenario.runtime, scenario.formation
+    _require(
+        network.election_s > 2 * network.heartbeat_s,
+        "network.election_s",
+        network.election_s,
+        f"more than twice network.heartbeat_s = {network.heartbeat_s:g}",
+    )
+    _require(
+        network.lease_s > network.heartbeat_s,
+        "network.lease_s",
+        network.lease_s,
+        f"more than network.heartbeat_s = {network.heartbeat_s:g}",
+    )
+    shortest_s, longest_s = scenario.cycles_s
+    for name, value in (
+        ("cycle_s", shortest_s),
+        ("cycle_s", longest_s),
+        ("move_s", shortest_s - formation.slack_s),
+    ):
+        ticks = value / runtime.tick_s
+        _require(
+            ticks >= 2 and abs(ticks - round(ticks)) < 1e-6,
+            f"formation.{name}",
+            value,
+            f"a multiple of runtime.tick_s = {runtime.tick_s:g}, at least twice it",
+        )
+    longest_move_s = longest_s - formation.slack_s
+    _require(
+        scenario.horizon_ticks * runtime.tick_s >= longest_move_s - 1e-6,
+        "tracking.horizon_ticks",
+        scenario.horizon_ticks,
+        f"long enough to hold a whole move of {longest_move_s:g} s, at most {MOST_TICKS}",
+    )
+    _require(
+        scenario.horizon_ticks <= MOST_TICKS,
+        "runtime.tick_s",  # a horizon that is given has its own bound
+        runtime.tick_s,
+        f"long enough for the longest T_F, {longest_s:g} s, to have at most {MOST_TICKS} ticks",
+    )
+    _require(
+        runtime.tick_resend_s < runtime.tick_deadline_s,
+        "runtime.tick_resend_s",
+        runtime.tick_resend_s,
+        f"less than runtime.tick_deadline_s = {runtime.tick_deadline_s:g}",
+    )
+    _require(
+        runtime.tick_deadline_s <= runtime.agent_silent_s,
+        "runtime.tick_deadline_s",
+        runtime.tick_deadline_s,
+        f"at most runtime.agent_silent_s = {runtime.agent_silent_s:g}",
+    )
+    _require(
+        network.lease_s <= runtime.agent_silent_s,
+        "network.lease_s",
+        network.lease_s,
+        f"at most runtime.agent_silent_s = {runtime.agent_silent_s:g}: a session that is lost is "
+        "noticed before its agent counts as silent",
+    )
+
+
+def _check_braking(scenario: Scenario) -> None:
+    # The emergency brake is made from scenarios, so its module imports theirs.
+    from laneweave.protocol.vehicle.braking import least_pitch_m  # noqa: PLC0415
+
+    reaction_s, tick_s = scenario.braking.reaction_s, scenario.runtime.tick_s
+    ticks = reaction_s / tick_s
+    _require(
+        ticks >= 1 - 1e-6 and abs(ticks - round(ticks)) < 1e-6,
+        "braking.reaction_s",
+        reaction_s,
+        f"a multiple of runtime.tick_s = {tick_s:g}, at least once it: a vehicle looks once in a "
+        "tick",
+    )
+    gap_m, least_m = scenario.formation.gap_m, least_pitch_m(scenario)
+    _require(
+        gap_m >= least_m,
+        "formation.gap_m",
+        gap_m,
+        f"at least {math.ceil(1000.0 * least_m) / 1000.0:g}: who holds one cell behind another at "
+        f"formation.speed_mps = {scenario.formation.speed_mps:g} must not brake in emergency "
+        "(vehicle.length_m, the tables braking and sensing)",
+    )
+
+
+def _check_settling(scenario: Scenario) -> None:
+    """Who settles in its cell with the least jerk must stay within the vehicle's limits.
+
+    From rest to rest over d in T that takes a speed of 15/8 d/T, an acceleration of 10/sqrt(3) d/T2
+    and a jerk of 60 d/T3.
+    """
+    formation, vehicle = scenario.formation, scenario.vehicle
+    way_m = formation.entry_spread_s * formation.speed_mps
+    speed_mps = min(vehicle.max_speed_mps - formation.speed_mps, formation.speed_mps)
+    accel_mps2 = min(vehicle.max_accel_mps2, -vehicle.min_accel_mps2)
+    least_s = max(
+        15.0 / 8.0 * way_m / speed_mps,
+        math.sqrt(10.0 / math.sqrt(3.0) * way_m / accel_mps2),
+        math.cbrt(60.0 * way_m / vehicle.max_jerk_mps3),
+    )
+    _require(
+        formation.settle_s >= least_s,
+        "formation.settle_s",
+        formation.settle_s,
+        f"at least {math.ceil(10.0 * least_s) / 10.0:g}: whoever enters up to {way_m:g} m beside "
+        "its cell settles there within the vehicle's limits",
+    )
+
+
+def _check_security(scenario: Scenario) -> None:
+    network, security = scenario.network, scenario.security
+    secured = security.mode == "mtls"
+    endpoints = [("network.endpoint", network.endpoint)] if network.endpoint else []
+    endpoints += [("network.listen", endpoint) for endpoint in network.listen]
+    for name, endpoint in endpoints:
+        if secured:
+            _require(
+                is_tls(endpoint), name, endpoint, "tls/HOST:PORT only, as security.mode is mtls"
+            )
+        else:
+            _require(not is_tls(endpoint), "security.mode", "off", f"mtls, as {name} is {endpoint}")
+    if not secured:
+        return
+    _require(bool(security.folder), "security.folder", "", "the folder of the certificates")
+    count = most_vehicles(scenario.demand, scenario.road.lanes)
+    _require(
+        count <= MOST_SECURED_VEHICLES,
+        "demand.duration_s",
+        scenario.demand.duration_s,
+        f"a demand of at most {MOST_SECURED_VEHICLES} vehicles where security.mode is mtls, this "
+        f"one may have {count}: the router has rules for each of them",
+    )
+    for identity in identities_of(scenario):
+        name = identity.common_name
+        _require(
+            len(name) <= LONGEST_COMMON_NAME,
+            f"security.{identity.party}s",
+            name,
+            f"at most {LONGEST_COMMON_NAME} characters: it is the common name of a certificate",
+        )

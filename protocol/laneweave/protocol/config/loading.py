@@ -1,0 +1,94 @@
+"""Reading a scenario: a TOML file, or tables, to a checked `Scenario`."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import attrs
+
+from laneweave.protocol.config.checks import check_effects, check_scenario
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.deployment import Security
+from laneweave.protocol.scenario.tables import PAPERS_FORMATIONS, Scenario
+from laneweave.protocol.structuring import structure
+
+
+def load_scenario(path: Path | None, **overrides: object) -> Scenario:
+    """Read a scenario and apply overrides such as `seed=3` or `demand__volume_veh_per_lane_h=1600`.
+
+    Args:
+        path: a TOML file; None takes the defaults: the paper's road, and formations of six.
+        **overrides: values that replace those of the file; `None` leaves the file's value.
+            `table__field` names a field of a table.
+
+    Raises:
+        BadInputError: the file cannot be read, is not TOML, a value is not acceptable, or has no
+            effect beside the file's other values.
+    """
+    data: dict[str, Any] = {}
+    if path is not None:
+        data = read_toml(path)
+        _resolve_folder(data, path)
+        check_effects(data, parse_scenario(data))
+    for name, value in overrides.items():
+        if value is None:
+            continue
+        *tables, key = name.split("__")
+        target = data
+        for table in tables:
+            target = target.setdefault(table, {})
+            if not isinstance(target, dict):
+                raise BadInputError(table, target, "a table")
+        target[key] = value
+    return parse_scenario(data)
+
+
+def _resolve_folder(data: dict[str, Any], path: Path) -> None:
+    """Make the folder of certificates one that does not depend on where a role is started."""
+    security = data.get("security")
+    if isinstance(security, dict):
+        folder = security.get("folder", Security().folder)
+        if isinstance(folder, str):
+            security["folder"] = str(path.parent / folder)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Raises:
+        BadInputError: the file cannot be read or is not TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise BadInputError("file", str(path), f"a readable file ({error.strerror})") from error
+    except (ValueError, RecursionError) as error:
+        # Not UTF-8, not TOML, a NUL in the path, too many digits, too deep.
+        raise BadInputError("file", str(path), f"valid TOML ({error})") from error
+
+
+def parse_scenario(data: Mapping[str, Any]) -> Scenario:
+    """Build a scenario from nested tables and cross-check it.
+
+    Raises:
+        BadInputError: a field is unknown, of the wrong type, out of range, or does not fit others.
+    """
+    scenario = structure(_with_current_names(data), Scenario)
+    check_scenario(scenario)
+    return scenario
+
+
+def _with_current_names(data: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the tables with `operation = "paper"`, an earlier name, in today's terms."""
+    formation = data.get("formation") if isinstance(data, Mapping) else None
+    if not isinstance(formation, Mapping) or formation.get("operation") != "paper":
+        return data
+    return {**data, "formation": {**PAPERS_FORMATIONS, **formation, "operation": "formations"}}
+
+
+def to_tables(scenario: Scenario) -> dict[str, Any]:
+    """Return nested tables from which `parse_scenario` builds the same scenario."""
+    return attrs.asdict(scenario)

@@ -1,0 +1,212 @@
+"""Message faults above the transport: a core that loses, doubles and delays what arrives for it.
+
+`FaultyCore` stands between a node and its core, so every receiver has a fate of its own for each
+message, over every transport and in virtual time alike. Only messages are touched: liveliness
+tokens, the state of the link and questions to a service pass as they are.
+
+Everything random comes from one generator for each topic, seeded by the run's seed and the
+process's label: equal seeds and equal arrivals give equal fates.
+"""
+
+from __future__ import annotations
+
+import heapq
+import random
+from collections.abc import Callable, Iterable, Iterator
+from itertools import count
+from typing import Any, Protocol
+
+import attrs
+from attrs import field, frozen
+
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.runtime.node import Arrived, Core, Effect, Event, Send, Wakeup
+from laneweave.protocol.scenario.validators import one_of, within
+from laneweave.protocol.wire.messages import RoadClock
+from laneweave.protocol.wire.topics import TOPICS
+
+SENDER_OF_ROLE = {"agent": "vehicle", "coordinator": "coordinator", "bridge": "bridge"}
+"""Who a process of each role speaks for, as rules name them."""
+SENDERS = tuple(SENDER_OF_ROLE.values())
+MESSAGE_TOPICS = tuple(topic.name for topic in TOPICS if topic.kind is not None)
+Wrap = Callable[[Core], Core]
+"""Puts something before a core, or nothing."""
+MOST_HELD = 10_000
+"""Delayed messages that wait at one time; what comes beyond is lost."""
+
+
+def _message_topics(_: object, attribute: attrs.Attribute[Any], value: tuple[str, ...]) -> None:
+    for name in value:
+        if name not in MESSAGE_TOPICS:
+            raise BadInputError(attribute.name, name, "any of " + ", ".join(MESSAGE_TOPICS))
+
+
+@frozen(kw_only=True)
+class MessageRule:
+    """What happens to some messages for some time. Rules add up: each has its turn.
+
+    Raises:
+        BadInputError: a value is not acceptable.
+    """
+
+    topics: tuple[str, ...] = field(default=(), validator=_message_topics)
+    """Names of topics; empty: all that carry messages."""
+    loss: float = field(default=0.0, validator=within(0.0, 1.0))
+    """Probability that a message does not reach a receiver."""
+    duplication: float = field(default=0.0, validator=within(0.0, 1.0))
+    """Probability that a receiver gets a message twice."""
+    delay_s: float = field(default=0.0, validator=within(0.0, 60.0))
+    """Wall-clock seconds by which each copy comes later."""
+    jitter_s: float = field(default=0.0, validator=within(0.0, 60.0))
+    """Uniformly drawn for each copy, and added; more than the messages' spacing reorders them."""
+    from_s: float = field(default=0.0, validator=within(0.0, 1e6))
+    """Road time from which the rule holds; 0: also before the road's clock starts."""
+    until_s: float | None = field(
+        default=None, validator=attrs.validators.optional(within(0.0, 1e6))
+    )
+    """Road time at which it ends; none: it holds to the end."""
+    sender: str | None = field(default=None, validator=attrs.validators.optional(one_of(*SENDERS)))
+    """Only what they send; none: whoever sends it."""
+    receiver: str | None = field(
+        default=None, validator=attrs.validators.optional(one_of(*SENDERS))
+    )
+    """Only what they receive; none: whoever receives it."""
+
+    def __attrs_post_init__(self) -> None:
+        """Check how the fields fit together."""
+        if self.until_s is not None and self.until_s <= self.from_s:
+            raise BadInputError("until_s", self.until_s, f"more than from_s, {self.from_s:g}")
+
+    def holds(self, road_s: float) -> bool:
+        """Tell whether the rule is in force at a road time."""
+        return self.from_s <= road_s and (self.until_s is None or road_s < self.until_s)
+
+
+class FaultBoard(Protocol):
+    """What the processes of a run share without messages."""
+
+    road_s: float
+    """Road time; the bridge's `FaultyCore` writes it, all others read it."""
+    dropped: int
+    """Messages that were lost; each `FaultyCore` counts its own up."""
+
+
+class FaultyCore:
+    """Another core, with message faults before it; a `Core` itself."""
+
+    def __init__(
+        self,
+        core: Core,
+        rules: Iterable[MessageRule],
+        board: FaultBoard,
+        *,
+        receiver: str,
+        seed: str,
+    ) -> None:
+        """Put faults before a core.
+
+        Args:
+            core: whoever should receive the messages.
+            rules: of the whole run; those for other receivers are ignored.
+            board: tells which rules are in force, and counts.
+            receiver: for whom the core receives, one of `SENDERS`.
+            seed: of all draws; tells this process from the others of the run.
+        """
+        self.core = core
+        self._board = board
+        self._rules = tuple(rule for rule in rules if rule.receiver in (None, receiver))
+        self._rules_for: dict[str, tuple[MessageRule, ...]] = {}
+        self._seed = seed
+        self._generators: dict[str, random.Random] = {}
+        self._held: list[tuple[float, int, Arrived]] = []
+        self._order = count()
+
+    @property
+    def wakeup_s(self) -> float | None:
+        """When the next delayed message arrives, or the core wants to be called."""
+        wakeup_s = self.core.wakeup_s
+        if not self._held:
+            return wakeup_s
+        return self._held[0][0] if wakeup_s is None else min(wakeup_s, self._held[0][0])
+
+    def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
+        """Take an event; see `Core`."""
+        for effect in self._on_event(event, now_s):
+            if isinstance(effect, Send) and isinstance(effect.message, RoadClock):
+                self._board.road_s = effect.message.t_s
+            yield effect
+
+    def _on_event(self, event: Event, now_s: float) -> Iterator[Effect]:
+        match event:
+            case Arrived():
+                yield from self._on_arrived(event, now_s)
+            case Wakeup():
+                yield from self._on_wakeup(event, now_s)
+            case _:
+                yield from self.core.handle(event, now_s)
+
+    def _on_arrived(self, arrived: Arrived, now_s: float) -> Iterator[Effect]:
+        delays_s = self._fate(arrived)
+        if not delays_s:
+            self._board.dropped += 1
+        for delay_s in delays_s:
+            if delay_s <= 0.0:
+                yield from self.core.handle(arrived, now_s)
+            elif len(self._held) < MOST_HELD:
+                heapq.heappush(self._held, (now_s + delay_s, next(self._order), arrived))
+            else:
+                self._board.dropped += 1
+
+    def _on_wakeup(self, wakeup: Wakeup, now_s: float) -> Iterator[Effect]:
+        while self._held and self._held[0][0] <= now_s:
+            yield from self.core.handle(heapq.heappop(self._held)[2], now_s)
+        wakeup_s = self.core.wakeup_s
+        if wakeup_s is not None and wakeup_s <= now_s:
+            yield from self.core.handle(wakeup, now_s)
+
+    def _fate(self, arrived: Arrived) -> list[float]:
+        """Return the delay of each copy of a message in s; none: it is lost."""
+        delays_s = [0.0]
+        name = arrived.topic.name
+        rules = self._rules_for.get(name)
+        if rules is None:
+            rules = self._rules_for[name] = tuple(
+                rule for rule in self._rules if not rule.topics or name in rule.topics
+            )
+        if not rules:
+            return delays_s
+        road_s, sender = self._board.road_s, _sender(arrived)
+        draw = self._generator(name).random
+        for rule in rules:
+            if not rule.holds(road_s) or rule.sender not in (None, sender):
+                continue
+            # Always both draws: a rule's duplicates do not depend on its loss.
+            lost, doubled = draw() < rule.loss, draw() < rule.duplication
+            if lost:
+                return []
+            delays_s = [
+                delay_s + rule.delay_s + (rule.jitter_s * draw() if rule.jitter_s else 0.0)
+                for delay_s in delays_s * (2 if doubled else 1)
+            ]
+        return delays_s
+
+    def _generator(self, topic: str) -> random.Random:
+        generator = self._generators.get(topic)
+        if generator is None:
+            # Text is hashed by SHA-512, alike in every process.
+            generator = random.Random(f"{self._seed}/{topic}")  # noqa: S311 (no secrets)
+            self._generators[topic] = generator
+        return generator
+
+
+def bare(core: Core) -> Core:
+    """Return a core as it is: the `Wrap` of a run without faults."""
+    return core
+
+
+def _sender(arrived: Arrived) -> str:
+    sender = arrived.topic.sender
+    if sender != "any":
+        return sender
+    role = arrived.parameters.get("role", "")
+    return SENDER_OF_ROLE.get(role, role)

@@ -1,0 +1,426 @@
+"""Pure cores and the node that drives one over a transport.
+
+A *core* is a state machine without I/O, clock, thread or randomness of its own: `handle` takes an
+event and the time and returns effects; `wakeup_s` says when it wants to be called again. A `Node`
+translates: payloads into typed events, effects into calls of the transport. Malformed input is
+counted and dropped here, so no core ever sees it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from typing import Any, Protocol
+
+import attrs
+import structlog
+from attrs import field, frozen
+
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.runtime.metrics import NodeNumbers, Snapshot
+from laneweave.protocol.runtime.transport import (
+    Delivery,
+    LinkDown,
+    LinkUp,
+    Question,
+    Received,
+    TokenDown,
+    TokenUp,
+    Transport,
+)
+from laneweave.protocol.wire.codec import decode, encode
+from laneweave.protocol.wire.messages import Name, Report
+from laneweave.protocol.wire.topics import Keys, Topic
+
+log = structlog.get_logger(__name__)
+
+TOO_LATE = "the deadline passed before it began"
+"""Why a delegated computation was not begun."""
+
+
+@frozen
+class Started:
+    """The node is up; the first event of every core."""
+
+
+@frozen
+class Arrived:
+    """A well-formed message."""
+
+    topic: Topic
+    parameters: Mapping[str, str]
+    message: Any
+
+
+@frozen
+class PeerUp:
+    """A peer's liveliness token appeared."""
+
+    topic: Topic
+    parameters: Mapping[str, str]
+
+
+@frozen
+class PeerDown:
+    """A peer's liveliness token vanished."""
+
+    topic: Topic
+    parameters: Mapping[str, str]
+
+
+@frozen
+class Wakeup:
+    """The time that the core asked for has come."""
+
+
+@frozen
+class Computed:
+    """A computation that the core ordered has ended; `error` is set when it raised."""
+
+    job: int
+    result: Any
+    error: str = ""
+
+
+@frozen
+class Asked:
+    """Somebody asks this node's service; answer with `Reply`."""
+
+    token: int
+    payload: bytes
+    encoding: str = ""
+    """MIME type of the payload; empty: not told."""
+
+
+@frozen
+class Stopping:
+    """The process was asked to end; the last event of a core."""
+
+
+Event = (
+    Started | Arrived | PeerUp | PeerDown | LinkUp | LinkDown | Wakeup | Computed | Asked | Stopping
+)
+
+
+@frozen
+class Send:
+    """Publish a message."""
+
+    topic: Topic
+    message: Any
+    parameters: dict[str, Any] = field(factory=dict)
+
+
+@frozen
+class Listen:
+    """Subscribe to a topic; parameters that are not given match anything."""
+
+    topic: Topic
+    parameters: dict[str, Any] = field(factory=dict)
+
+
+@frozen
+class Unlisten:
+    """Undo `Listen`."""
+
+    topic: Topic
+    parameters: dict[str, Any] = field(factory=dict)
+
+
+@frozen
+class Announce:
+    """Show a liveliness token."""
+
+    topic: Topic
+    parameters: dict[str, Any] = field(factory=dict)
+
+
+@frozen
+class Withdraw:
+    """Take a liveliness token back."""
+
+    topic: Topic
+    parameters: dict[str, Any] = field(factory=dict)
+
+
+@frozen
+class Watch:
+    """Be told of tokens that appear and vanish."""
+
+    topic: Topic
+    parameters: dict[str, Any] = field(factory=dict)
+
+
+@frozen
+class Serve:
+    """Answer questions on a topic."""
+
+    topic: Topic
+
+
+@frozen
+class Reply:
+    """Answer a question; `ok` false marks an error reply."""
+
+    token: int
+    payload: bytes
+    ok: bool = True
+    encoding: str = ""
+
+
+@frozen
+class Decline:
+    """Leave a question to others who serve the same topic."""
+
+    token: int
+
+
+@frozen
+class Compute:
+    """Run `work` beside the core, after what was ordered before; `Computed` brings its result."""
+
+    job: int
+    work: Callable[[], Any]
+
+
+@frozen
+class Delegate:
+    """Run `work` in a process of its own, beside others; `Computed` brings its result.
+
+    It is called with the seconds that are left until `deadline_s`, and not at all when none are:
+    then it counts as failed. Where it does not end long after the deadline, it is killed. `work`
+    can be pickled.
+    """
+
+    job: int
+    work: Callable[[float], Any]
+    deadline_s: float
+    """On the clock of `now_s`."""
+
+
+@frozen
+class End:
+    """The core has nothing more to do; the node leaves the network."""
+
+
+Effect = (
+    Send
+    | Listen
+    | Unlisten
+    | Announce
+    | Withdraw
+    | Watch
+    | Serve
+    | Reply
+    | Decline
+    | Compute
+    | Delegate
+    | End
+)
+
+
+class Core(Protocol):
+    """A state machine that a node drives."""
+
+    def handle(self, event: Event, now_s: float) -> Iterable[Effect]:
+        """Take one event at a time and return what to do.
+
+        What is in an event may be shared with other cores: it is not to be changed.
+        """
+
+    @property
+    def wakeup_s(self) -> float | None:
+        """When to be called with `Wakeup`, on the clock of `now_s`; None: not by itself."""
+
+
+class Node:
+    """Drives one core over one transport.
+
+    `order_work` takes computations off the node's hands and calls `dispatch(Computed(...))` when
+    one is done.
+    """
+
+    def __init__(
+        self,
+        core: Core,
+        transport: Transport,
+        keys: Keys,
+        order_work: Callable[[Compute | Delegate], None],
+        label: Name,
+        read: Callable[[str, bytes], Arrived] | None = None,
+        write: Callable[[object], bytes] = encode,
+    ) -> None:
+        """Join a core to its transport; nothing is sent before the first `dispatch`.
+
+        `label` tells this process from all others in reports. `read` does what
+        `read_message` does with `keys`, which is also the default; it may remember. `write` turns a
+        message into what `read` understands.
+        """
+        self._label = label
+        self.core = core
+        self.ended = False
+        self.published = 0
+        self.rejected = 0
+        self.received: dict[str, int] = {}
+        """Well-formed messages, by the name of their topic."""
+        self.handled = 0
+        """Events that the core has got."""
+        self.handling_s = 0.0
+        """Whoever drives the node may add up here how long that took."""
+        self._transport = transport
+        self._keys = keys
+        self._order_work = order_work
+        self._read = read or partial(read_message, keys)
+        self._write = write
+        self._encoded: tuple[object, bytes] = (None, b"")
+        """The newest message sent, and its bytes: a plan goes to one vehicle after the other."""
+
+    def deliver(self, delivery: Delivery, now_s: float) -> None:
+        """Translate what the transport hands over and let the core handle it."""
+        event: Event
+        try:
+            if isinstance(delivery, Received):
+                event = self._read(delivery.key, delivery.payload)
+                name = event.topic.name
+                self.received[name] = self.received.get(name, 0) + 1
+            else:
+                event = self._news(delivery)
+        except BadInputError as error:
+            self._reject(delivery, str(error))
+            return
+        self.dispatch(event, now_s)
+
+    def dispatch(self, event: Event, now_s: float) -> None:
+        """Let the core handle an event and carry out the effects."""
+        if self.ended:
+            return
+        self.handled += 1
+        for effect in self.core.handle(event, now_s):
+            if isinstance(effect, Send):
+                self._send(effect)
+            else:
+                self._carry_out(effect)
+
+    def numbers(self) -> list[Snapshot]:
+        """Return what this node and its core have counted."""
+        own = NodeNumbers(
+            self.published, self.received.copy(), self.rejected, self.handled, self.handling_s
+        )
+        offered: Iterable[Snapshot] = getattr(self.core, "numbers", ())
+        return [own, *offered]
+
+    def _news(self, delivery: LinkUp | LinkDown | Question | TokenUp | TokenDown) -> Event:
+        if isinstance(delivery, (LinkUp, LinkDown)):
+            return delivery
+        if isinstance(delivery, Question):
+            return Asked(delivery.token, delivery.payload, delivery.encoding)
+        known = known_key(self._keys, delivery.key)
+        return PeerUp(*known) if isinstance(delivery, TokenUp) else PeerDown(*known)
+
+    def _reject(self, delivery: Delivery, reason: str) -> None:
+        self.rejected += 1
+        # One line for the 1st, 10th, 100th, ...: a flood must not fill the log.
+        if self.rejected == 10 ** (len(str(self.rejected)) - 1):
+            key = getattr(delivery, "key", "")
+            log.warning("message ignored", key=key, reason=reason, ignored=self.rejected)
+
+    def _send(self, effect: Send) -> None:
+        message, topic = effect.message, effect.topic
+        self.published += 1
+        if isinstance(message, Report):
+            message = attrs.evolve(
+                message,
+                process=self._label,
+                published=self.published,
+                rejected=self.rejected,
+            )
+        if message is not self._encoded[0]:
+            self._encoded = message, self._write(message)
+        key = self._keys.key(topic, **effect.parameters)
+        self._transport.publish(key, self._encoded[1], topic.quality)
+
+    def _carry_out(self, effect: Effect) -> None:
+        transport = self._transport
+        match effect:
+            case Compute() | Delegate():
+                self._order_work(effect)
+            case Reply(token, payload, ok, encoding):
+                transport.answer(token, payload, ok=ok, encoding=encoding)
+            case Decline(token):
+                transport.decline(token)
+            case End():
+                self.ended = True
+                transport.close()
+            case _:
+                self._declare(effect)
+
+    def _declare(self, effect: Effect) -> None:
+        transport = self._transport
+        match effect:
+            case Listen(topic, parameters):
+                transport.subscribe(self._keys.all_of(topic, **parameters))
+            case Unlisten(topic, parameters):
+                transport.unsubscribe(self._keys.all_of(topic, **parameters))
+            case Announce(topic, parameters):
+                transport.announce(self._keys.key(topic, **parameters))
+            case Withdraw(topic, parameters):
+                transport.withdraw(self._keys.key(topic, **parameters))
+            case Watch(topic, parameters):
+                transport.watch(self._keys.all_of(topic, **parameters))
+            case Serve(topic):
+                transport.serve(self._keys.key(topic))
+
+
+def read_message(
+    keys: Keys,
+    key: str,
+    payload: bytes,
+    decode: Callable[[bytes, type], object] = decode,
+) -> Arrived:
+    """Return the message that arrived on a key; equal arguments give equal results.
+
+    Raises:
+        BadInputError: the key is none of `keys`, or the payload is no message of its topic.
+    """
+    topic, parameters = known_key(keys, key)
+    if topic.kind is None:
+        raise BadInputError("key", key, "a topic that carries messages")
+    return Arrived(topic, parameters, decode(payload, topic.kind))
+
+
+def known_key(keys: Keys, key: str) -> tuple[Topic, Mapping[str, str]]:
+    """Return a key's topic and parameters.
+
+    Raises:
+        BadInputError: the key is none of `keys`.
+    """
+    known = keys.read(key)
+    if known is None:
+        raise BadInputError("key", key, f"a topic of realm {keys.realm}")
+    return known
+
+
+def run_job(job: Compute) -> Computed:
+    """Run a computation and wrap its result or its failure."""
+    try:
+        return Computed(job.job, job.work())
+    except Exception as error:
+        log.exception("computation failed", job=job.job)
+        return Computed(job.job, None, f"{type(error).__name__}: {error}")
+
+
+def run_delegated(job: Delegate, now_s: Callable[[], float]) -> Computed:
+    """Run a delegated computation here, with the time that is left on the clock `now_s`."""
+    return run_job(Compute(job.job, partial(in_time, job.work, job.deadline_s, now_s)))
+
+
+def in_time(work: Callable[[float], Any], deadline_s: float, now_s: Callable[[], float]) -> object:
+    """Return what `work` does in the time that is left.
+
+    Raises:
+        TimeoutError: none is left.
+    """
+    left_s = deadline_s - now_s()
+    if left_s <= 0:
+        raise TimeoutError(TOO_LATE)
+    return work(left_s)

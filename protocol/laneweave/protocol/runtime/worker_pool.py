@@ -1,0 +1,255 @@
+"""Processes that compute for a core: the shell of its `Delegate` effects.
+
+A thread for each worker takes the next job, hands it to its process and waits: for the result, for
+the process's death, or until the job is long overdue. In the last two cases another process takes
+its place, and only that job has failed. (The pools of the standard library and of pebble end as a
+whole when a worker is killed while it waits for work.)
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import multiprocessing
+import queue
+import signal
+import threading
+import time
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
+from typing import Any
+
+import structlog
+
+from laneweave.protocol.runtime.node import Computed, Delegate, in_time
+from laneweave.protocol.runtime.processes import die_with_parent
+
+log = structlog.get_logger(__name__)
+
+OVERDUE_S = 5.0
+"""A worker that goes on for so long after its job's deadline is killed."""
+END_S = 2.0
+"""How long a killed process may take to be gone."""
+LOOK_S = 1.0
+"""How often a thread that has no job looks whether its process lives."""
+PAUSE_S = 0.5
+"""A process that died so soon after its start is not replaced at once: one that cannot start must
+not keep the machine busy."""
+
+# A fork would take over threads and sockets of the network.
+_CONTEXT = multiprocessing.get_context("spawn")
+_Order = tuple[Delegate, Callable[[Computed], None]]
+
+
+class WorkerPool:
+    """Workers of a process; they die with it, however it dies."""
+
+    def __init__(self, workers: int, warm_up: Callable[[], None] | None = None) -> None:
+        """Prepare; no process is started before the first job, or `start`.
+
+        Args:
+            workers: how many jobs run at a time.
+            warm_up: what each worker does when it starts; can be pickled.
+        """
+        self._orders: queue.SimpleQueue[_Order | None] = queue.SimpleQueue()
+        self._workers = [_Worker(self._orders, warm_up) for _ in range(workers)]
+        self._started = False
+
+    @property
+    def process_ids(self) -> list[int]:
+        """Ids of the processes that are up."""
+        return [worker.process_id for worker in self._workers if worker.process_id]
+
+    def start(self) -> None:
+        """Start the workers now, not with the first job; returns at once."""
+        if not self._started:
+            self._started = True
+            for worker in self._workers:
+                worker.thread.start()
+
+    def order(self, job: Delegate, done: Callable[[Computed], None]) -> None:
+        """Have a job done after those that were ordered before; `done` is called from a thread."""
+        self.start()
+        self._orders.put((job, done))
+
+    def close(self) -> None:
+        """End the workers at once, whatever they are doing; what they had is not heard of again."""
+        for worker in self._workers:
+            worker.end()
+        for _ in self._workers:
+            self._orders.put(None)
+        if self._started:
+            for worker in self._workers:
+                worker.thread.join(END_S)
+
+
+class _Worker:
+    """One process at a time, and the thread that looks after it."""
+
+    def __init__(
+        self, orders: queue.SimpleQueue[_Order | None], warm_up: Callable[[], None] | None
+    ) -> None:
+        self._orders = orders
+        self._warm_up = warm_up
+        self._lock = threading.Lock()
+        self._ending = threading.Event()
+        self._process: SpawnProcess | None = None
+        self._connection: Connection | None = None
+        self._begun_s = -math.inf
+        self.thread = threading.Thread(target=self._look_after, name="worker", daemon=True)
+
+    @property
+    def process_id(self) -> int:
+        """Id of the process; 0: there is none."""
+        process = self._process
+        return 0 if process is None or process.pid is None else process.pid
+
+    def end(self) -> None:
+        """Kill the process, and have the thread end."""
+        with self._lock:
+            self._ending.set()
+            process = self._process  # the thread may let go of it meanwhile
+            if process is not None:
+                process.kill()
+
+    def _look_after(self) -> None:
+        self._begin()
+        while not self._ending.is_set():
+            try:
+                order = self._orders.get(timeout=LOOK_S)
+            except queue.Empty:
+                if self._process is None or not self._process.is_alive():
+                    self._begin()
+                continue
+            if order is None:
+                break
+            job, done = order
+            try:
+                result = self._do(job)
+            except Exception as error:
+                # Whatever it is, the thread goes on: without it a share of the requests would wait.
+                log.exception("a worker is given up", job=job.job)
+                self._forget()
+                result = Computed(job.job, None, _described(error))
+            if not self._ending.is_set():
+                done(result)
+                if self._connection is None:
+                    self._begin()
+        self._forget()
+
+    def _begin(self) -> Connection | None:
+        """Start a process in the place of the one that was.
+
+        Returns:
+            The connection to it. None: the pool is ending, or the machine gives no process.
+        """
+        self._forget()
+        if time.monotonic() < self._begun_s + PAUSE_S:
+            self._ending.wait(PAUSE_S)
+        with self._lock:
+            if self._ending.is_set():
+                return None
+            self._begun_s = time.monotonic()
+            try:
+                self._process, self._connection = _start(self._warm_up)
+            except OSError as error:
+                log.warning("a worker cannot be started", reason=str(error))
+            return self._connection
+
+    def _forget(self) -> None:
+        """Let go of a process that is dead, or is to die."""
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+        if self._process is not None:
+            self._process.kill()
+            self._process.join(END_S)
+            self._process = None
+
+    def _do(self, job: Delegate) -> Computed:
+        """Do a job, where its process dies once more in another one."""
+        for _ in range(2):
+            connection = self._connection or self._begin()
+            done = None if connection is None else self._try(connection, job)
+            if done is not None:
+                return done
+            self._forget()
+            if not self._ending.is_set():
+                log.warning("a worker died", job=job.job)
+        return Computed(job.job, None, "the worker died")
+
+    def _try(self, connection: Connection, job: Delegate) -> Computed | None:
+        """Return what came of a job; None: the process died."""
+        left_s = max(0.0, job.deadline_s - time.monotonic())
+        try:
+            connection.send((job.work, job.deadline_s))
+            # A process that has just begun gets ready first; its pipe has room for a job.
+            if connection.poll(left_s + OVERDUE_S):
+                result, error = connection.recv()
+                return Computed(job.job, result, error)
+        except (EOFError, OSError):
+            return None
+        except Exception as error:
+            # It cannot be pickled. The pipe carries whole messages, so nothing of it is left there.
+            log.exception("a job or its result cannot be handed over", job=job.job)
+            return Computed(job.job, None, _described(error))
+        self._forget()
+        log.warning("a worker was stopped: it went on too long", job=job.job)
+        return Computed(job.job, None, "the worker was stopped: it went on too long")
+
+
+def _start(warm_up: Callable[[], None] | None) -> tuple[SpawnProcess, Connection]:
+    ours, theirs = _CONTEXT.Pipe()
+    with theirs:
+        process = _CONTEXT.Process(target=_work, args=(theirs, warm_up), name="worker", daemon=True)
+        try:
+            process.start()
+        except OSError:
+            ours.close()
+            raise
+    return process, ours
+
+
+def _work(connection: Connection, warm_up: Callable[[], None] | None) -> None:
+    """Do jobs until the other end is closed (the target of a worker's process)."""
+    die_with_parent()
+    # Ctrl-C reaches the whole group; the process that has the pool ends it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    if warm_up is not None:
+        warm_up()
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            _do_next(connection)
+
+
+def _do_next(connection: Connection) -> None:
+    """Do a job.
+
+    Raises:
+        EOFError, OSError: the other end is closed.
+    """
+    try:
+        work, deadline_s = connection.recv()
+        connection.send(_result(work, deadline_s))
+    except (EOFError, OSError):
+        raise
+    except Exception as error:  # it cannot be pickled
+        log.exception("a job or its result cannot be handed over")
+        connection.send((None, _described(error)))
+
+
+def _result(work: Callable[[float], Any], deadline_s: float) -> tuple[Any, str]:
+    # The clock of `time.monotonic` is one for all processes of a machine.
+    try:
+        return in_time(work, deadline_s, time.monotonic), ""
+    except TimeoutError as error:
+        return None, str(error)
+    except Exception as error:
+        log.exception("computation failed")
+        return None, _described(error)
+
+
+def _described(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"

@@ -1,0 +1,132 @@
+"""The tables of a configuration that tell how roles are deployed: network, security, service.
+
+They are part of the one TOML file that every role reads (`tables.py`); a file that holds only
+these is what docs/DEPLOYMENT.md calls a DEPLOYMENT.toml.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+import attrs
+from attrs import field, frozen
+
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.validators import host_port, key_part, key_parts, one_of, within
+
+FleetMembers = str | tuple[str, ...]
+"""A shard `I/N` of the vehicles that are announced, or vehicles by name."""
+MOST_SHARDS = 10_000
+
+
+@frozen
+class Shard:
+    """Which of the announced vehicles a process takes: those whose name falls to `index`."""
+
+    index: int
+    count: int
+
+    def takes(self, vehicle: str) -> bool:
+        """Tell whether a vehicle belongs to this shard, alike in every process."""
+        return zlib.crc32(vehicle.encode()) % self.count == self.index
+
+
+def parse_shard(text: str, name: str) -> Shard:
+    """Return the shard `I/N`.
+
+    Args:
+        text: what somebody wrote.
+        name: of the field or option, for the error.
+
+    Raises:
+        BadInputError: it is no shard.
+    """
+    index, _, count = text.partition("/")
+    digits = index.isdecimal() and count.isdecimal() and len(text) < 20
+    if not digits or not int(index) < int(count) <= MOST_SHARDS:
+        raise BadInputError(name, text, f"I/N with 0 <= I < N <= {MOST_SHARDS}")
+    return Shard(int(index), int(count))
+
+
+@frozen
+class Network:
+    """How roles find each other and when they give each other up; wall-clock seconds."""
+
+    realm: str = field(default="default", validator=key_part)
+    """First part of every key: deployments with different realms do not see each other."""
+    endpoint: str = ""
+    """Zenoh endpoint of the router; empty: a socket in a temporary folder (`laneweave run`)."""
+    listen: tuple[str, ...] = ()
+    """Where the router listens; empty: at `endpoint`."""
+    lease_s: float = field(default=1.0, validator=within(0.1, 60.0))
+    """A silent session is given up after this time (Zenoh's transport lease)."""
+    connect_timeout_s: float = field(default=0.0, validator=within(0.0, 86_400.0))
+    """How long a role tries to connect before it gives up: whoever starts the roles need not start
+    the router first. 0: once."""
+    heartbeat_s: float = field(default=0.1, validator=within(0.01, 10.0))
+    election_s: float = field(default=0.7, validator=within(0.05, 60.0))
+    """A candidate leads when it has been the best-ranked one for this long. A process that dies is
+    noticed at once by its liveliness token; this is for one that hangs."""
+    resend_s: float = field(default=0.2, validator=within(0.01, 10.0))
+    """PREPARE and PLAN are sent again after this time without an answer."""
+
+    @property
+    def listens_at(self) -> tuple[str, ...]:
+        """Endpoints at which the router listens."""
+        return self.listen or (self.endpoint,)
+
+
+def _fleets(_: object, attribute: attrs.Attribute[Any], value: Mapping[str, FleetMembers]) -> None:
+    for name, members in value.items():
+        field_name = f"{attribute.name}[{name}]"
+        if isinstance(members, str):
+            parse_shard(members, field_name)
+        elif not members:
+            raise BadInputError(field_name, [], "a shard I/N, or a list of vehicles")
+        key_parts(None, attribute, (name, *(() if isinstance(members, str) else members)))
+
+
+@frozen
+class Security:
+    """Who may do what on the network; off on one host, one switch for deployments."""
+
+    mode: str = field(default="off", validator=one_of("off", "mtls"))
+    """`mtls`: every process shows a certificate, and the router lets it do what its name allows."""
+    folder: str = "certs"
+    """Where the certificates are, as `laneweave certs init` makes them; relative to the file."""
+    fleets: Mapping[str, FleetMembers] = field(factory=dict, validator=_fleets, hash=False)
+    """Agent processes that drive several vehicles: a shard `I/N`, or the vehicles' names."""
+    vehicles: tuple[str, ...] = field(default=(), validator=key_parts)
+    """Vehicles that may have a process of their own; empty: all that may arrive in the demand."""
+    clients: tuple[str, ...] = field(default=("plan",), validator=key_parts)
+    """Who may ask the planning service."""
+    observers: tuple[str, ...] = field(default=("ping", "status", "watch"), validator=key_parts)
+    """Who may look on."""
+
+
+@frozen
+class Service:
+    """The planning service of every coordinator."""
+
+    workers: int = field(default=0, validator=within(0, 256))
+    """Processes that plan; 0: one less than there are cores, at least one."""
+    queue_limit: int = field(default=256, validator=within(1, 100_000))
+    """Requests in hand, those that are being planned among them; more are refused."""
+    max_request_bytes: int = field(default=262_144, validator=within(1024, 1 << 20))
+    """A longer request is refused."""
+    max_deadline_s: float = field(default=600.0, validator=within(0.001, 3600.0))
+    """A longer deadline is refused: nobody may have a worker for ever."""
+    cache_entries: int = field(default=1024, validator=within(0, 1_000_000))
+    """Answers that are kept for requests that are asked again by their id."""
+    cache_s: float = field(default=60.0, validator=within(0.0, 86_400.0))
+    """For how long."""
+
+
+@frozen
+class Observation:
+    """How a deployment is looked at."""
+
+    metrics: str = field(default="", validator=host_port)
+    """HOST:PORT at which a role shows its metrics in the Prometheus text format; empty: not."""

@@ -1,0 +1,6 @@
+"""Who may do what on the network, and how a process proves who it is.
+
+Entry points: `access.Access` (endpoint, realm and identity of a process), `rights` (a router's
+rules, derived from the table of topics), `certificates` (checks before use). Imported by
+`transports.zenoh` and by launch.
+"""

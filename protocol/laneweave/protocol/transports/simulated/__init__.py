@@ -1,0 +1,5 @@
+"""A network inside one process, in virtual time, with seeded faults; harsher than Zenoh.
+
+Entry point: `network.SimulatedNetwork`. Used by tests, by the fault search and by
+`laneweave run --transport simulated`.
+"""

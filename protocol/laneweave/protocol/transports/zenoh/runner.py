@@ -1,0 +1,129 @@
+"""Drives a core over Zenoh: the shell of every role."""
+
+from __future__ import annotations
+
+import os
+import queue
+import threading
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import structlog
+
+from laneweave.protocol.runtime.inbox import Inbox, Item
+from laneweave.protocol.runtime.metrics import Look, Observe, looking, unobserved
+from laneweave.protocol.runtime.node import (
+    Compute,
+    Computed,
+    Core,
+    Delegate,
+    Node,
+    Started,
+    Stopping,
+    Wakeup,
+    run_job,
+)
+from laneweave.protocol.runtime.processes import stop_signals
+from laneweave.protocol.security.access import Access
+from laneweave.protocol.transports.zenoh.transport import connect
+from laneweave.protocol.wire.messages import Name
+from laneweave.protocol.wire.topics import Keys
+
+if TYPE_CHECKING:
+    from laneweave.protocol.runtime.worker_pool import WorkerPool
+
+log = structlog.get_logger(__name__)
+
+
+def run_core(
+    core: Core,
+    access: Access,
+    pool: WorkerPool | None = None,
+    observe: Observe = unobserved,
+) -> None:
+    """Drive a core over Zenoh until it ends or the process gets SIGINT or SIGTERM.
+
+    To be called from the main thread. Computations run in a thread of their own, those that are
+    delegated in `pool`, which only a core that delegates needs. `observe` is told where the numbers
+    of node and core come from.
+
+    Raises:
+        BadInputError: the realm is malformed, or nobody has answered at the endpoint for
+            `connect_timeout_s`.
+    """
+    keys = Keys(access.realm)
+    inbox = Inbox()
+    worker = _Worker(inbox.put)
+
+    def order(job: Compute | Delegate) -> None:
+        if isinstance(job, Compute):
+            worker.order(job)
+        elif pool is not None:
+            pool.order(job, inbox.put)
+        else:
+            inbox.put(Computed(job.job, None, "this process has no workers"))
+
+    with stop_signals(lambda: inbox.put(Stopping())):
+        # Nothing else can be in there before: nobody is connected.
+        transport = connect(access, inbox.put, lambda wait_s: any(inbox.take(wait_s)))
+        if transport is None:
+            return
+        node = Node(core, transport, keys, order, Name(f"{os.getpid()}-{time.time_ns()}"))
+        observe(looking(inbox.put))
+        try:
+            node.dispatch(Started(), time.monotonic())
+            while not node.ended:
+                _step(node, inbox)
+        finally:
+            transport.close()
+
+
+def _step(node: Node, inbox: Inbox) -> None:
+    wakeup_s = node.core.wakeup_s
+    timeout_s = 1.0 if wakeup_s is None else min(1.0, max(0.0, wakeup_s - time.monotonic()))
+    for item in inbox.take(timeout_s):
+        _hand_over(node, item)
+    now_s = time.monotonic()
+    wakeup_s = node.core.wakeup_s
+    if wakeup_s is not None and wakeup_s <= now_s:
+        node.dispatch(Wakeup(), now_s)
+        node.handling_s += time.monotonic() - now_s
+
+
+def _hand_over(node: Node, item: Item) -> None:
+    now_s = time.monotonic()
+    if isinstance(item, Stopping):
+        log.info("stopping")
+        node.dispatch(item, now_s)
+        node.ended = True
+    elif isinstance(item, Look):
+        item.answer(node.numbers())
+    elif isinstance(item, Computed):
+        node.dispatch(item, now_s)
+    else:
+        node.deliver(item, now_s)
+    node.handling_s += time.monotonic() - now_s
+
+
+class _Worker:
+    """A thread that computes.
+
+    Started when first needed, and a daemon: a process that is asked to end does not wait for it.
+    """
+
+    def __init__(self, done: Callable[[Computed], None]) -> None:
+        """Prepare; `done` is called from the thread."""
+        self._done = done
+        self._jobs: queue.SimpleQueue[Compute] | None = None
+
+    def order(self, job: Compute) -> None:
+        """Have a job computed after those that were ordered before it."""
+        if self._jobs is None:
+            self._jobs = queue.SimpleQueue()
+            threading.Thread(target=self._work, args=(self._jobs,), daemon=True).start()
+        self._jobs.put(job)
+
+    def _work(self, jobs: queue.SimpleQueue[Compute]) -> None:
+        while True:
+            self._done(run_job(jobs.get()))

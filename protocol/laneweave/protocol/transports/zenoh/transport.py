@@ -1,0 +1,391 @@
+"""The transport over Zenoh: the only module that imports zenoh.
+
+Shape: every process is a client of one router, which is a Python process itself. Scouting and
+gossip are off; nothing listens but the router. Callbacks only enqueue. See docs/PROTOCOL.md for
+the settings of each topic and why they are so.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future, InvalidStateError
+from typing import Any
+
+import structlog
+import zenoh
+
+from laneweave.protocol.config.endpoints import check_endpoint
+from laneweave.protocol.config.identities import Party
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.runtime.metrics import Observe, RouterNumbers, unobserved
+from laneweave.protocol.runtime.processes import stop_signals
+from laneweave.protocol.runtime.transport import (
+    Answer,
+    Deliver,
+    LinkDown,
+    LinkUp,
+    Question,
+    Received,
+    TokenDown,
+    TokenUp,
+    learn,
+)
+from laneweave.protocol.security.access import Access
+from laneweave.protocol.security.certificates import check_credentials
+from laneweave.protocol.security.rights import RouterGuard
+from laneweave.protocol.transports.zenoh.settings import Setting, client_settings, router_settings
+from laneweave.protocol.wire.codec import MAX_BYTES
+from laneweave.protocol.wire.topics import Quality
+
+log = structlog.get_logger(__name__)
+
+# Express would send each sample in a packet of its own; with DROP it loses most of a synchronised
+# burst, so it is off everywhere.
+_QUALITY: dict[Quality, dict[str, Any]] = {
+    Quality.LATEST: {
+        "congestion_control": zenoh.CongestionControl.DROP,
+        "priority": zenoh.Priority.DATA,
+        "express": False,
+    },
+    Quality.ASSURED: {
+        "congestion_control": zenoh.CongestionControl.BLOCK,
+        "priority": zenoh.Priority.DATA,
+        "express": False,
+    },
+    Quality.LOCKSTEP: {
+        "congestion_control": zenoh.CongestionControl.BLOCK,
+        "priority": zenoh.Priority.REAL_TIME,
+        "express": False,
+    },
+}
+
+
+MAX_QUESTIONS = 4096
+"""Open questions beyond which more are left to others."""
+TOO_LONG = bytes(MAX_BYTES + 1)
+"""Stands for each question that is too long: nobody looks at it."""
+ROUTER_RUNTIME = "(rx: (worker_threads: 64))"
+"""Zenoh's default are two threads that receive. Each connection that has run into its lease holds
+one of them while it is closed, for up to 10 s (the linger of its socket): with two of them gone,
+nobody's messages go on. So many processes may vanish with a host at one time."""
+_RUNTIME_VARIABLE = "ZENOH_RUNTIME"
+CLIENT_RUNTIME = (
+    "(app: (worker_threads: 1), acc: (handover: app), tx: (handover: app), rx: (handover: app), "
+    "net: (handover: app))"
+)
+"""A single thread for all of Zenoh's task pools in a client. With one process per vehicle, passing
+each message between threads costs about a tenth of the time of two cores."""
+CONNECT_AGAIN_S = 0.5
+"""Between two attempts of a role that waits for its router."""
+
+
+def _open(settings: Iterable[Setting], runtime: str) -> zenoh.Session:
+    """Open a session.
+
+    Args:
+        settings: of the session.
+        runtime: value of `ZENOH_RUNTIME`, unless the environment sets it. Zenoh reads it at the
+            first session of a process only.
+
+    Raises:
+        zenoh.ZError: nobody answers, or it cannot listen.
+    """
+    config = zenoh.Config()
+    for path, value in settings:
+        config.insert_json5(path, json.dumps(value))
+    if _RUNTIME_VARIABLE in os.environ:
+        return zenoh.open(config)
+    os.environ[_RUNTIME_VARIABLE] = runtime
+    try:
+        return zenoh.open(config)
+    finally:
+        # Child processes may have another role, and inherit the environment.
+        os.environ.pop(_RUNTIME_VARIABLE, None)
+
+
+class ZenohTransport:
+    """One client session."""
+
+    def __init__(self, access: Access, deliver: Deliver) -> None:
+        """Connect to a router.
+
+        Args:
+            access: where the router is, and as whom to get there.
+            deliver: called from Zenoh's threads with each delivery; must return at once.
+
+        Raises:
+            BadInputError: the endpoint is malformed or nobody answers there, or the credentials
+                are not in order.
+        """
+        endpoint = check_endpoint(access.endpoint)
+        whose = ""
+        if access.credentials is not None:
+            check_credentials(access.credentials, access.identity)
+            whose = f", of the authority that vouches for {access.identity}"
+        try:
+            self._session = _open(client_settings(access), CLIENT_RUNTIME)
+        except zenoh.ZError as error:
+            raise BadInputError(
+                "network.endpoint", endpoint, f"the endpoint of a running router{whose}"
+            ) from error
+        self._deliver = deliver
+        self._subscriptions: dict[str, Any] = {}
+        self._tokens: dict[str, Any] = {}
+        self._watched: dict[str, Any] = {}
+        self._seen: dict[str, None] = {}
+        """Keys of the tokens that were last delivered as being there."""
+        self._seen_lock = threading.Lock()
+        self._served: dict[str, Any] = {}
+        self._questions: dict[int, zenoh.Query] = {}
+        self._question_lock = threading.Lock()
+        self._question_count = 0
+        self._closed = False
+        self._link_listener = self._session.info.declare_transport_events_listener(
+            self._on_link, history=False
+        )
+
+    def publish(self, key: str, payload: bytes, quality: Quality) -> None:
+        """Send; silently lost while there is no connection."""
+        with contextlib.suppress(zenoh.ZError):
+            self._session.put(key, payload, **_QUALITY[quality])
+
+    def subscribe(self, key_expression: str) -> None:
+        """Subscribe once; a second call for the same expression does nothing."""
+        if key_expression not in self._subscriptions and not self._closed:
+            self._subscriptions[key_expression] = self._session.declare_subscriber(
+                key_expression, self._on_sample
+            )
+
+    def unsubscribe(self, key_expression: str) -> None:
+        """Undo `subscribe`."""
+        subscription = self._subscriptions.pop(key_expression, None)
+        if subscription is not None:
+            subscription.undeclare()
+
+    def announce(self, key: str) -> None:
+        """Show a liveliness token."""
+        if key not in self._tokens and not self._closed:
+            self._tokens[key] = self._session.liveliness().declare_token(key)
+
+    def withdraw(self, key: str) -> None:
+        """Take a liveliness token back."""
+        token = self._tokens.pop(key, None)
+        if token is not None:
+            token.undeclare()
+
+    def watch(self, key_expression: str) -> None:
+        """Watch liveliness tokens once; a second call for the same expression does nothing."""
+        if key_expression not in self._watched and not self._closed:
+            self._watched[key_expression] = self._session.liveliness().declare_subscriber(
+                key_expression, self._on_token, history=True
+            )
+
+    def serve(self, key: str) -> None:
+        """Answer queries on a key."""
+        if key not in self._served and not self._closed:
+            self._served[key] = self._session.declare_queryable(key, self._on_query)
+
+    def answer(self, token: int, payload: bytes, *, ok: bool, encoding: str = "") -> None:
+        """Answer a query once."""
+        query = self._take_question(token)
+        if query is None:
+            return
+        with contextlib.suppress(zenoh.ZError):
+            if ok:
+                query.reply(query.key_expr, payload, encoding=encoding or None)
+            else:
+                query.reply_err(payload, encoding=encoding or None)
+            query.drop()  # type: ignore[no-untyped-call]
+
+    def decline(self, token: int) -> None:
+        """Leave a query to the others who serve its key."""
+        query = self._take_question(token)
+        if query is not None:
+            query.drop()  # type: ignore[no-untyped-call]
+
+    def _take_question(self, token: int) -> zenoh.Query | None:
+        with self._question_lock:
+            return self._questions.pop(token, None)
+
+    def ask(
+        self, key: str, payload: bytes, timeout_s: float, encoding: str = ""
+    ) -> Future[Answer | None]:
+        """Ask those who serve a key.
+
+        Returns:
+            The first answer, whoever gives it. None: nobody serves the key, or all who do have left
+            the question to others, died, or were cut off.
+
+        Raises:
+            TimeoutError: as the future's result, when nobody has answered in time.
+        """
+        first: Future[Answer | None] = Future()
+        first.set_running_or_notify_cancel()
+
+        def take(reply: zenoh.Reply) -> None:
+            _settle(first, _answer_of(reply))
+
+        # Without consolidation each reply is handed over as it comes: one server that hangs must
+        # not hold back the answers of the others.
+        try:
+            self._session.get(
+                key,
+                zenoh.handlers.Callback(take, lambda: _settle(first, None)),
+                payload=payload,
+                encoding=encoding or None,
+                timeout=timeout_s,
+                consolidation=zenoh.ConsolidationMode.NONE,
+            )
+        except zenoh.ZError:  # the session is closed
+            _settle(first, None)
+        return first
+
+    def close(self) -> None:
+        """Close the session; without it a callback subscriber hangs the interpreter at exit."""
+        if not self._closed:
+            self._closed = True
+            self._session.close()  # type: ignore[no-untyped-call]
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        self._deliver(Received(str(sample.key_expr), sample.payload.to_bytes()))
+
+    def _on_token(self, sample: zenoh.Sample) -> None:
+        # A session's own token comes from itself and, at times, again from the router.
+        kind = TokenUp if sample.kind == zenoh.SampleKind.PUT else TokenDown
+        news = kind(str(sample.key_expr))
+        with self._seen_lock:
+            if learn(self._seen, news):
+                self._deliver(news)
+
+    def _on_link(self, event: zenoh.TransportEvent) -> None:
+        self._deliver(LinkUp() if event.kind == zenoh.SampleKind.PUT else LinkDown())
+
+    def _on_query(self, query: zenoh.Query) -> None:
+        with self._question_lock:
+            if len(self._questions) >= MAX_QUESTIONS:
+                query.drop()  # type: ignore[no-untyped-call]
+                return
+            self._question_count += 1
+            token = self._question_count
+            self._questions[token] = query
+        payload = b""
+        if query.payload is not None:
+            payload = query.payload.to_bytes() if len(query.payload) <= MAX_BYTES else TOO_LONG
+        encoding = "" if query.encoding is None else str(query.encoding)
+        self._deliver(Question(str(query.key_expr), payload, token, encoding))
+
+
+def connect(
+    access: Access, deliver: Deliver, stopped: Callable[[float], object]
+) -> ZenohTransport | None:
+    """Connect to a router, however late it comes: for `connect_timeout_s`.
+
+    Args:
+        access: where the router is, and as whom to get there.
+        deliver: see `ZenohTransport`.
+        stopped: waits for so many seconds and tells whether the process was asked to end.
+
+    Returns:
+        The session; None: the process was asked to end meanwhile.
+
+    Raises:
+        BadInputError: the endpoint is malformed, or nobody has answered there in time.
+    """
+    check_endpoint(access.endpoint)
+    give_up_s = time.monotonic() + access.connect_timeout_s
+    waiting = False
+    while True:
+        try:
+            return ZenohTransport(access, deliver)
+        except BadInputError as error:
+            if error.field != "network.endpoint" or time.monotonic() >= give_up_s:
+                raise
+        if not waiting:
+            waiting = True
+            log.warning("waiting for the router", endpoint=access.endpoint)
+        if stopped(CONNECT_AGAIN_S):
+            return None
+
+
+def connect_patiently(access: Access, deliver: Deliver) -> ZenohTransport:
+    """Connect as `connect` does, for who is not asked to end meanwhile.
+
+    Raises:
+        BadInputError: as `connect`.
+    """
+    transport = connect(access, deliver, time.sleep)
+    assert transport is not None  # noqa: S101 (nobody asks `sleep` to end)
+    return transport
+
+
+def run_router(
+    listen: Sequence[str],
+    lease_s: float,
+    ready: Callable[[], None] | None = None,
+    told_by: str = "network.endpoint",
+    guard: RouterGuard | None = None,
+    observe: Observe = unobserved,
+) -> None:
+    """Run a Zenoh router until SIGINT or SIGTERM.
+
+    Args:
+        listen: endpoints where it listens. A socket file that a killed router left is replaced.
+        lease_s: after this time of silence the others give the router up.
+        ready: called when it listens.
+        told_by: the field that says where it listens, for errors.
+        guard: who may do what; None: anybody anything.
+        observe: is told where its numbers come from, when it listens.
+
+    Raises:
+        BadInputError: it cannot listen at an endpoint, or its credentials are not in order.
+    """
+    endpoints = [check_endpoint(endpoint, told_by) for endpoint in listen]
+    if guard is not None:
+        check_credentials(guard.credentials, str(Party.ROUTER), guard.host)
+    stop: queue.SimpleQueue[bool] = queue.SimpleQueue()
+    with stop_signals(lambda: stop.put(True)):
+        try:
+            session = _open(router_settings(endpoints, lease_s, guard), ROUTER_RUNTIME)
+        except zenoh.ZError as error:
+            raise BadInputError(
+                told_by, ", ".join(endpoints), "endpoints that are free to listen at"
+            ) from error
+        try:
+            observe(lambda: [RouterNumbers(len(session.info.transports()))])
+            if ready is not None:
+                ready()
+            stopping = False
+            while not stopping:
+                with contextlib.suppress(queue.Empty):
+                    stopping = stop.get(timeout=1.0)
+            log.info("stopping")
+        finally:
+            session.close()  # type: ignore[no-untyped-call]
+
+
+def _answer_of(reply: zenoh.Reply) -> Answer | Exception:
+    if reply.ok is not None:
+        sample = reply.ok
+        return Answer(sample.payload.to_bytes(), True, str(sample.encoding))
+    error = reply.err
+    text = error.payload.to_bytes() if error is not None else b""
+    if text == b"Timeout":
+        return TimeoutError("no answer in time")
+    return Answer(text, False, "" if error is None else str(error.encoding))
+
+
+def _settle(first: Future[Answer | None], outcome: Answer | Exception | None) -> None:
+    """Give a future its first outcome."""
+    if first.done():
+        return
+    with contextlib.suppress(InvalidStateError):
+        if isinstance(outcome, Exception):
+            first.set_exception(outcome)
+        else:
+            first.set_result(outcome)

@@ -1,0 +1,240 @@
+"""Plan execution: the vehicle's side of the execution protocol, rules V1 to V7.
+
+The vehicle holds its cell unless everything that its next move needs is *known*: it has promised
+and accepted a plan, every member of the roster has shown that it accepted the same plan (start
+gate), and every vehicle whose earlier move interferes has shown that it completed it. Time only
+paces; silence always means hold. `VEHICLE_RULES` is the table; docs/PROTOCOL.md shows it,
+docs/SAFETY.md has the argument.
+
+Whoever is in charge of a vehicle runs this machine: its agent, or its caretaker, which never moves.
+"""
+
+from __future__ import annotations
+
+from attrs import define, field
+
+from laneweave.protocol.lattice import Cell, Lattice, Move
+from laneweave.protocol.state_machine import RuleBook
+from laneweave.protocol.vehicle.execution_rules import (
+    ACCEPTED,
+    GATE,
+    NOTED,
+    PLAN,
+    PREPARE,
+    REST,
+    STATE,
+    TICK,
+    VEHICLE_RULES,
+    Stage,
+)
+from laneweave.protocol.vehicle.plans import Needs
+from laneweave.protocol.wire.messages import Ballot, Deed, Name, Plan, Prepare, Sense, VehicleState
+
+TIME_TOLERANCE_S = 1e-6
+LISTEN_S = 1.0
+"""A vehicle receives the states of its predecessors from this time before a move is due."""
+OVERDUE_SLOTS = 1.5
+OVERDUE_S = 2.0
+"""A move is overdue when it has been due for 1.5 slots, or for a slot and 2 s if that is less."""
+
+
+@define
+class PlanExecution:
+    """What one vehicle remembers of the protocol (V1: nothing promised, no plan).
+
+    `hold_cell`, `moving` and `joined` mirror the motion controller, which outlives this object.
+    """
+
+    vehicle: Name
+    incarnation: int
+    hold_cell: Cell
+    lattice: Lattice
+    joined: tuple[int, ...]
+    """Formations whose blocks plans may use, as the motion controller has confirmed; ascending."""
+    moving: bool = False
+    rules: RuleBook = field(factory=lambda: VEHICLE_RULES)
+    phase: Stage = Stage.FREE
+    promised: Ballot | None = None
+    plan: Plan | None = None
+    completed: int = 0
+    heard: dict[Name, int] = field(factory=dict)
+    """Completed moves of my plan that each other member has shown; -1: not ready yet."""
+    wanted_joined: tuple[int, ...] = field(init=False)
+    """What the motion controller should remember as joined."""
+    moving_in_plan: bool = False
+    """The motion under way is a move of the accepted plan."""
+    needs: tuple[Needs, ...] = ()
+    """For each of my moves what it needs of the others."""
+    t_s: float = 0.0
+    """Road time of the tick."""
+    shown: bool = False
+    """The controller has noted what is promised, so that the promise counts."""
+    estate: frozenset[Cell] | None = None
+    """Cells that the vehicle owns, as its controller has said last; None: formations own blocks."""
+    deed: Deed | None = None
+    """By which cells change hands: of the newest plan that was taken."""
+    noted: Deed | None = None
+    """The newest deed of the vehicle, as its controller has said last."""
+
+    def __attrs_post_init__(self) -> None:
+        """Want no more than the controller has."""
+        self.wanted_joined = self.joined
+
+    def on_prepare(self, prepare: Prepare) -> bool:
+        """V2: promise a ballot; true when a state should be shown at once."""
+        return self.rules.take(self, PREPARE, prepare) is not None
+
+    def on_plan(self, plan: Plan) -> bool:
+        """V3: take the plan of the promised ballot, once; true when it was taken now.
+
+        A plan that cannot be executed safely is not taken, whoever sent it. It is accepted, and
+        that is shown, when the motion controller has noted it for this very process (`on_noted`).
+        """
+        return self.rules.take(self, PLAN, plan) is not None
+
+    def on_noted(self, ballot: Ballot | None) -> bool:
+        """V3: the controller notes a plan for the process in charge; true when it is mine now."""
+        return self.rules.take(self, NOTED, ballot) is not None
+
+    def on_joined(self, formations: tuple[int, ...]) -> bool:
+        """The controller has noted formations as joined; true when some were not known yet.
+
+        What it says may be older than what is known already: nothing that has been joined parts.
+        """
+        if formations == self.joined or set(formations) <= set(self.joined):
+            return False
+        self.joined = tuple(sorted({*self.joined, *formations}))
+        self.wanted_joined = tuple(sorted({*self.joined, *self.wanted_joined}))
+        return True
+
+    def on_estate(self, sense: Sense) -> bool:
+        """The controller says what the vehicle owns; true when it has noted a promise by now.
+
+        What an earlier process has promised binds this one: it is taken for a PREPARE. Without
+        effect where formations own blocks.
+        """
+        if self.estate is None:
+            return False
+        if sense.promised is not None and sense.promised != self.promised:
+            self.on_prepare(Prepare(sense.promised, (), (self.vehicle,)))
+        before = self.shown
+        self.estate, self.noted = frozenset(sense.estate), sense.deed
+        self.shown = sense.promised == self.promised
+        return self.shown and not before
+
+    def on_state(self, state: VehicleState) -> None:
+        """V4: remember what another member of the same plan has shown."""
+        self.rules.take(self, STATE, state)
+
+    def tick(self, t_s: float) -> Move | None:
+        """V5 and V6: open the gate when it may, and return the move that starts now, if any."""
+        self.t_s = t_s
+        self.rules.take(self, GATE, None)
+        if self.rules.take(self, TICK, None) is None:
+            return None
+        return self.next_move
+
+    def end_motion(self) -> None:
+        """V7: the controller holds again."""
+        self.rules.take(self, REST, None)
+
+    @property
+    def next_move(self) -> Move | None:
+        """The first move of the plan that is not completed."""
+        if self.plan is None or self.completed >= len(self.plan.moves[self.vehicle]):
+            return None
+        return self.plan.moves[self.vehicle][self.completed]
+
+    @property
+    def wanted_accepted(self) -> Ballot | None:
+        """The plan that the motion controller should note as accepted."""
+        return self.plan.ballot if self.plan is not None else None
+
+    @property
+    def wanted_promised(self) -> Ballot | None:
+        """The promise that the motion controller should note, where it must."""
+        return self.promised if self.estate is not None else None
+
+    @property
+    def accepted(self) -> bool:
+        """It has a plan, and its motion controller has noted that."""
+        return self.phase in ACCEPTED
+
+    @property
+    def go(self) -> bool:
+        """The start gate is open."""
+        return self.phase is Stage.GOING
+
+    @property
+    def done(self) -> bool:
+        """All moves of the accepted plan are completed."""
+        return self.accepted and self.next_move is None
+
+    @property
+    def ready(self) -> bool:
+        """Accepted, and not moving or moving in a move of this plan."""
+        return bool(self.rules.functions["is_ready"](self, None))
+
+    def overdue(self, t_s: float) -> bool:
+        """Tell whether the next move has been due for too long."""
+        plan = self.plan
+        if plan is None or self.moving or not self.accepted:
+            return False
+        return self.is_due(t_s - min(OVERDUE_SLOTS * plan.slot_s, plan.slot_s + OVERDUE_S))
+
+    def is_due(self, t_s: float) -> bool:
+        """Tell whether the time of the next move has come."""
+        plan = self.plan
+        if plan is None:
+            return False
+        moves, completed = plan.moves[self.vehicle], self.completed
+        if completed >= len(moves):
+            return False
+        return t_s + TIME_TOLERANCE_S >= plan.t0_s + moves[completed][0] * plan.slot_s
+
+    def state(self, sense: Sense, formation: int, *, attended: bool) -> VehicleState:
+        """Return what to show to others.
+
+        Args:
+            sense: what the vehicle sensed last.
+            formation: in whose block it entered.
+            attended: whether an agent drives it.
+        """
+        return VehicleState(
+            vehicle=self.vehicle,
+            incarnation=self.incarnation,
+            formation=formation,
+            joined=self.joined,
+            promised=self.promised,
+            accepted=self.accepted,
+            ready=self.ready,
+            completed=self.completed,
+            hold_cell=self.hold_cell,
+            moving=self.moving,
+            go=self.go,
+            done=self.done,
+            overdue=self.overdue(sense.t_s),
+            attended=attended,
+            s_m=sense.state[0],
+            y_m=sense.state[3],
+            speed_mps=sense.state[1],
+            t_s=sense.t_s,
+            estate=sense.estate if sense.promised == self.promised else (),
+            deed=sense.deed,
+        )
+
+    def needs_states(self, t_s: float) -> bool:
+        """Tell whether the states of other vehicles matter now.
+
+        They do until the gate is open, and from `LISTEN_S` before the next move is due until that
+        is released. States missed in between do no harm: they are published again.
+        """
+        plan = self.plan
+        if plan is None:
+            return False
+        if self.phase is not Stage.GOING:
+            return True
+        if self.next_move is None or not self.is_due(t_s + LISTEN_S):
+            return False
+        needs = self.needs[self.completed]
+        return any(self.heard.get(other, -1) < count for other, count in needs.items())

@@ -1,0 +1,145 @@
+"""Plans as partial orders: what a move waits for, and what makes a plan executable.
+
+A plan is not a timetable. Its moves are ordered by *dependencies*, which every vehicle derives from
+the same PLAN message, and each dependency is released by a fact that stays true for ever: "A has
+completed k moves of this ballot".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import combinations
+
+from laneweave.protocol.lattice import Cell, footprint
+from laneweave.protocol.wire.messages import Name, Plan
+
+Needs = dict[Name, int]
+"""Completed moves that others must have shown before a move may start."""
+
+
+def dependencies(plan: Plan, vehicle: Name) -> tuple[Needs, ...]:
+    """Return for each move of a vehicle how many completed moves it needs of the others.
+
+    A move in step s needs of vehicle A: 1 + the index of A's last move in a step before s whose
+    footprint meets the move's; vehicles with no such move are left out.
+    """
+    return tuple(
+        _needs(plan, vehicle, step, footprint(origin, target))
+        for step, origin, target in plan.moves[vehicle]
+    )
+
+
+def _needs(plan: Plan, vehicle: Name, step: int, cells: frozenset[Cell]) -> Needs:
+    needs: Needs = {}
+    for other, moves in plan.moves.items():
+        if other == vehicle:
+            continue
+        for index, (other_step, origin, target) in enumerate(moves):
+            if other_step < step and cells & footprint(origin, target):
+                needs[other] = index + 1
+    return needs
+
+
+def plan_problems(plan: Plan) -> list[str]:
+    """Return what is wrong with a plan; empty when it can be executed safely.
+
+    Checked: the maps cover the roster; slots last; moves are chains of neighbouring cells from the
+    start cell with ascending steps; what vehicles occupy during a step (footprint of a move, or the
+    cell of a hold) is disjoint; the territory covers everything.
+    """
+    problems = list(_roster_problems(plan))
+    if plan.slot_s <= 0:
+        problems.append(f"a slot lasts {plan.slot_s:g} s")
+    if problems:
+        return problems
+    for vehicle in plan.roster:
+        problems += _chain_problems(plan, vehicle)
+    if problems:
+        return problems
+    problems += _step_problems(plan)
+    occupied = set(plan.start_cells.values())
+    for moves in plan.moves.values():
+        for _, origin, target in moves:
+            occupied |= footprint(origin, target)
+    missing = occupied - set(plan.territory)
+    if missing:
+        problems.append(f"territory lacks cells {sorted(missing)}")
+    return problems
+
+
+def estate_problems(plan: Plan) -> list[str]:
+    """Return what is wrong with how a plan hands cells over; empty when nothing is.
+
+    Checked: the maps cover the roster; no cell has two owners, before or after; no owner appears
+    from nowhere; every vehicle owns afterwards what it occupies.
+    """
+    problems = [
+        f"{name} does not cover the roster"
+        for name, mapping in (("before", plan.before), ("after", plan.after))
+        if set(mapping) != set(plan.roster)
+    ]
+    if problems:
+        return problems
+    for name, mapping in (("before", plan.before), ("after", plan.after)):
+        all_cells = [cell for cells in mapping.values() for cell in cells]
+        if len(all_cells) != len(set(all_cells)):
+            problems.append(f"a cell has two owners {name}")
+    owned = {cell for each in plan.before.values() for cell in each}
+    for vehicle, cells in plan.after.items():
+        occupied = {plan.start_cells[vehicle]}
+        for _, origin, target in plan.moves[vehicle]:
+            occupied |= footprint(origin, target)
+        if not occupied <= set(cells):
+            problems.append(f"{vehicle} does not own {sorted(occupied - set(cells))}")
+        if not set(cells) <= owned:
+            problems.append(f"nobody owned {sorted(set(cells) - owned)}")
+    return problems
+
+
+def _roster_problems(plan: Plan) -> Iterator[str]:
+    if len(set(plan.roster)) != len(plan.roster):
+        yield "roster names a vehicle twice"
+    for name, mapping in (
+        ("incarnations", plan.incarnations),
+        ("start_cells", plan.start_cells),
+        ("moves", plan.moves),
+    ):
+        if set(mapping) != set(plan.roster):
+            yield f"{name} does not cover the roster"
+
+
+def _chain_problems(plan: Plan, vehicle: Name) -> Iterator[str]:
+    cell = plan.start_cells[vehicle]
+    last_step = -1
+    for step, origin, target in plan.moves[vehicle]:
+        if step <= last_step:
+            yield f"{vehicle}: steps do not ascend at step {step}"
+        if origin != cell:
+            yield f"{vehicle}: move from {origin} in step {step}, but it is in {cell}"
+        apart = max(abs(origin[0] - target[0]), abs(origin[1] - target[1]))
+        if apart != 1:
+            yield f"{vehicle}: {origin} and {target} are not neighbours"
+        cell, last_step = target, step
+
+
+def _step_problems(plan: Plan) -> Iterator[str]:
+    cells = dict(plan.start_cells)
+    by_step: dict[int, dict[Name, Cell]] = {}
+    for vehicle, moves in plan.moves.items():
+        for step, _, target in moves:
+            by_step.setdefault(step, {})[vehicle] = target
+    for vehicle, other in _overlapping({name: frozenset({cell}) for name, cell in cells.items()}):
+        yield f"{vehicle} and {other} start in the same cell"
+    for step, moving in sorted(by_step.items()):
+        occupied = {
+            vehicle: footprint(cell, moving.get(vehicle, cell)) for vehicle, cell in cells.items()
+        }
+        for vehicle, other in _overlapping(occupied):
+            yield f"{vehicle} and {other} meet in step {step}"
+        cells |= moving
+
+
+def _overlapping(occupied: dict[Name, frozenset[Cell]]) -> Iterator[tuple[Name, Name]]:
+    for (vehicle, mine), (other, theirs) in combinations(occupied.items(), 2):
+        if mine & theirs:
+            yield vehicle, other

@@ -1,0 +1,174 @@
+"""The rule-based method: vehicles move as the rules say, SUMO shows them.
+
+Along the road accelerations are constant during a tick and within the vehicle's limits. Across it a
+lane change has constant speed, no faster than the slip limit allows, or takes no time at all.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable
+
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.sim_bridge.baselines.entrance import Entrance
+from laneweave.sim_bridge.baselines.lane_change_rules import Lanes, Rules, priority
+from laneweave.sim_bridge.baselines.vehicle import Vehicle
+from laneweave.sim_bridge.bodies.footprints import Pose
+from laneweave.sim_bridge.road.world import World
+
+_ROUNDING_M = 1e-9
+
+
+class RuleTraffic:
+    """Everybody on the road, moved by the rules; see `Traffic`."""
+
+    def __init__(self, scenario: Scenario, world: World) -> None:
+        """Begin with an empty road.
+
+        Args:
+            scenario: road, vehicles, tick, and the table `rule`.
+            world: an empty world, which shows the vehicles.
+        """
+        self._world = world
+        self._rules = Rules(scenario)
+        self._lanes = Lanes(scenario.road.lanes)
+        self._vehicles: dict[str, Vehicle] = {}
+        self._limits = scenario.vehicle
+        self._rule = scenario.rule
+        self._road = scenario.road
+        self._speed_mps = scenario.formation.speed_mps
+        self._tick_s = scenario.runtime.tick_s
+
+    @property
+    def vehicles(self) -> Collection[Vehicle]:
+        """All on the road, in order of entry."""
+        return self._vehicles.values()
+
+    def step(self, t_s: float, entrance: Entrance) -> list[Vehicle]:
+        """Move everybody on to `t_s`, then let enter for whom there is room."""
+        slowing = self._rules.sort(self._lanes)
+        leaders = self._lanes.leaders()
+        for vehicle in sorted(self._vehicles.values(), key=priority):
+            self._drive(vehicle, leaders.get(vehicle, ()), slows_down=vehicle in slowing)
+            self._shift(vehicle)
+        entered = self._let_enter(t_s, entrance)
+        for vehicle in self._vehicles.values():
+            self._world.place(vehicle.name, vehicle.state)
+        self._world.step()
+        return entered
+
+    def poses(self) -> dict[str, Pose]:
+        """Return where each vehicle is shown."""
+        return self._world.positions()
+
+    def collisions(self) -> list[tuple[str, str]]:
+        """Return the pairs that the world takes for colliding."""
+        return self._world.collisions()
+
+    def remove(self, vehicle: Vehicle) -> None:
+        """Take a vehicle off the road."""
+        del self._vehicles[vehicle.name]
+        self._lanes.leave(vehicle)
+        self._world.remove(vehicle.name)
+
+    def _drive(self, vehicle: Vehicle, leaders: Iterable[Vehicle], *, slows_down: bool) -> None:
+        """Move a vehicle along the road by one tick; whom it follows has been moved."""
+        s_m, before_mps, tick_s = vehicle.s_m, vehicle.speed_mps, self._tick_s
+        wanted_mps = min(
+            self._rules.approach_speed_mps(vehicle),
+            before_mps + self._limits.max_accel_mps2 * tick_s,
+        )
+        if slows_down:
+            braked_mps = before_mps - self._rule.slow_down_mps2 * tick_s
+            slow_mps = self._rules.slow_speed_mps(vehicle.s_m)
+            wanted_mps = min(wanted_mps, max(slow_mps, braked_mps))
+        follow = self._rules.following.speed_mps
+        for ahead in leaders:
+            safe_mps = follow(s_m, before_mps, ahead.s_m, ahead.speed_mps)
+            if safe_mps < wanted_mps:
+                wanted_mps = safe_mps
+        least_mps = before_mps + self._limits.min_accel_mps2 * tick_s
+        after_mps = max(wanted_mps, least_mps, 0.0)
+        vehicle.speed_mps = after_mps
+        vehicle.s_m = s_m + 0.5 * (before_mps + after_mps) * tick_s
+        vehicle.accel_mps2 = (after_mps - before_mps) / tick_s
+
+    def _shift(self, vehicle: Vehicle) -> None:
+        """Move a vehicle across the road by one tick."""
+        target_m = self._centre_m(vehicle.lane)
+        if vehicle.previous_lane is None:
+            vehicle.y_m, vehicle.lateral_speed_mps = target_m, 0.0
+            return
+        way_m = target_m - vehicle.y_m
+        slip_mps = self._limits.max_slip_ratio * vehicle.speed_mps
+        most_mps = min(self._road.lane_width_m / self._rule.lane_change_s, slip_mps)
+        if abs(way_m) <= most_mps * self._tick_s + _ROUNDING_M:
+            vehicle.y_m, vehicle.lateral_speed_mps = target_m, 0.0
+            self._lanes.end_change(vehicle)
+        else:
+            vehicle.lateral_speed_mps = math.copysign(most_mps, way_m)
+            vehicle.y_m += vehicle.lateral_speed_mps * self._tick_s
+
+    def _let_enter(self, t_s: float, entrance: Entrance) -> list[Vehicle]:
+        entered = []
+        for lane in range(self._road.lanes):
+            while (arrival := entrance.first(lane)) is not None:
+                s_m = self._room_m(lane, entrance.furthest_m(arrival, t_s))
+                if s_m is None:
+                    break
+                entrance.take(lane)
+                vehicle = Vehicle(
+                    arrival=arrival,
+                    entered_s=t_s - s_m / self._speed_mps,
+                    s_m=s_m,
+                    speed_mps=self._speed_mps,
+                    y_m=self._centre_m(lane),
+                    lane=lane,
+                )
+                self._vehicles[vehicle.name] = vehicle
+                self._lanes.enter(vehicle, lane)
+                self._world.add(vehicle.name, vehicle.state)
+                entered.append(vehicle)
+        return entered
+
+    def _room_m(self, lane: int, furthest_m: float) -> float | None:
+        """Return where on a lane a vehicle can enter at v_F, None if there is no room."""
+        if not self._lanes[lane]:
+            return furthest_m
+        ahead, speed_mps = self._lanes[lane][-1], self._speed_mps
+        following = self._rules.following
+        s_m = min(furthest_m, ahead.s_m - following.gap_m(speed_mps) - _ROUNDING_M)
+        if s_m < 0.0 or not following.suits(s_m, speed_mps, ahead.s_m, ahead.speed_mps):
+            return None
+        return s_m
+
+    def _centre_m(self, lane: int) -> float:
+        return (lane + 0.5) * self._road.lane_width_m
+
+
+def check_rule(scenario: Scenario) -> None:
+    """Check that the rules can be followed on a road.
+
+    Raises:
+        BadInputError: names the field that does not fit.
+    """
+    rule, road, speed_mps = scenario.rule, scenario.road, scenario.formation.speed_mps
+    # The speed falls in proportion to what is left of the road, seen once in a tick.
+    braking_m = speed_mps**2 / -scenario.vehicle.min_accel_mps2
+    least_m = braking_m + 3.0 * speed_mps * scenario.runtime.tick_s
+    if not least_m <= rule.stop_distance_m < road.s3_m:
+        raise BadInputError(
+            "rule.stop_distance_m",
+            rule.stop_distance_m,
+            f"at least {least_m:g}, to stop there from formation.speed_mps = {speed_mps:g}, and "
+            f"less than road.s3_m = {road.s3_m:g}",
+        )
+    changes_m = (road.lanes - 1) * speed_mps * rule.lane_change_s
+    if rule.stop_distance_m + changes_m > road.s3_m:
+        raise BadInputError(
+            "rule.lane_change_s",
+            rule.lane_change_s,
+            f"so short that {road.lanes - 1} lane changes at formation.speed_mps = {speed_mps:g} "
+            f"and rule.stop_distance_m fit into road.s3_m = {road.s3_m:g}",
+        )

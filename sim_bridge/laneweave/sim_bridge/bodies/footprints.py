@@ -1,0 +1,283 @@
+"""Where bodies are on the road, whether they overlap, how close they are, and what they see.
+
+A vehicle's body is a rectangle of its length L and width W. Its pose says
+
+    s        where the middle of its front bumper is along the road,
+    y        where its body's centre is across the road,
+    heading  the angle of its body, atan2(v_y, v): a body points where it goes.
+
+So the body's centre is (s - L/2 cos heading, y). The overlap test is exact for these rectangles. It
+is the ground truth of a run's safety; SUMO's collision list misses pairs that overlap between two
+lanes and is only a second opinion.
+
+`Bodies` sorts the vehicles along the road once, for all that is asked about them, and looks at near
+ones only.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+from laneweave.protocol.wire.messages import Neighbour
+
+Pose = tuple[float, float, float, float]
+"""(s m, y m, heading rad, speed m/s)."""
+
+_Point = tuple[float, float]
+
+_TOUCH_M = 1e-9
+"""Bodies that touch do not overlap, and a body that touches a lane border is not across it."""
+
+
+class LeastGaps(NamedTuple):
+    """The closest that any two vehicles are, one behind the other; infinite if there are none."""
+
+    gap_m: float
+    """Bumper to bumper, along the road."""
+    headway_s: float
+    """Distance front to front divided by the speed of the follower."""
+
+
+class Around(NamedTuple):
+    """Whom a vehicle sees, by lane."""
+
+    ahead: tuple[Neighbour, ...]
+    behind: tuple[Neighbour, ...]
+
+
+NOBODY_AROUND = Around((), ())
+
+Glimpse = tuple[int, float, float, float]
+"""(lane, gap m, speed m/s, acceleration m/s2): a `Neighbour` as plain numbers, of which sensors are
+to make one."""
+
+Glimpses = tuple[Sequence[Glimpse], Sequence[Glimpse]]
+"""(ahead, behind), by lane: an `Around` as plain numbers."""
+
+
+def pose_of(state: Sequence[float]) -> Pose:
+    """Return the pose of a vehicle state (s, v, a, y, v_y, a_y)."""
+    s_m, v_mps, _, y_m, v_y_mps, _ = state
+    return s_m, y_m, math.atan2(v_y_mps, max(v_mps, 0.0)), v_mps
+
+
+def corners(pose: Pose, length_m: float, width_m: float) -> tuple[_Point, _Point, _Point, _Point]:
+    """Return a body's corners (x, y): front right, front left, rear left, rear right.
+
+    In metres; x along the road from its start, y across it from the right edge.
+    """
+    s_m, y_m, heading, _ = pose
+    cosine, sine = math.cos(heading), math.sin(heading)
+    along_x, along_y = length_m * cosine, length_m * sine
+    across_x, across_y = -0.5 * width_m * sine, 0.5 * width_m * cosine
+    front_y, rear_y = y_m + 0.5 * along_y, y_m - 0.5 * along_y
+    return (
+        (s_m - across_x, front_y - across_y),
+        (s_m + across_x, front_y + across_y),
+        (s_m - along_x + across_x, rear_y + across_y),
+        (s_m - along_x - across_x, rear_y - across_y),
+    )
+
+
+class Bodies:
+    """All bodies on the road at one time, of equal size."""
+
+    def __init__(self, poses: Mapping[str, Pose], length_m: float, width_m: float) -> None:
+        """Sort them along the road.
+
+        Args:
+            poses: pose of each vehicle.
+            length_m: length of every body.
+            width_m: width of every body.
+        """
+        self._length_m, self._width_m = length_m, width_m
+        order = sorted([(pose[0], name, pose) for name, pose in poses.items()])
+        self._names = [name for _, name, _ in order]
+        self._poses = [pose for _, _, pose in order]
+        self._extents = [_extent(pose, length_m, width_m) for pose in self._poses]
+
+    def overlapping_pairs(self) -> list[tuple[str, str]]:
+        """Return all pairs of vehicles whose bodies overlap.
+
+        Sorted pairs of names, the lesser name first. Bodies that merely touch are not among them.
+        """
+        names, poses, extents = self._names, self._poses, self._extents
+        length_m, width_m = self._length_m, self._width_m
+        reach_m = length_m + width_m
+        count = len(poses)
+        pairs = []
+        for index, one in enumerate(poses):
+            s_m, (_, _, low, high) = one[0], extents[index]
+            for ahead in range(index + 1, count):
+                other = poses[ahead]
+                if other[0] - s_m >= reach_m:
+                    break
+                _, _, other_low, other_high = extents[ahead]
+                if other_low >= high or other_high <= low:
+                    continue  # side by side: nearly all that are near
+                if _intersect(one, other, length_m, width_m):
+                    name, other_name = names[index], names[ahead]
+                    pairs.append((min(name, other_name), max(name, other_name)))
+        return sorted(pairs)
+
+    def least_gaps(self) -> LeastGaps:
+        """Return the least gap and the least time headway between vehicles in line.
+
+        Two vehicles are in line if their bodies overlap laterally. The gap is how far the one
+        behind would have to move along the road to touch the other: exact for rotated bodies,
+        negative if and only if the bodies overlap. The one behind is the one whose front is behind.
+        """
+        length_m, width_m = self._length_m, self._width_m
+        # Of two with equal fronts names do not decide who is behind.
+        bodies = sorted(zip(self._poses, self._extents, strict=True))
+        # Of two leaders in line the one whose front is farther can only have the lesser gap if
+        # their fronts are closer than the most that rotation adds to a body.
+        slack_m = length_m + width_m
+        count = len(bodies)
+        turned = []
+        """Least possible gap and indices of pairs of which one body is turned."""
+        least_gap = least_headway = math.inf
+        for index, ((s_m, _, heading, speed_mps), (rear, front, low, high)) in enumerate(bodies):
+            low, high = low + _TOUCH_M, high - _TOUCH_M  # noqa: PLW2901
+            horizon_m = math.inf
+            for ahead in range(index + 1, count):
+                other, (other_rear, other_front, other_low, other_high) = bodies[ahead]
+                distance_m = other[0] - s_m
+                if distance_m > horizon_m:
+                    break
+                if other_low >= high or other_high <= low:
+                    continue
+                if horizon_m == math.inf:
+                    horizon_m = distance_m + slack_m
+                    if speed_mps > 0.0:
+                        least_headway = min(least_headway, distance_m / speed_mps)
+                bound_m = max(other_rear - front, rear - other_front)
+                if heading != 0.0 or other[2] != 0.0:
+                    turned.append((bound_m, index, ahead))
+                elif bound_m < least_gap:
+                    least_gap = bound_m  # of unturned bodies it is the gap itself
+        for bound_m, index, ahead in sorted(turned):
+            if bound_m >= least_gap:
+                break
+            gap_m = _gap_m(bodies[index][0], bodies[ahead][0], length_m, width_m)
+            least_gap = min(least_gap, gap_m)
+        return LeastGaps(least_gap, least_headway)
+
+    def glimpses(
+        self, lanes: int, lane_width_m: float, accels_mps2: Mapping[str, float]
+    ) -> dict[str, Glimpses]:
+        """Return whom each vehicle's local sensing would see around it if it were exact.
+
+        In each lane that its body touches or that is adjacent to such a lane, a vehicle sees the
+        nearest vehicle ahead that touches the lane, and the nearest one behind. A vehicle that
+        straddles two lanes is seen in both. The gap is bumper to bumper, with bodies taken as
+        unrotated; it is negative for vehicles side by side, of which the one with the front ahead
+        is ahead (at equal positions: the one with the greater name).
+
+        Args:
+            lanes: number of lanes.
+            lane_width_m: width of a lane.
+            accels_mps2: acceleration of each vehicle; zero where none is given.
+
+        Returns:
+            For each vehicle at most one ahead in each lane and one behind, by lane.
+        """
+        touched = []
+        """The first and the last lane that each body touches."""
+        for _, _, low, high in self._extents:
+            first = min(max(int((low + _TOUCH_M) // lane_width_m), 0), lanes - 1)
+            last = min(max(int((high - _TOUCH_M) // lane_width_m), first), lanes - 1)
+            touched.append((first, last))
+        names, poses, length_m = self._names, self._poses, self._length_m
+        accels = [accels_mps2.get(name, 0.0) for name in names]
+
+        def nearest(order: Iterable[int], sign: float) -> list[list[Glimpse]]:
+            """Return whom each one sees of those before it in an order, by lane."""
+            last_seen = [-1] * lanes
+            seen: list[list[Glimpse]] = [[]] * len(names)
+            for index in order:
+                first, last = touched[index]
+                s_m = poses[index][0]
+                found = []
+                for lane in range(max(first - 1, 0), min(last + 2, lanes)):
+                    other = last_seen[lane]
+                    if other >= 0:
+                        other_s_m, _, _, speed_mps = poses[other]
+                        gap_m = sign * (other_s_m - s_m) - length_m
+                        found.append((lane, gap_m, speed_mps, accels[other]))
+                seen[index] = found
+                for lane in range(first, last + 1):
+                    last_seen[lane] = index
+            return seen
+
+        ahead = nearest(range(len(names) - 1, -1, -1), 1.0)
+        behind = nearest(range(len(names)), -1.0)
+        return dict(zip(names, zip(ahead, behind, strict=True), strict=True))
+
+
+def _extent(pose: Pose, length_m: float, width_m: float) -> tuple[float, float, float, float]:
+    """Return a body's bounds: (least x, greatest x, least y, greatest y)."""
+    s_m, y_m, heading, _ = pose
+    if heading == 0.0:
+        return s_m - length_m, s_m, y_m - 0.5 * width_m, y_m + 0.5 * width_m
+    cosine, sine = math.cos(heading), math.sin(heading)
+    swing_m = 0.5 * width_m * abs(sine)
+    half_m = 0.5 * (width_m * abs(cosine) + length_m * abs(sine))
+    return s_m - length_m * cosine - swing_m, s_m + swing_m, y_m - half_m, y_m + half_m
+
+
+def _intersect(one: Pose, other: Pose, length_m: float, width_m: float) -> bool:
+    """Tell whether two bodies overlap, by the separating axis theorem."""
+    if one[2] == 0.0 == other[2]:
+        aside_m = abs(other[1] - one[1])
+        return abs(other[0] - one[0]) < length_m - _TOUCH_M and aside_m < width_m - _TOUCH_M
+    half_length, half_width = 0.5 * length_m, 0.5 * width_m
+    turn = other[2] - one[2]
+    half_along = half_length + half_length * abs(math.cos(turn)) + half_width * abs(math.sin(turn))
+    half_across = half_width + half_length * abs(math.sin(turn)) + half_width * abs(math.cos(turn))
+    between_x = (other[0] - half_length * math.cos(other[2])) - (
+        one[0] - half_length * math.cos(one[2])
+    )
+    between_y = other[1] - one[1]
+    for pose in (one, other):
+        cosine, sine = math.cos(pose[2]), math.sin(pose[2])
+        if abs(between_x * cosine + between_y * sine) >= half_along - _TOUCH_M:
+            return False
+        if abs(between_y * cosine - between_x * sine) >= half_across - _TOUCH_M:
+            return False
+    return True
+
+
+def _gap_m(behind: Pose, ahead: Pose, length_m: float, width_m: float) -> float:
+    """Return the distance along the road between two bodies that overlap laterally.
+
+    Over the y that both bodies cover, the rear boundary of a body is convex and the front boundary
+    is concave, both with kinks at corners: the least difference of the one ahead and the one behind
+    is at a corner or at an end of the common range.
+    """
+    if behind[2] == 0.0 and ahead[2] == 0.0:
+        return ahead[0] - length_m - behind[0]
+    one, other = corners(behind, length_m, width_m), corners(ahead, length_m, width_m)
+    low = max(min(y for _, y in one), min(y for _, y in other))
+    high = min(max(y for _, y in one), max(y for _, y in other))
+    levels = (low, *(y for _, y in (*one, *other) if low < y < high), high)
+    crossings = [(_crossings(one, y), _crossings(other, y)) for y in levels]
+    return max(
+        min(min(rear) - max(front) for front, rear in crossings),
+        # Where two turned bodies overlap laterally the one with its front ahead can be behind.
+        min(min(rear) - max(front) for rear, front in crossings),
+    )
+
+
+def _crossings(shape: Sequence[_Point], level_y: float) -> list[float]:
+    """Return the x at which a polygon's sides cross a level y that the polygon covers."""
+    found = []
+    for index, (x, y) in enumerate(shape):
+        other_x, other_y = shape[index - 1]
+        if min(y, other_y) <= level_y <= max(y, other_y):
+            share = (level_y - y) / (other_y - y) if other_y != y else 0.0
+            found += [x + share * (other_x - x)] if other_y != y else [x, other_x]
+    # Rounding can put the end of the common range just outside; its nearest corner is meant.
+    return found or [min(shape, key=lambda point: abs(point[1] - level_y))[0]]

@@ -1,0 +1,385 @@
+"""What a run leaves behind: the recorder's files plus what all roles reported, in summary.json."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from enum import Enum
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from attrs import define, field
+from numpy.typing import NDArray
+
+from laneweave.protocol.scenario.solvers import SOLVERS, STREAM_PLANNED, solver_of_event
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.vehicle.motion import State
+from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, LogEvent, Name, Report
+from laneweave.sim_bridge.bodies.footprints import LeastGaps
+from laneweave.sim_bridge.bodies.motion_controller import Rung
+from laneweave.sim_bridge.recording.recorder import Recorder
+from laneweave.sim_bridge.road.demand import Arrival
+
+PLANNED = ("plan-made", STREAM_PLANNED)
+"""Events that tell of a plan: of a formation, or of the whole stream."""
+
+
+class RecordedVehicle(Protocol):
+    """What is recorded of a vehicle on the road, whatever moves it."""
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+
+    @property
+    def arrival(self) -> Arrival:
+        """Its demand."""
+
+    @property
+    def entered_s(self) -> float:
+        """Road time at which its front passed s = 0."""
+
+    @property
+    def formation(self) -> int | None:
+        """Number of its formation, None if the method has none."""
+
+    @property
+    def state(self) -> State:
+        """(s m, v m/s, a m/s2, y m, v_y m/s, a_y m/s2)."""
+
+    @property
+    def cell(self) -> tuple[int | None, int]:
+        """Column and lane that it holds or moves to; column None off the lattice."""
+
+    @property
+    def rung_ticks(self) -> Mapping[Rung, int]:
+        """Ticks on each rung of the ladder; empty without a motion controller."""
+
+
+@define
+class _Leadership:
+    """Who leads, as heard in heartbeats."""
+
+    leader: tuple[Name, int] | None = None
+    heard_s: float = 0.0
+    changes: int = 0
+    recovery_s: list[float] = field(factory=list)
+
+
+class Ending(Enum):
+    """Why a run ended."""
+
+    COMPLETE = "complete"
+    """All demanded vehicles have left."""
+    INTERRUPTED = "interrupted"
+    """Somebody asked for it, or something failed."""
+    LIMIT = "limit"
+    """The road time limit was reached."""
+
+
+def write_summary(folder: Path, summary: dict[str, Any]) -> None:
+    """Write summary.json whole or not at all, whenever this process is killed."""
+    unfinished = folder / "summary.json.part"
+    text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
+    unfinished.write_text(text, encoding="utf-8")
+    unfinished.replace(folder / "summary.json")
+
+
+class RunRecord:
+    """Collects a run's measurements and writes its folder."""
+
+    def __init__(
+        self, folder: Path, scenario: Scenario, method: str, stopwatch: Callable[[], float]
+    ) -> None:
+        """Open a run's folder; see `Recorder` for its files."""
+        self._folder = folder
+        self._scenario = scenario
+        self._method = method
+        self._stopwatch = stopwatch
+        self._began = stopwatch()
+        self._recorder = Recorder(folder, scenario)
+        self._leadership = _Leadership()
+        self._reports: dict[tuple[Name, Name], Report] = {}
+        self._plans: list[dict[str, Any]] = []
+        self._plans_by_solver = Counter(dict.fromkeys(SOLVERS, 0))
+        self._ticks: list[tuple[float, int, float]] = []
+        self._rung_ticks = dict.fromkeys(Rung, 0)
+        self._missed_ticks = 0
+        self._caretaker_takeovers = 0
+        self._agent_takeovers = 0
+        self._left_off_lane = 0
+        self._left_unattended = 0
+        self._closed = False
+
+    # --- what the bridge sees -----------------------------------------------------------------
+
+    def note(self, t_s: float, kind: str, **data: object) -> None:
+        """Write an event of the bridge's own."""
+        if not self._closed:
+            self._recorder.event(t_s, kind, role="bridge", **data)
+
+    def on_demanded(self, arrival: Arrival) -> None:
+        """A vehicle wants to enter."""
+        self._recorder.demanded(arrival)
+
+    def on_entered(self, vehicle: RecordedVehicle) -> None:
+        """A vehicle entered the road."""
+        self._recorder.entered(vehicle.name, vehicle.entered_s, vehicle.formation)
+        self.note(
+            vehicle.entered_s,
+            "entered",
+            vehicle=vehicle.name,
+            lane=vehicle.arrival.lane,
+            preferred_lane=vehicle.arrival.preferred_lane,
+            formation=vehicle.formation,
+        )
+
+    def on_closed(self, closed: ClosedFormation, members: Sequence[Name]) -> None:
+        """A formation was closed."""
+        number, columns = closed.first_block, closed.columns(self._scenario.lattice)
+        for vehicle in members:
+            self._recorder.assign(vehicle, number)
+        self.note(
+            closed.closed_s,
+            "formation-closed",
+            formation=number,
+            vehicles=list(members),
+            columns=[columns[0], columns[-1]],
+        )
+
+    def on_left(self, vehicle: RecordedVehicle, t_s: float, *, attended: bool) -> None:
+        """A vehicle passed the end of the road since the last tick.
+
+        `attended`: an agent was in charge of it, not its caretaker.
+        """
+        s_m, v_mps, _, y_m, _, _ = vehicle.state
+        beyond_m = s_m - self._scenario.road.length_m
+        left_s = t_s - beyond_m / v_mps if v_mps > 0 else t_s
+        lane = int(y_m // self._scenario.road.lane_width_m)
+        self._recorder.left(vehicle.name, left_s, lane)
+        self._count_rungs(vehicle)
+        preferred_lane = vehicle.arrival.preferred_lane
+        self.note(
+            left_s,
+            "left",
+            vehicle=vehicle.name,
+            lane=lane,
+            on_preferred_lane=lane == preferred_lane,
+        )
+        self._left_unattended += not attended
+        if lane != preferred_lane:
+            self._left_off_lane += 1
+            self.note(
+                left_s,
+                "left-off-lane",
+                vehicle=vehicle.name,
+                lane=lane,
+                preferred_lane=preferred_lane,
+                attended=attended,
+            )
+
+    def on_still_on_road(self, vehicle: RecordedVehicle) -> None:
+        """The run ends while a vehicle is on the road."""
+        self._count_rungs(vehicle)
+
+    @property
+    def missed_ticks(self) -> int:
+        """Answers that had not come when their tick's deadline passed."""
+        return self._missed_ticks
+
+    def on_missed(self, agents: int) -> None:
+        """So many agents have not answered a tick by its deadline."""
+        self._missed_ticks += agents
+
+    def on_caretaker_took_over(self, t_s: float, vehicle: Name, reason: str) -> None:
+        """A vehicle's caretaker is in charge, since its agent is `absent` or `silent`."""
+        self._caretaker_takeovers += 1
+        self.note(t_s, "caretaker-took-over", vehicle=vehicle, reason=reason)
+
+    def on_agent_took_over(self, t_s: float, vehicle: Name, previous: str) -> None:
+        """A vehicle's agent has taken charge from the `caretaker`, or from an earlier `agent`."""
+        self._agent_takeovers += 1
+        self.note(t_s, "agent-took-over", vehicle=vehicle, previous=previous)
+
+    def on_shown(
+        self,
+        t_s: float,
+        vehicles: Iterable[RecordedVehicle],
+        *,
+        overlaps: Iterable[tuple[str, str]],
+        collisions: Iterable[tuple[str, str]],
+        gaps: LeastGaps,
+    ) -> None:
+        """All bodies were shown at a tick."""
+        overlaps = list(overlaps)
+        for pair in overlaps:
+            self.note(t_s, "overlap", vehicles=pair)
+        self._recorder.safety(overlaps, collisions, gaps)
+        self._recorder.tick(t_s, [_sample(vehicle) for vehicle in vehicles])
+
+    def on_tick(self, t_s: float, on_road: int, duration_s: float) -> None:
+        """A tick took this long."""
+        self._ticks.append((t_s, on_road, duration_s * 1e3))
+
+    # --- what others say ----------------------------------------------------------------------
+
+    def on_event(self, event: LogEvent) -> None:
+        """A role had something to say."""
+        if self._closed:
+            return
+        # The sender's own words about who it is do not count.
+        data = event.data | {"role": event.role, "name": event.name}
+        self._recorder.event(event.t_s, event.kind, **data)
+        if event.kind in PLANNED:
+            self._plans.append(event.data)
+            solver = solver_of_event(event.kind, event.data)
+            if solver is not None:
+                self._plans_by_solver[solver] += 1
+
+    def on_report(self, report: Report) -> None:
+        """A role reported its counters; the newest of a sender counts."""
+        self._reports[report.role, report.name] = report
+
+    def on_heartbeat(self, heartbeat: Heartbeat, t_s: float, now_s: float) -> None:
+        """Follow the leadership: how often it changes, and for how long nobody leads.
+
+        `now_s` is the node's clock.
+        """
+        leadership = self._leadership
+        sender = (heartbeat.coordinator, heartbeat.incarnation)
+        if not heartbeat.leading:
+            return
+        if sender != leadership.leader:
+            if leadership.leader is not None:
+                leadership.changes += 1
+                leadership.recovery_s.append(round(now_s - leadership.heard_s, 4))
+            leadership.leader = sender
+            self.note(t_s, "leader", coordinator=heartbeat.coordinator, term=heartbeat.term)
+        leadership.heard_s = now_s
+
+    # --- the end ------------------------------------------------------------------------------
+
+    def close(self, t_s: float, ending: Ending) -> None:
+        """Write everything down. Idempotent: the first ending counts."""
+        if self._closed:
+            return
+        self.note(t_s, "run-ended", ending=ending.value)
+        self._closed = True
+        self._recorder.close()
+        self._write_ticks()
+        summary = self._recorder.summarise(self._method, t_s) | {"ending": ending.value}
+        summary["vehicles"] |= {
+            "left_off_lane": self._left_off_lane,
+            "left_unattended": self._left_unattended,
+        }
+        write_summary(self._folder, summary | self._rest(t_s))
+
+    def _write_ticks(self) -> None:
+        """Write ticks.parquet: how long each tick took, with how many vehicles on the road."""
+        times, counts, durations = zip(*self._ticks, strict=True) if self._ticks else ((), (), ())
+        table = pa.table(
+            {
+                "t_s": pa.array(times, pa.float64()),
+                "on_road": pa.array(counts, pa.int32()),
+                "tick_ms": pa.array(durations, pa.float32()),
+            }
+        )
+        pq.write_table(table, self._folder / "ticks.parquet", compression="zstd")
+
+    def _count_rungs(self, vehicle: RecordedVehicle) -> None:
+        for rung, ticks in vehicle.rung_ticks.items():
+            self._rung_ticks[rung] += ticks
+
+    def _rest(self, t_s: float) -> dict[str, Any]:
+        wall_s, ticks = self._stopwatch() - self._began, self._rung_ticks
+        reports = self._reports.values()
+        solve_ms = _milliseconds(report.solve_ms for report in reports)
+        solves = sum(report.solves for report in reports)
+        osqp_solves = sum(report.osqp_solves for report in reports)
+        plan_ms = np.array([_number(plan.get("solve_ms")) for plan in self._plans])
+        return {
+            "planning": {
+                "plans": len(self._plans),
+                "optimal": sum(plan.get("status") == "optimal" for plan in self._plans),
+                "largest_formation": max(
+                    (int(_number(plan.get("vehicles"))) for plan in self._plans), default=0
+                ),
+                "by_solver": dict(self._plans_by_solver),
+                "fallbacks": sum(plan.get("fallback") is True for plan in self._plans),
+                "solve_ms": spread(plan_ms, 50, 95, largest=True),
+            },
+            "tracking": {
+                "solves": solves,
+                "osqp_solves": osqp_solves,
+                "unconstrained_steps": solves - osqp_solves,
+                "unusable": sum(report.unusable for report in reports),
+                "hold_law_ticks": ticks[Rung.HOLD] + ticks[Rung.GIVE_WAY],
+                "emergency_ticks": ticks[Rung.EMERGENCY],
+                "missed_ticks": self._missed_ticks,
+                "caretaker_takeovers": self._caretaker_takeovers,
+                "agent_takeovers": self._agent_takeovers,
+                "solve_ms": spread(solve_ms, 50, 99),
+            },
+            "runtime": {
+                "real_time_factor": round(t_s / wall_s, 3) if wall_s > 0 else 0.0,
+                "wall_s": round(wall_s, 3),
+                "processes": None,
+                "vehicles_per_process": self._scenario.runtime.vehicles_per_process,
+                "tick_ms": spread(np.array([tick[2] for tick in self._ticks]), 50, 99),
+            },
+            "messages": {
+                "published": _per_process(reports, "published"),
+                "dropped_by_faults": 0,
+                "rejected": _per_process(reports, "rejected"),
+            },
+            "failover": {
+                "leader_changes": self._leadership.changes,
+                "recovery_s": self._leadership.recovery_s,
+            },
+        }
+
+
+def _sample(vehicle: RecordedVehicle) -> tuple[str, float, float, float, float, int | None, int]:
+    s_m, v_mps, a_mps2, y_m, _, _ = vehicle.state
+    column, lane = vehicle.cell
+    return (vehicle.name, s_m, y_m, v_mps, a_mps2, column, lane)
+
+
+def _per_process(reports: Iterable[Report], counter: str) -> int:
+    """Add up a counter that processes report so far, each perhaps for several vehicles."""
+    newest: dict[Name, int] = {}
+    for report in reports:
+        newest[report.process] = max(newest.get(report.process, 0), getattr(report, counter))
+    return sum(newest.values())
+
+
+def _number(value: object) -> float:
+    return float(value) if isinstance(value, (int, float)) and math.isfinite(value) else 0.0
+
+
+def _milliseconds(packed: Iterable[bytes]) -> NDArray[np.float64]:
+    """Return the durations that can be durations: what comes from others may be anything."""
+    whole = b"".join(each for each in packed if len(each) % 4 == 0)
+    values = np.frombuffer(whole, dtype="<f4").astype(np.float64)
+    return values[np.isfinite(values) & (values >= 0.0)]
+
+
+def spread(
+    values: NDArray[Any], *percentiles: int, largest: bool = False
+) -> dict[str, float | None]:
+    """Return percentiles by name, `max` too if it is wanted; None where there are no values."""
+    ranks = {f"p{percentile}": percentile for percentile in percentiles}
+    if largest:
+        ranks["max"] = 100
+    return {name: _percentile(values, rank) for name, rank in ranks.items()}
+
+
+def _percentile(values: NDArray[Any], rank: int) -> float | None:
+    with np.errstate(all="ignore"):
+        value = float(np.percentile(values, rank)) if len(values) else math.nan
+    return round(value, 3) if math.isfinite(value) else None

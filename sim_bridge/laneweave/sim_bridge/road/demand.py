@@ -1,0 +1,81 @@
+"""Random arrivals at the start of the road.
+
+On each lane the headway between two arrivals is
+
+    min_headway + Exp(3600 / volume - min_headway)      (mean 3600 / volume seconds),
+
+and each vehicle draws the lane it prefers from the scenario's lane shares. Every lane has its own
+random generator for headways and another for preferences, all derived from the scenario's seed.
+So equal seeds give equal arrivals, a lane's arrivals do not depend on the number of other lanes,
+and the stream of a longer duration begins with that of a shorter one, names included.
+"""
+
+from __future__ import annotations
+
+from itertools import accumulate
+
+import numpy as np
+from attrs import frozen
+from numpy.random import Generator, SeedSequence, default_rng
+
+from laneweave.protocol.scenario.fleets import vehicle_name
+from laneweave.protocol.scenario.tables import Scenario
+
+_HEADWAYS, _PREFERENCES = 0, 1
+
+
+@frozen
+class Arrival:
+    """A vehicle that wants to enter the road."""
+
+    vehicle: str
+    """Its name: `v` and its number in order of arrival over all lanes, from 1."""
+    lane: int
+    """Lane on which it arrives; 0 is the rightmost."""
+    preferred_lane: int
+    """Lane on which it wants to leave the road."""
+    t_s: float
+    """Road time at which it would pass the start of the road if it were free."""
+
+
+def arrivals(scenario: Scenario) -> tuple[Arrival, ...]:
+    """Draw the arrivals of a scenario from its seed.
+
+    Args:
+        scenario: road, demand and seed.
+
+    Returns:
+        All arrivals in [0, demand.duration_s], by time, then lane.
+    """
+    drawn = sorted(
+        (t_s, lane, preferred)
+        for lane in range(scenario.road.lanes)
+        for t_s, preferred in _arrivals_on(lane, scenario)
+    )
+    return tuple(
+        Arrival(vehicle_name(number), lane, preferred, t_s)
+        for number, (t_s, lane, preferred) in enumerate(drawn, start=1)
+    )
+
+
+def _arrivals_on(lane: int, scenario: Scenario) -> list[tuple[float, int]]:
+    """Return (time in s, preferred lane) of each arrival on one lane."""
+    demand = scenario.demand
+    mean_excess_s = max(0.0, 3600.0 / demand.volume_veh_per_lane_h - demand.min_headway_s)
+    headways = _generator(scenario.seed, _HEADWAYS, lane)
+    preferences = _generator(scenario.seed, _PREFERENCES, lane)
+    # The last bound is one, whatever the rounding of the sum: a draw in [0, 1) finds a lane.
+    bounds = np.array([*accumulate(scenario.lane_shares)][:-1])
+    result: list[tuple[float, int]] = []
+    t_s = 0.0
+    while True:
+        t_s += demand.min_headway_s + mean_excess_s * headways.standard_exponential()
+        if t_s > demand.duration_s:
+            return result
+        preferred = int(np.searchsorted(bounds, preferences.random(), side="right"))
+        result.append((float(t_s), preferred))
+
+
+def _generator(seed: int, purpose: int, lane: int) -> Generator:
+    """Return the random generator of one purpose on one lane."""
+    return default_rng(SeedSequence(seed, spawn_key=(purpose, lane)))

@@ -1,0 +1,151 @@
+"""Entry metering at the start of the road.
+
+A vehicle enters at s = 0 with the lattice speed v_F. Its cell is the first free one on its lane,
+behind its lane predecessor, that passes s = 0 at most `spread_s` before or after the vehicle; from
+there it settles in its cell on the first stretch of road. With interlaced entry only every other
+cell may be entered ("checkerboard", the paper's structure for driving). Vehicles of a lane enter in
+order of arrival, at least a column's time apart.
+
+Where there are formations, `formation_building` says whether a formation takes a vehicle.
+
+Decisions are causal: they are taken in the order of time, and at one moment the lanes from the
+right, so nothing depends on arrivals that are still to come.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import insort
+
+from attrs import frozen
+
+from laneweave.protocol.lattice import Cell, Lattice
+from laneweave.sim_bridge.road.demand import Arrival
+from laneweave.sim_bridge.road.formation_building import FormationBuilder
+
+TIME_TOLERANCE_S = 1e-9
+"""Ticks and passing times are the same instants computed in two ways."""
+
+
+@frozen
+class Admission:
+    """A vehicle enters the road at s = 0 with speed v_F."""
+
+    arrival: Arrival
+    cell: Cell
+    t_s: float
+    """Road time at which it passes s = 0."""
+    offset_m: float = 0.0
+    """How far ahead of its cell it is."""
+
+
+class EntryMeter:
+    """Assigns lattice cells to arriving vehicles; pure and incremental."""
+
+    def __init__(
+        self,
+        lattice: Lattice,
+        spread_s: float = 0.0,
+        builder: FormationBuilder | None = None,
+        *,
+        interlaced: bool = False,
+    ) -> None:
+        """Start with an empty road at road time 0.
+
+        Args:
+            lattice: the lattice whose cells are given out.
+            spread_s: most time between a vehicle and its cell at s = 0.
+            builder: builds formations of the vehicles that enter; None: there are none.
+            interlaced: whether only every other cell may be entered.
+        """
+        self._lattice = lattice
+        self._builder = builder
+        self._spread_s = spread_s
+        self._interlaced = interlaced
+        self._queues: list[list[Arrival]] = [[] for _ in range(lattice.lanes)]
+        self._names: set[str] = set()
+        self._columns = [0] * lattice.lanes
+        """The next column of each lane that may be entered."""
+        self._free_s = [-math.inf] * lattice.lanes
+        """When the next vehicle of each lane may follow the one before."""
+
+    @property
+    def waiting(self) -> tuple[Arrival, ...]:
+        """Vehicles that were demanded and not admitted yet, lane by lane."""
+        return tuple(arrival for queue in self._queues for arrival in queue)
+
+    def closed_column(self, lane: int) -> int:
+        """Return the last column of a lane that nobody will enter any more."""
+        return self._columns[lane] + 1
+
+    def demand(self, arrival: Arrival) -> None:
+        """Queue a vehicle on its lane, in order of arrival time.
+
+        It may be queued before its arrival time. Queued after it, the vehicle takes the first
+        possible cell from then on.
+
+        Raises:
+            ValueError: the lattice lacks its lane or its preferred lane, or it waits already.
+        """
+        lanes = range(self._lattice.lanes)
+        if arrival.lane not in lanes or arrival.preferred_lane not in lanes:
+            raise ValueError(f"{arrival} needs lanes 0 to {self._lattice.lanes - 1}")
+        if arrival.vehicle in self._names:
+            raise ValueError(f"{arrival.vehicle} is waiting already")
+        self._names.add(arrival.vehicle)
+        insort(self._queues[arrival.lane], arrival, key=lambda other: other.t_s)
+
+    def admit(self, until_s: float) -> list[Admission]:
+        """Decide on all entries up to a road time that were not decided on before.
+
+        Args:
+            until_s: road time, usually now; a vehicle demanded later enters later.
+
+        Returns:
+            The vehicles that enter, by time, then lane.
+        """
+        admissions = []
+        while True:
+            t_s, lane = min((self._entry_s(lane), lane) for lane in range(self._lattice.lanes))
+            if t_s > until_s + TIME_TOLERANCE_S:
+                break
+            cell = (self._columns[lane], lane)
+            arrival = self._takes(cell, t_s)
+            if arrival is not None:
+                late_s = self._lattice.passing_time_s(cell[0]) - t_s
+                offset_m = late_s * self._lattice.speed_mps
+                admissions.append(Admission(arrival, cell, t_s, offset_m))
+                self._free_s[lane] = t_s + self._lattice.pitch_m / self._lattice.speed_mps
+            self._columns[lane] -= 1
+        # A column that has passed is not for those who are demanded later.
+        for lane in range(self._lattice.lanes):
+            self._skip(lane, until_s - TIME_TOLERANCE_S)
+        return admissions
+
+    def _entry_s(self, lane: int) -> float:
+        """Return when the first of a queue enters, if its next cell is free for it."""
+        queue = self._queues[lane]
+        if not queue:
+            return math.inf
+        ready_s = max(queue[0].t_s, self._free_s[lane])
+        self._skip(lane, ready_s)
+        return max(ready_s, self._lattice.passing_time_s(self._columns[lane]) - self._spread_s)
+
+    def _skip(self, lane: int, t_s: float) -> None:
+        """Go on to the first column of a lane that can still be entered at a time."""
+        lattice, column = self._lattice, self._columns[lane]
+        if self._builder is not None:
+            column = int(min(column, self._builder.first_open_column))
+        while lattice.passing_time_s(column) + self._spread_s < t_s or (
+            self._interlaced and not lattice.interlaced((column, lane))
+        ):
+            column -= 1
+        self._columns[lane] = column
+
+    def _takes(self, cell: Cell, t_s: float) -> Arrival | None:
+        """Return the first of the queue, if a formation takes it, or there are none."""
+        builder, queue = self._builder, self._queues[cell[1]]
+        if builder is not None and not builder.takes(cell, queue[0].preferred_lane, t_s):
+            return None
+        self._names.discard(queue[0].vehicle)
+        return queue.pop(0)

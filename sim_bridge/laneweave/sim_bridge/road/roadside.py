@@ -1,0 +1,276 @@
+"""The roadside at the entrance: it meters vehicles in, counts them, and tells who is there.
+
+Its census is complete, which is what lets a coordinator know a roster for certain.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from itertools import chain
+
+from attrs import frozen
+
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.runtime.node import Effect, Send
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.wire.messages import (
+    Announcement,
+    Census,
+    CensusEntry,
+    ClosedFormation,
+    Name,
+    RoadClock,
+)
+from laneweave.protocol.wire.topics import CENSUS, CLOCK
+from laneweave.sim_bridge.road.demand import Arrival, arrivals
+from laneweave.sim_bridge.road.entry import TIME_TOLERANCE_S, Admission, EntryMeter
+from laneweave.sim_bridge.road.formation_building import formation_builder
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
+
+CENSUS_EVERY_TICKS = 10
+MOST_EMPTY = 12
+"""A vehicle gets at most so many empty cells behind it; fewer where moves begin soon, since it must
+have them all before it is asked for any."""
+
+
+@frozen
+class Counts:
+    """How many vehicles were demanded (up to now), entered, are on the road, have left."""
+
+    demanded: int
+    entered: int
+    on_road: int
+    left: int
+
+    def clock(self, tick: int, t_s: float, *, ended: bool, bridge: int = 0) -> RoadClock:
+        """Return the clock message of a tick."""
+        return RoadClock(
+            tick=tick,
+            t_s=t_s,
+            demanded=self.demanded,
+            entered=self.entered,
+            on_road=self.on_road,
+            left=self.left,
+            ended=ended,
+            bridge=bridge,
+        )
+
+
+class Roadside:
+    """Demand, entry metering and census."""
+
+    def __init__(self, scenario: Scenario, bridge: int = 0) -> None:
+        """Draw the demand of a scenario; `bridge` is the incarnation of whoever sends the news."""
+        self._bridge = bridge
+        self._announce_s = scenario.runtime.announce_s
+        self._tick_s = scenario.runtime.tick_s
+        self._lanes = scenario.road.lanes
+        # A tick and one more, so that nobody comes unannounced.
+        lattice, formation = scenario.lattice, scenario.formation
+        ahead_s = self._announce_s + self._tick_s
+        self._announced_per_lane = math.ceil(ahead_s / formation.entry_spacing_s) + 1
+        self._rolling = formation.rolling
+        self._builder = formation_builder(scenario)
+        self._meter = EntryMeter(
+            lattice,
+            formation.entry_spread_s,
+            self._builder,
+            interlaced=formation.interlaced,
+        )
+        self._closed: list[ClosedFormation] = []
+        """All that have been closed, as long as one of their vehicles is on the road."""
+        self._closed_to = -1
+        self._recent: list[tuple[int, int, Name]] = []
+        """Column, lane and name of those who have entered, as far as they are near."""
+        self._next: list[list[tuple[int, Name]]] = [[] for _ in range(self._lanes)]
+        """Who has entered behind them since cells were handed out, foremost first."""
+        self._left_over: list[Cell] = []
+        """Empty cells that nobody has got yet."""
+        self._handed_out = [1 + MOST_EMPTY] * self._lanes
+        """The last column of each lane that was handed out."""
+        columns = int(scenario.moves_from_m / lattice.pitch_m)
+        self._most_empty = max(0, min(MOST_EMPTY, columns - 2))
+        self._arrivals = arrivals(scenario)
+        self._demanded = 0
+        self._queued = 0
+        self._entered = 0
+        self._left = 0
+        self._announced: tuple[Announcement, ...] = ()
+        self._census_sent_tick = -CENSUS_EVERY_TICKS
+        self._census_changed = True
+        """Somebody entered or left since the last census, or a block has closed."""
+
+    def newly_demanded(self, t_s: float) -> tuple[Arrival, ...]:
+        """Return the vehicles that arrived since the last call."""
+        first = self._demanded
+        while (
+            self._demanded < len(self._arrivals)
+            and self._arrivals[self._demanded].t_s <= t_s + TIME_TOLERANCE_S
+        ):
+            self._demanded += 1
+        return self._arrivals[first : self._demanded]
+
+    def admit(self, t_s: float) -> list[Admission]:
+        """Return the vehicles whose cells pass the start of the road up to now."""
+        # Queue those who arrive until the next tick: their cell may pass between two ticks.
+        while (
+            self._queued < len(self._arrivals)
+            and self._arrivals[self._queued].t_s <= t_s + self._tick_s
+        ):
+            self._meter.demand(self._arrivals[self._queued])
+            self._queued += 1
+        admissions = self._meter.admit(t_s)
+        for admission in admissions:
+            column, lane = admission.cell
+            self._next[lane].append((column, Name(admission.arrival.vehicle)))
+        self._entered += len(admissions)
+        self._census_changed |= bool(admissions)
+        return admissions
+
+    def close_formations(self, t_s: float) -> list[ClosedFormation]:
+        """Return the formations that have been closed since the last call.
+
+        Call it after `admit`, which decides on their members.
+        """
+        if self._builder is None:
+            return []
+        closed = self._builder.closed(t_s)
+        self._closed += closed
+        if self._builder.closed_to > self._closed_to:
+            self._closed_to = self._builder.closed_to
+            self._census_changed = True
+        return closed
+
+    def hand_out(self, vehicles: Mapping[Name, RoadVehicle]) -> None:
+        """Give empty cells at the entrance to vehicles near them.
+
+        Nothing happens where formations own blocks. A cell becomes somebody's when nobody can
+        enter in it any more. Those that nobody is near to wait for the next vehicles; what is
+        too far ahead of these, too, stays nobody's.
+        """
+        if not self._rolling:
+            return
+        for lane in range(self._lanes):
+            closed = self._meter.closed_column(lane)
+            for column in range(self._handed_out[lane] - 1, closed - 1, -1):
+                if self._next[lane] and self._next[lane][0][0] == column:
+                    self._meet(column, lane, self._next[lane].pop(0)[1])
+                else:
+                    self._hand_over((column, lane), vehicles)
+            self._handed_out[lane] = closed
+        left_over, self._left_over = self._left_over, []
+        for cell in left_over:
+            if cell[0] <= max(self._handed_out) + 2 * self._most_empty:
+                self._hand_over(cell, vehicles)
+
+    def _hand_over(self, cell: Cell, vehicles: Mapping[Name, RoadVehicle]) -> None:
+        """Give an empty cell to whoever is near; best to whoever is ahead, on the same lane."""
+        column, lane = cell
+        first, last = column - self._most_empty, column + self._most_empty
+        near = [
+            (entered < column, number != lane, abs(entered - column), name)
+            for entered, number, name in self._recent
+            if first <= entered <= last and name in vehicles
+        ]
+        if near:
+            vehicles[min(near)[-1]].controller.own(cell)
+        else:
+            self._left_over.append(cell)
+
+    def _meet(self, column: int, lane: int, name: Name) -> None:
+        """Take note of a vehicle in its cell, and forget what is far ahead of it."""
+        far = column + 2 * self._most_empty
+        self._recent = [one for one in self._recent if one[0] <= far]
+        self._recent.append((column, lane, name))
+
+    def count_left(self) -> None:
+        """Count a vehicle that passed the end of the road."""
+        self._left += 1
+        self._census_changed = True
+
+    def news(
+        self, tick: int, t_s: float, on_road: Collection[RoadVehicle], *, ended: bool = False
+    ) -> Iterator[Effect]:
+        """Send the clock, and the census on every change, every 10 ticks, and at the end.
+
+        That a formation has closed is a change, too: now its roster is known.
+
+        Args:
+            tick: number of the tick that begins.
+            t_s: its road time.
+            on_road: all vehicles on the road.
+            ended: whether it is the last one.
+        """
+        counts = self.counts(len(on_road))
+        yield Send(CLOCK, counts.clock(tick, t_s, ended=ended, bridge=self._bridge))
+        due = ended or tick >= self._census_sent_tick + CENSUS_EVERY_TICKS
+        announced = self.announcements_changed(t_s)
+        if announced or due or self._census_changed:
+            self._census_changed = False
+            self._census_sent_tick = tick
+            yield Send(CENSUS, self.census(t_s, on_road))
+
+    def counts(self, on_road: int) -> Counts:
+        """Return the counts."""
+        return Counts(self._demanded, self._entered, on_road, self._left)
+
+    def exhausted(self, t_s: float) -> bool:
+        """Tell whether nobody waits and nobody will arrive any more."""
+        return (
+            self._queued == len(self._arrivals)
+            and not self._meter.waiting
+            and (not self._arrivals or self._arrivals[-1].t_s <= t_s)
+        )
+
+    def announcements_changed(self, t_s: float) -> bool:
+        """Look who is about to arrive; tell whether that has changed."""
+        before = self._announced
+        self._announced = self._announcements(t_s)
+        return self._announced != before
+
+    def census(self, t_s: float, on_road: Iterable[RoadVehicle]) -> Census:
+        """Return the vehicles on the road, those announced, and the closed formations."""
+        vehicles = tuple(on_road)
+        present = {vehicle.formation for vehicle in vehicles}
+        self._closed = [closed for closed in self._closed if closed.first_block in present]
+        return Census(
+            t_s=t_s,
+            on_road=tuple(
+                CensusEntry(
+                    vehicle=vehicle.name,
+                    cell=vehicle.admission.cell,
+                    preferred_lane=vehicle.admission.arrival.preferred_lane,
+                    entered_s=vehicle.admission.t_s,
+                )
+                for vehicle in vehicles
+            ),
+            announced=self._announced,
+            formations=tuple(self._closed),
+            closed_to=self._closed_to,
+            bridge=self._bridge,
+        )
+
+    def _announcements(self, t_s: float) -> tuple[Announcement, ...]:
+        """Return those who may enter within the announced time, however long the queue is."""
+        room = [self._announced_per_lane] * self._lanes
+        coming = []
+        for arrival in chain(self._meter.waiting, self._upcoming(t_s)):
+            if room[arrival.lane] > 0:
+                room[arrival.lane] -= 1
+                coming.append(arrival)
+        return tuple(
+            Announcement(
+                vehicle=Name(arrival.vehicle),
+                lane=arrival.lane,
+                preferred_lane=arrival.preferred_lane,
+                arrival_s=arrival.t_s,
+            )
+            for arrival in sorted(coming, key=lambda arrival: (arrival.t_s, arrival.vehicle))
+        )
+
+    def _upcoming(self, t_s: float) -> Iterator[Arrival]:
+        for index in range(self._queued, len(self._arrivals)):
+            if self._arrivals[index].t_s > t_s + self._announce_s:
+                return
+            yield self._arrivals[index]

@@ -1,0 +1,137 @@
+"""A vehicle on the road."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from attrs import define
+
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.vehicle.motion import State, cell_state
+from laneweave.protocol.wire.messages import ClosedFormation, Name, Sense
+from laneweave.sim_bridge.bodies.footprints import Glimpses
+from laneweave.sim_bridge.bodies.motion_controller import MotionController, Rung
+from laneweave.sim_bridge.bodies.plant import Plant
+from laneweave.sim_bridge.bodies.sensors import Sensors
+from laneweave.sim_bridge.road.demand import Arrival
+from laneweave.sim_bridge.road.entry import Admission
+
+NEAR_M = 0.01
+"""A vehicle that enters this near to its cell is there."""
+
+
+@define
+class RoadVehicle:
+    """Body, motion controller and sensors of one vehicle."""
+
+    name: Name
+    admission: Admission
+    controller: MotionController
+    sensors: Sensors | None = None
+    """None: it knows itself exactly, and sees nobody."""
+    formation: int | None = None
+    """Number of its formation, of its block in the rolling operation; None: not known yet."""
+
+    @classmethod
+    def entering(cls, admission: Admission, t_s: float, scenario: Scenario) -> RoadVehicle:
+        """Return a vehicle that has driven at v_F since it was admitted, at road time `t_s`.
+
+        It is to settle in its cell within `formation.settle_s`.
+        """
+        lattice, tick_s = scenario.lattice, scenario.runtime.tick_s
+        rest = cell_state(lattice, admission.cell, t_s)
+        s_m = rest[0] + admission.offset_m
+        name = Name(admission.arrival.vehicle)
+        controller = MotionController(
+            Plant((s_m, *rest[1:]), scenario.vehicle, tick_s), scenario, admission.cell
+        )
+        if abs(admission.offset_m) > NEAR_M:
+            controller.motion_end_tick = round((t_s + scenario.formation.settle_s) / tick_s)
+        if scenario.formation.rolling:
+            controller.own(admission.cell)
+        formation = None if scenario.formation.closes_by_vehicles else controller.joined[0]
+        return cls(name, admission, controller, Sensors(scenario, name), formation)
+
+    @property
+    def state(self) -> State:
+        """(s m, v m/s, a m/s2, y m, v_y m/s, a_y m/s2)."""
+        return self.controller.plant.state
+
+    @property
+    def block(self) -> int:
+        """Number of the block in which it entered."""
+        return self.controller.lattice.block_of(self.admission.cell[0])
+
+    def join(self, closed: ClosedFormation) -> None:
+        """Take note that its formation is closed: plans must be for all of its blocks."""
+        self.formation = closed.first_block
+        self.controller.join(closed.blocks)
+
+    @property
+    def arrival(self) -> Arrival:
+        """Its demand."""
+        return self.admission.arrival
+
+    @property
+    def entered_s(self) -> float:
+        """Road time at which its front passed s = 0."""
+        return self.admission.t_s
+
+    @property
+    def cell(self) -> Cell:
+        """The cell that it holds or moves to."""
+        return self.controller.hold_cell
+
+    @property
+    def rung_ticks(self) -> Mapping[Rung, int]:
+        """Ticks on each rung of the ladder."""
+        return self.controller.rung_ticks
+
+    def perceive(self, around: Glimpses) -> None:
+        """Let its sensors measure where it is now, and whom it sees.
+
+        Args:
+            around: whom exact sensors would see.
+        """
+        sensors = self.sensors
+        if sensors is not None:
+            self.controller.perceive(sensors.measure(self.state), sensors.look(around))
+
+    def sense(self, tick: int, *, caretaker: bool, left: bool = False) -> Sense:
+        """Return what its sensors and its motion controller know at a tick.
+
+        Args:
+            tick: number of the tick that begins.
+            caretaker: whether its caretaker is in charge.
+            left: whether it has left the road.
+        """
+        controller = self.controller
+        around = controller.around
+        return Sense(
+            vehicle=self.name,
+            tick=tick,
+            t_s=tick * controller.tick_s,
+            state=controller.measured,
+            hold_cell=controller.hold_cell,
+            motion_end_tick=controller.motion_end_tick,
+            motion_origin=controller.motion_origin,
+            motion_ticks=controller.motion_ticks,
+            preferred_lane=self.admission.arrival.preferred_lane,
+            ahead=around.ahead,
+            behind=around.behind,
+            setpoint=controller.plant.setpoint,
+            formation=self.block,
+            attendant=controller.attendant,
+            caretaker=caretaker,
+            joined=controller.joined,
+            accepted=controller.accepted,
+            left=left,
+            estate=controller.estate,
+            promised=controller.promised,
+            deed=controller.deed,
+        )
+
+    def step(self, tick: int) -> None:
+        """Drive from `tick` to the next one."""
+        self.controller.step(tick)

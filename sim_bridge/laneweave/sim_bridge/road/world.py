@@ -1,0 +1,70 @@
+"""Where the bodies are shown, and what is measured and sensed there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol
+
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.vehicle.motion import State
+from laneweave.protocol.wire.messages import Name
+from laneweave.sim_bridge.bodies.footprints import Bodies, Pose
+from laneweave.sim_bridge.recording.run_record import RunRecord
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
+
+
+class World(Protocol):
+    """Where the bodies are shown; `SumoWorld` in every real run."""
+
+    def add(self, vehicle: str, state: State) -> None:
+        """Put a vehicle on the road."""
+
+    def place(self, vehicle: str, state: State) -> None:
+        """Say where a vehicle is at the end of the next step."""
+
+    def step(self) -> None:
+        """Advance by one tick."""
+
+    def positions(self) -> dict[str, Pose]:
+        """Return where each vehicle is shown."""
+
+    def collisions(self) -> list[tuple[str, str]]:
+        """Return the pairs that the world itself takes for colliding."""
+
+    def remove(self, vehicle: str) -> None:
+        """Take a vehicle off the road."""
+
+
+def show_bodies(
+    world: World,
+    vehicles: Mapping[Name, RoadVehicle],
+    scenario: Scenario,
+    record: RunRecord,
+    t_s: float,
+) -> None:
+    """Let the world show all bodies, record what it shows, and let each vehicle's sensors look.
+
+    Args:
+        world: advanced by one tick.
+        vehicles: all on the road, moved on already.
+        scenario: size of vehicles and lanes.
+        record: takes overlaps, collisions, gaps and samples.
+        t_s: road time after the tick.
+    """
+    states = {name: vehicle.state for name, vehicle in vehicles.items()}
+    for name, state in states.items():
+        world.place(name, state)
+    world.step()
+    road, size = scenario.road, scenario.vehicle
+    bodies = Bodies(world.positions(), size.length_m, size.width_m)
+    accels_mps2: dict[str, float] = {name: state[2] for name, state in states.items()}
+    around = bodies.glimpses(road.lanes, road.lane_width_m, accels_mps2)
+    for name, vehicle in vehicles.items():
+        vehicle.perceive(around[name])
+    record.on_shown(
+        t_s,
+        vehicles.values(),
+        overlaps=bodies.overlapping_pairs(),
+        collisions=world.collisions(),
+        gaps=bodies.least_gaps(),
+    )

@@ -1,0 +1,124 @@
+"""Whatever happens to messages and processes: no cell has two owners, and leaders never err."""
+
+from __future__ import annotations
+
+from random import Random
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from laneweave.coordinator.rolling import ballot as handover_module
+from laneweave.coordinator.rolling.ballot import _Sign, estate_of
+from laneweave.protocol.state_machine import RuleBook
+from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
+from laneweave.protocol.wire.messages import Ballot, Deed, VehicleState
+from laneweave.sim_bridge.bodies.motion_controller import MotionController
+from support.rolling_road import Road, WrongError
+
+STEPS = 600
+SEEDS = range(300)
+"""In which each planted bug is found."""
+
+
+def first_wrong(rules: RuleBook = VEHICLE_RULES) -> int | None:
+    for seed in SEEDS:
+        try:
+            Road(Random(seed), rules).run(STEPS)
+        except WrongError:
+            return seed
+    return None
+
+
+@given(st.integers(0, 2**32))
+@settings(max_examples=60, deadline=None)
+def test_no_cell_has_two_owners_and_everybody_owns_where_it_is(seed: int) -> None:
+    Road(Random(seed)).run(STEPS)
+
+
+def test_much_happens_and_still_no_cell_has_two_owners() -> None:
+    roads = [Road(Random(seed)) for seed in range(100)]
+    for road in roads:
+        road.run(STEPS)
+    assert sum(road.moves for road in roads) > 200
+    assert sum(len(road.opened) for road in roads) > 200
+
+
+def test_a_leader_never_errs_about_what_somebody_owns() -> None:
+    """However old what it knows of the others: what it can tell is true, and mostly all of it."""
+    told = told_in_part = not_told = 0
+    for seed in range(60):
+        road = Road(Random(1000 + seed))
+        for _ in range(STEPS // 5):
+            road.run(5)
+            for leader in road.leaders:
+                for car in road.cars.values():
+                    deed, state = car.controller.deed, car.state_now()
+                    if not state.estate:
+                        continue  # a promise that its controller has not noted
+                    estate = estate_of(state, leader.states)
+                    if estate is None:
+                        not_told += 1
+                    elif estate == road.owned(car):
+                        told += 1
+                    else:
+                        assert deed is not None
+                        assert estate == set(deed.before) & set(deed.after)
+                        assert estate <= road.owned(car)
+                        told_in_part += 1
+                    assert estate is not None or (deed is not None and not deed.open)
+    assert told > 10 * told_in_part > 0
+    assert told > not_told > 0
+
+
+# --- would it be noticed? ---------------------------------------------------------------------
+
+
+def forget_promise(patch: pytest.MonkeyPatch) -> None:
+    """A promise does not bind the next process, and plans are accepted without deeds."""
+    hand_over = MotionController.hand_over
+
+    def mutant(self: MotionController, incarnation: int) -> None:
+        hand_over(self, incarnation)
+        self.promised = None
+
+    def accept(self: MotionController, ballot: Ballot) -> None:
+        self.accepted = ballot if self.accepted is None else max(self.accepted, ballot)
+
+    patch.setattr(MotionController, "hand_over", mutant)
+    patch.setattr(MotionController, "accept", accept)
+
+
+def newer_deed_is_no_news(patch: pytest.MonkeyPatch) -> None:
+    """Whoever has promised more had no open deed, though it may have had one in between."""
+    sign = handover_module._sign
+
+    def mutant(state: VehicleState | None, deed: Deed) -> _Sign:
+        found = sign(state, deed)
+        return _Sign.CLOSED if found is _Sign.NEWER else found
+
+    patch.setattr(handover_module, "_sign", mutant)
+
+
+def never_open(patch: pytest.MonkeyPatch) -> None:
+    """A vehicle owns what it thinks it owns."""
+
+    def mutant(state: VehicleState, *_: object) -> frozenset[tuple[int, int]]:
+        return frozenset(state.estate)
+
+    patch.setattr(handover_module, "estate_of", mutant)
+
+
+@pytest.mark.parametrize("plant", [forget_promise, newer_deed_is_no_news, never_open])
+def test_a_planted_bug_is_found(plant: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert callable(plant)
+    plant(monkeypatch)
+    assert first_wrong() is not None
+
+
+@pytest.mark.parametrize(
+    "broken", [{"all_are_ready": lambda *_: True}, {"take_possession": lambda *_: None}],
+    ids=lambda broken: next(iter(broken)),
+)  # fmt: skip
+def test_a_broken_rule_is_found(broken: dict[str, object]) -> None:
+    assert first_wrong(VEHICLE_RULES.planted(**broken)) is not None  # type: ignore[arg-type]

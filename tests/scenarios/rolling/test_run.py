@@ -1,0 +1,87 @@
+"""Whole runs in the rolling operation: real roles on the simulated network, and no SUMO."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.transports.simulated.network import Conditions, SimulatedNetwork
+from laneweave.protocol.wire.messages import Name
+from laneweave.sim_bridge.core import Phase
+from laneweave.sim_bridge.road.demand import Arrival
+from support import bridge_bench as bench
+from support.bridge_bench import Street, make_scenario, read_summary
+
+SCENARIO = make_scenario(
+    formation={"operation": "rolling"},
+    road={"lanes": 2, "s1_m": 20.0, "s2_m": 160.0, "s3_m": 320.0},
+)
+DEMAND = tuple(
+    Arrival(f"v{number}", number % 2, 1 - number % 2, 1.3 + 1.7 * number) for number in range(6)
+)
+"""Everybody wants the other lane."""
+BAD = Conditions(jitter_s=0.05, loss=0.2, duplication=0.1)
+
+
+def watched(street: Street) -> Callable[[], bool]:
+    """Return when to stop; before, check that no cell has two owners at any time."""
+    opened = set()
+
+    def look() -> bool:
+        owners: dict[Cell, Name] = {}
+        controllers = {name: each.controller for name, each in street.bridge.vehicles.items()}
+        for controller in controllers.values():
+            if controller.deed is not None and controller.deed.open:
+                opened.add(controller.deed.ballot)
+        for name, controller in controllers.items():
+            deed, cells = controller.deed, set(controller.estate)
+            if deed is not None and not deed.open and deed.ballot in opened:
+                cells = set(deed.after)
+            assert controller.hold_cell in cells
+            for cell in cells:
+                assert cell not in owners, f"{cell} is of {owners[cell]} and of {name}"
+                owners[cell] = name
+        return street.bridge.phase is Phase.ENDED
+
+    return look
+
+
+def run(folder: Path, conditions: Conditions) -> Street:
+    street = Street(SCENARIO, folder, DEMAND, conditions)
+    street.start_coordinators(2)
+    street.start_shard()
+    street.run(watched(street))
+    return street
+
+
+def test_everybody_gets_to_its_lane(tmp_path: Path) -> None:
+    run(tmp_path, Conditions())
+    summary = read_summary(tmp_path)
+    assert summary["ending"] == "complete"
+    assert summary["vehicles"]["on_preferred_lane"] == len(DEMAND)
+    assert summary["safety"]["overlaps"] == summary["safety"]["emergency_brakes"] == 0
+    assert summary["tracking"]["hold_law_ticks"] == 0
+
+
+def test_on_a_bad_network_nothing_worse_happens_than_that_somebody_is_late(tmp_path: Path) -> None:
+    run(tmp_path, BAD)
+    summary = read_summary(tmp_path)
+    assert summary["ending"] == "complete"
+    assert summary["vehicles"]["left"] == len(DEMAND)
+    assert summary["safety"]["overlaps"] == 0
+
+
+@pytest.mark.parametrize("conditions", [Conditions(), BAD], ids=["good", "bad"])
+def test_messages_in_kind_make_the_same_run(
+    tmp_path: Path, conditions: Conditions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    as_bytes = run(tmp_path / "bytes", conditions)
+    monkeypatch.setattr(bench, "SimulatedNetwork", partial(SimulatedNetwork, in_kind=True))
+    in_kind = run(tmp_path / "kind", conditions)
+    assert as_bytes.world.shown == in_kind.world.shown
+    assert len(as_bytes.world.shown) > 300
+    assert as_bytes.network.delivered == in_kind.network.delivered

@@ -1,0 +1,389 @@
+"""A bridge under test: real core, record and roadside; bodies are shown where they were placed."""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from collections.abc import Callable, Iterable
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from attrs import define, field, fields
+
+from laneweave.agents.core import AgentCore
+from laneweave.agents.host import AgentHost
+from laneweave.coordinator.core import CoordinatorCore
+from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.lattice import Cell, Move, territory
+from laneweave.protocol.runtime.node import (
+    Arrived,
+    Core,
+    Effect,
+    End,
+    Event,
+    Node,
+    PeerDown,
+    PeerUp,
+    Send,
+    Started,
+    Wakeup,
+)
+from laneweave.protocol.scenario.deployment import Shard
+from laneweave.protocol.scenario.tables import Scenario, Sensing
+from laneweave.protocol.transports.simulated.network import Conditions, SimulatedNetwork
+from laneweave.protocol.vehicle.motion import State
+from laneweave.protocol.wire.codec import encode
+from laneweave.protocol.wire.messages import Ballot, Command, Name, Plan, Prepare, Report, Sense
+from laneweave.protocol.wire.topics import COMMAND, PLAN, PREPARE, REPORT, VEHICLE_ALIVE, Keys
+from laneweave.sim_bridge.bodies.footprints import Pose, pose_of
+from laneweave.sim_bridge.core import BRIDGE, BridgeCore, Phase
+from laneweave.sim_bridge.recording.run_record import RunRecord
+from laneweave.sim_bridge.road.demand import Arrival
+
+ROAD = {"lanes": 2, "s1_m": 20.0, "s2_m": 20.0, "s3_m": 160.0}
+"""As short as the checks allow: a vehicle takes 14 s."""
+EXACT = {field.name: 0.0 for field in fields(Sensing)}
+"""Sensors without errors."""
+REALM = "bench"
+KEYS = Keys(REALM)
+FOR_EVER_S = 1e6
+
+
+def make_scenario(**tables: dict[str, Any]) -> Scenario:
+    """Return the paper's operation on a short road with exact sensors, but for some tables."""
+    formation = {"operation": "paper", **tables.pop("formation", {})}
+    return parse_scenario({"road": ROAD, "sensing": EXACT, "formation": formation} | tables)
+
+
+def arrival(vehicle: str, t_s: float, lane: int = 0, preferred_lane: int = 0) -> Arrival:
+    return Arrival(vehicle, lane, preferred_lane, t_s)
+
+
+class PlainWorld:
+    """Shows every body where it was placed, and remembers all that it has shown."""
+
+    def __init__(self) -> None:
+        """Begin with an empty road."""
+        self.shown: list[dict[str, Pose]] = []
+        """After each tick."""
+        self.at: dict[str, State] = {}
+
+    def add(self, vehicle: str, state: State) -> None:
+        assert vehicle not in self.at
+        self.at[vehicle] = state
+
+    def place(self, vehicle: str, state: State) -> None:
+        assert vehicle in self.at
+        self.at[vehicle] = state
+
+    def step(self) -> None:
+        self.shown.append(self.positions())
+
+    def positions(self) -> dict[str, Pose]:
+        return {vehicle: pose_of(state) for vehicle, state in self.at.items()}
+
+    def collisions(self) -> list[tuple[str, str]]:
+        return []
+
+    def remove(self, vehicle: str) -> None:
+        del self.at[vehicle]
+
+
+def make_bridge(
+    scenario: Scenario,
+    folder: Path,
+    arrivals: Iterable[Arrival] | None = None,
+    *,
+    pace: float | None = 1.0,
+    incarnation: int = 0,
+    new_incarnation: Callable[[], int] | None = None,
+) -> tuple[BridgeCore, PlainWorld]:
+    """Return a bridge with the given demand, or with the scenario's."""
+    world = PlainWorld()
+    record = RunRecord(folder, scenario, "formation", lambda: 0.0)
+    core = BridgeCore(
+        scenario,
+        world,
+        record,
+        new_incarnation=new_incarnation or count(1).__next__,
+        pace=pace,
+        incarnation=incarnation,
+        stopwatch=lambda: 0.0,
+    )
+    if arrivals is not None:
+        core._roadside._arrivals = tuple(arrivals)
+    return core, world
+
+
+def read_summary(folder: Path) -> dict[str, Any]:
+    text = (folder / "summary.json").read_text(encoding="utf-8")
+    summary: dict[str, Any] = json.loads(text)
+    return summary
+
+
+def read_events(folder: Path, kind: str) -> list[dict[str, Any]]:
+    lines = (folder / "events.jsonl").read_text(encoding="utf-8").splitlines()
+    return [event for event in map(json.loads, lines) if event["kind"] == kind]
+
+
+# --- by hand ----------------------------------------------------------------------------------
+
+
+@define
+class Desk:
+    """A bridge that is driven event by event, and what it has said."""
+
+    scenario: Scenario
+    folder: Path
+    arrivals: Iterable[Arrival] | None = None
+    pace: float | None = 1.0
+    now_s: float = 0.0
+    effects: list[Effect] = field(factory=list)
+    core: BridgeCore = field(init=False)
+    world: PlainWorld = field(init=False)
+
+    def __attrs_post_init__(self) -> None:
+        """Make the bridge; it is not started."""
+        self.core, self.world = make_bridge(
+            self.scenario, self.folder, self.arrivals, pace=self.pace
+        )
+
+    def give(self, event: Event) -> list[Effect]:
+        effects = self.core.handle(event, self.now_s)
+        self.effects += effects
+        return effects
+
+    def start(self, *up: str) -> list[Effect]:
+        """Start the bridge, with agents that are there already."""
+        for vehicle in up:
+            self.core._answers.up.add(Name(vehicle))
+        return self.give(Started())
+
+    def up(self, vehicle: str) -> list[Effect]:
+        return self.give(PeerUp(VEHICLE_ALIVE, {"vehicle": vehicle}))
+
+    def down(self, vehicle: str) -> list[Effect]:
+        return self.give(PeerDown(VEHICLE_ALIVE, {"vehicle": vehicle}))
+
+    def wake(self) -> list[Effect]:
+        """Let time pass until the bridge wants to be woken."""
+        assert self.core.wakeup_s is not None
+        self.now_s = max(self.now_s, self.core.wakeup_s)
+        return self.give(Wakeup())
+
+    def answer(self, vehicle: str, **changes: Any) -> list[Effect]:  # noqa: ANN401 (fields)
+        return self.give(Arrived(COMMAND, {"vehicle": vehicle}, self.command(vehicle, **changes)))
+
+    def command(self, vehicle: str, **changes: Any) -> Command:  # noqa: ANN401 (fields)
+        """Return an answer to the current tick: go on as you are.
+
+        As agents do, it comes with a new incarnation when the caretaker is in charge.
+        """
+        name = Name(vehicle)
+        controller = self.core.vehicles[name].controller
+        cared_for = name in self.core._attendance
+        known: dict[str, Any] = {
+            "vehicle": name,
+            "incarnation": max(controller.attendant + cared_for, 1),
+            "tick": self.core.tick,
+            "hold_cell": controller.hold_cell,
+            "motion_end_tick": 0,
+            "motion_origin": controller.hold_cell,
+            "jerks": jerks((0.0, 0.0), ticks=self.scenario.horizon_ticks),
+        }
+        return Command(**(known | changes))
+
+    def report(self, role: str, name: str, **counters: Any) -> list[Effect]:  # noqa: ANN401
+        message = Report(Name(role), Name(name), **counters)
+        return self.give(Arrived(REPORT, {"role": role, "name": name}, message))
+
+    def report_own(self) -> list[Effect]:
+        """Bring the bridge its own report, as the network does."""
+        return self.report("bridge", BRIDGE)
+
+    def drive(self, until: Callable[[], bool], *deaf: str) -> None:
+        """Answer for all agents that are up, but for some, until something is so."""
+        for _ in range(20_000):
+            if until():
+                return
+            awaited = sorted(self.core._answers.awaited - set(deaf))
+            if self.core.phase is Phase.ANSWERS and awaited:
+                self.answer(awaited[0])
+            else:
+                self.wake()
+        raise AssertionError("it never is")
+
+    def drive_to(self, tick: int, *deaf: str) -> None:
+        """Go on until a tick has been opened and its vehicles have been asked."""
+        self.drive(lambda: self.core.tick >= tick and self.core.phase is Phase.ANSWERS, *deaf)
+
+    def drive_to_silence(self, *silent: str) -> None:
+        """Go on without a word of some agents until they count as silent."""
+        answers = self.core._answers
+        self.drive(
+            lambda: answers.silent >= set(silent) and self.core.phase is Phase.ANSWERS, *silent
+        )
+
+    def drive_to_entry(self, *vehicles: str) -> None:
+        """Go on until vehicles are on the road and wait for their agents' answers."""
+        self.drive(
+            lambda: self.core.phase is Phase.ANSWERS and set(vehicles) <= set(self.core.vehicles)
+        )
+
+
+def jerks(*pairs: tuple[float, float], ticks: int = 1) -> bytes:
+    return np.array(pairs * ticks, dtype="<f4").tobytes()
+
+
+def sent(effects: Iterable[Effect], kind: type) -> list[Any]:
+    """Return the messages of a kind."""
+    return [
+        effect.message
+        for effect in effects
+        if isinstance(effect, Send) and isinstance(effect.message, kind)
+    ]
+
+
+def asked(effects: Iterable[Effect]) -> list[str]:
+    """Return who was told what its sensors see."""
+    return [sense.vehicle for sense in sent(effects, Sense) if not sense.left]
+
+
+def ended(effects: Iterable[Effect]) -> bool:
+    return any(isinstance(effect, End) for effect in effects)
+
+
+# --- with agents ------------------------------------------------------------------------------
+
+CATCH_UP_S = 0.015
+"""What a process takes for each event that it has missed."""
+
+
+class Sleeper:
+    """A process that can be put to sleep while its session lives on."""
+
+    def __init__(self, core: Core) -> None:
+        """Be awake."""
+        self.asleep = False
+        self._core = core
+        self._missed: deque[Event] = deque()
+        self._next_s = 0.0
+
+    @property
+    def wakeup_s(self) -> float | None:
+        if self.asleep:
+            return None
+        return self._next_s if self._missed else self._core.wakeup_s
+
+    def handle(self, event: Event, now_s: float) -> Iterable[Effect]:
+        """Hand an event on, or keep it for later; after a sleep, one thing after the other."""
+        if not (self.asleep or self._missed):
+            return self._core.handle(event, now_s)
+        if not isinstance(event, Wakeup):
+            self._missed.append(event)
+        if self.asleep or now_s < self._next_s:
+            return ()
+        self._next_s = now_s + CATCH_UP_S
+        return self._core.handle(self._missed.popleft(), now_s)
+
+
+@define
+class Street:
+    """A bridge and its agents on a simulated network."""
+
+    scenario: Scenario
+    folder: Path
+    arrivals: Iterable[Arrival] | None = None
+    conditions: Conditions = field(factory=Conditions)
+    pace: float = 1.0
+    seed: int = 1
+    """Of the network."""
+    network: SimulatedNetwork = field(init=False)
+    bridge: BridgeCore = field(init=False)
+    world: PlainWorld = field(init=False)
+    nodes: list[Node] = field(factory=list)
+    agents: dict[Name, AgentCore] = field(factory=dict)
+    """The newest of each vehicle."""
+    _incarnations: int = 0
+
+    def __attrs_post_init__(self) -> None:
+        """Start the bridge."""
+        self.network = SimulatedNetwork(self.seed, self.conditions)
+        self.start_bridge("bridge", self.folder)
+
+    def start_bridge(self, name: str, folder: Path) -> None:
+        self._incarnations += 1
+        folder.mkdir(parents=True, exist_ok=True)
+        self.bridge, self.world = make_bridge(
+            self.scenario,
+            folder,
+            self.arrivals,
+            pace=self.pace,
+            incarnation=self._incarnations,
+            new_incarnation=self._new_incarnation,
+        )
+        self._add(name, self.bridge)
+
+    def start_coordinators(self, count: int = 1) -> None:
+        for number in range(count):
+            name = Name(f"c{number}")
+            self._add(name, CoordinatorCore(name, number + 1, self.scenario))
+
+    def start_agents(self, *vehicles: str) -> Sleeper:
+        """Start one process for some vehicles."""
+        host = Sleeper(AgentHost(self._make_agent, [Name(vehicle) for vehicle in vehicles]))
+        self._add(f"agent-{vehicles[0]}", host)
+        return host
+
+    def start_shard(self, index: int = 0, count: int = 1) -> AgentHost:
+        """Start a process for all vehicles that fall to it."""
+        host = AgentHost(self._make_agent, shard=Shard(index, count))
+        self._add(f"shard-{index}", host)
+        return host
+
+    def _make_agent(self, vehicle: Name) -> AgentCore:
+        self.agents[vehicle] = AgentCore(vehicle, self._new_incarnation, self.scenario)
+        return self.agents[vehicle]
+
+    def _new_incarnation(self) -> int:
+        self._incarnations += 1
+        return self._incarnations
+
+    def _add(self, name: str, core: Core) -> None:
+        self.nodes.append(self.network.add(name, core, REALM))
+
+    def run(self, until: Callable[[], bool] | None = None) -> None:
+        """Let the network run until the bridge has ended, or until something is so."""
+        stop = until or (lambda: self.bridge.phase is Phase.ENDED)
+        self.network.run(self.network.now_s + FOR_EVER_S, stop)
+        assert stop()
+
+    def run_to(self, tick: int) -> None:
+        self.run(lambda: self.bridge.tick >= tick)
+
+    def order(self, vehicle: str, target: Cell, t0_s: float) -> None:
+        """Give a vehicle a plan of its own, as a leader does: one move."""
+        name, agent = Name(vehicle), self.agents[Name(vehicle)]
+        start = self.bridge.vehicles[name].controller.hold_cell
+        ballot = Ballot(1, Name("c9"), 1, 1)
+        block = self.scenario.lattice.block_of(start[0])
+        move: Move = (0, start, target)
+        plan = Plan(
+            ballot=ballot,
+            formations=(block,),
+            roster=(name,),
+            incarnations={name: agent._incarnation},
+            start_cells={name: start},
+            moves={name: (move,)},
+            t0_s=t0_s,
+            slot_s=self.scenario.cycles_s[0],
+            territory=tuple(sorted(territory([start], [move]))),
+        )
+        prepare = Prepare(ballot, (block,), (name,))
+        for topic, message in ((PREPARE, prepare), (PLAN, plan)):
+            self.network.inject(KEYS.key(topic, vehicle=vehicle), encode(message))
+            self.network.run(self.network.now_s + 0.02)  # nothing overtakes it
+        assert agent.execution is not None
+        assert agent.execution.plan == plan

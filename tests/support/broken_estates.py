@@ -1,0 +1,142 @@
+"""What planted bugs of the rolling operation put in the place of rules; see `planted_bugs`."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+import pytest
+from attrs import evolve
+
+from laneweave.coordinator.rolling import ballot as handover
+from laneweave.coordinator.rolling.ballot import Handover, States
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.vehicle import execution_rules as vehicle_rules
+from laneweave.protocol.vehicle.execution import PlanExecution
+from laneweave.protocol.wire.messages import Command, Deed, Name, Plan, Sense, VehicleState
+from laneweave.sim_bridge.bodies.motion_controller import MotionController
+
+Patch = pytest.MonkeyPatch
+
+
+def obey(patch: Patch) -> None:
+    take = MotionController.take
+
+    def mutant(self: MotionController, command: Command) -> bool:
+        estate = self.estate
+        self.estate = tuple(sorted({*estate, command.hold_cell}))
+        taken = take(self, command)
+        self.estate = estate
+        return taken
+
+    patch.setattr(MotionController, "take", mutant)
+
+
+def possess_at_once(patch: Patch) -> None:
+    draw_up = MotionController.draw_up
+
+    def mutant(self: MotionController, deed: Deed) -> None:
+        draw_up(self, deed)
+        self.take_possession(deed.ballot)
+
+    patch.setattr(MotionController, "draw_up", mutant)
+
+
+def draw_up_anything(patch: Patch) -> None:
+    def mutant(self: MotionController, deed: Deed) -> None:
+        if deed != self.deed:
+            self.deed, self.estate = deed, deed.before
+
+    patch.setattr(MotionController, "draw_up", mutant)
+
+
+def forget_promise(patch: Patch) -> None:
+    hand_over = MotionController.hand_over
+
+    def mutant(self: MotionController, incarnation: int) -> None:
+        hand_over(self, incarnation)
+        self.promised = None
+
+    patch.setattr(MotionController, "hand_over", mutant)
+
+
+def forget_estate(patch: Patch) -> None:
+    hand_over = MotionController.hand_over
+
+    def mutant(self: MotionController, incarnation: int) -> None:
+        first = self.attendant == 0
+        hand_over(self, incarnation)
+        if not first:
+            self.estate = (self.hold_cell,)
+
+    patch.setattr(MotionController, "hand_over", mutant)
+
+
+def show_estate_at_once(patch: Patch) -> None:
+    state = PlanExecution.state
+
+    def mutant(
+        self: PlanExecution, sense: Sense, formation: int, *, attended: bool
+    ) -> VehicleState:
+        noted = evolve(sense, promised=self.promised)
+        return state(self, noted, formation, attended=attended)
+
+    patch.setattr(PlanExecution, "state", mutant)
+
+
+def void_shut_deeds(patch: Patch) -> None:
+    def mutant(state: VehicleState, states: States, gone: Collection[Name]) -> frozenset[Cell]:
+        del states, gone
+        return frozenset(state.estate)
+
+    patch.setattr(handover, "estate_of", mutant)
+
+
+def void_by_common_promise(patch: Patch) -> None:
+    estate_of = handover.estate_of
+
+    def mutant(
+        state: VehicleState, states: States, gone: Collection[Name]
+    ) -> frozenset[Cell] | None:
+        deed = state.deed
+        if deed is not None and not deed.open:
+            promised = {states[name].promised for name in deed.roster if name in states}
+            if promised == {state.promised} and state.promised != deed.ballot:
+                return frozenset(deed.before)
+        return estate_of(state, states, gone)
+
+    patch.setattr(handover, "estate_of", mutant)
+
+
+def forget_motion(patch: Patch) -> None:
+    estate_of = handover.estate_of
+
+    def mutant(
+        state: VehicleState, states: States, gone: Collection[Name]
+    ) -> frozenset[Cell] | None:
+        return estate_of(evolve(state, moving=False), states, gone)
+
+    patch.setattr(handover, "estate_of", mutant)
+
+
+def check_no_estates(patch: Patch) -> None:
+    patch.setattr(handover, "estate_problems", _no_problems)
+    patch.setattr(vehicle_rules, "estate_problems", _no_problems)
+
+
+def keep_what_is_given(patch: Patch) -> None:
+    make = Handover._plan
+
+    def mutant(self: Handover, before: Mapping[Name, frozenset[Cell]]) -> Plan:
+        plan = make(self, before)
+        after = {
+            name: tuple(sorted({*cells, *plan.before[name]})) for name, cells in plan.after.items()
+        }
+        return evolve(plan, after=after)
+
+    patch.setattr(Handover, "_plan", mutant)
+    check_no_estates(patch)
+
+
+def _no_problems(plan: Plan) -> list[str]:
+    del plan
+    return []

@@ -1,0 +1,161 @@
+"""Cores that record what they are handed, on a simulated network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+
+from attrs import define, field
+
+from laneweave.protocol.runtime.node import (
+    Announce,
+    Arrived,
+    Compute,
+    Effect,
+    Event,
+    Listen,
+    PeerDown,
+    PeerUp,
+    Send,
+    Started,
+    Wakeup,
+    Watch,
+)
+from laneweave.protocol.transports.simulated.network import Conditions, SimulatedNetwork
+from laneweave.protocol.transports.simulated.virtual_time import Trace
+from laneweave.protocol.wire.messages import Heartbeat, Name
+from laneweave.protocol.wire.topics import HEARTBEAT, VEHICLE_ALIVE
+
+REALM = "r"
+CALM = Conditions(delay_s=0.002, jitter_s=0.0)
+STORM = Conditions(
+    jitter_s=0.05, loss=0.3, duplication=0.2, compute_jitter_s=0.1, compute_failure=0.3
+)
+Handler = Callable[[Event, float], Iterable[Effect]]
+
+
+def no_effects(_: Event, __: float) -> Iterable[Effect]:
+    return ()
+
+
+@define
+class Recorder:
+    """A core that records every event and answers with what `on_event` says."""
+
+    on_event: Handler = no_effects
+    events: list[tuple[float, Event]] = field(factory=list)
+    wakeup_s: float | None = None
+
+    def handle(self, event: Event, now_s: float) -> Iterable[Effect]:
+        self.events.append((now_s, event))
+        return self.on_event(event, now_s)
+
+    def of(self, *kinds: type) -> list[Event]:
+        return [event for _, event in self.events if isinstance(event, kinds)]
+
+    def times(self, kind: type) -> list[float]:
+        return [now_s for now_s, event in self.events if isinstance(event, kind)]
+
+    @property
+    def numbers(self) -> list[int]:
+        """Which beats arrived, in order."""
+        return [event.message.term for _, event in self.events if isinstance(event, Arrived)]
+
+    @property
+    def tokens(self) -> list[str]:
+        """`+name` and `-name` of each token that appeared or vanished."""
+        signs = {PeerUp: "+", PeerDown: "-"}
+        return [
+            signs[type(event)] + event.parameters["vehicle"]
+            for _, event in self.events
+            if isinstance(event, (PeerUp, PeerDown))
+        ]
+
+
+def beat(number: int, sender: str = "a") -> Send:
+    message = Heartbeat(Name(sender), 1, number, leading=False, formations=0)
+    return Send(HEARTBEAT, message, {"coordinator": sender})
+
+
+def at_start(*effects: Effect) -> Handler:
+    return lambda event, _: effects if isinstance(event, Started) else ()
+
+
+def token(name: str) -> Announce:
+    return Announce(VEHICLE_ALIVE, {"vehicle": name})
+
+
+def listener() -> Recorder:
+    return Recorder(at_start(Listen(HEARTBEAT), Watch(VEHICLE_ALIVE)))
+
+
+def network_of(
+    conditions: Conditions = CALM,
+    seed: int = 1,
+    more: Mapping[str, Recorder] | None = None,
+    **cores: Recorder,
+) -> SimulatedNetwork:
+    """Return a network in which the cores have started."""
+    network = SimulatedNetwork(seed, conditions)
+    for name, core in (cores | dict(more or {})).items():
+        network.add(name, core, REALM)
+    network.run(0.1)
+    return network
+
+
+def send(network: SimulatedNetwork, name: str, *numbers: int) -> None:
+    """Have a node send beats now."""
+    core = network.node(name).core
+    assert isinstance(core, Recorder)
+    before, core.on_event = core.on_event, lambda *_: [beat(number, name) for number in numbers]
+    network.node(name).dispatch(Wakeup(), network.now_s)
+    core.on_event = before
+
+
+def perform(network: SimulatedNetwork, name: str, *effects: Effect) -> None:
+    """Have a node carry out effects now."""
+    core = network.node(name).core
+    assert isinstance(core, Recorder)
+    before, core.on_event = core.on_event, lambda *_: effects
+    network.node(name).dispatch(Wakeup(), network.now_s)
+    core.on_event = before
+
+
+def chatter(
+    seed: int, conditions: Conditions, trace: Trace | None = None, *, in_kind: bool = False
+) -> tuple[list[list[tuple[float, Event]]], tuple[int, int]]:
+    """Run nodes that talk, with all faults, and return what each saw."""
+
+    def make(name: str) -> Recorder:
+        core = Recorder()
+        sent = 0
+
+        def talk(event: Event, now_s: float) -> Iterable[Effect]:
+            nonlocal sent
+            if isinstance(event, Started):
+                core.wakeup_s = now_s + 0.01
+                return [Listen(HEARTBEAT), Watch(VEHICLE_ALIVE), token(name)]
+            if isinstance(event, Wakeup):
+                core.wakeup_s = now_s + 0.01
+                sent += 1
+                return [beat(sent, name), *([Compute(sent, lambda: 1)] if sent % 10 == 0 else [])]
+            return ()
+
+        core.on_event = talk
+        return core
+
+    cores = {name: make(name) for name in ("a", "b", "c")}
+    network = SimulatedNetwork(seed, conditions, in_kind=in_kind)
+    network.trace = trace
+    for name, core in cores.items():
+        network.add(name, core, REALM)
+    network.at(0.1, network.set_clock, "c", 0.05, 0.95)
+    network.at(0.2, network.pause, "a")
+    network.at(0.5, network.disconnect, "b")
+    network.at(0.7, network.reconnect, "b")
+    network.at(0.9, network.resume, "a")
+    network.at(1.0, network.lose_router)
+    network.at(1.1, network.restore_router)
+    network.at(2.2, network.kill, "c")
+    network.at(2.3, network.lose, lambda key: 0.5 if key.endswith("b") else 0.0)
+    network.run(2.6)
+    return [core.events for core in cores.values()], (network.dropped, network.delivered)

@@ -1,0 +1,47 @@
+"""Scenarios of tests that mean the paper's operation: interlaced blocks of columns, T_F = 4 s."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from attrs import evolve
+
+from laneweave.protocol.scenario.tables import FormationSettings, Scenario
+from laneweave.protocol.wire.messages import CensusEntry, ClosedFormation
+from laneweave.sim_bridge.road.formation_building import formation_builder
+
+FORMATIONS = FormationSettings(
+    operation="formations", entry="interlaced", close="columns", cycle_s=4.0
+)
+PAPER = Scenario(formation=FORMATIONS)
+
+
+def paper(scenario: Scenario) -> Scenario:
+    """Return a scenario in the paper's operation."""
+    formation = evolve(
+        scenario.formation,
+        operation="formations",
+        entry="interlaced",
+        close="columns",
+        cycle_s=4.0,
+    )
+    return evolve(scenario, formation=formation)
+
+
+def closing_time_s(block: int, scenario: Scenario = PAPER) -> float:
+    """Return the road time from which on nobody can enter a block of columns any more."""
+    lattice = scenario.lattice
+    passing_s = lattice.passing_time_s(lattice.block_range(block)[0])
+    return passing_s + scenario.formation.entry_spread_s
+
+
+def closed_blocks(
+    on_road: Iterable[CensusEntry], t_s: float, scenario: Scenario = PAPER
+) -> tuple[tuple[ClosedFormation, ...], int]:
+    """Return which formations of these vehicles the roadside has closed, and up to which block."""
+    builder = formation_builder(scenario)
+    assert builder is not None, "the rolling operation has no formations"
+    for entry in on_road:
+        builder.takes(entry.cell, entry.preferred_lane, entry.entered_s)
+    formations = tuple(builder.closed(t_s))
+    return formations, builder.closed_to

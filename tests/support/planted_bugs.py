@@ -1,0 +1,435 @@
+"""Planted bugs: each breaks one rule of the protocol, to show that the tests would notice.
+
+Most replace a guard or an action in one of the two rule books; a few change a row of the table, or
+something outside the books (`plant`). For each there is a story that it spoils; where it says so,
+the story then ends with two vehicles in one cell. docs/SAFETY.md says what else catches it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import pytest
+from attrs import field, frozen
+
+from laneweave.coordinator.formations.leader_rules import LEADER_RULES
+from laneweave.protocol.state_machine import Function, RuleBook, Transition
+from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
+from support import broken_estates as rolling
+from support import broken_rules as broken
+
+ROWS_OF_OTHERS = {
+    "L1": "election: coordinator.election",
+    "L3": "ballots: CoordinatorCore",
+    "census": "which formations are closed: roadside, coordinator.formation",
+    "joining": "which formations are joined: coordinator.groups",
+    "charge": "who acts for a vehicle: AgentCore, MotionController",
+    "caretaker": "who acts for a vehicle without agent: sim_bridge.caretaker",
+    "estate": "which cells are whose in the rolling operation: MotionController, plans",
+    "handover": "how a leader hands cells over: coordinator.handover",
+}
+"""Rules that are not, or not only, in the rule books, and where they are."""
+
+
+def _nothing(_: pytest.MonkeyPatch) -> None:
+    """Change nothing outside the rule books."""
+
+
+@frozen(eq=False)
+class PlantedBug:
+    """One broken rule."""
+
+    name: str
+    rule: str
+    """Of docs/PROTOCOL.md, or one of `ROWS_OF_OTHERS`."""
+    text: str
+    """What is broken."""
+    story: str
+    """A story of tests/scenarios that it spoils."""
+    collides: bool = True
+    """The spoilt story ends with two vehicles in one cell (in the rolling operation also: with two
+    owners of one, or with a body in a cell that is not its own); otherwise nothing worse than
+    disorder, or a vehicle that waits for ever."""
+    vehicle: Mapping[str, Function] = field(factory=dict)
+    """Guards and actions of a vehicle that are replaced."""
+    leader: Mapping[str, Function] = field(factory=dict)
+    """Guards and actions of a leader that are replaced."""
+    vehicle_row: Callable[[Transition], Transition] | None = None
+    """Changes rows of a vehicle's table."""
+    plant: Callable[[pytest.MonkeyPatch], None] = _nothing
+    """Changes what is in no rule book."""
+
+    @property
+    def vehicle_rules(self) -> RuleBook:
+        """A vehicle's rules with this bug."""
+        book = VEHICLE_RULES.planted(**self.vehicle)
+        if self.vehicle_row is None:
+            return book
+        return RuleBook(map(self.vehicle_row, book.table), book.functions)
+
+    @property
+    def leader_rules(self) -> RuleBook:
+        """A leader's rules with this bug."""
+        return LEADER_RULES.planted(**self.leader)
+
+
+BUGS: tuple[PlantedBug, ...] = (
+    # --- V2: promises
+    PlantedBug(
+        "lower-ballot-promised", "V2", "A lower ballot than the promised one is promised, too.",
+        "late_duplicate_plan", collides=False, vehicle={"is_above_promise": broken.always},
+    ),
+    PlantedBug(
+        "promise-keeps-count", "V2", "A promise does not begin the count of moves anew.",
+        "count_begins_anew", vehicle={"drop_plan": broken.keep_count},
+    ),
+    PlantedBug(
+        "promise-keeps-plan", "V2", "A promise does not end the part in the old plan.",
+        "prepare_while_moving", vehicle={"drop_plan": broken.skip},
+    ),
+    PlantedBug(
+        "promise-keeps-heard", "V2", "What was heard of the old plan counts in the new one.",
+        "heard_begins_anew", vehicle={"forget_heard": broken.skip},
+    ),
+    PlantedBug(
+        "joining-not-asked", "V2", "A promise does not ask the controller to join formations.",
+        "joint_ballot", collides=False, vehicle={"promise": broken.promise_without_joining},
+    ),
+    # --- V3: acceptance
+    PlantedBug(
+        "no-promise-check", "V3", "Any plan that names the vehicle is accepted at any time.",
+        "plan_of_a_zombie", collides=False,
+        vehicle={"is_promised_ballot": broken.always, "accept": broken.accept_anew},
+        vehicle_row=broken.plan_in_any_phase,
+    ),
+    PlantedBug(
+        "acceptance-not-noted", "V3", "A plan is accepted without the motion controller's word.",
+        "zombie_takes_a_newer_plan",
+        vehicle={"is_noted": broken.always}, plant=broken.note_by_itself,
+    ),
+    PlantedBug(
+        "zombie-plan-accepted", "V3", "A plan of a lower ballot than the promised one is accepted.",
+        "plan_of_a_lower_ballot", vehicle={"is_promised_ballot": broken.always},
+    ),
+    PlantedBug(
+        "plan-taken-twice", "V3", "A repeated PLAN begins the plan anew.",
+        "plan_repeated", vehicle={"accept": broken.accept_anew},
+        vehicle_row=broken.plan_in_any_phase,
+    ),
+    PlantedBug(
+        "incarnation-not-checked", "V3", "A plan for an earlier process is accepted.",
+        "plan_for_an_earlier_process", vehicle={"names_my_incarnation": broken.always},
+    ),
+    PlantedBug(
+        "start-cell-not-checked", "V3", "A plan that begins in another cell is accepted.",
+        "planner_mistakes_a_cell", vehicle={"starts_in_my_cell": broken.always},
+    ),
+    PlantedBug(
+        "plan-not-checked", "V3", "A plan in which two vehicles meet is accepted.",
+        "planner_lets_two_meet", vehicle={"is_executable": broken.always},
+    ),
+    PlantedBug(
+        "territory-not-checked", "V3", "A plan beyond the blocks of its formations is accepted.",
+        "planner_leaves_its_block", vehicle={"keeps_to_its_blocks": broken.always},
+    ),
+    PlantedBug(
+        "joined-not-checked", "V3", "A plan for formations that were not joined is accepted.",
+        "planner_claims_another_block", vehicle={"has_joined": broken.always},
+    ),
+    PlantedBug(
+        "part-of-blocks-accepted", "V3", "A plan for some of the joined blocks is accepted.",
+        "planner_leaves_a_block_out", vehicle={"has_joined": broken.plans_for_some_of_its_blocks},
+    ),
+    # --- V4, V5: news and the start gate
+    PlantedBug(
+        "no-gate", "V5", "A vehicle moves as soon as it has the plan, whoever else has it.",
+        "start_gate_guards_a_moving_vehicle", vehicle={"all_are_ready": broken.always},
+    ),
+    PlantedBug(
+        "gate-minus-one", "V5", "The gate opens when all other members but one are ready.",
+        "gate_minus_one", vehicle={"all_are_ready": broken.all_but_one_are_ready},
+    ),
+    PlantedBug(
+        "gate-on-promise", "V4", "The promises of all others open the gate.",
+        "gate_on_promise",
+        vehicle={"is_of_my_plan": broken.promised_my_ballot, "hear": broken.hear_whoever},
+    ),
+    PlantedBug(
+        "ready-while-moving", "V4", "Who has accepted counts as ready, though it still moves.",
+        "prepare_while_moving", vehicle={"is_ready": broken.has_plan},
+    ),
+    PlantedBug(
+        "one-acceptance-opens-the-gate", "V4", "Any other member's acceptance opens the gate.",
+        "gate_minus_one", vehicle={"shows_open_gate": broken.always},
+    ),
+    PlantedBug(
+        "go-of-another-ballot", "V4", "An open gate in another ballot opens this one.",
+        "gate_is_open_for_all", vehicle={"is_of_my_plan": broken.accepted_mine_or_goes},
+    ),
+    PlantedBug(
+        "release-on-any-ballot", "V4", "Moves completed in any plan count for this one.",
+        "newer_ballot_releases_nothing", vehicle={"is_of_my_plan": broken.accepted_anything},
+    ),
+    PlantedBug(
+        "release-on-a-newer-ballot", "V4", "Moves completed in a newer plan count for this one.",
+        "newer_ballot_releases_nothing", vehicle={"is_of_my_plan": broken.accepted_mine_or_newer},
+    ),
+    PlantedBug(
+        "move-under-way-counts", "V4", "A move that has begun counts as completed.",
+        "dependency", vehicle={"hear": broken.hear_moves_under_way},
+    ),
+    # --- V6, V7: moves
+    PlantedBug(
+        "timetable", "V6", "The clock alone releases moves.",
+        "dependency", vehicle={"is_released": broken.always},
+    ),
+    PlantedBug(
+        "lease", "V6", "A move is released when it has been due for long: `it must have stopped`.",
+        "lease", vehicle={"is_released": broken.is_released_after_a_while},
+    ),
+    PlantedBug(
+        "need-minus-one", "V6", "A move waits for one completed move less than it needs.",
+        "dependency", vehicle={"dependencies": broken.one_less},
+    ),
+    PlantedBug(
+        "corners-forgotten", "V6", "The corner cells of diagonal moves are nobody's.",
+        "corner", vehicle={"dependencies": broken.without_corners},
+    ),
+    PlantedBug(
+        "start-while-moving", "V6", "A move begins before the one under way has ended.",
+        "one_motion_at_a_time", vehicle={"is_holding": broken.always},
+    ),
+    PlantedBug(
+        "no-pacing", "V6", "Moves begin before their time.",
+        "paced_by_the_clock", collides=False, vehicle={"is_time": broken.always},
+    ),
+    PlantedBug(
+        "counted-at-the-start", "V7", "A move is counted when it begins.",
+        "dependency", vehicle={"start_move": broken.start_and_count, "count_move": broken.skip},
+    ),
+    PlantedBug(
+        "old-motion-counts", "V7", "A motion of an older plan is counted in the new one.",
+        "motion_of_an_old_plan", vehicle={"moved_in_plan": broken.always},
+    ),
+    # --- a leader
+    PlantedBug(
+        "heartbeat-revives-the-dead", "L1", "A heartbeat in flight revives a dead candidate.",
+        "heartbeat_of_the_dead", collides=False, plant=broken.revive,
+    ),
+    PlantedBug(
+        "disconnected-candidate-leads", "L1", "Who lost its connection takes all others for dead.",
+        "own_connection_lost", collides=False, plant=broken.believe_the_void,
+    ),
+    PlantedBug(
+        "adoption-by-hearsay", "L2", "A plan is adopted though not everybody was heard.",
+        "leader_killed_after_half_of_the_plans", collides=False,
+        leader={"all_are_heard": broken.always, "one_plan_is_in_force": broken.heard_have_accepted},
+    ),
+    PlantedBug(
+        "mixed-ballots-adopted", "L2", "A plan is adopted though some accepted another one.",
+        "mixed_ballots", collides=False, leader={"one_plan_is_in_force": broken.all_have_accepted},
+    ),
+    PlantedBug(
+        "overdue-plan-adopted", "L2", "A plan that stalls is adopted.",
+        "overdue_is_not_adopted", collides=False,
+        leader={"one_plan_is_in_force": broken.one_ballot},
+    ),
+    PlantedBug(
+        "adoption-interrupts", "L2", "Adopted promises are forgotten, so everybody seems new.",
+        "adoption", collides=False, leader={"adopt": broken.adopt_the_ballot_only},
+    ),
+    PlantedBug(
+        "ballot-reused-after-restart", "L3", "Ballots do not tell processes of one name apart.",
+        "leader_restarts", plant=broken.forget_incarnation,
+    ),
+    PlantedBug(
+        "second-plan-under-one-ballot", "L3", "The roster is asked again under the same ballot.",
+        "one_plan_per_ballot", leader={"prepare": broken.prepare_the_same},
+    ),
+    PlantedBug(
+        "old-states-are-news", "L4", "A late state of an earlier process counts as a promise.",
+        "late_promise_of_an_earlier_process", collides=False, leader={"is_news": broken.any_member},
+    ),
+    PlantedBug(
+        "promise-of-any-ballot", "L4", "A promise of another ballot is counted for this one.",
+        "leader_restarts", collides=False, leader={"is_promise": broken.promised_something},
+    ),
+    PlantedBug(
+        "joined-ignored", "L4", "A promise counts whatever its vehicle has joined.",
+        "joint_ballot_needs_all", collides=False, leader={"has_joined": broken.always},
+    ),
+    PlantedBug(
+        "part-of-blocks-planned", "L4", "Leaders plan for some of the joined blocks; all accept.",
+        "joint_ballot_needs_all", leader={"has_joined": broken.always},
+        vehicle={"has_joined": broken.plans_for_some_of_its_blocks}, plant=broken.join_nothing,
+    ),
+    PlantedBug(
+        "void-promise-counted", "L4", "The promise of a process that has gone is kept.",
+        "promise_forgotten", collides=False, leader={"void_promise": broken.skip},
+    ),
+    PlantedBug(
+        "promise-without-cell", "L4", "The leader plans from other cells than were promised.",
+        "late_duplicate_plan", collides=False, leader={"count_promise": broken.count_entry_cell},
+    ),
+    PlantedBug(
+        "roster-by-hearsay", "L5", "The roster is whoever was heard.",
+        "roster_by_hearsay", leader={"roster": broken.whoever_is_heard},
+    ),
+    PlantedBug(
+        "early-exclusion", "L5", "The promises of a majority are enough.",
+        "silent_vehicle", leader={"roster": broken.majority},
+    ),
+    PlantedBug(
+        "promises-not-awaited", "L5", "The first promises are enough to plan for them.",
+        "silent_vehicle",
+        leader={
+            "all_have_promised": broken.anybody_has_promised,
+            "roster": broken.whoever_has_promised,
+        },
+    ),
+    PlantedBug(
+        "prepared-again-after-failure", "L5", "After failed planning a new ballot is prepared.",
+        "planning_fails", collides=False, leader={"keep_ballot": broken.prepare_anew},
+    ),
+    PlantedBug(
+        "failed-planning-repeated-at-once", "L5", "Failed planning is repeated without a pause.",
+        "planning_fails", collides=False, leader={"may_try": broken.always},
+    ),
+    PlantedBug(
+        "promise-taken-for-acceptance", "L6", "Who has promised counts as having the plan.",
+        "plan_lost_for_one", collides=False, leader={"is_acceptance": broken.promised_b},
+    ),
+    PlantedBug(
+        "one-acceptance-is-enough", "L6", "The leader rests when the first vehicle has the plan.",
+        "plan_lost_for_one", collides=False, leader={"is_the_last": broken.always},
+    ),
+    PlantedBug(
+        "outbid-not-noticed", "L7", "A leader that was outbid goes on.",
+        "two_leaders", collides=False, leader={"shows_higher_promise": broken.never},
+    ),
+    PlantedBug(
+        "restart-not-noticed", "L8", "A vehicle whose process changed counts as if it had not.",
+        "restart_hidden_by_a_duplicate", collides=False,
+        leader={"restarted": broken.shows_another_ballot},
+    ),
+    PlantedBug(
+        "refused-plan-sent-for-ever", "L8", "A plan that nobody accepts is never given up.",
+        "planner_lets_two_meet", collides=False,
+        leader={"time_is_up": broken.time_is_up_unless_issuing},
+    ),
+    PlantedBug(
+        "stall-not-noticed", "L8", "A plan that stalls is watched for ever.",
+        "adopted_plan_stalls", collides=False, leader={"stalls": broken.never},
+    ),
+    PlantedBug(
+        "wrong-lane-not-noticed", "L8", "A vehicle that an old plan left on a wrong lane stays.",
+        "adopted_for_other_targets", collides=False, leader={"is_astray": broken.never},
+    ),
+    PlantedBug(
+        "new-targets-not-noticed", "L8", "New members or wishes change nothing.",
+        "new_member", collides=False, leader={"has_new_targets": broken.never},
+    ),
+    # --- outside the books
+    PlantedBug(
+        "planned-before-closed", "census", "A formation is planned while vehicles may still enter.",
+        "formation_closes", plant=broken.close_at_once,
+    ),
+    PlantedBug(
+        "closed-before-all-entered", "census", "A formation closes while vehicles may still enter.",
+        "formation_closes", plant=broken.close_early,
+    ),
+    PlantedBug(
+        "joined-not-learned", "joining", "A leader does not learn which formations are joined.",
+        "joint_ballot_is_learned", collides=False, plant=broken.join_nothing,
+    ),
+    PlantedBug(
+        "superseded-command-played", "charge", "The controller plays the commands of any process.",
+        "superseded_agent", plant=broken.play_everything,
+    ),
+    PlantedBug(
+        "speaks-before-in-charge", "charge", "An agent promises before it is in charge.",
+        "agent_that_is_not_in_charge", collides=False, plant=broken.speak_at_once,
+    ),
+    PlantedBug(
+        "waking-agent-goes-on", "charge", "An agent that hung goes on as if nobody had taken over.",
+        "agent_that_hung", collides=False, plant=broken.keep_incarnation,
+    ),
+    PlantedBug(
+        "caretaker-accepts-moves", "caretaker", "The caretaker accepts moves that it never makes.",
+        "caretaker_never_moves", collides=False, plant=broken.accept_moves,
+    ),
+    PlantedBug(
+        "caretaker-forgets-motion", "caretaker", "A vehicle under way counts as being there.",
+        "caretaker_of_a_moving_vehicle", plant=broken.never_moving,
+    ),
+    # --- the rolling operation
+    PlantedBug(
+        "estate-not-checked", "V3", "A plan that takes a cell for the vehicle's is accepted.",
+        "rolling_false_claim", vehicle={"keeps_to_its_estates": broken.always},
+    ),
+    PlantedBug(
+        "possession-not-taken", "V5", "Who opens its gate moves, and takes no possession.",
+        "rolling_handover", collides=False, vehicle={"take_possession": broken.skip},
+    ),
+    PlantedBug(
+        "moves-off-its-estate", "V5", "Without possession, and the controller obeys all the same.",
+        "rolling_handover", vehicle={"take_possession": broken.skip}, plant=rolling.obey,
+    ),
+    PlantedBug(
+        "possession-without-gate", "estate", "A vehicle owns what a plan gives when it accepts.",
+        "rolling_gate", plant=rolling.possess_at_once,
+    ),
+    PlantedBug(
+        "deed-after-promise", "estate", "An old deed is drawn up after a higher promise.",
+        "rolling_late_command", plant=rolling.draw_up_anything,
+    ),
+    PlantedBug(
+        "promise-dies-with-process", "estate", "A new process may promise less than the last one.",
+        "rolling_agent_restarts", collides=False, plant=rolling.forget_promise,
+    ),
+    PlantedBug(
+        "estate-dies-with-process", "estate", "With the agent the cells are lost.",
+        "rolling_agent_restarts", collides=False, plant=rolling.forget_estate,
+    ),
+    PlantedBug(
+        "promise-not-noted", "handover", "A promise counts before the controller has noted it.",
+        "rolling_promise_not_noted", collides=False, plant=rolling.show_estate_at_once,
+    ),
+    PlantedBug(
+        "shut-deeds-ignored", "handover", "Whose gate is shut owns what it owned before the deed.",
+        "rolling_gates_moved_on", plant=rolling.void_shut_deeds,
+    ),
+    PlantedBug(
+        "common-promise-voids-deeds", "handover", "A newer promise of all makes older deeds void.",
+        "rolling_gates_moved_on", plant=rolling.void_by_common_promise,
+    ),
+    PlantedBug(
+        "body-left-out", "handover", "Who is under way does without the cell that it comes from.",
+        "rolling_under_way", plant=rolling.forget_motion,
+    ),
+    PlantedBug(
+        "owner-left-out", "handover", "A cell is taken from an owner that is not in the roster.",
+        "rolling_owner_left_out", vehicle={"keeps_to_its_estates": broken.always},
+        plant=rolling.check_no_estates,
+    ),
+    PlantedBug(
+        "cell-kept-by-both", "handover", "Who gives a cell keeps it, too.",
+        "rolling_handover", vehicle={"keeps_to_its_estates": broken.always},
+        plant=rolling.keep_what_is_given,
+    ),
+)  # fmt: skip
+
+NOT_A_SAFETY_MATTER: Mapping[str, str] = {
+    "is_in_roster": "a PREPARE is sent to its roster only; to promise more means to hold",
+    "show": "what is not shown now is shown at the next tick",
+    "is_moving": "a motion that is not under way cannot end",
+    "has_next_move": "without a next move there is nothing to begin",
+    "rest": "who never rests never moves again",
+    "observe": "how long a leader listens is a matter of progress",
+    "back_off": "the length of a pause is a matter of progress",
+    "had_promised": "it only guards `void_promise`",
+    "order_plan": "the planning itself is the leader's work; vehicles check the plan",
+    "issue": "to send the plan is all that there is to it",
+    "count_acceptance": "it only saves messages",
+}
+"""Guards and actions that no bug is planted in, and why."""

@@ -1,0 +1,231 @@
+"""Streams to plan, what plans cost, and what they cost at least."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from itertools import pairwise, product
+
+import numpy as np
+from hypothesis import strategies as st
+from scipy.optimize import Bounds, LinearConstraint, milp
+from scipy.sparse import coo_array
+
+from laneweave.coordinator.planning.conflicts import ConflictModel
+from laneweave.coordinator.planning.geometry.settings import Geometry
+from laneweave.coordinator.planning.grid import Cell, Move
+from laneweave.coordinator.planning.rolling.planner import (
+    StreamCosts,
+    StreamPlan,
+    StreamRoad,
+    StreamVehicle,
+    Way,
+)
+from oracles.path_rules import conflict_kinds
+
+ROAD = StreamRoad(3, 15.0, 60.0, (400.0, 1000.0), 1000.0, 5.0, most_ways=2000)
+SHORT = StreamRoad(3, 15.0, 30.0, (-20.0, 150.0), 150.0, 5.0)
+"""Everybody sorts from the beginning, in up to five slots."""
+FOLLOWING = ConflictModel(("node", "edge", "special-1", "closing"))
+MODELS = (
+    FOLLOWING,
+    ConflictModel(("node",)),
+    ConflictModel(("node", "edge", "special-2", "special-4")),
+    ConflictModel(("geometric",)),
+    ConflictModel(("geometric", "closing"), Geometry()),
+    ConflictModel(("geometric",), Geometry(lateness_s=0.5)),
+)
+COSTS = StreamCosts()
+
+Stream = tuple[StreamRoad, int, list[StreamVehicle], list[Cell]]
+"""Road, slot, vehicles, and cells that are blocked."""
+
+
+@st.composite
+def streams(draw: st.DrawFn) -> Stream:
+    """Draw streams up to full density, in which everything may be out of order."""
+    road = StreamRoad(
+        draw(st.integers(1, 4)),
+        15.0,
+        draw(st.sampled_from((30.0, 60.0))),
+        (draw(st.sampled_from((-10.0, 100.0, 400.0))), draw(st.sampled_from((500.0, 550.0)))),
+        500.0,
+        5.0,
+        draw(st.sampled_from((1, 2))),
+        draw(st.sampled_from(MODELS)),
+        most_ways=400,
+    )
+    slot = draw(st.integers(0, 9))
+    begin = draw(st.integers(-6, 36)) - int(slot * road.advance_m / road.pitch_m)
+    every = list(product(range(begin, begin + draw(st.integers(1, 10))), range(road.lanes)))
+    density = draw(st.sampled_from((0.2, 0.7, 0.9, 1.0)))
+    random = draw(st.randoms(use_true_random=False))
+    cells = random.sample(every, max(1, int(density * len(every))))
+    share_held = draw(st.sampled_from((0.0, 0.0, 0.1, 0.5)))
+    vehicles = [
+        StreamVehicle(f"v{i}", cell, random.randrange(road.lanes), random.random() < share_held)
+        for i, cell in enumerate(cells)
+    ]
+    blocked = draw(st.lists(st.sampled_from(every), max_size=4))
+    return road, slot, vehicles, blocked
+
+
+def place_m(road: StreamRoad, slot: int, cell: Cell) -> float:
+    return cell[0] * road.pitch_m + slot * road.advance_m
+
+
+def may_move(road: StreamRoad, slot: int, move: Move) -> bool:
+    places = [place_m(road, slot, cell) for cell in move]
+    return (
+        min(places) - road.body_m >= road.sorting_m[0]
+        and max(places) + road.advance_m <= road.sorting_m[1]
+        and 0 <= move[1][1] < road.lanes
+    )
+
+
+def moves_from(road: StreamRoad, slot: int, vehicle: StreamVehicle, cell: Cell) -> list[Move]:
+    """Return all moves of mode 1."""
+    found = [(cell, cell)]
+    for column, lane in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        move = cell, (cell[0] + column, cell[1] + lane)
+        if not vehicle.held and may_move(road, slot, move):
+            found.append(move)
+    return found
+
+
+def missing(road: StreamRoad, slot: int, vehicle: StreamVehicle) -> float:
+    """Return what it costs that a vehicle ends off its lane."""
+    chances, s = 0, slot
+    while place_m(road, s, vehicle.cell) <= road.length_m:
+        here = vehicle.cell, vehicle.cell
+        chances += may_move(road, s, here)
+        s += 1
+    return COSTS.missing * (1.0 + 1.0 / (1.0 + chances))
+
+
+def step_cost(vehicle: StreamVehicle, move: Move) -> float:
+    cost = COSTS.off_lane * (move[0][1] != vehicle.lane) + COSTS.move * (move[0] != move[1])
+    return cost + COSTS.backward * (move[1][0] < move[0][0])
+
+
+def cost_of(road: StreamRoad, slot: int, vehicle: StreamVehicle, way: Way) -> float:
+    cost = sum(step_cost(vehicle, move) for move in pairwise(way))
+    return cost + missing(road, slot, vehicle) * (way[-1][1] != vehicle.lane)
+
+
+def cost_of_plan(road: StreamRoad, plan: StreamPlan, vehicles: Sequence[StreamVehicle]) -> float:
+    return sum(cost_of(road, plan.slot, v, plan.ways[v.vehicle]) for v in vehicles)
+
+
+def conflicts(model: ConflictModel, a: Move, b: Move) -> bool:
+    if model.geometry is not None:
+        return model.kind(a, b) is not None
+    return bool(conflict_kinds(a, b, model.kinds))
+
+
+def least_cost_of_two(
+    road: StreamRoad, slot: int, one: StreamVehicle, other: StreamVehicle
+) -> float:
+    """Return the least cost in mode 1, by dynamic programming over the cells of both."""
+    best = {(one.cell, other.cell): 0.0}
+    done = []
+    s = slot
+    while best:
+        following: dict[tuple[Cell, Cell], float] = {}
+        for cells, cost in best.items():
+            moves = []
+            for vehicle, cell in zip((one, other), cells, strict=True):
+                left = place_m(road, s, cell) > road.length_m
+                moves.append([(cell, cell)] if left else moves_from(road, s, vehicle, cell))
+            for pair in product(*moves):
+                total = cost
+                on_road = [place_m(road, s, move[0]) <= road.length_m for move in pair]
+                if all(on_road) and conflicts(road.model, *pair):
+                    continue
+                for vehicle, move, here in zip((one, other), pair, on_road, strict=True):
+                    total += step_cost(vehicle, move) if here else 0.0
+                ends = pair[0][1], pair[1][1]
+                if total < following.get(ends, np.inf):
+                    following[ends] = total
+        s += 1
+        best = {}
+        for ends, cost in following.items():
+            if all(place_m(road, s, cell) > road.length_m for cell in ends):
+                pairs = zip((one, other), ends, strict=True)
+                off = sum(missing(road, slot, v) * (cell[1] != v.lane) for v, cell in pairs)
+                done.append(cost + off)
+            else:
+                best[ends] = cost
+    return min(done)
+
+
+class Programme:
+    """The least cost in mode 1 with node, edge and following conflicts: a flow for each vehicle.
+
+    Moves that touch a cell exclude each other, and so do those that close up from three columns.
+    """
+
+    def __init__(self, road: StreamRoad, slot: int, vehicles: Sequence[StreamVehicle]) -> None:
+        """Lay down all moves."""
+        self.cost: list[float] = []
+        self.rows: list[tuple[set[int], set[int], float, float]] = []
+        rivals: dict[tuple[int, str, Cell], set[int]] = defaultdict(set)
+        for vehicle in vehicles:
+            into: dict[Cell, set[int]] = {vehicle.cell: set()}
+            supply = 1.0
+            s = slot
+            while into:
+                following: dict[Cell, set[int]] = defaultdict(set)
+                for cell, arriving in into.items():
+                    leaving = set()
+                    for move in moves_from(road, s, vehicle, cell):
+                        x = self._variable(road, slot, s, vehicle, move)
+                        leaving.add(x)
+                        for key in _rows_of(move):
+                            rivals[s, *key].add(x)
+                        if place_m(road, s + 1, move[1]) <= road.length_m:
+                            following[move[1]].add(x)
+                    self.rows.append((leaving, arriving, supply, supply))
+                    supply = 0.0
+                into = following
+                s += 1
+        self.rows += [(xs, set(), 0.0, 1.0) for xs in rivals.values() if len(xs) > 1]
+
+    def _variable(
+        self, road: StreamRoad, first: int, slot: int, vehicle: StreamVehicle, move: Move
+    ) -> int:
+        cost = step_cost(vehicle, move)
+        if place_m(road, slot + 1, move[1]) > road.length_m and move[1][1] != vehicle.lane:
+            cost += missing(road, first, vehicle)
+        self.cost.append(cost)
+        return len(self.cost) - 1
+
+    def least_cost(self) -> float:
+        entries = [
+            (i, x, sign)
+            for i, (plus, minus, _, _) in enumerate(self.rows)
+            for xs, sign in ((plus, 1.0), (minus, -1.0))
+            for x in xs
+        ]
+        row, column, value = zip(*entries, strict=True)
+        shape = len(self.rows), len(self.cost)
+        matrix = coo_array((value, (row, column)), shape=shape).tocsr()
+        lower, upper = [row[2] for row in self.rows], [row[3] for row in self.rows]
+        result = milp(
+            np.array(self.cost),
+            integrality=np.ones(len(self.cost)),
+            bounds=Bounds(0, 1),
+            constraints=LinearConstraint(matrix, lower, upper),
+            options={"mip_rel_gap": 0.0},
+        )
+        assert result.status == 0, result.message
+        return float(result.fun)
+
+
+def _rows_of(move: Move) -> list[tuple[str, Cell]]:
+    rows = [("cell", cell) for cell in set(move)]
+    if move[1][0] > move[0][0]:
+        rows.append(("closing", move[0]))
+    if move[1][0] < move[0][0]:
+        rows.append(("closing", (move[0][0] - 3, move[0][1])))
+    return rows

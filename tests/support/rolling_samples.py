@@ -1,0 +1,85 @@
+"""Vehicles, plans and states of the rolling operation, by hand."""
+
+from __future__ import annotations
+
+from attrs import evolve
+
+from laneweave.protocol.lattice import Cell, Move, territory
+from laneweave.protocol.state_machine import RuleBook
+from laneweave.protocol.vehicle.execution import PlanExecution
+from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
+from laneweave.protocol.wire.messages import Ballot, Deed, Name, Plan, Sense, VehicleState
+from support.rolling_road import LATTICE
+
+A, B, C = Name("A"), Name("B"), Name("C")
+LOW, MID, HIGH = (Ballot(term, Name("c1"), 10, 1) for term in (1, 2, 3))
+HOME: Cell = (0, 0)
+TARGET: Cell = (0, 1)
+BEFORE: dict[Name, tuple[Cell, ...]] = {A: (HOME, (1, 0)), B: (TARGET, (1, 1), (2, 1))}
+"""A is at home, B in (2, 1); A is to move into a cell of B's."""
+AFTER: dict[Name, tuple[Cell, ...]] = {A: (HOME, TARGET, (1, 0)), B: ((1, 1), (2, 1))}
+SLOT_S, T0_S = 4.0, 100.0
+INCARNATION = 7
+
+
+def make_plan(ballot: Ballot = MID) -> Plan:
+    cells: dict[Name, Cell] = {A: HOME, B: (2, 1)}
+    moves: dict[Name, tuple[Move, ...]] = {A: ((0, HOME, TARGET),), B: ()}
+    return Plan(
+        ballot=ballot,
+        formations=(0,),
+        roster=(A, B),
+        incarnations=dict.fromkeys(cells, INCARNATION),
+        start_cells=cells,
+        moves=moves,
+        t0_s=T0_S,
+        slot_s=SLOT_S,
+        territory=tuple(sorted(territory(cells.values(), moves[A]))),
+        before=BEFORE,
+        after=AFTER,
+    )
+
+
+def deed_of(name: Name, ballot: Ballot = MID, roster: tuple[Name, ...] = (A, B)) -> Deed:
+    return Deed(ballot, BEFORE[name], AFTER[name], roster)
+
+
+def vehicle(name: Name = A, rules: RuleBook = VEHICLE_RULES) -> PlanExecution:
+    cell = make_plan().start_cells[name]
+    return PlanExecution(
+        name, INCARNATION, cell, LATTICE, (), rules=rules, estate=frozenset(BEFORE[name])
+    )
+
+
+def sense(
+    name: Name = A,
+    promised: Ballot | None = None,
+    deed: Deed | None = None,
+    accepted: Ballot | None = None,
+    estate: tuple[Cell, ...] | None = None,
+) -> Sense:
+    return Sense(
+        name, 1, 1.0, (0.0,) * 6, HOME, 0, HOME, 0, (), (), attendant=INCARNATION,
+        promised=promised, deed=deed, accepted=accepted,
+        estate=BEFORE[name] if estate is None else estate,
+    )  # fmt: skip
+
+
+def state(
+    name: Name = A,
+    promised: Ballot | None = None,
+    deed: Deed | None = None,
+    *,
+    estate: tuple[Cell, ...] | None = None,
+    accepted: bool = False,
+    t_s: float = 1.0,
+) -> VehicleState:
+    """Return what a vehicle shows that holds in the cell where the plan begins."""
+    if estate is None:
+        estate = BEFORE.get(name, ((9, 2),))
+    cell = make_plan().start_cells.get(name, estate[0] if estate else (9, 2))
+    shown = vehicle().state(sense(), 0, attended=True)
+    return evolve(
+        shown, vehicle=name, hold_cell=cell, promised=promised, deed=deed, estate=estate,
+        accepted=accepted, ready=accepted, t_s=t_s,
+    )  # fmt: skip

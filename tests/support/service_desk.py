@@ -1,0 +1,131 @@
+"""A coordinator on a bench: what it is told, what it answers, and who is on its road."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+
+from attrs import evolve
+
+from laneweave.coordinator.core import CoordinatorCore
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.runtime.node import Arrived, Compute, Effect, Send, Started, Wakeup
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.wire.messages import (
+    Ballot,
+    Census,
+    CensusEntry,
+    LogEvent,
+    Name,
+    VehicleState,
+)
+from laneweave.protocol.wire.topics import CENSUS
+from support.paper import PAPER, closed_blocks
+from support.states import holding
+
+SCENARIO = PAPER
+LATTICE, ELECTION_S = SCENARIO.lattice, SCENARIO.network.election_s
+T_S = 20.0
+"""Road time: block 0 has closed and is on the way to S3."""
+A, B, C, D, E, F = (Name(letter) for letter in "ABCDEF")
+Cells = dict[Name, Cell]
+
+
+class Desk:
+    """A coordinator and what it has been told."""
+
+    def __init__(
+        self, name: str = "c1", incarnation: int = 1, scenario: Scenario = SCENARIO
+    ) -> None:
+        """Start a coordinator."""
+        self.core = CoordinatorCore(Name(name), incarnation, scenario)
+        self.now_s = 0.0
+        self.effects = list(self.core.handle(Started(), 0.0))
+
+    def give(self, *events: object) -> list[Effect]:
+        effects: list[Effect] = []
+        for event in events:
+            effects += self.core.handle(event, self.now_s)  # type: ignore[arg-type]
+            assert self.core.wakeup_s is not None
+            assert self.core.wakeup_s > self.now_s
+        self.effects += effects
+        return effects
+
+    def wait(self, seconds: float) -> list[Effect]:
+        self.now_s += seconds
+        return self.give(Wakeup())
+
+    def lead(self) -> list[Effect]:
+        return self.wait(ELECTION_S)
+
+    def watch(self, seconds: float) -> None:
+        """Let time pass without a pause."""
+        for _ in range(round(seconds / 0.1)):
+            self.wait(0.1)
+
+    def tell(self, message: object) -> list[Effect]:
+        return self.give(Arrived(CENSUS, {}, message))
+
+    @property
+    def ballot(self) -> Ballot:
+        ballot = self.core.controls[0].ballot
+        assert ballot is not None
+        return ballot
+
+    def collect_promises(self, cells: Cells, lanes: dict[Name, int]) -> list[Effect]:
+        """Lead a formation up to the order of its plan."""
+        self.lead()
+        self.tell(census(cells, lanes))
+        for name, cell in cells.items():
+            self.tell(state(name, cell))
+        return self.promise(cells)
+
+    def promise(
+        self, cells: Cells, joined: tuple[int, ...] = (0,), unattended: Collection[Name] = ()
+    ) -> list[Effect]:
+        """Let all of a roster promise the ballot of formation 0, or of its group."""
+        effects: list[Effect] = []
+        for name, cell in cells.items():
+            shown = state(name, cell, self.ballot, t_s=1.0, joined=joined)
+            effects += self.tell(evolve(shown, attended=name not in unattended))
+        return effects
+
+
+def census(cells: Cells, lanes: dict[Name, int] | None = None, t_s: float = T_S) -> Census:
+    entries = tuple(
+        CensusEntry(name, cell, (lanes or {}).get(name, 0), 0.0) for name, cell in cells.items()
+    )
+    return Census(t_s, entries, (), *closed_blocks(entries, t_s))
+
+
+def state(
+    name: Name,
+    cell: Cell = (0, 0),
+    promised: Ballot | None = None,
+    *,
+    accepted: bool = False,
+    t_s: float = 0.0,
+    joined: tuple[int, ...] | None = None,
+) -> VehicleState:
+    formation = LATTICE.block_of(cell[0]) if -8 < cell[0] <= 0 else 0
+    return holding(
+        name,
+        promised,
+        cell,
+        formation=formation,
+        joined=(formation,) if joined is None else joined,
+        accepted=accepted,
+        ready=accepted,
+        t_s=t_s,
+    )
+
+
+def messages(effects: Iterable[Effect], kind: type) -> list[Send]:
+    return [e for e in effects if isinstance(e, Send) and isinstance(e.message, kind)]
+
+
+def jobs(effects: Iterable[Effect]) -> list[Compute]:
+    return [e for e in effects if isinstance(e, Compute)]
+
+
+def logged(effects: Iterable[Effect]) -> list[str]:
+    return [e.message.kind for e in messages(effects, LogEvent)]

@@ -1,0 +1,371 @@
+"""The driver takes motions over, ends them when the body is there, and tracks or is silent."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import attrs
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from laneweave.agents.driving.driver import Course, Drive, Effort, TrackingDriver
+from laneweave.agents.driving.motions import REPEAT_TICKS
+from laneweave.agents.driving.reference import Window
+from laneweave.agents.driving.surroundings import NOBODY, Gaps
+from laneweave.agents.driving.tracker import Tracker, TrackResult
+from laneweave.protocol.lattice import Cell, Move
+from laneweave.protocol.scenario.tables import Scenario, Sensing
+from laneweave.protocol.vehicle.motion import (
+    ARRIVED_ACROSS_M,
+    ARRIVED_ALONG_M,
+    State,
+    cell_state,
+    integrate,
+    limited_jerk,
+)
+from laneweave.protocol.wire.messages import Neighbour, Report, Sense
+from laneweave.protocol.wire.topics import SENSE
+from laneweave.sim_bridge.bodies.motion_controller import Rung
+from laneweave.sim_bridge.bodies.plant import Plant
+from support.agent_rig import HOME, LATTICE, ME, MOVE_TICKS, SCENARIO, TICK_S, sent, up_and_running
+from support.driving import Road
+
+N = SCENARIO.horizon_ticks
+MOVE: Move = (0, HOME, (-1, 2))
+
+
+class Probe(Tracker):
+    """A tracker that can be broken, and remembers what it was told of the others."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Begin unbroken."""
+        super().__init__(scenario)
+        self.broken = False
+        self.gaps = NOBODY
+        self.state: State | None = None
+
+    def rest(self, state: State, goal: State) -> TrackResult | None:
+        """Leave everything to the program, which can be broken."""
+        del state, goal
+        return None
+
+    def solve(self, state: State, window: Window, gaps: Gaps = NOBODY) -> TrackResult:
+        self.state, self.gaps = state, gaps
+        result = super().solve(state, window, gaps)
+        if self.broken:
+            return attrs.evolve(result, usable=False, jerk=np.full_like(result.jerk, np.nan))
+        return result
+
+
+def sense(
+    tick: int = 10,
+    cell: Cell = HOME,
+    *,
+    end_tick: int = 0,
+    origin: Cell | None = None,
+    ticks: int = 0,
+    off: tuple[float, float] = (0.0, 0.0),
+    ahead: tuple[Neighbour, ...] = (),
+    behind: tuple[Neighbour, ...] = (),
+) -> Sense:
+    """Return what a vehicle senses that is `off` metres from its cell, along and across."""
+    t_s = tick * TICK_S
+    s, v, a, y, v_y, a_y = cell_state(LATTICE, cell, t_s)
+    state = (s + off[0], v, a, y + off[1], v_y, a_y)
+    return Sense(
+        ME, tick, t_s, state, cell, end_tick, origin or cell, 0, ahead, behind, motion_ticks=ticks
+    )
+
+
+def driver(make_tracker: Callable[[Scenario], Tracker] = Tracker) -> TrackingDriver:
+    """Return a driver that holds the home cell since tick 10."""
+    made = TrackingDriver(SCENARIO, make_tracker)
+    made.take_over(sense())
+    return made
+
+
+def probed() -> tuple[TrackingDriver, Probe]:
+    probes: list[Probe] = []
+
+    def make(scenario: Scenario) -> Tracker:
+        probes.append(Probe(scenario))
+        return probes[-1]
+
+    return driver(make), probes[0]
+
+
+def jerks(drive: Drive) -> NDArray[np.float64]:
+    return np.frombuffer(drive.jerks, "<f4").reshape(-1, 2).astype(float)
+
+
+def play(state: State, drive: Drive) -> State:
+    """Play all jerks of a drive, one for each tick."""
+    for along, across in jerks(drive).tolist():
+        state = integrate(
+            state, limited_jerk(state, (along, across), SCENARIO.vehicle, TICK_S), TICK_S
+        )
+    return state
+
+
+# --- references -------------------------------------------------------------------------------
+
+
+def test_holding_has_no_end_and_a_whole_horizon_to_play() -> None:
+    drive = driver().drive(sense(), moving=False)
+    assert (drive.motion_end_tick, drive.motion_origin) == (0, HOME)
+    assert jerks(drive) == pytest.approx(np.zeros((N, 2)), abs=1e-4)
+
+
+def test_a_move_ends_after_its_time_and_its_horizon_ends_in_the_target() -> None:
+    made = driver()
+    made.begin(MOVE, 10, MOVE_TICKS)
+    drive = made.drive(sense(), moving=True)
+    assert (drive.motion_end_tick, drive.motion_origin) == (10 + MOVE_TICKS, HOME)
+    end = play(sense().state, drive)
+    assert end == pytest.approx(cell_state(LATTICE, MOVE[2], (10 + N) * TICK_S), abs=0.02)
+
+
+def test_a_motion_under_way_is_taken_over_where_it_is() -> None:
+    made = driver()
+    made.begin(MOVE, 10, MOVE_TICKS)
+    plant = Plant(sense().state, SCENARIO.vehicle, TICK_S)
+    for tick in range(10, 25):
+        felt = attrs.evolve(sense(tick), state=plant.state, setpoint=plant.setpoint)
+        drive = made.drive(felt, moving=True)
+        plant.step(*jerks(drive)[0].tolist())
+    felt = attrs.evolve(
+        sense(
+            25,
+            MOVE[2],
+            end_tick=drive.motion_end_tick,
+            origin=drive.motion_origin,
+            ticks=drive.motion_ticks,
+        ),
+        state=plant.state,
+        setpoint=plant.setpoint,
+    )
+    heir = TrackingDriver(SCENARIO)
+    heir.take_over(felt)
+    assert not heir.at_rest(felt)
+    theirs, mine = made.drive(felt, moving=True), heir.drive(felt, moving=True)
+    assert (mine.motion_end_tick, mine.motion_origin) == (10 + MOVE_TICKS, HOME)
+    assert mine.motion_ticks == MOVE_TICKS
+    assert jerks(mine) == pytest.approx(jerks(theirs), abs=1e-3)
+
+
+@pytest.mark.parametrize("end_tick", [0, 9, 10])
+def test_a_motion_whose_time_is_over_is_taken_over_as_a_hold(end_tick: int) -> None:
+    made = TrackingDriver(SCENARIO)
+    made.take_over(sense(end_tick=end_tick, origin=(-2, 1), ticks=MOVE_TICKS))
+    assert made.at_rest(sense())
+    assert made.drive(sense(), moving=False).motion_origin == HOME
+
+
+@pytest.mark.parametrize("ticks", [44, 68])
+def test_a_long_move_is_taken_over_with_the_time_that_it_takes(ticks: int) -> None:
+    """A new process knows no plan: the motion controller has kept how long the move takes."""
+    scenario = Scenario()
+    made = TrackingDriver(scenario)
+    made.take_over(sense())
+    made.begin(MOVE, 10, ticks)
+    plant = Plant(sense().state, scenario.vehicle, TICK_S)
+    for tick in range(10, 30):
+        felt = attrs.evolve(sense(tick), state=plant.state, setpoint=plant.setpoint)
+        drive = made.drive(felt, moving=True)
+        plant.step(*jerks(drive)[0].tolist())
+    assert (drive.motion_end_tick, drive.motion_ticks) == (10 + ticks, ticks)
+    felt = attrs.evolve(
+        sense(30, MOVE[2], end_tick=10 + ticks, origin=HOME, ticks=ticks),
+        state=plant.state,
+        setpoint=plant.setpoint,
+    )
+    heir = TrackingDriver(scenario)
+    heir.take_over(felt)
+    theirs, mine = made.drive(felt, moving=True), heir.drive(felt, moving=True)
+    assert (mine.motion_end_tick, mine.motion_ticks) == (10 + ticks, ticks)
+    assert jerks(mine) == pytest.approx(jerks(theirs), abs=1e-3)
+    assert heir.motion(10 + 2 * REPEAT_TICKS) == Course(HOME, MOVE[2], 10, ticks)
+
+
+@pytest.mark.parametrize("ticks", [0, MOVE_TICKS - 1, 2**63 - 1, -1])
+def test_a_move_of_an_impossible_duration_is_taken_over_as_a_hold(ticks: int) -> None:
+    heir = TrackingDriver(SCENARIO)
+    heir.take_over(sense(25, MOVE[2], end_tick=48, origin=HOME, ticks=ticks))
+    drive = heir.drive(sense(25, MOVE[2]), moving=False)
+    assert (drive.motion_origin, drive.motion_ticks) == (MOVE[2], 0)
+
+
+# --- the end of a motion ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("tick", "off", "rests"),
+    [
+        (10 + MOVE_TICKS, (0.0, 0.0), True),
+        (10 + MOVE_TICKS + 50, (0.0, 0.0), True),
+        (10 + MOVE_TICKS - 1, (0.0, 0.0), False),
+        (10 + MOVE_TICKS, (ARRIVED_ALONG_M - 0.01, ARRIVED_ACROSS_M - 0.01), True),
+        (10 + MOVE_TICKS, (-ARRIVED_ALONG_M + 0.01, -ARRIVED_ACROSS_M + 0.01), True),
+        (10 + MOVE_TICKS, (-ARRIVED_ALONG_M - 0.01, 0.0), False),
+        (10 + MOVE_TICKS, (0.0, ARRIVED_ACROSS_M + 0.01), False),
+    ],
+)
+def test_a_motion_ends_when_its_time_is_over_and_the_body_is_there(
+    tick: int, off: tuple[float, float], rests: bool
+) -> None:
+    made = driver()
+    made.begin(MOVE, 10, MOVE_TICKS)
+    assert made.at_rest(sense(tick, MOVE[2], off=off)) is rests
+
+
+def test_at_rest_is_meant_for_the_target_and_not_for_where_it_came_from() -> None:
+    made = driver()
+    made.begin(MOVE, 10, MOVE_TICKS)
+    assert not made.at_rest(sense(10 + MOVE_TICKS, HOME))
+
+
+def test_a_late_motion_says_that_it_goes_on() -> None:
+    """Whoever takes the vehicle over must not take the time's end for the motion's end."""
+    made = driver()
+    made.begin(MOVE, 10, MOVE_TICKS)
+    tick = 10 + MOVE_TICKS + 5
+    late = sense(tick, MOVE[2], off=(-2.0, 0.0))
+    assert made.drive(late, moving=True).motion_end_tick == tick + 1
+    assert made.drive(late, moving=False).motion_end_tick == 0
+
+
+# --- what is tracked --------------------------------------------------------------------------
+
+
+def test_the_commanded_state_is_tracked_and_not_the_bodys() -> None:
+    """What the set-point is about to do needs no correction."""
+    made, probe = probed()
+    s, v, a, y, v_y, a_y = sense().state
+    felt = attrs.evolve(sense(), state=(s, v + 0.4, a - 0.5, y, v_y, a_y), setpoint=(0.7, 0.2))
+    made.drive(felt, moving=False)
+    lag_s = SCENARIO.vehicle.actuator_lag_s
+    expected = (s + lag_s * 0.4, v + 0.4 - lag_s * 0.5, 0.7, y, v_y, 0.2)
+    assert probe.state == pytest.approx(expected)
+
+
+LEAST_M = SCENARIO.tracking.min_gap_m
+
+
+@pytest.mark.parametrize(
+    ("ahead", "gap_m"),
+    [
+        ((), None),
+        ((Neighbour(1, 4.0, 15.0),), 4.0),
+        ((Neighbour(0, 3.5, 15.0), Neighbour(2, 4.0, 15.0)), None),
+        ((Neighbour(0, 3.5, 15.0), Neighbour(1, 4.5, 15.0), Neighbour(2, 4.0, 15.0)), 4.5),
+    ],
+    ids=["nobody", "own lane", "beside", "own lane counts only"],
+)
+def test_who_holds_minds_its_own_lane(ahead: tuple[Neighbour, ...], gap_m: float | None) -> None:
+    made, probe = probed()
+    felt = sense(ahead=ahead, behind=ahead)
+    made.drive(felt, moving=False)
+    if gap_m is None:
+        assert probe.gaps is NOBODY
+    else:
+        assert probe.gaps.latest is not None
+        assert probe.gaps.latest[0] == pytest.approx(felt.state[0] + gap_m - LEAST_M)
+        assert probe.gaps.earliest is not None
+        assert probe.gaps.earliest[0] == pytest.approx(felt.state[0] - gap_m + LEAST_M)
+
+
+def test_who_changes_lanes_minds_the_lane_that_it_enters_from_the_start() -> None:
+    made, probe = probed()
+    made.begin(MOVE, 10, MOVE_TICKS)
+    felt = sense(ahead=(Neighbour(0, 3.0, 15.0), Neighbour(1, 4.5, 15.0), Neighbour(2, 4.0, 15.0)))
+    made.drive(felt, moving=True)
+    assert probe.gaps.latest is not None
+    assert probe.gaps.latest[0] == pytest.approx(felt.state[0] + 4.0 - LEAST_M)
+
+
+# --- when tracking fails ----------------------------------------------------------------------
+
+
+def test_an_unusable_answer_leaves_what_is_being_played() -> None:
+    made, probe = probed()
+    made.begin(MOVE, 10, MOVE_TICKS)
+    assert len(jerks(made.drive(sense(), moving=True))) == N
+    probe.broken = True
+    for ticks in (3, 4, 20):
+        drive = made.drive(sense(10 + ticks), moving=True)
+        assert drive == Drive(10 + MOVE_TICKS, HOME, MOVE_TICKS, b"")
+
+
+def test_a_usable_answer_ends_the_silence() -> None:
+    made, probe = probed()
+    probe.broken = True
+    assert made.drive(sense(11), moving=False).jerks == b""
+    probe.broken = False
+    felt = sense(12, off=(-1.0, 0.0))
+    drive = made.drive(felt, moving=False)
+    assert jerks(drive)[0, 0] > 1.0
+    assert drive == driver().drive(felt, moving=False)
+
+
+def test_meanwhile_the_body_goes_on_with_the_last_good_trajectory_and_then_holds() -> None:
+    """With exact sensors the body moves as if nothing had failed."""
+    exact = Sensing(**dict.fromkeys((field.name for field in attrs.fields(Sensing)), 0.0))
+    scenario = attrs.evolve(SCENARIO, sensing=exact)
+    broken_at, probes = 25, []
+
+    def make(of: Scenario) -> Tracker:
+        probes.append(Probe(of))
+        return probes[-1]
+
+    roads = [Road(scenario, {ME: HOME}) for _ in range(2)]
+    for road in roads:
+        road.driven[ME].driver = TrackingDriver(scenario, make)
+        road.driven[ME].driver.take_over(road.vehicles[ME].sense(0, caretaker=False))
+        for _ in range(10 + 4 * N):
+            probes[-1].broken = road is roads[1] and road.tick > broken_at
+            road.step({ME: MOVE} if road.tick == 10 else None)
+    good, bad = (road.record.states for road in roads)
+    trajectory = slice(0, broken_at + N + 1)
+    assert np.array(bad)[trajectory] == pytest.approx(np.array(good)[trajectory], abs=1e-4)
+    controller = roads[1].vehicles[ME].controller
+    assert controller.rung_ticks == {
+        Rung.PLAY: broken_at + N, Rung.HOLD: 10 + 4 * N - broken_at - N,
+        Rung.GIVE_WAY: 0, Rung.EMERGENCY: 0,
+    }  # fmt: skip
+    goal = cell_state(LATTICE, MOVE[2], roads[1].tick * TICK_S)
+    assert bad[-1][0] == pytest.approx(goal, abs=0.01)
+
+
+def test_the_effort_counts_solves_and_failures() -> None:
+    made, probe = probed()
+    assert made.effort == Effort()
+    for tick, broken in ((10, False), (11, True), (12, True), (13, False)):
+        probe.broken = broken
+        made.drive(sense(tick), moving=False)
+    effort = made.effort
+    assert (effort.solves, effort.unusable) == (4, 2)
+    solve_ms = np.frombuffer(effort.solve_ms, "<f4")
+    assert len(solve_ms) == 4
+    assert (solve_ms >= 0.0).all()
+
+
+def test_an_agent_with_a_broken_tracker_finishes_its_move_and_reports_the_failures() -> None:
+    probes: list[Probe] = []
+
+    def make(scenario: Scenario) -> TrackingDriver:
+        def make_tracker(of: Scenario) -> Tracker:
+            probes.append(Probe(of))
+            return probes[-1]
+
+        return TrackingDriver(scenario, make_tracker)
+
+    rig = up_and_running(make)
+    rig.accept(MOVE)
+    rig.run(5)
+    probes[-1].broken = True
+    state = rig.run(150)
+    assert (state.completed, state.moving) == (1, False)
+    assert rig.off(MOVE[2]) < 0.3
+    (report,) = sent(rig.hand(SENSE, rig.sense(left=True)), Report)
+    assert (report.solves, report.unusable) == (rig.tick, 150)

@@ -1,0 +1,256 @@
+"""The tracker's fast path is the program's solution, and gaps on both sides are minded."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from attrs import evolve, frozen
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import linalg
+
+from laneweave.agents.driving import tracker as tracker_module
+from laneweave.agents.driving.reference import Reference, Window, axis_matrices
+from laneweave.agents.driving.surroundings import Gaps
+from laneweave.agents.driving.tracker import Tracker, TrackResult
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.vehicle.motion import State, cell_state, integrate
+
+SCENARIO = Scenario()
+LIMITS, LATTICE, TICK_S = SCENARIO.vehicle, SCENARIO.lattice, SCENARIO.runtime.tick_s
+N = SCENARIO.horizon_ticks
+ALWAYS = evolve(SCENARIO, tracking=evolve(SCENARIO.tracking, always_solve=True))
+TIMES_S = TICK_S * np.arange(N + 1)
+MOVES = [(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
+SPREAD = (0.25, 0.2, 0.3, 0.08, 0.08, 0.1)
+"""Of the errors of half of the problems; the other half has ten times as much."""
+
+
+@frozen(eq=False)
+class Problem:
+    state: State
+    window: Window
+    gaps: Gaps
+
+
+def problems(count: int, seed: int = 2) -> Iterator[Problem]:
+    rng = random.Random(seed)
+    for number in range(count):
+        dx, dy = rng.choice(MOVES)
+        reference = Reference.moves(SCENARIO, (0, 1), [(0, (dx, 1 + dy))] if dx or dy else [])
+        window = reference.window(rng.randrange(-5, 45))
+        scale = 10.0 if number % 2 else 1.0
+        state = tuple(
+            now + rng.gauss(0.0, scale * each)
+            for now, each in zip(window.states[0].tolist(), SPREAD, strict=True)
+        )
+        yield Problem(state, window, random_gaps(rng, window, scale))
+
+
+def random_gaps(rng: random.Random, window: Window, scale: float) -> Gaps:
+    """Return gaps that the reference keeps, so that it need not yield."""
+    sides = rng.choice(("", "", "ahead", "behind", "both"))
+    s = window.states[:, 0]
+    play = scale * np.abs(rng.gauss(0.0, 0.6)) + rng.uniform(0.0, 0.2) * TIMES_S
+    latest = s + play if sides in {"ahead", "both"} else None
+    earliest = s - play - rng.uniform(0.0, 1.0) if sides in {"behind", "both"} else None
+    return Gaps(earliest, latest)
+
+
+@pytest.fixture
+def exact(monkeypatch: pytest.MonkeyPatch) -> Tracker:
+    """Return a tracker that always runs OSQP, with tight tolerances."""
+    tight = evolve(tracker_module.SETTINGS, eps_abs=1e-7, max_iter=20_000, row_tolerance=1e-3)
+    monkeypatch.setattr(tracker_module, "SETTINGS", tight)
+    return Tracker(ALWAYS)
+
+
+def states_of(problem: Problem, result: TrackResult) -> np.ndarray:
+    """Return the states (N, 6) that follow from a plan."""
+    state, way = problem.state, []
+    for along, across in result.jerk.tolist():
+        state = integrate(state, (along, across), TICK_S)
+        way.append(state)
+    return np.array(way)
+
+
+def least_slack(problem: Problem, result: TrackResult) -> float:
+    """Return the least distance to a limit or gap; negative: it is violated."""
+    s, v, a, _, v_y, a_y = states_of(problem, result).T
+    slacks = [
+        v, LIMITS.max_speed_mps - v, a - LIMITS.min_accel_mps2, LIMITS.max_accel_mps2 - a,
+        LIMITS.max_lateral_accel_mps2 - np.abs(a_y), LIMITS.max_slip_ratio * v - np.abs(v_y),
+        LIMITS.max_jerk_mps3 - np.abs(result.jerk[:, 0]),
+        LIMITS.max_lateral_jerk_mps3 - np.abs(result.jerk[:, 1]),
+    ]  # fmt: skip
+    if problem.gaps.latest is not None:
+        slacks.append(problem.gaps.latest[1:] - s)
+    if problem.gaps.earliest is not None:
+        slacks.append(s - problem.gaps.earliest[1:])
+    return min(float(slack.min()) for slack in slacks)
+
+
+def regulated(problem: Problem) -> np.ndarray:
+    """Return the jerks (N, 2) of the linear-quadratic regulator, from scipy's Riccati equation."""
+    transition, effect = axis_matrices(TICK_S)
+    jerks = problem.window.jerks.copy()
+    error = np.array(problem.state) - problem.window.states[0]
+    for axis, weights in enumerate((tracker_module._WEIGHTS, tracker_module._LATERAL_WEIGHTS)):
+        weight = np.array([[tracker_module._JERK_WEIGHT]])
+        cost = linalg.solve_discrete_are(transition, effect, np.diag(weights), weight)
+        gain = np.linalg.solve(weight + effect.T @ cost @ effect, effect.T @ cost @ transition)
+        now = error[3 * axis : 3 * axis + 3]
+        for k in range(N):
+            correction = -gain @ now
+            jerks[k, axis] += correction[0]
+            now = transition @ now + effect @ correction
+    return jerks
+
+
+def test_the_fast_path_gives_the_programs_solution_and_only_where_no_row_is_in_the_way(
+    exact: Tracker,
+) -> None:
+    fast = Tracker(SCENARIO)
+    taken, refused = 0, 0
+    for problem in problems(200):
+        result = fast.solve(problem.state, problem.window, problem.gaps)
+        free = evolve(result, jerk=regulated(problem))
+        slack = least_slack(problem, free)
+        if result.iterations == 0:
+            taken += 1
+            assert result.usable
+            assert slack >= -1e-6
+            np.testing.assert_allclose(result.jerk, free.jerk, atol=1e-4)
+            if taken % 3:
+                continue  # tight tolerances take their time
+            expected = exact.solve(problem.state, problem.window, problem.gaps)
+            assert expected.usable
+            assert expected.iterations > 0
+            np.testing.assert_allclose(result.jerk, expected.jerk, atol=5e-3)
+        else:
+            refused += 1
+            assert slack < 1e-6
+    assert min(taken, refused) >= 40
+
+
+def test_without_the_fast_path_osqp_gives_nearly_the_same() -> None:
+    fast, slow = Tracker(SCENARIO), Tracker(ALWAYS)
+    for problem in problems(60, seed=3):
+        result = fast.solve(problem.state, problem.window, problem.gaps)
+        other = slow.solve(problem.state, problem.window, problem.gaps)
+        if result.iterations == 0 and other.usable:
+            assert np.abs(result.jerk[:5] - other.jerk[:5]).max() < 0.5
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        (0.0, 0.0, 0.0, 0.0, 0.0, 2.6),
+        (0.0, 0.0, 4.8, 0.0, 0.0, 0.0),
+        (-7.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        (0.0, 3.9, 0.0, 0.0, 0.0, 0.0),
+        (0.0, 0.0, 0.0, 2.0, 0.0, 0.0),
+    ],
+)
+def test_it_is_not_taken_where_a_limit_is_in_the_way(change: tuple[float, ...]) -> None:
+    window = Reference.hold(SCENARIO, (0, 1)).window(0)
+    state = tuple(a + b for a, b in zip(cell_state(LATTICE, (0, 1), 0.0), change, strict=True))
+    assert Tracker(SCENARIO).solve(state, window).iterations > 0  # type: ignore[arg-type]
+
+
+# --- gaps -----------------------------------------------------------------------------------------
+
+
+def at_rest() -> tuple[State, Window]:
+    return cell_state(LATTICE, (0, 1), 0.0), Reference.hold(SCENARIO, (0, 1)).window(0)
+
+
+def first_metres(gaps: Gaps, ticks: int = 15) -> float:
+    """Return how far it gets ahead of its reference in some ticks."""
+    state, window = at_rest()
+    result = Tracker(SCENARIO).solve(state, window, gaps)
+    assert result.usable
+    problem = Problem(state, window, gaps)
+    return float(states_of(problem, result)[ticks - 1, 0] - window.states[ticks, 0])
+
+
+def test_those_behind_push() -> None:
+    _, window = at_rest()
+    s = window.states[:, 0]
+    assert first_metres(Gaps(earliest=s - 0.5)) == 0.0
+    assert first_metres(Gaps(earliest=s + 0.8)) > 0.3
+
+
+def test_they_do_not_push_far() -> None:
+    state, window = at_rest()
+    s = window.states[:, 0]
+    one, far = (Tracker(SCENARIO).solve(state, window, Gaps(earliest=s + by)) for by in (1.0, 9.0))
+    assert (one.jerk == far.jerk).all()
+    assert first_metres(Gaps(earliest=s + 9.0), N) < 1.1
+
+
+def test_those_ahead_win_when_it_is_squeezed() -> None:
+    state, window = at_rest()
+    s = window.states[:, 0]
+    alone = Tracker(SCENARIO).solve(state, window, Gaps(latest=s - 1.5))
+    squeezed = Tracker(SCENARIO).solve(state, window, Gaps(earliest=s + 0.9, latest=s - 1.5))
+    assert squeezed.usable
+    assert squeezed.jerk[0, 0] < -0.5
+    problem = Problem(state, window, Gaps())
+    ends = [states_of(problem, result)[-1, 0] - s[-1] for result in (alone, squeezed)]
+    assert max(ends) < -1.0
+
+
+def test_both_are_kept_where_there_is_room() -> None:
+    _, window = at_rest()
+    s = window.states[:, 0]
+    assert first_metres(Gaps(earliest=s + 0.2, latest=s + 0.7), N) == pytest.approx(0.2, abs=0.1)
+
+
+def test_rows_of_those_behind_leave_nothing_behind() -> None:
+    state, window = at_rest()
+    used = Tracker(ALWAYS)
+    assert used.solve(state, window, Gaps(earliest=window.states[:, 0] + 0.9)).jerk[0, 0] > 0.2
+    for _ in range(20):
+        result = used.solve(state, window)
+    np.testing.assert_allclose(result.jerk, 0.0, atol=0.05)
+
+
+def _as_state(values: tuple[float, ...]) -> State:
+    s, v, a, y, v_y, a_y = values
+    return s, v, a, y, v_y, a_y
+
+
+@given(
+    st.tuples(*[st.floats(-1.0, 1.0)] * 6),
+    st.sampled_from([(0, 0), (-40, 1), (7, 2)]),
+    st.integers(0, 4000),
+)
+def test_who_rests_in_its_cell_gets_the_same_jerks_without_the_program(
+    shares: tuple[float, ...], cell: tuple[int, int], tick: int
+) -> None:
+    """Whatever the errors for which rows are not looked at: none of them binds."""
+    scenario = Scenario()
+    tracker = Tracker(scenario)
+    goal = cell_state(scenario.lattice, cell, tick * scenario.runtime.tick_s)
+    harmless = tracker.harmless
+    state = tuple(
+        at + 0.999 * share * most for at, share, most in zip(goal, shares, harmless, strict=True)
+    )
+    quick = tracker.rest(_as_state(state), goal)
+    whole = tracker.solve(_as_state(state), Reference.hold(scenario, cell).window(tick))
+    assert quick is not None
+    assert whole.iterations == 0
+    np.testing.assert_allclose(quick.jerk, whole.jerk, atol=1e-9)
+
+
+def test_who_is_farther_from_its_cell_is_not_at_rest() -> None:
+    scenario = Scenario()
+    tracker = Tracker(scenario)
+    goal = cell_state(scenario.lattice, (0, 0), 0.0)
+    for axis, most in enumerate(tracker.harmless):
+        state = tuple(at + 1.01 * most * (index == axis) for index, at in enumerate(goal))
+        assert tracker.rest(_as_state(state), goal) is None

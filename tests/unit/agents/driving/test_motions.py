@@ -1,0 +1,406 @@
+"""Motions are told when they begin and while they last, and heard of beside what is sensed."""
+
+from __future__ import annotations
+
+import attrs
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from laneweave.agents.core import AgentCore
+from laneweave.agents.driving.motions import FRESH_TICKS, REPEAT_TICKS, Motions
+from laneweave.agents.driving.reference import Reference
+from laneweave.agents.driving.surroundings import SENSED_S, Gaps, Surroundings
+from laneweave.agents.host import AgentHost
+from laneweave.launch.fault_search.light_driver import LightDriver
+from laneweave.protocol.lattice import STRETCH_COLUMNS, Cell
+from laneweave.protocol.runtime.node import Arrived, Effect, Listen, Send, Unlisten
+from laneweave.protocol.vehicle.motion import cell_state
+from laneweave.protocol.wire.messages import Motion, Name, Neighbour, Sense
+from laneweave.protocol.wire.topics import MOTION, SENSE
+from support.agent_rig import HOME, ME, MOVE_TICKS, SCENARIO, TICK_S, Rig, sent, up_and_running
+from support.driving import Road, road_scenario
+
+Array = NDArray[np.float64]
+
+OTHER = Name("other")
+N, LENGTH_M, LEAST_M = (
+    SCENARIO.horizon_ticks,
+    SCENARIO.vehicle.length_m,
+    SCENARIO.tracking.min_gap_m,
+)
+KNOWN = round(SENSED_S / TICK_S)
+"""Ticks for which local sensing is extrapolated."""
+BEGIN = 10
+BACK: tuple[Cell, Cell] = ((1, 1), (0, 1))
+"""Somebody ahead of the home cell falls back to the next cell."""
+
+
+# --- what an agent tells --------------------------------------------------------------------------
+
+
+def told(rig: Rig, ticks: int) -> list[Motion]:
+    """Run and return the motions that were sent."""
+    found: list[Motion] = []
+    for _ in range(ticks):
+        effects = rig.hand(SENSE, rig.sense())
+        found += sent(effects, Motion)
+        (command,) = [
+            e.message for e in effects if isinstance(e, Send) and e.topic.name == "command"
+        ]
+        rig.take(command)
+        rig.coast(1)
+    return found
+
+
+def test_a_motion_is_told_when_it_begins_and_every_ten_ticks_while_it_lasts() -> None:
+    rig = up_and_running()
+    rig.accept((0, HOME, (-1, 2)))
+    begin = rig.tick
+    motions = told(rig, MOVE_TICKS + 15)
+    assert motions == [
+        Motion(ME, 1, 0, HOME, (-1, 2), begin, MOVE_TICKS, tick)
+        for tick in range(begin, begin + MOVE_TICKS, REPEAT_TICKS)
+    ]
+    assert len(motions) == 4
+
+
+def test_the_motion_goes_out_after_command_and_state_on_a_key_of_its_own() -> None:
+    rig = up_and_running()
+    rig.formation, rig.joined = 0, (0,)
+    rig.accept((0, HOME, (-1, 2)))
+    effects = [e for e in rig.hand(SENSE, rig.sense()) if isinstance(e, Send)]
+    assert [effect.topic.name for effect in effects] == ["command", "state", "motion"]
+    assert effects[-1].parameters == {"stretch": 0, "vehicle": ME}
+
+
+def test_who_holds_tells_nothing() -> None:
+    assert told(up_and_running(), 25) == []
+
+
+def test_who_is_not_in_charge_tells_nothing() -> None:
+    """A new process takes a motion over, and speaks only once a SENSE has put it in charge."""
+    rig = up_and_running()
+    rig.accept((0, HOME, (-1, 2)))
+    begin = rig.tick
+    assert len(told(rig, REPEAT_TICKS)) == 1
+    rig.restart()
+    assert told(rig, 1) == []  # it claims the vehicle, at a tick at which a motion is repeated
+    motions = told(rig, REPEAT_TICKS)
+    assert [(m.incarnation, m.begin_tick, m.tick) for m in motions] == [
+        (2, begin, begin + 2 * REPEAT_TICKS)
+    ]
+
+
+def test_a_light_driver_tells_nothing() -> None:
+    rig = up_and_running(LightDriver)
+    rig.accept((0, HOME, (-1, 2)))
+    assert told(rig, 20) == []
+    assert rig.shown[-1].moving
+
+
+# --- whom a host listens to -----------------------------------------------------------------------
+
+
+class Listener(LightDriver):
+    """A driver that keeps what it hears."""
+
+    heard: dict[str, list[Motion]]
+    """Of all drivers, by where they are; the test empties it."""
+
+    def take_over(self, sense: Sense) -> None:
+        super().take_over(sense)
+        self.name = sense.vehicle
+
+    def hear(self, motion: Motion) -> None:
+        self.heard.setdefault(self.name, []).append(motion)
+
+
+A, B, C = Name("A"), Name("B"), Name("C")
+
+
+def host_of(*vehicles: Name) -> AgentHost:
+    Listener.heard = {}
+    return AgentHost(lambda name: AgentCore(name, lambda: 1, SCENARIO, Listener), vehicles)
+
+
+def put(
+    host: AgentHost, vehicle: Name, stretch: int, tick: int = 1, *, charge: int = 1
+) -> list[Effect]:
+    """Let a vehicle sense that it is in a stretch, and which process is in charge."""
+    cell = (-stretch * STRETCH_COLUMNS, 0)
+    t_s = tick * TICK_S
+    felt = Sense(
+        vehicle, tick, t_s, cell_state(SCENARIO.lattice, cell, t_s), cell, 0, cell, 0, (),
+        formation=SCENARIO.lattice.block_of(cell[0]), attendant=charge,
+    )  # fmt: skip
+    return list(host.handle(Arrived(SENSE, {"vehicle": vehicle}, felt), 0.0))
+
+
+def of_motions(effects: list[Effect]) -> list[tuple[type, int]]:
+    return [
+        (type(effect), effect.parameters["stretch"])
+        for effect in effects
+        if isinstance(effect, (Listen, Unlisten)) and effect.topic is MOTION
+    ]
+
+
+def tell(host: AgentHost, vehicle: Name, stretch: int) -> None:
+    motion = Motion(vehicle, 1, stretch, *BACK, BEGIN, MOVE_TICKS, BEGIN)
+    list(host.handle(Arrived(MOTION, {"stretch": str(stretch), "vehicle": vehicle}, motion), 0))
+
+
+def test_listens_to_the_stretches_around_its_vehicles_while_they_are_in_charge() -> None:
+    host = host_of(A, B)
+    assert of_motions(put(host, A, 4, charge=0)) == []
+    assert of_motions(put(host, A, 4, 2)) == [(Listen, 3), (Listen, 4), (Listen, 5)]
+    assert of_motions(put(host, A, 4, 3)) == []
+    assert of_motions(put(host, B, 5)) == [(Listen, 6)]
+    assert of_motions(put(host, A, 4, 4, charge=9)) == [(Unlisten, 3)]
+    assert of_motions(put(host, B, 5, 2, charge=9)) == [(Unlisten, 4), (Unlisten, 5), (Unlisten, 6)]
+
+
+def test_who_has_left_wants_nothing_any_more() -> None:
+    rig = up_and_running()
+    assert rig.agent.wanted_motions == (-1, 0, 1)
+    rig.hand(SENSE, rig.sense(left=True))
+    assert not rig.agent.wanted_motions
+
+
+def test_hands_motions_to_all_but_the_sender_whose_stretches_are_near() -> None:
+    host = host_of(A, B, C)
+    for vehicle, stretch in ((A, 4), (B, 5), (C, 6)):
+        put(host, vehicle, stretch)
+    tell(host, B, 5)
+    tell(host, A, 4)
+    tell(host, Name("D"), 7)
+    heard = {name: [motion.vehicle for motion in each] for name, each in Listener.heard.items()}
+    assert heard == {A: [B], B: [A], C: [B, "D"]}
+
+
+def test_who_is_not_in_charge_hears_nothing() -> None:
+    host = host_of(A, B)
+    put(host, A, 4, charge=0)
+    put(host, B, 4)
+    tell(host, C, 4)
+    assert set(Listener.heard) == {B}
+
+
+# --- what the surroundings make of it -------------------------------------------------------------
+
+
+def motion(
+    cells: tuple[Cell, Cell] = BACK, *, name: Name = OTHER, incarnation: int = 1, tick: int = BEGIN
+) -> Motion:
+    return Motion(name, incarnation, 0, *cells, BEGIN, MOVE_TICKS, tick)
+
+
+def path(tick: int, cells: tuple[Cell, Cell] = BACK) -> Array:
+    """Return the reference (N + 1, 6) of somebody else's motion from a tick on."""
+    return Reference.move(SCENARIO, *cells, BEGIN).window(tick).states
+
+
+def neighbour(
+    states: Array, lane: int, tick: int, *, off_m: float = 0.0, off_mps: float = 0.0
+) -> Neighbour:
+    """Return how somebody is seen from the home cell whose commanded state is off its reference."""
+    s, v, a = states[0, :3].tolist()
+    lag_s = SCENARIO.vehicle.actuator_lag_s
+    speed_mps = v + off_mps - lag_s * a
+    front_m = s + off_m - lag_s * (speed_mps - SCENARIO.formation.speed_mps)
+    gap_m = abs(front_m - cell_state(SCENARIO.lattice, HOME, tick * TICK_S)[0]) - LENGTH_M
+    return Neighbour(lane, gap_m, speed_mps, a)
+
+
+def gaps(
+    around: Surroundings,
+    tick: int,
+    ahead: tuple[Neighbour, ...] = (),
+    behind: tuple[Neighbour, ...] = (),
+    lane: int = HOME[1],
+) -> Gaps:
+    """Return what others leave a vehicle in the home cell."""
+    state = cell_state(SCENARIO.lattice, HOME, tick * TICK_S)
+    felt = Sense(ME, tick, tick * TICK_S, state, HOME, 0, HOME, 0, ahead, behind)
+    return around.gaps(felt, state, lane)
+
+
+def hearing(*motions: Motion) -> Surroundings:
+    around = Surroundings(SCENARIO)
+    for each in motions:
+        around.hear(each)
+    return around
+
+
+@pytest.mark.parametrize("off_m", [0.0, 0.8, -0.8])
+def test_who_is_ahead_is_predicted_along_its_motion_from_where_it_is_sensed(off_m: float) -> None:
+    states = path(20)
+    found = gaps(hearing(motion()), 20, (neighbour(states, 1, 20, off_m=off_m),)).latest
+    assert found is not None
+    expected = states[:, 0] + off_m - LENGTH_M - LEAST_M
+    assert found[KNOWN + 1 :] == pytest.approx(expected[KNOWN + 1 :], abs=1e-9)
+    assert found[0] == pytest.approx(expected[0], abs=1e-9)
+    assert (found <= expected + 1e-9).all()
+
+
+def test_who_is_behind_is_predicted_likewise() -> None:
+    cells = ((-3, 1), (-2, 1))
+    states = path(20, cells)
+    found = gaps(hearing(motion(cells)), 20, behind=(neighbour(states, 1, 20),)).earliest
+    assert found is not None
+    expected = states[:, 0] + LENGTH_M + LEAST_M
+    assert found[KNOWN + 1 :] == pytest.approx(expected[KNOWN + 1 :], abs=1e-9)
+
+
+def beyond_sensing(around: Surroundings, tick: int, *seen: Neighbour, lane: int = 1) -> bool:
+    """Tell whether anybody ahead is predicted for longer than local sensing can."""
+    latest = gaps(around, tick, seen, lane=lane).latest
+    return latest is not None and bool(np.isfinite(latest[KNOWN + 1 :]).any())
+
+
+def test_a_motion_counts_only_for_who_is_where_it_should_be() -> None:
+    around, states = hearing(motion()), path(20)
+    assert beyond_sensing(around, 20, neighbour(states, 1, 20))
+    for off_m in (2.0, -2.0):
+        assert not beyond_sensing(around, 20, neighbour(states, 1, 20, off_m=off_m))
+    for off_mps in (1.5, -1.5):
+        assert not beyond_sensing(around, 20, neighbour(states, 1, 20, off_mps=off_mps))
+    assert not beyond_sensing(around, 20, neighbour(states, 2, 20), lane=2)
+
+
+def test_who_is_sensed_counts_whatever_was_said() -> None:
+    """A forged motion, at the place of somebody who slows down: it says that he drives away."""
+    scenario = attrs.evolve(SCENARIO, tracking=attrs.evolve(SCENARIO.tracking, min_gap_m=9.0))
+    away: tuple[Cell, Cell] = ((0, 1), (1, 1))
+    seen = neighbour(path(BEGIN, away), 1, BEGIN, off_m=-0.5, off_mps=-0.8)
+    plain, misled = Surroundings(scenario), Surroundings(scenario)
+    misled.hear(motion(away))
+    sensed, both = gaps(plain, BEGIN, (seen,)).latest, gaps(misled, BEGIN, (seen,)).latest
+    assert sensed is not None
+    assert both is not None
+    assert (both[: KNOWN + 1] == sensed[: KNOWN + 1]).all()
+    said = path(BEGIN, away)[:, 0] - path(BEGIN, away)[0, 0] + sensed[0]
+    assert said[KNOWN] > sensed[KNOWN] + 0.5
+
+
+def test_a_motion_that_has_ended_or_was_not_repeated_does_not_count() -> None:
+    for tick, repeats, counts in (
+        (BEGIN + FRESH_TICKS, 0, True),
+        (BEGIN + FRESH_TICKS + 1, 0, False),
+        (BEGIN + FRESH_TICKS + 1, 1, True),
+        (BEGIN + MOVE_TICKS - 1, 3, True),
+        (BEGIN + MOVE_TICKS, 3, False),
+    ):
+        said = [motion(tick=BEGIN + n * REPEAT_TICKS) for n in range(repeats + 1)]
+        around = hearing(*said, said[0])  # a duplicate that is late makes nothing older
+        assert beyond_sensing(around, tick, neighbour(path(tick), 1, tick)) is counts, tick
+
+
+def test_a_motion_that_comes_when_it_has_ended_does_not_count() -> None:
+    """Also within the tick in which others were forgotten already."""
+    tick = BEGIN + MOVE_TICKS
+    third = attrs.evolve(motion(name=Name("third")), begin_tick=tick, tick=tick)
+    around, seen = hearing(third), neighbour(path(tick), 1, tick)
+    assert not beyond_sensing(around, tick, seen)
+    around.hear(motion(tick=tick - 1))
+    assert not beyond_sensing(around, tick, seen)
+
+
+def test_motions_that_do_not_count_any_more_are_forgotten() -> None:
+    motions = Motions(SCENARIO)
+    names = [Name(f"v{number}") for number in range(20)]
+    for name in names:
+        motions.hear(motion(name=name))
+    assert len(motions.heard) == 20
+    motions.advance(BEGIN + MOVE_TICKS)
+    assert len(motions.heard) == 0
+
+
+def test_the_newest_incarnation_and_then_the_newest_motion_counts() -> None:
+    states = path(20)
+    seen = neighbour(states, 1, 20)
+    elsewhere: tuple[Cell, Cell] = ((5, 0), (5, 1))
+    newer = motion(elsewhere, incarnation=2)
+    assert not beyond_sensing(hearing(motion(), newer), 20, seen)
+    assert not beyond_sensing(hearing(newer, motion()), 20, seen)
+    assert beyond_sensing(hearing(motion(elsewhere), motion(incarnation=2)), 20, seen)
+    later = attrs.evolve(motion(elsewhere), begin_tick=BEGIN + 5)
+    assert not beyond_sensing(hearing(motion(), later), 20, seen)
+    assert not beyond_sensing(hearing(later, motion()), 20, seen)
+    older = attrs.evolve(motion(elsewhere), begin_tick=BEGIN - 5)
+    assert beyond_sensing(hearing(motion(), older), 20, seen)
+
+
+def test_a_motion_counts_while_its_body_touches_a_lane_that_counts() -> None:
+    out: tuple[Cell, Cell] = ((0, 1), (0, 2))
+    tick = BEGIN + 5
+    states = path(tick, out)
+    seen = neighbour(states, 1, tick)
+    found = gaps(hearing(motion(out)), tick, (seen,)).latest
+    assert found is not None
+    right_m = states[:, 3] - SCENARIO.vehicle.width_m / 2.0
+    left_lane_m = 2 * SCENARIO.road.lane_width_m
+    assert np.isfinite(found[right_m < left_lane_m]).all()
+    assert np.isinf(found[-1])
+    # For who enters that lane, too, it does not leave at all.
+    found = gaps(hearing(motion(out)), tick, (seen,), lane=2).latest
+    assert found is not None
+    assert np.isfinite(found).all()
+
+
+@pytest.mark.parametrize(
+    "nonsense",
+    [
+        motion(((1, 1), (1, 1))),
+        motion(((1, 1), (3, 1))),
+        motion(((1, 1), (0, 2))),  # oblique, which mode 1 does not know
+        motion(((2**63 - 1, 2**63 - 1), (-(2**63), 0))),
+        attrs.evolve(motion(), ticks=MOVE_TICKS - 1),  # no slot of this scenario lasts so long
+        attrs.evolve(motion(), ticks=0),
+        attrs.evolve(motion(), ticks=2**63 - 1),
+        attrs.evolve(motion(), ticks=-(2**63)),
+        attrs.evolve(motion(), begin_tick=2**63 - 1, tick=-(2**63)),
+        attrs.evolve(motion(), begin_tick=-(2**63), tick=2**63 - 1),
+    ],
+)
+def test_nonsense_changes_nothing(nonsense: Motion) -> None:
+    seen = neighbour(path(20), 1, 20)
+    assert not beyond_sensing(hearing(nonsense), 20, seen)
+    assert beyond_sensing(hearing(nonsense, motion(name=Name("third"))), 20, seen)
+
+
+# --- in closed loop -------------------------------------------------------------------------------
+
+FIRST, SECOND = Name("first"), Name("second")
+LEAST_APART_M = 12.0
+"""More than two leave who hold one behind the other: the second one has to give way."""
+
+
+def follow(seed: int, *, broadcast: bool) -> tuple[Array, Array]:
+    """Return accelerations of who follows and the gap, by tick, while the first one falls back."""
+    scenario = road_scenario(seed)
+    scenario = attrs.evolve(
+        scenario, tracking=attrs.evolve(scenario.tracking, min_gap_m=LEAST_APART_M)
+    )
+    road = Road(scenario, {FIRST: (0, 1), SECOND: (-2, 1)})
+    road.broadcast = broadcast
+    for tick in range(80):
+        road.step({FIRST: (0, (0, 1), (-1, 1))} if tick == BEGIN else {})
+    states = np.array(road.record.states)
+    return states[:, 1, 2], states[:, 0, 0] - states[:, 1, 0] - scenario.vehicle.length_m
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_who_hears_that_somebody_falls_back_brakes_earlier_and_less(seed: int) -> None:
+    surprised, _ = follow(seed, broadcast=False)
+    warned, gap_m = follow(seed, broadcast=True)
+    assert gap_m.min() > LEAST_APART_M
+    assert warned.min() > 0.85 * surprised.min()
+    early = slice(BEGIN, BEGIN + 10)
+    assert warned[early].min() < surprised[early].min() - 0.3
+
+
+def test_equal_seeds_give_equal_runs() -> None:
+    one, other, different = (follow(seed, broadcast=True)[0] for seed in (3, 3, 4))
+    assert (one == other).all()
+    assert (one != different).any()

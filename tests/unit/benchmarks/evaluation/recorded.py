@@ -1,0 +1,94 @@
+"""Runs and points made by hand, for the tests of the evaluation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from attrs import evolve
+
+from evaluation.evidence import Evidence, setting_of
+from evaluation.points import PointRow, Traced
+from laneweave.launch.report.runs import Run
+from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.scenario.tables import Scenario
+
+BASE = load_scenario(None, demand__duration_s=600.0)
+
+
+def scenario(volume: float, seed: int, base: Scenario = BASE) -> Scenario:
+    """Return the scenario of a point."""
+    demand = evolve(base.demand, volume_veh_per_lane_h=volume)
+    return evolve(base, demand=demand, seed=seed)
+
+
+def summary(travel_s: float | None, **changed: Any) -> dict[str, Any]:  # noqa: ANN401 - any JSON
+    """Return a summary; keys of `changed` replace whole tables in part."""
+    made: dict[str, Any] = {
+        "ending": "complete",
+        "vehicles": {"demanded": 100, "left": 100, "on_preferred_lane": 100},
+        "travel_time_s": {"mean": travel_s, "p95": None if travel_s is None else travel_s + 1.0},
+        "throughput_veh_per_lane_h": 990.0,
+        "safety": {
+            "overlaps": 0,
+            "emergency_brakes": 0,
+            "min_gap_m": 9.8,
+            "min_headway_s": 0.86,
+            "min_accel_mps2": -6.8,
+            "max_accel_mps2": 4.8,
+        },
+        "planning": {"largest_formation": 6, "solve_ms": {"p95": 10.0}},
+    }
+    for key, value in changed.items():
+        made[key] = made[key] | value if isinstance(value, dict) else value
+    return made
+
+
+def run(
+    label: str, volume: float, seed: int, found: dict[str, Any], reason: str = "", folder: str = "x"
+) -> Run:
+    """Return a run without files."""
+    return Run(Path("nowhere") / folder, label, scenario(volume, seed), found, reason)
+
+
+TRACED = Traced(
+    runs=5,
+    lattice_least_m=14.93,
+    lattice_pairs=20_000,
+    lattice_worst_off_m=0.07,
+    lattice_kept=True,
+    slow_m=None,
+    slowest_mps=14.6,
+)
+
+
+def point(label: str, volume: float, travel_s: float, traced: Traced | None = TRACED) -> PointRow:
+    """Return a point of five seeds at which nothing is wrong."""
+    return PointRow(
+        label=label,
+        volume_veh_per_lane_h=volume,
+        seeds=(1, 2, 3, 4, 5),
+        failed=(),
+        demanded=4000,
+        left=4000,
+        on_preferred_lane=4000,
+        travel_s=travel_s,
+        travel_sd_s=0.1,
+        travel_p95_s=travel_s + 1.0,
+        throughput_veh_per_lane_h=volume,
+        overlaps=0,
+        emergency_brakes=0,
+        min_gap_m=9.8,
+        min_headway_s=0.86,
+        min_accel_mps2=-6.8,
+        max_accel_mps2=4.8,
+        within_limits=True,
+        largest_formation=6,
+        planning_p95_ms=12.0,
+        traced=traced,
+    )
+
+
+def evidence(*points: PointRow) -> Evidence:
+    """Return evidence of some points, in the setting of the evaluation."""
+    return Evidence(setting=setting_of([run("rule", 1000.0, 1, {})]), points=points)

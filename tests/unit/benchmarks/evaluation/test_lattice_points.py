@@ -1,0 +1,133 @@
+"""Spacing at lattice points: who counts, what is measured, and what is too near."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from attrs import evolve
+
+from evaluation.lattice_points import TOLERANCE_M, lattice_spacing
+from evaluation.points import slow_stretch, within_limits
+from laneweave.launch.report.trajectories import OFF_LATTICE, Tracks
+from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.scenario.tables import Scenario
+
+SCENARIO = load_scenario(None)
+LATTICE = SCENARIO.lattice
+TICKS = np.arange(0, 401)
+"""40 s: ten slots."""
+Vehicle = tuple[int, int, float]
+"""(column, lane, metres ahead of its cell)."""
+
+
+def parked(*vehicles: Vehicle, scenario: Scenario = SCENARIO) -> Tracks:
+    """Return vehicles that hold their cells for 40 s."""
+    t_s = np.tile(TICKS * scenario.runtime.tick_s, len(vehicles))
+    column, lane, ahead_m = (
+        np.repeat(values, len(TICKS)) for values in zip(*vehicles, strict=True)
+    )
+    rows = len(t_s)
+    return Tracks(
+        names=tuple(f"v{number}" for number in range(len(vehicles))),
+        starts=len(TICKS) * np.arange(len(vehicles) + 1),
+        t_s=t_s,
+        s_m=LATTICE.speed_mps * t_s + LATTICE.pitch_m * column + ahead_m,
+        y_m=(lane + 0.5) * LATTICE.lane_width_m,
+        speed_mps=np.full(rows, LATTICE.speed_mps),
+        accel_mps2=np.zeros(rows),
+        column=column.astype(np.int64),
+        lane=lane.astype(np.int64),
+    )
+
+
+def moved(tracks: Tracks, vehicle: int, slot: int, column: int) -> Tracks:
+    """Return tracks in which a vehicle goes to another column in a slot."""
+    rows = tracks.rows(vehicle)
+    begin, end = rows.start + 40 * slot, rows.start + 40 * (slot + 1)
+    columns, s_m = tracks.column.copy(), tracks.s_m.copy()
+    steps = column - int(columns[begin])
+    columns[begin + 1 : rows.stop] = column
+    s_m[begin:end] += np.linspace(0.0, steps * LATTICE.pitch_m, 40)
+    s_m[end : rows.stop] += steps * LATTICE.pitch_m
+    return evolve(tracks, column=columns, s_m=s_m)
+
+
+def test_spacing_is_from_front_to_front_on_a_lane() -> None:
+    found = lattice_spacing(parked((0, 0, 0.0), (2, 0, 0.1), (1, 1, -0.05)), SCENARIO)
+    assert found.least_m == pytest.approx(30.1)
+    assert found.worst_off_m == pytest.approx(0.1)
+    # From 10 s (`settle_s`) to 40 s there are eight ends of slots of 4 s.
+    assert found.pairs == 8
+    assert found.keeps(LATTICE.pitch_m)
+
+
+@pytest.mark.parametrize(
+    ("near_m", "kept"), [(TOLERANCE_M - 0.01, True), (TOLERANCE_M + 0.01, False)]
+)
+def test_too_near(near_m: float, *, kept: bool) -> None:
+    found = lattice_spacing(parked((0, 0, near_m), (1, 0, 0.0)), SCENARIO)
+    assert found.least_m == pytest.approx(15.0 - near_m)
+    assert found.keeps(LATTICE.pitch_m) is kept
+
+
+def test_the_body_counts_not_the_cell_that_it_should_be_in() -> None:
+    found = lattice_spacing(parked((0, 0, 0.0), (1, 0, -12.0)), SCENARIO)
+    assert found.least_m == pytest.approx(3.0)
+    assert found.worst_off_m == pytest.approx(12.0)
+
+
+def test_nearer_on_the_way_is_no_matter() -> None:
+    """One leaves a cell while another comes: only at the ends of slots do both rest."""
+    tracks = moved(parked((0, 0, 0.0), (2, 0, 0.0)), 0, slot=4, column=1)
+    assert np.diff(tracks.s_m.reshape(2, -1), axis=0).min() == pytest.approx(15.0)
+    found = lattice_spacing(tracks, SCENARIO)
+    assert found.least_m == pytest.approx(15.0)
+    assert found.worst_off_m == pytest.approx(0.0)
+
+
+def test_slots_may_end_at_any_tick() -> None:
+    """Formations have their own time points; they are found by when cells change."""
+    tracks = moved(parked((0, 0, 0.0), (2, 0, 0.0)), 0, slot=4, column=1)
+    shifted = evolve(tracks, t_s=tracks.t_s + 2.3, s_m=tracks.s_m + 2.3 * LATTICE.speed_mps)
+    found = lattice_spacing(shifted, SCENARIO)
+    assert found.least_m == pytest.approx(15.0)
+    assert found.worst_off_m == pytest.approx(0.0)
+
+
+def test_who_has_just_entered_does_not_count() -> None:
+    late = evolve(SCENARIO, formation=evolve(SCENARIO.formation, settle_s=39.0))
+    found = lattice_spacing(parked((0, 0, 0.0), (1, 0, -9.0)), late)
+    assert found.pairs == 1
+    later = evolve(SCENARIO, formation=evolve(SCENARIO.formation, settle_s=41.0))
+    assert lattice_spacing(parked((0, 0, 0.0), (1, 0, -9.0)), later).least_m is None
+
+
+def test_without_a_lattice_there_is_nothing_to_look_at() -> None:
+    tracks = parked((0, 0, 0.0), (1, 0, -9.0))
+    found = lattice_spacing(
+        evolve(tracks, column=np.full_like(tracks.column, OFF_LATTICE)), SCENARIO
+    )
+    assert (found.least_m, found.pairs, found.worst_off_m) == (None, 0, None)
+    floats, ints = np.empty(0), np.empty(0, np.int64)
+    nobody = Tracks(
+        (), np.zeros(1, np.int64), floats, floats, floats, floats, floats, ints, ints
+    )  # fmt: skip
+    assert lattice_spacing(nobody, SCENARIO).pairs == 0
+
+
+def test_limits() -> None:
+    assert within_limits(-10.0004, 5.0, SCENARIO)
+    assert within_limits(None, None, SCENARIO)
+    assert not within_limits(-10.01, 4.0, SCENARIO)
+    assert not within_limits(-9.0, 5.01, SCENARIO)
+
+
+def test_the_congested_stretch() -> None:
+    scenario = load_scenario(None, demand__duration_s=100.0)
+    tracks = parked((0, 0, 0.0))
+    slow = (tracks.s_m > 300.0) & (tracks.s_m < 400.0)
+    # Between warm-up and last arrival: 60 to 100 s.
+    tracks = evolve(tracks, t_s=tracks.t_s + 60.0, speed_mps=np.where(slow, 3.0, 15.0))
+    assert slow_stretch(tracks, scenario) == ((300.0, 400.0), 3.0)
+    assert slow_stretch(evolve(tracks, speed_mps=np.full(401, 15.0)), scenario) == (None, 15.0)
+    assert slow_stretch(evolve(tracks, t_s=tracks.t_s - 60.0), scenario) == (None, None)

@@ -1,0 +1,250 @@
+"""Tables, goals and statements: they follow the data, and say what is missing."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from attrs import evolve
+
+from evaluation.agreement import Agreement
+from evaluation.evidence import Evidence, Picture, read_evidence, write_evidence
+from evaluation.goals import goals_table, meets
+from evaluation.points import PlanningTimes
+from evaluation.programme import FORMATIONS, GOALS, LABELS, VOLUMES, Goal, planned
+from evaluation.statements import PAPER_VOLUMES, statements_table
+from evaluation.tables import document_parts
+from evaluation.trials import AgreementRow, CostRow, FactorRow
+from laneweave.protocol.errors import BadInputError
+from unit.benchmarks.evaluation.recorded import TRACED, evidence, point
+
+DRIVER = Path(__file__).resolve().parents[4] / "benchmarks" / "evaluation.py"
+
+
+def cells(table: str, first: str) -> list[str]:
+    """Return the cells of the row that begins so."""
+    (row,) = [line for line in table.splitlines() if line.startswith(f"| {first}")]
+    return [cell.strip() for cell in row.strip("|").split("|")]
+
+
+def full() -> Evidence:
+    """Return evidence with every point, formation control at its goals, rules that congest."""
+    times = {"formations": 66.6, "rolling": 66.5, "paper-6": 67.4, "paper-12": 67.4, "lc2013": 67.5}
+    rows = [
+        point(label, volume, times.get(label, 45.0 + volume / 40.0))
+        for label in LABELS
+        for volume in VOLUMES
+        if planned(label, volume)
+    ]
+    jam = evolve(TRACED, slow_m=(500.0, 800.0), slowest_mps=3.0)
+    rows = [evolve(row, traced=jam) if row.label.startswith("rule") else row for row in rows]
+    times_ms = (PlanningTimes("tappa", 990, 1.5, 20.25, 800.0),)
+    rows = [
+        evolve(row, plans=1000, fallbacks=9, planning=times_ms)
+        if row.label == "formations"
+        else row
+        for row in rows
+    ]
+    agreed = AgreementRow(1600.0, 1, 120.0, 0, 170, Agreement(160, 0, 0, 0, 0.0))
+    return evolve(
+        evidence(*rows),
+        pictures=(Picture("evaluation-all.png", "boxes", "Travel times."),),
+        agreements=(agreed,),
+        factors=tuple(
+            FactorRow(trial, "laneweave run", 1, 90, factor, 10.0, 20.0)
+            for trial, factor in (("zenoh", 2.1), ("zenoh-50", 5.1), ("simulated", 5.9))
+        ),
+        costs=(
+            CostRow("short", "laneweave run", 1000.0, 100, 0.2),
+            CostRow("long", "laneweave run", 10_000.0, 1000, 0.22),
+        ),
+    )
+
+
+def test_what_is_missing_says_so() -> None:
+    parts = document_parts(Evidence())
+    assert cells(parts["evaluation travel times"], "1600") == ["1600", *["missing"] * len(LABELS)]
+    assert cells(parts["evaluation travel times"], "2000")[1:] == [
+        "missing" if label in ("formations", "rolling") else "-" for label in LABELS
+    ]
+    for name in ("planning", "lattice", "agreement", "factors", "costs"):
+        assert "missing" in parts[f"evaluation {name}"]
+    goals = parts["evaluation goals"].splitlines()[2:]
+    assert all("missing" in line and line.endswith("|  |") for line in goals)
+    statements = parts["evaluation statements"]
+    assert "holds" not in statements
+    assert "not hold" not in statements
+
+
+def test_nothing_is_missing() -> None:
+    for name, text in document_parts(full()).items():
+        assert "missing" not in text, name
+
+
+def test_cells() -> None:
+    some = evolve(
+        point("lc2013", 1000.0, 67.123),
+        seeds=(1, 2),
+        failed=((2, "1 pairs of vehicles overlapped"),),
+        overlaps=1,
+        emergency_brakes=8,
+        on_preferred_lane=3998,
+    )
+    parts = document_parts(evidence(some))
+    place = 1 + LABELS.index("lc2013")
+    shown = {name: cells(parts[f"evaluation {name}"], "1000")[place] for name in (
+        "runs", "travel times", "lanes", "margins", "brakes", "throughput"
+    )}  # fmt: skip
+    assert shown == {
+        "runs": "2 of 5, 1 failed",
+        "travel times": "67.12 (68.1)",
+        "lanes": "99.950 % (2 off)",
+        "margins": "9.80 / 0.86 / -6.8, **1 overlaps**",
+        "brakes": "0.2",
+        "throughput": "1000",
+    }
+    assert "Arrivals in each run: 600 s." in parts["evaluation runs"]
+
+
+def test_a_point_whose_runs_all_failed() -> None:
+    parts = document_parts(
+        evidence(evolve(point("rule", 1000.0, 0.0), seeds=(), failed=((1, "x"),)))
+    )
+    assert cells(parts["evaluation travel times"], "1000")[1 + LABELS.index("rule")] == "failed"
+    assert cells(parts["evaluation runs"], "1000")[1 + LABELS.index("rule")] == "0 of 5, 1 failed"
+
+
+def test_goals() -> None:
+    table = goals_table(full())
+    assert cells(table, "`rolling`, 2400")[1:] == [
+        "at most 67 s, at least 99.9 % on their lane", "66.50 s, 100 %", "holds",
+    ]  # fmt: skip
+    assert cells(table, "`formations`, 1600")[1:] == [
+        "at most 66.9 s, 100 % on their lane, within 3.5 m/s2, at most 1 % fallbacks",
+        "66.60 s, 100 %, -6.80 to 4.80 m/s2, 9 of 1,000 plans",
+        "**missed**",
+    ]
+    assert cells(table, "`formations`, 1000")[3] == "holds"
+    assert cells(table, "`paper-12`, 1600")[3] == "holds"
+    runs = sum(planned(label, volume) for label in FORMATIONS for volume in VOLUMES)
+    spacing = f"14.93 m, least of {20_000 * runs:,} in {5 * runs} runs"
+    assert cells(table, "spacing")[2:] == [spacing, "holds"]
+    assert cells(table, "real-time factor at 1600, one process, s")[2:] == ["5.90", "**missed**"]
+    assert cells(table, "cost")[2:] == ["1.10 times", "holds"]
+    assert cells(table, "three points")[3] == "holds"
+
+
+@pytest.mark.parametrize(
+    ("on_lane", "share_percent", "met"),
+    [(4000, 100.0, True), (3999, 100.0, False), (3998, 99.95, True), (3997, 99.95, False)],
+)
+def test_shares_are_of_all_who_came(on_lane: int, share_percent: float, *, met: bool) -> None:
+    row = evolve(point("rolling", 2200.0, 67.5), on_preferred_lane=on_lane)
+    goal = Goal("rolling", 2200.0, 67.5, share_percent)
+    assert meets(row, goal) is met
+    assert not meets(row, evolve(goal, travel_s=67.4))
+    assert not meets(evolve(row, travel_s=None), goal)
+
+
+def test_goals_for_accelerations_and_fallbacks() -> None:
+    row = evolve(point("formations", 1600.0, 66.0), plans=200, fallbacks=2)
+    row = evolve(row, min_accel_mps2=-3.504, max_accel_mps2=3.1)
+    goal = Goal("formations", 1600.0, 66.9, accel_mps2=3.5, fallback_percent=1.0)
+    assert goal in GOALS
+    assert meets(row, goal)
+    for worse in ({"fallbacks": 3}, {"min_accel_mps2": -3.51}, {"max_accel_mps2": None}):
+        assert not meets(evolve(row, **worse), goal)
+
+
+def test_planning_times() -> None:
+    lines = document_parts(full())["evaluation planning"].splitlines()
+    shown = "| `formations` | 1600 | `tappa` | 990 | 1.5 | 20.2 | 800.0 | 9 of 1,000 |"
+    assert lines.count(shown) == 1
+
+
+def test_a_broken_promise_is_a_goal_missed() -> None:
+    bad = evolve(
+        point("rolling", 2400.0, 66.0, evolve(TRACED, lattice_least_m=14.2, lattice_kept=False)),
+        overlaps=1,
+        within_limits=False,
+    )
+    table = goals_table(evidence(point("paper-12", 1000.0, 67.0), bad))
+    for goal in ("overlaps", "accelerations", "spacing"):
+        assert cells(table, goal)[3] == "**missed**"
+
+
+def test_statements_follow_the_data() -> None:
+    table = statements_table(full())
+    assert cells(table, "The travel time of formation control")[2] == "holds"
+    # 45 s + volume / 40: congested, above 83.3 s, from 1600 on; faster than formations below 900.
+    assert cells(table, "Severe congestion")[2] == "**does not hold**"
+    assert "`rule` at 1600, not yet at 1450" in cells(table, "Severe congestion")[1]
+    assert cells(table, "The congestion is at")[2] == "holds"
+    assert cells(table, "Formation control is faster")[2] == "holds"
+    bound = cells(table, "At most 3600 v_F / 2 d_F")
+    assert bound[0].endswith("here 1800 veh/(lane h)")
+    assert bound[2] == "holds"
+    assert "`formations` carries 2000 of 2000, `rolling` carries 2400 of 2400" in bound[1]
+    # At 500 and 750 the rules take 57.5 and 63.75 s, formations 67.4 s.
+    assert cells(table, "Below 1000")[2] == "**does not hold**"
+
+
+def test_readings_of_the_rules_may_differ() -> None:
+    rows = [point("paper-6", volume, 68.0) for volume in PAPER_VOLUMES]
+    rows += [point("rule", volume, 67.0) for volume in PAPER_VOLUMES]
+    rows += [point("rule-net", volume, 200.0) for volume in PAPER_VOLUMES]
+    table = statements_table(evidence(*rows))
+    assert cells(table, "The rules bring")[2] == "so far: holds"
+    assert "seeds yet" not in table
+    assert "5 seeds yet" in statements_table(evidence(evolve(rows[0], seeds=(1,))))
+    for statement in ("Severe congestion", "Formation control is faster"):
+        assert cells(table, statement)[2] == "so far: depends on the reading"
+    assert "`rule` minus `paper-6` -1.0, -1.0, -1.0, -1.0, -1.0 s" in table
+
+
+def test_evidence_is_what_was_written(tmp_path: Path) -> None:
+    path = tmp_path / "evaluation.json"
+    assert read_evidence(path) == Evidence()
+    write_evidence(full(), path)
+    assert read_evidence(path) == full()
+    path.write_text(json.dumps({"schema": "laneweave.evaluation/1", "speed": 1}))
+    with pytest.raises(BadInputError, match="speed"):
+        read_evidence(path)
+
+
+def test_parts_that_are_not_there_anew_stay() -> None:
+    old = full()
+    new = Evidence(factors=old.factors[:1])
+    assert old.renewed(new) == evolve(old, factors=old.factors[:1])
+    points = evidence(point("rule", 1000.0, 70.0))
+    renewed = old.renewed(points)
+    assert (renewed.points, renewed.pictures) == (points.points, ())
+    assert renewed.costs == old.costs
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--only", "everything"),
+        ("--seeds", "5:1"),
+        ("--budget", "soon"),
+        ("--duration", "-3"),
+        ("--jobs", "0"),
+        ("--only", "report", "--sweeps", "nowhere"),
+    ],
+)
+def test_bad_options_are_refused_in_one_line(options: tuple[str, ...], tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, DRIVER, "--out", tmp_path, *options],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert options[-2] in done.stderr
+    assert done.stderr.splitlines()[-1].count("allowed: ") == 1
+    assert not list(tmp_path.iterdir())

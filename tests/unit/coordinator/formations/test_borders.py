@@ -1,0 +1,180 @@
+"""Neighbouring formations do not close up across the border of their blocks."""
+
+from __future__ import annotations
+
+import pytest
+from attrs import evolve
+
+from laneweave.coordinator.formations.borders import kept_apart, steps_of
+from laneweave.coordinator.formations.leader_rules import Phase
+from laneweave.coordinator.planning.conflicts import ConflictModel
+from laneweave.protocol.lattice import Move
+from laneweave.protocol.runtime.node import Compute, Effect, run_job
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.vehicle.plans import plan_problems
+from laneweave.protocol.wire.messages import Ballot, LogEvent, Name, Plan
+from support.service_desk import SCENARIO as DESK_SCENARIO
+from support.service_desk import A, B, C, Cells, D, Desk, E, F, census, jobs, messages, state
+
+SCENARIO = evolve(DESK_SCENARIO, formation=evolve(DESK_SCENARIO.formation, solver="branching"))
+"""Of the plans with equal cost, those of branching close up across the border."""
+SLOT_S, MOVE_S = SCENARIO.cycles_s[0], SCENARIO.move_s
+SLACK_S = SCENARIO.formation.slack_s
+CLOSING = ConflictModel(("closing",))
+T0_S = 30.0
+MOST_STEPS = 9
+
+
+def plan_of(*moves: tuple[Move, ...], t0_s: float = T0_S) -> Plan:
+    roster = tuple(Name(letter) for letter in "ABCDEF"[: len(moves)])
+    return Plan(
+        ballot=Ballot(1, Name("c1"), 1, 1),
+        formations=(1,),
+        roster=roster,
+        incarnations=dict.fromkeys(roster, 1),
+        start_cells={name: each[0][1] for name, each in zip(roster, moves, strict=True)},
+        moves=dict(zip(roster, moves, strict=True)),
+        t0_s=t0_s,
+        slot_s=SLOT_S,
+        territory=(),
+    )
+
+
+def closing_pairs(one: Plan, other: Plan) -> list[tuple[Move, Move]]:
+    """Return the moves of two plans that are made at the same time and close up."""
+    return [
+        (mine, theirs)
+        for my_moves in one.moves.values()
+        for mine in my_moves
+        for their_moves in other.moves.values()
+        for theirs in their_moves
+        if abs(one.t0_s + mine[0] * SLOT_S - other.t0_s - theirs[0] * SLOT_S) < MOVE_S
+        and CLOSING.kind(mine[1:], theirs[1:])
+    ]
+
+
+# --- pauses ---------------------------------------------------------------------------------------
+
+UP = plan_of(
+    ((0, (-6, 1), (-5, 1)), (1, (-5, 1), (-4, 1)), (2, (-4, 1), (-4, 0))),
+    ((0, (-7, 2), (-6, 2)), (2, (-6, 2), (-6, 1))),
+)
+"""In its second slot a vehicle moves to the front column of its block."""
+
+
+def back(step: int, lane: int = 1, t0_s: float = T0_S) -> Plan:
+    """Return a plan of the block ahead: in a slot a vehicle moves back to its last column."""
+    return plan_of(((step, (-2, lane), (-3, lane)),), t0_s=t0_s)
+
+
+def steps(plan: Plan) -> list[list[int]]:
+    return [[step for step, _, _ in moves] for moves in plan.moves.values()]
+
+
+def test_all_pause_before_the_slot_in_which_two_would_close_up() -> None:
+    assert closing_pairs(UP, back(1))
+    plan = kept_apart(UP, [back(1)], SLACK_S, MOST_STEPS)
+    assert closing_pairs(plan, back(1)) == []
+    assert steps(plan) == [[0, 2, 3], [0, 3]]
+    cells = [[move[1:] for move in moves] for moves in plan.moves.values()]
+    assert cells == [[move[1:] for move in moves] for moves in UP.moves.values()]
+    assert steps_of(plan) == 4
+
+
+def test_the_plan_of_the_block_ahead_pauses_too_if_it_is_the_later_one() -> None:
+    assert steps(kept_apart(back(1), [UP], SLACK_S, MOST_STEPS)) == [[2]]
+
+
+def test_it_pauses_again_while_others_come_back() -> None:
+    others = [back(1), back(2), back(4)]
+    assert steps(kept_apart(UP, others, SLACK_S, MOST_STEPS)) == [[0, 3, 4], [0, 4]]
+
+
+@pytest.mark.parametrize("other", [back(0), back(2), back(1, lane=2), back(1, t0_s=T0_S + SLOT_S)])
+def test_nobody_pauses_for_moves_at_other_times_or_on_other_lanes(other: Plan) -> None:
+    assert kept_apart(UP, [other], SLACK_S, MOST_STEPS) == UP
+
+
+@pytest.mark.parametrize(("late_s", "expected"), [(-2.0, 2), (2.0, 3), (0.3, 3), (-0.3, 2)])
+def test_slots_that_overlap_count(late_s: float, expected: int) -> None:
+    """Blocks need not pass S3 a whole number of slots apart."""
+    plan = kept_apart(UP, [back(1, t0_s=T0_S + late_s)], SLACK_S, MOST_STEPS)
+    assert closing_pairs(plan, back(1, t0_s=T0_S + late_s)) == []
+    assert steps(plan)[0] == [0, expected, expected + 1]
+
+
+def test_a_plan_does_not_outlast_the_road() -> None:
+    assert kept_apart(UP, [back(1)], SLACK_S, 3) == UP
+
+
+def test_without_moves_there_is_nothing_to_keep_apart() -> None:
+    nobody = plan_of()
+    assert steps_of(nobody) == 0
+    assert kept_apart(nobody, [UP], SLACK_S, MOST_STEPS) == nobody
+
+
+# --- the leader -----------------------------------------------------------------------------------
+
+G, H, J, K, L = (Name(letter) for letter in "GHJKL")
+AHEAD: Cells = {A: (-1, 1), B: (-3, 1), C: (0, 2), D: (0, 0), E: (-2, 2), F: (-2, 0)}
+"""Block 0. In its third slot C comes back to the last column of lane 2."""
+BEHIND: Cells = {G: (-5, 1), H: (-4, 2), J: (-7, 1), K: (-4, 0), L: (-6, 2)}
+"""Block 1. In its second slot, which is the same time, L would go to the front column of lane 2."""
+LANES = {A: 1, B: 0, C: 0, D: 2, E: 0, F: 1, G: 1, H: 0, J: 2, K: 1, L: 1}
+
+
+def two_formations(scenario: Scenario = SCENARIO) -> tuple[Desk, Compute, Compute]:
+    """Lead up to the orders for both blocks."""
+    desk = Desk(scenario=scenario)
+    desk.lead()
+    desk.tell(census(AHEAD | BEHIND, LANES))
+    for name, cell in (AHEAD | BEHIND).items():
+        desk.tell(state(name, cell))
+    (ahead,) = jobs(desk.promise(AHEAD))
+    ballot, effects = desk.core.controls[1].ballot, list[Effect]()
+    for name, cell in BEHIND.items():
+        effects += desk.tell(state(name, cell, ballot, t_s=1.0))
+    (behind,) = jobs(effects)
+    return desk, ahead, behind
+
+
+def plans(desk: Desk) -> tuple[Plan, Plan]:
+    one, other = desk.core.controls[0].plan, desk.core.controls[1].plan
+    assert one is not None
+    assert other is not None
+    assert plan_problems(one) == plan_problems(other) == []
+    return one, other
+
+
+def awaited(effects: list[Effect]) -> list[dict[str, object]]:
+    found = [send.message for send in messages(effects, LogEvent)]
+    return [message.data for message in found if message.kind == "neighbours-awaited"]
+
+
+def test_the_later_plan_of_two_neighbours_pauses() -> None:
+    desk, ahead, behind = two_formations()
+    assert awaited(desk.give(run_job(ahead))) == []
+    assert awaited(desk.give(run_job(behind))) == [{"formation": 1, "slots": 1}]
+    assert closing_pairs(*plans(desk)) == []
+
+
+def test_so_does_that_of_the_block_ahead_if_it_is_made_later() -> None:
+    desk, ahead, behind = two_formations()
+    assert awaited(desk.give(run_job(behind))) == []
+    assert awaited(desk.give(run_job(ahead))) == [{"formation": 0, "slots": 1}]
+    assert closing_pairs(*plans(desk)) == []
+
+
+def test_nobody_pauses_for_a_plan_that_was_outbid() -> None:
+    desk, ahead, behind = two_formations()
+    desk.give(run_job(ahead))
+    desk.tell(state(A, AHEAD[A], Ballot(4, Name("c0"), 3, 2), t_s=2.0))
+    assert desk.core.controls[0].phase is Phase.BACKING_OFF
+    assert awaited(desk.give(run_job(behind))) == []
+
+
+def test_a_scenario_whose_plans_may_close_up_has_no_pauses() -> None:
+    formation = evolve(SCENARIO.formation, conflicts=("node", "edge", "special-1"))
+    desk, ahead, behind = two_formations(evolve(SCENARIO, formation=formation))
+    assert awaited(desk.give(run_job(ahead), run_job(behind))) == []
+    assert closing_pairs(*plans(desk))

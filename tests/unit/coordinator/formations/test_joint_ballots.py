@@ -1,0 +1,393 @@
+"""Joint ballots, members without agents, and who is observed: the coordinator's core end to end."""
+
+from __future__ import annotations
+
+from attrs import evolve
+
+from laneweave.coordinator.core import JUST_CLOSED_S
+from laneweave.coordinator.formations.leader_rules import Phase
+from laneweave.protocol.runtime.node import Compute, Effect, PeerUp, run_job
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.vehicle.plans import plan_problems
+from laneweave.protocol.wire.messages import Ballot, LogEvent, Name, Plan, Prepare, RoadClock
+from laneweave.protocol.wire.topics import BRIDGE_ALIVE
+from support.paper import closing_time_s
+from support.service_desk import (
+    ELECTION_S,
+    LATTICE,
+    SCENARIO,
+    T_S,
+    A,
+    B,
+    C,
+    Cells,
+    D,
+    Desk,
+    E,
+    F,
+    census,
+    jobs,
+    logged,
+    messages,
+    state,
+)
+
+JOINING = evolve(SCENARIO, formation=evolve(SCENARIO.formation, max_joined=2))
+FULL: Cells = {A: (0, 0), B: (-1, 1), C: (-2, 0), D: (-3, 1), E: (-2, 2)}
+"""Block 0: all five want lane 1, which has four cells."""
+NEXT: Cells = {F: (-5, 1)}
+"""Block 1."""
+BEHIND: Cells = {name: (column - 4, lane) for name, (column, lane) in FULL.items()}
+"""The same five in block 1."""
+LANES = dict.fromkeys(FULL, 1) | {F: 0}
+
+
+def plan_of(effects: list[Effect]) -> Plan:
+    """Return the one plan that was sent, to all of its roster."""
+    sent = messages(effects, Plan)
+    plan = sent[0].message
+    assert isinstance(plan, Plan)
+    assert [send.parameters["vehicle"] for send in sent] == list(plan.roster)
+    assert all(send.message == plan for send in sent)
+    return plan
+
+
+def notes(effects: list[Effect], kind: str) -> list[dict[str, object]]:
+    found = [send.message for send in messages(effects, LogEvent)]
+    return [message.data for message in found if message.kind == kind]
+
+
+def overfull(scenario: Scenario) -> tuple[Desk, Compute]:
+    """Lead up to the order for the overfull block; block 1 is behind it and has been prepared."""
+    desk = Desk(scenario=scenario)
+    desk.lead()
+    desk.tell(census(FULL | NEXT, LANES))
+    for name, cell in (FULL | NEXT).items():
+        desk.tell(state(name, cell))
+    (job,) = jobs(desk.promise(FULL))
+    return desk, job
+
+
+def behind_of_one(desk: Desk, t_s: float) -> list[Effect]:
+    """Let those in block 1 promise, who all want lane 1, and before them F in block 0."""
+    cells: Cells = {F: (0, 0)} | BEHIND
+    desk.lead()
+    desk.tell(census(cells, dict.fromkeys(cells, 1), t_s=t_s))
+    for name, cell in cells.items():
+        desk.tell(state(name, cell))
+    desk.promise({F: (0, 0)})
+    ballot, effects = desk.core.controls[1].ballot, list[Effect]()
+    for name, cell in BEHIND.items():
+        effects += desk.tell(state(name, cell, ballot, t_s=1.0))
+    return effects
+
+
+# --- an overfull lane -------------------------------------------------------------------------
+
+
+def test_without_joining_all_but_one_get_their_lane_and_that_is_logged() -> None:
+    desk, job = overfull(SCENARIO)
+    effects = desk.give(run_job(job))
+    plan = plan_of(effects)
+    assert plan_problems(plan) == []
+    ends = {name: moves[-1][2] if moves else FULL[name] for name, moves in plan.moves.items()}
+    missed = [name for name, cell in ends.items() if cell[1] != 1]
+    assert len(missed) == 1
+    assert notes(effects, "lane-out-of-reach") == [{"formation": 0, "vehicles": missed}]
+    assert desk.core.controls[0].out_of_reach == {*missed}
+
+
+def test_an_overfull_lane_is_sorted_by_a_joint_ballot_of_two_formations() -> None:
+    desk, job = overfull(JOINING)
+    separate = desk.core.controls[1].ballot
+    effects = desk.give(run_job(job))
+    assert notes(effects, "formations-joined") == [{"formations": [0, 1]}]
+    assert messages(effects, Plan) == []
+    assert {number: each.formation.numbers for number, each in desk.core.controls.items()} == {
+        0: (0, 1)
+    }
+    everybody = FULL | NEXT
+    prepares = []
+    for name, cell in everybody.items():
+        prepares += messages(desk.tell(state(name, cell, t_s=0.5)), Prepare)
+    assert [send.parameters["vehicle"] for send in prepares] == list(everybody)
+    assert {send.message for send in prepares} == {Prepare(desk.ballot, (0, 1), tuple(everybody))}
+    assert separate is not None
+    assert desk.ballot > separate
+
+    # Promised, but not yet known to be remembered by the motion controllers.
+    assert jobs(desk.promise(everybody)) == []
+    (job,) = jobs(desk.promise(everybody, joined=(0, 1)))
+    effects = desk.give(run_job(job))
+    plan = plan_of(effects)
+    assert plan_problems(plan) == []
+    assert (plan.ballot, plan.formations, plan.roster) == (desk.ballot, (0, 1), tuple(everybody))
+    assert set(plan.territory) <= LATTICE.block_cells(0) | LATTICE.block_cells(1)
+    for name, moves in plan.moves.items():
+        assert (moves[-1][2] if moves else everybody[name])[1] == LANES[name]
+    assert notes(effects, "lane-out-of-reach") == []
+    for name, cell in everybody.items():
+        desk.tell(state(name, cell, desk.ballot, accepted=True, t_s=2.0, joined=(0, 1)))
+    assert desk.core.controls[0].phase is Phase.WATCHING
+
+
+def test_a_result_for_a_formation_that_has_been_joined_meanwhile_is_dropped() -> None:
+    desk, job = overfull(JOINING)
+    ballot = desk.core.controls[1].ballot
+    (other,) = jobs(desk.tell(state(F, NEXT[F], ballot, t_s=1.0)))
+    desk.give(run_job(job))
+    effects = desk.give(run_job(other))
+    assert messages(effects, Plan) == []
+    assert logged(effects) == []
+
+
+def test_with_nobody_near_a_formation_is_planned_alone() -> None:
+    desk = Desk(scenario=JOINING)
+    (job,) = jobs(desk.collect_promises(FULL, LANES))
+    effects = desk.give(run_job(job))
+    assert plan_of(effects).formations == (0,)
+    assert len(notes(effects, "lane-out-of-reach")) == 1
+
+
+def test_the_last_formation_is_joined_with_the_one_before_it() -> None:
+    desk = Desk(scenario=JOINING)
+    (job,) = jobs(behind_of_one(desk, T_S))
+    assert notes(desk.give(run_job(job)), "formations-joined") == [{"formations": [0, 1]}]
+    assert desk.core.controls[0].formation.roster == (*FULL, F)
+
+
+def test_formations_are_not_joined_when_together_they_are_too_late() -> None:
+    """They begin when the rear of the last one is in S3, and end when the first one leaves."""
+    short_road = evolve(JOINING, road=evolve(JOINING.road, s3_m=130.0))
+    desk, job = overfull(short_road)
+    effects = desk.give(run_job(job))
+    assert notes(effects, "formations-joined") == []
+    assert plan_of(effects).formations == (0,)
+
+
+def test_nobody_is_joined_who_has_settled() -> None:
+    """Block 0 is about to leave; behind it there is an overfull lane."""
+    desk = Desk(scenario=JOINING)
+    (job,) = jobs(behind_of_one(desk, 63.0))
+    assert desk.core.controls[0].phase is Phase.SETTLED
+    assert plan_of(desk.give(run_job(job))).formations == (1,)
+    assert sorted(desk.core.controls) == [0, 1]
+
+
+def test_no_more_formations_are_joined_than_the_scenario_allows() -> None:
+    desk, job = overfull(JOINING)
+    desk.give(run_job(job))
+    everybody = FULL | NEXT
+    third: Cells = {Name("third"): (-9, 1)}
+    crowd = LANES | dict.fromkeys(NEXT, 1) | {Name("third"): 1}
+    cells: Cells = everybody | {Name(f"x{index}"): (-7 + index, 2) for index in range(4)}
+    lanes = dict.fromkeys(cells, 1) | crowd
+    desk.tell(census(cells | third, lanes, t_s=T_S + 1.0))
+    for name, cell in cells.items():
+        desk.tell(state(name, cell, t_s=0.5))
+    (job,) = jobs(desk.promise(cells, joined=(0, 1)))
+    effects = desk.give(run_job(job))
+    assert notes(effects, "formations-joined") == []
+    assert plan_of(effects).formations == (0, 1)
+
+
+# --- groups that others have made -------------------------------------------------------------
+
+
+def test_a_group_is_learned_from_a_state_of_any_member() -> None:
+    desk = Desk()
+    desk.lead()
+    desk.tell(census(FULL | NEXT, LANES))
+    assert sorted(desk.core.controls) == [0, 1]
+    desk.tell(state(F, NEXT[F], joined=(0, 1)))
+    assert sorted(desk.core.controls) == [0]
+    control = desk.core.controls[0]
+    assert (control.formation.numbers, control.formation.roster) == ((0, 1), (*FULL, F))
+    desk.tell(state(F, NEXT[F], joined=(1,), t_s=9.0))  # nobody takes that back
+    assert desk.core.controls[0] is control
+
+
+def test_a_ballot_is_widened_when_a_promise_shows_more_formations() -> None:
+    desk, _ = overfull(SCENARIO)
+    ballot = desk.ballot
+    desk.tell(state(A, FULL[A], ballot, joined=(0, 1), t_s=2.0))
+    for name, cell in (FULL | NEXT).items():
+        desk.tell(state(name, cell, ballot, joined=(0, 1), t_s=3.0))
+    control = desk.core.controls[0]
+    assert (control.phase, control.formation.numbers) == (Phase.PREPARING, (0, 1))
+    assert desk.ballot > ballot
+
+
+def test_an_acceptance_that_shows_more_formations_puts_no_plan_in_force() -> None:
+    desk = Desk()
+    (job,) = jobs(desk.collect_promises({A: (0, 0)}, {A: 1}))
+    desk.give(run_job(job))
+    accepted = state(A, (0, 0), desk.ballot, accepted=True, t_s=2.0, joined=(0, 1))
+    assert logged(desk.tell(accepted)) == []
+    control = desk.core.controls[0]
+    assert (control.formation.numbers, control.phase) == ((0, 1), Phase.OBSERVING)
+
+
+def test_groups_that_overlap_become_one() -> None:
+    desk = Desk()
+    desk.lead()
+    cells: Cells = {A: (0, 0), B: (-5, 1), C: (-9, 1)}
+    desk.tell(census(cells))
+    assert sorted(desk.core.controls) == [0, 1, 2]
+    desk.tell(state(A, cells[A], joined=(0, 1)))
+    desk.tell(evolve(state(C, cells[C]), formation=2, joined=(1, 2)))
+    assert {number: each.formation.numbers for number, each in desk.core.controls.items()} == {
+        0: (0, 1, 2)
+    }
+
+
+def test_a_group_is_planned_only_once_its_later_block_has_closed_in_the_census() -> None:
+    """Until then somebody may enter whom no ballot would know of."""
+    desk = Desk()
+    desk.lead()
+    cells: Cells = {A: (0, 0), B: (-4, 0)}
+    late_s = closing_time_s(1)
+    desk.tell(census({A: cells[A]}, t_s=late_s - 3.0))
+    assert sorted(desk.core.controls) == [0]
+    desk.tell(state(A, cells[A], joined=(0, 1)))
+    assert desk.core.controls == {}
+    desk.tell(census(cells, t_s=late_s - 0.1))
+    desk.tell(RoadClock(99, late_s + 5.0, 2, 2, 2, 0, ended=False))
+    assert desk.core.controls == {}
+    desk.tell(census(cells, t_s=late_s))
+    assert desk.core.controls[0].formation.roster == (A, B)
+
+
+def test_those_who_are_left_of_a_group_stay_joined() -> None:
+    desk = Desk()
+    desk.lead()
+    desk.tell(census({A: (0, 0), B: (-4, 0)}))
+    desk.tell(state(A, joined=(0, 1)))
+    desk.tell(census({B: (-4, 0)}, t_s=T_S + 1.0))
+    control = desk.core.controls[0]
+    assert (control.formation.numbers, control.formation.roster) == ((0, 1), (B,))
+
+
+def test_another_road_has_other_groups() -> None:
+    desk = Desk()
+    desk.lead()
+    desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}))
+    desk.tell(census({A: (0, 0), B: (-4, 0)}))
+    desk.tell(state(A, joined=(0, 1)))
+    assert sorted(desk.core.controls) == [0]
+    desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "8"}))
+    desk.tell(census({A: (0, 0), B: (-4, 0)}))
+    assert sorted(desk.core.controls) == [0, 1]
+
+
+# --- who is observed first --------------------------------------------------------------------
+
+
+def just_closed(number: int = 0) -> float:
+    return closing_time_s(number) + 0.1
+
+
+def test_a_formation_that_closes_before_the_leaders_eyes_is_prepared_at_once() -> None:
+    desk = Desk()
+    desk.lead()
+    desk.watch(ELECTION_S + 0.1)
+    prepares = messages(desk.tell(census({A: (0, 0), B: (-1, 1)}, t_s=just_closed())), Prepare)
+    assert [send.parameters["vehicle"] for send in prepares] == [A, B]
+
+
+def test_a_formation_that_closed_before_the_leader_saw_it_is_observed() -> None:
+    desk = Desk()
+    desk.lead()
+    desk.watch(ELECTION_S + 0.1)
+    seen_s = closing_time_s(0) + JUST_CLOSED_S + 0.1
+    assert messages(desk.tell(census({A: (0, 0)}, t_s=seen_s)), Prepare) == []
+    theirs = Ballot(4, Name("c0"), 3, 2)
+    desk.tell(state(A, (0, 0), theirs, accepted=True))
+    assert desk.core.controls[0].phase is Phase.WATCHING
+    assert desk.ballot == theirs
+
+
+def test_a_leader_that_has_just_begun_observes_every_formation() -> None:
+    desk = Desk()
+    desk.watch(2 * ELECTION_S - 0.2)  # of which it has led for the last 0.8 s
+    assert desk.core.election.leading
+    assert messages(desk.tell(census({A: (0, 0)}, t_s=just_closed())), Prepare) == []
+    assert desk.core.controls[0].phase is Phase.OBSERVING
+
+
+def test_a_leader_that_was_paused_observes_every_formation() -> None:
+    """Another one may have led, and planned, while it slept."""
+    desk = Desk()
+    desk.lead()
+    desk.watch(2 * ELECTION_S)
+    desk.wait(ELECTION_S)
+    assert messages(desk.tell(census({A: (0, 0)}, t_s=just_closed())), Prepare) == []
+    assert desk.core.controls[0].phase is Phase.OBSERVING
+    desk.watch(ELECTION_S + 0.1)
+    later = census({A: (0, 0), B: (-4, 0)}, t_s=just_closed(1))
+    assert [send.parameters["vehicle"] for send in messages(desk.tell(later), Prepare)] == [B]
+
+
+def test_a_plan_in_force_is_logged_with_the_time_at_which_its_formation_had_closed() -> None:
+    desk = Desk()
+    cells: Cells = {A: (0, 0), B: (-1, 1)}
+    (job,) = jobs(desk.collect_promises(cells, {A: 1, B: 0}))
+    desk.give(run_job(job))
+    told: list[Effect] = []
+    for name, cell in cells.items():
+        told += desk.tell(state(name, cell, desk.ballot, accepted=True, t_s=2.0))
+        told += desk.tell(state(name, cell, desk.ballot, accepted=True, t_s=2.1))
+    assert notes(told, "plan-in-force") == [{"formation": 0, "closed_s": closing_time_s(0)}]
+
+
+# --- members without agents -------------------------------------------------------------------
+
+
+def test_a_vehicle_without_an_agent_keeps_its_cell_and_the_others_drive_around_it() -> None:
+    """A holds in the middle lane, between B and the lane that B wants."""
+    cells: Cells = {A: (-1, 1), B: (-1, 2)}
+    desk = Desk()
+    desk.lead()
+    desk.tell(census(cells, {A: 0, B: 0}))
+    for name, cell in cells.items():
+        desk.tell(state(name, cell))
+    (job,) = jobs(desk.promise(cells, unattended=[A]))
+    effects = desk.give(run_job(job))
+    plan = plan_of(effects)
+    assert plan_problems(plan) == []
+    assert (plan.moves[A], plan.start_cells[A]) == ((), cells[A])
+    assert plan.moves[B][-1][2][1] == 0
+    assert all(cells[A] not in move[1:] for move in plan.moves[B])
+    assert notes(effects, "lane-out-of-reach") == [{"formation": 0, "vehicles": [A]}]
+
+
+def test_when_nobody_can_be_moved_the_plan_has_no_moves() -> None:
+    cells: Cells = {A: (0, 0), B: (-1, 1)}
+    desk = Desk()
+    desk.lead()
+    desk.tell(census(cells, {A: 0, B: 2}))
+    for name, cell in cells.items():
+        desk.tell(state(name, cell))
+    (job,) = jobs(desk.promise(cells, unattended=[A, B]))
+    effects = desk.give(run_job(job))
+    assert plan_of(effects).moves == {A: (), B: ()}
+    assert logged(effects) == ["lane-out-of-reach"]
+    for name, cell in cells.items():
+        shown = state(name, cell, desk.ballot, accepted=True, t_s=2.0)
+        desk.tell(evolve(shown, attended=False, done=True))
+    desk.watch(3.0)
+    assert desk.core.controls[0].phase is Phase.WATCHING  # and it is not planned again for ever
+
+
+def test_a_lane_that_only_those_without_agents_miss_is_no_reason_to_join() -> None:
+    desk = Desk(scenario=JOINING)
+    desk.lead()
+    cells: Cells = {A: (0, 0), B: (-1, 1)} | NEXT
+    desk.tell(census(cells, {A: 2, B: 0, F: 0}))
+    for name, cell in cells.items():
+        desk.tell(state(name, cell))
+    mine = {name: cells[name] for name in (A, B)}
+    (job,) = jobs(desk.promise(mine, unattended=[A]))
+    effects = desk.give(run_job(job))
+    assert plan_of(effects).formations == (0,)
+    assert notes(effects, "lane-out-of-reach") == [{"formation": 0, "vehicles": [A]}]

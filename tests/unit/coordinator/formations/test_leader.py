@@ -1,0 +1,783 @@
+"""Rules L2 to L8 for one formation, transition by transition."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Iterable
+
+import pytest
+from attrs import evolve
+
+from laneweave.coordinator.formations.control import FormationControl
+from laneweave.coordinator.formations.leader_rules import (
+    BACK_OFF_S,
+    ISSUE_S,
+    LEADER_RULES,
+    LONGEST_RETRY_S,
+    MOST_BACK_OFFS,
+    OBSERVE_S,
+    RETRY_S,
+    Phase,
+)
+from laneweave.coordinator.formations.roster import Formation
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.wire.messages import Ballot, CensusEntry, Name, Plan, Prepare, VehicleState
+from support.rule_recorder import RuleRecorder
+
+A, B, C = Name("A"), Name("B"), Name("C")
+OTHERS = Ballot(1, Name("other"), 1, 1)
+RESEND_S = 0.2
+RNG = random.Random(1)
+Reach = Callable[..., tuple[FormationControl, Ballot]]
+
+
+def formation(*names: Name, lane: int = 1, numbers: tuple[int, ...] = (0,)) -> Formation:
+    return Formation(numbers, tuple(CensusEntry(name, (0, 0), lane, 0.0) for name in names))
+
+
+class Ballots:
+    """A source of ballots like a coordinator's."""
+
+    def __init__(self) -> None:
+        """Begin with term 1."""
+        self.term, self.given = 1, 0
+
+    def __call__(self, above: Ballot | None) -> Ballot:
+        if above is not None:
+            self.term = max(self.term, above.term + 1)
+        self.given += 1
+        return Ballot(self.term, Name("me"), 1, self.given)
+
+
+def control(*names: Name, numbers: tuple[int, ...] = (0,)) -> FormationControl:
+    made = FormationControl(formation(*names, numbers=numbers), Ballots(), RNG, RESEND_S)
+    made.begin(0.0)
+    return made
+
+
+def state(
+    name: Name,
+    promised: Ballot | None = None,
+    *,
+    accepted: bool = False,
+    incarnation: int = 1,
+    t_s: float = 0.0,
+    cell: Cell = (0, 0),
+    done: bool = False,
+    overdue: bool = False,
+    attended: bool = True,
+    joined: tuple[int, ...] = (0,),
+) -> VehicleState:
+    return VehicleState(
+        vehicle=name,
+        incarnation=incarnation,
+        formation=0,
+        joined=joined,
+        promised=promised,
+        accepted=accepted,
+        ready=accepted,
+        completed=0,
+        hold_cell=cell,
+        moving=False,
+        go=False,
+        done=done,
+        overdue=overdue,
+        attended=attended,
+        s_m=0.0,
+        y_m=0.0,
+        speed_mps=0.0,
+        t_s=t_s,
+    )
+
+
+def phase(leader: FormationControl) -> Phase:
+    return leader.phase
+
+
+def hear(leader: FormationControl, *states: VehicleState, now_s: float = 0.0) -> None:
+    for each in states:
+        leader.on_state(each, now_s)
+
+
+def to(sent: Iterable[tuple[Name, Prepare | Plan]]) -> list[Name]:
+    return [name for name, _ in sent]
+
+
+def preparing(*names: Name) -> tuple[FormationControl, Ballot]:
+    leader = control(*names)
+    hear(leader, *(state(name) for name in names))
+    assert phase(leader) is Phase.PREPARING
+    assert leader.ballot is not None
+    return leader, leader.ballot
+
+
+def planning(*names: Name) -> tuple[FormationControl, Ballot]:
+    leader, ballot = preparing(*names)
+    hear(leader, *(state(name, ballot) for name in names))
+    assert leader.take_planning_order(0.0)
+    return leader, ballot
+
+
+def plan_of(leader: FormationControl) -> Plan:
+    assert leader.ballot is not None
+    cells = leader.hold_cells
+    return Plan(
+        leader.ballot, leader.formation.numbers, tuple(cells), leader.incarnations, cells,
+        dict.fromkeys(cells, ()), 0.0, 4.0, (),
+    )  # fmt: skip
+
+
+def issuing(*names: Name) -> tuple[FormationControl, Ballot]:
+    leader, ballot = planning(*names)
+    leader.on_plan(plan_of(leader), 0.0)
+    return leader, ballot
+
+
+def watching(*names: Name) -> tuple[FormationControl, Ballot]:
+    leader, ballot = issuing(*names)
+    hear(leader, *(state(name, ballot, accepted=True) for name in names))
+    assert phase(leader) is Phase.WATCHING
+    return leader, ballot
+
+
+# --- L2 ---------------------------------------------------------------------------------------
+
+
+def test_l2_adopts_a_plan_that_all_have_accepted_and_sends_nothing() -> None:
+    leader = control(A, B)
+    hear(leader, state(A, OTHERS, accepted=True), state(B, OTHERS, accepted=True))
+    assert (leader.phase, leader.ballot, leader.plan) == (Phase.WATCHING, OTHERS, None)
+    leader.on_time(100.0)
+    assert list(leader.outgoing(100.0)) == []
+    assert not leader.take_planning_order(100.0)
+    assert leader.wakeup_s is None
+
+
+@pytest.mark.parametrize(
+    "last",
+    [
+        state(B),
+        state(B, OTHERS),
+        state(B, OTHERS._replace(seq=2), accepted=True),
+        state(B, OTHERS, accepted=True, overdue=True),
+    ],
+    ids=["nothing promised", "promised only", "another plan", "overdue"],
+)
+def test_l2_mixed_states_lead_to_a_new_ballot(last: VehicleState) -> None:
+    leader = control(A, B)
+    hear(leader, state(A, OTHERS, accepted=True))
+    assert phase(leader) is Phase.OBSERVING
+    hear(leader, last)
+    assert phase(leader) is Phase.PREPARING
+    assert leader.ballot is not None
+    assert leader.ballot > OTHERS
+
+
+def test_l2_waits_for_the_states_of_the_roster_but_not_for_ever() -> None:
+    leader = control(A, B)
+    hear(leader, state(A, OTHERS, accepted=True))
+    leader.on_time(OBSERVE_S - 0.01)
+    assert phase(leader) is Phase.OBSERVING
+    assert leader.wakeup_s == OBSERVE_S
+    leader.on_time(OBSERVE_S)
+    assert phase(leader) is Phase.PREPARING
+
+
+def test_strangers_say_nothing() -> None:
+    leader = control(A)
+    hear(leader, state(C, OTHERS._replace(term=9)))
+    assert phase(leader) is Phase.OBSERVING
+    hear(leader, state(A))
+    assert leader.ballot == Ballot(1, Name("me"), 1, 1)
+
+
+def test_l2_an_adopted_plan_is_watched_by_its_promises() -> None:
+    leader = control(A, B)
+    hear(leader, state(A, OTHERS, accepted=True), state(B, OTHERS, accepted=True, incarnation=7))
+    assert leader.incarnations == {A: 1, B: 7}
+
+
+def test_without_observing_it_prepares_at_once_whatever_it_would_hear() -> None:
+    """A formation that has closed under this leader has no plan that could be adopted."""
+    leader = FormationControl(formation(A, B), Ballots(), RNG, RESEND_S)
+    leader.begin(5.0, observe=False)
+    assert (leader.phase, leader.wakeup_s) == (Phase.PREPARING, 5.0)
+    assert to(leader.outgoing(5.0)) == [A, B]
+    hear(leader, state(A, OTHERS._replace(term=0)), now_s=5.0)
+    assert phase(leader) is Phase.PREPARING  # a lower ballot is overruled
+    hear(leader, state(B, OTHERS._replace(term=3)), now_s=5.0)
+    assert phase(leader) is Phase.BACKING_OFF
+
+
+def test_begin_observes_from_its_own_time_on() -> None:
+    leader = FormationControl(formation(A), Ballots(), RNG, RESEND_S)
+    leader.begin(100.0)
+    leader.on_time(100.0 + OBSERVE_S - 0.01)
+    assert phase(leader) is Phase.OBSERVING
+    leader.on_time(100.0 + OBSERVE_S)
+    assert phase(leader) is Phase.PREPARING
+
+
+# --- L3 and L4 --------------------------------------------------------------------------------
+
+
+def test_l3_a_new_ballot_is_above_everything_seen() -> None:
+    leader = control(A, B)
+    hear(leader, state(A, OTHERS), state(B, OTHERS._replace(term=5)))
+    assert leader.ballot == Ballot(6, Name("me"), 1, 1)
+
+
+def test_prepare_goes_to_those_who_have_not_promised_until_they_have() -> None:
+    leader, ballot = preparing(A, B)
+    sent = dict(leader.outgoing(0.0))
+    assert sent == dict.fromkeys((A, B), Prepare(ballot, (0,), (A, B)))
+    assert list(leader.outgoing(RESEND_S / 2)) == []
+    hear(leader, state(A, ballot))
+    assert to(leader.outgoing(RESEND_S)) == [B]
+    assert leader.wakeup_s == 2 * RESEND_S
+
+
+def test_l4_only_this_ballot_is_a_promise_and_not_once_accepted() -> None:
+    leader, ballot = preparing(A)
+    for each in (state(A), state(A, ballot._replace(seq=0)), state(A, ballot, accepted=True)):
+        hear(leader, each)
+        assert not leader.take_planning_order(0.0)
+
+
+def test_a_promise_that_was_forgotten_is_void() -> None:
+    leader, ballot = preparing(A, B)
+    hear(leader, state(A, ballot), state(A, incarnation=2), state(B, ballot))
+    assert not leader.take_planning_order(0.0)
+    assert to(leader.outgoing(0.0)) == [A]
+    hear(leader, state(A, ballot, incarnation=2, cell=(3, 1)))
+    assert leader.take_planning_order(0.0)
+    assert leader.incarnations == {A: 2, B: 1}
+    assert leader.hold_cells == {A: (3, 1), B: (0, 0)}
+
+
+@pytest.mark.parametrize(
+    ("newer", "older"),
+    [
+        (state(A, Ballot(1, Name("me"), 1, 1), t_s=2.0), state(A, t_s=1.0)),
+        (state(A, Ballot(1, Name("me"), 1, 1)), state(A)),
+        (state(A, Ballot(1, Name("me"), 1, 1)), state(A, Ballot(0, Name("x"), 1, 1))),
+        (state(A, Ballot(1, Name("me"), 1, 1), incarnation=2), state(A, t_s=9.0)),
+    ],
+    ids=["older time", "no promise yet", "lower promise", "older process"],
+)
+def test_a_late_state_takes_no_promise_back(newer: VehicleState, older: VehicleState) -> None:
+    leader, _ = preparing(A)
+    hear(leader, newer, older)
+    assert leader.take_planning_order(0.0)
+
+
+# --- joint ballots ----------------------------------------------------------------------------
+
+
+def test_prepare_of_a_joint_ballot_names_all_formations() -> None:
+    leader = FormationControl(formation(A, B, numbers=(3, 4)), Ballots(), RNG, RESEND_S)
+    leader.begin(0.0, observe=False)
+    assert leader.ballot is not None
+    expected = Prepare(leader.ballot, (3, 4), (A, B))
+    assert dict(leader.outgoing(0.0)) == {A: expected, B: expected}
+
+
+@pytest.mark.parametrize("joined", [(), (0,), (1,), (0, 2), (0, 1, 2)])
+def test_a_promise_counts_once_the_vehicle_has_joined_exactly_the_formations(
+    joined: tuple[int, ...],
+) -> None:
+    """Fewer: its controller could forget them with the agent. More: others may be in its way."""
+    leader = control(A, numbers=(0, 1))
+    hear(leader, state(A, joined=joined))
+    assert leader.ballot is not None
+    hear(leader, state(A, leader.ballot, joined=joined, t_s=1.0))
+    assert leader.promises == {}
+    assert not leader.take_planning_order(0.0)
+    assert to(leader.outgoing(0.0)) == [A]
+    hear(leader, state(A, leader.ballot, joined=(0, 1), t_s=1.1))
+    assert leader.take_planning_order(0.0)
+
+
+def test_a_promise_is_void_once_the_vehicle_shows_more_formations() -> None:
+    leader, ballot = preparing(A, B)
+    hear(leader, state(A, ballot), state(A, ballot, joined=(0, 1), t_s=1.0), state(B, ballot))
+    assert not leader.take_planning_order(0.0)
+
+
+# --- L5 ---------------------------------------------------------------------------------------
+
+
+def test_l5_needs_the_whole_roster_and_orders_once() -> None:
+    leader, ballot = preparing(A, B, C)
+    hear(leader, state(A, ballot), state(B, ballot))
+    assert not leader.take_planning_order(0.0)
+    hear(leader, state(C, ballot))
+    assert leader.take_planning_order(0.0)
+    assert not leader.take_planning_order(0.0)
+    assert (leader.phase, leader.wakeup_s) == (Phase.PLANNING, None)
+    assert list(leader.outgoing(9.0)) == []
+
+
+def test_l5_failed_planning_keeps_the_ballot_and_tries_again_later_and_later() -> None:
+    leader, ballot = planning(A)
+    now_s = 0.0
+    for pause_s in (RETRY_S, 2 * RETRY_S, 4 * RETRY_S):
+        leader.on_planning_failed(now_s)
+        assert leader.wakeup_s == now_s + pause_s
+        assert not leader.take_planning_order(now_s + pause_s - 0.01)
+        now_s += pause_s
+        leader.on_time(now_s)
+        assert list(leader.outgoing(now_s)) == []
+        assert leader.take_planning_order(now_s)
+        assert leader.ballot == ballot
+    leader.on_plan(plan_of(leader), now_s)
+    assert leader.failures == 0
+
+
+def test_l5_the_pauses_after_failed_planning_do_not_grow_for_ever() -> None:
+    leader, _ = planning(A)
+    now_s, pauses = 0.0, []
+    for _ in range(8):
+        leader.on_planning_failed(now_s)
+        pauses.append((leader.wakeup_s or 0.0) - now_s)
+        now_s += pauses[-1]
+        assert leader.take_planning_order(now_s)
+    assert pauses == [1.0, 2.0, 4.0, 8.0, 8.0, 8.0, 8.0, 8.0]
+    assert max(pauses) == LONGEST_RETRY_S
+
+
+def test_a_new_ballot_has_not_failed_yet() -> None:
+    leader, _ = planning(A)
+    leader.on_planning_failed(0.0)
+    leader.on_members(formation(A, lane=2), 0.1)
+    assert leader.ballot is not None
+    hear(leader, state(A, leader.ballot, t_s=1.0), now_s=0.1)
+    assert leader.take_planning_order(0.1)
+
+
+@pytest.mark.parametrize("reach", [preparing, issuing, watching])
+def test_results_that_nobody_waits_for_change_nothing(reach: Reach) -> None:
+    leader, ballot = reach(A, B)
+    before = (leader.phase, leader.plan, leader.failures)
+    leader.on_planning_failed(3.0)
+    leader.settle(3.0)
+    assert (leader.phase, leader.plan, leader.failures) == before
+    assert leader.ballot == ballot
+
+
+def test_restart_during_the_pause_after_failed_planning() -> None:
+    leader, ballot = planning(A)
+    leader.on_planning_failed(0.0)
+    hear(leader, state(A, incarnation=2))
+    assert not leader.take_planning_order(RETRY_S)
+    assert to(leader.outgoing(RETRY_S)) == [A]
+    hear(leader, state(A, ballot, incarnation=2))
+    assert leader.take_planning_order(RETRY_S + RESEND_S)
+
+
+# --- L6 ---------------------------------------------------------------------------------------
+
+
+def test_l6_the_plan_goes_to_those_who_have_not_accepted() -> None:
+    leader, ballot = issuing(A, B)
+    plan = plan_of(leader)
+    assert list(leader.outgoing(0.0)) == [(A, plan), (B, plan)]
+    hear(leader, state(A, ballot, accepted=True))
+    assert list(leader.outgoing(RESEND_S - 0.01)) == []
+    assert list(leader.outgoing(RESEND_S)) == [(B, plan)]
+    hear(leader, state(B, ballot))  # still only promised
+    assert phase(leader) is Phase.ISSUING
+    hear(leader, state(B, ballot, accepted=True))
+    assert (leader.phase, leader.ballot) == (Phase.WATCHING, ballot)
+    assert list(leader.outgoing(99.0)) == []
+
+
+def test_l6_acceptances_count_once_and_of_this_ballot_only() -> None:
+    leader, ballot = issuing(A, B)
+    for _ in range(2):
+        hear(leader, state(A, ballot, accepted=True))
+    hear(leader, state(B, ballot._replace(seq=0), accepted=True))
+    assert leader.accepted == {A}
+    assert phase(leader) is Phase.ISSUING
+
+
+def test_l8_a_plan_that_somebody_refuses_is_given_up() -> None:
+    leader, ballot = issuing(A, B)
+    hear(leader, state(A, ballot, accepted=True))
+    leader.on_time(ISSUE_S - 0.01)
+    assert phase(leader) is Phase.ISSUING
+    assert to(leader.outgoing(ISSUE_S - 0.01)) == [B]
+    leader.on_time(ISSUE_S)
+    assert phase(leader) is Phase.PREPARING
+    assert leader.ballot is not None
+    assert leader.ballot > ballot
+    assert to(leader.outgoing(ISSUE_S)) == [A, B]
+
+
+# --- L7 ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("reach", [preparing, planning, issuing, watching])
+@pytest.mark.parametrize("higher", [Ballot(2, Name("a"), 1, 1), Ballot(1, Name("z"), 1, 1)])
+def test_l7_outbid_backs_off_then_looks_and_takes_a_higher_term(
+    reach: Reach, higher: Ballot
+) -> None:
+    leader, ballot = reach(A, B)
+    hear(leader, state(A, higher, t_s=1.0), now_s=5.0)
+    assert phase(leader) is Phase.BACKING_OFF
+    pause_s = (leader.wakeup_s or 0.0) - 5.0
+    assert BACK_OFF_S[0] <= pause_s <= BACK_OFF_S[1]
+    assert list(leader.outgoing(9.0)) == []
+    assert not leader.take_planning_order(9.0)
+    leader.on_time(5.0 + pause_s)
+    assert phase(leader) is Phase.OBSERVING
+    hear(leader, state(A, higher, t_s=2.0), state(B, ballot, t_s=2.0), now_s=6.0)
+    assert phase(leader) is Phase.PREPARING
+    assert leader.ballot is not None
+    assert leader.ballot.term > higher.term
+
+
+def test_l7_adopts_the_others_plan_if_it_is_in_force_after_the_pause() -> None:
+    leader, _ = issuing(A, B)
+    higher = Ballot(2, Name("z"), 1, 1)
+    hear(leader, state(A, higher, t_s=1.0))
+    leader.on_time(1.0)
+    for name in (A, B):
+        hear(leader, state(name, higher, accepted=True, incarnation=2, t_s=2.0))
+    assert (leader.phase, leader.ballot) == (Phase.WATCHING, higher)
+    # The incarnations that promised this leader's own ballot are history.
+    hear(leader, state(A, higher, accepted=True, incarnation=2, t_s=3.0))
+    assert phase(leader) is Phase.WATCHING
+
+
+class Longest(random.Random):
+    """Every pause is as long as it may be."""
+
+    def uniform(self, a: float, b: float) -> float:
+        del a
+        return b
+
+
+def outbid(leader: FormationControl, now_s: float) -> tuple[float, Ballot]:
+    """Show a leader a higher ballot; return how long it pauses, and the new ballot after that."""
+    assert leader.ballot is not None
+    higher = leader.ballot._replace(term=leader.ballot.term + 1)
+    hear(leader, state(A, higher, t_s=now_s), now_s=now_s)
+    assert phase(leader) is Phase.BACKING_OFF
+    pause_s = (leader.wakeup_s or 0.0) - now_s
+    leader.on_time(now_s + pause_s - 1e-6)
+    assert phase(leader) is Phase.BACKING_OFF
+    leader.on_time(now_s + pause_s)
+    hear(leader, state(A, higher, t_s=now_s), state(B, t_s=now_s), now_s=now_s + pause_s)
+    assert phase(leader) is Phase.PREPARING
+    assert leader.ballot > higher
+    return pause_s, leader.ballot
+
+
+def promise_and_plan(leader: FormationControl, ballot: Ballot, now_s: float) -> None:
+    hear(leader, state(A, ballot, t_s=now_s), state(B, ballot, t_s=now_s), now_s=now_s)
+    assert leader.take_planning_order(now_s)
+    leader.on_plan(plan_of(leader), now_s)
+
+
+def test_l7_pauses_grow_so_that_one_of_two_leaders_gets_the_time_to_plan() -> None:
+    leader, _ = preparing(A, B)
+    leader.rng = Longest()
+    pauses = []
+    for now_s in range(0, 30 * (MOST_BACK_OFFS + 3), 30):
+        pause_s, ballot = outbid(leader, float(now_s))
+        pauses.append(pause_s / BACK_OFF_S[1])
+        promise_and_plan(leader, ballot, now_s + 25.0)  # promises and a plan are no success yet
+    growing = [2.0**number for number in range(MOST_BACK_OFFS)]
+    assert pauses == pytest.approx([*growing, *[2.0**MOST_BACK_OFFS] * 3])
+
+
+@pytest.mark.parametrize("success", ["accepted", "adopted"])
+def test_l7_after_a_success_the_pauses_are_short_again(success: str) -> None:
+    leader, _ = preparing(A, B)
+    leader.rng = Longest()
+    for now_s in (0.0, 30.0, 60.0):
+        pause_s, ballot = outbid(leader, now_s)
+    assert pause_s == pytest.approx(4.0 * BACK_OFF_S[1])
+    if success == "accepted":
+        promise_and_plan(leader, ballot, 80.0)
+        hear(leader, state(A, ballot, accepted=True, t_s=81.0), now_s=81.0)
+    else:
+        theirs = ballot._replace(term=ballot.term + 1)
+        hear(leader, state(A, theirs, accepted=True, t_s=80.0), now_s=80.0)
+        leader.on_time(100.0)
+        for name in (A, B):
+            hear(leader, state(name, theirs, accepted=True, t_s=101.0), now_s=101.0)
+        assert (phase(leader), leader.ballot) == (Phase.WATCHING, theirs)
+    pause_s, _ = outbid(leader, 120.0)
+    assert pause_s == pytest.approx(BACK_OFF_S[1])
+
+
+# --- L8 ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("reach", [planning, issuing, watching])
+def test_l8_a_restarted_agent_leads_to_a_new_ballot(reach: Reach) -> None:
+    leader, ballot = reach(A, B)
+    hear(leader, state(A, incarnation=2))
+    assert phase(leader) is Phase.PREPARING
+    assert leader.ballot is not None
+    assert leader.ballot > ballot
+
+
+@pytest.mark.parametrize("promised", [None, OTHERS])
+def test_l8_a_restarted_agent_in_an_adopted_plan(promised: Ballot | None) -> None:
+    """A duplicate of the old PREPARE may make it promise the adopted ballot once more."""
+    leader = control(A, B)
+    hear(leader, state(A, OTHERS, accepted=True), state(B, OTHERS, accepted=True))
+    hear(leader, state(A, promised, incarnation=2))
+    assert phase(leader) is Phase.PREPARING
+
+
+def test_l8_overdue_leads_to_a_new_ballot() -> None:
+    leader, ballot = watching(A, B)
+    hear(leader, state(A, ballot, accepted=True, overdue=True))
+    assert phase(leader) is Phase.PREPARING
+
+
+def test_l8_new_targets_lead_to_a_new_ballot() -> None:
+    leader, _ = watching(A, B)
+    leader.on_members(formation(A, B), 1.0)
+    assert phase(leader) is Phase.WATCHING
+    leader.on_members(formation(A, B, lane=2), 1.0)
+    assert phase(leader) is Phase.PREPARING
+
+
+def test_l8_an_adopted_plan_that_ended_on_the_wrong_lane_was_for_other_targets() -> None:
+    leader = control(A)
+    hear(leader, state(A, OTHERS, accepted=True, cell=(0, 2)))
+    assert phase(leader) is Phase.WATCHING
+    hear(leader, state(A, OTHERS, accepted=True, cell=(0, 1), done=True, t_s=1.0))
+    assert phase(leader) is Phase.WATCHING
+    hear(leader, state(A, OTHERS, accepted=True, cell=(0, 2), done=True, t_s=2.0))
+    assert phase(leader) is Phase.PREPARING
+
+
+def astray(**changes: object) -> VehicleState:
+    """Return what a member shows that is done on lane 2 and prefers lane 1."""
+    done = state(A, Ballot(1, Name("me"), 1, 1), accepted=True, cell=(0, 2), done=True, t_s=1.0)
+    return evolve(done, **changes)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("shown", "out_of_reach", "then"),
+    [
+        (astray(), (), Phase.PREPARING),
+        (astray(done=False), (), Phase.WATCHING),
+        (astray(hold_cell=(5, 1)), (), Phase.WATCHING),
+        (astray(), (A,), Phase.WATCHING),
+        (astray(), (B,), Phase.PREPARING),
+    ],
+    ids=["astray", "on its way", "on its lane", "out of reach", "another is out of reach"],
+)
+def test_l8_who_ends_on_the_wrong_lane_needs_a_new_plan_unless_that_was_the_plan(
+    shown: VehicleState, out_of_reach: tuple[Name, ...], then: Phase
+) -> None:
+    leader, ballot = planning(A, B)
+    leader.on_plan(plan_of(leader), 0.0, out_of_reach)
+    hear(leader, *(state(name, ballot, accepted=True) for name in (A, B)))
+    assert phase(leader) is Phase.WATCHING
+    hear(leader, shown)
+    assert phase(leader) is then
+
+
+def test_l8_who_was_out_of_reach_of_an_own_plan_may_be_astray_in_an_adopted_one() -> None:
+    leader, ballot = planning(A)
+    leader.on_plan(plan_of(leader), 0.0, [A])
+    hear(leader, state(A, ballot, accepted=True))
+    higher = ballot._replace(term=9)
+    hear(leader, state(A, higher, t_s=1.0))
+    leader.on_time(1.0)
+    hear(leader, state(A, higher, accepted=True, t_s=2.0), now_s=1.0)
+    assert phase(leader) is Phase.WATCHING
+    hear(leader, astray(promised=higher, t_s=3.0))
+    assert phase(leader) is Phase.PREPARING
+
+
+def test_l8_who_cannot_be_moved_is_not_astray() -> None:
+    """Otherwise a vehicle without an agent would have its formation planned for ever."""
+    leader, ballot = preparing(A, B)
+    hear(leader, state(A, ballot, attended=False), state(B, ballot))
+    assert leader.take_planning_order(0.0)
+    assert leader.unattended == {A}
+    leader.on_plan(plan_of(leader), 0.0)
+    hear(leader, *(state(name, ballot, accepted=True, attended=name is B) for name in (A, B)))
+    hear(leader, astray(attended=False))
+    assert phase(leader) is Phase.WATCHING
+
+
+def test_l8_an_agent_that_takes_over_from_the_caretaker_leads_to_a_new_ballot() -> None:
+    leader, ballot = preparing(A)
+    hear(leader, state(A, ballot, attended=False))
+    assert leader.take_planning_order(0.0)
+    leader.on_plan(plan_of(leader), 0.0)
+    hear(leader, state(A, ballot, accepted=True, attended=False))
+    assert phase(leader) is Phase.WATCHING
+    hear(leader, state(A, incarnation=2))
+    assert phase(leader) is Phase.PREPARING
+
+
+# --- the roster -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("reach", [preparing, planning, issuing])
+def test_who_leaves_takes_the_ballot_along(reach: Reach) -> None:
+    leader, ballot = reach(A, B)
+    leader.on_members(formation(A), 1.0)
+    assert phase(leader) is Phase.PREPARING
+    assert leader.ballot is not None
+    assert leader.ballot > ballot
+    assert list(leader.outgoing(1.0)) == [(A, Prepare(leader.ballot, (0,), (A,)))]
+    hear(leader, state(B, leader.ballot), state(A, leader.ballot))
+    assert leader.take_planning_order(1.0)
+    assert set(leader.hold_cells) == {A}
+
+
+def test_who_leaves_a_plan_in_force_stops_nobody() -> None:
+    leader, ballot = watching(A, B)
+    leader.on_members(formation(A), 1.0)
+    assert (leader.phase, leader.ballot) == (Phase.WATCHING, ballot)
+
+
+def test_who_leaves_while_observing_is_not_waited_for() -> None:
+    leader = control(A, B)
+    leader.on_members(formation(A), 0.1)
+    hear(leader, state(A, OTHERS, accepted=True))
+    assert phase(leader) is Phase.WATCHING
+
+
+@pytest.mark.parametrize("reach", [preparing, planning, issuing, watching])
+def test_what_those_showed_who_left_is_forgotten(reach: Reach) -> None:
+    leader, _ = reach(A, B)
+    leader.on_members(formation(A), 1.0)
+    assert set(leader.states) == {A}
+    hear(leader, state(B, OTHERS._replace(term=9), t_s=2.0))
+    assert set(leader.states) == {A}
+    assert leader.phase in (Phase.PREPARING, Phase.WATCHING)
+
+
+def test_who_joins_a_plan_in_force_leads_to_a_new_ballot_for_all() -> None:
+    leader, _ = watching(A, B)
+    leader.on_members(formation(A, B, C), 1.0)
+    assert phase(leader) is Phase.PREPARING
+    assert to(leader.outgoing(1.0)) == [A, B, C]
+
+
+def test_settled_is_the_end() -> None:
+    leader, ballot = planning(A)
+    leader.settle(0.0)
+    hear(leader, state(A, ballot, incarnation=2, overdue=True))
+    leader.on_time(1e6)
+    leader.on_members(formation(A, lane=2), 1e6)
+    assert (leader.phase, leader.wakeup_s) == (Phase.SETTLED, None)
+    assert list(leader.outgoing(1e6)) == []
+
+
+# --- the table as a whole ---------------------------------------------------------------------
+
+
+def test_a_history_takes_every_row_of_the_table() -> None:
+    """No row is hidden behind an earlier one."""
+    book = RuleRecorder(LEADER_RULES)
+    leader = FormationControl(formation(A, B), Ballots(), RNG, RESEND_S, book)
+    clock = iter(range(1, 1000))
+
+    def show(name: Name, promised: Ballot | None, **changes: object) -> None:
+        each = evolve(state(name, promised, t_s=next(clock)), **changes)  # type: ignore[arg-type]
+        hear(leader, each, now_s=leader.now_s)
+
+    def promise_and_plan() -> None:
+        for name in (A, B):
+            show(name, leader.ballot, incarnation=2)
+        assert leader.take_planning_order(leader.now_s)
+
+    def issue() -> None:
+        promise_and_plan()
+        leader.on_plan(plan_of(leader), leader.now_s)
+
+    def watch() -> None:
+        issue()
+        for name in (A, B):
+            show(name, leader.ballot, incarnation=2, accepted=True)
+
+    leader.begin(0.0)
+    for name in (A, B):
+        show(name, OTHERS, accepted=True)  # adopted
+    show(A, OTHERS, incarnation=2)  # restarted
+    show(A, OTHERS._replace(term=50), incarnation=2)  # outbid
+    leader.on_time(10.0)  # the pause is over
+    leader.on_time(10.0 + OBSERVE_S)  # nobody says anything
+    show(A, leader.ballot, incarnation=2)
+    show(A, None, incarnation=3)  # void
+    leader.begin(20.0)
+    for name in (A, B):
+        show(name, None, incarnation=2)  # all are heard, and nothing is in force
+    promise_and_plan()
+    leader.on_planning_failed(20.0)
+    leader.now_s = 20.0 + RETRY_S
+    watch()
+    show(A, leader.ballot, incarnation=2, accepted=True, overdue=True)  # stalls
+    watch()
+    show(A, leader.ballot, incarnation=2, accepted=True, done=True, hold_cell=(0, 2))  # astray
+    watch()
+    leader.on_members(formation(A, B, lane=2), leader.now_s)  # new targets
+    issue()
+    leader.on_time(leader.now_s + ISSUE_S)  # somebody refuses
+    leader.on_members(formation(A, B, lane=1), leader.now_s)  # new targets, unfinished
+    promise_and_plan()
+    leader.settle(leader.now_s)
+    names = {f"{row.rule} {row.event} {row.guards}" for row in LEADER_RULES.table}
+    taken = {
+        f"{row.rule} {row.event} {row.guards}"
+        for row in map(LEADER_RULES.table.__getitem__, book.taken)
+    }
+    assert names - taken == set()
+
+
+def test_a_bug_is_planted_in_one_leader_and_in_no_other() -> None:
+    book = LEADER_RULES.planted(roster=lambda me: me.formation.roster[:1])
+    for rules, ordered in ((book, True), (LEADER_RULES, False)):
+        leader = FormationControl(formation(A, B), Ballots(), RNG, RESEND_S, rules)
+        leader.begin(0.0, observe=False)
+        hear(leader, state(A, leader.ballot))
+        assert leader.take_planning_order(0.0) is ordered
+
+
+# --- ballots ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_under_random_states_ballots_only_rise_and_plans_need_all_promises(seed: int) -> None:
+    rng = random.Random(seed)
+    leader, now_s, ballots = control(A, B), 0.0, [Ballot(0, Name(""), 0, 0)]
+    for _ in range(300):
+        now_s += rng.choice((0.0, 0.05, 0.3))
+        known = leader.ballot or OTHERS
+        promised = rng.choice((None, OTHERS, known, known, known._replace(term=known.term + 1)))
+        each = state(
+            rng.choice((A, B)),
+            promised,
+            accepted=promised is not None and rng.random() < 0.4,
+            incarnation=rng.choice((1, 1, 1, 2)),
+            t_s=now_s + rng.uniform(-0.3, 0.0),
+            overdue=rng.random() < 0.1,
+        )
+        leader.on_state(each, now_s)
+        leader.on_time(now_s)
+        if leader.take_planning_order(now_s):
+            assert set(leader.hold_cells) == {A, B}
+            if rng.random() < 0.7:
+                leader.on_plan(plan_of(leader), now_s)
+            else:
+                leader.on_planning_failed(now_s)
+        for _, message in leader.outgoing(now_s):
+            assert message.ballot == leader.ballot
+            if message.ballot != ballots[-1]:
+                assert message.ballot > ballots[-1]
+                ballots.append(message.ballot)
+    assert len(ballots) > 3

@@ -1,0 +1,138 @@
+"""Deeds whose gate is shut: what can be told, who must be asked, and that nobody waits for ever."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from itertools import count
+
+import pytest
+from attrs import evolve
+
+from laneweave.coordinator.planning.rolling.planner import StreamPlan, StreamVehicle
+from laneweave.coordinator.rolling.ballot import estate_of, partners, sure_of
+from laneweave.coordinator.rolling.control import StreamControl
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.runtime.node import Computed
+from laneweave.protocol.scenario.tables import FormationSettings, Road, Scenario
+from laneweave.protocol.wire.messages import Ballot, Census, CensusEntry, Deed, Name, VehicleState
+from support.states import holding
+
+A, B, C = Name("a"), Name("b"), Name("c")
+SCENARIO = Scenario(
+    road=Road(s1_m=0.0, s2_m=0.0, s3_m=600.0), formation=FormationSettings(operation="rolling")
+)
+
+
+def ballot(seq: int) -> Ballot:
+    return Ballot(1, Name("c1"), 1, seq)
+
+
+def deed(seq: int, before: tuple[Cell, ...], after: tuple[Cell, ...]) -> Deed:
+    return Deed(ballot(seq), before, after, (A, B))
+
+
+def state(vehicle: Name, promised: int, *estate: Cell, **more: object) -> VehicleState:
+    return holding(vehicle, ballot(promised), estate[0], estate=estate, **more)
+
+
+TAKES = deed(1, ((3, 0),), ((3, 0), (3, 1)))
+GIVES = deed(1, ((4, 1), (3, 1)), ((4, 1),))
+TAKER = state(A, 1, (3, 0), deed=TAKES, accepted=True, ready=True)
+GIVER = state(B, 1, (4, 1), (3, 1), deed=GIVES, accepted=True, ready=True, done=True)
+
+
+def told(giver: VehicleState, *others: VehicleState) -> frozenset[Cell] | None:
+    return estate_of(giver, {other.vehicle: other for other in (giver, *others)})
+
+
+def test_nothing_can_be_told_while_both_may_open_their_gates() -> None:
+    assert told(GIVER, TAKER) is None
+    assert sure_of(GIVER, {A: TAKER, B: GIVER}) == {(4, 1)}
+    assert partners(GIVER, {A: TAKER, B: GIVER}) == {A, B}
+
+
+@pytest.mark.parametrize(
+    ("taker", "estate"),
+    [
+        (state(A, 1, (3, 0), (3, 1), deed=Deed(ballot(1), open=True)), {(4, 1)}),
+        (state(A, 2, (3, 0)), {(4, 1), (3, 1)}),  # it has never had the deed
+        (evolve(TAKER, promised=ballot(2), accepted=False), {(4, 1), (3, 1)}),
+        (state(A, 3, (3, 0), deed=Deed(ballot(2), open=True)), {(4, 1)}),  # it will never tell
+    ],
+)
+def test_what_one_shows_tells_what_the_other_owns(taker: VehicleState, estate: set[Cell]) -> None:
+    giver = evolve(GIVER, promised=ballot(2), accepted=False)
+    assert told(giver, taker) == frozenset(estate)
+
+
+def test_who_has_left_tells_nothing_and_is_not_waited_for() -> None:
+    giver = evolve(GIVER, promised=ballot(2), accepted=False)
+    assert told(giver) is None  # it may be there, and was not heard yet
+    assert estate_of(giver, {B: giver}, {A}) == frozenset({(4, 1)})
+    assert partners(giver, {B: giver}) == {B}
+
+
+def test_a_body_under_way_may_need_what_it_gives() -> None:
+    giver = evolve(GIVER, promised=ballot(2), accepted=False, moving=True)
+    assert told(giver) is None
+
+
+class Orders:
+    """A planner that moves whom it is told to, and notes who is held."""
+
+    def __init__(self, moves: dict[Name, Cell]) -> None:
+        """Plan these moves in each slot."""
+        self.moves = moves
+        self.held: set[str] = set()
+
+    def plan(
+        self,
+        slot: int,
+        vehicles: Sequence[StreamVehicle],
+        before: StreamPlan | None = None,
+        blocked: Collection[Cell] = (),
+    ) -> StreamPlan:
+        del before, blocked
+        self.held = {vehicle.vehicle for vehicle in vehicles if vehicle.held}
+        ways = {
+            vehicle.vehicle: (vehicle.cell, self.moves.get(Name(vehicle.vehicle), vehicle.cell))
+            for vehicle in vehicles
+        }
+        return StreamPlan(slot, ways, ())
+
+
+def plan_once(planner: Orders, *states: VehicleState) -> StreamControl:
+    """Let a leader hear states and plan one slot."""
+    numbers = count(10)
+    control = StreamControl(SCENARIO, lambda _: ballot(next(numbers)), planner)
+    entries = tuple(CensusEntry(each.vehicle, each.hold_cell, 0, 0.0) for each in states)
+    control.on_census(Census(0.0, entries, ()))
+    for each in states:
+        control.on_state(each)
+    assert not list(control.order(lambda: 1, 0.0, 0.0))
+    (order,) = control.order(lambda: 1, 9.5, 9.5)
+    list(control.finish(Computed(order.job, order.work()), 9.6, 9.6))
+    return control
+
+
+def test_who_may_know_what_a_member_owns_is_asked_too() -> None:
+    other = state(C, 1, (5, 1), (5, 0))
+    giver = evolve(GIVER, deed=deed(1, ((4, 1), (3, 1), (4, 0)), ((4, 1), (4, 0))))
+    giver = evolve(giver, estate=((4, 1), (3, 1), (4, 0)))
+    control = plan_once(Orders({B: (4, 0)}), TAKER, giver, other)
+    assert [handover.roster for handover in control.handovers] == [(A, B)]
+
+
+def test_who_waits_at_a_gate_that_never_opens_is_planned_for() -> None:
+    taker = evolve(TAKER, estate=((3, 0), (2, 0)))
+    taker = evolve(taker, deed=deed(1, ((3, 0), (2, 0)), ((3, 0), (2, 0), (3, 1))))
+    planner = Orders({A: (2, 0)})
+    control = plan_once(planner, taker, GIVER)
+    assert not planner.held
+    assert [set(handover.moves) for handover in control.handovers] == [{A}]
+
+
+def test_who_is_about_to_move_is_left_alone() -> None:
+    planner = Orders({})
+    plan_once(planner, evolve(TAKER, go=True), GIVER)
+    assert planner.held == {A}

@@ -1,0 +1,133 @@
+"""Slots of plans: as long as the road allows, and only those of the scenario."""
+
+from __future__ import annotations
+
+import pytest
+from attrs import evolve
+
+from laneweave.coordinator.formations import pacing
+from laneweave.coordinator.formations.borders import kept_apart, steps_of
+from laneweave.coordinator.formations.pacing import LEAST_RESERVE_S, RESERVE_S
+from laneweave.coordinator.formations.roster import start_time_s, time_left_s
+from laneweave.protocol.lattice import Cell, Move
+from laneweave.protocol.scenario.tables import FormationSettings, Scenario
+from laneweave.protocol.wire.messages import Ballot, Name, Plan
+
+SCENARIO = Scenario()
+LATTICE = SCENARIO.lattice
+A = Name("A")
+FRONT = 0
+
+
+def climbing(steps: int) -> Plan:
+    """Return a plan of one vehicle that makes a step in each slot, up and down between lanes."""
+    cells: list[Cell] = [(FRONT, step % 2) for step in range(steps + 1)]
+    moves: tuple[Move, ...] = tuple((step, cells[step], cells[step + 1]) for step in range(steps))
+    return Plan(
+        ballot=Ballot(1, Name("c1"), 1, 1),
+        formations=(0,),
+        roster=(A,),
+        incarnations={A: 1},
+        start_cells={A: cells[0]},
+        moves={A: moves},
+        t0_s=start_time_s(cells, 0.0, SCENARIO),
+        slot_s=SCENARIO.cycles_s[0],
+        territory=tuple(sorted(set(cells))),
+    )
+
+
+def paced(plan: Plan, scenario: Scenario = SCENARIO) -> Plan:
+    end_s = plan.t0_s + left_s(plan)
+    return pacing.paced(plan, [], plan.t0_s, end_s, scenario)
+
+
+def left_s(plan: Plan) -> float:
+    return time_left_s(plan.territory, plan.t0_s, SCENARIO)
+
+
+@pytest.mark.parametrize("steps", range(1, 12))
+def test_slots_are_the_longest_that_leave_a_reserve(steps: int) -> None:
+    plan = climbing(steps)
+    chosen = paced(plan)
+    assert chosen == evolve(plan, slot_s=chosen.slot_s)
+    leisurely, hasty = (
+        max(
+            (s for s in SCENARIO.slots_s if steps * s <= left_s(plan) - reserve_s),
+            default=SCENARIO.slots_s[0],
+        )
+        for reserve_s in (RESERVE_S, LEAST_RESERVE_S)
+    )
+    comfortable = leisurely >= SCENARIO.comfortable_cycle_s
+    assert chosen.slot_s == pytest.approx(leisurely if comfortable else hasty)
+
+
+def test_more_steps_have_shorter_slots() -> None:
+    slots = [paced(climbing(steps)).slot_s for steps in range(1, 12)]
+    assert slots == sorted(slots, reverse=True)
+    assert (slots[0], slots[-1]) == (7.0, 4.0)
+    assert len(set(slots)) > 2
+    assert set(slots) <= set(SCENARIO.slots_s)
+
+
+def test_a_late_plan_has_shorter_slots() -> None:
+    plan = climbing(4)
+    late = evolve(plan, t0_s=plan.t0_s + left_s(plan) - 4 * 6.0 - RESERVE_S)
+    assert paced(plan).slot_s == pytest.approx(7.0)
+    assert paced(late).slot_s == pytest.approx(6.0)
+    assert paced(evolve(late, t0_s=late.t0_s + 0.1)).slot_s == pytest.approx(5.8)
+
+
+def test_haste_takes_of_the_reserve() -> None:
+    plan = climbing(6)
+    late = evolve(plan, t0_s=plan.t0_s + left_s(plan) - 6 * 5.0 - LEAST_RESERVE_S)
+    assert paced(late).slot_s == pytest.approx(5.0)
+
+
+def test_a_plan_begins_before_its_rear_is_in_s3_unless_a_lane_change_does() -> None:
+    along: tuple[Move, ...] = ((0, (-3, 0), (-2, 0)), (1, (-2, 0), (-2, 1)))
+    plan = evolve(
+        climbing(0),
+        start_cells={A: (-3, 0)},
+        moves={A: along},
+        t0_s=start_time_s([(-3, 0)], 0.0, SCENARIO),
+        territory=((-3, 0), (-2, 0), (-2, 1)),
+    )
+    end_s = time_left_s(plan.territory, 0.0, SCENARIO)
+    early = pacing.paced(plan, [], 0.0, end_s, SCENARIO)
+    changes_s = early.t0_s + early.slot_s
+    assert early.t0_s < plan.t0_s
+    assert changes_s == pytest.approx(start_time_s([(-2, 0)], 0.0, SCENARIO))
+    assert pacing.paced(plan, [], plan.t0_s - 1.0, end_s, SCENARIO).t0_s == pytest.approx(
+        plan.t0_s - 1.0
+    )
+
+
+def test_a_plan_without_moves_has_the_longest_slots() -> None:
+    assert paced(climbing(0)).slot_s == SCENARIO.slots_s[-1]
+
+
+def test_a_given_cycle_leaves_no_choice() -> None:
+    scenario = Scenario(formation=FormationSettings(cycle_s=5.0))
+    assert scenario.slots_s == (5.0,)
+    assert {paced(climbing(steps), scenario).slot_s for steps in (1, 6, 12)} == {5.0}
+
+
+@pytest.mark.parametrize(
+    ("slot_s", "their_slot_s", "late_s", "pauses"),
+    [
+        (4.0, 7.0, 0.0, 1),
+        (7.0, 4.0, 0.0, 1),
+        (4.0, 7.0, 6.7, 1),
+        (4.0, 7.0, 6.8, 0),
+        (4.0, 7.0, -4.0, 0),
+    ],
+)
+def test_neighbours_with_slots_of_other_lengths_are_kept_apart(
+    slot_s: float, their_slot_s: float, late_s: float, pauses: int
+) -> None:
+    """Their move lasts as long as their slot but for the slack."""
+    mine = evolve(climbing(1), moves={A: ((0, (-5, 1), (-4, 1)),)}, slot_s=slot_s)
+    theirs = evolve(mine, moves={A: ((0, (-2, 1), (-3, 1)),)}, slot_s=their_slot_s)
+    late = evolve(mine, t0_s=mine.t0_s + late_s)
+    paused = kept_apart(late, [theirs], SCENARIO.formation.slack_s, 9)
+    assert (steps_of(paused) - 1 > 0) is bool(pauses)

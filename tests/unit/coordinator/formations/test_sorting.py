@@ -1,0 +1,324 @@
+"""Lane sorting: from promises to a request, and from paths to moves."""
+
+from __future__ import annotations
+
+import pytest
+from attrs import evolve
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from laneweave.coordinator.formations import sorting as sorting_module
+from laneweave.coordinator.formations.groups import Numbers
+from laneweave.coordinator.formations.sorting import Sorting, SortingTask, plan_requests, sort_lanes
+from laneweave.coordinator.planning import PlanRequest, PlanResponse, Weights, checked_plan
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.lattice import Cell, footprint
+from laneweave.protocol.scenario.tables import DrivingStructure, Scenario
+from laneweave.protocol.wire.messages import Name
+from support.paper import FORMATIONS, PAPER
+
+SCENARIO = PAPER
+LATTICE = SCENARIO.lattice
+WEIGHTS = Weights(1, 2)
+NODES = SCENARIO.formation.max_nodes
+DEADLINE_S = 60.0
+A, B, C, D, E, F = (Name(letter) for letter in "ABCDEF")
+
+
+def task(
+    cells: dict[Name, Cell],
+    lanes: dict[Name, int],
+    *unattended: Name,
+    numbers: Numbers = (0,),
+    scenario: Scenario = SCENARIO,
+) -> SortingTask:
+    deadline_s = scenario.formation.planning_deadline_s
+    return SortingTask(numbers, cells, lanes, unattended, scenario, deadline_s or DEADLINE_S)
+
+
+def sort(order: SortingTask) -> Sorting:
+    return sort_lanes(order, NODES, WEIGHTS)
+
+
+def ends(order: SortingTask, sorting: Sorting) -> dict[Name, Cell]:
+    return {
+        name: moves[-1][2] if moves else order.hold_cells[name]
+        for name, moves in sorting.moves.items()
+    }
+
+
+# --- the request ------------------------------------------------------------------------------
+
+
+def test_the_request_is_in_the_blocks_own_columns_and_in_the_order_of_the_roster() -> None:
+    order = task({B: (-4, 0), A: (-7, 1)}, {A: 0, B: 2}, numbers=(1,))
+    request = next(plan_requests(order))
+    assert [(v.id, v.cell, v.lane) for v in request.vehicles] == [(B, (3, 0), 2), (A, (0, 1), 0)]
+    assert (request.grid.columns, request.grid.lanes) == (4, 3)
+    assert sorted(lane for _, lane in request.targets) == [0, 2]
+    assert request.mode == SCENARIO.formation.mode
+    assert request.conflicts == SCENARIO.formation.conflict_kinds
+
+
+def test_of_blocks_without_vehicles_only_held_cells_are_used() -> None:
+    """Deserted blocks may hold vehicles that the leader has not heard of."""
+    order = task({A: (-5, 0), B: (-1, 1)}, {A: 1, B: 2}, numbers=(0, 1))
+    kept_out = evolve(order, deserted=(1,))
+    first = order.columns.start
+    in_block = {(column - first, lane) for column, lane in LATTICE.block_cells(1)}
+    assert order.blocked == ()
+    assert set(kept_out.blocked) == in_block - {kept_out.movers[A]}
+    moves = sort(kept_out).moves
+    assert all(target[0] > -4 for each in moves.values() for _, _, target in each), (
+        "out of the block only"
+    )
+
+
+def test_the_request_follows_the_scenario() -> None:
+    scenario = evolve(
+        SCENARIO, formation=evolve(FORMATIONS, mode=2, planning_deadline_s=1.5, solver="branching")
+    )
+    request = next(plan_requests(task({A: (0, 0)}, {A: 1}, scenario=scenario)))
+    assert (request.mode, request.conflicts, request.deadline_s, request.solver) == (
+        2,
+        ("geometric", "closing"),
+        1.5,
+        "branching",
+    )
+
+
+def test_joined_formations_have_one_grid_from_the_last_rear_to_the_first_front() -> None:
+    order = task({A: (0, 0), B: (-7, 1)}, {A: 0, B: 1}, numbers=(0, 1))
+    assert (order.columns, order.blocked) == (range(-7, 1), ())
+    assert order.movers == {A: (7, 0), B: (0, 1)}
+
+
+def test_blocks_between_joined_formations_are_blocked() -> None:
+    """Formations 0 and 2 were joined by others; what lies between belongs to formation 1."""
+    order = task({A: (0, 0), B: (-11, 1)}, {A: 0, B: 1}, numbers=(0, 2))
+    between = LATTICE.block_cells(1)
+    assert {(column - 11, lane) for column, lane in order.blocked} == between
+    sorting = sort(order)
+    assert sorting.solved
+    assert sorting.moves == {A: (), B: ()}
+
+
+def test_who_has_no_agent_blocks_its_cell_and_is_no_vehicle_of_the_request() -> None:
+    order = task({A: (0, 0), B: (-1, 1), C: (-2, 0)}, {A: 1, B: 0, C: 0}, B)
+    request = next(plan_requests(order))
+    assert request.grid.blocked == {(2, 1)}
+    assert [vehicle.id for vehicle in request.vehicles] == [A, C]
+    assert (2, 1) not in request.targets
+
+
+def test_who_gets_no_place_on_its_lane_is_sent_to_its_own_target() -> None:
+    cells: dict[Name, Cell] = {A: (0, 0), B: (-1, 0), C: (-2, 0), D: (-3, 0), E: (0, 2)}
+    request = next(plan_requests(task(cells, dict.fromkeys(cells, 0))))
+    for vehicle in request.vehicles:
+        if vehicle.id == E:
+            assert [request.targets[index] for index in vehicle.eligible or ()] == [(3, 2)]
+        else:
+            assert (vehicle.lane, vehicle.eligible) == (0, None)
+
+
+def test_who_is_dropped_keeps_to_the_lane_that_it_is_on() -> None:
+    order = task({A: (0, 0), B: (-1, 1)}, {A: 2, B: 2})
+    lanes = [vehicle.lane for vehicle in next(plan_requests(order, A)).vehicles]
+    assert lanes == [0, 2]
+
+
+# --- sorting ----------------------------------------------------------------------------------
+
+
+def test_paths_become_moves_on_the_lattice() -> None:
+    order = task({A: (-4, 0), B: (-6, 0)}, {A: 2, B: 0}, numbers=(1,))
+    sorting = sort(order)
+    assert sorting.moves == {A: ((0, (-4, 0), (-4, 1)), (1, (-4, 1), (-4, 2))), B: ()}
+    assert (sorting.out_of_reach, sorting.short_of_room, sorting.solved) == ((), False, True)
+
+
+def test_waiting_is_no_move() -> None:
+    """B wants the cell that A leaves; whatever the plan, each move is to another cell."""
+    order = task({A: (0, 0), B: (0, 1)}, {A: 2, B: 0})
+    sorting = sort(order)
+    for moves in sorting.moves.values():
+        assert all(origin != target for _, origin, target in moves)
+        assert [move[0] for move in moves] == sorted({move[0] for move in moves})
+    assert {name: cell[1] for name, cell in ends(order, sorting).items()} == {A: 2, B: 0}
+
+
+def test_nobody_to_move_needs_no_planner() -> None:
+    sorting = sort(task({A: (0, 0), B: (-1, 1)}, {A: 1, B: 1}, A, B))
+    assert sorting.response is None
+    assert sorting.solved
+    assert sorting.moves == {A: (), B: ()}
+    assert (sorting.out_of_reach, sorting.short_of_room) == ((A,), False)
+
+
+def test_all_drive_around_who_has_no_agent() -> None:
+    order = task({A: (-1, 1), B: (-1, 2)}, {A: 0, B: 0}, A)
+    sorting = sort(order)
+    assert sorting.moves[A] == ()
+    assert ends(order, sorting)[B][1] == 0
+    assert all((-1, 1) not in footprint(*move[1:]) for move in sorting.moves[B])
+    assert (sorting.out_of_reach, sorting.short_of_room) == ((A,), False)
+
+
+def test_an_overfull_lane_leaves_one_out_and_is_short_of_room() -> None:
+    cells: dict[Name, Cell] = {A: (0, 0), B: (-1, 1), C: (-2, 0), D: (-3, 1), E: (-2, 2)}
+    order = task(cells, dict.fromkeys(cells, 1))
+    sorting = sort(order)
+    assert sorting.solved
+    assert sorting.short_of_room
+    lanes = {name: cell[1] for name, cell in ends(order, sorting).items()}
+    assert list(lanes.values()).count(1) == 4
+    assert sorting.out_of_reach == tuple(name for name, lane in lanes.items() if lane != 1)
+    wider = sort(evolve(order, numbers=(0, 1)))
+    assert (wider.out_of_reach, wider.short_of_room) == ((), False)
+
+
+def walled_in() -> SortingTask:
+    """Return a sorting in which A, which wants lane 2, cannot leave its corner.
+
+    C and E have no agents, B wants lane 0 (front to the right):
+
+        lane 2  .  .  .  .
+        lane 1  .  B  .  C
+        lane 0  .  .  E  A
+    """
+    cells: dict[Name, Cell] = {A: (0, 0), B: (-2, 1), C: (0, 1), E: (-1, 0)}
+    return task(cells, {A: 2, B: 0, C: 1, E: 0}, C, E)
+
+
+def test_one_in_a_corner_does_not_keep_the_others_from_their_lanes() -> None:
+    order = walled_in()
+    whole = next(plan_requests(order))
+    assert checked_plan(whole, max_nodes=NODES, weights=WEIGHTS).status == "infeasible"
+    sorting = sort(order)
+    assert sorting.solved
+    assert sorting.moves[A] == ()
+    assert ends(order, sorting)[B][1] == 0
+    assert sorting.out_of_reach == (A,)
+    assert sorting.short_of_room
+
+
+def test_when_nothing_works_nobody_moves_and_the_answer_says_so() -> None:
+    """A and B are both walled in: with one of them dropped, the other is still stuck."""
+    held: dict[Name, Cell] = {C: (0, 1), D: (-1, 0), E: (-2, 0), F: (-3, 1)}
+    order = task(
+        {A: (0, 0), B: (-3, 0)} | held,
+        {A: 2, B: 2} | {name: lane for name, (_, lane) in held.items()},
+        *held,
+    )
+    sorting = sort(order)
+    assert sorting.response is not None
+    assert (sorting.response.status, sorting.solved) == ("infeasible", False)
+    assert set(sorting.moves.values()) == {()}
+    assert sorting.out_of_reach == (A, B)
+    assert sorting.short_of_room
+
+
+def test_a_search_that_ran_out_of_nodes_says_nothing_of_room() -> None:
+    """With a neighbour's block as well it would only take longer."""
+    cells = {A: (0, 0), B: (-1, 1), C: (-2, 0), D: (-3, 1), E: (0, 2), F: (-2, 2)}
+    order = task(cells, {A: 2, B: 2, C: 1, D: 0, E: 0, F: 1})
+    sorting = sort_lanes(order, 1, WEIGHTS)
+    assert sorting.response is not None
+    assert sorting.response.status == "timeout"
+    assert (sorting.solved, sorting.short_of_room) == (False, False)
+    assert sort(order).solved
+
+
+def test_a_structure_without_room_for_all_is_not_tried() -> None:
+    cells = {A: (0, 0), B: (-1, 1), C: (-2, 0)}
+    order = task(cells, dict.fromkeys(cells, 0))
+    one_lane = DrivingStructure(from_m=200.0, structure="interlaced", lanes=(0,))
+    sorting = sort(evolve(order, structure=one_lane))
+    assert "3 vehicles" in sorting.impossible
+    assert (sorting.solved, sorting.short_of_room, sorting.out_of_reach) == (True, False, ())
+    assert set(sorting.moves.values()) == {()}
+    two_lanes = evolve(one_lane, lanes=(0, 1))
+    assert sort(evolve(order, structure=two_lanes)).impossible == ""
+
+
+def test_a_structure_that_cannot_be_reached_is_planned_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Excusing one vehicle from its lane, as in a sorting, would plan the same request again."""
+    asked = list[PlanRequest]()
+
+    def count(request: PlanRequest, *, max_nodes: int, weights: Weights) -> PlanResponse:
+        asked.append(request)
+        return checked_plan(request, max_nodes=max_nodes, weights=weights)
+
+    monkeypatch.setattr(sorting_module, "checked_plan", count)
+    held: dict[Name, Cell] = {C: (0, 1), D: (-1, 0), E: (-2, 0), F: (-3, 1)}
+    order = task({A: (0, 0), B: (-3, 0)} | held, dict.fromkeys([A, B, *held], 0), *held)
+    lane_2 = DrivingStructure(from_m=200.0, structure="parallel", lanes=(2,))
+    sorting = sort(evolve(order, structure=lane_2))
+    assert (sorting.solved, len(asked)) == (False, 1)
+
+
+def test_all_placements_share_one_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each attempt takes 2 s of a deadline of 5 s, and every plan has too many steps."""
+    asked, now_s = list[float](), [100.0]
+
+    def slow_plan(request: PlanRequest, *, max_nodes: int, weights: Weights) -> PlanResponse:
+        asked.append(request.deadline_s)
+        now_s[0] += 2.0
+        return checked_plan(request, max_nodes=max_nodes, weights=weights)
+
+    monkeypatch.setattr(sorting_module, "checked_plan", slow_plan)
+    cells = {A: (0, 0), B: (-1, 1), C: (-2, 0), D: (-3, 1), E: (0, 2), F: (-2, 2)}
+    order = task(cells, {A: 2, B: 2, C: 1, D: 0, E: 0, F: 1}, numbers=(0, 1))
+    hurried = evolve(order, deadline_s=5.0, steps=0)
+    assert len(list(plan_requests(hurried))) > 3
+    assert sort_lanes(hurried, NODES, WEIGHTS, lambda: now_s[0]).solved
+    assert asked == [5.0, 3.0, 1.0]
+
+
+@pytest.mark.parametrize("cell", [(1, 0), (-4, 0), (0, 3), (-1, 1)])
+def test_promises_that_cannot_be_planned_from_are_refused(cell: Cell) -> None:
+    """Outside the blocks, beside the road, or where another one is."""
+    with pytest.raises(BadInputError):
+        sort(task({A: cell, B: (-1, 1)}, {A: 0, B: 1}))
+
+
+@st.composite
+def tasks(draw: st.DrawFn) -> SortingTask:
+    numbers = draw(st.sampled_from([(0,), (1,), (0, 1)]))
+    block = sorted(cell for number in numbers for cell in LATTICE.block_cells(number))
+    cells = draw(st.lists(st.sampled_from(block), min_size=1, max_size=5, unique=True))
+    names = [Name(f"v{index}") for index in range(len(cells))]
+    lanes = draw(st.lists(st.integers(0, 2), min_size=5, max_size=5))
+    unattended = draw(st.lists(st.sampled_from(names), max_size=2, unique=True))
+    held = dict(zip(names, cells, strict=True))
+    return task(held, dict(zip(names, lanes, strict=False)), *unattended, numbers=numbers)
+
+
+@settings(max_examples=60, deadline=None)
+@given(tasks())
+def test_whatever_is_sorted_stays_inside_and_says_who_misses_its_lane(order: SortingTask) -> None:
+    sorting = sort(order)
+    inside = {cell for number in order.numbers for cell in LATTICE.block_cells(number)}
+    assert set(sorting.moves) == set(order.hold_cells)
+    held = {order.hold_cells[name] for name in order.unattended}
+    for name, moves in sorting.moves.items():
+        cell = order.hold_cells[name]
+        for _, origin, target in moves:
+            assert origin == cell
+            assert name not in order.unattended
+            assert footprint(origin, target) <= inside - held
+            cell = target
+    final = ends(order, sorting)
+    assert len(set(final.values())) == len(final)
+    missed = {name for name, cell in final.items() if cell[1] != order.preferred_lanes[name]}
+    assert set(sorting.out_of_reach) == missed
+    if sorting.solved:
+        assert sorting.short_of_room == bool(missed - set(order.unattended))
+
+
+def test_a_sorting_without_paths_is_not_solved() -> None:
+    response = sort(task({A: (0, 0)}, {A: 1})).response
+    assert isinstance(response, PlanResponse)
+    assert not Sorting(evolve(response, paths=()), {}, (), short_of_room=False).solved

@@ -1,0 +1,231 @@
+"""Targets: as many as vehicles, on their lanes while there is room, where the ways are short."""
+
+from __future__ import annotations
+
+from itertools import permutations
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from laneweave.coordinator.formations.targets import Targets, place
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.wire.messages import Name
+
+COLUMNS, LANES = 4, 3
+GRID = [(column, lane) for column in range(COLUMNS) for lane in range(LANES)]
+
+
+@st.composite
+def formations(
+    draw: st.DrawFn, *, most_blocked: int = 4, fitting: bool = False
+) -> tuple[dict[Name, Cell], dict[Name, int], set[Cell]]:
+    """Draw cells, preferred lanes and blocked cells; `fitting`: no lane is wanted too often."""
+    blocked = set(draw(st.lists(st.sampled_from(GRID), max_size=most_blocked, unique=True)))
+    free = [cell for cell in GRID if cell not in blocked]
+    cells = draw(st.lists(st.sampled_from(free), max_size=min(6, len(free)), unique=True))
+    names = [Name(f"v{index}") for index in range(len(cells))]
+    if fitting:
+        lanes = [lane for _, lane in draw(st.permutations(free))]
+    else:
+        lanes = draw(st.lists(st.integers(0, LANES - 1), min_size=6, max_size=6))
+    return (
+        dict(zip(names, cells, strict=True)),
+        dict(zip(names, lanes, strict=False)),
+        blocked,
+    )
+
+
+def way(cell: Cell, target: Cell) -> int:
+    return abs(cell[0] - target[0]) + abs(cell[1] - target[1])
+
+
+def place_all(
+    cells: dict[Name, Cell], lanes: dict[Name, int], blocked: set[Cell] | None = None
+) -> Targets:
+    return place(cells, lanes, COLUMNS, LANES, blocked or set())
+
+
+def parallel_targets(
+    lane: int, cells: list[Cell], columns: int, free: list[int] | None = None
+) -> list[Cell]:
+    """Return the targets on a lane that all vehicles need."""
+    open_columns = range(columns) if free is None else free
+    blocked = {(column, lane) for column in range(columns) if column not in open_columns}
+    held = {Name(f"v{index}"): cell for index, cell in enumerate(cells)}
+    targets = place(held, dict.fromkeys(held, lane), columns, LANES, blocked)
+    return [cell for cell in targets.cells if cell not in targets.own.values()]
+
+
+# --- a whole formation ------------------------------------------------------------------------
+
+
+@settings(max_examples=200, deadline=None)
+@given(formations())
+def test_targets_are_as_many_as_vehicles_distinct_free_and_inside(
+    drawn: tuple[dict[Name, Cell], dict[Name, int], set[Cell]],
+) -> None:
+    cells, lanes, blocked = drawn
+    targets = place_all(cells, lanes, blocked)
+    assert len(targets.cells) == len(set(targets.cells)) == len(cells)
+    assert set(targets.cells) <= set(GRID) - blocked
+
+
+@settings(max_examples=200, deadline=None)
+@given(formations())
+def test_each_lane_offers_as_many_cells_as_are_wanted_or_free(
+    drawn: tuple[dict[Name, Cell], dict[Name, int], set[Cell]],
+) -> None:
+    """Who gets no place on its lane gets one of its own, and nobody else does."""
+    cells, lanes, blocked = drawn
+    targets = place_all(cells, lanes, blocked)
+    shared = [cell for cell in targets.cells if cell not in targets.own.values()]
+    for lane in range(LANES):
+        wanting = [name for name in cells if lanes[name] == lane]
+        free = sum((column, lane) not in blocked for column in range(COLUMNS))
+        assert sum(cell[1] == lane for cell in shared) == min(len(wanting), free)
+        assert sum(name in targets.own for name in wanting) == max(0, len(wanting) - free)
+
+
+@settings(max_examples=100, deadline=None)
+@given(formations(fitting=True))
+def test_with_room_for_everybody_nobody_has_a_target_of_its_own(
+    drawn: tuple[dict[Name, Cell], dict[Name, int], set[Cell]],
+) -> None:
+    cells, lanes, blocked = drawn
+    targets = place_all(cells, lanes, blocked)
+    assert targets.own == {}
+    assert sorted(lane for _, lane in targets.cells) == sorted(lanes[name] for name in cells)
+
+
+@settings(max_examples=100, deadline=None)
+@given(formations(most_blocked=0, fitting=True))
+def test_without_blocked_cells_it_is_the_parallel_structure_of_each_lane(
+    drawn: tuple[dict[Name, Cell], dict[Name, int], set[Cell]],
+) -> None:
+    cells, lanes, _ = drawn
+    expected = [
+        target
+        for lane in range(LANES)
+        for target in shortest_row(lane, [cells[name] for name in cells if lanes[name] == lane])
+    ]
+    assert list(place_all(cells, lanes).cells) == expected
+
+
+def shortest_row(lane: int, cells: list[Cell]) -> list[Cell]:
+    """Return the row of neighbouring cells with the shortest ways, tried one by one.
+
+    Among equals the one whose middle is nearest to the block's, then the rearmost.
+    """
+    count = len(cells)
+    rows = [
+        [(first + index, lane) for index in range(count)] for first in range(COLUMNS - count + 1)
+    ]
+
+    def rank(row: list[Cell]) -> tuple[int, float, Cell]:
+        shortest = min(sum(map(way, cells, order)) for order in permutations(row))
+        middle = sum(column for column, _ in row) / count
+        return shortest, abs(middle - (COLUMNS - 1) / 2), row[0]
+
+    return min(rows, key=rank) if count else []
+
+
+def test_on_an_overfull_lane_those_furthest_away_stay_out() -> None:
+    names = [Name(letter) for letter in "abcde"]
+    cells: dict[Name, Cell] = dict(
+        zip(names, [(0, 2), (1, 0), (2, 1), (3, 0), (0, 0)], strict=True)
+    )
+    targets = place_all(cells, dict.fromkeys(names, 0))
+    assert set(targets.cells[:4]) == {(column, 0) for column in range(4)}
+    assert targets.own == {Name("a"): (0, 2)}  # it stays where it is
+    assert targets.cells[4] == (0, 2)
+
+
+def test_where_all_are_as_far_away_names_decide() -> None:
+    cells: dict[Name, Cell] = {Name(letter): (0, 0) for letter in "cab"}
+    assert set(place(cells, dict.fromkeys(cells, 0), 2, 2).own) == {Name("c")}
+
+
+def test_who_stays_out_gets_the_nearest_cell_that_is_left() -> None:
+    """Not its own one when somebody else needs that; among equals the rearmost."""
+    names = [Name(letter) for letter in "abcdef"]
+    cells: dict[Name, Cell] = dict(
+        zip(names, [(0, 2), (1, 2), (2, 2), (3, 1), (1, 0), (2, 0)], strict=True)
+    )
+    lanes = dict.fromkeys(names, 2) | {Name("c"): 0}
+    targets = place_all(cells, lanes)
+    assert (2, 0) in targets.cells  # for c
+    assert targets.own == {Name("f"): (1, 0)}
+
+
+def test_a_blocked_cell_is_no_target_and_leaves_a_gap() -> None:
+    cells: dict[Name, Cell] = {Name("a"): (0, 0), Name("b"): (2, 1)}
+    targets = place_all(cells, dict.fromkeys(cells, 0), {(1, 0)})
+    assert sorted(targets.cells) == [(0, 0), (2, 0)]
+
+
+def test_a_lane_without_free_cells_offers_none() -> None:
+    cells: dict[Name, Cell] = {Name("a"): (0, 1)}
+    full = {(column, 0) for column in range(COLUMNS)}
+    targets = place_all(cells, {Name("a"): 0}, full)
+    assert (targets.cells, targets.own) == (((0, 1),), {Name("a"): (0, 1)})
+
+
+def test_nobody_needs_no_targets() -> None:
+    assert place_all({}, {}) == Targets((), {})
+
+
+# --- one lane ---------------------------------------------------------------------------------
+
+
+@given(
+    cells=st.lists(st.tuples(st.integers(0, 7), st.integers(0, 2)), max_size=8, unique=True),
+    lane=st.integers(0, 2),
+)
+def test_targets_of_a_lane_are_contiguous_and_inside(cells: list[Cell], lane: int) -> None:
+    targets = parallel_targets(lane, cells, 8)
+    columns = [target[0] for target in targets]
+    assert len(targets) == len(cells)
+    assert {target[1] for target in targets} <= {lane}
+    assert columns == list(range(columns[0], columns[0] + len(columns))) if columns else True
+    assert all(0 <= column < 8 for column in columns)
+
+
+@given(
+    cells=st.lists(st.tuples(st.integers(0, 3), st.integers(0, 2)), max_size=4, unique=True),
+    lane=st.integers(0, 2),
+)
+def test_targets_of_a_lane_are_where_the_ways_are_short(cells: list[Cell], lane: int) -> None:
+    assert parallel_targets(lane, cells, COLUMNS) == shortest_row(lane, cells)
+
+
+@pytest.mark.parametrize(
+    ("lane", "cells", "targets"),
+    [
+        (1, [(2, 1), (3, 1)], [(2, 1), (3, 1)]),
+        (1, [(6, 0), (7, 2)], [(6, 1), (7, 1)]),
+        (0, [], []),
+    ],
+)
+def test_examples_of_short_ways(lane: int, cells: list[Cell], targets: list[Cell]) -> None:
+    assert parallel_targets(lane, cells, 8) == targets
+
+
+@given(
+    free=st.lists(st.integers(0, 7), max_size=8, unique=True).map(sorted),
+    cells=st.lists(st.tuples(st.integers(0, 7), st.integers(0, 2)), max_size=8, unique=True),
+)
+def test_only_free_columns_are_targets_and_none_between_is_left_out(
+    free: list[int], cells: list[Cell]
+) -> None:
+    columns = [column for column, _ in parallel_targets(1, cells, 8, free)]
+    assert len(columns) == min(len(cells), len(free))
+    if columns:
+        assert columns == [column for column in free if columns[0] <= column <= columns[-1]]
+
+
+def test_more_vehicles_than_cells_get_all_cells_of_the_lane() -> None:
+    cells = [(column, lane) for column in range(2) for lane in range(2)]
+    assert parallel_targets(0, cells, 2) == [(0, 0), (1, 0)]
+    assert parallel_targets(0, cells, 2, [1]) == [(1, 0)]
+    assert parallel_targets(0, cells, 2, []) == []

@@ -1,0 +1,222 @@
+"""The solver by branching, beyond the comparison with the oracle in `test_against_milp`."""
+
+import pytest
+from attrs import evolve
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from laneweave.coordinator.planning import PlanRequest, PlanResponse, plan, problems_of_response
+from laneweave.coordinator.planning.budget import Budget
+from laneweave.coordinator.planning.exact.branching import Branching
+from laneweave.coordinator.planning.exact.relaxation import ceiling_of
+from laneweave.coordinator.planning.exact.relaxation_kernel import PER_MOVE
+from laneweave.coordinator.planning.grid import Cell, Grid, Mode
+from laneweave.coordinator.planning.instances import formation_request
+from laneweave.coordinator.planning.problem import Problem
+from laneweave.coordinator.planning.request import VehicleRequest
+from support.planning_oracles import requests
+
+# By the oracle (tests/oracles/milp_oracle.py), in 0.2 to 0.6 s each.
+COSTS_OF_TWELVE = {0: 35, 1: 33, 2: 29}
+
+
+def solved(request: PlanRequest, max_nodes: int | None = None) -> PlanResponse:
+    response = plan(request, solver="branching", max_nodes=max_nodes)
+    assert problems_of_response(request, response) == []
+    return response
+
+
+@pytest.mark.parametrize(("seed", "cost"), COSTS_OF_TWELVE.items())
+def test_twelve_vehicles_are_planned_at_least_cost(seed: int, cost: int) -> None:
+    response = solved(formation_request(seed, vehicles=12))
+    assert (response.status, response.cost, response.lower_bound) == ("optimal", cost, cost)
+
+
+@settings(max_examples=60, deadline=None)
+@given(requests())
+def test_both_solvers_agree(request: PlanRequest) -> None:
+    by_tree, by_branching = plan(request, solver="tappa", fallback=False), solved(request)
+    assert (by_branching.status, by_branching.cost) == (by_tree.status, by_tree.cost)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("size", [7, 8])
+@pytest.mark.parametrize(
+    ("mode", "conflicts"),
+    [(1, ("node", "edge")), (1, None), (2, ("node", "edge")), (2, None)],
+    ids=["node and edge", "following", "mode 2, node and edge", "geometric"],
+)
+def test_both_solvers_agree_on_formations(
+    seed: int, size: int, mode: Mode, conflicts: tuple[str, ...] | None
+) -> None:
+    request = formation_request(seed, vehicles=size, mode=mode, conflicts=conflicts)
+    branching = solved(request)
+    tappa = plan(request, solver="tappa", max_nodes=300, fallback=False)
+    assert branching.status == "optimal"
+    assert branching.cost is not None
+    assert tappa.lower_bound is not None
+    assert tappa.lower_bound <= branching.cost
+    assert tappa.status == "timeout" or tappa.cost is not None
+    assert tappa.cost is None or branching.cost <= tappa.cost
+    assert tappa.status != "optimal" or tappa.cost == branching.cost
+
+
+def mirrored(request: PlanRequest, *, columns: bool) -> PlanRequest:
+    """Return a request seen from the other end of the road, or from the other side."""
+    grid = request.grid
+
+    def turned(cell: Cell) -> Cell:
+        column, lane = cell
+        return (grid.columns - 1 - column, lane) if columns else (column, grid.lanes - 1 - lane)
+
+    def of(vehicle: VehicleRequest) -> VehicleRequest:
+        lane = vehicle.lane
+        if lane is not None and not columns:
+            lane = grid.lanes - 1 - lane
+        return evolve(vehicle, cell=turned(vehicle.cell), lane=lane)
+
+    return evolve(
+        request,
+        grid=Grid(grid.columns, grid.lanes, map(turned, grid.blocked)),
+        vehicles=tuple(map(of, request.vehicles)),
+        targets=tuple(map(turned, request.targets)),
+    )
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10_000), st.integers(2, 8), st.sampled_from((1, 2)))
+def test_the_cost_does_not_depend_on_the_point_of_view(seed: int, size: int, mode: int) -> None:
+    request = formation_request(seed, vehicles=size, mode=1 if mode == 1 else 2)
+    cost = solved(request).cost
+    assert solved(mirrored(request, columns=True)).cost == cost
+    assert solved(mirrored(request, columns=False)).cost == cost
+    assert solved(evolve(request, vehicles=request.vehicles[::-1])).cost == cost
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10_000), st.integers(2, 8), st.sampled_from((1, 2)), st.data())
+def test_a_blocked_cell_never_lowers_the_cost(
+    seed: int, size: int, mode: int, data: st.DataObject
+) -> None:
+    request = formation_request(seed, vehicles=size, mode=1 if mode == 1 else 2)
+    grid = request.grid
+    used = {*request.targets, *(vehicle.cell for vehicle in request.vehicles)}
+    cells = ((c, lane) for c in range(grid.columns) for lane in range(grid.lanes))
+    blocked = data.draw(st.sampled_from([cell for cell in cells if cell not in used]))
+    narrower = evolve(request, grid=Grid(grid.columns, grid.lanes, [blocked]))
+    before, after = solved(request), solved(narrower)
+    assert before.cost is not None
+    if after.status != "infeasible":
+        assert after.cost is not None
+        assert after.cost >= before.cost
+
+
+def test_equal_requests_get_equal_plans() -> None:
+    request = formation_request(5, vehicles=9)
+    first, second = solved(request), solved(request)
+    assert (first.paths, first.assignment) == (second.paths, second.assignment)
+
+
+def test_what_cannot_be_solved_is_proven_so() -> None:
+    """Two vehicles in a single lane cannot change places."""
+    request = PlanRequest(
+        Grid(4, 1),
+        1,
+        ("node", "edge", "special-1"),
+        (VehicleRequest("a", (0, 0), eligible=(1,)), VehicleRequest("b", (2, 0), eligible=(0,))),
+        ((0, 0), (2, 0)),
+    )
+    response = solved(request)
+    assert (response.status, response.lower_bound) == ("infeasible", None)
+
+
+@pytest.mark.parametrize(
+    ("vehicles", "targets"),
+    [
+        ((VehicleRequest("a", (0, 0)), VehicleRequest("b", (0, 1))), ((2, 0),)),
+        ((VehicleRequest("a", (0, 0), lane=1),), ((2, 0),)),
+        ((VehicleRequest("a", (0, 0), eligible=()),), ((2, 0),)),
+    ],
+    ids=["more vehicles than targets", "no target on the lane", "no target at all"],
+)
+def test_who_has_no_target_cannot_arrive(
+    vehicles: tuple[VehicleRequest, ...], targets: tuple[Cell, ...]
+) -> None:
+    request = PlanRequest(Grid(3, 2), 1, ("geometric",), vehicles, targets)
+    by_tree = plan(request, solver="tappa")
+    assert solved(request).status == by_tree.status == "infeasible"
+
+
+def test_of_many_too_who_has_no_target_cannot_arrive() -> None:
+    """A path set must not be made of targets that a vehicle may not have."""
+    block = [(1 + number // 3, number % 3) for number in range(20)]
+    vehicles = (
+        VehicleRequest("a", (0, 0), eligible=(0,)),
+        VehicleRequest("b", (0, 2), eligible=(0,)),
+        *(VehicleRequest(f"v{number}", cell) for number, cell in enumerate(block[:18])),
+    )
+    targets = ((13, 1), *block, (14, 0))
+    request = PlanRequest(Grid(16, 3), 1, ("node", "edge", "special-1"), vehicles, targets)
+    response = solved(request)
+    assert (response.status, response.lower_bound) == ("infeasible", None)
+
+
+def test_rounding_does_not_refute_a_cost() -> None:
+    """The value of 24 vehicles that move 180 times each, added up move by move."""
+    moved = sum(1.0 + PER_MOVE for _ in range(24 * 180))
+    assert moved > 24 * 180 * (1.0 + PER_MOVE)
+    assert moved <= ceiling_of(24 * 180) < 24 * 180 + 1
+
+
+def test_a_far_target_of_few_vehicles_is_no_obstacle() -> None:
+    """Longer ways than to the nearest targets are needed."""
+    vehicles = (
+        VehicleRequest("a", (0, 0)),
+        VehicleRequest("b", (0, 1)),
+        VehicleRequest("c", (1, 0), lane=1),
+    )
+    request = PlanRequest(Grid(60, 3), 1, ("geometric",), vehicles, ((0, 0), (59, 0), (1, 1)))
+    response = solved(request)
+    assert response.status == "optimal"
+    assert response.cost == plan(request, solver="tappa").cost
+
+
+def test_tables_that_do_not_fit_into_memory_are_not_made() -> None:
+    vehicles = (VehicleRequest("a", (0, 0)),)
+    request = PlanRequest(Grid(1000, 16), 1, ("geometric",), vehicles, ((999, 15),), 20.0)
+    assert solved(request).cost == 999 + 15
+
+
+def test_tables_of_too_many_targets_are_not_made() -> None:
+    """Each vehicle has a list of its own: 60 teams with 399 targets on 16,000 cells."""
+    targets = [(column, lane) for column in range(900, 925) for lane in range(16)]
+    vehicles = tuple(
+        VehicleRequest(f"v{i}", (i, 0), eligible=tuple(j for j in range(400) if j != i))
+        for i in range(60)
+    )
+    kinds = ("node", "edge", "special-1")
+    request = PlanRequest(Grid(1000, 16), 1, kinds, vehicles, tuple(targets))
+    problem = Problem(request.grid, 1, request.conflict_model, [v.cell for v in vehicles], targets)
+    search = Branching(problem, request.choices(), Budget())
+    search.run()
+    assert search.gave_up
+
+
+def test_a_wide_road_and_a_long_way_are_no_obstacle() -> None:
+    vehicles = tuple(VehicleRequest(f"v{lane}", (0, lane), lane=15 - lane) for lane in (0, 5, 11))
+    request = PlanRequest(Grid(4, 16), 2, ("geometric",), vehicles, ((3, 15), (3, 10), (3, 4)))
+    response = solved(request)
+    assert (response.status, response.cost) == ("optimal", 15 + 5 + 7)
+
+
+def test_what_it_cannot_do_is_left_to_the_other_solver() -> None:
+    request = evolve(formation_request(1, vehicles=4, mode=2), conflicts=("edge",))
+    assert solved(request).status == "optimal"
+
+
+def test_without_time_for_a_proof_the_bound_tells_how_far_it_got() -> None:
+    request = formation_request(3, vehicles=12)
+    response = solved(request, max_nodes=30)
+    assert response.status in ("timeout", "feasible")
+    assert response.lower_bound is not None
+    assert 39 <= response.lower_bound <= 42

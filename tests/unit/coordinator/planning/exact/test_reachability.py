@@ -1,0 +1,107 @@
+"""The search over joint states."""
+
+import pytest
+from hypothesis import given, settings
+
+from laneweave.coordinator.planning import PlanRequest, VehicleRequest, problems_of_paths
+from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
+from laneweave.coordinator.planning.exact.reachability import Verdict, explore
+from laneweave.coordinator.planning.facade import cells_of, plan
+from laneweave.coordinator.planning.geometry.settings import Geometry
+from laneweave.coordinator.planning.grid import Grid
+from laneweave.coordinator.planning.path_map import RelativePathMap
+from laneweave.coordinator.planning.problem import Problem
+from laneweave.coordinator.planning.validator import problems_of_response
+from support.planning_oracles import cheapest_plan, requests
+
+
+def _explore(request: PlanRequest, max_moves: int = 10**6) -> tuple[Problem, Verdict]:
+    cells = [vehicle.cell for vehicle in request.vehicles]
+    model = request.conflict_model
+    problem = Problem(request.grid, request.mode, model, cells, request.targets)
+    return problem, explore(problem, request.choices(), Budget(), max_moves)
+
+
+@settings(max_examples=80, deadline=None)
+@given(requests())
+def test_verdict_agrees_with_the_joint_search(request: PlanRequest) -> None:
+    problem, verdict = _explore(request)
+    solvable = cheapest_plan(request) is not None
+    assert verdict.impossible != solvable
+    assert (verdict.solution is not None) == solvable
+    if verdict.solution is not None:
+        cells = cells_of(problem, verdict.solution)
+        rows = RelativePathMap.padded(["" for _ in cells], cells).rows
+        assert problems_of_paths(request, verdict.solution.assignment, rows) == []
+
+
+PUZZLE = PlanRequest(
+    Grid(3, 3),
+    1,
+    ("node", "edge", "special-1"),
+    tuple(
+        VehicleRequest(f"v{i}", cell, eligible=(i,))
+        for i, cell in enumerate([(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (2, 0), (2, 1)])
+    ),
+    ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (2, 1), (2, 0)),
+)
+"""The eight puzzle with two tiles exchanged, which has no solution."""
+
+
+def test_a_search_that_is_cut_off_shows_nothing() -> None:
+    _, verdict = _explore(PUZZLE, max_moves=500)
+    assert verdict == Verdict(solution=None, impossible=False)
+
+
+def test_time_is_checked() -> None:
+    cells = [vehicle.cell for vehicle in PUZZLE.vehicles]
+    model = PUZZLE.conflict_model
+    problem = Problem(PUZZLE.grid, 1, model, cells, PUZZLE.targets)
+    ticks = iter(range(1000))
+    budget = Budget(deadline=3.0, clock=lambda: float(next(ticks)))
+    with pytest.raises(BudgetSpentError):
+        explore(problem, PUZZLE.choices(), budget, max_moves=10**9)
+
+
+def test_a_crowded_block_is_solved() -> None:
+    """The cheapest plan costs 25 (by the oracle)."""
+    wishes = {(1, 2): 1, (2, 1): 1, (3, 0): 2, (2, 0): 0, (3, 1): 1, (3, 2): 0}
+    request = PlanRequest(
+        Grid(4, 3),
+        1,
+        ("node", "edge", "special-1"),
+        tuple(
+            VehicleRequest(f"v{number}", cell, lane=lane)
+            for number, (cell, lane) in enumerate(wishes.items())
+        ),
+        ((2, 0), (3, 0), (1, 1), (2, 1), (3, 1), (3, 2)),
+    )
+    response = plan(request, max_nodes=2_000, solver="branching")
+    assert (response.status, response.cost) == ("optimal", 25)
+    assert not problems_of_response(request, response)
+
+
+def test_who_may_pass_but_not_wait_beside_is_not_impossible() -> None:
+    """In wide cells two may pass each other obliquely, but special-4 forbids to pass who waits."""
+    geometry = Geometry(
+        length_m=3.5,
+        width_m=2.0,
+        lane_width_m=8.0,
+        pitch_m=26.0,
+        move_s=10.0,
+        slot_s=10.2,
+        speed_mps=27.0,
+        clearance_along_m=0.0,
+        clearance_across_m=0.0,
+    )
+    grid = Grid(2, 3, [(0, 2), (1, 0)])
+    targets = ((1, 2), (0, 0))
+    vehicles = (
+        VehicleRequest("a", (0, 1), eligible=(0,)),
+        VehicleRequest("b", (1, 1), eligible=(1,)),
+    )
+    kinds = ("geometric", "special-4")
+    request = PlanRequest(grid, 2, kinds, vehicles, targets, geometry=geometry)
+    _, verdict = _explore(request)
+    assert verdict.solution is not None
+    assert verdict.solution.cost == plan(request).cost == 2

@@ -1,0 +1,103 @@
+"""Conflict rows: cliques that cover every conflict."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from laneweave.coordinator.planning.conflict_cliques import Row, row_patterns
+from laneweave.coordinator.planning.conflicts import KINDS, ConflictModel
+from laneweave.coordinator.planning.exact.arrays import lattice
+from laneweave.coordinator.planning.grid import Grid, Mode, Move, displacements
+from oracles.instances import EVERY_VARIANT
+
+MODELS: list[tuple[Mode, tuple[str, ...]]] = [
+    (1 if mode == 1 else 2, tuple(kinds)) for mode, kinds in EVERY_VARIANT if kinds is not None
+]
+FAR = range(-3, 4)
+NEAR = range(-2, 3)
+
+
+def moves_of(pattern: Row, mode: Mode, column: int, lane: int) -> set[Move]:
+    """Return the moves of a row with its anchor in a cell."""
+    steps = displacements(mode)
+    moves = set()
+    for c, left, d in pattern:
+        cell = column + c, lane + left
+        moves.add((cell, (cell[0] + steps[d][0], cell[1] + steps[d][1])))
+    return moves
+
+
+@pytest.mark.parametrize(("mode", "kinds"), MODELS)
+def test_every_conflict_is_in_a_row_and_every_row_excludes(
+    mode: Mode, kinds: tuple[str, ...]
+) -> None:
+    model = ConflictModel(kinds)
+    patterns = row_patterns(mode, model)
+    rows = [
+        moves_of(pattern, mode, column, lane)
+        for pattern in patterns
+        for column in range(-6, 7)
+        for lane in range(-4, 5)
+    ]
+    for pattern in patterns:
+        for a, b in combinations(sorted(moves_of(pattern, mode, 0, 0)), 2):
+            assert a[0] == b[0] or model.kind(a, b) is not None
+    steps = displacements(mode)
+    origin = [((0, 0), step) for step in steps]
+    others = [
+        ((column, lane), (column + along, lane + across))
+        for column in FAR
+        for lane in NEAR
+        for along, across in steps
+        if (column, lane) != (0, 0)
+    ]
+    for a in origin:
+        for b in others:
+            if model.kind(a, b) is not None:
+                assert any(a in row and b in row for row in rows), (a, b)
+
+
+@pytest.mark.parametrize(("mode", "kinds"), MODELS)
+def test_from_cells_of_a_row_can_be_told_apart(mode: Mode, kinds: tuple[str, ...]) -> None:
+    """See `Lattice.near`."""
+    grid, model = Grid(9, 5), ConflictModel(kinds)
+    ways = lattice(grid, mode, model)
+    assert ways.near_count == (12 if "closing" in kinds else 9)
+    assert set(ways.near.tolist()) == set(range(ways.near_count))
+    cells: dict[int, set[int]] = {}
+    for d, cell, m in np.argwhere(ways.row >= 0).tolist():
+        cells.setdefault(int(ways.row[d, cell, m]), set()).add(cell)
+    assert len(cells) == ways.row_count
+    for of_row in cells.values():
+        assert len({int(ways.near[cell]) for cell in of_row}) == len(of_row)
+
+
+@pytest.mark.parametrize(
+    ("mode", "kinds", "moves"),
+    [(1, ("node", "edge", "special-1"), 9), (1, ("geometric",), 9), (2, ("geometric",), 25)],
+)
+def test_of_footprints_there_is_one_row_for_each_cell(
+    mode: Mode, kinds: tuple[str, ...], moves: int
+) -> None:
+    (pattern,) = row_patterns(mode, ConflictModel(kinds))
+    assert len(pattern) == moves
+
+
+@pytest.mark.parametrize(
+    ("mode", "kinds", "moves"),
+    [(1, ("node", "edge", "special-1"), 4), (1, ("geometric",), 4), (2, ("geometric",), 20)],
+)
+def test_of_vehicles_that_close_up_there_is_one_row_more(
+    mode: Mode, kinds: tuple[str, ...], moves: int
+) -> None:
+    others = row_patterns(mode, ConflictModel(kinds))
+    *same, pattern = row_patterns(mode, ConflictModel((*kinds, "closing")))
+    assert tuple(same) == others
+    assert len(pattern) == moves
+
+
+@pytest.mark.parametrize("kind", sorted(set(KINDS) - {"node", "geometric"}))
+def test_there_are_no_rows_where_vehicles_may_share_a_cell(kind: str) -> None:
+    with pytest.raises(ValueError, match="share a cell"):
+        row_patterns(2, ConflictModel((kind,)))

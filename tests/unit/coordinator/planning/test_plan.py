@@ -1,0 +1,355 @@
+"""The planner as a whole: exact, complete on small spaces, punctual, repeatable."""
+
+import itertools
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import attrs
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import laneweave.coordinator
+import laneweave.protocol
+from laneweave.coordinator.planning import (
+    PlanRequest,
+    PlanResponse,
+    VehicleRequest,
+    Weights,
+    plan,
+    problems_of_response,
+)
+from laneweave.coordinator.planning.conflicts import KINDS
+from laneweave.coordinator.planning.grid import Cell, Grid, Mode
+from laneweave.coordinator.planning.instances import block_request, formation_request
+from laneweave.coordinator.planning.path_map import RelativePathMap, final_arrival
+from laneweave.protocol.errors import BadInputError
+from support.planning_oracles import cheapest_plan, requests
+
+
+class CountingClock:
+    """A clock on which each look at it takes a millisecond."""
+
+    def __init__(self) -> None:
+        """Start at zero."""
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        self.now += 0.001
+        return self.now
+
+
+def _corridor(*vehicles: tuple[Cell, int], columns: int = 4) -> PlanRequest:
+    """Return vehicles on a single lane, each with the column of its target."""
+    return PlanRequest(
+        Grid(columns, 1),
+        1,
+        ("node", "edge", "special-1"),
+        tuple(VehicleRequest(f"v{i}", cell, eligible=(i,)) for i, (cell, _) in enumerate(vehicles)),
+        tuple((column, 0) for _, column in vehicles),
+        deadline_s=60.0,
+    )
+
+
+@settings(max_examples=120, deadline=None)
+@given(requests())
+def test_cost_is_optimal_or_infeasibility_is_proven(request: PlanRequest) -> None:
+    response = plan(request)
+    expected = cheapest_plan(request)
+    assert response.status == ("infeasible" if expected is None else "optimal")
+    assert response.cost == expected
+    assert response.lower_bound == expected
+    assert problems_of_response(request, response) == []
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_block_family_is_solved(seed: int) -> None:
+    request = block_request(seed, deadline_s=60.0)
+    response = plan(request)
+    assert response.status == "optimal"
+    assert problems_of_response(request, response) == []
+
+
+def test_waiting_and_coming_back_are_paid_for() -> None:
+    """The second vehicle stands on its target but must leave it and come back."""
+    request = PlanRequest(
+        Grid(3, 2, [(0, 1), (2, 1)]),
+        1,
+        ("node", "edge", "special-1"),
+        (
+            VehicleRequest("passing", (0, 0), eligible=(0,)),
+            VehicleRequest("in the way", (1, 0), eligible=(1,)),
+        ),
+        ((2, 0), (1, 0)),
+        deadline_s=60.0,
+    )
+    response = plan(request)
+    assert response.status == "optimal"
+    # One step to make way, two to pass, one more until the cell is free, and back.
+    assert [final_arrival(path) for path in response.paths] == [3, 4]
+    assert response.cost == 7
+
+
+def test_a_vehicle_at_its_target_stays() -> None:
+    response = plan(_corridor(((0, 0), 0), ((2, 0), 2)))
+    assert (response.status, response.cost, response.steps) == ("optimal", 0, 0)
+    assert response.paths == (((0, 0),), ((2, 0),))
+
+
+def test_no_needless_moves() -> None:
+    """Vehicles that must wait anyway wait in their cells instead of driving about."""
+    for seed in range(5):
+        request = formation_request(seed, deadline_s=60.0)
+        response = plan(request)
+        for i, path in enumerate(response.paths):
+            others = [p for j, p in enumerate(response.paths) if j != i]
+            assert _is_lazy(request, path, others)
+
+
+def _is_lazy(request: PlanRequest, path: tuple[Cell, ...], others: list[tuple[Cell, ...]]) -> bool:
+    """Tell whether no detour (leave a cell, come straight back) could be replaced by waiting."""
+    model = request.conflict_model
+    for k in range(len(path) - 2):
+        if path[k] == path[k + 2] != path[k + 1]:
+            calm = (*path[: k + 1], path[k], *path[k + 2 :])
+            path_map = RelativePathMap.padded(["" for _ in request.vehicles], [calm, *others])
+            if all(conflict.first > 0 for conflict in path_map.conflicts(model)):
+                return False
+    return True
+
+
+class TestInfeasible:
+    def test_swap_in_a_corridor(self) -> None:
+        response = plan(_corridor(((0, 0), 2), ((2, 0), 0)))
+        assert response.status == "infeasible"
+        assert response.cost is None
+        assert response.paths == ()
+
+    def test_no_eligible_target(self) -> None:
+        request = block_request(0)
+        lonely = attrs.evolve(request.vehicles[0], lane=None, eligible=())
+        response = plan(attrs.evolve(request, vehicles=(lonely, *request.vehicles[1:])))
+        assert response.status == "infeasible"
+        assert response.nodes_expanded == 0
+
+    def test_two_vehicles_that_want_one_target(self) -> None:
+        request = _corridor(((0, 0), 2), ((1, 0), 3))
+        both = tuple(attrs.evolve(vehicle, eligible=(0,)) for vehicle in request.vehicles)
+        assert plan(attrs.evolve(request, vehicles=both)).status == "infeasible"
+
+    def test_more_vehicles_than_targets(self) -> None:
+        request = block_request(0)
+        vehicles = tuple(attrs.evolve(v, lane=None) for v in request.vehicles)
+        fewer = attrs.evolve(request, vehicles=vehicles, targets=request.targets[1:])
+        assert plan(fewer).status == "infeasible"
+
+    def test_unreachable_target_is_noticed_at_once_however_many_assignments_there_are(
+        self,
+    ) -> None:
+        columns = [(c, lane) for c in range(9) for lane in (0, 2)]
+        request = PlanRequest(
+            Grid(9, 3, [(c, 1) for c in range(9)]),
+            2,
+            ("geometric",),
+            tuple(VehicleRequest(f"v{i}", cell) for i, cell in enumerate(columns[:16:2])),
+            ((8, 2), *((c, 0) for c in range(1, 8))),
+            deadline_s=60.0,
+        )
+        response = plan(request)
+        assert response.status == "infeasible"
+        assert response.assignments_tried == 0
+
+    def test_one_infeasible_assignment_does_not_hold_up_the_others(self) -> None:
+        """The cheapest assignment needs an impossible overtaking in a corridor."""
+        request = PlanRequest(
+            Grid(6, 1),
+            1,
+            ("node", "edge", "special-1"),
+            (
+                VehicleRequest("a", (0, 0), eligible=(1, 2)),
+                VehicleRequest("b", (1, 0), eligible=(0, 3)),
+            ),
+            ((0, 0), (2, 0), (4, 0), (5, 0)),
+            deadline_s=60.0,
+        )
+        response = plan(request)
+        assert response.status == "optimal"
+        assert response.assignment == (1, 3)
+        assert response.cost == cheapest_plan(request)
+
+
+@pytest.mark.parametrize("solver", ["tappa", "branching"])
+@pytest.mark.parametrize(
+    ("mode", "kinds"), [(1, ("node", "edge", "special-1")), (2, ("geometric",))]
+)
+def test_who_would_close_up_goes_one_after_the_other(
+    solver: str, mode: Mode, kinds: tuple[str, ...]
+) -> None:
+    vehicles = VehicleRequest("a", (0, 0), eligible=(0,)), VehicleRequest("b", (3, 0), lane=0)
+    targets = ((1, 0), (2, 0))
+    at_once = PlanRequest(Grid(4, 1), mode, kinds, vehicles, targets)
+    assert plan(at_once, solver=solver).cost == 2
+    in_turn = attrs.evolve(at_once, conflicts=(*kinds, "closing"))
+    response = plan(in_turn, solver=solver)
+    assert (response.status, response.cost) == ("optimal", 3)
+    assert problems_of_response(in_turn, response) == []
+
+
+class TestDeadline:
+    @pytest.mark.parametrize(
+        ("solver", "looks"),
+        [
+            *(("tappa", looks) for looks in (2, 5, 20, 100, 400)),
+            *(("branching", looks) for looks in (2, 5, 8, 12)),
+        ],
+    )
+    def test_deadline_is_kept_and_the_bound_holds(self, solver: str, looks: int) -> None:
+        whole = block_request(25, deadline_s=3600.0)
+        optimum = plan(whole).cost
+        assert optimum is not None
+        clock = CountingClock()
+        response = plan(attrs.evolve(whole, deadline_s=looks * 0.001), solver=solver, clock=clock)
+        # Nothing looks at the clock again after the deadline, but to leave every loop.
+        assert clock.now <= (looks + 8) * 0.001
+        assert response.status in ("feasible", "timeout")
+        assert response.lower_bound is not None
+        assert response.lower_bound <= optimum
+        assert problems_of_response(whole, response) == []
+        if response.cost is not None:
+            assert response.cost >= optimum
+
+    def test_an_unsolvable_request_that_is_too_large_to_prove_times_out(self) -> None:
+        vehicles = tuple(VehicleRequest(f"v{i}", (i, 0), eligible=(i,)) for i in range(12))
+        targets = tuple((11 - i, 0) for i in range(12))
+        request = PlanRequest(Grid(40, 1), 1, ("node", "edge", "special-1"), vehicles, targets, 0.2)
+        response = plan(request, clock=CountingClock())
+        assert response.status == "timeout"
+        # One look at the clock finds that there is no time for another node, few leave all loops.
+        assert 150 <= response.solve_ms <= 200 + 8
+        assert response.lower_bound is not None
+        assert response.lower_bound >= 72
+
+    def test_more_time_never_gives_a_worse_plan(self) -> None:
+        request = block_request(29, deadline_s=3600.0)
+        costs, bounds = [], []
+        for nodes in (0, 1, 10, 100, 400, 10_000):
+            response = plan(request, max_nodes=nodes)
+            costs.append(float("inf") if response.cost is None else response.cost)
+            bounds.append(response.lower_bound)
+            assert response.nodes_expanded <= nodes
+            assert (response.status == "optimal") == (response.cost == response.lower_bound)
+        assert costs == sorted(costs, reverse=True)
+        assert bounds == sorted(bounds, key=lambda bound: bound or 0)
+        assert costs[-1] == bounds[-1]
+
+
+def _without_time(response: PlanResponse) -> PlanResponse:
+    return attrs.evolve(response, solve_ms=0.0)
+
+
+SCRIPT = """
+from laneweave.coordinator.planning import plan
+from laneweave.coordinator.planning.instances import block_request
+for seed in range(6):
+    for mode in (1, 2):
+        r = plan(block_request(seed, mode=mode, deadline_s=3600.0), max_nodes=60)
+        print(r.status, r.cost, r.lower_bound, r.assignment, r.paths, r.nodes_expanded)
+"""
+
+
+class TestRepeatable:
+    def test_equal_requests_get_equal_responses(self) -> None:
+        request = block_request(25, deadline_s=3600.0)
+        first, second = (plan(request, max_nodes=300) for _ in range(2))
+        assert _without_time(first) == _without_time(second)
+
+    def test_hash_seed_does_not_matter(self) -> None:
+        roots = [
+            str(Path(package.__file__ or "").parents[2])
+            for package in (laneweave.coordinator, laneweave.protocol)
+        ]
+
+        def run(hash_seed: str) -> str:
+            environment = {
+                **os.environ,
+                "PYTHONHASHSEED": hash_seed,
+                "PYTHONPATH": os.pathsep.join(roots),
+            }
+            command = [sys.executable, "-c", SCRIPT]
+            return subprocess.run(
+                command, env=environment, check=True, capture_output=True, text=True
+            ).stdout
+
+        first, second = run("1"), run("2")
+        assert first.count("\n") == 12
+        assert first == second
+
+
+def _transformed(
+    request: PlanRequest, move: Callable[[Cell], Cell], order: tuple[int, ...] | None = None
+) -> PlanRequest:
+    vehicles = [attrs.evolve(v, cell=move(v.cell)) for v in request.vehicles]
+    return attrs.evolve(
+        request,
+        grid=attrs.evolve(request.grid, blocked=[move(cell) for cell in request.grid.blocked]),
+        vehicles=tuple(vehicles if order is None else (vehicles[i] for i in order)),
+        targets=tuple(move(target) for target in request.targets),
+    )
+
+
+class TestSymmetry:
+    @settings(max_examples=25, deadline=None)
+    @given(requests(most_vehicles=4, most_cells=12), st.sampled_from(["front", "side", "both"]))
+    def test_mirrored_formations_cost_the_same(self, request: PlanRequest, axis: str) -> None:
+        columns, lanes = request.grid.columns, request.grid.lanes
+
+        def mirrored(cell: Cell) -> Cell:
+            column = columns - 1 - cell[0] if axis != "side" else cell[0]
+            lane = lanes - 1 - cell[1] if axis != "front" else cell[1]
+            return column, lane
+
+        one, other = (plan(r, max_nodes=1500) for r in (request, _transformed(request, mirrored)))
+        if {one.status, other.status} <= {"optimal", "infeasible"}:
+            assert (one.status, one.cost) == (other.status, other.cost)
+
+    @settings(max_examples=25, deadline=None)
+    @given(requests(most_vehicles=4, most_cells=12), st.data())
+    def test_order_of_vehicles_does_not_matter(
+        self, request: PlanRequest, data: st.DataObject
+    ) -> None:
+        order = tuple(data.draw(st.permutations(range(len(request.vehicles)))))
+        shuffled = _transformed(request, lambda cell: cell, order)
+        one, other = (plan(r, max_nodes=1500) for r in (request, shuffled))
+        if {one.status, other.status} <= {"optimal", "infeasible"}:
+            assert (one.status, one.cost) == (other.status, other.cost)
+
+    def test_more_conflicts_never_make_it_cheaper(self) -> None:
+        for seed in range(3):
+            costs = [
+                plan(
+                    formation_request(
+                        seed, vehicles=5, mode=2, conflicts=KINDS[:count], deadline_s=60.0
+                    )
+                ).cost
+                for count in range(1, len(KINDS) + 1)
+            ]
+            proven = [cost for cost in costs if cost is not None]
+            assert len(proven) == len(costs)
+            assert proven == sorted(proven)
+
+
+class TestWeights:
+    def test_smaller_weights_prove_the_same_optimum(self) -> None:
+        request = block_request(3, vehicles=4, deadline_s=60.0)
+        costs = {
+            plan(request, weights=Weights(straight, oblique)).cost
+            for straight, oblique in itertools.product((0, 1), (0, 1, 2))
+        }
+        assert len(costs) == 1
+
+    def test_weights_that_are_no_bound_are_rejected(self) -> None:
+        with pytest.raises(BadInputError, match="l_o"):
+            plan(block_request(0, mode=2), weights=Weights(1, 2))

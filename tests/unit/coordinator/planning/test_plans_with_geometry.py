@@ -1,0 +1,257 @@
+"""Plans whose conflicts are computed from geometry: exact, and far enough apart when driven."""
+
+import json
+from collections.abc import Iterator
+from functools import cache
+from itertools import product
+from random import Random
+from typing import Any
+
+import numpy as np
+import pytest
+
+from laneweave.agents.driving.reference import move_profile
+from laneweave.coordinator.planning import PlanRequest, checked_plan, plan, problems_of_paths
+from laneweave.coordinator.planning.budget import Budget
+from laneweave.coordinator.planning.exact.reachability import explore
+from laneweave.coordinator.planning.geometry.settings import Geometry
+from laneweave.coordinator.planning.grid import Mode, displacements
+from laneweave.coordinator.planning.instances import formation_request
+from laneweave.coordinator.planning.problem import Problem
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.solvers import SOLVERS
+from laneweave.protocol.scenario.tables import Scenario
+from oracles import joint_search
+from oracles.instances import random_request, small_request
+from oracles.moving_bodies import Bodies, Profile, drive, least_gap_of_plan_m
+from oracles.path_rules import check_paths
+from oracles.proven import Oracle, by_oracle
+
+ON_TIME = {"lateness_s": 0.0}
+LATE = {"lateness_s": 0.5}
+CITY = {
+    "length_m": 4.0,
+    "width_m": 1.7,
+    "lane_width_m": 3.0,
+    "pitch_m": 12.0,
+    "move_s": 4.4,
+    "slot_s": 5.0,
+    "speed_mps": 13.0,
+    "clearance_along_m": 3.5,
+    "clearance_across_m": 0.2,
+    "lateness_s": 0.6,
+}
+GEOMETRIES: tuple[dict[str, float], ...] = ({}, ON_TIME, LATE, CITY)
+TIGHT = {
+    "clearance_along_m": 1.0,
+    "clearance_across_m": 0.0,
+    "profile_error_along_m": 0.0,
+    "profile_error_across_m": 0.0,
+    "lateness_s": 0.0,
+}
+"""So little that vehicles may follow each other round corners."""
+KINDS = (["geometric"], ["geometric"], ["node", "geometric"], ["special-1", "geometric"])
+
+INSTANCES = 60
+CHUNK = 10
+
+
+def faults(request: dict[str, Any], cost: int | None, solver: str, seed: int) -> list[str]:
+    """What is wrong with a plan, by what it claims, by its paths, and by driving it."""
+    asked = PlanRequest.from_dict({"deadline_s": 60.0, **request})
+    response = checked_plan(asked, solver=solver, fallback=False).to_dict()
+    claims = response["status"], response["cost"]
+    if claims != ("infeasible" if cost is None else "optimal", cost):
+        return [f"answers {claims}, the oracle {cost}"]
+    if cost is None:
+        return []
+    found = check_paths(request, response)
+    rng = Random(seed)
+    least_m = min(drive(request, response, rng) for _ in range(3))
+    if least_m < Bodies(**request["geometry"]).clearance_along_m:
+        found.append(f"only {least_m:.2f} m apart")
+    return found
+
+
+def _request(seed: int) -> dict[str, Any]:
+    geometry = GEOMETRIES[seed % len(GEOMETRIES)]
+    kinds = KINDS[seed // len(GEOMETRIES) % len(KINDS)]
+    return {**random_request(seed), "conflicts": kinds, "geometry": geometry}
+
+
+def compared() -> Iterator[dict[str, Any]]:
+    """Return the requests whose costs `proven` may know."""
+    yield from map(_request, range(INSTANCES))
+
+
+@by_oracle
+@pytest.mark.parametrize("first", range(0, INSTANCES, CHUNK))
+def test_planner_agrees_with_the_oracle(first: int, oracle: Oracle) -> None:
+    """The oracle computes conflicts by simulating bodies."""
+    wrong = []
+    for seed in range(first, first + CHUNK):
+        request = _request(seed)
+        cost = oracle(request)
+        wrong += [
+            f"seed {seed}, {solver}: {fault}: {json.dumps(request)}"
+            for solver in SOLVERS
+            for fault in faults(request, cost, solver, seed)
+        ]
+    assert not wrong, "\n".join(wrong)
+
+
+CROWDED = ((3, 2, 2), (4, 1, 2), (3, 2, 3), (2, 2, 3), (2, 2, 4))
+MODES: tuple[Mode, ...] = (1, 2)
+
+
+@pytest.mark.parametrize("geometry", [*GEOMETRIES, TIGHT], ids=str)
+@pytest.mark.parametrize("mode", MODES)
+def test_planner_agrees_with_joint_search_where_space_is_scarce(
+    geometry: dict[str, float], mode: Mode
+) -> None:
+    wrong = []
+    for seed, (columns, lanes, count) in product(range(5), CROWDED):
+        request = {
+            **small_request(
+                seed,
+                columns=columns,
+                lanes=lanes,
+                count=count,
+                mode=mode,
+                conflicts=["geometric"],
+            ),
+            "geometry": geometry,
+        }
+        cost = joint_search.optimal_cost(request)
+        wrong += [
+            f"seed {seed}, {solver}: {fault}: {json.dumps(request)}"
+            for solver in SOLVERS
+            for fault in faults(request, cost, solver, seed)
+        ]
+    assert not wrong, "\n".join(wrong)
+
+
+# ------------------------------------------------------------------------------------- trains
+
+TRAIN = {
+    "schema": "laneweave.plan.request/1",
+    "grid": {"columns": 5, "lanes": 1},
+    "mode": 1,
+    "conflicts": ["geometric"],
+    "vehicles": [{"id": f"v{i}", "cell": [i, 0], "eligible": [i]} for i in range(4)],
+    "targets": [[i + 1, 0] for i in range(4)],
+}
+"""Four vehicles without a gap, each to go one cell ahead."""
+
+
+@pytest.mark.parametrize(
+    ("geometry", "cost"), [(None, 10), ({}, 10), ({"lateness_s": 0.8}, 10), (LATE, 4), (ON_TIME, 4)]
+)
+def test_a_train_starts_together_where_nobody_is_too_late(
+    geometry: dict[str, float] | None, cost: int
+) -> None:
+    more = {} if geometry is None else {"geometry": geometry}
+    for solver in SOLVERS:
+        response = checked_plan(PlanRequest.from_dict({**TRAIN, **more}), solver=solver)
+        assert (response.status, response.cost) == ("optimal", cost)
+
+
+def test_paths_that_are_too_close_are_found() -> None:
+    """By the validator, by the rules, and by driving: the train, for which one is too late."""
+    paths = [[[i, 0], [i + 1, 0]] for i in range(4)]
+    response = {"paths": paths, "assignment": [0, 1, 2, 3], "steps": 1, "cost": 4}
+    late = {**TRAIN, "geometry": {"lateness_s": 1.2}}
+    cells = [[(i, 0), (i + 1, 0)] for i in range(4)]
+    assert len(problems_of_paths(PlanRequest.from_dict(late), (0, 1, 2, 3), cells)) == 3
+    assert len(check_paths(late, response)) == 3
+    assert min(drive(late, response, Random(seed)) for seed in range(20)) < 2.0
+    in_time = {**TRAIN, "geometry": LATE}
+    assert problems_of_paths(PlanRequest.from_dict(in_time), (0, 1, 2, 3), cells) == []
+    assert check_paths(in_time, response) == []
+    assert 6.0 < min(drive(in_time, response, Random(seed)) for seed in range(20)) < 7.0
+
+
+@pytest.mark.parametrize(("geometry", "cost"), [(TIGHT, 6), (ON_TIME, None), ({}, None)], ids=str)
+def test_a_ring_can_only_turn_as_a_whole(geometry: dict[str, float], cost: int | None) -> None:
+    """There is no free cell, so the joint search must let vehicles follow each other."""
+    ring = [(0, 0), (1, 0), (2, 0), (2, 1), (1, 1), (0, 1)]
+    document = {
+        "schema": "laneweave.plan.request/1",
+        "grid": {"columns": 3, "lanes": 2},
+        "mode": 1,
+        "conflicts": ["geometric"],
+        "vehicles": [
+            {"id": f"v{i}", "cell": list(cell), "eligible": [i]} for i, cell in enumerate(ring)
+        ],
+        "targets": [list(ring[(i + 1) % 6]) for i in range(6)],
+        "geometry": geometry,
+    }
+    assert joint_search.optimal_cost(document) == cost
+    request = PlanRequest.from_dict(document)
+    cells = [vehicle.cell for vehicle in request.vehicles]
+    problem = Problem(request.grid, request.mode, request.conflict_model, cells, request.targets)
+    verdict = explore(problem, request.choices(), Budget(), 10**6)
+    assert verdict.impossible == (cost is None)
+    assert (verdict.solution is None) == (cost is None)
+    assert plan(request).cost == cost
+
+
+# ------------------------------------------------------------------ what agents really drive
+
+
+@cache
+def driven() -> Profile:
+    """The trajectories of agents in the default scenario."""
+    scenario = Scenario()
+    states = {step: move_profile(scenario, *step).states for step in displacements(2)}
+    return Profile(
+        scenario.move_s,
+        {step: array[:, [0, 3]] for step, array in states.items()},
+        {step: array[:, [1, 4]] for step, array in states.items()},
+    )
+
+
+@pytest.mark.parametrize("lateness_s", [0.0, 0.2, 0.5])
+def test_formations_keep_the_clearance_when_agents_drive_them(lateness_s: float) -> None:
+    """Eight vehicles in mode 2, by a timetable, with delays."""
+    least_m = []
+    for seed in range(6):
+        document = formation_request(seed, vehicles=8, mode=2).to_dict()
+        document["geometry"] = {"lateness_s": lateness_s}
+        response = checked_plan(PlanRequest.from_dict(document), max_nodes=300)
+        paths = [list(path) for path in response.paths]
+        bodies = Bodies(lateness_s=lateness_s)
+        for number in range(4):
+            rng = Random(10 * seed + number)
+            least_m.append(
+                least_gap_of_plan_m(bodies, paths, rng, lateness_s, bodies.slot_s, driven())
+            )
+    assert min(least_m) >= 5.0
+    # Vehicles do follow each other: with footprints 9.8 m would remain.
+    assert lateness_s == 0.0 or min(least_m) < 9.0
+    assert np.isfinite(least_m).all()
+
+
+@pytest.mark.parametrize(("late_s", "enough"), [(1.59, True), (1.9, False)])
+def test_the_limit_of_lateness_keeps_steps_apart(late_s: float, enough: bool) -> None:
+    """The table compares moves of one step; here the one ahead arrives during the next one."""
+    paths = [[(-1, 0), (0, 0), (1, 1)], [(0, 0), (1, 0), (1, 0)]]
+    if enough:
+        Geometry(lateness_s=late_s)
+    else:
+        with pytest.raises(BadInputError, match="when the next step begins"):
+            Geometry(lateness_s=late_s)
+    bodies = Bodies(lateness_s=late_s)
+    gaps_m = [
+        least_gap_of_plan_m(
+            bodies,
+            paths,
+            Random(seed),
+            late_s,
+            bodies.slot_s,
+            window_s=(bodies.slot_s, bodies.move_s + late_s),
+        )
+        for seed in range(200)
+    ]
+    assert (min(gaps_m) >= bodies.clearance_along_m) == enough
+    assert abs(min(gaps_m) - bodies.clearance_along_m) < 1.5

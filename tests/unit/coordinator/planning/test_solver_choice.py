@@ -1,0 +1,109 @@
+"""Which solver plans: asked for by name, by default, and the fallback from TAPPA to branching."""
+
+from __future__ import annotations
+
+import math
+
+import attrs
+import pytest
+
+from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan, plan
+from laneweave.coordinator.planning.facade import TAPPA_SHARE
+from laneweave.coordinator.planning.instances import block_request, formation_request
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.solvers import SOLVERS
+
+EASY = block_request(1, vehicles=3, deadline_s=3600.0)
+HARD = block_request(25, conflicts=("node", "edge", "special-1", "closing"), deadline_s=3600.0)
+"""TAPPA needs thousands of nodes for it, branching less than a hundred."""
+NODES = 400
+
+
+class Clock:
+    """Each look takes 10 ms."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        self.now += 0.01
+        return self.now
+
+
+def test_tappa_plans_unless_another_solver_is_named() -> None:
+    assert plan(EASY).solver == "tappa"
+    assert plan(attrs.evolve(EASY, solver="branching")).solver == "branching"
+    assert plan(attrs.evolve(EASY, solver="branching"), solver="tappa").solver == "tappa"
+
+
+def test_a_plan_in_time_is_no_fallback() -> None:
+    assert not any(plan(EASY, solver=solver).fallback for solver in SOLVERS)
+
+
+def test_an_unknown_solver_is_refused() -> None:
+    with pytest.raises(BadInputError, match=r"^solver: got .*guess.*tappa, branching"):
+        PlanRequest.from_dict(EASY.to_dict() | {"solver": "guess"})
+    with pytest.raises(BadInputError, match=r"^solver: got .*; allowed: a string"):
+        PlanRequest.from_dict(EASY.to_dict() | {"solver": 1})
+    with pytest.raises(BadInputError, match=r"^solver: got"):
+        plan(EASY, solver="guess")
+
+
+@pytest.mark.parametrize("solver", [None, *SOLVERS])
+def test_a_request_keeps_its_solver_in_json(solver: str | None) -> None:
+    request = attrs.evolve(EASY, solver=solver)
+    assert PlanRequest.from_dict(request.to_dict()) == request
+
+
+def test_responses_from_before_there_was_a_choice_can_be_read() -> None:
+    written = plan(EASY).to_dict()
+    assert written.pop("solver") == "tappa"
+    assert "fallback" not in written
+    old = PlanResponse.from_dict(written)
+    assert (old.solver, old.fallback) == (None, False)
+    assert old.to_dict() == written
+
+
+# --- fallback ---------------------------------------------------------------------------------
+
+
+def test_branching_goes_on_when_tappa_has_spent_its_nodes() -> None:
+    alone = checked_plan(HARD, max_nodes=NODES, solver="tappa", fallback=False)
+    assert (alone.status, alone.solver, alone.fallback) == ("timeout", "tappa", False)
+    response = checked_plan(HARD, max_nodes=NODES)
+    best = checked_plan(HARD, solver="branching")
+    assert (response.solver, response.fallback) == ("branching", True)
+    assert (response.status, response.cost) == ("optimal", best.cost)
+    assert TAPPA_SHARE * NODES < response.nodes_expanded <= NODES
+    assert response.assignments_tried > 0
+    assert PlanResponse.from_dict(response.to_dict()) == response
+
+
+def test_a_fallback_by_nodes_is_repeatable() -> None:
+    one, other = (attrs.evolve(plan(HARD, max_nodes=NODES), solve_ms=0.0) for _ in range(2))
+    assert one == other
+
+
+@pytest.mark.parametrize(("seed", "nodes"), [(33, 20), (10, 40), (6, 80), (43, 80)])
+def test_the_cheaper_path_set_and_the_higher_bound_are_kept(seed: int, nodes: int) -> None:
+    """TAPPA has a path set without proof; branching finds a cheaper one or proves its cost."""
+    request = formation_request(seed, vehicles=8, deadline_s=3600.0)
+    alone = plan(request, max_nodes=math.ceil(TAPPA_SHARE * nodes), solver="tappa", fallback=False)
+    both = plan(request, max_nodes=nodes)
+    assert (both.solver, both.fallback) == ("branching", True)
+    assert alone.cost is not None
+    assert both.cost is not None
+    assert both.cost <= alone.cost
+    assert (both.lower_bound or 0) >= (alone.lower_bound or 0)
+
+
+def test_branching_goes_on_when_tappa_has_spent_its_time() -> None:
+    response = plan(attrs.evolve(HARD, deadline_s=30.0), clock=Clock())
+    assert (response.solver, response.fallback) == ("branching", True)
+    assert response.solve_ms <= 30.1e3
+
+
+def test_tappa_spends_all_where_branching_cannot_plan() -> None:
+    """Where vehicles may share a cell, branching cannot plan at all."""
+    request = attrs.evolve(EASY, conflicts=("edge",))
+    asked = [plan(request, solver=solver) for solver in SOLVERS]
+    assert [(one.solver, one.fallback) for one in asked] == [("tappa", False), ("tappa", True)]

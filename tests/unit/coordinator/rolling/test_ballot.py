@@ -1,0 +1,276 @@
+"""One ballot: who promised, what everybody owns, the plan, and when it is given up."""
+
+from __future__ import annotations
+
+import pytest
+from attrs import evolve
+
+from laneweave.coordinator.rolling.ballot import Handover, Phase, estate_of, partners, sure_of
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.vehicle.plans import estate_problems, plan_problems
+from laneweave.protocol.wire.messages import Ballot, Deed, Name, Plan, Prepare, VehicleState
+from support.rolling_samples import (
+    AFTER,
+    BEFORE,
+    HIGH,
+    HOME,
+    LOW,
+    MID,
+    TARGET,
+    A,
+    B,
+    C,
+    deed_of,
+    make_plan,
+    state,
+)
+
+RESEND_S = 0.2
+OWNED_BEFORE, OWNED_AFTER = frozenset(BEFORE[A]), frozenset(AFTER[A])
+SURE = OWNED_BEFORE & OWNED_AFTER
+BETWEEN = Ballot(2, Name("c1"), 10, 2)
+"""Above MID, below HIGH."""
+
+
+def make_handover(moves: dict[Name, tuple[Cell, Cell]] | None = None) -> Handover:
+    return Handover(
+        ballot=MID,
+        roster=(A, B),
+        moves=moves or {A: (HOME, TARGET)},
+        t0_s=100.0,
+        slot_s=4.0,
+        resend_s=RESEND_S,
+        due_s=1.0,
+    )
+
+
+def tell(handover: Handover, *states: VehicleState) -> None:
+    known: dict[Name, VehicleState] = {}
+    for each in states:
+        known[each.vehicle] = each
+        if each.vehicle in handover.roster:
+            handover.on_state(each, known)
+
+
+def issued() -> Handover:
+    handover = make_handover()
+    tell(handover, state(A, MID), state(B, MID))
+    assert handover.phase is Phase.ISSUING
+    return handover
+
+
+# --- what somebody owns -----------------------------------------------------------------------
+
+DEED = deed_of(A, MID, (A, B, C))
+CLOSED = state(A, HIGH, DEED)
+"""A has promised more, and its gate was closed then."""
+
+
+def test_without_a_deed_or_with_an_open_one_the_estate_is_what_is_shown() -> None:
+    assert estate_of(state(A, HIGH), {}) == OWNED_BEFORE
+    taken = state(A, HIGH, Deed(MID, open=True), estate=AFTER[A])
+    assert estate_of(taken, {}) == OWNED_AFTER
+
+
+def test_one_that_knows_the_open_gate_is_enough() -> None:
+    knows = state(C, MID, Deed(MID, open=True))
+    assert estate_of(CLOSED, {C: knows}) == OWNED_AFTER
+    # Also while A still could open its own gate.
+    assert estate_of(state(A, MID, DEED), {C: knows}) == OWNED_AFTER
+
+
+@pytest.mark.parametrize("older", [None, Deed(LOW, open=True)])
+def test_one_that_has_promised_more_without_the_deed_keeps_the_gate_closed(
+    older: Deed | None,
+) -> None:
+    assert estate_of(CLOSED, {C: state(C, BETWEEN, older)}) == OWNED_BEFORE
+    assert estate_of(state(A, MID, DEED), {C: state(C, BETWEEN, older)}) == OWNED_BEFORE
+
+
+@pytest.mark.parametrize(
+    "silent",
+    [
+        state(C, MID),  # it may accept yet
+        state(C, LOW),
+        state(C, None),
+        state(C, BETWEEN, estate=()),  # its controller has not noted the promise
+        state(C, MID, DEED),  # it may open its gate yet
+    ],
+)  # fmt: skip
+def test_what_may_still_come_tells_nothing(silent: VehicleState) -> None:
+    others = {B: state(B, HIGH, DEED), C: silent}
+    assert estate_of(CLOSED, others) is None
+    assert sure_of(CLOSED, others) == SURE
+    assert partners(CLOSED, others) == {B, C}
+
+
+def test_all_have_turned_away_with_closed_gates() -> None:
+    others = {B: state(B, BETWEEN, DEED), C: state(C, HIGH, DEED)}
+    assert estate_of(CLOSED, others) == sure_of(CLOSED, others) == OWNED_BEFORE
+    assert partners(CLOSED, others) == frozenset()
+    assert estate_of(state(A, MID, DEED), others) is None  # A may open its own gate
+    assert estate_of(evolve(CLOSED, estate=()), others) is None
+
+
+@pytest.mark.parametrize("newer", [None, state(C, HIGH, Deed(BETWEEN, open=True))])
+def test_where_nobody_will_tell_some_cells_are_certain_either_way(
+    newer: VehicleState | None,
+) -> None:
+    """Somebody opened the gate or did not, and has gone, or taken part in another plan since."""
+    there = {} if newer is None else {C: newer}
+    gone = {C} if newer is None else set[Name]()
+    assert estate_of(CLOSED, {B: state(B, HIGH, DEED), **there}, gone) == SURE
+    assert estate_of(CLOSED, {B: state(B, MID, DEED), **there}, gone) == SURE
+    assert (
+        estate_of(CLOSED, {B: state(B, HIGH, Deed(MID, open=True)), **there}, gone) == OWNED_AFTER
+    )
+    assert estate_of(CLOSED, {B: state(B, HIGH), **there}, gone) == OWNED_BEFORE
+    assert partners(CLOSED, {B: state(B, HIGH, DEED), **there}) == {B, *there}
+    # Under way it may still be in a cell that it is about to give.
+    moving = evolve(CLOSED, moving=True)
+    assert estate_of(moving, there, gone) is None
+    assert sure_of(moving, there, gone) == SURE
+
+
+def test_strangers_and_older_states_of_oneself_tell_nothing() -> None:
+    stranger, others = Name("X"), {B: state(B, MID, DEED), C: state(C, MID, DEED)}
+    assert estate_of(CLOSED, {stranger: state(stranger, HIGH), **others}) is None
+    assert estate_of(CLOSED, {A: state(A, HIGH, Deed(MID, open=True)), **others}) is None
+
+
+def test_whoever_was_alone_in_a_plan_knows() -> None:
+    alone = deed_of(A, MID, (A,))
+    assert estate_of(state(A, HIGH, alone), {}) == OWNED_BEFORE
+    assert estate_of(state(A, MID, alone), {}) is None
+
+
+# --- promises ---------------------------------------------------------------------------------
+
+
+def test_prepares_until_all_have_promised() -> None:
+    handover = make_handover()
+    assert handover.outgoing(0.9) == []
+    assert handover.wakeup_s == 1.0
+    expected = Prepare(MID, (), (A, B))
+    assert handover.outgoing(1.0) == [(A, expected), (B, expected)]
+    assert handover.outgoing(1.1) == []
+    assert handover.wakeup_s == 1.0 + RESEND_S
+    tell(handover, state(A, MID))
+    assert handover.outgoing(1.2) == [(B, expected)]
+
+
+@pytest.mark.parametrize(
+    "no_promise",
+    [state(B, LOW), state(B), state(B, MID, estate=()), state(B, MID, accepted=True)],
+    ids=["of an older ballot", "none", "not noted", "accepted already"],
+)
+def test_what_is_no_promise_does_not_count(no_promise: VehicleState) -> None:
+    handover = make_handover()
+    tell(handover, state(A, MID), no_promise)
+    assert (handover.phase, set(handover.promises)) == (Phase.PREPARING, {A})
+
+
+def test_the_plan_is_made_from_the_promises() -> None:
+    handover = issued()
+    plan = handover.plan
+    assert plan == evolve(
+        make_plan(), formations=plan.formations if plan else (), incarnations={A: 7, B: 7}
+    )
+    assert plan is not None
+    assert plan_problems(plan) == estate_problems(plan) == []
+    assert handover.outgoing(1.0) == [(A, plan), (B, plan)]
+    assert handover.outgoing(1.1) == []
+    tell(handover, state(B, MID, accepted=True))
+    assert handover.outgoing(1.2) == [(A, plan)]
+    tell(handover, state(A, MID, accepted=True))
+    assert handover.phase is Phase.IN_FORCE
+    assert handover.wakeup_s is None
+    assert handover.outgoing(9.0) == []
+
+
+def test_the_newest_promise_counts() -> None:
+    """What the roadside gives between two states is known."""
+    handover = make_handover()
+    tell(handover, state(A, MID), state(A, MID, estate=(*BEFORE[A], (5, 0))), state(B, MID))
+    assert handover.plan is not None
+    assert handover.plan.before[A] == (*BEFORE[A], (5, 0))
+    assert handover.plan.after[A] == (*AFTER[A], (5, 0))
+
+
+def test_two_that_move_behind_each_other_need_more_than_one_slot() -> None:
+    """A cell that somebody leaves in this slot is its own in it."""
+    handover = make_handover({A: (HOME, TARGET), B: ((2, 1), (1, 1))})
+    tell(handover, state(A, MID), state(B, MID))
+    assert handover.phase is Phase.ISSUING
+    handover = make_handover({A: (HOME, (1, 1)), B: ((2, 1), (1, 1))})
+    tell(handover, state(A, MID), state(B, MID))
+    assert handover.phase is Phase.GIVEN_UP
+    assert "meet in step 0" in handover.why
+
+
+def test_a_closed_deed_of_an_older_plan_is_resolved_by_the_others() -> None:
+    old = Deed(LOW, ((2, 1),), BEFORE[B], (A, B))
+    handover = make_handover()
+    tell(handover, state(A, MID, Deed(LOW, open=True)), state(B, MID, old, estate=((2, 1),)))
+    assert isinstance(handover.plan, Plan)
+    assert handover.plan.before == BEFORE
+
+
+# --- giving up --------------------------------------------------------------------------------
+
+WRONG = {
+    "A is not where it was planned from": [evolve(state(A, MID), hold_cell=(1, 0)), state(B, MID)],
+    "B does not own": [state(A, MID), evolve(state(B, MID), hold_cell=TARGET)],
+    "nobody owned": [state(A, MID), state(B, MID, estate=((2, 1),))],
+    "a cell has two owners": [state(A, MID, estate=(*BEFORE[A], (2, 1))), state(B, MID)],
+    "nobody can tell what B owns": [
+        state(C, LOW, Deed(LOW, (), (), (A, B, C))),  # it may open its gate yet
+        state(A, MID, Deed(LOW, BEFORE[A], BEFORE[A], (A,))),
+        state(B, MID, Deed(LOW, BEFORE[B], (), (A, B, C))),
+    ],
+    "outbid": [state(A, MID), state(B, HIGH)],
+    "A has restarted": [state(A, MID), evolve(state(A, LOW), incarnation=8)],
+}
+
+
+@pytest.mark.parametrize("why", WRONG)
+def test_is_given_up_when_it_cannot_come_about(why: str) -> None:
+    handover = make_handover()
+    tell(handover, *WRONG[why])
+    assert handover.phase is Phase.GIVEN_UP
+    assert why in handover.why
+    assert handover.plan is None
+    assert handover.wakeup_s is None
+    assert handover.outgoing(9.0) == []
+
+
+def test_nobody_moves_whom_nobody_drives() -> None:
+    handover = make_handover()
+    tell(handover, evolve(state(A, MID), attended=False), state(B, MID))
+    assert handover.why == "A is not where it was planned from"
+    handover = make_handover()
+    tell(handover, state(A, MID), evolve(state(B, MID), attended=False))
+    assert handover.phase is Phase.ISSUING  # who only hands cells over need not be driven
+
+
+def test_whoever_restarts_cannot_accept() -> None:
+    handover = issued()
+    tell(handover, evolve(state(B, MID), incarnation=8))
+    assert (handover.phase, handover.why) == (Phase.GIVEN_UP, "B has restarted")
+
+
+def test_outbid_while_the_plan_is_sent() -> None:
+    handover = issued()
+    tell(handover, state(B, HIGH))
+    assert handover.why == "outbid"
+
+
+def test_what_is_in_force_or_given_up_stays_so() -> None:
+    handover = issued()
+    tell(handover, state(A, MID, accepted=True), state(B, MID, accepted=True))
+    tell(handover, state(A, HIGH))
+    assert handover.phase is Phase.IN_FORCE
+    handover = make_handover()
+    handover.give_up("no reason")
+    tell(handover, state(A, MID), state(B, MID))
+    assert (handover.phase, handover.why) == (Phase.GIVEN_UP, "no reason")

@@ -1,0 +1,653 @@
+"""The stream is planned once in each slot, from what is known for certain, and put into force."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from itertools import count
+from typing import Any
+
+import pytest
+from attrs import define, evolve, field
+
+from laneweave.coordinator.planning.rolling.planner import StreamPlan, StreamVehicle
+from laneweave.coordinator.rolling.ballot import Phase
+from laneweave.coordinator.rolling.control import (
+    AHEAD_M,
+    BESIDE,
+    LATEST_S,
+    PATIENCE_S,
+    SHOWN_S,
+    Note,
+    StreamControl,
+    _clusters,
+)
+from laneweave.coordinator.rolling.planner import CheckedPlanner, stream_planner, stream_road
+from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.runtime.node import Compute, Computed
+from laneweave.protocol.wire.messages import Ballot, Census, CensusEntry, Deed, Name, Plan, Prepare
+from laneweave.protocol.wire.messages import VehicleState as State
+from support.rolling_road import ROLLING
+from support.rolling_samples import state
+
+A, B, C, D = (Name(letter) for letter in "ABCD")
+SLOT_S = ROLLING.cycles_s[0]
+SLOT = 5
+BEGUN_S = SLOT * SLOT_S
+LOOK_S = BEGUN_S + SHOWN_S + 0.1
+"""The first tick after what is planned from."""
+HOMES: dict[Name, Cell] = {A: (0, 0), B: (2, 1), C: (-4, 0), D: (-8, 2)}
+ESTATES: dict[Name, tuple[Cell, ...]] = {
+    A: ((0, 0), (1, 0), (-1, 0)),
+    B: ((2, 1), (1, 1), (0, 1), (-1, 1)),
+    C: ((-4, 0), (-5, 0), (-4, 1)),
+    D: ((-8, 2), (-9, 2), (-8, 1)),
+}
+OLD = Ballot(1, Name("c0"), 1, 1)
+
+
+def shown(
+    name: Name,
+    promised: Ballot | None = None,
+    deed: Deed | None = None,
+    **changes: Any,  # noqa: ANN401 (fields)
+) -> State:
+    plain = state(name, promised, deed, estate=ESTATES[name], t_s=BEGUN_S + 0.4)
+    return evolve(plain, hold_cell=HOMES[name], done=True, **changes)
+
+
+def census(*names: Name) -> Census:
+    entries = tuple(CensusEntry(name, HOMES[name], 1, 0.0) for name in names)
+    return Census(BEGUN_S, entries, ())
+
+
+@define
+class Call:
+    """What the planner was asked."""
+
+    slot: int
+    vehicles: dict[str, StreamVehicle]
+    before: StreamPlan | None
+    blocked: frozenset[Cell]
+
+
+@define
+class Bench:
+    """A stream control with a planner that answers what the test says."""
+
+    ways: dict[str, tuple[Cell, ...]] = field(factory=dict)
+    calls: list[Call] = field(factory=list)
+    seq: Iterable[int] = field(factory=lambda: count(1))
+    jobs: Iterable[int] = field(factory=lambda: count(100))
+    asked_above: list[Ballot | None] = field(factory=list)
+    control: StreamControl = field(init=False)
+
+    def __attrs_post_init__(self) -> None:
+        """Be the planner."""
+        self.control = StreamControl(ROLLING, self.new_ballot, self)
+
+    def new_ballot(self, above: Ballot | None) -> Ballot:
+        self.asked_above.append(above)
+        return Ballot(7, Name("c1"), 1, next(iter(self.seq)))
+
+    def plan(
+        self,
+        slot: int,
+        vehicles: Iterable[StreamVehicle],
+        before: StreamPlan | None = None,
+        blocked: Iterable[Cell] = (),
+    ) -> StreamPlan:
+        asked = {vehicle.vehicle: vehicle for vehicle in vehicles}
+        self.calls.append(Call(slot, asked, before, frozenset(blocked)))
+        return StreamPlan(slot, self.ways, ())
+
+    def hear(self, *states: State) -> list[Note]:
+        return [
+            note
+            for each in states
+            if self.control.on_state(each)
+            for note in self.control.on_awaited(each)
+        ]
+
+    def order(self, t_s: float = LOOK_S, now_s: float | None = None) -> Compute | None:
+        """Order at a road time; the node's clock is alike, unless it is given."""
+        clock_s = t_s if now_s is None else now_s
+        orders = list(self.control.order(lambda: next(iter(self.jobs)), t_s, clock_s))
+        assert len(orders) <= 1
+        return orders[0] if orders else None
+
+    def think(self, t_s: float = LOOK_S) -> list[Note]:
+        """Order a plan, compute it, and take it at once."""
+        compute = self.order(t_s)
+        assert compute is not None
+        return self.finish(compute, t_s)
+
+    def finish(self, compute: Compute, t_s: float) -> list[Note]:
+        computed = Computed(compute.job, compute.work())
+        return list(self.control.finish(computed, t_s, 50.0))
+
+
+def bench(*names: Name) -> Bench:
+    """Return a bench that has heard of vehicles for long enough."""
+    made = Bench()
+    made.control.on_census(census(*names))
+    assert made.order(BEGUN_S - 2.0) is None
+    made.hear(*(shown(name) for name in names))
+    return made
+
+
+# --- when it plans ----------------------------------------------------------------------------
+
+
+def test_plans_the_next_slot_when_this_one_s_moves_are_shown() -> None:
+    desk = bench(A, B)
+    assert desk.order(BEGUN_S + SHOWN_S) is None
+    desk.think()
+    assert [call.slot for call in desk.calls] == [SLOT + 1]
+    assert desk.order(BEGUN_S + SLOT_S - 0.1) is None  # once a slot
+    assert desk.order(BEGUN_S + SLOT_S + SHOWN_S) is None
+    desk.think(LOOK_S + SLOT_S)
+    assert [call.slot for call in desk.calls] == [SLOT + 1, SLOT + 2]
+
+
+def test_only_one_planning_at_a_time() -> None:
+    desk = bench(A)
+    compute = desk.order()
+    assert compute is not None
+    later_s = LOOK_S + SLOT_S
+    assert desk.order(later_s) is None
+    desk.finish(compute, later_s - SLOT_S + 1.0)
+    assert desk.order(later_s) is not None
+
+
+def test_nothing_is_planned_without_a_road() -> None:
+    desk = Bench()
+    assert desk.order() is None
+    desk.control.on_census(census())
+    assert desk.order(now_s=0.0) is None
+    assert desk.order(now_s=10.0) is None
+
+
+def test_a_new_leader_listens_first() -> None:
+    """However fast or slow the road is; then it looks at once, and at the newest."""
+    desk = Bench()
+    desk.control.on_census(evolve(census(), t_s=BEGUN_S + 0.9))
+    assert desk.order(LOOK_S, now_s=10.0) is None
+    desk.control.on_census(evolve(census(A), t_s=BEGUN_S + 0.9))
+    desk.hear(evolve(shown(A), t_s=BEGUN_S + 1.0))
+    assert desk.order(BEGUN_S + 3.0, now_s=10.0 + PATIENCE_S - 0.01) is None
+    compute = desk.order(BEGUN_S + 1.0, now_s=10.0 + PATIENCE_S)
+    assert compute is not None
+    compute.work()
+    assert not desk.calls[0].vehicles[A].held
+
+
+def test_who_leads_again_listens_again_and_leaves_alone_what_was_begun() -> None:
+    desk = bench(A, B)
+    desk.ways = {A: ((0, 0), (0, 1))}
+    desk.think()
+    desk.control.take_over()
+    assert (desk.control.handovers, desk.control.wakeups) == ([], [])
+    assert set(desk.control.shown.states) == {A, B}  # what they have shown stays true
+    later_s = LOOK_S + SLOT_S
+    assert desk.order(later_s + PATIENCE_S) is None  # it needs a census, too
+    desk.control.on_census(census(A, B))
+    assert desk.order(later_s) is None
+    desk.hear(evolve(shown(A), hold_cell=(1, 0), t_s=later_s + 0.2))
+    compute = desk.order(later_s + PATIENCE_S)
+    assert compute is not None
+    compute.work()
+    assert desk.calls[-1].vehicles == {
+        A: StreamVehicle(A, (1, 0), 1, held=False),
+        B: StreamVehicle(B, HOMES[B], 1, held=True),  # where it was when it was heard last
+    }
+
+
+def test_a_plan_that_comes_late_is_dropped() -> None:
+    desk = bench(A)
+    desk.ways = {A: ((0, 0), (1, 0))}
+    begins_s = (SLOT + 1) * SLOT_S
+    compute = desk.order()
+    assert compute is not None
+    assert [note.kind for note in desk.finish(compute, begins_s + LATEST_S + 0.1)] == [
+        "planning-late"
+    ]
+    assert desk.control.handovers == []
+    desk = bench(A)
+    desk.ways = {A: ((0, 0), (1, 0))}
+    compute = desk.order()
+    assert compute is not None
+    assert [note.kind for note in desk.finish(compute, begins_s + LATEST_S - 0.1)] == [
+        "stream-planned"
+    ]
+    assert len(desk.control.handovers) == 1
+
+
+def test_results_of_others_and_failures_change_nothing() -> None:
+    desk = bench(A)
+    compute = desk.order()
+    assert compute is not None
+    stranger = Computed(compute.job + 1, compute.work())
+    assert list(desk.control.finish(stranger, BEGUN_S, 0.0)) == []
+    failed = Computed(compute.job, None, "out of memory")
+    (note,) = desk.control.finish(failed, BEGUN_S, 0.0)
+    assert (note.kind, note.data["error"]) == ("planning-failed", "out of memory")
+    assert list(desk.control.finish(failed, BEGUN_S, 0.0)) == []
+    assert desk.order(LOOK_S + SLOT_S) is not None
+
+
+# --- what it plans from -----------------------------------------------------------------------
+
+
+def test_the_planner_sees_everybody_and_what_is_owned() -> None:
+    desk = bench(A, B)
+    desk.think()
+    (call,) = desk.calls
+    assert call.vehicles == {
+        name: StreamVehicle(name, HOMES[name], 1, held=False) for name in (A, B)
+    }
+    free = {*ESTATES[A], *ESTATES[B]}
+    lanes = range(ROLLING.road.lanes)
+    window = {(column, lane) for column in range(-BESIDE, 2 + BESIDE + 1) for lane in lanes}
+    assert call.blocked == window - free
+    assert call.before is None
+    desk.think(LOOK_S + SLOT_S)
+    assert desk.calls[1].before == StreamPlan(SLOT + 1, {}, ())
+
+
+def test_it_plans_from_where_vehicles_will_hold() -> None:
+    desk = bench(A, B)
+    desk.hear(shown(A, OLD, moving=True, accepted=True, t_s=BEGUN_S + 0.4))
+    moved = shown(A, OLD, moving=True, accepted=True, t_s=BEGUN_S + SHOWN_S)
+    desk.hear(evolve(moved, hold_cell=(1, 0)))
+    desk.think()
+    assert desk.calls[0].vehicles[A].cell == (1, 0)
+    assert not desk.calls[0].vehicles[A].held
+
+
+def test_what_is_shown_later_does_not_count() -> None:
+    """Whether it has arrived by then depends on how fast messages are."""
+    desk = bench(A, B)
+    desk.hear(evolve(shown(A, OLD), hold_cell=(1, 0), t_s=LOOK_S))
+    desk.hear(evolve(shown(C), t_s=LOOK_S))
+    desk.control.on_census(evolve(census(B, D), t_s=LOOK_S))
+    desk.think()
+    (call,) = desk.calls
+    assert call.vehicles == {
+        name: StreamVehicle(name, HOMES[name], 1, held=False) for name in (A, B)
+    }
+    desk.think(LOOK_S + SLOT_S)
+    assert set(desk.calls[1].vehicles) == {B, D}
+
+
+def test_what_has_arrived_in_another_order_counts() -> None:
+    desk = bench(A)
+    desk.hear(evolve(shown(A), hold_cell=(2, 0), t_s=LOOK_S))
+    desk.hear(evolve(shown(A), hold_cell=(1, 0), t_s=BEGUN_S + SHOWN_S))
+    desk.hear(evolve(shown(A), hold_cell=(0, 0), t_s=BEGUN_S + SHOWN_S - 0.1))
+    desk.hear(evolve(shown(A, OLD), hold_cell=(2, 0), t_s=LOOK_S))  # twice in a tick
+    desk.think()
+    assert desk.calls[0].vehicles[A].cell == (1, 0)
+
+
+def test_who_has_just_left_was_there_when_it_looked() -> None:
+    desk = bench(A, B)
+    desk.control.on_census(evolve(census(A), t_s=LOOK_S))
+    desk.think()
+    assert desk.calls[0].vehicles[B] == StreamVehicle(B, HOMES[B], 1, held=False)
+
+
+def test_whoever_is_not_heard_does_not_keep_others_from_being_planned() -> None:
+    """Somebody else may be where it entered by now."""
+    for names in ((A, B), (B, A)):
+        desk = bench(*names)
+        desk.control.on_census(census(*names, C))
+        desk.hear(evolve(shown(A), hold_cell=HOMES[C], t_s=BEGUN_S + SHOWN_S))
+        desk.think()
+        assert set(desk.calls[0].vehicles) == {A, B}
+    desk = bench(A, B)
+    desk.hear(evolve(shown(A), hold_cell=HOMES[B], t_s=BEGUN_S + SHOWN_S))
+    desk.think()
+    assert len(desk.calls[0].vehicles) == 1
+
+
+def test_who_has_gone_on_since_takes_nobody_along() -> None:
+    desk = bench(A, B)
+    desk.ways = {A: ((0, 0), (0, 1)), B: ((2, 1), (2, 2))}
+    compute = desk.order()
+    assert compute is not None
+    desk.hear(evolve(shown(A, OLD, moving=True), hold_cell=(1, 0), t_s=LOOK_S))
+    desk.hear(evolve(shown(B), estate=(*ESTATES[B], (2, 2)), t_s=LOOK_S))
+    desk.finish(compute, LOOK_S)
+    assert [set(handover.moves) for handover in desk.control.handovers] == [{B}]
+
+
+def test_what_has_not_come_about_is_given_up_when_its_slot_has_begun() -> None:
+    desk = bench(A)
+    desk.ways = {A: ((0, 0), (1, 0))}
+    desk.think()
+    (handover,) = desk.control.handovers
+    desk.order(handover.t0_s + LATEST_S)
+    assert handover.wakeup_s is not None
+    desk.order(handover.t0_s + LATEST_S + 0.1)
+    assert handover.phase is Phase.GIVEN_UP
+
+
+@pytest.mark.parametrize("late", [True, False])
+def test_a_plan_that_is_not_used_ends_what_was_begun_all_the_same(*, late: bool) -> None:
+    desk = bench(A)
+    desk.ways = {A: ((0, 0), (1, 0))}
+    desk.think()
+    (handover,) = desk.control.handovers
+    compute = desk.order(LOOK_S + SLOT_S)
+    assert compute is not None
+    if late:
+        desk.finish(compute, (SLOT + 2) * SLOT_S + LATEST_S + 0.1)
+    else:
+        list(desk.control.finish(Computed(compute.job, None, "out of memory"), LOOK_S, 0.0))
+    assert handover.phase is Phase.GIVEN_UP
+
+
+def test_whoever_has_shown_nothing_in_time_is_held() -> None:
+    desk = bench(A)
+    desk.control.on_census(census(A, C))
+    desk.hear(evolve(shown(C), t_s=LOOK_S))
+    desk.think()
+    assert [vehicle.held for vehicle in desk.calls[0].vehicles.values()] == [False, True]
+
+
+def test_whoever_is_late_is_held_and_its_cells_are_blocked() -> None:
+    """Its gate is open, so its move may begin at any time until it promises something else."""
+    desk = bench(A, B)
+    late = shown(A, OLD, Deed(OLD, open=True), accepted=True, go=True)
+    desk.hear(evolve(late, done=False, estate=(*ESTATES[A], (5, 1)), t_s=BEGUN_S + 0.5))
+    desk.think()
+    (call,) = desk.calls
+    assert call.vehicles[A].held
+    assert {(1, 0), (-1, 0), (5, 1)} <= call.blocked
+    assert not {HOMES[A], (1, 1)} & call.blocked
+
+
+def test_whoever_waits_at_a_closed_gate_is_asked_for_something_newer() -> None:
+    """What it owns either way may be used."""
+    desk = bench(A, B)
+    deed = Deed(OLD, ESTATES[A], (HOMES[A], (1, 0)), (A, B))
+    waits = shown(A, OLD, deed, accepted=True)
+    desk.hear(evolve(waits, done=False, t_s=BEGUN_S + 0.5))
+    desk.think()
+    (call,) = desk.calls
+    assert not call.vehicles[A].held
+    assert (1, 0) not in call.blocked
+    assert (-1, 0) in call.blocked
+
+
+def test_whoever_is_far_from_where_moves_begin_is_not_planned_for() -> None:
+    road = parse_scenario({"formation": {"operation": "rolling"}, "road": {"s2_m": 2000.0}})
+    desk = Bench()
+    desk.control = StreamControl(road, desk.new_ballot, desk)
+    far_s = (road.moves_from_m - AHEAD_M) / 15.0
+    slot = math.ceil(far_s / SLOT_S)
+    desk.control.on_census(census(A, D))  # D is 120 m behind A
+    assert desk.order(slot * SLOT_S - 2.0) is None
+    desk.hear(shown(A), shown(D))
+    desk.think(slot * SLOT_S + LOOK_S - BEGUN_S)
+    assert set(desk.calls[0].vehicles) == {A}
+
+
+def test_whoever_nobody_drives_is_held_and_its_cells_are_free() -> None:
+    desk = bench(A, B)
+    desk.hear(shown(B, attended=False))
+    desk.think()
+    (call,) = desk.calls
+    assert [vehicle.held for vehicle in call.vehicles.values()] == [False, True]
+    assert not set(ESTATES[B]) & call.blocked
+
+
+def test_whoever_was_not_heard_stays_where_it_entered_and_owns_nothing() -> None:
+    desk = bench(A)
+    desk.control.on_census(census(A, B))
+    desk.ways = {A: ((0, 0), (0, 1)), B: ((2, 1), (2, 1))}
+    desk.think()
+    (call,) = desk.calls
+    assert call.vehicles[B] == StreamVehicle(B, HOMES[B], 1, held=True)
+    assert set(ESTATES[B]) <= call.blocked
+    assert desk.control.handovers == []  # A would need a cell that is B's
+
+
+def test_cells_of_which_nobody_can_tell_whose_they_are_are_blocked() -> None:
+    desk = bench(A, B)
+    desk.hear(shown(B, OLD, Deed(OLD, ESTATES[B], (HOMES[B],), (A, B)), accepted=True))
+    desk.think()
+    assert set(ESTATES[B]) & desk.calls[0].blocked == set(ESTATES[B]) - {HOMES[B]}
+
+
+def test_a_promise_that_is_not_noted_shows_no_estate() -> None:
+    desk = bench(A, B)
+    desk.hear(evolve(shown(B, OLD), estate=(), t_s=BEGUN_S + 0.5))
+    desk.think()
+    assert set(ESTATES[B]) <= desk.calls[0].blocked
+
+
+# --- states -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("older", "newer"),
+    [
+        (shown(A), evolve(shown(A), t_s=BEGUN_S + 1.0)),
+        (evolve(shown(A), t_s=BEGUN_S + 1.0), evolve(shown(A), incarnation=8)),
+        (shown(A), shown(A, OLD)),
+        (evolve(shown(A, OLD), estate=()), shown(A, OLD)),
+        (shown(A, OLD), shown(A, OLD, accepted=True)),
+        (shown(A, OLD), shown(A, OLD, Deed(OLD))),
+        (shown(A, OLD, Deed(OLD)), shown(A, OLD, Deed(OLD, open=True))),
+    ],
+    ids=["tick", "process", "promise", "noted", "acceptance", "deed", "gate"],
+)
+def test_the_newest_state_counts_in_whichever_order_they_come(older: State, newer: State) -> None:
+    for states in ((older, newer), (newer, older)):
+        desk = Bench()
+        desk.control.on_census(census(A))
+        desk.hear(*states)
+        assert desk.control.shown.states[A] == newer
+
+
+def test_ballots_are_above_all_that_was_promised() -> None:
+    desk = bench(A, B)
+    desk.hear(evolve(shown(B, OLD), t_s=BEGUN_S + 0.5))
+    desk.ways = {A: ((0, 0), (1, 0))}
+    desk.think()
+    assert desk.asked_above == [OLD]
+
+
+# --- ballots ----------------------------------------------------------------------------------
+
+
+def test_one_ballot_for_the_mover_and_the_owners_of_its_cells() -> None:
+    desk = bench(A, B, C)
+    desk.ways = {A: ((0, 0), (0, 1)), B: ((2, 1), (2, 1)), C: ((-4, 0),)}
+    (note,) = desk.think()
+    (handover,) = desk.control.handovers
+    assert handover.roster == (A, B)
+    assert handover.moves == {A: ((0, 0), (0, 1))}
+    assert (handover.t0_s, handover.slot_s) == ((SLOT + 1) * SLOT_S, SLOT_S)
+    expected = {"slot": SLOT + 1, "moves": 1, "ballots": 1, "largest": 2, "vehicles": 3}
+    assert expected.items() <= note.data.items()
+
+
+def test_moves_that_share_an_owner_share_a_ballot() -> None:
+    desk = bench(A, B, C, D)
+    desk.ways = {
+        A: ((0, 0), (0, 1)),
+        B: ((2, 1), (1, 1)),
+        C: ((-4, 0), (-5, 0)),
+        D: ((-8, 2), (-8, 2)),
+    }
+    desk.think()
+    assert [handover.roster for handover in desk.control.handovers] == [(A, B), (C,)]
+    assert set(desk.control.handovers[0].moves) == {A, B}
+
+
+def test_whose_promises_would_tell_what_somebody_owns_are_asked_for() -> None:
+    """C's gate is closed as far as it knows: B may have opened its own, and D of an older plan."""
+    newer = OLD._replace(seq=2)
+    desk = bench(A, B, C, D)
+    desk.hear(
+        shown(C, newer, Deed(newer, ESTATES[C], ESTATES[C], (B, C)), accepted=True),
+        shown(B, newer, Deed(newer, ESTATES[B], ESTATES[B], (B, C)), accepted=True),
+        shown(D, OLD, Deed(OLD, open=True), accepted=True),
+    )
+    desk.ways = {C: ((-4, 0), (-5, 0))}
+    desk.think()
+    assert [handover.roster for handover in desk.control.handovers] == [(B, C)]
+    desk = bench(A, B, C, D)
+    desk.ways = {C: ((-4, 0), (-5, 0))}
+    desk.think()
+    assert [handover.roster for handover in desk.control.handovers] == [(C,)]
+
+
+def test_clusters_are_what_hangs_together() -> None:
+    groups = [{A, B}, {C}, {D}, {B, C}]
+    assert sorted(map(sorted, _clusters(groups))) == [[A, B, C], [D]]
+    assert _clusters([]) == []
+
+
+def run_ballot(desk: Bench) -> Plan:
+    """Let A and B promise what they are asked; return the plan that A is sent."""
+    sent = dict(desk.control.outgoing(50.0))
+    assert {type(message) for message in sent.values()} == {Prepare}
+    ballot = desk.control.handovers[0].ballot
+    desk.hear(*(evolve(shown(name, ballot), t_s=BEGUN_S + 1.0) for name in sent))
+    plan = dict(desk.control.outgoing(50.0))[A]
+    assert isinstance(plan, Plan)
+    return plan
+
+
+def test_from_the_plan_to_a_ballot_in_force() -> None:
+    desk = bench(A, B)
+    desk.ways = {A: ((0, 0), (0, 1))}
+    desk.think()
+    assert desk.control.wakeups == [50.0]
+    plan = run_ballot(desk)
+    assert plan.moves == {A: ((0, (0, 0), (0, 1)),), B: ()}
+    assert desk.control.in_force == 0
+    accepted = [
+        evolve(shown(name, plan.ballot, accepted=True), t_s=BEGUN_S + 1.0) for name in (A, B)
+    ]
+    assert desk.hear(accepted[0]) == []
+    assert desk.hear(accepted[1]) == [
+        Note("plan-in-force", {"slot": SLOT + 1, "closed_s": BEGUN_S + SHOWN_S})
+    ]
+    assert desk.control.in_force == 1
+    assert desk.control.wakeups == []
+
+
+def test_what_has_not_come_about_is_given_up_with_the_next_plan() -> None:
+    desk = bench(A, B)
+    desk.ways = {A: ((0, 0), (0, 1))}
+    desk.think()
+    (old,) = desk.control.handovers
+    desk.think(LOOK_S + SLOT_S)
+    assert old.phase is Phase.GIVEN_UP
+    assert old not in desk.control.handovers
+    assert desk.control.handovers[0].ballot > old.ballot
+
+
+def test_a_ballot_that_fails_is_noted() -> None:
+    desk = bench(A, B)
+    desk.ways = {A: ((0, 0), (0, 1))}
+    desk.think()
+    (note,) = desk.hear(evolve(shown(B, Ballot(9, Name("c2"), 1, 1)), t_s=BEGUN_S + 1.0))
+    assert (note.kind, note.data) == ("handover-given-up", {"roster": [A, B], "why": "outbid"})
+    assert desk.hear(evolve(shown(A), t_s=BEGUN_S + 1.0)) == []
+
+
+# --- the census -------------------------------------------------------------------------------
+
+
+def test_whoever_leaves_is_forgotten_and_its_ballot_given_up() -> None:
+    desk = bench(A, B, C)
+    desk.ways = {A: ((0, 0), (0, 1)), C: ((-4, 0), (-5, 0))}
+    desk.think()
+    first, second = desk.control.handovers
+    desk.control.on_census(census(A, C))
+    assert set(desk.control.shown.states) == {A, C}
+    assert (first.phase, first.why) == (Phase.GIVEN_UP, "B has left")
+    assert second.phase is Phase.PREPARING
+
+
+def test_what_is_in_force_stays_so_when_somebody_leaves() -> None:
+    desk = bench(A, B)
+    desk.ways = {A: ((0, 0), (0, 1))}
+    desk.think()
+    (handover,) = desk.control.handovers
+    handover.phase = Phase.IN_FORCE
+    desk.control.on_census(census(A))
+    assert handover.phase is Phase.IN_FORCE
+
+
+def test_another_road_begins_with_nothing() -> None:
+    """Its clock begins at 0."""
+    desk = bench(A, B)
+    desk.ways = {A: ((0, 0), (0, 1))}
+    desk.think()
+    desk.control.forget()
+    assert (desk.control.shown.states, desk.control.handovers, desk.control.wakeups) == ({}, [], [])
+    assert desk.order(LOOK_S + SLOT_S) is None
+    desk.control.on_census(evolve(census(A), t_s=0.0))
+    assert desk.order(0.0, now_s=100.0) is None  # it listens first
+    compute = desk.order(SHOWN_S + 0.1, now_s=101.0)
+    assert compute is not None
+    compute.work()
+    call = desk.calls[-1]
+    assert (call.slot, call.before) == (1, None)
+    assert call.vehicles == {A: StreamVehicle(A, HOMES[A], 1, held=True)}  # not heard
+
+
+def test_nothing_is_kept_of_those_that_have_left() -> None:
+    desk = bench(A, B, C)
+    desk.hear(*(evolve(shown(name), t_s=BEGUN_S + 0.5) for name in (A, B, C)))
+    desk.control.on_census(evolve(census(B), t_s=BEGUN_S + 0.5))
+    desk.think()
+    kept = desk.control.shown
+    assert set(kept.states) == {B}
+    assert (set(kept._before), kept._left) == ({B}, {})
+
+
+# --- the real planner -------------------------------------------------------------------------
+
+
+def test_the_real_planner_takes_what_it_is_given() -> None:
+    """Also somebody who was not heard, whose own cell is blocked."""
+    control = StreamControl(ROLLING, lambda _: Ballot(7, Name("c1"), 1, 1), stream_planner(ROLLING))
+    control.on_census(census(A, B, C))
+    assert list(control.order(lambda: 1, BEGUN_S - 2.0, 0.0)) == []
+    for name in (A, B):
+        assert not control.on_state(shown(name))
+    (compute,) = control.order(lambda: 1, LOOK_S, 9.0)
+    plan = compute.work()
+    assert isinstance(plan, StreamPlan)
+    assert set(plan.ways) == {A, B, C}
+    for vehicle, way in plan.ways.items():
+        assert way[0] == HOMES[Name(vehicle)]
+    assert set(plan.ways[C]) == {HOMES[C]}
+    (note,) = control.finish(Computed(1, plan), LOOK_S, 0.0)
+    assert note.kind == "stream-planned"
+
+
+def test_a_wrong_plan_is_no_plan() -> None:
+    """The planner is not trusted: a way that ends on the road is not issued."""
+    bench = Bench(ways={A: (HOMES[A], HOMES[A])})
+    planner = CheckedPlanner(stream_road(ROLLING), bench)
+    bench.control = StreamControl(ROLLING, bench.new_ballot, planner)
+    bench.control.on_census(census(A))
+    bench.hear(shown(A))
+    assert bench.order(BEGUN_S - 2.0) is None
+    compute = bench.order()
+    assert compute is not None
+    with pytest.raises(ValueError, match=f"the plan of slot {SLOT + 1} is wrong: .* on the road"):
+        compute.work()
+    (note,) = bench.control.finish(Computed(compute.job, None, "wrong"), LOOK_S, 0.0)
+    assert note == Note("planning-failed", {"slot": SLOT + 1, "error": "wrong"})
+    assert bench.control.handovers == []

@@ -1,0 +1,41 @@
+"""`laneweave bench planner`."""
+
+import math
+
+import pytest
+from attrs import evolve
+
+from laneweave.coordinator.planning import plan
+from laneweave.coordinator.planning.instances import formation_request
+from laneweave.launch.bench.planner import FAMILIES, bench_planner, gap_percent, planner_table
+from laneweave.protocol.errors import BadInputError
+
+
+def test_every_family_and_size_gets_a_row() -> None:
+    rows = list(
+        bench_planner([2, 4], list(FAMILIES), instances=3, seed=5, deadline_s=4.0, solver="tappa")
+    )
+    assert [(row["family"], row["vehicles"]) for row in rows] == [
+        (family, size) for family in FAMILIES for size in (2, 4)
+    ]
+    for row in rows:
+        assert row["optimal"] == row["instances"] == row["answered_in_100_ms"] == 3
+        assert 0 < row["cpu_ms"]["p50"] <= row["cpu_ms"]["max"]
+        assert row["gap_percent"]["max"] == 0.0
+    assert planner_table(rows).row_count == len(rows)
+
+
+def test_what_does_not_fit_into_a_block_is_told() -> None:
+    with pytest.raises(BadInputError, match="13 vehicles do not fit"):
+        FAMILIES["block"].request(0, 13, 4.0)
+
+
+def test_what_is_not_proven_has_a_gap() -> None:
+    response = plan(formation_request(0, vehicles=4))
+    assert gap_percent(response) == 0.0
+    cost = response.cost
+    assert cost is not None
+    assert gap_percent(evolve(response, status="feasible", lower_bound=cost - 1)) == 100 / (
+        cost - 1
+    )
+    assert gap_percent(evolve(response, status="timeout", cost=None)) == math.inf

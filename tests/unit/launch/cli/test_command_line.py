@@ -1,0 +1,89 @@
+"""Parts of the command line that need no process: folders, the road ahead, and the last words."""
+
+import json
+import tempfile
+import time
+from pathlib import Path
+
+import pytest
+
+from laneweave.launch.cli import role_commands
+from laneweave.launch.run import run_folder
+from laneweave.launch.run.local_run import MAX_TEMPORARY_BYTES, check_temporary_folder
+from laneweave.launch.run.logs import last_error
+from laneweave.protocol.config.identities import coordinator_names
+from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.tables import Scenario
+
+
+def test_a_new_folder_tells_what_is_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(time, "strftime", lambda _: "20260102-030405")
+    settings = load_scenario(None, seed=7, demand__volume_veh_per_lane_h=1450.5)
+
+    folders = [run_folder.new_folder(None, settings, "formation") for _ in range(3)]
+
+    name = "formation-1450.5-seed7-20260102-030405"
+    assert [str(folder) for folder in folders] == [
+        f"runs/{name}",
+        f"runs/{name}-2",
+        f"runs/{name}-3",
+    ]
+    assert all(folder.is_dir() for folder in folders)
+
+
+def test_an_empty_folder_will_do_once(tmp_path: Path) -> None:
+    out = tmp_path / "a" / "b"
+    out.mkdir(parents=True)
+    assert run_folder.new_folder(out, Scenario(), "formation").is_dir()
+    with pytest.raises(BadInputError, match="a new or empty folder"):
+        run_folder.new_folder(out, Scenario(), "formation")
+
+
+def test_a_folder_with_something_in_it_will_not(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for out in (tmp_path, tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(BadInputError, match="--out: got "):
+            run_folder.new_folder(out, Scenario(), "formation")
+
+
+@pytest.mark.parametrize("pace", [None, 0.01, 1, 1000])
+def test_paces(pace: float | None) -> None:
+    role_commands.check_pace(pace)
+
+
+@pytest.mark.parametrize("pace", [0, -1, 1001, float("nan"), float("inf")])
+def test_impossible_paces(pace: float) -> None:
+    with pytest.raises(BadInputError, match="--pace"):
+        role_commands.check_pace(pace)
+
+
+def test_coordinators_are_named_in_their_order() -> None:
+    assert coordinator_names(load_scenario(None, runtime__coordinators=2)) == ("c1", "c2")
+
+
+def test_sockets_must_fit_below_the_temporary_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    longest = "/" + "t" * (MAX_TEMPORARY_BYTES - 1)
+    monkeypatch.setattr(tempfile, "tempdir", longest)
+    check_temporary_folder()
+    monkeypatch.setattr(tempfile, "tempdir", longest + "t")
+    with pytest.raises(BadInputError, match="TMPDIR"):
+        check_temporary_folder()
+
+
+def test_the_last_error_of_a_process(tmp_path: Path) -> None:
+    path = tmp_path / "log.jsonl"
+    assert last_error(path, "bridge") == ""
+    entries = (
+        {"name": "bridge", "level": "error", "event": "first"},
+        {"name": "bridge", "level": "error", "event": "x", "exception": "Traceback\n  y\nE: z\n"},
+        {"name": "bridge", "level": "info", "event": "stopping"},
+        {"name": "c1", "level": "error", "event": "cannot start", "reason": "no router"},
+    )
+    lines = [json.dumps(entry) for entry in entries]
+    path.write_text("\n".join([*lines, '{"name": "bri']), encoding="utf-8")
+
+    assert last_error(path, "bridge") == "E: z"
+    assert last_error(path, "c1") == "no router"
+    assert last_error(path, "c2") == ""

@@ -1,0 +1,60 @@
+"""The entry point: Ctrl-C arrives, whatever the process is doing."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+INTERRUPTS = 60
+
+# All is loaded behind the entry point, as in the real command: threads inherit what it set.
+SOLVING = """
+import signal, sys
+from laneweave.launch import entry
+
+def solve() -> None:
+    from laneweave.agents.driving.tracker import Tracker
+    from laneweave.agents.driving.reference import Reference
+    from laneweave.protocol.vehicle.motion import cell_state
+    from laneweave.protocol.scenario.tables import Scenario
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    signal.alarm(90)  # whoever started it may be gone
+    scenario = Scenario()
+    tracker, window = Tracker(scenario), Reference.hold(scenario, (3, 1)).window(0)
+    s, *rest = cell_state(scenario.lattice, (3, 1), 0.0)
+    for _ in range(int(sys.argv[1])):
+        try:
+            print("solving", flush=True)
+            while True:
+                tracker.solve((s + 1.0, *rest), window)
+        except KeyboardInterrupt:
+            print("interrupted", flush=True)
+
+class Cli:
+    main = staticmethod(solve)
+
+sys.modules["laneweave.launch.cli.main"] = Cli
+sys.modules["laneweave.launch"].cli = Cli
+entry.main()
+"""
+
+
+def test_no_interrupt_is_lost_while_osqp_solves() -> None:
+    """Without the watcher one in eight would be forgotten."""
+    command = [sys.executable, "-c", SOLVING, str(INTERRUPTS)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        watchdog = threading.Timer(60.0, process.kill)
+        watchdog.start()
+        try:
+            for index in range(INTERRUPTS):
+                assert process.stdout.readline() == "solving\n"
+                time.sleep(0.01 + 0.000_37 * index)
+                process.send_signal(signal.SIGINT)
+                assert process.stdout.readline() == "interrupted\n"
+        finally:
+            watchdog.cancel()
+            process.kill()

@@ -1,0 +1,193 @@
+"""compose.yaml and Containerfile agree with the code, as far as that shows without an engine."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from typer.main import get_command
+
+from laneweave.launch.cli.main import app
+from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.scenario.tables import Scenario
+
+ROOT = Path(__file__).resolve().parents[4]
+COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "compose.yaml").read_text(encoding="utf-8"))
+SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
+CONTAINERFILE = (ROOT / "Containerfile").read_text(encoding="utf-8")
+NEEDS = {"agent": "agent", "bridge": "sim", "certs": "certs", "watch": "watch"}
+"""The extra that a role does not run without."""
+WRITABLE = re.compile(r"^[\w.-]+:(?P<target>/[\w/.-]+)$")
+"""A named volume that may be written to."""
+
+each_service = pytest.mark.parametrize("service", sorted(SERVICES))
+
+
+def role(service: str) -> str:
+    name: str = SERVICES[service]["command"][0]
+    return name
+
+
+def extras(service: str) -> list[str]:
+    text: str = SERVICES[service]["build"]["args"]["EXTRAS"]
+    return text.split(",") if text else []
+
+
+def port_of(service: str) -> str:
+    """Return the port at which the live page is served, for containers and for this host alike."""
+    listen: str = parameters(SERVICES[service]["command"]).get("listen", "")
+    _, _, port = listen.rpartition(":")
+    assert SERVICES[service].get("ports", []) == ([f"127.0.0.1:{port}:{port}"] if port else [])
+    return port
+
+
+def once(service: str) -> bool:
+    return SERVICES[service].get("restart") == "no"
+
+
+def check(service: str) -> list[str]:
+    """Return the words of a health check, if it is one of the program's own."""
+    kind, program, *words = SERVICES[service].get("healthcheck", {"test": ["CMD", "none"]})["test"]
+    assert kind == "CMD"
+    return words if program == "laneweave" else []
+
+
+def parameters(words: list[str]) -> dict[str, Any]:
+    """Parse a command line as the command itself does."""
+    group: Any = get_command(app)
+    command = group.commands[words[0]]
+    words = words[1:]
+    while hasattr(command, "commands"):
+        command, words = command.commands[words[0]], words[1:]
+    found: dict[str, Any] = command.make_context("laneweave", list(words)).params
+    return found
+
+
+def configuration() -> Scenario:
+    return load_scenario(ROOT / "scenarios" / "compose.toml")
+
+
+@each_service
+def test_commands_exist_and_read_the_one_configuration(service: str) -> None:
+    for words in filter(None, (SERVICES[service]["command"], check(service))):
+        config = parameters(words).get("config")
+        if config is not None:
+            assert (ROOT / config.relative_to("/")).is_file()
+    assert once(service) or parameters(SERVICES[service]["command"])["config"] is not None
+
+
+@each_service
+def test_whoever_lasts_shows_its_health_and_is_started_again(service: str) -> None:
+    if once(service):
+        return
+    found = SERVICES[service]
+    # The bridge is done when all vehicles have left.
+    assert found["restart"] == ("on-failure:3" if service == "bridge" else "unless-stopped")
+    asks_itself = f"127.0.0.1:{port_of(service)}" in found["healthcheck"]["test"][-1]
+    assert asks_itself if service == "watch" else check(service)
+
+
+@each_service
+def test_images_have_what_their_role_needs_and_no_more(service: str) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    known = set(project["optional-dependencies"])
+    needed = {NEEDS[role(service)]} if role(service) in NEEDS else set()
+    assert needed <= set(extras(service)) <= known - {"all", "dev", "bench", "dask"}
+    assert "sim" not in set(extras(service)) - needed
+    same = [other for other in SERVICES if SERVICES[other]["image"] == SERVICES[service]["image"]]
+    assert {tuple(extras(other)) for other in same} == {tuple(extras(service))}
+
+
+@each_service
+def test_containers_have_no_rights_to_misuse(service: str) -> None:
+    found = SERVICES[service]
+    assert found["read_only"] is True
+    assert found["init"] is True
+    assert found["cap_drop"] == ["ALL"]
+    assert found["security_opt"] == ["no-new-privileges:true"]
+    assert "/tmp" in found["tmpfs"]  # noqa: S108 (in the container)
+    users = re.findall(r"^USER (\S+)$", CONTAINERFILE, re.MULTILINE)
+    assert users == ["laneweave"]
+
+
+@each_service
+def test_dependencies_are_services_that_can_be_waited_for(service: str) -> None:
+    for name, how in SERVICES[service].get("depends_on", {}).items():
+        if how["condition"] == "service_completed_successfully":
+            assert once(name)
+        else:
+            assert how["condition"] == "service_healthy"
+            assert "healthcheck" in SERVICES[name]
+
+
+@each_service
+def test_what_a_volume_covers_is_in_the_image_and_belongs_to_the_user(service: str) -> None:
+    made = set(" ".join(re.findall(r"mkdir -p ([^&\\]+)", CONTAINERFILE)).split())
+    for volume in SERVICES[service]["volumes"]:
+        if not volume.startswith("./"):
+            assert volume.partition(":")[0] in COMPOSE["volumes"]
+            assert volume.split(":")[1] in made
+        if match := WRITABLE.match(volume):
+            assert match["target"] in made
+        else:
+            assert volume.endswith(":ro")
+
+
+def test_the_planner_finds_its_compiled_code() -> None:
+    place = re.search(r"NUMBA_CACHE_DIR=(\S+)", CONTAINERFILE)
+    assert place is not None
+    for service in SERVICES:
+        if role(service) == "coordinator":
+            assert f"compiled:{place[1]}" in SERVICES[service]["volumes"]
+
+
+def test_the_router_is_found_by_its_service_name_whenever_it_comes() -> None:
+    network = configuration().network
+    host, port = re.fullmatch(r"\w+/([\w-]+):(\d+)", network.endpoint).groups()  # type: ignore[union-attr]
+    assert role(host) == "router"
+    assert [listen.partition("/")[2] for listen in network.listen] == [f"0.0.0.0:{port}"]
+    assert network.connect_timeout_s > 10.0
+
+
+def test_every_fleet_has_one_container_that_looks_at_its_own_health() -> None:
+    fleets = configuration().security.fleets
+    agents = {
+        parameters(service["command"])["fleet"]: service
+        for name, service in SERVICES.items()
+        if role(name) == "agent"
+    }
+    assert agents.keys() == fleets.keys()
+    for fleet, service in agents.items():
+        assert parameters(service["healthcheck"]["test"][2:])["shard"] == fleets[fleet]
+    shards = sorted(str(shard) for shard in fleets.values())
+    assert shards == [f"{index}/{len(shards)}" for index in range(len(shards))]
+
+
+def test_every_coordinator_has_one_container_that_looks_at_its_own_health() -> None:
+    names = []
+    for name, service in SERVICES.items():
+        if role(name) == "coordinator":
+            names.append(parameters(service["command"])["name"])
+            assert parameters(service["healthcheck"]["test"][2:])["name"] == names[-1]
+    assert names == [f"c{number + 1}" for number in range(configuration().runtime.coordinators)]
+
+
+def test_certificates_are_made_by_one_and_read_by_all() -> None:
+    security = configuration().security
+    assert security.mode == "mtls"
+    for name, service in SERVICES.items():
+        (volume,) = [one for one in service["volumes"] if one.startswith("certs:")]
+        rest = "" if role(name) == "certs" else ":ro"
+        assert volume == f"certs:{security.folder}{rest}"
+
+
+def test_the_image_is_made_of_files_that_exist() -> None:
+    for source in re.findall(r"^COPY (?!--from)(\S+) ", CONTAINERFILE, re.MULTILINE):
+        assert (ROOT / source).exists()
+    needed = re.findall(r"lib\w+[\d-]*\d", (ROOT / "README.md").read_text(encoding="utf-8"))
+    (debian,) = re.findall(r"--no-install-recommends \\\n\s+([^\\]+) \\", CONTAINERFILE)
+    assert set(debian.split()) <= set(needed)

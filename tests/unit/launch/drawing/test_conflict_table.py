@@ -1,0 +1,81 @@
+"""The picture of the conflict table shows what the tables say."""
+
+from __future__ import annotations
+
+from collections import Counter
+from itertools import product
+from pathlib import Path
+
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
+from PIL import Image
+
+from laneweave.coordinator.planning.geometry.conflict_table import Pair, close_pairs
+from laneweave.coordinator.planning.geometry.settings import Geometry
+from laneweave.coordinator.planning.grid import Cell, displacements
+from laneweave.launch.drawing.conflict_table import (
+    PANELS,
+    Judge,
+    Verdict,
+    conflict_figure,
+    counts,
+    draw_conflicts,
+)
+
+NEAR = range(-2, 3)
+OFFSETS = [offset for offset in product(NEAR, NEAR) if offset != (0, 0)]
+
+
+def pairs_of(a: Cell) -> list[Pair]:
+    return [(offset, a, b) for offset in OFFSETS for b in displacements(2)]
+
+
+def drawn(axes: Axes) -> Counter[str]:
+    names = [verdict.name for verdict in Verdict]
+    marks = [patch for patch in axes.patches if patch.get_label() in names]
+    for mark in marks:
+        colour = Verdict[str(mark.get_label())].value
+        assert to_hex(mark.get_facecolor()) == colour
+    return Counter(str(mark.get_label()) for mark in marks)
+
+
+@pytest.mark.parametrize("geometry", [Geometry(), Geometry(clearance_along_m=7.0)])
+def test_each_pair_is_drawn_once_in_the_colour_of_its_verdict(geometry: Geometry) -> None:
+    judge = Judge.of(geometry)
+    panels = conflict_figure(geometry).axes
+    assert [axes.get_title() for axes in panels] == list(PANELS)
+    for axes, a in zip(panels, PANELS.values(), strict=True):
+        expected = Counter(judge.verdict(pair).name for pair in pairs_of(a))
+        assert drawn(axes) == expected
+        assert sum(expected.values()) == 24 * 9
+
+
+def test_verdicts() -> None:
+    judge = Judge.of(Geometry())
+    found = {
+        judge.verdict(((1, 0), (1, 0), (-1, 0))): Verdict.ON_TIME,
+        judge.verdict(((0, 1), (0, 1), (0, 1))): Verdict.LATE,
+        judge.verdict(((1, 0), (1, 0), (1, 0))): Verdict.LATER,
+        judge.verdict(((-1, 1), (1, 1), (1, 1))): Verdict.FOOTPRINT,
+        judge.verdict(((0, 1), (1, 0), (1, 0))): Verdict.NEVER,
+    }
+    assert list(found) == list(found.values())
+
+
+def test_counts_are_those_of_the_tables() -> None:
+    rows = {name: (one, two) for name, one, two in counts()}
+    different = [pair for pair in close_pairs(Geometry()) if pair[0] != (0, 0)]
+    assert rows["geometric with `geometry`, any delay"][1] == len(different) == 344
+    assert rows["geometric: footprints"] == (48, 360)
+    assert rows["node, edge, special-1 to special-4"] == (48, 280)
+    ordered = list(rows.values())[2:]
+    assert ordered == sorted(ordered, reverse=True)
+
+
+def test_a_picture_is_written(tmp_path: Path) -> None:
+    out = tmp_path / "images" / "conflicts.png"
+    draw_conflicts(out, dpi=40)
+    with Image.open(out) as image:
+        assert image.width == 400
+        assert len(image.convert("RGB").getcolors(1 << 20) or []) > 50

@@ -1,0 +1,202 @@
+"""Plans on the road: driven by the vehicles' own controllers, and drawn."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import attrs
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+from numpy.typing import NDArray
+from PIL import Image
+
+from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan
+from laneweave.launch.cli import main as cli
+from laneweave.launch.cli import plan_command
+from laneweave.launch.drawing import figures as drawing
+from laneweave.launch.drawing import plan_on_road as road_drawing
+from laneweave.launch.drawing.plan_driving import Drive, drive_plan
+from laneweave.launch.drawing.plan_on_road import MAX_INSTANTS, _Picture, draw_road, road_figure
+from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.vehicle.motion import cell_state
+
+EXAMPLES = Path(__file__).resolve().parents[4] / "docs" / "examples"
+CASE_STUDY = EXAMPLES / "case-study.json"
+REQUEST = PlanRequest.from_dict(json.loads(CASE_STUDY.read_text(encoding="utf-8")))
+NAMES = [vehicle.id for vehicle in REQUEST.vehicles]
+PLAN = checked_plan(REQUEST)
+NO_PLAN = PlanResponse("infeasible", None, None, None, (), (), 1.0, 1, 1)
+SCENARIO = Scenario()
+
+
+@pytest.fixture(autouse=True)
+def _logs_stay_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command would bind them to a stream that ends with the test."""
+    monkeypatch.setattr(cli, "log_to_terminal", lambda: None)
+
+
+@pytest.fixture(scope="module")
+def driven() -> Drive:
+    return drive_plan(SCENARIO, NAMES, PLAN.paths)
+
+
+def errors_m(drive: Drive, paths: tuple[tuple[Cell, ...], ...]) -> NDArray[np.float64]:
+    """How far each body is from its cell, along and across, when each step ends."""
+    lattice, slot = drive.scenario.lattice, drive.slot_ticks
+    found = [
+        [
+            drive.states[number, k * slot] - cell_state(lattice, cell, drive.time_s(k * slot))
+            for k, cell in enumerate(path)
+        ]
+        for number, path in enumerate(paths)
+    ]
+    return np.abs(np.array(found))[:, :, [0, 3]]
+
+
+def test_everybody_is_in_its_cell_when_a_step_ends(driven: Drive) -> None:
+    assert PLAN.steps is not None
+    assert driven.states.shape == (5, PLAN.steps * driven.slot_ticks + 1, 6)
+    assert driven.time_s(driven.ticks) == pytest.approx(PLAN.steps * SCENARIO.cycles_s[0])
+    assert errors_m(driven, PLAN.paths).max() < 0.2
+
+
+def test_limits_of_the_vehicle_are_kept(driven: Drive) -> None:
+    vehicle = SCENARIO.vehicle
+    accels = driven.states[:, :, 2]
+    assert accels.min() >= vehicle.min_accel_mps2
+    assert accels.max() <= vehicle.max_accel_mps2
+    assert np.abs(np.diff(driven.states[:, :, 0], axis=1)).min() > 0
+
+
+def test_what_the_conflict_kinds_allow_is_shown(driven: Drive) -> None:
+    """With node and edge conflicts alone, vehicles 2 and 3 pass through each other's corners."""
+    assert driven.overlaps == (("2", "3"),)
+    careful = attrs.evolve(REQUEST, conflicts=("geometric",))
+    plan = checked_plan(careful)
+    apart = drive_plan(SCENARIO, NAMES, plan.paths)
+    assert apart.overlaps == ()
+    assert apart.min_gap_m > 0
+
+
+def test_the_scenario_says_how_fast_and_how_far() -> None:
+    slow = load_scenario(None, formation__cycle_s=6.0, formation__gap_m=12.0)
+    drive = drive_plan(slow, NAMES, PLAN.paths)
+    assert drive.time_s(drive.ticks) == pytest.approx(18.0)
+    assert errors_m(drive, PLAN.paths).max() < 0.2
+    assert float(np.ptp(drive.states[:, 0, 0])) == pytest.approx(24.0)
+
+
+def test_a_panel_for_each_instant_shows_all_bodies_where_they_are(driven: Drive) -> None:
+    figure = road_figure(_Picture.of(REQUEST, PLAN, SCENARIO))
+    *roads, along, across = figure.axes
+    assert len(roads) == len(PLAN.paths[0])
+    for step, axes in enumerate(roads):
+        shapes = [patch for patch in axes.patches if type(patch) is Polygon]
+        fronts = [float(shape.get_xy()[:, 0].max()) for shape in shapes]
+        expected = driven.states[:, step * driven.slot_ticks, 0]
+        assert fronts == pytest.approx(expected.tolist(), abs=0.5)
+    assert [axes.get_ylabel() for axes in roads] == ["0.0 s", "4.0 s", "8.0 s", "12.0 s"]
+    assert len(along.lines) == 5
+    relative_m = [np.asarray(line.get_ydata()) for line in along.lines]
+    ends = [path[-1][0] * SCENARIO.formation.gap_m for path in PLAN.paths]
+    assert [float(line[-1]) for line in relative_m] == pytest.approx(ends, abs=0.2)
+    assert {text.get_text() for text in across.texts} >= {"3, 4", "5", "1, 2"}
+    assert "bodies overlap, as its conflict kinds allow: 2 and 3" in figure.get_suptitle()
+
+
+def test_of_a_long_plan_some_instants_are_drawn() -> None:
+    request = PlanRequest.from_dict(
+        {
+            "schema": "laneweave.plan.request/1",
+            "grid": {"columns": 20, "lanes": 1},
+            "vehicles": [{"id": "$v$", "cell": [0, 0]}],
+            "targets": [[19, 0]],
+        }
+    )
+    figure = road_figure(_Picture.of(request, checked_plan(request), SCENARIO))
+    *roads, _, _ = figure.axes
+    assert len(roads) == MAX_INSTANTS
+    assert (roads[0].get_ylabel(), roads[-1].get_ylabel()) == ("0.0 s", "76.0 s")
+
+
+def test_without_a_plan_the_start_is_drawn(tmp_path: Path) -> None:
+    figure = road_figure(_Picture.of(REQUEST, NO_PLAN, SCENARIO))
+    assert len(figure.axes) == 3
+    assert figure.get_suptitle() == "infeasible: the start"
+    for name in ("start.png", "start.gif"):
+        draw_road(REQUEST, NO_PLAN, SCENARIO, tmp_path / name)
+        assert (tmp_path / name).stat().st_size > 1000
+
+
+def test_an_animation_has_a_frame_for_each_tick(tmp_path: Path) -> None:
+    request = attrs.evolve(REQUEST, vehicles=REQUEST.vehicles[:2])
+    paths = tuple(path[:2] for path in PLAN.paths[:2])
+    draw_road(request, attrs.evolve(PLAN, paths=paths), SCENARIO, tmp_path / "road.gif")
+    with Image.open(tmp_path / "road.gif") as image:
+        assert image.format == "GIF"
+        frames: list[bytes] = []
+        for frame in range(getattr(image, "n_frames", 1)):
+            image.seek(frame)
+            frames.append(image.convert("RGB").tobytes())
+    assert len(frames) == 41
+    assert len(set(frames)) == len(frames)
+
+
+# --- the command ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("scenario", "shown"), [(None, "3 steps of 4 s"), ("[formation]\ncycle_s = 6.0", "of 6 s")]
+)
+def test_the_road_is_drawn_beside_the_answer(
+    scenario: str | None,
+    shown: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A configuration that names no router says how the road is; the plan is made here."""
+    titles: list[str] = []
+
+    def noted(figure: Figure, out: Path, dpi: float) -> None:
+        titles.append(figure.get_suptitle())
+        drawing.save(figure, out, dpi)
+
+    monkeypatch.setattr(road_drawing, "save", noted)
+    arguments = ["plan", str(CASE_STUDY), "--draw-road", str(tmp_path / "road.png")]
+    if scenario is not None:
+        (tmp_path / "road.toml").write_text(scenario, encoding="utf-8")
+        arguments += ["--config", str(tmp_path / "road.toml")]
+    assert cli._status(arguments) == 0
+    assert json.loads(capsys.readouterr().out)["cost"] == 7
+    assert (tmp_path / "road.png").read_bytes().startswith(b"\x89PNG")
+    assert shown in titles[0]
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        (["--draw-road", "road.pdf"], "--draw-road: got 'road.pdf'; allowed: a file that ends"),
+        (["--draw-road", "missing/road.png"], "--draw-road: got 'missing/road.png'"),
+        (["--draw-road", "road.png", "--config", "fast.toml"], "formation.move_s: got 1.0"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused_in_one_line(
+    options: list[str],
+    line: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "fast.toml").write_text("[formation]\nmove_s = 1.0", encoding="utf-8")
+    monkeypatch.setattr(plan_command, "checked_plan", None)
+    assert cli._status(["plan", str(CASE_STUDY), *options]) == 2
+    told = capsys.readouterr()
+    assert (told.out, len(told.err.splitlines())) == ("", 1)
+    assert told.err.startswith(line)

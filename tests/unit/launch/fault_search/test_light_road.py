@@ -1,0 +1,196 @@
+"""The light road: bodies, the real motion controller's rules, caretakers, clocks, census."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import count, pairwise
+
+import pytest
+
+from laneweave.launch.fault_search.light_road import LightRoad, Visit
+from laneweave.launch.fault_search.setup import make_scenario
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.runtime.node import Arrived, Effect, PeerDown, PeerUp, Send, Started, Wakeup
+from laneweave.protocol.vehicle.motion import at_rest_in_cell
+from laneweave.protocol.wire.messages import (
+    Ballot,
+    Census,
+    Command,
+    Deed,
+    Name,
+    Prepare,
+    Sense,
+    VehicleState,
+)
+from laneweave.protocol.wire.topics import COMMAND, PREPARE, VEHICLE_ALIVE
+
+SCENARIO = make_scenario(lanes=3, max_joined=1)
+A = Name("a")
+OWN = {"vehicle": "a"}
+
+
+class Log:
+    """A watcher that notes everything."""
+
+    def __init__(self) -> None:
+        """Begin with nothing."""
+        self.lines: list[tuple[object, ...]] = []
+
+    def enter(self, t_s: float, vehicle: str, cell: Cell) -> None:
+        self.lines.append(("enter", round(t_s, 3), vehicle, cell))
+
+    def own(self, t_s: float, vehicle: str, estate: tuple[Cell, ...], deed: Deed | None) -> None:
+        pass
+
+    def leave(self, t_s: float, vehicle: str) -> None:
+        self.lines.append(("leave", round(t_s, 3), vehicle))
+
+    def begin(
+        self, t_s: float, vehicle: str, incarnation: int, way: tuple[Cell, Cell], lasts_s: float
+    ) -> None:
+        self.lines.append(("begin", round(t_s, 3), vehicle, incarnation, way, lasts_s))
+
+    def advance(self, t_s: float) -> None:
+        pass
+
+
+class Bench:
+    """A road with one vehicle, driven by hand."""
+
+    def __init__(self, **visit: float | None) -> None:
+        """Open the road."""
+        self.log = Log()
+        given = {"enters_s": 0.0, "leaves_s": None} | visit
+        self.road = LightRoad(
+            SCENARIO,
+            [Visit(A, (4, 1), **given)],  # type: ignore[arg-type]
+            {A: 2},
+            self.log,
+            count(100).__next__,
+            lambda: 0.8,
+            lambda: self.loses,
+        )
+        self.loses = False
+        self.now_s = 0.0
+        list(self.road.handle(Started(), 0.0))
+
+    def tick(self) -> list[object]:
+        """Let the next tick happen and return the messages sent."""
+        self.now_s = self.road.wakeup_s
+        return messages(self.road.handle(Wakeup(), self.now_s))
+
+    def sense(self) -> Sense:
+        return next(message for message in self.tick() if isinstance(message, Sense))
+
+    def command(self, incarnation: int, cell: Cell, tick: int | None = None) -> list[object]:
+        tick = self.road.tick if tick is None else tick
+        command = Command(A, incarnation, tick, cell, tick + 8, (4, 1), b"")
+        return messages(self.road.handle(Arrived(COMMAND, OWN, command), self.now_s))
+
+    def agent(self, *, up: bool) -> None:
+        event = PeerUp if up else PeerDown
+        list(self.road.handle(event(VEHICLE_ALIVE, OWN), self.now_s))
+
+
+def messages(effects: Iterator[Effect]) -> list[object]:
+    return [effect.message for effect in effects if isinstance(effect, Send)]
+
+
+@pytest.fixture
+def bench() -> Bench:
+    """A road after its first tick, its vehicle driven by process 7."""
+    bench = Bench()
+    bench.agent(up=True)
+    bench.tick()
+    bench.command(7, (4, 1))
+    return bench
+
+
+def test_the_process_in_charge_moves_the_body(bench: Bench) -> None:
+    bench.tick()
+    bench.command(7, (4, 2))
+    assert bench.log.lines == [
+        ("enter", 0.0, "a", (4, 1)),
+        ("begin", 0.1, "a", 7, ((4, 1), (4, 2)), 0.8),
+    ]
+    lateral = [bench.sense().state[3] for _ in range(9)]
+    assert lateral[3] == pytest.approx(1.5 * 3.5 + 3.5 * 0.5)
+    assert lateral[7] == lateral[8] == 2.5 * 3.5
+
+
+def test_a_lost_command_changes_nothing(bench: Bench) -> None:
+    bench.tick()
+    bench.loses = True
+    bench.command(7, (4, 2))
+    assert len(bench.log.lines) == 1
+
+
+def test_a_late_command_counts_unless_a_newer_one_was_there(bench: Bench) -> None:
+    for _ in range(3):
+        bench.tick()
+    bench.command(7, (4, 2), tick=2)
+    assert len(bench.log.lines) == 2
+    bench.command(7, (4, 1), tick=1)
+    assert len(bench.log.lines) == 2
+    assert bench.road.refused == 1
+
+
+def test_an_earlier_process_is_refused(bench: Bench) -> None:
+    bench.tick()
+    bench.command(6, (4, 2))
+    assert len(bench.log.lines) == 1
+    assert bench.road.refused == 1
+
+
+def test_a_vehicle_without_agent_gets_a_caretaker_that_gives_way(bench: Bench) -> None:
+    for _ in range(10):  # so long an agent may take to come
+        bench.tick()
+    bench.agent(up=False)
+    sent = bench.tick()
+    assert [message.attended for message in sent if isinstance(message, VehicleState)] == [False]
+    sense = next(message for message in sent if isinstance(message, Sense))
+    assert sense.caretaker
+    assert sense.attendant == 100
+    prepare = Prepare(Ballot(1, Name("c1"), 1, 1), (-1,), (A,))
+    (state,) = messages(bench.road.handle(Arrived(PREPARE, OWN, prepare), bench.now_s))
+    assert isinstance(state, VehicleState)
+    assert state.promised == prepare.ballot
+    bench.agent(up=True)
+    bench.command(101, (4, 1))
+    assert not bench.sense().caretaker
+    assert bench.road.takeovers == 1
+
+
+def test_a_silent_agent_is_replaced(bench: Bench) -> None:
+    ticks = round(SCENARIO.runtime.agent_silent_s / SCENARIO.runtime.tick_s)
+    assert not any(bench.sense().caretaker for _ in range(ticks - 1))
+    assert any(bench.sense().caretaker for _ in range(3))
+
+
+def test_a_wrong_clock_shifts_no_cell() -> None:
+    bench = Bench(clock_offset_s=0.04, clock_drift=-0.05)
+    senses = [bench.sense() for _ in range(30)]
+    assert {round(sense.t_s - sense.tick * 0.1, 4) for sense in senses} != {0.0}
+    for sense in senses:
+        assert abs(sense.t_s - sense.tick * 0.1) <= 0.1
+        assert at_rest_in_cell(sense.state, SCENARIO.lattice, (4, 1), sense.t_s)
+    assert all(one.t_s < other.t_s for one, other in pairwise(senses))
+
+
+def test_who_leaves_is_told_and_is_in_no_census(bench: Bench) -> None:
+    bench = Bench(leaves_s=0.25)
+    bench.agent(up=True)
+    sent = [bench.tick() for _ in range(4)]
+    census = [message for message in sent[3] if isinstance(message, Census)]
+    assert [len(each.on_road) for each in census] == [0]
+    assert [message.left for message in sent[3] if isinstance(message, Sense)] == [True]
+    assert bench.log.lines[-1] == ("leave", 0.3, "a")
+    bench.agent(up=False)
+    bench.tick()
+    assert not [message for message in bench.tick() if isinstance(message, Sense)]
+
+
+def test_new_wishes_are_in_the_next_census(bench: Bench) -> None:
+    bench.road.prefer({A: 0})
+    (census,) = [message for message in bench.tick() if isinstance(message, Census)]
+    assert census.on_road[0].preferred_lane == 0

@@ -1,0 +1,165 @@
+"""`laneweave simulate`: seeds, processes, what is printed, and how it ends."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+from attrs import evolve
+
+from laneweave.launch.cli.options import check_jobs, parse_seeds
+from laneweave.launch.fault_search.checker import Violation
+from laneweave.launch.fault_search.profiles import PROFILES
+from laneweave.launch.fault_search.search import (
+    BATCH,
+    Result,
+    describe,
+    run_seeds,
+    search,
+    tell_story,
+)
+from laneweave.launch.fault_search.simulated_run import Outcome, Totals
+from laneweave.protocol.errors import BadInputError
+
+CALM = PROFILES["calm"]
+LANEWEAVE = Path(sys.executable).with_name("laneweave")
+WELL_UNDER_WAY_S = 2.5
+"""Loading everything takes half of it."""
+
+
+def simulate(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [LANEWEAVE, "simulate", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize(("text", "seeds"), [("0:1", range(1)), ("5:20", range(5, 20))])
+def test_seeds(text: str, seeds: range) -> None:
+    assert parse_seeds(text) == seeds
+
+
+@pytest.mark.parametrize("text", ["", "5", "3:3", "4:3", "-1:3", "a:b", "0:1:2", "0:99999999999"])
+def test_bad_seeds(text: str) -> None:
+    with pytest.raises(BadInputError, match="A:B with A < B"):
+        parse_seeds(text)
+
+
+@pytest.mark.parametrize("jobs", [0, -1, 1000])
+def test_bad_jobs(jobs: int) -> None:
+    with pytest.raises(BadInputError, match="--jobs"):
+        check_jobs(jobs)
+
+
+def test_several_processes_come_to_the_same_as_one() -> None:
+    seeds = range(BATCH + 2)  # each process gets some
+    one = search(seeds, CALM, jobs=1, digest=True)
+    two = search(seeds, CALM, jobs=2, digest=True)
+    assert one.digests == two.digests
+    assert one.digest == two.digest
+    assert evolve(one.totals, cpu_s=0.0, virtual_s=0.0) == evolve(
+        two.totals, cpu_s=0.0, virtual_s=0.0
+    )
+    assert len(set(one.digests.values())) == one.passed == len(seeds)
+
+
+def test_profiles_and_seeds_make_different_runs() -> None:
+    digests = {
+        run_seeds([seed], PROFILES[name], digest=True)[0].digest
+        for seed in (1, 2)
+        for name in ("calm", "dense")
+    }
+    assert len(digests) == 4
+
+
+def test_failures_are_described_with_the_command_that_replays_them() -> None:
+    violation = Violation("cell", 3.25, ("v01", "v02"), "both occupy [(0, 0)]")
+    failed = (Outcome(17, (violation,), Totals(runs=1)),)
+    lines = list(describe(Result(Totals(runs=20), failed), CALM))
+    assert lines[:3] == [
+        "seed 17 failed:",
+        "     3.250 s  cell: v01, v02: both occupy [(0, 0)]",
+        "  again: laneweave simulate --seeds 17:18 --profile calm --verbose",
+    ]
+    assert lines[-1] == "19 passed, 1 failed"
+
+
+def test_the_story_of_a_run() -> None:
+    lines = list(tell_story(1, CALM))
+    assert lines[0] == "seed 1, profile calm:"
+    told = "\n".join(lines)
+    for word in (
+        "PREPARE",
+        "PLAN",
+        "STATE",
+        "COMMAND",
+        "moves",
+        "everything is made whole",
+        "*** v01",
+    ):
+        assert word in told
+
+
+def test_the_command() -> None:
+    done = simulate("--seeds", "0:4", "--profile", "calm", "--jobs", "2", "--digest")
+    assert done.returncode == 0
+    lines = done.stdout.splitlines()
+    assert lines[0].startswith("digest ")
+    assert "x real time on one core" in lines[1]
+    assert lines[-1] == "4 passed, 0 failed"
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["--seeds", "9:3"], "--seeds: got '9:3'; allowed: A:B with A < B"),
+        (["--profile", "mild"], "--profile: got 'mild'; allowed: mixed, calm"),
+        (["--jobs", "0"], "--jobs: got 0; allowed: [1, 256]"),
+    ],
+)
+def test_bad_input_is_one_line(arguments: list[str], line: str) -> None:
+    done = simulate(*arguments)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith(line)
+    assert done.stderr.count("\n") == 1
+
+
+def spent_s(pid: int) -> float:
+    """Return the processor time of a process and its children, on which other load has no say."""
+    spent = 0.0
+    for process in (psutil.Process(pid), *psutil.Process(pid).children()):
+        with contextlib.suppress(psutil.NoSuchProcess):
+            spent += process.cpu_times().user
+    return spent
+
+
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_interrupted(jobs: str) -> None:
+    process = subprocess.Popen(
+        [LANEWEAVE, "simulate", "--seeds", "0:100000", "--jobs", jobs],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        while spent_s(process.pid) < WELL_UNDER_WAY_S:
+            assert process.poll() is None
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 1
+    assert out == ""
+    assert err == "interrupted\n"

@@ -1,0 +1,132 @@
+"""What a seed draws: roads, visits and wishes that make sense under every profile."""
+
+import random
+from collections import Counter
+from itertools import pairwise
+
+import pytest
+
+from laneweave.launch.fault_search.light_road import Visit
+from laneweave.launch.fault_search.profiles import PROFILES, profile_named
+from laneweave.launch.fault_search.setup import BLOCK_COLUMNS, Setup
+from laneweave.protocol.config.checks import check_scenario
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.wire.messages import ClosedFormation, Name
+
+EVERY = pytest.mark.parametrize(
+    "name", [name for name, profile in PROFILES.items() if not profile.rolling]
+)
+ROLLING = pytest.mark.parametrize(
+    "name", [name for name, profile in PROFILES.items() if profile.rolling]
+)
+
+
+def draw(name: str, count: int = 60) -> list[tuple[Setup, random.Random]]:
+    rngs = [random.Random(seed) for seed in range(count)]
+    return [(Setup.drawn(PROFILES[name], rng), rng) for rng in rngs]
+
+
+def formation_of(setup: Setup, visit: Visit) -> ClosedFormation:
+    """Return in whose columns a vehicle enters."""
+    block = setup.scenario.lattice.block_of(visit.cell[0])
+    (formation,) = (one for one in setup.formations if block in one.blocks)
+    return formation
+
+
+def columns_of(setup: Setup, formation: ClosedFormation) -> int:
+    return len(formation.columns(setup.scenario.lattice))
+
+
+def asks_for_too_much(setup: Setup, wishes: dict[Name, int]) -> bool:
+    """Tell whether more vehicles of a formation want a lane than that has cells."""
+    lanes = Counter((formation_of(setup, each), wishes[each.vehicle]) for each in setup.visits)
+    return any(count > columns_of(setup, formation) for (formation, _), count in lanes.items())
+
+
+@EVERY
+def test_formations_follow_each_other_and_close_when_their_last_column_has_passed(
+    name: str,
+) -> None:
+    lengths = set()
+    for setup, _ in draw(name):
+        lattice = setup.scenario.lattice
+        columns = [one.columns(lattice) for one in setup.formations]
+        for ahead, behind in pairwise(columns):
+            assert behind[-1] < ahead[0]
+        for one, own in zip(setup.formations, columns, strict=True):
+            assert one.closed_s >= lattice.passing_time_s(own[0])
+            lengths.add(len(own))
+    assert BLOCK_COLUMNS in lengths
+    assert (len(lengths) > 2) is (PROFILES[name].growing > 0)
+
+
+@EVERY
+def test_every_road_is_a_valid_scenario_with_room_for_all(name: str) -> None:
+    for setup, _ in draw(name):
+        check_scenario(setup.scenario)
+        cells = [visit.cell for visit in setup.visits]
+        assert len(set(cells)) == len(cells)
+        lattice = setup.scenario.lattice
+        for visit in setup.visits:
+            assert formation_of(setup, visit) in setup.formations
+            assert visit.enters_s >= lattice.passing_time_s(visit.cell[0])
+            assert visit.leaves_s is None or visit.leaves_s > visit.enters_s
+
+
+@EVERY
+def test_in_every_formation_somebody_stays(name: str) -> None:
+    for setup, _ in draw(name):
+        stay = {formation_of(setup, visit) for visit in setup.visits if not visit.leaves_s}
+        assert stay == set(setup.formations)
+
+
+@EVERY
+def test_the_last_wishes_can_be_fulfilled(name: str) -> None:
+    for setup, rng in draw(name):
+        wishes = setup.wishes(rng, last=True)
+        if asks_for_too_much(setup, wishes):
+            assert setup.scenario.formation.max_joined > 1
+            assert setup.adjoin
+            together = Counter(wishes.values())
+            assert max(together.values()) <= sum(columns_of(setup, one) for one in setup.formations)
+
+
+def test_lanes_are_crowded_now_and_then() -> None:
+    crowded = 0
+    for setup, rng in draw("joint"):
+        crowded += asks_for_too_much(setup, setup.wishes(rng, last=True))
+    assert crowded > 5
+
+
+def test_profiles_draw_from_their_ranges() -> None:
+    for name, profile in PROFILES.items():
+        for setup, _ in draw(name):
+            assert setup.mix.conditions.loss in profile.loss
+            assert setup.scenario.road.lanes in range(profile.lanes[0], profile.lanes[1] + 1)
+            if not profile.rolling:
+                assert len(setup.formations) in range(profile.blocks[0], profile.blocks[1] + 1)
+    assert all(len(setup.visits) == 12 for setup, _ in draw("dense"))
+
+
+def test_an_unknown_profile_is_refused() -> None:
+    with pytest.raises(BadInputError, match="mixed, calm, loss"):
+        profile_named("mild")
+
+
+@ROLLING
+def test_a_stretch_of_the_rolling_operation_has_one_owner_for_each_cell(name: str) -> None:
+    for setup, rng in draw(name):
+        check_scenario(setup.scenario)
+        cells = [visit.cell for visit in setup.visits] + [grant.cell for grant in setup.grants]
+        assert len(set(cells)) == len(cells)
+        enters = {visit.vehicle: visit.enters_s for visit in setup.visits}
+        for grant in setup.grants:
+            assert grant.t_s >= enters[grant.owner]
+        wanted = Counter(setup.wishes(rng, last=True).values())
+        assert max(wanted.values()) <= setup.stretch_columns
+
+
+def test_dense_stretches_are_dense() -> None:
+    for setup, _ in draw("rolling-dense"):
+        room = setup.stretch_columns * setup.scenario.road.lanes
+        assert 0.5 <= len(setup.visits) / room <= 0.9

@@ -1,0 +1,94 @@
+"""What a fault of the leader costs until the next plan, on hand-made histories.
+
+When somebody leads again is tested with the faults that strike leaders (test_fault_injection).
+"""
+
+from __future__ import annotations
+
+import pytest
+
+from laneweave.launch.faults.failover import IN_FORCE, Failover
+from laneweave.launch.observe.observer import View
+from laneweave.protocol.wire.messages import Heartbeat, LogEvent, Name, RoadClock
+
+C1, C2 = Name("c1"), Name("c2")
+START_S = 100.0
+
+
+class History:
+    """A road clock that began at 100 s of the wall clock, and what is seen of the coordinators."""
+
+    def __init__(self, pace: float = 1.0) -> None:
+        """Begin with c1 leading."""
+        self.view = View()
+        self.failover = Failover(lease_s=1.0)
+        self.pace = pace
+        self.leads(C1, 1, START_S)
+
+    def look(self, now_s: float) -> None:
+        road_s = round((now_s - START_S) * self.pace, 1)
+        self.view.take(RoadClock(round(road_s * 10), road_s, 0, 0, 0, 0, ended=False))
+        self.failover.look(self.view, now_s)
+
+    def look_until(self, now_s: float) -> None:
+        for index in range(round((now_s - START_S) * 10) + 1):
+            self.look(START_S + index / 10)
+
+    def leads(self, name: Name, term: int, now_s: float) -> None:
+        self.view.take(Heartbeat(name, 1, term, leading=True, formations=0))
+        self.look(now_s)
+
+    def plan(self, name: Name, closed_s: float, now_s: float) -> None:
+        data = {"closed_s": closed_s}
+        self.view.take(LogEvent(Name("coordinator"), name, 0.0, Name(IN_FORCE), data))
+        self.look(now_s)
+
+
+def struck(at_s: float, for_s: float | None = None, pace: float = 1.0) -> History:
+    history = History(pace)
+    history.look_until(at_s)
+    history.failover.on_struck(history.view, at_s, for_s)
+    return history
+
+
+def test_the_next_plan_counts_from_the_fault() -> None:
+    history = struck(110.0)
+    history.leads(C2, 2, 110.03)
+    history.plan(C2, 9.0, 110.25)
+    history.plan(C2, 9.0, 110.5)
+    assert history.failover.recovery_s == [pytest.approx(0.03)]
+    assert history.failover.plan_recovery_s == [pytest.approx(0.25)]
+
+
+@pytest.mark.parametrize("pace", [1.0, 4.0])
+def test_a_formation_that_closes_later_counts_from_its_closing(pace: float) -> None:
+    history = struck(101.0, pace=pace)
+    history.leads(C2, 2, 101.05)
+    closing_s = START_S + 30.0 / pace
+    history.look_until(closing_s)
+    history.plan(C2, 30.0, closing_s + 0.2)
+    assert history.failover.plan_recovery_s == [pytest.approx(0.2, abs=0.11)]
+
+
+def test_what_the_dead_leader_had_sent_does_not_count() -> None:
+    history = struck(110.0)
+    history.plan(C1, 9.0, 110.3)
+    assert history.failover.plan_recovery_s == []
+    history.leads(C2, 2, 110.4)
+    history.plan(C2, 9.0, 110.5)
+    assert history.failover.plan_recovery_s == [pytest.approx(0.5)]
+
+
+def test_a_leader_that_was_stopped_shortly_goes_on_by_itself() -> None:
+    history = struck(110.0, for_s=0.2)
+    history.plan(C1, 9.0, 110.01)
+    history.plan(C1, 9.0, 110.3)
+    assert history.failover.plan_recovery_s == [pytest.approx(0.3)]
+    assert history.failover.recovery_s == []
+
+
+def test_other_events_say_nothing() -> None:
+    history = struck(110.0)
+    history.view.take(LogEvent(Name("coordinator"), C2, 0.0, Name("plan-made"), {}))
+    history.look(110.2)
+    assert history.failover.plan_recovery_s == []

@@ -1,0 +1,211 @@
+"""Faults made ready for a run: for processes, and for the simulated network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+
+from laneweave.launch.faults.control_files import SharedBoard
+from laneweave.launch.faults.injection import FaultInjection
+from laneweave.launch.faults.local_faults import ProcessFaults
+from laneweave.launch.faults.network_namespaces import GroupNetwork, NamespacesUnavailableError
+from laneweave.launch.faults.specification import Faults, Kill, Partition, Pause, load_faults
+from laneweave.launch.run.outcome import Outcome
+from laneweave.launch.run.role_processes import Order, RoleProcesses
+from laneweave.launch.run.roles import MessageFaults, fork_server
+from laneweave.launch.run.simulated_run import SimulatedRun
+from laneweave.protocol.config.loading import load_scenario, to_tables
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.runtime.message_faults import MessageRule
+from laneweave.protocol.scenario.tables import Scenario
+
+LOSS = MessageRule(loss=0.5)
+CUT = Partition(between=("coordinators", "others"), from_s=5.0)
+
+
+def processes() -> RoleProcesses:
+    """Return processes of which none is ever started."""
+    return RoleProcesses(fork_server(), lambda _: ({}, {}), ("c1", "c2"))
+
+
+def without_namespaces(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_: GroupNetwork) -> None:
+        raise NamespacesUnavailableError("nobody may")
+
+    monkeypatch.setattr(GroupNetwork, "open", refuse)
+
+
+# --- processes ------------------------------------------------------------------------------------
+
+
+def equip(faults: ProcessFaults, role: str, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    return faults.equip(Order(role, name, {}), to_tables(faults.scenario), {"folder": "f"})
+
+
+def test_each_start_of_a_role_gets_rules_and_a_fate_of_its_own(tmp_path: Path) -> None:
+    faults = ProcessFaults.open(Faults(messages=(LOSS,), seed=9), Scenario(), processes(), tmp_path)
+    given = [
+        equip(faults, role, name)[1]["faults"]
+        for role, name in (
+            *(("coordinator", "c1"), ("coordinator", "c1"), ("bridge", "bridge")),
+            ("agent", "agent-v0001"),
+        )
+    ]
+    assert all(isinstance(one, MessageFaults) and one.rules == (LOSS,) for one in given)
+    assert [one.seed for one in given] == ["9/c1/1", "9/c1/2", "9/bridge/1", "9/agent-v0001/1"]
+    assert [one.receiver for one in given] == ["coordinator", "coordinator", "bridge", "vehicle"]
+    assert len({one.word for one in given}) == 4
+
+
+def test_the_router_has_no_message_faults(tmp_path: Path) -> None:
+    faults = ProcessFaults.open(Faults(messages=(LOSS,)), Scenario(), processes(), tmp_path)
+    assert equip(faults, "router", "router") == (to_tables(Scenario()), {"folder": "f"})
+
+
+def test_without_namespaces_a_partition_takes_messages_and_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    without_namespaces(monkeypatch)
+    faults = ProcessFaults.open(Faults(partition=(CUT,)), Scenario(), processes(), tmp_path)
+    _, options = equip(faults, "coordinator", "c1")
+    assert options["faults"].rules == tuple(CUT.message_rules())
+    assert faults.summary() == {
+        "injected": [],
+        "partition_methods": {"partition[0]": "messages"},
+        "why_no_namespaces": "nobody may",
+    }
+
+
+def test_without_namespaces_those_who_insist_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    without_namespaces(monkeypatch)
+    insisting = Partition(between=("bridge", "others"), method="namespaces")
+    with pytest.raises(BadInputError, match=r"partition\[1\].method: .*nobody may"):
+        ProcessFaults.open(Faults(partition=(CUT, insisting)), Scenario(), processes(), tmp_path)
+
+
+class _FakeNetwork(GroupNetwork):
+    """Namespaces that are only names."""
+
+    def process_id(self, name: str) -> int:
+        return {"hub": 11, "coordinators": 12}[name]
+
+    def cut_off(self, groups: Any) -> set[str]:  # noqa: ANN401 (any collection)
+        changed = set(groups) ^ self._cut
+        self._cut = set(groups)
+        return changed
+
+
+def test_with_namespaces_groups_find_the_router_over_their_link(tmp_path: Path) -> None:
+    stage = processes()
+    pair = Partition(between=("vehicles", "bridge"))
+    plan = Faults(partition=(CUT, pair))
+    faults = ProcessFaults(
+        plan,
+        Scenario(),
+        SharedBoard(tmp_path / "board"),
+        FaultInjection.of(plan, 1, stage, 1.0),
+        _FakeNetwork(stage.context, ("coordinators",)),
+    )
+
+    _, router = equip(faults, "router", "router")
+    tables, coordinator = equip(faults, "coordinator", "c1")
+    bridge_tables, bridge = equip(faults, "bridge", "bridge")
+
+    assert (router["namespace"], router["listen"]) == (11, ("tcp/0.0.0.0:7447",))
+    assert coordinator["namespace"] == 12
+    assert tables["network"]["endpoint"] == "tcp/10.77.255.1:7447"
+    assert "namespace" not in bridge
+    assert bridge_tables == to_tables(Scenario())
+    # The pair cannot be cut by a link: its rules are there, the other partition's are not.
+    assert bridge["faults"].rules == tuple(pair.message_rules())
+    methods = faults.summary()["partition_methods"]
+    assert methods == {"partition[0]": "namespaces", "partition[1]": "messages"}
+
+
+# --- the simulated network ------------------------------------------------------------------------
+
+
+@pytest.fixture
+def simulate(tmp_path: Path) -> Callable[[str, Faults], Outcome]:
+    """Run a few vehicles over the simulated network."""
+    scenario = load_scenario(
+        None,
+        road__s2_m=60.0,
+        road__s3_m=240.0,
+        demand__volume_veh_per_lane_h=1300.0,
+        demand__duration_s=12.0,
+    )
+
+    def run(name: str, faults: Faults) -> Outcome:
+        return SimulatedRun(scenario, tmp_path / name, faults=faults, show_progress=False).run()
+
+    return run
+
+
+def test_a_simulated_run_with_everything_repeats_itself(
+    simulate: Callable[[str, Faults], Outcome], tmp_path: Path
+) -> None:
+    faults = load_faults("everything", ("c1", "c2", "c3"))
+
+    first, second = simulate("first", faults), simulate("second", faults)
+
+    assert first.summary is not None
+    assert second.summary is not None
+    assert first.summary["safety"]["overlaps"] == 0
+    assert first.summary["messages"]["dropped_by_faults"] > 0
+    assert len(first.summary["faults"]["injected"]) >= 3
+    for part in ("faults", "messages", "vehicles", "failover"):
+        assert first.summary[part] == second.summary[part]
+    name = "trajectories.parquet"
+    tables = [pq.read_table(tmp_path / folder / name) for folder in ("first", "second")]
+    assert tables[0].equals(tables[1])
+
+
+def test_a_simulated_run_can_do_all_but_two(
+    simulate: Callable[[str, Faults], Outcome],
+) -> None:
+    found = simulate(
+        "all",
+        Faults(
+            kill=(
+                Kill(at_s=5.0, restart_after_s=1.0),
+                Kill(at_s=8.0, target="router", restart_after_s=1.0),
+                Kill(at_s=10.0, target="agent", count=2, restart_after_s=0.5),
+                Kill(at_s=12.0, target="v0003"),
+            ),
+            pause=(Pause(at_s=14.0, target="coordinator", for_s=2.0),),
+            partition=(Partition(between=("bridge", "others"), from_s=16.0, until_s=17.0),),
+        ),
+    )
+    assert found.problems == ()
+    assert found.summary is not None
+    assert found.summary["safety"]["overlaps"] == 0
+    done = [one["fault"] for one in found.summary["faults"]["injected"]]
+    assert done == ["kill[0]", "kill[1]", "kill[2]", "kill[2]", "kill[3]", "pause[0]"]
+    assert found.summary["faults"]["partition_methods"] == {"partition[0]": "messages"}
+    assert len(found.summary["failover"]["recovery_s"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("faults", "name"),
+    [
+        (Faults(pause=(Pause(at_s=1.0, target="router", for_s=1.0),)), "pause[0].target"),
+        (
+            Faults(partition=(CUT, Partition(between=("bridge", "others"), method="namespaces"))),
+            "partition[1].method",
+        ),
+    ],
+)
+def test_what_the_simulated_network_cannot_do_is_refused(
+    simulate: Callable[[str, Faults], Outcome], tmp_path: Path, faults: Faults, name: str
+) -> None:
+    with pytest.raises(BadInputError) as caught:
+        simulate("out", faults)
+    assert caught.value.field == name
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,210 @@
+"""Who is struck by kills and pauses, what is put right again, and how recoveries are measured."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from attrs import define, field
+
+from laneweave.launch.faults.injection import FaultInjection
+from laneweave.launch.faults.specification import Faults, Kill, Pause
+from laneweave.launch.observe.observer import View
+from laneweave.protocol.wire.messages import Census, CensusEntry, Heartbeat, Name
+
+LEASE_S = 1.0
+
+
+@define
+class FakeStage:
+    """Roles that are only names; writes down what is done to them."""
+
+    coordinators: tuple[str, ...] = ("c1", "c2", "c3")
+    agents: tuple[str, ...] = ("v1", "v2", "v3", "v4")
+    dead: set[str] = field(factory=set)
+    done: list[tuple[str, str]] = field(factory=list)
+
+    @property
+    def running(self) -> list[str]:
+        names = ("router", *self.coordinators, *(f"agent-{name}" for name in self.agents))
+        return [name for name in names if name not in self.dead]
+
+    def agent_of(self, vehicle: str) -> str | None:
+        return f"agent-{vehicle}" if vehicle in self.agents else None
+
+    def kill(self, name: str) -> None:
+        assert name in self.running
+        self.dead.add(name)
+        self.done.append(("kill", name))
+
+    def pause(self, name: str) -> None:
+        assert name in self.running
+        self.done.append(("pause", name))
+
+    def resume(self, name: str) -> None:
+        self.done.append(("resume", name))
+
+    def start_again(self, name: str) -> None:
+        assert name in self.dead
+        self.dead.discard(name)
+        self.done.append(("start", name))
+
+
+def on_road(*vehicles: str, leader: str | None = "c1", incarnation: int = 1) -> View:
+    entries = tuple(CensusEntry(Name(vehicle), (0, 0), 0, 0.0) for vehicle in vehicles)
+    return View(
+        census=Census(0.0, entries, ()),
+        leader=Name(leader) if leader is not None else None,
+        incarnation=incarnation,
+    )
+
+
+def leads(view: View, name: str, incarnation: int = 1) -> None:
+    heartbeat = Heartbeat(Name(name), incarnation, view.term, leading=True, formations=0)
+    view.take(heartbeat)
+
+
+def injection(stage: FakeStage, seed: int = 1, **faults: Any) -> FaultInjection:  # noqa: ANN401
+    return FaultInjection.of(Faults(**faults), seed, stage, LEASE_S)
+
+
+def test_the_leader_of_the_moment_is_killed() -> None:
+    stage, view = FakeStage(), on_road(leader="c2")
+    faults = injection(stage, kill=(Kill(at_s=5.0),))
+    faults.step(4.9, 0.0, view)
+    assert stage.done == []
+    faults.step(5.0, 0.1, view)
+    assert stage.done == [("kill", "c2")]
+    assert view.leader is None
+    assert faults.injected == [{"t_s": 5.0, "fault": "kill[0]", "killed": "c2"}]
+
+
+def test_who_has_no_target_waits_for_one() -> None:
+    stage, view = FakeStage(), on_road(leader=None)
+    faults = injection(stage, kill=(Kill(at_s=5.0),))
+    faults.step(5.0, 0.0, view)
+    assert stage.done == []
+    assert faults.never_happened() == ["the run ended before leader was killed at 5 s"]
+    leads(view, "c3")
+    faults.step(5.5, 0.5, view)
+    assert stage.done == [("kill", "c3")]
+    assert faults.never_happened() == []
+
+
+def test_targets_by_name() -> None:
+    stage = FakeStage()
+    kills = tuple(Kill(at_s=1.0, target=name) for name in ("c3", "router", "v2"))
+    injection(stage, kill=kills).step(1.0, 0.0, on_road("v2"))
+    assert stage.done == [("kill", "c3"), ("kill", "router"), ("kill", "agent-v2")]
+
+
+def test_agents_are_chosen_among_those_on_the_road_each_once() -> None:
+    stage, view = FakeStage(), on_road("v1", "v3", "v4")
+    faults = injection(stage, kill=(Kill(at_s=1.0, target="agent", count=4, restart_after_s=0.5),))
+    for step in range(10):
+        faults.step(1.0 + step, float(step), view)
+    killed = [name for verb, name in stage.done if verb == "kill"]
+    assert sorted(killed) == ["agent-v1", "agent-v3", "agent-v4"]
+    assert sorted(name for verb, name in stage.done if verb == "start") == sorted(killed)
+
+
+def test_the_choice_among_agents_is_drawn_from_the_seed() -> None:
+    def killed(seed: int) -> list[tuple[str, str]]:
+        stage = FakeStage()
+        faults = injection(stage, seed, kill=(Kill(at_s=1.0, target="agent", count=4),))
+        faults.step(1.0, 0.0, on_road("v1", "v2", "v3", "v4"))
+        return stage.done
+
+    assert killed(1) == killed(1)
+    assert len({tuple(killed(seed)) for seed in range(10)}) > 1
+
+
+def test_a_coordinator_is_chosen_among_those_that_run() -> None:
+    stage = FakeStage(dead={"c1", "c3"})
+    injection(stage, kill=(Kill(at_s=1.0, target="coordinator"),)).step(1.0, 0.0, on_road())
+    assert stage.done == [("kill", "c2")]
+
+
+def test_a_restart_comes_after_wall_clock_time() -> None:
+    stage, view = FakeStage(), on_road()
+    faults = injection(stage, kill=(Kill(at_s=5.0, target="router", restart_after_s=3.0),))
+    assert faults.wakeup_s is None
+    faults.step(5.0, 100.0, view)
+    assert faults.wakeup_s == 103.0
+    faults.step(5.0, 102.9, view)  # road time stands still without a router
+    assert stage.done == [("kill", "router")]
+    faults.step(5.0, 103.0, view)
+    assert stage.done == [("kill", "router"), ("start", "router")]
+    assert faults.wakeup_s is None
+
+
+def test_a_pause_ends_after_wall_clock_time_and_nobody_is_struck_during_it() -> None:
+    stage, view = FakeStage(), on_road()
+    faults = injection(
+        stage,
+        pause=(Pause(at_s=5.0, target="c2", for_s=2.0),),
+        kill=(Kill(at_s=5.5, target="c2"),),
+    )
+    faults.step(5.0, 100.0, view)
+    faults.step(5.5, 100.5, view)
+    assert stage.done == [("pause", "c2")]
+    faults.step(7.0, 102.0, view)
+    assert stage.done == [("pause", "c2"), ("resume", "c2"), ("kill", "c2")]
+
+
+# --- recovery -------------------------------------------------------------------------------------
+
+
+def test_recovery_is_measured_until_another_process_leads() -> None:
+    stage, view = FakeStage(), on_road(leader="c1")
+    faults = injection(stage, kill=(Kill(at_s=5.0),))
+    faults.step(5.0, 100.0, view)
+    leads(view, "c1")  # was still under way
+    faults.step(5.1, 100.1, view)
+    assert view.leader is None
+    assert faults.failover.recovery_s == []
+    leads(view, "c2")
+    faults.step(5.3, 100.3, view)
+    assert faults.failover.recovery_s == [0.3]
+    faults.step(6.0, 101.0, view)
+    assert faults.failover.recovery_s == [0.3]
+
+
+def test_a_new_process_of_the_same_name_is_another_one() -> None:
+    stage, view = FakeStage(coordinators=("c1",)), on_road(leader="c1", incarnation=1)
+    faults = injection(stage, kill=(Kill(at_s=5.0, restart_after_s=0.5),))
+    faults.step(5.0, 100.0, view)
+    faults.step(5.5, 100.5, view)
+    leads(view, "c1", incarnation=2)
+    faults.step(6.5, 101.5, view)
+    assert faults.failover.recovery_s == [1.5]
+
+
+def test_a_pause_longer_than_the_lease_is_a_failover() -> None:
+    stage, view = FakeStage(), on_road(leader="c1")
+    faults = injection(stage, pause=(Pause(at_s=5.0, for_s=4.0),))
+    faults.step(5.0, 100.0, view)
+    leads(view, "c2")
+    faults.step(6.2, 101.2, view)
+    assert faults.failover.recovery_s == [1.2]
+
+
+def test_a_pause_within_the_lease_is_none() -> None:
+    stage, view = FakeStage(), on_road(leader="c1")
+    faults = injection(stage, pause=(Pause(at_s=5.0, for_s=LEASE_S),))
+    faults.step(5.0, 100.0, view)
+    assert view.leader == "c1"
+    leads(view, "c2")
+    faults.step(6.2, 101.2, view)
+    assert faults.failover.recovery_s == []
+
+
+def test_a_leader_that_woke_before_anybody_took_over_is_no_failover() -> None:
+    stage, view = FakeStage(), on_road(leader="c1")
+    faults = injection(stage, pause=(Pause(at_s=5.0, for_s=1.5),))
+    faults.step(5.0, 100.0, view)
+    faults.step(6.5, 101.5, view)
+    leads(view, "c1")
+    faults.step(6.6, 101.6, view)
+    leads(view, "c2")
+    faults.step(9.0, 109.0, view)
+    assert faults.failover.recovery_s == []

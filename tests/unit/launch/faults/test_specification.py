@@ -1,0 +1,289 @@
+"""Faults: what a file may say, which presets there are, and that the reference tells it all."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import attrs
+import pytest
+
+from laneweave.launch.faults.specification import (
+    GROUPS,
+    Faults,
+    Kill,
+    Partition,
+    Pause,
+    load_faults,
+    preset_names,
+)
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.runtime.message_faults import MessageRule
+
+ROOT = Path(__file__).resolve().parents[4]
+COORDINATORS = ("c1", "c2")
+VEHICLES = ("v0001", "v0002")
+PRESETS = ("blackout", "everything", "leader-chaos", "lossy10", "lossy50", "router-restart")
+
+
+def load(tmp_path: Path, text: str) -> Faults:
+    path = tmp_path / "faults.toml"
+    path.write_text(text, encoding="utf-8")
+    return load_faults(path, COORDINATORS, VEHICLES)
+
+
+def test_no_file_is_no_faults() -> None:
+    assert load_faults(None, COORDINATORS) == Faults()
+    assert not Faults()
+
+
+def test_a_file_says_all_there_is(tmp_path: Path) -> None:
+    found = load(
+        tmp_path,
+        """
+        seed = 7
+        [[messages]]
+        topics = ["state", "plan"]
+        loss = 0.1
+        sender = "vehicle"
+        from_s = 3
+        until_s = 4.5
+        [[kill]]
+        at_s = 3
+        [[kill]]
+        target = "agent"
+        count = 20
+        between_s = [10, 30]
+        restart_after_s = 2
+        restart_share = 0.5
+        [[kill]]
+        target = "v0002"
+        at_s = 1
+        every_s = 2
+        times = 3
+        [[pause]]
+        target = "c2"
+        at_s = 1.5
+        for_s = 2
+        [[pause]]
+        at_s = 1.5
+        for_s = [0.1, 15]
+        [[partition]]
+        between = ["coordinators", "others"]
+        from_s = 5
+        until_s = 6
+        """,
+    )
+    assert found == Faults(
+        seed=7,
+        messages=(
+            MessageRule(
+                topics=("state", "plan"), loss=0.1, sender="vehicle", from_s=3.0, until_s=4.5
+            ),
+        ),
+        kill=(
+            Kill(at_s=3.0, target="leader"),
+            Kill(
+                target="agent",
+                count=20,
+                between_s=(10.0, 30.0),
+                restart_after_s=2.0,
+                restart_share=0.5,
+            ),
+            Kill(target="v0002", at_s=1.0, every_s=2.0, times=3),
+        ),
+        pause=(Pause(target="c2", at_s=1.5, for_s=2.0), Pause(at_s=1.5, for_s=(0.1, 15.0))),
+        partition=(Partition(between=("coordinators", "others"), from_s=5.0, until_s=6.0),),
+    )
+    assert found
+
+
+@pytest.mark.parametrize(
+    ("text", "field"),
+    [
+        ('[[kill]]\ntarget = "c3"\nat_s = 1.0', "kill[0].target"),
+        ('[[kill]]\nat_s = 1.0\n[[kill]]\ntarget = ""\nat_s = 1.0', "kill[1].target"),
+        ('[[pause]]\ntarget = "v0003"\nat_s = 1.0\nfor_s = 1', "pause[0].target"),
+        ("[[kill]]", "kill[0].at_s"),
+        ("[[kill]]\nat_s = -0.1", "kill[0].at_s"),
+        ("[[kill]]\nat_s = inf", "kill[0].at_s"),
+        ("[[kill]]\nat_s = true", "kill[0].at_s"),
+        ("[[kill]]\nat_s = 1.0\nat_m = 1.0", "kill[0].at_m"),
+        ("[[kill]]\nat_s = 1.0\nbetween_s = [1, 2]", "kill[0].between_s"),
+        ("[[kill]]\nbetween_s = [2, 1]", "kill[0].between_s"),
+        ("[[kill]]\nbetween_s = [1]", "kill[0].between_s"),
+        ("[[kill]]\nbetween_s = [1, 2]\nevery_s = 1", "kill[0].every_s"),
+        ("[[kill]]\nat_s = 1\nevery_s = 0", "kill[0].every_s"),
+        ("[[kill]]\nat_s = 1\ntimes = 2", "kill[0].times"),
+        ("[[kill]]\nat_s = 1\nevery_s = 1\ntimes = 0", "kill[0].times"),
+        ("[[kill]]\nat_s = 1\ncount = 2", "kill[0].count"),
+        ('[[kill]]\nat_s = 1\ntarget = "agent"\ncount = 0', "kill[0].count"),
+        ("[[kill]]\nat_s = 1\nrestart_share = 0.5", "kill[0].restart_share"),
+        ("[[kill]]\nat_s = 1\nrestart_after_s = 1\nrestart_share = 1.5", "kill[0].restart_share"),
+        ("[kill]\nat_s = 1.0", "kill"),
+        ("[[delay]]\nat_s = 1.0", "delay"),
+        ("[[pause]]\nat_s = 1.0", "pause[0].for_s"),
+        ("[[pause]]\nat_s = 1.0\nfor_s = 0", "pause[0].for_s"),
+        ("[[pause]]\nat_s = 1.0\nfor_s = [2, 1]", "pause[0].for_s"),
+        ("[[pause]]\nat_s = 1.0\nfor_s = [1, 2, 3]", "pause[0].for_s"),
+        ('[[pause]]\nat_s = 1.0\nfor_s = "long"', "pause[0].for_s"),
+        ("[[messages]]\nloss = 1.5", "messages[0].loss"),
+        ('[[messages]]\ntopics = ["service"]', "messages[0].topics"),
+        ("[[messages]]\nfrom_s = 3\nuntil_s = 3", "messages[0].until_s"),
+        ('[[partition]]\nbetween = ["bridge"]', "partition[0].between"),
+        ('[[partition]]\nbetween = ["bridge", "bridge"]', "partition[0].between"),
+        ('[[partition]]\nbetween = ["others", "bridge"]', "partition[0].between"),
+        ('[[partition]]\nbetween = ["router", "others"]', "partition[0].between"),
+        (
+            '[[partition]]\nbetween = ["bridge", "others"]\nmethod = "magic"',
+            "partition[0].method",
+        ),
+        (
+            '[[partition]]\nbetween = ["bridge", "vehicles"]\nmethod = "namespaces"',
+            "partition[0].method",
+        ),
+        ("seed = -1", "seed"),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path: Path, text: str, field: str) -> None:
+    with pytest.raises(BadInputError) as caught:
+        load(tmp_path, text)
+    assert str(caught.value).startswith(f"{field}: got ")
+
+
+def test_the_allowed_targets_are_told(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="allowed: leader, c1, c2, coordinator, router, agent"):
+        load(tmp_path, '[[kill]]\ntarget = "bridge"\nat_s = 1.0')
+
+
+# --- partitions -----------------------------------------------------------------------------------
+
+
+def ways(partition: Partition) -> set[tuple[str | None, str | None]]:
+    return {(rule.sender, rule.receiver) for rule in partition.message_rules()}
+
+
+def test_a_partition_of_two_groups_loses_messages_both_ways() -> None:
+    partition = Partition(between=("vehicles", "coordinators"), from_s=5.0, until_s=8.0)
+    assert ways(partition) == {("vehicle", "coordinator"), ("coordinator", "vehicle")}
+    for rule in partition.message_rules():
+        assert (rule.loss, rule.topics, rule.from_s, rule.until_s) == (1.0, (), 5.0, 8.0)
+    assert not partition.may_use_links
+
+
+def test_a_group_that_is_cut_off_still_hears_itself() -> None:
+    partition = Partition(between=("vehicles", "others"))
+    assert ways(partition) == {
+        *(("vehicle", "coordinator"), ("coordinator", "vehicle")),
+        *(("vehicle", "bridge"), ("bridge", "vehicle")),
+    }
+    assert partition.may_use_links
+    assert not Partition(between=("vehicles", "others"), method="messages").may_use_links
+
+
+def test_a_partition_has_a_window() -> None:
+    partition = Partition(between=("bridge", "others"), from_s=5.0, until_s=8.0)
+    assert [partition.holds(t_s) for t_s in (4.9, 5.0, 7.9, 8.0)] == [False, True, True, False]
+    assert Partition(between=("bridge", "others")).holds(1e6)
+
+
+# --- presets --------------------------------------------------------------------------------------
+
+
+def test_the_presets_are_those_that_are_promised() -> None:
+    assert preset_names() == PRESETS
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_loads_for_any_run(name: str) -> None:
+    assert load_faults(name, ("c1",), ())
+
+
+@pytest.mark.parametrize(("name", "loss"), [("lossy10", 0.1), ("lossy50", 0.5)])
+def test_lossy_presets_take_every_message_of_the_whole_run(name: str, loss: float) -> None:
+    assert load_faults(name, COORDINATORS) == Faults(messages=(MessageRule(loss=loss),))
+
+
+def test_blackout_begins_after_a_minute() -> None:
+    expected = Faults(messages=(MessageRule(loss=1.0, from_s=60.0),))
+    assert load_faults("blackout", COORDINATORS) == expected
+
+
+def test_an_unknown_name_gives_one_line_with_the_presets() -> None:
+    with pytest.raises(BadInputError) as caught:
+        load_faults("lossy99", COORDINATORS)
+    line = str(caught.value)
+    assert "--faults: got 'lossy99'" in line
+    assert all(name in line for name in PRESETS)
+    assert "\n" not in line
+
+
+def test_a_file_goes_before_a_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "lossy10").write_text("seed = 3\n", encoding="utf-8")
+    assert load_faults("lossy10", COORDINATORS) == Faults(seed=3)
+
+
+# --- docs/FAULTS.md -------------------------------------------------------------------------------
+
+REFERENCE = (ROOT / "docs" / "FAULTS.md").read_text(encoding="utf-8")
+
+
+def reference_rows(heading: str) -> list[list[str]]:
+    """Return the cells of the first table below a heading, without its head."""
+    part = REFERENCE.partition(f"\n{heading}\n")[2]
+    table = re.search(r"^\|.*?\n\n", part, re.MULTILINE | re.DOTALL)
+    assert table is not None, heading
+    lines = table[0].strip().splitlines()[2:]
+    return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines]
+
+
+def allowed_range(attribute: attrs.Attribute[Any]) -> str | None:
+    validator = getattr(attribute.validator, "validator", attribute.validator)
+    if validator is None:
+        return None
+    found = inspect.getclosurevars(validator).nonlocals
+    if "low" not in found:
+        return None
+    bracket = "(" if found["open_low"] else "["
+    low, high = (
+        "2^63 - 1" if value > 2**53 else f"{value:.10g}" for value in (found["low"], found["high"])
+    )
+    return f"{bracket}{low}, {high}]"
+
+
+@pytest.mark.parametrize(
+    ("heading", "kind"),
+    [
+        ("## Messages: `[[messages]]`", MessageRule),
+        ("## Kills: `[[kill]]`", Kill),
+        ("## Pauses: `[[pause]]`", Pause),
+        ("## Partitions: `[[partition]]`", Partition),
+    ],
+)
+def test_the_reference_has_every_field_with_default_and_range(heading: str, kind: type) -> None:
+    rows = {cells[0].strip("`"): cells[1:] for cells in reference_rows(heading)}
+    fields = {attribute.name: attribute for attribute in attrs.fields(kind)}
+    assert rows.keys() == fields.keys()
+    for name, attribute in fields.items():
+        default, allowed, meaning = rows[name]
+        if attribute.default is attrs.NOTHING:
+            assert default == "required", name
+        elif attribute.default is None:
+            assert default == "not set", name
+        else:
+            value = attribute.default
+            shown = json.dumps(list(value) if isinstance(value, tuple) else value)
+            assert default == f"`{shown}`", name
+        expected = allowed_range(attribute)
+        assert expected is None or allowed == expected, name
+        assert meaning, name
+
+
+def test_the_reference_lists_presets_and_groups() -> None:
+    assert tuple(sorted(cells[0].strip("`") for cells in reference_rows("## Presets"))) == PRESETS
+    part = REFERENCE.partition("## Partitions: `[[partition]]`")[2]
+    assert all(f"`{group}`" in part for group in GROUPS)

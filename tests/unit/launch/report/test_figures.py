@@ -1,0 +1,94 @@
+"""Pictures are drawn from any run's files, short and empty ones included."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from laneweave.launch.drawing.colours import lane_colours
+from laneweave.launch.report.figures import speed_heatmap, travel_time_boxplot
+from laneweave.launch.report.snapshots import road_snapshots
+from laneweave.protocol.config.loading import parse_scenario
+from laneweave.sim_bridge.recording.recorder import Recorder
+from laneweave.sim_bridge.road.demand import Arrival
+
+
+def make_run(folder: Path, lanes: int = 3, vehicles: int = 12, *, lattice: bool = True) -> Path:
+    """Record vehicles that drive straight on, one per second, from 55 s on."""
+    scenario = parse_scenario({"road": {"lanes": lanes}})
+    with Recorder(folder, scenario) as recorder:
+        for number in range(vehicles):
+            lane = number % lanes
+            recorder.demanded(Arrival(f"v{number}", lane, lane, 55.0 + number))
+            recorder.entered(f"v{number}", 55.5 + number, number // 6 if lattice else None)
+        for tick in range(1300):
+            t_s = 0.1 * tick
+            samples = []
+            for number in range(vehicles):
+                s_m = 15.0 * (t_s - 55.5 - number)
+                if 0.0 <= s_m < 1000.0:
+                    y_m = (number % lanes + 0.5) * 3.5
+                    samples.append(
+                        (f"v{number}", s_m, y_m, 15.0, 0.0, -number if lattice else None, 0)
+                    )
+            recorder.tick(t_s, samples)
+        for number in range(vehicles):
+            recorder.left(f"v{number}", 55.5 + number + 1000 / 15, number % lanes)
+    return folder
+
+
+def is_picture(path: Path) -> bool:
+    return path.read_bytes().startswith(b"\x89PNG") and path.stat().st_size > 2000
+
+
+def draw_all(folder: Path) -> None:
+    travel_time_boxplot([folder], folder / "box.png", dpi=60)
+    speed_heatmap(folder, folder / "heat.png", dpi=60)
+    road_snapshots(folder, folder / "road.png", dpi=60)
+    assert all(is_picture(folder / name) for name in ("box.png", "heat.png", "road.png"))
+
+
+@pytest.mark.parametrize("lanes", [1, 2, 3, 5])
+def test_pictures_of_any_number_of_lanes(tmp_path: Path, lanes: int) -> None:
+    draw_all(make_run(tmp_path, lanes, lattice=lanes != 2))
+
+
+def test_pictures_of_an_empty_run(tmp_path: Path) -> None:
+    Recorder(tmp_path, parse_scenario({})).close()
+    draw_all(tmp_path)
+
+
+def test_given_times_and_stretch_and_resolution(tmp_path: Path) -> None:
+    folder = make_run(tmp_path)
+    small, large = tmp_path / "small.png", tmp_path / "large.png"
+    for out, dpi in ((small, 50), (large, 100)):
+        road_snapshots(folder, out, times=[70.0, 500.0], stretch_m=(100.0, 300.0), dpi=dpi)
+    assert large.stat().st_size > small.stat().st_size
+
+
+def test_runs_side_by_side(tmp_path: Path) -> None:
+    folders = [make_run(tmp_path / name, vehicles=n) for name, n in (("a", 12), ("b", 8), ("c", 2))]
+    travel_time_boxplot(folders, tmp_path / "new folder" / "box.png", dpi=60)
+    assert is_picture(tmp_path / "new folder" / "box.png")
+
+
+def test_lanes_are_coloured_as_in_the_paper() -> None:
+    blue, green, red = lane_colours(3)
+    assert (lane_colours(1), lane_colours(2)) == ((blue,), (blue, red))
+    assert green not in lane_colours(2)
+    assert len(set(lane_colours(8))) == 8
+
+
+def test_matplotlib_is_imported_only_to_draw() -> None:
+    code = (
+        "import sys; import laneweave.launch.report.figures, laneweave.launch.report.snapshots; "
+        "sys.exit('matplotlib' in sys.modules)"
+    )
+    path = [entry for entry in sys.path if entry]
+    finished = subprocess.run(
+        [sys.executable, "-c", f"import sys; sys.path[:0] = {path!r}; {code}"], check=False
+    )
+    assert finished.returncode == 0

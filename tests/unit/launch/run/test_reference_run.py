@@ -1,0 +1,172 @@
+"""Whole runs of the reference methods, in SUMO, on a short road."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+from typer.testing import CliRunner
+
+from laneweave.launch.cli.main import app
+from laneweave.launch.cli.role_commands import LC2013, RULE
+from laneweave.launch.run.outcome import Outcome
+from laneweave.launch.run.reference_run import ReferenceRun, check_reference
+from laneweave.protocol.config.loading import parse_scenario, to_tables
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.sim_bridge.baselines import run as road
+from laneweave.sim_bridge.bodies.footprints import Bodies
+from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
+from laneweave.sim_bridge.road.demand import Arrival
+from support.bridge_bench import read_events, read_summary
+
+METHODS = (RULE, LC2013)
+each_method = pytest.mark.parametrize("method", METHODS)
+
+
+def scenario(volume: float = 600.0, seed: int = 1, **tables: dict[str, Any]) -> Scenario:
+    return parse_scenario(
+        {
+            "seed": seed,
+            "road": {"s1_m": 20.0, "s2_m": 30.0, "s3_m": 350.0},
+            "demand": {"volume_veh_per_lane_h": volume, "duration_s": 30.0},
+        }
+        | tables
+    )
+
+
+def finished(settings: Scenario, folder: Path, method: str) -> Outcome:
+    check_reference(settings, method)
+    return ReferenceRun(settings, folder, method, show_progress=False).run()
+
+
+def columns(folder: Path, name: str) -> dict[str, list[Any]]:
+    table: dict[str, list[Any]] = pq.read_table(folder / f"{name}.parquet").to_pydict()
+    return table
+
+
+@each_method
+@pytest.mark.parametrize("lane_change_s", [0.0, 4.0])
+def test_at_low_volume_everybody_leaves_on_its_lane(
+    tmp_path: Path, method: str, lane_change_s: float
+) -> None:
+    settings = parse_scenario(to_tables(scenario()) | {method: {"lane_change_s": lane_change_s}})
+    outcome = finished(settings, tmp_path, method)
+    assert outcome.exit_status == 0
+    found = read_summary(tmp_path)
+    vehicles = found["vehicles"]
+    assert vehicles["demanded"] == vehicles["left"] == vehicles["on_preferred_lane"] > 5
+    assert found["method"] == method
+    assert found["safety"]["overlaps"] == 0
+    assert found["safety"]["min_accel_mps2"] >= -10.0
+    assert found["safety"]["max_accel_mps2"] <= 5.0
+    trips = columns(tmp_path, "trips")
+    assert trips["final_lane"] == trips["preferred_lane"]
+    assert set(trips["formation"]) == {None}
+    # Some changed lanes, and only in S3.
+    rows = columns(tmp_path, "trajectories")
+    arrived = dict(zip(trips["vehicle"], trips["arrival_lane"], strict=True))
+    changed = {
+        s_m
+        for s_m, lane, name in zip(rows["s_m"], rows["lane"], rows["vehicle"], strict=True)
+        if lane != arrived[name]
+    }
+    assert min(changed) >= 50.0
+    assert set(rows["column"]) == {None}
+
+
+@each_method
+def test_equal_seeds_give_equal_runs(tmp_path: Path, method: str) -> None:
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        finished(scenario(1500.0, seed), tmp_path / name, method)
+    assert columns(tmp_path / "a", "trajectories") == columns(tmp_path / "b", "trajectories")
+    assert columns(tmp_path / "a", "trips") != columns(tmp_path / "c", "trips")
+
+
+@each_method
+def test_a_lone_vehicle_takes_as_long_as_the_road_is(
+    tmp_path: Path, method: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lone = Arrival("v0001", 0, 2, 61.234)
+    monkeypatch.setattr(road, "arrivals", lambda _: (lone,))
+    finished(Scenario(), tmp_path, method)
+    travel_time_s = read_summary(tmp_path)["travel_time_s"]
+    assert travel_time_s["mean"] == pytest.approx(1000.0 / 15.0, abs=1e-3)
+    (entered,) = read_events(tmp_path, "entered")
+    assert entered["t_s"] == pytest.approx(61.234)
+
+
+def shape(value: Any) -> Any:  # noqa: ANN401 (JSON)
+    """Return the keys of a summary, nested."""
+    return {key: shape(inner) for key, inner in value.items()} if isinstance(value, dict) else ()
+
+
+@each_method
+def test_the_summary_has_the_schema_of_formation_runs(tmp_path: Path, method: str) -> None:
+    record = RunRecord(tmp_path / "formation", Scenario(), "formation", lambda: 0.0)
+    record.close(1.0, Ending.COMPLETE)
+    finished(scenario(), tmp_path / method, method)
+    found = read_summary(tmp_path / method)
+    assert shape(found) == shape(read_summary(tmp_path / "formation"))
+    assert found["planning"]["plans"] == found["tracking"]["solves"] == 0
+    assert found["runtime"]["processes"] == 1
+
+
+@each_method
+def test_a_run_that_does_not_end_is_ended(tmp_path: Path, method: str) -> None:
+    outcome = finished(scenario(runtime={"max_road_s": 15.0}), tmp_path, method)
+    assert outcome.exit_status == 1
+    assert read_summary(tmp_path)["ending"] == Ending.LIMIT.value
+
+
+@each_method
+def test_bodies_that_overlap_break_a_promise(
+    tmp_path: Path, method: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Bodies, "overlapping_pairs", lambda _: [("v0001", "v0002")])
+    outcome = finished(scenario(), tmp_path, method)
+    assert outcome.exit_status == 1
+    assert "1 pairs of vehicles overlapped" in outcome.problems
+
+
+@each_method
+def test_an_interrupted_run_leaves_its_summary(
+    tmp_path: Path, method: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(road.ReferenceRoad, "advance", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        finished(scenario(), tmp_path, method)
+    assert read_summary(tmp_path)["ending"] == Ending.INTERRUPTED.value
+
+
+# --- the command ------------------------------------------------------------------------------
+
+
+@each_method
+def test_the_command_leaves_all_files(tmp_path: Path, method: str) -> None:
+    out = tmp_path / "run"
+    options = ("--duration", "5", "--volume", "600", "--transport", "zenoh", "--out", str(out))
+    done = CliRunner().invoke(app, ["run", "--method", method, *options])
+    assert done.exit_code == 0
+    assert {path.name for path in out.iterdir()} == {
+        *("events.jsonl", "log.jsonl", "summary.json"),
+        *("ticks.parquet", "trajectories.parquet", "trips.parquet"),
+        *("road.png", "speed.png", "travel_time.png"),
+        *("comfort.png", "spacing.png", "report.html"),
+    }
+
+
+@each_method
+def test_faults_are_refused(tmp_path: Path, method: str) -> None:
+    out = tmp_path / "run"
+    done = CliRunner().invoke(
+        app, ["run", "--method", method, "--faults", "lossy10", "--out", str(out)]
+    )
+    assert isinstance(done.exception, BadInputError)
+    assert done.exception.field == "--faults"
+    assert not out.exists()

@@ -1,0 +1,59 @@
+"""Starting roles: what happens when no process can be made."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from typing import NoReturn
+
+import pytest
+
+from laneweave.launch.run.roles import PRELOADED, THREAD_LIMITS, start_role
+from laneweave.protocol.errors import CommandFailedError
+
+
+class _DeadServer:
+    """A fork server that dies while it is asked for a process."""
+
+    def __init__(self, error: Exception) -> None:
+        self._error = error
+
+    def Process(self, **_: object) -> _DeadServer:  # noqa: N802 (the context's name)
+        return self
+
+    def start(self) -> NoReturn:
+        raise self._error
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (EOFError(), "the fork server is gone"),
+        (ConnectionRefusedError(111, "Connection refused"), "Connection refused"),
+    ],
+)
+def test_a_dead_fork_server_is_a_failure_with_words(error: Exception, reason: str) -> None:
+    with pytest.raises(CommandFailedError, match=rf"cannot start agent-v1: .*{reason}"):
+        start_role(_DeadServer(error), "agent", "agent-v1", {}, {})  # type: ignore[arg-type]
+
+
+LOOK_AROUND = """
+import gc, importlib, os, sys
+before = len(os.listdir("/proc/self/fd"))
+importlib.import_module(sys.argv[1])
+print(len(os.listdir("/proc/self/task")))
+print(len(os.listdir("/proc/self/fd")) - before)
+print(gc.get_count()[2], gc.get_freeze_count() > len(gc.get_objects()))
+"""
+
+
+def test_the_fork_server_has_one_thread_and_nothing_open_and_leaves_nothing_to_collect() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", LOOK_AROUND, PRELOADED],
+        env=os.environ | dict.fromkeys(THREAD_LIMITS, "1"),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.split() == ["1", "0", "0", "True"], done.stderr

@@ -1,0 +1,143 @@
+"""A recorded run as frames: everybody is where the files say that they were."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from laneweave.launch.cli.main import app
+from laneweave.launch.report.runs import single_run
+from laneweave.launch.report.trajectories import read_tracks
+from laneweave.launch.watch.frames import MOVING
+from laneweave.launch.watch.recorded_run import Recording
+from laneweave.protocol.errors import BadInputError
+from support.older_recordings import older_recording
+
+
+def frames(recording: Recording) -> list[dict[str, Any]]:
+    return [json.loads(text) for text in recording.frames(0, recording.last)]
+
+
+def test_everybody_is_where_they_were(recorded: Path) -> None:
+    recording, tracks = Recording(recorded), read_tracks(recorded)
+    shown = frames(recording)
+    assert [frame["n"] for frame in shown] == list(range(recording.last + 1))
+    assert {frame["status"] for frame in shown} == {"recorded"}
+    seen = 0
+    for frame in shown:
+        there = np.flatnonzero(np.abs(tracks.t_s - frame["t"]) < 1e-6)
+        places = {tracks.names[tracks.vehicle[row]]: row for row in there}
+        assert places.keys() == {row[0] for row in frame["vehicles"]}
+        for name, s_m, y_m, speed_mps, *_ in frame["vehicles"]:
+            row = places[name]
+            assert s_m == pytest.approx(tracks.s_m[row], abs=0.006)
+            assert y_m == pytest.approx(tracks.y_m[row], abs=0.006)
+            assert speed_mps == pytest.approx(tracks.speed_mps[row], abs=0.006)
+            seen += 1
+    assert seen > 1000
+    assert any(row[8] & MOVING for frame in shown for row in frame["vehicles"])
+    assert recording.scene["step_s"] == pytest.approx(0.2)
+    assert shown[-1]["t"] == pytest.approx(tracks.t_s.max(), abs=0.4)
+
+
+def test_counts_lanes_and_leaders_are_those_of_the_run(recorded: Path) -> None:
+    recording, summary = Recording(recorded), single_run(recorded).summary
+    last = frames(recording)[-1]
+    vehicles = summary["vehicles"]
+    assert last["counts"] == [vehicles["demanded"], vehicles["entered"], 0, vehicles["left"]]
+    assert last["leader"] == ["c1", 1]
+    assert last["plan"] is not None
+    assert [event[2] for event in last["news"]][:2] == ["leader-elected", "leader"]
+    assert frames(recording)[0]["leader"] is None
+    assert recording.scene["losses"]["published"] == summary["messages"]["published"]
+    lanes = {row[0]: row[4] for frame in frames(recording) for row in frame["vehicles"]}
+    assert set(lanes.values()) == {0, 1, 2}
+
+
+def test_formations_are_shown_from_their_closing_on(recorded: Path) -> None:
+    closed = [
+        event for event in map(json.loads, (recorded / "events.jsonl").read_text().splitlines())
+        if event["kind"] == "formation-closed"
+    ]  # fmt: skip
+    assert len({rear - front for event in closed for rear, front in [event["columns"]]}) > 1
+    seen: set[int] = set()
+    for frame in frames(Recording(recorded)):
+        there = {row[0] for row in frame["vehicles"]}
+        known = [event for event in closed if event["t_s"] <= frame["t"]]
+        assert sorted(frame["formations"], key=lambda one: one[0]) == [
+            [event["formation"], *event["columns"]]
+            for event in known
+            if there.intersection(event["vehicles"])
+        ]
+        number = {name: event["formation"] for event in known for name in event["vehicles"]}
+        assert {row[0]: row[5] for row in frame["vehicles"]} == {
+            name: number.get(name, -1) for name in there
+        }
+        seen.update(one[0] for one in frame["formations"])
+    assert seen == {event["formation"] for event in closed}
+
+
+def test_an_older_recording_has_formations_of_equal_length(recorded: Path, tmp_path: Path) -> None:
+    folder = older_recording(recorded, tmp_path / "run")
+    shown = frames(Recording(folder))
+    assert {one[2] - one[1] for frame in shown for one in frame["formations"]} == {3}
+    assert all(one[2] == -4 * one[0] for frame in shown for one in frame["formations"])
+    # When a block was closed is not known: its vehicles are shown in it from the beginning.
+    assert all(row[5] >= 0 for frame in shown for row in frame["vehicles"])
+
+
+def test_formations_that_plan_together(recorded: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(recorded, folder)
+    first, second = Recording(folder).frame(100)["formations"][::-1][:2]
+    event = {"t_s": 15.0, "kind": "formations-joined", "role": "coordinator", "name": "c1"}
+    blocks = list(range(-first[2], -second[1] + 1))
+    with (folder / "events.jsonl").open("a") as events:
+        events.write(json.dumps(event | {"formations": blocks}) + "\n")
+        events.write(json.dumps(event | {"role": "agent", "formations": "all"}) + "\n")
+    recording = Recording(folder)
+    assert recording.frame(70)["joined"] == []
+    assert recording.frame(100)["joined"] == [[first[0], second[0]]]
+
+
+def test_nothing_before_and_after(recorded: Path) -> None:
+    recording = Recording(recorded)
+    assert recording.frames(recording.last + 1, recording.last + 9) == []
+    assert len(recording.frames(recording.last - 1, recording.last + 9)) == 2
+
+
+@pytest.mark.parametrize("lost", ["trajectories.parquet", "summary.json", "trips.parquet"])
+def test_what_is_no_run_is_refused(recorded: Path, tmp_path: Path, lost: str) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(recorded, folder)
+    (folder / lost).unlink()
+    with pytest.raises(BadInputError, match="the folder of a"):
+        Recording(folder)
+
+
+def test_a_run_with_damaged_events_is_refused(recorded: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(recorded, folder)
+    (folder / "events.jsonl").write_text('{"t_s": 1.0}\n')
+    with pytest.raises(BadInputError, match="DIR"):
+        Recording(folder)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["/nowhere"], "DIR"),
+        (["/nowhere", "--endpoint", "tcp/127.0.0.1:1"], "--endpoint"),
+        (["/nowhere", "--config", "scenarios/paper.toml"], "--config"),
+        ([], "network.endpoint"),
+        (["--endpoint", "udp/127.0.0.1:1"], "network.endpoint"),
+    ],
+)
+def test_bad_input_of_the_command(arguments: list[str], words: str) -> None:
+    with pytest.raises(BadInputError, match=words):
+        app(["watch", *arguments, "--listen", "127.0.0.1:0"], standalone_mode=False)

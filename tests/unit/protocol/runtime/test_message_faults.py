@@ -1,0 +1,332 @@
+"""Message faults before a core: what is lost, doubled, late; and that nothing else is touched."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from attrs import define, field
+
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.runtime import message_faults as faulty_core
+from laneweave.protocol.runtime.message_faults import FaultyCore, MessageRule, bare
+from laneweave.protocol.runtime.node import (
+    Arrived,
+    Asked,
+    Effect,
+    Event,
+    PeerDown,
+    PeerUp,
+    Send,
+    Started,
+    Stopping,
+    Wakeup,
+)
+from laneweave.protocol.runtime.transport import LinkDown, LinkUp
+from laneweave.protocol.wire.messages import Heartbeat, LogEvent, Name, Report, RoadClock
+from laneweave.protocol.wire.topics import (
+    CLOCK,
+    COORDINATOR_ALIVE,
+    EVENT,
+    HEARTBEAT,
+    REPORT,
+    STATE,
+    Topic,
+)
+
+
+@define
+class Board:
+    road_s: float = 0.0
+    dropped: int = 0
+
+
+@define
+class Listener:
+    """A core that writes down what reaches it, and says what it is told to say."""
+
+    wakeup_s: float | None = None
+    says: list[Effect] = field(factory=list)
+    heard: list[tuple[Event, float]] = field(factory=list)
+
+    def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
+        self.heard.append((event, now_s))
+        yield from self.says
+
+    @property
+    def numbers(self) -> list[int]:
+        return [event.message for event, _ in self.heard if isinstance(event, Arrived)]
+
+
+def arrived(number: int, topic: Topic = STATE, **parameters: str) -> Arrived:
+    return Arrived(topic, parameters, number)
+
+
+def faulty(
+    *rules: MessageRule, board: Board | None = None, receiver: str = "vehicle", seed: str = "1"
+) -> tuple[FaultyCore, Listener]:
+    listener = Listener()
+    return FaultyCore(listener, rules, board or Board(), receiver=receiver, seed=seed), listener
+
+
+def feed(core: FaultyCore, event: Event, now_s: float = 0.0) -> list[Effect]:
+    return list(core.handle(event, now_s))
+
+
+def run_until(core: FaultyCore, end_s: float) -> None:
+    """Wake the core whenever it wants to be woken."""
+    while (wakeup_s := core.wakeup_s) is not None and wakeup_s <= end_s:
+        feed(core, Wakeup(), wakeup_s)
+
+
+def received(rule: MessageRule, count: int = 2000, seed: str = "1") -> list[int]:
+    core, listener = faulty(rule, seed=seed)
+    for number in range(count):
+        feed(core, arrived(number))
+    run_until(core, 100.0)
+    return listener.numbers
+
+
+def test_without_rules_everything_passes_at_once() -> None:
+    board = Board()
+    core, listener = faulty(board=board)
+    for number in range(100):
+        feed(core, arrived(number), 0.1 * number)
+    assert listener.numbers == list(range(100))
+    assert board.dropped == 0
+    assert core.wakeup_s is None
+
+
+def test_loss_of_one_takes_everything_and_counts_it() -> None:
+    board = Board(dropped=3)
+    core, listener = faulty(MessageRule(loss=1.0), board=board)
+    for number in range(10):
+        feed(core, arrived(number))
+    assert listener.heard == []
+    assert board.dropped == 13
+
+
+@pytest.mark.parametrize("loss", [0.1, 0.5, 0.9])
+def test_loss_takes_its_share(loss: float) -> None:
+    passed = received(MessageRule(loss=loss), 5000)
+    assert passed == sorted(set(passed))
+    assert len(passed) / 5000 == pytest.approx(1.0 - loss, abs=0.02)
+
+
+def test_duplication_of_one_doubles_everything() -> None:
+    assert received(MessageRule(duplication=1.0), 3) == [0, 0, 1, 1, 2, 2]
+
+
+def test_duplication_doubles_its_share() -> None:
+    passed = received(MessageRule(duplication=0.25), 5000)
+    assert len(passed) / 5000 == pytest.approx(1.25, abs=0.02)
+
+
+def test_duplicates_do_not_depend_on_the_loss() -> None:
+    lossless = received(MessageRule(duplication=0.5))
+    lossy = received(MessageRule(duplication=0.5, loss=0.3))
+    doubled = {number for number in lossless if lossless.count(number) == 2}
+    assert {number for number in lossy if lossy.count(number) == 2} == doubled & set(lossy)
+
+
+def test_a_delay_keeps_the_order() -> None:
+    core, listener = faulty(MessageRule(delay_s=0.5))
+    for number in range(5):
+        feed(core, arrived(number), 0.1 * number)
+    assert listener.heard == []
+    assert core.wakeup_s == 0.5
+    run_until(core, 0.75)
+    assert listener.numbers == [0, 1, 2]
+    run_until(core, 10.0)
+    assert listener.numbers == [0, 1, 2, 3, 4]
+    times_s = [now_s for _, now_s in listener.heard]
+    assert times_s == pytest.approx([0.5, 0.6, 0.7, 0.8, 0.9])
+
+
+def test_jitter_longer_than_the_spacing_reorders() -> None:
+    core, listener = faulty(MessageRule(delay_s=0.1, jitter_s=1.0))
+    for number in range(200):
+        feed(core, arrived(number), 0.1 * number)
+        run_until(core, 0.1 * number)
+    run_until(core, 100.0)
+    assert sorted(listener.numbers) == list(range(200))
+    assert listener.numbers != list(range(200))
+    for event, now_s in listener.heard:
+        assert isinstance(event, Arrived)
+        assert 0.1 <= now_s - 0.1 * event.message <= 1.1 + 1e-9
+
+
+def test_copies_of_one_message_have_delays_of_their_own() -> None:
+    core, listener = faulty(MessageRule(duplication=1.0, jitter_s=1.0))
+    feed(core, arrived(7))
+    run_until(core, 2.0)
+    (_, first_s), (_, second_s) = listener.heard
+    assert listener.numbers == [7, 7]
+    assert first_s != second_s
+
+
+def test_rules_add_up() -> None:
+    core, listener = faulty(
+        MessageRule(duplication=1.0), MessageRule(duplication=1.0), MessageRule(delay_s=1.0)
+    )
+    feed(core, arrived(1))
+    assert listener.heard == []
+    run_until(core, 1.0)
+    assert listener.numbers == [1, 1, 1, 1]
+
+
+def test_a_rule_holds_in_its_window_of_road_time() -> None:
+    board = Board()
+    core, listener = faulty(MessageRule(loss=1.0, from_s=10.0, until_s=20.0), board=board)
+    for road_s in (0.0, 9.9, 10.0, 19.9, 20.0, 30.0):
+        board.road_s = road_s
+        # The node's clock has nothing to do with it.
+        feed(core, arrived(int(road_s * 10)), now_s=1000.0)
+    assert listener.numbers == [0, 99, 200, 300]
+
+
+def test_a_rule_from_zero_holds_before_the_road_clock_starts() -> None:
+    core, listener = faulty(MessageRule(loss=1.0, from_s=0.0), board=Board())
+    feed(core, arrived(1))
+    assert listener.heard == []
+
+
+def test_a_rule_is_for_its_topics() -> None:
+    core, listener = faulty(MessageRule(topics=("state", "plan"), loss=1.0))
+    feed(core, arrived(1, STATE))
+    feed(core, arrived(2, HEARTBEAT))
+    assert listener.numbers == [2]
+
+
+@pytest.mark.parametrize(
+    ("topic", "parameters", "sender"),
+    [
+        (STATE, {}, "vehicle"),
+        (HEARTBEAT, {}, "coordinator"),
+        (CLOCK, {}, "bridge"),
+        (REPORT, {"role": "agent", "name": "v1"}, "vehicle"),
+        (EVENT, {"role": "coordinator", "name": "c1"}, "coordinator"),
+        (EVENT, {"role": "bridge", "name": "bridge"}, "bridge"),
+    ],
+)
+def test_a_rule_is_for_its_sender(topic: Topic, parameters: dict[str, str], sender: str) -> None:
+    for named in faulty_core.SENDERS:
+        core, listener = faulty(MessageRule(loss=1.0, sender=named))
+        feed(core, arrived(1, topic, **parameters))
+        assert (listener.heard == []) is (named == sender)
+
+
+def test_a_rule_is_for_its_receiver() -> None:
+    for named in faulty_core.SENDERS:
+        core, listener = faulty(MessageRule(loss=1.0, receiver=named), receiver="coordinator")
+        feed(core, arrived(1))
+        assert (listener.heard == []) is (named == "coordinator")
+
+
+def test_equal_seeds_give_equal_fates_and_others_others() -> None:
+    rule = MessageRule(loss=0.5, duplication=0.5, jitter_s=0.5)
+    assert received(rule, seed="7/c1/1") == received(rule, seed="7/c1/1")
+    assert received(rule, seed="7/c1/1") != received(rule, seed="7/c2/1")
+
+
+def test_the_fates_of_one_topic_do_not_depend_on_another() -> None:
+    rule = MessageRule(loss=0.5)
+    core, listener = faulty(rule)
+    for number in range(200):
+        feed(core, arrived(number, STATE))
+        feed(core, arrived(-1, HEARTBEAT))
+    assert [number for number in listener.numbers if number >= 0] == received(rule, 200)
+
+
+def test_what_is_no_message_passes_untouched() -> None:
+    core, listener = faulty(MessageRule(loss=1.0))
+    events: list[Event] = [
+        Started(),
+        PeerUp(COORDINATOR_ALIVE, {}),
+        PeerDown(COORDINATOR_ALIVE, {}),
+        LinkDown(),
+        LinkUp(),
+        Asked(1, b""),
+        Stopping(),
+    ]
+    for event in events:
+        feed(core, event)
+    assert [event for event, _ in listener.heard] == events
+
+
+def test_the_core_is_woken_when_it_wants_and_not_for_delayed_messages() -> None:
+    core, listener = faulty(MessageRule(delay_s=1.0))
+    listener.wakeup_s = 3.0
+    feed(core, arrived(1), 0.0)
+    assert core.wakeup_s == 1.0
+    feed(core, Wakeup(), 1.0)
+    assert listener.heard == [(arrived(1), 1.0)]
+    assert core.wakeup_s == 3.0
+    feed(core, Wakeup(), 3.0)
+    assert listener.heard[1:] == [(Wakeup(), 3.0)]
+
+
+def test_both_are_served_at_one_wakeup() -> None:
+    core, listener = faulty(MessageRule(delay_s=1.0))
+    listener.wakeup_s = 1.0
+    feed(core, arrived(1), 0.0)
+    feed(core, Wakeup(), 1.0)
+    assert [event for event, _ in listener.heard] == [arrived(1), Wakeup()]
+
+
+def test_no_more_are_held_than_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(faulty_core, "MOST_HELD", 5)
+    board = Board()
+    core, listener = faulty(MessageRule(delay_s=1.0), board=board)
+    for number in range(8):
+        feed(core, arrived(number))
+    run_until(core, 1.0)
+    assert listener.numbers == [0, 1, 2, 3, 4]
+    assert board.dropped == 3
+
+
+def test_effects_pass() -> None:
+    core, listener = faulty()
+    heartbeat = Heartbeat(Name("c1"), 1, 1, leading=False, formations=0)
+    event = LogEvent(Name("agent"), Name("v1"), 0.0, Name("kind"))
+    report = Report(Name("agent"), Name("v1"), solves=3)
+    listener.says = [
+        Send(HEARTBEAT, heartbeat),
+        Send(EVENT, event, {"role": "agent"}),
+        Send(REPORT, report, {"role": "agent"}),
+    ]
+    assert feed(core, Started()) == listener.says
+
+
+def test_the_bridge_tells_the_road_time() -> None:
+    board = Board()
+    core, listener = faulty(board=board, receiver="bridge")
+    listener.says = [Send(CLOCK, RoadClock(125, 12.5, 3, 2, 1, 1, ended=False))]
+    feed(core, Started())
+    assert board.road_s == 12.5
+
+
+def test_a_bare_core_is_the_core_itself() -> None:
+    core = Listener()
+    assert bare(core) is core
+
+
+@pytest.mark.parametrize(
+    ("values", "name"),
+    [
+        ({"loss": 1.1}, "loss"),
+        ({"duplication": -0.1}, "duplication"),
+        ({"delay_s": -1.0}, "delay_s"),
+        ({"jitter_s": 61.0}, "jitter_s"),
+        ({"topics": ("states",)}, "topics"),
+        ({"topics": ("vehicle-alive",)}, "topics"),
+        ({"sender": "router"}, "sender"),
+        ({"receiver": "any"}, "receiver"),
+        ({"from_s": 5.0, "until_s": 5.0}, "until_s"),
+    ],
+)
+def test_what_is_wrong_with_a_rule_is_named(values: dict[str, Any], name: str) -> None:
+    with pytest.raises(BadInputError) as caught:
+        MessageRule(**values)
+    assert caught.value.field == name

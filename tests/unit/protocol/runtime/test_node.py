@@ -1,0 +1,314 @@
+"""The node: malformed input is counted, effects reach the transport, `End` closes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import msgpack
+import pytest
+from attrs import define, evolve, field
+
+from laneweave.protocol.runtime.metrics import NodeNumbers
+from laneweave.protocol.runtime.node import (
+    Announce,
+    Arrived,
+    Asked,
+    Compute,
+    Computed,
+    Decline,
+    Delegate,
+    Effect,
+    End,
+    Event,
+    Listen,
+    Node,
+    PeerDown,
+    PeerUp,
+    Reply,
+    Send,
+    Serve,
+    Started,
+    Unlisten,
+    Wakeup,
+    Watch,
+    Withdraw,
+    run_job,
+)
+from laneweave.protocol.runtime.transport import (
+    Delivery,
+    LinkDown,
+    LinkUp,
+    Question,
+    Received,
+    TokenDown,
+    TokenUp,
+)
+from laneweave.protocol.wire.codec import MAX_BYTES, decode, encode
+from laneweave.protocol.wire.messages import Census, Heartbeat, Name, Report, RoadClock
+from laneweave.protocol.wire.topics import (
+    CENSUS,
+    CLOCK,
+    COORDINATOR_ALIVE,
+    HEARTBEAT,
+    REPORT,
+    SERVICE,
+    STATE,
+    VEHICLE_ALIVE,
+    Keys,
+    Quality,
+)
+
+KEYS = Keys("r")
+BEAT = Heartbeat(Name("c1"), 7, 2, leading=True, formations=1)
+BEAT_KEY = "laneweave/r/heartbeat/c1"
+
+
+@define
+class Recorder:
+    """A core that records what happens and answers with prepared effects."""
+
+    effects: list[Effect] = field(factory=list)
+    events: list[tuple[Event, float]] = field(factory=list)
+    wakeup_s: float | None = None
+
+    def handle(self, event: Event, now_s: float) -> Iterable[Effect]:
+        self.events.append((event, now_s))
+        effects, self.effects = self.effects, []
+        return effects
+
+
+@define
+class Calls:
+    """A transport that records its calls."""
+
+    calls: list[tuple[Any, ...]] = field(factory=list)
+
+    def publish(self, key: str, payload: bytes, quality: Quality) -> None:
+        self.calls.append(("publish", key, payload, quality))
+
+    def subscribe(self, key_expression: str) -> None:
+        self.calls.append(("subscribe", key_expression))
+
+    def unsubscribe(self, key_expression: str) -> None:
+        self.calls.append(("unsubscribe", key_expression))
+
+    def announce(self, key: str) -> None:
+        self.calls.append(("announce", key))
+
+    def withdraw(self, key: str) -> None:
+        self.calls.append(("withdraw", key))
+
+    def watch(self, key_expression: str) -> None:
+        self.calls.append(("watch", key_expression))
+
+    def serve(self, key: str) -> None:
+        self.calls.append(("serve", key))
+
+    def answer(self, token: int, payload: bytes, *, ok: bool, encoding: str = "") -> None:
+        self.calls.append(("answer", token, payload, ok, encoding))
+
+    def decline(self, token: int) -> None:
+        self.calls.append(("decline", token))
+
+    def close(self) -> None:
+        self.calls.append(("close",))
+
+
+@define
+class Bench:
+    """A node with its recording core and transport."""
+
+    core: Recorder = field(factory=Recorder)
+    transport: Calls = field(factory=Calls)
+    jobs: list[Compute | Delegate] = field(factory=list)
+    node: Node = field(init=False)
+
+    @node.default
+    def _make_node(self) -> Node:
+        return Node(self.core, self.transport, KEYS, self.jobs.append, Name("n1"))
+
+    def carry_out(self, *effects: Effect) -> list[tuple[Any, ...]]:
+        self.core.effects = list(effects)
+        self.node.dispatch(Wakeup(), 1.0)
+        return self.transport.calls
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+# --- what comes in ----------------------------------------------------------------------------
+
+
+def test_a_message_arrives_typed(bench: Bench) -> None:
+    bench.node.deliver(Received(BEAT_KEY, encode(BEAT)), 3.5)
+    assert bench.core.events == [(Arrived(HEARTBEAT, {"coordinator": "c1"}, BEAT), 3.5)]
+    assert bench.node.rejected == 0
+
+
+@pytest.mark.parametrize(
+    ("delivery", "event"),
+    [
+        (LinkUp(), LinkUp()),
+        (LinkDown(), LinkDown()),
+        (Question("any/key", b"q", 4), Asked(4, b"q")),
+        (
+            TokenUp("laneweave/r/alive/vehicle/v1"),
+            PeerUp(VEHICLE_ALIVE, {"vehicle": "v1"}),
+        ),
+        (
+            TokenDown("laneweave/r/alive/coordinator/c1/17"),
+            PeerDown(COORDINATOR_ALIVE, {"coordinator": "c1", "incarnation": "17"}),
+        ),
+    ],
+)
+def test_deliveries_become_events(bench: Bench, delivery: Delivery, event: Event) -> None:
+    bench.node.deliver(delivery, 1.0)
+    assert bench.core.events == [(event, 1.0)]
+
+
+def deep_field(depth: int) -> bytes:
+    body: bytes = msgpack.packb([1, "Heartbeat", {"coordinator": "HERE"}])
+    return body.replace(b"\xa4HERE", b"\x91" * depth + b"\x01")
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"\xc1",
+        b"\x91" * 5000,
+        b"\0" * (MAX_BYTES + 1),
+        encode(BEAT)[:-1],
+        encode(BEAT) + b"\0",
+        encode(RoadClock(1, 1.0, 0, 0, 0, 0, ended=False)),
+        msgpack.packb([1, "Heartbeat", {1: 2, None: 3, b"x": 4}]),
+        msgpack.packb([1, "Heartbeat", {"coordinator": [[[[[[1]]]]]]}]),
+        deep_field(900),
+        msgpack.packb([1, "Heartbeat", "x" * 100_000]),
+        msgpack.packb({}),
+    ],
+    ids=range(12),
+)
+def test_a_malformed_payload_is_counted_and_not_raised(bench: Bench, payload: bytes) -> None:
+    for _ in range(3):
+        bench.node.deliver(Received(BEAT_KEY, payload), 1.0)
+    assert bench.node.rejected == 3
+    assert bench.core.events == []
+
+
+@pytest.mark.parametrize(
+    "key",
+    ["", "x", "laneweave/other/heartbeat/c1", "laneweave/r/heartbeat", "laneweave/r/heartbeat/é",
+     "laneweave/r/heartbeat/{coordinator}", "laneweave/r/heartbeat/c1/x"],
+)  # fmt: skip
+def test_an_unknown_topic_is_counted(bench: Bench, key: str) -> None:
+    bench.node.deliver(Received(key, encode(BEAT)), 1.0)
+    bench.node.deliver(TokenUp(key), 1.0)
+    bench.node.deliver(TokenDown(key), 1.0)
+    assert bench.node.rejected == 3
+    assert bench.core.events == []
+
+
+@pytest.mark.parametrize("key", ["laneweave/r/alive/vehicle/v1", "laneweave/r/service/plan"])
+def test_a_message_on_a_topic_without_messages_is_counted(bench: Bench, key: str) -> None:
+    bench.node.deliver(Received(key, encode(BEAT)), 1.0)
+    assert bench.node.rejected == 1
+    assert bench.core.events == []
+
+
+# --- what goes out ----------------------------------------------------------------------------
+
+
+def test_effects_reach_the_transport(bench: Bench) -> None:
+    work = Compute(1, lambda: 2)
+    calls = bench.carry_out(
+        Listen(STATE, {"formation": 3}),
+        Listen(CENSUS),
+        Unlisten(STATE, {"formation": 3}),
+        Announce(VEHICLE_ALIVE, {"vehicle": "v1"}),
+        Withdraw(VEHICLE_ALIVE, {"vehicle": "v1"}),
+        Watch(VEHICLE_ALIVE),
+        Serve(SERVICE),
+        Reply(5, b"a"),
+        Reply(6, b"e", ok=False, encoding="application/json"),
+        Decline(7),
+        Send(HEARTBEAT, BEAT, {"coordinator": "c1"}),
+        work,
+    )
+    assert calls == [
+        ("subscribe", "laneweave/r/state/3/*"),
+        ("subscribe", "laneweave/r/census"),
+        ("unsubscribe", "laneweave/r/state/3/*"),
+        ("announce", "laneweave/r/alive/vehicle/v1"),
+        ("withdraw", "laneweave/r/alive/vehicle/v1"),
+        ("watch", "laneweave/r/alive/vehicle/*"),
+        ("serve", "laneweave/r/service/plan"),
+        ("answer", 5, b"a", True, ""),
+        ("answer", 6, b"e", False, "application/json"),
+        ("decline", 7),
+        ("publish", BEAT_KEY, encode(BEAT), Quality.LATEST),
+    ]
+    assert bench.jobs == [work]
+
+
+def test_a_report_gets_the_counters_of_the_node(bench: Bench) -> None:
+    for _ in range(4):
+        bench.node.deliver(Received(BEAT_KEY, b"x"), 1.0)
+    beat = Send(HEARTBEAT, BEAT, {"coordinator": "c1"})
+    report = Report(
+        Name("coordinator"), Name("c1"), published=99, solves=5, unusable=1, solve_ms=b"\0" * 4
+    )
+    calls = bench.carry_out(
+        beat, beat, beat, Send(REPORT, report, {"role": "coordinator", "name": "c1"})
+    )
+    sent = decode(calls[-1][2], Report)
+    assert sent == evolve(report, process=Name("n1"), published=4, rejected=4)
+    assert bench.node.published == 4
+
+
+def test_a_node_tells_what_it_has_counted(bench: Bench) -> None:
+    node = bench.node
+    bench.core.effects = [Send(HEARTBEAT, BEAT, {"coordinator": "c1"})]
+    node.dispatch(Started(), 0.0)
+    node.deliver(Received(BEAT_KEY, encode(BEAT)), 1.0)
+    node.deliver(Received(BEAT_KEY, b"nonsense"), 1.0)
+    node.deliver(LinkDown(), 1.0)
+    (found,) = node.numbers()
+    assert found == NodeNumbers(1, {"heartbeat": 1}, 1, 3, 0.0)
+
+
+def test_end_closes_the_transport_and_nothing_is_handled_any_more(bench: Bench) -> None:
+    assert bench.carry_out(End()) == [("close",)]
+    assert bench.node.ended
+    events = list(bench.core.events)
+    bench.node.dispatch(Wakeup(), 2.0)
+    bench.node.deliver(Received(BEAT_KEY, encode(BEAT)), 2.0)
+    bench.node.deliver(LinkDown(), 2.0)
+    assert bench.core.events == events
+    assert bench.transport.calls == [("close",)]
+
+
+def test_nothing_is_sent_before_the_first_event(bench: Bench) -> None:
+    assert bench.transport.calls == []
+    bench.node.dispatch(Started(), 0.0)
+    assert bench.core.events == [(Started(), 0.0)]
+
+
+def test_census_and_clock_have_no_parameters(bench: Bench) -> None:
+    bench.node.deliver(Received("laneweave/r/census", encode(Census(1.0, (), ()))), 1.0)
+    assert bench.core.events == [(Arrived(CENSUS, {}, Census(1.0, (), ())), 1.0)]
+    assert CLOCK.parameters == ()
+
+
+# --- computations -----------------------------------------------------------------------------
+
+
+def test_a_computation_brings_its_result_or_its_failure() -> None:
+    def fail() -> None:
+        raise RuntimeError("no luck")
+
+    assert run_job(Compute(3, lambda: [1])) == Computed(3, [1])
+    assert run_job(Compute(4, fail)) == Computed(4, None, "RuntimeError: no luck")

@@ -1,0 +1,292 @@
+"""Workers: real processes that compute, fail, hang and are killed."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import multiprocessing
+import os
+import queue
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from laneweave.protocol.runtime import worker_pool
+from laneweave.protocol.runtime.node import Computed, Delegate
+from laneweave.protocol.runtime.worker_pool import WorkerPool
+from support import worker_jobs as jobs
+
+WAIT_S = 30.0
+"""Nothing here takes a tenth of this; it only guards against hanging."""
+
+
+class Bench:
+    """A pool, and what has come of its jobs."""
+
+    def __init__(self, workers: int) -> None:
+        """Start nothing yet."""
+        self.pool = WorkerPool(workers)
+        self.done: queue.SimpleQueue[Computed] = queue.SimpleQueue()
+        self._jobs = 0
+
+    def order(self, work: Callable[[float], Any], within_s: float = WAIT_S) -> int:
+        """Order a job; returns its number."""
+        self._jobs += 1
+        job = Delegate(self._jobs, work, time.monotonic() + within_s)
+        self.pool.order(job, self.done.put)
+        return self._jobs
+
+    def do(self, work: Callable[[float], Any], within_s: float = WAIT_S) -> Computed:
+        """Have a job done."""
+        job = self.order(work, within_s)
+        computed = self.done.get(timeout=WAIT_S)
+        assert computed.job == job
+        return computed
+
+    def process_id(self) -> int:
+        """Return which process does jobs."""
+        found = self.do(jobs.process_id).result
+        assert isinstance(found, int)
+        return found
+
+
+@pytest.fixture(scope="module")
+def one() -> Iterator[Bench]:
+    """A pool of one worker that all tests share: each leaves it able to go on."""
+    bench = Bench(1)
+    with contextlib.closing(bench.pool):
+        yield bench
+
+
+@pytest.fixture(scope="module")
+def two() -> Iterator[Bench]:
+    bench = Bench(2)
+    with contextlib.closing(bench.pool):
+        yield bench
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    give_up = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < give_up
+        time.sleep(0.005)
+
+
+def is_gone(process_id: int) -> bool:
+    try:
+        return psutil.Process(process_id).status() == psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return True
+
+
+# --- jobs -------------------------------------------------------------------------------------
+
+
+def test_a_job_is_done_by_another_process(one: Bench) -> None:
+    process_id = one.process_id()
+    assert process_id != os.getpid()
+    assert one.pool.process_ids == [process_id]
+    assert one.process_id() == process_id
+
+
+def test_a_job_is_told_how_much_time_is_left(one: Bench) -> None:
+    assert 4.0 < one.do(jobs.left, within_s=5.0).result <= 5.0
+
+
+def test_an_exception_is_the_jobs_error(one: Bench) -> None:
+    before = one.process_id()
+    computed = one.do(jobs.fail)
+    assert (computed.result, computed.error) == (None, "ValueError: no such thing")
+    assert one.process_id() == before
+
+
+@pytest.mark.parametrize("within_s", [0.0, -1.0, -math.inf])
+def test_a_job_whose_deadline_has_passed_is_not_begun(
+    one: Bench, tmp_path: Path, within_s: float
+) -> None:
+    computed = one.do(partial(jobs.note, tmp_path / "begun"), within_s)
+    assert (computed.result, computed.error) == (None, "the deadline passed before it began")
+    assert not jobs.noted(tmp_path / "begun")
+
+
+def test_a_deadline_that_passes_while_the_job_waits_counts(one: Bench, tmp_path: Path) -> None:
+    one.process_id()  # has begun
+    first = one.order(partial(jobs.sleep, 0.2))
+    second = one.order(partial(jobs.note, tmp_path / "begun"), within_s=0.1)
+    assert one.done.get(timeout=WAIT_S) == Computed(first, 0.2)
+    assert one.done.get(timeout=WAIT_S) == Computed(
+        second, None, "the deadline passed before it began"
+    )
+    assert not jobs.noted(tmp_path / "begun")
+
+
+@pytest.mark.parametrize(
+    "work",
+    [lambda _: None, jobs.Shy(), jobs.lock, jobs.shy],
+    ids=["job", "job there", "result", "result here"],
+)
+def test_what_cannot_be_handed_over_is_an_error_of_its_job_only(
+    one: Bench, work: Callable[[float], Any]
+) -> None:
+    before = one.process_id()
+    computed = one.do(work)
+    assert computed.result is None
+    assert computed.error
+    assert one.process_id() == before
+
+
+def test_workers_work_at_the_same_time(two: Bench, tmp_path: Path) -> None:
+    for _ in range(2):
+        two.order(partial(jobs.meet, tmp_path / "here"))
+    met = {two.done.get(timeout=WAIT_S).result for _ in range(2)}
+    assert met == set(two.pool.process_ids)
+    assert len(met) == 2
+
+
+# --- workers that die or hang -----------------------------------------------------------------
+
+
+def test_an_idle_worker_that_is_killed_is_replaced(one: Bench) -> None:
+    before = one.process_id()
+    os.kill(before, signal.SIGKILL)
+    assert one.process_id() not in (before, os.getpid())
+
+
+def test_a_worker_that_is_killed_is_replaced_without_a_job(one: Bench) -> None:
+    before = one.process_id()
+    os.kill(before, signal.SIGKILL)
+    wait_until(lambda: one.pool.process_ids not in ([before], []))
+    assert one.process_id() == one.pool.process_ids[0] != before
+
+
+def test_the_job_of_a_worker_that_is_killed_is_done_by_another(two: Bench, tmp_path: Path) -> None:
+    file = tmp_path / "begun"
+    job = two.order(partial(jobs.hang_at_first, file))
+    wait_until(lambda: len(jobs.noted(file)) == 1)
+    (killed,) = jobs.noted(file)
+    # The other worker is not disturbed.
+    assert two.do(jobs.process_id).result != killed
+    os.kill(killed, signal.SIGKILL)
+    computed = two.done.get(timeout=WAIT_S)
+    assert (computed.job, computed.error) == (job, "")
+    assert computed.result == jobs.noted(file)[1] != killed
+
+
+def test_a_job_that_kills_each_worker_is_tried_twice(one: Bench, tmp_path: Path) -> None:
+    computed = one.do(partial(jobs.die, tmp_path / "begun"))
+    assert (computed.result, computed.error) == (None, "the worker died")
+    assert len(set(jobs.noted(tmp_path / "begun"))) == 2
+    assert one.process_id() not in jobs.noted(tmp_path / "begun")
+
+
+@pytest.mark.parametrize("number", [0, signal.SIGSTOP], ids=["busy", "stopped"])
+def test_a_worker_that_goes_on_too_long_is_killed(
+    one: Bench, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    before = one.process_id()
+    monkeypatch.setattr(worker_pool, "OVERDUE_S", 0.1)
+    one.order(partial(jobs.sleep, 1000.0), within_s=0.1)
+    os.kill(before, number)
+    assert one.done.get(timeout=WAIT_S).error == "the worker was stopped: it went on too long"
+    wait_until(lambda: is_gone(before))
+    monkeypatch.undo()
+    assert one.process_id() != before
+
+
+def test_ctrl_c_is_for_the_process_that_has_the_pool(one: Bench) -> None:
+    before = one.process_id()
+    os.kill(before, signal.SIGINT)
+    assert one.process_id() == before
+
+
+def test_a_machine_that_gives_no_process_is_an_error_of_the_job(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refuse(*_: object) -> None:
+        raise BlockingIOError("no process")
+
+    bench = Bench(1)
+    with contextlib.closing(bench.pool):
+        with monkeypatch.context() as patch:
+            patch.setattr(worker_pool._CONTEXT.Process, "start", refuse)
+            assert bench.do(jobs.process_id).error == "the worker died"
+        assert bench.process_id() in bench.pool.process_ids
+
+
+# --- begin and end ----------------------------------------------------------------------------
+
+
+def test_nothing_is_started_before_the_first_job() -> None:
+    before = multiprocessing.active_children()
+    bench = Bench(2)
+    assert bench.pool.process_ids == []
+    assert multiprocessing.active_children() == before
+    bench.pool.close()
+    assert multiprocessing.active_children() == before
+
+
+def test_an_end_waits_for_no_job(tmp_path: Path) -> None:
+    bench = Bench(2)
+    for _ in range(5):
+        bench.order(partial(jobs.hang_at_first, tmp_path / "begun"))
+    wait_until(lambda: len(jobs.noted(tmp_path / "begun")) >= 1)
+    processes = bench.pool.process_ids
+
+    begun_s = time.monotonic()
+    bench.pool.close()
+    # Nothing is waited for: this is for a machine with much else to do.
+    assert time.monotonic() < begun_s + 2.0
+
+    assert len(processes) == 2
+    assert all(is_gone(process) for process in processes)
+    assert bench.pool.process_ids == []
+    bench.pool.close()
+
+
+OWNER = """
+import sys, time
+from functools import partial
+from pathlib import Path
+from laneweave.protocol.runtime.node import Delegate
+from laneweave.protocol.runtime.worker_pool import WorkerPool
+from unit.protocol import jobs
+
+if __name__ == "__main__":
+    pool = WorkerPool(2)
+    met = []
+    meet = partial(jobs.meet, Path(sys.argv[1]))
+    for number in range(2):
+        pool.order(Delegate(number, meet, time.monotonic() + 60), met.append)
+    while len(met) < 2:
+        time.sleep(0.01)
+    pool.order(Delegate(3, partial(jobs.sleep, 1000.0), time.monotonic() + 60), met.append)
+    print(*pool.process_ids, flush=True)
+    time.sleep(1000.0)
+"""
+
+
+def test_workers_die_with_the_process_that_has_the_pool(tmp_path: Path) -> None:
+    script = tmp_path / "owner.py"
+    script.write_text(OWNER, encoding="utf-8")
+    environment = dict(os.environ) | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    with subprocess.Popen(
+        [sys.executable, str(script), str(tmp_path / "met")],
+        stdout=subprocess.PIPE,
+        text=True,
+        env=environment,
+    ) as owner:
+        try:
+            assert owner.stdout is not None
+            workers = [int(word) for word in owner.stdout.readline().split()]
+        finally:
+            owner.kill()
+    assert len(workers) == 2
+    wait_until(lambda: all(is_gone(worker) for worker in workers))

@@ -1,0 +1,135 @@
+"""Credentials that are not in order are found before they are used."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import attrs
+import pytest
+import structlog
+
+from laneweave.launch.deploy.certificate_authority import issue, load_authority, make_authority
+from laneweave.protocol.config.identities import parse_identity
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.security.access import Credentials
+from laneweave.protocol.security.certificates import check_credentials, examine
+
+NAME = "coordinator.c1"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Certificates of two who take part, and of the router."""
+    folder = tmp_path_factory.mktemp("certs")
+    authority = make_authority(folder)
+    for name in (NAME, "vehicle.v1"):
+        issue(authority, folder, parse_identity(name), days=30.0)
+    hosts = ("router.example", "10.1.2.3")
+    issue(authority, folder, parse_identity("router"), days=30.0, hosts=hosts)
+    return folder
+
+
+def credentials(folder: Path, name: str = NAME) -> Credentials:
+    return Credentials(str(folder / "ca.pem"), str(folder / f"{name}.pem"),
+                       str(folder / f"{name}.key"))  # fmt: skip
+
+
+def refusal(given: Credentials, identity: str = NAME, host: str = "") -> BadInputError:
+    with pytest.raises(BadInputError) as caught:
+        examine(given, identity, host)
+    assert len(str(caught.value).splitlines()) == 1
+    return caught.value
+
+
+def test_what_is_in_order(folder: Path) -> None:
+    assert examine(credentials(folder), NAME).warnings == ()
+    for host in ("", "router.example", "10.1.2.3", "localhost", "127.0.0.1", "::1"):
+        assert examine(credentials(folder, "router"), "router", host).warnings == ()
+
+
+def test_the_key_as_text(folder: Path) -> None:
+    text = (folder / f"{NAME}.key").read_text()
+    given = attrs.evolve(credentials(folder), private_key="", private_key_pem=text)
+    assert examine(given, NAME).warnings == ()
+    other = (folder / "vehicle.v1.key").read_text()
+    error = refusal(attrs.evolve(given, private_key_pem=other))
+    assert error.field == "private key"
+    assert other.splitlines()[1] not in str(error)
+    assert refusal(attrs.evolve(given, private_key_pem="nonsense")).field == "certificate"
+
+
+@pytest.mark.parametrize(
+    ("part", "field"),
+    [("ca", "certificate authority"), ("certificate", "certificate"),
+     ("private_key", "private key")],
+)  # fmt: skip
+@pytest.mark.parametrize("content", [None, b"", b"text", b"\0\xff"])
+def test_a_file_that_is_none(
+    folder: Path, tmp_path: Path, part: str, field: str, content: bytes | None
+) -> None:
+    path = tmp_path / "file"
+    if content is not None:
+        path.write_bytes(content)
+    error = refusal(attrs.evolve(credentials(folder), **{part: str(path)}))
+    assert error.field == field
+    assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize("part", ["ca", "certificate", "private_key"])
+def test_pem_with_nothing_in_it(folder: Path, tmp_path: Path, part: str) -> None:
+    path = tmp_path / "file"
+    path.write_text("-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n")
+    refusal(attrs.evolve(credentials(folder), **{part: str(path)}))
+
+
+def test_somebody_elses(folder: Path) -> None:
+    error = refusal(credentials(folder), "coordinator.c2")
+    assert error.field == "certificate"
+    assert "this one is of coordinator.c1" in error.allowed
+    wrong_key = attrs.evolve(
+        credentials(folder), private_key=credentials(folder, "vehicle.v1").private_key
+    )
+    assert refusal(wrong_key).field == "private key"
+
+
+def test_another_authority(folder: Path, tmp_path: Path) -> None:
+    issue(make_authority(tmp_path), tmp_path, parse_identity(NAME), days=30.0)
+    mixed = attrs.evolve(credentials(tmp_path), ca=str(folder / "ca.pem"))
+    assert "has signed" in refusal(mixed).allowed
+
+
+@pytest.mark.parametrize(("days", "words"), [(-1.0, "expired"), (30.0, "")])
+def test_out_of_time(folder: Path, tmp_path: Path, days: float, words: str) -> None:
+    issue(load_authority(folder), tmp_path, parse_identity(NAME), days=days)
+    shutil.copy(folder / "ca.pem", tmp_path)
+    if words:
+        assert words in refusal(credentials(tmp_path)).allowed
+    else:
+        assert examine(credentials(tmp_path), NAME).warnings == ()
+
+
+def test_what_ends_soon_or_lies_open_is_warned_of(folder: Path, tmp_path: Path) -> None:
+    issue(load_authority(folder), tmp_path, parse_identity(NAME), days=3.0)
+    shutil.copy(folder / "ca.pem", tmp_path)
+    (tmp_path / f"{NAME}.key").chmod(0o640)
+    first, second = examine(credentials(tmp_path), NAME).warnings
+    assert "expires in 3.0 days" in first
+    assert "may be read by others" in second
+    # A role that waits for its router asks again and again.
+    with structlog.testing.capture_logs() as logged:
+        for _ in range(3):
+            check_credentials(credentials(tmp_path), NAME)
+    assert len(logged) == 2
+
+
+def test_the_router_is_where_clients_look_for_it(folder: Path) -> None:
+    error = refusal(credentials(folder, "router"), "router", "elsewhere.example")
+    assert "elsewhere.example" in error.allowed
+    refusal(credentials(folder, "router"), "router", "10.1.2.4")
+
+
+def test_roles_do_not_change_places(folder: Path) -> None:
+    """The router's certificate is of no use to a client, and the other way round."""
+    assert "purpose" in refusal(credentials(folder, "router"), NAME).allowed
+    assert "purpose" in refusal(credentials(folder), "router").allowed

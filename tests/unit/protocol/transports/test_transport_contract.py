@@ -1,0 +1,812 @@
+"""The contract of a transport, held by both: Zenoh with a real router, and the simulation."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Protocol
+
+import pytest
+from attrs import define, field
+
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.runtime.node import (
+    Announce,
+    Arrived,
+    Asked,
+    Compute,
+    Computed,
+    Core,
+    Effect,
+    End,
+    Event,
+    Listen,
+    PeerDown,
+    PeerUp,
+    Reply,
+    Send,
+    Serve,
+    Started,
+    Wakeup,
+    Watch,
+)
+from laneweave.protocol.runtime.transport import (
+    Answer,
+    Delivery,
+    LinkDown,
+    LinkUp,
+    Question,
+    Received,
+    TokenDown,
+    TokenUp,
+    Transport,
+)
+from laneweave.protocol.security.access import Access
+from laneweave.protocol.transports.simulated.network import SimulatedNetwork
+from laneweave.protocol.transports.zenoh.runner import run_core
+from laneweave.protocol.transports.zenoh.transport import ZenohTransport
+from laneweave.protocol.wire.codec import encode
+from laneweave.protocol.wire.messages import Heartbeat, Name
+from laneweave.protocol.wire.topics import HEARTBEAT, SERVICE, VEHICLE_ALIVE, Keys, Quality
+
+REALM = "r"
+KEYS = Keys(REALM)
+LEASE_S = 0.5
+WAIT_S = 10.0
+ASK_S = 3 * WAIT_S
+"""An answer that comes only when the question is given up comes too late for every test."""
+"""Longest wait for what must come; what comes, comes in milliseconds."""
+QUIET_S = 0.15
+"""How long to wait for what must not come (Zenoh, wall-clock)."""
+
+BEATS = KEYS.all_of(HEARTBEAT)
+TOKENS = KEYS.all_of(VEHICLE_ALIVE)
+PLAN_SERVICE = KEYS.key(SERVICE)
+
+
+def beat_key(name: str) -> str:
+    return KEYS.key(HEARTBEAT, coordinator=name)
+
+
+def token_key(name: str) -> str:
+    return KEYS.key(VEHICLE_ALIVE, vehicle=name)
+
+
+FLOW = beat_key("flow")
+SETTLED = token_key("settled")
+
+
+def beat(number: int = 0) -> bytes:
+    return encode(Heartbeat(Name("c"), 1, number, leading=False, formations=0))
+
+
+@define
+class Party:
+    """One participant: what it may call, and what it was handed."""
+
+    transport: Transport
+    got: list[Delivery]
+
+    def received(self) -> list[Received]:
+        return [item for item in self.all_received() if item.key != FLOW]
+
+    def all_received(self) -> list[Received]:
+        return [item for item in self.got if isinstance(item, Received)]
+
+    def tokens(self) -> list[str]:
+        signs = {TokenUp: "+", TokenDown: "-"}
+        return [
+            signs[type(item)] + item.key.rpartition("/")[2]
+            for item in self.got
+            if isinstance(item, (TokenUp, TokenDown)) and item.key != SETTLED
+        ]
+
+    def questions(self) -> list[Question]:
+        return [item for item in self.got if isinstance(item, Question)]
+
+
+Answers = list[Answer | None]
+
+
+class Bed(Protocol):
+    """What a test needs of either network."""
+
+    def join(self, name: str) -> Party:
+        """Add a participant."""
+
+    def join_process(self, name: str) -> None:
+        """Add a participant with a process of its own that shows the token of its name."""
+
+    def kill(self, name: str) -> None:
+        """Kill such a process, without a word."""
+
+    def ask(self, payload: bytes) -> Answers:
+        """Ask the service; the list gets the answer, or None when there is no service."""
+
+    def break_link(self, *parties: Party) -> None:
+        """Take participants off the network."""
+
+    def mend_link(self, *parties: Party) -> None:
+        """Bring them back."""
+
+    def until(self, condition: Callable[[], object]) -> None:
+        """Let time pass until something holds; fail when it does not in time."""
+
+    def quiet(self) -> None:
+        """Let enough time pass for everything under way to arrive."""
+
+
+# --- the simulated network --------------------------------------------------------------------
+
+
+@define
+class Recorder:
+    """A core that turns events back into the deliveries that they came from."""
+
+    got: list[Delivery] = field(factory=list)
+    first: tuple[Effect, ...] = ()
+    wakeup_s: float | None = None
+
+    def handle(self, event: Event, now_s: float) -> Iterable[Effect]:
+        del now_s
+        match event:
+            case Started():
+                return self.first
+            case Arrived(topic, parameters, message):
+                self.got.append(Received(KEYS.key(topic, **parameters), encode(message)))
+            case PeerUp(topic, parameters):
+                self.got.append(TokenUp(KEYS.key(topic, **parameters)))
+            case PeerDown(topic, parameters):
+                self.got.append(TokenDown(KEYS.key(topic, **parameters)))
+            case Asked(token, payload):
+                self.got.append(Question(PLAN_SERVICE, payload, token))
+            case LinkUp() | LinkDown():
+                self.got.append(event)
+            case _:
+                pass
+        return ()
+
+
+@define
+class SimulatedBed:
+    """Virtual time."""
+
+    network: SimulatedNetwork = field(factory=lambda: SimulatedNetwork(seed=1))
+    _names: dict[int, str] = field(factory=dict)
+
+    def join(self, name: str) -> Party:
+        core = Recorder()
+        node = self.network.add(name, core, REALM)
+        party = Party(node._transport, core.got)
+        self._names[id(party)] = name
+        return party
+
+    def join_process(self, name: str) -> None:
+        core = Recorder(first=(Announce(VEHICLE_ALIVE, {"vehicle": name}),))
+        self.network.add(name, core, REALM)
+        self.network.run(self.network.now_s)
+
+    def kill(self, name: str) -> None:
+        self.network.kill(name)
+
+    def ask(self, payload: bytes) -> Answers:
+        answers: Answers = []
+        self.network.ask(PLAN_SERVICE, payload, answers.append)
+        return answers
+
+    def break_link(self, *parties: Party) -> None:
+        for party in parties:
+            self.network.disconnect(self._names[id(party)])
+
+    def mend_link(self, *parties: Party) -> None:
+        for party in parties:
+            self.network.reconnect(self._names[id(party)])
+
+    def until(self, condition: Callable[[], object]) -> None:
+        self.network.run(self.network.now_s + WAIT_S, stop=lambda: bool(condition()))
+        assert condition()
+
+    def quiet(self) -> None:
+        self.network.run(self.network.now_s + 1.0)
+
+
+# --- Zenoh ------------------------------------------------------------------------------------
+
+ROUTER = """
+import sys
+from laneweave.protocol.transports.zenoh.transport import run_router
+run_router([sys.argv[1]], float(sys.argv[2]), ready=lambda: print("ready", flush=True))
+"""
+MEMBER = """
+import sys, time
+from laneweave.protocol.transports.zenoh.transport import ZenohTransport
+from laneweave.protocol.security.access import Access
+transport = ZenohTransport(Access(sys.argv[1], lease_s=float(sys.argv[2])), lambda delivery: None)
+transport.announce(sys.argv[3])
+print("ready", flush=True)
+time.sleep(60)
+"""
+
+
+def start_process(code: str, *arguments: str) -> subprocess.Popen[bytes]:
+    """Start a Python process and wait until it says that it is ready."""
+    process = subprocess.Popen([sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    if process.stdout.readline() != b"ready\n":
+        process.kill()
+        pytest.fail("the process did not get ready")
+    return process
+
+
+def end_process(process: subprocess.Popen[bytes]) -> int:
+    """End a process in good order, or by force; return its exit status."""
+    process.terminate()
+    try:
+        return process.wait(WAIT_S)
+    finally:
+        process.kill()
+        process.wait()
+        assert process.stdout is not None
+        process.stdout.close()
+
+
+@define
+class Router:
+    """A router process at a unix socket."""
+
+    socket: Path
+    process: subprocess.Popen[bytes] = field(init=False)
+
+    @property
+    def endpoint(self) -> str:
+        return f"unixsock-stream/{self.socket}"
+
+    def start(self) -> None:
+        self.process = start_process(ROUTER, self.endpoint, str(LEASE_S))
+
+    def kill(self) -> None:
+        self.process.kill()
+        end_process(self.process)
+        self.socket.unlink(missing_ok=True)
+
+
+@define
+class ZenohBed:
+    """Real sessions; what runs in a process of its own is killed with SIGKILL."""
+
+    router: Router
+    _opened: list[ZenohTransport] = field(factory=list)
+    _processes: dict[str, subprocess.Popen[bytes]] = field(factory=dict)
+
+    def join(self, name: str) -> Party:
+        del name
+        return self._join()
+
+    def _join(self) -> Party:
+        got: list[Delivery] = []
+        transport = ZenohTransport(Access(self.router.endpoint, lease_s=LEASE_S), got.append)
+        self._opened.append(transport)
+        return Party(transport, got)
+
+    def join_process(self, name: str) -> None:
+        self._processes[name] = start_process(
+            MEMBER, self.router.endpoint, str(LEASE_S), token_key(name)
+        )
+
+    def kill(self, name: str) -> None:
+        self._processes[name].kill()
+
+    def ask(self, payload: bytes) -> Answers:
+        answers: Answers = []
+        client = self._join().transport
+        assert isinstance(client, ZenohTransport)
+
+        asked = client.ask(PLAN_SERVICE, payload, ASK_S)
+        asked.add_done_callback(lambda done: answers.append(done.result()))
+        return answers
+
+    def break_link(self, *parties: Party) -> None:
+        del parties
+        self.router.kill()
+
+    def mend_link(self, *parties: Party) -> None:
+        del parties
+        self.router.start()
+
+    def until(self, condition: Callable[[], object]) -> None:
+        give_up_s = time.monotonic() + WAIT_S
+        while not condition():
+            assert time.monotonic() < give_up_s, "it did not come"
+            time.sleep(0.002)
+
+    def quiet(self) -> None:
+        time.sleep(QUIET_S)
+
+    def close(self) -> None:
+        for transport in self._opened:
+            transport.close()
+        for process in self._processes.values():
+            end_process(process)
+
+
+@pytest.fixture(scope="module")
+def router(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Router]:
+    router = Router(tmp_path_factory.mktemp("router") / "s")
+    router.start()
+    yield router
+    assert end_process(router.process) == 0, "the router does not end in good order"
+
+
+@pytest.fixture(params=["simulated", "zenoh"])
+def bed(request: pytest.FixtureRequest) -> Iterator[Bed]:
+    if request.param == "simulated":
+        yield SimulatedBed()
+        return
+    zenoh_bed = ZenohBed(request.getfixturevalue("router"))
+    yield zenoh_bed
+    zenoh_bed.close()
+
+
+@pytest.fixture(params=["simulated", "zenoh"])
+def breakable_bed(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Bed]:
+    if request.param == "simulated":
+        yield SimulatedBed()
+        return
+    router = Router(tmp_path / "s")
+    router.start()
+    zenoh_bed = ZenohBed(router)
+    yield zenoh_bed
+    zenoh_bed.close()
+    router.kill()
+
+
+def flow(bed: Bed, sender: Party, receiver: Party) -> None:
+    """Wait until a new subscription is known to a sender: beats on a key of its own arrive."""
+    count = len(receiver.all_received())
+
+    def arrives() -> bool:
+        sender.transport.publish(FLOW, beat(), Quality.ASSURED)
+        bed.quiet()
+        return len(receiver.all_received()) > count
+
+    bed.until(arrives)
+
+
+def settle(bed: Bed, party: Party) -> None:
+    """Wait until the network knows all that a participant has declared: a token declared last."""
+    watcher = bed.join(f"watcher-{id(party)}")
+    watcher.transport.watch(SETTLED)
+    party.transport.announce(SETTLED)
+    bed.until(lambda: TokenUp(SETTLED) in watcher.got)
+    party.transport.withdraw(SETTLED)
+    bed.until(lambda: TokenDown(SETTLED) in watcher.got)
+    watcher.transport.close()
+
+
+# --- publish and subscribe --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("quality", Quality)
+def test_what_is_published_reaches_subscribers(bed: Bed, quality: Quality) -> None:
+    a, b, c = bed.join("a"), bed.join("b"), bed.join("c")
+    for party in (b, c):
+        party.transport.subscribe(BEATS)
+        flow(bed, a, party)
+    a.transport.publish(beat_key("x"), beat(7), quality)
+    bed.until(lambda: b.received() and c.received())
+    bed.quiet()
+    assert b.received() == c.received() == [Received(beat_key("x"), beat(7))]
+    assert a.received() == []
+
+
+def test_an_expression_selects_keys(bed: Bed) -> None:
+    a, one, deep, exact, other = (bed.join(name) for name in "abcde")
+    one.transport.subscribe(BEATS)
+    deep.transport.subscribe(f"laneweave/{REALM}/**")
+    exact.transport.subscribe(beat_key("x"))
+    exact.transport.subscribe(FLOW)
+    other.transport.subscribe("laneweave/other/**")
+    for party in (one, deep, exact):
+        flow(bed, a, party)
+    for name in ("x", "y"):
+        a.transport.publish(beat_key(name), beat(), Quality.ASSURED)
+    bed.until(lambda: len(one.received()) == len(deep.received()) == 2 and exact.received())
+    bed.quiet()
+    assert {item.key for item in one.received()} == {beat_key("x"), beat_key("y")}
+    assert {item.key for item in deep.received()} == {beat_key("x"), beat_key("y")}
+    assert [item.key for item in exact.received()] == [beat_key("x")]
+    assert other.received() == []
+
+
+def test_own_messages_come_back(bed: Bed) -> None:
+    a = bed.join("a")
+    a.transport.subscribe(BEATS)
+    a.transport.subscribe(BEATS)
+    a.transport.publish(beat_key("a"), beat(3), Quality.ASSURED)
+    bed.until(a.received)
+    bed.quiet()
+    assert a.received() == [Received(beat_key("a"), beat(3))]
+
+
+def test_nothing_comes_after_unsubscribe(bed: Bed) -> None:
+    a, b, c = bed.join("a"), bed.join("b"), bed.join("c")
+    for party in (b, c):
+        party.transport.subscribe(BEATS)
+        flow(bed, a, party)
+    b.transport.unsubscribe(BEATS)
+    b.transport.unsubscribe(BEATS)
+    b.transport.unsubscribe(TOKENS)
+    bed.quiet()
+    a.transport.publish(beat_key("a"), beat(), Quality.ASSURED)
+    bed.until(c.received)
+    bed.quiet()
+    assert b.received() == []
+    b.transport.subscribe(BEATS)
+    flow(bed, a, b)
+
+
+# --- tokens -----------------------------------------------------------------------------------
+
+
+def test_a_token_is_seen_to_appear_and_vanish(bed: Bed) -> None:
+    a, b = bed.join("a"), bed.join("b")
+    b.transport.watch(TOKENS)
+    a.transport.announce(token_key("a"))
+    bed.until(lambda: b.tokens() == ["+a"])
+    a.transport.withdraw(token_key("a"))
+    bed.until(lambda: b.tokens() == ["+a", "-a"])
+    a.transport.announce(token_key("a"))
+    bed.until(lambda: b.tokens() == ["+a", "-a", "+a"])
+
+
+def test_a_watcher_begins_with_the_tokens_that_are_there(bed: Bed) -> None:
+    a, b = bed.join("a"), bed.join("b")
+    a.transport.announce(token_key("a1"))
+    a.transport.announce(token_key("a2"))
+    a.transport.announce(token_key("gone"))
+    a.transport.withdraw(token_key("gone"))
+    settle(bed, a)
+    b.transport.watch(TOKENS)
+    bed.until(lambda: len(b.tokens()) == 2)
+    bed.quiet()
+    assert sorted(b.tokens()) == ["+a1", "+a2"]
+
+
+def test_a_watcher_sees_only_what_it_watches(bed: Bed) -> None:
+    a, b, c = bed.join("a"), bed.join("b"), bed.join("c")
+    b.transport.watch(token_key("a1"))
+    c.transport.watch(TOKENS)
+    a.transport.announce(token_key("a2"))
+    a.transport.announce(token_key("a1"))
+    bed.until(lambda: b.tokens() and len(c.tokens()) == 2)
+    bed.quiet()
+    assert b.tokens() == ["+a1"]
+
+
+def news_of(party: Party, name: str) -> str:
+    return "".join(token[0] for token in party.tokens() if token[1:] == name)
+
+
+def test_own_tokens_are_seen_too(bed: Bed) -> None:
+    a = bed.join("a")
+    a.transport.announce(token_key("before"))
+    a.transport.watch(TOKENS)
+    a.transport.announce(token_key("after"))
+    bed.until(lambda: sorted(a.tokens()) == ["+after", "+before"])
+    a.transport.withdraw(token_key("before"))
+    bed.until(lambda: "-before" in a.tokens())
+    bed.quiet()
+    bed.until(lambda: news_of(a, "before").endswith("-"))
+    assert news_of(a, "before") in {"+-", "+-+-"}
+    assert news_of(a, "after") == "+"
+
+
+def test_news_of_a_token_come_by_turns(bed: Bed) -> None:
+    a, b = bed.join("a"), bed.join("b")
+    names = [f"t{number}" for number in range(20)]
+    for name in names:
+        a.transport.announce(token_key(name))
+        a.transport.watch(token_key(name))
+        b.transport.watch(token_key(name))
+    bed.until(lambda: len(a.tokens()) >= len(names) and len(b.tokens()) >= len(names))
+    for name in names:
+        a.transport.withdraw(token_key(name))
+    gone = {f"-{name}" for name in names}
+    bed.until(lambda: gone <= set(a.tokens()) and gone <= set(b.tokens()))
+    bed.quiet()
+    bed.until(lambda: all(news_of(a, name).endswith("-") for name in names))
+    assert {news_of(b, name) for name in names} == {"+-"}
+    assert {news_of(a, name) for name in names} <= {"+-", "+-+-"}
+
+
+def test_repeated_calls_change_nothing(bed: Bed) -> None:
+    a, b = bed.join("a"), bed.join("b")
+    b.transport.watch(TOKENS)
+    b.transport.watch(TOKENS)
+    a.transport.announce(token_key("a"))
+    a.transport.announce(token_key("a"))
+    a.transport.withdraw(token_key("unknown"))
+    bed.until(b.tokens)
+    bed.quiet()
+    assert b.tokens() == ["+a"]
+    a.transport.withdraw(token_key("a"))
+    a.transport.withdraw(token_key("a"))
+    bed.until(lambda: len(b.tokens()) == 2)
+    bed.quiet()
+    assert b.tokens() == ["+a", "-a"]
+
+
+def test_a_token_of_two_vanishes_with_the_last(bed: Bed) -> None:
+    a, b, c = bed.join("a"), bed.join("b"), bed.join("c")
+    c.transport.watch(TOKENS)
+    a.transport.announce(token_key("both"))
+    b.transport.announce(token_key("both"))
+    bed.until(c.tokens)
+    settle(bed, b)
+    a.transport.close()
+    bed.quiet()
+    assert c.tokens() == ["+both"]
+    b.transport.withdraw(token_key("both"))
+    bed.until(lambda: c.tokens() == ["+both", "-both"])
+
+
+def test_closing_takes_the_tokens_back(bed: Bed) -> None:
+    a, b = bed.join("a"), bed.join("b")
+    b.transport.watch(TOKENS)
+    a.transport.announce(token_key("a"))
+    bed.until(lambda: b.tokens() == ["+a"])
+    a.transport.close()
+    bed.until(lambda: b.tokens() == ["+a", "-a"])
+
+
+def test_a_killed_process_loses_its_token(bed: Bed) -> None:
+    b = bed.join("b")
+    b.transport.watch(TOKENS)
+    bed.join_process("v")
+    bed.until(lambda: b.tokens() == ["+v"])
+    bed.kill("v")
+    bed.until(lambda: b.tokens() == ["+v", "-v"])
+    assert LinkDown() not in b.got
+
+
+# --- questions --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ok", [True, False])
+def test_a_question_gets_its_answer(bed: Bed, *, ok: bool) -> None:
+    server = bed.join("server")
+    server.transport.serve(PLAN_SERVICE)
+    server.transport.serve(PLAN_SERVICE)
+    settle(bed, server)
+    answers = bed.ask(b"what?")
+    bed.until(server.questions)
+    question = server.questions()[0]
+    assert question.key == PLAN_SERVICE
+    assert question.payload == b"what?"
+    assert answers == []
+    server.transport.answer(question.token, b"that", ok=ok)
+    server.transport.answer(question.token, b"again", ok=True)
+    bed.until(lambda: answers)
+    bed.quiet()
+    assert [given and (given.payload, given.ok) for given in answers] == [(b"that", ok)]
+    assert len(server.questions()) == 1
+
+
+def test_questions_have_tokens_of_their_own(bed: Bed) -> None:
+    server = bed.join("server")
+    server.transport.serve(PLAN_SERVICE)
+    settle(bed, server)
+    first, second = bed.ask(b"1"), bed.ask(b"2")
+    bed.until(lambda: len(server.questions()) == 2)
+    for question in reversed(server.questions()):
+        server.transport.answer(question.token, b"to " + question.payload, ok=True)
+    bed.until(lambda: first and second)
+    assert [given and given.payload for given in first + second] == [b"to 1", b"to 2"]
+
+
+def test_an_answer_to_an_unknown_question_is_ignored(bed: Bed) -> None:
+    server = bed.join("server")
+    server.transport.answer(12345, b"x", ok=True)
+    server.transport.answer(-1, b"x", ok=False)
+
+
+def test_a_question_without_a_service_is_not_answered(bed: Bed) -> None:
+    answers = bed.ask(b"?")
+    bed.until(lambda: answers)
+    assert answers == [None]
+
+
+def test_one_server_that_hangs_does_not_hold_back_the_others(bed: Bed) -> None:
+    servers = [bed.join("hangs"), bed.join("works")]
+    for server in servers:
+        server.transport.serve(PLAN_SERVICE)
+        settle(bed, server)
+    answers = bed.ask(b"?")
+    bed.until(lambda: all(server.questions() for server in servers))
+    servers[1].transport.answer(servers[1].questions()[0].token, b"!", ok=True)
+    bed.until(lambda: answers)  # and the other one has not answered yet
+    assert [given and given.payload for given in answers] == [b"!"]
+    servers[0].transport.answer(servers[0].questions()[0].token, b"late", ok=True)
+    bed.quiet()
+    assert [given and given.payload for given in answers] == [b"!"]
+
+
+def test_a_question_is_left_to_those_who_answer(bed: Bed) -> None:
+    servers = [bed.join("leaves"), bed.join("answers")]
+    for server in servers:
+        server.transport.serve(PLAN_SERVICE)
+        settle(bed, server)
+    answers = bed.ask(b"?")
+    bed.until(lambda: all(server.questions() for server in servers))
+    servers[0].transport.decline(servers[0].questions()[0].token)
+    servers[0].transport.decline(servers[0].questions()[0].token)
+    servers[0].transport.answer(servers[0].questions()[0].token, b"after all", ok=True)
+    bed.quiet()
+    assert answers == []
+    servers[1].transport.answer(servers[1].questions()[0].token, b"!", ok=True)
+    bed.until(lambda: answers)
+    assert [given and given.payload for given in answers] == [b"!"]
+
+
+def test_a_question_that_all_leave_is_answered_by_nobody(bed: Bed) -> None:
+    servers = [bed.join("a"), bed.join("b")]
+    for server in servers:
+        server.transport.serve(PLAN_SERVICE)
+        settle(bed, server)
+    answers = bed.ask(b"?")
+    bed.until(lambda: all(server.questions() for server in servers))
+    for server in servers:
+        server.transport.decline(server.questions()[0].token)
+        server.transport.decline(-1)
+    bed.until(lambda: answers)
+    assert answers == [None]
+
+
+# --- the end ----------------------------------------------------------------------------------
+
+
+def test_after_close_everything_is_harmless(bed: Bed) -> None:
+    a, b = bed.join("a"), bed.join("b")
+    b.transport.subscribe(BEATS)
+    b.transport.watch(TOKENS)
+    a.transport.subscribe(BEATS)
+    a.transport.announce(token_key("a"))
+    a.transport.serve(PLAN_SERVICE)
+    bed.until(lambda: b.tokens() == ["+a"])
+    for _ in range(2):
+        a.transport.close()
+    bed.until(lambda: b.tokens() == ["+a", "-a"])
+    for _ in range(2):
+        a.transport.publish(beat_key("a"), beat(), Quality.ASSURED)
+        a.transport.unsubscribe(BEATS)
+        a.transport.subscribe(BEATS)
+        a.transport.withdraw(token_key("a"))
+        a.transport.announce(token_key("a"))
+        a.transport.announce(token_key("a2"))
+        a.transport.watch(TOKENS)
+        a.transport.serve(PLAN_SERVICE)
+        a.transport.answer(1, b"", ok=True)
+        a.transport.close()
+    a.got.clear()
+    b.transport.publish(beat_key("b"), beat(), Quality.ASSURED)
+    bed.until(b.received)
+    bed.quiet()
+    assert a.got == []
+    assert [item.key for item in b.received()] == [beat_key("b")]
+    assert b.tokens() == ["+a", "-a"]
+
+
+# --- the link ---------------------------------------------------------------------------------
+
+
+def test_without_the_link_everybody_vanishes_and_comes_back(breakable_bed: Bed) -> None:
+    bed = breakable_bed
+    a, b = bed.join("a"), bed.join("b")
+    a.transport.announce(token_key("a"))
+    b.transport.announce(token_key("b"))
+    b.transport.watch(TOKENS)
+    b.transport.subscribe(BEATS)
+    bed.until(lambda: sorted(b.tokens()) == ["+a", "+b"])
+    b.got.clear()
+    bed.break_link(a, b)
+    bed.until(lambda: len(b.tokens()) == 2 and LinkDown() in b.got)
+    assert sorted(b.tokens()) == ["-a", "-b"]
+    assert LinkUp() not in b.got
+    # No call raises meanwhile.
+    a.transport.publish(beat_key("a"), beat(1), Quality.ASSURED)
+    a.transport.announce(token_key("meanwhile"))
+    b.got.clear()
+    bed.mend_link(a, b)
+    bed.until(lambda: len(b.tokens()) == 3 and LinkUp() in b.got)
+    assert sorted(b.tokens()) == ["+a", "+b", "+meanwhile"]
+    flow(bed, a, b)
+
+
+# --- what Zenoh alone has ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "endpoint", ["", "udp/127.0.0.1:1", "unixsock-stream", "tcp/", "tcp/nonsense", "tls/127.0.0.1"]
+)
+def test_a_malformed_endpoint_is_refused(endpoint: str) -> None:
+    with pytest.raises(BadInputError) as caught:
+        ZenohTransport(Access(endpoint, lease_s=LEASE_S), lambda _: None)
+    assert caught.value.field == "network.endpoint"
+
+
+def test_an_endpoint_without_a_router_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError) as caught:
+        ZenohTransport(Access(f"unixsock-stream/{tmp_path}/none"), lambda _: None)
+    assert caught.value.field == "network.endpoint"
+
+
+def test_a_service_that_does_not_answer_is_a_timeout(router: Router) -> None:
+    bed = ZenohBed(router)
+    server = bed.join("server")
+    server.transport.serve(PLAN_SERVICE)
+    settle(bed, server)
+    client = bed.join("client").transport
+    assert isinstance(client, ZenohTransport)
+    with pytest.raises(TimeoutError, match="in time"):
+        client.ask(PLAN_SERVICE, b"", 0.2).result(WAIT_S)
+    bed.close()
+
+
+@define
+class Errand:
+    """A core that beats itself awake, computes, serves itself, and ends when all is done."""
+
+    events: list[Event] = field(factory=list)
+    wakeup_s: float | None = None
+
+    def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
+        self.events.append(event)
+        match event:
+            case Started():
+                yield Listen(HEARTBEAT)
+                yield Watch(VEHICLE_ALIVE)
+                yield Serve(SERVICE)
+                yield Announce(VEHICLE_ALIVE, {"vehicle": "errand"})
+                self.wakeup_s = now_s + 0.05
+            case Wakeup():
+                self.wakeup_s = None
+                message = Heartbeat(Name("c"), 1, 1, leading=False, formations=0)
+                yield Send(HEARTBEAT, message, {"coordinator": "errand"})
+                yield Compute(1, lambda: "done")
+            case Computed(1, "done"):
+                self.wakeup_s = None
+            case Asked(token):
+                yield Reply(token, b"yes")
+                yield End()
+            case _:
+                pass
+
+
+def test_a_core_runs_over_zenoh_until_it_ends(router: Router) -> None:
+    core = Errand()
+    answers: Answers = []
+    watcher = ZenohBed(router)
+    client = watcher.join("client")
+    client.transport.watch(TOKENS)
+
+    def ask_at_last() -> None:
+        watcher.until(lambda: any(isinstance(event, Computed) for event in core.events))
+        assert isinstance(client.transport, ZenohTransport)
+        answers.append(client.transport.ask(PLAN_SERVICE, b"?", WAIT_S).result(WAIT_S))
+
+    thread = threading.Thread(target=ask_at_last, daemon=True)
+    thread.start()
+    a_core: Core = core
+    run_core(a_core, Access(router.endpoint, REALM, LEASE_S))
+    thread.join(WAIT_S)
+    watcher.until(lambda: client.tokens() == ["+errand", "-errand"])
+    watcher.close()
+    assert [given and (given.payload, given.ok) for given in answers] == [(b"yes", True)]
+    kinds = [type(event) for event in core.events]
+    assert kinds[0] is Started
+    for kind in (Wakeup, Arrived, Computed, PeerUp, Asked):
+        assert kinds.count(kind) == 1

@@ -1,0 +1,721 @@
+"""Rules V1 to V7 of the execution protocol, guard by guard."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from attrs import evolve
+
+from laneweave.protocol.lattice import Cell, Lattice, Move, territory
+from laneweave.protocol.vehicle.execution import LISTEN_S, PlanExecution
+from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES, Stage
+from laneweave.protocol.wire.messages import Ballot, Name, Plan, Prepare, Sense, VehicleState
+from support.rule_recorder import RuleRecorder
+
+A, B, C = Name("A"), Name("B"), Name("C")
+LOW = Ballot(1, Name("c1"), 10, 1)
+MID = Ballot(1, Name("c2"), 5, 9)
+HIGH = Ballot(2, Name("c1"), 10, 2)
+SLOT_S = 4.0
+T0_S = 100.0
+OVERDUE_S = 6.0
+LATTICE = Lattice(pitch_m=15.0, speed_mps=15.0, lane_width_m=3.5, lanes=3, block_columns=8)
+"""Block 0 has the columns -7 to 0, block 1 those from -15 to -8."""
+AT: dict[Name, Cell] = {A: (-4, 0), B: (-3, 0)}
+
+
+def vehicle(
+    name: Name = A,
+    cell: Cell = (-4, 0),
+    *,
+    moving: bool = False,
+    joined: tuple[int, ...] = (0,),
+) -> PlanExecution:
+    return PlanExecution(name, 7, cell, LATTICE, joined, moving=moving)
+
+
+def prepare(ballot: Ballot, *roster: Name, formations: tuple[int, ...] = (0,)) -> Prepare:
+    return Prepare(ballot, formations, roster or (A, B))
+
+
+def make_plan(
+    ballot: Ballot = MID,
+    moves: dict[Name, tuple[Move, ...]] | None = None,
+    cells: dict[Name, Cell] | None = None,
+    formations: tuple[int, ...] = (0,),
+) -> Plan:
+    cells = cells or AT
+    moves = dict.fromkeys(cells, ()) | (moves or {A: ((0, (-4, 0), (-4, 1)),)})
+    return Plan(
+        ballot=ballot,
+        formations=formations,
+        roster=tuple(cells),
+        incarnations=dict.fromkeys(cells, 7),
+        start_cells=cells,
+        moves=moves,
+        t0_s=T0_S,
+        slot_s=SLOT_S,
+        territory=tuple(territory(cells.values(), [m for each in moves.values() for m in each])),
+    )
+
+
+def shown(
+    name: Name = B,
+    ballot: Ballot | None = MID,
+    completed: int = 0,
+    *,
+    accepted: bool = True,
+    ready: bool = True,
+    go: bool = False,
+) -> VehicleState:
+    return VehicleState(
+        vehicle=name,
+        incarnation=7,
+        formation=0,
+        joined=(0,),
+        promised=ballot,
+        accepted=accepted,
+        ready=ready,
+        completed=completed,
+        hold_cell=(-4, 0),
+        moving=False,
+        go=go,
+        done=False,
+        overdue=False,
+        attended=True,
+        s_m=0.0,
+        y_m=0.0,
+        speed_mps=0.0,
+        t_s=0.0,
+    )
+
+
+def taken(plan: Plan | None = None, name: Name = A) -> PlanExecution:
+    """Promise and take a plan, which the controller has not noted yet."""
+    plan = plan or make_plan()
+    execution = vehicle(name, plan.start_cells[name])
+    execution.on_prepare(prepare(plan.ballot, *plan.roster))
+    assert execution.on_plan(plan)
+    return execution
+
+
+def accept(execution: PlanExecution, plan: Plan) -> None:
+    """Take a plan, and let the controller note it."""
+    assert execution.on_plan(plan)
+    assert execution.on_noted(plan.ballot)
+
+
+def accepted(plan: Plan | None = None, name: Name = A) -> PlanExecution:
+    execution = taken(plan, name)
+    assert execution.promised is not None
+    assert execution.on_noted(execution.promised)
+    return execution
+
+
+def going(plan: Plan | None = None, name: Name = A) -> PlanExecution:
+    """Accept a plan and hear the open gate from the first other member."""
+    execution = accepted(plan, name)
+    assert execution.plan is not None
+    other = next(each for each in execution.plan.roster if each != name)
+    execution.on_state(shown(other, go=True))
+    assert execution.go
+    return execution
+
+
+def gate(execution: PlanExecution) -> bool:
+    return execution.go
+
+
+# --- V1 ---------------------------------------------------------------------------------------
+
+
+def test_v1_starts_with_nothing() -> None:
+    execution = vehicle(joined=(0, 3))
+    assert (execution.promised, execution.plan, execution.completed) == (None, None, 0)
+    assert not any((execution.go, execution.ready, execution.done, execution.moving))
+    assert (execution.phase, execution.next_move, execution.tick(1e9)) == (Stage.FREE, None, None)
+    assert not execution.overdue(1e9)
+    assert execution.wanted_joined == execution.joined == (0, 3)
+
+
+def test_v1_takes_a_motion_over() -> None:
+    execution = vehicle(cell=(-4, 1), moving=True)
+    assert not execution.ready
+    execution.end_motion()
+    assert (execution.moving, execution.completed, execution.hold_cell) == (False, 0, (-4, 1))
+
+
+# --- V2 ---------------------------------------------------------------------------------------
+
+
+def test_v2_promises_rising_ballots_only() -> None:
+    execution = vehicle()
+    for ballot, promised in ((MID, MID), (LOW, MID), (MID, MID), (HIGH, HIGH), (MID, HIGH)):
+        assert execution.on_prepare(prepare(ballot))  # whatever the ballot, the state answers
+        assert execution.promised == promised
+        assert execution.phase is Stage.PROMISED
+
+
+@pytest.mark.parametrize(
+    ("lower", "higher"),
+    [
+        (Ballot(1, Name("z"), 9, 9), Ballot(2, Name("a"), 1, 1)),
+        (Ballot(1, Name("a"), 9, 9), Ballot(1, Name("b"), 1, 1)),
+        (Ballot(1, Name("a"), 1, 9), Ballot(1, Name("a"), 2, 1)),
+        (Ballot(1, Name("a"), 1, 9), Ballot(1, Name("a"), 1, 10)),
+    ],
+)
+def test_v2_term_then_coordinator_then_incarnation_then_seq(lower: Ballot, higher: Ballot) -> None:
+    execution = vehicle()
+    execution.on_prepare(prepare(lower))
+    execution.on_prepare(prepare(higher))
+    assert execution.promised == higher
+    execution.on_prepare(prepare(lower))
+    assert execution.promised == higher
+
+
+def test_v2_not_in_the_roster() -> None:
+    execution = vehicle()
+    assert not execution.on_prepare(prepare(HIGH, B, C, formations=(0, 1)))
+    assert (execution.promised, execution.phase) == (None, Stage.FREE)
+    assert execution.wanted_joined == (0,)
+
+
+def test_v2_forgets_plan_progress_gate_and_what_was_heard() -> None:
+    execution = going()
+    execution.on_state(shown(completed=3))
+    assert execution.tick(T0_S) is not None
+    execution.end_motion()
+    assert (execution.completed, execution.heard) == (1, {B: 3})
+    execution.on_prepare(prepare(HIGH))
+    assert (execution.plan, execution.completed, execution.go) == (None, 0, False)
+    assert (execution.heard, execution.needs) == ({}, ())
+    assert execution.hold_cell == (-4, 1)
+
+
+@pytest.mark.parametrize("ballot", [LOW, MID])
+@pytest.mark.parametrize("reach", [taken, accepted, going])
+def test_v2_a_repeat_or_a_lower_ballot_changes_nothing(
+    ballot: Ballot, reach: Callable[[], PlanExecution]
+) -> None:
+    execution = reach()
+    execution.on_state(shown())
+    before = repr(execution)
+    assert execution.on_prepare(prepare(ballot, formations=(0, 1)))
+    assert repr(execution) == before
+
+
+def test_v2_while_moving_the_motion_ends_but_counts_for_no_plan() -> None:
+    execution = accepted()
+    execution.on_state(shown())
+    assert execution.tick(T0_S) == (0, (-4, 0), (-4, 1))
+    assert (execution.hold_cell, execution.moving, execution.ready) == ((-4, 1), True, True)
+
+    execution.on_prepare(prepare(HIGH))
+    assert (execution.hold_cell, execution.moving, execution.ready) == ((-4, 1), True, False)
+    newer = make_plan(HIGH, {A: ((0, (-4, 1), (-4, 2)),)}, {A: (-4, 1), B: (-3, 0)})
+    accept(execution, newer)
+    assert not execution.ready  # it still occupies the footprint of the old move
+    execution.on_state(shown(ballot=HIGH))
+    assert execution.tick(T0_S) is None
+    assert not gate(execution)
+
+    execution.end_motion()
+    assert execution.completed == 0
+    assert execution.ready
+    assert execution.tick(T0_S) == (0, (-4, 1), (-4, 2))
+
+
+def test_v2_asks_for_the_formations_of_the_ballot_and_never_for_fewer() -> None:
+    execution = vehicle(joined=(0, 2))
+    for ballot, formations, wanted in (
+        (LOW, (0, 1), (0, 1, 2)),
+        (MID, (0,), (0, 1, 2)),
+        (HIGH, (5, 0), (0, 1, 2, 5)),
+    ):
+        execution.on_prepare(prepare(ballot, formations=formations))
+        assert execution.wanted_joined == wanted
+        assert execution.joined == (0, 2)  # that is for the motion controller to say
+
+
+def test_what_was_joined_stays_joined_whatever_comes_late() -> None:
+    execution = vehicle(joined=(0, 2))
+    for heard, news, known in (
+        ((0,), False, (0, 2)),
+        ((), False, (0, 2)),
+        ((0, 1, 2), True, (0, 1, 2)),
+        ((0, 1, 2), False, (0, 1, 2)),
+        ((5, 0), True, (0, 1, 2, 5)),
+        ((0, 2), False, (0, 1, 2, 5)),
+    ):
+        assert execution.on_joined(heard) == news
+        assert execution.joined == known
+
+
+# --- V3 ---------------------------------------------------------------------------------------
+
+
+def test_v3_accepts_the_plan_of_the_promised_ballot_once() -> None:
+    execution = accepted()
+    plan = execution.plan
+    assert (execution.ready, execution.phase) == (True, Stage.GATED)
+    assert not execution.on_plan(make_plan())
+    assert not execution.on_plan(make_plan(moves={A: ((0, (-4, 0), (-5, 0)),)}))  # a second one
+    assert execution.plan is plan
+
+
+def test_v3_with_the_gate_open_no_plan_is_accepted() -> None:
+    execution = going()
+    plan = execution.plan
+    assert not execution.on_plan(make_plan(moves={A: ((0, (-4, 0), (-5, 0)),)}))
+    assert (execution.plan, execution.phase) == (plan, Stage.GOING)
+
+
+def test_v3_needs_a_promise() -> None:
+    assert not vehicle().on_plan(make_plan())
+
+
+@pytest.mark.parametrize("ballot", [LOW, HIGH])
+def test_v3_ignores_plans_of_other_ballots(ballot: Ballot) -> None:
+    execution = vehicle()
+    execution.on_prepare(prepare(MID))
+    assert not execution.on_plan(make_plan(ballot))
+    assert (execution.plan, execution.promised) == (None, MID)
+
+
+@pytest.mark.parametrize(
+    "spoiled",
+    [
+        evolve(make_plan(), incarnations={A: 6, B: 7}),
+        evolve(make_plan(), incarnations={A: 8, B: 7}),
+        evolve(make_plan(), incarnations={B: 7}),
+        make_plan(cells={A: (-4, 2), B: (-3, 0)}, moves={B: ()}),
+        evolve(make_plan(), start_cells={B: (-3, 0)}),
+        evolve(make_plan(), territory=()),
+        evolve(make_plan(), roster=(B,)),
+        make_plan(moves={A: ((0, (-4, 0), (-3, 0)),)}),
+        make_plan(moves={A: ((0, (-4, 0), (-4, 2)),)}),
+        evolve(make_plan(), slot_s=0.0),
+        evolve(make_plan(), formations=()),
+        evolve(make_plan(), formations=(1,)),
+        make_plan(formations=(0, 1)),
+    ],
+    ids=[
+        "older incarnation",
+        "newer incarnation",
+        "no incarnation",
+        "other start cell",
+        "no start cell",
+        "territory",
+        "not in the roster",
+        "drives into B",
+        "jumps",
+        "no time",
+        "no block",
+        "another block",
+        "a block that is not joined",
+    ],
+)
+def test_v3_ignores_a_plan_that_does_not_fit(spoiled: Plan) -> None:
+    execution = vehicle()
+    execution.on_prepare(prepare(MID))
+    assert not execution.on_plan(spoiled)
+    assert (execution.plan, execution.needs, execution.phase) == (None, (), Stage.PROMISED)
+    assert execution.on_plan(make_plan())  # the right one is still welcome
+
+
+@pytest.mark.parametrize("beyond", [(-8, 0), (1, 0), (-4, 3), (-4, -1), (-20, 0)])
+def test_v3_the_territory_stays_within_the_blocks_of_the_plan(beyond: Cell) -> None:
+    """Plans of other formations run at the same time; only the blocks keep them apart."""
+    execution = vehicle()
+    execution.on_prepare(prepare(MID))
+    plan = make_plan()
+    assert not execution.on_plan(evolve(plan, territory=(*plan.territory, beyond)))
+    assert execution.on_plan(evolve(plan, territory=(*plan.territory, (-7, 2), (0, 2))))
+
+
+def test_v3_a_joint_plan_waits_until_the_controller_has_confirmed_its_formations() -> None:
+    execution = vehicle()
+    execution.on_prepare(prepare(MID, formations=(0, 1)))
+    joint = make_plan(
+        moves={A: ((0, (-4, 0), (-4, 1)),)}, cells={A: (-4, 0), B: (-9, 0)}, formations=(0, 1)
+    )
+    for joined in ((0,), (1,), (), (0, 2)):
+        execution.joined = joined
+        assert not execution.on_plan(joint)
+    execution.joined = (0, 1)
+    assert execution.on_plan(joint)
+
+
+@pytest.mark.parametrize("formations", [(0,), (1,), (0, 1), (1, 2), (0, 2)])
+def test_v3_ignores_a_plan_for_some_of_the_blocks_that_are_joined(
+    formations: tuple[int, ...],
+) -> None:
+    """Vehicles of the other blocks may be in any of them."""
+    execution = vehicle(joined=(0, 1, 2))
+    execution.on_prepare(prepare(MID, formations=(0, 1, 2)))
+    cells: dict[Name, Cell] = {A: (-4, 0)}
+    assert not execution.on_plan(make_plan(cells=cells, formations=formations))
+    assert execution.on_plan(make_plan(cells=cells, formations=(0, 1, 2)))
+
+
+def waits(execution: PlanExecution) -> bool:
+    """Tell whether nothing of what a vehicle does or shows is that of one that has accepted."""
+    return (
+        execution.phase is Stage.TAKEN
+        and execution.tick(T0_S + 100.0) is None
+        and not any((execution.accepted, execution.ready, execution.go, execution.done))
+        and not execution.overdue(T0_S + 1000.0)
+    )
+
+
+@pytest.mark.parametrize("name", [A, B])  # B has no moves
+def test_v3_a_plan_is_accepted_when_the_controller_has_noted_it(name: Name) -> None:
+    execution = taken(name=name)
+    for heard in ((), (shown(A), shown(B)), (shown(A, go=True), shown(B, go=True))):
+        for state in heard:
+            execution.on_state(state)
+        assert waits(execution)  # whatever the others show
+    assert execution.needs_states(0.0)
+    assert execution.on_noted(MID)
+    assert (execution.phase, execution.accepted, execution.ready) == (Stage.GATED, True, True)
+    assert execution.done == (name == B)
+    execution.tick(T0_S)
+    assert execution.go  # what it has heard meanwhile counts
+
+
+@pytest.mark.parametrize("noted", [None, LOW, HIGH])
+def test_v3_what_the_controller_has_noted_of_another_ballot_says_nothing(
+    noted: Ballot | None,
+) -> None:
+    execution = taken()
+    assert not execution.on_noted(noted)
+    assert waits(execution)
+    assert execution.on_noted(MID)
+
+
+def test_v3_a_note_counts_once_and_only_for_a_plan_that_was_taken() -> None:
+    free, promised = vehicle(), vehicle()
+    promised.on_prepare(prepare(MID))
+    for execution in (free, promised, accepted(), going()):
+        before = repr(execution)
+        assert not execution.on_noted(MID)
+        assert not execution.on_noted(None)
+        assert repr(execution) == before
+
+
+def test_v3_a_plan_that_was_dropped_before_it_was_noted_is_not_accepted() -> None:
+    execution = taken()
+    execution.on_prepare(prepare(HIGH))
+    assert not execution.on_noted(MID)
+    newer = make_plan(HIGH)
+    assert execution.on_plan(newer)
+    assert not execution.on_noted(MID)  # that was the other one
+    assert waits(execution)
+    assert execution.on_noted(HIGH)
+
+
+# --- V4 and V5 --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "state",
+    [
+        shown(accepted=False),
+        shown(accepted=False, go=True),
+        shown(ballot=LOW),
+        shown(ballot=HIGH, completed=5, go=True),
+        shown(ballot=None, accepted=False),
+        shown(name=C, go=True),
+        shown(name=A, go=True),
+    ],
+    ids=[
+        "not accepted",
+        "not accepted, but go",
+        "older ballot",
+        "newer ballot",
+        "nothing",
+        "a stranger",
+        "itself",
+    ],
+)
+def test_v4_states_that_say_nothing(state: VehicleState) -> None:
+    execution = accepted()
+    execution.on_state(state)
+    assert execution.heard == {}
+    assert execution.tick(T0_S) is None
+    assert not execution.go
+
+
+def test_v4_without_a_plan_nothing_is_heard() -> None:
+    execution = vehicle()
+    execution.on_state(shown(go=True))
+    execution.on_prepare(prepare(MID))
+    execution.on_state(shown(go=True))
+    assert (execution.heard, execution.go) == ({}, False)
+
+
+def test_v4_not_ready_counts_as_nothing_completed() -> None:
+    execution = accepted()
+    execution.on_state(shown(ready=False, completed=2))
+    assert execution.heard == {B: -1}
+    assert execution.tick(T0_S) is None
+    execution.on_state(shown(completed=0))
+    assert execution.heard == {B: 0}
+
+
+@pytest.mark.parametrize("reach", [taken, accepted, going])
+def test_v4_late_states_take_nothing_back(reach: Callable[[], PlanExecution]) -> None:
+    execution = reach()
+    for completed, ready, known in ((2, True, 2), (1, True, 2), (5, False, 2), (3, True, 3)):
+        execution.on_state(shown(completed=completed, ready=ready))
+        assert execution.heard == {B: known}
+
+
+def test_v4_an_open_gate_spreads() -> None:
+    execution = accepted()
+    execution.on_state(shown(ready=False, go=True))
+    assert gate(execution)
+    execution.on_state(shown(go=False))
+    assert gate(execution)
+    assert execution.tick(T0_S) is not None
+
+
+def test_v5_the_gate_needs_everybody() -> None:
+    cells: dict[Name, Cell] = {A: (-4, 0), B: (-2, 0), C: (-1, 0)}
+    execution = accepted(make_plan(cells=cells))
+    assert execution.tick(T0_S) is None
+    execution.on_state(shown(B))
+    assert execution.tick(T0_S) is None
+    execution.on_state(shown(C, ready=False))
+    assert execution.tick(T0_S) is None
+    assert not gate(execution)
+    execution.on_state(shown(C))
+    assert execution.tick(T0_S) == (0, (-4, 0), (-4, 1))
+    assert gate(execution)
+
+
+def test_v5_alone_in_the_roster() -> None:
+    execution = accepted(make_plan(cells={A: (-4, 0)}))
+    assert not gate(execution)
+    assert execution.tick(T0_S) is not None
+    assert gate(execution)
+
+
+def test_v5_opens_for_others_before_the_own_time_and_without_own_moves() -> None:
+    execution = accepted(name=B)
+    execution.on_state(shown(A))
+    assert execution.tick(T0_S - 50.0) is None
+    assert execution.go
+
+
+# --- V6 and V7 --------------------------------------------------------------------------------
+
+
+def test_v6_not_before_its_time() -> None:
+    execution = going(make_plan(moves={A: ((3, (-4, 0), (-4, 1)),)}))
+    due_s = T0_S + 3 * SLOT_S
+    assert execution.tick(due_s - 0.01) is None
+    assert (execution.hold_cell, execution.moving) == ((-4, 0), False)
+    assert execution.tick(due_s) == (3, (-4, 0), (-4, 1))
+    assert (execution.hold_cell, execution.moving) == ((-4, 1), True)
+
+
+def test_v6_late_is_not_too_late() -> None:
+    execution = going()
+    assert execution.tick(T0_S + 100.0) == (0, (-4, 0), (-4, 1))
+
+
+def test_v6_time_without_the_gate_is_not_enough() -> None:
+    assert accepted().tick(T0_S + 100.0) is None
+
+
+def test_v6_dependencies() -> None:
+    """B follows A through two cells: each of its moves waits for the count that frees them."""
+    moves: dict[Name, tuple[Move, ...]] = {
+        A: ((0, (-3, 0), (-2, 0)), (1, (-2, 0), (-1, 0)), (5, (-1, 0), (-1, 1))),
+        B: ((1, (-4, 0), (-3, 0)), (2, (-3, 0), (-2, 0))),
+    }
+    execution = accepted(make_plan(moves=moves, cells={A: (-3, 0), B: (-4, 0)}), B)
+    late_s = T0_S + 100.0
+    execution.on_state(shown(A, completed=0))
+    assert execution.tick(late_s) is None
+    execution.on_state(shown(A, completed=1))
+    assert execution.tick(late_s) == (1, (-4, 0), (-3, 0))
+    assert execution.tick(late_s) is None  # one at a time
+    execution.end_motion()
+    assert execution.tick(late_s) is None
+    execution.on_state(shown(A, completed=2))
+    assert execution.tick(late_s) == (2, (-3, 0), (-2, 0))
+
+
+def test_v7_counts_and_is_done() -> None:
+    moves: dict[Name, tuple[Move, ...]] = {A: ((0, (-4, 0), (-4, 1)), (1, (-4, 1), (-4, 2)))}
+    execution = going(make_plan(moves=moves))
+    for count, t_s in ((0, T0_S), (1, T0_S + SLOT_S)):
+        assert execution.completed == count
+        assert not execution.done
+        assert execution.tick(t_s) is not None
+        assert execution.completed == count  # only once it is there
+        execution.end_motion()
+    assert execution.done
+    assert execution.hold_cell == (-4, 2)
+    assert execution.tick(T0_S + 1000.0) is None
+
+
+@pytest.mark.parametrize("reach", [vehicle, taken, accepted, going])
+def test_v7_without_a_motion_nothing_ends(reach: Callable[[], PlanExecution]) -> None:
+    execution = reach()
+    before = repr(execution)
+    execution.end_motion()
+    assert repr(execution) == before
+
+
+def test_without_moves_it_is_done_at_once() -> None:
+    execution = accepted(name=B)
+    assert execution.done
+    assert not execution.overdue(T0_S + 1000.0)
+
+
+# --- what it shows and wants to hear ----------------------------------------------------------
+
+
+def test_states_matter_until_the_gate_is_open_and_while_a_move_waits() -> None:
+    assert not vehicle().needs_states(T0_S)
+    moves: dict[Name, tuple[Move, ...]] = {
+        A: ((0, (-3, 0), (-2, 0)),),
+        B: ((1, (-4, 0), (-3, 0)),),
+    }
+    execution = accepted(make_plan(moves=moves, cells={A: (-3, 0), B: (-4, 0)}), B)
+    assert execution.needs_states(0.0)
+    execution.on_state(shown(A, go=True))
+    assert not execution.needs_states(T0_S + SLOT_S - LISTEN_S - 0.1)
+    assert execution.needs_states(T0_S + SLOT_S - LISTEN_S)
+    execution.on_state(shown(A, completed=1))
+    assert not execution.needs_states(T0_S + SLOT_S)
+
+
+def test_overdue_runs_from_the_moment_the_next_move_is_due() -> None:
+    execution = accepted(make_plan(moves={A: ((2, (-4, 0), (-4, 1)),)}))
+    due_s = T0_S + 2 * SLOT_S
+    assert not execution.overdue(due_s + OVERDUE_S - 0.01)
+    assert execution.overdue(due_s + OVERDUE_S)
+    execution.on_state(shown())
+    assert execution.tick(due_s + OVERDUE_S) is not None
+    assert not execution.overdue(due_s + OVERDUE_S)  # on its way
+    execution.end_motion()
+    assert not execution.overdue(due_s + 100.0)  # done
+    execution.on_prepare(prepare(HIGH))
+    assert not execution.overdue(due_s + 100.0)  # no plan
+
+
+@pytest.mark.parametrize(("slot_s", "patience_s"), [(1.0, 1.5), (4.0, 6.0), (7.0, 9.0)])
+def test_how_long_a_move_may_be_due_follows_the_slots_of_its_plan(
+    slot_s: float, patience_s: float
+) -> None:
+    execution = accepted(evolve(make_plan(), slot_s=slot_s))
+    assert not execution.overdue(T0_S + patience_s - 0.01)
+    assert execution.overdue(T0_S + patience_s)
+
+
+@pytest.mark.parametrize("attended", [True, False])
+def test_the_state_says_what_the_vehicle_knows_and_senses(*, attended: bool) -> None:
+    sense = Sense(
+        A, 1001, 100.1, (7.0, 14.0, 0.5, 2.0, 0.1, 0.0), (-4, 1), 1038, (-4, 0), 2, (), joined=(0,)
+    )
+    execution = going()
+    assert execution.tick(T0_S) is not None
+    expected = VehicleState(
+        vehicle=A,
+        incarnation=7,
+        formation=3,
+        joined=(0,),
+        promised=MID,
+        accepted=True,
+        ready=True,
+        completed=0,
+        hold_cell=(-4, 1),
+        moving=True,
+        go=True,
+        done=False,
+        overdue=False,
+        attended=attended,
+        s_m=7.0,
+        y_m=2.0,
+        speed_mps=14.0,
+        t_s=100.1,
+    )
+    assert execution.state(sense, 3, attended=attended) == expected
+    execution.end_motion()
+    assert execution.state(sense, 3, attended=attended) == evolve(
+        expected, moving=False, done=True, completed=1
+    )
+    late = evolve(sense, t_s=T0_S + OVERDUE_S)
+    assert accepted().state(late, 3, attended=attended).overdue
+
+
+# --- the table as a whole ---------------------------------------------------------------------
+
+
+def test_a_history_takes_every_row_of_the_table() -> None:
+    """No row is hidden behind an earlier one."""
+    book = RuleRecorder(VEHICLE_RULES)
+    execution = evolve(vehicle(moving=True), rules=book)
+    execution.on_plan(make_plan())
+    execution.end_motion()
+    for _ in range(2):
+        execution.on_prepare(prepare(MID))
+    for _ in range(2):
+        execution.on_plan(make_plan())
+    for _ in range(2):
+        execution.on_noted(MID)
+    execution.on_state(shown())
+    for _ in range(2):
+        execution.tick(T0_S)
+    for _ in range(2):
+        execution.end_motion()
+    execution.on_prepare(prepare(HIGH))
+    accept(execution, make_plan(HIGH, {A: ()}, {A: (-4, 1), B: (-3, 0)}))
+    for _ in range(2):
+        execution.on_state(shown(ballot=HIGH, go=True))
+    rules = [f"{book.table[row].rule} row {row}" for row in book.taken]
+    assert rules == [
+        "V7 row 9", "V2 row 0", "V2 row 1", "V3 row 2", "V3 row 3", "V4 row 5", "V5 row 6",
+        "V6 row 7", "V7 row 8", "V2 row 0", "V3 row 2", "V3 row 3", "V4 row 4", "V4 row 5",
+    ]  # fmt: skip
+    assert {*book.taken} == {*range(len(VEHICLE_RULES.table))}
+
+
+def always(*_: object) -> bool:
+    return True
+
+
+@pytest.mark.parametrize(
+    ("rule", "spoiled"),
+    [
+        ("is_promised_ballot", make_plan(LOW)),
+        ("has_joined", make_plan(formations=(0, 1))),
+        ("starts_in_my_cell", make_plan(cells={A: (-4, 2), B: (-3, 0)}, moves={B: ()})),
+    ],
+)
+def test_a_bug_is_planted_in_one_execution_and_in_no_other(rule: str, spoiled: Plan) -> None:
+    sound, buggy = vehicle(), evolve(vehicle(), rules=VEHICLE_RULES.planted(**{rule: always}))
+    for execution in (sound, buggy):
+        execution.on_prepare(prepare(MID))
+    assert buggy.on_plan(spoiled)
+    assert not sound.on_plan(spoiled)
+
+
+def test_dependencies_can_be_planted_too() -> None:
+    book = VEHICLE_RULES.planted(
+        dependencies=lambda plan, name: tuple({} for _ in plan.moves[name])
+    )
+    plan = make_plan(moves={A: ((1, (-4, 0), (-3, 0)),), B: ((0, (-3, 0), (-2, 0)),)})
+    sound, buggy = vehicle(), evolve(vehicle(), rules=book)
+    for execution in (sound, buggy):
+        execution.on_prepare(prepare(MID))
+        accept(execution, plan)
+        execution.on_state(shown(go=True))
+    assert buggy.tick(T0_S + 100.0) is not None
+    assert sound.tick(T0_S + 100.0) is None

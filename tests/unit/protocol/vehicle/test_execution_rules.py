@@ -1,0 +1,244 @@
+"""A vehicle that owns cells: what it promises, which plans it accepts, when it takes possession."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from attrs import evolve
+
+from laneweave.protocol.vehicle.execution import PlanExecution
+from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES, Stage
+from laneweave.protocol.vehicle.plans import estate_problems, plan_problems
+from laneweave.protocol.wire.messages import Deed, Plan, Prepare
+from support.rolling_samples import (
+    AFTER,
+    BEFORE,
+    HIGH,
+    HOME,
+    LOW,
+    MID,
+    T0_S,
+    TARGET,
+    A,
+    B,
+    C,
+    deed_of,
+    make_plan,
+    sense,
+    state,
+    vehicle,
+)
+
+PREPARE = Prepare(MID, (), (A, B))
+
+
+def promised() -> PlanExecution:
+    execution = vehicle()
+    assert execution.on_prepare(PREPARE)
+    assert execution.on_estate(sense(promised=MID))
+    return execution
+
+
+def accepted() -> PlanExecution:
+    """Accept the plan, and let the controller note it with its deed."""
+    execution = promised()
+    assert execution.on_plan(make_plan())
+    noted = sense(promised=MID, deed=deed_of(A), accepted=MID)
+    assert execution.on_noted(noted.accepted)
+    execution.on_estate(noted)
+    return execution
+
+
+# --- which plans are sound --------------------------------------------------------------------
+
+
+def without(name: str) -> Callable[[Plan], Plan]:
+    def spoil(plan: Plan) -> Plan:
+        part: dict[str, Any] = {name: {A: getattr(plan, name)[A]}}
+        return evolve(plan, **part)
+
+    return spoil
+
+
+def changed(name: str, **cells: tuple[tuple[int, int], ...]) -> Callable[[Plan], Plan]:
+    def spoil(plan: Plan) -> Plan:
+        part: dict[str, Any] = {name: getattr(plan, name) | cells}
+        return evolve(plan, **part)
+
+    return spoil
+
+
+UNSOUND = {
+    "before does not cover the roster": without("before"),
+    "after does not cover the roster": without("after"),
+    "a cell has two owners before": changed("before", A=(HOME, (1, 0), TARGET)),
+    "a cell has two owners after": changed("after", B=(TARGET, (1, 1), (2, 1))),
+    "A does not own [(0, 1)]": changed("after", A=(HOME, (1, 0))),
+    "B does not own [(2, 1)]": changed("after", B=((1, 1),)),
+    "nobody owned [(9, 9)]": changed("after", B=((1, 1), (2, 1), (9, 9))),
+}
+
+
+def test_a_sound_plan_has_no_problems() -> None:
+    assert estate_problems(make_plan()) == plan_problems(make_plan()) == []
+
+
+@pytest.mark.parametrize("problem", UNSOUND)
+def test_an_unsound_plan_is_refused(problem: str) -> None:
+    plan = UNSOUND[problem](make_plan())
+    assert problem in estate_problems(plan)
+    assert plan_problems(plan) == []
+    execution = promised()
+    assert not execution.on_plan(plan)
+    assert execution.plan is None
+    assert execution.on_plan(make_plan())
+
+
+def test_without_its_guard_any_estates_are_accepted() -> None:
+    execution = vehicle(rules=VEHICLE_RULES.planted(keeps_to_its_estates=lambda *_: True))
+    execution.on_prepare(PREPARE)
+    assert execution.on_plan(changed("before", A=(HOME, (7, 7)))(make_plan()))
+
+
+def test_a_plan_that_takes_more_for_mine_is_refused() -> None:
+    plan = make_plan()
+    execution = promised()
+    assert not execution.on_plan(changed("before", A=(*BEFORE[A], (7, 0)))(plan))
+    # Less does no harm: what nobody knows of is nobody's from then on.
+    less = evolve(plan, before=BEFORE | {A: (HOME,)}, after=AFTER | {A: (HOME, TARGET)})
+    assert execution.on_plan(less)
+
+
+def test_what_a_closed_deed_would_give_me_may_be_mine() -> None:
+    """Others may know that its gate is open."""
+    plan = changed("before", A=(*BEFORE[A], (7, 0)))(make_plan(HIGH))
+    deed = Deed(LOW, BEFORE[A], (*BEFORE[A], (7, 0)), (A, C))
+    execution = vehicle()
+    execution.on_prepare(Prepare(HIGH, (), (A, B)))
+    execution.on_estate(sense(promised=HIGH))
+    assert not execution.on_plan(plan)
+    execution.on_estate(sense(promised=HIGH, deed=deed))
+    assert execution.on_plan(plan)
+
+
+def test_neither_blocks_nor_joined_formations_matter() -> None:
+    plan = evolve(make_plan(), formations=(17,))
+    execution = promised()
+    assert execution.on_plan(plan)
+    assert execution.wanted_joined == ()
+
+
+# --- promises ---------------------------------------------------------------------------------
+
+
+def test_a_promise_shows_an_estate_only_when_the_controller_has_noted_it() -> None:
+    execution = vehicle()
+    old = sense(deed=deed_of(A, LOW))
+    assert execution.state(old, 0, attended=True).estate == BEFORE[A]
+    execution.on_prepare(PREPARE)
+    assert execution.wanted_promised == MID
+    assert not execution.on_estate(old)
+    assert execution.state(old, 0, attended=True).estate == ()
+    noted = sense(promised=MID)
+    assert execution.on_estate(noted)
+    assert execution.state(noted, 0, attended=True).estate == BEFORE[A]
+    assert not execution.on_estate(noted)  # nothing new
+
+
+def test_what_an_earlier_process_promised_binds_the_next_one() -> None:
+    execution = vehicle()
+    assert execution.on_estate(sense(promised=MID))
+    assert (execution.promised, execution.phase) == (MID, Stage.PROMISED)
+    assert execution.on_prepare(Prepare(LOW, (), (A, B)))  # it shows what it has promised
+    assert execution.promised == MID
+    assert execution.on_prepare(Prepare(HIGH, (), (A, B)))
+    assert execution.promised == HIGH
+
+
+def test_a_later_promise_drops_the_plan_and_keeps_the_gate_closed() -> None:
+    execution = accepted()
+    assert execution.go is False
+    assert execution.on_prepare(Prepare(HIGH, (), (A, B)))
+    assert (execution.plan, execution.wanted_accepted) == (None, None)
+    execution.on_state(evolve(state(B, MID, accepted=True), go=True))
+    execution.tick(T0_S)
+    assert execution.go is False
+    assert execution.deed == deed_of(A)  # it says no more than what was accepted
+
+
+def test_an_unnoted_plan_is_not_accepted() -> None:
+    execution = promised()
+    assert execution.on_plan(make_plan())
+    assert not execution.on_noted(None)
+    execution.on_state(evolve(state(B, MID, accepted=True), go=True))
+    assert not execution.accepted
+    assert not execution.go
+
+
+# --- taking possession ------------------------------------------------------------------------
+
+
+def test_the_deed_says_what_the_plan_says() -> None:
+    execution = promised()
+    assert execution.deed is None
+    execution.on_plan(make_plan())
+    assert execution.deed == Deed(MID, BEFORE[A], AFTER[A], (A, B))
+
+
+def test_takes_possession_when_all_are_ready() -> None:
+    execution = accepted()
+    assert execution.tick(T0_S) is None
+    assert execution.deed == deed_of(A)
+    execution.on_state(state(B, MID, accepted=True))
+    assert execution.deed == deed_of(A)
+    assert execution.tick(T0_S) == (0, HOME, TARGET)
+    assert execution.deed == Deed(MID, open=True)
+
+
+def test_takes_possession_before_the_moves_are_due() -> None:
+    execution = accepted()
+    execution.on_state(state(B, MID, accepted=True))
+    assert execution.tick(T0_S - 1.0) is None
+    assert execution.deed == Deed(MID, open=True)
+
+
+def test_takes_possession_when_another_has() -> None:
+    execution = accepted()
+    execution.on_state(evolve(state(B, MID, accepted=True), ready=False, go=True))
+    assert execution.deed == Deed(MID, open=True)
+    assert execution.go
+
+
+def test_does_not_take_possession_while_it_moves() -> None:
+    execution = promised()
+    execution.moving = True
+    execution.on_plan(make_plan())
+    execution.on_noted(MID)
+    execution.on_state(state(B, MID, accepted=True))
+    execution.tick(T0_S)
+    assert execution.deed == deed_of(A)
+    execution.end_motion()
+    execution.tick(T0_S)
+    assert execution.deed == Deed(MID, open=True)
+
+
+def test_without_possession_the_deed_stays_closed() -> None:
+    execution = vehicle(rules=VEHICLE_RULES.planted(take_possession=lambda *_: None))
+    execution.on_prepare(PREPARE)
+    execution.on_plan(make_plan())
+    execution.on_noted(MID)
+    execution.on_state(state(B, MID, accepted=True))
+    assert execution.tick(T0_S) is not None
+    assert execution.deed == deed_of(A)
+
+
+def test_where_formations_own_blocks_there_are_no_deeds() -> None:
+    execution = evolve(vehicle(), estate=None, joined=(-1, 0))
+    execution.on_prepare(Prepare(MID, (-1, 0), (A, B)))
+    assert execution.wanted_promised is None
+    assert not execution.on_estate(sense(promised=HIGH))
+    assert execution.promised == MID
+    assert execution.on_plan(evolve(make_plan(), formations=(-1, 0), before={}, after={}))
+    assert execution.deed is None

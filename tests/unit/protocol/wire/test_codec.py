@@ -1,0 +1,577 @@
+"""The codec: what goes in comes out; all that is not exactly a message is one `BadInputError`."""
+
+from __future__ import annotations
+
+import math
+import random
+from types import NoneType, UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+import attrs
+import msgpack
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.wire.codec import KINDS, MAX_BYTES, VERSION, decode, encode, field_names
+from laneweave.protocol.wire.messages import (
+    Announcement,
+    Ballot,
+    Census,
+    CensusEntry,
+    ClosedFormation,
+    Command,
+    Deed,
+    Heartbeat,
+    LogEvent,
+    Motion,
+    Name,
+    Neighbour,
+    Plan,
+    Prepare,
+    Report,
+    RoadClock,
+    Sense,
+    VehicleState,
+)
+from laneweave.protocol.wire.topics import NAME_PATTERN
+
+V1, V2 = Name("v1"), Name("v2")
+BALLOT = Ballot(3, Name("c1"), 1_700_000_000_000_000_000, 2)
+DEED = Deed(BALLOT, ((0, 0), (1, 0)), ((0, 1),), (V1, V2))
+SAMPLES: tuple[object, ...] = (
+    Heartbeat(Name("c1"), 17, 3, leading=True, formations=2),
+    Prepare(BALLOT, (-1, 0), (V1, V2)),
+    Plan(
+        BALLOT,
+        (-1, 0),
+        (V1, V2),
+        {V1: 11, V2: 12},
+        {V1: (0, 0), V2: (2, 1)},
+        {V1: ((0, (0, 0), (0, 1)),), V2: ()},
+        t0_s=12.5,
+        slot_s=4.0,
+        territory=((0, 0), (0, 1), (2, 1)),
+        before={V1: ((0, 0),), V2: ((0, 1), (2, 1))},
+        after={V1: ((0, 0), (0, 1)), V2: ((2, 1),)},
+    ),
+    VehicleState(
+        V1, 11, -1, (-1, 0), BALLOT, accepted=True, ready=True, completed=1, hold_cell=(0, 1),
+        moving=False, go=True, done=False, overdue=False, attended=True, s_m=1.5, y_m=1.75,
+        speed_mps=15.0, t_s=13.0, estate=((0, 0), (1, 0)), deed=DEED,
+    ),
+    Sense(
+        V1, 130, 13.0, (1.5, 15.0, 0.0, 1.75, 0.0, 0.0), (0, 1), 120, (0, 0), 2,
+        (Neighbour(0, 10.0, 15.0), Neighbour(1, -0.5, 14.0, -1.5)), (Neighbour(0, 4.0, 16.0, 0.5),),
+        (0.25, -0.5), formation=-1, attendant=11, caretaker=True, joined=(-1, 0),
+        estate=((0, 1),), promised=BALLOT, deed=Deed(BALLOT, open=True),
+    ),
+    Command(V1, 11, 130, (0, 1), 140, (0, 0), b"\0" * 16, 38, (-1, 0), BALLOT, BALLOT, DEED),
+    Census(
+        13.0, (CensusEntry(V1, (0, 1), 2, 5.0),), (Announcement(V2, 0, 1, 20.0),),
+        (ClosedFormation(-1, 0, 12.0),), 0,
+    ),
+    RoadClock(130, 13.0, demanded=5, entered=4, on_road=3, left=1, ended=False),
+    Report(Name("agent"), V1, Name("17-4"), 10, 3, 5, 1, 2, b"\0\0\0\0"),
+    LogEvent(Name("bridge"), Name("b"), 13.0, Name("overlap"), {"n": 1, "pair": ["v1", "v2"]}),
+    Motion(V1, 11, -1, (0, 0), (0, 1), begin_tick=120, ticks=38, tick=130),
+)  # fmt: skip
+NAMES_NOT_ALLOWED = ("a/b", "a*", "", "x" * 65, "a b", "a#", "$", "a?", "é", "a\n", "v1\n", "\0")
+
+PARTS = (Neighbour, CensusEntry, Announcement, ClosedFormation, Deed)
+HINTS = {kind: get_type_hints(kind) for kind in (*KINDS.values(), *PARTS)}
+
+Body = dict[Any, Any]
+
+
+# --- what is well typed, and how to draw it ---------------------------------------------------
+
+
+def is_well_typed(value: object, hint: Any) -> bool:  # noqa: ANN401
+    """Tell whether a value is what the annotation says, exactly and at every depth."""
+    if hint is Name:
+        return type(value) is str and NAME_PATTERN.fullmatch(value) is not None
+    if hint is Ballot:
+        return type(value) is Ballot and all(map(is_well_typed, value, (int, Name, int, int)))
+    if attrs.has(hint):
+        return type(value) is hint and all(
+            is_well_typed(getattr(value, name), part) for name, part in HINTS[hint].items()
+        )
+    if hint is int:
+        return type(value) is int and -(2**63) <= value < 2**63
+    if hint is float:
+        return type(value) is float and math.isfinite(value)
+    if get_origin(hint) in (Union, UnionType):
+        return any(is_well_typed(value, part) for part in get_args(hint))
+    if get_origin(hint) is tuple:
+        return _is_well_typed_tuple(value, get_args(hint))
+    if get_origin(hint) is dict:
+        key_hint, value_hint = get_args(hint)
+        return type(value) is dict and all(
+            is_well_typed(key, key_hint) and (value_hint is Any or is_well_typed(item, value_hint))
+            for key, item in value.items()
+        )
+    return type(value) is hint
+
+
+def _is_well_typed_tuple(value: object, parts: tuple[Any, ...]) -> bool:
+    if type(value) is not tuple:
+        return False
+    if parts[-1] is Ellipsis:
+        return all(is_well_typed(item, parts[0]) for item in value)
+    return len(value) == len(parts) and all(map(is_well_typed, value, parts))
+
+
+INTS = st.integers(-(2**63), 2**63 - 1)
+NAMES = st.from_regex(NAME_PATTERN, fullmatch=True)
+NUMBERS = st.floats(-1e12, 1e12)
+PLAIN = st.dictionaries(
+    st.text(max_size=8),
+    st.recursive(
+        st.none() | st.booleans() | INTS | NUMBERS | st.text(max_size=8),
+        lambda inner: (
+            st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3)
+        ),
+        max_leaves=6,
+    ),
+    max_size=4,
+)
+SIMPLE: dict[Any, st.SearchStrategy[Any]] = {
+    int: INTS,
+    float: NUMBERS,
+    bool: st.booleans(),
+    bytes: st.binary(max_size=40),
+    Name: NAMES,
+    NoneType: st.none(),
+    Ballot: st.builds(Ballot, INTS, NAMES, INTS, INTS),
+    dict[str, Any]: PLAIN,
+}
+
+
+def values(hint: Any) -> st.SearchStrategy[Any]:  # noqa: ANN401
+    """Return a strategy for the values of an annotation."""
+    if hint in SIMPLE:
+        return SIMPLE[hint]
+    if attrs.has(hint):
+        return st.builds(hint, **{name: values(part) for name, part in HINTS[hint].items()})
+    parts = get_args(hint)
+    if get_origin(hint) in (Union, UnionType):
+        return st.one_of(*map(values, parts))
+    if get_origin(hint) is dict:
+        return st.dictionaries(values(parts[0]), values(parts[1]), max_size=4)
+    if parts[-1] is Ellipsis:
+        return st.lists(values(parts[0]), max_size=4).map(tuple)
+    return st.tuples(*map(values, parts))
+
+
+def envelope(message: object) -> tuple[int, str, Body]:
+    """Return version, kind and fields of a message as a stranger would write them."""
+    version, kind, body = msgpack.unpackb(encode(message), strict_map_key=False)
+    return version, kind, body
+
+
+def pack(*parts: object) -> bytes:
+    packed: bytes = msgpack.packb(list(parts))
+    return packed
+
+
+def refusal(payload: bytes, expected: type | None = None) -> BadInputError:
+    """Return the one error of a payload, which must be readable too."""
+    with pytest.raises(BadInputError) as caught:
+        decode(payload, expected)
+    assert len(str(caught.value).splitlines()) == 1
+    assert len(str(caught.value)) < 800
+    return caught.value
+
+
+def accepts_only_well_typed(payload: bytes) -> bool:
+    """Decode any bytes; tell whether they were a message, which then has the right types."""
+    problem: BadInputError | None = None
+    try:
+        message = decode(payload)
+    except BadInputError as error:
+        problem = error
+    if problem is not None:
+        assert len(str(problem).splitlines()) == 1
+        return False
+    assert is_well_typed(message, type(message))
+    return True
+
+
+# --- round trip -------------------------------------------------------------------------------
+
+
+def test_there_is_a_sample_of_every_kind() -> None:
+    assert {type(sample) for sample in SAMPLES} == set(KINDS.values())
+
+
+@pytest.mark.parametrize("sample", SAMPLES, ids=lambda sample: type(sample).__name__)
+def test_a_sample_comes_back_equal_and_well_typed(sample: object) -> None:
+    decoded = decode(encode(sample), type(sample))
+    assert decoded == sample
+    assert is_well_typed(decoded, type(sample))
+    assert set(envelope(sample)[2]) == set(field_names(type(sample)))
+
+
+@pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
+def test_any_value_comes_back(kind: type) -> None:
+    @settings(max_examples=25, deadline=None)
+    @given(values(kind))
+    def check(message: object) -> None:
+        decoded = decode(encode(message), kind)
+        assert decoded == message
+        assert is_well_typed(decoded, kind)
+
+    check()
+
+
+def test_a_vehicle_without_a_promise_comes_back() -> None:
+    state = attrs.evolve(
+        next(sample for sample in SAMPLES if isinstance(sample, VehicleState)), promised=None
+    )
+    assert decode(encode(state)) == state
+
+
+def test_an_int_is_taken_where_a_number_is_meant() -> None:
+    version, kind, body = envelope(SAMPLES[7])
+    decoded = decode(pack(version, kind, body | {"t_s": 13}))
+    assert isinstance(decoded, RoadClock)
+    assert type(decoded.t_s) is float
+
+
+# --- the envelope -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("version", [0, 2, -1, "1", None, True, 1.0, [1], {}, b"1", 2**64 - 1])
+def test_another_version_is_refused(version: object) -> None:
+    assert VERSION == 1
+    _, kind, body = envelope(SAMPLES[0])
+    assert refusal(pack(version, kind, body)).field == "version"
+
+
+@pytest.mark.parametrize(
+    "kind", ["Hearbeat", "heartbeat", "", "object", "Ballot", "Neighbour", 1, None, [], {}, b"Plan"]
+)
+def test_an_unknown_kind_is_refused(kind: object) -> None:
+    version, _, body = envelope(SAMPLES[0])
+    assert refusal(pack(version, kind, body)).field == "kind"
+
+
+def test_another_kind_than_the_expected_is_refused() -> None:
+    for sample in SAMPLES:
+        for expected in KINDS.values():
+            if expected is not type(sample):
+                error = refusal(encode(sample), expected)
+                assert error.field == "kind"
+                assert expected.__name__ in str(error)
+
+
+@pytest.mark.parametrize("body", [None, 1, "x", [], [["tick", 1]], b"", True])
+def test_fields_that_are_no_map_are_refused(body: object) -> None:
+    assert refusal(pack(1, "RoadClock", body)).field == "RoadClock"
+
+
+@pytest.mark.parametrize(
+    "envelope_",
+    [None, 1, "Plan", {}, [], [1], [1, "Plan"], [1, "Plan", {}, {}], {"0": 1, "1": "Plan"}],
+)
+def test_what_is_no_envelope_is_refused(envelope_: object) -> None:
+    packed: bytes = msgpack.packb(envelope_)
+    assert refusal(packed).field == "message"
+
+
+def test_an_oversize_payload_is_refused_before_it_is_read() -> None:
+    body = envelope(SAMPLES[8])[2] | {"solve_ms": b"\0" * MAX_BYTES}
+    assert refusal(pack(1, "Report", body)).field == "message"
+    assert refusal(b"\0" * (MAX_BYTES + 1)).field == "message"
+
+
+def test_bytes_after_the_message_are_refused() -> None:
+    for sample in SAMPLES:
+        assert refusal(encode(sample) + b"\0").field == "message"
+
+
+# --- field by field ---------------------------------------------------------------------------
+
+FIELDS = [
+    pytest.param(sample, name, id=f"{type(sample).__name__}.{name}")
+    for sample in SAMPLES
+    for name in field_names(type(sample))
+]
+NUMBERS_NOT_ALLOWED = (math.nan, math.inf, -math.inf, 1.1e12, -1e300)
+NOT_INTS: tuple[Any, ...] = (True, False, 1.0, "1", None, [], {}, b"1", 2**63, 2**64 - 1, -math.inf)
+NOT_LISTS: tuple[Any, ...] = (None, 1, True, "ab", b"ab", {}, {0: 1, 1: 2}, {"0": 1})
+NOT_MAPS: tuple[Any, ...] = (None, 1, True, "ab", b"ab", [], [["v1", 1]])
+BALLOTS_NOT_ALLOWED: tuple[Any, ...] = (
+    [], [1, "c", 2], [1, "c", 2, 3, 4], [True, "c", 2, 3], [1, "c/", 2, 3], [1, 7, 2, 3],
+    [1, "c", 2.0, 3], [1, "c", 2, "3"], [2**63, "c", 2, 3], "abcd", b"abcd", 4, {},
+    {"term": 1, "coordinator": "c", "incarnation": 2, "seq": 3}, [[1, "c", 2, 3]],
+)  # fmt: skip
+
+
+def wrong_values(hint: Any) -> list[Any]:  # noqa: ANN401
+    """Return values that an annotation does not allow."""
+    parts = get_args(hint)
+    if hint == dict[str, Any]:
+        deep: Any = 1
+        for _ in range(300):
+            deep = [deep]
+        foreign: tuple[Any, ...] = (
+            math.nan,
+            b"x",
+            2**63,
+            msgpack.ExtType(5, b"x"),
+            msgpack.Timestamp(1, 2),
+            deep,
+        )
+        keys: list[Any] = [{1: 1}, {"a": {1: 1}}, {b"a": 1}]
+        return [*NOT_MAPS, *keys, *({"a": item} for item in foreign)]
+    if get_origin(hint) is dict:
+        named: list[Any] = [
+            {name: right_value(parts[1])} for name in (*NAMES_NOT_ALLOWED, 1, None, b"v1")
+        ]
+        return [*NOT_MAPS, *named, *({"v1": wrong} for wrong in wrong_values(parts[1]))]
+    if get_origin(hint) is tuple and parts[-1] is Ellipsis:
+        return [*NOT_LISTS] + [[wrong] for wrong in wrong_values(parts[0])]
+    if get_origin(hint) is tuple:
+        good = [right_value(part) for part in parts]
+        nested = [
+            [*good[:place], wrong, *good[place + 1 :]]
+            for place, part in enumerate(parts)
+            for wrong in wrong_values(part)
+        ]
+        return [*NOT_LISTS, [], good[:-1], [*good, good[-1]], *nested]
+    if attrs.has(hint):
+        body = {name: right_value(part) for name, part in HINTS[hint].items()}
+        needed = [field.name for field in attrs.fields(hint) if field.default is attrs.NOTHING]
+        lacking: list[Any] = [{k: v for k, v in body.items() if k != name} for name in needed]
+        parts_wrong: list[Any] = [
+            body | {name: wrong}
+            for name, part in HINTS[hint].items()
+            for wrong in wrong_values(part)
+        ]
+        return [*NOT_MAPS, body | {"more": 1}, body | {1: 1}, *lacking, *parts_wrong]
+    simple: dict[Any, list[Any]] = {
+        int: [*NOT_INTS],
+        float: [*NUMBERS_NOT_ALLOWED, True, "1.0", None, [], {}, b"1"],
+        bool: [0, 1, 0.0, "true", None, [], {}, b""],
+        bytes: ["x", None, 1, [], [0, 0], {}, True],
+        Name: [*NAMES_NOT_ALLOWED, 1, True, None, [], {}, b"v1", 1.5],
+        Ballot: [None, *BALLOTS_NOT_ALLOWED],
+        Ballot | None: [*BALLOTS_NOT_ALLOWED],
+    }
+    if hint not in simple and NoneType in parts:
+        return [wrong for wrong in wrong_values(parts[0]) if wrong is not None]
+    return simple[hint]
+
+
+def right_value(hint: Any) -> Any:  # noqa: ANN401
+    """Return one allowed value."""
+    parts = get_args(hint)
+    if get_origin(hint) is tuple:
+        return [] if parts[-1] is Ellipsis else [right_value(part) for part in parts]
+    return {int: 1, float: 1.0, bool: True, bytes: b"", Name: "v1", Ballot: [1, "c", 2, 3]}[hint]
+
+
+@pytest.mark.parametrize(("sample", "name"), FIELDS)
+def test_every_wrong_value_of_a_field_is_refused_by_name(sample: object, name: str) -> None:
+    version, kind, body = envelope(sample)
+    wrongs = wrong_values(HINTS[type(sample)][name])
+    assert len(wrongs) > 5
+    for wrong in wrongs:
+        error = refusal(pack(version, kind, body | {name: wrong}), type(sample))
+        assert error.field.startswith(f"{kind}.{name}"), (wrong, error)
+
+
+@pytest.mark.parametrize(("sample", "name"), FIELDS)
+def test_a_missing_field_is_refused_by_name(sample: object, name: str) -> None:
+    version, kind, body = envelope(sample)
+    del body[name]
+    attribute = attrs.fields_dict(type(sample))[name]  # type: ignore[arg-type]
+    payload = pack(version, kind, body)
+    if attribute.default is attrs.NOTHING:
+        assert refusal(payload).field == f"{kind}.{name}"
+    else:
+        assert accepts_only_well_typed(payload)
+
+
+@pytest.mark.parametrize("sample", SAMPLES, ids=lambda sample: type(sample).__name__)
+def test_an_extra_field_is_refused_by_name(sample: object) -> None:
+    version, kind, body = envelope(sample)
+    assert refusal(pack(version, kind, body | {"extra": 1})).field == f"{kind}.extra"
+    assert refusal(pack(version, kind, body | {"a\n\x1b[2J": 1})).field.startswith(f"{kind}.a")
+
+
+@pytest.mark.parametrize("key", [1, None, b"tick", True, 1.5])
+@pytest.mark.parametrize("sample", SAMPLES, ids=lambda sample: type(sample).__name__)
+def test_a_field_whose_name_is_no_text_is_refused(sample: object, key: object) -> None:
+    version, kind, body = envelope(sample)
+    assert refusal(pack(version, kind, body | {key: 1})).field == kind
+    assert refusal(pack(version, kind, body | {key: 1, "extra": 1, 7: 7})).field.startswith(kind)
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong", "field"),
+    [
+        ("ahead", [{"lane": 0, "gap_m": 1.0}], "Sense.ahead[0].speed_mps"),
+        (
+            "ahead",
+            [{"lane": 0, "gap_m": 1.0, "speed_mps": 1.0}, {"lane": 0, "gap_m": "1"}],
+            "Sense.ahead[1].gap_m",
+        ),
+        ("ahead", [{"lane": 0, "gap_m": 1.0, "speed_mps": 1.0, "x": 1}], "Sense.ahead[0].x"),
+        ("ahead", [[0, 1.0, 1.0]], "Sense.ahead[0]"),
+        (
+            "behind",
+            [{"lane": 0, "gap_m": 1.0, "speed_mps": 1.0, "accel_mps2": None}],
+            "Sense.behind[0].accel_mps2",
+        ),
+        ("setpoint", [0.0, math.inf], "Sense.setpoint[1]"),
+        ("state", [0.0, 0.0, math.nan, 0.0, 0.0, 0.0], "Sense.state[2]"),
+        ("hold_cell", [0, "1"], "Sense.hold_cell[1]"),
+    ],
+)
+def test_the_path_leads_to_the_wrong_part(name: str, wrong: object, field: str) -> None:
+    version, kind, body = envelope(SAMPLES[4])
+    assert refusal(pack(version, kind, body | {name: wrong})).field == field
+
+
+def test_the_path_leads_into_maps() -> None:
+    version, kind, body = envelope(SAMPLES[2])
+    moves = {"v1": [[0, [0, 0], [0, 1]], [1, [0, 1], [0, None]]], "v2": []}
+    error = refusal(pack(version, kind, body | {"moves": moves}))
+    assert error.field == "Plan.moves[v1][1][2][1]"
+    assert error.value is None
+
+
+# --- anything at all --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("opening", [b"\x91", b"\x81", b"\x81\xa1a", b"\x93\x01\xa4Plan\x81\xa1a"])
+@pytest.mark.parametrize("depth", [100, 500, 1000, 5000, 100_000])
+def test_deep_nesting_is_refused(opening: bytes, depth: int) -> None:
+    refusal(opening * depth)
+    refusal(opening * depth + b"\x01")
+
+
+@pytest.mark.parametrize(("sample", "name"), FIELDS)
+@pytest.mark.parametrize("depth", [50, 900, 1100])
+def test_a_deeply_nested_field_is_refused(sample: object, name: str, depth: int) -> None:
+    version, kind, body = envelope(sample)
+    body[name] = "HERE"
+    inner = b"\x91" * depth + b"\x01"
+    payload = pack(version, kind, body).replace(b"\xa4HERE", inner)
+    assert refusal(payload).field.startswith((f"{kind}.{name}", "message"))
+
+
+@pytest.mark.parametrize("sample", SAMPLES, ids=lambda sample: type(sample).__name__)
+def test_every_truncation_is_refused(sample: object) -> None:
+    payload = encode(sample)
+    for length in range(len(payload)):
+        assert refusal(payload[:length]).field == "message"
+
+
+def test_random_bytes_are_refused() -> None:
+    rng = random.Random(1)
+    decoded = 0
+    for _ in range(10_000):
+        decoded += accepts_only_well_typed(rng.randbytes(rng.randrange(80)))
+    assert decoded == 0
+
+
+def test_random_bodies_are_refused() -> None:
+    rng = random.Random(2)
+    names = list(KINDS)
+    for _ in range(3000):
+        head: bytes = b"\x93\x01" + msgpack.packb(rng.choice(names))
+        assert not accepts_only_well_typed(head + rng.randbytes(rng.randrange(60)))
+
+
+@pytest.mark.parametrize("sample", SAMPLES, ids=lambda sample: type(sample).__name__)
+def test_flipped_bits_never_give_wrong_types(sample: object) -> None:
+    payload = encode(sample)
+    for place in range(len(payload)):
+        for bit in range(8):
+            flipped = bytearray(payload)
+            flipped[place] ^= 1 << bit
+            accepts_only_well_typed(bytes(flipped))
+
+
+def test_mixed_up_messages_never_give_wrong_types() -> None:
+    rng = random.Random(3)
+    parts = [value for sample in SAMPLES for value in envelope(sample)[2].values()]
+    for _ in range(5000):
+        version, kind, body = envelope(rng.choice(SAMPLES))
+        for name in rng.sample(list(body), k=min(len(body), 2)):
+            body[name] = rng.choice(parts)
+        accepts_only_well_typed(pack(version, kind, body))
+
+
+JUNK = st.recursive(
+    st.none() | st.booleans() | INTS | st.floats() | st.text(max_size=5) | st.binary(max_size=5),
+    lambda inner: (
+        st.lists(inner, max_size=4)
+        | st.dictionaries(st.none() | st.integers(-9, 9) | st.text(max_size=4), inner, max_size=4)
+    ),
+    max_leaves=10,
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.sampled_from(SAMPLES), st.data())
+def test_junk_in_a_field_never_gives_wrong_types(sample: object, data: st.DataObject) -> None:
+    version, kind, body = envelope(sample)
+    name = data.draw(st.sampled_from(sorted(body)))
+    accepts_only_well_typed(pack(version, kind, body | {name: data.draw(JUNK)}))
+
+
+@settings(max_examples=100, deadline=None)
+@given(JUNK)
+def test_junk_is_never_a_message(junk: object) -> None:
+    packed: bytes = msgpack.packb(junk)
+    assert not accepts_only_well_typed(packed)
+
+
+# --- the error line ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        "x" * 10**6,
+        "a\nb\r\x1b[2J\u2028c",
+        16**20_000,
+        list(range(10**5)),
+        {"a": "b" * 10**5},
+        b"\n",
+    ],
+    ids=["long", "controls", "huge int", "list", "map", "bytes"],
+)
+def test_an_error_is_one_short_readable_line(value: object) -> None:
+    for field in ("road.lanes", str(value)[:200] if not isinstance(value, int) else "x"):
+        line = str(BadInputError(field, value, "what is allowed"))
+        assert len(line.splitlines()) == 1
+        assert line.isprintable()
+        assert len(line) < 300
+        assert line.endswith("; allowed: what is allowed")
+
+
+def test_an_error_shows_values_that_contain_themselves_or_nest_deeply() -> None:
+    loop: list[Any] = []
+    loop.append(loop)
+    deep: list[Any] = []
+    for _ in range(5000):
+        deep = [deep]
+    for value in (loop, deep):
+        assert len(str(BadInputError("field", value, "less"))) < 120
+
+
+def test_within_joins_names() -> None:
+    def joined(parent: str, field: str) -> str:
+        return BadInputError(field, 1, "2").within(parent).field
+
+    assert joined("road", "lanes") == "road.lanes"
+    assert joined("kill", "[1].at_s") == "kill[1].at_s"
+    assert joined("", "seed") == "seed"
+    assert joined("seed", "") == "seed"

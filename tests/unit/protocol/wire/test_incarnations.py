@@ -1,0 +1,79 @@
+"""Incarnations rise, and no two processes ever have the same one."""
+
+from __future__ import annotations
+
+import os
+import time
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from laneweave.protocol.wire.incarnations import Incarnations, above
+
+STEP = 1 << 22
+NUMBERS = st.integers(0, 1 << 62)
+
+
+@given(number=NUMBERS, floor=NUMBERS)
+def test_above_is_the_least_number_of_the_same_process_that_will_do(
+    number: int, floor: int
+) -> None:
+    result = above(number, floor)
+    assert result > floor
+    assert result >= number
+    assert result % STEP == number % STEP
+    assert result == number or result - STEP <= floor
+
+
+@given(number=NUMBERS, distance=st.integers(-2 * STEP, 2 * STEP))
+def test_above_near_the_floor(number: int, distance: int) -> None:
+    result = above(number, number + distance)
+    assert (result - number) % STEP == 0
+    assert result - number == max(0, (distance // STEP + 1) * STEP)
+
+
+@given(first=NUMBERS, second=NUMBERS, floor=NUMBERS)
+def test_processes_that_step_above_the_same_floor_do_not_meet(
+    first: int, second: int, floor: int
+) -> None:
+    met = above(first, floor) == above(second, floor)
+    assert not met or first % STEP == second % STEP
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The time in ns, which the test sets."""
+    now_ns = [1_700_000_000_000_000_000]
+    monkeypatch.setattr(time, "time_ns", lambda: now_ns[0])
+    return now_ns
+
+
+def test_numbers_rise_also_when_the_clock_stands_still_or_goes_back(clock: list[int]) -> None:
+    incarnations = Incarnations()
+    numbers = []
+    for passed_ns in (0, 0, 1, STEP, -10 * STEP, 0, 1_000_000_000):
+        clock[0] += passed_ns
+        numbers.append(incarnations())
+    assert numbers == sorted(set(numbers))
+    assert {number % STEP for number in numbers} == {os.getpid() % STEP}
+
+
+def test_numbers_are_times(clock: list[int]) -> None:
+    """So that a process that starts later has the greater one."""
+    assert abs(Incarnations()() - clock[0]) < STEP
+    before = Incarnations()()
+    clock[0] += STEP
+    assert Incarnations()() == before + STEP
+
+
+def test_processes_of_the_same_moment_have_different_numbers(
+    clock: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    numbers = set[int]()
+    for process in (4321, 4322, STEP - 1):
+        monkeypatch.setattr(os, "getpid", lambda process=process: process)
+        incarnations = Incarnations()
+        numbers |= {incarnations() for _ in range(5)}
+    assert len(numbers) == 15
+    assert {abs(number - clock[0]) < 6 * STEP for number in numbers} == {True}

@@ -1,0 +1,173 @@
+"""The key grammar: what is built is read back, and nothing foreign is understood."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.wire.codec import KINDS
+from laneweave.protocol.wire.topics import (
+    CLOCK,
+    COMMAND,
+    NAME_PATTERN,
+    STATE,
+    TOPICS,
+    VEHICLE_ALIVE,
+    Keys,
+    Topic,
+    matches,
+)
+
+KEYS = Keys("r-1")
+NAMES = st.from_regex(NAME_PATTERN, fullmatch=True)
+BAD_PARTS = ("", "a/b", "a*", "**", "$*", "a#b", "a?b", "a b", "é", "x" * 65, "a\n", "{x}", "@")
+
+
+def filled(topic: Topic, text: str = "x") -> dict[str, str]:
+    return {name: f"{text}{index}" for index, name in enumerate(topic.parameters)}
+
+
+@pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
+def test_what_is_built_is_read_back(topic: Topic) -> None:
+    @given(st.tuples(*(NAMES for _ in topic.parameters)), NAMES)
+    def check(texts: tuple[str, ...], realm: str) -> None:
+        keys = Keys(realm)
+        parameters = dict(zip(topic.parameters, texts, strict=True))
+        key = keys.key(topic, **parameters)
+        assert keys.read(key) == (topic, parameters)
+        assert matches(keys.all_of(topic), key)
+        assert not re.search(r"[*$?#\s{}]|//|^/|/$", key)
+
+    check()
+
+
+def test_numbers_become_text() -> None:
+    key = KEYS.key(STATE, formation=-3, vehicle="v1")
+    assert key == "laneweave/r-1/state/-3/v1"
+    assert KEYS.read(key) == (STATE, {"formation": "-3", "vehicle": "v1"})
+
+
+def test_equal_numbers_with_different_texts_stay_apart() -> None:
+    keys = [KEYS.key(COMMAND, vehicle=vehicle) for vehicle in (1, True, 1.0, "1")]
+    assert [key.rpartition("/")[2] for key in keys] == ["1", "True", "1.0", "1"]
+
+
+@pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
+def test_the_longest_key_is_read_back(topic: Topic) -> None:
+    keys = Keys("x" * 64)
+    parameters = dict.fromkeys(topic.parameters, "y" * 64)
+    assert keys.read(keys.key(topic, **parameters)) == (topic, parameters)
+
+
+def test_who_reads_a_key_cannot_change_what_others_read() -> None:
+    key = KEYS.key(COMMAND, vehicle="v1")
+    known = KEYS.read(key)
+    assert known is not None
+    with pytest.raises(TypeError):
+        known[1]["vehicle"] = "v2"  # type: ignore[index]
+    assert KEYS.read(key) == (COMMAND, {"vehicle": "v1"})
+
+
+def test_topics_are_distinct() -> None:
+    assert len({topic.name for topic in TOPICS}) == len(TOPICS)
+    shapes = {re.sub(r"{\w+}", "*", topic.pattern) for topic in TOPICS}
+    assert len(shapes) == len(TOPICS)
+    keys = [KEYS.key(topic, **filled(topic)) for topic in TOPICS]
+    for topic, key in zip(TOPICS, keys, strict=True):
+        assert [other for other in keys if matches(KEYS.all_of(topic), other)] == [key]
+
+
+def test_every_message_kind_has_one_topic() -> None:
+    carried = [topic.kind for topic in TOPICS if topic.kind is not None]
+    assert sorted(kind.__name__ for kind in carried) == sorted(KINDS)
+
+
+@pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
+def test_the_grammar_has_no_reserved_characters(topic: Topic) -> None:
+    assert re.fullmatch(r"([a-z]+|{[a-z]+})(/([a-z]+|{[a-z]+}))*", topic.pattern)
+    assert re.fullmatch(r"[a-z-]+", topic.name)
+
+
+@pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
+def test_a_foreign_realm_is_not_understood(topic: Topic) -> None:
+    key = KEYS.key(topic, **filled(topic))
+    assert Keys("r-2").read(key) is None
+    assert Keys("r").read(key) is None
+    assert KEYS.read(key.replace("laneweave/", "other/")) is None
+    assert KEYS.read("/" + key) is None
+    assert KEYS.read(key + "/") is None
+    assert KEYS.read(key + "/more") is None
+    assert KEYS.read(key.rpartition("/")[0]) is None
+
+
+@pytest.mark.parametrize(
+    "key",
+    ["", "/", "laneweave", "laneweave/r-1", "laneweave/r-1/", "laneweave/r-1/none",
+     "laneweave/r-1/CLOCK", "laneweave/r-1/clock/x", "laneweave/r-1/state/1", "clock",
+     "laneweave/r-1/state//v1", "laneweave/r-1/alive/tram/x", "laneweave//r-1/clock",
+     "laneweave/r-1/command/*", "laneweave/r-1/command/**", "laneweave/r-1/**",
+     "laneweave/*/clock", "laneweave/r-1/command/é", "laneweave/r-1/command/{vehicle}",
+     "laneweave/r-1/command/" + "x" * 65, "laneweave/r-1/command/a b"],
+)  # fmt: skip
+def test_a_malformed_key_is_not_understood(key: str) -> None:
+    assert KEYS.read(key) is None
+
+
+@given(st.text(max_size=40))
+def test_any_text_is_read_or_refused(text: str) -> None:
+    for key in (text, f"laneweave/r-1/{text}", f"laneweave/r-1/state/{text}"):
+        known = KEYS.read(key)
+        if known is not None:
+            topic, parameters = known
+            assert KEYS.key(topic, **parameters) == key
+
+
+@pytest.mark.parametrize("part", BAD_PARTS)
+def test_a_parameter_that_is_no_key_part_is_refused(part: str) -> None:
+    with pytest.raises(BadInputError) as caught:
+        KEYS.key(COMMAND, vehicle=part)
+    assert caught.value.field == "vehicle"
+
+
+@pytest.mark.parametrize("realm", [*BAD_PARTS, "*"])
+def test_a_realm_that_is_no_key_part_is_refused(realm: str) -> None:
+    with pytest.raises(BadInputError) as caught:
+        Keys(realm)
+    assert caught.value.field == "network.realm"
+
+
+def test_expressions_leave_parameters_open() -> None:
+    assert KEYS.all_of(CLOCK) == "laneweave/r-1/clock"
+    assert KEYS.all_of(VEHICLE_ALIVE) == "laneweave/r-1/alive/vehicle/*"
+    assert KEYS.key(STATE, formation=2, vehicle="*") == "laneweave/r-1/state/2/*"
+
+
+def test_a_missing_parameter_is_a_mistake_of_the_caller() -> None:
+    with pytest.raises(KeyError):
+        KEYS.key(COMMAND)
+
+
+@pytest.mark.parametrize(
+    ("expression", "key", "expected"),
+    [
+        ("a/b", "a/b", True),
+        ("a/b", "a/c", False),
+        ("a/*", "a/b", True),
+        ("a/*", "a", False),
+        ("a/*", "a/b/c", False),
+        ("*/b", "a/b", True),
+        ("a/**", "a", True),
+        ("a/**", "a/b/c", True),
+        ("**/c", "a/b/c", True),
+        ("a/**/c", "a/c", True),
+        ("a/**/c", "a/b/b/c", True),
+        ("a/**/c", "a/b", False),
+        ("**", "a/b", True),
+    ],
+)
+def test_matching_follows_zenohs_rules(expression: str, key: str, *, expected: bool) -> None:
+    assert matches(expression, key) is expected

@@ -1,0 +1,165 @@
+"""The emergency brake in closed loop: it brakes in time, and no earlier than it has to."""
+
+from __future__ import annotations
+
+import attrs
+import numpy as np
+import pytest
+from hypothesis import assume, example, given, settings
+from hypothesis import strategies as st
+
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.vehicle.braking import EmergencyBrake, last_tick_m
+from laneweave.protocol.vehicle.motion import Jerk, commanded_state, limited_jerk
+from laneweave.protocol.wire.messages import Command, Name, Neighbour
+from laneweave.sim_bridge.bodies.footprints import Around
+from laneweave.sim_bridge.bodies.motion_controller import MotionController, Rung
+from laneweave.sim_bridge.bodies.plant import Plant
+from laneweave.sim_bridge.bodies.sensors import Sensors
+
+SCENARIO = Scenario()
+LIMITS, TICK_S = SCENARIO.vehicle, SCENARIO.runtime.tick_s
+MARGIN_M = SCENARIO.braking.margin_m
+WITHIN_A_TICK_M = 10.0 * TICK_S**2 / 8.0
+"""A body that stops within a tick goes so much farther than with full brake all the time."""
+BRAKE = EmergencyBrake(SCENARIO)
+
+
+def plant_at(front_m: float, v_mps: float, a_mps2: float = 0.0) -> Plant:
+    return Plant((front_m, v_mps, a_mps2, 1.75, 0.0, 0.0), LIMITS, TICK_S)
+
+
+def seen(own: Plant, ahead: Plant) -> Neighbour:
+    gap_m = ahead.state[0] - LIMITS.length_m - own.state[0]
+    return Neighbour(0, gap_m, ahead.state[1], ahead.state[2])
+
+
+def spare_m(own: Plant, ahead: Plant, jerk: Jerk) -> float:
+    """Return what a motion controller would find; the body allows no more than its limits."""
+    pursued = commanded_state(own.state, own.setpoint, LIMITS, 0.0)
+    allowed = limited_jerk(pursued, jerk, LIMITS, TICK_S)
+    return BRAKE.spare_m(own.state, own.setpoint[0], allowed, [seen(own, ahead)])
+
+
+def keepable(v_mps: float, a_mps2: float) -> bool:
+    """Tell whether a vehicle that keeps its limits can be in this state."""
+    pursued = v_mps + LIMITS.actuator_lag_s * a_mps2
+    needed = a_mps2 * a_mps2 / (2.0 * LIMITS.max_jerk_mps3) + abs(a_mps2) * TICK_S
+    return needed <= pursued <= LIMITS.max_speed_mps - needed
+
+
+@pytest.mark.parametrize("v_mps", [0.5, 3.0, 15.0, 24.0])
+@pytest.mark.parametrize("a_mps2", [-4.0, 0.0, 3.0])
+@pytest.mark.parametrize("jerk", [-15.0, 0.0, 15.0])
+def test_what_is_to_spare_is_where_the_body_stops_that_brakes_one_tick_later(
+    v_mps: float, a_mps2: float, jerk: float
+) -> None:
+    if not keepable(v_mps, a_mps2):
+        return
+    own, wall = plant_at(0.0, v_mps, a_mps2), plant_at(80.0, 0.0)
+    expected_m = spare_m(own, wall, (jerk, 0.0))
+    own.step(jerk, 0.0)
+    while own.state[1] > 1e-6:
+        own.brake(0.0)
+    left_m = seen(own, wall).gap_m - MARGIN_M
+    # What is to spare counts the longest last tick.
+    longest_m = last_tick_m(-LIMITS.min_accel_mps2, TICK_S)
+    assert expected_m - 1e-4 <= left_m <= expected_m + longest_m + 1e-4
+
+
+JERKS = st.lists(st.sampled_from((-15.0, -5.0, 0.0, 5.0, 15.0)), min_size=1, max_size=10)
+
+
+@given(
+    st.tuples(st.floats(0.0, 25.0), st.floats(-9.0, 5.0)),
+    st.tuples(st.floats(0.0, 25.0), st.floats(-9.0, 5.0)),
+    st.one_of(st.just(0.0), st.floats(0.0, 30.0)),
+    JERKS,
+    JERKS,
+    st.integers(0, 60),
+)
+@example((16.5, -6.0), (16.0, 0.0), 0.0, [-15.0], [-15.0], 0)
+@example((20.8, -8.48), (19.45, 0.1), 0.0, [-15.0], [-15.0], 0)
+@settings(max_examples=150, deadline=None)
+def test_nobody_runs_into_who_brakes_as_hard_as_it_can_at_any_time(
+    own_motion: tuple[float, float],
+    other_motion: tuple[float, float],
+    extra_m: float,
+    own_jerks: list[float],
+    other_jerks: list[float],
+    braking_tick: int,
+) -> None:
+    """Whatever it was told to do, from wherever there was room for it at all."""
+    assume(keepable(*own_motion))
+    assume(keepable(*other_motion))
+    own, other = plant_at(0.0, *own_motion), plant_at(LIMITS.length_m, *other_motion)
+    lacking_m = -spare_m(own, other, (own_jerks[0], 0.0))
+    gap_m = max(lacking_m, MARGIN_M) + extra_m
+    other = plant_at(LIMITS.length_m + gap_m, *other_motion)
+    for tick in range(braking_tick + 60):
+        jerk: Jerk = (own_jerks[tick // 4 % len(own_jerks)], 0.0)
+        brakes = spare_m(own, other, jerk) < 0.0
+        if tick >= braking_tick:
+            other.brake(0.0)
+        else:
+            other.step(other_jerks[tick // 4 % len(other_jerks)], 0.0)
+        if brakes:
+            own.brake(0.0)
+        else:
+            own.step(*jerk)
+        # The margin is what is left at the end. On the way it is less where somebody begins so near
+        # while it is faster and brakes already.
+        assert seen(own, other).gap_m >= 0.3 * MARGIN_M
+    assert seen(own, other).gap_m >= MARGIN_M - 2.0 * WITHIN_A_TICK_M
+    assert other.state[1] == pytest.approx(0.0, abs=0.05)
+
+
+def drive_behind(
+    scenario: Scenario, number: int, gap_m: float, *, braking_tick: int
+) -> tuple[float, MotionController]:
+    """Let somebody speed up behind one that holds and then brakes; return the least gap."""
+    own, other = plant_at(0.0, 15.0), plant_at(LIMITS.length_m + gap_m, 15.0)
+    controller = MotionController(own, scenario, (0, 0))
+    sensors = Sensors(scenario, Name(f"v{number}"))
+    least_m = gap_m
+    for tick in range(braking_tick + 60):
+        jerks = np.array([(15.0, 0.0)], dtype="<f4").tobytes()
+        controller.take(Command(Name("v"), 1, tick, (0, 0), tick + 1, (0, 0), jerks))
+        around = sensors.look(([attrs.astuple(seen(own, other))], []))
+        controller.perceive(sensors.measure(own.state), around)
+        controller.step(tick)
+        if tick >= braking_tick:
+            other.brake(0.0)
+        else:
+            other.step(0.0, 0.0)
+        least_m = min(least_m, seen(own, other).gap_m)
+    return least_m, controller
+
+
+@pytest.mark.parametrize("jerk", [-40.0, -1000.0, -3e38])
+def test_who_commands_braking_that_the_body_cannot_do_has_not_braked(jerk: float) -> None:
+    own, wall = plant_at(0.0, 15.0), plant_at(24.0, 0.0)
+    controller = MotionController(own, SCENARIO, (0, 0))
+    for tick in range(40):
+        jerks = np.array([(jerk, 0.0)], dtype="<f4").tobytes()
+        controller.take(Command(Name("v"), 1, tick, (0, 0), tick + 1, (0, 0), jerks))
+        controller.perceive(own.state, Around((seen(own, wall),), ()))
+        controller.step(tick)
+        assert seen(own, wall).gap_m > MARGIN_M - 0.1
+    assert controller.rung_ticks[Rung.EMERGENCY] > 0
+
+
+@pytest.mark.parametrize("number", range(24))
+def test_errors_of_measurement_do_not_make_it_too_late(number: int) -> None:
+    """An agent gone mad speeds up behind somebody who brakes sooner or later."""
+    least_m, controller = drive_behind(SCENARIO, number, 4.0 + number, braking_tick=3 * number)
+    assert least_m > 0.0
+    assert controller.rung_ticks[Rung.EMERGENCY] > 0
+
+
+def test_it_is_not_more_careful_than_it_has_to_be() -> None:
+    """Exact sensors: who brakes behind one that stops comes to rest little more than its margin."""
+    exact = {field.name: 0.0 for field in attrs.fields(type(SCENARIO.sensing))}
+    scenario = attrs.evolve(SCENARIO, sensing=type(SCENARIO.sensing)(**exact))
+    least_m, _ = drive_behind(scenario, 0, 12.0, braking_tick=12)
+    assert MARGIN_M - 3.0 * WITHIN_A_TICK_M <= least_m <= MARGIN_M + 1.5

@@ -1,0 +1,338 @@
+"""The motion controller plays what it was told, then brings its vehicle to rest."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+from attrs import evolve
+
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.vehicle.motion import Jerk, cell_state
+from laneweave.protocol.wire.messages import Ballot, Command, Name
+from laneweave.sim_bridge.bodies.motion_controller import MAX_COLUMN, MotionController, Rung
+from laneweave.sim_bridge.bodies.plant import Plant
+from support.paper import PAPER
+
+SCENARIO = PAPER
+LATTICE, TICK_S = SCENARIO.lattice, SCENARIO.runtime.tick_s
+HOME: Cell = (0, 1)
+AGENT = 5
+"""Incarnation of the process that drives."""
+
+
+@pytest.fixture
+def controller() -> MotionController:
+    plant = Plant(cell_state(LATTICE, HOME, 0.0), SCENARIO.vehicle, TICK_S)
+    controller = MotionController(plant, SCENARIO, HOME)
+    controller.hand_over(AGENT)
+    return controller
+
+
+def command(
+    tick: int, *pairs: tuple[float, float], hold_cell: Cell = HOME, incarnation: int = AGENT
+) -> Command:
+    played = np.array(pairs, dtype="<f4").tobytes()
+    return Command(Name("v"), incarnation, tick, hold_cell, tick + len(pairs), HOME, played)
+
+
+def driven(controller: MotionController) -> dict[Rung, int]:
+    """Return for how many ticks it drove by which rung."""
+    return {rung: ticks for rung, ticks in controller.rung_ticks.items() if ticks}
+
+
+def plays(controller: MotionController, tick: int) -> Jerk | None:
+    """Return the jerk that it would play at a tick; None: it would play nothing."""
+    rung, jerk = controller._way(tick, ())
+    return jerk if rung is Rung.PLAY else None
+
+
+def test_without_a_command_it_holds_its_cell(controller: MotionController) -> None:
+    for tick in range(50):
+        controller.step(tick)
+    assert controller.plant.state == pytest.approx(cell_state(LATTICE, HOME, 50 * TICK_S))
+    assert driven(controller) == {Rung.HOLD: 50}
+    assert (controller.motion_origin, controller.motion_end_tick) == (HOME, 0)
+
+
+def test_plays_jerk_by_jerk_and_from_the_middle_when_ticks_were_missed(
+    controller: MotionController,
+) -> None:
+    assert controller.take(command(10, (1.0, 0.0), (2.0, 0.5), (-4.0, 0.0)))
+    controller.step(11)
+    assert controller.plant.setpoint == pytest.approx((2.0 * TICK_S, 0.5 * TICK_S))
+    controller.step(12)
+    assert controller.plant.setpoint == pytest.approx((-2.0 * TICK_S, 0.5 * TICK_S))
+    assert driven(controller) == {Rung.PLAY: 2}
+
+
+def test_comes_to_rest_in_the_last_cell_when_the_trajectory_has_run_out(
+    controller: MotionController,
+) -> None:
+    target: Cell = (1, 2)
+    controller.take(command(0, *[(3.0, 0.0)] * 4, hold_cell=target))
+    for tick in range(300):
+        controller.step(tick)
+    assert driven(controller) == {Rung.PLAY: 4, Rung.HOLD: 296}
+    assert controller.plant.state == pytest.approx(cell_state(LATTICE, target, 30.0), abs=0.01)
+
+
+def test_the_newest_command_counts(controller: MotionController) -> None:
+    assert controller.take(command(5, (1.0, 0.0)))
+    for tick in (5, 4, -1):
+        assert not controller.take(command(tick, (9.0, 0.0), hold_cell=(1, 1)))
+    assert (controller.command_tick, controller.hold_cell) == (5, HOME)
+    assert controller.take(command(6, (2.0, 0.0), hold_cell=(1, 1)))
+    assert (controller.command_tick, controller.hold_cell) == (6, (1, 1))
+    assert (controller.motion_origin, controller.motion_end_tick) == (HOME, 7)
+
+
+def test_a_command_without_jerks_leaves_the_motion_under_way_as_it_is(
+    controller: MotionController,
+) -> None:
+    controller.take(command(5, (1.0, 0.0), (2.0, 0.0), hold_cell=(1, 1)))
+    controller.step(5)
+    assert controller.take(command(6, hold_cell=(1, 1)))
+    assert (controller.command_tick, controller.motion_end_tick) == (6, 7)
+    controller.step(6)
+    assert controller.plant.setpoint[0] == pytest.approx(3.0 * TICK_S)
+    assert driven(controller) == {Rung.PLAY: 2}
+
+
+def test_a_command_without_jerks_that_names_another_cell_goes_there_by_the_hold_law(
+    controller: MotionController,
+) -> None:
+    controller.take(command(5, (1.0, 0.0), (2.0, 0.0)))
+    assert controller.take(command(6, hold_cell=(1, 1)))
+    controller.step(6)
+    assert controller.hold_cell == (1, 1)
+    assert driven(controller) == {Rung.HOLD: 1}
+
+
+# --- who is in charge -------------------------------------------------------------------------
+
+
+def known(controller: MotionController) -> tuple[object, ...]:
+    return (
+        controller.attendant,
+        controller.joined,
+        controller.accepted,
+        controller.command_tick,
+        controller.hold_cell,
+        controller.motion_origin,
+        controller.motion_end_tick,
+        plays(controller, 3),
+    )
+
+
+def test_nobody_is_in_charge_of_a_new_vehicle() -> None:
+    plant = Plant(cell_state(LATTICE, HOME, 0.0), SCENARIO.vehicle, TICK_S)
+    controller = MotionController(plant, SCENARIO, (-9, 1))
+    assert (controller.attendant, controller.joined) == (0, (LATTICE.block_of(-9),))
+    assert controller.accepted is None
+
+
+def test_an_older_process_is_refused_whatever_it_says(controller: MotionController) -> None:
+    controller.take(command(3, (1.0, 0.0)))
+    before = known(controller)
+    for cell in (HOME, (1, 1)):
+        late = evolve(command(4, (9.0, 0.0), hold_cell=cell, incarnation=AGENT - 1), joined=(7,))
+        assert not controller.take(late)
+        assert known(controller) == before
+    assert not controller.take(evolve(command(4, incarnation=AGENT - 1), jerks=b"nonsense"))
+
+
+def test_a_newer_process_takes_charge_with_its_command(controller: MotionController) -> None:
+    controller.take(command(3, (1.0, 0.0)))
+    assert controller.take(command(4, (2.0, 0.0), incarnation=AGENT + 1))
+    assert controller.attendant == AGENT + 1
+    assert plays(controller, 4) == (2.0, 0.0)
+    assert not controller.take(command(5, (3.0, 0.0)))
+    assert plays(controller, 4) == (2.0, 0.0)
+
+
+def test_who_takes_charge_cannot_move_with_the_same_command(controller: MotionController) -> None:
+    """It could not speak for the vehicle yet, so nobody has made room for its move."""
+    controller.take(command(3, (1.0, 0.0)))
+    before = known(controller)
+    assert not controller.take(command(4, (2.0, 0.0), hold_cell=(1, 1), incarnation=AGENT + 1))
+    assert known(controller) == before
+    assert controller.take(command(4, (2.0, 0.0), incarnation=AGENT + 1))
+    assert controller.take(command(5, (2.0, 0.0), hold_cell=(1, 1), incarnation=AGENT + 1))
+
+
+def test_a_claim_that_came_second_is_tried_again_with_the_next_tick(
+    controller: MotionController,
+) -> None:
+    """The one before has begun to move in this tick, of which the claim does not know."""
+    assert controller.take(command(3, (1.0, 0.0), hold_cell=(1, 1)))
+    assert not controller.take(command(3, (2.0, 0.0), incarnation=AGENT + 1))
+    assert (controller.attendant, controller.hold_cell) == (AGENT, (1, 1))
+    claim = command(4, (2.0, 0.0), hold_cell=(1, 1), incarnation=AGENT + 1)
+    assert controller.take(claim)
+    assert controller.attendant == AGENT + 1
+
+
+def test_handing_over_leaves_the_motion_as_it_is(controller: MotionController) -> None:
+    controller.take(command(3, *[(1.0, 0.0)] * 9, hold_cell=(1, 1)))
+    before = known(controller)
+    controller.hand_over(AGENT + 7)
+    assert known(controller) == (AGENT + 7, *before[1:])
+    for incarnation in (AGENT, AGENT + 7):
+        with pytest.raises(ValueError, match="not above"):
+            controller.hand_over(incarnation)
+
+
+def test_formations_are_joined_for_ever_and_only_by_who_is_in_charge(
+    controller: MotionController,
+) -> None:
+    own = LATTICE.block_of(HOME[0])
+    controller.take(evolve(command(3), joined=(own + 2,)))
+    assert [*controller.joined] == [own, own + 2]
+    controller.take(evolve(command(4), joined=()))
+    controller.take(evolve(command(5), joined=(own + 1, own + 2)))
+    controller.take(evolve(command(6, incarnation=AGENT - 1), joined=(own + 5,)))
+    controller.take(evolve(command(5), joined=(own + 6,)))
+    assert [*controller.joined] == [own, own + 1, own + 2]
+
+
+# --- what it notes ----------------------------------------------------------------------------
+
+LOW, HIGH = Ballot(1, Name("c1"), 7, 1), Ballot(1, Name("c1"), 7, 2)
+
+
+def asking(
+    accepted: Ballot | None, *joined: int, tick: int = 3, incarnation: int = AGENT
+) -> Command:
+    return evolve(command(tick, incarnation=incarnation), accepted=accepted, joined=joined)
+
+
+def test_an_acceptance_is_noted_with_a_command(controller: MotionController) -> None:
+    assert controller.take(asking(LOW))
+    assert controller.accepted == LOW
+    controller.take(asking(None, tick=4))
+    assert controller.accepted == LOW
+
+
+def test_what_the_one_in_charge_asks_for_is_noted_whatever_the_tick(
+    controller: MotionController,
+) -> None:
+    controller.take(command(5, (1.0, 0.0)))
+    before = known(controller)
+    for tick, ballot in ((5, LOW), (4, HIGH)):
+        late = evolve(command(tick, (9.0, 0.0), hold_cell=(1, 1)), accepted=ballot, joined=(7,))
+        assert controller.note(late)
+        assert not controller.note(late)  # nothing new
+        assert (controller.accepted, controller.joined[-1]) == (ballot, 7)
+    assert known(controller)[3:] == before[3:]  # it is not played
+
+
+def test_the_newest_acceptance_counts(controller: MotionController) -> None:
+    assert controller.note(asking(HIGH))
+    for older in (LOW, None):
+        assert not controller.note(asking(older))
+        assert controller.accepted == HIGH
+
+
+@pytest.mark.parametrize("incarnation", [AGENT - 1, AGENT + 1])
+def test_nothing_is_noted_for_who_is_not_in_charge(
+    controller: MotionController, incarnation: int
+) -> None:
+    """Neither for one that has been replaced nor, before its claim, for its successor."""
+    before = known(controller)
+    assert not controller.note(asking(LOW, 7, incarnation=incarnation))
+    assert known(controller) == before
+
+
+def test_numbers_out_of_range_are_not_noted(controller: MotionController) -> None:
+    before = known(controller)
+    assert not controller.note(asking(LOW, 0, MAX_COLUMN + 1))
+    assert known(controller) == before
+
+
+@pytest.mark.parametrize("claim", ["command", "hand over"])
+def test_an_acceptance_is_forgotten_when_another_takes_charge(
+    controller: MotionController, claim: str
+) -> None:
+    controller.take(asking(LOW, 7))
+    joined = controller.joined
+    if claim == "command":
+        assert controller.take(asking(None, tick=4, incarnation=AGENT + 1))
+    else:
+        controller.hand_over(AGENT + 1)
+    assert (controller.accepted, controller.joined) == (None, joined)
+    assert not controller.note(asking(HIGH, tick=4))  # its time is over
+    assert controller.accepted is None
+    assert controller.note(asking(LOW, tick=4, incarnation=AGENT + 1))
+
+
+def test_a_claim_that_is_refused_makes_nothing_forgotten(controller: MotionController) -> None:
+    controller.take(asking(LOW))
+    claim = command(4, hold_cell=(1, 1), incarnation=AGENT + 1)
+    assert not controller.take(claim)
+    assert controller.accepted == LOW
+
+
+# --- what it refuses --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"jerks": b"1234"},
+        {"jerks": struct.pack("<3f", 1.0, 1.0, 1.0)},
+        {"jerks": struct.pack("<2f", float("nan"), 0.0)},
+        {"jerks": struct.pack("<4f", 0.0, 0.0, 0.0, float("-inf"))},
+        {"hold_cell": (0, -1)},
+        {"hold_cell": (0, LATTICE.lanes)},
+        {"hold_cell": (MAX_COLUMN + 1, 0)},
+        {"motion_origin": (-MAX_COLUMN - 1, 0)},
+        {"motion_origin": (0, 2**62)},
+        {"joined": (0, MAX_COLUMN + 1)},
+    ],
+)
+def test_a_bad_command_is_refused_whole(
+    controller: MotionController, changes: dict[str, object]
+) -> None:
+    controller.take(command(3, (1.0, 0.0)))
+    before = known(controller)
+    for incarnation in (AGENT, AGENT + 1):
+        good = command(4, (2.0, 0.0), hold_cell=(1, 1), incarnation=incarnation)
+        with pytest.raises(BadInputError):
+            controller.take(evolve(good, **changes))  # type: ignore[arg-type]
+        assert known(controller) == before
+
+
+def test_the_body_has_its_own_limits(controller: MotionController) -> None:
+    controller.take(command(0, *[(3e38, -3e38)] * 100))
+    for tick in range(100):
+        controller.step(tick)
+        _, v, a, _, v_y, a_y = controller.plant.state
+        assert 0.0 <= v <= SCENARIO.vehicle.max_speed_mps + 1e-9
+        assert a <= SCENARIO.vehicle.max_accel_mps2 + 1e-9
+        assert abs(a_y) <= SCENARIO.vehicle.max_lateral_accel_mps2 + 1e-9
+        assert abs(v_y) <= SCENARIO.vehicle.max_slip_ratio * v + 1e-9
+
+
+# --- when nobody drives -----------------------------------------------------------------------
+
+
+def test_a_motion_is_over_when_its_time_is_and_the_body_is_there(
+    controller: MotionController,
+) -> None:
+    assert not controller.moving(0)
+    controller.take(command(0, (0.0, 0.0), (0.0, 0.0)))
+    for tick, moving in ((0, True), (1, True), (2, False)):
+        assert controller.moving(tick) == moving
+        controller.step(tick)
+    controller.take(command(3, (0.0, 0.0), hold_cell=(1, 1)))
+    ends = [tick for tick in range(4, 200) if _moving_after(controller, tick)]
+    assert 30 < len(ends) < 120  # one column, by the hold law
+    assert ends == list(range(4, 4 + len(ends)))
+
+
+def _moving_after(controller: MotionController, tick: int) -> bool:
+    controller.step(tick - 1)
+    return controller.moving(tick)

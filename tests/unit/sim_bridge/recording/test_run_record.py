@@ -1,0 +1,265 @@
+"""What a run leaves behind of what roles report, and how it ended."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.wire.messages import Heartbeat, LogEvent, Name, Report
+from laneweave.sim_bridge.bodies.footprints import LeastGaps
+from laneweave.sim_bridge.bodies.motion_controller import Rung
+from laneweave.sim_bridge.recording.run_record import Ending, RunRecord, write_summary
+from laneweave.sim_bridge.road.demand import Arrival
+from laneweave.sim_bridge.road.entry import Admission
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from support.bridge_bench import read_events, read_summary
+
+SCENARIO = Scenario()
+NO_GAPS = LeastGaps(30.0, 2.0)
+
+
+class Watch:
+    """A stopwatch that is moved by hand."""
+
+    def __init__(self) -> None:
+        """Begin at some time."""
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def watch() -> Watch:
+    return Watch()
+
+
+@pytest.fixture
+def record(tmp_path: Path, watch: Watch) -> Iterator[RunRecord]:
+    record = RunRecord(tmp_path, SCENARIO, "formation", watch)
+    yield record
+    record.close(0.0, Ending.INTERRUPTED)
+
+
+def vehicle(name: str = "v0001", *, lane: int = 0, preferred_lane: int = 1) -> RoadVehicle:
+    admission = Admission(Arrival(name, lane, preferred_lane, 0.5), (-2, lane), 2.0)
+    return RoadVehicle.entering(admission, 2.0, SCENARIO)
+
+
+def report(
+    role: str, name: str, process: str = "1", *, published: int = 0, rejected: int = 0
+) -> Report:
+    return Report(Name(role), Name(name), Name(process), published, rejected)
+
+
+def floats(*values: float) -> bytes:
+    return struct.pack(f"<{len(values)}f", *values)
+
+
+# --- how it ended -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ending", Ending)
+def test_the_summary_says_how_the_run_ended(
+    record: RunRecord, tmp_path: Path, ending: Ending
+) -> None:
+    record.close(12.0, ending)
+    assert read_summary(tmp_path)["ending"] == ending.value
+    assert read_summary(tmp_path)["simulated_s"] == 12.0
+    (event,) = read_events(tmp_path, "run-ended")
+    assert (event["ending"], event["t_s"]) == (ending.value, 12.0)
+
+
+def test_the_first_ending_counts_and_nothing_follows_it(record: RunRecord, tmp_path: Path) -> None:
+    record.close(12.0, Ending.COMPLETE)
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    record.close(15.0, Ending.INTERRUPTED)
+    record.note(15.0, "leader")
+    record.on_event(LogEvent(Name("agent"), Name("A"), 15.0, Name("late")))
+    record.on_heartbeat(Heartbeat(Name("c0"), 1, 1, leading=True, formations=0), 15.0, 1.0)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_summary_is_written_whole(tmp_path: Path) -> None:
+    write_summary(tmp_path, {"old": 1})
+    with pytest.raises(ValueError, match="JSON"):
+        write_summary(tmp_path, {"bad": float("nan")})
+    assert read_summary(tmp_path) == {"old": 1}
+    write_summary(tmp_path, {"new": 2})
+    assert [path.name for path in tmp_path.iterdir()] == ["summary.json"]
+
+
+# --- messages ---------------------------------------------------------------------------------
+
+
+def test_messages_are_counted_once_per_process(record: RunRecord, tmp_path: Path) -> None:
+    """Vehicles that share a process all report what the process has counted so far."""
+    for message in (
+        report("agent", "A", "1", published=100, rejected=1),
+        report("agent", "B", "1", published=140, rejected=3),
+        report("agent", "C", "1", published=120, rejected=2),  # in whatever order they arrive
+        report("agent", "D", "2", published=10),
+        report("bridge", "bridge", "3", published=1000),
+        report("coordinator", "c0", "4", published=5),
+        report("coordinator", "c0", "4", published=50),
+    ):
+        record.on_report(message)
+    record.close(1.0, Ending.COMPLETE)
+    assert read_summary(tmp_path)["messages"] == {
+        "published": 140 + 10 + 1000 + 50,
+        "rejected": 3,
+        "dropped_by_faults": 0,
+    }
+
+
+def test_the_newest_report_of_a_sender_counts(record: RunRecord, tmp_path: Path) -> None:
+    record.on_report(Report(Name("agent"), Name("A"), solves=5, solve_ms=floats(9.0)))
+    record.on_report(Report(Name("agent"), Name("A"), solves=7, unusable=1, solve_ms=floats(1.0)))
+    record.on_report(
+        Report(Name("agent"), Name("B"), solves=2, osqp_solves=1, solve_ms=floats(3.0))
+    )
+    record.close(1.0, Ending.COMPLETE)
+    tracking = read_summary(tmp_path)["tracking"]
+    assert (tracking["solves"], tracking["unusable"]) == (9, 1)
+    assert (tracking["osqp_solves"], tracking["unconstrained_steps"]) == (1, 8)
+    assert tracking["solve_ms"]["p50"] == 2.0
+
+
+@pytest.mark.parametrize("nonsense", [b"123", floats(float("nan"), float("inf"), -1.0), b""])
+def test_durations_that_are_none_are_left_out(
+    record: RunRecord, tmp_path: Path, nonsense: bytes
+) -> None:
+    record.on_report(Report(Name("agent"), Name("A"), solve_ms=nonsense))
+    record.on_report(Report(Name("agent"), Name("B"), solve_ms=floats(2.0)))
+    record.close(1.0, Ending.COMPLETE)
+    assert read_summary(tmp_path)["tracking"]["solve_ms"] == {"p50": 2.0, "p99": 2.0}
+
+
+def test_plans_are_counted_from_events(record: RunRecord, tmp_path: Path) -> None:
+    coordinator = (Name("coordinator"), Name("c0"))
+    made: tuple[dict[str, Any], ...] = (
+        {"status": "optimal", "vehicles": 4, "solve_ms": 10.0, "solver": "tappa"},
+        {"status": "bounded", "vehicles": 6, "solve_ms": 30.0},
+        {"status": [], "vehicles": "many", "solve_ms": None, "name": "somebody-else"},
+        {"status": "optimal", "solver": "branching", "fallback": True},
+        {"status": "optimal", "solver": ["tappa"], "fallback": "yes"},
+    )
+    kinds = ("plan-made", "stream-planned", *("plan-made",) * 3)
+    for kind, data in zip(kinds, made, strict=True):
+        record.on_event(LogEvent(*coordinator, 5.0, Name(kind), data))
+    record.on_event(LogEvent(*coordinator, 6.0, Name("leader-elected"), {"term": 3}))
+    record.close(9.0, Ending.COMPLETE)
+    planning = read_summary(tmp_path)["planning"]
+    assert (planning["plans"], planning["optimal"], planning["largest_formation"]) == (5, 3, 6)
+    assert planning["by_solver"] == {"tappa": 1, "branching": 1, "rolling": 1}
+    assert planning["fallbacks"] == 1
+    assert planning["solve_ms"]["max"] == 30.0
+    assert [event["name"] for event in read_events(tmp_path, "plan-made")] == ["c0"] * 4
+    assert read_events(tmp_path, "leader-elected")[0]["term"] == 3
+
+
+# --- leadership -------------------------------------------------------------------------------
+
+
+def test_recovery_is_the_time_in_which_nobody_was_heard_leading(
+    record: RunRecord, tmp_path: Path
+) -> None:
+    def beat(name: str, incarnation: int = 1, *, leading: bool = True) -> Heartbeat:
+        return Heartbeat(Name(name), incarnation, 1, leading=leading, formations=0)
+
+    record.on_heartbeat(beat("c1", leading=False), 0.0, 1.0)
+    record.on_heartbeat(beat("c0"), 0.1, 2.0)
+    record.on_heartbeat(beat("c0"), 0.2, 3.0)
+    record.on_heartbeat(beat("c1", leading=False), 0.3, 3.2)
+    record.on_heartbeat(beat("c1"), 0.4, 3.5)
+    record.on_heartbeat(beat("c1", incarnation=2), 0.5, 5.0)  # the same name, another process
+    record.close(1.0, Ending.COMPLETE)
+    assert read_summary(tmp_path)["failover"] == {"leader_changes": 2, "recovery_s": [0.5, 1.5]}
+    leaders = [event["coordinator"] for event in read_events(tmp_path, "leader")]
+    assert leaders == ["c0", "c1", "c1"]
+
+
+# --- the world --------------------------------------------------------------------------------
+
+
+def test_a_trip_is_written_down(record: RunRecord, tmp_path: Path) -> None:
+    traveller = vehicle()
+    record.on_demanded(traveller.admission.arrival)
+    record.on_entered(traveller)
+    plant = traveller.controller.plant
+    plant._state = (SCENARIO.road.length_m + 6.0, 15.0, 0.0, 5.25, 0.0, 0.0)
+    traveller.controller.rung_ticks |= {Rung.PLAY: 90, Rung.HOLD: 3, Rung.GIVE_WAY: 1}
+    stays = vehicle("v0002")
+    record.on_demanded(stays.admission.arrival)
+    record.on_entered(stays)
+    stays.controller.rung_ticks |= {Rung.HOLD: 2, Rung.GIVE_WAY: 1, Rung.EMERGENCY: 5}
+    record.on_left(traveller, 70.0, attended=True)
+    record.on_still_on_road(stays)
+    record.close(70.0, Ending.LIMIT)
+    (left,) = read_events(tmp_path, "left")
+    assert left["t_s"] == pytest.approx(69.6)  # 6 m beyond the end at 15 m/s
+    assert (left["lane"], left["on_preferred_lane"]) == (1, True)
+    (entered, _) = read_events(tmp_path, "entered")
+    assert (entered["t_s"], entered["lane"], entered["preferred_lane"]) == (2.0, 0, 1)
+    summary = read_summary(tmp_path)
+    assert (summary["vehicles"]["entered"], summary["vehicles"]["left"]) == (2, 1)
+    assert summary["tracking"]["hold_law_ticks"] == 7
+    assert summary["tracking"]["emergency_ticks"] == 5
+
+
+def test_a_vehicle_that_stands_at_the_end_has_left(record: RunRecord, tmp_path: Path) -> None:
+    traveller = vehicle()
+    record.on_demanded(traveller.admission.arrival)
+    record.on_entered(traveller)
+    traveller.controller.plant._state = (SCENARIO.road.length_m, 0.0, 0.0, 1.75, 0.0, 0.0)
+    record.on_left(traveller, 70.0, attended=True)
+    assert read_events(tmp_path, "left")[0]["t_s"] == 70.0
+
+
+def test_what_was_shown_is_recorded(record: RunRecord, tmp_path: Path) -> None:
+    pair = ("v0001", "v0002")
+    for tick in range(3):
+        record.on_shown(
+            0.1 * tick,
+            [vehicle(name) for name in pair],
+            overlaps=[pair] if tick == 1 else [],
+            collisions=[],
+            gaps=NO_GAPS,
+        )
+    record.close(0.3, Ending.COMPLETE)
+    assert read_summary(tmp_path)["safety"]["overlaps"] == 1
+    (event,) = read_events(tmp_path, "overlap")
+    assert (event["vehicles"], event["t_s"]) == (list(pair), 0.1)
+    rows = pq.read_table(tmp_path / "trajectories.parquet").to_pylist()
+    assert [(row["vehicle"], row["column"], row["lane"]) for row in rows] == [
+        (name, -2, 0) for _ in range(3) for name in pair
+    ]
+
+
+def test_ticks_are_timed(record: RunRecord, watch: Watch, tmp_path: Path) -> None:
+    for tick in range(4):
+        record.on_tick(0.1 * tick, tick, 0.001 * (tick + 1))
+    watch.now += 2.0
+    record.close(8.0, Ending.COMPLETE)
+    runtime = read_summary(tmp_path)["runtime"]
+    assert (runtime["real_time_factor"], runtime["wall_s"]) == (4.0, 2.0)
+    assert runtime["tick_ms"]["p50"] == 2.5
+    assert runtime["processes"] is None  # the bridge cannot know
+    assert runtime["vehicles_per_process"] == 1
+    rows = pq.read_table(tmp_path / "ticks.parquet").to_pylist()
+    assert [row["on_road"] for row in rows] == [0, 1, 2, 3]
+
+
+def test_a_run_in_which_nothing_happened_has_a_summary(record: RunRecord, tmp_path: Path) -> None:
+    record.close(0.0, Ending.INTERRUPTED)
+    found = read_summary(tmp_path)
+    assert found["runtime"]["real_time_factor"] == 0.0
+    assert found["tracking"]["solve_ms"] == {"p50": None, "p99": None}
+    assert found["planning"]["largest_formation"] == 0
+    assert pq.read_table(tmp_path / "ticks.parquet").num_rows == 0

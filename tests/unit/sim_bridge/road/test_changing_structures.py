@@ -1,0 +1,124 @@
+"""Formations that change on their way: structures one after the other, and one that takes in more.
+
+Real roles on the simulated network, without SUMO.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.sim_bridge.core import Phase
+from laneweave.sim_bridge.road.demand import Arrival
+from support.bridge_bench import EXACT, Street, arrival, read_summary
+
+LOOK_S = 0.5
+"""How long before a change the cells are looked at."""
+
+
+def drive(scenario: Scenario, folder: Path, arrivals: tuple[Arrival, ...]) -> list[dict[str, Any]]:
+    """Drive a demand to its end; return the events, each with the cells of all vehicles then."""
+    street = Street(scenario, folder, arrivals)
+    street.start_coordinators(2)
+    street.start_shard()
+    cells: dict[float, dict[str, Cell]] = {}
+
+    def ended() -> bool:
+        bridge = street.bridge
+        cells[round(bridge.t_s, 1)] = {str(n): v.cell for n, v in bridge.vehicles.items()}
+        return bridge.phase is Phase.ENDED
+
+    street.run(ended)
+    summary = read_summary(folder)
+    assert summary["safety"]["overlaps"] == 0
+    assert summary["vehicles"]["on_preferred_lane"] == summary["vehicles"]["demanded"]
+    (folder / "cells.json").write_text(json.dumps([[t_s, each] for t_s, each in cells.items()]))
+    return [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
+
+
+def cells_at(folder: Path, t_s: float) -> dict[str, tuple[int, int]]:
+    looks = json.loads((folder / "cells.json").read_text())
+    _, cells = min(looks, key=lambda look: abs(look[0] - t_s))
+    return {name: (column, lane) for name, (column, lane) in cells.items()}
+
+
+def of_kind(events: list[dict[str, Any]], kind: str) -> list[dict[str, Any]]:
+    return [event for event in events if event["kind"] == kind]
+
+
+def test_a_formation_takes_on_one_structure_after_the_other(tmp_path: Path) -> None:
+    scenario = parse_scenario(
+        {
+            "road": {"lanes": 3, "s1_m": 50.0, "s2_m": 950.0, "s3_m": 400.0},
+            "sensing": EXACT,
+            "formation": {
+                "structures": [
+                    {"from_m": 200.0, "structure": "interlaced"},
+                    {"from_m": 600.0, "structure": "parallel", "lanes": [0, 1]},
+                ]
+            },
+        }
+    )
+    arrivals = tuple(arrival(f"v{n}", 1.0 + 0.8 * n, n % 3, (n + 1) % 3) for n in range(6))
+    events = drive(scenario, tmp_path, arrivals)
+    plans = of_kind(events, "plan-made")
+    assert [plan["vehicles"] for plan in plans] == [6, 6, 6]
+    assert {plan["solver"] for plan in plans} == {"tappa"}
+
+    interlaced = cells_at(tmp_path, plans[1]["t0_s"] - LOOK_S)
+    assert len({(column + lane) % 2 for column, lane in interlaced.values()}) == 1
+    parallel = cells_at(tmp_path, plans[2]["t0_s"] - LOOK_S)
+    assert {lane for _, lane in parallel.values()} == {0, 1}
+    for wanted in (0, 1):
+        columns = sorted(column for column, lane in parallel.values() if lane == wanted)
+        assert columns == list(range(columns[0], columns[0] + len(columns)))
+
+
+def joining(join: str) -> Scenario:
+    return parse_scenario(
+        {
+            "road": {"lanes": 3, "s1_m": 50.0, "s2_m": 450.0, "s3_m": 500.0},
+            "sensing": EXACT,
+            "formation": {
+                "max_columns": 3,
+                "max_joined": 2,
+                "join": join,
+                "structures": [{"from_m": 250.0, "structure": "interlaced"}],
+            },
+        }
+    )
+
+
+LATECOMER = (
+    arrival("v1", 1.0, 0, 0),
+    arrival("v2", 1.0, 2, 2),
+    arrival("v3", 2.0, 1, 1),
+    arrival("v4", 2.1, 2, 2),
+    arrival("v5", 3.2, 1, 0),
+)
+"""Four of a formation, and one that comes when it is closed (paper, Fig. 2b)."""
+
+
+def test_a_vehicle_joins_a_formation_that_has_room(tmp_path: Path) -> None:
+    scenario = joining("room")
+    events = drive(scenario, tmp_path, LATECOMER)
+    assert [len(event["vehicles"]) for event in of_kind(events, "formation-closed")] == [4, 1]
+    (joined,) = of_kind(events, "formations-joined")
+    assert joined["why"] == "room"
+    sorting = of_kind(events, "plan-made")[-1]
+    assert sorting["vehicles"] == 5
+    together = cells_at(tmp_path, sorting["t0_s"] - LOOK_S)
+    assert len(together) == 5
+    assert len({(column + lane) % 2 for column, lane in together.values()}) == 1
+    columns = [column for column, _ in together.values()]
+    assert max(columns) - min(columns) < 4
+
+
+def test_without_need_formations_stay_apart_unless_they_may_join(tmp_path: Path) -> None:
+    events = drive(joining("needed"), tmp_path, LATECOMER)
+    assert of_kind(events, "formations-joined") == []
+    assert {plan["vehicles"] for plan in of_kind(events, "plan-made")} == {4, 1}

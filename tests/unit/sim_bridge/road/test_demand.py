@@ -1,0 +1,92 @@
+"""Arrivals: repeatable, with the headways and lane shares that the scenario asks for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.sim_bridge.road.demand import arrivals
+
+
+def scenario(seed: int = 1, lanes: int = 3, **demand: object) -> Scenario:
+    return parse_scenario({"seed": seed, "road": {"lanes": lanes}, "demand": demand})
+
+
+def test_equal_seeds_give_equal_arrivals_and_others_do_not() -> None:
+    assert arrivals(scenario(7)) == arrivals(scenario(7))
+    assert arrivals(scenario(7)) != arrivals(scenario(8))
+
+
+@given(
+    seed=st.integers(0, 2**63 - 1),
+    volume=st.floats(50.0, 3600.0),
+    duration=st.floats(1.0, 200.0),
+    longer=st.floats(0.0, 200.0),
+)
+@settings(max_examples=40, deadline=None)
+def test_a_longer_stream_begins_with_the_shorter_one(
+    seed: int, volume: float, duration: float, longer: float
+) -> None:
+    short = arrivals(scenario(seed, volume_veh_per_lane_h=volume, duration_s=duration))
+    long = arrivals(scenario(seed, volume_veh_per_lane_h=volume, duration_s=duration + longer))
+    assert long[: len(short)] == short
+    assert all(arrival.t_s > duration for arrival in long[len(short) :])
+
+
+def test_names_number_the_arrivals_in_time_order() -> None:
+    stream = arrivals(scenario(3))
+    assert [arrival.vehicle for arrival in stream[:3]] == ["v0001", "v0002", "v0003"]
+    assert [arrival.t_s for arrival in stream] == sorted(arrival.t_s for arrival in stream)
+    assert len({arrival.vehicle for arrival in stream}) == len(stream)
+
+
+def test_a_lane_does_not_depend_on_the_number_of_lanes() -> None:
+    two, four = arrivals(scenario(5, lanes=2)), arrivals(scenario(5, lanes=4))
+    for lane in (0, 1):
+        assert [a.t_s for a in two if a.lane == lane] == [a.t_s for a in four if a.lane == lane]
+
+
+@pytest.mark.parametrize("volume", [1000.0, 1750.0])
+def test_headways_have_the_minimum_and_the_mean_and_are_exponential(volume: float) -> None:
+    stream = arrivals(scenario(11, volume_veh_per_lane_h=volume, duration_s=20_000.0))
+    headways = np.concatenate([np.diff([a.t_s for a in stream if a.lane == n]) for n in range(3)])
+    excess = headways - 1.0
+    mean = 3600.0 / volume - 1.0
+    assert excess.min() >= 0.0
+    assert excess.mean() == pytest.approx(mean, rel=0.03)
+    assert excess.std() == pytest.approx(mean, rel=0.04)
+    assert np.median(excess) == pytest.approx(mean * np.log(2.0), rel=0.05)
+    lag_one = np.corrcoef(excess[:-1], excess[1:])[0, 1]
+    assert abs(lag_one) < 0.03
+
+
+def test_lanes_are_independent() -> None:
+    stream = arrivals(scenario(2, duration_s=4000.0))
+    counts = [
+        np.histogram([a.t_s for a in stream if a.lane == lane], bins=200)[0] for lane in range(3)
+    ]
+    correlation = np.corrcoef(counts)
+    assert np.abs(correlation[np.triu_indices(3, 1)]).max() < 0.25
+
+
+@pytest.mark.parametrize("shares", [(), (1.0, 2.0, 1.0), (0.0, 1.0, 0.0)])
+def test_preferences_follow_the_lane_shares(shares: tuple[float, ...]) -> None:
+    chosen = scenario(4, duration_s=20_000.0, lane_shares=list(shares))
+    stream = arrivals(chosen)
+    for lane in range(3):
+        mine = [arrival.preferred_lane for arrival in stream if arrival.lane == lane]
+        for preferred, share in enumerate(chosen.lane_shares):
+            assert mine.count(preferred) / len(mine) == pytest.approx(share, abs=0.02)
+
+
+def test_a_volume_at_the_least_headway_is_regular() -> None:
+    stream = arrivals(scenario(1, lanes=1, volume_veh_per_lane_h=3600.0, duration_s=10.5))
+    assert [arrival.t_s for arrival in stream] == pytest.approx(range(1, 11))
+
+
+def test_one_lane_is_preferred_by_all() -> None:
+    assert {arrival.preferred_lane for arrival in arrivals(scenario(1, lanes=1))} == {0}

@@ -1,0 +1,173 @@
+"""The entry meter keeps its rules for any demand, and decides without looking ahead."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.lattice import Lattice
+from laneweave.sim_bridge.road.demand import Arrival, arrivals
+from laneweave.sim_bridge.road.entry import Admission, EntryMeter
+from laneweave.sim_bridge.road.formation_building import ColumnBlocks
+
+
+def lattice(lanes: int = 3, block_columns: int = 4) -> Lattice:
+    return Lattice(15.0, 15.0, 3.5, lanes, block_columns)
+
+
+@st.composite
+def demands(draw: st.DrawFn) -> tuple[Lattice, int, list[Arrival]]:
+    """A lattice, a formation size, and any demand, dense enough to queue."""
+    lanes = draw(st.integers(1, 5))
+    grid = lattice(lanes, draw(st.integers(1, 6)))
+    drawn = draw(
+        st.lists(
+            st.tuples(st.floats(0, 60), st.integers(0, lanes - 1), st.integers(0, lanes - 1)),
+            max_size=60,
+        )
+    )
+    stream = [
+        Arrival(f"v{number:04d}", lane, preferred, t_s)
+        for number, (t_s, lane, preferred) in enumerate(sorted(drawn), start=1)
+    ]
+    return grid, draw(st.integers(1, 12)), stream
+
+
+def interlaced_meter(grid: Lattice, most: int = 6, spread_s: float = 0.0) -> EntryMeter:
+    """Return the meter of the paper's operation."""
+    return EntryMeter(grid, spread_s, ColumnBlocks(grid, most, spread_s), interlaced=True)
+
+
+def check(grid: Lattice, most: int, admissions: list[Admission]) -> None:
+    """Check every rule of the entry."""
+    assert len({admission.cell for admission in admissions}) == len(admissions)
+    taken: Counter[int] = Counter()
+    preferring: Counter[tuple[int, int]] = Counter()
+    for admission in admissions:
+        column, lane = admission.cell
+        assert grid.interlaced(admission.cell)
+        assert lane == admission.arrival.lane
+        assert admission.t_s == grid.passing_time_s(column)
+        assert admission.t_s >= admission.arrival.t_s
+        block = grid.block_of(column)
+        taken[block] += 1
+        preferring[block, admission.arrival.preferred_lane] += 1
+    assert all(count <= most for count in taken.values())
+    assert all(count <= grid.block_columns for count in preferring.values())
+    assert [a.t_s for a in admissions] == sorted(a.t_s for a in admissions)
+    for lane in range(grid.lanes):
+        mine = [admission for admission in admissions if admission.cell[1] == lane]
+        columns = [admission.cell[0] for admission in mine]
+        assert columns == sorted(set(columns), reverse=True)
+        times = [admission.arrival.t_s for admission in mine]
+        assert times == sorted(times)
+
+
+@given(demands())
+@settings(max_examples=150, deadline=None)
+def test_rules_hold_and_everyone_enters(case: tuple[Lattice, int, list[Arrival]]) -> None:
+    grid, most, stream = case
+    meter = interlaced_meter(grid, most)
+    for arrival in stream:
+        meter.demand(arrival)
+    admissions = meter.admit(60.0 + 10.0 * grid.block_columns * len(stream) + 10.0)
+    check(grid, most, admissions)
+    assert {admission.arrival for admission in admissions} == set(stream)
+    assert meter.waiting == ()
+
+
+@given(demands(), st.floats(0.05, 7.0))
+@settings(max_examples=100, deadline=None)
+def test_decisions_need_no_knowledge_of_the_future(
+    case: tuple[Lattice, int, list[Arrival]], tick_s: float
+) -> None:
+    grid, most, stream = case
+    whole, stepwise = interlaced_meter(grid, most), interlaced_meter(grid, most)
+    for arrival in stream:
+        whole.demand(arrival)
+    end_s = 120.0
+    expected = whole.admit(end_s)
+    admissions = []
+    pending = list(stream)
+    for number in range(int(end_s / tick_s) + 2):
+        now_s = min(number * tick_s, end_s)
+        while pending and pending[0].t_s <= now_s + 1e-9:
+            stepwise.demand(pending.pop(0))
+        admissions += stepwise.admit(now_s)
+    assert admissions == expected
+
+
+def test_a_vehicle_takes_the_first_interlaced_cell_that_it_can_reach() -> None:
+    meter = interlaced_meter(lattice())
+    meter.demand(Arrival("early", 0, 0, 0.0))
+    meter.demand(Arrival("later", 1, 0, 0.2))
+    meter.demand(Arrival("behind", 0, 0, 0.1))
+    found = {a.arrival.vehicle: a for a in meter.admit(10.0)}
+    assert found["early"].cell == (0, 0)
+    assert found["later"].cell == (-1, 1)
+    assert found["behind"].cell == (-2, 0)
+    assert found["behind"].t_s == 2.0
+    assert found["behind"].t_s - found["behind"].arrival.t_s == pytest.approx(1.9)
+
+
+def test_a_block_takes_no_more_than_can_reach_their_lane() -> None:
+    # Five vehicles want lane 1, which has four cells in a block.
+    meter = interlaced_meter(lattice())
+    for number in range(2):
+        for lane in range(3):
+            meter.demand(Arrival(f"{number}-{lane}", lane, 1, 0.0))
+    columns = [admission.cell[0] for admission in meter.admit(30.0)]
+    assert [lattice().block_of(column) for column in columns] == [0, 0, 0, 0, 1, 1]
+
+
+def test_a_block_takes_no_more_than_the_largest_formation() -> None:
+    meter = interlaced_meter(lattice(block_columns=8), 5)
+    for number in range(4):
+        for lane in range(3):
+            meter.demand(Arrival(f"{number}-{lane}", lane, lane, 0.0))
+    admissions = meter.admit(100.0)
+    blocks = Counter(lattice(block_columns=8).block_of(a.cell[0]) for a in admissions)
+    assert list(blocks.values()) == [5, 5, 2]
+
+
+def test_the_paper_s_blocks_hold_six() -> None:
+    grid = lattice()
+    for block in range(4):
+        assert sum(grid.interlaced(cell) for cell in grid.block_cells(block)) == 6
+
+
+def test_a_late_demand_takes_no_column_that_has_passed() -> None:
+    meter = interlaced_meter(lattice())
+    assert meter.admit(5.0) == []
+    meter.demand(Arrival("late", 0, 0, 1.0))
+    (admission,) = meter.admit(20.0)
+    assert admission.cell == (-6, 0)
+    assert admission.t_s == 6.0
+
+
+def test_impossible_demands_are_refused() -> None:
+    meter = interlaced_meter(lattice())
+    meter.demand(Arrival("twice", 0, 0, 0.0))
+    with pytest.raises(ValueError, match="waiting already"):
+        meter.demand(Arrival("twice", 1, 0, 0.0))
+    with pytest.raises(ValueError, match="lanes 0 to 2"):
+        meter.demand(Arrival("off", 3, 0, 0.0))
+    with pytest.raises(ValueError, match="lanes 0 to 2"):
+        meter.demand(Arrival("off", 0, -1, 0.0))
+
+
+@pytest.mark.parametrize(("volume", "most_s"), [(1000.0, 1.5), (1450.0, 2.5), (1600.0, 4.0)])
+def test_delay_stays_small_below_capacity(volume: float, most_s: float) -> None:
+    demand = {"volume_veh_per_lane_h": volume, "duration_s": 600.0}
+    scenario = parse_scenario({"demand": demand, "formation": {"operation": "paper"}})
+    meter = interlaced_meter(scenario.lattice, scenario.formation.max_vehicles)
+    stream = arrivals(scenario)
+    for arrival in stream:
+        meter.demand(arrival)
+    delays = [entry.t_s - entry.arrival.t_s for entry in meter.admit(700.0)]
+    assert len(delays) == len(stream)
+    assert sum(delays) / len(delays) < most_s

@@ -1,0 +1,292 @@
+"""Who is announced, who enters, and who has been counted when."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from attrs import define, field
+
+from laneweave.protocol.config.loading import load_scenario, parse_scenario
+from laneweave.protocol.runtime.node import Send
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.structuring import structure
+from laneweave.protocol.wire.messages import Census, ClosedFormation, Name, RoadClock
+from laneweave.sim_bridge.road.entry import Admission
+from laneweave.sim_bridge.road.roadside import Counts, Roadside
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from support.paper import closing_time_s, paper
+
+
+def crowded(operation: str = "paper", **runtime: Any) -> Scenario:  # noqa: ANN401 (fields)
+    """More than twice what can enter: the queue grows as long as there is demand."""
+    return parse_scenario(
+        {
+            "demand": {"volume_veh_per_lane_h": 3600, "duration_s": 120, "min_headway_s": 0.5},
+            "formation": {"operation": operation},
+            "runtime": runtime,
+        }
+    )
+
+
+AWKWARD = {
+    "demand": {"volume_veh_per_lane_h": 2000, "min_headway_s": 1.8, "duration_s": 400},
+    "formation": {"gap_m": 13.5, "cycle_s": 3.9, "move_s": 3.6},
+    "runtime": {"tick_s": 0.3},
+    "braking": {"reaction_s": 0.3},
+}
+"""Vehicles arrive in step, every 1.8 s; ticks and passing times meet, but for rounding."""
+LONG_TICKS = {
+    "demand": {"volume_veh_per_lane_h": 3600, "min_headway_s": 0.1, "duration_s": 120},
+    "formation": {"gap_m": 5.5, "speed_mps": 50, "move_s": 4.0},
+    "vehicle": {"max_speed_mps": 60, "length_m": 4.0},
+    "tracking": {"min_gap_m": 1.0},
+    "road": {"s3_m": 1000},
+    "runtime": {"tick_s": 1.0},
+}
+"""More than one vehicle enters on a lane in a tick; nobody could drive so close, so nothing checks
+how these fields fit together."""
+
+
+class Watch:
+    """Lets a roadside run dry, and checks at every tick what holds at every tick."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Prepare a roadside."""
+        self.roadside = Roadside(scenario)
+        self.demanded: set[str] = set()
+        self.announced: set[str] = set()
+        self.entered: list[str] = []
+        self.most_announced = 0
+        self._scenario = scenario
+
+    def run(self) -> None:
+        tick = 0
+        while not self.roadside.exhausted(tick * self._scenario.runtime.tick_s):
+            self.tick(tick)
+            tick += 1
+            assert tick < 1_000_000
+        counts = self.roadside.counts(on_road=0)
+        assert counts.demanded == counts.entered == len(self.entered) == len(set(self.entered))
+
+    def tick(self, tick: int) -> None:
+        roadside, t_s = self.roadside, tick * self._scenario.runtime.tick_s
+        self.demanded |= {arrival.vehicle for arrival in roadside.newly_demanded(t_s)}
+        for admission in roadside.admit(t_s):
+            vehicle = admission.arrival.vehicle
+            assert vehicle in self.demanded
+            assert vehicle in self.announced
+            self.entered.append(vehicle)
+        counts = roadside.counts(on_road=0)
+        assert (counts.demanded, counts.entered) == (len(self.demanded), len(self.entered))
+        roadside.announcements_changed(t_s)
+        announced = roadside.census(t_s, ()).announced
+        assert [(a.arrival_s, a.vehicle) for a in announced] == sorted(
+            (a.arrival_s, a.vehicle) for a in announced
+        )
+        names = {announcement.vehicle for announcement in announced}
+        assert not names & set(self.entered)
+        # Once announced, announced until entered: agents rely on it.
+        assert self.announced - set(self.entered) <= names
+        self.announced |= names
+        self.most_announced = max(self.most_announced, len(names))
+
+
+@pytest.mark.parametrize("announce_s", [0.0, 0.05, 6.0, 30.0])
+@pytest.mark.parametrize(("operation", "columns"), [("paper", 2), ("rolling", 1)])
+def test_everybody_is_announced_before_entering_and_never_too_many_at_once(
+    announce_s: float, operation: str, columns: int
+) -> None:
+    scenario = crowded(operation, announce_s=announce_s)
+    watch = Watch(scenario)
+    watch.run()
+    assert len(watch.entered) > 300
+    # On each lane one vehicle can enter in so many columns' time.
+    lattice = scenario.lattice
+    per_lane = math.ceil((announce_s + 0.1) * lattice.speed_mps / (columns * lattice.pitch_m)) + 1
+    assert watch.most_announced == per_lane * lattice.lanes
+
+
+@pytest.mark.parametrize("announce_s", [0.0, 2.0])
+def test_long_ticks_change_nothing(announce_s: float) -> None:
+    data = LONG_TICKS | {"runtime": {"tick_s": 1.0, "announce_s": announce_s}}
+    watch = Watch(structure(data, Scenario))
+    watch.run()
+    assert len(watch.entered) > 300
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_demand_is_counted_before_the_entry_however_awkward_the_ticks(seed: int) -> None:
+    watch = Watch(parse_scenario(AWKWARD | {"seed": seed}))
+    watch.run()
+    assert len(watch.entered) > 300
+
+
+def test_announcements_come_in_time_and_say_what_is_known() -> None:
+    scenario = parse_scenario({"demand": {"volume_veh_per_lane_h": 200, "duration_s": 100}})
+    roadside = Roadside(scenario)
+    seen: dict[str, float] = {}
+    for tick in range(1200):
+        t_s = 0.1 * tick
+        roadside.newly_demanded(t_s)
+        roadside.admit(t_s)
+        roadside.announcements_changed(t_s)
+        assert not roadside.announcements_changed(t_s)
+        for announcement in roadside.census(t_s, ()).announced:
+            seen.setdefault(announcement.vehicle, t_s)
+            arrival = next(a for a in roadside._arrivals if a.vehicle == announcement.vehicle)
+            assert announcement.lane == arrival.lane
+            assert announcement.preferred_lane == arrival.preferred_lane
+            assert announcement.arrival_s == arrival.t_s
+    assert len(seen) == len(roadside._arrivals) > 5
+    for arrival in roadside._arrivals:
+        # The queues are short here: nobody waits for room among the announced.
+        assert arrival.t_s - seen[arrival.vehicle] > min(arrival.t_s, 5.9) - 0.2
+
+
+def test_the_census_lists_the_road_as_it_was_entered() -> None:
+    scenario = Scenario()
+    roadside = Roadside(scenario)
+    admissions: list[Admission] = []
+    tick = 0
+    while not admissions:
+        admissions = roadside.admit(0.1 * tick)
+        tick += 1
+    vehicles = [RoadVehicle.entering(each, 0.1 * tick, scenario) for each in admissions]
+    for vehicle in vehicles:
+        vehicle.controller.hold_cell = (9, 9)  # wherever it is by now
+    entries = roadside.census(9.0, vehicles).on_road
+    assert [(e.vehicle, e.cell, e.entered_s) for e in entries] == [
+        (a.arrival.vehicle, a.cell, a.t_s) for a in admissions
+    ]
+
+
+def test_counts_make_the_clock() -> None:
+    roadside = Roadside(Scenario())
+    roadside.count_left()
+    assert roadside.counts(on_road=7) == Counts(demanded=0, entered=0, on_road=7, left=1)
+    clock = roadside.counts(on_road=7).clock(5, 0.5, ended=True)
+    assert (clock.tick, clock.t_s, clock.on_road, clock.left, clock.ended) == (5, 0.5, 7, 1, True)
+
+
+@pytest.mark.parametrize("ended", [False, True])
+def test_all_news_name_the_bridge_that_they_come_from(*, ended: bool) -> None:
+    news = list(Roadside(Scenario(), 17).news(0, 0.0, (), ended=ended))
+    messages = [effect.message for effect in news if isinstance(effect, Send)]
+    assert [type(message) for message in messages] == [RoadClock, Census]
+    assert [message.bridge for message in messages] == [17, 17]
+
+
+def test_is_not_exhausted_while_somebody_is_still_to_come() -> None:
+    scenario = parse_scenario({"demand": {"volume_veh_per_lane_h": 60, "duration_s": 60}})
+    roadside = Roadside(scenario)
+    last_s = roadside._arrivals[-1].t_s
+    assert not roadside.exhausted(last_s + 1.0)  # nobody has been queued
+    roadside.admit(last_s - 0.01)
+    assert not roadside.exhausted(last_s + 1.0)  # somebody waits
+    roadside.admit(last_s + 60.0)
+    assert not roadside.exhausted(last_s - 0.01)
+    assert roadside.exhausted(last_s)
+
+
+def test_a_census_tells_at_once_that_a_block_has_closed() -> None:
+    """Who leads need not wait for the next second to know a roster for certain."""
+    scenario = paper(load_scenario(None, seed=1, demand__duration_s=0.001))
+    roadside = Roadside(scenario)
+    tick_s, told = scenario.runtime.tick_s, {}
+    for tick in range(100):
+        roadside.close_formations(tick * tick_s)
+        for effect in roadside.news(tick, tick * tick_s, []):
+            if isinstance(effect, Send) and isinstance(effect.message, Census):
+                told[tick] = effect.message.closed_to
+    for block in range(2):
+        first = min(tick for tick in told if told[tick] >= block)
+        assert first == math.ceil(closing_time_s(block, scenario) / tick_s - 1e-6)
+    assert len(told) < 20
+
+
+@define
+class CensusWatch:
+    """Lets vehicles in and out, and checks what each census tells of formations."""
+
+    scenario: Scenario
+    vehicles: dict[Name, RoadVehicle] = field(factory=dict)
+    told: dict[int, ClosedFormation] = field(factory=dict)
+    """What censuses have told, by number."""
+    closed_to: int = -1
+    left: int = 0
+
+    def run(self, end_s: float) -> None:
+        roadside, tick_s = Roadside(self.scenario), self.scenario.runtime.tick_s
+        for tick in range(round(end_s / tick_s)):
+            self._tick(roadside, tick, tick * tick_s)
+
+    def _tick(self, roadside: Roadside, tick: int, t_s: float) -> None:
+        for admission in roadside.admit(t_s):
+            vehicle = RoadVehicle.entering(admission, t_s, self.scenario)
+            self.vehicles[vehicle.name] = vehicle
+            assert vehicle.block > self.closed_to, "a census said that nobody would"
+            assert vehicle.formation is None
+            assert vehicle.controller.joined == (vehicle.block,)
+        closed = roadside.close_formations(t_s)
+        for formation in closed:
+            for vehicle in self.vehicles.values():
+                if vehicle.block in formation.blocks:
+                    vehicle.join(formation)
+        lasts_s = self.scenario.road.length_m / self.scenario.formation.speed_mps
+        for name, vehicle in list(self.vehicles.items()):
+            if t_s > vehicle.admission.t_s + lasts_s:
+                del self.vehicles[name]
+                self.left += 1
+        censuses = [
+            effect.message
+            for effect in roadside.news(tick, t_s, self.vehicles.values())
+            if isinstance(effect, Send) and isinstance(effect.message, Census)
+        ]
+        assert censuses or not closed, "a formation has closed, and nobody is told"
+        for census in censuses:
+            self._check(census)
+
+    def _check(self, census: Census) -> None:
+        assert census.closed_to >= self.closed_to
+        self.closed_to = census.closed_to
+        for one, other in pairwise(census.formations):
+            assert one.last_block < other.first_block
+        for formation in census.formations:
+            assert formation.closed_s <= census.t_s
+            assert formation.last_block <= census.closed_to
+            assert self.told.setdefault(formation.first_block, formation) == formation
+        present = set()
+        for vehicle in self.vehicles.values():
+            if vehicle.block > census.closed_to:
+                assert vehicle.formation is None
+                continue
+            (mine,) = (one for one in census.formations if vehicle.block in one.blocks)
+            assert vehicle.formation == mine.first_block
+            assert vehicle.controller.joined == mine.blocks
+            present.add(mine)
+        assert set(census.formations) == present
+
+
+@pytest.mark.parametrize("volume", [30.0, 1000.0, 2000.0])
+def test_a_census_tells_whose_the_columns_are_and_which_are_closed(volume: float) -> None:
+    scenario = load_scenario(
+        None, seed=3, demand__duration_s=200.0, demand__volume_veh_per_lane_h=volume
+    )
+    watch = CensusWatch(scenario)
+    watch.run(300.0)
+    assert watch.left > 0
+    assert not watch.vehicles
+    used = [block for formation in watch.told.values() for block in formation.blocks]
+    assert len(set(used)) == len(used), "a column has two formations"
+
+
+def test_a_census_of_the_rolling_operation_tells_of_no_formations() -> None:
+    roadside = Roadside(load_scenario(None, formation__operation="rolling"))
+    for tick in range(600):
+        roadside.admit(0.1 * tick)
+        assert roadside.close_formations(0.1 * tick) == []
+    census = roadside.census(60.0, ())
+    assert (census.formations, census.closed_to) == ((), -1)

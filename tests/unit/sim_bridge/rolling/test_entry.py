@@ -1,0 +1,247 @@
+"""Entry in the rolling operation, and who owns the cells at the entrance."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+from attrs import define, field
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.lattice import Cell, Lattice
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.wire.messages import Name
+from laneweave.sim_bridge.road.demand import Arrival, arrivals
+from laneweave.sim_bridge.road.entry import Admission, EntryMeter
+from laneweave.sim_bridge.road.formation_building import ColumnBlocks
+from laneweave.sim_bridge.road.roadside import MOST_EMPTY, Roadside
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
+
+LANES = 3
+COLUMN_S = 1.0
+LATTICE = Lattice(15.0, 15.0, 3.5, LANES, 4)
+SMALL_S = 1e-6
+
+
+@st.composite
+def streams(draw: st.DrawFn, headway_s: float = 0.0) -> list[Arrival]:
+    """Arrivals on all lanes, at least a headway apart on each."""
+    stream = []
+    for lane in range(LANES):
+        t_s = 0.0
+        for number, gap_s in enumerate(draw(st.lists(st.floats(0.0, 5.0), max_size=12))):
+            t_s += headway_s + gap_s
+            stream.append(Arrival(f"v{lane}-{number}", lane, draw(st.integers(0, 2)), t_s))
+    return sorted(stream, key=lambda arrival: arrival.t_s)
+
+
+def admitted(meter: EntryMeter, stream: list[Arrival], tick_s: float = 0.1) -> list[Admission]:
+    admissions = []
+    pending = list(stream)
+    for tick in range(1500):
+        while pending and pending[0].t_s <= (tick + 1) * tick_s:
+            meter.demand(pending.pop(0))
+        admissions += meter.admit(tick * tick_s)
+    assert not pending
+    assert meter.waiting == ()
+    return admissions
+
+
+def rolling_meter() -> EntryMeter:
+    return EntryMeter(LATTICE, COLUMN_S / 2)
+
+
+# --- the meter --------------------------------------------------------------------------------
+
+
+@given(streams(), st.sampled_from([(0.5, False), (1.0, True), (0.25, True), (0.7, False)]))
+@settings(max_examples=100, deadline=None)
+def test_nobody_is_far_from_its_cell_or_close_to_another(
+    stream: list[Arrival], how: tuple[float, bool]
+) -> None:
+    spread_s, interlaced = how
+    builder = ColumnBlocks(LATTICE, 6, spread_s) if interlaced else None
+    meter = EntryMeter(LATTICE, spread_s, builder, interlaced=interlaced)
+    admissions = admitted(meter, stream)
+    assert {admission.arrival for admission in admissions} == set(stream)
+    assert len({admission.cell for admission in admissions}) == len(admissions)
+    for admission in admissions:
+        passing_s = LATTICE.passing_time_s(admission.cell[0])
+        assert abs(passing_s - admission.t_s) <= spread_s + SMALL_S
+        assert admission.offset_m == pytest.approx(15.0 * (passing_s - admission.t_s))
+        assert admission.t_s >= admission.arrival.t_s
+        assert admission.cell[1] == admission.arrival.lane
+        assert not interlaced or LATTICE.interlaced(admission.cell)
+    for lane in range(LANES):
+        mine = [admission for admission in admissions if admission.cell[1] == lane]
+        columns = [admission.cell[0] for admission in mine]
+        assert columns == sorted(columns, reverse=True)
+        for first, second in pairwise(mine):
+            assert second.t_s >= first.t_s + COLUMN_S - SMALL_S
+            assert second.arrival.t_s >= first.arrival.t_s
+
+
+@given(streams(headway_s=COLUMN_S))
+@settings(max_examples=100, deadline=None)
+def test_nobody_waits_who_comes_a_column_behind_the_one_before(stream: list[Arrival]) -> None:
+    for admission in admitted(rolling_meter(), stream):
+        assert admission.t_s == pytest.approx(admission.arrival.t_s, abs=SMALL_S)
+
+
+def test_who_comes_too_close_waits_until_it_may_follow() -> None:
+    meter = rolling_meter()
+    for number in range(3):
+        meter.demand(Arrival(f"v{number}", 0, 0, 0.4 + 0.1 * number))
+    entries = [(admission.cell, admission.t_s) for admission in meter.admit(10.0)]
+    assert entries == [((0, 0), 0.4), ((-1, 0), pytest.approx(1.4)), ((-2, 0), pytest.approx(2.4))]
+
+
+def test_a_column_closes_when_nobody_can_enter_it_any_more() -> None:
+    meter = rolling_meter()
+    closed = [1]
+    for tick in range(40):
+        meter.admit(tick * 0.1)
+        closed.append(meter.closed_column(1))
+        assert LATTICE.passing_time_s(closed[-1]) + COLUMN_S / 2 <= tick * 0.1 + SMALL_S
+    assert closed == sorted(closed, reverse=True)
+    assert closed[-1] == -3
+    meter.demand(Arrival("late", 1, 0, 0.0))
+    (admission,) = meter.admit(4.0)
+    assert admission.cell == (-4, 1)
+
+
+def test_in_the_paper_s_operation_cells_farther_ahead_are_caught_up_with() -> None:
+    paper = parse_scenario({"formation": {"operation": "paper"}})
+    assert paper.formation.entry_spread_s == 1.5 * COLUMN_S
+    rolling = parse_scenario({"formation": {"operation": "rolling"}})
+    assert rolling.formation.entry_spread_s == COLUMN_S / 2
+
+
+# --- cells at the entrance --------------------------------------------------------------------
+
+
+def make_scenario(**formation: object) -> Scenario:
+    return parse_scenario({"formation": {"operation": "rolling", **formation}})
+
+
+@define
+class Entrance:
+    """A roadside with a demand by hand, and everybody who has entered."""
+
+    stream: list[Arrival]
+    scenario: Scenario = field(factory=make_scenario)
+    tick_s: float = 0.1
+    roadside: Roadside = field(init=False)
+    vehicles: dict[Name, RoadVehicle] = field(factory=dict)
+    tick: int = 0
+
+    def __attrs_post_init__(self) -> None:
+        """Replace the demand."""
+        self.roadside = Roadside(self.scenario)
+        self.roadside._arrivals = tuple(self.stream)
+
+    def run(self, until_s: float) -> Entrance:
+        while self.tick * self.tick_s <= until_s:
+            t_s = self.tick * self.tick_s
+            for admission in self.roadside.admit(t_s):
+                vehicle = RoadVehicle.entering(admission, t_s, self.scenario)
+                self.vehicles[vehicle.name] = vehicle
+            self.roadside.hand_out(self.vehicles)
+            self.tick += 1
+        return self
+
+    def estate(self, name: str) -> list[Cell]:
+        return sorted(self.vehicles[Name(name)].controller.estate, reverse=True)
+
+    def owners(self) -> dict[Cell, Name]:
+        owners: dict[Cell, Name] = {}
+        for name, vehicle in self.vehicles.items():
+            for cell in vehicle.controller.estate:
+                assert cell not in owners, f"{cell} is of {owners[cell]} and of {name}"
+                owners[cell] = name
+        return owners
+
+
+@given(streams(), st.sampled_from([0.1, 0.3, 1.0, 2.5]))
+@settings(max_examples=60, deadline=None)
+def test_every_cell_near_behind_a_vehicle_of_the_lane_is_its(
+    stream: list[Arrival], tick_s: float
+) -> None:
+    entrance = Entrance(stream, tick_s=tick_s).run(120.0)
+    assert len(entrance.vehicles) == len(stream)
+    owners = entrance.owners()
+    for lane in range(LANES):
+        columns = sorted(
+            (vehicle.admission.cell[0], name)
+            for name, vehicle in entrance.vehicles.items()
+            if vehicle.admission.cell[1] == lane
+        )
+        for index, (column, name) in enumerate(columns):
+            rear = columns[index - 1][0] if index else column - MOST_EMPTY - 1
+            for each in range(column, max(rear, column - MOST_EMPTY - 1), -1):
+                assert owners[each, lane] == name
+
+
+@given(streams(), st.sampled_from([0.1, 1.0]))
+@settings(max_examples=60, deadline=None)
+def test_every_cell_that_is_near_to_somebody_has_an_owner(
+    stream: list[Arrival], tick_s: float
+) -> None:
+    """Also on lanes on which nobody enters, and ahead of the first vehicle."""
+    entrance = Entrance(stream, tick_s=tick_s).run(120.0)
+    owners = entrance.owners()
+    entered = [vehicle.admission.cell[0] for vehicle in entrance.vehicles.values()]
+    for column in range(MOST_EMPTY, -100, -1):
+        if any(0 <= one - column <= MOST_EMPTY for one in entered):
+            assert all((column, lane) in owners for lane in range(LANES)), column
+
+
+def test_cells_ahead_of_the_first_vehicle_are_its_as_far_as_they_are_near() -> None:
+    entrance = Entrance([Arrival("first", 1, 0, 20.2)]).run(20.3)
+    estate = entrance.estate("first")
+    assert estate[0][0] == -20 + MOST_EMPTY
+    assert {lane for _, lane in estate} == {0, 1, 2}
+
+
+def test_a_cell_is_handed_out_when_nobody_can_enter_it_any_more() -> None:
+    entrance = Entrance([Arrival("first", 1, 0, 0.0)]).run(1.4)
+    assert min(entrance.estate("first")) == (0, 0)
+    entrance.run(1.6)
+    assert min(entrance.estate("first")) == (-1, 0)
+
+
+def test_most_get_no_more_than_some_cells() -> None:
+    entrance = Entrance([Arrival("first", 1, 0, 0.0), Arrival("next", 1, 0, 50.0)]).run(60.0)
+    assert min(entrance.estate("first"))[0] == -MOST_EMPTY
+    assert max(entrance.estate("next"))[0] == -50 + MOST_EMPTY
+
+
+def test_cells_behind_a_vehicle_that_has_left_are_nobody_s() -> None:
+    entrance = Entrance([Arrival("first", 1, 0, 0.0)]).run(3.0)
+    gone = entrance.vehicles.pop(Name("first"))
+    owned = gone.controller.estate
+    entrance.run(8.0)
+    assert gone.controller.estate == owned
+    assert entrance.owners() == {}
+
+
+def test_where_formations_own_blocks_nothing_is_handed_out() -> None:
+    entrance = Entrance([Arrival("first", 1, 0, 0.0)], make_scenario(operation="paper")).run(9.0)
+    assert entrance.estate("first") == []
+
+
+def test_a_whole_demand_enters_without_waiting() -> None:
+    scenario = parse_scenario(
+        {
+            "formation": {"operation": "rolling"},
+            "demand": {"volume_veh_per_lane_h": 2000.0, "min_headway_s": 1.0, "duration_s": 60.0},
+        }
+    )
+    stream = list(arrivals(scenario))
+    entrance = Entrance(stream, scenario).run(62.0)
+    assert len(entrance.vehicles) == len(stream) > 60
+    for vehicle in entrance.vehicles.values():
+        admission = vehicle.admission
+        assert admission.t_s == pytest.approx(admission.arrival.t_s, abs=SMALL_S)

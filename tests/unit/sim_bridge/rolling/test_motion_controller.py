@@ -1,0 +1,281 @@
+"""What the motion controller keeps of promises, deeds and estates, however orders arrive."""
+
+from __future__ import annotations
+
+from itertools import permutations, product
+
+import pytest
+from attrs import evolve
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.wire.messages import Ballot, Command, Deed, Name, Prepare
+from laneweave.sim_bridge.bodies.motion_controller import MotionController
+from laneweave.sim_bridge.road.caretaker import Caretaker
+from laneweave.sim_bridge.road.demand import Arrival
+from laneweave.sim_bridge.road.entry import Admission
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from support.rolling_road import controller_of
+from support.rolling_samples import AFTER, BEFORE, HIGH, HOME, LOW, MID, A, B, deed_of, make_plan
+
+AGENT = 7
+
+
+def make_controller() -> MotionController:
+    controller = controller_of(BEFORE[A])
+    controller.hand_over(AGENT)
+    return controller
+
+
+def order(
+    promised: Ballot | None = None,
+    deed: Deed | None = None,
+    accepted: Ballot | None = None,
+    incarnation: int = AGENT,
+) -> Command:
+    return Command(
+        A, incarnation, 0, HOME, 0, HOME, b"", promised=promised, deed=deed, accepted=accepted
+    )
+
+
+OPEN = Deed(MID, open=True)
+PROMISE = order(MID)
+ACCEPTANCE = order(MID, deed_of(A), MID)
+POSSESSION = order(MID, OPEN, MID)
+"""What an agent says one after the other; each time it says all that it has to say."""
+NEXT_PROMISE = order(HIGH, OPEN)
+"""It has taken possession, and then promised more."""
+
+
+def kept(controller: MotionController) -> tuple[object, ...]:
+    deed = controller.deed
+    return controller.promised, controller.accepted, deed, frozenset(controller.estate)
+
+
+def test_an_estate_is_what_the_roadside_gave() -> None:
+    controller = make_controller()
+    assert kept(controller) == (None, None, None, frozenset(BEFORE[A]))
+
+
+def test_orders_one_after_the_other() -> None:
+    controller = make_controller()
+    assert controller.note(PROMISE)
+    assert not controller.note(PROMISE)
+    assert controller.note(ACCEPTANCE)
+    assert kept(controller) == (MID, MID, deed_of(A), frozenset(BEFORE[A]))
+    assert controller.note(POSSESSION)
+    assert kept(controller) == (MID, MID, OPEN, frozenset(AFTER[A]))
+    assert not controller.note(ACCEPTANCE)  # a duplicate opens and closes nothing
+    assert kept(controller) == (MID, MID, OPEN, frozenset(AFTER[A]))
+
+
+def test_a_deed_of_less_than_was_promised_is_not_drawn_up() -> None:
+    controller = make_controller()
+    controller.note(order(HIGH))
+    controller.note(ACCEPTANCE)
+    assert kept(controller) == (HIGH, None, None, frozenset(BEFORE[A]))
+
+
+def test_without_its_deed_a_plan_is_not_accepted() -> None:
+    controller = make_controller()
+    controller.note(order(MID, None, MID))
+    assert controller.accepted is None
+    controller.note(order(MID, deed_of(A, LOW), MID))
+    assert (controller.accepted, controller.deed) == (None, None)
+
+
+def test_only_the_newest_deed_can_be_opened() -> None:
+    controller = make_controller()
+    controller.note(ACCEPTANCE)
+    newer = Deed(HIGH, BEFORE[A], BEFORE[A], (A,))
+    controller.note(order(HIGH, newer, HIGH))
+    controller.note(POSSESSION)
+    assert controller.deed == newer
+    assert set(controller.estate) == set(BEFORE[A])
+
+
+def test_a_promise_binds_the_next_process() -> None:
+    controller = make_controller()
+    controller.note(order(HIGH))
+    controller.hand_over(AGENT + 1)
+    assert (controller.promised, controller.accepted) == (HIGH, None)
+    controller.note(evolve(ACCEPTANCE, incarnation=AGENT + 1))
+    assert (controller.promised, controller.deed) == (HIGH, None)
+
+
+def test_a_deed_outlives_the_process_and_its_acceptance_does_not() -> None:
+    controller = make_controller()
+    controller.note(ACCEPTANCE)
+    controller.hand_over(AGENT + 1)
+    assert kept(controller) == (MID, None, deed_of(A), frozenset(BEFORE[A]))
+    assert not controller.note(POSSESSION)  # of the process that was replaced
+    assert controller.deed == deed_of(A)
+
+
+def test_where_formations_own_blocks_acceptance_needs_no_deed() -> None:
+    admission = Admission(Arrival("A", 0, 0, 0.0), HOME, 0.0)
+    paper = parse_scenario({"formation": {"operation": "paper"}})
+    controller = RoadVehicle.entering(admission, 0.0, paper).controller
+    controller.hand_over(AGENT)
+    controller.note(order(accepted=MID))
+    assert (controller.accepted, controller.estate) == (MID, ())
+
+
+# --- any order --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("orders", list(permutations((PROMISE, ACCEPTANCE, POSSESSION))))
+def test_any_order_of_one_plan_ends_sound(orders: tuple[Command, ...]) -> None:
+    """Possession is said after the acceptance is known to be noted, so it comes last once."""
+    controller = make_controller()
+    for each in (*orders, ACCEPTANCE, POSSESSION, *orders):
+        controller.note(each)
+        check(controller)
+    assert kept(controller) == (MID, MID, OPEN, frozenset(AFTER[A]))
+
+
+def check(controller: MotionController) -> None:
+    """Check that what is kept fits together."""
+    deed = controller.deed
+    if deed is not None and not deed.open:
+        assert set(controller.estate) == set(deed.before)
+    if controller.accepted is not None:
+        assert deed is not None
+        assert deed.ballot >= controller.accepted
+    if deed is not None:
+        assert controller.promised is not None
+        assert deed.ballot <= controller.promised
+
+
+BALLOTS = [Ballot(term, Name("c1"), 1, seq) for term in (1, 2) for seq in (1, 2)]
+CELLS: list[Cell] = [(column, lane) for column in (0, 1, 2) for lane in (0, 1)]
+
+
+@st.composite
+def histories(draw: st.DrawFn) -> list[Command | Cell]:
+    """What an honest agent says over several ballots, each thing in any place, more than once."""
+    said: list[Command | Cell] = []
+    deed: Deed | None = None
+    estate = set(BEFORE[A])
+    for ballot in sorted(draw(st.sets(st.sampled_from(BALLOTS), min_size=1))):
+        said.append(order(ballot, deed))
+        how_far = draw(st.integers(0, 2))
+        if how_far >= 1:
+            after = {HOME, *draw(st.sets(st.sampled_from(CELLS), max_size=3))}
+            deed = Deed(ballot, tuple(sorted(estate)), tuple(sorted(after)), (A, B))
+            said.append(order(ballot, deed, ballot))
+            if how_far == 2:
+                deed = Deed(ballot, open=True)
+                said.append(order(ballot, deed, ballot))
+                estate = after
+    late = draw(st.lists(st.sampled_from(said), max_size=6))
+    granted: list[Command | Cell] = [(50 + index, 0) for index in range(draw(st.integers(0, 2)))]
+    return draw(st.permutations([*said, *late, *granted]))
+
+
+@given(histories(), st.integers(0, 20))
+@settings(max_examples=200, deadline=None)
+def test_however_orders_arrive_what_is_kept_is_sound(
+    history: list[Command | Cell], restart: int
+) -> None:
+    controller = make_controller()
+    final: dict[Ballot, Deed | None] = {}
+    granted = set()
+    for index, each in enumerate(history):
+        if index == restart:
+            controller.hand_over(AGENT + 1)
+        before = controller.promised, controller.deed
+        if isinstance(each, Command):
+            controller.note(each)
+        else:
+            controller.own(each)
+            granted.add(each)
+        check(controller)
+        assert granted <= set(controller.estate)
+        assert before[0] is None or (controller.promised or LOW) >= before[0]
+        if before[1] is not None:
+            assert controller.deed is not None
+            assert controller.deed.ballot >= before[1].ballot
+        # With a promise, which deed is the newest of the older ones is final.
+        promised, deed = controller.promised, controller.deed
+        if promised is not None and (deed is None or deed.ballot < promised):
+            newest = final.setdefault(promised, deed)
+            assert (newest and newest.ballot) == (deed and deed.ballot)
+
+
+# --- cells from the roadside ------------------------------------------------------------------
+
+GIVEN: Cell = (-1, 0)
+
+
+@pytest.mark.parametrize("when", range(4))
+def test_a_cell_that_comes_at_any_time_is_kept(when: int) -> None:
+    """The plan was made before anybody knew of it."""
+    controller = make_controller()
+    for step, each in enumerate((PROMISE, ACCEPTANCE, POSSESSION)):
+        if when == step:
+            controller.own(GIVEN)
+        controller.note(each)
+    if when == 3:
+        controller.own(GIVEN)
+    assert set(controller.estate) == {*AFTER[A], GIVEN}
+
+
+@pytest.mark.parametrize(("when", "opened"), list(product(range(2), (False, True))))
+def test_a_cell_that_a_plan_knew_is_not_kept_by_force(when: int, *, opened: bool) -> None:
+    controller = make_controller()
+    controller.own(GIVEN)
+    if when:
+        controller.note(PROMISE)
+    given_away = Deed(MID, (*BEFORE[A], GIVEN), AFTER[A], (A, B))
+    controller.note(order(MID, given_away, MID))
+    if opened:
+        controller.note(POSSESSION)
+    assert (GIVEN in controller.estate) is not opened
+    later = Deed(HIGH, AFTER[A], AFTER[A], (A,))
+    controller.note(order(HIGH, later, HIGH))
+    assert GIVEN not in controller.estate
+
+
+def test_a_closed_deed_shows_the_cell_on_both_sides() -> None:
+    controller = make_controller()
+    controller.note(ACCEPTANCE)
+    controller.own(GIVEN)
+    deed = controller.deed
+    assert deed is not None
+    assert GIVEN in deed.before
+    assert GIVEN in deed.after
+
+
+# --- the caretaker ----------------------------------------------------------------------------
+
+
+def make_caretaker(controller: MotionController) -> Caretaker:
+    admission = Admission(Arrival("A", 0, 0, 0.0), HOME, 0.0)
+    return Caretaker(RoadVehicle(A, admission, controller), AGENT + 1, 0)
+
+
+def test_the_caretaker_hands_cells_over_and_moves_nothing() -> None:
+    controller = controller_of(BEFORE[B][::-1])
+    admission = Admission(Arrival("B", 1, 0, 0.0), (2, 1), 0.0)
+    vehicle = RoadVehicle(B, admission, controller)
+    caretaker = Caretaker(vehicle, AGENT, 0)
+    plan = make_plan()
+    state = caretaker.on_message(Prepare(MID, (), (A, B)), 0)
+    assert state is not None
+    assert (state.promised, state.estate) == (MID, controller.estate)
+    state = caretaker.on_message(plan, 0)
+    assert state is not None
+    assert state.accepted
+    assert state.deed == controller.deed == deed_of(B)
+    assert controller.accepted == MID
+
+
+def test_the_caretaker_is_bound_by_what_the_agent_promised() -> None:
+    controller = make_controller()
+    controller.note(order(HIGH))
+    caretaker = make_caretaker(controller)
+    shown = caretaker.show(0)
+    assert (shown.promised, shown.estate) == (HIGH, tuple(sorted(BEFORE[A])))

@@ -1,0 +1,110 @@
+"""The road on which SUMO drives: its network, and what SUMO makes of it."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.sim_bridge.baselines.lc2013 import check_lc2013
+from laneweave.sim_bridge.sumo.network import NetworkFiles, write_network_with_exits
+from laneweave.sim_bridge.sumo.traffic import SumoTraffic
+from laneweave.sim_bridge.sumo.world import SumoWorld
+
+
+def written(folder: Path, **tables: dict[str, Any]) -> tuple[NetworkFiles, ET.Element, ET.Element]:
+    """Return the files and what is in them."""
+    files = write_network_with_exits(parse_scenario(tables), folder)
+    network, routes = (ET.parse(path).getroot() for path in (files.network, files.routes))  # noqa: S314 (our own)
+    return files, network, routes
+
+
+# --- the files --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lanes", [1, 3, 8])
+def test_each_lane_leads_to_an_exit_of_its_own(tmp_path: Path, lanes: int) -> None:
+    _, network, routes = written(tmp_path, road={"lanes": lanes})
+    connections = {(one.attrib["fromLane"], one.attrib["to"]) for one in network.iter("connection")}
+    assert connections == {(str(lane), f"exit{lane}") for lane in range(lanes)}
+    edges = {one.attrib["id"]: one.attrib["edges"] for one in routes.iter("route")}
+    assert edges == {f"road-{lane}": f"road exit{lane}" for lane in range(lanes)}
+
+
+def test_lanes_go_on_where_they_were_and_the_road_ends_where_it_should(tmp_path: Path) -> None:
+    _, network, _ = written(tmp_path, formation={"speed_mps": 12.0})
+    shapes = {one.attrib["id"]: one.attrib["shape"] for one in network.iter("lane")}
+    for lane in range(3):
+        end = f"1000.000000,{(lane + 0.5) * 3.5:.6f}"
+        assert shapes[f"road_{lane}"].endswith(end)
+        assert shapes[f"exit{lane}_0"].startswith(end)
+    assert {float(one.attrib["speed"]) for one in network.iter("lane")} == {12.0}
+
+
+def test_the_parameters_are_those_of_the_scenario(tmp_path: Path) -> None:
+    table = {"headway_s": 0.8, "min_gap_m": 0.5, "lane_change_s": 4.0}
+    files, _, routes = written(tmp_path, lc2013=table)
+    kind = next(routes.iter("vType")).attrib
+    assert (kind["carFollowModel"], kind["laneChangeModel"]) == ("Krauss", "LC2013")
+    assert [float(kind[name]) for name in ("tau", "minGap", "accel", "decel")] == [0.8, 0.5, 5, 10]
+    assert files.options[-2:] == ("--lanechange.duration", "4.000000")
+
+
+def test_a_headway_within_a_tick_is_refused() -> None:
+    with pytest.raises(BadInputError, match=r"lc2013\.headway_s"):
+        check_lc2013(parse_scenario({"lc2013": {"headway_s": 0.05}}))
+
+
+# --- SUMO -------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def traffic(tmp_path: Path) -> Iterator[SumoTraffic]:
+    with SumoTraffic(Scenario(), tmp_path / "sumo") as traffic:
+        yield traffic
+
+
+def test_who_is_offered_stands_where_it_was_offered(traffic: SumoTraffic) -> None:
+    traffic.offer("v1", 2, 0, 0.6)
+    assert traffic.step() == ("v1",)
+    assert traffic.positions()["v1"] == pytest.approx((0.6, 8.75, 0.0, 15.0), abs=1e-6)
+    assert traffic.step() == ()
+    assert traffic.positions()["v1"] == pytest.approx((2.1, 8.75, 0.0, 15.0), abs=1e-6)
+
+
+def test_who_finds_no_room_waits(traffic: SumoTraffic) -> None:
+    traffic.offer("v1", 0, 0, 0.0)
+    traffic.step()
+    traffic.offer("v2", 0, 0, 0.0)
+    ticks = 1
+    while "v2" not in traffic.step():
+        ticks += 1
+    # 0.66 s and a body, at 15 m/s.
+    assert ticks == 10
+
+
+def test_who_may_not_change_lanes_stays_and_waits_at_the_end(traffic: SumoTraffic) -> None:
+    traffic.offer("v1", 0, 1, 0.0)
+    traffic.allow_lane_changes("v1", allowed=False)
+    for _ in range(900):
+        traffic.step()
+    s_m, y_m, _, speed_mps = traffic.positions()["v1"]
+    assert (y_m, speed_mps) == (1.75, 0.0)
+    assert 900.0 < s_m <= 1000.0
+    traffic.allow_lane_changes("v1", allowed=True)
+    while s_m < 1000.0:
+        traffic.step()
+        s_m, y_m, _, _ = traffic.positions()["v1"]
+    assert y_m == pytest.approx(5.25)
+
+
+def test_there_is_one_simulation_per_process(traffic: SumoTraffic, tmp_path: Path) -> None:
+    assert traffic.positions() == {}
+    with pytest.raises(RuntimeError, match="one simulation per process"):
+        SumoWorld(Scenario(), tmp_path / "other")
