@@ -21,6 +21,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
+from conflict_drawing import conflict
 from laneweave.agents.driving.reference import move_profile
 from laneweave.coordinator.planning import PlanRequest, checked_plan, warm_up
 from laneweave.coordinator.planning.conflict_cliques import row_patterns
@@ -29,7 +30,6 @@ from laneweave.coordinator.planning.geometry.conflict_table import Pair, close_p
 from laneweave.coordinator.planning.geometry.settings import Geometry
 from laneweave.coordinator.planning.grid import displacements
 from laneweave.coordinator.planning.instances import formation_request
-from laneweave.launch.drawing.conflict_table import conflict
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import cell_state
 from laneweave.sim_bridge.bodies.footprints import Bodies, pose_of

@@ -19,6 +19,7 @@ if __name__ == "__main__":  # run as a program: as `pythonpath` in pyproject.tom
     sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
+from conflict_drawing import counts, draw_conflicts
 from evaluation.evidence import read_evidence
 from evaluation.tables import document_parts
 from laneweave.agents.metrics import AgentNumbers
@@ -27,7 +28,6 @@ from laneweave.coordinator.metrics import CoordinatorNumbers
 from laneweave.coordinator.planning import PlanRequest
 from laneweave.coordinator.planning.explanation import explain
 from laneweave.coordinator.service.server import ServiceNumbers
-from laneweave.launch.drawing.conflict_table import counts, draw_conflicts
 from laneweave.launch.drawing.tappa_process import draw_explanation
 from laneweave.launch.fault_search.profiles import PROFILES
 from laneweave.launch.observe.metrics_server import PROCESS, PROCESS_MEANING

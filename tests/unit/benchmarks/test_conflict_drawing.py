@@ -11,10 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from PIL import Image
 
-from laneweave.coordinator.planning.geometry.conflict_table import Pair, close_pairs
-from laneweave.coordinator.planning.geometry.settings import Geometry
-from laneweave.coordinator.planning.grid import Cell, displacements
-from laneweave.launch.drawing.conflict_table import (
+from conflict_drawing import (
     PANELS,
     Judge,
     Verdict,
@@ -22,6 +19,9 @@ from laneweave.launch.drawing.conflict_table import (
     counts,
     draw_conflicts,
 )
+from laneweave.coordinator.planning.geometry.conflict_table import Pair, close_pairs
+from laneweave.coordinator.planning.geometry.settings import Geometry
+from laneweave.coordinator.planning.grid import Cell, displacements
 
 NEAR = range(-2, 3)
 OFFSETS = [offset for offset in product(NEAR, NEAR) if offset != (0, 0)]

@@ -4,7 +4,7 @@ A panel for each kind of move of vehicle A; others follow by symmetry. Around A 
 which B may start, with an arrow for each of its moves and a dot for waiting, coloured by how late
 one of the two must be to come too close to the other.
 
-This module needs matplotlib: import it only to draw.
+Used by docs/generate.py and geometry.py; no part of the installed package.
 """
 
 from __future__ import annotations
