@@ -6,7 +6,7 @@ from typing import Final
 
 from attrs import frozen
 
-from laneweave.launch.cli.options import KeepTrajectories
+from laneweave.launch.methods import KeepTrajectories
 from laneweave.launch.sweep.points import Point, plan_points
 from laneweave.protocol.scenario.tables import Scenario
 

@@ -18,7 +18,6 @@ from rich.console import Console
 from laneweave.launch.cli import certs_commands, config_commands
 from laneweave.launch.cli.options import check_jobs, parse_seeds
 from laneweave.launch.cli.role_commands import (
-    METHOD,
     SOLVER_NAMES,
     SolverOption,
     agent,
@@ -31,6 +30,7 @@ from laneweave.launch.cli.role_commands import (
 )
 from laneweave.launch.cli.status_command import status
 from laneweave.launch.cli.study_commands import report, sweep
+from laneweave.launch.methods import FORMATION
 from laneweave.launch.run.logs import log_to_terminal
 from laneweave.launch.run.run_folder import draw_own, new_folder
 from laneweave.protocol.config.loading import load_scenario
@@ -73,7 +73,7 @@ class TransportChoice(StrEnum):
 class Method(StrEnum):
     """How vehicles are controlled."""
 
-    formation = METHOD
+    formation = FORMATION
     rule = "rule"
     lc2013 = "lc2013"
 
@@ -197,14 +197,14 @@ def _run_formations(
     check_moves(settings)
     vehicles = {arrival.vehicle for arrival in arrivals(settings)}
     plan_of_faults = load_faults(faults, coordinator_names(settings), vehicles)
-    folder = new_folder(out, settings, METHOD)
+    folder = new_folder(out, settings, FORMATION)
     if transport is TransportChoice.simulated:
         from laneweave.launch.run.garbage_collection import collect_seldom
         from laneweave.launch.run.simulated_run import SimulatedRun
 
         collect_seldom()
-        return SimulatedRun(settings, folder, METHOD, plan_of_faults, show_progress=show).run()
-    return LocalRun(settings, folder, METHOD, plan_of_faults, show, pace).run()
+        return SimulatedRun(settings, folder, FORMATION, plan_of_faults, show_progress=show).run()
+    return LocalRun(settings, folder, FORMATION, plan_of_faults, show, pace).run()
 
 
 def _run_reference(settings: Scenario, out: Path | None, method: Method, *, show: bool) -> Outcome:

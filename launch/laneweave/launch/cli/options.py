@@ -4,20 +4,11 @@ from __future__ import annotations
 
 import os
 import re
-from enum import StrEnum
 
 from laneweave.protocol.errors import BadInputError
 
 MOST_SEEDS = 10_000_000
 MOST_JOBS = 256
-
-
-class KeepTrajectories(StrEnum):
-    """Of which points the trajectories are kept."""
-
-    none = "none"
-    first_seed = "first-seed"
-    all = "all"
 
 
 def parse_seeds(text: str, most: int = MOST_SEEDS) -> range:

@@ -15,6 +15,7 @@ import typer
 from rich.console import Console
 
 from laneweave.launch.deploy.deployments import load_deployment
+from laneweave.launch.methods import FORMATION
 from laneweave.launch.run.logs import LogFormat, LogLevel, log_role
 from laneweave.launch.run.run_folder import draw_own, new_folder
 from laneweave.protocol.errors import BadInputError
@@ -24,11 +25,6 @@ from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.security.access import access_of
 
 log = structlog.get_logger(__name__)
-
-METHOD = "formation"
-"""How a bridge's vehicles are controlled, as its summary says."""
-RULE, LC2013 = "rule", "lc2013"
-"""Reference methods."""
 
 ConfigOption = Annotated[
     Path | None, typer.Option("--config", metavar="DEPLOYMENT.toml", help="Scenario and network.")
@@ -164,8 +160,8 @@ def bridge(
     check_pace(pace)
     settings = load_deployment(config, endpoint, observation__metrics=metrics)
     with _as_role("bridge", "bridge", settings, log_format, log_level) as observe:
-        folder = new_folder(out, settings, METHOD)
-        run_bridge(settings, folder, METHOD, pace, observe=observe)
+        folder = new_folder(out, settings, FORMATION)
+        run_bridge(settings, folder, FORMATION, pace, observe=observe)
     outcome = complete_summary(folder, problems=())
     print_outcome(outcome, Console())
     draw_own(folder)

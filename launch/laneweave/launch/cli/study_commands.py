@@ -11,8 +11,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from laneweave.launch.cli.options import KeepTrajectories, check_jobs, parse_seeds
-from laneweave.launch.sweep.methods import METHODS
+from laneweave.launch.cli.options import check_jobs, parse_seeds
+from laneweave.launch.methods import METHODS, KeepTrajectories
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.errors import BadInputError
 
@@ -57,9 +57,9 @@ def sweep(
     no_progress: Annotated[bool, typer.Option("--no-progress", help="Show no progress.")] = False,
 ) -> None:
     """Run methods x volumes x seeds in parallel, in virtual time; what is finished stays."""
+    from laneweave.launch.methods import parse_methods
     from laneweave.launch.sweep.folder import SweepFolder
     from laneweave.launch.sweep.local_workers import run_locally
-    from laneweave.launch.sweep.methods import parse_methods
     from laneweave.launch.sweep.points import parse_volumes, plan_points
     from laneweave.launch.sweep.sweep import Runner, conduct, print_results
 

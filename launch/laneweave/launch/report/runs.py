@@ -10,8 +10,8 @@ from typing import Any
 from attrs import evolve, frozen
 
 from laneweave.launch.drawing.figures import scenario_of
+from laneweave.launch.methods import rank
 from laneweave.launch.sweep.folder import DONE, MARK_FILE, point_folders, read_record, read_summary
-from laneweave.launch.sweep.methods import rank
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.tables import Scenario
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Final
 
 from laneweave.launch.drawing.figures import FAINT_INK, INK
-from laneweave.launch.sweep.methods import METHODS
+from laneweave.launch.methods import METHODS
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from attrs import define
 
-from laneweave.launch.cli.role_commands import RULE
+from laneweave.launch.methods import RULE
 from laneweave.launch.observe.observer import View
 from laneweave.launch.run.outcome import Outcome, complete_summary
 from laneweave.launch.run.progress import RunProgress

@@ -25,8 +25,8 @@ from typing import Any, Self
 
 from attrs import asdict, frozen
 
+from laneweave.launch.methods import METHODS, affects, rank
 from laneweave.launch.sweep.execution import LOG_FILE, Ended
-from laneweave.launch.sweep.methods import METHODS, has_a_say, rank
 from laneweave.launch.sweep.points import Point
 from laneweave.launch.sweep.results import Row, write_results
 from laneweave.protocol.config.loading import parse_scenario, to_tables
@@ -168,7 +168,7 @@ class SweepFolder:
                 raise BadInputError("--out", str(self.out), f"a folder without {record.label}")
             expected = _flat(to_tables(labelled.settings(parse_scenario(tables))))
             for field, value in _flat(to_tables(recorded)).items():
-                if expected[field] != value and has_a_say(field, record.method):
+                if expected[field] != value and affects(field, record.method):
                     raise BadInputError(field, expected[field], f"{value}, {where}")
 
     def is_finished(self, point: Point) -> bool:

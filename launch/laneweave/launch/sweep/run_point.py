@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from laneweave.launch.cli.role_commands import LC2013, METHOD, RULE
+from laneweave.launch.methods import FORMATION, LC2013, RULE
 from laneweave.launch.run.outcome import Outcome
 from laneweave.launch.run.reference_run import ReferenceRun
 from laneweave.launch.run.simulated_run import SimulatedRun
@@ -14,7 +14,7 @@ from laneweave.protocol.scenario.tables import Scenario
 
 
 def _run_formation(scenario: Scenario, folder: Path) -> Outcome:
-    return SimulatedRun(scenario, folder, METHOD, show_progress=False).run()
+    return SimulatedRun(scenario, folder, FORMATION, show_progress=False).run()
 
 
 def _run_rule(scenario: Scenario, folder: Path) -> Outcome:
@@ -26,7 +26,7 @@ def _run_lc2013(scenario: Scenario, folder: Path) -> Outcome:
 
 
 _RUNS: Final[dict[str, Callable[[Scenario, Path], Outcome]]] = {
-    METHOD: _run_formation,
+    FORMATION: _run_formation,
     RULE: _run_rule,
     LC2013: _run_lc2013,
 }

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from laneweave.launch.cli.main import app
-from laneweave.launch.cli.role_commands import LC2013, RULE
+from laneweave.launch.methods import LC2013, RULE
 from laneweave.launch.run.outcome import Outcome
 from laneweave.launch.run.reference_run import ReferenceRun, check_reference
 from laneweave.protocol.config.loading import parse_scenario, to_tables

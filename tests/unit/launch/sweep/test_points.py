@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from laneweave.launch.cli import main as cli
-from laneweave.launch.cli.options import KeepTrajectories
-from laneweave.launch.sweep.methods import METHODS, parse_methods, rank
+from laneweave.launch.methods import METHODS, KeepTrajectories, parse_methods, rank
 from laneweave.launch.sweep.points import parse_volumes, plan_points
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.errors import BadInputError

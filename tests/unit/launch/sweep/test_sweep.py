@@ -12,7 +12,7 @@ import psutil
 import pyarrow.parquet as pq
 import pytest
 
-from laneweave.launch.sweep.methods import has_a_say
+from laneweave.launch.methods import affects
 from support.sweeping import command, results, short_road, sweep
 
 LISTS = ("--volumes", "1200,1600", "--seeds", "1:3")
@@ -163,8 +163,8 @@ def test_settings_that_a_method_does_not_read_may_be_others(whole: Path, tmp_pat
         ("seed", "lc2013", True),
     ],
 )
-def test_what_has_a_say(field: str, method: str, matters: bool) -> None:
-    assert has_a_say(field, method) is matters
+def test_what_affects(field: str, method: str, matters: bool) -> None:
+    assert affects(field, method) is matters
 
 
 def test_other_folders_are_refused(scenario: Path, tmp_path: Path) -> None:

@@ -1,19 +1,33 @@
-"""The labels of a sweep: each names a method and the settings that it is run with."""
+"""The methods of control, and the labels of a sweep: each names a method and its settings."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from enum import StrEnum
 from typing import Final
 
 from attrs import field, frozen
 
-from laneweave.launch.cli.role_commands import LC2013, METHOD, RULE
 from laneweave.protocol.config.loading import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.tables import PAPERS_FORMATIONS, FormationSettings, Scenario
 
-LARGEST_OF_TAPPA: Final = 6
+FORMATION: Final = "formation"
+"""Formation control, by this project's agents and coordinators."""
+RULE: Final = "rule"
+LC2013: Final = "lc2013"
+"""The two reference methods: the paper's rules, and SUMO's own lane changing."""
+
+MAX_TAPPA_VEHICLES: Final = 6
 """Larger formations are planned by branching."""
+
+
+class KeepTrajectories(StrEnum):
+    """Which runs of a sweep keep their trajectories."""
+
+    none = "none"
+    first_seed = "first-seed"
+    all = "all"
 
 
 @frozen
@@ -24,7 +38,7 @@ class LabelledMethod:
     """As `laneweave run --method` names it."""
     meaning: str
     overrides: Mapping[str, object] = field(factory=dict)
-    """`table.field` -> value, in place of the scenario's."""
+    """`table.field` -> value that replaces the scenario's."""
 
     def settings(self, base: Scenario) -> Scenario:
         """Return a scenario with these settings.
@@ -43,10 +57,10 @@ _FORMATIONS: Final = FormationSettings()
 
 
 def _default() -> LabelledMethod:
-    """Return formations as they are by default, whatever the scenario says of them."""
+    """Return formations with the default settings, whatever the scenario sets."""
     names = ("operation", "entry", "close", "cycle_s", "move_s", "max_vehicles", "max_columns")
     return LabelledMethod(
-        METHOD,
+        FORMATION,
         f"formations of at most {_FORMATIONS.max_vehicles} vehicles, as long as traffic makes them",
         {f"formation.{name}": getattr(_FORMATIONS, name) for name in names}
         | _solver(_FORMATIONS.max_vehicles),
@@ -54,9 +68,9 @@ def _default() -> LabelledMethod:
 
 
 def _paper(max_vehicles: int, block_columns: int) -> LabelledMethod:
-    """Return the paper's formations, of at most so many vehicles in so many columns."""
+    """Return the paper's formations of at most `max_vehicles` in `block_columns` columns."""
     return LabelledMethod(
-        METHOD,
+        FORMATION,
         f"the paper's formations, of at most {max_vehicles} vehicles in {block_columns} columns",
         {
             "formation.operation": "formations",
@@ -70,15 +84,15 @@ def _paper(max_vehicles: int, block_columns: int) -> LabelledMethod:
 
 
 def _solver(max_vehicles: int) -> dict[str, object]:
-    """Return what chooses the planner of formations of at most so many vehicles."""
-    return {"formation.solver": "tappa" if max_vehicles <= LARGEST_OF_TAPPA else "branching"}
+    """Return the setting of the solver for formations of at most `max_vehicles`."""
+    return {"formation.solver": "tappa" if max_vehicles <= MAX_TAPPA_VEHICLES else "branching"}
 
 
 METHODS: Final[dict[str, LabelledMethod]] = {
-    "formation": LabelledMethod(METHOD, "formation control as the scenario says"),
+    "formation": LabelledMethod(FORMATION, "formation control as the scenario says"),
     "formations": _default(),
     "rolling": LabelledMethod(
-        METHOD, "the whole stream, planned anew in each slot", {"formation.operation": "rolling"}
+        FORMATION, "the whole stream, planned anew in each slot", {"formation.operation": "rolling"}
     ),
     "paper-6": _paper(6, 4),
     "paper-12": _paper(12, 8),
@@ -86,40 +100,40 @@ METHODS: Final[dict[str, LabelledMethod]] = {
     "rule": LabelledMethod(RULE, "the paper's rules, d_R from front to front"),
     "rule-net": LabelledMethod(RULE, "the paper's rules, d_R as a net gap", {"rule.gap": "net"}),
     "rule-yielding": LabelledMethod(
-        RULE, "the paper's rules, everybody gives way", {"rule.yielding": "all"}
+        RULE, "the paper's rules, every vehicle yields", {"rule.yielding": "all"}
     ),
     "lc2013": LabelledMethod(LC2013, "SUMO's own lane changing and Krauss following"),
     "lc2013-4s": LabelledMethod(
         LC2013, "the same with lane changes of 4 s", {"lc2013.lane_change_s": 4.0}
     ),
 }
-"""In the order in which tables and figures show them."""
+"""By label, in the order of tables and figures."""
 
 
-_EVERYBODY = ("schema", "seed", "road", "demand", "vehicle", "runtime", "formation.speed_mps")
+_READ_BY_ALL = ("schema", "seed", "road", "demand", "vehicle", "runtime", "formation.speed_mps")
 """Tables and fields of a scenario that any method may read."""
 
-_NOBODY = ("security", "service", "observation")
-"""Tables that change no run."""
+_WITHOUT_EFFECT = ("security", "service", "observation")
+"""Tables that do not change any run."""
 
 
-def has_a_say(field_name: str, method: str) -> bool:
-    """Tell whether a field of a scenario can change what a method's runs bring.
+def affects(field_name: str, method: str) -> bool:
+    """Tell whether a field of a scenario can change the results of a method.
 
     Args:
         field_name: `table.field`, or the name of a field outside tables.
         method: as `laneweave run --method` names it.
     """
     table = field_name.partition(".")[0]
-    if table in _NOBODY:
+    if table in _WITHOUT_EFFECT:
         return False
-    if method == METHOD:
+    if method == FORMATION:
         return table not in (RULE, LC2013)
-    return table == method or table in _EVERYBODY or field_name in _EVERYBODY
+    return table == method or table in _READ_BY_ALL or field_name in _READ_BY_ALL
 
 
 def parse_methods(text: str) -> tuple[str, ...]:
-    """Return the labels of a list with commas.
+    """Return the labels of a comma-separated list.
 
     Raises:
         BadInputError: a label is unknown or named twice.
@@ -134,6 +148,6 @@ def parse_methods(text: str) -> tuple[str, ...]:
 
 
 def rank(label: str) -> tuple[int, str]:
-    """Return by what labels are sorted: their place in the table, unknown ones behind them."""
+    """Return the sort key of a label: its place in `METHODS`, unknown labels last."""
     known = list(METHODS)
     return (known.index(label) if label in METHODS else len(known), label)
