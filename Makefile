@@ -6,14 +6,14 @@ STAMP  := $(VENV)/.installed
 RUN    ?= runs/demo
 BUDGET ?= 90
 
-# Who has nothing left to do takes over half of what another still has.
+# An idle worker takes over half of another worker's remaining tests.
 PYTEST := $(BIN)/pytest -n 2 --dist worksteal
 
 # Linear algebra stays on one thread: many processes share few cores.
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test test-full evaluation evaluation-faults docs check format clean install help
+.PHONY: demo test test-unit test-full evaluation evaluation-faults docs check format clean install help
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 19
@@ -42,6 +42,9 @@ check: $(STAMP) ## format, lint, types, import contracts
 format: $(STAMP) ## rewrite the code in the project's format
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+test-unit: $(STAMP) ## the inner loop: no processes, under a minute
+	$(PYTEST) -m 'not full and not slow' tests/unit
 
 test: $(STAMP) ## what CI runs
 	$(PYTEST) -m 'not full'

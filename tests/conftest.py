@@ -1,4 +1,4 @@
-"""For all tests: what they start can be interrupted, and in which order they run."""
+"""Settings for all tests: signals, order, and a summary of tests skipped without a browser."""
 
 from __future__ import annotations
 
@@ -6,24 +6,41 @@ import signal
 
 import pytest
 
+from support.chromium import NO_BROWSER
+
 FIRST = ("tests/system/", "tests/simulation/")
-"""Long ones. Who runs tests in parallel ends with short ones, so that nobody waits for the last."""
+"""Folders of long tests. They run first, so that parallel workers finish at about the same time."""
 SHORT = "tests/system/test_bad_input.py"
+"""System tests that are short."""
 
 
 def pytest_configure() -> None:
-    """Heed SIGINT: a shell's background jobs ignore it, and their children inherit that."""
+    """Restore SIGINT: a shell's background jobs ignore it, and child processes inherit that."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Let those who wait for processes begin, while another worker computes."""
-    items.sort(key=_turn)
+    """Run tests that wait for processes first, beside tests that compute."""
+    items.sort(key=_rank)
 
 
-def _turn(item: pytest.Item) -> int:
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say how many tests were skipped for want of a browser, and how to install one."""
+    skipped = [
+        report
+        for report in terminalreporter.stats.get("skipped", [])
+        if NO_BROWSER in str(report.longrepr)
+    ]
+    if skipped:
+        terminalreporter.write_line(
+            f"{len(skipped)} tests of the live page and of reports were skipped: {NO_BROWSER}. "
+            "On Debian: apt-get install chromium chromium-driver"
+        )
+
+
+def _rank(item: pytest.Item) -> int:
     if item.nodeid.startswith(SHORT):
         return len(FIRST)
-    found = (turn for turn, folder in enumerate(FIRST) if item.nodeid.startswith(folder))
+    found = (rank for rank, folder in enumerate(FIRST) if item.nodeid.startswith(folder))
     return next(found, len(FIRST) + 1)

@@ -1,4 +1,4 @@
-"""A real Chromium for tests of pages: Debian's, which downloads nothing."""
+"""Chromium, as Debian installs it, for tests of web pages."""
 
 from __future__ import annotations
 
@@ -13,25 +13,23 @@ from attrs import frozen
 from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
 
+NO_BROWSER = "no browser: chromium and chromium-driver are not installed"
 PROGRAM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 WAIT_S = 30.0
 
-needs_chromium = pytest.mark.skipif(
-    PROGRAM is None or DRIVER is None,
-    reason="chromium and chromium-driver are not installed: there is no browser to test in",
-)
+needs_chromium = pytest.mark.skipif(PROGRAM is None or DRIVER is None, reason=NO_BROWSER)
 
 
 @frozen
 class Page:
-    """What a test does with a page."""
+    """A page in a browser."""
 
     driver: webdriver.Chrome
 
     def open(self, address: str) -> None:
-        """Go to an address; what an earlier page had to say does not count."""
+        """Open an address and discard the console output of the page before."""
         self.driver.get("about:blank")
-        self.complaints()
+        self.console_errors()
         self.driver.get(address)
 
     def run(self, script: str) -> Any:  # noqa: ANN401 - any JSON
@@ -39,27 +37,27 @@ class Page:
         return self.driver.execute_script(f"return {script}")
 
     def text(self, identity: str) -> str:
-        """Return what an element says."""
+        """Return the text of an element."""
         return str(self.run(f"document.getElementById('{identity}').textContent"))
 
     def click(self, identity: str) -> None:
-        """Click on an element, as a hand would: where it can be seen."""
+        """Click on an element, which must be visible."""
         self.driver.find_element("id", identity).click()
 
     def wait_until(self, condition: Callable[[], object]) -> None:
-        """Wait until something is as it should be."""
+        """Wait until a condition holds; fail with the page's text after `WAIT_S`."""
         give_up = time.monotonic() + WAIT_S
         while not condition():
             assert time.monotonic() < give_up, self.run("document.body.innerText")
             time.sleep(0.05)
 
-    def complaints(self) -> list[str]:
+    def console_errors(self) -> list[str]:
         """Return what the page has written to the console since the last call."""
         return [str(entry["message"]) for entry in self.driver.get_log("browser")]  # type: ignore[no-untyped-call]
 
 
 def new_page(profile: Path) -> Iterator[Page]:
-    """Yield a page in a browser of its own, which ends with it."""
+    """Yield a page in its own browser, and quit the browser afterwards."""
     options = webdriver.ChromeOptions()
     options.binary_location = str(PROGRAM)
     for argument in (
@@ -73,7 +71,7 @@ def new_page(profile: Path) -> Iterator[Page]:
     ):
         options.add_argument(argument)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    # With both paths given, selenium looks for nothing.
+    # With both paths given, selenium does not search for or download a driver.
     driver = webdriver.Chrome(options=options, service=Service(str(DRIVER)))
     try:
         yield Page(driver)

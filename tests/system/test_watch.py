@@ -139,7 +139,7 @@ def test_90_vehicles_are_shown_ten_times_a_second(lab: Lab, page: Page) -> None:
         assert page.text("candidates") == "c1c2"
         assert page.text("pill") == "live"
         _check_pause_and_slider(page)
-    assert page.complaints() == []
+    assert page.console_errors() == []
     stop(lab, watch, router)
     lab.check_nothing_left()
 
@@ -223,7 +223,7 @@ def test_a_recorded_run_is_played(finished_run: FinishedRun, lab: Lab, page: Pag
     last_s = float(tracks.t_s.max())
     assert 0.0 <= float(page.text("time").removesuffix(" s")) - last_s <= 0.4
     assert page.text("counts").endswith(f"{summary(folder)['vehicles']['left']} left")
-    assert page.complaints() == []
+    assert page.console_errors() == []
     stop(lab, watch)
     lab.check_nothing_left()
 

@@ -269,7 +269,7 @@ def test_generated_parts_are_up_to_date() -> None:
 def test_places_in_the_code_exist() -> None:
     """Rule tables name `module.py: Class.method` or `module.py: function`."""
     sources: dict[str, str] = {}
-    for path in ROOT.glob("*/laneweave/*/*.py"):
+    for path in ROOT.glob("*/laneweave/**/*.py"):
         sources[path.name] = sources.get(path.name, "") + path.read_text(encoding="utf-8")
     places = re.findall(r"`(\w+\.py): ([\w.]+)`", read("PROTOCOL.md") + read("SAFETY.md"))
     assert places
