@@ -41,7 +41,7 @@ TICK_S = 0.1
 START_S = 30.0
 FILL_S = 240.0
 FIRST_PAINT = "return performance.getEntriesByName('first-contentful-paint')[0].startTime"
-STATS = "return {...laneweaveWatch.stats, t: laneweaveWatch.film.newest?.t}"
+STATS = "return {...laneweaveWatch.stats, t: laneweaveWatch.store.newest?.t}"
 DEPLOYMENT = """\
 schema = "laneweave.scenario/1"
 [demand]

@@ -12,8 +12,7 @@ from pathlib import Path
 from prometheus_client.parser import text_string_to_metric_families
 
 from laneweave.launch.cli.status_command import listen
-from laneweave.launch.observe.role_health import BRIDGE, COORDINATOR, RoleHealth
-from laneweave.launch.observe.status import Status
+from laneweave.launch.observe.status import BRIDGE, COORDINATOR, RoleHealth, Status
 from laneweave.protocol.config.loading import load_scenario
 from support.harness import END_S, Ended, Lab
 from system.test_deployment import deployment, free_tcp, start_router, stop
@@ -64,7 +63,7 @@ def test_status_of_a_deployment(lab: Lab) -> None:
     assert nobody.err.startswith("network.endpoint: got ")
 
     router = start_router(lab, config)
-    assert seen(config).problem == "nobody leads: no coordinator is there"
+    assert seen(config).problem == "there is no leader: no coordinator is there"
     first = lab.start("coordinator", "--config", config, "--name", "c1")
     second = lab.start("coordinator", "--config", config, "--name", "c2")
     shards = [lab.start("agent", "--config", config, "--shard", f"{i}/2") for i in range(2)]

@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 from attrs import define, field
 from rich.table import Table
 
-from laneweave.launch.observe.observer import View
+from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.local_run import LocalRun
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.scenario.tables import Scenario
@@ -46,7 +46,7 @@ class _Window:
     cpu_s: dict[str, float] = field(factory=dict)
     memory: dict[str, list[tuple[float, float]]] = field(factory=dict)
 
-    def watch(self, view: View, process_ids: Mapping[str, int]) -> None:
+    def watch(self, view: RoadView, process_ids: Mapping[str, int]) -> None:
         """Take measurements while the window is open."""
         now_s = time.perf_counter()
         if self.began is None and view.t_s >= self.begin_s:

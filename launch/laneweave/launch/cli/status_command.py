@@ -1,4 +1,4 @@
-"""`laneweave status`: what a deployment does, and whether it is well."""
+"""`laneweave status`: the state of a deployment, and whether it is healthy."""
 
 from __future__ import annotations
 
@@ -16,9 +16,18 @@ from rich.table import Table
 
 from laneweave.launch.deploy.deployments import load_deployment
 from laneweave.launch.observe.observer import Observer
-from laneweave.launch.observe.role_health import AGENT, BRIDGE, COORDINATOR, RoleHealth
-from laneweave.launch.observe.status import Candidate, Status, status_of
-from laneweave.launch.observe.tally import HEARD, TOKENS, Tally
+from laneweave.launch.observe.road_view import Coordinator, RoadView
+from laneweave.launch.observe.status import (
+    AGENT,
+    BRIDGE,
+    COORDINATOR,
+    LISTENED,
+    LOSS_WINDOW_TICKS,
+    TOKENS,
+    RoleHealth,
+    Status,
+    status_of,
+)
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.scenario.deployment import parse_shard
 from laneweave.protocol.scenario.tables import Scenario
@@ -26,11 +35,11 @@ from laneweave.protocol.security.access import access_of
 from laneweave.protocol.wire.topics import NAME_PATTERN, NAME_RULE, Keys
 
 WAIT_S = 0.1
-"""Listening goes on in parts of this length."""
+"""Longest wait for a message before the end of listening is checked."""
 
 
 class Role(StrEnum):
-    """Whose health is asked for."""
+    """Kind of the process whose health is checked."""
 
     coordinator = COORDINATOR
     bridge = BRIDGE
@@ -45,22 +54,21 @@ def status(
     endpoint: Annotated[
         str | None, typer.Option("--endpoint", help="Zenoh endpoint of the router.")
     ] = None,
-    realm: Annotated[str | None, typer.Option("--realm", help="Realm to look at.")] = None,
+    realm: Annotated[str | None, typer.Option("--realm", help="Realm to observe.")] = None,
     seconds: Annotated[
         float, typer.Option("--seconds", min=0.1, max=60.0, help="How long to listen.")
     ] = 2.0,
-    role: Annotated[
-        Role | None, typer.Option("--role", help="Only whether one process is well.")
-    ] = None,
+    role: Annotated[Role | None, typer.Option("--role", help="Check one process only.")] = None,
     name: Annotated[
-        str | None, typer.Option("--name", help="Of the coordinator, or of the agent's vehicle.")
+        str | None,
+        typer.Option("--name", help="Name of the coordinator, or of the agent's vehicle."),
     ] = None,
     shard: Annotated[
-        str | None, typer.Option("--shard", metavar="I/N", help="Of the agents.")
+        str | None, typer.Option("--shard", metavar="I/N", help="Shard of the agents.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Listen to a deployment and tell how it is; status 1: it is not well."""
+    """Listen to a deployment and print its state; exit status 1: it is not healthy."""
     settings = load_deployment(config, endpoint, network__realm=realm)
     health = _role_health(role, name, shard)
     found = listen(settings, seconds, health)
@@ -83,49 +91,53 @@ def _role_health(role: Role | None, name: str | None, shard: str | None) -> Role
         raise BadInputError("--name", name, f"with --role coordinator or agent: {NAME_RULE}")
     if name is None and role in (Role.coordinator, Role.agent):
         also = ", or --shard I/N" if role is Role.agent else ""
-        raise BadInputError("--name", "", f"the name of the process to look at{also}")
+        raise BadInputError("--name", "", f"the name of the process to check{also}")
     return None if role is None else RoleHealth(role.value, name or "")
 
 
 def listen(settings: Scenario, seconds: float, health: RoleHealth | None = None) -> Status:
-    """Listen to a deployment and return how it is, or how one process of it is.
+    """Listen to a deployment and return its status.
 
     Args:
         settings: the deployment.
-        seconds: how long; shorter where one process is found well before.
-        health: of one process; None: of the whole.
+        seconds: how long to listen; a health check of one process ends once it succeeds.
+        health: the check of one process; None: the whole deployment is checked.
 
     Raises:
-        BadInputError: nobody answers at the endpoint.
+        BadInputError: there is no router at the endpoint.
     """
     from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 
     network = settings.network
-    observer = Observer(Keys(network.realm), topics=HEARD, tokens=TOKENS)
-    access = access_of(settings, "observer.status")
+    observer = Observer(
+        Keys(network.realm),
+        view=RoadView(loss_window_ticks=LOSS_WINDOW_TICKS),
+        topics=LISTENED,
+        tokens=TOKENS,
+    )
+    access, view = access_of(settings, "observer.status"), observer.view
+
+    def problem() -> str | None:
+        assert health is not None  # noqa: S101 (asked only then)
+        return health.problem(view, began_s, now_s, network.election_s)
+
     with contextlib.closing(ZenohTransport(access, observer.inbox.put)) as transport:
-        tally = Tally(time.monotonic())
+        began_s = now_s = time.monotonic()
+        end_s = began_s + seconds
         observer.subscribe(transport)
-        end_s = tally.began_s + seconds
-        now_s = tally.began_s
         while now_s < end_s:
             for news in observer.news(min(WAIT_S, end_s - now_s)):
                 now_s = time.monotonic()
-                tally.take(news, now_s)
+                view.take(news, now_s)
                 if now_s >= end_s:
-                    break  # more than can be taken in must not keep it here
+                    break  # more messages than can be processed must not delay the end
             now_s = time.monotonic()
-            if (
-                health is not None
-                and health.may_end_early(tally)
-                and health.problem(tally, now_s, network.election_s) is None
-            ):
+            if health is not None and health.may_end_early(view) and problem() is None:
                 break
-    found = status_of(tally, now_s, network.election_s, network.endpoint, network.realm)
+    found = status_of(view, began_s, now_s, network.election_s, network.endpoint, network.realm)
     if health is None:
         return found
-    problem = health.problem(tally, now_s, network.election_s)
-    return evolve(found, healthy=problem is None, problem=problem)
+    return evolve(found, healthy=problem() is None, problem=problem())
 
 
 def show(found: Status, console: Console) -> None:
@@ -138,14 +150,16 @@ def show(found: Status, console: Console) -> None:
 
 def _rows(found: Status) -> list[tuple[str, str]]:
     plans, road, vehicles = found.plans, found.road, found.vehicles
-    leader = "nobody" if found.leader is None else f"{found.leader}, term {found.term}"
+    leader = "none" if found.leader is None else f"{found.leader}, term {found.term}"
     if len(found.claims) > 1:
         leader += f"; {len(found.claims)} claim to lead: {', '.join(found.claims)}"
     in_force = f"{plans.in_force} in force"
     if plans.operation is not None:
         in_force += f", {plans.operation} operation"
     if plans.formations is not None:
-        in_force += f", {plans.formations_with_plan} of {plans.formations} closed ones have one"
+        in_force += (
+            f", {plans.formations_with_plan} of {plans.formations} closed formations have one"
+        )
     rows = [
         ("health", "healthy" if found.healthy else "not healthy"),
         ("realm", f"{found.realm} at {found.endpoint}, {found.listened_s:.1f} s"),
@@ -161,11 +175,11 @@ def _rows(found: Status) -> list[tuple[str, str]]:
             f"{road.on_road} on the road, {road.entered} entered, {road.left} left, "
             f"{road.demanded} demanded"
         )
-        who = (
+        drivers = (
             f"{vehicles.attended} attended, {vehicles.unattended} unattended, "
             f"{vehicles.unheard} not heard; {vehicles.agents} agents"
         )
-        rows += [("road", f"{road.t_s:.1f} s, {pace}; {counts}"), ("vehicles", who)]
+        rows += [("road", f"{road.t_s:.1f} s, {pace}; {counts}"), ("vehicles", drivers)]
     rates = ", ".join(f"{topic} {rate:.1f}" for topic, rate in found.messages_per_s.items())
     rows.append(("messages/s", rates or "none"))
     loss = found.loss
@@ -173,7 +187,7 @@ def _rows(found: Status) -> list[tuple[str, str]]:
     return rows
 
 
-def _candidate(one: Candidate) -> str:
+def _candidate(one: Coordinator) -> str:
     if one.heard_s_ago is None:
         return f"{one.coordinator} not heard"
     leads = ", claims to lead" if one.leading else ""

@@ -12,7 +12,7 @@ from bisect import bisect_left
 
 from attrs import define, field
 
-from laneweave.launch.observe.observer import View
+from laneweave.launch.observe.road_view import RoadView
 from laneweave.protocol.wire.messages import LogEvent
 
 IN_FORCE = "plan-in-force"
@@ -41,7 +41,7 @@ class Failover:
     _seen_s: list[float] = field(factory=list)
     """When the road clock showed each of these times first."""
 
-    def on_struck(self, view: View, now_s: float, for_s: float | None) -> None:
+    def on_struck(self, view: RoadView, now_s: float, for_s: float | None) -> None:
         """The leader was killed (`for_s` is None), or paused for some time."""
         self._target, self._target_s = view.leader, now_s
         self._lasting, self._led_again = for_s is None, False
@@ -53,16 +53,16 @@ class Failover:
             self._awake_s = math.inf if for_s is None else now_s + for_s
         view.leader = None
 
-    def look(self, view: View, now_s: float) -> None:
+    def look(self, view: RoadView, now_s: float) -> None:
         """Look at what is known by now: who leads, which plans are in force."""
         if not self._road_s or view.t_s > self._road_s[-1]:
             self._road_s.append(view.t_s)
             self._seen_s.append(now_s)
         self._look_for_leader(view, now_s)
-        for event in view.take_news():
+        for event in view.take_events():
             self._on_event(event, now_s)
 
-    def _look_for_leader(self, view: View, now_s: float) -> None:
+    def _look_for_leader(self, view: RoadView, now_s: float) -> None:
         if view.leader not in (None, self._target):
             self._led_again = True
         if self._struck is None or view.leader is None:

@@ -14,7 +14,7 @@ from attrs import define, field, frozen
 from laneweave.launch.faults.failover import Failover
 from laneweave.launch.faults.schedule import Blow, FaultSchedule
 from laneweave.launch.faults.specification import AGENT, COORDINATOR, LEADER, Faults
-from laneweave.launch.observe.observer import View
+from laneweave.launch.observe.road_view import RoadView
 
 log = structlog.get_logger(__name__)
 
@@ -83,7 +83,7 @@ class FaultInjection:
         """When `step` should be called at the latest, on the clock of `now_s`."""
         return min((struck.due_s for struck in self._struck), default=None)
 
-    def step(self, road_s: float, now_s: float, view: View) -> None:
+    def step(self, road_s: float, now_s: float, view: RoadView) -> None:
         """Do what is due.
 
         Args:
@@ -116,7 +116,7 @@ class FaultInjection:
             else:
                 self.stage.start_again(struck.name)
 
-    def _choose(self, blow: Blow, view: View) -> str | None:
+    def _choose(self, blow: Blow, view: RoadView) -> str | None:
         running = [name for name in self.stage.running if name not in self._paused]
         target = blow.strike.target
         if target in (COORDINATOR, AGENT):
@@ -127,7 +127,7 @@ class FaultInjection:
             name = self.stage.agent_of(target)
         return name if name in running else None
 
-    def _candidates(self, blow: Blow, view: View, running: Collection[str]) -> Iterator[str]:
+    def _candidates(self, blow: Blow, view: RoadView, running: Collection[str]) -> Iterator[str]:
         if blow.strike.target == COORDINATOR:
             yield from (name for name in self.stage.coordinators if name in running)
             return
@@ -138,7 +138,7 @@ class FaultInjection:
             if name is not None and name in running and name not in struck:
                 yield name
 
-    def _strike(self, blow: Blow, name: str, road_s: float, now_s: float, view: View) -> None:
+    def _strike(self, blow: Blow, name: str, road_s: float, now_s: float, view: RoadView) -> None:
         self._targets.setdefault(blow.strike_name, set()).add(name)
         self.injected.append({"t_s": round(road_s, 3), "fault": blow.strike_name, blow.verb: name})
         log.warning(blow.verb, target=name, t_s=road_s, fault=blow.strike_name)

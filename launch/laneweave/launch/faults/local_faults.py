@@ -20,7 +20,7 @@ from laneweave.launch.faults.specification import (
     Faults,
     Partition,
 )
-from laneweave.launch.observe.observer import View
+from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.role_processes import ROUTER, Order, RoleProcesses
 from laneweave.launch.run.roles import MessageFaults
 from laneweave.protocol.errors import BadInputError, CommandFailedError
@@ -108,7 +108,7 @@ class ProcessFaults:
     def _cuts_links(self, partition: Partition) -> bool:
         return self.network is not None and partition.may_use_links
 
-    def step(self, now_s: float, view: View) -> None:
+    def step(self, now_s: float, view: RoadView) -> None:
         """Do what is due; `now_s` is wall-clock time.
 
         Raises:

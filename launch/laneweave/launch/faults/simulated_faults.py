@@ -10,7 +10,7 @@ from attrs import define, field
 from laneweave.launch.faults.control_files import LocalBoard
 from laneweave.launch.faults.injection import FaultInjection
 from laneweave.launch.faults.specification import MESSAGES, NAMESPACES, ROUTER, Faults
-from laneweave.launch.observe.observer import View
+from laneweave.launch.observe.road_view import RoadView
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.message_faults import FaultyCore, MessageRule
 from laneweave.protocol.runtime.node import Core
@@ -94,7 +94,7 @@ class SimulatedFaults:
         rules: tuple[MessageRule, ...] = (*faults.messages, *partitions)
         return FaultyCore(core, rules, self.board, receiver=receiver, seed=f"{seed}/{name}/{start}")
 
-    def step(self, now_s: float, view: View) -> None:
+    def step(self, now_s: float, view: RoadView) -> None:
         """Do what is due; `now_s` is virtual time."""
         wakeup_s = self.injection.wakeup_s
         if self.board.road_s != self._stepped_s or (wakeup_s is not None and wakeup_s <= now_s):

@@ -1,5 +1,6 @@
-"""Looking at a deployment from outside: observer, status, health, metrics server.
+"""Observing a deployment from outside: views, status, health, message loss, metrics server.
 
-Entry points: `observer.Observer`, `status`. An observer publishes nothing. Imported by `run`,
-`watch`, `report` and `cli`.
+Entry points: `observer.Observer` with its `road_view.RoadView`, `status.status_of`,
+`metrics_server.shown_metrics`. An observer publishes nothing. Imported by `faults`, `run`, `watch`,
+`report`, `bench` and `cli`.
 """

@@ -1,46 +1,47 @@
-"""The state of a deployment, made of what an observer heard, and whether it is healthy."""
+"""The state of a deployment, and whether it or one of its processes is healthy."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 import attrs
-from attrs import frozen
+from attrs import field, frozen
 
-from laneweave.launch.observe.tally import RoadTally, Tally
+from laneweave.launch.observe.road_view import Coordinator, RoadView, claims_of
+from laneweave.protocol.wire.topics import (
+    BRIDGE_ALIVE,
+    COORDINATOR_ALIVE,
+    TOPICS,
+    VEHICLE_ALIVE,
+    Quality,
+)
 
 SCHEMA = "laneweave.status/1"
+LISTENED = tuple(
+    topic for topic in TOPICS if topic.kind is not None and topic.quality is Quality.LATEST
+)
+"""Topics whose publishers do not wait for slow subscribers: an observer must not slow them down."""
+TOKENS = (COORDINATOR_ALIVE, VEHICLE_ALIVE, BRIDGE_ALIVE)
+LOSS_WINDOW_TICKS = 10_000
+"""More than `laneweave status` listens."""
 
-
-@frozen
-class Candidate:
-    """A coordinator."""
-
-    coordinator: str
-    incarnation: int
-    leading: bool
-    """It claims to lead, and was heard within `network.election_s`."""
-    term: int | None
-    """None, as in the next two: no heartbeat was heard."""
-    plans_in_force: int | None
-    heard_s_ago: float | None
-    token: bool
-    """Its liveliness token is there."""
+COORDINATOR, BRIDGE, AGENT = "coordinator", "bridge", "agent"
 
 
 @frozen
 class Plans:
-    """What is in force."""
+    """The plans in force."""
 
     in_force: int
-    """As the leader says."""
+    """As the leader publishes."""
     operation: str | None
-    """`formations` or `rolling`, by what vehicles show; None: they show too little."""
+    """`formations` or `rolling`, derived from vehicle states; None: they do not tell."""
     formations: int | None
     """Closed formations on the road, as the census lists them; None: there is no such list."""
     formations_with_plan: int | None
-    """Those of them of which a vehicle shows that it has accepted a plan."""
+    """Formations of which a vehicle has accepted a plan."""
 
 
 @frozen
@@ -61,16 +62,16 @@ class Road:
 
 @frozen
 class Vehicles:
-    """Who is on the road, by the census, and who speaks for them, by their states."""
+    """The vehicles on the road, as the census lists them, by the source of their states."""
 
     attended: int
-    """An agent drives it."""
+    """Driven by an agent."""
     unattended: int
-    """Its caretaker speaks for it."""
+    """Without an agent; the bridge's caretaker publishes its state."""
     unheard: int
-    """No state of it was heard."""
+    """No state was heard."""
     agents: int
-    """Agents whose tokens are there, of vehicles on the road or announced."""
+    """Agents with a token, of vehicles on the road or announced."""
 
 
 @frozen
@@ -95,8 +96,8 @@ class Status:
     term: int | None
     """The leader's."""
     claims: tuple[str, ...]
-    """Who claims to lead; more than one: they have not heard each other yet."""
-    candidates: tuple[Candidate, ...]
+    """Coordinators that claim to lead; with more than one, they have not heard each other yet."""
+    candidates: tuple[Coordinator, ...]
     plans: Plans
     road: Road | None
     vehicles: Vehicles
@@ -105,32 +106,37 @@ class Status:
     loss: Loss
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the status as JSON has it."""
+        """Return the status as a JSON object."""
         return {"schema": SCHEMA} | attrs.asdict(self)
 
 
 def status_of(
-    tally: Tally, now_s: float, election_s: float, endpoint: str = "", realm: str = ""
+    view: RoadView,
+    began_s: float,
+    now_s: float,
+    election_s: float,
+    endpoint: str = "",
+    realm: str = "",
 ) -> Status:
-    """Return what a tally says.
+    """Return the status of a deployment.
 
     Args:
-        tally: what was heard.
-        now_s: the end of listening, on the tally's clock.
+        view: what was heard.
+        began_s: when listening began, on the observer's clock.
+        now_s: when listening ended.
         election_s: a coordinator that was not heard for this long does not lead.
         endpoint: where the observer listened.
         realm: in which realm.
     """
-    candidates = _candidates(tally, now_s, election_s)
-    # As everybody does: the highest term leads; the lowest name among equals.
-    claims = sorted(
-        (one for one in candidates if one.leading),
-        key=lambda one: (-(one.term or 0), one.coordinator),
-    )
+    candidates = [
+        one
+        for one in view.coordinators(now_s, election_s)
+        if one.token or (one.heard_s_ago is not None and one.heard_s_ago < election_s)
+    ]
+    claims = claims_of(candidates)
     leader = claims[0] if claims else None
-    road = _road(tally.road)
-    listened_s = now_s - tally.began_s
-    problem = _problem(tally, candidates, leader, listened_s, election_s)
+    listened_s = now_s - began_s
+    problem = _problem(view, candidates, leader, listened_s, election_s)
     return Status(
         healthy=problem is None,
         problem=problem,
@@ -141,47 +147,95 @@ def status_of(
         term=leader.term if leader else None,
         claims=tuple(one.coordinator for one in claims),
         candidates=tuple(candidates),
-        plans=_plans(tally.road, leader),
-        road=road,
-        vehicles=_vehicles(tally),
+        plans=_plans(view, leader),
+        road=_road(view),
+        vehicles=_vehicles(view),
         messages_per_s={
             topic: round(count / listened_s, 2) if listened_s > 0 else 0.0
-            for topic, count in sorted(tally.counts.items())
+            for topic, count in sorted(view.message_counts.items())
         },
-        loss=Loss(_rounded(tally.road.clock_loss), _rounded(tally.road.state_loss)),
+        loss=Loss(_rounded(view.loss.clock_loss), _rounded(view.loss.state_loss)),
     )
 
 
-def road_problem(tally: Tally, listened_s: float) -> str | None:
-    """Return what is wrong with the road, if there is one."""
-    first, newest = tally.road.first, tally.road.newest
-    if first is None or newest is None:
-        if tally.bridges:
-            return f"a bridge is there, but its clock was not heard for {listened_s:.1f} s"
-        return None
-    if newest.ended:
-        return None
-    if newest.tick == first.tick:
-        return f"the road stands still at {newest.t_s:.1f} s for {listened_s:.1f} s"
-    if not tally.bridges:
-        return f"the bridge has gone at {newest.t_s:.1f} s, before its road had ended"
-    return None
+@frozen
+class RoleHealth:
+    """The health check of one process."""
+
+    role: str
+    """`COORDINATOR`, `BRIDGE` or `AGENT`."""
+    name: str = ""
+    """Of the coordinator, the vehicle or the shard."""
+    takes: Callable[[str], bool] = field(default=lambda _: False)
+    """Tells whether a vehicle belongs to the shard; unused for a single vehicle."""
+    is_shard: bool = False
+
+    def problem(
+        self, view: RoadView, began_s: float, now_s: float, election_s: float
+    ) -> str | None:
+        """Return what is wrong so far; None: nothing. Arguments as of `status_of`."""
+        if not view.linked:
+            return LINK_LOST
+        if self.role == COORDINATOR:
+            return self._coordinator_problem(view, now_s, election_s)
+        if self.role == BRIDGE:
+            if not view.bridge_tokens:
+                return "no bridge is there"
+            return _road_problem(view, now_s - began_s)
+        if self.is_shard:
+            return self._shard_problem(view)
+        return None if self.name in view.agent_tokens else f"{self.name}: its agent is not there"
+
+    def may_end_early(self, view: RoadView) -> bool:
+        """Tell whether enough was heard to conclude that nothing is wrong."""
+        return not self.is_shard or view.census is not None
+
+    def _coordinator_problem(self, view: RoadView, now_s: float, election_s: float) -> str | None:
+        found = [
+            one
+            for one in view.coordinators(now_s, election_s)
+            if one.token and one.coordinator == self.name
+        ]
+        if not found:
+            return f"coordinator {self.name} is not there"
+        if any(one.heard_s_ago is not None and one.heard_s_ago < election_s for one in found):
+            return None
+        return f"coordinator {self.name} is there, but was not heard for {election_s:g} s"
+
+    def _shard_problem(self, view: RoadView) -> str | None:
+        """Return what is wrong with a shard; one without vehicles on the road is healthy."""
+        unattended = [
+            entry.vehicle
+            for entry in (view.census.on_road if view.census is not None else ())
+            if self.takes(entry.vehicle)
+            and (
+                entry.vehicle not in view.agent_tokens
+                or (entry.vehicle in view.states and not view.states[entry.vehicle].attended)
+            )
+        ]
+        if not unattended:
+            return None
+        count = len(unattended)
+        return f"shard {self.name}: {count} vehicles are unattended, {unattended[0]} among them"
+
+
+LINK_LOST = "the connection to the router was lost"
 
 
 def _problem(
-    tally: Tally,
-    candidates: list[Candidate],
-    leader: Candidate | None,
+    view: RoadView,
+    candidates: list[Coordinator],
+    leader: Coordinator | None,
     listened_s: float,
     election_s: float,
 ) -> str | None:
-    if not tally.linked:
-        return "the connection to the router was lost"
+    if not view.linked:
+        return LINK_LOST
     if leader is None:
         count = len(candidates)
-        there = f"{count} coordinators are there" if count != 1 else "one is there"
-        return f"nobody leads: {there if count else 'no coordinator is there'}"
-    # One that was killed is silent, however long its token stays.
+        found = f"{count} coordinators are there" if count != 1 else "one coordinator is there"
+        return f"there is no leader: {found if count else 'no coordinator is there'}"
+    # The token of a killed process may outlast it, so only processes that were heard count.
     heard = Counter(
         one.coordinator
         for one in candidates
@@ -190,41 +244,36 @@ def _problem(
     for name, processes in heard.items():
         if processes > 1:
             return f"{processes} coordinators are called {name}: names must differ"
-    return road_problem(tally, listened_s)
+    return _road_problem(view, listened_s)
 
 
-def _candidates(tally: Tally, now_s: float, election_s: float) -> list[Candidate]:
-    found = []
-    for process in sorted(tally.candidates | (tally.heartbeats.keys() - tally.gone)):
-        heartbeat, heard_s = tally.heartbeats.get(process, (None, 0.0))
-        fresh = heartbeat is not None and now_s - heard_s < election_s
-        if not fresh and process not in tally.candidates:
-            continue
-        found.append(
-            Candidate(
-                coordinator=process[0],
-                incarnation=process[1],
-                leading=heartbeat is not None and fresh and heartbeat.leading,
-                term=None if heartbeat is None else heartbeat.term,
-                plans_in_force=None if heartbeat is None else heartbeat.formations,
-                heard_s_ago=None if heartbeat is None else round(now_s - heard_s, 3),
-                token=process in tally.candidates,
-            )
-        )
-    return found
+def _road_problem(view: RoadView, listened_s: float) -> str | None:
+    """Return what is wrong with the road, if there is one."""
+    first, newest = view.first_clock, view.clock
+    if first is None or newest is None:
+        if view.bridge_tokens:
+            return f"a bridge is there, but its clock was not heard for {listened_s:.1f} s"
+        return None
+    if newest.ended:
+        return None
+    if newest.tick == first.tick:
+        return f"the road stands still at {newest.t_s:.1f} s for {listened_s:.1f} s"
+    if not view.bridge_tokens:
+        return f"the bridge has gone at {newest.t_s:.1f} s, before its road had ended"
+    return None
 
 
-def _plans(road: RoadTally, leader: Candidate | None) -> Plans:
+def _plans(view: RoadView, leader: Coordinator | None) -> Plans:
     in_force = (leader.plans_in_force if leader else None) or 0
-    states = road.states.values()
+    states = view.states.values()
     if not states:
         return Plans(in_force, None, None, None)
-    # Only in the rolling operation vehicles own cells, or have deeds.
+    # Vehicles own cells and transfer them only in the rolling operation.
     if any(state.estate or state.deed for state in states):
         return Plans(in_force, "rolling", None, None)
-    if road.census is None:
+    if view.census is None:
         return Plans(in_force, "formations", None, None)
-    closed = road.census.formations
+    closed = view.census.formations
     accepted = {state.formation for state in states if state.accepted}
     planned = sum(
         any(one.first_block <= block <= one.last_block for block in accepted) for one in closed
@@ -232,11 +281,12 @@ def _plans(road: RoadTally, leader: Candidate | None) -> Plans:
     return Plans(in_force, "formations", len(closed), planned)
 
 
-def _road(road: RoadTally) -> Road | None:
-    if road.first is None or road.newest is None:
+def _road(view: RoadView) -> Road | None:
+    first, clock = view.first_clock, view.clock
+    if first is None or clock is None:
         return None
-    clock, advanced_s = road.newest, road.newest.t_s - road.first.t_s
-    lasted_s = road.newest_heard_s - road.first_heard_s
+    advanced_s = clock.t_s - first.t_s
+    lasted_s = view.clock_heard_s - view.first_clock_heard_s
     return Road(
         t_s=round(clock.t_s, 3),
         advanced_s=round(advanced_s, 3),
@@ -249,15 +299,14 @@ def _road(road: RoadTally) -> Road | None:
     )
 
 
-def _vehicles(tally: Tally) -> Vehicles:
-    census = tally.road.census
-    names = [entry.vehicle for entry in census.on_road] if census is not None else []
-    states = [tally.road.states.get(name) for name in names]
+def _vehicles(view: RoadView) -> Vehicles:
+    entries = view.census.on_road if view.census is not None else ()
+    states = [view.states.get(entry.vehicle) for entry in entries]
     return Vehicles(
         attended=sum(state is not None and state.attended for state in states),
         unattended=sum(state is not None and not state.attended for state in states),
         unheard=sum(state is None for state in states),
-        agents=len(tally.agents),
+        agents=len(view.agent_tokens),
     )
 
 

@@ -21,7 +21,8 @@ from attrs import define, field
 from laneweave.coordinator.planning import warm_up
 from laneweave.launch.faults.local_faults import ProcessFaults
 from laneweave.launch.faults.specification import Faults
-from laneweave.launch.observe.observer import Observer, View
+from laneweave.launch.observe.observer import Observer
+from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.logs import last_error
 from laneweave.launch.run.outcome import Outcome, complete_summary
 from laneweave.launch.run.progress import RunProgress
@@ -76,7 +77,7 @@ class LocalRun:
     faults: Faults = field(factory=Faults)
     show_progress: bool = True
     pace: float | None = None
-    watch: Callable[[View, Mapping[str, int]], None] | None = None
+    watch: Callable[[RoadView, Mapping[str, int]], None] | None = None
     """Called ten times a second with what is known and the process id of each role."""
     _processes: RoleProcesses = field(init=False)
     _options: dict[str, Any] = field(init=False)
@@ -195,7 +196,7 @@ class LocalRun:
             if faults is not None:
                 self._problems += faults.injection.never_happened()
 
-    def _road_s(self, view: View) -> float:
+    def _road_s(self, view: RoadView) -> float:
         """Return the road time, also where a fault keeps its news from the supervisor."""
         faults = self._active_faults
         return max(view.t_s, faults.board.road_s) if faults is not None else view.t_s

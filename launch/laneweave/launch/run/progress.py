@@ -9,7 +9,7 @@ from typing import Self
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from laneweave.launch.observe.observer import View
+from laneweave.launch.observe.road_view import RoadView
 from laneweave.protocol.scenario.tables import Scenario
 
 
@@ -50,7 +50,7 @@ class RunProgress:
         """Take the bar away."""
         self._bar.stop()
 
-    def update(self, view: View) -> None:
+    def update(self, view: RoadView) -> None:
         """Show what is known now."""
         clock = view.clock
         if clock is None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from attrs import define
 
 from laneweave.launch.methods import RULE
-from laneweave.launch.observe.observer import View
+from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.outcome import Outcome, complete_summary
 from laneweave.launch.run.progress import RunProgress
 from laneweave.protocol.scenario.tables import Scenario
@@ -47,7 +47,7 @@ class ReferenceRun:
                 while road.ending is None:
                     road.advance()
                     if road.tick % PROGRESS_EVERY_TICKS == 0:
-                        progress.update(View(clock=road.clock))
+                        progress.update(RoadView(clock=road.clock))
             finally:
                 record.close(road.t_s, road.ending or Ending.INTERRUPTED)
         return complete_summary(self.folder, problems=(), processes=1)

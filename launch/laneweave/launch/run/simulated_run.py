@@ -19,7 +19,8 @@ from laneweave.launch.faults.simulated_faults import (
     check_simulated,
 )
 from laneweave.launch.faults.specification import Faults
-from laneweave.launch.observe.observer import TOPICS, View
+from laneweave.launch.observe.observer import TOPICS
+from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.outcome import Outcome, complete_summary
 from laneweave.launch.run.progress import RunProgress
 from laneweave.protocol.config.identities import coordinator_names
@@ -46,17 +47,16 @@ class _Watcher:
 
     wakeup_s = None
 
-    def __init__(self, view: View, on_news: Callable[[], None]) -> None:
+    def __init__(self, view: RoadView, on_news: Callable[[], None]) -> None:
         self._view = view
         self._on_news = on_news
 
     def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
-        del now_s
         if isinstance(event, Started):
             for topic in TOPICS:
                 yield Listen(topic)
         elif isinstance(event, Arrived):
-            self._view.take(event.message)
+            self._view.take(event, now_s)
             self._on_news()
 
 
@@ -70,7 +70,7 @@ class SimulatedRun:
     faults: Faults = field(factory=Faults)
     conditions: Conditions = field(factory=Conditions)
     show_progress: bool = True
-    _view: View = field(factory=View)
+    _view: RoadView = field(factory=RoadView)
     _roles: SimulatedRoles = field(init=False)
     _active_faults: SimulatedFaults | None = None
     _incarnations: Iterator[int] = field(factory=lambda: count(1))

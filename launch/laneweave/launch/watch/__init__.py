@@ -1,10 +1,6 @@
 """The live page: `laneweave watch`, of a deployment or of a recorded run.
 
-live_road   messages in, frames out: the pure core (with loss, candidates, news)
-recorded    the frames of a run's folder
-frames      what goes over the websocket: the one place that says so
-ring        the last minutes
-server      the page, its websocket, /healthz
-process     sockets, signals, the thread that listens to the network
-templates/  the page itself; how roads are drawn is in `laneweave.launch.web`
+Entry points: `process.watch_live`, `process.watch_recorded`. `live_road` (a pure core) and
+`recorded_run` make the messages that `frames` defines, `server` sends them to browsers;
+`templates/` is the page, which draws roads with `laneweave.launch.web`. Imported by `cli` only.
 """

@@ -1,10 +1,9 @@
 """The live road: what an observer knows of a deployment, and the frames made of it.
 
-A pure core: messages and times go in, frames come out. It listens to what roadside, vehicles and
-coordinators publish anyway, and says nothing. Every vehicle shows its state in each tick;
-between two of them, and while single ones are lost, it is drawn where its speed has taken it.
-Whoever is not heard for `UNHEARD_S` is drawn in its cell and marked: that is where a vehicle holds
-of which nothing new is known, but nobody has seen it there.
+A pure core: messages and times go in, frames come out. Every vehicle publishes its state in each
+tick; between two states, and while single ones are lost, it is drawn where its speed has taken it.
+A vehicle that was not heard for `UNHEARD_S` is drawn in its cell and marked: a vehicle without new
+information holds its cell, but its real position is not known.
 """
 
 from __future__ import annotations
@@ -12,209 +11,164 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from attrs import define, field
-
 from laneweave.launch.observe.column_owners import Formations
-from laneweave.launch.watch.coordinators import Candidates, leader_of
-from laneweave.launch.watch.event_feed import Newest, plan_facts
-from laneweave.launch.watch.frames import MOVING, OVERDUE, UNATTENDED, UNHEARD, Row
-from laneweave.launch.watch.message_loss import LossMeter
+from laneweave.launch.observe.road_view import RoadView, claims_of
+from laneweave.launch.watch.frames import (
+    MOVING,
+    OVERDUE,
+    UNATTENDED,
+    UNHEARD,
+    EventFeed,
+    Row,
+    plan_row,
+)
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.wire.messages import (
     Ballot,
-    Census,
     CensusEntry,
-    Heartbeat,
     LogEvent,
     Name,
     Plan,
-    RoadClock,
     VehicleState,
 )
 from laneweave.protocol.wire.topics import CENSUS, CLOCK, EVENT, HEARTBEAT, PLAN, STATE
 
 TOPICS = (STATE, CLOCK, CENSUS, HEARTBEAT, PLAN, EVENT)
-"""What is subscribed to; the most frequent one first."""
+"""Subscribed topics; the most frequent one first."""
 UNHEARD_S = 1.0
 """Road time after which a vehicle counts as not heard."""
 STILL_S = 2.0
-"""Wall-clock time after which a clock that says nothing stands still."""
-FORGET_S = 5.0
-"""States further from the clock than this are those of an earlier road."""
-MOST_PLANS = 500
-
-
-@define
-class _Road:
-    """What is known of one run of the road."""
-
-    loss: LossMeter
-    clock: RoadClock | None = None
-    clock_s: float = 0.0
-    """When it was heard, wall clock."""
-    census: Census | None = None
-    states: dict[Name, VehicleState] = field(factory=dict)
+"""Wall-clock time without a clock message after which the road is shown as standing still."""
+MAX_PLANS = 500
+MAX_COORDINATORS = 32
+LOSS_WINDOW_TICKS = 100
 
 
 class LiveRoad:
-    """What is known of a deployment, from nothing on."""
+    """What is known of a deployment."""
 
     def __init__(self, scenario: Scenario, wall_s: float) -> None:
-        """Begin to watch at a wall-clock time, connected."""
+        """Begin to observe at a wall-clock time, connected to the router."""
         self.scenario = scenario
-        self.connected = True
-        self.run = 0
-        """Number of the road, from 1 on when the first one is heard of."""
-        self._bridge = -1
-        self._road = self._new_road()
-        self._candidates = Candidates(scenario.network.election_s)
+        self.view = RoadView(loss_window_ticks=LOSS_WINDOW_TICKS)
         self._targets: dict[Ballot, dict[Name, Cell]] = {}
-        """Of each plan the last cells of those who move."""
-        self._news = Newest()
+        """For each plan the last cell of every vehicle that moves."""
+        self._events = EventFeed()
         self._plan: list[Any] | None = None
         self._status, self._since_s = "waiting", wall_s
         self._shown: tuple[int, str, int] | None = None
         """Run, status and tick of the last frame."""
 
-    def _new_road(self) -> _Road:
-        return _Road(LossMeter(self.scenario.runtime.tick_s))
-
-    # --- what is heard ------------------------------------------------------------------------
-
     def take(self, news: object, wall_s: float) -> None:
-        """Take a message or a change of the link, at a wall-clock time."""
+        """Process a message or a change of the link, at a wall-clock time."""
+        roads = self.view.roads
+        self.view.take(news, wall_s)
+        if 0 < roads < self.view.roads:
+            self._plan, self._events = None, EventFeed()
+            self._targets.clear()
         match news:
-            case VehicleState():
-                self._on_state(news)
-            case RoadClock() if self._is_of_this_road(news.bridge):
-                self._on_clock(news, wall_s)
-            case Census() if self._is_of_this_road(news.bridge):
-                if self._road.census is None or news.t_s >= self._road.census.t_s:
-                    self._road.census = news
-                    self._road.loss.on_census(news)
-            case Heartbeat():
-                self._candidates.on_heartbeat(news, wall_s)
             case Plan():
                 self._on_plan(news)
             case LogEvent():
-                self._plan = plan_facts(news.t_s, news.kind, news.data) or self._plan
-                self._news.add(news.t_s, news.name, news.kind, news.data)
-            case LinkUp() | LinkDown():
-                self.connected = isinstance(news, LinkUp)
+                self._plan = plan_row(news.t_s, news.kind, news.data) or self._plan
+                self._events.add(news.t_s, news.name, news.kind, news.data)
             case _:
                 pass
-
-    def _is_of_this_road(self, bridge: int) -> bool:
-        """Tell whether news are not those of an earlier road; a newer one begins anew."""
-        if bridge > self._bridge:
-            self._bridge, self._road = bridge, self._new_road()
-            self._plan = None
-            if self.run:  # what was heard before the first road is about it, too
-                self._news = Newest()
-            self._targets.clear()
-            self.run += 1
-        return bridge == self._bridge
-
-    def _on_clock(self, clock: RoadClock, wall_s: float) -> None:
-        road = self._road
-        if road.clock is None or clock.tick >= road.clock.tick:
-            road.clock, road.clock_s = clock, wall_s
-            road.loss.on_clock(clock)
-
-    def _on_state(self, state: VehicleState) -> None:
-        road = self._road
-        if road.clock is None or abs(state.t_s - road.clock.t_s) > FORGET_S:
-            return
-        road.loss.on_state(state)
-        known = road.states.get(state.vehicle)
-        if known is None or state.t_s >= known.t_s:
-            road.states[state.vehicle] = state
 
     def _on_plan(self, plan: Plan) -> None:
         self._targets[plan.ballot] = {
             vehicle: moves[-1][2] for vehicle, moves in plan.moves.items() if moves
         }
-        while len(self._targets) > MOST_PLANS:
+        while len(self._targets) > MAX_PLANS:
             del self._targets[next(iter(self._targets))]
 
-    # --- what is shown ------------------------------------------------------------------------
-
     def changed(self, wall_s: float) -> bool:
-        """Tell whether there is a tick or a status that the last frame has not shown."""
+        """Tell whether there is a tick or a status that the last frame did not contain."""
         return self._shown != self._identity(wall_s)
 
     def frame(self, number: int, wall_s: float) -> dict[str, Any]:
         """Return what is known as a frame; see `frames`."""
         self._shown = self._identity(wall_s)
-        self._note_status(wall_s)
-        road, candidates = self._road, self._candidates.now(wall_s)
-        leader, clock = leader_of(candidates), road.clock
-        self._forget_who_left()
-        formations = self._formations()
+        self._update_status(wall_s)
+        view = self.view
+        self._forget_departed()
+        clock, loss, formations = view.clock, view.loss, self._formations()
         rows = self._rows(clock.t_s, formations) if clock is not None else ()
         return {
             "n": number,
-            "run": self.run,
+            "run": view.roads,
             "t": round(clock.t_s, 3) if clock is not None else None,
             "w": round(wall_s, 3),
             "status": self._status,
             "since": round(self._since_s, 3),
-            "leader": [leader.name, leader.term] if leader is not None else None,
-            "candidates": [[c.name, c.term, c.leading, c.silent] for c in candidates],
+            **self._leadership(wall_s),
             "counts": [clock.demanded, clock.entered, clock.on_road, clock.left] if clock else None,
-            "loss": [road.loss.expected, road.loss.lost] if road.loss.expected else None,
+            "loss": [loss.expected, loss.lost] if loss.expected else None,
             "plan": self._plan,
-            "news": self._news.rows,
+            "news": self._events.rows,
             "formations": [[one.number, one.rear, one.front] for one in formations.listed],
             "joined": formations.joined(
-                {state.joined for state in road.states.values()}, self.scenario.lattice
+                {state.joined for state in view.states.values()}, self.scenario.lattice
             ),
             "vehicles": [row.compact() for row in rows],
         }
 
+    def _leadership(self, wall_s: float) -> dict[str, Any]:
+        """Return the fields `leader` and `candidates`: of each name the newest process."""
+        election_s = self.scenario.network.election_s
+        newest = {one.coordinator: one for one in self.view.coordinators(wall_s, election_s)}
+        coordinators = list(newest.values())[:MAX_COORDINATORS]
+        claims = claims_of(coordinators)
+        return {
+            "leader": [claims[0].coordinator, claims[0].term] if claims else None,
+            "candidates": [
+                [one.coordinator, one.term, one.leading, (one.heard_s_ago or 0.0) >= election_s]
+                for one in coordinators
+            ],
+        }
+
     def _identity(self, wall_s: float) -> tuple[int, str, int]:
-        clock = self._road.clock
-        return self.run, self._status_now(wall_s), clock.tick if clock is not None else -1
+        clock = self.view.clock
+        return self.view.roads, self._status_at(wall_s), clock.tick if clock is not None else -1
 
-    def _status_now(self, wall_s: float) -> str:
-        road = self._road
-        if not self.connected:
+    def _status_at(self, wall_s: float) -> str:
+        view = self.view
+        if not view.linked:
             return "lost"
-        if road.clock is None:
+        if view.clock is None:
             return "waiting"
-        if road.clock.ended:
+        if view.clock.ended:
             return "ended"
-        return "still" if wall_s - road.clock_s > STILL_S else "live"
+        return "still" if wall_s - view.clock_heard_s > STILL_S else "live"
 
-    def _note_status(self, wall_s: float) -> None:
-        status = self._status_now(wall_s)
+    def _update_status(self, wall_s: float) -> None:
+        status = self._status_at(wall_s)
         if status != self._status:
             self._status = status
-            self._since_s = self._road.clock_s if status == "still" else wall_s
+            self._since_s = self.view.clock_heard_s if status == "still" else wall_s
 
-    def _forget_who_left(self) -> None:
-        road = self._road
-        if road.census is None:
+    def _forget_departed(self) -> None:
+        view = self.view
+        if view.census is None:
             return
-        listed = {entry.vehicle for entry in road.census.on_road}
-        road.states = {
+        listed = {entry.vehicle for entry in view.census.on_road}
+        view.states = {
             name: state
-            for name, state in road.states.items()
-            # Who was heard after the census may have entered after it.
-            if name in listed or state.t_s > road.census.t_s
+            for name, state in view.states.items()
+            # A vehicle that was heard after the census may have entered after it.
+            if name in listed or state.t_s > view.census.t_s
         }
 
     def _formations(self) -> Formations:
         """Return the closed formations on the road; none in the rolling operation."""
-        census = self._road.census
+        census = self.view.census
         if census is None or self.scenario.formation.rolling:
             return Formations(())
         return Formations.of_census(census.formations, self.scenario.lattice)
 
     def _rows(self, t_s: float, formations: Formations) -> Iterator[Row]:
-        census, states = self._road.census, self._road.states
+        census, states = self.view.census, self.view.states
         listed = {entry.vehicle: entry for entry in census.on_road} if census is not None else {}
         for name, entry in listed.items():
             yield self._row(name, t_s, entry, states.get(name), formations)
@@ -249,7 +203,7 @@ class LiveRoad:
                 hold=state.hold_cell,
                 target=self._target_of(state),
                 flags=flags | OVERDUE * state.overdue,
-                estate=[cell for cell in state.estate if cell != state.hold_cell],
+                owned=[cell for cell in state.estate if cell != state.hold_cell],
             )
         cell = state.hold_cell if state is not None else entry.cell if entry is not None else (0, 0)
         return Row(
@@ -265,7 +219,7 @@ class LiveRoad:
         )
 
     def _target_of(self, state: VehicleState) -> Cell | None:
-        """Return where the vehicle's plan leads, None if it has none or it was not heard."""
+        """Return the last cell of the vehicle's plan; None: it has none, or it was not heard."""
         if state.promised is None or not state.accepted or state.done:
             return None
         return self._targets.get(state.promised, {}).get(state.vehicle)

@@ -1,7 +1,7 @@
-"""`laneweave watch` as a process: the socket, the signals, and the thread that listens.
+"""`laneweave watch` as a process: the socket, the signals, and the observer's thread.
 
-The thread takes in what Zenoh delivers and makes frames; the event loop serves browsers. Between
-them go whole frames, one way.
+The thread processes what Zenoh delivers and makes frames; the event loop serves browsers. Only
+whole frames go from the thread to the loop.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ import structlog
 import uvicorn
 
 from laneweave.launch.observe.observer import Observer
-from laneweave.launch.watch.frame_buffer import Ring
-from laneweave.launch.watch.frames import Film, compact, scene_of
+from laneweave.launch.watch.frames import FrameBuffer, FrameSource, compact, scene_of
 from laneweave.launch.watch.live_road import TOPICS, LiveRoad
 from laneweave.launch.watch.server import Audience, Health, make_app
 from laneweave.protocol.errors import BadInputError
@@ -38,18 +37,18 @@ log = structlog.get_logger(__name__)
 STEP_S: Final = 0.1
 """Time between two frames; wall clock."""
 SLACK_S: Final = 0.02
-"""A frame may come so much early: ticks are not quite regular, and each shall have its own."""
+"""A frame may be early by this much, so that slightly irregular ticks each have a frame."""
 IDLE_S: Final = 1.0
-"""A frame comes at least this often, to say that nothing has changed."""
+"""Longest time between two frames, also when nothing has changed."""
 POLL_S: Final = 0.02
-MOST_AT_A_TIME: Final = 5_000
-"""News that are taken in before anything else is looked at."""
+MAX_BATCH: Final = 5_000
+"""Messages that are processed before the next frame is made."""
 IDENTITY: Final = "observer.watch"
-"""In the process's certificate, where the network is secured."""
-MOST_WAITING: Final = 20_000
-"""Messages that wait to be taken in; more are not taken."""
+"""The process's identity in a secured network."""
+MAX_QUEUED: Final = 20_000
+"""Messages that wait to be processed; further ones are dropped."""
 END_S: Final = 1.0
-"""How long browsers may take to end."""
+"""Time that browsers have to disconnect at the end."""
 LISTEN_RULE: Final = "HOST:PORT, an address of this machine; port 0: any free one"
 
 
@@ -57,23 +56,23 @@ def watch_live(scenario: Scenario, listen: str, ready: Callable[[str], None]) ->
     """Serve the page of a deployment until SIGINT or SIGTERM.
 
     Args:
-        scenario: road and network; the same that the roles have.
+        scenario: road and network, as of the deployment's roles.
         listen: HOST:PORT.
-        ready: called with the page's address when it can be asked for.
+        ready: called with the page's address when it is served.
 
     Raises:
-        BadInputError: nobody answers at the endpoint, or the address cannot be listened at.
+        BadInputError: there is no router at the endpoint, or the address cannot be used.
     """
-    with contextlib.closing(open_socket(listen)) as listener, _Eye(scenario) as eye:
-        _serve(listener, eye.ring, eye.audience, eye.health, ready, eye.start)
-        eye.check()
+    with contextlib.closing(open_socket(listen)) as listener, _LiveObserver(scenario) as observer:
+        _serve(listener, observer.buffer, observer.audience, observer.health, ready, observer.start)
+        observer.check()
 
 
 def watch_recorded(folder: Path, listen: str, ready: Callable[[str], None]) -> None:
     """Serve the page of a recorded run until SIGINT or SIGTERM.
 
     Raises:
-        BadInputError: it is not the folder of a finished run, or the address cannot be listened at.
+        BadInputError: it is not the folder of a finished run, or the address cannot be used.
     """
     from laneweave.launch.watch.recorded_run import Recording  # noqa: PLC0415 (needs pyarrow)
 
@@ -90,7 +89,7 @@ def open_socket(listen: str) -> socket.socket:
     """Return a socket that listens at an address.
 
     Raises:
-        BadInputError: it is no address, or nobody can listen there.
+        BadInputError: it is not an address, or it cannot be used.
     """
     host, colon, port = listen.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
@@ -104,20 +103,20 @@ def open_socket(listen: str) -> socket.socket:
         raise BadInputError("--listen", listen, allowed) from error
 
 
-class _Eye:
-    """Listens to a deployment in a thread of its own and makes frames."""
+class _LiveObserver:
+    """Observes a deployment and makes frames, in a thread of its own."""
 
     def __init__(self, scenario: Scenario) -> None:
-        """Connect; the router may come late.
+        """Connect, waiting some time for the router.
 
         Raises:
-            BadInputError: nobody answers there.
+            BadInputError: there is no router at the endpoint.
         """
         self.audience = Audience()
-        self.ring = Ring(scene_of(scenario, "live", scenario.network.realm, STEP_S))
+        self.buffer = FrameBuffer(scene_of(scenario, "live", scenario.network.realm, STEP_S))
         self._observer = Observer(Keys(scenario.network.realm), topics=TOPICS)
         self._transport = connect_patiently(access_of(scenario, IDENTITY), self._deliver)
-        # Seconds that do not jump when somebody sets the clock.
+        # Seconds that do not jump when the system clock is set.
         self._offset_s = time.time() - time.monotonic()
         self._road = LiveRoad(scenario, self._wall_s())
         self._made_s = self._wall_s()
@@ -127,8 +126,8 @@ class _Eye:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._give_up: Callable[[], None] = lambda: None
 
-    def __enter__(self) -> _Eye:
-        """Use it as a context manager: it leaves the network at the end."""
+    def __enter__(self) -> _LiveObserver:
+        """Return itself; the context ends with a closed connection."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -139,43 +138,43 @@ class _Eye:
         self._transport.close()
 
     def start(self, give_up: Callable[[], None]) -> None:
-        """Begin to listen, from the event loop; `give_up` ends the process."""
+        """Subscribe and start the thread; call from the event loop. `give_up` ends the process."""
         self._loop, self._give_up = asyncio.get_running_loop(), give_up
         self._observer.subscribe(self._transport)
         self._thread.start()
 
     def check(self) -> None:
-        """Raise what has ended the thread, if something has."""
+        """Raise the error that ended the thread, if there was one."""
         if self._failure is not None:
             raise self._failure
 
     def health(self) -> tuple[bool, dict[str, Any]]:
-        """Return whether the observer is connected and at work."""
+        """Return whether the observer is connected and makes frames."""
         age_s = self._wall_s() - self._made_s
-        connected = self._road.connected
-        facts = {"connected": connected, "runs": self._road.run, "frame_age_s": round(age_s, 3)}
-        return connected and age_s < 3.0 * IDLE_S, facts
+        view = self._road.view
+        facts = {"connected": view.linked, "runs": view.roads, "frame_age_s": round(age_s, 3)}
+        return view.linked and age_s < 3.0 * IDLE_S, facts
 
     def _wall_s(self) -> float:
         return time.monotonic() + self._offset_s
 
     def _deliver(self, delivery: Delivery) -> None:
         inbox = self._observer.inbox
-        if inbox.qsize() < MOST_WAITING:
+        if inbox.qsize() < MAX_QUEUED:
             inbox.put(delivery)
 
     def _run(self) -> None:
         try:
             while not self._stop.is_set():
-                for news in islice(self._observer.news(POLL_S), MOST_AT_A_TIME):
+                for news in islice(self._observer.news(POLL_S), MAX_BATCH):
                     message = news.message if isinstance(news, Arrived) else news
                     self._road.take(message, self._wall_s())
-                self._show()
+                self._make_frame()
         except Exception as error:  # noqa: BLE001 (reported by the main thread, which ends)
             self._failure = error
             self._call(self._give_up)
 
-    def _show(self) -> None:
+    def _make_frame(self) -> None:
         wall_s = self._wall_s()
         age_s = wall_s - self._made_s
         due = age_s >= STEP_S - SLACK_S and self._road.changed(wall_s)
@@ -189,8 +188,8 @@ class _Eye:
     """Of the next frame."""
 
     def _publish(self, frame: str) -> None:
-        """Hand a frame out, in the event loop."""
-        self.ring.append(frame)
+        """Offer a frame to all browsers; runs in the event loop."""
+        self.buffer.append(frame)
         self.audience.offer(frame)
 
     def _call(self, function: Callable[..., None], *arguments: object) -> None:
@@ -201,26 +200,26 @@ class _Eye:
 
 
 class _Server(uvicorn.Server):
-    """A server that leaves signals to whoever runs it."""
+    """A server that leaves signals to its caller."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """Capture none: the library's own way would end the process by the signal."""
+        """Capture none: the library's own handler would end the process by the signal."""
         yield
 
 
 def _serve(
     listener: socket.socket,
-    film: Film,
+    source: FrameSource,
     audience: Audience,
     health: Health,
     ready: Callable[[str], None],
     start: Callable[[Callable[[], None]], None] = lambda _: None,
 ) -> None:
     config = uvicorn.Config(
-        make_app(film, audience, health),
+        make_app(source, audience, health),
         log_config=None,
-        # What it says about browsers that come and go is of no interest on a terminal.
+        # Connecting and disconnecting browsers are of no interest on a terminal.
         log_level="critical",
         access_log=False,
         lifespan="off",
@@ -253,6 +252,6 @@ def _serve(
 
 
 def address_of(listener: socket.socket) -> str:
-    """Return the address of the page."""
+    """Return the URL of the page."""
     host, port = listener.getsockname()[:2]
     return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"

@@ -1,8 +1,7 @@
-"""A recorded run as frames, made when somebody asks for them.
+"""A recorded run as frames, made on request.
 
-The files of a run do not say who owned which cells, where plans led beyond the cell that a vehicle
-held or moved to, or which messages were lost; so neither do these frames. What the summary says of
-messages stands in the scene.
+The files of a run do not contain owned cells, plans beyond a vehicle's current cell or move, or
+lost messages; so neither do these frames. The scene has the summary's message counts.
 """
 
 from __future__ import annotations
@@ -21,20 +20,19 @@ from numpy.typing import NDArray
 from laneweave.launch.observe.column_owners import JOINED, Formations, recorded_formations
 from laneweave.launch.report.runs import Run, single_run
 from laneweave.launch.report.trajectories import OFF_LATTICE, Tracks, read_tracks
-from laneweave.launch.watch.event_feed import Newest, plan_facts
-from laneweave.launch.watch.frames import MOVING, Row, compact, scene_of
+from laneweave.launch.watch.frames import MOVING, EventFeed, Row, compact, plan_row, scene_of
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
 
 STEP_S = 0.2
-"""Road time between two frames; the page draws what is between them."""
+"""Road time between two frames; the page interpolates."""
 STILL_M = 0.25
-"""Who is further across from the middle of its cell moves."""
+"""A vehicle at a greater lateral distance from the middle of its cell is moving."""
 
 
 @frozen
 class _Moment:
-    """What events had told at some time."""
+    """The state of a run after one of its events."""
 
     t_s: float
     leader: tuple[str, int] | None = None
@@ -47,7 +45,7 @@ class _Moment:
 
 
 class Recording:
-    """A finished run's folder; a `Film`."""
+    """A finished run's folder as a `FrameSource`."""
 
     def __init__(self, folder: Path) -> None:
         """Read a run's folder.
@@ -72,7 +70,7 @@ class Recording:
         self._step_s = stride * tick_s
         self._numbers, self._rows = _frames_of(self._tracks, tick_s, stride)
         self.first = 0
-        # One more than there are: then all have left.
+        # The last frame is after the last recorded one: all vehicles have left.
         self.last = int(self._numbers[-1]) + 1 if len(self._numbers) else 0
         demands_s = [float(trip["demanded_s"]) for trip in self._trips.values()]
         self._demands_s = np.sort(np.array(demands_s, dtype=np.float64))
@@ -85,7 +83,7 @@ class Recording:
         }
 
     def frames(self, begin: int, end: int) -> list[str]:
-        """Return the frames from `begin` to `end`, as far as the run goes."""
+        """Return the frames from `begin` to `end` (included), as far as the run goes."""
         numbers = range(max(begin, self.first), min(end, self.last) + 1)
         return [compact(self.frame(number)) for number in numbers]
 
@@ -149,7 +147,7 @@ class Recording:
 def _frames_of(
     tracks: Tracks, tick_s: float, stride: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the frame of each row that is shown, ascending, and (row, vehicle) pairs."""
+    """Return the frame number of each sampled row, ascending, and (row, vehicle) pairs."""
     ticks = np.rint(tracks.t_s / tick_s).astype(np.int64)
     rows = np.flatnonzero(ticks % stride == 0)
     numbers = ticks[rows] // stride
@@ -165,7 +163,7 @@ def _trips(folder: Path) -> dict[str, dict[str, Any]]:
 
 
 def _moments(folder: Path) -> Iterator[_Moment]:
-    """Yield what events had told, from nothing on, in order of time."""
+    """Yield the state after each event in order of time, beginning with an empty one."""
     yield _Moment(float("-inf"))
     events = []
     for line in (folder / "events.jsonl").read_text(encoding="utf-8").splitlines():
@@ -173,23 +171,23 @@ def _moments(folder: Path) -> Iterator[_Moment]:
         events.append((float(event.pop("t_s")), str(event.pop("kind")), event))
     leader: tuple[str, int] | None = None
     plan: list[Any] | None = None
-    newest, entered, left = Newest(), 0, 0
+    feed, entered, left = EventFeed(), 0, 0
     joined: tuple[tuple[int, ...], ...] = ()
     for t_s, kind, data in sorted(events, key=lambda event: event[0]):
         role = data.pop("role", "")
-        who = str(data.pop("name", role))
+        process = str(data.pop("name", role))
         if kind == "leader":
             leader = (str(data.get("coordinator")), int(data.get("term", 0)))
-        plan = plan_facts(t_s, kind, data) or plan
+        plan = plan_row(t_s, kind, data) or plan
         entered += kind == "entered"
         left += kind == "left"
         if kind == JOINED and role == "coordinator":
             joined = (*joined, tuple(map(int, data["formations"])))
-        newest.add(t_s, who, kind, data)
-        yield _Moment(t_s, leader, plan, tuple(newest.rows), entered, left, joined)
+        feed.add(t_s, process, kind, data)
+        yield _Moment(t_s, leader, plan, tuple(feed.rows), entered, left, joined)
 
 
 def _losses(run: Run) -> dict[str, int]:
-    """Return what a summary says of messages: published, and dropped by injected faults."""
+    """Return the summary's counts of messages published, and dropped by injected faults."""
     messages = run.summary.get("messages") or {}
     return {name: int(messages.get(name) or 0) for name in ("published", "dropped_by_faults")}

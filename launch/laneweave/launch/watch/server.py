@@ -1,7 +1,7 @@
 """The page, its websocket, and the health check, as one ASGI application.
 
-A browser that is slower than the road gets fewer frames: for each one there is one place for the
-newest frame and one for its newest wish, and nothing else waits for it.
+A browser that is slower than the road gets fewer frames: for each browser only the newest frame and
+its newest request are kept.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
-from laneweave.launch.watch.frames import Film, opening, reel
+from laneweave.launch.watch.frames import FrameSource, batch, opening
 from laneweave.launch.web import road_script, text_of
 
-MOST_BROWSERS: Final = 50
-MOST_WISH_CHARACTERS: Final = 200
-"""A longer message is none from the page."""
+MAX_BROWSERS: Final = 50
+MAX_REQUEST_CHARACTERS: Final = 200
+"""The page sends no longer messages."""
 POLICY_VIOLATION, TRY_LATER = 1008, 1013
-"""Status codes of websockets."""
+"""Websocket status codes."""
 HEADERS: Final = {
     "cache-control": "no-cache",
     "content-security-policy": (
@@ -41,7 +41,7 @@ HEADERS: Final = {
 }
 _FILES: Final = {
     "/": ("page.html", "text/html"),
-    "/film.js": ("film.js", "text/javascript"),
+    "/frames.js": ("frames.js", "text/javascript"),
     "/layers.js": ("layers.js", "text/javascript"),
     "/watch.js": ("watch.js", "text/javascript"),
     "/style.css": ("style.css", "text/css"),
@@ -50,77 +50,77 @@ _FILES: Final = {
 
 @define(eq=False)
 class Browser:
-    """What waits for one browser: at most one frame and one wish."""
+    """Pending output of one browser: at most one frame and one request."""
 
     frame: str | None = None
-    wish: tuple[int, int] | None = None
-    left_out: int = 0
+    request: tuple[int, int] | None = None
+    skipped: int = 0
     """Frames that newer ones have replaced."""
-    _news: asyncio.Event = field(factory=asyncio.Event)
+    _pending: asyncio.Event = field(factory=asyncio.Event)
 
     def offer(self, frame: str) -> None:
-        """Let it have a frame instead of one that it has not taken yet."""
-        self.left_out += self.frame is not None
+        """Set the next frame; it replaces one that was not sent yet."""
+        self.skipped += self.frame is not None
         self.frame = frame
-        self._news.set()
+        self._pending.set()
 
-    def ask(self, wish: tuple[int, int]) -> None:
-        """Note a wish; an older one that waits still is forgotten."""
-        self.wish = wish
-        self._news.set()
+    def ask(self, request: tuple[int, int]) -> None:
+        """Set the next request; it replaces one that was not answered yet."""
+        self.request = request
+        self._pending.set()
 
-    async def next(self, film: Film) -> str:
-        """Wait for what is to be sent next; wishes come first."""
-        while self.wish is None and self.frame is None:
-            self._news.clear()
-            await self._news.wait()
-        if self.wish is not None:
-            (begin, end), self.wish = self.wish, None
-            return reel(film, begin, end)
+    async def next(self, source: FrameSource) -> str:
+        """Wait for the next message to send; answers to requests come first."""
+        while self.request is None and self.frame is None:
+            self._pending.clear()
+            await self._pending.wait()
+        if self.request is not None:
+            (begin, end), self.request = self.request, None
+            return batch(source, begin, end)
         frame, self.frame = self.frame, None
-        assert frame is not None  # noqa: S101 (one of both is there)
+        assert frame is not None  # noqa: S101 (there is one or the other)
         return frame
 
 
 @define
 class Audience:
-    """All browsers."""
+    """All connected browsers."""
 
     browsers: set[Browser] = field(factory=set)
 
     def offer(self, frame: str) -> None:
-        """Let everybody have a frame."""
+        """Offer a frame to every browser."""
         for browser in self.browsers:
             browser.offer(frame)
 
 
 Health = Callable[[], tuple[bool, dict[str, Any]]]
-"""Whether all is well, and what there is to say about it."""
+"""Returns whether the server is healthy, and facts about it."""
 
 
-def make_app(film: Film, audience: Audience, health: Health) -> Starlette:
+def make_app(source: FrameSource, audience: Audience, health: Health) -> Starlette:
     """Return the application.
 
     Args:
-        film: the frames that can be asked for.
-        audience: whom frames are offered to as they come.
-        health: asked at each health check.
+        source: the frames that can be requested.
+        audience: the browsers that get live frames.
+        health: called at each health check.
     """
-    scene = partial(opening, film, uuid4().hex)
+    scene = partial(opening, source, uuid4().hex)
 
     async def healthz(_request: Request) -> Response:
-        well, facts = health()
-        facts = {"ok": well, **facts, "browsers": len(audience.browsers)}
-        return JSONResponse(facts, status_code=200 if well else 503, headers=HEADERS)
+        healthy, facts = health()
+        facts = {"ok": healthy, **facts, "browsers": len(audience.browsers)}
+        return JSONResponse(facts, status_code=200 if healthy else 503, headers=HEADERS)
 
     async def stream(socket: WebSocket) -> None:
         if not same_origin(socket):
             await socket.close(POLICY_VIOLATION)
-        elif len(audience.browsers) >= MOST_BROWSERS:
+        elif len(audience.browsers) >= MAX_BROWSERS:
             await socket.accept()
             await socket.close(TRY_LATER)
         else:
-            await _serve(socket, film, audience, scene)
+            await _serve(socket, source, audience, scene)
 
     return Starlette(
         routes=[
@@ -133,17 +133,17 @@ def make_app(film: Film, audience: Audience, health: Health) -> Starlette:
 
 
 def same_origin(socket: WebSocket) -> bool:
-    """Tell whether a page of this server opens the socket, or none at all.
+    """Tell whether the socket was opened by a page of this server, or outside a browser.
 
-    Browsers let any page open a websocket to anywhere and say whose page it is.
+    A browser lets any page open a websocket to any server, and sends the origin of the page.
     """
     origin = socket.headers.get("origin")
     return origin is None or urlsplit(origin).netloc == socket.headers.get("host")
 
 
-def wish_of(text: str | None) -> tuple[int, int] | None:
-    """Return the numbers of the frames that a message of the page asks for, None if it is none."""
-    if text is None or len(text) > MOST_WISH_CHARACTERS:
+def request_of(text: str | None) -> tuple[int, int] | None:
+    """Return the frame numbers that a message of the page requests; None: it is malformed."""
+    if text is None or len(text) > MAX_REQUEST_CHARACTERS:
         return None
     with contextlib.suppress(ValueError, TypeError, KeyError, RecursionError):
         begin, end = json.loads(text)["want"]
@@ -153,12 +153,12 @@ def wish_of(text: str | None) -> tuple[int, int] | None:
 
 
 async def _serve(
-    socket: WebSocket, film: Film, audience: Audience, scene: Callable[[], str]
+    socket: WebSocket, source: FrameSource, audience: Audience, scene: Callable[[], str]
 ) -> None:
     await socket.accept()
     browser = Browser()
     audience.browsers.add(browser)
-    sender = asyncio.create_task(_send(socket, browser, film, scene()))
+    sender = asyncio.create_task(_send(socket, browser, source, scene()))
     try:
         await _listen(socket, browser)
     finally:
@@ -167,13 +167,13 @@ async def _serve(
         await asyncio.gather(sender, return_exceptions=True)
 
 
-async def _send(socket: WebSocket, browser: Browser, film: Film, scene: str) -> None:
-    # A browser that has vanished is noticed by the listener, too, which ends this.
+async def _send(socket: WebSocket, browser: Browser, source: FrameSource, scene: str) -> None:
+    # The listener, too, notices that a browser has disconnected, and cancels this task.
     with contextlib.suppress(WebSocketDisconnect, RuntimeError):
         await socket.send_text(scene)
         while True:
-            # Waits while the browser does not read: then frames are left out, not queued.
-            await socket.send_text(await browser.next(film))
+            # Waits while the browser does not read: then frames are skipped, not queued.
+            await socket.send_text(await browser.next(source))
 
 
 async def _listen(socket: WebSocket, browser: Browser) -> None:
@@ -181,12 +181,12 @@ async def _listen(socket: WebSocket, browser: Browser) -> None:
         message = await socket.receive()
         if message["type"] != "websocket.receive":
             return
-        wish = wish_of(message.get("text"))
-        if wish is None:
+        request = request_of(message.get("text"))
+        if request is None:
             if socket.application_state is WebSocketState.CONNECTED:
                 await socket.close(POLICY_VIOLATION)
             return
-        browser.ask(wish)
+        browser.ask(request)
 
 
 def _file(path: str, name: str, kind: str) -> Route:

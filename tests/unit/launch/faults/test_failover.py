@@ -8,7 +8,7 @@ from __future__ import annotations
 import pytest
 
 from laneweave.launch.faults.failover import IN_FORCE, Failover
-from laneweave.launch.observe.observer import View
+from laneweave.launch.observe.road_view import RoadView
 from laneweave.protocol.wire.messages import Heartbeat, LogEvent, Name, RoadClock
 
 C1, C2 = Name("c1"), Name("c2")
@@ -20,14 +20,14 @@ class History:
 
     def __init__(self, pace: float = 1.0) -> None:
         """Begin with c1 leading."""
-        self.view = View()
+        self.view = RoadView()
         self.failover = Failover(lease_s=1.0)
         self.pace = pace
         self.leads(C1, 1, START_S)
 
     def look(self, now_s: float) -> None:
         road_s = round((now_s - START_S) * self.pace, 1)
-        self.view.take(RoadClock(round(road_s * 10), road_s, 0, 0, 0, 0, ended=False))
+        self.view.take(RoadClock(round(road_s * 10), road_s, 0, 0, 0, 0, ended=False), 0.0)
         self.failover.look(self.view, now_s)
 
     def look_until(self, now_s: float) -> None:
@@ -35,12 +35,12 @@ class History:
             self.look(START_S + index / 10)
 
     def leads(self, name: Name, term: int, now_s: float) -> None:
-        self.view.take(Heartbeat(name, 1, term, leading=True, formations=0))
+        self.view.take(Heartbeat(name, 1, term, leading=True, formations=0), 0.0)
         self.look(now_s)
 
     def plan(self, name: Name, closed_s: float, now_s: float) -> None:
         data = {"closed_s": closed_s}
-        self.view.take(LogEvent(Name("coordinator"), name, 0.0, Name(IN_FORCE), data))
+        self.view.take(LogEvent(Name("coordinator"), name, 0.0, Name(IN_FORCE), data), 0.0)
         self.look(now_s)
 
 
@@ -89,6 +89,6 @@ def test_a_leader_that_was_stopped_shortly_goes_on_by_itself() -> None:
 
 def test_other_events_say_nothing() -> None:
     history = struck(110.0)
-    history.view.take(LogEvent(Name("coordinator"), C2, 0.0, Name("plan-made"), {}))
+    history.view.take(LogEvent(Name("coordinator"), C2, 0.0, Name("plan-made"), {}), 0.0)
     history.look(110.2)
     assert history.failover.plan_recovery_s == []

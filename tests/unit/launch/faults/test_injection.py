@@ -8,7 +8,7 @@ from attrs import define, field
 
 from laneweave.launch.faults.injection import FaultInjection
 from laneweave.launch.faults.specification import Faults, Kill, Pause
-from laneweave.launch.observe.observer import View
+from laneweave.launch.observe.road_view import RoadView
 from laneweave.protocol.wire.messages import Census, CensusEntry, Heartbeat, Name
 
 LEASE_S = 1.0
@@ -49,18 +49,18 @@ class FakeStage:
         self.done.append(("start", name))
 
 
-def on_road(*vehicles: str, leader: str | None = "c1", incarnation: int = 1) -> View:
+def on_road(*vehicles: str, leader: str | None = "c1", incarnation: int = 1) -> RoadView:
     entries = tuple(CensusEntry(Name(vehicle), (0, 0), 0, 0.0) for vehicle in vehicles)
-    return View(
+    return RoadView(
         census=Census(0.0, entries, ()),
         leader=Name(leader) if leader is not None else None,
         incarnation=incarnation,
     )
 
 
-def leads(view: View, name: str, incarnation: int = 1) -> None:
+def leads(view: RoadView, name: str, incarnation: int = 1) -> None:
     heartbeat = Heartbeat(Name(name), incarnation, view.term, leading=True, formations=0)
-    view.take(heartbeat)
+    view.take(heartbeat, 0.0)
 
 
 def injection(stage: FakeStage, seed: int = 1, **faults: Any) -> FaultInjection:  # noqa: ANN401

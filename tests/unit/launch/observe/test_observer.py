@@ -1,8 +1,11 @@
-"""The launcher's view of a run: newer news wins, nonsense is ignored."""
+"""What an observer knows: newer messages replace older ones, malformed ones are ignored."""
 
 import queue
 
-from laneweave.launch.observe.observer import Observer, View
+from attrs import evolve
+
+from laneweave.launch.observe.observer import Observer
+from laneweave.launch.observe.road_view import RoadView
 from laneweave.protocol.runtime.transport import LinkDown, Received, TokenUp
 from laneweave.protocol.wire.codec import encode
 from laneweave.protocol.wire.messages import Census, Heartbeat, Name, RoadClock
@@ -17,43 +20,53 @@ def heartbeat(name: str, term: int, *, leading: bool = True) -> Heartbeat:
     return Heartbeat(Name(name), 1, term, leading=leading, formations=0)
 
 
-def test_a_view_of_nothing() -> None:
-    view = View()
+def test_an_empty_view() -> None:
+    view = RoadView()
     assert (view.clock, view.census, view.leader, view.term) == (None, None, None, 0)
     assert view.t_s == 0.0
 
 
 def test_road_time_does_not_go_back() -> None:
-    view = View()
+    view = RoadView()
     for tick in (5, 7, 6, 7):
-        view.take(clock(tick))
+        view.take(clock(tick), 0.0)
     assert view.t_s == 0.7
 
 
+def test_messages_of_an_earlier_bridge_are_ignored() -> None:
+    view = RoadView()
+    for bridge, tick in ((1, 50), (2, 3), (1, 51), (2, 4)):
+        view.take(evolve(clock(tick), bridge=bridge), 0.0)
+        view.take(Census(tick / 10, (), (), bridge=bridge), 0.0)
+    assert (view.roads, view.bridge, view.t_s) == (2, 2, 0.4)
+    assert view.census is not None
+    assert view.census.t_s == 0.4
+
+
 def test_an_older_census_is_ignored() -> None:
-    view = View()
+    view = RoadView()
     for t_s in (2.0, 1.0):
-        view.take(Census(t_s, (), ()))
+        view.take(Census(t_s, (), ()), 0.0)
     assert view.census == Census(2.0, (), ())
 
 
 def test_the_highest_term_leads() -> None:
-    view = View()
-    view.take(heartbeat("c2", 3))
-    view.take(heartbeat("c1", 2))
-    view.take(heartbeat("c3", 9, leading=False))
+    view = RoadView()
+    view.take(heartbeat("c2", 3), 0.0)
+    view.take(heartbeat("c1", 2), 0.0)
+    view.take(heartbeat("c3", 9, leading=False), 0.0)
     assert (view.leader, view.term) == ("c2", 3)
-    view.take(heartbeat("c1", 4))
+    view.take(heartbeat("c1", 4), 0.0)
     assert (view.leader, view.term) == ("c1", 4)
 
 
-def test_other_messages_do_not_matter() -> None:
-    view = View()
-    view.take(object())
-    assert view == View()
+def test_other_messages_are_ignored() -> None:
+    view = RoadView()
+    view.take(object(), 0.0)
+    assert view == RoadView()
 
 
-def test_an_observer_reads_what_is_well_formed() -> None:
+def test_an_observer_ignores_malformed_messages() -> None:
     observer = Observer(Keys("here"), queue.SimpleQueue())
     key = Keys("here").key(HEARTBEAT, coordinator="c1")
     for delivery in (
@@ -74,7 +87,7 @@ def test_an_observer_reads_what_is_well_formed() -> None:
     assert observer.inbox.empty()
 
 
-def test_an_observer_does_not_wait_for_ever() -> None:
+def test_waiting_ends_at_the_timeout() -> None:
     observer = Observer(Keys("here"))
     observer.wait(0.001)
-    assert observer.view == View()
+    assert observer.view == RoadView()

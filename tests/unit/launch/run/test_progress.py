@@ -3,17 +3,17 @@
 import attrs
 import pytest
 
-from laneweave.launch.observe.observer import View
+from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.progress import RunProgress
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.wire.messages import Name, RoadClock
 
 CLOCK = RoadClock(10, 1.0, demanded=4, entered=2, on_road=2, left=0, ended=False)
 VIEWS = (
-    View(),
-    View(clock=CLOCK),
-    View(clock=CLOCK, leader=Name("c1"), term=2),
-    View(clock=attrs.evolve(CLOCK, tick=10**9, t_s=1e8)),
+    RoadView(),
+    RoadView(clock=CLOCK),
+    RoadView(clock=CLOCK, leader=Name("c1"), term=2),
+    RoadView(clock=attrs.evolve(CLOCK, tick=10**9, t_s=1e8)),
 )
 
 

@@ -21,11 +21,10 @@ from attrs import define, field
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from laneweave.launch.watch.frame_buffer import Ring
-from laneweave.launch.watch.frames import MOST_WANTED, Film, compact
+from laneweave.launch.watch.frames import MAX_REQUESTED, FrameBuffer, FrameSource, compact
 from laneweave.launch.watch.process import open_socket
 from laneweave.launch.watch.recorded_run import Recording
-from laneweave.launch.watch.server import Audience, Browser, make_app, wish_of
+from laneweave.launch.watch.server import Audience, Browser, make_app, request_of
 from laneweave.protocol.errors import BadInputError
 
 WAIT_S = 20.0
@@ -36,15 +35,15 @@ BIG = "x" * 100_000
 class Site:
     """A server in a thread."""
 
-    film: Film
+    source: FrameSource
     audience: Audience = field(factory=Audience)
-    well: bool = True
+    healthy: bool = True
     _listener: socket.socket = field(factory=lambda: open_socket("127.0.0.1:0"))
     _loop: asyncio.AbstractEventLoop | None = None
 
     @contextlib.contextmanager
     def running(self) -> Iterator[Site]:
-        app = make_app(self.film, self.audience, lambda: (self.well, {"more": 1}))
+        app = make_app(self.source, self.audience, lambda: (self.healthy, {"more": 1}))
         config = uvicorn.Config(app, log_config=None, lifespan="off", timeout_graceful_shutdown=1)
         server = uvicorn.Server(config)
         thread = threading.Thread(target=lambda: asyncio.run(self._serve(server)))
@@ -98,8 +97,8 @@ def receive(browser: ClientConnection) -> dict[str, Any]:
     return message
 
 
-def live_film(count: int = 5) -> Ring:
-    ring = Ring({"kind": "live"})
+def live_source(count: int = 5) -> FrameBuffer:
+    ring = FrameBuffer({"kind": "live"})
     for _ in range(count):
         ring.append(compact({"n": ring.next}))
     return ring
@@ -107,19 +106,19 @@ def live_film(count: int = 5) -> Ring:
 
 @pytest.fixture(scope="module")
 def shared_site() -> Iterator[Site]:
-    with Site(live_film()).running() as running:
+    with Site(live_source()).running() as running:
         yield running
 
 
 @pytest.fixture
 def site(shared_site: Site) -> Site:
-    """Return a server that all is well with, and that nobody looks at."""
-    shared_site.well = True
+    """Return a server that all is healthy with, and that nobody looks at."""
+    shared_site.healthy = True
     wait_until(lambda: not shared_site.audience.browsers)
     return shared_site
 
 
-@pytest.mark.parametrize("path", ["/", "/road.js", "/film.js", "/layers.js", "/watch.js"])
+@pytest.mark.parametrize("path", ["/", "/road.js", "/frames.js", "/layers.js", "/watch.js"])
 def test_the_page_needs_nobody_else(site: Site, path: str) -> None:
     status, kind, text = site.get(path)
     assert status == 200
@@ -132,7 +131,7 @@ def test_the_health_check_says_whether_all_is_well(site: Site) -> None:
     status, kind, text = site.get("/healthz")
     assert (status, kind) == (200, "application/json")
     assert json.loads(text) == {"ok": True, "more": 1, "browsers": 0}
-    site.well = False
+    site.healthy = False
     status, _, text = site.get("/healthz")
     assert (status, json.loads(text)["ok"]) == (503, False)
 
@@ -172,7 +171,7 @@ def test_a_slow_browser_gets_fewer_frames_and_holds_nobody_up(site: Site) -> Non
             site.offer(compact({"n": number, "filling": BIG}))
             # The fast one reads every frame, the slow one none.
             assert receive(fast)["n"] == number
-        assert max(browser.left_out for browser in site.audience.browsers) > 20
+        assert max(browser.skipped for browser in site.audience.browsers) > 20
     # It is gone at last, whatever is still under way to it.
     wait_until(lambda: not site.audience.browsers)
 
@@ -210,7 +209,7 @@ def deaf_socket(site: Site) -> socket.socket:
     ],
 )
 def test_whoever_talks_nonsense_is_shown_out(site: Site, message: str | bytes) -> None:
-    assert wish_of(None if isinstance(message, bytes) else message) is None
+    assert request_of(None if isinstance(message, bytes) else message) is None
     with site.browser() as browser:
         receive(browser)
         browser.send(message)
@@ -231,7 +230,7 @@ def test_pages_of_others_are_not_served(site: Site) -> None:
 def test_there_is_an_end_to_the_number_of_browsers(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("laneweave.launch.watch.server.MOST_BROWSERS", 1)
+    monkeypatch.setattr("laneweave.launch.watch.server.MAX_BROWSERS", 1)
     with site.browser() as first, site.browser() as second:
         receive(first)
         with pytest.raises(ConnectionClosed):
@@ -240,7 +239,7 @@ def test_there_is_an_end_to_the_number_of_browsers(
 
 def test_an_end_does_not_wait_for_browsers() -> None:
     with contextlib.ExitStack() as stack:
-        with Site(live_film()).running() as site:
+        with Site(live_source()).running() as site:
             browser = stack.enter_context(site.browser())
             receive(browser)
             began = time.monotonic()
@@ -256,7 +255,7 @@ def test_a_recorded_run_over_the_websocket(recorded: Path) -> None:
         assert (scene["kind"], scene["first"], scene["last"]) == ("recorded", 0, recording.last)
         browser.send(json.dumps({"want": [20, 10**6]}))
         frames = receive(browser)["frames"]
-        assert [frame["n"] for frame in frames] == list(range(20, 20 + MOST_WANTED))
+        assert [frame["n"] for frame in frames] == list(range(20, 20 + MAX_REQUESTED))
         assert frames[-1]["vehicles"]
 
 
@@ -265,7 +264,7 @@ def test_nothing_queues_for_a_browser() -> None:
     for number in range(1000):
         browser.offer(str(number))
         browser.ask((number, number))
-    assert (browser.frame, browser.wish, browser.left_out) == ("999", (999, 999), 999)
+    assert (browser.frame, browser.request, browser.skipped) == ("999", (999, 999), 999)
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,10 @@
 "use strict";
-// What is drawn between the road and the vehicles: columns of formations, cells, targets.
+// Layers between the road and the vehicles: columns of formations, cells, targets, marks.
 
 const laneweaveLayers = (() => {
   const ROUND_PX = 3;
 
-  /** Corners on the canvas of a cell: [x, y, width, height]. */
+  /** Return the rectangle of a cell on the canvas: [x, y, width, height]. */
   function cellBox(painter, [column, lane], t) {
     const { scene } = painter;
     const [rear, front] = laneweaveRoad.columnsAt(scene, column, column, t);
@@ -28,14 +28,14 @@ const laneweaveLayers = (() => {
     return body.lane < 0 ? painter.theme.faint : colours[body.lane % colours.length];
   }
 
-  /** Cells that vehicles hold, framed, and the others that they own, in their colour. */
+  /** Draw the hold cells of vehicles, framed, and the other cells that they own. */
   function cells(bodies, t) {
     return (painter) => {
       const { pen } = painter;
       for (const body of bodies) {
         pen.fillStyle = pen.strokeStyle = ownColour(painter, body);
         pen.globalAlpha = 0.09;
-        for (const cell of body.estate) {
+        for (const cell of body.owned) {
           if (!onStrip(painter, cell[0], t)) continue;
           rounded(pen, cellBox(painter, cell, t), 1.5);
           pen.fill();
@@ -53,7 +53,7 @@ const laneweaveLayers = (() => {
     };
   }
 
-  /** Formations with their columns, {numbers, rear, front}; those that plan together are one. */
+  /** Return formations with their columns, {numbers, rear, front}; joined ones are merged. */
   function groups(formations, joined) {
     const groupOf = new Map();
     for (const group of joined) for (const number of group) groupOf.set(number, group[0]);
@@ -69,7 +69,7 @@ const laneweaveLayers = (() => {
     return [...found.values()].sort((a, b) => b.front - a.front);
   }
 
-  /** Columns that formations own, framed, with their numbers above. */
+  /** Draw the columns of formations, framed, with their numbers above. */
   function blocks(formations, joined, t) {
     return (painter) => {
       const { pen, theme, scene } = painter;
@@ -96,7 +96,7 @@ const laneweaveLayers = (() => {
     };
   }
 
-  /** Where plans lead: a line from each vehicle to a ring in its target, unless it is there. */
+  /** Draw a line from each vehicle to a ring in its target, unless it has arrived. */
   function targets(bodies, t) {
     return (painter) => {
       const { pen, scene } = painter;
@@ -122,9 +122,9 @@ const laneweaveLayers = (() => {
     };
   }
 
-  /** Marks around vehicles of which something is out of the ordinary. */
+  /** Draw rings around vehicles that have no agent or are overdue. */
   function marks(bodies) {
-    const odd = laneweaveFilm.UNATTENDED | laneweaveFilm.OVERDUE;
+    const odd = laneweaveFrames.UNATTENDED | laneweaveFrames.OVERDUE;
     return (painter) => {
       const { pen, scene } = painter;
       pen.strokeStyle = "#e08b27";

@@ -1,10 +1,10 @@
 "use strict";
-// The page: connection, controls, numbers. `window.laneweaveWatch` tells tests what it has done.
+// The page: connection, controls, figures. Tests read its counters in `window.laneweaveWatch`.
 
-const PAINT_MS = 28; // between two pictures, at least
-const NUMBERS_MS = 200; // between two updates of the numbers beside the road
-const WINDOW_M = 150; // of road that is shown when something is followed
-const AHEAD = 40; // frames that are fetched before they are needed
+const PAINT_MS = 28; // minimum time between two paintings
+const NUMBERS_MS = 200; // minimum time between two updates of the figures
+const WINDOW_M = 150; // length of road shown when something is followed
+const AHEAD = 40; // frames fetched in advance
 const RETRY_MS = [300, 600, 1200, 2500];
 const PACES = [0.5, 1, 2, 5, 10];
 const CALM = matchMedia("(prefers-reduced-motion: reduce)");
@@ -15,13 +15,13 @@ const clockTime = (seconds) => new Date(seconds * 1000).toLocaleTimeString([], {
 
 class Watch {
   constructor() {
-    this.film = new laneweaveFilm.Film();
+    this.store = new laneweaveFrames.FrameStore();
     this.painter = null;
     this.follow = null; // {vehicle} or {formation}
-    this.place = null; // number of the frame that is shown, with a fraction; null: the newest
+    this.place = null; // number of the shown frame, with a fraction; null: the newest
     this.playing = false; // recorded only
     this.pace = 1;
-    this.stale = true; // something but the time has changed since the last picture
+    this.stale = true; // must be painted again although the time has not changed
     this.painted = 0;
     this.counted = 0;
     this.tries = 0;
@@ -35,7 +35,7 @@ class Watch {
   }
 
   get live() {
-    return this.film.scene !== null && this.film.scene.kind === "live";
+    return this.store.scene !== null && this.store.scene.kind === "live";
   }
 
   // --- the connection ---------------------------------------------------------------------------
@@ -46,7 +46,7 @@ class Watch {
     socket.onmessage = (event) => this.take(event.data);
     socket.onclose = () => {
       this.offlineSince ??= Date.now() / 1000;
-      this.film.waiting = false;
+      this.store.waiting = false;
       this.showStatus();
       const delay = RETRY_MS[Math.min(this.tries, RETRY_MS.length - 1)];
       this.tries += 1;
@@ -55,7 +55,7 @@ class Watch {
   }
 
   take(text) {
-    const what = this.film.take(text);
+    const what = this.store.take(text);
     if (what === "scene") {
       this.tries = 0;
       this.offlineSince = null;
@@ -70,28 +70,28 @@ class Watch {
   }
 
   ask(ahead) {
-    const wish = this.place === null ? null : this.film.wish(this.place, ahead);
-    if (wish && this.socket.readyState === WebSocket.OPEN) {
-      this.socket.send(JSON.stringify({ want: wish }));
-    } else if (wish) {
-      this.film.waiting = false;
+    const missing = this.place === null ? null : this.store.missing(this.place, ahead);
+    if (missing && this.socket.readyState === WebSocket.OPEN) {
+      this.socket.send(JSON.stringify({ want: missing }));
+    } else if (missing) {
+      this.store.waiting = false;
     }
   }
 
   // --- controls ---------------------------------------------------------------------------------
 
   begin() {
-    const { scene } = this.film;
+    const { scene } = this.store;
     this.painter = new laneweaveRoad.Painter(part("road"), scene, this.theme());
     document.title = `${scene.title} · laneweave`;
     part("title").textContent = scene.title;
     part("cells-name").textContent = this.live || !scene.rolling ? "cells" : "held cells";
     part("paces").hidden = this.live;
     if (!this.live && this.place === null) {
-      this.place = this.film.first;
+      this.place = this.store.first;
       this.playing = !CALM.matches;
     }
-    if (this.live && this.place !== null && this.place > this.film.last) this.place = null;
+    if (this.live && this.place !== null && this.place > this.store.last) this.place = null;
     this.showLegend();
     this.showButton();
   }
@@ -100,7 +100,7 @@ class Watch {
     part("pause").addEventListener("click", () => this.toggle());
     part("slider").addEventListener("input", (event) => {
       this.place = Number(event.target.value);
-      if (this.live && this.place >= this.film.last) this.place = null;
+      if (this.live && this.place >= this.store.last) this.place = null;
       this.showButton();
       this.stale = true;
     });
@@ -136,9 +136,9 @@ class Watch {
 
   toggle() {
     if (this.live) {
-      this.place = this.place === null ? this.film.last : null;
+      this.place = this.place === null ? this.store.last : null;
     } else {
-      if (!this.playing && this.place >= this.film.last) this.place = this.film.first;
+      if (!this.playing && this.place >= this.store.last) this.place = this.store.first;
       this.playing = !this.playing;
     }
     this.stale = true;
@@ -150,7 +150,7 @@ class Watch {
     part("pause").textContent = running ? "Pause" : this.live ? "Go live" : "Play";
   }
 
-  /** What can be followed now, as options of the view. */
+  /** Offer what can be followed now as options of the view. */
   offer() {
     const { bodies } = this.picture ?? { bodies: [] };
     const shown = laneweaveLayers.groups(this.current?.formations ?? [], []);
@@ -167,7 +167,7 @@ class Watch {
   look(name) {
     const formation = /^formation (\d+)$/.exec(name);
     this.follow = formation ? { formation: Number(formation[1]) } : name ? { vehicle: name } : null;
-    this.columns = null; // of the formation that is followed, once it was seen
+    this.columns = null; // of the followed formation, once it was seen
     const view = part("view");
     view.value = name;
     if (view.value !== name) {
@@ -178,11 +178,11 @@ class Watch {
     this.stale = true;
   }
 
-  /** Follow the vehicle that was clicked on. */
+  /** Follow the vehicle under the pointer. */
   pick(event) {
     const place = this.painter?.placeAt(event.offsetX, event.offsetY);
     if (!place || !this.picture) return;
-    const [length, width] = this.film.scene.body_m;
+    const [length, width] = this.store.scene.body_m;
     const hit = this.picture.bodies.find(
       (body) => Math.abs(place.s - body.s + length / 2) < length && Math.abs(place.y - body.y) < width,
     );
@@ -191,18 +191,18 @@ class Watch {
 
   // --- the picture ------------------------------------------------------------------------------
 
-  /** What is to be shown: [frame, next frame, share of the way]; null: nothing yet. */
+  /** Return what to show: [frame, next frame, fraction between them]; null: nothing yet. */
   moment(now) {
-    const { film } = this;
+    const { store } = this;
     if (this.place === null) {
-      if (!film.newest) return null;
-      if (!film.before || CALM.matches) return [film.newest, null, 0];
+      if (!store.newest) return null;
+      if (!store.before || CALM.matches) return [store.newest, null, 0];
       const share = Math.min(1, (now - this.arrived) / this.interval);
-      return [film.before, film.newest, share];
+      return [store.before, store.newest, share];
     }
     const from = Math.floor(this.place);
-    const frame = film.get(from) ?? film.get(from - 1);
-    return frame ? [frame, film.get(from + 1), this.place - from] : null;
+    const frame = store.get(from) ?? store.get(from - 1);
+    return frame ? [frame, store.get(from + 1), this.place - from] : null;
   }
 
   turn(now) {
@@ -210,7 +210,7 @@ class Watch {
     if (!this.painter || now - this.painted < PAINT_MS) return;
     if (this.playing) this.advance((now - this.painted) / 1000);
     this.painted = now;
-    if (this.place !== null) this.place = Math.max(this.place, this.film.first);
+    if (this.place !== null) this.place = Math.max(this.place, this.store.first);
     if (this.place !== null) this.ask(this.playing ? AHEAD : 1);
     const moment = this.moment(now);
     if (!moment) return;
@@ -225,14 +225,14 @@ class Watch {
     }
   }
 
-  /** Play on, unless the frames are not here yet. */
+  /** Advance the playback, unless the frames have not arrived. */
   advance(seconds) {
-    const { film } = this;
-    const next = this.place + (this.pace * Math.min(seconds, 0.2)) / film.scene.step_s;
-    const there = Math.min(film.last, Math.floor(next) + 1);
-    if (film.get(there) === null) return;
-    this.place = Math.min(film.last, next);
-    if (this.place >= film.last) {
+    const { store } = this;
+    const next = this.place + (this.pace * Math.min(seconds, 0.2)) / store.scene.step_s;
+    const there = Math.min(store.last, Math.floor(next) + 1);
+    if (store.get(there) === null) return;
+    this.place = Math.min(store.last, next);
+    if (this.place >= store.last) {
       this.playing = false;
       this.showButton();
     }
@@ -241,9 +241,9 @@ class Watch {
 
   paint([frame, next, share]) {
     const { painter } = this;
-    const { scene } = this.film;
+    const { scene } = this.store;
     this.current = next && share >= 0.5 ? next : frame;
-    const picture = laneweaveFilm.between(frame, next, share);
+    const picture = laneweaveFrames.between(frame, next, share);
     this.picture = picture;
     const { t, bodies } = picture;
     const layers = [];
@@ -283,9 +283,9 @@ class Watch {
   // --- numbers ----------------------------------------------------------------------------------
 
   showNumbers(frame) {
-    const { film } = this;
-    const { scene } = film;
-    const { onLane, knownLane, speed } = laneweaveFilm.facts(scene, this.picture.bodies);
+    const { store } = this;
+    const { scene } = store;
+    const { onLane, knownLane, speed } = laneweaveFrames.facts(scene, this.picture.bodies);
     const say = (id, text) => {
       const element = part(id);
       if (element.textContent !== text) element.textContent = text;
@@ -351,38 +351,38 @@ class Watch {
   }
 
   showTime(frame, say) {
-    const { film } = this;
+    const { store } = this;
     const slider = part("slider");
-    slider.min = film.first;
-    slider.max = Math.max(film.first, film.last);
-    slider.value = this.place ?? film.last;
+    slider.min = store.first;
+    slider.max = Math.max(store.first, store.last);
+    slider.value = this.place ?? store.last;
     const road = frame.t === null ? "no road" : `${frame.t.toFixed(1)} s`;
     let text = road;
-    if (this.live && this.place !== null && film.newest) {
-      text = `${road}, ${(film.newest.w - frame.w).toFixed(1)} s ago`;
+    if (this.live && this.place !== null && store.newest) {
+      text = `${road}, ${(store.newest.w - frame.w).toFixed(1)} s ago`;
     } else if (!this.live) {
-      text = `${road} of ${(film.last * film.scene.step_s).toFixed(1)} s`;
+      text = `${road} of ${(store.last * store.scene.step_s).toFixed(1)} s`;
     }
     say("now", text);
     slider.setAttribute("aria-valuetext", text);
   }
 
   showStatus() {
-    const frame = this.film.newest;
+    const frame = this.store.newest;
     let [pill, words] = ["connecting", ""];
     if (this.offlineSince !== null) {
       pill = "offline";
-      words = `This page has lost its server, since ${clockTime(this.offlineSince)}. Trying again.`;
-    } else if (this.film.scene && !this.live) {
+      words = `Connection to the server lost at ${clockTime(this.offlineSince)}. Reconnecting.`;
+    } else if (this.store.scene && !this.live) {
       pill = "recorded";
     } else if (frame) {
       pill = frame.status;
       const since = clockTime(frame.since);
       words = {
-        lost: `Connection to the router lost, since ${since}. Trying again.`,
-        waiting: "Connected. There is no road yet: waiting for a bridge.",
-        still: `The road's clock stands still, since ${since}.`,
-        ended: `The run has ended, at ${since}. Waiting for the next one.`,
+        lost: `Connection to the router lost at ${since}. Reconnecting.`,
+        waiting: "Connected. No road yet: waiting for a bridge.",
+        still: `The road's clock has stood still since ${since}.`,
+        ended: `The run ended at ${since}. Waiting for the next one.`,
         live: "",
       }[pill];
     }
@@ -397,7 +397,7 @@ class Watch {
   }
 
   showLegend() {
-    const { colours, names, lattice, rolling } = this.film.scene;
+    const { colours, names, lattice, rolling } = this.store.scene;
     const entry = (style, words) => {
       const span = document.createElement("span");
       if (style) {
@@ -412,12 +412,12 @@ class Watch {
     const own = names.map((name, lane) => entry({ kind: "car", colour: colours[lane] }, `prefers ${name}`));
     const rest = [
       entry(null, `darker: slower than ${lattice.speed_mps} m/s; lighter: faster`),
-      entry({ kind: "cell" }, this.live && rolling ? "cells that a vehicle owns; framed: holds" : "cell that a vehicle holds"),
-      entry({ kind: "target" }, "where it is going"),
+      entry({ kind: "cell" }, this.live && rolling ? "cells that a vehicle owns; framed: its hold cell" : "hold cell of a vehicle"),
+      entry({ kind: "target" }, "target of a vehicle"),
       ...(rolling ? [] : [entry({ kind: "block" }, "columns of a formation")]),
     ];
     if (this.live) {
-      rest.push(entry({ kind: "ghost" }, "not heard: where it should be"));
+      rest.push(entry({ kind: "ghost" }, "not heard: expected position"));
       rest.push(entry({ kind: "odd" }, "without agent, or overdue"));
     }
     part("legend").replaceChildren(...own.reverse(), ...rest);

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.skipif(
     NODE is None, reason="node is not installed: nothing here can run the page's script"
 )
 PAGE = "laneweave.launch.watch"
-BEGIN = "const film = new laneweaveFilm.Film();"
+BEGIN = "const store = new laneweaveFrames.FrameStore();"
 
 
 def in_node(program: str, data: object = None) -> Any:  # noqa: ANN401 - any JSON
@@ -40,7 +40,7 @@ def in_node(program: str, data: object = None) -> Any:  # noqa: ANN401 - any JSO
     return json.loads(done.stdout)
 
 
-PARTS = ("film", "layers")
+PARTS = ("frames", "layers")
 
 
 def scene(kind: str, first: int, last: int, session: str = "a") -> str:
@@ -60,9 +60,9 @@ def reel(first: int, last: int, begin: int, end: int) -> str:
 def test_frames_that_are_pushed_are_kept_and_bounded() -> None:
     messages = [scene("live", 0, -1), *(frame(number) for number in range(3100))]
     found = in_node(
-        f"{BEGIN} for (const one of data) film.take(one);"
-        "return [film.first, film.last, film.texts.size, film.newest.n, film.before.n,"
-        " film.get(99), film.get(100).n];",
+        f"{BEGIN} for (const one of data) store.take(one);"
+        "return [store.first, store.last, store.texts.size, store.newest.n, store.before.n,"
+        " store.get(99), store.get(100).n];",
         messages,
     )
     assert found == [100, 3099, 3000, 3099, 3098, None, 100]
@@ -71,10 +71,11 @@ def test_frames_that_are_pushed_are_kept_and_bounded() -> None:
 def test_what_is_missing_is_asked_for_once() -> None:
     messages = [scene("recorded", 0, 500), reel(0, 500, 0, 49), reel(0, 500, 60, 70)]
     found = in_node(
-        f"{BEGIN} film.take(data[0]); const wishes = [film.wish(3.5, 10), film.wish(3.5, 10)];"
-        "film.take(data[1]); wishes.push(film.wish(3.5, 10), film.wish(45, 10));"
-        "film.take(data[2]); wishes.push(film.wish(60, 5), film.wish(499.5, 40));"
-        "return wishes;",
+        f"{BEGIN} store.take(data[0]);"
+        "const requests = [store.missing(3.5, 10), store.missing(3.5, 10)];"
+        "store.take(data[1]); requests.push(store.missing(3.5, 10), store.missing(45, 10));"
+        "store.take(data[2]); requests.push(store.missing(60, 5), store.missing(499.5, 40));"
+        "return requests;",
         messages,
     )
     assert found == [[3, 52], None, None, [50, 99], None, [499, 500]]
@@ -83,8 +84,8 @@ def test_what_is_missing_is_asked_for_once() -> None:
 def test_another_server_has_other_frames() -> None:
     messages = [scene("live", 0, 9), frame(9), scene("live", 0, 12), scene("live", 0, 2, "b")]
     found = in_node(
-        f"{BEGIN} return data.map((one) => {{ film.take(one);"
-        " return [film.first, film.last, film.texts.size]; });",
+        f"{BEGIN} return data.map((one) => {{ store.take(one);"
+        " return [store.first, store.last, store.texts.size]; });",
         messages,
     )
     assert found == [[0, 9, 0], [0, 9, 1], [0, 12, 1], [0, 2, 0]]
@@ -97,13 +98,13 @@ def row(name: str, s_m: float, y_m: float, flags: int = 1) -> list[Any]:
 def test_between_two_frames_vehicles_are_on_their_way() -> None:
     one = json.loads(frame(1, 10.0, vehicles=[row("a", 100.0, 5.0), row("gone", 999.0, 5.0)]))
     two = json.loads(frame(2, 10.2, vehicles=[row("a", 103.0, 5.3), row("new", 0.0, 5.0)]))
-    between = "return laneweaveFilm.between(data[0], data[1], 0.5);"
+    between = "return laneweaveFrames.between(data[0], data[1], 0.5);"
     shown = in_node(between, [one, two])
     assert shown["t"] == pytest.approx(10.1)
     assert [body["name"] for body in shown["bodies"]] == ["a", "new"]
     body = shown["bodies"][0]
     assert (body["s"], body["y"], body["slope"]) == pytest.approx((101.5, 5.15, 0.25 / 3.0))
-    assert (body["hold"], body["target"], body["estate"]) == ([-3, 1], None, [[-4, 1], [-5, 1]])
+    assert (body["hold"], body["target"], body["owned"]) == ([-3, 1], None, [[-4, 1], [-5, 1]])
     # Who drives straight on is drawn so, whatever the errors of measurement; another run is
     # another road; nobody jumps.
     two["vehicles"][0][8] = 0
@@ -132,5 +133,5 @@ def test_numbers_beside_the_road() -> None:
         {"lane": -1, "y": 5.0, "v": 99.0, "faint": True},
     ]
     data = {"scene": {"road": {"lane_width_m": 3.5}}, "bodies": bodies}
-    found = in_node("return laneweaveFilm.facts(data.scene, data.bodies);", data)
+    found = in_node("return laneweaveFrames.facts(data.scene, data.bodies);", data)
     assert found == {"onLane": 1, "knownLane": 2, "speed": 15.0}

@@ -1,15 +1,18 @@
-"""Message loss is what was expected and did not come, and nothing else."""
+"""Message loss: expected messages that did not arrive."""
 
 from __future__ import annotations
 
 import random
 
-from laneweave.launch.watch.message_loss import GRACE_TICKS, WINDOW_TICKS, LossMeter
+import pytest
+
+from laneweave.launch.observe.message_loss import GRACE_TICKS, LossMeter
 from laneweave.protocol.wire.messages import Name
 from support.convoy import Convoy
 
 CONVOY = Convoy(6)
 START = 100
+WINDOW_TICKS = 100
 
 
 def drive(
@@ -25,30 +28,30 @@ def drive(
 
 
 def test_nothing_is_expected_before_a_tick_is_over() -> None:
-    meter = LossMeter(0.1)
+    meter = LossMeter(WINDOW_TICKS)
     drive(meter, range(START, START + GRACE_TICKS))
     assert (meter.expected, meter.lost) == (0, 0)
 
 
-def test_nothing_is_lost() -> None:
-    meter = LossMeter(0.1)
+def test_no_loss() -> None:
+    meter = LossMeter(WINDOW_TICKS)
     drive(meter, range(START, START + 61))
-    # From the tick after the first one that was heard.
+    # Counted from the tick after the first clock.
     assert (meter.expected, meter.lost) == ((60 - GRACE_TICKS) * CONVOY.count, 0)
 
 
-def test_what_is_lost_is_counted_once() -> None:
+def test_lost_states_are_counted_once() -> None:
     generator = random.Random(4)
     lost = frozenset(
         (generator.randrange(6), generator.randrange(START + 1, START + 50)) for _ in range(40)
     )
-    meter = LossMeter(0.1)
+    meter = LossMeter(WINDOW_TICKS)
     drive(meter, range(START, START + 61), lost=lost)
     assert meter.lost == len(lost)
 
 
-def test_doubles_and_late_ones_are_no_loss() -> None:
-    meter = LossMeter(0.1)
+def test_duplicate_and_late_states_are_not_lost() -> None:
+    meter = LossMeter(WINDOW_TICKS)
     late = (2, START + 5)
     drive(meter, range(START, START + 8), lost=frozenset({late}))
     for _ in range(2):
@@ -58,7 +61,7 @@ def test_doubles_and_late_ones_are_no_loss() -> None:
 
 
 def test_only_the_last_ticks_count() -> None:
-    meter = LossMeter(0.1)
+    meter = LossMeter(WINDOW_TICKS)
     silent = frozenset((number, tick) for number in range(6) for tick in range(100, 200))
     drive(meter, range(START, 200), lost=silent)
     assert meter.lost == meter.expected > 0
@@ -66,15 +69,36 @@ def test_only_the_last_ticks_count() -> None:
     assert (meter.expected, meter.lost) == (WINDOW_TICKS * CONVOY.count, 0)
 
 
-def test_a_gap_of_the_clock_is_a_loss_of_states() -> None:
-    meter = LossMeter(0.1)
+def test_states_are_expected_in_ticks_whose_clock_was_lost() -> None:
+    meter = LossMeter(WINDOW_TICKS)
     drive(meter, range(START, START + 30))
     drive(meter, range(START + 40, START + 70))
     assert meter.lost == 10 * CONVOY.count
 
 
-def test_who_leaves_is_not_expected_any_more_and_who_enters_is_from_when_it_is_heard() -> None:
-    meter, name = LossMeter(0.1), CONVOY.names[0]
+def test_loss_of_clocks() -> None:
+    meter = LossMeter(WINDOW_TICKS)
+    assert (meter.clock_loss, meter.state_loss) == (None, None)
+    for tick in (100, 101, 104, 103, 104, 109, 115):
+        meter.on_clock(CONVOY.clock(tick))
+    # Ticks 101 to 110 are over; 101, 103, 104 and 109 arrived.
+    assert meter.clock_loss == pytest.approx(0.6)
+
+
+def test_ticks_before_the_first_census_count_the_vehicles_that_it_lists() -> None:
+    meter = LossMeter(WINDOW_TICKS)
+    for tick in range(START, START + 21):
+        meter.on_clock(CONVOY.clock(tick))
+        if tick == START + 4:
+            meter.on_census(CONVOY.census(tick))
+        for number in range(1, CONVOY.count):
+            meter.on_state(CONVOY.state(number, tick))
+    assert (meter.lost, meter.expected) == (15, 15 * CONVOY.count)
+    assert meter.state_loss == pytest.approx(1 / CONVOY.count)
+
+
+def test_vehicles_that_leave_and_enter() -> None:
+    meter, name = LossMeter(WINDOW_TICKS), CONVOY.names[0]
     without = frozenset({name})
     for tick in range(START, START + 60):
         meter.on_clock(CONVOY.clock(tick))
@@ -85,12 +109,12 @@ def test_who_leaves_is_not_expected_any_more_and_who_enters_is_from_when_it_is_h
             meter.on_census(census)
         for number in range(0 if there else 1, CONVOY.count):
             meter.on_state(CONVOY.state(number, tick))
-    # Listed two ticks before it speaks for the first time. It entered long ago, so these are lost.
+    # It entered long ago, so two states are expected between its first listing and first state.
     assert meter.lost == 2
 
 
-def test_after_a_long_silence_old_ticks_are_not_gone_through() -> None:
-    meter = LossMeter(0.1)
+def test_after_a_long_silence_only_the_window_is_counted() -> None:
+    meter = LossMeter(WINDOW_TICKS)
     drive(meter, range(START, START + 10))
     meter.on_clock(CONVOY.clock(10**9))
     assert meter.expected <= WINDOW_TICKS * CONVOY.count

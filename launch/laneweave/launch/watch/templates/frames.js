@@ -1,16 +1,16 @@
 "use strict";
-// Frames as they come from the server, and what lies between two of them. Nothing here needs a
-// browser. What goes over the websocket: laneweave/launch/watch/frames.py.
+// Stores the frames of the server, and interpolates between them. Does not need a browser.
+// Messages of the websocket: laneweave/launch/watch/frames.py.
 
-const laneweaveFilm = (() => {
+const laneweaveFrames = (() => {
   const KEPT = 3000; // frames, as text
-  const PARSED = 16; // of them, ready to be drawn
+  const PARSED = 16; // of them, ready to be painted
   const BATCH = 50; // frames in one answer of the server
-  const JUMP_M = 40; // nobody drives so far between two frames
-  const UNSURE_M = 0.05; // across the road: no more than errors of measurement
+  const JUMP_M = 40; // no vehicle drives this far between two frames
+  const UNSURE_M = 0.05; // lateral measurement error
   const [MOVING, UNATTENDED, UNHEARD, OVERDUE] = [1, 2, 4, 8];
 
-  class Film {
+  class FrameStore {
     constructor() {
       this.scene = null;
       this.clear();
@@ -26,7 +26,7 @@ const laneweaveFilm = (() => {
       this.waiting = false; // for an answer
     }
 
-    /** Take a message of the server; returns "scene", "frame" or "reel". */
+    /** Process a message of the server; return "scene", "frame" or "reel". */
     take(text) {
       const message = JSON.parse(text);
       if (message.scene) {
@@ -61,7 +61,7 @@ const laneweaveFilm = (() => {
       if (this.texts.size > KEPT) this.texts.delete(this.texts.keys().next().value);
     }
 
-    /** The frame of a number, null while it is not here. */
+    /** Return the frame of a number; null: it has not arrived. */
     get(number) {
       let frame = this.parsed.get(number);
       if (frame) return frame;
@@ -73,8 +73,8 @@ const laneweaveFilm = (() => {
       return frame;
     }
 
-    /** The numbers [from, to] to ask for so that `ahead` frames from a place on are here, or null. */
-    wish(place, ahead) {
+    /** Return the numbers [from, to] of missing frames among the next `ahead` ones, or null. */
+    missing(place, ahead) {
       if (this.waiting) return null;
       const from = Math.max(this.first, Math.floor(place));
       const to = Math.min(this.last, Math.floor(place) + ahead);
@@ -88,19 +88,19 @@ const laneweaveFilm = (() => {
     }
   }
 
-  function body([name, s, y, v, lane, formation, hold, target, flags, estate]) {
+  function body([name, s, y, v, lane, formation, hold, target, flags, owned]) {
     const cells = [];
-    for (let i = 0; i + 1 < estate.length; i += 2) cells.push([estate[i], estate[i + 1]]);
+    for (let i = 0; i + 1 < owned.length; i += 2) cells.push([owned[i], owned[i + 1]]);
     return {
       name, s, y, v, lane, formation, flags, slope: 0,
       hold: hold || null,
       target: target || null,
-      estate: cells,
+      owned: cells,
       faint: (flags & UNHEARD) !== 0,
     };
   }
 
-  /** Everybody at a share of the way from one frame to the next, which may be null: {t, bodies}. */
+  /** Interpolate between two frames, of which the second may be null: {t, bodies}. */
   function between(one, next, share) {
     if (!next || next.run !== one.run || one.t === null || next.t === null || next.t < one.t) {
       return { t: one.t, bodies: one.vehicles.map(body) };
@@ -112,7 +112,7 @@ const laneweaveFilm = (() => {
       const from = earlier.get(found.name);
       const ds = from ? found.s - from[1] : 0;
       if (!from || Math.abs(ds) > JUMP_M) return found;
-      // Errors of measurement would turn those who drive straight on.
+      // Measurement errors would rotate vehicles that drive straight on.
       const dy = found.flags & MOVING ? found.y - from[2] : 0;
       const beyond = Math.max(0, Math.abs(dy) - UNSURE_M);
       found.slope = ds > 0.05 ? (Math.sign(dy) * beyond) / ds : 0;
@@ -124,7 +124,7 @@ const laneweaveFilm = (() => {
     return { t: mix(one.t, next.t), bodies };
   }
 
-  /** What the numbers beside the road say: {onLane, knownLane, speed}. */
+  /** Return the figures shown above the road: {onLane, knownLane, speed}. */
   function facts(scene, bodies) {
     const width = scene.road.lane_width_m;
     const known = bodies.filter((one) => one.lane >= 0);
@@ -134,5 +134,5 @@ const laneweaveFilm = (() => {
     return { onLane: there.length, knownLane: known.length, speed: heard.length ? speed : null };
   }
 
-  return { Film, between, facts, MOVING, UNATTENDED, UNHEARD, OVERDUE };
+  return { FrameStore, between, facts, MOVING, UNATTENDED, UNHEARD, OVERDUE };
 })();
