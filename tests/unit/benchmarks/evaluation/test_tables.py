@@ -21,7 +21,7 @@ from evaluation.trials import AgreementRow, CostRow, FactorRow
 from laneweave.protocol.errors import BadInputError
 from unit.benchmarks.evaluation.recorded import TRACED, evidence, point
 
-DRIVER = Path(__file__).resolve().parents[4] / "benchmarks" / "evaluation.py"
+DRIVER = Path(__file__).resolve().parents[4] / "benchmarks" / "evaluate.py"
 
 
 def cells(table: str, first: str) -> list[str]:

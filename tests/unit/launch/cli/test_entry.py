@@ -13,7 +13,7 @@ INTERRUPTS = 60
 # All is loaded behind the entry point, as in the real command: threads inherit what it set.
 SOLVING = """
 import signal, sys
-from laneweave.launch import entry
+from laneweave.launch.cli import entry
 
 def solve() -> None:
     from laneweave.agents.driving.tracker import Tracker
@@ -37,7 +37,7 @@ class Cli:
     main = staticmethod(solve)
 
 sys.modules["laneweave.launch.cli.main"] = Cli
-sys.modules["laneweave.launch"].cli = Cli
+sys.modules["laneweave.launch.cli"].main = Cli
 entry.main()
 """
 

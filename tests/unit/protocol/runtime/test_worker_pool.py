@@ -257,7 +257,7 @@ from functools import partial
 from pathlib import Path
 from laneweave.protocol.runtime.node import Delegate
 from laneweave.protocol.runtime.worker_pool import WorkerPool
-from unit.protocol import jobs
+from support import worker_jobs as jobs
 
 if __name__ == "__main__":
     pool = WorkerPool(2)

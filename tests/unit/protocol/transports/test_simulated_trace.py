@@ -39,7 +39,7 @@ def test_equal_seeds_give_equal_traces_in_any_process(conditions: Conditions) ->
     digest = TraceDigest()
     chatter(5, conditions, digest)
     code = (
-        "from unit.protocol.recorder import *\n"
+        "from support.node_recorder import *\n"
         "from laneweave.protocol.transports.simulated.trace import TraceDigest\n"
         "digest = TraceDigest()\n"
         f"chatter(5, {'STORM' if conditions == STORM else 'CALM'}, digest)\n"
