@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conflict_drawing import conflict
-from laneweave.agents.driving.reference import move_profile
+from laneweave.agents.driving.trajectory import move_profile
 from laneweave.coordinator.planning import PlanRequest, checked_plan, warm_up
 from laneweave.coordinator.planning.conflict_cliques import row_patterns
 from laneweave.coordinator.planning.conflicts import PAPER_KINDS, ConflictModel

@@ -12,7 +12,7 @@ from itertools import count
 from attrs import define, evolve, field
 
 from laneweave.agents.core import AgentCore
-from laneweave.agents.driving.driver import Drive, Effort
+from laneweave.agents.driving.driver import Drive, SolverStats
 from laneweave.protocol.lattice import Cell, Lattice, Move
 from laneweave.protocol.runtime.node import Arrived, Effect, Send, Started
 from laneweave.protocol.scenario.deployment import Network
@@ -62,7 +62,7 @@ ROLLING = evolve(SCENARIO, formation=evolve(SCENARIO.formation, operation="rolli
 class StoryDriver:
     """Drives without dynamics: a motion is over when the story has brought the body there."""
 
-    effort = Effort()
+    solver_stats = SolverStats()
 
     def __init__(self, scenario: Scenario) -> None:
         """Make a driver that knows nothing of its vehicle yet."""
@@ -89,7 +89,7 @@ class StoryDriver:
     def motion(self, tick: int) -> None:
         """Tell others nothing: there are no trajectories."""
 
-    def hear(self, motion: Motion) -> None:
+    def on_motion(self, motion: Motion) -> None:
         """Ignore others' motions."""
 
 

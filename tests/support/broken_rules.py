@@ -326,14 +326,14 @@ def speak_at_once(patch: pytest.MonkeyPatch) -> None:
 
 
 def note_by_itself(patch: pytest.MonkeyPatch) -> None:
-    ask = AgentCore._ask_to_note
+    ask = AgentCore._request_note
 
     def mutant(self: AgentCore, execution: PlanExecution) -> Iterator[Effect]:
         yield from ask(self, execution)
         if execution.plan is not None and execution.on_noted(execution.plan.ballot):
-            yield self._show()
+            yield self._state()
 
-    patch.setattr(AgentCore, "_ask_to_note", mutant)
+    patch.setattr(AgentCore, "_request_note", mutant)
 
 
 def keep_incarnation(patch: pytest.MonkeyPatch) -> None:

@@ -102,7 +102,7 @@ class Road:
     @property
     def unusable(self) -> int:
         """Solutions of trackers that could not be used."""
-        return sum(one.driver.effort.unusable for one in self.driven.values())
+        return sum(one.driver.solver_stats.unusable for one in self.driven.values())
 
     def step(
         self, begins: Mapping[Name, Move] | None = None, braking: Collection[Name] = ()
@@ -165,7 +165,7 @@ class Road:
             )  # fmt: skip
             for other, listener in self.driven.items():
                 if other != name:
-                    listener.driver.hear(motion)
+                    listener.driver.on_motion(motion)
 
     def _show(self) -> None:
         road, size = self.scenario.road, self.scenario.vehicle

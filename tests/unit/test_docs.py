@@ -21,7 +21,7 @@ import pytest
 import typer
 from numpy.typing import NDArray
 
-from laneweave.agents.driving.reference import move_profile
+from laneweave.agents.driving.trajectory import move_profile
 from laneweave.coordinator.planning import PlanRequest
 from laneweave.launch.cli.main import app
 from laneweave.launch.cli.plan_command import answer_request

@@ -1,14 +1,19 @@
-"""The vehicle agent's core: charge, protocol and driving of one vehicle.
+"""The vehicle agent's core: the claim on one vehicle, its plan execution and its driving.
 
-At each tick it hears what its sensors and its motion controller know, makes sure that it is in
-charge of the vehicle, decides whether a move may begin (`execution`), and answers with what to
-drive (`driver`). Between ticks it promises, accepts, and listens to the others. When in doubt it
-holds its cell.
+At each tick it receives a SENSE with the measurements of the sensors and the state of the motion
+controller, checks that it is in charge of the vehicle, decides whether a move may begin
+(`execution`), and answers with a COMMAND that holds a trajectory (`driver`). Between ticks it
+answers PREPARE and PLAN and follows the states of other vehicles. When in doubt it holds its cell.
 
-**Charge.** One process at a time acts for a vehicle; its motion controller says which. An agent
-claims the vehicle with its first COMMAND and says nothing to others before a SENSE has shown that
-it is in charge. When another agent is, it falls silent. When the caretaker is - because this agent
-hung, or was not heard - it takes a new incarnation and claims the vehicle anew.
+**The claim.** One process at a time acts for a vehicle; the vehicle's motion controller decides
+which. An agent claims the vehicle with its first COMMAND and sends nothing to other processes
+before a SENSE has shown that it is in charge. When another agent is in charge, it stays silent.
+When the caretaker is in charge (because this agent hung or its messages were lost), it takes a new
+incarnation and claims the vehicle again.
+
+**The road.** A SENSE names its bridge. A newer bridge has another road and begins again at tick 0:
+the agent forgets the earlier road and takes a new incarnation. From then on it ignores the earlier
+bridge, whose messages may still be on their way.
 """
 
 from __future__ import annotations
@@ -17,7 +22,7 @@ from collections.abc import Callable
 
 from attrs import evolve
 
-from laneweave.agents.driving.driver import Course, Driver, Effort, TrackingDriver
+from laneweave.agents.driving.driver import Course, Driver, SolverStats, TrackingDriver
 from laneweave.protocol.lattice import Move, stretch_of
 from laneweave.protocol.runtime.node import (
     Announce,
@@ -69,20 +74,20 @@ class AgentCore:
         make_driver: Callable[[Scenario], Driver] = TrackingDriver,
         rules: RuleBook = VEHICLE_RULES,
     ) -> None:
-        """Make an agent that knows nothing of its vehicle yet (V1).
+        """Make an agent that has not received a SENSE yet (V1).
 
         Args:
             vehicle: its name.
             new_incarnation: returns a number that no process has used before, greater than all
                 earlier ones.
             scenario: lattice, limits, timing.
-            make_driver: makes what drives the vehicle.
-            rules: of plan execution; others than `VEHICLE_RULES` only in tests.
+            make_driver: makes the vehicle's driver; the fault simulation has a cheaper one.
+            rules: of plan execution; the fault simulation plants bugs here.
         """
         self.vehicle = vehicle
         self.ended = False
         self.execution: PlanExecution | None = None
-        """None until it has met its vehicle."""
+        """None before the first SENSE."""
         self._scenario = scenario
         self._new_incarnation = new_incarnation
         self._incarnation = new_incarnation()
@@ -90,22 +95,22 @@ class AgentCore:
         self._rules = rules
         self._formation: int | None = None
         self.wanted_motions: tuple[int, ...] = ()
-        """Stretches of columns whose vehicles may come near; none while it is not in charge."""
+        """Stretches of columns whose motions matter now; empty while it is not in charge."""
         self.wanted_states: tuple[int, ...] = ()
         """Formations whose states matter to this vehicle now."""
         self._move: Move | None = None
         """The newest move that it has begun."""
         self._move_ticks = 0
-        """How long that takes."""
+        """Duration of that move."""
         self._sense: Sense | None = None
         self._command: Command | None = None
         self._own = {"vehicle": vehicle}
-        self._shown_by: dict[str, object] = {}
-        """Parameters of what others see of it."""
+        self._state_parameters: dict[str, object] = {}
+        """Topic parameters of its STATE."""
 
     @property
     def wakeup_s(self) -> float | None:
-        """Ticks drive the agent; it has no clock of its own."""
+        """None: ticks drive the agent."""
         return None
 
     @property
@@ -120,9 +125,9 @@ class AgentCore:
         )
 
     @property
-    def effort(self) -> Effort:
-        """What driving has cost so far."""
-        return self._driver.effort
+    def solver_stats(self) -> SolverStats:
+        """Counters and durations of tracking so far."""
+        return self._driver.solver_stats
 
     def handle(self, event: Event, now_s: float) -> list[Effect]:
         """Take an event; see `Core`."""
@@ -141,11 +146,11 @@ class AgentCore:
             case Started():
                 return [
                     *(Listen(topic, self._own) for topic in (SENSE, PREPARE, PLAN)),
-                    # Last: who sees the token may rely on the subscriptions.
+                    # Last: a process that sees the token may rely on the subscriptions.
                     Announce(VEHICLE_ALIVE, self._own),
                 ]
             case Stopping():
-                return [self._report()]
+                return [self._final_report()]
             case _:
                 return []
 
@@ -157,22 +162,22 @@ class AgentCore:
         if execution.needs_states(sense.t_s):
             self.wanted_states = execution.plan.formations
 
-    def hear(self, motion: Motion) -> None:
-        """Take what another vehicle of the wanted formations says of its motion."""
-        self._driver.hear(motion)
+    def on_motion(self, motion: Motion) -> None:
+        """Take the motion of a vehicle in one of the wanted stretches."""
+        self._driver.on_motion(motion)
 
     def _on_message(self, message: object) -> list[Effect]:
         execution = self.execution
-        assert execution is not None  # noqa: S101 (in charge: it has met the vehicle)
+        assert execution is not None  # noqa: S101 (in charge: there was a SENSE)
         match message:
             case VehicleState():
                 execution.on_state(message)
             case Prepare():
                 if execution.on_prepare(message):
-                    return [*self._ask_to_note(execution), self._show()]
+                    return [*self._request_note(execution), self._state()]
             case Plan():
                 if execution.on_plan(message):
-                    return self._ask_to_note(execution)
+                    return self._request_note(execution)
             case _:
                 pass
         return []
@@ -182,28 +187,32 @@ class AgentCore:
     def _on_sense(self, sense: Sense) -> list[Effect]:
         if sense.vehicle != self.vehicle:
             return []
+        if self._sense is not None and sense.bridge != self._sense.bridge:
+            if sense.bridge < self._sense.bridge:
+                return []
+            self._forget_road()
         if sense.left:
             return self.leave()
         if self._sense is not None and sense.tick <= self._sense.tick:
             if sense.tick == self._sense.tick and self._command is not None:
-                return [*self._take_note(sense), Send(COMMAND, self._command, self._own)]
+                return [*self._on_confirmation(sense), Send(COMMAND, self._command, self._own)]
             return []
         was_in_charge = self.in_charge
         self._sense = sense
         if sense.attendant > self._incarnation:
             self._command, self.wanted_motions = None, ()
             if not sense.caretaker:
-                return []  # another process is in charge, and well: this one must not drive
+                return []  # another agent is in charge: this one must not drive
             self._incarnation = above(self._new_incarnation(), sense.attendant)
         in_charge = self.in_charge
         if not (was_in_charge and in_charge):
-            # Also while a claim is under way: until it is granted somebody else may have moved.
-            self._meet_vehicle(sense)
+            # Also while a claim is pending: until it is granted another process may begin a move.
+            self._take_over(sense)
         return self._act(sense, in_charge=in_charge)
 
     def _act(self, sense: Sense, *, in_charge: bool) -> list[Effect]:
         execution = self.execution
-        assert execution is not None  # noqa: S101 (met the vehicle)
+        assert execution is not None  # noqa: S101 (there was a SENSE)
         self.wanted_motions = _stretches_near(execution.hold_cell[0]) if in_charge else ()
         if in_charge:
             execution.on_joined(sense.joined)
@@ -227,29 +236,29 @@ class AgentCore:
         )
         effects: list[Effect] = [Send(COMMAND, self._command, self._own)]
         if in_charge:
-            effects.append(self._show())
+            effects.append(self._state())
             course = self._driver.motion(sense.tick)
             if course is not None:
-                effects.append(self._tell(course, sense.tick))
+                effects.append(self._motion(course, sense.tick))
         return effects
 
-    def _take_note(self, sense: Sense) -> list[Effect]:
-        """Hear within a tick what the controller has noted for the process in charge."""
+    def _on_confirmation(self, sense: Sense) -> list[Effect]:
+        """Take a repeated SENSE: the controller may have noted something within the tick."""
         execution = self.execution
         if execution is None or not self.in_charge or sense.attendant != self._incarnation:
             return []
         self._sense = sense
-        news = [
+        changes = [
             execution.on_joined(sense.joined),
             execution.on_noted(sense.accepted),
             execution.on_estate(sense),
         ]
-        return [self._show()] if any(news) else []
+        return [self._state()] if any(changes) else []
 
-    def _ask_to_note(self, execution: PlanExecution) -> list[Effect]:
-        """Ask the controller at once, not only with the next tick's COMMAND."""
+    def _request_note(self, execution: PlanExecution) -> list[Effect]:
+        """Ask the controller to note something now, before the next tick's COMMAND."""
         command = self._command
-        assert command is not None  # noqa: S101 (in charge: it has commanded)
+        assert command is not None  # noqa: S101 (in charge: it has sent one)
         self._command = evolve(
             command,
             joined=execution.wanted_joined,
@@ -259,10 +268,16 @@ class AgentCore:
         )
         return [Send(COMMAND, self._command, self._own)] if self._command != command else []
 
-    def _meet_vehicle(self, sense: Sense) -> None:
+    def _forget_road(self) -> None:
+        """Forget the vehicle of an earlier bridge, as a process that starts anew (V1)."""
+        self._incarnation = self._new_incarnation()
+        self._sense = self._command = self._move = self.execution = None
+        self.wanted_motions, self.wanted_states = (), ()
+
+    def _take_over(self, sense: Sense) -> None:
         """V1: take over what the motion controller is doing."""
         self._formation, self._move = sense.formation, None
-        self._shown_by = {"formation": sense.formation, "vehicle": self.vehicle}
+        self._state_parameters = {"formation": sense.formation, "vehicle": self.vehicle}
         self._driver.take_over(sense)
         self.execution = PlanExecution(
             vehicle=self.vehicle,
@@ -278,8 +293,8 @@ class AgentCore:
     def _decide(self, sense: Sense, execution: PlanExecution) -> None:
         """V5 to V7."""
         if execution.moving and self._move is not None and sense.hold_cell != self._move[2]:
-            # The motion controller has not heard of the move, so the body is still at its origin:
-            # a trajectory that began earlier would have run away from it. Its plan may be gone.
+            # The motion controller has not received the move, so the body is still at its origin:
+            # a trajectory that began earlier would be ahead of it. The plan may be gone by now.
             self._driver.begin(self._move, sense.tick, self._move_ticks)
         if execution.moving and self._driver.at_rest(sense):
             execution.end_motion()
@@ -289,16 +304,16 @@ class AgentCore:
             self._move_ticks = self._scenario.move_ticks(execution.plan.slot_s)
             self._driver.begin(move, sense.tick, self._move_ticks)
 
-    # --- what others see ----------------------------------------------------------------------
+    # --- messages to other processes -----------------------------------------------------------
 
-    def _show(self) -> Effect:
+    def _state(self) -> Effect:
         execution, sense = self.execution, self._sense
-        assert execution is not None  # noqa: S101 (met the vehicle)
-        assert sense is not None  # noqa: S101 (met the vehicle)
+        assert execution is not None  # noqa: S101 (there was a SENSE)
+        assert sense is not None  # noqa: S101 (there was a SENSE)
         state = execution.state(sense, self._formation or 0, attended=True)
-        return Send(STATE, state, self._shown_by)
+        return Send(STATE, state, self._state_parameters)
 
-    def _tell(self, course: Course, tick: int) -> Effect:
+    def _motion(self, course: Course, tick: int) -> Effect:
         motion = Motion(
             vehicle=self.vehicle,
             incarnation=self._incarnation,
@@ -312,25 +327,25 @@ class AgentCore:
         return Send(MOTION, motion, {"stretch": motion.stretch, "vehicle": self.vehicle})
 
     def leave(self) -> list[Effect]:
-        """End: the vehicle is not on the road any more."""
+        """End, because the vehicle has left the road."""
         if self.ended:
             return []
         self.ended, self.wanted_motions, self.wanted_states = True, (), ()
         return [
-            self._report(),
+            self._final_report(),
             *(Unlisten(topic, self._own) for topic in (SENSE, PREPARE, PLAN)),
             Withdraw(VEHICLE_ALIVE, self._own),
         ]
 
-    def _report(self) -> Effect:
-        effort = self.effort
+    def _final_report(self) -> Effect:
+        stats = self.solver_stats
         report = Report(
             role=Name("agent"),
             name=self.vehicle,
-            solves=effort.solves,
-            unusable=effort.unusable,
-            osqp_solves=effort.osqp_solves,
-            solve_ms=effort.solve_ms,
+            solves=stats.solves,
+            unusable=stats.unusable,
+            osqp_solves=stats.osqp_solves,
+            solve_ms=stats.solve_ms,
         )
         return Send(REPORT, report, {"role": "agent", "name": self.vehicle})
 

@@ -1,4 +1,4 @@
-"""Several vehicle agents in one process (`--vehicles-per-process`), and agents on announcement."""
+"""An agent process: hosts the agents of named vehicles, or of its shard of announced vehicles."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from laneweave.protocol.wire.topics import (
 )
 
 ALONE_S = 60.0
-"""Agents end when no bridge has been there for this long (node clock)."""
+"""Agents of named vehicles end when there was no bridge for this long (node clock)."""
 
 
 class AgentHost:
-    """The core of an agent process: hands events to the vehicles that they concern."""
+    """The core of an agent process: dispatches events to the agents that they concern."""
 
     def __init__(
         self,
@@ -45,42 +45,42 @@ class AgentHost:
         vehicles: Iterable[Name] = (),
         shard: Shard | None = None,
     ) -> None:
-        """Host named vehicles, or with a `shard` every announced vehicle that falls to it."""
+        """Host named vehicles, or with a `shard` every announced vehicle that belongs to it."""
         self._make_agent = make_agent
         self._shard = shard
         self._agents: dict[Name, AgentCore] = {name: make_agent(name) for name in vehicles}
         self._seen: set[Name] = set(self._agents)
-        self._heard: dict[Topic, set[int]] = {MOTION: set(), STATE: set()}
-        """Stretches and blocks whose messages it listens to."""
-        self._near: list[tuple[int, ...]] = []
-        """Stretches whose motions each vehicle wants, when that was looked at last."""
-        self._awaited: list[tuple[int, ...]] = []
-        """Blocks whose states each vehicle wants."""
+        self._subscribed: dict[Topic, set[int]] = {MOTION: set(), STATE: set()}
+        """Stretches and blocks that it has subscribed to."""
+        self._motions: list[tuple[int, ...]] = []
+        """Stretches whose motions each vehicle wanted at the last update."""
+        self._states: list[tuple[int, ...]] = []
+        """Blocks whose states each vehicle wanted at the last update."""
         self._census_s = 0.0
         self._bridge = -1
         """Incarnation of the newest bridge."""
         self._alone_since_s: float | None = 0.0
-        """Since when no bridge is there."""
+        """When the bridge was lost; None: there is one."""
         self._solves = self._unusable = 0
-        """Of agents that have ended."""
+        """Counters of agents that have ended."""
 
     @property
     def numbers(self) -> tuple[Snapshot, ...]:
-        """What the agents have counted."""
+        """Counters of all agents."""
         agents = self._agents.values()
-        efforts = [agent.effort for agent in agents]
+        stats = [agent.solver_stats for agent in agents]
         return (
             AgentNumbers(
                 vehicles=len(agents),
                 vehicles_in_charge=sum(agent.in_charge for agent in agents),
-                solves_total=self._solves + sum(effort.solves for effort in efforts),
-                unusable_total=self._unusable + sum(effort.unusable for effort in efforts),
+                solves_total=self._solves + sum(each.solves for each in stats),
+                unusable_total=self._unusable + sum(each.unusable for each in stats),
             ),
         )
 
     @property
     def wakeup_s(self) -> float | None:
-        """When to give up waiting for a bridge; a shard waits for ever."""
+        """When to stop waiting for a bridge; a shard never stops."""
         if self._shard is not None or self._alone_since_s is None:
             return None
         return self._alone_since_s + ALONE_S
@@ -88,16 +88,16 @@ class AgentHost:
     def handle(self, event: Event, now_s: float) -> list[Effect]:
         """Take an event; see `Core`."""
         if isinstance(event, Arrived) and isinstance(event.message, Motion):
-            self._on_motion(event.message)  # after which there is nothing else to listen to
+            self._on_motion(event.message)  # changes no subscription
             return []
         hosted = bool(self._agents)
         if isinstance(event, Arrived):
             effects = self._on_message(event, now_s)
         else:
             effects = self._on_event(event, now_s)
-            self._listen_nearby(effects)
+            self._update_subscriptions(effects)
         if hosted and not self._agents and self._shard is None:
-            effects.append(End())  # last: nothing can be undone on a network that the node has left
+            effects.append(End())  # last: after it the node has left the network
         return effects
 
     def _on_event(self, event: Event, now_s: float) -> list[Effect]:
@@ -107,16 +107,16 @@ class AgentHost:
                 effects: list[Effect] = [Watch(BRIDGE_ALIVE)]
                 if self._shard is not None:
                     effects.append(Listen(CENSUS))
-                return effects + self._hand_to_all(event, now_s)
+                return effects + self._dispatch_to_all(event, now_s)
             case PeerUp(topic, parameters) if topic is BRIDGE_ALIVE:
-                return self._meet_bridge(incarnation_of(parameters))
+                return self._on_bridge(incarnation_of(parameters))
             case PeerDown(topic, parameters) if topic is BRIDGE_ALIVE:
                 if incarnation_of(parameters) == self._bridge:
                     self._alone_since_s = now_s
             case Wakeup() if self.wakeup_s is not None and now_s >= self.wakeup_s:
                 return [End()]
             case Stopping():
-                return self._hand_to_all(event, now_s)
+                return self._dispatch_to_all(event, now_s)
             case _:
                 pass
         return []
@@ -128,64 +128,67 @@ class AgentHost:
             for agent in self._agents.values():
                 if message.formation in agent.wanted_states:
                     effects += agent.handle(event, now_s)
-            self._listen_nearby(effects)
+            self._update_subscriptions(effects)
             return effects
         if isinstance(message, Census):
             effects = self._on_census(message, now_s)
-            self._listen_nearby(effects)
+            self._update_subscriptions(effects)
             return effects
         name = event.parameters.get("vehicle")
-        return self._hand_on(event, Name(name), now_s) if name in self._agents else []
+        return self._dispatch(event, Name(name), now_s) if name in self._agents else []
 
     def _on_motion(self, motion: Motion) -> None:
         for name, agent in self._agents.items():
             if name != motion.vehicle and motion.stretch in agent.wanted_motions:
-                agent.hear(motion)
+                agent.on_motion(motion)
 
-    def _hand_to_all(self, event: Event, now_s: float) -> list[Effect]:
+    def _dispatch_to_all(self, event: Event, now_s: float) -> list[Effect]:
         effects: list[Effect] = []
         for agent in self._agents.values():
             effects += agent.handle(event, now_s)
         return effects
 
-    def _meet_bridge(self, incarnation: int) -> list[Effect]:
-        """Take note of a bridge: a new one has new vehicles, whatever their names."""
+    def _on_bridge(self, incarnation: int) -> list[Effect]:
+        """Take the token of a bridge: a new one has other vehicles, even if names are equal.
+
+        Agents of named vehicles find out by themselves, from the first SENSE of the new bridge.
+        """
         effects: list[Effect] = []
         if incarnation < max(self._bridge, 0):
             return effects  # left over from an earlier run, or no bridge at all
         self._alone_since_s = None
         if self._shard is not None and self._bridge not in (-1, incarnation):
             for name in list(self._agents):
-                effects += self._part_with(name).leave()
+                effects += self._remove(name).leave()
             self._seen.clear()
             self._census_s = 0.0
         self._bridge = incarnation
         return effects
 
-    def _part_with(self, name: Name) -> AgentCore:
-        """Take an agent out; what it has counted stays."""
+    def _remove(self, name: Name) -> AgentCore:
+        """Remove an agent and keep its counters."""
         agent = self._agents.pop(name)
-        effort = agent.effort
-        self._solves += effort.solves
-        self._unusable += effort.unusable
+        stats = agent.solver_stats
+        self._solves += stats.solves
+        self._unusable += stats.unusable
         return agent
 
-    def _hand_on(self, event: Event, name: Name, now_s: float) -> list[Effect]:
+    def _dispatch(self, event: Event, name: Name, now_s: float) -> list[Effect]:
         agent = self._agents[name]
         wanted = agent.wanted_motions, agent.wanted_states
         effects = agent.handle(event, now_s)
         if agent.ended:
-            self._part_with(name)
-        # Not after every message: a host of many would look at all of them for each of them.
+            self._remove(name)
+        # Not after every message: it looks at all agents of the host.
         if agent.ended or wanted != (agent.wanted_motions, agent.wanted_states):
-            self._listen_nearby(effects)
+            self._update_subscriptions(effects)
         return effects
 
     def _on_census(self, census: Census, now_s: float) -> list[Effect]:
         effects: list[Effect] = []
         shard = self._shard
         if shard is None or census.bridge not in (0, self._bridge):
-            return effects  # of an earlier road, or of one whose token has not been seen yet
+            return effects  # of another road
         if census.t_s < self._census_s:
             return effects
         self._census_s = census.t_s
@@ -196,30 +199,28 @@ class AgentHost:
                 self._agents[name] = self._make_agent(name)
                 effects += self._agents[name].handle(Started(), now_s)
         for name in sorted(set(self._agents) - set(listed)):
-            # It left, and the bridge's word of it was lost.
-            effects += self._part_with(name).leave()
+            # It has left, and the bridge's message about that was lost.
+            effects += self._remove(name).leave()
         self._seen = set(listed)
         return effects
 
-    def _listen_nearby(self, effects: list[Effect]) -> None:
+    def _update_subscriptions(self, effects: list[Effect]) -> None:
         """Subscribe to the motions and states that matter now, and only to those.
 
-        States are most of the traffic, and most of the time nobody waits for anybody.
+        States are most of the traffic, and most of the time no vehicle waits for another one.
         """
-        near, awaited = [], []
-        for agent in self._agents.values():
-            near.append(agent.wanted_motions)
-            awaited.append(agent.wanted_states)
-        if near != self._near:
-            self._near = near
-            effects += self._listen(MOTION, near)
-        if awaited != self._awaited:
-            self._awaited = awaited
-            effects += self._listen(STATE, awaited)
+        motions = [agent.wanted_motions for agent in self._agents.values()]
+        states = [agent.wanted_states for agent in self._agents.values()]
+        if motions != self._motions:
+            self._motions = motions
+            effects += self._subscribe(MOTION, motions)
+        if states != self._states:
+            self._states = states
+            effects += self._subscribe(STATE, states)
 
-    def _listen(self, topic: Topic, numbers: Iterable[Iterable[int]]) -> list[Effect]:
-        before, wanted = self._heard[topic], {one for each in numbers for one in each}
-        self._heard[topic] = wanted
+    def _subscribe(self, topic: Topic, numbers: Iterable[Iterable[int]]) -> list[Effect]:
+        before, wanted = self._subscribed[topic], {one for each in numbers for one in each}
+        self._subscribed[topic] = wanted
         where = topic.parameters[0]
         return [
             *(Unlisten(topic, {where: number}) for number in sorted(before - wanted)),

@@ -1,4 +1,4 @@
-"""What an agent process offers to whoever looks at it."""
+"""Metrics of an agent process."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from laneweave.protocol.runtime.metrics import told
 
 @frozen
 class AgentNumbers:
-    """The vehicles of one process."""
+    """Counters of the vehicles of one process."""
 
     ABOUT: ClassVar[str] = "agent"
 

@@ -1,4 +1,4 @@
-"""The agent process: one vehicle, or several, over Zenoh."""
+"""The agent process: one or several vehicles over Zenoh."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from laneweave.protocol.wire.messages import Name, Sense
 
 
 def warm_up(scenario: Scenario) -> None:
-    """Plan all moves and drive a tick of one, so that processes forked from this one need not."""
+    """Plan all moves and drive one tick, so that processes forked from this one need not."""
     driver = TrackingDriver(scenario)
     column, lane = cell = (0, 1)
     for (dx, dy), ticks in product(product((-1, 0, 1), repeat=2), scenario.move_durations):
@@ -53,13 +53,13 @@ def run_agents(
     Args:
         scenario: what all vehicles know.
         access: how this process gets onto the network.
-        vehicles: whom it drives; empty: all of the shard, as they are announced.
+        vehicles: names of its vehicles; empty: all of the shard, as they are announced.
         shard: see `AgentHost`.
-        wrap: may put faults before them.
-        observe: is told where their numbers come from.
+        wrap: wraps the core, to inject faults.
+        observe: registers the metrics source.
 
     Raises:
-        BadInputError: nobody answers at the endpoint.
+        BadInputError: there is no answer at the endpoint.
     """
     incarnations = Incarnations()
     host = AgentHost(

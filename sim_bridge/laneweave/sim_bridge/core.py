@@ -279,7 +279,9 @@ class BridgeCore:
         for arrival in self._roadside.newly_demanded(self.t_s):
             self._record.on_demanded(arrival)
         for admission in self._roadside.admit(self.t_s):
-            self._at_entrance.append(RoadVehicle.entering(admission, self.t_s, self.scenario))
+            self._at_entrance.append(
+                RoadVehicle.entering(admission, self.t_s, self.scenario, self._incarnation)
+            )
         self.phase = Phase.AGENTS
         self._until_s = now_s + self._patience_s
 

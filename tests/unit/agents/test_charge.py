@@ -8,7 +8,7 @@ import pytest
 from attrs import evolve
 
 from laneweave.agents.core import AgentCore
-from laneweave.agents.driving.driver import Drive, Effort
+from laneweave.agents.driving.driver import Drive, SolverStats
 from laneweave.protocol.lattice import Cell, Move
 from laneweave.protocol.runtime.node import Effect, Send, Wakeup
 from laneweave.protocol.scenario.tables import Scenario
@@ -30,7 +30,7 @@ from support.agent_rig import BALLOT, HOME, LATTICE, ME, OTHER, TICK_S, Rig, mak
 class Passenger:
     """A driver that drives nothing and keeps a diary."""
 
-    effort = Effort()
+    solver_stats = SolverStats()
 
     def __init__(self, _: Scenario) -> None:
         """Begin with an empty diary."""
@@ -55,7 +55,7 @@ class Passenger:
     def motion(self, tick: int) -> None:
         """Tell others nothing."""
 
-    def hear(self, motion: Motion) -> None:
+    def on_motion(self, motion: Motion) -> None:
         """Ignore others' motions."""
 
 

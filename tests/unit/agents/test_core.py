@@ -136,6 +136,25 @@ def test_older_ticks_and_other_vehicles_are_ignored() -> None:
     assert rig.run().t_s == pytest.approx((rig.tick - 1) * TICK_S)
 
 
+def test_a_newer_bridge_has_another_road_on_which_the_agent_starts_anew() -> None:
+    rig = up_and_running()
+    rig.accept((0, HOME, (-1, 2)))
+    rig.run(20)
+    old = attrs.evolve(rig.sense(), tick=rig.tick + 50)
+    first = Rig().sense()  # of the next road: tick 0, and no process is in charge yet
+    (claim,) = sent(rig.hand(SENSE, attrs.evolve(first, bridge=7)), Command)
+    assert (claim.tick, claim.incarnation, claim.hold_cell) == (0, 2, HOME)
+    assert not rig.agent.in_charge
+    # A message of the earlier bridge may still be on its way, and its tick is higher.
+    assert rig.hand(SENSE, old) == []
+    granted = attrs.evolve(first, bridge=7, tick=1, t_s=TICK_S, attendant=2)
+    rig.hand(SENSE, granted)
+    state = rig.shown[-1]
+    assert (state.incarnation, state.promised, state.accepted) == (2, None, False)
+    assert rig.hand(SENSE, attrs.evolve(old, left=True)) == []
+    assert not rig.agent.ended
+
+
 def test_a_promise_is_shown_at_once_and_an_acceptance_as_soon_as_it_is_noted() -> None:
     rig = up_and_running()
     tick = rig.tick

@@ -372,3 +372,18 @@ def test_everybody_starts_afresh_with_the_next_bridge(tmp_path: Path, end_of_fir
     assert summary["tracking"]["hold_law_ticks"] == 0
     assert read_events(tmp_path / "second", "agent-missing") == []
     assert read_events(tmp_path / "second", "agent-silent") == []
+
+
+def test_agents_of_named_vehicles_follow_the_next_bridge(tmp_path: Path) -> None:
+    """Their vehicles are not left to the caretaker until the ticks of the first road are passed."""
+    street = Street(SHORT_ROAD, tmp_path / "first", [arrival("v1", 0.5)])
+    street.start_agents("v1")
+    street.run_to(90)
+    street.network.kill("bridge")
+    street.network.run(street.network.now_s + 3.0)
+    street.start_bridge("next-bridge", tmp_path / "second")
+    street.run()
+    check_complete(street, tmp_path / "second")
+    summary = read_summary(tmp_path / "second")
+    assert summary["tracking"]["hold_law_ticks"] == 0
+    assert summary["tracking"]["caretaker_takeovers"] == 0

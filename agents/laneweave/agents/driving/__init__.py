@@ -1,5 +1,7 @@
-"""How a vehicle drives: reference trajectories, tracking by quadratic programs, neighbours.
+"""Driving: how a vehicle follows its cell or its move.
 
-Entry point: `driver.Driver`. `reference` plans trajectories between cells, `tracker` follows them,
-`qp` is the only module that imports osqp. Pure; imported by `agents.core`.
+Entry point: `driver.Driver`. `trajectory` plans moves between cells, `reference` puts them on the
+road clock, `tracker` follows them (`program`: the quadratic program, `regulator`: its unconstrained
+solution), `surroundings` predicts neighbours. `qp` is the only module that imports osqp. No I/O;
+imported by `agents.core`, `agents.process` and launch.
 """

@@ -1,22 +1,22 @@
-"""The driver: from the cell to hold, or the move to make, to jerks for the motion controller.
+"""The driver: computes jerks for the motion controller from the cell to hold or the move to make.
 
-It lays the reference through the lattice points (`trajectory`) and tracks it (`tracker`). When a
-solution is not usable it has nothing to say: the motion controller goes on with the last good
-trajectory, and knows how to go on from there (`sim_bridge.motion_controller`: the ladder). It knows
-nothing of the protocol.
+It lays the reference through the lattice points (`reference`) and tracks it (`tracker`). When a
+solution is not usable it sends no jerks: the motion controller continues with the last usable
+trajectory and its own fallbacks (`sim_bridge.bodies.motion_controller`). It knows nothing of the
+protocol.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
 from attrs import define, frozen
 
 from laneweave.agents.driving.motions import REPEAT_TICKS
+from laneweave.agents.driving.program import NO_GAPS
 from laneweave.agents.driving.reference import Reference
-from laneweave.agents.driving.surroundings import NOBODY, Surroundings
+from laneweave.agents.driving.surroundings import Surroundings
 from laneweave.agents.driving.tracker import Tracker
 from laneweave.protocol.lattice import Cell, Move
 from laneweave.protocol.scenario.tables import Scenario
@@ -28,21 +28,21 @@ _FLOAT32 = np.dtype("<f4")
 
 @define  # made at each tick: frozen ones take three times as long
 class Drive:
-    """What the motion controller should play from this tick on."""
+    """What the motion controller executes from this tick on."""
 
     motion_end_tick: int
     """End of the motion under way; 0 when the vehicle holds."""
     motion_origin: Cell
     motion_ticks: int
-    """How long the move takes; 0: it settles in its cell, or holds."""
+    """Duration of the move; 0: the vehicle settles in its cell, or holds."""
     jerks: bytes
-    """Little-endian float32 pairs (along, across) in m/s3, one for each tick of the horizon; none
-    when there is nothing better than what is being played."""
+    """Little-endian float32 pairs (along, across) in m/s3, one for each tick of the horizon; empty
+    when there is nothing better than what is being executed."""
 
 
 @frozen
 class Course:
-    """A motion, as it is told to others."""
+    """A motion as published to other vehicles."""
 
     origin: Cell
     target: Cell
@@ -51,57 +51,55 @@ class Course:
 
 
 @frozen
-class Effort:
-    """What driving has cost so far."""
+class SolverStats:
+    """Counters and durations of tracking so far."""
 
     solves: int = 0
     unusable: int = 0
     osqp_solves: int = 0
-    """Of the solves, those for which OSQP ran."""
+    """Solves for which OSQP ran."""
     solve_ms: bytes = b""
-    """Little-endian float32 CPU milliseconds, one for each solve."""
+    """Little-endian float32 CPU milliseconds of each solve."""
 
 
 class Driver(Protocol):
     """Drives one vehicle; `TrackingDriver` in every real agent."""
 
     def take_over(self, sense: Sense) -> None:
-        """Go on with what the motion controller is doing."""
+        """Continue the motion that the motion controller executes."""
 
     def begin(self, move: Move, tick: int, ticks: int) -> None:
-        """Begin a move at this tick; it takes `ticks` of them."""
+        """Begin a move of `ticks` ticks at this tick."""
 
     def at_rest(self, sense: Sense) -> bool:
-        """Tell whether the motion under way has ended."""
+        """Return whether the motion under way has ended."""
 
     def drive(self, sense: Sense, *, moving: bool) -> Drive:
-        """Return what to play from this tick on."""
+        """Return what the motion controller executes from this tick on."""
 
     def motion(self, tick: int) -> Course | None:
-        """Return what to tell others at this tick of the motion under way; None: nothing."""
+        """Return the motion to publish at this tick, if one is due."""
 
-    def hear(self, motion: Motion) -> None:
-        """Take what another vehicle says of its motion."""
+    def on_motion(self, motion: Motion) -> None:
+        """Take the announced motion of another vehicle."""
 
     @property
-    def effort(self) -> Effort:
-        """What it has cost so far."""
+    def solver_stats(self) -> SolverStats:
+        """Counters and durations of tracking so far."""
 
 
 class TrackingDriver:
-    """Tracks references with a quadratic program at each tick."""
+    """Drives by tracking a reference at each tick."""
 
-    def __init__(
-        self, scenario: Scenario, make_tracker: Callable[[Scenario], Tracker] = Tracker
-    ) -> None:
-        """Make a driver that knows nothing of its vehicle yet."""
+    def __init__(self, scenario: Scenario) -> None:
+        """Make a driver that has no vehicle yet; `take_over` gives it one."""
         self._scenario = scenario
-        self._tracker = make_tracker(scenario)
+        self._tracker = Tracker(scenario)
         self._reference: Reference | None = None
         self._goal: Cell = (0, 0)
         self._durations = scenario.move_durations
         self._ticks = 0
-        """How long the newest move takes."""
+        """Duration of the newest move."""
         self._lattice = scenario.lattice
         self._vehicle = scenario.vehicle
         self._speed_mps = scenario.lattice.speed_mps
@@ -110,13 +108,13 @@ class TrackingDriver:
         self._unusable = self._osqp_solves = 0
 
     @property
-    def effort(self) -> Effort:
-        """What it has cost so far."""
+    def solver_stats(self) -> SolverStats:
+        """Counters and durations of tracking so far."""
         solve_ms = np.array(self._solve_ms, dtype="<f4").tobytes()
-        return Effort(len(self._solve_ms), self._unusable, self._osqp_solves, solve_ms)
+        return SolverStats(len(self._solve_ms), self._unusable, self._osqp_solves, solve_ms)
 
     def take_over(self, sense: Sense) -> None:
-        """Go on with what the motion controller is doing."""
+        """Continue the motion that the motion controller executes."""
         scenario = self._scenario
         self._goal = sense.hold_cell
         if sense.motion_origin == sense.hold_cell and sense.motion_end_tick > sense.tick + 3:
@@ -139,26 +137,26 @@ class TrackingDriver:
             self._reference = Reference.hold(scenario, sense.hold_cell)
 
     def begin(self, move: Move, tick: int, ticks: int) -> None:
-        """Begin a move at this tick; it takes `ticks` of them."""
+        """Begin a move of `ticks` ticks at this tick."""
         self._goal, self._ticks = move[2], ticks
         self._reference = Reference.move(self._scenario, move[1], move[2], tick, ticks)
 
     def at_rest(self, sense: Sense) -> bool:
-        """Tell whether the motion's time is over and the body is at its target.
+        """Return whether the time of the motion is over and the body is at its target.
 
-        A body that is late still moves, though the time of its motion is over.
+        A late body is still moving although the time of its motion is over.
         """
-        return sense.tick >= self._path.end_tick and at_rest_in_cell(
+        return sense.tick >= self._current.end_tick and at_rest_in_cell(
             sense.state, self._lattice, self._goal, sense.t_s
         )
 
     def drive(self, sense: Sense, *, moving: bool) -> Drive:
         """Track the reference."""
-        reference, tick = self._path, sense.tick
+        reference, tick = self._current, sense.tick
         state = commanded_state(sense.state, sense.setpoint, self._vehicle, self._speed_mps)
         gaps = self._surroundings.gaps(sense, state, self._goal[1])
         result = None
-        if gaps is NOBODY and tick >= reference.end_tick:
+        if gaps is NO_GAPS and tick >= reference.end_tick:
             goal = cell_state(self._lattice, self._goal, sense.t_s)
             result = self._tracker.rest(state, goal)
         if result is None:
@@ -167,7 +165,7 @@ class TrackingDriver:
         self._unusable += not result.usable
         self._osqp_solves += result.iterations > 0
         return Drive(
-            # Past its time but not there yet: still moving, for whoever takes the vehicle over.
+            # A late body is still moving: an agent that takes over must know.
             motion_end_tick=max(reference.end_tick, tick + 1) if moving else 0,
             motion_origin=reference.origin,
             motion_ticks=self._ticks if reference.origin != self._goal else 0,
@@ -175,19 +173,19 @@ class TrackingDriver:
         )
 
     def motion(self, tick: int) -> Course | None:
-        """Return the motion when it begins and now and then while it lasts."""
-        path = self._reference
-        if path is None or path.origin == self._goal:
+        """Return the motion when it begins and every `REPEAT_TICKS` while it lasts."""
+        reference = self._reference
+        if reference is None or reference.origin == self._goal:
             return None
-        if tick >= path.end_tick or (tick - path.start_tick) % REPEAT_TICKS:
+        if tick >= reference.end_tick or (tick - reference.start_tick) % REPEAT_TICKS:
             return None
-        return Course(path.origin, self._goal, path.start_tick, self._ticks)
+        return Course(reference.origin, self._goal, reference.start_tick, self._ticks)
 
-    def hear(self, motion: Motion) -> None:
-        """Reckon with another vehicle's motion."""
-        self._surroundings.hear(motion)
+    def on_motion(self, motion: Motion) -> None:
+        """Take the announced motion of another vehicle."""
+        self._surroundings.on_motion(motion)
 
     @property
-    def _path(self) -> Reference:
+    def _current(self) -> Reference:
         assert self._reference is not None  # noqa: S101 (it has taken over)
         return self._reference

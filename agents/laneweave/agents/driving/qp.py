@@ -49,8 +49,6 @@ class QPSettings:
     """Over-relaxation of the iteration, in (0, 2)."""
     eps_infeasible: float = 1e-4
     """Accuracy of the certificate by which a program is given up as infeasible."""
-    check_duality_gap: bool = False
-    """Whether the duality gap, an absolute cost, must also be below eps_abs."""
     polishing: bool = False
     """Whether a solution is refined on its active rows (to machine accuracy when it works)."""
     row_tolerance: float = 2e-3
@@ -244,7 +242,7 @@ def _osqp_settings(settings: QPSettings) -> Any:  # noqa: ANN401 - OSQP's own ty
     osqp.alpha = settings.alpha
     osqp.adaptive_rho = 1 if settings.adaptive_rho_interval else 0
     osqp.adaptive_rho_interval = settings.adaptive_rho_interval
-    osqp.check_dualgap = int(settings.check_duality_gap)
+    osqp.check_dualgap = 0
     osqp.polishing = int(settings.polishing)
     osqp.eps_prim_inf = settings.eps_infeasible
     return osqp

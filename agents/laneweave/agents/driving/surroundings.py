@@ -1,10 +1,11 @@
-"""Surroundings: what those ahead and behind leave a vehicle, as its own sensors see them.
+"""Surroundings: the gaps that vehicles ahead and behind leave, as a vehicle's own sensors see them.
 
-They count in the lanes that the body touches and in the lane that it enters. Each is predicted at
-constant speed, as far as that holds; and where one is at the place of a motion that was heard of
-(`motions`), along its trajectory from where it is sensed, too. At each tick the nearer one of both
-counts: what is said can only add to what is seen. All positions are commanded ones
-(`protocol.motion`): bodies of equal lag keep every distance that their commanded states keep.
+Neighbours count in the lanes that the body touches and in the lane that it enters. Each is
+predicted at constant speed for `SENSED_S`. A neighbour at the place of an announced motion
+(`motions`) is also predicted along that motion's trajectory, starting where it is sensed. At each
+tick the nearer prediction counts, so an announcement can only add to what is sensed. All positions
+are commanded ones (`protocol.vehicle.motion`): bodies of equal lag keep the distances that their
+commanded states keep.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from attrs import frozen
 from numpy.typing import NDArray
 
 from laneweave.agents.driving.motions import Motions
+from laneweave.agents.driving.program import NO_GAPS, Gaps
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import Motion, Neighbour, Sense
@@ -24,38 +26,11 @@ from laneweave.protocol.wire.messages import Motion, Neighbour, Sense
 Array = NDArray[np.float64]
 
 SENSED_S = 1.0
-"""How far ahead local sensing is extrapolated: speeds change."""
+"""Time for which a sensed neighbour is predicted: speeds change."""
 
 
-@frozen(eq=False)
-class Gaps:
-    """Where the front bumper should stay for others' sake now and at the next N ticks [m].
-
-    Commanded positions, each (N + 1,); infinite where there is nobody.
-    """
-
-    earliest: Array | None = None
-    """Ahead of this, for those behind; None: nobody is behind."""
-    latest: Array | None = None
-    """Behind this, for those ahead; None: nobody is ahead."""
-
-    def check(self, ticks: int) -> None:
-        """Check the shapes for a horizon of N ticks.
-
-        Raises:
-            ValueError: one is not (N + 1,).
-        """
-        shape = (ticks + 1,)
-        for name, positions in (("earliest", self.earliest), ("latest", self.latest)):
-            if positions is not None and positions.shape != shape:
-                raise ValueError(f"{name} has shape {positions.shape}, expected {shape}")
-
-
-NOBODY = Gaps()
-
-
-_Seen = tuple[int, float, float]
-"""Of somebody who is sensed: lane, where the front bumper should be for its sake, its speed."""
+_Sensed = tuple[int, float, float]
+"""(lane, front-bumper limit [m], speed [m/s]) of a sensed neighbour."""
 
 
 @frozen
@@ -64,7 +39,8 @@ class _Side:
 
     sign: float
     nearest: Callable[[Any, Any], Any]
-    nobody: float
+    free: float
+    """Limit where there is no neighbour."""
 
 
 _AHEAD = _Side(1.0, np.minimum, np.inf)
@@ -72,7 +48,7 @@ _BEHIND = _Side(-1.0, np.maximum, -np.inf)
 
 
 class Surroundings:
-    """Predicts those around one vehicle."""
+    """Predicts the neighbours of one vehicle."""
 
     def __init__(self, scenario: Scenario) -> None:
         """Take sizes, limits and horizon from a scenario."""
@@ -83,44 +59,44 @@ class Surroundings:
         self._length_m = limits.length_m
         self._lag_s = limits.actuator_lag_s
         self._speed_mps = scenario.formation.speed_mps
-        self._least_m = scenario.tracking.min_gap_m
-        # What this vehicle can gain or lose in the time of prediction, beside its speed.
+        self._min_gap_m = scenario.tracking.min_gap_m
+        # How far acceleration or braking can take this vehicle during the prediction.
         self._gain_m = limits.max_accel_mps2 * SENSED_S**2 / 2.0
         self._loss_m = -limits.min_accel_mps2 * SENSED_S**2 / 2.0
         self._times_s = np.arange(scenario.horizon_ticks + 1) * scenario.runtime.tick_s
         self._beyond = self._times_s > SENSED_S + 1e-9
 
-    def hear(self, motion: Motion) -> None:
-        """Take what another vehicle says of its motion."""
-        self._motions.hear(motion)
+    def on_motion(self, motion: Motion) -> None:
+        """Take the announced motion of another vehicle."""
+        self._motions.add(motion)
 
     def gaps(self, sense: Sense, state: State, lane: int) -> Gaps:
-        """Return what the others leave; those that cannot come into question are left out.
+        """Return the gaps that neighbours leave, without neighbours too far away to matter.
 
         Args:
-            sense: what the sensors see.
+            sense: measurements of the sensors.
             state: commanded state of this vehicle.
             lane: the lane that it is in or enters.
         """
         first, last = self._lattice.lanes_touched(sense.state[3], self._width_m)
         touched = first, last, lane
         latest = earliest = None
-        ahead, near = self._look(sense, state, sense.ahead, touched, 1.0, self._gain_m)
+        ahead, near = self._relevant(sense, state, sense.ahead, touched, 1.0, self._gain_m)
         if near:
-            latest = self._sensed(near, _AHEAD)
-        behind, near = self._look(sense, state, sense.behind, touched, -1.0, -self._loss_m)
+            latest = self._at_constant_speed(near, _AHEAD)
+        behind, near = self._relevant(sense, state, sense.behind, touched, -1.0, -self._loss_m)
         if near:
-            earliest = self._sensed(near, _BEHIND)
-        if self._motions.heard:
+            earliest = self._at_constant_speed(near, _BEHIND)
+        if self._motions.known:
             self._motions.advance(sense.tick)
             lanes = min(first, lane), max(last, lane)
             if ahead:
-                latest = self._said(latest, ahead, _AHEAD, lanes)
+                latest = self._with_motions(latest, ahead, _AHEAD, lanes)
             if behind:
-                earliest = self._said(earliest, behind, _BEHIND, lanes)
-        return NOBODY if latest is None and earliest is None else Gaps(earliest, latest)
+                earliest = self._with_motions(earliest, behind, _BEHIND, lanes)
+        return NO_GAPS if latest is None and earliest is None else Gaps(earliest, latest)
 
-    def _look(
+    def _relevant(
         self,
         sense: Sense,
         state: State,
@@ -128,66 +104,66 @@ class Surroundings:
         touched: tuple[int, int, int],
         sign: float,
         change_m: float,
-    ) -> tuple[list[_Seen], list[_Seen]]:
-        """Return who counts, if any motion is known, and who comes into question as sensed.
+    ) -> tuple[list[_Sensed], list[_Sensed]]:
+        """Return neighbours in relevant lanes (if motions are known), and those of them in reach.
 
-        It runs twice at each tick of each vehicle, and mostly nobody is near.
+        It runs twice at each tick of each vehicle, and mostly no neighbour is in reach.
 
         Args:
-            sense: what the sensors see.
+            sense: measurements of the sensors.
             state: commanded state of this vehicle.
-            others: those on one side.
+            others: the neighbours on one side.
             touched: the first and the last lane that the body touches; the lane that it enters.
-            sign: 1 for those ahead, -1 for those behind.
-            change_m: how far the vehicle can get towards them in the time of prediction, beside
-                its speed; negative behind.
+            sign: 1 ahead, -1 behind.
+            change_m: how far acceleration can take the vehicle towards them during the prediction;
+                negative behind.
         """
         first, last, lane = touched
-        heard, lag_s = self._motions.heard, self._lag_s
-        counting: list[_Seen] = []
-        near: list[_Seen] = []
+        motions_known, lag_s = self._motions.known, self._lag_s
+        relevant: list[_Sensed] = []
+        near: list[_Sensed] = []
         for other in others:
             if first <= other.lane <= last or other.lane == lane:
-                # How far its commanded position is from its position.
+                # From its position to its commanded position.
                 lag_m = lag_s * (other.speed_mps - self._speed_mps)
-                front_m = sense.state[0] + sign * (other.gap_m - self._least_m) + lag_m
+                front_m = sense.state[0] + sign * (other.gap_m - self._min_gap_m) + lag_m
                 other_mps = max(other.speed_mps + lag_s * other.accel_mps2, 0.0)
-                if heard:
-                    counting.append((other.lane, front_m, other_mps))
-                # Greatest now or at the end of prediction, since it cannot but bend upwards.
+                if motions_known:
+                    relevant.append((other.lane, front_m, other_mps))
+                # Largest now or at the end of the prediction, since it is convex in time.
                 closer_m = (state[1] - other_mps) * SENSED_S + change_m
                 if sign * closer_m < 0.0:
                     closer_m = 0.0
                 if sign * (state[0] + closer_m) > sign * front_m:
                     near.append((other.lane, front_m, other_mps))
-        return counting, near
+        return relevant, near
 
-    def _sensed(self, others: list[_Seen], side: _Side) -> Array:
-        """Return the nearest positions at constant speeds."""
-        positions = np.full(self._times_s.shape, side.nobody)
+    def _at_constant_speed(self, others: list[_Sensed], side: _Side) -> Array:
+        """Return the nearest limits (N + 1,) of neighbours predicted at constant speed."""
+        positions = np.full(self._times_s.shape, side.free)
         for _, front_m, speed_mps in others:
             positions = side.nearest(positions, front_m + speed_mps * self._times_s)
-        positions[self._beyond] = side.nobody
+        positions[self._beyond] = side.free
         return positions
 
-    def _said(
+    def _with_motions(
         self,
         positions: Array | None,
-        others: list[_Seen],
+        others: list[_Sensed],
         side: _Side,
         lanes: tuple[int, int],
     ) -> Array | None:
-        """Return positions, or nearer ones of those whose motions are known.
+        """Return limits that also respect the announced motions of neighbours.
 
         Args:
-            positions: as sensed.
-            others: who is sensed.
+            positions: limits of the prediction at constant speed; None: there are none.
+            others: sensed neighbours.
             side: where they are.
-            lanes: the first and the last one that count.
+            lanes: the first and the last relevant lane.
         """
-        apart_m = side.sign * (self._length_m + self._least_m)
+        apart_m = side.sign * (self._length_m + self._min_gap_m)
         for lane, front_m, speed_mps in others:
-            fronts = self._motions.fronts(lane, front_m + apart_m, speed_mps, lanes, side.nobody)
+            fronts = self._motions.fronts(lane, front_m + apart_m, speed_mps, lanes, side.free)
             if fronts is None:
                 continue
             fronts -= apart_m

@@ -84,7 +84,7 @@ def measure_runtime(vehicles: str | None, seconds: float, per_process: int, seed
 def measure_tracker(instances: int, seed: int) -> Report:
     """Measure a tick of tracking, on `instances` recorded episodes of each situation."""
     rows = tracker_bench.bench_tracker(load_scenario(None), instances=instances, seed=seed)
-    goals = {"family": "gap-rows", "solver": "tracker", "cpu_ms": tracker_bench.GOALS_MS}
+    goals = {"cpu_ms": tracker_bench.GOALS_MS}
     return Report("tracker", rows, tracker_bench.tracker_table(rows), goals)
 
 

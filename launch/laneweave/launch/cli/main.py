@@ -188,7 +188,7 @@ def _run_formations(
     *,
     show: bool,
 ) -> Outcome:
-    from laneweave.agents.driving.reference import check_moves
+    from laneweave.agents.driving.trajectory import check_moves
     from laneweave.launch.faults.specification import load_faults
     from laneweave.launch.run.local_run import LocalRun
     from laneweave.protocol.config.identities import coordinator_names

@@ -130,7 +130,7 @@ def agent(
     log_level: LevelOption = None,
 ) -> None:
     """Run the agents of named vehicles, or of all that are announced."""
-    from laneweave.agents.driving.reference import check_moves
+    from laneweave.agents.driving.trajectory import check_moves
     from laneweave.agents.process import run_agents
     from laneweave.launch.deploy.assigned_vehicles import crew_of
 

@@ -75,7 +75,7 @@ def _check_network(scenario: Scenario, report: Report) -> None:
 def _check_moves(scenario: Scenario, report: Report) -> None:
     """Check what agents check when they start, where agents can start."""
     try:
-        from laneweave.agents.driving.reference import check_moves  # noqa: PLC0415 (an extra)
+        from laneweave.agents.driving.trajectory import check_moves  # noqa: PLC0415 (an extra)
     except ModuleNotFoundError:
         return
     try:

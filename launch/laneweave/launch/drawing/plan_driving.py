@@ -1,7 +1,7 @@
 """A plan driven on the road: its relative paths, followed by the vehicles' own controllers.
 
 Step k begins at k T_F. Each vehicle follows its path as an agent drives it: the reference of
-`agents.trajectory`, the tracker, and the body of the simulated world (`sim_bridge.plant`). All hold
+`agents.driving`, its tracker, and the simulated body (`sim_bridge.bodies.plant`). All hold
 their start cells at time 0. There is no noise and no other traffic, and nobody keeps a distance:
 what is driven is the plan, with all that its conflict kinds allow.
 
@@ -16,8 +16,9 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from laneweave.agents.driving.reference import Reference, check_moves
+from laneweave.agents.driving.reference import Reference
 from laneweave.agents.driving.tracker import Tracker
+from laneweave.agents.driving.trajectory import check_moves
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import cell_state, commanded_state
@@ -90,16 +91,14 @@ def _drive_vehicle(
     scenario: Scenario, path: Sequence[Cell], slot_ticks: int, ticks: int
 ) -> NDArray[np.float64]:
     """Return the states of one vehicle, (ticks + 1, 6)."""
-    moves = [
-        (step * slot_ticks, path[step + 1])
-        for step in range(len(path) - 1)
-        if path[step] != path[step + 1]
-    ]
-    reference, tracker = Reference.moves(scenario, path[0], moves), Tracker(scenario)
+    reference, tracker = Reference.hold(scenario, path[0]), Tracker(scenario)
     start = cell_state(scenario.lattice, path[0], 0.0)
     plant = Plant(start, scenario.vehicle, scenario.runtime.tick_s)
     states, speed_mps = [start], scenario.formation.speed_mps
     for tick in range(ticks):
+        step, since = divmod(tick, slot_ticks)
+        if since == 0 and path[step] != path[step + 1]:
+            reference = Reference.move(scenario, path[step], path[step + 1], tick)
         state = commanded_state(plant.state, plant.setpoint, scenario.vehicle, speed_mps)
         jerk_s, jerk_y = tracker.solve(state, reference.window(tick)).jerk[0].tolist()
         states.append(plant.step(jerk_s, jerk_y))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from laneweave.agents.driving.driver import Drive, Effort
+from laneweave.agents.driving.driver import Drive, SolverStats
 from laneweave.protocol.lattice import Cell, Move
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import at_rest_in_cell
@@ -24,9 +24,9 @@ class LightDriver:
         self._end_tick = self._ticks = 0
 
     @property
-    def effort(self) -> Effort:
+    def solver_stats(self) -> SolverStats:
         """Nothing is solved here."""
-        return Effort()
+        return SolverStats()
 
     def take_over(self, sense: Sense) -> None:
         """Go on with what the motion controller is doing."""
@@ -52,5 +52,5 @@ class LightDriver:
     def motion(self, tick: int) -> None:
         """Tell others nothing: nobody here has trajectories, and events are what a search costs."""
 
-    def hear(self, motion: Motion) -> None:
+    def on_motion(self, motion: Motion) -> None:
         """Ignore others' motions."""

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from attrs import evolve, frozen
 
-from laneweave.agents.driving.reference import check_moves
+from laneweave.agents.driving.trajectory import check_moves
 from laneweave.launch.methods import METHODS, KeepTrajectories
 from laneweave.protocol.config.loading import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError

@@ -192,7 +192,8 @@ class Sense:
 
     Missing: sent again every `runtime.tick_resend_s` until the deadline; after it the vehicle's
     last trajectory is continued. Duplicated: answered again, the same way. Older than the newest
-    tick seen: ignored.
+    tick of the same bridge, or from an older bridge than the newest: ignored. From a newer bridge:
+    the agent forgets the earlier road and takes a new incarnation.
     """
 
     vehicle: Name
@@ -234,6 +235,8 @@ class Sense:
     """Highest ballot that the process in charge has promised, as the controller has noted."""
     deed: Deed | None = None
     """Newest deed of the vehicle."""
+    bridge: int = 0
+    """Incarnation of the bridge: ticks of another one belong to another road; 0: not told."""
 
 
 @frozen

@@ -32,9 +32,13 @@ class RoadVehicle:
     """None: it knows itself exactly, and sees nobody."""
     formation: int | None = None
     """Number of its formation, of its block in the rolling operation; None: not known yet."""
+    bridge: int = 0
+    """Incarnation of the bridge."""
 
     @classmethod
-    def entering(cls, admission: Admission, t_s: float, scenario: Scenario) -> RoadVehicle:
+    def entering(
+        cls, admission: Admission, t_s: float, scenario: Scenario, bridge: int = 0
+    ) -> RoadVehicle:
         """Return a vehicle that has driven at v_F since it was admitted, at road time `t_s`.
 
         It is to settle in its cell within `formation.settle_s`.
@@ -51,7 +55,7 @@ class RoadVehicle:
         if scenario.formation.rolling:
             controller.own(admission.cell)
         formation = None if scenario.formation.closes_by_vehicles else controller.joined[0]
-        return cls(name, admission, controller, Sensors(scenario, name), formation)
+        return cls(name, admission, controller, Sensors(scenario, name), formation, bridge)
 
     @property
     def state(self) -> State:
@@ -130,6 +134,7 @@ class RoadVehicle:
             estate=controller.estate,
             promised=controller.promised,
             deed=controller.deed,
+            bridge=self.bridge,
         )
 
     def step(self, tick: int) -> None:

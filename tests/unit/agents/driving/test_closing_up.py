@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from laneweave.agents.driving.reference import (
+from laneweave.agents.driving.trajectory import (
     _TRACKING_ERROR_M,
-    Waypoint,
     check_moves,
     move_profile,
     plan_trajectory,
@@ -87,10 +86,10 @@ def test_who_holds_behind_has_room_to_brake_when_somebody_falls_back(dy: int) ->
 
 def test_a_move_of_least_jerk_alone_would_not_leave_it() -> None:
     """The reason for the envelope."""
-    points = Waypoint(0, 0.0, 0.0), Waypoint(38, SCENARIO.formation.gap_m, 0.0)
+    trajectory = plan_trajectory(LIMITS, V_F, TICK_S, 38, SCENARIO.formation.gap_m, 0.0)
     own, other = mover((0, 1)), mover((2, 1))
     least_m = float("inf")
-    for along, across in plan_trajectory(SCENARIO, points).jerks.tolist():
+    for along, across in trajectory.jerks.tolist():
         least_m = min(least_m, spare_m(own, (along, across), other))
         own.step(along, across)
         other.step(0.0, 0.0)

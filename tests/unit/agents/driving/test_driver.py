@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import attrs
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from laneweave.agents.driving.driver import Course, Drive, Effort, TrackingDriver
+from laneweave.agents.driving.driver import Course, Drive, SolverStats, TrackingDriver
 from laneweave.agents.driving.motions import REPEAT_TICKS
+from laneweave.agents.driving.program import NO_GAPS, Gaps
 from laneweave.agents.driving.reference import Window
-from laneweave.agents.driving.surroundings import NOBODY, Gaps
 from laneweave.agents.driving.tracker import Tracker, TrackResult
 from laneweave.protocol.lattice import Cell, Move
 from laneweave.protocol.scenario.tables import Scenario, Sensing
@@ -42,7 +40,7 @@ class Probe(Tracker):
         """Begin unbroken."""
         super().__init__(scenario)
         self.broken = False
-        self.gaps = NOBODY
+        self.gaps = NO_GAPS
         self.state: State | None = None
 
     def rest(self, state: State, goal: State) -> TrackResult | None:
@@ -50,7 +48,7 @@ class Probe(Tracker):
         del state, goal
         return None
 
-    def solve(self, state: State, window: Window, gaps: Gaps = NOBODY) -> TrackResult:
+    def solve(self, state: State, window: Window, gaps: Gaps = NO_GAPS) -> TrackResult:
         self.state, self.gaps = state, gaps
         result = super().solve(state, window, gaps)
         if self.broken:
@@ -78,21 +76,22 @@ def sense(
     )
 
 
-def driver(make_tracker: Callable[[Scenario], Tracker] = Tracker) -> TrackingDriver:
+def driver() -> TrackingDriver:
     """Return a driver that holds the home cell since tick 10."""
-    made = TrackingDriver(SCENARIO, make_tracker)
+    made = TrackingDriver(SCENARIO)
     made.take_over(sense())
     return made
 
 
+def with_probe(made: TrackingDriver, scenario: Scenario = SCENARIO) -> Probe:
+    """Replace the tracker of a driver."""
+    made._tracker = probe = Probe(scenario)
+    return probe
+
+
 def probed() -> tuple[TrackingDriver, Probe]:
-    probes: list[Probe] = []
-
-    def make(scenario: Scenario) -> Tracker:
-        probes.append(Probe(scenario))
-        return probes[-1]
-
-    return driver(make), probes[0]
+    made = driver()
+    return made, with_probe(made)
 
 
 def jerks(drive: Drive) -> NDArray[np.float64]:
@@ -267,7 +266,7 @@ def test_who_holds_minds_its_own_lane(ahead: tuple[Neighbour, ...], gap_m: float
     felt = sense(ahead=ahead, behind=ahead)
     made.drive(felt, moving=False)
     if gap_m is None:
-        assert probe.gaps is NOBODY
+        assert probe.gaps is NO_GAPS
     else:
         assert probe.gaps.latest is not None
         assert probe.gaps.latest[0] == pytest.approx(felt.state[0] + gap_m - LEAST_M)
@@ -312,18 +311,12 @@ def test_meanwhile_the_body_goes_on_with_the_last_good_trajectory_and_then_holds
     """With exact sensors the body moves as if nothing had failed."""
     exact = Sensing(**dict.fromkeys((field.name for field in attrs.fields(Sensing)), 0.0))
     scenario = attrs.evolve(SCENARIO, sensing=exact)
-    broken_at, probes = 25, []
-
-    def make(of: Scenario) -> Tracker:
-        probes.append(Probe(of))
-        return probes[-1]
-
+    broken_at = 25
     roads = [Road(scenario, {ME: HOME}) for _ in range(2)]
     for road in roads:
-        road.driven[ME].driver = TrackingDriver(scenario, make)
-        road.driven[ME].driver.take_over(road.vehicles[ME].sense(0, caretaker=False))
+        probe = with_probe(road.driven[ME].driver, scenario)
         for _ in range(10 + 4 * N):
-            probes[-1].broken = road is roads[1] and road.tick > broken_at
+            probe.broken = road is roads[1] and road.tick > broken_at
             road.step({ME: MOVE} if road.tick == 10 else None)
     good, bad = (road.record.states for road in roads)
     trajectory = slice(0, broken_at + N + 1)
@@ -337,33 +330,27 @@ def test_meanwhile_the_body_goes_on_with_the_last_good_trajectory_and_then_holds
     assert bad[-1][0] == pytest.approx(goal, abs=0.01)
 
 
-def test_the_effort_counts_solves_and_failures() -> None:
+def test_solver_stats_count_solves_and_failures() -> None:
     made, probe = probed()
-    assert made.effort == Effort()
+    assert made.solver_stats == SolverStats()
     for tick, broken in ((10, False), (11, True), (12, True), (13, False)):
         probe.broken = broken
         made.drive(sense(tick), moving=False)
-    effort = made.effort
-    assert (effort.solves, effort.unusable) == (4, 2)
-    solve_ms = np.frombuffer(effort.solve_ms, "<f4")
+    stats = made.solver_stats
+    assert (stats.solves, stats.unusable) == (4, 2)
+    solve_ms = np.frombuffer(stats.solve_ms, "<f4")
     assert len(solve_ms) == 4
     assert (solve_ms >= 0.0).all()
 
 
 def test_an_agent_with_a_broken_tracker_finishes_its_move_and_reports_the_failures() -> None:
-    probes: list[Probe] = []
-
-    def make(scenario: Scenario) -> TrackingDriver:
-        def make_tracker(of: Scenario) -> Tracker:
-            probes.append(Probe(of))
-            return probes[-1]
-
-        return TrackingDriver(scenario, make_tracker)
-
-    rig = up_and_running(make)
+    rig = up_and_running()
+    made = rig.agent._driver
+    assert isinstance(made, TrackingDriver)
+    probe = with_probe(made)
     rig.accept(MOVE)
     rig.run(5)
-    probes[-1].broken = True
+    probe.broken = True
     state = rig.run(150)
     assert (state.completed, state.moving) == (1, False)
     assert rig.off(MOVE[2]) < 0.3

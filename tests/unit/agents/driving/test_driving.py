@@ -54,7 +54,7 @@ def test_osqp_in_every_tick_drives_the_same_trajectories() -> None:
         road = Road(scenario, {ME: (0, 1), OTHER: (1, 1)})
         for tick in range(150):
             road.step(moves.get(tick))
-        efforts = [one.driver.effort for one in road.driven.values()]
+        efforts = [one.driver.solver_stats for one in road.driven.values()]
         assert [effort.solves for effort in efforts] == [150, 150]
         expected = 150 if scenario.tracking.always_solve else 0
         assert [effort.osqp_solves for effort in efforts] == [expected, expected]

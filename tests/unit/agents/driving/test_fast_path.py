@@ -12,9 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import linalg
 
-from laneweave.agents.driving import tracker as tracker_module
-from laneweave.agents.driving.reference import Reference, Window, axis_matrices
-from laneweave.agents.driving.surroundings import Gaps
+from laneweave.agents.driving import program as program_module
+from laneweave.agents.driving.program import Gaps
+from laneweave.agents.driving.reference import Reference, Window
+from laneweave.agents.driving.regulator import (
+    JERK_WEIGHT,
+    LATERAL_WEIGHTS,
+    WEIGHTS,
+    axis_matrices,
+)
 from laneweave.agents.driving.tracker import Tracker, TrackResult
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import State, cell_state, integrate
@@ -40,7 +46,7 @@ def problems(count: int, seed: int = 2) -> Iterator[Problem]:
     rng = random.Random(seed)
     for number in range(count):
         dx, dy = rng.choice(MOVES)
-        reference = Reference.moves(SCENARIO, (0, 1), [(0, (dx, 1 + dy))] if dx or dy else [])
+        reference = Reference.move(SCENARIO, (0, 1), (dx, 1 + dy), 0)
         window = reference.window(rng.randrange(-5, 45))
         scale = 10.0 if number % 2 else 1.0
         state = tuple(
@@ -63,8 +69,8 @@ def random_gaps(rng: random.Random, window: Window, scale: float) -> Gaps:
 @pytest.fixture
 def exact(monkeypatch: pytest.MonkeyPatch) -> Tracker:
     """Return a tracker that always runs OSQP, with tight tolerances."""
-    tight = evolve(tracker_module.SETTINGS, eps_abs=1e-7, max_iter=20_000, row_tolerance=1e-3)
-    monkeypatch.setattr(tracker_module, "SETTINGS", tight)
+    tight = evolve(program_module.SETTINGS, eps_abs=1e-7, max_iter=20_000, row_tolerance=1e-3)
+    monkeypatch.setattr(program_module, "SETTINGS", tight)
     return Tracker(ALWAYS)
 
 
@@ -98,9 +104,9 @@ def regulated(problem: Problem) -> np.ndarray:
     transition, effect = axis_matrices(TICK_S)
     jerks = problem.window.jerks.copy()
     error = np.array(problem.state) - problem.window.states[0]
-    for axis, weights in enumerate((tracker_module._WEIGHTS, tracker_module._LATERAL_WEIGHTS)):
-        weight = np.array([[tracker_module._JERK_WEIGHT]])
-        cost = linalg.solve_discrete_are(transition, effect, np.diag(weights), weight)
+    for axis, weights in enumerate((WEIGHTS, LATERAL_WEIGHTS)):
+        weight = np.array([[JERK_WEIGHT]])
+        cost = linalg.solve_discrete_are(transition, effect, weights, weight)
         gain = np.linalg.solve(weight + effect.T @ cost @ effect, effect.T @ cost @ transition)
         now = error[3 * axis : 3 * axis + 3]
         for k in range(N):
@@ -236,9 +242,9 @@ def test_who_rests_in_its_cell_gets_the_same_jerks_without_the_program(
     scenario = Scenario()
     tracker = Tracker(scenario)
     goal = cell_state(scenario.lattice, cell, tick * scenario.runtime.tick_s)
-    harmless = tracker.harmless
+    errors = tracker.unconstrained_errors
     state = tuple(
-        at + 0.999 * share * most for at, share, most in zip(goal, shares, harmless, strict=True)
+        at + 0.999 * share * most for at, share, most in zip(goal, shares, errors, strict=True)
     )
     quick = tracker.rest(_as_state(state), goal)
     whole = tracker.solve(_as_state(state), Reference.hold(scenario, cell).window(tick))
@@ -251,6 +257,6 @@ def test_who_is_farther_from_its_cell_is_not_at_rest() -> None:
     scenario = Scenario()
     tracker = Tracker(scenario)
     goal = cell_state(scenario.lattice, (0, 0), 0.0)
-    for axis, most in enumerate(tracker.harmless):
+    for axis, most in enumerate(tracker.unconstrained_errors):
         state = tuple(at + 1.01 * most * (index == axis) for index, at in enumerate(goal))
         assert tracker.rest(_as_state(state), goal) is None

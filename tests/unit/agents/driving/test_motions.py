@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.driving.motions import FRESH_TICKS, REPEAT_TICKS, Motions
+from laneweave.agents.driving.program import Gaps
 from laneweave.agents.driving.reference import Reference
-from laneweave.agents.driving.surroundings import SENSED_S, Gaps, Surroundings
+from laneweave.agents.driving.surroundings import SENSED_S, Surroundings
 from laneweave.agents.host import AgentHost
 from laneweave.launch.fault_search.light_driver import LightDriver
 from laneweave.protocol.lattice import STRETCH_COLUMNS, Cell
@@ -112,7 +113,7 @@ class Listener(LightDriver):
         super().take_over(sense)
         self.name = sense.vehicle
 
-    def hear(self, motion: Motion) -> None:
+    def on_motion(self, motion: Motion) -> None:
         self.heard.setdefault(self.name, []).append(motion)
 
 
@@ -228,7 +229,7 @@ def gaps(
 def hearing(*motions: Motion) -> Surroundings:
     around = Surroundings(SCENARIO)
     for each in motions:
-        around.hear(each)
+        around.on_motion(each)
     return around
 
 
@@ -274,7 +275,7 @@ def test_who_is_sensed_counts_whatever_was_said() -> None:
     away: tuple[Cell, Cell] = ((0, 1), (1, 1))
     seen = neighbour(path(BEGIN, away), 1, BEGIN, off_m=-0.5, off_mps=-0.8)
     plain, misled = Surroundings(scenario), Surroundings(scenario)
-    misled.hear(motion(away))
+    misled.on_motion(motion(away))
     sensed, both = gaps(plain, BEGIN, (seen,)).latest, gaps(misled, BEGIN, (seen,)).latest
     assert sensed is not None
     assert both is not None
@@ -302,7 +303,7 @@ def test_a_motion_that_comes_when_it_has_ended_does_not_count() -> None:
     third = attrs.evolve(motion(name=Name("third")), begin_tick=tick, tick=tick)
     around, seen = hearing(third), neighbour(path(tick), 1, tick)
     assert not beyond_sensing(around, tick, seen)
-    around.hear(motion(tick=tick - 1))
+    around.on_motion(motion(tick=tick - 1))
     assert not beyond_sensing(around, tick, seen)
 
 
@@ -310,10 +311,10 @@ def test_motions_that_do_not_count_any_more_are_forgotten() -> None:
     motions = Motions(SCENARIO)
     names = [Name(f"v{number}") for number in range(20)]
     for name in names:
-        motions.hear(motion(name=name))
-    assert len(motions.heard) == 20
+        motions.add(motion(name=name))
+    assert len(motions.known) == 20
     motions.advance(BEGIN + MOVE_TICKS)
-    assert len(motions.heard) == 0
+    assert len(motions.known) == 0
 
 
 def test_the_newest_incarnation_and_then_the_newest_motion_counts() -> None:

@@ -9,12 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from laneweave.agents.driving.reference import (
+from laneweave.agents.driving.reference import Reference
+from laneweave.agents.driving.trajectory import (
     InfeasibleTrajectoryError,
-    Leg,
-    Reference,
     Trajectory,
-    Waypoint,
     move_profile,
     plan_trajectory,
 )
@@ -108,44 +106,30 @@ def test_the_papers_slot_of_four_seconds_is_less_harsh() -> None:
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.lists(st.sampled_from(MOVES), min_size=1, max_size=4), st.data())
-def test_plans_rest_at_every_waypoint(moves: list[tuple[int, int]], data: st.DataObject) -> None:
-    tick, s, y = data.draw(st.integers(-50, 50)), 7.0, 1.75
-    points = [Waypoint(tick, s, y)]
-    for dx, dy in moves:
-        tick, s, y = tick + data.draw(st.integers(38, 60)), s + 15.0 * dx, y + 3.5 * dy
-        points.append(Waypoint(tick, s, y))
-    plan = plan_trajectory(SCENARIO, points)
-    assert plan.ticks == points[-1].tick - points[0].tick
-    for point in points:
-        np.testing.assert_allclose(
-            plan.states[point.tick - points[0].tick],
-            [point.position_m, 0.0, 0.0, point.lateral_m, 0.0, 0.0],
-            atol=1e-3,
-        )
-    check_limits(plan)
+@given(st.sampled_from(MOVES), st.integers(38, 60))
+def test_slower_moves_keep_all_limits_and_end_at_rest(move: tuple[int, int], ticks: int) -> None:
+    profile = move_profile(SCENARIO, *move, ticks)
+    assert profile.ticks == ticks
+    end = [15.0 * move[0], 0.0, 0.0, 3.5 * move[1], 0.0, 0.0]
+    np.testing.assert_allclose(profile.states[-1], end, atol=1e-3)
+    check_limits(profile)
 
 
-def test_plan_of_one_leg_obeys_the_dynamics() -> None:
-    plan = plan_trajectory(SCENARIO, [Waypoint(0, 0.0, 0.0), Waypoint(90, 40.0, -7.0)])
-    check_limits(plan)
-    check_exact(plan.states, plan.jerks)
+def planned(ticks: int, ds_m: float, dy_m: float) -> Trajectory:
+    speed_mps = SCENARIO.formation.speed_mps
+    return plan_trajectory(SCENARIO.vehicle, speed_mps, TICK_S, ticks, ds_m, dy_m)
 
 
-@pytest.mark.parametrize(
-    "points",
-    [
-        [],
-        [Waypoint(0, 0.0, 0.0)],
-        [Waypoint(5, 0.0, 0.0), Waypoint(5, 1.0, 0.0)],
-        [Waypoint(0, 0.0, 0.0), Waypoint(38, float("nan"), 0.0)],
-        [Waypoint(0, 0.0, 0.0), Waypoint(2, 1.0, 0.0)],
-        [Waypoint(0, 0.0, 0.0), Waypoint(1, 1.0, 0.0)],
-    ],
-)
-def test_bad_plans_raise(points: list[Waypoint]) -> None:
+def test_long_trajectories_obey_the_dynamics() -> None:
+    trajectory = planned(90, 40.0, -7.0)
+    check_limits(trajectory)
+    check_exact(trajectory.states, trajectory.jerks)
+
+
+@pytest.mark.parametrize(("ticks", "ds_m"), [(38, float("nan")), (2, 1.0), (1, 1.0)])
+def test_impossible_trajectories_raise(ticks: int, ds_m: float) -> None:
     with pytest.raises(ValueError, match=r".+"):
-        plan_trajectory(SCENARIO, points)
+        planned(ticks, ds_m, 0.0)
 
 
 def test_reference_before_during_and_after_a_move() -> None:
@@ -181,27 +165,11 @@ def test_reference_of_a_hold() -> None:
     assert not window.jerks.any()
 
 
-def test_reference_of_a_chain_is_exact_and_ends_in_the_last_cell() -> None:
-    chain = [(20, (1, 1)), (60, (0, 2)), (98, (0, 1)), (150, (-1, 0))]
-    reference = Reference.moves(SCENARIO, (0, 0), chain)
-    for tick in range(0, 240, 40):
+def test_reference_follows_any_trajectory() -> None:
+    reference = Reference(SCENARIO, (0, 0), planned(70, 20.0, 3.5), 5)
+    for tick in range(0, 120, 40):
         window = reference.window(tick)
         check_exact(window.states, window.jerks)
-    for tick, cell in ((59, (1, 1)), (98, (0, 2)), (140, (0, 1)), (188, (-1, 0))):
-        expected = cell_state(SCENARIO.lattice, cell, tick * TICK_S)
-        np.testing.assert_allclose(reference.window(tick).states[0], expected, atol=1e-6)
-
-
-def test_overlapping_legs_are_refused() -> None:
-    with pytest.raises(ValueError, match="begins before"):
-        Reference.moves(SCENARIO, (0, 0), [(20, (1, 1)), (57, (2, 2))])
-    with pytest.raises(ValueError, match="neighbouring"):
-        Reference.moves(SCENARIO, (0, 0), [(20, (1, 1)), (58, (1, 3))])
-
-
-def test_reference_follows_any_trajectory() -> None:
-    plan = plan_trajectory(SCENARIO, [Waypoint(0, 0.0, 0.0), Waypoint(70, 20.0, 3.5)])
-    reference = Reference(SCENARIO, (0, 0), [Leg(5, plan)])
     end = reference.window(75).states[0] - cell_state(SCENARIO.lattice, (0, 0), 75 * TICK_S)
     np.testing.assert_allclose(end, [20.0, 0.0, 0.0, 3.5, 0.0, 0.0], atol=1e-6)
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from attrs import evolve
 
-from laneweave.agents.driving.surroundings import NOBODY, SENSED_S, Gaps, Surroundings
+from laneweave.agents.driving.program import NO_GAPS, Gaps
+from laneweave.agents.driving.surroundings import SENSED_S, Surroundings
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import State, cell_state, commanded_state
@@ -78,9 +79,9 @@ def test_it_minds_the_lanes_that_it_touches_and_the_one_that_it_enters(
 
 
 def test_without_anybody_there_is_nothing_to_mind() -> None:
-    assert minded(sense()) is NOBODY
+    assert minded(sense()) is NO_GAPS
     beside = (Neighbour(0, 1.0, V_F), Neighbour(2, 1.0, V_F))
-    assert minded(sense(beside, beside)) is NOBODY
+    assert minded(sense(beside, beside)) is NO_GAPS
 
 
 def test_those_ahead_and_those_behind_are_told_apart() -> None:
@@ -182,5 +183,5 @@ def test_who_is_left_out_cannot_matter() -> None:
 def test_who_is_too_close_counts_even_while_the_gap_opens(side: str) -> None:
     opens = Neighbour(1, 2.2, 18.0) if side == "ahead" else Neighbour(1, 1.5, 9.0)
     gaps = minded(sense((opens,), ()) if side == "ahead" else sense((), (opens,)))
-    assert gaps is not NOBODY
+    assert gaps is not NO_GAPS
     assert (off(gaps.latest)[0] < 0.0) if side == "ahead" else (off(gaps.earliest)[0] > 0.0)

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from laneweave.agents.driving.program import Gaps
 from laneweave.agents.driving.reference import Reference, Window
-from laneweave.agents.driving.surroundings import Gaps
 from laneweave.agents.driving.tracker import Tracker, TrackResult
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.tables import Scenario
@@ -120,16 +120,8 @@ def test_without_error_the_jerk_is_the_references(dx: int, dy: int) -> None:
         np.testing.assert_allclose(result.jerk, window.jerks, atol=1e-6)
 
 
-def test_chain_of_moves() -> None:
-    chain = [(5, (1, 1)), (45, (0, 0)), (85, (0, 1)), (125, (-1, 2))]
-    log = drive(Reference.moves(SCENARIO, (0, 0), chain), cell_state(LATTICE, (0, 0), 0.0), 170)
-    assert max(excess(state, first_jerk(result)) for state, result in log) <= 1e-6
-    for tick, cell in ((43, (1, 1)), (83, (0, 0)), (123, (0, 1)), (163, (-1, 2))):
-        assert np.abs(error(log[tick - 1][0], cell, tick)).max() < 0.01
-
-
-def test_next_move_appears_only_when_its_step_is_released() -> None:
-    """The tracker sees one move at a time, as in operation."""
+def test_moves_follow_one_another() -> None:
+    """The tracker has the reference of one move at a time, as in operation."""
     state, tracker = cell_state(LATTICE, (0, 0), 0.0), Tracker(SCENARIO)
     cells: list[Cell] = [(0, 0), (1, 1), (1, 2), (0, 1)]
     for step, (origin, target) in enumerate(pairwise(cells)):
@@ -138,13 +130,13 @@ def test_next_move_appears_only_when_its_step_is_released() -> None:
             result = tracker.solve(state, reference.window(tick))
             state = integrate(state, first_jerk(result), TICK_S)
             assert excess(state, first_jerk(result)) <= 1e-6
-    assert np.abs(error(state, cells[-1], 120)).max() < 0.01
+        assert np.abs(error(state, target, 40 * step + 40)).max() < 0.01
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 @pytest.mark.parametrize(("dx", "dy"), [(0, 0), (1, 1), (-1, -1), (-1, 0), (0, 1)])
 def test_disturbed_start_converges(dx: int, dy: int, sign: float) -> None:
-    reference = Reference.moves(SCENARIO, (0, 1), [(0, (dx, 1 + dy))])
+    reference = Reference.move(SCENARIO, (0, 1), (dx, 1 + dy), 0)
     start = shifted(
         cell_state(LATTICE, (0, 1), 0.0), *(sign * e for e in (0.5, 0.5, 0, 0.5, 0.5, 0))
     )
@@ -326,8 +318,12 @@ def script(tracker: Tracker) -> bytes:
     rng = random.Random(7)
     predict = braking(14.0, 2.0, 60, end_speed=9.0)
     state, jerks = cell_state(LATTICE, (0, 1), 0.0), b""
-    reference = Reference.moves(SCENARIO, (0, 1), [(10, (-1, 2)), (50, (-1, 1))])
+    moves = [
+        Reference.move(SCENARIO, (0, 1), (-1, 2), 10),
+        Reference.move(SCENARIO, (-1, 2), (-1, 1), 50),
+    ]
     for tick in range(110):
+        reference = moves[tick >= 50]
         gaps = behind_of(predict(tick)) if tick > 55 else Gaps()
         result = tracker.solve(state, reference.window(tick), gaps)
         jerks += result.jerk.tobytes() + bytes([result.usable])

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from laneweave.agents.driving.reference import move_profile
+from laneweave.agents.driving.trajectory import move_profile
 from laneweave.coordinator.planning import PlanRequest, checked_plan, plan, problems_of_paths
 from laneweave.coordinator.planning.budget import Budget
 from laneweave.coordinator.planning.exact.reachability import explore

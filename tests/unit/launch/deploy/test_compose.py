@@ -96,7 +96,7 @@ def test_images_have_what_their_role_needs_and_no_more(service: str) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     known = set(project["optional-dependencies"])
     needed = {NEEDS[role(service)]} if role(service) in NEEDS else set()
-    assert needed <= set(extras(service)) <= known - {"all", "dev", "bench", "dask"}
+    assert needed <= set(extras(service)) <= known - {"all", "dev", "dask"}
     assert "sim" not in set(extras(service)) - needed
     same = [other for other in SERVICES if SERVICES[other]["image"] == SERVICES[service]["image"]]
     assert {tuple(extras(other)) for other in same} == {tuple(extras(service))}

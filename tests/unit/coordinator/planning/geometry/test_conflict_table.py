@@ -10,7 +10,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from laneweave.agents.driving.reference import move_profile
+from laneweave.agents.driving.trajectory import move_profile
 from laneweave.coordinator.planning.conflicts import (
     PAPER_KINDS,
     ConflictModel,

@@ -1,0 +1,356 @@
+"""Trajectories between cells: minimum-jerk motions that keep every limit of the vehicle.
+
+In the moving frame a vehicle goes from rest to rest. A minimum-jerk quintic over one cell needs
+6 m/s2 in 3.8 s, more than the vehicle can do. A move is therefore the solution of the quadratic
+program over n ticks of h seconds
+
+    minimise    sum_k j_s,k^2 + j_y,k^2
+    subject to  z_{k+1} = A z_k + B u_k,  z_0 = 0,  z_n = (ds, 0, 0, dy, 0, 0)
+                speed, acceleration, jerk and slip within a share of the vehicle's limits
+
+which is solved once per kind of move and process. Its jerks are integrated again, exactly, and the
+result is checked against all limits, whatever the solver reported.
+
+States are commanded states (`protocol.vehicle.motion`): the body follows them with its actuators'
+lag and is 0.1 m short of its cell when the time of the move is over, 0.04 m at the end of the slot
+(default lags). A move forwards approaches the vehicle that holds in the cell beyond its target. It
+stays so far behind that the emergency brake (`protocol.vehicle.braking`) need not act, with a
+margin for errors:
+
+    s_k+r + (lag + r h) v_F + (v_F + v_k+r)^2 / (2 b)
+        <=  2 d_F - L + braking distance of the vehicle ahead - margin - errors
+
+for every tick k and r ticks of reaction; the square is replaced by its tangents.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from attrs import frozen
+from numpy.typing import NDArray
+from scipy import sparse
+
+from laneweave.agents.driving.qp import MAX_ITERATIONS, QPSettings, QuadraticProgram
+from laneweave.agents.driving.regulator import axis_matrices
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.tables import Scenario, Vehicle
+from laneweave.protocol.vehicle.braking import (
+    ERROR_SIGMAS,
+    last_tick_m,
+    lead_way_m,
+    own_braking_mps2,
+    spare_error_m,
+)
+
+Array = NDArray[np.float64]
+
+LIMIT_SHARE = 0.96
+"""Share of each limit that a trajectory uses; the rest is left to the tracker."""
+_END_TOLERANCE = 1e-3
+"""Accepted error at the end of a trajectory [m, m/s, m/s2]."""
+_LIMIT_TOLERANCE = 1e-4
+"""Accepted excess over a limit's share [m/s, m/s2, m/s3]."""
+_TRACKING_ERROR_M = 0.25
+"""Margin for tracking errors behind a vehicle ahead."""
+_CLOSING_SPEEDUP = 0.5
+"""Largest closing speed that the tangents cover, as a share of v_F."""
+_TANGENTS = 5
+_SETTINGS = QPSettings(
+    eps_abs=1e-6,
+    max_iter=40_000,
+    check_termination=25,
+    rho=0.3,
+    alpha=1.8,
+    eps_infeasible=1e-8,
+    polishing=True,
+    row_tolerance=1e-4,
+)
+
+
+class InfeasibleTrajectoryError(ValueError):
+    """No trajectory keeps all limits in the time given."""
+
+
+@frozen(eq=False)
+class Trajectory:
+    """Samples of a motion in the moving frame; obeys the discrete dynamics exactly."""
+
+    states: Array
+    """(n + 1, 6): s [m], v [m/s] and a [m/s2] along the road, s and v relative to the lattice;
+    y [m], v_y [m/s], a_y [m/s2]."""
+    jerks: Array
+    """(n, 2): j_s, j_y [m/s3], constant during each tick."""
+
+    @property
+    def ticks(self) -> int:
+        """Duration n."""
+        return len(self.jerks)
+
+
+@frozen
+class Envelope:
+    """Bound on position and speed behind a vehicle that holds, so that braking is in time."""
+
+    ticks: int
+    """Ticks of reaction."""
+    brake_mps2: float
+    max_m: float
+    """Upper bound of s + (v_F + v)^2 / (2 brake), with s and v relative to the lattice."""
+
+    @classmethod
+    def behind(cls, scenario: Scenario, gap_m: float) -> Envelope:
+        """Return the envelope of a move that starts with a net gap of `gap_m` to a vehicle."""
+        speed_mps, braking = scenario.formation.speed_mps, scenario.braking
+        ticks = max(round(braking.reaction_s / scenario.runtime.tick_s), 1)
+        lost_s = scenario.vehicle.actuator_lag_s + ticks * scenario.runtime.tick_s
+        errors_m = ERROR_SIGMAS * spare_error_m(scenario, (1.0 + _CLOSING_SPEEDUP) * speed_mps)
+        brake_mps2, tick_s = own_braking_mps2(scenario), scenario.runtime.tick_s
+        kept_m = braking.margin_m + errors_m + _TRACKING_ERROR_M + last_tick_m(brake_mps2, tick_s)
+        max_m = gap_m + lead_way_m(scenario, speed_mps) - kept_m - lost_s * speed_mps
+        return cls(ticks, brake_mps2, max_m)
+
+
+@lru_cache(maxsize=256)
+def move_profile(scenario: Scenario, dx: int, dy: int, ticks: int | None = None) -> Trajectory:
+    """Return the move by `dx` columns and `dy` lanes, from rest at the origin; cached per process.
+
+    Args:
+        scenario: limits, tick, lattice.
+        dx: columns, -1 to 1.
+        dy: lanes, -1 to 1.
+        ticks: duration; None: that of the scenario's shortest T_F.
+
+    Raises:
+        InfeasibleTrajectoryError: the move cannot be driven within the limits.
+        ValueError: the cells are not neighbours.
+    """
+    if abs(dx) > 1 or abs(dy) > 1:
+        raise ValueError(f"({dx}, {dy}) does not lead to a neighbouring cell")
+    if ticks is None:
+        ticks = scenario.move_ticks(scenario.cycles_s[0])
+    beyond_m = 2.0 * scenario.formation.gap_m - scenario.vehicle.length_m
+    return plan_trajectory(
+        scenario.vehicle,
+        scenario.formation.speed_mps,
+        scenario.runtime.tick_s,
+        ticks,
+        dx * scenario.formation.gap_m,
+        dy * scenario.road.lane_width_m,
+        Envelope.behind(scenario, beyond_m) if dx > 0 else None,
+    )
+
+
+def check_moves(scenario: Scenario) -> None:
+    """Check that every move of the scenario can be driven within the vehicle's limits.
+
+    All of them are planned, for every T_F that a plan may have, and stay in the cache.
+
+    Raises:
+        BadInputError: one cannot.
+    """
+    for slot_s in scenario.slots_s:
+        for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1)):
+            if dx and dy and scenario.formation.mode == 1:
+                continue
+            try:
+                move_profile(scenario, dx, dy, scenario.move_ticks(slot_s))
+            except InfeasibleTrajectoryError as error:
+                raise BadInputError(
+                    "formation.move_s",
+                    slot_s - scenario.formation.slack_s,
+                    f"long enough for a move by {dx} columns and {dy} lanes ({error}), or change "
+                    + ("formation.gap_m or the table braking" if dx > 0 else "the table vehicle"),
+                ) from error
+
+
+@lru_cache(maxsize=256)
+def plan_trajectory(
+    limits: Vehicle,
+    speed_mps: float,
+    tick_s: float,
+    ticks: int,
+    ds_m: float,
+    dy_m: float,
+    envelope: Envelope | None = None,
+) -> Trajectory:
+    """Return the minimum-jerk trajectory from rest at (0, 0) to rest at (ds, dy); cached.
+
+    Args:
+        limits: the vehicle's limits.
+        speed_mps: v_F.
+        tick_s: length of a tick.
+        ticks: duration.
+        ds_m: distance along the road, relative to the lattice.
+        dy_m: distance across the road.
+        envelope: bound behind a vehicle that holds ahead; None: there is none.
+
+    Raises:
+        InfeasibleTrajectoryError: it cannot be driven within the limits.
+        ValueError: a number is not finite.
+    """
+    if ds_m == 0.0 and dy_m == 0.0:
+        return _integrated(np.zeros((ticks, 2)), tick_s)
+    # With a unit of time near an eighth of the duration, all states are of similar size.
+    unit_s = ticks * tick_s / 8.0
+    program = _trajectory_program(
+        limits, speed_mps, tick_s / unit_s, unit_s, ticks, (ds_m, dy_m), envelope
+    )
+    what = f"{ds_m:g} m along and {dy_m:g} m across in {ticks * tick_s:g} s"
+    if envelope is not None:
+        what += ", with room to brake behind a vehicle that holds beyond"
+    solution = program.solve()
+    if not solution.usable:
+        out = solution.status == MAX_ITERATIONS
+        why = "out of iterations" if out else f"solver status {solution.status}"
+        raise InfeasibleTrajectoryError(
+            f"{what}: no trajectory within {LIMIT_SHARE:.0%} of the vehicle's limits ({why})"
+        )
+    jerks = solution.x[6 * ticks :].reshape(2, ticks).T / unit_s**3
+    trajectory = _integrated(jerks, tick_s)
+    end_error = np.abs(trajectory.states[-1] - (ds_m, 0.0, 0.0, dy_m, 0.0, 0.0)).max()
+    excess = _excess(trajectory, limits, speed_mps)
+    if not (end_error < _END_TOLERANCE and excess < _LIMIT_TOLERANCE):
+        raise InfeasibleTrajectoryError(
+            f"{what}: the best trajectory misses its end by {end_error:.2g} and a limit by "
+            f"{excess:.2g}"
+        )
+    return trajectory
+
+
+def _trajectory_program(
+    limits: Vehicle,
+    speed_mps: float,
+    h: float,
+    unit_s: float,
+    n: int,
+    end_m: tuple[float, float],
+    envelope: Envelope | None,
+) -> QuadraticProgram:
+    """Return the program in units of `unit_s`: x = (z_s [3n], z_y [3n], j_s [n], j_y [n])."""
+    transition, effect = axis_matrices(h)
+    eye = sparse.eye(n)
+    shift = sparse.diags([np.ones(n - 1)], [-1], shape=(n, n)) if n > 1 else sparse.eye(1) * 0.0
+    step = sparse.kron(shift, transition) - sparse.eye(3 * n)
+    drive = sparse.kron(eye, effect)
+    last = sparse.csr_matrix(
+        (np.ones(3), (np.arange(3), np.arange(3 * n - 3, 3 * n))), shape=(3, 3 * n)
+    )
+
+    def pick(index: int) -> Any:  # noqa: ANN401 - scipy.sparse has no types
+        return sparse.kron(eye, np.eye(3)[index : index + 1])
+
+    slip = limits.max_slip_ratio * LIMIT_SHARE
+    v_unit, a_unit, j_unit = unit_s * LIMIT_SHARE, unit_s**2 * LIMIT_SHARE, unit_s**3 * LIMIT_SHARE
+    infinite, ends = np.inf, np.array([[d, 0.0, 0.0] for d in end_m])
+    # Columns of x, lower bound, upper bound.
+    rows: list[tuple[list[Any], Any, Any]] = [
+        ([step, None, drive, None], 0.0, 0.0),
+        ([None, step, None, drive], 0.0, 0.0),
+        (
+            [pick(1), None, None, None],
+            -v_unit * speed_mps,
+            v_unit * (limits.max_speed_mps - speed_mps),
+        ),
+        (
+            [pick(2), None, None, None],
+            a_unit * limits.min_accel_mps2,
+            a_unit * limits.max_accel_mps2,
+        ),
+        ([None, pick(2), None, None], *_both(a_unit * limits.max_lateral_accel_mps2)),
+        ([-slip * pick(1), pick(1), None, None], -infinite, slip * speed_mps * unit_s),
+        ([slip * pick(1), pick(1), None, None], -slip * speed_mps * unit_s, infinite),
+        ([None, None, eye, None], *_both(j_unit * limits.max_jerk_mps3)),
+        ([None, None, None, eye], *_both(j_unit * limits.max_lateral_jerk_mps3)),
+        ([last, None, None, None], ends[0], ends[0]),
+        ([None, last, None, None], ends[1], ends[1]),
+    ]
+    if envelope is not None:
+        brake, later = envelope.brake_mps2, eye.tocsr()[envelope.ticks - 1 :]
+        for share in np.linspace(0.0, _CLOSING_SPEEDUP, _TANGENTS):
+            speed = speed_mps * (1.0 + share)
+            # At this speed: v^2 / (2 b) >= speed (2 v - speed) / (2 b).
+            row = sparse.kron(later, np.array([[1.0, speed / brake / unit_s, 0.0]]))
+            max_m = envelope.max_m - speed * (2.0 * speed_mps - speed) / (2.0 * brake)
+            rows.append(([row, None, None, None], -infinite, max_m))
+    heights = [next(m for m in blocks if m is not None).shape[0] for blocks, _, _ in rows]
+    return QuadraticProgram(
+        sparse.diags([np.concatenate([np.zeros(6 * n), np.ones(2 * n)])], [0]),
+        sparse.bmat([blocks for blocks, _, _ in rows]),
+        np.concatenate([np.full(m, low) for m, (_, low, _) in zip(heights, rows, strict=True)]),
+        np.concatenate([np.full(m, high) for m, (_, _, high) in zip(heights, rows, strict=True)]),
+        settings=_SETTINGS,
+    )
+
+
+def _both(limit: float) -> tuple[float, float]:
+    return -limit, limit
+
+
+def settling_trajectory(scenario: Scenario, start: Array, ticks: int) -> Trajectory:
+    """Return the trajectory with the least sum of squared jerks from a state to rest at the origin.
+
+    Limits are ignored: a vehicle that enters has so long for one and a half columns that it never
+    comes near them.
+
+    Args:
+        scenario: tick.
+        start: state (6,) relative to the lattice point where it ends.
+        ticks: duration, at least three.
+    """
+    tick_s = scenario.runtime.tick_s
+    reach, power = _reach(tick_s, ticks)
+    ends = np.stack([power @ start[:3], power @ start[3:]], axis=1)
+    jerks = np.asarray(np.linalg.lstsq(reach, -ends, rcond=None)[0], dtype=np.float64)
+    return _integrated(jerks, tick_s, start)
+
+
+@lru_cache(maxsize=256)
+def _reach(tick_s: float, ticks: int) -> tuple[Array, Array]:
+    """Return how each tick's jerk (3, ticks) and the initial state (3, 3) change the last state."""
+    transition, effect = axis_matrices(tick_s)
+    power: Array = np.eye(3)
+    effects = []
+    for _ in range(ticks):
+        effects.append(power @ effect[:, 0])
+        power = transition @ power
+    return np.array(effects[::-1]).T, power
+
+
+def _integrated(jerks: Array, tick_s: float, start: Array | None = None) -> Trajectory:
+    """Return the read-only trajectory of jerks (n, 2) from a state, or from rest at the origin."""
+    transition, effect = axis_matrices(tick_s)
+    states = np.zeros((len(jerks) + 1, 6))
+    if start is not None:
+        states[0] = start
+    effect, first, second = effect[:, 0], states[:, :3], states[:, 3:]
+    for k, (along, across) in enumerate(jerks.tolist()):
+        first[k + 1] = transition @ first[k] + effect * along
+        second[k + 1] = transition @ second[k] + effect * across
+    jerks = np.ascontiguousarray(jerks)
+    states.flags.writeable = False
+    jerks.flags.writeable = False
+    return Trajectory(states, jerks)
+
+
+def _excess(trajectory: Trajectory, limits: Vehicle, speed_mps: float) -> float:
+    """Return the largest excess over a limit's share [m/s, m/s2, m/s3]; NaN if a sample is."""
+    _, v, a, _, v_y, a_y = trajectory.states.T
+    jerk = np.abs(trajectory.jerks).max(axis=0)
+    share = LIMIT_SHARE
+    return float(
+        np.max(
+            [
+                (-v - share * speed_mps).max(),
+                (v - share * (limits.max_speed_mps - speed_mps)).max(),
+                (share * limits.min_accel_mps2 - a).max(),
+                (a - share * limits.max_accel_mps2).max(),
+                (np.abs(a_y) - share * limits.max_lateral_accel_mps2).max(),
+                (np.abs(v_y) - share * limits.max_slip_ratio * (speed_mps + v)).max(),
+                jerk[0] - share * limits.max_jerk_mps3,
+                jerk[1] - share * limits.max_lateral_jerk_mps3,
+            ]
+        )
+    )
