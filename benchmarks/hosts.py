@@ -29,6 +29,8 @@ from typing import Any
 import pyarrow.parquet as pq
 from attrs import frozen
 
+from laneweave.protocol.wire.events import CARETAKER_TOOK_OVER
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from support.hosts import Hosts, compose, lasts, open_hosts
 
@@ -136,7 +138,7 @@ def figures(folder: Path) -> dict[str, Any]:
         "on_lane_percent": 100.0 * vehicles["on_preferred_lane"] / max(1, vehicles["left"]),
         "travel_time_s": statistics.fmean(times) if times else None,
         "leader_changes": summary["failover"]["leader_changes"],
-        "caretakers": kinds["caretaker-took-over"],
+        "caretakers": kinds[CARETAKER_TOOK_OVER],
         "real_time_factor": summary["runtime"]["real_time_factor"],
     }
 

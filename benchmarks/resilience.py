@@ -23,6 +23,8 @@ import numpy as np
 import pyarrow.parquet as pq
 from attrs import frozen
 
+from laneweave.protocol.wire.events import CARETAKER_TOOK_OVER, PLAN_MADE
+
 HERE = Path(__file__).resolve().parent
 TIMEOUT_S = 3600.0
 
@@ -105,9 +107,9 @@ def figures(folder: Path) -> dict[str, Any]:
     for line in (folder / "events.jsonl").read_text(encoding="utf-8").splitlines():
         event = json.loads(line)
         kinds[event["kind"]] += 1
-        if event["kind"] == "plan-made":
+        if event["kind"] == PLAN_MADE:
             plans[event["formation"]] += 1
-        if event["kind"] == "caretaker-took-over":
+        if event["kind"] == CARETAKER_TOOK_OVER:
             killed.add(event["vehicle"])
     others = [
         trip for trip in trips if trip["vehicle"] not in killed and trip["left_s"] is not None

@@ -23,13 +23,13 @@ from pathlib import Path
 import attrs
 
 from laneweave.launch.deploy.certificate_authority import issue, make_authority
-from laneweave.protocol.config.identities import parse_identity
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.runtime.transport import Delivery, Received
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.security.access import Access, access_of
-from laneweave.protocol.security.rights import RouterGuard, guard_of
+from laneweave.protocol.security.access import Access, RouterGuard
+from laneweave.protocol.security.rights import access_of, guard_of
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport, run_router
+from laneweave.protocol.wire.identities import parse_identity
 from laneweave.protocol.wire.topics import STATE, Keys, Quality
 
 ROUNDS, SAMPLES, PERIOD_S, PAYLOAD_BYTES = 6, 500, 0.002, 300

@@ -22,20 +22,25 @@ if __name__ == "__main__":  # run as a program: as `pythonpath` in pyproject.tom
 from conflict_drawing import counts, draw_conflicts
 from evaluation.evidence import read_evidence
 from evaluation.tables import document_parts
-from laneweave.agents.metrics import AgentNumbers
+from laneweave.agents.metrics import AgentMetrics
 from laneweave.coordinator.formations.leader_rules import LEADER_RULES, Phase
-from laneweave.coordinator.metrics import CoordinatorNumbers
+from laneweave.coordinator.metrics import CoordinatorMetrics
 from laneweave.coordinator.planning import PlanRequest
 from laneweave.coordinator.planning.explanation import explain
-from laneweave.coordinator.service.server import ServiceNumbers
+from laneweave.coordinator.service.server import ServiceMetrics
 from laneweave.launch.drawing.tappa_process import draw_explanation
 from laneweave.launch.fault_search.profiles import PROFILES
 from laneweave.launch.observe.metrics_server import PROCESS, PROCESS_MEANING
-from laneweave.protocol.runtime.metrics import NodeNumbers, RouterNumbers, Snapshot, metrics_of
+from laneweave.protocol.runtime.metrics import (
+    MetricsSnapshot,
+    NodeMetrics,
+    RouterMetrics,
+    metrics_of,
+)
 from laneweave.protocol.security.rights import rights_table
 from laneweave.protocol.state_machine import markdown_table, mermaid_diagram
 from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES, Stage
-from laneweave.sim_bridge.metrics import BridgeNumbers
+from laneweave.sim_bridge.metrics import BridgeMetrics
 from support.planted_bugs import BUGS
 
 DOCS = Path(__file__).resolve().parent
@@ -65,13 +70,13 @@ STABILITY = DOCS / "evidence" / "stability.json"
 CONFLICTS = DOCS / "images" / "conflict-table.png"
 CASE = DOCS / "examples" / "case-study.json"
 SOLVING = DOCS / "images" / "solving-process.png"
-SNAPSHOTS: dict[type[Snapshot], str] = {
-    NodeNumbers: "every role but the router",
-    CoordinatorNumbers: "coordinator",
-    ServiceNumbers: "coordinator",
-    AgentNumbers: "agent",
-    BridgeNumbers: "bridge",
-    RouterNumbers: "router",
+SNAPSHOTS: dict[type[MetricsSnapshot], str] = {
+    NodeMetrics: "every role but the router",
+    CoordinatorMetrics: "coordinator",
+    ServiceMetrics: "coordinator",
+    AgentMetrics: "agent",
+    BridgeMetrics: "bridge",
+    RouterMetrics: "router",
 }
 """What offers numbers, and whose they are."""
 

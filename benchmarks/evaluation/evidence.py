@@ -13,6 +13,7 @@ from evaluation.points import Key, PointRow
 from evaluation.programme import FORMATIONS
 from evaluation.trials import AgreementRow, CostRow, FactorRow
 from laneweave.launch.report.runs import Run
+from laneweave.protocol.files import write_atomically
 from laneweave.protocol.structuring import structure
 
 SCHEMA: Final = "laneweave.evaluation/1"
@@ -110,7 +111,5 @@ def read_evidence(path: Path) -> Evidence:
 
 def write_evidence(evidence: Evidence, path: Path) -> None:
     """Write it whole or not at all."""
-    unfinished = path.with_suffix(".part")
     text = json.dumps(asdict(evidence), indent=1)
-    unfinished.write_text(text + "\n", encoding="utf-8")
-    unfinished.replace(path)
+    write_atomically(path, text + "\n")

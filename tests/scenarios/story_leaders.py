@@ -11,7 +11,7 @@ from attrs import define, field
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.formations.control import FormationControl
 from laneweave.coordinator.formations.roster import Formation
-from laneweave.protocol.lattice import Move, territory
+from laneweave.protocol.lattice import PlannedMove, territory
 from laneweave.protocol.runtime.node import (
     Arrived,
     Compute,
@@ -244,7 +244,7 @@ def written_plan(text: str, control: FormationControl, ballot: Ballot) -> Plan:
     text, _, roster = text.partition(" for ")
     members = frozenset(roster.split()) or frozenset(control.hold_cells)
     cells = {name: cell for name, cell in control.hold_cells.items() if name in members}
-    moves: dict[Name, tuple[Move, ...]] = dict.fromkeys(cells, ())
+    moves: dict[Name, tuple[PlannedMove, ...]] = dict.fromkeys(cells, ())
     at = dict(cells)
     text, _, blocks = text.partition(" in blocks ")
     for item in text.split():

@@ -13,7 +13,7 @@ from attrs import define, evolve, field
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.driving.driver import Drive, SolverStats
-from laneweave.protocol.lattice import Cell, Lattice, Move
+from laneweave.protocol.lattice import Cell, Lattice, PlannedMove
 from laneweave.protocol.runtime.node import Arrived, Effect, Send, Started
 from laneweave.protocol.scenario.deployment import Network
 from laneweave.protocol.scenario.tables import FormationSettings, Road, Runtime, Scenario
@@ -75,7 +75,7 @@ class StoryDriver:
         self._origin, self._goal = sense.motion_origin, sense.hold_cell
         self._ticks = sense.motion_ticks
 
-    def begin(self, move: Move, tick: int, ticks: int) -> None:
+    def begin(self, move: PlannedMove, tick: int, ticks: int) -> None:
         del tick
         self._ticks = ticks
         _, self._origin, self._goal = move

@@ -11,7 +11,7 @@ from attrs import evolve
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.driving.driver import Driver, TrackingDriver
-from laneweave.protocol.lattice import Cell, Move, territory
+from laneweave.protocol.lattice import Cell, PlannedMove, territory
 from laneweave.protocol.runtime.node import Arrived, Effect, Event, Send
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import State, cell_state, commanded_state, hold_law
@@ -173,7 +173,9 @@ class Rig:
         goal = cell_state(LATTICE, cell, self.tick * TICK_S)
         return max(abs(self.state[0] - goal[0]), abs(self.state[3] - goal[3]))
 
-    def accept(self, *moves: Move, ballot: Ballot = BALLOT, t0_tick: int | None = None) -> None:
+    def accept(
+        self, *moves: PlannedMove, ballot: Ballot = BALLOT, t0_tick: int | None = None
+    ) -> None:
         """Promise and accept a plan for this vehicle alone."""
         incarnation = self.shown[-1].incarnation
         self.hand(PREPARE, Prepare(ballot, (0,), (ME,)))
@@ -184,7 +186,7 @@ class Rig:
 
 
 def make_plan(
-    moves: dict[Name, tuple[Move, ...]],
+    moves: dict[Name, tuple[PlannedMove, ...]],
     cells: dict[Name, Cell],
     incarnations: dict[Name, int],
     ballot: Ballot = BALLOT,

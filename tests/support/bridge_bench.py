@@ -16,7 +16,7 @@ from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.protocol.config.loading import parse_scenario
-from laneweave.protocol.lattice import Cell, Move, territory
+from laneweave.protocol.lattice import Cell, PlannedMove, territory
 from laneweave.protocol.runtime.node import (
     Arrived,
     Core,
@@ -32,7 +32,8 @@ from laneweave.protocol.runtime.node import (
 )
 from laneweave.protocol.scenario.deployment import Shard
 from laneweave.protocol.scenario.tables import Scenario, Sensing
-from laneweave.protocol.transports.simulated.network import Conditions, SimulatedNetwork
+from laneweave.protocol.transports.simulated.network import SimulatedNetwork
+from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.codec import encode
 from laneweave.protocol.wire.messages import Ballot, Command, Name, Plan, Prepare, Report, Sense
@@ -369,7 +370,7 @@ class Street:
         start = self.bridge.vehicles[name].controller.hold_cell
         ballot = Ballot(1, Name("c9"), 1, 1)
         block = self.scenario.lattice.block_of(start[0])
-        move: Move = (0, start, target)
+        move: PlannedMove = (0, start, target)
         plan = Plan(
             ballot=ballot,
             formations=(block,),

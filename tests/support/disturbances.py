@@ -26,7 +26,7 @@ from laneweave.agents.driving.reference import Reference
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.tables import Scenario, Vehicle
-from laneweave.protocol.transports.simulated.network import Conditions
+from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.bodies.footprints import Bodies

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from laneweave.agents.driving.driver import TrackingDriver
 from laneweave.protocol.config.loading import load_scenario
-from laneweave.protocol.lattice import Cell, Move, stretch_of
+from laneweave.protocol.lattice import Cell, PlannedMove, stretch_of
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.wire.messages import Command, Motion, Name
@@ -105,7 +105,7 @@ class Road:
         return sum(one.driver.solver_stats.unusable for one in self.driven.values())
 
     def step(
-        self, begins: Mapping[Name, Move] | None = None, braking: Collection[Name] = ()
+        self, begins: Mapping[Name, PlannedMove] | None = None, braking: Collection[Name] = ()
     ) -> None:
         """Go on by one tick.
 
@@ -131,7 +131,7 @@ class Road:
         self.tick += 1
         self._show()
 
-    def _drive(self, one: Driven, move: Move | None) -> None:
+    def _drive(self, one: Driven, move: PlannedMove | None) -> None:
         """Hear the vehicle's sensors and answer with a COMMAND, as its agent does."""
         sense = one.vehicle.sense(self.tick, caretaker=False)
         one.moving = one.moving and not one.driver.at_rest(sense)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from attrs import frozen
 
-from laneweave.protocol.lattice import Cell, Move
+from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.wire.messages import Name
 from support.driving import LimitUse, Road, limit_use, road_scenario
@@ -63,7 +63,7 @@ class Situation:
         """The second vehicle."""
         return list(self.cells)[1]
 
-    def begins(self, tick: int) -> dict[Name, Move]:
+    def begins(self, tick: int) -> dict[Name, PlannedMove]:
         """Return the moves that begin with a tick."""
         origin = self.cells[self.follower]
         if tick != MOVE_TICK or origin == self.target:

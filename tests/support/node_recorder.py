@@ -20,8 +20,8 @@ from laneweave.protocol.runtime.node import (
     Wakeup,
     Watch,
 )
-from laneweave.protocol.transports.simulated.network import Conditions, SimulatedNetwork
-from laneweave.protocol.transports.simulated.virtual_time import Trace
+from laneweave.protocol.transports.simulated.network import SimulatedNetwork
+from laneweave.protocol.transports.simulated.virtual_time import Conditions, Trace
 from laneweave.protocol.wire.messages import Heartbeat, Name
 from laneweave.protocol.wire.topics import HEARTBEAT, VEHICLE_ALIVE
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from attrs import evolve
 
-from laneweave.protocol.lattice import Cell, Move, territory
+from laneweave.protocol.lattice import Cell, PlannedMove, territory
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.vehicle.execution import PlanExecution
 from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
@@ -24,7 +24,7 @@ INCARNATION = 7
 
 def make_plan(ballot: Ballot = MID) -> Plan:
     cells: dict[Name, Cell] = {A: HOME, B: (2, 1)}
-    moves: dict[Name, tuple[Move, ...]] = {A: ((0, HOME, TARGET),), B: ()}
+    moves: dict[Name, tuple[PlannedMove, ...]] = {A: ((0, HOME, TARGET),), B: ()}
     return Plan(
         ballot=ballot,
         formations=(0,),

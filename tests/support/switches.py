@@ -16,7 +16,7 @@ from attrs import frozen
 
 from laneweave.coordinator.planning import PlanRequest, VehicleRequest, checked_plan
 from laneweave.coordinator.planning.grid import Grid
-from laneweave.protocol.lattice import Cell, Move
+from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.plans import plan_problems
 from laneweave.protocol.wire.messages import Ballot, Name, Plan
@@ -56,7 +56,7 @@ class Switch:
         """How many slots it takes."""
         return len(self.paths[0]) - 1
 
-    def begins(self, step: int) -> dict[Name, Move]:
+    def begins(self, step: int) -> dict[Name, PlannedMove]:
         """Return the moves that begin with a step."""
         return {
             name: (step, path[step], path[step + 1])

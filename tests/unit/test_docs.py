@@ -30,11 +30,11 @@ from laneweave.launch.observe.status import SCHEMA, Status
 from laneweave.protocol.config.loading import load_scenario, parse_scenario
 from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.scenario.tables import CONFLICT_KINDS, Scenario
-from laneweave.protocol.scenario.validators import HOST_PORT_RULE
+from laneweave.protocol.validators import HOST_PORT_RULE, NAME_RULE
 from laneweave.protocol.vehicle.motion import cell_state
 from laneweave.protocol.wire import messages
 from laneweave.protocol.wire.codec import KINDS, field_names
-from laneweave.protocol.wire.topics import NAME_RULE, TOPICS
+from laneweave.protocol.wire.topics import TOPICS
 from laneweave.sim_bridge.bodies.footprints import Bodies, pose_of
 from laneweave.sim_bridge.recording.run_record import Ending
 

@@ -23,7 +23,7 @@ from collections.abc import Callable
 from attrs import evolve
 
 from laneweave.agents.driving.driver import Course, Driver, SolverStats, TrackingDriver
-from laneweave.protocol.lattice import Move, stretch_of
+from laneweave.protocol.lattice import PlannedMove, stretch_of
 from laneweave.protocol.runtime.node import (
     Announce,
     Arrived,
@@ -40,7 +40,7 @@ from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.vehicle.execution import PlanExecution
 from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
-from laneweave.protocol.wire.incarnations import above
+from laneweave.protocol.wire.identities import above
 from laneweave.protocol.wire.messages import (
     Command,
     Motion,
@@ -98,7 +98,7 @@ class AgentCore:
         """Stretches of columns whose motions matter now; empty while it is not in charge."""
         self.wanted_states: tuple[int, ...] = ()
         """Formations whose states matter to this vehicle now."""
-        self._move: Move | None = None
+        self._move: PlannedMove | None = None
         """The newest move that it has begun."""
         self._move_ticks = 0
         """Duration of that move."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 from laneweave.agents.core import AgentCore
-from laneweave.agents.metrics import AgentNumbers
-from laneweave.protocol.runtime.metrics import Snapshot
+from laneweave.agents.metrics import AgentMetrics
+from laneweave.protocol.runtime.metrics import MetricsSnapshot
 from laneweave.protocol.runtime.node import (
     Arrived,
     Effect,
@@ -65,12 +65,12 @@ class AgentHost:
         """Counters of agents that have ended."""
 
     @property
-    def numbers(self) -> tuple[Snapshot, ...]:
+    def metrics(self) -> tuple[MetricsSnapshot, ...]:
         """Counters of all agents."""
         agents = self._agents.values()
         stats = [agent.solver_stats for agent in agents]
         return (
-            AgentNumbers(
+            AgentMetrics(
                 vehicles=len(agents),
                 vehicles_in_charge=sum(agent.in_charge for agent in agents),
                 solves_total=self._solves + sum(each.solves for each in stats),

@@ -6,18 +6,18 @@ from typing import ClassVar
 
 from attrs import field, frozen
 
-from laneweave.protocol.runtime.metrics import told
+from laneweave.protocol.runtime.metrics import metric
 
 
 @frozen
-class AgentNumbers:
+class AgentMetrics:
     """Counters of the vehicles of one process."""
 
     ABOUT: ClassVar[str] = "agent"
 
-    vehicles: int = field(metadata=told("Vehicles that this process drives or waits for"))
+    vehicles: int = field(metadata=metric("Vehicles that this process drives or waits for"))
     vehicles_in_charge: int = field(
-        metadata=told("Vehicles on the road of which this process is in charge")
+        metadata=metric("Vehicles on the road of which this process is in charge")
     )
-    solves_total: int = field(metadata=told("Trajectories that were tracked, one for each tick"))
-    unusable_total: int = field(metadata=told("Solutions of the tracker that could not be used"))
+    solves_total: int = field(metadata=metric("Trajectories that were tracked, one for each tick"))
+    unusable_total: int = field(metadata=metric("Solutions of the tracker that could not be used"))

@@ -15,7 +15,7 @@ from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.security.access import Access
 from laneweave.protocol.transports.zenoh.runner import run_core
 from laneweave.protocol.vehicle.motion import cell_state
-from laneweave.protocol.wire.incarnations import Incarnations
+from laneweave.protocol.wire.identities import Incarnations
 from laneweave.protocol.wire.messages import Name, Sense
 
 

@@ -13,12 +13,12 @@ from laneweave.coordinator.formations.groups import Groups
 from laneweave.coordinator.formations.leader_rules import LEADER_RULES, Phase
 from laneweave.coordinator.formations.planner import FormationPlanner, Note
 from laneweave.coordinator.formations.roster import Formation, closed_formations, with_room
-from laneweave.coordinator.metrics import CoordinatorNumbers
+from laneweave.coordinator.metrics import CoordinatorMetrics
 from laneweave.coordinator.rolling.control import Note as StreamNote
 from laneweave.coordinator.rolling.control import StreamControl
 from laneweave.coordinator.rolling.planner import Planner, stream_planner
 from laneweave.coordinator.service.server import PlanningService
-from laneweave.protocol.runtime.metrics import Snapshot
+from laneweave.protocol.runtime.metrics import MetricsSnapshot
 from laneweave.protocol.runtime.node import (
     Announce,
     Arrived,
@@ -40,6 +40,12 @@ from laneweave.protocol.runtime.node import (
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.state_machine import RuleBook
+from laneweave.protocol.wire.events import (
+    FORMATIONS_JOINED,
+    LEADER_ELECTED,
+    LEADER_STEPPED_DOWN,
+    PLAN_IN_FORCE,
+)
 from laneweave.protocol.wire.messages import (
     Ballot,
     Census,
@@ -129,11 +135,11 @@ class CoordinatorCore:
         self._wakeup_s: float | None = None
 
     @property
-    def numbers(self) -> tuple[Snapshot, ...]:
+    def metrics(self) -> tuple[MetricsSnapshot, ...]:
         """What this candidate has counted."""
         election = self.election
         return (
-            CoordinatorNumbers(
+            CoordinatorMetrics(
                 leading=election.leading,
                 term=election.term,
                 candidates=1 + len(list(election.living(self._handled_s))),
@@ -141,7 +147,7 @@ class CoordinatorCore:
                 plans_in_force=self._in_force,
                 road_seconds=self.t_s,
             ),
-            self.service.numbers,
+            self.service.metrics,
         )
 
     @property
@@ -291,7 +297,7 @@ class CoordinatorCore:
         control.on_state(state, now_s)
         if issuing and control.phase is Phase.WATCHING:
             closed_s = control.formation.closed_s
-            yield self._log("plan-in-force", formation=group[0], closed_s=closed_s)
+            yield self._log(PLAN_IN_FORCE, formation=group[0], closed_s=closed_s)
 
     def _on_computed(self, computed: Computed, now_s: float) -> Iterator[Effect]:
         if self.service.owns(computed.job):
@@ -318,7 +324,7 @@ class CoordinatorCore:
         else:
             yield Unlisten(STATE)
         self._heartbeat_s = now_s
-        kind = "leader-elected" if self.election.leading else "leader-stepped-down"
+        kind = LEADER_ELECTED if self.election.leading else LEADER_STEPPED_DOWN
         log.info(kind, coordinator=self.name, term=self.election.term)
         yield self._log(kind, term=self.election.term)
 
@@ -374,7 +380,7 @@ class CoordinatorCore:
         formations = closed_formations(census, self.t_s, self.scenario, self._groups)
         for numbers in with_room(formations, self.t_s, self.scenario):
             self._groups.join(numbers)
-            yield self._log("formations-joined", formations=list(numbers), why="room")
+            yield self._log(FORMATIONS_JOINED, formations=list(numbers), why="room")
             formations = closed_formations(census, self.t_s, self.scenario, self._groups)
         for number in set(self.controls) - set(formations):
             del self.controls[number]
@@ -414,7 +420,7 @@ class CoordinatorCore:
             if isinstance(outcome, Compute):
                 yield outcome
                 continue
-            self._road_changed |= outcome.kind == "formations-joined"
+            self._road_changed |= outcome.kind == FORMATIONS_JOINED
             yield self._log(outcome.kind, **outcome.data)
 
     # --- small things -------------------------------------------------------------------------

@@ -16,9 +16,9 @@ from laneweave.protocol.runtime.message_faults import Wrap, bare
 from laneweave.protocol.runtime.metrics import Observe, unobserved
 from laneweave.protocol.runtime.worker_pool import WorkerPool
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.security.access import access_of
+from laneweave.protocol.security.rights import access_of
 from laneweave.protocol.transports.zenoh.runner import run_core
-from laneweave.protocol.wire.incarnations import Incarnations
+from laneweave.protocol.wire.identities import Incarnations
 from laneweave.protocol.wire.messages import Name
 
 log = structlog.get_logger(__name__)

@@ -1,14 +1,13 @@
-"""The lattice: relative coordinate system (RCS) of the paper, Section 2.2.
+"""The lattice: the relative coordinate system (RCS) of the paper, Section 2.2.
 
 One endless lattice moves at the formation speed v_F along the road. A cell is (column, lane):
-columns grow forwards, lanes to the left, both may be any integer. Its pitch is d_F along the road
-and the lane width across. All vehicles know it from the shared road clock:
+columns grow forwards, lanes to the left, both from any integer. Its pitch is d_F along the road
+and the lane width across. Its position follows from the road clock:
 
     s(cell, t) = v_F t + column d_F         (front bumper, road start at s = 0)
     y(cell)    = (lane + 1/2) lane width    (body centre, right road edge at y = 0)
 
-So column c passes the start of the road at t = -c d_F / v_F, and vehicles that enter later have
-smaller columns.
+Column c passes the start of the road at t = -c d_F / v_F, so later vehicles have smaller columns.
 """
 
 from __future__ import annotations
@@ -21,9 +20,9 @@ Cell = tuple[int, int]
 """(column, lane)."""
 
 STRETCH_COLUMNS = 4
-"""Columns of a stretch. A vehicle receives the motions of its own and both adjacent stretches."""
+"""Columns of a stretch; a vehicle receives the motions of its own and both adjacent ones."""
 
-Move = tuple[int, Cell, Cell]
+PlannedMove = tuple[int, Cell, Cell]
 """(step, from, to): in this step of its plan the vehicle moves to a neighbouring cell."""
 
 
@@ -37,8 +36,8 @@ def footprint(origin: Cell, target: Cell) -> frozenset[Cell]:
     return frozenset({origin, target, (column, to_lane), (to_column, lane)})
 
 
-def territory(start_cells: Iterable[Cell], moves: Iterable[Move]) -> frozenset[Cell]:
-    """Return every cell that a plan may occupy: its start cells and all footprints of its moves."""
+def territory(start_cells: Iterable[Cell], moves: Iterable[PlannedMove]) -> frozenset[Cell]:
+    """Return all cells that a plan may occupy: its start cells and the footprints of its moves."""
     cells = set(start_cells)
     for _, origin, target in moves:
         cells |= footprint(origin, target)
@@ -46,22 +45,20 @@ def territory(start_cells: Iterable[Cell], moves: Iterable[Move]) -> frozenset[C
 
 
 def stretch_of(column: int) -> int:
-    """Return the number of the stretch of columns that a column lies in.
+    """Return the number of the stretch of columns that contains a column.
 
-    Stretches bound who needs to hear of a vehicle's motion: those in its own stretch and in the two
-    next to it.
+    Vehicles publish their motions per stretch, and receive those of three stretches.
     """
     return -column // STRETCH_COLUMNS
 
 
 @frozen
 class Lattice:
-    """Geometry of the moving lattice and of its blocks of columns, which formations own.
+    """Geometry of the moving lattice and of its blocks of columns.
 
-    Block number b has the columns -(b + 1) W + 1 .. -b W for block width W. The number is a pure
-    function of the column, and columns are never used twice. A formation owns one block, or, where
-    its length follows the traffic, a run of blocks of one column each; its number is that of its
-    foremost block.
+    Block number b has the columns -(b + 1) W + 1 .. -b W for block width W. The number is a
+    function of the column, and columns are never reused. A formation owns one block or several
+    consecutive ones; its number is that of its foremost block.
     """
 
     pitch_m: float
@@ -91,7 +88,7 @@ class Lattice:
         return (s_m - column * self.pitch_m) / self.speed_mps
 
     def block_of(self, column: int) -> int:
-        """Return the number of the block that a column lies in."""
+        """Return the number of the block that contains a column."""
         return -column // self.block_columns
 
     def block_range(self, block: int) -> range:
@@ -106,6 +103,6 @@ class Lattice:
 
     @staticmethod
     def interlaced(cell: Cell) -> bool:
-        """Tell whether a cell belongs to the interlaced structure (paper, Fig. on structures)."""
+        """Return whether a cell belongs to the interlaced structure (paper, Section 2.2)."""
         column, lane = cell
         return (column + lane) % 2 == 0

@@ -16,7 +16,7 @@ from enum import Enum
 import structlog
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.runtime.metrics import Snapshot
+from laneweave.protocol.runtime.metrics import MetricsSnapshot
 from laneweave.protocol.runtime.node import (
     Announce,
     Arrived,
@@ -33,6 +33,7 @@ from laneweave.protocol.runtime.node import (
     Watch,
 )
 from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.wire.events import AGENT_MISSING, AGENT_SILENT
 from laneweave.protocol.wire.messages import (
     Command,
     Heartbeat,
@@ -51,7 +52,7 @@ from laneweave.protocol.wire.topics import (
     SENSE,
     VEHICLE_ALIVE,
 )
-from laneweave.sim_bridge.metrics import BridgeNumbers
+from laneweave.sim_bridge.metrics import BridgeMetrics
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
 from laneweave.sim_bridge.road.attendance import Attendance
 from laneweave.sim_bridge.road.leaving import Leaving, tell_left
@@ -131,11 +132,11 @@ class BridgeCore:
     # --- as a core ----------------------------------------------------------------------------
 
     @property
-    def numbers(self) -> tuple[Snapshot, ...]:
+    def metrics(self) -> tuple[MetricsSnapshot, ...]:
         """What the bridge has counted."""
         counts = self._roadside.counts(len(self.vehicles))
         return (
-            BridgeNumbers(
+            BridgeMetrics(
                 road_seconds=self.t_s,
                 ticks_total=self.tick,
                 missed_answers_total=self._record.missed_ticks,
@@ -311,7 +312,7 @@ class BridgeCore:
             if vehicle.name in self._answers.up:
                 self._unreported.add(vehicle.name)
             else:
-                self._record.note(self.t_s, "agent-missing", vehicle=vehicle.name)
+                self._record.note(self.t_s, AGENT_MISSING, vehicle=vehicle.name)
                 # Where one did not come, the next are not worth a long wait, until one does.
                 self._patience_s = self.scenario.network.resend_s
         self._at_entrance.clear()
@@ -327,7 +328,7 @@ class BridgeCore:
     def _take_care(self, now_s: float) -> Iterator[Effect]:
         """Put caretakers in charge of vehicles whose agents are silent or not there."""
         for name in self._answers.settle(now_s):
-            self._record.note(self.t_s, "agent-silent", vehicle=name)
+            self._record.note(self.t_s, AGENT_SILENT, vehicle=name)
         for vehicle, absence in self._attendance.unattended(self.vehicles, now_s):
             self._record.on_caretaker_took_over(self.t_s, vehicle.name, absence)
             yield from self._attendance.take_charge(vehicle, self.tick)

@@ -6,24 +6,24 @@ from typing import ClassVar
 
 from attrs import field, frozen
 
-from laneweave.protocol.runtime.metrics import told
+from laneweave.protocol.runtime.metrics import metric
 
 
 @frozen
-class BridgeNumbers:
+class BridgeMetrics:
     """The road as the bridge counts it."""
 
     ABOUT: ClassVar[str] = "bridge"
 
-    road_seconds: float = field(metadata=told("Road time"))
-    ticks_total: int = field(metadata=told("Ticks of the road that are over"))
+    road_seconds: float = field(metadata=metric("Road time"))
+    ticks_total: int = field(metadata=metric("Ticks of the road that are over"))
     missed_answers_total: int = field(
-        metadata=told("Answers of agents that had not come when their tick's deadline passed")
+        metadata=metric("Answers of agents that had not come when their tick's deadline passed")
     )
-    vehicles_demanded_total: int = field(metadata=told("Vehicles that have arrived at the road"))
-    vehicles_entered_total: int = field(metadata=told("Vehicles that have entered the road"))
-    vehicles_left_total: int = field(metadata=told("Vehicles that have left the road at its end"))
-    vehicles_on_road: int = field(metadata=told("Vehicles on the road"))
+    vehicles_demanded_total: int = field(metadata=metric("Vehicles that have arrived at the road"))
+    vehicles_entered_total: int = field(metadata=metric("Vehicles that have entered the road"))
+    vehicles_left_total: int = field(metadata=metric("Vehicles that have left the road at its end"))
+    vehicles_on_road: int = field(metadata=metric("Vehicles on the road"))
     vehicles_unattended: int = field(
-        metadata=told("Vehicles on the road of which a caretaker is in charge")
+        metadata=metric("Vehicles on the road of which a caretaker is in charge")
     )

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.transports.simulated.network import Conditions, SimulatedNetwork
+from laneweave.protocol.transports.simulated.network import SimulatedNetwork
+from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.core import Phase
 from laneweave.sim_bridge.road.demand import Arrival

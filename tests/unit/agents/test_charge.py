@@ -9,7 +9,7 @@ from attrs import evolve
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.driving.driver import Drive, SolverStats
-from laneweave.protocol.lattice import Cell, Move
+from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.runtime.node import Effect, Send, Wakeup
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import cell_state
@@ -35,13 +35,13 @@ class Passenger:
     def __init__(self, _: Scenario) -> None:
         """Begin with an empty diary."""
         self.taken_over: list[int] = []
-        self.begun: list[Move] = []
+        self.begun: list[PlannedMove] = []
         self.resting = True
 
     def take_over(self, sense: Sense) -> None:
         self.taken_over.append(sense.tick)
 
-    def begin(self, move: Move, tick: int, ticks: int) -> None:
+    def begin(self, move: PlannedMove, tick: int, ticks: int) -> None:
         del tick, ticks
         self.begun.append(move)
 

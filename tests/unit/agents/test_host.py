@@ -9,7 +9,7 @@ from attrs import evolve
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.host import ALONE_S, AgentHost
-from laneweave.agents.metrics import AgentNumbers
+from laneweave.agents.metrics import AgentMetrics
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import (
     Announce,
@@ -234,16 +234,16 @@ def test_ends_when_the_last_vehicle_has_left() -> None:
 
 def test_what_agents_have_counted_stays_when_they_end() -> None:
     host = make_host(A, B)
-    (before,) = host.numbers
-    assert before == AgentNumbers(
+    (before,) = host.metrics
+    assert before == AgentMetrics(
         vehicles=2, vehicles_in_charge=0, solves_total=0, unusable_total=0
     )
     for name in (A, B):
         hand(host, SENSE, name, sense(name, FRONT))
-    (driving,) = host.numbers
+    (driving,) = host.metrics
     assert driving == evolve(before, vehicles_in_charge=2, solves_total=2)
     hand(host, SENSE, A, sense(A, FRONT, 2, left=True))
-    (after,) = host.numbers
+    (after,) = host.metrics
     assert after == evolve(driving, vehicles=1, vehicles_in_charge=1)
 
 

@@ -13,7 +13,7 @@ from laneweave.coordinator.formations.planner import START_MARGIN_S
 from laneweave.coordinator.formations.roster import start_time_s
 from laneweave.coordinator.formations.sorting import Sorting, SortingTask, sort_lanes
 from laneweave.coordinator.planning import Weights
-from laneweave.protocol.lattice import Cell, Move
+from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.runtime.node import (
     Announce,
     Asked,
@@ -392,7 +392,7 @@ def test_failed_planning_is_logged_and_tried_again_under_the_same_ballot(spoil: 
             nothing = evolve(sorting.response, status="timeout", paths=())
             result = evolve(result, result=evolve(sorting, response=nothing))
         case _:
-            swapped: dict[Name, tuple[Move, ...]] = {
+            swapped: dict[Name, tuple[PlannedMove, ...]] = {
                 A: ((0, (0, 0), (-1, 1)),),
                 B: ((0, (-1, 1), (0, 0)),),
             }

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from laneweave.protocol.runtime.node import Arrived, Listen
-from laneweave.protocol.transports.simulated.network import Conditions, Parcel, SimulatedNetwork
+from laneweave.protocol.transports.simulated.network import Parcel, SimulatedNetwork
+from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.wire.codec import encode
 from laneweave.protocol.wire.messages import Heartbeat, Name
 from laneweave.protocol.wire.topics import COMMAND, HEARTBEAT, Keys

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from laneweave.protocol.lattice import Cell, Lattice, Move, footprint, territory
+from laneweave.protocol.lattice import Cell, Lattice, PlannedMove, footprint, territory
 
 LATTICES = st.builds(
     Lattice,
@@ -100,7 +100,9 @@ def test_a_hold_occupies_its_cell(cell: Cell) -> None:
 
 
 @given(st.lists(CELLS, max_size=8), st.lists(MOVES, max_size=8))
-def test_the_territory_contains_starts_and_footprints(cells: list[Cell], moves: list[Move]) -> None:
+def test_the_territory_contains_starts_and_footprints(
+    cells: list[Cell], moves: list[PlannedMove]
+) -> None:
     expected = set(cells).union(*(footprint(origin, target) for _, origin, target in moves))
     assert territory(cells, moves) == expected
 

@@ -9,8 +9,8 @@ import pytest
 from attrs import field, frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.validators import within
 from laneweave.protocol.structuring import NumberOrRange, structure
+from laneweave.protocol.validators import within
 
 
 @frozen

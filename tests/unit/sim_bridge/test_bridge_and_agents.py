@@ -8,7 +8,7 @@ import pytest
 
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.transports.simulated.network import Conditions
+from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.bodies.motion_controller import Rung
 from laneweave.sim_bridge.core import Phase

@@ -10,7 +10,7 @@ from attrs import evolve
 
 from laneweave.protocol.runtime.node import Arrived, Effect, Listen, Send, Stopping, Unlisten
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
-from laneweave.protocol.wire.incarnations import above
+from laneweave.protocol.wire.identities import above
 from laneweave.protocol.wire.messages import Ballot, Name, Plan, Prepare, Sense, VehicleState
 from laneweave.protocol.wire.topics import COMMAND, PLAN, PREPARE, STATE
 from laneweave.sim_bridge.core import Phase

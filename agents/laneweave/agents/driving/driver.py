@@ -18,7 +18,7 @@ from laneweave.agents.driving.program import NO_GAPS
 from laneweave.agents.driving.reference import Reference
 from laneweave.agents.driving.surroundings import Surroundings
 from laneweave.agents.driving.tracker import Tracker
-from laneweave.protocol.lattice import Cell, Move
+from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import at_rest_in_cell, cell_state, commanded_state
 from laneweave.protocol.wire.messages import Motion, Sense
@@ -68,7 +68,7 @@ class Driver(Protocol):
     def take_over(self, sense: Sense) -> None:
         """Continue the motion that the motion controller executes."""
 
-    def begin(self, move: Move, tick: int, ticks: int) -> None:
+    def begin(self, move: PlannedMove, tick: int, ticks: int) -> None:
         """Begin a move of `ticks` ticks at this tick."""
 
     def at_rest(self, sense: Sense) -> bool:
@@ -136,7 +136,7 @@ class TrackingDriver:
         else:
             self._reference = Reference.hold(scenario, sense.hold_cell)
 
-    def begin(self, move: Move, tick: int, ticks: int) -> None:
+    def begin(self, move: PlannedMove, tick: int, ticks: int) -> None:
         """Begin a move of `ticks` ticks at this tick."""
         self._goal, self._ticks = move[2], ticks
         self._reference = Reference.move(self._scenario, move[1], move[2], tick, ticks)

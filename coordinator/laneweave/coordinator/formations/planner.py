@@ -33,6 +33,17 @@ from laneweave.protocol.lattice import Cell, territory
 from laneweave.protocol.runtime.node import Compute, Computed
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.plans import plan_problems
+from laneweave.protocol.wire.events import (
+    FORMATION_TOO_LATE,
+    FORMATIONS_JOINED,
+    LANE_OUT_OF_REACH,
+    NEIGHBOURS_AWAITED,
+    PLAN_MADE,
+    PLANNING_FAILED,
+    ROOM_AWAITED,
+    STRUCTURE_IMPOSSIBLE,
+    STRUCTURE_TOO_LATE,
+)
 from laneweave.protocol.wire.messages import Ballot, Plan
 
 START_MARGIN_S = 0.5
@@ -108,11 +119,11 @@ class FormationPlanner:
         start_s, end_s = self._start_s(formation, cells, t_s), self._end_s(formation)
         if not formation.sorts and end_s < start_s + scenario.cycles_s[0]:
             control.on_planning_failed(now_s)
-            yield Note("structure-too-late", {"formation": numbers[0], "stage": formation.stage})
+            yield Note(STRUCTURE_TOO_LATE, {"formation": numbers[0], "stage": formation.stage})
             return
         if steps_left(cells, start_s, scenario.cycles_s[0], scenario) == 0:
             control.settle(now_s)
-            yield Note("formation-too-late", {"formation": numbers[0]})
+            yield Note(FORMATION_TOO_LATE, {"formation": numbers[0]})
             return
         task = SortingTask(
             numbers,
@@ -176,11 +187,11 @@ class FormationPlanner:
         if isinstance(result, Sorting):
             status = result.response.status if result.response is not None else "optimal"
             if result.short_of_room and self._join_neighbour(control, controls, t_s):
-                yield Note("formations-joined", {"formations": list(self._groups.of(number))})
+                yield Note(FORMATIONS_JOINED, {"formations": list(self._groups.of(number))})
                 return
             if result.short_of_room and self._room_is_coming(control.formation.numbers, t_s):
                 control.on_planning_failed(now_s)
-                yield Note("room-awaited", {"formation": number})
+                yield Note(ROOM_AWAITED, {"formation": number})
                 return
             if result.solved:
                 planned = self._plan(control, result, t_s)
@@ -194,7 +205,7 @@ class FormationPlanner:
                 error = "; ".join(problems)
         control.on_planning_failed(now_s)
         data = {"formation": number, "status": status, "error": error}
-        yield Note("planning-failed", data)
+        yield Note(PLANNING_FAILED, data)
 
     def _join_neighbour(
         self, control: FormationControl, controls: Mapping[int, FormationControl], t_s: float
@@ -305,15 +316,15 @@ def _notes(formation: Formation, sorting: Sorting, pauses: int, plan: Plan) -> I
     number = formation.numbers[0]
     if sorting.impossible:
         data = {"formation": number, "stage": formation.stage, "why": sorting.impossible}
-        yield Note("structure-impossible", data)
+        yield Note(STRUCTURE_IMPOSSIBLE, data)
     if sorting.response is not None:
         timing = {"t0_s": plan.t0_s, "slot_s": plan.slot_s}
-        yield Note("plan-made", _facts(number, sorting.response) | timing)
+        yield Note(PLAN_MADE, _facts(number, sorting.response) | timing)
     if pauses:
-        yield Note("neighbours-awaited", {"formation": number, "slots": pauses})
+        yield Note(NEIGHBOURS_AWAITED, {"formation": number, "slots": pauses})
     if sorting.out_of_reach:
         vehicles = [str(name) for name in sorting.out_of_reach]
-        yield Note("lane-out-of-reach", {"formation": number, "vehicles": vehicles})
+        yield Note(LANE_OUT_OF_REACH, {"formation": number, "vehicles": vehicles})
 
 
 def _facts(number: int, response: PlanResponse) -> dict[str, Any]:

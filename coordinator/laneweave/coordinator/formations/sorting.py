@@ -22,7 +22,7 @@ from laneweave.coordinator.formations.targets import placements
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, Weights, checked_plan
 from laneweave.coordinator.planning.budget import Clock
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.lattice import Cell, Move
+from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.tables import DrivingStructure, Scenario
 from laneweave.protocol.wire.messages import Name
 
@@ -101,7 +101,7 @@ class Sorting:
 
     response: PlanResponse | None
     """Of the planner; None: there is nobody to move."""
-    moves: dict[Name, tuple[Move, ...]]
+    moves: dict[Name, tuple[PlannedMove, ...]]
     """Moves of every member, on the lattice."""
     out_of_reach: tuple[Name, ...]
     """Members that do not get to their lanes."""
@@ -226,7 +226,7 @@ def _form(
 
 def _sorting(task: SortingTask, response: PlanResponse | None) -> Sorting:
     first = task.columns.start
-    moves: dict[Name, tuple[Move, ...]] = dict.fromkeys(task.hold_cells, ())
+    moves: dict[Name, tuple[PlannedMove, ...]] = dict.fromkeys(task.hold_cells, ())
     ends = dict(task.hold_cells)
     paths = response.paths if response is not None else ()
     for name, path in zip(task.movers, paths, strict=False):

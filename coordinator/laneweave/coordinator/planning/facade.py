@@ -26,7 +26,7 @@ from laneweave.coordinator.planning.request import PlanRequest, checked_solver
 from laneweave.coordinator.planning.response import PlanResponse, Status
 from laneweave.coordinator.planning.solution import Solution, tidied
 from laneweave.coordinator.planning.validator import problems_of_response
-from laneweave.protocol.scenario.solvers import DEFAULT_SOLVER
+from laneweave.protocol.scenario.tables import DEFAULT_SOLVER
 
 TAPPA_SHARE: Final = 0.75
 """Share of the deadline, and of the node limit, after which branching plans in place of TAPPA.

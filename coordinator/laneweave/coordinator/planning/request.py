@@ -27,7 +27,7 @@ from laneweave.coordinator.planning.json_fields import (
 from laneweave.coordinator.planning.preference import eligible_targets
 from laneweave.coordinator.planning.structures import STRUCTURES, shortage, structure_targets
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.solvers import SOLVERS
+from laneweave.protocol.scenario.tables import SOLVERS
 
 REQUEST_SCHEMA: Final = "laneweave.plan.request/1"
 DEFAULT_DEADLINE_S: Final = 4.0

@@ -13,7 +13,7 @@ from enum import Enum
 
 from attrs import define, field
 
-from laneweave.protocol.lattice import Cell, Move, footprint, territory
+from laneweave.protocol.lattice import Cell, PlannedMove, footprint, territory
 from laneweave.protocol.vehicle.plans import estate_problems, plan_problems
 from laneweave.protocol.wire.messages import Ballot, Deed, Name, Plan, Prepare, VehicleState
 
@@ -209,7 +209,7 @@ class Handover:
         needed = {name: footprint(*move) for name, move in self.moves.items()}
         given = {cell for cells in needed.values() for cell in cells}
         after = {name: (cells - given) | needed.get(name, set()) for name, cells in before.items()}
-        moves: dict[Name, tuple[Move, ...]] = dict.fromkeys(self.roster, ())
+        moves: dict[Name, tuple[PlannedMove, ...]] = dict.fromkeys(self.roster, ())
         moves |= {name: ((0, *move),) for name, move in self.moves.items()}
         start_cells = {name: self.promises[name].hold_cell for name in self.roster}
         return Plan(

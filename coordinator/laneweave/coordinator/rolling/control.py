@@ -22,6 +22,13 @@ from laneweave.coordinator.rolling.planner import Planner
 from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.runtime.node import Compute, Computed
 from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.wire.events import (
+    HANDOVER_GIVEN_UP,
+    PLAN_IN_FORCE,
+    PLANNING_FAILED,
+    PLANNING_LATE,
+    STREAM_PLANNED,
+)
 from laneweave.protocol.wire.messages import Ballot, Census, Name, Plan, Prepare, VehicleState
 
 SHOWN_S = 0.5
@@ -136,11 +143,11 @@ class StreamControl:
         handover = self._of[state.vehicle]
         handover.on_state(state, self.shown.states)
         if handover.phase is Phase.GIVEN_UP:
-            yield Note("handover-given-up", {"roster": list(handover.roster), "why": handover.why})
+            yield Note(HANDOVER_GIVEN_UP, {"roster": list(handover.roster), "why": handover.why})
         elif handover.phase is Phase.IN_FORCE and self.in_force == 1:
             slot = round(handover.t0_s / self._slot_s)
             begun_s = handover.t0_s - self._slot_s
-            yield Note("plan-in-force", {"slot": slot, "closed_s": begun_s + SHOWN_S})
+            yield Note(PLAN_IN_FORCE, {"slot": slot, "closed_s": begun_s + SHOWN_S})
 
     # --- the slot -----------------------------------------------------------------------------
 
@@ -231,16 +238,16 @@ class StreamControl:
             handover.give_up("the next slot is planned")
         table = computed.result
         if not isinstance(table, StreamPlan):
-            yield Note("planning-failed", {"slot": slot, "error": computed.error})
+            yield Note(PLANNING_FAILED, {"slot": slot, "error": computed.error})
             return
         self._table = table
         t0_s = slot * self._slot_s
         if t_s > t0_s + LATEST_S:
-            yield Note("planning-late", {"slot": slot})
+            yield Note(PLANNING_LATE, {"slot": slot})
             return
         self.handovers = list(self._handovers(table, t0_s, now_s))
         self._of = {name: each for each in self.handovers for name in each.roster}
-        yield Note("stream-planned", self._facts(table))
+        yield Note(STREAM_PLANNED, self._facts(table))
 
     def _facts(self, table: StreamPlan) -> dict[str, Any]:
         sizes = [len(handover.roster) for handover in self.handovers]

@@ -38,13 +38,14 @@ from laneweave.coordinator.service.query import (
     ServiceOverloadedError,
     ServiceUnavailableError,
 )
-from laneweave.protocol.config.identities import Identity, Party
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.transport import Answer
-from laneweave.protocol.security.access import Access, access_of
+from laneweave.protocol.security.access import Access
+from laneweave.protocol.security.rights import access_of
 from laneweave.protocol.transports.zenoh.transport import connect_patiently
-from laneweave.protocol.wire.topics import SERVICE, Keys
+from laneweave.protocol.wire.identities import Identity
+from laneweave.protocol.wire.topics import SERVICE, Keys, Party
 
 __all__ = [
     "AsyncPlanClient",

@@ -32,10 +32,10 @@ from laneweave.coordinator.service.format import (
 )
 from laneweave.coordinator.service.rendezvous import falls_to
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.runtime.metrics import told
+from laneweave.protocol.runtime.metrics import metric
 from laneweave.protocol.runtime.node import TOO_LATE, Decline, Delegate, Effect, Reply
 from laneweave.protocol.scenario.deployment import Service
-from laneweave.protocol.scenario.solvers import DEFAULT_SOLVER
+from laneweave.protocol.scenario.tables import DEFAULT_SOLVER
 
 HANDED_OUT_AHEAD = 1
 """Jobs for each worker beside the one that it does, so that it need not wait for the next."""
@@ -44,34 +44,36 @@ CACHE_BYTES = 1 << 26
 
 
 @frozen
-class ServiceNumbers:
+class ServiceMetrics:
     """What the service has done so far, and has in hand."""
 
     ABOUT: ClassVar[str] = "service"
 
-    taken_total: int = field(default=0, metadata=told("Requests that fell to this coordinator"))
+    taken_total: int = field(default=0, metadata=metric("Requests that fell to this coordinator"))
     left_total: int = field(
-        default=0, metadata=told("Requests that were left to other coordinators")
+        default=0, metadata=metric("Requests that were left to other coordinators")
     )
-    answered_total: int = field(default=0, metadata=told("Requests that were planned and answered"))
+    answered_total: int = field(
+        default=0, metadata=metric("Requests that were planned and answered")
+    )
     repeated_total: int = field(
         default=0,
-        metadata=told("Requests that were answered with another one's answer, by their id"),
+        metadata=metric("Requests that were answered with another one's answer, by their id"),
     )
-    invalid_total: int = field(default=0, metadata=told("Requests refused: not valid"))
-    overloaded_total: int = field(default=0, metadata=told("Requests refused: too many in hand"))
+    invalid_total: int = field(default=0, metadata=metric("Requests refused: not valid"))
+    overloaded_total: int = field(default=0, metadata=metric("Requests refused: too many in hand"))
     late_total: int = field(
         default=0,
-        metadata=told("Requests dropped: the deadline passed before a worker was free"),
+        metadata=metric("Requests dropped: the deadline passed before a worker was free"),
     )
-    failed_total: int = field(default=0, metadata=told("Requests whose planning failed"))
-    planning_seconds_total: float = field(default=0.0, metadata=told("Solvers' time"))
+    failed_total: int = field(default=0, metadata=metric("Requests whose planning failed"))
+    planning_seconds_total: float = field(default=0.0, metadata=metric("Solvers' time"))
     service_seconds_total: float = field(
         default=0.0,
-        metadata=told("Time from requests' arrivals to their answers, without the solvers' time"),
+        metadata=metric("Time from requests' arrivals to their answers, without the solvers' time"),
     )
-    waiting: int = field(default=0, metadata=told("Requests that wait for a worker"))
-    planning: int = field(default=0, metadata=told("Requests that workers have"))
+    waiting: int = field(default=0, metadata=metric("Requests that wait for a worker"))
+    planning: int = field(default=0, metadata=metric("Requests that workers have"))
 
 
 @define(eq=False)
@@ -126,12 +128,12 @@ class PlanningService:
         self._answers: dict[str, _Kept] = {}
         """Answers by the request's id, in order of their time."""
         self._kept_bytes = 0
-        self._numbers = ServiceNumbers()
+        self._metrics = ServiceMetrics()
 
     @property
-    def numbers(self) -> ServiceNumbers:
+    def metrics(self) -> ServiceMetrics:
         """What has been done so far."""
-        return attrs.evolve(self._numbers, waiting=len(self._waiting), planning=len(self._planning))
+        return attrs.evolve(self._metrics, waiting=len(self._waiting), planning=len(self._planning))
 
     @property
     def wakeup_s(self) -> float | None:
@@ -305,8 +307,8 @@ class PlanningService:
             self._kept_bytes -= len(answers.pop(oldest).answer)
 
     def _count(self, name: str, by: float = 1) -> None:
-        counted = getattr(self._numbers, name) + by
-        self._numbers = attrs.evolve(self._numbers, **{name: counted})
+        counted = getattr(self._metrics, name) + by
+        self._metrics = attrs.evolve(self._metrics, **{name: counted})
 
 
 def _digest(request: PlanRequest) -> bytes:

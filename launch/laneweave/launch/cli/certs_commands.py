@@ -8,11 +8,13 @@ from typing import Annotated
 
 import typer
 
-from laneweave.protocol.config.endpoints import host_of
-from laneweave.protocol.config.identities import Identity, Party, coordinator_names, parse_identity
 from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.validators import host_of
+from laneweave.protocol.wire.identities import Identity, parse_identity
+from laneweave.protocol.wire.topics import Party
 
 app = typer.Typer(help="Make test certificates.", add_completion=False)
 

@@ -10,9 +10,10 @@ from rich.console import Console
 from rich.table import Table
 
 from laneweave.launch.deploy.config_check import check_deployment
-from laneweave.protocol.config.identities import Identity, Party, parse_identity
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.wire.identities import Identity, parse_identity
+from laneweave.protocol.wire.topics import Party
 
 app = typer.Typer(help="Look at a configuration.", add_completion=False)
 BAD_INPUT = 2

@@ -191,7 +191,7 @@ def _run_formations(
     from laneweave.agents.driving.trajectory import check_moves
     from laneweave.launch.faults.specification import load_faults
     from laneweave.launch.run.local_run import LocalRun
-    from laneweave.protocol.config.identities import coordinator_names
+    from laneweave.protocol.config.participants import coordinator_names
     from laneweave.sim_bridge.road.demand import arrivals
 
     check_moves(settings)

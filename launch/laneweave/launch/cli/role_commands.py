@@ -20,9 +20,8 @@ from laneweave.launch.run.logs import LogFormat, LogLevel, log_role
 from laneweave.launch.run.run_folder import draw_own, new_folder
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.metrics import Observe, unobserved
-from laneweave.protocol.scenario.solvers import SOLVERS
-from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.security.access import access_of
+from laneweave.protocol.scenario.tables import SOLVERS, Scenario
+from laneweave.protocol.security.rights import access_of
 
 log = structlog.get_logger(__name__)
 
@@ -100,7 +99,7 @@ def coordinator(
 ) -> None:
     """Run a coordinator candidate; it also answers plan requests."""
     from laneweave.coordinator.process import run_coordinator
-    from laneweave.protocol.wire.topics import NAME_PATTERN, NAME_RULE
+    from laneweave.protocol.validators import NAME_PATTERN, NAME_RULE
 
     if not NAME_PATTERN.fullmatch(name):
         raise BadInputError("--name", name, NAME_RULE)

@@ -31,8 +31,9 @@ from laneweave.launch.observe.status import (
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.scenario.deployment import parse_shard
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.security.access import access_of
-from laneweave.protocol.wire.topics import NAME_PATTERN, NAME_RULE, Keys
+from laneweave.protocol.security.rights import access_of
+from laneweave.protocol.validators import NAME_PATTERN, NAME_RULE
+from laneweave.protocol.wire.topics import Keys
 
 WAIT_S = 0.1
 """Longest wait for a message before the end of listening is checked."""

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 
 from attrs import frozen
 
-from laneweave.protocol.config.identities import Identity, Party
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.deployment import FleetMembers, Security, Shard, parse_shard
-from laneweave.protocol.wire.topics import NAME_PATTERN, NAME_RULE
+from laneweave.protocol.validators import NAME_PATTERN, NAME_RULE
+from laneweave.protocol.wire.identities import Identity
+from laneweave.protocol.wire.topics import Party
 
 EVERYBODY = "0/1"
 

@@ -19,9 +19,10 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from laneweave.protocol.config.identities import Identity, Party
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.security.access import ca_path, certificate_path, key_path
+from laneweave.protocol.wire.identities import Identity
+from laneweave.protocol.wire.topics import Party
 
 CA_NAME = "laneweave test authority"
 CA_DAYS = 3650.0

@@ -9,14 +9,14 @@ from collections.abc import Iterator, Mapping
 
 from attrs import define, field
 
-from laneweave.protocol.config.endpoints import check_endpoint, host_of
-from laneweave.protocol.config.identities import Identity, Party, identities_of
+from laneweave.protocol.config.participants import demanded_vehicles, identities_of, members_of
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.fleets import demanded_vehicles, members_of
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.security.access import KNOWN_RULE, credentials_of
 from laneweave.protocol.security.certificates import examine
-from laneweave.protocol.security.rights import EVERYWHERE, rules_of
+from laneweave.protocol.security.rights import EVERYWHERE, KNOWN_RULE, credentials_of, rules_of
+from laneweave.protocol.validators import check_endpoint, host_of
+from laneweave.protocol.wire.identities import Identity
+from laneweave.protocol.wire.topics import Party
 
 
 @define

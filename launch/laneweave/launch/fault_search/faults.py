@@ -13,7 +13,8 @@ from attrs import frozen
 
 from laneweave.launch.fault_search.profiles import Profile
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.transports.simulated.network import Conditions, SimulatedNetwork
+from laneweave.protocol.transports.simulated.network import SimulatedNetwork
+from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.wire.codec import decode
 from laneweave.protocol.wire.topics import TOPICS
 

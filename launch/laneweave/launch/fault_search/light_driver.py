@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from laneweave.agents.driving.driver import Drive, SolverStats
-from laneweave.protocol.lattice import Cell, Move
+from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import at_rest_in_cell
 from laneweave.protocol.wire.messages import Motion, Sense
@@ -33,7 +33,7 @@ class LightDriver:
         self._origin, self._goal = sense.motion_origin, sense.hold_cell
         self._end_tick, self._ticks = sense.motion_end_tick, sense.motion_ticks
 
-    def begin(self, move: Move, tick: int, ticks: int) -> None:
+    def begin(self, move: PlannedMove, tick: int, ticks: int) -> None:
         """Begin a move at this tick; it takes `ticks` of them."""
         _, self._origin, self._goal = move
         self._end_tick, self._ticks = tick + ticks, ticks

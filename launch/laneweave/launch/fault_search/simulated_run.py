@@ -34,7 +34,7 @@ from laneweave.protocol.runtime.node import Core, Send
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
-from laneweave.protocol.transports.simulated.trace import TraceDigest
+from laneweave.protocol.transports.simulated.virtual_time import TraceDigest
 from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
 from laneweave.protocol.wire.codec import encode
 from laneweave.protocol.wire.messages import Command, Name, Plan, Prepare, Sense, VehicleState

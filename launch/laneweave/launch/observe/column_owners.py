@@ -13,9 +13,10 @@ import pyarrow.parquet as pq
 from attrs import field, frozen
 
 from laneweave.protocol.lattice import Lattice
+from laneweave.protocol.wire.events import FORMATION_CLOSED, FORMATIONS_JOINED, PLAN_MADE
 from laneweave.protocol.wire.messages import ClosedFormation
 
-CLOSED, JOINED, PLANNED = "formation-closed", "formations-joined", "plan-made"
+CLOSED, JOINED, PLANNED = FORMATION_CLOSED, FORMATIONS_JOINED, PLAN_MADE
 """Events of a run that are about formations."""
 
 

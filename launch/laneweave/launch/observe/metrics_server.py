@@ -16,8 +16,8 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.runtime.metrics import Observe, Snapshot, Source, metrics_of
-from laneweave.protocol.scenario.validators import host_and_port
+from laneweave.protocol.runtime.metrics import MetricsSnapshot, Observe, Source, metrics_of
+from laneweave.protocol.validators import host_and_port
 
 log = structlog.get_logger(__name__)
 
@@ -51,7 +51,7 @@ class NumbersCollector(Collector):
             yield from families(snapshot)
 
 
-def families(snapshot: Snapshot) -> Iterator[Metric]:
+def families(snapshot: MetricsSnapshot) -> Iterator[Metric]:
     """Yield the numbers of a snapshot as Prometheus knows them."""
     for metric in metrics_of(type(snapshot)):
         kind = CounterMetricFamily if metric.counts else GaugeMetricFamily

@@ -15,6 +15,7 @@ from attrs import field, frozen
 
 from laneweave.launch.drawing.colours import lane_names
 from laneweave.launch.web import road_script
+from laneweave.protocol.files import write_atomically
 
 PAGE_FILE: Final = "report.html"
 _TEMPLATES = files("laneweave.launch.report") / "templates"
@@ -68,9 +69,7 @@ def write_page(page: Page, folder: Path) -> Path:
         script=_script() if page.animations else "",
     )
     path = folder / PAGE_FILE
-    unfinished = path.with_suffix(".part")
-    unfinished.write_text(text, encoding="utf-8")
-    unfinished.replace(path)
+    write_atomically(path, text)
     return path
 
 

@@ -28,12 +28,12 @@ from laneweave.launch.run.outcome import Outcome, complete_summary
 from laneweave.launch.run.progress import RunProgress
 from laneweave.launch.run.role_processes import ROUTER, Order, RoleEnd, RoleProcesses
 from laneweave.launch.run.roles import fork_server
-from laneweave.protocol.config.identities import coordinator_names
 from laneweave.protocol.config.loading import to_tables
+from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.scenario.deployment import Security
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.security.access import access_of
+from laneweave.protocol.security.rights import access_of
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.topics import Keys
 from laneweave.sim_bridge.road.demand import arrivals

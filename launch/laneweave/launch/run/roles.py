@@ -32,7 +32,7 @@ from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.runtime.message_faults import FaultyCore, MessageRule, Wrap, bare
 from laneweave.protocol.runtime.node import Core
 from laneweave.protocol.runtime.processes import die_with_parent
-from laneweave.protocol.security.access import access_of
+from laneweave.protocol.security.rights import access_of
 
 log = structlog.get_logger(__name__)
 

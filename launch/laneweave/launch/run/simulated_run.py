@@ -23,10 +23,11 @@ from laneweave.launch.observe.observer import TOPICS
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.outcome import Outcome, complete_summary
 from laneweave.launch.run.progress import RunProgress
-from laneweave.protocol.config.identities import coordinator_names
+from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.runtime.node import Arrived, Core, Effect, Event, Listen, Started
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.transports.simulated.network import Conditions, SimulatedNetwork
+from laneweave.protocol.transports.simulated.network import SimulatedNetwork
+from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.core import BridgeCore, Phase
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord

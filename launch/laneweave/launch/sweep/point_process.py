@@ -13,6 +13,7 @@ from laneweave.launch.run.logs import log_to_terminal
 from laneweave.launch.sweep.execution import JOB_FILE, RESULT_FILE
 from laneweave.launch.sweep.run_point import run_method
 from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.files import write_atomically
 from laneweave.protocol.runtime.processes import die_with_parent
 
 
@@ -32,10 +33,7 @@ def main(folder: Path, parent: int) -> None:
     collect_seldom()
     job = json.loads((folder / JOB_FILE).read_text(encoding="utf-8"))
     outcome = run_method(parse_scenario(job["tables"]), job["method"], folder)
-    result = folder / RESULT_FILE
-    unfinished = result.with_suffix(".part")
-    unfinished.write_text(json.dumps({"problems": outcome.problems}), encoding="utf-8")
-    unfinished.replace(result)
+    write_atomically(folder / RESULT_FILE, json.dumps({"problems": outcome.problems}))
 
 
 if __name__ == "__main__":

@@ -13,6 +13,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from attrs import frozen
 
+from laneweave.protocol.files import write_atomically
+
 SCHEMA_KEY, SCHEMA = b"laneweave.schema", b"laneweave.sweep.results/1"
 
 _FIRST: dict[str, pa.DataType] = {
@@ -67,9 +69,9 @@ def results_table(rows: Iterable[Row]) -> pa.Table:
 
 def write_results(rows: Iterable[Row], path: Path) -> None:
     """Write the table whole or not at all."""
-    unfinished = path.with_suffix(".part")
-    pq.write_table(results_table(rows), unfinished, compression="zstd")
-    unfinished.replace(path)
+    write_atomically(
+        path, lambda part: pq.write_table(results_table(rows), part, compression="zstd")
+    )
 
 
 def flat_numbers(tables: Mapping[str, Any], parent: str = "") -> dict[str, float | int | None]:

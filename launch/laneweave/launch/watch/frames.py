@@ -59,8 +59,14 @@ from attrs import define, field, frozen
 from laneweave.launch.drawing.colours import lane_names
 from laneweave.launch.drawing.road_scene import road_scene
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.solvers import STREAM_PLANNED, solver_of_event
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.tables import Scenario, solver_of_event
+from laneweave.protocol.wire.events import (
+    ENTERED,
+    FORMATION_CLOSED,
+    LEFT,
+    PLAN_EVENTS,
+    PLAN_IN_FORCE,
+)
 
 FORMAT: Final = "laneweave.watch/1"
 MAX_REQUESTED: Final = 50
@@ -75,9 +81,8 @@ MAX_CHARACTERS: Final = 48_000_000
 MAX_EVENTS: Final = 8
 MAX_EVENT_CHARACTERS: Final = 90
 MAX_NUMBER: Final = 1e12
-PLAN_EVENTS: Final = (STREAM_PLANNED, "plan-made")
 FREQUENT_EVENTS: Final = (
-    *PLAN_EVENTS, "plan-in-force", "formation-closed", "entered", "left",
+    *PLAN_EVENTS, PLAN_IN_FORCE, FORMATION_CLOSED, ENTERED, LEFT,
 )  # fmt: skip
 """Events that are not shown, because they would displace all others."""
 

@@ -6,11 +6,11 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from laneweave.protocol.config.endpoints import is_tls
-from laneweave.protocol.config.identities import LONGEST_COMMON_NAME, identities_of
+from laneweave.protocol.config.participants import identities_of, max_vehicles
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.fleets import most_vehicles
 from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.validators import is_tls
+from laneweave.protocol.wire.identities import MAX_COMMON_NAME
 
 LEAST_GAP_M = 1.0
 """Between bumpers of neighbouring cells: bodies turn to change lanes, and track with some error."""
@@ -321,7 +321,7 @@ def _check_security(scenario: Scenario) -> None:
     if not secured:
         return
     _require(bool(security.folder), "security.folder", "", "the folder of the certificates")
-    count = most_vehicles(scenario.demand, scenario.road.lanes)
+    count = max_vehicles(scenario.demand, scenario.road.lanes)
     _require(
         count <= MOST_SECURED_VEHICLES,
         "demand.duration_s",
@@ -332,8 +332,8 @@ def _check_security(scenario: Scenario) -> None:
     for identity in identities_of(scenario):
         name = identity.common_name
         _require(
-            len(name) <= LONGEST_COMMON_NAME,
+            len(name) <= MAX_COMMON_NAME,
             f"security.{identity.party}s",
             name,
-            f"at most {LONGEST_COMMON_NAME} characters: it is the common name of a certificate",
+            f"at most {MAX_COMMON_NAME} characters: it is the common name of a certificate",
         )

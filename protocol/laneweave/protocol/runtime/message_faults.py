@@ -1,11 +1,10 @@
-"""Message faults above the transport: a core that loses, doubles and delays what arrives for it.
+"""Message faults above the transport: a core wrapper that loses, duplicates and delays messages.
 
-`FaultyCore` stands between a node and its core, so every receiver has a fate of its own for each
-message, over every transport and in virtual time alike. Only messages are touched: liveliness
-tokens, the state of the link and questions to a service pass as they are.
+`FaultyCore` sits between a node and its core, so each receiver loses or delays messages on its own,
+with any transport. Liveliness tokens, link events and queries are not affected.
 
-Everything random comes from one generator for each topic, seeded by the run's seed and the
-process's label: equal seeds and equal arrivals give equal fates.
+Each topic has a random generator, seeded by the run's seed and the process's label: equal seeds and
+equal arrivals give equal faults.
 """
 
 from __future__ import annotations
@@ -20,19 +19,28 @@ import attrs
 from attrs import field, frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.runtime.node import Arrived, Core, Effect, Event, Send, Wakeup
-from laneweave.protocol.scenario.validators import one_of, within
+from laneweave.protocol.runtime.metrics import MetricsSnapshot
+from laneweave.protocol.runtime.node import (
+    Arrived,
+    Core,
+    Effect,
+    Event,
+    Send,
+    Wakeup,
+    core_metrics,
+)
+from laneweave.protocol.validators import one_of, within
 from laneweave.protocol.wire.messages import RoadClock
 from laneweave.protocol.wire.topics import TOPICS
 
 SENDER_OF_ROLE = {"agent": "vehicle", "coordinator": "coordinator", "bridge": "bridge"}
-"""Who a process of each role speaks for, as rules name them."""
+"""Sender that a process of each role counts as, in rules."""
 SENDERS = tuple(SENDER_OF_ROLE.values())
 MESSAGE_TOPICS = tuple(topic.name for topic in TOPICS if topic.kind is not None)
 Wrap = Callable[[Core], Core]
-"""Puts something before a core, or nothing."""
-MOST_HELD = 10_000
-"""Delayed messages that wait at one time; what comes beyond is lost."""
+"""Function that wraps a core, or returns it unchanged."""
+MAX_HELD = 10_000
+"""Maximum number of delayed messages; more are lost."""
 
 
 def _message_topics(_: object, attribute: attrs.Attribute[Any], value: tuple[str, ...]) -> None:
@@ -43,56 +51,56 @@ def _message_topics(_: object, attribute: attrs.Attribute[Any], value: tuple[str
 
 @frozen(kw_only=True)
 class MessageRule:
-    """What happens to some messages for some time. Rules add up: each has its turn.
+    """Fault of some messages for some time; several rules are applied in turn.
 
     Raises:
         BadInputError: a value is not acceptable.
     """
 
     topics: tuple[str, ...] = field(default=(), validator=_message_topics)
-    """Names of topics; empty: all that carry messages."""
+    """Topic names; empty: all that carry messages."""
     loss: float = field(default=0.0, validator=within(0.0, 1.0))
-    """Probability that a message does not reach a receiver."""
+    """Probability that a receiver does not get a message."""
     duplication: float = field(default=0.0, validator=within(0.0, 1.0))
     """Probability that a receiver gets a message twice."""
     delay_s: float = field(default=0.0, validator=within(0.0, 60.0))
-    """Wall-clock seconds by which each copy comes later."""
+    """Delay of each copy, in wall-clock seconds."""
     jitter_s: float = field(default=0.0, validator=within(0.0, 60.0))
-    """Uniformly drawn for each copy, and added; more than the messages' spacing reorders them."""
+    """Maximum of a uniform extra delay per copy; above the messages' spacing it reorders them."""
     from_s: float = field(default=0.0, validator=within(0.0, 1e6))
-    """Road time from which the rule holds; 0: also before the road's clock starts."""
+    """Road time at which the rule starts; 0: also before the road's clock starts."""
     until_s: float | None = field(
         default=None, validator=attrs.validators.optional(within(0.0, 1e6))
     )
-    """Road time at which it ends; none: it holds to the end."""
+    """Road time at which it ends; None: at the end of the run."""
     sender: str | None = field(default=None, validator=attrs.validators.optional(one_of(*SENDERS)))
-    """Only what they send; none: whoever sends it."""
+    """Kind of sender; None: any."""
     receiver: str | None = field(
         default=None, validator=attrs.validators.optional(one_of(*SENDERS))
     )
-    """Only what they receive; none: whoever receives it."""
+    """Kind of receiver; None: any."""
 
     def __attrs_post_init__(self) -> None:
-        """Check how the fields fit together."""
+        """Check the fields against each other."""
         if self.until_s is not None and self.until_s <= self.from_s:
             raise BadInputError("until_s", self.until_s, f"more than from_s, {self.from_s:g}")
 
     def holds(self, road_s: float) -> bool:
-        """Tell whether the rule is in force at a road time."""
+        """Return whether the rule is in force at a road time."""
         return self.from_s <= road_s and (self.until_s is None or road_s < self.until_s)
 
 
 class FaultBoard(Protocol):
-    """What the processes of a run share without messages."""
+    """State that the processes of a run share without messages."""
 
     road_s: float
-    """Road time; the bridge's `FaultyCore` writes it, all others read it."""
+    """Road time; written by the bridge's `FaultyCore`, read by all others."""
     dropped: int
-    """Messages that were lost; each `FaultyCore` counts its own up."""
+    """Number of lost messages; each `FaultyCore` adds its own."""
 
 
 class FaultyCore:
-    """Another core, with message faults before it; a `Core` itself."""
+    """A core with message faults at its input; a `Core` itself."""
 
     def __init__(
         self,
@@ -103,14 +111,14 @@ class FaultyCore:
         receiver: str,
         seed: str,
     ) -> None:
-        """Put faults before a core.
+        """Wrap a core.
 
         Args:
-            core: whoever should receive the messages.
-            rules: of the whole run; those for other receivers are ignored.
-            board: tells which rules are in force, and counts.
-            receiver: for whom the core receives, one of `SENDERS`.
-            seed: of all draws; tells this process from the others of the run.
+            core: receives the messages that are not lost.
+            rules: rules of the whole run; those for other receivers are ignored.
+            board: shared road time and counter.
+            receiver: kind of receiver, one of `SENDERS`.
+            seed: seed of all draws, different in each process of the run.
         """
         self.core = core
         self._board = board
@@ -122,15 +130,20 @@ class FaultyCore:
         self._order = count()
 
     @property
+    def metrics(self) -> Iterable[MetricsSnapshot]:
+        """Metrics of the wrapped core."""
+        return core_metrics(self.core)
+
+    @property
     def wakeup_s(self) -> float | None:
-        """When the next delayed message arrives, or the core wants to be called."""
+        """Time of the next delayed message or of the core's wakeup."""
         wakeup_s = self.core.wakeup_s
         if not self._held:
             return wakeup_s
         return self._held[0][0] if wakeup_s is None else min(wakeup_s, self._held[0][0])
 
     def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
-        """Take an event; see `Core`."""
+        """Handle an event; see `Core`."""
         for effect in self._on_event(event, now_s):
             if isinstance(effect, Send) and isinstance(effect.message, RoadClock):
                 self._board.road_s = effect.message.t_s
@@ -152,7 +165,7 @@ class FaultyCore:
         for delay_s in delays_s:
             if delay_s <= 0.0:
                 yield from self.core.handle(arrived, now_s)
-            elif len(self._held) < MOST_HELD:
+            elif len(self._held) < MAX_HELD:
                 heapq.heappush(self._held, (now_s + delay_s, next(self._order), arrived))
             else:
                 self._board.dropped += 1
@@ -165,7 +178,7 @@ class FaultyCore:
             yield from self.core.handle(wakeup, now_s)
 
     def _fate(self, arrived: Arrived) -> list[float]:
-        """Return the delay of each copy of a message in s; none: it is lost."""
+        """Return the delay of each copy of a message [s]; an empty list if it is lost."""
         delays_s = [0.0]
         name = arrived.topic.name
         rules = self._rules_for.get(name)
@@ -180,7 +193,7 @@ class FaultyCore:
         for rule in rules:
             if not rule.holds(road_s) or rule.sender not in (None, sender):
                 continue
-            # Always both draws: a rule's duplicates do not depend on its loss.
+            # Draw both in any case, so that duplicates do not depend on loss.
             lost, doubled = draw() < rule.loss, draw() < rule.duplication
             if lost:
                 return []
@@ -193,14 +206,14 @@ class FaultyCore:
     def _generator(self, topic: str) -> random.Random:
         generator = self._generators.get(topic)
         if generator is None:
-            # Text is hashed by SHA-512, alike in every process.
+            # Text seeds are hashed with SHA-512, equally in all processes.
             generator = random.Random(f"{self._seed}/{topic}")  # noqa: S311 (no secrets)
             self._generators[topic] = generator
         return generator
 
 
 def bare(core: Core) -> Core:
-    """Return a core as it is: the `Wrap` of a run without faults."""
+    """Return a core unchanged: the `Wrap` of a run without faults."""
     return core
 
 

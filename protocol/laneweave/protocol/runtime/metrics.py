@@ -1,12 +1,11 @@
-"""Numbers that a process offers to whoever looks at it, without knowing who that is.
+"""Metrics of a process: what it counts, described once, readable from other threads.
 
-A *snapshot* is a frozen attrs class with a class variable `ABOUT` and one field for each number: an
-int, a float, a bool, or a mapping of text to number. The class is the one description of its
-numbers: a field's name says the unit last, in base units, and ends with `_total` if the number only
-ever grows; its metadata, made by `told`, says what it is.
+A *snapshot* is a frozen attrs class with a class variable `ABOUT` and one field per metric: an int,
+a float, a bool, or a mapping of text to number. Field names end with the unit, in base units, and
+with `_total` if the value only ever grows; their metadata, made by `metric`, describes them.
 
-Whoever looks does so from a thread of its own, and never into what another one counts: it puts a
-`Look` among the events of the process, and the thread that counts answers it (`looking`).
+A reader never touches the counters of another thread: it puts a `SnapshotRequest` among the events
+of the process, and the thread that counts answers it (`snapshot_source`).
 """
 
 from __future__ import annotations
@@ -19,88 +18,80 @@ import attrs
 from attrs import frozen
 
 PREFIX = "laneweave"
-LOOK_S = 2.0
-"""A process that is too busy to tell its numbers in this time hangs."""
+SNAPSHOT_TIMEOUT_S = 2.0
+"""A process that does not answer a request in this time counts as hanging."""
 
 
-class Snapshot(attrs.AttrsInstance, Protocol):
-    """Numbers of one subject at one moment."""
+class MetricsSnapshot(attrs.AttrsInstance, Protocol):
+    """Metrics of one subject at one moment."""
 
     ABOUT: ClassVar[str]
-    """What they are about, the first word of their names."""
+    """Subject: the first word of the metrics' names."""
 
 
-Source = Callable[[], Iterable[Snapshot]]
-"""Returns the numbers of a process as they are now; callable from any thread but its own. Raises
-`TimeoutError` where the process hangs."""
+Source = Callable[[], Iterable[MetricsSnapshot]]
+"""Returns the current metrics of a process; callable from any thread but its own. Raises
+`TimeoutError` if the process hangs."""
 Observe = Callable[[Source], None]
-"""Is told where the numbers of a process come from, once they can be asked for."""
+"""Callback that registers the metrics source of a process, once it is ready."""
 
 
 def unobserved(_: Source) -> None:
-    """Let nobody look: the `Observe` of most processes."""
+    """Ignore the source: the `Observe` of a process without a metrics server."""
 
 
 @frozen
-class Look:
-    """Somebody wants to know a process's numbers."""
+class SnapshotRequest:
+    """Request for the metrics of a process, answered by the thread that counts."""
 
-    _answers: queue.SimpleQueue[Iterable[Snapshot]] = attrs.field(factory=queue.SimpleQueue)
+    _answers: queue.SimpleQueue[Iterable[MetricsSnapshot]] = attrs.field(factory=queue.SimpleQueue)
 
-    def answer(self, numbers: Iterable[Snapshot]) -> None:
-        """Tell them; to be called by the thread that counts."""
-        self._answers.put(numbers)
+    def answer(self, snapshots: Iterable[MetricsSnapshot]) -> None:
+        """Answer; called by the thread that counts."""
+        self._answers.put(snapshots)
 
-    def wait(self) -> Iterable[Snapshot]:
+    def wait(self) -> Iterable[MetricsSnapshot]:
         """Return the answer.
 
         Raises:
             TimeoutError: there was none in time.
         """
         try:
-            return self._answers.get(timeout=LOOK_S)
+            return self._answers.get(timeout=SNAPSHOT_TIMEOUT_S)
         except queue.Empty:
-            raise TimeoutError(f"no numbers within {LOOK_S:g} s") from None
+            raise TimeoutError(f"no metrics within {SNAPSHOT_TIMEOUT_S:g} s") from None
 
 
-def looking(ask: Callable[[Look], None]) -> Source:
-    """Return a source that hands looks to `ask` and waits for their answers."""
+def snapshot_source(request: Callable[[SnapshotRequest], None]) -> Source:
+    """Return a source that passes requests to `request` and waits for their answers."""
 
-    def look() -> Iterable[Snapshot]:
-        one = Look()
-        ask(one)
+    def snapshots() -> Iterable[MetricsSnapshot]:
+        one = SnapshotRequest()
+        request(one)
         return one.wait()
 
-    return look
-
-
-class Offering(Protocol):
-    """A core that has numbers to offer."""
-
-    @property
-    def numbers(self) -> Iterable[Snapshot]:
-        """Its numbers as they are now."""
+    return snapshots
 
 
 @frozen
 class Metric:
-    """The description of one number."""
+    """Description of one metric."""
 
     name: str
-    """Whole, as in `laneweave_node_published_total`."""
+    """Full name, such as `laneweave_node_published_total`."""
     meaning: str
     label: str
-    """What tells the parts of it from each other; empty: it has none."""
+    """Name of the label that distinguishes its parts; empty: it has none."""
     field: str
-    """Of the snapshot."""
+    """Field of the snapshot."""
 
     @property
     def counts(self) -> bool:
         """Whether it only ever grows."""
         return self.name.endswith("_total")
 
-    def samples(self, snapshot: Snapshot) -> Iterator[tuple[tuple[str, ...], float]]:
-        """Yield the labels' values and the number, for each part of it."""
+    def samples(self, snapshot: MetricsSnapshot) -> Iterator[tuple[tuple[str, ...], float]]:
+        """Yield (label values, number) for each part."""
         value = getattr(snapshot, self.field)
         if self.label:
             for part, number in value.items():
@@ -109,8 +100,8 @@ class Metric:
             yield (), float(value)
 
 
-def told(meaning: str, *, label: str = "") -> dict[str, Any]:
-    """Return a field's metadata.
+def metric(meaning: str, *, label: str = "") -> dict[str, Any]:
+    """Return the metadata of a metric's field.
 
     Args:
         meaning: what the number is, in one sentence without the full stop.
@@ -119,8 +110,8 @@ def told(meaning: str, *, label: str = "") -> dict[str, Any]:
     return {"meaning": meaning, "label": label}
 
 
-def metrics_of(kind: type[Snapshot]) -> tuple[Metric, ...]:
-    """Return what the numbers of a snapshot are."""
+def metrics_of(kind: type[MetricsSnapshot]) -> tuple[Metric, ...]:
+    """Return the descriptions of a snapshot's metrics."""
     return tuple(
         Metric(
             name=f"{PREFIX}_{kind.ABOUT}_{attribute.name}",
@@ -133,30 +124,30 @@ def metrics_of(kind: type[Snapshot]) -> tuple[Metric, ...]:
 
 
 @frozen
-class NodeNumbers:
-    """What a node has counted."""
+class NodeMetrics:
+    """Counters of a node."""
 
     ABOUT: ClassVar[str] = "node"
 
-    published_total: int = attrs.field(metadata=told("Messages that this process has published"))
+    published_total: int = attrs.field(metadata=metric("Messages that this process has published"))
     received_total: Mapping[str, int] = attrs.field(
-        metadata=told("Well-formed messages that have arrived", label="topic")
+        metadata=metric("Well-formed messages that have arrived", label="topic")
     )
     rejected_total: int = attrs.field(
-        metadata=told("Messages that have arrived and were not well formed")
+        metadata=metric("Messages that have arrived and were not well formed")
     )
     events_total: int = attrs.field(
-        metadata=told("Events that the core has handled: messages, tokens, timers, results")
+        metadata=metric("Events that the core has handled: messages, tokens, timers, results")
     )
     handling_seconds_total: float = attrs.field(
-        metadata=told("Time that this process has spent on handling events")
+        metadata=metric("Time that this process has spent on handling events")
     )
 
 
 @frozen
-class RouterNumbers:
-    """What a router knows of itself."""
+class RouterMetrics:
+    """Counters of a router."""
 
     ABOUT: ClassVar[str] = "router"
 
-    sessions: int = attrs.field(metadata=told("Processes that are connected"))
+    sessions: int = attrs.field(metadata=metric("Processes that are connected"))

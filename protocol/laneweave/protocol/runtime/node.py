@@ -1,9 +1,9 @@
-"""Pure cores and the node that drives one over a transport.
+"""Events, effects, and the node that drives a pure core over a transport.
 
 A *core* is a state machine without I/O, clock, thread or randomness of its own: `handle` takes an
-event and the time and returns effects; `wakeup_s` says when it wants to be called again. A `Node`
-translates: payloads into typed events, effects into calls of the transport. Malformed input is
-counted and dropped here, so no core ever sees it.
+event and the time and returns effects; `wakeup_s` is the time of its next wakeup. A `Node` decodes
+payloads into typed events and carries out effects with the transport. It counts and drops
+malformed input, so a core never sees it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import structlog
 from attrs import field, frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.runtime.metrics import NodeNumbers, Snapshot
+from laneweave.protocol.runtime.metrics import MetricsSnapshot, NodeMetrics
 from laneweave.protocol.runtime.transport import (
     Delivery,
     LinkDown,
@@ -35,12 +35,12 @@ from laneweave.protocol.wire.topics import Keys, Topic
 log = structlog.get_logger(__name__)
 
 TOO_LATE = "the deadline passed before it began"
-"""Why a delegated computation was not begun."""
+"""Error of a delegated computation that was not started."""
 
 
 @frozen
 class Started:
-    """The node is up; the first event of every core."""
+    """The node has started: the first event of every core."""
 
 
 @frozen
@@ -70,12 +70,12 @@ class PeerDown:
 
 @frozen
 class Wakeup:
-    """The time that the core asked for has come."""
+    """The time `wakeup_s` of the core has come."""
 
 
 @frozen
 class Computed:
-    """A computation that the core ordered has ended; `error` is set when it raised."""
+    """A computation of the core has ended; `error` is set if it raised."""
 
     job: int
     result: Any
@@ -84,17 +84,17 @@ class Computed:
 
 @frozen
 class Asked:
-    """Somebody asks this node's service; answer with `Reply`."""
+    """A question to this node's service; answer with `Reply` or `Decline`."""
 
     token: int
     payload: bytes
     encoding: str = ""
-    """MIME type of the payload; empty: not told."""
+    """MIME type of the payload; empty: unknown."""
 
 
 @frozen
 class Stopping:
-    """The process was asked to end; the last event of a core."""
+    """The process is to end: the last event of a core."""
 
 
 Event = (
@@ -137,7 +137,7 @@ class Announce:
 
 @frozen
 class Withdraw:
-    """Take a liveliness token back."""
+    """Withdraw a liveliness token."""
 
     topic: Topic
     parameters: dict[str, Any] = field(factory=dict)
@@ -145,7 +145,7 @@ class Withdraw:
 
 @frozen
 class Watch:
-    """Be told of tokens that appear and vanish."""
+    """Receive `PeerUp` and `PeerDown` for matching tokens."""
 
     topic: Topic
     parameters: dict[str, Any] = field(factory=dict)
@@ -170,14 +170,14 @@ class Reply:
 
 @frozen
 class Decline:
-    """Leave a question to others who serve the same topic."""
+    """Leave a question to the other servers of the topic."""
 
     token: int
 
 
 @frozen
 class Compute:
-    """Run `work` beside the core, after what was ordered before; `Computed` brings its result."""
+    """Run `work` on another thread, after earlier jobs; `Computed` brings its result."""
 
     job: int
     work: Callable[[], Any]
@@ -185,11 +185,11 @@ class Compute:
 
 @frozen
 class Delegate:
-    """Run `work` in a process of its own, beside others; `Computed` brings its result.
+    """Run `work` in a worker process; `Computed` brings its result.
 
-    It is called with the seconds that are left until `deadline_s`, and not at all when none are:
-    then it counts as failed. Where it does not end long after the deadline, it is killed. `work`
-    can be pickled.
+    `work` must be picklable. It is called with the seconds left until `deadline_s`; if none are
+    left it is not called and counts as failed. A worker is killed when it exceeds the deadline by
+    far.
     """
 
     job: int
@@ -200,7 +200,7 @@ class Delegate:
 
 @frozen
 class End:
-    """The core has nothing more to do; the node leaves the network."""
+    """Leave the network: the core has nothing more to do."""
 
 
 Effect = (
@@ -223,22 +223,24 @@ class Core(Protocol):
     """A state machine that a node drives."""
 
     def handle(self, event: Event, now_s: float) -> Iterable[Effect]:
-        """Take one event at a time and return what to do.
+        """Handle one event and return the effects.
 
-        What is in an event may be shared with other cores: it is not to be changed.
+        The content of an event may be shared with other cores and must not be modified.
         """
 
     @property
     def wakeup_s(self) -> float | None:
-        """When to be called with `Wakeup`, on the clock of `now_s`; None: not by itself."""
+        """Time of the next `Wakeup`, on the clock of `now_s`; None: none is needed."""
+
+
+def core_metrics(core: Core) -> Iterable[MetricsSnapshot]:
+    """Return the metrics of a core: its property `metrics`, or nothing if it has none."""
+    metrics: Iterable[MetricsSnapshot] = getattr(core, "metrics", ())
+    return metrics
 
 
 class Node:
-    """Drives one core over one transport.
-
-    `order_work` takes computations off the node's hands and calls `dispatch(Computed(...))` when
-    one is done.
-    """
+    """Drives one core over one transport."""
 
     def __init__(
         self,
@@ -252,9 +254,14 @@ class Node:
     ) -> None:
         """Join a core to its transport; nothing is sent before the first `dispatch`.
 
-        `label` tells this process from all others in reports. `read` does what
-        `read_message` does with `keys`, which is also the default; it may remember. `write` turns a
-        message into what `read` understands.
+        Args:
+            core: receives the events.
+            transport: carries out the effects.
+            keys: key grammar of the realm.
+            order_work: runs computations elsewhere, and calls `dispatch(Computed(...))` at the end.
+            label: distinguishes this process from all others in reports.
+            read: decodes a message, as `read_message` does, which is the default; may cache.
+            write: encodes a message for `read`.
         """
         self._label = label
         self.core = core
@@ -262,21 +269,21 @@ class Node:
         self.published = 0
         self.rejected = 0
         self.received: dict[str, int] = {}
-        """Well-formed messages, by the name of their topic."""
+        """Well-formed messages by topic name."""
         self.handled = 0
-        """Events that the core has got."""
+        """Events that the core has handled."""
         self.handling_s = 0.0
-        """Whoever drives the node may add up here how long that took."""
+        """Total handling time, added up by the runner."""
         self._transport = transport
         self._keys = keys
         self._order_work = order_work
         self._read = read or partial(read_message, keys)
         self._write = write
         self._encoded: tuple[object, bytes] = (None, b"")
-        """The newest message sent, and its bytes: a plan goes to one vehicle after the other."""
+        """Newest message and its bytes: a plan is sent to one vehicle after the other."""
 
     def deliver(self, delivery: Delivery, now_s: float) -> None:
-        """Translate what the transport hands over and let the core handle it."""
+        """Translate a delivery into an event and let the core handle it."""
         event: Event
         try:
             if isinstance(delivery, Received):
@@ -301,13 +308,12 @@ class Node:
             else:
                 self._carry_out(effect)
 
-    def numbers(self) -> list[Snapshot]:
-        """Return what this node and its core have counted."""
-        own = NodeNumbers(
+    def metrics(self) -> list[MetricsSnapshot]:
+        """Return the metrics of this node and its core."""
+        own = NodeMetrics(
             self.published, self.received.copy(), self.rejected, self.handled, self.handling_s
         )
-        offered: Iterable[Snapshot] = getattr(self.core, "numbers", ())
-        return [own, *offered]
+        return [own, *core_metrics(self.core)]
 
     def _news(self, delivery: LinkUp | LinkDown | Question | TokenUp | TokenDown) -> Event:
         if isinstance(delivery, (LinkUp, LinkDown)):
@@ -319,7 +325,7 @@ class Node:
 
     def _reject(self, delivery: Delivery, reason: str) -> None:
         self.rejected += 1
-        # One line for the 1st, 10th, 100th, ...: a flood must not fill the log.
+        # Log the 1st, 10th, 100th, ... only: a flood must not fill the log.
         if self.rejected == 10 ** (len(str(self.rejected)) - 1):
             key = getattr(delivery, "key", "")
             log.warning("message ignored", key=key, reason=reason, ignored=self.rejected)
@@ -377,10 +383,10 @@ def read_message(
     payload: bytes,
     decode: Callable[[bytes, type], object] = decode,
 ) -> Arrived:
-    """Return the message that arrived on a key; equal arguments give equal results.
+    """Return the message that arrived on a key; a pure function.
 
     Raises:
-        BadInputError: the key is none of `keys`, or the payload is no message of its topic.
+        BadInputError: the key is not one of `keys`, or the payload is not a message of its topic.
     """
     topic, parameters = known_key(keys, key)
     if topic.kind is None:
@@ -392,7 +398,7 @@ def known_key(keys: Keys, key: str) -> tuple[Topic, Mapping[str, str]]:
     """Return a key's topic and parameters.
 
     Raises:
-        BadInputError: the key is none of `keys`.
+        BadInputError: the key is not one of `keys`.
     """
     known = keys.read(key)
     if known is None:
@@ -401,7 +407,7 @@ def known_key(keys: Keys, key: str) -> tuple[Topic, Mapping[str, str]]:
 
 
 def run_job(job: Compute) -> Computed:
-    """Run a computation and wrap its result or its failure."""
+    """Run a computation and return its result or error."""
     try:
         return Computed(job.job, job.work())
     except Exception as error:
@@ -410,15 +416,15 @@ def run_job(job: Compute) -> Computed:
 
 
 def run_delegated(job: Delegate, now_s: Callable[[], float]) -> Computed:
-    """Run a delegated computation here, with the time that is left on the clock `now_s`."""
+    """Run a delegated computation in this process, on the clock `now_s`."""
     return run_job(Compute(job.job, partial(in_time, job.work, job.deadline_s, now_s)))
 
 
 def in_time(work: Callable[[float], Any], deadline_s: float, now_s: Callable[[], float]) -> object:
-    """Return what `work` does in the time that is left.
+    """Return the result of `work`, called with the time left.
 
     Raises:
-        TimeoutError: none is left.
+        TimeoutError: no time is left.
     """
     left_s = deadline_s - now_s()
     if left_s <= 0:

@@ -14,7 +14,7 @@ import attrs
 from attrs import field, frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.validators import host_port, key_part, key_parts, one_of, within
+from laneweave.protocol.validators import host_port, key_part, key_parts, one_of, within
 
 FleetMembers = str | tuple[str, ...]
 """A shard `I/N` of the vehicles that are announced, or vehicles by name."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Final
 
 import attrs
 from attrs import field, frozen
@@ -19,8 +19,8 @@ from attrs.validators import optional
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Lattice
 from laneweave.protocol.scenario.deployment import Network, Observation, Security, Service
-from laneweave.protocol.scenario.solvers import DEFAULT_SOLVER, SOLVERS
-from laneweave.protocol.scenario.validators import one_of, within
+from laneweave.protocol.validators import one_of, within
+from laneweave.protocol.wire.events import STREAM_PLANNED
 
 SCHEMA = "laneweave.scenario/1"
 
@@ -45,6 +45,11 @@ PAPERS_FORMATIONS: Mapping[str, object] = MappingProxyType(
 """Fields of the table `formation` that make it the paper's: what `operation = "paper"` stands for
 where a file, a recording or an option says so."""
 
+SOLVERS: Final = ("tappa", "branching")
+"""`tappa`: the paper's algorithm. `branching`: branch and bound, for large formations."""
+DEFAULT_SOLVER: Final = "tappa"
+ROLLING_SOLVER: Final = "rolling"
+"""Planner of the rolling operation, where plans are counted by solver."""
 CONFLICT_KINDS = (
     "node",
     "edge",
@@ -55,6 +60,14 @@ CONFLICT_KINDS = (
     "geometric",
     "closing",
 )
+
+
+def solver_of_event(kind: str, data: Mapping[str, Any]) -> str | None:
+    """Return the solver that an event reports; None if it reports none."""
+    if kind == STREAM_PLANNED:
+        return ROLLING_SOLVER
+    solver = data.get("solver")
+    return str(solver) if solver in SOLVERS else None
 
 
 def _conflict_kinds(_: object, attribute: attrs.Attribute[Any], value: Sequence[str]) -> None:

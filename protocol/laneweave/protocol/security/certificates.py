@@ -20,9 +20,9 @@ from typing import Any
 import structlog
 from attrs import frozen
 
-from laneweave.protocol.config.identities import Party
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.security.access import Credentials
+from laneweave.protocol.wire.topics import Party
 
 log = structlog.get_logger(__name__)
 

@@ -1,9 +1,8 @@
-"""Who may do what on the network: a router's rules, derived from the table of topics.
+"""Rights of each process on a secured network, derived from the table of topics.
 
-Nothing is allowed but what follows from a row of `topics.TOPICS`: whoever sends under a topic may
-do so under the keys that name it, readers read all keys of the topic, its addressee those that name
-it. A router checks both what comes in from a process and what goes out to it, so each right has a
-flow, seen from the router. Pure; only `zenoh_transport` knows how a router is told.
+Each right follows from a row of `topics.TOPICS`: senders may send on the keys that name them,
+readers read all keys of the topic, the addressee those that name it. A router checks what comes in
+from a process and what goes out to it, so each right has a flow, seen from the router. Pure.
 """
 
 from __future__ import annotations
@@ -11,23 +10,42 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from enum import StrEnum
+from pathlib import Path
 from typing import Any
 
 from attrs import frozen
 
-from laneweave.protocol.config.endpoints import host_of
-from laneweave.protocol.config.identities import Identity, Party, identities_of
-from laneweave.protocol.scenario.fleets import demanded_vehicles, members_of
+from laneweave.protocol.config.participants import demanded_vehicles, identities_of, members_of
+from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.security.access import Credentials, credentials_of
+from laneweave.protocol.security.access import (
+    Access,
+    Credentials,
+    RouterGuard,
+    ca_path,
+    certificate_path,
+    key_path,
+)
+from laneweave.protocol.validators import host_of
 from laneweave.protocol.wire.codec import MAX_BYTES
-from laneweave.protocol.wire.topics import TOPICS, Exchange, Keys, Topic
+from laneweave.protocol.wire.identities import Identity, parse_identity
+from laneweave.protocol.wire.topics import ANY_SENDER, TOPICS, Exchange, Keys, Party, Topic
 
+CA_FILE = "LANEWEAVE_CA_FILE"
+CERTIFICATE_FILE = "LANEWEAVE_CERTIFICATE_FILE"
+PRIVATE_KEY_FILE = "LANEWEAVE_PRIVATE_KEY_FILE"
+PRIVATE_KEY = "LANEWEAVE_PRIVATE_KEY"
+"""Environment variables that take precedence over the files in `security.folder`."""
+# Zenoh accepts unknown identities but silently drops their traffic, so they are rejected here.
+KNOWN_RULE = (
+    "an identity of this configuration: runtime.coordinators, security.fleets, "
+    "security.vehicles, security.clients, security.observers"
+)
 REQUEST_MARGIN = 2
-"""Requests up to so many times the longest come in: the service refuses them, and says why."""
-
+"""The router lets in requests up to this factor above the limit, so that the service itself can
+refuse them with a reason."""
 EVERYWHERE = ("0.0.0.0", "::")  # noqa: S104 (compared with, not listened at)
-"""Hosts at which a router listens and nobody looks for it."""
+"""Hosts that mean all interfaces: a router listens there, but clients cannot connect to them."""
 
 
 class Flow(StrEnum):
@@ -40,10 +58,10 @@ class Flow(StrEnum):
 SENDING: dict[Exchange, tuple[tuple[Flow, str], ...]] = {
     Exchange.MESSAGES: ((Flow.IN, "put"),),
     Exchange.TOKENS: ((Flow.IN, "liveliness_token"),),
-    # That somebody serves is told to those who ask for it before they ask.
+    # A querier learns that a server exists before it queries.
     Exchange.QUESTIONS: ((Flow.IN, "query"), (Flow.OUT, "reply"), (Flow.OUT, "declare_queryable")),
 }
-"""What a router lets a topic's sender do: flow, and kind of Zenoh's messages."""
+"""Rights of a topic's sender: flow, and kind of Zenoh message."""
 READING: dict[Exchange, tuple[tuple[Flow, str], ...]] = {
     Exchange.MESSAGES: ((Flow.IN, "declare_subscriber"), (Flow.OUT, "put")),
     Exchange.TOKENS: (
@@ -53,14 +71,14 @@ READING: dict[Exchange, tuple[tuple[Flow, str], ...]] = {
     ),
     Exchange.QUESTIONS: ((Flow.IN, "declare_queryable"), (Flow.IN, "reply"), (Flow.OUT, "query")),
 }
-"""What it lets its readers do."""
+"""Rights of its readers."""
 _REPORTING = {Party.VEHICLE: "agent", Party.COORDINATOR: "coordinator", Party.BRIDGE: "bridge"}
-"""Roles under which those who may send `any` topic do so."""
+"""Role in the keys of topics that any of these may send."""
 
 
 @frozen
 class Rule:
-    """One kind of Zenoh's messages that one identity may send or get on some keys."""
+    """Right of one identity to send or receive one kind of Zenoh message."""
 
     flow: Flow
     message: str
@@ -69,18 +87,18 @@ class Rule:
 
 
 def rules_of(identity: Identity, scenario: Scenario) -> tuple[Rule, ...]:
-    """Return all that an identity may do in a deployment."""
+    """Return all rights of an identity in a deployment."""
     allowed: dict[tuple[Flow, str], dict[str, None]] = {}
     keys = Keys(scenario.network.realm)
-    for party, name in _parts(identity, scenario):
+    for party, name in _represented(identity, scenario):
         for topic in TOPICS:
             for right, parameters in _rights(topic, party, name):
                 allowed.setdefault(right, {})[keys.all_of(topic, **parameters)] = None
     return tuple(Rule(flow, message, tuple(found)) for (flow, message), found in allowed.items())
 
 
-def _parts(identity: Identity, scenario: Scenario) -> Iterator[tuple[Party, str]]:
-    """Yield in whose name an identity acts: a fleet in that of each of its vehicles, too."""
+def _represented(identity: Identity, scenario: Scenario) -> Iterator[tuple[Party, str]]:
+    """Yield the parties and names that an identity acts for: a fleet also for its vehicles."""
     yield identity.party, identity.name
     if identity.party is Party.FLEET:
         members = scenario.security.fleets.get(identity.name, ())
@@ -91,10 +109,10 @@ def _parts(identity: Identity, scenario: Scenario) -> Iterator[tuple[Party, str]
 def _rights(
     topic: Topic, party: Party, name: str
 ) -> Iterator[tuple[tuple[Flow, str], dict[str, str]]]:
-    """Yield what a topic gives somebody, and the parameters of the keys on which it does."""
+    """Yield the rights that a topic grants, each with the parameters that its keys must have."""
     own = _own(topic, party, name)
     sending, reading = SENDING[topic.exchange], READING[topic.exchange]
-    if party == topic.sender or (topic.sender == "any" and party in _REPORTING):
+    if party == topic.sender or (topic.sender == ANY_SENDER and party in _REPORTING):
         yield from ((right, own) for right in sending)
     if party == topic.deputy:
         yield from ((right, {}) for right in sending)
@@ -105,31 +123,68 @@ def _rights(
 
 
 def _own(topic: Topic, party: Party, name: str) -> dict[str, str]:
-    """Return the parameters that a key has when it names somebody."""
+    """Return the parameters of the keys that name this process."""
     own = {str(party): name}
     if party in _REPORTING:
         own |= {"role": _REPORTING[party], "name": name or str(party)}
     return {key: value for key, value in own.items() if key in topic.parameters}
 
 
-# --- what a router is told ------------------------------------------------------------------------
+# --- what processes and the router are given ------------------------------------------------------
 
 
-@frozen
-class RouterGuard:
-    """What a router needs to let everybody do what they may, and nothing else."""
+def access_of(
+    scenario: Scenario, identity: str, environment: Mapping[str, str] = os.environ
+) -> Access:
+    """Return how a process joins the network of a deployment.
 
-    credentials: Credentials
-    host: str
-    """Where clients look for it; empty where the configuration does not tell."""
-    access_control: dict[str, Any]
-    """As Zenoh has it."""
-    size_limits: list[dict[str, Any]]
-    """Zenoh's `low_pass_filter`."""
+    Args:
+        scenario: the deployment.
+        identity: common name of the process's certificate, such as `coordinator.c1`.
+        environment: may hold paths of credentials, or the private key.
+
+    Raises:
+        BadInputError: the identity is unknown, or the environment contradicts itself.
+    """
+    network = scenario.network
+    return Access(
+        network.endpoint,
+        network.realm,
+        network.lease_s,
+        credentials_of(scenario, identity, environment),
+        identity,
+        network.connect_timeout_s,
+    )
+
+
+def credentials_of(
+    scenario: Scenario, identity: str, environment: Mapping[str, str] = os.environ
+) -> Credentials | None:
+    """Return the credentials of a process; None if the network is not secured.
+
+    Raises:
+        BadInputError: the identity is unknown, or the environment contradicts itself.
+    """
+    if scenario.security.mode == "off":
+        return None
+    known = parse_identity(identity)
+    if known not in set(identities_of(scenario)):
+        raise BadInputError("identity", identity, KNOWN_RULE)
+    name = known.common_name
+    folder = Path(scenario.security.folder)
+    key_pem, key_file = environment.get(PRIVATE_KEY, ""), environment.get(PRIVATE_KEY_FILE, "")
+    if key_pem and key_file:
+        raise BadInputError(PRIVATE_KEY_FILE, key_file, f"nothing, as {PRIVATE_KEY} is set")
+    return Credentials(
+        ca=environment.get(CA_FILE) or str(ca_path(folder)),
+        certificate=environment.get(CERTIFICATE_FILE) or str(certificate_path(folder, name)),
+        private_key="" if key_pem else key_file or str(key_path(folder, name)),
+        private_key_pem=key_pem,
+    )
 
 
 def guard_of(scenario: Scenario, environment: Mapping[str, str] = os.environ) -> RouterGuard | None:
-    """Return what a deployment's router needs; None where the network is not secured.
+    """Return what a deployment's router enforces; None if the network is not secured.
 
     Raises:
         BadInputError: the environment contradicts itself.
@@ -147,7 +202,7 @@ def guard_of(scenario: Scenario, environment: Mapping[str, str] = os.environ) ->
 
 
 def access_control(scenario: Scenario) -> dict[str, Any]:
-    """Return a deployment's rules in the form of Zenoh's `access_control`; the rest is denied."""
+    """Return the rights of all identities as Zenoh's `access_control`; all else is denied."""
     rules: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
@@ -177,7 +232,7 @@ def access_control(scenario: Scenario) -> dict[str, Any]:
 
 
 def size_limits(scenario: Scenario) -> list[dict[str, Any]]:
-    """Return the longest messages that a router lets in, in the form of `low_pass_filter`."""
+    """Return the maximum message sizes as Zenoh's `low_pass_filter`."""
     keys = Keys(scenario.network.realm)
     questions = [keys.all_of(topic) for topic in TOPICS if topic.exchange is Exchange.QUESTIONS]
     messages = [keys.all_of(topic) for topic in TOPICS if topic.exchange is Exchange.MESSAGES]
@@ -188,17 +243,17 @@ def size_limits(scenario: Scenario) -> list[dict[str, Any]]:
     ]
 
 
-def _size_limit(name: str, message: str, keys: list[str], most_bytes: int) -> dict[str, Any]:
+def _size_limit(name: str, message: str, keys: list[str], max_bytes: int) -> dict[str, Any]:
     return {
         "id": name,
         "flows": [str(Flow.IN)],
         "messages": [message],
         "key_exprs": keys,
-        "size_limit": most_bytes,
+        "size_limit": max_bytes,
     }
 
 
-# --- the same for people --------------------------------------------------------------------------
+# --- documentation --------------------------------------------------------------------------------
 
 _VERBS = {
     Exchange.MESSAGES: ("sends", "reads"),
@@ -209,7 +264,7 @@ _TABLE = (Party.BRIDGE, Party.COORDINATOR, Party.VEHICLE, Party.FLEET, Party.CLI
 
 
 def rights_table() -> str:
-    """Return the Markdown table of who may do what, for docs/DEPLOYMENT.md."""
+    """Return the Markdown table of rights for docs/DEPLOYMENT.md."""
     lines = ["| certificate | may |", "|---|---|"]
     for party in _TABLE:
         identity = Identity(party, "" if party is Party.BRIDGE else "NAME")

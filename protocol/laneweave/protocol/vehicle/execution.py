@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from attrs import define, field
 
-from laneweave.protocol.lattice import Cell, Lattice, Move
+from laneweave.protocol.lattice import Cell, Lattice, PlannedMove
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.vehicle.execution_rules import (
     ACCEPTED,
@@ -126,7 +126,7 @@ class PlanExecution:
         """V4: remember what another member of the same plan has shown."""
         self.rules.take(self, STATE, state)
 
-    def tick(self, t_s: float) -> Move | None:
+    def tick(self, t_s: float) -> PlannedMove | None:
         """V5 and V6: open the gate when it may, and return the move that starts now, if any."""
         self.t_s = t_s
         self.rules.take(self, GATE, None)
@@ -139,7 +139,7 @@ class PlanExecution:
         self.rules.take(self, REST, None)
 
     @property
-    def next_move(self) -> Move | None:
+    def next_move(self) -> PlannedMove | None:
         """The first move of the plan that is not completed."""
         if self.plan is None or self.completed >= len(self.plan.moves[self.vehicle]):
             return None

@@ -1,7 +1,7 @@
 """MessagePack codec of the messages: [version, kind, fields].
 
-Decoding checks size, version, kind, field names, types, finiteness and ranges; whatever is wrong
-becomes one `BadInputError`. It never raises anything else, whatever the bytes.
+Decoding checks size, version, kind, field names, types, finiteness and ranges. Arbitrary bytes
+raise `BadInputError` and nothing else.
 """
 
 from __future__ import annotations
@@ -14,27 +14,14 @@ from attrs import fields
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.structuring import first_problem, strict_converter
-from laneweave.protocol.wire import messages
+from laneweave.protocol.validators import NAME_PATTERN, NAME_RULE
 from laneweave.protocol.wire.messages import Ballot, Name
-from laneweave.protocol.wire.topics import NAME_PATTERN, NAME_RULE
+from laneweave.protocol.wire.topics import TOPICS
 
 VERSION = 1
 MAX_BYTES = 1 << 20
 KINDS: dict[str, type] = {
-    kind.__name__: kind
-    for kind in (
-        messages.Heartbeat,
-        messages.Prepare,
-        messages.Plan,
-        messages.VehicleState,
-        messages.Motion,
-        messages.Sense,
-        messages.Command,
-        messages.Census,
-        messages.RoadClock,
-        messages.Report,
-        messages.LogEvent,
-    )
+    topic.kind.__name__: topic.kind for topic in TOPICS if topic.kind is not None
 }
 _MIN_INT, _MAX_INT = -(2**63), 2**63 - 1
 _MIN_FLOAT, _MAX_FLOAT = -1e12, 1e12

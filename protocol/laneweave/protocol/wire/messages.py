@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, NewType
 
 from attrs import field, frozen
 
-from laneweave.protocol.lattice import Cell, Lattice, Move
+from laneweave.protocol.lattice import Cell, Lattice, PlannedMove
 
 Name = NewType("Name", str)
 """Name of a vehicle, coordinator or role: letters, digits, `_`, `-`, `.`; at most 64."""
@@ -94,7 +94,7 @@ class Plan:
     incarnations: dict[Name, int]
     """Incarnation of each vehicle's agent when it promised."""
     start_cells: dict[Name, Cell]
-    moves: dict[Name, tuple[Move, ...]]
+    moves: dict[Name, tuple[PlannedMove, ...]]
     """(step, from, to) of each vehicle, steps ascending."""
     t0_s: float
     """Road time at which step 0 may begin."""

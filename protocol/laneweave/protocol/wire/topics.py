@@ -1,57 +1,78 @@
-"""The key grammar: which message travels on which key, from whom, with which quality of service.
+"""Key grammar: each topic's keys, message class, sender, readers and quality of service.
 
     laneweave/{realm}/{topic}/...
 
-`TOPICS` is the one table from which keys are built, received keys are understood, the rights of
-those who take part are granted (`rights.py`), and docs/PROTOCOL.md is checked.
+Everything else follows from the table `TOPICS`: keys and their parsing, the message classes that
+the codec knows, the rights of processes (`security.rights`), and a table of docs/PROTOCOL.md.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from enum import Enum
+from enum import Enum, StrEnum
 from functools import lru_cache
 from types import MappingProxyType
 
 from attrs import frozen
 
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.validators import NAME_PATTERN, NAME_RULE
 from laneweave.protocol.wire import messages
 
 PREFIX = "laneweave"
-NAME_PATTERN = re.compile(r"[A-Za-z0-9_.-]{1,64}")
-NAME_RULE = "letters, digits, `_`, `-`, `.`; at least 1, at most 64"
 
 
 class Quality(Enum):
-    """Quality of service of a topic; `zenoh_transport` maps it to Zenoh's settings."""
+    """Quality of service of a topic; `transports.zenoh` maps it to Zenoh's settings."""
 
     LATEST = "latest"
-    """Periodic, so that a lost one hardly matters. Dropped when the network is congested."""
+    """Periodic messages; dropped when the network is congested."""
     ASSURED = "assured"
-    """Waits when the network is congested; acknowledged and sent again by the protocol."""
+    """Blocks when the network is congested; acknowledged and resent by the protocol."""
     LOCKSTEP = "lockstep"
-    """As ASSURED, before everything else: ticks and their answers."""
+    """As ASSURED, with the highest priority: ticks and their answers."""
 
 
 class Exchange(Enum):
-    """What goes on under a topic's keys."""
+    """Kind of communication on a topic's keys."""
 
     MESSAGES = "messages"
     """The sender publishes; readers subscribe."""
     TOKENS = "tokens"
     """The sender shows a liveliness token; readers watch it."""
     QUESTIONS = "questions"
-    """The sender asks; readers serve, and answer."""
+    """The sender queries; readers serve and answer."""
+
+
+class Party(StrEnum):
+    """Kinds of processes, by the rights that they have."""
+
+    ROUTER = "router"
+    """Forwards all messages."""
+    BRIDGE = "bridge"
+    """Simulates the road."""
+    COORDINATOR = "coordinator"
+    """Candidate for leadership; also answers plan requests."""
+    VEHICLE = "vehicle"
+    """Agent process of one vehicle."""
+    FLEET = "fleet"
+    """Agent process of several vehicles, which it may take from the census."""
+    CLIENT = "client"
+    """Asks the planning service."""
+    OBSERVER = "observer"
+    """Only reads."""
+
+
+ANY_SENDER = "any"
+"""Vehicles, coordinators and the bridge, each under its own {role} and {name}."""
 
 
 @frozen
 class Topic:
-    """One kind of key, and who does what with it.
+    """One kind of key: what travels on it, and which processes send and read it.
 
-    Senders and readers are kinds of processes, `Party` of `identities.py` by its value. What a
-    router lets them do (`rights.py`) follows from these fields and from nothing else.
+    The rights that a router grants (`security.rights`) follow from these fields alone.
     """
 
     name: str
@@ -60,15 +81,14 @@ class Topic:
     kind: type | None
     """Message class; None for tokens and the planning service."""
     sender: str
-    """Whoever the key names, where it names one of this kind. `any`: vehicles, coordinators and
-    the bridge, each under its own {role} and {name}."""
+    """A `Party`, or `ANY_SENDER`. A process that the key names sends under its own name only."""
     quality: Quality
-    readers: tuple[str, ...] = ()
-    """They read all keys of the topic."""
-    addressee: str = ""
-    """Likewise only the keys that name it."""
-    deputy: str = ""
-    """It sends in the sender's place, whoever that is."""
+    readers: tuple[Party, ...] = ()
+    """Parties that read all keys of the topic."""
+    addressee: Party | None = None
+    """Party that reads only the keys that name it."""
+    deputy: Party | None = None
+    """Party that may send in place of any sender."""
     exchange: Exchange = Exchange.MESSAGES
 
     @property
@@ -78,65 +98,66 @@ class Topic:
 
 
 CLOCK = Topic(
-    "clock", "clock", messages.RoadClock, "bridge", Quality.LATEST,
-    readers=("coordinator", "observer"),
+    "clock", "clock", messages.RoadClock, Party.BRIDGE, Quality.LATEST,
+    readers=(Party.COORDINATOR, Party.OBSERVER),
 )  # fmt: skip
 CENSUS = Topic(
-    "census", "census", messages.Census, "bridge", Quality.LATEST,
-    readers=("coordinator", "fleet", "observer"),
+    "census", "census", messages.Census, Party.BRIDGE, Quality.LATEST,
+    readers=(Party.COORDINATOR, Party.FLEET, Party.OBSERVER),
 )  # fmt: skip
 SENSE = Topic(
-    "sense", "sense/{vehicle}", messages.Sense, "bridge", Quality.LOCKSTEP, addressee="vehicle"
-)
-COMMAND = Topic(
-    "command", "command/{vehicle}", messages.Command, "vehicle", Quality.LOCKSTEP,
-    readers=("bridge",),
+    "sense", "sense/{vehicle}", messages.Sense, Party.BRIDGE, Quality.LOCKSTEP,
+    addressee=Party.VEHICLE,
 )  # fmt: skip
-# Vehicles read each other's: who waits for somebody has to see that it has left its cell. Where
-# nobody attends a vehicle, its caretaker, a part of the bridge, speaks for it.
+COMMAND = Topic(
+    "command", "command/{vehicle}", messages.Command, Party.VEHICLE, Quality.LOCKSTEP,
+    readers=(Party.BRIDGE,),
+)  # fmt: skip
+# Vehicles read each other's states: one that waits must see that another has left its cell. The
+# caretaker of a vehicle without an agent, a part of the bridge, sends in the agent's place.
 STATE = Topic(
-    "state", "state/{formation}/{vehicle}", messages.VehicleState, "vehicle", Quality.LATEST,
-    readers=("coordinator", "vehicle", "observer"), deputy="bridge",
+    "state", "state/{formation}/{vehicle}", messages.VehicleState, Party.VEHICLE, Quality.LATEST,
+    readers=(Party.COORDINATOR, Party.VEHICLE, Party.OBSERVER), deputy=Party.BRIDGE,
 )  # fmt: skip
 MOTION = Topic(
-    "motion", "motion/{stretch}/{vehicle}", messages.Motion, "vehicle", Quality.LATEST,
-    readers=("vehicle", "observer"),
+    "motion", "motion/{stretch}/{vehicle}", messages.Motion, Party.VEHICLE, Quality.LATEST,
+    readers=(Party.VEHICLE, Party.OBSERVER),
 )  # fmt: skip
 PREPARE = Topic(
-    "prepare", "prepare/{vehicle}", messages.Prepare, "coordinator", Quality.ASSURED,
-    addressee="vehicle", readers=("bridge",),
+    "prepare", "prepare/{vehicle}", messages.Prepare, Party.COORDINATOR, Quality.ASSURED,
+    addressee=Party.VEHICLE, readers=(Party.BRIDGE,),
 )  # fmt: skip
 PLAN = Topic(
-    "plan", "plan/{vehicle}", messages.Plan, "coordinator", Quality.ASSURED,
-    addressee="vehicle", readers=("bridge", "observer"),
+    "plan", "plan/{vehicle}", messages.Plan, Party.COORDINATOR, Quality.ASSURED,
+    addressee=Party.VEHICLE, readers=(Party.BRIDGE, Party.OBSERVER),
 )  # fmt: skip
 HEARTBEAT = Topic(
-    "heartbeat", "heartbeat/{coordinator}", messages.Heartbeat, "coordinator", Quality.LATEST,
-    readers=("coordinator", "bridge", "observer"),
+    "heartbeat", "heartbeat/{coordinator}", messages.Heartbeat, Party.COORDINATOR, Quality.LATEST,
+    readers=(Party.COORDINATOR, Party.BRIDGE, Party.OBSERVER),
 )  # fmt: skip
 REPORT = Topic(
-    "report", "report/{role}/{name}", messages.Report, "any", Quality.ASSURED,
-    readers=("bridge", "observer"),
+    "report", "report/{role}/{name}", messages.Report, ANY_SENDER, Quality.ASSURED,
+    readers=(Party.BRIDGE, Party.OBSERVER),
 )  # fmt: skip
 EVENT = Topic(
-    "event", "event/{role}/{name}", messages.LogEvent, "any", Quality.ASSURED,
-    readers=("bridge", "observer"),
+    "event", "event/{role}/{name}", messages.LogEvent, ANY_SENDER, Quality.ASSURED,
+    readers=(Party.BRIDGE, Party.OBSERVER),
 )  # fmt: skip
 COORDINATOR_ALIVE = Topic(
-    "coordinator-alive", "alive/coordinator/{coordinator}/{incarnation}", None, "coordinator",
-    Quality.ASSURED, readers=("coordinator", "observer"), exchange=Exchange.TOKENS,
+    "coordinator-alive", "alive/coordinator/{coordinator}/{incarnation}", None, Party.COORDINATOR,
+    Quality.ASSURED, readers=(Party.COORDINATOR, Party.OBSERVER), exchange=Exchange.TOKENS,
 )  # fmt: skip
 VEHICLE_ALIVE = Topic(
-    "vehicle-alive", "alive/vehicle/{vehicle}", None, "vehicle", Quality.ASSURED,
-    readers=("bridge", "observer"), exchange=Exchange.TOKENS,
+    "vehicle-alive", "alive/vehicle/{vehicle}", None, Party.VEHICLE, Quality.ASSURED,
+    readers=(Party.BRIDGE, Party.OBSERVER), exchange=Exchange.TOKENS,
 )  # fmt: skip
 BRIDGE_ALIVE = Topic(
-    "bridge-alive", "alive/bridge/{incarnation}", None, "bridge", Quality.ASSURED,
-    readers=("coordinator", "vehicle", "observer"), exchange=Exchange.TOKENS,
+    "bridge-alive", "alive/bridge/{incarnation}", None, Party.BRIDGE, Quality.ASSURED,
+    readers=(Party.COORDINATOR, Party.VEHICLE, Party.OBSERVER), exchange=Exchange.TOKENS,
 )  # fmt: skip
 SERVICE = Topic(
-    "service", "service/plan", None, "client", Quality.ASSURED,
-    readers=("coordinator",), exchange=Exchange.QUESTIONS,
+    "service", "service/plan", None, Party.CLIENT, Quality.ASSURED,
+    readers=(Party.COORDINATOR,), exchange=Exchange.QUESTIONS,
 )  # fmt: skip
 
 TOPICS = (
@@ -186,16 +207,16 @@ class Keys:
         return self.key(topic, **(dict.fromkeys(topic.parameters, "*") | given))
 
     def read(self, key: str) -> tuple[Topic, Mapping[str, str]] | None:
-        """Return a key's topic and parameters, or None when it is not one of ours."""
+        """Return a key's topic and parameters; None for a foreign key."""
         return _read(self.realm, key) if len(key) <= _MAX_KEY else None
 
 
 _MEMO = 1024
-"""Keys remembered, in each direction: a process uses few of them, many times a second."""
+"""Size of the caches of keys; a process uses few keys, many times a second."""
 _MAX_KEY = max(
     len(re.sub(r"{\w+}", "x" * 64, f"{PREFIX}/{{realm}}/{topic.pattern}")) for topic in TOPICS
 )
-"""Characters of the longest key; no longer text is looked at or remembered."""
+"""Maximum length of a key in characters; longer texts are neither parsed nor cached."""
 _PATTERNS = tuple((topic, tuple(topic.pattern.split("/"))) for topic in TOPICS)
 
 
@@ -219,7 +240,7 @@ def _read(realm: str, key: str) -> tuple[Topic, Mapping[str, str]] | None:
         if len(pattern) == len(parts):
             found = _match(pattern, parts)
             if found is not None:
-                # All who read this key share the answer.
+                # The cached result is shared by all callers.
                 return topic, MappingProxyType(found)
     return None
 
@@ -237,13 +258,13 @@ def _match(pattern: Iterable[str], parts: Iterable[str]) -> dict[str, str] | Non
 
 
 def incarnation_of(parameters: Mapping[str, str]) -> int:
-    """Return the incarnation in the parameters of a token's key, -1 where it is no number."""
+    """Return the incarnation in a token key's parameters; -1 if it is not a number."""
     incarnation = parameters["incarnation"]
     return int(incarnation) if incarnation.isdecimal() else -1
 
 
 def matches(expression: str, key: str) -> bool:
-    """Tell whether a key expression matches a key: `*` is one part, `**` any number of parts."""
+    """Return whether an expression matches a key: `*` is one part, `**` any number of parts."""
     if "*" not in expression:
         return expression == key
     return _compiled(expression).fullmatch("/" + key) is not None
@@ -251,7 +272,7 @@ def matches(expression: str, key: str) -> bool:
 
 @lru_cache(maxsize=_MEMO)
 def _compiled(expression: str) -> re.Pattern[str]:
-    """Return the pattern of the keys that match, each part with a slash before it."""
+    """Return a pattern for the matching keys, each part preceded by a slash."""
     wild = {"*": "/[^/]*", "**": "(?:/[^/]*)*"}
     return re.compile(
         "".join(wild.get(part) or "/" + re.escape(part) for part in expression.split("/"))
@@ -259,5 +280,5 @@ def _compiled(expression: str) -> re.Pattern[str]:
 
 
 def matches_any(expressions: Iterable[str], key: str) -> bool:
-    """Tell whether one of several key expressions matches a key."""
+    """Return whether one of several key expressions matches a key."""
     return any(matches(expression, key) for expression in expressions)

@@ -16,17 +16,26 @@ import pyarrow.parquet as pq
 from attrs import define, field
 from numpy.typing import NDArray
 
-from laneweave.protocol.scenario.solvers import SOLVERS, STREAM_PLANNED, solver_of_event
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.files import write_atomically
+from laneweave.protocol.scenario.tables import SOLVERS, Scenario, solver_of_event
 from laneweave.protocol.vehicle.motion import State
+from laneweave.protocol.wire.events import (
+    AGENT_TOOK_OVER,
+    CARETAKER_TOOK_OVER,
+    ENTERED,
+    FORMATION_CLOSED,
+    LEADER,
+    LEFT,
+    LEFT_OFF_LANE,
+    OVERLAP,
+    PLAN_EVENTS,
+    RUN_ENDED,
+)
 from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, LogEvent, Name, Report
 from laneweave.sim_bridge.bodies.footprints import LeastGaps
 from laneweave.sim_bridge.bodies.motion_controller import Rung
 from laneweave.sim_bridge.recording.recorder import Recorder
 from laneweave.sim_bridge.road.demand import Arrival
-
-PLANNED = ("plan-made", STREAM_PLANNED)
-"""Events that tell of a plan: of a formation, or of the whole stream."""
 
 
 class RecordedVehicle(Protocol):
@@ -83,11 +92,9 @@ class Ending(Enum):
 
 
 def write_summary(folder: Path, summary: dict[str, Any]) -> None:
-    """Write summary.json whole or not at all, whenever this process is killed."""
-    unfinished = folder / "summary.json.part"
+    """Write summary.json completely or not at all, even if this process is killed."""
     text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
-    unfinished.write_text(text, encoding="utf-8")
-    unfinished.replace(folder / "summary.json")
+    write_atomically(folder / "summary.json", text)
 
 
 class RunRecord:
@@ -132,7 +139,7 @@ class RunRecord:
         self._recorder.entered(vehicle.name, vehicle.entered_s, vehicle.formation)
         self.note(
             vehicle.entered_s,
-            "entered",
+            ENTERED,
             vehicle=vehicle.name,
             lane=vehicle.arrival.lane,
             preferred_lane=vehicle.arrival.preferred_lane,
@@ -146,7 +153,7 @@ class RunRecord:
             self._recorder.assign(vehicle, number)
         self.note(
             closed.closed_s,
-            "formation-closed",
+            FORMATION_CLOSED,
             formation=number,
             vehicles=list(members),
             columns=[columns[0], columns[-1]],
@@ -166,7 +173,7 @@ class RunRecord:
         preferred_lane = vehicle.arrival.preferred_lane
         self.note(
             left_s,
-            "left",
+            LEFT,
             vehicle=vehicle.name,
             lane=lane,
             on_preferred_lane=lane == preferred_lane,
@@ -176,7 +183,7 @@ class RunRecord:
             self._left_off_lane += 1
             self.note(
                 left_s,
-                "left-off-lane",
+                LEFT_OFF_LANE,
                 vehicle=vehicle.name,
                 lane=lane,
                 preferred_lane=preferred_lane,
@@ -199,12 +206,12 @@ class RunRecord:
     def on_caretaker_took_over(self, t_s: float, vehicle: Name, reason: str) -> None:
         """A vehicle's caretaker is in charge, since its agent is `absent` or `silent`."""
         self._caretaker_takeovers += 1
-        self.note(t_s, "caretaker-took-over", vehicle=vehicle, reason=reason)
+        self.note(t_s, CARETAKER_TOOK_OVER, vehicle=vehicle, reason=reason)
 
     def on_agent_took_over(self, t_s: float, vehicle: Name, previous: str) -> None:
         """A vehicle's agent has taken charge from the `caretaker`, or from an earlier `agent`."""
         self._agent_takeovers += 1
-        self.note(t_s, "agent-took-over", vehicle=vehicle, previous=previous)
+        self.note(t_s, AGENT_TOOK_OVER, vehicle=vehicle, previous=previous)
 
     def on_shown(
         self,
@@ -218,7 +225,7 @@ class RunRecord:
         """All bodies were shown at a tick."""
         overlaps = list(overlaps)
         for pair in overlaps:
-            self.note(t_s, "overlap", vehicles=pair)
+            self.note(t_s, OVERLAP, vehicles=pair)
         self._recorder.safety(overlaps, collisions, gaps)
         self._recorder.tick(t_s, [_sample(vehicle) for vehicle in vehicles])
 
@@ -235,7 +242,7 @@ class RunRecord:
         # The sender's own words about who it is do not count.
         data = event.data | {"role": event.role, "name": event.name}
         self._recorder.event(event.t_s, event.kind, **data)
-        if event.kind in PLANNED:
+        if event.kind in PLAN_EVENTS:
             self._plans.append(event.data)
             solver = solver_of_event(event.kind, event.data)
             if solver is not None:
@@ -259,7 +266,7 @@ class RunRecord:
                 leadership.changes += 1
                 leadership.recovery_s.append(round(now_s - leadership.heard_s, 4))
             leadership.leader = sender
-            self.note(t_s, "leader", coordinator=heartbeat.coordinator, term=heartbeat.term)
+            self.note(t_s, LEADER, coordinator=heartbeat.coordinator, term=heartbeat.term)
         leadership.heard_s = now_s
 
     # --- the end ------------------------------------------------------------------------------
@@ -268,7 +275,7 @@ class RunRecord:
         """Write everything down. Idempotent: the first ending counts."""
         if self._closed:
             return
-        self.note(t_s, "run-ended", ending=ending.value)
+        self.note(t_s, RUN_ENDED, ending=ending.value)
         self._closed = True
         self._recorder.close()
         self._write_ticks()

@@ -13,7 +13,7 @@ from enum import StrEnum
 from laneweave.protocol.runtime.node import Effect, Event, Listen, PeerDown, PeerUp, Send, Unlisten
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.wire.incarnations import above
+from laneweave.protocol.wire.identities import above
 from laneweave.protocol.wire.messages import Command, Name, Plan, Prepare, VehicleState
 from laneweave.protocol.wire.topics import PLAN, PREPARE, STATE, VEHICLE_ALIVE
 from laneweave.sim_bridge.road.answers import Answers

@@ -18,7 +18,7 @@ import numpy as np
 from attrs import frozen
 from numpy.random import Generator, SeedSequence, default_rng
 
-from laneweave.protocol.scenario.fleets import vehicle_name
+from laneweave.protocol.config.participants import vehicle_name
 from laneweave.protocol.scenario.tables import Scenario
 
 _HEADWAYS, _PREFERENCES = 0, 1

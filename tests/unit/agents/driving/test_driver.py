@@ -12,7 +12,7 @@ from laneweave.agents.driving.motions import REPEAT_TICKS
 from laneweave.agents.driving.program import NO_GAPS, Gaps
 from laneweave.agents.driving.reference import Window
 from laneweave.agents.driving.tracker import Tracker, TrackResult
-from laneweave.protocol.lattice import Cell, Move
+from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.tables import Scenario, Sensing
 from laneweave.protocol.vehicle.motion import (
     ARRIVED_ACROSS_M,
@@ -30,7 +30,7 @@ from support.agent_rig import HOME, LATTICE, ME, MOVE_TICKS, SCENARIO, TICK_S, s
 from support.driving import Road
 
 N = SCENARIO.horizon_ticks
-MOVE: Move = (0, HOME, (-1, 2))
+MOVE: PlannedMove = (0, HOME, (-1, 2))
 
 
 class Probe(Tracker):

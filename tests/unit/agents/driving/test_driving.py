@@ -6,7 +6,7 @@ import attrs
 import numpy as np
 import pytest
 
-from laneweave.protocol.lattice import Move, footprint
+from laneweave.protocol.lattice import PlannedMove, footprint
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import Name
 from support import emergencies, switches
@@ -45,7 +45,7 @@ def test_equal_seeds_give_equal_switches() -> None:
 def test_osqp_in_every_tick_drives_the_same_trajectories() -> None:
     """`tracking.always_solve` changes where the answer comes from, not the answer."""
     always = attrs.evolve(SCENARIO, tracking=attrs.evolve(SCENARIO.tracking, always_solve=True))
-    moves: dict[int, dict[Name, Move]] = {
+    moves: dict[int, dict[Name, PlannedMove]] = {
         20: {ME: (1, (0, 1), (0, 0))},
         80: {OTHER: (1, (1, 1), (0, 1))},
     }
@@ -125,7 +125,7 @@ def test_one_brakes_and_the_others_are_on_their_way() -> None:
 def closing_up(slots: int) -> Road:
     """Let two close up from three columns to one, the one ahead so many slots later."""
     road = Road(SCENARIO, {ME: (0, 1), OTHER: (3, 1)})
-    moves: dict[Name, Move] = {ME: (0, (0, 1), (1, 1)), OTHER: (0, (3, 1), (2, 1))}
+    moves: dict[Name, PlannedMove] = {ME: (0, (0, 1), (1, 1)), OTHER: (0, (3, 1), (2, 1))}
     first = SLOT_TICKS * (1 + max(-slots, 0))
     begin = {ME: first, OTHER: first + slots * SLOT_TICKS}
     while road.tick <= max(begin.values()) + SLOT_TICKS:

@@ -8,7 +8,7 @@ from attrs import evolve
 from laneweave.coordinator.formations.borders import kept_apart, steps_of
 from laneweave.coordinator.formations.leader_rules import Phase
 from laneweave.coordinator.planning.conflicts import ConflictModel
-from laneweave.protocol.lattice import Move
+from laneweave.protocol.lattice import PlannedMove
 from laneweave.protocol.runtime.node import Compute, Effect, run_job
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.plans import plan_problems
@@ -25,7 +25,7 @@ T0_S = 30.0
 MOST_STEPS = 9
 
 
-def plan_of(*moves: tuple[Move, ...], t0_s: float = T0_S) -> Plan:
+def plan_of(*moves: tuple[PlannedMove, ...], t0_s: float = T0_S) -> Plan:
     roster = tuple(Name(letter) for letter in "ABCDEF"[: len(moves)])
     return Plan(
         ballot=Ballot(1, Name("c1"), 1, 1),
@@ -40,7 +40,7 @@ def plan_of(*moves: tuple[Move, ...], t0_s: float = T0_S) -> Plan:
     )
 
 
-def closing_pairs(one: Plan, other: Plan) -> list[tuple[Move, Move]]:
+def closing_pairs(one: Plan, other: Plan) -> list[tuple[PlannedMove, PlannedMove]]:
     """Return the moves of two plans that are made at the same time and close up."""
     return [
         (mine, theirs)

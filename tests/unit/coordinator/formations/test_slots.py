@@ -9,7 +9,7 @@ from laneweave.coordinator.formations import pacing
 from laneweave.coordinator.formations.borders import kept_apart, steps_of
 from laneweave.coordinator.formations.pacing import LEAST_RESERVE_S, RESERVE_S
 from laneweave.coordinator.formations.roster import start_time_s, time_left_s
-from laneweave.protocol.lattice import Cell, Move
+from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.tables import FormationSettings, Scenario
 from laneweave.protocol.wire.messages import Ballot, Name, Plan
 
@@ -22,7 +22,9 @@ FRONT = 0
 def climbing(steps: int) -> Plan:
     """Return a plan of one vehicle that makes a step in each slot, up and down between lanes."""
     cells: list[Cell] = [(FRONT, step % 2) for step in range(steps + 1)]
-    moves: tuple[Move, ...] = tuple((step, cells[step], cells[step + 1]) for step in range(steps))
+    moves: tuple[PlannedMove, ...] = tuple(
+        (step, cells[step], cells[step + 1]) for step in range(steps)
+    )
     return Plan(
         ballot=Ballot(1, Name("c1"), 1, 1),
         formations=(0,),
@@ -84,7 +86,7 @@ def test_haste_takes_of_the_reserve() -> None:
 
 
 def test_a_plan_begins_before_its_rear_is_in_s3_unless_a_lane_change_does() -> None:
-    along: tuple[Move, ...] = ((0, (-3, 0), (-2, 0)), (1, (-2, 0), (-2, 1)))
+    along: tuple[PlannedMove, ...] = ((0, (-3, 0), (-2, 0)), (1, (-2, 0), (-2, 1)))
     plan = evolve(
         climbing(0),
         start_cells={A: (-3, 0)},

@@ -16,7 +16,7 @@ from laneweave.coordinator.planning.instances import (
     formation_request,
     traffic_request,
 )
-from laneweave.protocol.scenario.solvers import SOLVERS
+from laneweave.protocol.scenario.tables import SOLVERS
 from oracles import joint_search, milp_oracle
 from oracles.instances import (
     CLOSING,

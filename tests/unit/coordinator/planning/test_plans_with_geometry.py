@@ -19,8 +19,7 @@ from laneweave.coordinator.planning.grid import Mode, displacements
 from laneweave.coordinator.planning.instances import formation_request
 from laneweave.coordinator.planning.problem import Problem
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.solvers import SOLVERS
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.tables import SOLVERS, Scenario
 from oracles import joint_search
 from oracles.instances import random_request, small_request
 from oracles.moving_bodies import Bodies, Profile, drive, least_gap_of_plan_m

@@ -11,7 +11,7 @@ from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_pl
 from laneweave.coordinator.planning.facade import TAPPA_SHARE
 from laneweave.coordinator.planning.instances import block_request, formation_request
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.solvers import SOLVERS
+from laneweave.protocol.scenario.tables import SOLVERS
 
 EASY = block_request(1, vehicles=3, deadline_s=3600.0)
 HARD = block_request(25, conflicts=("node", "edge", "special-1", "closing"), deadline_s=3600.0)

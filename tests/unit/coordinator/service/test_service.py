@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from laneweave.coordinator.service import server as service
 from laneweave.coordinator.service.format import FAILED, INVALID, LATE, OVERLOADED
 from laneweave.coordinator.service.rendezvous import falls_to
-from laneweave.coordinator.service.server import PlanningService, ServiceNumbers
+from laneweave.coordinator.service.server import PlanningService, ServiceMetrics
 from laneweave.protocol.runtime.node import (
     Computed,
     Decline,
@@ -283,13 +283,13 @@ def test_what_waits_until_its_deadline_is_dropped(desk: Desk) -> None:
     for _ in range(2):
         desk.ask(REQUEST | {"deadline_s": 50.0})
     token = desk.ask(REQUEST | {"deadline_s": 5.0})
-    assert desk.service.numbers.waiting == 1
+    assert desk.service.metrics.waiting == 1
     assert desk.service.wakeup_s == desk.now_s + 5.0
     desk.wait(4.9)
     assert token not in desk.replies
     desk.wait(0.2)
     assert desk.answer(token)["code"] == LATE
-    assert desk.service.numbers.waiting == 0
+    assert desk.service.metrics.waiting == 0
     assert desk.service.wakeup_s == desk.now_s - 5.1 + 50.0  # of the one that is handed out ahead
 
 
@@ -307,7 +307,7 @@ def test_what_was_handed_out_ahead_is_dropped_at_its_deadline(desk: Desk) -> Non
     for _ in range(3):
         desk.work()
     assert desk.answer(busy)["status"] == desk.answer(again)["status"] == "optimal"
-    assert desk.service.numbers.late_total == 1
+    assert desk.service.metrics.late_total == 1
 
 
 def test_what_is_being_planned_is_not_dropped_at_its_deadline(desk: Desk) -> None:
@@ -347,7 +347,7 @@ def test_workers_get_one_ahead_and_the_rest_waits_in_order(desk: Desk) -> None:
         assert token not in desk.replies
         desk.work()
         assert token in desk.replies
-    assert desk.service.numbers.answered_total == 5
+    assert desk.service.metrics.answered_total == 5
 
 
 def test_too_many_requests_in_hand_are_refused_until_one_is_done(desk: Desk) -> None:
@@ -379,7 +379,7 @@ def test_a_repeated_request_waits_for_the_plan_under_way(desk: Desk) -> None:
     assert len(desk.orders) == 1
     desk.work()
     assert desk.answer(tokens[0]) == desk.answer(tokens[1]) == desk.answer(tokens[2])
-    assert desk.service.numbers.repeated_total == 2
+    assert desk.service.metrics.repeated_total == 2
 
 
 def test_any_text_may_be_an_id(desk: Desk) -> None:
@@ -433,7 +433,7 @@ def test_no_answers_are_kept_where_none_may_be() -> None:
     for _ in range(2):
         desk.ask(named("r"))
         desk.work()
-    assert desk.service.numbers.answered_total == 2
+    assert desk.service.metrics.answered_total == 2
 
 
 def test_answers_are_forgotten_when_they_are_long(
@@ -502,7 +502,7 @@ def test_the_load_is_shared_evenly() -> None:
 
 def test_what_falls_to_another_is_left_to_it(desk: Desk) -> None:
     tokens = [desk.ask(named(str(n)), others=("c2",)) for n in range(40)]
-    numbers = desk.service.numbers
+    numbers = desk.service.metrics
     assert desk.left
     assert numbers.left_total == len(desk.left)
     assert numbers.taken_total == len(tokens) - len(desk.left) > 0
@@ -513,13 +513,13 @@ def test_what_falls_to_another_is_left_to_it(desk: Desk) -> None:
 
 
 def test_the_numbers_tell_what_was_done(desk: Desk) -> None:
-    assert desk.service.numbers == ServiceNumbers()
+    assert desk.service.metrics == ServiceMetrics()
     desk.ask(named("r"))
     desk.ask(named("r"))
     desk.ask({})
     desk.wait(2.0)
     desk.work()
-    numbers = desk.service.numbers
+    numbers = desk.service.metrics
     assert (numbers.taken_total, numbers.answered_total) == (3, 1)
     assert (numbers.repeated_total, numbers.invalid_total) == (1, 1)
     assert numbers.planning_seconds_total > 0

@@ -11,8 +11,8 @@ from laneweave.launch.cli import role_commands
 from laneweave.launch.run import run_folder
 from laneweave.launch.run.local_run import MAX_TEMPORARY_BYTES, check_temporary_folder
 from laneweave.launch.run.logs import last_error
-from laneweave.protocol.config.identities import coordinator_names
 from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.tables import Scenario
 

@@ -10,8 +10,8 @@ from attrs import frozen
 
 from laneweave.launch.cli import main as cli
 from laneweave.launch.deploy.config_check import Report, check_deployment
-from laneweave.protocol.config.identities import parse_identity
 from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.wire.identities import parse_identity
 
 DEPLOYMENT = """
 [network]

@@ -7,7 +7,7 @@ import pytest
 
 from laneweave.launch.fault_search.bodies import Geometry
 from laneweave.launch.fault_search.checker import MOST_VIOLATIONS, Checker, Violation
-from laneweave.protocol.lattice import Cell, Move
+from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.wire.messages import Ballot, Name, Plan, Sense, VehicleState
 from support.states import holding
 
@@ -20,7 +20,7 @@ def ballot(seq: int) -> Ballot:
     return Ballot(1, Name("c1"), 1, seq)
 
 
-def plan(seq: int, moves: dict[Name, tuple[Move, ...]]) -> Plan:
+def plan(seq: int, moves: dict[Name, tuple[PlannedMove, ...]]) -> Plan:
     return Plan(
         ballot=ballot(seq),
         formations=(0,),
@@ -55,7 +55,7 @@ class Scene:
             self.checker.enter(0.0, name, cell)
             self.checker.sent(0.0, state(name, None, cell))
 
-    def issue(self, t_s: float, seq: int, **moves: tuple[Move, ...]) -> None:
+    def issue(self, t_s: float, seq: int, **moves: tuple[PlannedMove, ...]) -> None:
         self.checker.sent(t_s, plan(seq, {Name(name): each for name, each in moves.items()}))
 
     def move(self, t_s: float, name: Name, seq: int, target: Cell, lasts_s: float = MOVE_S) -> None:

@@ -15,7 +15,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from laneweave.launch.observe.metrics_server import families, shown_metrics
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.runtime.metrics import Snapshot, looking, metrics_of, told
+from laneweave.protocol.runtime.metrics import MetricsSnapshot, metric, metrics_of, snapshot_source
 
 
 @frozen
@@ -24,9 +24,9 @@ class Counted:
 
     ABOUT: ClassVar[str] = "test"
 
-    apples_total: int = field(default=3, metadata=told("Apples eaten"))
+    apples_total: int = field(default=3, metadata=metric("Apples eaten"))
     pears_total: Mapping[str, int] = field(
-        factory=lambda: {"green": 1, "red": 2}, metadata=told("Pears eaten", label="colour")
+        factory=lambda: {"green": 1, "red": 2}, metadata=metric("Pears eaten", label="colour")
     )
     ripe: bool = True
     age_seconds: float = 1.5
@@ -64,7 +64,7 @@ def test_numbers_become_metrics() -> None:
 def test_numbers_are_asked_for_when_somebody_looks() -> None:
     address, eaten = free_address(), 0
 
-    def source() -> Iterable[Snapshot]:
+    def source() -> Iterable[MetricsSnapshot]:
         nonlocal eaten
         eaten += 1
         return [Counted(apples_total=eaten)]
@@ -82,15 +82,15 @@ def test_numbers_are_asked_for_when_somebody_looks() -> None:
 
 
 def test_the_thread_that_counts_answers() -> None:
-    with pytest.raises(TimeoutError, match="no numbers within 2 s"):
-        looking(lambda _: None)()
-    assert list(looking(lambda look: look.answer([Counted()]))()) == [Counted()]
+    with pytest.raises(TimeoutError, match="no metrics within 2 s"):
+        snapshot_source(lambda _: None)()
+    assert list(snapshot_source(lambda look: look.answer([Counted()]))()) == [Counted()]
 
 
 def test_a_process_that_hangs_tells_nothing() -> None:
     address = free_address()
 
-    def source() -> Iterable[Snapshot]:
+    def source() -> Iterable[MetricsSnapshot]:
         raise TimeoutError
 
     with shown_metrics(address) as observe:

@@ -10,13 +10,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from laneweave.protocol.config.endpoints import check_endpoint, host_of, is_tls
-from laneweave.protocol.config.identities import Identity, Party, identities_of, parse_identity
 from laneweave.protocol.config.loading import load_scenario, parse_scenario, to_tables
+from laneweave.protocol.config.participants import demanded_vehicles, identities_of, members_of
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.deployment import Shard, parse_shard
-from laneweave.protocol.scenario.fleets import demanded_vehicles, members_of
-from laneweave.protocol.security.access import Credentials, access_of
+from laneweave.protocol.security.access import Credentials
+from laneweave.protocol.security.rights import access_of
+from laneweave.protocol.validators import check_endpoint, host_of, is_tls
+from laneweave.protocol.wire.identities import Identity, parse_identity
+from laneweave.protocol.wire.topics import Party
 from laneweave.sim_bridge.road.demand import arrivals
 
 MTLS: dict[str, Any] = {"network": {"endpoint": "tls/r:7447"}, "security": {"mode": "mtls"}}

@@ -4,7 +4,7 @@ import pytest
 
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.validators import host_and_port
+from laneweave.protocol.validators import host_and_port
 
 
 @pytest.mark.parametrize(

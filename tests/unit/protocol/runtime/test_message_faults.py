@@ -276,7 +276,7 @@ def test_both_are_served_at_one_wakeup() -> None:
 
 
 def test_no_more_are_held_than_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(faulty_core, "MOST_HELD", 5)
+    monkeypatch.setattr(faulty_core, "MAX_HELD", 5)
     board = Board()
     core, listener = faulty(MessageRule(delay_s=1.0), board=board)
     for number in range(8):

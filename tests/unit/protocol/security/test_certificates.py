@@ -10,10 +10,10 @@ import pytest
 import structlog
 
 from laneweave.launch.deploy.certificate_authority import issue, load_authority, make_authority
-from laneweave.protocol.config.identities import parse_identity
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.security.access import Credentials
 from laneweave.protocol.security.certificates import check_credentials, examine
+from laneweave.protocol.wire.identities import parse_identity
 
 NAME = "coordinator.c1"
 

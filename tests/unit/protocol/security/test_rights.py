@@ -7,8 +7,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from laneweave.protocol.config.identities import Party, identities_of, parse_identity
 from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.config.participants import identities_of
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.security.rights import (
     Flow,
@@ -19,7 +19,8 @@ from laneweave.protocol.security.rights import (
     rules_of,
     size_limits,
 )
-from laneweave.protocol.wire.topics import TOPICS, Exchange, Keys, matches
+from laneweave.protocol.wire.identities import parse_identity
+from laneweave.protocol.wire.topics import TOPICS, Exchange, Keys, Party, matches
 
 SCENARIO = parse_scenario(
     {

@@ -23,14 +23,9 @@ from laneweave.protocol.runtime.node import (
     Watch,
 )
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
-from laneweave.protocol.transports.simulated.members import INJECTED_FAILURE
-from laneweave.protocol.transports.simulated.network import (
-    REJOIN_S,
-    Clock,
-    Conditions,
-    SimulatedNetwork,
-)
-from laneweave.protocol.transports.simulated.virtual_time import Item
+from laneweave.protocol.transports.simulated.member import INJECTED_FAILURE
+from laneweave.protocol.transports.simulated.network import REJOIN_S, SimulatedNetwork
+from laneweave.protocol.transports.simulated.virtual_time import Clock, Conditions, Item
 from laneweave.protocol.wire.codec import encode
 from laneweave.protocol.wire.topics import HEARTBEAT, VEHICLE_ALIVE
 from support.node_recorder import (

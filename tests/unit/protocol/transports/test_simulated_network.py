@@ -23,11 +23,8 @@ from laneweave.protocol.runtime.node import (
     Withdraw,
 )
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
-from laneweave.protocol.transports.simulated.network import (
-    KILL_SEEN_S,
-    Conditions,
-    SimulatedNetwork,
-)
+from laneweave.protocol.transports.simulated.network import KILL_SEEN_S, SimulatedNetwork
+from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.wire.codec import encode
 from laneweave.protocol.wire.topics import HEARTBEAT, VEHICLE_ALIVE
 from support.node_recorder import (

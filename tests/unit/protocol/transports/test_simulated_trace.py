@@ -26,9 +26,7 @@ from laneweave.protocol.runtime.transport import (
     TokenDown,
     TokenUp,
 )
-from laneweave.protocol.transports.simulated.network import Conditions
-from laneweave.protocol.transports.simulated.trace import TraceDigest
-from laneweave.protocol.transports.simulated.virtual_time import Item
+from laneweave.protocol.transports.simulated.virtual_time import Conditions, Item, TraceDigest
 from support.node_recorder import CALM, STORM, chatter
 
 TESTS = Path(__file__).parents[3]
@@ -40,7 +38,7 @@ def test_equal_seeds_give_equal_traces_in_any_process(conditions: Conditions) ->
     chatter(5, conditions, digest)
     code = (
         "from support.node_recorder import *\n"
-        "from laneweave.protocol.transports.simulated.trace import TraceDigest\n"
+        "from laneweave.protocol.transports.simulated.virtual_time import TraceDigest\n"
         "digest = TraceDigest()\n"
         f"chatter(5, {'STORM' if conditions == STORM else 'CALM'}, digest)\n"
         "print(digest.hexdigest())"

@@ -224,7 +224,7 @@ run_router([sys.argv[1]], float(sys.argv[2]), ready=lambda: print("ready", flush
 MEMBER = """
 import sys, time
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
-from laneweave.protocol.security.access import Access
+from laneweave.protocol.security.rights import Access
 transport = ZenohTransport(Access(sys.argv[1], lease_s=float(sys.argv[2])), lambda delivery: None)
 transport.announce(sys.argv[3])
 print("ready", flush=True)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 from attrs import evolve
 
-from laneweave.protocol.lattice import Cell, Lattice, Move, territory
+from laneweave.protocol.lattice import Cell, Lattice, PlannedMove, territory
 from laneweave.protocol.vehicle.execution import LISTEN_S, PlanExecution
 from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES, Stage
 from laneweave.protocol.wire.messages import Ballot, Name, Plan, Prepare, Sense, VehicleState
@@ -41,7 +41,7 @@ def prepare(ballot: Ballot, *roster: Name, formations: tuple[int, ...] = (0,)) -
 
 def make_plan(
     ballot: Ballot = MID,
-    moves: dict[Name, tuple[Move, ...]] | None = None,
+    moves: dict[Name, tuple[PlannedMove, ...]] | None = None,
     cells: dict[Name, Cell] | None = None,
     formations: tuple[int, ...] = (0,),
 ) -> Plan:
@@ -533,7 +533,7 @@ def test_v6_time_without_the_gate_is_not_enough() -> None:
 
 def test_v6_dependencies() -> None:
     """B follows A through two cells: each of its moves waits for the count that frees them."""
-    moves: dict[Name, tuple[Move, ...]] = {
+    moves: dict[Name, tuple[PlannedMove, ...]] = {
         A: ((0, (-3, 0), (-2, 0)), (1, (-2, 0), (-1, 0)), (5, (-1, 0), (-1, 1))),
         B: ((1, (-4, 0), (-3, 0)), (2, (-3, 0), (-2, 0))),
     }
@@ -551,7 +551,7 @@ def test_v6_dependencies() -> None:
 
 
 def test_v7_counts_and_is_done() -> None:
-    moves: dict[Name, tuple[Move, ...]] = {A: ((0, (-4, 0), (-4, 1)), (1, (-4, 1), (-4, 2)))}
+    moves: dict[Name, tuple[PlannedMove, ...]] = {A: ((0, (-4, 0), (-4, 1)), (1, (-4, 1), (-4, 2)))}
     execution = going(make_plan(moves=moves))
     for count, t_s in ((0, T0_S), (1, T0_S + SLOT_S)):
         assert execution.completed == count
@@ -583,7 +583,7 @@ def test_without_moves_it_is_done_at_once() -> None:
 
 def test_states_matter_until_the_gate_is_open_and_while_a_move_waits() -> None:
     assert not vehicle().needs_states(T0_S)
-    moves: dict[Name, tuple[Move, ...]] = {
+    moves: dict[Name, tuple[PlannedMove, ...]] = {
         A: ((0, (-3, 0), (-2, 0)),),
         B: ((1, (-4, 0), (-3, 0)),),
     }

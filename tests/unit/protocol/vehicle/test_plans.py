@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from laneweave.protocol.lattice import Cell, Move, territory
+from laneweave.protocol.lattice import Cell, PlannedMove, territory
 from laneweave.protocol.vehicle.plans import dependencies, plan_problems
 from laneweave.protocol.wire.messages import Ballot, Name, Plan
 
@@ -19,7 +19,7 @@ BALLOT = Ballot(1, Name("c1"), 5, 0)
 A, B, C = Name("a"), Name("b"), Name("c")
 
 
-def make_plan(starts: dict[Name, Cell], moves: dict[Name, tuple[Move, ...]]) -> Plan:
+def make_plan(starts: dict[Name, Cell], moves: dict[Name, tuple[PlannedMove, ...]]) -> Plan:
     cells = territory(starts.values(), [move for own in moves.values() for move in own])
     return Plan(
         BALLOT,
@@ -56,7 +56,7 @@ def occupied_cells(origin: Cell, target: Cell) -> set[Cell]:
     return cells
 
 
-def needs_in_words(plan: Plan, own: Move, other: Name) -> int:
+def needs_in_words(plan: Plan, own: PlannedMove, other: Name) -> int:
     """1 + index of the other's last move in a step before whose footprint meets; 0: none."""
     step, origin, target = own
     earlier = [
@@ -93,7 +93,7 @@ def draw_plan(seed: int, *, careful: bool) -> Plan:
     grid = [(column, lane) for column in range(4) for lane in range(3)]
     names = [Name(f"v{index}") for index in range(rng.randint(1, 6))]
     starts = dict(zip(names, rng.sample(grid, len(names)), strict=True))
-    cells, moves = dict(starts), {name: list[Move]() for name in names}
+    cells, moves = dict(starts), {name: list[PlannedMove]() for name in names}
     for step in range(rng.randint(1, 8)):
         taken = {name: {cell} for name, cell in cells.items()}
         for name in rng.sample(names, len(names)):
@@ -209,7 +209,7 @@ def test_a_plan_has_problems_exactly_if_bodies_meet(plan: Plan) -> None:
     assert (plan_problems(plan) == []) is is_executable_in_words(plan)
 
 
-def with_moves(vehicle: Name, *moves: Move) -> Callable[[Plan], Plan]:
+def with_moves(vehicle: Name, *moves: PlannedMove) -> Callable[[Plan], Plan]:
     def change(plan: Plan) -> Plan:
         return attrs.evolve(plan, moves=plan.moves | {vehicle: moves})
 

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.validators import NAME_PATTERN
 from laneweave.protocol.wire.codec import KINDS, MAX_BYTES, VERSION, decode, encode, field_names
 from laneweave.protocol.wire.messages import (
     Announcement,
@@ -35,7 +36,6 @@ from laneweave.protocol.wire.messages import (
     Sense,
     VehicleState,
 )
-from laneweave.protocol.wire.topics import NAME_PATTERN
 
 V1, V2 = Name("v1"), Name("v2")
 BALLOT = Ballot(3, Name("c1"), 1_700_000_000_000_000_000, 2)

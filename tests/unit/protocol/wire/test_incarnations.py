@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from laneweave.protocol.wire.incarnations import Incarnations, above
+from laneweave.protocol.wire.identities import Incarnations, above
 
 STEP = 1 << 22
 NUMBERS = st.integers(0, 1 << 62)

@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.validators import NAME_PATTERN
 from laneweave.protocol.wire.codec import KINDS
 from laneweave.protocol.wire.topics import (
     CLOCK,
     COMMAND,
-    NAME_PATTERN,
     STATE,
     TOPICS,
     VEHICLE_ALIVE,

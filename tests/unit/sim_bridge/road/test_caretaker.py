@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from attrs import evolve
 
-from laneweave.protocol.lattice import Cell, Move, territory
+from laneweave.protocol.lattice import Cell, PlannedMove, territory
 from laneweave.protocol.wire.messages import Ballot, Command, Name, Plan, Prepare, VehicleState
 from laneweave.sim_bridge.road.caretaker import Caretaker
 from laneweave.sim_bridge.road.demand import Arrival
@@ -56,8 +56,10 @@ def prepare(ballot: Ballot = FIRST, *formations: int) -> Prepare:
     return Prepare(ballot, formations or (FORMATION,), (A, B))
 
 
-def plan(ballot: Ballot = FIRST, *, own_moves: tuple[Move, ...] = (), start: Cell = HOME) -> Plan:
-    moves: dict[Name, tuple[Move, ...]] = {A: own_moves, B: ((0, OTHER, (-1, 2)),)}
+def plan(
+    ballot: Ballot = FIRST, *, own_moves: tuple[PlannedMove, ...] = (), start: Cell = HOME
+) -> Plan:
+    moves: dict[Name, tuple[PlannedMove, ...]] = {A: own_moves, B: ((0, OTHER, (-1, 2)),)}
     starts = {A: start, B: OTHER}
     return Plan(
         ballot=ballot,

@@ -1,15 +1,15 @@
 """The transport in virtual time: a network inside one process that is harsher than Zenoh.
 
-Nodes, messages and computations live on one event queue; time jumps from event to event. Each
-message to each receiver may be lost, duplicated, delayed and so overtaken, drawn from one seeded
-generator: equal seeds give equal runs. Nodes can be killed, paused, woken and cut off, the router
-can be lost and clocks can be wrong, with the liveliness behaviour that was measured on Zenoh (a
-killed process is seen at once, a silent one after its lease; a node that loses the network sees
-everybody else vanish).
+Nodes, messages and computations share one event queue; time jumps from event to event. Each
+message may be lost, duplicated, delayed and reordered for each receiver, drawn from one seeded
+generator: equal seeds give equal runs. Nodes can be killed, paused, resumed and disconnected, the
+router can be lost and clocks can be wrong. Liveliness behaves as measured on Zenoh: a killed
+process is noticed at once, a silent one after its lease, and a node that loses the network sees all
+others vanish.
 
-Every message travels as bytes and is checked on receipt, as on Zenoh. But all who receive the same
-bytes are handed one and the same message: no core may change what it is handed. Where speed is all
-that matters messages may travel as they are (`in_kind`).
+Messages travel as bytes and are checked on receipt, as on Zenoh. All receivers of the same bytes
+share one decoded message, so no core may modify it. With `in_kind`, messages travel as objects,
+without codec and checks, for speed.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from bisect import insort
 from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache, partial
 from itertools import count
+
+from attrs import frozen
 
 from laneweave.protocol.runtime.node import (
     Arrived,
@@ -38,27 +40,22 @@ from laneweave.protocol.runtime.transport import (
     Received,
     TokenDown,
 )
-from laneweave.protocol.transports.simulated.conditions import Clock, Conditions
-from laneweave.protocol.transports.simulated.members import Member
-from laneweave.protocol.transports.simulated.tokens import Tokens
-from laneweave.protocol.transports.simulated.transport import SimulatedTransport
-from laneweave.protocol.transports.simulated.virtual_time import Simulation
+from laneweave.protocol.transports.simulated.member import Member, Tokens
+from laneweave.protocol.transports.simulated.virtual_time import Clock, Conditions, Simulation
 from laneweave.protocol.wire.codec import decode, encode
 from laneweave.protocol.wire.messages import Name
-from laneweave.protocol.wire.topics import Keys, Topic, matches, matches_any
-
-__all__ = ["KILL_SEEN_S", "REJOIN_S", "Clock", "Conditions", "SimulatedNetwork"]
+from laneweave.protocol.wire.topics import Keys, Quality, Topic, matches, matches_any
 
 KILL_SEEN_S = 0.005
-"""A killed process is noticed within this time (measured on Zenoh: 2 to 9 ms)."""
+"""Time until others notice a killed process (measured on Zenoh: 2 to 9 ms)."""
 REJOIN_S = (0.2, 0.9)
-"""How long a node takes to find a router that has come back (measured on Zenoh)."""
+"""Range of the time until a node reconnects to a router that is back (measured on Zenoh)."""
 _REMEMBERED = 4096
-"""Messages that are remembered as they were read, once for all receivers."""
+"""Size of the caches of decoded messages, which all receivers share."""
 
 
 class Parcel(bytes):
-    """A message that travels as it is, in place of its bytes."""
+    """A message that travels as an object, in place of its bytes."""
 
     message: object
 
@@ -70,12 +67,12 @@ class Parcel(bytes):
 
 
 class _Reader:
-    """Reads what arrives at the nodes of a realm, whether it travelled as bytes or as it is."""
+    """Decodes the messages of a realm, whether they travel as bytes or as objects."""
 
     def __init__(self, keys: Keys, read_payload: Callable[[bytes, type], object]) -> None:
         self._keys = keys
         self._known: dict[str, tuple[Topic, Mapping[str, str]]] = {}
-        # Some go to many on keys of their own, like a plan: they are still decoded only once.
+        # A plan has many receivers, each with a key of its own: it is still decoded only once.
         read = partial(read_message, keys, decode=read_payload)
         self._read = lru_cache(maxsize=_REMEMBERED)(read)
 
@@ -88,28 +85,100 @@ class _Reader:
         return Arrived(known[0], known[1], payload.message)
 
 
+@frozen
+class _Question:
+    """A question at one of the servers that may answer it."""
+
+    server: Member
+    answer: Callable[[Answer | None], None]
+    tokens: set[int]
+    """Tokens of all servers that may still answer; shared among them."""
+
+
+class SimulatedTransport:
+    """One node's view of the simulated network: the peer of `ZenohTransport`."""
+
+    def __init__(self, network: SimulatedNetwork, member: Member) -> None:
+        """Attach a member to a network."""
+        self._network = network
+        self._member = member
+
+    def publish(self, key: str, payload: bytes, quality: Quality) -> None:
+        """Send to all subscribers; each copy is lost or delayed on its own."""
+        del quality
+        if not self._member.closed:
+            self._network.carry(self._member.name, key, payload)
+
+    def subscribe(self, key_expression: str) -> None:
+        """Subscribe."""
+        self._member.subscriptions[key_expression] = None
+        self._network.reroute(self._member, key_expression)
+
+    def unsubscribe(self, key_expression: str) -> None:
+        """Undo `subscribe`."""
+        self._member.subscriptions.pop(key_expression, None)
+        self._network.reroute(self._member, key_expression)
+
+    def announce(self, key: str) -> None:
+        """Show a token."""
+        if key not in self._member.tokens and not self._member.closed:
+            self._member.tokens[key] = None
+            self._network.tokens.appeared(self._member, key)
+
+    def withdraw(self, key: str) -> None:
+        """Withdraw a token."""
+        if key in self._member.tokens and not self._member.closed:
+            del self._member.tokens[key]
+            self._network.tokens.vanished(self._member, key)
+
+    def watch(self, key_expression: str) -> None:
+        """Watch tokens, beginning with those that are there."""
+        member = self._member
+        if key_expression not in member.watched and not member.closed:
+            member.watched[key_expression] = None
+            if member.connected:
+                self._network.tokens.introduce(member, (key_expression,))
+
+    def serve(self, key: str) -> None:
+        """Answer questions on a key."""
+        self._member.served.add(key)
+
+    def answer(self, token: int, payload: bytes, *, ok: bool, encoding: str = "") -> None:
+        """Answer a question once."""
+        self._network.take_answer(self._member, token, Answer(payload, ok, encoding))
+
+    def decline(self, token: int) -> None:
+        """Leave a question to the other servers."""
+        self._network.take_answer(self._member, token, None)
+
+    def close(self) -> None:
+        """Leave the network."""
+        if not self._member.closed:
+            self._network.remove(self._member.name)
+
+
 class SimulatedNetwork(Simulation):
     """The network and its nodes, in virtual time."""
 
     def __init__(
         self, seed: int, conditions: Conditions | None = None, *, in_kind: bool = False
     ) -> None:
-        """Make an empty network at time 0; `in_kind`: messages travel without codec and checks."""
+        """Create an empty network at time 0; `in_kind`: messages bypass codec and checks."""
         super().__init__(seed, conditions)
         self._in_kind = in_kind
         self._members: dict[str, Member] = {}
-        self._tokens = Tokens(self, self._members)
+        self.tokens = Tokens(self, self._members)
         self._clocks: dict[str, Clock] = {}
         self._routes: dict[str, tuple[Member, ...]] = {}
-        """For each key who receives what is published on it, in order of their start."""
+        """Receivers of each key, in order of their start."""
         self._beside: dict[str, list[str]] = {}
-        """Keys of the routes that differ in their last part only, by what they have in common."""
+        """Keys of the routes, by all but their last part."""
         self._cut: Callable[[str, str], bool] | None = None
         self._loss_on: Callable[[str], float] | None = None
         self._router_up = True
         self._outages = 0
-        self._answers: dict[int, tuple[Callable[[Answer | None], None], set[int]]] = {}
-        """For each open question who asked, and the tokens of those who may still answer."""
+        self._questions: dict[int, _Question] = {}
+        """Open questions, by the token under which each server knows them."""
         self._token_count = count(1)
         self._label_count = count(1)
         self._member_count = count()
@@ -126,7 +195,8 @@ class SimulatedNetwork(Simulation):
         """
         if name in self._members:
             raise ValueError(f"node {name} is already in the network")
-        member = Member(self, SimulatedTransport(self, name), next(self._member_count))
+        member = Member(self, name, next(self._member_count))
+        member.transport = SimulatedTransport(self, member)
         member.clock = self._clocks.get(name)
         member.node = Node(
             core,
@@ -160,17 +230,17 @@ class SimulatedNetwork(Simulation):
     # --- faults of nodes --------------------------------------------------------------------
 
     def kill(self, name: str) -> None:
-        """Kill a node: it is gone without a word; its tokens vanish at once."""
+        """Kill a node: its tokens vanish at once, and it sends nothing more."""
         self._vanish(name, KILL_SEEN_S)
 
     def stop(self, name: str) -> None:
-        """Ask a node to end, as SIGTERM does; a paused one does so when it is resumed."""
+        """Ask a node to end, as SIGTERM does; a paused one ends when it is resumed."""
         member = self._members.get(name)
         if member is not None:
             member.hand_over(Stopping())
 
     def pause(self, name: str) -> None:
-        """Stop a node's clock and hands; its tokens vanish after the lease."""
+        """Pause a node, as SIGSTOP does; its tokens vanish after the lease."""
         member = self._members[name]
         if member.paused:
             return
@@ -179,21 +249,21 @@ class SimulatedNetwork(Simulation):
         self.at(self.now_s + self.conditions.lease_s, self._lapse, member, member.pauses)
 
     def resume(self, name: str) -> None:
-        """Wake a paused node: it finds everything that queued up, as a zombie does."""
+        """Resume a paused node: it handles all inputs that have queued up."""
         member = self._members[name]
         if not member.paused:
             return
         if member.lapsed:
             member.lapsed = False
-            self._tokens.show_all(member)
+            self.tokens.show_all(member)
         member.wake()
         self._rejoin_later(member)
 
     def set_clock(self, name: str, offset_s: float = 0.0, rate: float = 1.0) -> None:
-        """Let the clock of a node show `offset + rate * t` at virtual time t; default: exact.
+        """Set a node's clock to show `offset + rate * t` at virtual time t; default: exact.
 
-        The clock is its machine's: a node that starts under this name later finds it so. For a
-        node that runs already time jumps.
+        The clock belongs to the machine: a node that starts later under this name has it, too. For
+        a running node time jumps.
 
         Raises:
             ValueError: an argument is not finite, or the clock does not go forwards.
@@ -205,55 +275,52 @@ class SimulatedNetwork(Simulation):
     # --- faults of the network --------------------------------------------------------------
 
     def cut(self, blocked: Callable[[str, str], bool] | None) -> None:
-        """Partition: messages from a to b are lost where `blocked(a, b)`; None heals."""
+        """Partition: messages from a to b are lost if `blocked(a, b)`; None ends it."""
         self._cut = blocked
 
     def lose(self, loss_on: Callable[[str], float] | None) -> None:
-        """Lose messages by their key: with probability `loss_on(key)` where that is the greater.
-
-        None: with `Conditions.loss` on every key.
-        """
+        """Lose messages with probability max(`loss_on(key)`, `Conditions.loss`); None ends it."""
         self._loss_on = loss_on
 
     def disconnect(self, name: str) -> None:
-        """Take a node off the network: it and the others see each other's tokens vanish, at once.
+        """Disconnect a node: it and the others see each other's tokens vanish at once.
 
-        The node sees its own vanish too, and its `LinkDown` anywhere among them.
+        The node sees its own vanish, too, and `LinkDown` at a random place among these.
         """
         member = self._members[name]
         member.unplugged = True
         self._break_links([member])
 
     def reconnect(self, name: str) -> None:
-        """Bring a node back at once; while the router is lost: when it finds that again."""
+        """Reconnect a node: at once, or when the router is back."""
         member = self._members[name]
         member.unplugged = False
         if self._router_up:
             self._join(member)
 
     def lose_router(self) -> None:
-        """Take every node off the network: everybody sees everybody vanish, at once."""
+        """Disconnect all nodes: each sees all others vanish at once."""
         if self._router_up:
             self._router_up = False
             self._outages += 1
             self._break_links(list(self._members.values()))
 
     def restore_router(self) -> None:
-        """Bring the router back; each node finds it in its own time, drawn from `REJOIN_S`."""
+        """Bring the router back; each node reconnects after a time drawn from `REJOIN_S`."""
         if not self._router_up:
             self._router_up = True
             for member in self._members.values():
                 self._rejoin_later(member)
 
     def inject(self, key: str, payload: bytes) -> None:
-        """Deliver any bytes on any key, as a stranger on the network could."""
+        """Deliver arbitrary bytes on a key, as an intruder could."""
         for receiver in self._route(key):
             self._send(receiver, Received(key, payload))
 
     # --- what transports call ---------------------------------------------------------------
 
     def carry(self, sender: str, key: str, payload: bytes) -> None:
-        """Carry a payload to every subscriber of its key."""
+        """Send a payload to every subscriber of its key."""
         source = self._members.get(sender)
         if source is None or not source.connected:
             self.dropped += 1
@@ -267,12 +334,12 @@ class SimulatedNetwork(Simulation):
         for receiver in self._route(key) if route is None else route:
             if (
                 not receiver.connected
-                or (cut is not None and cut(sender, receiver.transport.name))
+                or (cut is not None and cut(sender, receiver.name))
                 or (loss and draw() < loss)
             ):
                 self.dropped += 1
                 continue
-            # `_send` written out: most events of a simulation are made here.
+            # `_send`, inlined: most events of a simulation originate here.
             arrival_s = self.now_s + conditions.delay_s + conditions.jitter_s * draw()
             arguments = (receiver.connection, message)
             heapq.heappush(self.queue, (arrival_s, next(self.order), receiver.arrive, arguments))
@@ -280,69 +347,52 @@ class SimulatedNetwork(Simulation):
                 self._send(receiver, message)
 
     def ask(self, key: str, payload: bytes, answer: Callable[[Answer | None], None]) -> None:
-        """Ask all who serve the key and take the first answer; None: nobody serves it."""
+        """Ask all servers of the key and take the first answer.
+
+        The answer is None if there is no server, or if each has declined, died or been cut off.
+        """
         servers = [
-            member
-            for member in self._members.values()
-            if member.connected and key in member.transport.served
+            member for member in self._members.values() if member.connected and key in member.served
         ]
         numbered = {next(self._token_count): server for server in servers}
-        open_tokens = set(numbered)
+        tokens = set(numbered)
         for token, server in numbered.items():
-            self._answers[token] = answer, open_tokens
+            self._questions[token] = _Question(server, answer, tokens)
             self._send(server, Question(key, payload, token))
         if not servers:
             self.at(self.now_s + self.delay_s(), answer, None)
 
-    def take_answer(self, server: str, token: int, given: Answer | None) -> None:
-        """Hand the first answer to whoever asked; None when all leave it to others."""
-        if token not in self._answers or not self._members[server].connected:
+    def take_answer(self, server: Member, token: int, given: Answer | None) -> None:
+        """Take the answer of a server; None: it declines."""
+        if token in self._questions and server.connected and not server.closed:
+            self._settle(token, given)
+
+    def _settle(self, token: int, given: Answer | None) -> None:
+        """Pass the first answer on; None when no server is left that may answer."""
+        question = self._questions.get(token)
+        if question is None:
             return
-        answer, open_tokens = self._answers[token]
-        done = open_tokens if given is not None else {token}
-        for other in tuple(done):
-            del self._answers[other]
-            open_tokens.discard(other)
-        if not open_tokens:
-            self.at(self.now_s + self.delay_s(), answer, given)
+        for other in tuple(question.tokens) if given is not None else (token,):
+            del self._questions[other]
+            question.tokens.discard(other)
+        if not question.tokens:
+            self.at(self.now_s + self.delay_s(), question.answer, given)
 
-    def show_token(self, owner: str, key: str) -> None:
-        """Tell all watchers of a new token."""
-        self._tokens.appeared(self._members[owner], key)
+    def _abandon_questions(self, server: Member) -> None:
+        """Settle the questions that a server can no longer answer."""
+        for token in [token for token, one in self._questions.items() if one.server is server]:
+            self._settle(token, None)
 
-    def hide_token(self, owner: str, key: str) -> None:
-        """Tell all watchers that a token is gone."""
-        self._tokens.vanished(self._members[owner], key)
-
-    def show_all_tokens(self, watcher: str, expression: str) -> None:
-        """Tell a new watcher of the tokens that are there."""
-        member = self._members[watcher]
-        if member.connected:
-            self._tokens.introduce(member, (expression,))
-
-    def reroute(self, name: str, expressions: Iterable[str]) -> None:
-        """Bring the routes up to date after subscriptions of a node have changed.
-
-        Args:
-            name: the node.
-            expressions: what it has subscribed to, or does not subscribe to any more.
-        """
-        member = self._members.get(name)
-        if member is not None:
-            for expression in expressions:
-                self._reroute(member, expression)
-
-    def _reroute(self, member: Member, expression: str) -> None:
-        """Give a member its place in the routes of all keys that match, or take it out of them."""
+    def reroute(self, member: Member, expression: str) -> None:
+        """Update the routes of all matching keys after a subscription has changed."""
         for key in self._known_keys(expression):
             receivers = [other for other in self._routes[key] if other is not member]
-            transport = member.transport
-            if not transport.closed and matches_any(transport.subscriptions, key):
+            if not member.closed and matches_any(member.subscriptions, key):
                 insort(receivers, member, key=lambda other: other.number)
             self._routes[key] = tuple(receivers)
 
     def _known_keys(self, expression: str) -> list[str]:
-        """Return the keys of the routes that match."""
+        """Return the matching keys that have routes."""
         fixed, star, rest = expression.partition("*")
         if not star:
             return [expression] if expression in self._routes else []
@@ -351,13 +401,13 @@ class SimulatedNetwork(Simulation):
         return [key for key in self._routes if matches(expression, key)]
 
     def remove(self, name: str) -> None:
-        """Take a node out that left in good order."""
+        """Remove a node that has left by itself."""
         self._vanish(name, self.conditions.delay_s)
 
     # --- inside -----------------------------------------------------------------------------
 
     def _reader(self, realm: str) -> _Reader:
-        """Return what reads messages for all nodes of a realm: each only once."""
+        """Return the reader that all nodes of a realm share."""
         if realm not in self._readers:
             self._readers[realm] = _Reader(Keys(realm), self._decode)
         return self._readers[realm]
@@ -366,23 +416,26 @@ class SimulatedNetwork(Simulation):
         member = self._members.pop(name, None)
         if member is None:
             return
-        member.transport.closed = True
-        for expression in member.transport.subscriptions:
-            self._reroute(member, expression)
+        member.closed = True
+        for expression in member.subscriptions:
+            self.reroute(member, expression)
         if member.visible:
-            self.at(self.now_s + seen_after_s, self._tokens.hide_all, member)
+            self.at(self.now_s + seen_after_s, self.tokens.hide_all, member)
+        self.at(self.now_s + seen_after_s, self._abandon_questions, member)
 
     def _lapse(self, member: Member, pause: int) -> None:
-        if member.paused and member.pauses == pause and not member.transport.closed:
-            self._tokens.hide_all(member)
+        if member.paused and member.pauses == pause and not member.closed:
+            self.tokens.hide_all(member)
             member.lapsed = True
+            self._abandon_questions(member)
 
     def _break_links(self, members: Iterable[Member]) -> None:
         broken = [member for member in members if member.connected]
         for member in broken:
-            self._tokens.hide_all(member)
+            self.tokens.hide_all(member)
             member.connected = False
             member.connection += 1
+            self._abandon_questions(member)
         for member in broken:
             news: list[Delivery] = [TokenDown(key) for key in member.seen]
             member.seen.clear()
@@ -394,8 +447,8 @@ class SimulatedNetwork(Simulation):
         if member.connected:
             return
         member.connected = True
-        self._tokens.show_all(member, but=member)
-        self._tokens.introduce(member, member.transport.watched)
+        self.tokens.show_all(member, but=member)
+        self.tokens.introduce(member, member.watched)
         member.hand_over(LinkUp())
 
     def _rejoin_later(self, member: Member) -> None:
@@ -405,8 +458,8 @@ class SimulatedNetwork(Simulation):
 
     def _rejoin(self, member: Member, outage: int) -> None:
         lost_again = self._outages != outage
-        # A paused node looks for the router when it wakes.
-        if not (lost_again or member.paused or member.unplugged or member.transport.closed):
+        # A paused node reconnects when it is resumed.
+        if not (lost_again or member.paused or member.unplugged or member.closed):
             self._join(member)
 
     def _route(self, key: str) -> tuple[Member, ...]:
@@ -415,13 +468,13 @@ class SimulatedNetwork(Simulation):
             route = self._routes[key] = tuple(
                 member
                 for member in self._members.values()
-                if matches_any(member.transport.subscriptions, key)
+                if matches_any(member.subscriptions, key)
             )
             self._beside.setdefault(key[: key.rfind("/") + 1], []).append(key)
         return route
 
     def _send(self, receiver: Member, delivery: Delivery) -> None:
-        # As in `carry`, to the last bit.
+        # Must draw exactly as `carry` does.
         conditions = self.conditions
         arrival_s = self.now_s + conditions.delay_s + conditions.jitter_s * self.random.random()
         self.at(arrival_s, receiver.arrive, receiver.connection, delivery)

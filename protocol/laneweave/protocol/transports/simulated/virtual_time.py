@@ -1,51 +1,106 @@
-"""Virtual time: one event queue, one seeded generator, and what a whole simulation shares."""
+"""Virtual time: an event queue, the conditions and clocks of a simulation, and its trace digest."""
 
 from __future__ import annotations
 
 import heapq
+import math
 import random
 from collections.abc import Callable
+from hashlib import blake2b
 from itertools import count
 from typing import Any
 
+from attrs import field, frozen
+from attrs.validators import and_, ge, gt, le, lt
+
 from laneweave.protocol.runtime.node import Computed, Started, Stopping, Wakeup
-from laneweave.protocol.runtime.transport import Delivery
-from laneweave.protocol.transports.simulated.conditions import Conditions
+from laneweave.protocol.runtime.transport import (
+    Delivery,
+    Question,
+    Received,
+    TokenDown,
+    TokenUp,
+)
 
 Item = Delivery | Computed | Started | Stopping | Wakeup
-"""What a node is handed."""
+"""Input of a node."""
 Trace = Callable[[float, str, Item], None]
-"""Is told the virtual time, a node's name and what it is handed, in order."""
+"""Called with the virtual time, a node's name and its input, in order."""
 Action = Callable[..., None]
+
+_SHARE = and_(ge(0.0), le(1.0))
+_TIME = and_(ge(0.0), lt(math.inf))
+
+
+@frozen
+class Conditions:
+    """How the network treats messages, and how long computations take."""
+
+    delay_s: float = field(default=0.002, validator=_TIME)
+    jitter_s: float = field(default=0.003, validator=_TIME)
+    """Delay is uniform in [delay, delay + jitter], so messages overtake each other."""
+    loss: float = field(default=0.0, validator=_SHARE)
+    """Probability that a receiver does not get a message."""
+    duplication: float = field(default=0.0, validator=_SHARE)
+    """Probability that a receiver gets a message twice."""
+    lease_s: float = field(default=0.5, validator=_TIME)
+    """The tokens of a paused node vanish after this time."""
+    compute_s: float = field(default=0.05, validator=_TIME)
+    """Minimum virtual time of a computation."""
+    compute_jitter_s: float = field(default=0.0, validator=_TIME)
+    """Computation time is uniform in [compute, compute + jitter]."""
+    compute_failure: float = field(default=0.0, validator=_SHARE)
+    """Probability that a computation fails."""
+
+
+@frozen
+class Clock:
+    """A machine's clock, which shows `offset + rate * t` at virtual time t."""
+
+    offset_s: float = field(default=0.0, validator=and_(gt(-math.inf), lt(math.inf)))
+    rate: float = field(default=1.0, validator=and_(gt(0.0), lt(math.inf)))
+
+    def local_s(self, virtual_s: float) -> float:
+        """Return the time that the clock shows at a virtual time."""
+        return self.offset_s + self.rate * virtual_s
+
+    def virtual_s(self, local_s: float) -> float:
+        """Return the first virtual time, up to rounding, at which the clock shows `local_s`."""
+        virtual_s = (local_s - self.offset_s) / self.rate
+        # Round up: a node that is woken must not find that its time has not come yet.
+        step_s = math.ulp(virtual_s)
+        while self.local_s(virtual_s) < local_s:
+            virtual_s += step_s
+            step_s *= 2.0
+        return virtual_s
 
 
 class Simulation:
-    """The virtual clock, and the queue of all that is still to happen."""
+    """Virtual clock, queue of future events, and the one random generator."""
 
     def __init__(self, seed: int, conditions: Conditions | None = None) -> None:
-        """Begin at time 0 with an empty queue."""
+        """Start at time 0 with an empty queue."""
         self.now_s = 0.0
         self.conditions = conditions or Conditions()
-        """May be replaced at any time; what is under way keeps its fate."""
+        """May be replaced at any time; messages in transit are not affected."""
         self.trace: Trace | None = None
-        """Is told all that nodes are handed; None costs nothing."""
+        """Called with every input of every node, if set."""
         self.dropped = 0
-        """Messages that did not reach a receiver, counted for each receiver."""
+        """Messages that did not reach a receiver, counted per receiver."""
         self.delivered = 0
-        """Deliveries that nodes were handed."""
+        """Deliveries to nodes."""
         self.random = random.Random(seed)  # noqa: S311 (simulation, not secrets)
-        """The one source of chance."""
         self.queue: list[tuple[float, int, Action, tuple[Any, ...]]] = []
-        """Time, order among equal times, action and its arguments."""
+        """(time, order among equal times, action, arguments)."""
         self.order = count()
 
     def at(self, time_s: float, action: Action, *arguments: object) -> None:
-        """Do something at a virtual time, e.g. inject a fault; what is past is done now."""
+        """Schedule an action at a virtual time; a time in the past means now."""
         at_s = max(time_s, self.now_s)
         heapq.heappush(self.queue, (at_s, next(self.order), action, arguments))
 
     def step(self) -> bool:
-        """Process the next event; false when there is none."""
+        """Process the next event; return False if there is none."""
         if not self.queue:
             return False
         self.now_s, _, action, arguments = heapq.heappop(self.queue)
@@ -53,7 +108,7 @@ class Simulation:
         return True
 
     def run(self, until_s: float, stop: Callable[[], bool] | None = None) -> None:
-        """Process events up to a virtual time, or until `stop` says so."""
+        """Process events up to a virtual time, or until `stop` returns True."""
         queue = self.queue
         while queue and queue[0][0] <= until_s:
             if stop is not None and stop():
@@ -64,5 +119,43 @@ class Simulation:
             self.now_s = max(self.now_s, until_s)
 
     def delay_s(self) -> float:
-        """Draw how long a message is under way."""
+        """Draw the transit time of a message."""
         return self.conditions.delay_s + self.conditions.jitter_s * self.random.random()
+
+
+class TraceDigest:
+    """A trace that keeps a running hash of all inputs of all nodes: are two runs the same?
+
+    Results of computations are left out, since they may be any object; their effect shows in the
+    messages that follow.
+    """
+
+    def __init__(self) -> None:
+        """Start with an empty trace."""
+        self.events = 0
+        self._hash = blake2b(digest_size=16)
+
+    def __call__(self, now_s: float, name: str, item: Item) -> None:
+        """Add one event."""
+        self.events += 1
+        about: tuple[object, ...] = ()
+        payload = b""
+        match item:
+            case Received(key, payload):
+                about = (key,)
+            case TokenUp(key) | TokenDown(key):
+                about = (key,)
+            case Question(key, payload, token):
+                about = (key, token)
+            case Computed(job, _, error):
+                about = (job, error)
+            case _:
+                pass
+        # The length separates the payload from what follows it.
+        line = repr((now_s, name, type(item).__name__, *about, len(payload)))
+        self._hash.update(line.encode())
+        self._hash.update(payload)
+
+    def hexdigest(self) -> str:
+        """Return the digest of all events so far: 32 hexadecimal digits."""
+        return self._hash.hexdigest()

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import structlog
 
 from laneweave.protocol.runtime.inbox import Inbox, Item
-from laneweave.protocol.runtime.metrics import Look, Observe, looking, unobserved
+from laneweave.protocol.runtime.metrics import Observe, SnapshotRequest, snapshot_source, unobserved
 from laneweave.protocol.runtime.node import (
     Compute,
     Computed,
@@ -70,7 +70,7 @@ def run_core(
         if transport is None:
             return
         node = Node(core, transport, keys, order, Name(f"{os.getpid()}-{time.time_ns()}"))
-        observe(looking(inbox.put))
+        observe(snapshot_source(inbox.put))
         try:
             node.dispatch(Started(), time.monotonic())
             while not node.ended:
@@ -97,8 +97,8 @@ def _hand_over(node: Node, item: Item) -> None:
         log.info("stopping")
         node.dispatch(item, now_s)
         node.ended = True
-    elif isinstance(item, Look):
-        item.answer(node.numbers())
+    elif isinstance(item, SnapshotRequest):
+        item.answer(node.metrics())
     elif isinstance(item, Computed):
         node.dispatch(item, now_s)
     else:

@@ -20,10 +20,8 @@ from typing import Any
 import structlog
 import zenoh
 
-from laneweave.protocol.config.endpoints import check_endpoint
-from laneweave.protocol.config.identities import Party
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.runtime.metrics import Observe, RouterNumbers, unobserved
+from laneweave.protocol.runtime.metrics import Observe, RouterMetrics, unobserved
 from laneweave.protocol.runtime.processes import stop_signals
 from laneweave.protocol.runtime.transport import (
     Answer,
@@ -36,12 +34,12 @@ from laneweave.protocol.runtime.transport import (
     TokenUp,
     learn,
 )
-from laneweave.protocol.security.access import Access
+from laneweave.protocol.security.access import Access, RouterGuard
 from laneweave.protocol.security.certificates import check_credentials
-from laneweave.protocol.security.rights import RouterGuard
 from laneweave.protocol.transports.zenoh.settings import Setting, client_settings, router_settings
+from laneweave.protocol.validators import check_endpoint
 from laneweave.protocol.wire.codec import MAX_BYTES
-from laneweave.protocol.wire.topics import Quality
+from laneweave.protocol.wire.topics import Party, Quality
 
 log = structlog.get_logger(__name__)
 
@@ -357,7 +355,7 @@ def run_router(
                 told_by, ", ".join(endpoints), "endpoints that are free to listen at"
             ) from error
         try:
-            observe(lambda: [RouterNumbers(len(session.info.transports()))])
+            observe(lambda: [RouterMetrics(len(session.info.transports()))])
             if ready is not None:
                 ready()
             stopping = False

@@ -1,0 +1,74 @@
+"""Names of all processes and vehicles of a deployment, derived from its scenario.
+
+The bridge numbers vehicles in order of arrival. The launcher starts agents, and the router grants
+rights, before any vehicle arrives, so both need the names in advance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+
+from laneweave.protocol.scenario.deployment import FleetMembers, parse_shard
+from laneweave.protocol.scenario.tables import Demand, Scenario
+from laneweave.protocol.wire.identities import Identity
+from laneweave.protocol.wire.topics import Party
+
+
+def vehicle_name(number: int) -> str:
+    """Return the name of a vehicle by its number in order of arrival, from 1."""
+    return f"v{number:04d}"
+
+
+def max_vehicles(demand: Demand, lanes: int) -> int:
+    """Return an upper bound on the number of vehicles that arrive in a demand.
+
+    Arrivals are random. The count of a lane varies less than a Poisson variable of the same mean,
+    so six standard deviations are exceeded in fewer than one of 10^8 demands; and each lane has at
+    most one arrival per `demand.min_headway_s`.
+    """
+    mean = lanes * demand.volume_veh_per_lane_h * demand.duration_s / 3600.0
+    likely = math.ceil(mean + 6.0 * math.sqrt(mean)) + 10
+    if demand.min_headway_s <= 0.0:
+        return likely
+    return min(likely, lanes * math.floor(demand.duration_s / demand.min_headway_s + 1e-9))
+
+
+def demanded_vehicles(scenario: Scenario) -> tuple[str, ...]:
+    """Return the names of all vehicles that may arrive in a scenario."""
+    count = max_vehicles(scenario.demand, scenario.road.lanes)
+    return tuple(vehicle_name(number) for number in range(1, count + 1))
+
+
+def members_of(members: FleetMembers, vehicles: Iterable[str]) -> tuple[str, ...]:
+    """Return the vehicles of a fleet; `vehicles` are all that a shard selects from."""
+    if isinstance(members, str):
+        shard = parse_shard(members, "security.fleets")
+        return tuple(vehicle for vehicle in vehicles if shard.takes(vehicle))
+    return members
+
+
+def coordinator_names(scenario: Scenario) -> tuple[str, ...]:
+    """Return the names of a scenario's coordinator candidates, best-ranked first."""
+    return tuple(f"c{index + 1}" for index in range(scenario.runtime.coordinators))
+
+
+def single_vehicles(scenario: Scenario) -> tuple[str, ...]:
+    """Return the vehicles that may have a process of their own."""
+    return scenario.security.vehicles or demanded_vehicles(scenario)
+
+
+def identities_of(scenario: Scenario) -> Iterator[Identity]:
+    """Yield all identities of a deployment."""
+    security = scenario.security
+    yield Identity(Party.ROUTER)
+    yield Identity(Party.BRIDGE)
+    for party, names in (
+        (Party.COORDINATOR, coordinator_names(scenario)),
+        (Party.FLEET, tuple(security.fleets)),
+        (Party.CLIENT, security.clients),
+        (Party.OBSERVER, security.observers),
+        (Party.VEHICLE, single_vehicles(scenario)),
+    ):
+        for name in names:
+            yield Identity(party, name)

@@ -1,0 +1,260 @@
+"""A member of the simulated network (a node on its machine) and the liveliness tokens it sees."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+
+from laneweave.protocol.runtime.node import (
+    Compute,
+    Computed,
+    Delegate,
+    Node,
+    Stopping,
+    Wakeup,
+    run_delegated,
+    run_job,
+)
+from laneweave.protocol.runtime.transport import (
+    Delivery,
+    LinkDown,
+    LinkUp,
+    Question,
+    Received,
+    TokenDown,
+    TokenUp,
+    Transport,
+    learn,
+)
+from laneweave.protocol.transports.simulated.virtual_time import Clock, Item, Simulation
+from laneweave.protocol.wire.topics import matches_any
+
+WAKE_AGAIN_S = 0.001
+"""Delay of a wakeup that a core requests for a past time, so that virtual time goes on."""
+INJECTED_FAILURE = "injected failure"
+"""Error of a computation that fails because of `Conditions.compute_failure`."""
+
+
+_DELIVERIES = (Received, TokenUp, TokenDown, LinkUp, LinkDown, Question)
+
+
+class Member:
+    """One node with its clock, alarm, computations and connection."""
+
+    node: Node
+    transport: Transport
+
+    def __init__(self, simulation: Simulation, name: str, number: int) -> None:
+        """Start connected and running, with an exact clock; the network sets node and transport."""
+        self.name = name
+        self.number = number
+        """Ascending in the order in which members join."""
+        self.subscriptions: dict[str, None] = {}
+        self.watched: dict[str, None] = {}
+        self.tokens: dict[str, None] = {}
+        self.served: set[str] = set()
+        self.closed = False
+        self.clock: Clock | None = None
+        """None: it shows virtual time."""
+        self.connected = True
+        self.unplugged = False
+        """Disconnected on its own: a router that comes back does not change that."""
+        self.connection = 0
+        """Number of the connection: messages of an earlier one do not arrive."""
+        self.paused = False
+        self.pauses = 0
+        self.lapsed = False
+        """Paused for longer than its lease."""
+        self.news_s = 0.0
+        """Arrival time of the newest token event: these do not overtake each other."""
+        self.seen: dict[str, None] = {}
+        """Tokens that it was last told are there."""
+        self._simulation = simulation
+        self._backlog: list[Item] = []
+        self._alarm = 0
+        """Number of the newest alarm; older ones are void."""
+        self._alarm_s = math.inf
+        """Virtual time of the newest alarm; infinite: there is none."""
+        self._computed_s = {Compute: 0.0, Delegate: 0.0}
+        """End of the newest computation of each kind."""
+
+    @property
+    def visible(self) -> bool:
+        """Whether others see its tokens."""
+        return self.connected and not self.lapsed
+
+    # --- input ------------------------------------------------------------------------------
+
+    def arrive(self, connection: int, delivery: Delivery) -> None:
+        """Deliver what was sent during this connection."""
+        if not self.connected or self.connection != connection:
+            return
+        if (
+            isinstance(delivery, Received)
+            or not isinstance(delivery, (TokenUp, TokenDown))
+            or learn(self.seen, delivery)
+        ):
+            self.hand_over(delivery)
+
+    def hand_over(self, item: Item) -> None:
+        """Let the node handle an input, now or when it is resumed."""
+        if self.closed:
+            return
+        if self.paused:
+            self._backlog.append(item)
+        else:
+            self._handle(item)
+            if isinstance(item, Stopping):
+                self.transport.close()
+            self._set_alarm()
+
+    def _handle(self, item: Item) -> None:
+        simulation = self._simulation
+        now_s = simulation.now_s
+        if simulation.trace is not None:
+            simulation.trace(now_s, self.name, item)
+        local_s = self._local_s()
+        if isinstance(item, _DELIVERIES):
+            simulation.delivered += 1
+            self.node.deliver(item, local_s)
+        else:
+            self.node.dispatch(item, local_s)
+
+    # --- time -------------------------------------------------------------------------------
+
+    def _local_s(self) -> float:
+        """Return the time on its own clock."""
+        now_s = self._simulation.now_s
+        return now_s if self.clock is None else self.clock.local_s(now_s)
+
+    def wake(self) -> None:
+        """End a pause: handle all queued inputs in order."""
+        self.paused = False
+        backlog, self._backlog = self._backlog, []
+        for item in backlog:
+            self.hand_over(item)
+        self._reset_alarm()
+
+    def set_clock(self, clock: Clock) -> None:
+        """Replace its clock."""
+        self.clock = clock
+        self._reset_alarm()
+
+    def _reset_alarm(self) -> None:
+        self._alarm_s = math.inf
+        self._set_alarm()
+
+    def _set_alarm(self, soonest_s: float = 0.0) -> None:
+        """Set an alarm for the core's wakeup unless an earlier one is set.
+
+        An alarm that proves too early sets the next one. That is much rarer than a core postponing
+        its wakeup.
+        """
+        if self.closed or self.paused:
+            return
+        wakeup_s = self.node.core.wakeup_s
+        if wakeup_s is None:
+            return
+        due_s = wakeup_s if self.clock is None else self.clock.virtual_s(wakeup_s)
+        if due_s < self._alarm_s:
+            self._alarm_s = due_s
+            self._alarm += 1
+            at_s = due_s if due_s > self._simulation.now_s else soonest_s
+            self._simulation.at(at_s, self._ring, self._alarm)
+
+    def _ring(self, alarm: int) -> None:
+        if self.closed or self.paused or self._alarm != alarm:
+            return
+        self._alarm_s = math.inf
+        now_s = self._simulation.now_s
+        wakeup_s = self.node.core.wakeup_s
+        local_s = self._local_s()
+        if wakeup_s is not None and wakeup_s <= local_s:
+            self._handle(Wakeup())
+        self._set_alarm(now_s + WAKE_AGAIN_S)
+
+    # --- computations -----------------------------------------------------------------------
+
+    def compute(self, job: Compute | Delegate) -> None:
+        """Run a computation and deliver its result after its virtual duration."""
+        simulation = self._simulation
+        conditions, draw = simulation.conditions, simulation.random.random
+        duration_s = conditions.compute_s
+        if conditions.compute_jitter_s:
+            duration_s += conditions.compute_jitter_s * draw()
+        if conditions.compute_failure and draw() < conditions.compute_failure:
+            computed = Computed(job.job, None, INJECTED_FAILURE)
+        else:
+            computed = (
+                run_job(job) if isinstance(job, Compute) else run_delegated(job, self._local_s)
+            )
+        # As on one thread and one worker: jobs of a kind end in the order of their requests.
+        end_s = max(self._computed_s[type(job)], simulation.now_s + duration_s)
+        self._computed_s[type(job)] = end_s
+        simulation.at(end_s, self.hand_over, computed)
+
+
+class Tokens:
+    """Liveliness: reports tokens that appear and vanish to the members that watch them.
+
+    Several nodes may show a token on one key: it appears with the first and vanishes with the last.
+    Reports are never lost and stay in order, as Zenoh's declarations do.
+    """
+
+    def __init__(self, simulation: Simulation, members: Mapping[str, Member]) -> None:
+        """Serve all that are in `members` at the time of each call."""
+        self._simulation = simulation
+        self._members = members
+
+    def appeared(self, owner: Member, key: str) -> None:
+        """Report a token that its owner has just shown."""
+        if owner.visible and not self._shown(key, owner):
+            self._publish(TokenUp(key))
+
+    def vanished(self, owner: Member, key: str) -> None:
+        """Report a token that its owner has just withdrawn."""
+        if owner.visible and not self._shown(key, owner):
+            self._publish(TokenDown(key))
+
+    def introduce(self, watcher: Member, expressions: Iterable[str]) -> None:
+        """Report the tokens that are there to one watcher."""
+        keys = (
+            key
+            for member in self._members.values()
+            if member.visible
+            for key in member.tokens
+            if matches_any(expressions, key)
+        )
+        for key in dict.fromkeys(keys):
+            self._send(watcher, TokenUp(key))
+
+    def show_all(self, owner: Member, but: Member | None = None) -> None:
+        """Report the tokens of a member that has become visible, to all but one."""
+        if owner.visible:
+            for key in owner.tokens:
+                if not self._shown(key, owner):
+                    self._publish(TokenUp(key), but)
+
+    def hide_all(self, owner: Member) -> None:
+        """Report to all but the owner that the tokens of a visible member are gone."""
+        if owner.visible:
+            for key in owner.tokens:
+                if not self._shown(key, owner):
+                    self._publish(TokenDown(key), owner)
+
+    def _shown(self, key: str, owner: Member) -> bool:
+        """Return whether another member shows a token on this key."""
+        return any(
+            member is not owner and member.visible and key in member.tokens
+            for member in self._members.values()
+        )
+
+    def _publish(self, news: TokenUp | TokenDown, but: Member | None = None) -> None:
+        for member in self._members.values():
+            if member is not but and member.connected and matches_any(member.watched, news.key):
+                self._send(member, news)
+
+    def _send(self, watcher: Member, news: TokenUp | TokenDown) -> None:
+        simulation = self._simulation
+        watcher.news_s = max(watcher.news_s, simulation.now_s + simulation.delay_s())
+        simulation.at(watcher.news_s, watcher.arrive, watcher.connection, news)

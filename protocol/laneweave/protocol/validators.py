@@ -1,0 +1,106 @@
+"""What a configured value may be: names, numbers, endpoints, and validators for attrs fields.
+
+Every check raises `BadInputError` with the field, the value and the allowed range.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import attrs
+
+from laneweave.protocol.errors import BadInputError
+
+NAME_PATTERN = re.compile(r"[A-Za-z0-9_.-]{1,64}")
+NAME_RULE = "letters, digits, `_`, `-`, `.`; at least 1, at most 64"
+HOST_PORT_RULE = "HOST:PORT with a port from 1 to 65535, or nothing"
+ENDPOINT_RULE = "unixsock-stream/PATH, tcp/HOST:PORT or tls/HOST:PORT"
+_NETWORK = re.compile(r"(?:tcp|tls)/(?P<host>\[[0-9A-Fa-f:.%]+\]|[^\s/:?#\[\]]+):(?P<port>\d{1,5})")
+# Zenoh reads session settings, those of TLS included, after `?` and `#`.
+_SOCKET = re.compile(r"unixsock-stream/[^?#]+")
+Validator = Callable[[Any, "attrs.Attribute[Any]", Any], None]
+
+
+def within(low: float, high: float, *, open_low: bool = False) -> Validator:
+    """Return a validator for a finite number in [low, high], or (low, high] if `open_low`."""
+
+    def check(_: object, attribute: attrs.Attribute[Any], value: float) -> None:
+        # NaN fails both comparisons.
+        if not low <= value <= high or (open_low and value == low):
+            bracket = "(" if open_low else "["
+            raise BadInputError(attribute.name, value, f"{bracket}{low:g}, {high:g}]")
+
+    return check
+
+
+def one_of(*choices: object) -> Validator:
+    """Return a validator for a fixed set of values."""
+
+    def check(_: object, attribute: attrs.Attribute[Any], value: object) -> None:
+        if value not in choices:
+            raise BadInputError(attribute.name, value, ", ".join(map(str, choices)))
+
+    return check
+
+
+def key_part(_: object, attribute: attrs.Attribute[Any], value: str) -> None:
+    """Check that a value can be one part of a key."""
+    if not NAME_PATTERN.fullmatch(value):
+        raise BadInputError(attribute.name, value, NAME_RULE)
+
+
+def key_parts(_: object, attribute: attrs.Attribute[Any], value: Sequence[str]) -> None:
+    """Check that values can be parts of keys and that none is repeated."""
+    for one in value:
+        key_part(None, attribute, one)
+        if value.count(one) > 1:
+            raise BadInputError(attribute.name, one, "each name once")
+
+
+def host_port(_: object, attribute: attrs.Attribute[Any], value: str) -> None:
+    """Check that a value is HOST:PORT, or empty."""
+    if value:
+        host_and_port(attribute.name, value)
+
+
+def host_and_port(name: str, text: str) -> tuple[str, int]:
+    """Return the parts of HOST:PORT; an IPv6 address is in brackets.
+
+    Raises:
+        BadInputError: the text has another form.
+    """
+    host, _, port = text.rpartition(":")
+    bare = host[1:-1] if host[:1] == "[" and host[-1:] == "]" else host
+    is_port = port.isascii() and port.isdecimal() and len(port) < 6 and 1 <= int(port) <= 65535
+    if not is_port or not bare or (":" in bare) != (bare != host) or " " in bare:
+        raise BadInputError(name, text, HOST_PORT_RULE)
+    return bare, int(port)
+
+
+def check_endpoint(endpoint: str, name: str = "network.endpoint") -> str:
+    """Return a Zenoh endpoint.
+
+    Args:
+        endpoint: text to check.
+        name: field name for the error.
+
+    Raises:
+        BadInputError: the endpoint is malformed, or of a kind that the Zenoh wheel lacks.
+    """
+    found = _NETWORK.fullmatch(endpoint)
+    if not _SOCKET.fullmatch(endpoint) and (found is None or int(found["port"]) > 65535):
+        raise BadInputError(name, endpoint, ENDPOINT_RULE)
+    return endpoint
+
+
+def is_tls(endpoint: str) -> bool:
+    """Return whether traffic through an endpoint is encrypted."""
+    return endpoint.startswith("tls/")
+
+
+def host_of(endpoint: str) -> str:
+    """Return the host of a well-formed endpoint without brackets; empty for socket files."""
+    found = _NETWORK.fullmatch(endpoint)
+    return found["host"].strip("[]") if found else ""

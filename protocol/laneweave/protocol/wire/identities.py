@@ -1,0 +1,80 @@
+"""Identities and incarnations of processes.
+
+    router  bridge  coordinator.NAME  vehicle.NAME  fleet.NAME  client.NAME  observer.NAME
+
+The *identity* is the common name of a process's certificate; the router grants rights by it
+(`security.rights`). The *incarnation* tells one start of a process from all others: a time in ns
+whose low bits are the process id, so numbers grow with time and two live processes of one machine
+never share one, even after `above` has raised a number past the clock.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+
+from attrs import frozen
+
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.validators import NAME_PATTERN
+from laneweave.protocol.wire.topics import Party
+
+MAX_COMMON_NAME = 64
+"""Maximum length in characters, by X.520."""
+IDENTITY_RULE = (
+    "router, bridge, or coordinator, vehicle, fleet, client or observer with a dot and a name, "
+    f"at most {MAX_COMMON_NAME} characters"
+)
+_PROCESS_BITS = 22
+"""Size of a Linux process id; one step of the remaining bits is 4 ms."""
+_STEP = 1 << _PROCESS_BITS
+
+
+@frozen
+class Identity:
+    """Identity of one process."""
+
+    party: Party
+    name: str = ""
+    """Empty for the router and the bridge."""
+
+    @property
+    def common_name(self) -> str:
+        """Its form in a certificate."""
+        return f"{self.party}.{self.name}" if self.name else str(self.party)
+
+
+def parse_identity(text: str, field: str = "identity") -> Identity:
+    """Return the identity with this common name.
+
+    Raises:
+        BadInputError: the text is not an identity.
+    """
+    kind, dot, name = text.partition(".")
+    if len(text) <= MAX_COMMON_NAME and kind in list(Party):
+        party = Party(kind)
+        unnamed = party in (Party.ROUTER, Party.BRIDGE)
+        if not dot if unnamed else NAME_PATTERN.fullmatch(name):
+            return Identity(party, name)
+    raise BadInputError(field, text, IDENTITY_RULE)
+
+
+class Incarnations:
+    """Generator of incarnations for this process, in ascending order."""
+
+    def __init__(self) -> None:
+        """Start below every incarnation."""
+        self._last = 0
+
+    def __call__(self) -> int:
+        """Return an incarnation that no process has used before."""
+        number = time.time_ns() // _STEP * _STEP + os.getpid() % _STEP
+        self._last = number = above(number, self._last)
+        return number
+
+
+def above(number: int, floor: int) -> int:
+    """Return `number`, or the next incarnation of the same process that is greater than `floor`."""
+    if number > floor:
+        return number
+    return number + -(-(floor + 1 - number) // _STEP) * _STEP
