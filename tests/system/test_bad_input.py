@@ -64,6 +64,9 @@ def the_line(ended: Ended) -> str:
         (["run", "--solver", "magic"], "formation.solver: got 'magic'"),
         (["run", "--operation", "rolling", "--solver", "tappa"], "--solver: got 'tappa'; allowed"),
         (["run", "--method", "rule", "--solver", "tappa"], "--solver: got 'tappa'; allowed: none"),
+        (["run", "--method", "rule", "--pace", "2"], "--pace: got '2.0'; allowed: none with"),
+        (["run", "--method", "lc2013", "--transport", "zenoh"], "--transport: got 'zenoh'"),
+        (["run", "--transport", "simulated", "--pace", "2"], "--pace: got '2.0'; allowed: none"),
         (["run", "--pace", "0"], "--pace: got 0.0"),
         (["run", "--pace", "nan"], "--pace: got nan"),
         (["run", "missing.toml"], "missing.toml"),
@@ -156,6 +159,13 @@ def test_scenarios(lab: Lab, text: str, named: str) -> None:
 def test_faults(lab: Lab, text: str, named: str) -> None:
     faults = lab.path("faults.toml", text)
     assert named in refused(lab, "run", "--faults", faults, "--out", "out")
+
+
+def test_a_refused_run_leaves_no_folder(lab: Lab) -> None:
+    faults = lab.path("faults.toml", "[[pause]]\ntarget = 'router'\nat_s = 1.0\nfor_s = 1.0")
+    options = ("--transport", "simulated", "--faults", faults, "--out", "out")
+    assert "pause[0].target: got 'router'" in refused(lab, "run", *options)
+    assert not (lab.folder / "out").exists()
 
 
 def _change(**changes: object) -> str:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from laneweave.agents.driving.trajectory import move_profile
 from laneweave.coordinator.planning import PlanRequest
 from laneweave.launch.cli.main import app
-from laneweave.launch.cli.plan_command import answer_request
+from laneweave.launch.cli.plan_answers import answer_request
 from laneweave.launch.faults.specification import load_faults
 from laneweave.launch.observe.status import SCHEMA, Status
 from laneweave.protocol.config.loading import load_scenario, parse_scenario

@@ -1,8 +1,8 @@
-"""The entry point of the package: signals first, since it takes its time to load.
+"""The entry point of the package; it sets up signals before it loads the command line.
 
-Ctrl-C is taken as SIGTERM is. OSQP puts its own handler for SIGINT in place while it solves, for
-the whole process, and forgets the signal when it comes too late in a solution (measured: one in
-eight while solving without a pause). So no thread ever receives it but one, which passes it on.
+SIGINT is forwarded as SIGTERM. While OSQP solves, it installs its own handler for SIGINT in the
+whole process, and loses signals that arrive late in a solution (measured: one in eight during
+continuous solving). Therefore only one thread receives SIGINT, and forwards it.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ import threading
 
 
 def main() -> None:
-    """Load the command line and run it; Ctrl-C before it runs ends the process without a word."""
-    # Who is told to ignore SIGINT goes on to do so.
+    """Load and run the command line; Ctrl-C before it runs ends the process silently."""
+    # Respect a parent that lets this process ignore SIGINT.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        # Threads and processes that are started from now on inherit it.
+        # Threads and processes that start later inherit the mask.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        threading.Thread(target=_pass_interrupts_on, name="interrupts", daemon=True).start()
+        threading.Thread(target=_forward_interrupts, name="interrupts", daemon=True).start()
     from laneweave.launch.cli import main as cli
 
     cli.main()
 
 
-def _pass_interrupts_on() -> None:
+def _forward_interrupts() -> None:
     while True:
         signal.sigwait({signal.SIGINT})
         os.kill(os.getpid(), signal.SIGTERM)

@@ -1,37 +1,141 @@
-"""Values of options that several commands share."""
+"""Options that several commands share: their declarations, checks and values."""
 
 from __future__ import annotations
 
 import os
 import re
+import sys
+from pathlib import Path
+from typing import Annotated
 
+import typer
+
+from laneweave.launch.run.logs import LogFormat, LogLevel
+from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.tables import SOLVERS, Scenario
 
-MOST_SEEDS = 10_000_000
-MOST_JOBS = 256
+MAX_SEEDS = 10_000_000
+MAX_JOBS = 256
+SOLVER_NAMES = " or ".join(SOLVERS)
+
+ScenarioArgument = Annotated[
+    Path | None, typer.Argument(metavar="[SCENARIO.toml]", help="Default: the paper's road.")
+]
+Duration = Annotated[
+    float | None, typer.Option("--duration", help="Seconds during which vehicles arrive.")
+]
+Seeds = Annotated[
+    str, typer.Option("--seeds", metavar="A:B", help="Seeds to run; B is not included.")
+]
+Jobs = Annotated[
+    int | None, typer.Option("--jobs", metavar="N", help="Processes; default: all cores.")
+]
+NoProgress = Annotated[bool, typer.Option("--no-progress", help="Show no progress bar.")]
+RunFolder = Annotated[
+    Path | None, typer.Option("--out", metavar="DIR", help="Default: a new folder in runs/.")
+]
+Solver = Annotated[
+    str | None,
+    typer.Option("--solver", metavar="NAME", help=f"{SOLVER_NAMES}; default: formation.solver."),
+]
+Config = Annotated[
+    Path | None, typer.Option("--config", metavar="DEPLOYMENT.toml", help="Scenario and network.")
+]
+Endpoint = Annotated[
+    str | None, typer.Option("--endpoint", help="Zenoh endpoint; overrides the configuration.")
+]
+Metrics = Annotated[
+    str | None,
+    typer.Option(
+        "--metrics",
+        metavar="HOST:PORT",
+        help="Serve metrics over HTTP there; overrides the configuration.",
+    ),
+]
+Log = Annotated[
+    LogFormat, typer.Option("--log", envvar="LANEWEAVE_LOG", help="Log format on stderr.")
+]
+Level = Annotated[
+    LogLevel | None,
+    typer.Option(
+        "--log-level",
+        envvar="LANEWEAVE_LOG_LEVEL",
+        help="Lowest level to log; default: warning as text, info as JSON.",
+    ),
+]
 
 
-def parse_seeds(text: str, most: int = MOST_SEEDS) -> range:
+def load_deployment(config: Path | None, endpoint: str | None, **overrides: object) -> Scenario:
+    """Return the configuration of a deployment, which has the endpoint of its router.
+
+    Args:
+        config: path of a DEPLOYMENT.toml; None: the defaults.
+        endpoint: endpoint of the router; overrides that of the file.
+        **overrides: see `load_scenario`.
+
+    Raises:
+        BadInputError: the file is not valid, or there is no endpoint.
+    """
+    settings = load_scenario(config, network__endpoint=endpoint, **overrides)
+    if not settings.network.endpoint:
+        raise BadInputError(
+            "network.endpoint", "", "an endpoint, in the configuration or with --endpoint"
+        )
+    return settings
+
+
+def parse_seeds(text: str, max_seeds: int = MAX_SEEDS) -> range:
     """Return the seeds of `A:B`, B excluded.
 
     Raises:
-        BadInputError: it is no such range, an empty one or too long.
+        BadInputError: the text is not such a range, or the range is empty or too long.
     """
     match = re.fullmatch(r"(\d{1,12}):(\d{1,12})", text)
     seeds = range(int(match[1]), int(match[2])) if match else range(0)
-    if not 0 < len(seeds) <= most:
-        raise BadInputError("--seeds", text, f"A:B with A < B, at most {most} seeds")
+    if not 0 < len(seeds) <= max_seeds:
+        raise BadInputError("--seeds", text, f"A:B with A < B, at most {max_seeds} seeds")
     return seeds
 
 
 def check_jobs(jobs: int | None) -> int:
-    """Return the number of processes to use; None: as many as there are cores.
+    """Return the number of processes to use; by default the number of cores.
 
     Raises:
         BadInputError: it is out of range.
     """
     if jobs is None:
         return len(os.sched_getaffinity(0))
-    if not 1 <= jobs <= MOST_JOBS:
-        raise BadInputError("--jobs", jobs, f"[1, {MOST_JOBS}]")
+    if not 1 <= jobs <= MAX_JOBS:
+        raise BadInputError("--jobs", jobs, f"[1, {MAX_JOBS}]")
     return jobs
+
+
+def check_pace(pace: float | None) -> None:
+    """Check the option `--pace`.
+
+    Raises:
+        BadInputError: it is out of range.
+    """
+    if pace is not None and not 0.01 <= pace <= 1000:
+        raise BadInputError("--pace", pace, "[0.01, 1000]")
+
+
+def refuse_inert(where: str, **options: object) -> None:
+    """Refuse options that would have no effect.
+
+    Args:
+        where: the reason, such as `with --method rule`.
+        **options: values by the names of the options, with underscores; None: not given.
+
+    Raises:
+        BadInputError: one of them is given.
+    """
+    for name, value in options.items():
+        if value is not None:
+            raise BadInputError(f"--{name.replace('_', '-')}", str(value), f"none {where}")
+
+
+def shows_progress(no_progress: bool) -> bool:
+    """Return whether to show a progress bar."""
+    return not no_progress and sys.stderr.isatty()

@@ -1,6 +1,7 @@
-"""The commands that run one role each: `router`, `ping`, `coordinator`, `agent`, `bridge`, `watch`.
+"""The commands that run one role of a deployment each.
 
-Each imports what it needs when it runs: an agent starts without SUMO, a coordinator without OSQP.
+Each command imports what it needs when it runs: an agent starts without SUMO, a coordinator without
+OSQP.
 """
 
 from __future__ import annotations
@@ -14,55 +15,35 @@ import structlog
 import typer
 from rich.console import Console
 
-from laneweave.launch.deploy.deployments import load_deployment
+from laneweave.launch.cli.options import (
+    Config,
+    Endpoint,
+    Level,
+    Log,
+    Metrics,
+    RunFolder,
+    Solver,
+    check_pace,
+    load_deployment,
+    refuse_inert,
+)
 from laneweave.launch.methods import FORMATION
 from laneweave.launch.run.logs import LogFormat, LogLevel, log_role
-from laneweave.launch.run.run_folder import draw_own, new_folder
+from laneweave.launch.run.run_folder import draw_report, new_folder
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.metrics import Observe, unobserved
-from laneweave.protocol.scenario.tables import SOLVERS, Scenario
+from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.security.rights import access_of
 
 log = structlog.get_logger(__name__)
 
-ConfigOption = Annotated[
-    Path | None, typer.Option("--config", metavar="DEPLOYMENT.toml", help="Scenario and network.")
-]
-RealmEndpoint = Annotated[
-    str | None, typer.Option("--endpoint", help="Zenoh endpoint; overrides the configuration.")
-]
-MetricsOption = Annotated[
-    str | None,
-    typer.Option(
-        "--metrics",
-        metavar="HOST:PORT",
-        help="Show metrics over HTTP there; overrides the configuration.",
-    ),
-]
-SOLVER_NAMES = " or ".join(SOLVERS)
-SolverOption = Annotated[
-    str | None,
-    typer.Option("--solver", metavar="NAME", help=f"{SOLVER_NAMES}; default: formation.solver."),
-]
-LogOption = Annotated[
-    LogFormat, typer.Option("--log", envvar="LANEWEAVE_LOG", help="How to log to stderr.")
-]
-LevelOption = Annotated[
-    LogLevel | None,
-    typer.Option(
-        "--log-level",
-        envvar="LANEWEAVE_LOG_LEVEL",
-        help="What to log; default: warning as text, info as JSON.",
-    ),
-]
-
 
 def router(
-    config: ConfigOption = None,
-    endpoint: RealmEndpoint = None,
-    metrics: MetricsOption = None,
-    log_format: LogOption = LogFormat.text,
-    log_level: LevelOption = None,
+    config: Config = None,
+    endpoint: Endpoint = None,
+    metrics: Metrics = None,
+    log_format: Log = LogFormat.text,
+    log_level: Level = None,
 ) -> None:
     """Run the Zenoh router of a deployment."""
     from laneweave.protocol.security.rights import guard_of
@@ -80,7 +61,7 @@ def router(
         )
 
 
-def ping(config: ConfigOption = None, endpoint: RealmEndpoint = None) -> None:
+def ping(config: Config = None, endpoint: Endpoint = None) -> None:
     """Open a session at a router and close it: the health check of a deployment."""
     from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 
@@ -89,15 +70,17 @@ def ping(config: ConfigOption = None, endpoint: RealmEndpoint = None) -> None:
 
 
 def coordinator(
-    config: ConfigOption = None,
-    endpoint: RealmEndpoint = None,
-    name: Annotated[str, typer.Option("--name", help="Rank: the lowest name leads.")] = "c1",
-    solver: SolverOption = None,
-    metrics: MetricsOption = None,
-    log_format: LogOption = LogFormat.text,
-    log_level: LevelOption = None,
+    config: Config = None,
+    endpoint: Endpoint = None,
+    name: Annotated[
+        str, typer.Option("--name", help="The coordinator with the lowest name leads.")
+    ] = "c1",
+    solver: Solver = None,
+    metrics: Metrics = None,
+    log_format: Log = LogFormat.text,
+    log_level: Level = None,
 ) -> None:
-    """Run a coordinator candidate; it also answers plan requests."""
+    """Run a coordinator, which also answers plan requests."""
     from laneweave.coordinator.process import run_coordinator
     from laneweave.protocol.validators import NAME_PATTERN, NAME_RULE
 
@@ -114,43 +97,41 @@ def agent(
     vehicles: Annotated[
         list[str] | None, typer.Argument(metavar="[VEHICLE]...", help="Default: all announced.")
     ] = None,
-    config: ConfigOption = None,
-    endpoint: RealmEndpoint = None,
+    config: Config = None,
+    endpoint: Endpoint = None,
     shard: Annotated[
         str | None,
-        typer.Option("--shard", metavar="I/N", help="Take every N-th announced vehicle."),
+        typer.Option("--shard", metavar="I/N", help="Drive every N-th announced vehicle."),
     ] = None,
     fleet: Annotated[
         str | None,
-        typer.Option("--fleet", metavar="NAME", help="Take those of a fleet in security.fleets."),
+        typer.Option("--fleet", metavar="NAME", help="Drive this fleet of security.fleets."),
     ] = None,
-    metrics: MetricsOption = None,
-    log_format: LogOption = LogFormat.text,
-    log_level: LevelOption = None,
+    metrics: Metrics = None,
+    log_format: Log = LogFormat.text,
+    log_level: Level = None,
 ) -> None:
     """Run the agents of named vehicles, or of all that are announced."""
     from laneweave.agents.driving.trajectory import check_moves
     from laneweave.agents.process import run_agents
-    from laneweave.launch.deploy.assigned_vehicles import crew_of
+    from laneweave.launch.deploy.assigned_vehicles import assigned_vehicles
 
     settings = load_deployment(config, endpoint, observation__metrics=metrics)
     check_moves(settings)
-    crew = crew_of(settings.security, vehicles or (), shard, fleet)
-    access = access_of(settings, crew.identity)
-    with _as_role("agent", crew.identity, settings, log_format, log_level) as observe:
-        run_agents(settings, access, crew.vehicles, crew.shard, observe=observe)
+    assigned = assigned_vehicles(settings.security, vehicles or (), shard, fleet)
+    access = access_of(settings, assigned.identity)
+    with _as_role("agent", assigned.identity, settings, log_format, log_level) as observe:
+        run_agents(settings, access, assigned.vehicles, assigned.shard, observe=observe)
 
 
 def bridge(
-    config: ConfigOption = None,
-    endpoint: RealmEndpoint = None,
-    out: Annotated[Path | None, typer.Option("--out", metavar="DIR")] = None,
-    pace: Annotated[
-        float | None, typer.Option("--pace", help="Road seconds per second; default 1.")
-    ] = 1.0,
-    metrics: MetricsOption = None,
-    log_format: LogOption = LogFormat.text,
-    log_level: LevelOption = None,
+    config: Config = None,
+    endpoint: Endpoint = None,
+    out: RunFolder = None,
+    pace: Annotated[float | None, typer.Option("--pace", help="Road seconds per second.")] = 1.0,
+    metrics: Metrics = None,
+    log_format: Log = LogFormat.text,
+    log_level: Level = None,
 ) -> None:
     """Run the simulated world of a deployment."""
     from laneweave.launch.run.outcome import complete_summary, print_outcome
@@ -158,27 +139,29 @@ def bridge(
 
     check_pace(pace)
     settings = load_deployment(config, endpoint, observation__metrics=metrics)
-    with _as_role("bridge", "bridge", settings, log_format, log_level) as observe:
-        folder = new_folder(out, settings, FORMATION)
+    with (
+        _as_role("bridge", "bridge", settings, log_format, log_level) as observe,
+        new_folder(out, settings, FORMATION) as folder,
+    ):
         run_bridge(settings, folder, FORMATION, pace, observe=observe)
     outcome = complete_summary(folder, problems=())
     print_outcome(outcome, Console())
-    draw_own(folder)
-    # A role that was asked to end did what it was asked, however far the run had come.
-    asked_to_end = outcome.summary is not None and outcome.summary["ending"] == "interrupted"
+    draw_report(folder)
+    # A role that ends because of a signal has not failed, even if its run is incomplete.
+    interrupted = outcome.summary is not None and outcome.summary["ending"] == "interrupted"
     broken = outcome.summary is None or outcome.summary["safety"]["overlaps"]
-    raise typer.Exit(1 if broken else 0 if asked_to_end else outcome.exit_status)
+    raise typer.Exit(1 if broken else 0 if interrupted else outcome.exit_status)
 
 
 def watch(
     folder: Annotated[
         Path | None,
-        typer.Argument(metavar="[DIR]", help="A run's folder; default: the deployment."),
+        typer.Argument(metavar="[DIR]", help="Folder of a run; default: the deployment."),
     ] = None,
-    config: ConfigOption = None,
-    endpoint: RealmEndpoint = None,
+    config: Config = None,
+    endpoint: Endpoint = None,
     listen: Annotated[
-        str, typer.Option("--listen", metavar="HOST:PORT", help="Port 0: any that is free.")
+        str, typer.Option("--listen", metavar="HOST:PORT", help="Port 0: any free port.")
     ] = "127.0.0.1:8080",
 ) -> None:
     """Serve a page that shows a deployment's road live, or a recorded run, until Ctrl-C."""
@@ -187,27 +170,15 @@ def watch(
     if folder is None:
         watch_live(load_deployment(config, endpoint), listen, typer.echo)
         return
-    for option, value in (("--config", config), ("--endpoint", endpoint)):
-        if value is not None:
-            raise BadInputError(option, value, "nothing beside DIR, which needs no network")
+    refuse_inert("with DIR, which needs no network", config=config, endpoint=endpoint)
     watch_recorded(folder, listen, typer.echo)
-
-
-def check_pace(pace: float | None) -> None:
-    """Check the option `--pace`.
-
-    Raises:
-        BadInputError: it is too slow or too fast.
-    """
-    if pace is not None and not 0.01 <= pace <= 1000:
-        raise BadInputError("--pace", pace, "[0.01, 1000]")
 
 
 @contextmanager
 def _as_role(
     role: str, name: str, settings: Scenario, form: LogFormat, level: LogLevel | None
 ) -> Iterator[Observe]:
-    """Log as a role, and show its metrics if the deployment wants them."""
+    """Log as a role, and serve its metrics if the configuration says so."""
     log_role(role, name, form, level)
     network, address = settings.network, settings.observation.metrics
     log.info("starting", endpoint=network.endpoint, realm=network.realm, metrics=address)

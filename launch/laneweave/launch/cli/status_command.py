@@ -14,7 +14,7 @@ from attrs import evolve
 from rich.console import Console
 from rich.table import Table
 
-from laneweave.launch.deploy.deployments import load_deployment
+from laneweave.launch.cli.options import load_deployment
 from laneweave.launch.observe.observer import Observer
 from laneweave.launch.observe.road_view import Coordinator, RoadView
 from laneweave.launch.observe.status import (

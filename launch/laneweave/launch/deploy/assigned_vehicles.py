@@ -1,4 +1,4 @@
-"""Which vehicles an agent process drives, and as whom: from what was given on the command line."""
+"""The vehicles that an agent process drives and its identity, from the command line."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from laneweave.protocol.validators import NAME_PATTERN, NAME_RULE
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.topics import Party
 
-EVERYBODY = "0/1"
+ALL_VEHICLES = "0/1"
 
 
 @frozen
-class Crew:
-    """Whom an agent process drives."""
+class AssignedVehicles:
+    """The vehicles that an agent process drives."""
 
     identity: str
-    """As whom it takes part."""
+    """Identity of the process."""
     vehicles: tuple[str, ...]
-    """By name; none: those of the shard, as they are announced."""
+    """Their names; empty: those of the shard, as they are announced."""
     shard: Shard | None
 
 
-def crew_of(
+def assigned_vehicles(
     security: Security, vehicles: Sequence[str], shard: str | None, fleet: str | None
-) -> Crew:
-    """Return whom an agent process drives.
+) -> AssignedVehicles:
+    """Return the vehicles that an agent process drives.
 
     Args:
-        security: knows the fleets.
-        vehicles: named on the command line.
-        shard: `--shard`.
-        fleet: `--fleet`.
+        security: table of the configuration, with the fleets.
+        vehicles: names on the command line.
+        shard: value of `--shard`.
+        fleet: value of `--fleet`.
 
     Raises:
         BadInputError: these contradict each other, or a secured deployment has no such fleet.
@@ -53,12 +53,14 @@ def crew_of(
                 "one vehicle, or more of them with the --fleet as which they take part, as "
                 "security.mode is mtls",
             )
-        return Crew(_vehicle(vehicles[0]), tuple(vehicles), None)
-    taken = parse_shard(shard or EVERYBODY, "--shard")
-    return Crew(_fleet(_fleet_of_shard(security, taken)), (), taken)
+        return AssignedVehicles(_vehicle(vehicles[0]), tuple(vehicles), None)
+    taken = parse_shard(shard or ALL_VEHICLES, "--shard")
+    return AssignedVehicles(_fleet(_fleet_of_shard(security, taken)), (), taken)
 
 
-def _of_fleet(security: Security, vehicles: Sequence[str], shard: str | None, fleet: str) -> Crew:
+def _of_fleet(
+    security: Security, vehicles: Sequence[str], shard: str | None, fleet: str
+) -> AssignedVehicles:
     if shard is not None:
         raise BadInputError("--shard", shard, "nothing beside --fleet")
     members = security.fleets.get(fleet)
@@ -70,12 +72,12 @@ def _of_fleet(security: Security, vehicles: Sequence[str], shard: str | None, fl
         if not (taken.takes(vehicle) if taken is not None else vehicle in members):
             raise BadInputError("VEHICLE", vehicle, f"a vehicle of the fleet {fleet}")
     if vehicles:
-        return Crew(_fleet(fleet), tuple(vehicles), None)
-    return Crew(_fleet(fleet), () if isinstance(members, str) else members, taken)
+        return AssignedVehicles(_fleet(fleet), tuple(vehicles), None)
+    return AssignedVehicles(_fleet(fleet), () if isinstance(members, str) else members, taken)
 
 
 def _fleet_of_shard(security: Security, shard: Shard) -> str:
-    """Return the name of the fleet that is a shard; any where that does not matter."""
+    """Return the name of the fleet that consists of a shard; any name without security."""
     for name, members in security.fleets.items():
         if _shard(members) == shard:
             return name

@@ -21,8 +21,7 @@ from laneweave.launch.fault_search.checker import Violation
 from laneweave.launch.fault_search.profiles import Profile
 from laneweave.launch.fault_search.simulated_run import Outcome, Totals, World
 from laneweave.launch.fault_search.story import Story
-from laneweave.launch.run.garbage_collection import collect_seldom
-from laneweave.launch.run.roles import die_with_supervisor
+from laneweave.launch.run.roles import collect_rarely, die_with_supervisor
 from laneweave.protocol.errors import CommandFailedError
 
 BATCH = 20
@@ -102,7 +101,7 @@ def search(
 def _batches(seeds: range, profile: Profile, jobs: int, *, digest: bool) -> Iterator[list[Outcome]]:
     batches = [seeds[first : first + BATCH] for first in range(0, len(seeds), BATCH)]
     if jobs == 1 or len(batches) == 1:
-        collect_seldom()
+        collect_rarely()
         for batch in batches:
             yield run_seeds(batch, profile, digest=digest)
         return
@@ -139,7 +138,7 @@ def _quiet() -> None:
     die_with_supervisor()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     quiet_logs()
-    collect_seldom()
+    collect_rarely()
 
 
 def quiet_logs() -> None:
@@ -201,7 +200,7 @@ def describe_totals(totals: Totals) -> Iterator[str]:
     yield f"faults: {faults or 'none'}"
 
 
-def tell_story(seed: int, profile: Profile) -> Iterator[str]:
+def story_of(seed: int, profile: Profile) -> Iterator[str]:
     """Run one seed again and return what happened around its first violation."""
     story = Story()
     outcome = World(seed, profile, story=story).run()

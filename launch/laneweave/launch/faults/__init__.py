@@ -1,5 +1,6 @@
-"""Faults of a run: what a faults file may say, when each fault is due, and how it is done.
+"""Faults of a run: their specification, when each one is due, and how they are applied.
 
-Entry points: `specification.load_faults`, `injection`. `presets/` holds the named fault files.
-Imported by `run` and `cli`.
+Entry points: `specification.load_faults` reads a fault file, `injection.FaultInjection` applies it
+to the processes of a local run or the roles of a simulated one. `presets/` has the named fault
+files. Imported by `run` and `cli`; imports `observe`.
 """

@@ -1,6 +1,8 @@
-"""Carrying out a faults file during a run: who is struck, when, and what is put right again.
+"""The fault engine: applies a fault specification to a run, real or simulated.
 
-The same for processes and for the simulated network: what can be done to a role is behind `Stage`.
+Kills and pauses act on roles through `RoleControl`, which the processes of a local run and the
+roles of a simulated run implement. Message faults and partitions are rules that each role gets when
+it starts; a local run may instead make partitions with network namespaces.
 """
 
 from __future__ import annotations
@@ -12,144 +14,237 @@ import structlog
 from attrs import define, field, frozen
 
 from laneweave.launch.faults.failover import Failover
-from laneweave.launch.faults.schedule import Blow, FaultSchedule
-from laneweave.launch.faults.specification import AGENT, COORDINATOR, LEADER, Faults
+from laneweave.launch.faults.network_namespaces import GroupNetwork, NamespacesUnavailableError
+from laneweave.launch.faults.schedule import FaultEvent, FaultSchedule
+from laneweave.launch.faults.specification import (
+    AGENT,
+    COORDINATOR,
+    LEADER,
+    MESSAGES,
+    NAMESPACES,
+    FaultSpec,
+    Partition,
+)
 from laneweave.launch.observe.road_view import RoadView
+from laneweave.protocol.errors import CommandFailedError
+from laneweave.protocol.runtime.message_faults import MessageRule
 
 log = structlog.get_logger(__name__)
 
 
-class Stage(Protocol):
-    """The roles of a run, as faults see them; all by their names."""
+class RoleControl(Protocol):
+    """The roles of a run by name, and what faults can do to them."""
 
     @property
     def running(self) -> Collection[str]:
-        """Roles that are up; paused ones are among them, killed ones are not."""
+        """Roles that run; paused ones included, killed ones not."""
 
     @property
     def coordinators(self) -> Collection[str]:
-        """All coordinators, up or not."""
+        """All coordinators, running or not."""
 
     def agent_of(self, vehicle: str) -> str | None:
-        """Return the role that drives a vehicle, if one has been started."""
+        """Return the role that drives a vehicle; None: it has not been started."""
 
     def kill(self, name: str) -> None:
-        """End a role at once, without a word."""
+        """End a role at once, without cleaning up."""
 
     def pause(self, name: str) -> None:
-        """Stop a role where it is."""
+        """Suspend a role."""
 
     def resume(self, name: str) -> None:
-        """Let a paused role go on; nothing happens to one that has died meanwhile."""
+        """Resume a paused role; do nothing if it has ended meanwhile."""
 
-    def start_again(self, name: str) -> None:
-        """Start a role that was killed, with an empty memory."""
+    def restart(self, name: str) -> None:
+        """Start a killed role again with an empty memory."""
 
 
 @frozen
-class _Struck:
-    """A role for which something is to be put right."""
+class _Recovery:
+    """A resume or restart that is due later."""
 
-    name: str
+    role: str
     due_s: float
     """Node clock."""
-    paused: bool
-    """To be resumed; otherwise: to be started again."""
+    resumes: bool
+    """Resume the role; otherwise restart it."""
 
 
 @define
 class FaultInjection:
-    """All kills and pauses of one run."""
+    """The faults of one run."""
 
-    stage: Stage
-    schedule: FaultSchedule
-    failover: Failover
+    specification: FaultSpec
+    seed: int
+    """Seed of the scenario; that of the specification takes precedence."""
+    roles: RoleControl
+    lease_s: float
+    network: GroupNetwork | None = None
+    """Namespaces for the partitions that use them; None: messages are dropped instead."""
+    why_no_network: str = ""
     injected: list[dict[str, Any]] = field(factory=list)
-    """What was done: road time, strike, verb, target."""
-    _waiting: list[Blow] = field(factory=list)
-    """Due, but there has been no target yet."""
-    _struck: list[_Struck] = field(factory=list)
+    """Applied faults: road time, name of the fault, and what happened to which target."""
+    failover: Failover = field(init=False)
+    schedule: FaultSchedule = field(init=False)
+    _starts: dict[str, int] = field(factory=dict)
+    """Number of starts of each role."""
+    _waiting: list[FaultEvent] = field(factory=list)
+    """Due events without a target so far."""
+    _recoveries: list[_Recovery] = field(factory=list)
     _targets: dict[str, set[str]] = field(factory=dict)
-    """Whom each strike has struck; agents are struck by each only once."""
+    """Targets of each fault; a fault hits each agent only once."""
     _paused: set[str] = field(factory=set)
+    _in_force: set[str] = field(factory=set)
+    """Names of the partitions in force."""
 
-    @classmethod
-    def of(cls, faults: Faults, seed: int, stage: Stage, lease_s: float) -> FaultInjection:
-        """Prepare the faults of a run; `seed` and `lease_s` are its scenario's."""
-        return cls(stage, FaultSchedule(faults, seed), Failover(lease_s))
+    def __attrs_post_init__(self) -> None:
+        """Draw the schedule."""
+        self.failover = Failover(self.lease_s)
+        self.schedule = FaultSchedule(self.specification, self.seed)
 
     @property
     def wakeup_s(self) -> float | None:
-        """When `step` should be called at the latest, on the clock of `now_s`."""
-        return min((struck.due_s for struck in self._struck), default=None)
+        """Latest time of the next call of `step`, on the clock of `now_s`; None: no limit."""
+        return min((recovery.due_s for recovery in self._recoveries), default=None)
+
+    def message_rules(self) -> tuple[MessageRule, ...]:
+        """Return the rules for messages, including those that make partitions."""
+        partitions = (
+            rule
+            for partition in self.specification.partition
+            if not self._uses_links(partition)
+            for rule in partition.message_rules()
+        )
+        return (*self.specification.messages, *partitions)
+
+    def seed_of_start(self, name: str) -> str:
+        """Return the seed of the message faults for the next start of a role."""
+        start = self._starts[name] = self._starts.get(name, 0) + 1
+        seed = self.seed if self.specification.seed is None else self.specification.seed
+        return f"{seed}/{name}/{start}"
 
     def step(self, road_s: float, now_s: float, view: RoadView) -> None:
-        """Do what is due.
+        """Apply all faults that are due.
 
         Args:
             road_s: road time.
-            now_s: the node's clock: wall-clock seconds, or those of the simulated network.
-            view: who leads and who is on the road; a leader that is struck is taken out of it.
+            now_s: the node's clock: wall-clock time, or time of the simulated network.
+            view: leader and census; a leader that becomes a target is removed from it.
+
+        Raises:
+            CommandFailedError: a role cannot be restarted, or a link not be changed.
         """
-        self._put_right(now_s)
+        self._recover(now_s)
         self.failover.look(view, now_s)
         self._waiting += self.schedule.due(road_s)
         waiting, self._waiting = self._waiting, []
-        for blow in waiting:
-            name = self._choose(blow, view)
+        for event in waiting:
+            name = self._choose(event, view)
             if name is None:
-                self._waiting.append(blow)
+                self._waiting.append(event)
             else:
-                self._strike(blow, name, road_s, now_s, view)
+                self._apply(event, name, road_s, now_s, view)
+        self._partition(road_s)
 
-    def never_happened(self) -> list[str]:
-        """Return a line for each fault of which nothing has happened."""
-        return self.schedule.never_happened(set(self._targets))
+    def unused_faults(self) -> list[str]:
+        """Return one line for each fault that has had no effect."""
+        return self.schedule.unused_faults(set(self._targets))
 
-    def _put_right(self, now_s: float) -> None:
-        due = [struck for struck in self._struck if struck.due_s <= now_s]
-        self._struck = [struck for struck in self._struck if struck.due_s > now_s]
-        for struck in due:
-            if struck.paused:
-                self._paused.discard(struck.name)
-                self.stage.resume(struck.name)
+    def results(self, dropped: int) -> dict[str, Any]:
+        """Return the arguments of `complete_summary` that concern faults.
+
+        `dropped` is the number of messages that faults have dropped.
+        """
+        methods = {
+            name: NAMESPACES if self._uses_links(partition) else MESSAGES
+            for name, partition in self.specification.partitions()
+        }
+        faults: dict[str, Any] = {"injected": self.injected, "partition_methods": methods}
+        if self.why_no_network:
+            faults["why_no_namespaces"] = self.why_no_network
+        return {"failover": self.failover, "dropped": dropped, "faults": faults}
+
+    def close(self) -> None:
+        """Release the network namespaces; to be called when all roles have ended."""
+        if self.network is not None:
+            self.network.close()
+
+    # --- kills and pauses ---------------------------------------------------------------------
+
+    def _recover(self, now_s: float) -> None:
+        due = [recovery for recovery in self._recoveries if recovery.due_s <= now_s]
+        self._recoveries = [recovery for recovery in self._recoveries if recovery.due_s > now_s]
+        for recovery in due:
+            if recovery.resumes:
+                self._paused.discard(recovery.role)
+                self.roles.resume(recovery.role)
             else:
-                self.stage.start_again(struck.name)
+                self.roles.restart(recovery.role)
 
-    def _choose(self, blow: Blow, view: RoadView) -> str | None:
-        running = [name for name in self.stage.running if name not in self._paused]
-        target = blow.strike.target
+    def _choose(self, event: FaultEvent, view: RoadView) -> str | None:
+        running = [name for name in self.roles.running if name not in self._paused]
+        target = event.fault.target
         if target in (COORDINATOR, AGENT):
-            candidates = sorted(self._candidates(blow, view, running))
-            return blow.draw.choice(candidates) if candidates else None
+            candidates = sorted(self._candidates(event, view, running))
+            return event.draw.choice(candidates) if candidates else None
         name = view.leader if target == LEADER else target
         if name not in running:
-            name = self.stage.agent_of(target)
+            name = self.roles.agent_of(target)
         return name if name in running else None
 
-    def _candidates(self, blow: Blow, view: RoadView, running: Collection[str]) -> Iterator[str]:
-        if blow.strike.target == COORDINATOR:
-            yield from (name for name in self.stage.coordinators if name in running)
+    def _candidates(
+        self, event: FaultEvent, view: RoadView, running: Collection[str]
+    ) -> Iterator[str]:
+        if event.fault.target == COORDINATOR:
+            yield from (name for name in self.roles.coordinators if name in running)
             return
-        struck = self._targets.get(blow.strike_name, set())
+        earlier = self._targets.get(event.fault_name, set())
         entries = view.census.on_road if view.census is not None else ()
-        agents = dict.fromkeys(self.stage.agent_of(entry.vehicle) for entry in entries)
+        agents = dict.fromkeys(self.roles.agent_of(entry.vehicle) for entry in entries)
         for name in agents:
-            if name is not None and name in running and name not in struck:
+            if name is not None and name in running and name not in earlier:
                 yield name
 
-    def _strike(self, blow: Blow, name: str, road_s: float, now_s: float, view: RoadView) -> None:
-        self._targets.setdefault(blow.strike_name, set()).add(name)
-        self.injected.append({"t_s": round(road_s, 3), "fault": blow.strike_name, blow.verb: name})
-        log.warning(blow.verb, target=name, t_s=road_s, fault=blow.strike_name)
-        if blow.for_s is not None:
-            self.stage.pause(name)
+    def _apply(
+        self, event: FaultEvent, name: str, road_s: float, now_s: float, view: RoadView
+    ) -> None:
+        self._targets.setdefault(event.fault_name, set()).add(name)
+        self._record(road_s, event.fault_name, event.verb, name)
+        if event.for_s is not None:
+            self.roles.pause(name)
             self._paused.add(name)
-            self._struck.append(_Struck(name, now_s + blow.for_s, paused=True))
+            self._recoveries.append(_Recovery(name, now_s + event.for_s, resumes=True))
         else:
-            self.stage.kill(name)
-            if blow.restart_after_s is not None:
-                again_s = now_s + blow.restart_after_s
-                self._struck.append(_Struck(name, again_s, paused=False))
+            self.roles.kill(name)
+            if event.restart_after_s is not None:
+                restart_s = now_s + event.restart_after_s
+                self._recoveries.append(_Recovery(name, restart_s, resumes=False))
         if name == view.leader:
-            self.failover.on_struck(view, now_s, blow.for_s)
+            self.failover.on_leader_fault(view, now_s, event.for_s)
+
+    def _record(self, road_s: float, fault: str, verb: str, target: str) -> None:
+        self.injected.append({"t_s": round(road_s, 3), "fault": fault, verb: target})
+        log.warning(verb, target=target, t_s=road_s, fault=fault)
+
+    # --- partitions ---------------------------------------------------------------------------
+
+    def _uses_links(self, partition: Partition) -> bool:
+        return self.network is not None and partition.may_use_links
+
+    def _partition(self, road_s: float) -> None:
+        in_force = {
+            name: partition
+            for name, partition in self.specification.partitions()
+            if partition.holds(road_s)
+        }
+        if in_force.keys() == self._in_force:
+            return
+        if self.network is not None:
+            cut = {part.between[0] for part in in_force.values() if self._uses_links(part)}
+            try:
+                self.network.cut_off(cut)
+            except NamespacesUnavailableError as error:
+                raise CommandFailedError(f"cannot change a link: {error}") from error
+        for name in sorted(in_force.keys() ^ self._in_force):
+            self._record(road_s, name, "partition", "began" if name in in_force else "ended")
+        self._in_force = set(in_force)

@@ -1,15 +1,14 @@
-"""Groups of processes in network namespaces of their own, so that partitions are real ones.
+"""Network namespaces for groups of processes, so that partitions affect real connections.
 
-The namespaces form a star. The router lives in the hub, which has one address for all; each group
-is joined to it by one pair of virtual Ethernet devices (veth), and taking the hub's end down cuts
-the group off: its packets vanish, its connections run into their leases, and it sees everybody
-else's tokens go. The supervisor of a run talks to the router through a Unix socket, which no
-namespace concerns.
+The namespaces form a star. The router runs in the hub, which has the same address for all groups. A
+pair of virtual Ethernet devices (veth) connects each group to the hub; setting the hub's end down
+disconnects the group: packets are lost, connections end with their leases, and the group loses the
+liveliness tokens of all others. The launcher reaches the router through a Unix socket, which
+namespaces do not affect.
 
-Each namespace is held by a process of the run and has no name. The kernel removes it, with its
-devices and addresses, when the last process in it has ended, however the run ends: nothing outside
-is touched and nothing is left behind. It takes the right to make namespaces (CAP_SYS_ADMIN) and the
-program `ip`.
+A process of the run holds each namespace, which has no name. The kernel removes the namespace with
+its devices and addresses when the last process in it ends, so that no run leaves anything behind.
+This requires CAP_SYS_ADMIN and the program `ip`.
 """
 
 from __future__ import annotations
@@ -26,27 +25,30 @@ from pathlib import Path
 
 from attrs import define, field
 
+from laneweave.launch.faults.specification import NAMESPACES, FaultSpec
+from laneweave.protocol.errors import BadInputError
+
 PORT = 7447
 HUB_ADDRESS = "10.77.255.1"
-"""Of the hub, whichever link leads there: all groups can read the same configuration."""
+"""Address of the hub on every link, so that all groups can share one configuration."""
 ANSWER_S = 10.0
-"""How long a namespace may take to be made, or a command in it to be done."""
+"""Longest time to create a namespace or to run a command in it."""
 HUB = "hub"
 _CLONE_NEWNET = 0x40000000
 _PATH = os.pathsep.join((os.environ.get("PATH", os.defpath), "/usr/sbin", "/sbin"))
 _UPLINK = "uplink"
-"""A group's end of its pair of devices; the hub's end is called as the group."""
+"""A group's end of its pair of devices; the hub's end has the name of the group."""
 
 
 class NamespacesUnavailableError(RuntimeError):
-    """Network namespaces cannot be made or used here; the message says why."""
+    """Network namespaces cannot be created or used here; the message says why."""
 
 
 def join_namespace(process_id: int) -> None:
-    """Move this process, which must have one thread only, into another one's network namespace.
+    """Move this process into the network namespace of another one; call it with a single thread.
 
     Raises:
-        OSError: that is not allowed, or there is no such process.
+        OSError: permission is missing, or the other process does not exist.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     with Path(f"/proc/{process_id}/ns/net").open("rb") as namespace:
@@ -54,10 +56,10 @@ def join_namespace(process_id: int) -> None:
 
 
 def hold_namespace(connection: Connection) -> None:
-    """Make a network namespace and carry out commands in it, until the other end is closed.
+    """Create a network namespace and run commands in it until the connection is closed.
 
-    Answers an empty text when all is well, the reason when it is not: first for the namespace, then
-    for each list of words that it receives.
+    Sends an empty text on success, or else the reason: once for the namespace, then for each
+    command received as a list of words.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -82,7 +84,7 @@ def _check(status: int) -> None:
 
 def _run(words: list[str]) -> str:
     try:
-        done = subprocess.run(  # noqa: S603 (words are made in this module)
+        done = subprocess.run(  # noqa: S603 (the words come from this module)
             words, capture_output=True, text=True, timeout=ANSWER_S / 2, check=False
         )
     except (OSError, subprocess.TimeoutExpired) as error:
@@ -92,7 +94,7 @@ def _run(words: list[str]) -> str:
 
 @define
 class _Namespace:
-    """The supervisor's side of a namespace and of the process that holds it."""
+    """The launcher's side of a namespace and of the process that holds it."""
 
     process: ForkServerProcess
     connection: Connection
@@ -138,7 +140,7 @@ class _Namespace:
 
 @define
 class GroupNetwork:
-    """The namespaces of a run: a hub with the router, and one for each group."""
+    """The namespaces of a run: the hub with the router, and one per group."""
 
     context: ForkServerContext
     groups: tuple[str, ...]
@@ -146,10 +148,10 @@ class GroupNetwork:
     _cut: set[str] = field(factory=set)
 
     def open(self) -> None:
-        """Make the namespaces and their links.
+        """Create the namespaces and their links.
 
         Raises:
-            NamespacesUnavailableError: that is not possible here; nothing is left of it.
+            NamespacesUnavailableError: this is not possible here; nothing is left behind.
         """
         try:
             for name in (HUB, *self.groups):
@@ -173,25 +175,25 @@ class GroupNetwork:
         leaf.ip("route", "add", "default", "via", f"{self._network(group)}.1")
 
     def _network(self, group: str) -> str:
-        """Return the first three parts of the addresses of a group's link."""
+        """Return the first three bytes of the addresses on a group's link."""
         return f"10.77.{self.groups.index(group)}"
 
     def process_id(self, name: str) -> int:
-        """Return a process in a group's namespace, or in the hub's, for `join_namespace`."""
+        """Return the id of a process in the namespace of a group or of the hub."""
         return self._namespaces[name].process_id
 
     @property
     def listen(self) -> str:
-        """Zenoh endpoint at which the router listens to the groups."""
+        """Zenoh endpoint at which the router listens for the groups."""
         return f"tcp/0.0.0.0:{PORT}"
 
     @property
     def endpoint(self) -> str:
-        """Zenoh endpoint of the router, as every group sees it."""
+        """Zenoh endpoint of the router for every group."""
         return f"tcp/{HUB_ADDRESS}:{PORT}"
 
     def cut_off(self, groups: Collection[str]) -> set[str]:
-        """Take exactly these groups' links down, and return those of which that is news.
+        """Set the links of exactly these groups down, and return the groups that changed.
 
         Raises:
             NamespacesUnavailableError: a command failed.
@@ -205,7 +207,34 @@ class GroupNetwork:
         return changed
 
     def close(self) -> None:
-        """Let the kernel have the namespaces; to be called when the roles in them have ended."""
+        """Release the namespaces; to be called when the roles in them have ended."""
         for namespace in self._namespaces.values():
             namespace.close()
         self._namespaces.clear()
+
+
+def open_network(
+    specification: FaultSpec, context: ForkServerContext
+) -> tuple[GroupNetwork | None, str]:
+    """Create the namespaces that partitions use.
+
+    Returns:
+        The namespaces, or None and the reason; the reason is empty if no partition needs them.
+
+    Raises:
+        BadInputError: a partition requires namespaces, and they cannot be created.
+    """
+    partitions = specification.partition
+    groups = dict.fromkeys(part.between[0] for part in partitions if part.may_use_links)
+    if not groups:
+        return None, ""
+    network = GroupNetwork(context, tuple(groups))
+    try:
+        network.open()
+    except NamespacesUnavailableError as error:
+        for name, partition in specification.partitions():
+            if partition.method == NAMESPACES:
+                allowed = f"messages, since there can be none here ({error})"
+                raise BadInputError(f"{name}.method", NAMESPACES, allowed) from error
+        return None, str(error)
+    return network, ""

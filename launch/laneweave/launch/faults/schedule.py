@@ -1,7 +1,7 @@
-"""When each kill and pause of a faults file is due: times drawn from the seed.
+"""Fault events: when each kill and pause of a fault specification is due.
 
-Every strike draws from generators of its own, so that a fault that is added to a file leaves the
-times of the others as they are.
+Each fault of the specification draws from its own random generators, so that adding a fault does
+not change the times of the others.
 """
 
 from __future__ import annotations
@@ -14,100 +14,107 @@ from operator import attrgetter
 
 from attrs import field, frozen
 
-from laneweave.launch.faults.specification import Faults, Kill, Pause, Strike
+from laneweave.launch.faults.specification import (
+    FaultSpec,
+    Kill,
+    Partition,
+    Pause,
+    RoleFault,
+)
+from laneweave.protocol.runtime.message_faults import MessageRule
 
 
 @frozen
-class Blow:
-    """One process that is to be struck once."""
+class FaultEvent:
+    """One kill or pause of one role."""
 
-    strike_name: str
-    """Its strike's name in the file, such as `kill[0]`."""
-    strike: Strike
+    fault_name: str
+    """Name of its fault in the file, such as `kill[0]`."""
+    fault: RoleFault
     due_s: float
     """Road time."""
     draw: random.Random = field(eq=False, repr=False)
-    """For the choice among several targets."""
+    """Generator for the choice among several targets."""
     for_s: float | None = None
-    """A pause: how long, in wall-clock seconds."""
+    """Length of a pause in wall-clock seconds."""
     restart_after_s: float | None = None
-    """A kill: after how many wall-clock seconds the process is started again; none: never."""
+    """Wall-clock seconds between a kill and the restart; None: no restart."""
 
     @property
     def verb(self) -> str:
-        """What happens to the target."""
-        return "paused" if isinstance(self.strike, Pause) else "killed"
+        """The effect on the target: `killed` or `paused`."""
+        return _verb(self.fault)
 
 
 class FaultSchedule:
-    """All blows of a run, in the order of their times; some strikes never end."""
+    """All fault events of a run in the order of their times; some faults repeat without end."""
 
-    def __init__(self, faults: Faults, seed: int) -> None:
-        """Draw; `seed` counts where the faults bring none of their own."""
-        seed = seed if faults.seed is None else faults.seed
-        self._strikes = dict(faults.strikes())
-        self._windows = tuple(faults.windows())
+    def __init__(self, specification: FaultSpec, seed: int) -> None:
+        """Draw the events with the seed of the specification, or else with `seed`."""
+        seed = seed if specification.seed is None else specification.seed
+        self._specification = specification
         self._reached_s = 0.0
         self._coming = heapq.merge(
-            *(_blows(seed, name, strike) for name, strike in self._strikes.items()),
+            *(_events(seed, name, fault) for name, fault in specification.role_faults()),
             key=attrgetter("due_s"),
         )
         self._next = next(self._coming, None)
 
-    def due(self, road_s: float) -> Iterator[Blow]:
-        """Yield the blows that have become due since the last call."""
+    def due(self, road_s: float) -> Iterator[FaultEvent]:
+        """Yield the events that have become due since the last call."""
         self._reached_s = max(self._reached_s, road_s)
         while self._next is not None and self._next.due_s <= road_s:
             yield self._next
             self._next = next(self._coming, None)
 
-    def never_happened(self, struck: set[str]) -> list[str]:
-        """Return a line for each fault of which nothing has happened when a run has ended.
+    def unused_faults(self, applied: set[str]) -> list[str]:
+        """Return one line for each fault that has had no effect when the run ends.
 
-        `struck` names the strikes of which at least one blow has found its target.
+        `applied` has the names of the faults of which at least one event has found a target.
         """
-        lines = []
-        for name, strike in self._strikes.items():
-            if name not in struck:
-                verb = "killed" if isinstance(strike, Kill) else "paused"
-                lines.append(
-                    f"the run ended before {strike.target} was {verb} at {strike.from_s:g} s"
-                )
+        lines = [
+            f"the run ended before {fault.target} was {_verb(fault)} at {fault.from_s:g} s"
+            for name, fault in self._specification.role_faults()
+            if name not in applied
+        ]
+        windows: list[tuple[str, MessageRule | Partition]] = [
+            *((f"messages[{i}]", rule) for i, rule in enumerate(self._specification.messages)),
+            *self._specification.partitions(),
+        ]
         lines += [
-            f"the run ended before {name} came into force at {from_s:g} s"
-            for name, from_s in self._windows
-            if from_s > self._reached_s
+            f"the run ended before {name} came into force at {window.from_s:g} s"
+            for name, window in windows
+            if window.from_s > self._reached_s
         ]
         return lines
 
 
-def _blows(seed: int, name: str, strike: Strike) -> Iterator[Blow]:
-    """Yield the blows of one strike by time."""
-    for number, due_s in enumerate(_times(seed, name, strike)):
+def _verb(fault: RoleFault) -> str:
+    return "paused" if isinstance(fault, Pause) else "killed"
+
+
+def _events(seed: int, name: str, fault: RoleFault) -> Iterator[FaultEvent]:
+    """Yield the events of one fault in the order of their times."""
+    for number, due_s in enumerate(_times(seed, name, fault)):
         draw = random.Random(f"{seed}/{name}/{number}")  # noqa: S311 (no secrets)
         for_s = restart_after_s = None
-        if isinstance(strike, Pause):
-            span = strike.for_s
-            for_s = draw.uniform(*span) if isinstance(span, tuple) else span
-        elif isinstance(strike, Kill):
-            # Evenly spread, so that the share holds however many there are in the end.
-            before, after = (int(strike.restart_share * (number + n) + 1e-9) for n in (0, 1))
+        if isinstance(fault, Pause):
+            for_s = draw.uniform(*fault.for_s) if isinstance(fault.for_s, tuple) else fault.for_s
+        elif isinstance(fault, Kill):
+            # Restarts are spread evenly, so that the share holds for any number of kills.
+            before, after = (int(fault.restart_share * (number + n) + 1e-9) for n in (0, 1))
             if after > before:
-                restart_after_s = strike.restart_after_s
-        yield Blow(name, strike, due_s, draw, for_s, restart_after_s)
+                restart_after_s = fault.restart_after_s
+        yield FaultEvent(name, fault, due_s, draw, for_s, restart_after_s)
 
 
-def _times(seed: int, name: str, strike: Strike) -> Iterator[float]:
-    """Yield a strike's times in order, each as often as it has targets."""
-    if strike.between_s is not None:
+def _times(seed: int, name: str, fault: RoleFault) -> Iterator[float]:
+    """Yield the times of a fault in order, each as often as the fault has targets."""
+    if fault.between_s is not None:
         draw = random.Random(f"{seed}/{name}")  # noqa: S311 (no secrets)
-        drawn = strike.count * (strike.times or 1)
-        yield from sorted(draw.uniform(*strike.between_s) for _ in range(drawn))
+        drawn = fault.count * (fault.times or 1)
+        yield from sorted(draw.uniform(*fault.between_s) for _ in range(drawn))
         return
-    first_s = strike.from_s
-    if strike.every_s is None:
-        repeats: Iterator[int] = iter((0,))
-    else:
-        repeats = islice(count(), strike.times)
+    repeats = islice(count(), 1 if fault.every_s is None else fault.times)
     for repeat in repeats:
-        yield from [first_s + repeat * (strike.every_s or 0.0)] * strike.count
+        yield from [fault.from_s + repeat * (fault.every_s or 0.0)] * fault.count

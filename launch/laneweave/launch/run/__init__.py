@@ -1,5 +1,6 @@
-"""One run: its processes, its progress, its outcome.
+"""One run: over processes (`local_run`), over the simulated network, or of a reference method.
 
-Entry points: `local_run` (processes on this machine over Zenoh), `simulated_run` (virtual time),
-`reference_run` (the paper's rules, LC2013). Imported by `cli`, `sweep` and `bench`.
+Entry points: `local_run.LocalRun`, `simulated_run.SimulatedRun` and `reference_run.ReferenceRun`,
+whose `run` returns an `outcome.Outcome`. Imported by `cli`, `sweep`, `bench` and `fault_search`;
+imports `faults` and `observe`.
 """

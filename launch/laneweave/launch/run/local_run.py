@@ -1,7 +1,7 @@
-"""A run on this machine: router, coordinators, bridge and agents as processes over Zenoh.
+"""A run on this machine with router, coordinators, bridge and agents as processes over Zenoh.
 
-The supervisor starts them, starts an agent for every vehicle that is announced, watches them,
-injects faults, and always cleans up: on success, on failure, on Ctrl-C, and when a process dies.
+The launcher starts them, starts an agent for each announced vehicle, watches all processes, applies
+faults, and ends everything: on success, on failure, on Ctrl-C, and when a process dies.
 """
 
 from __future__ import annotations
@@ -19,18 +19,21 @@ import attrs
 from attrs import define, field
 
 from laneweave.coordinator.planning import warm_up
-from laneweave.launch.faults.local_faults import ProcessFaults
-from laneweave.launch.faults.specification import Faults
+from laneweave.launch.faults.board import MessageFaults, SharedBoard
+from laneweave.launch.faults.injection import FaultInjection
+from laneweave.launch.faults.network_namespaces import HUB, open_network
+from laneweave.launch.faults.specification import SENDER_OF_GROUP, FaultSpec
 from laneweave.launch.observe.observer import Observer
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.logs import last_error
 from laneweave.launch.run.outcome import Outcome, complete_summary
 from laneweave.launch.run.progress import RunProgress
-from laneweave.launch.run.role_processes import ROUTER, Order, RoleEnd, RoleProcesses
+from laneweave.launch.run.role_processes import ROUTER, RoleEnd, RoleProcesses, StartOrder
 from laneweave.launch.run.roles import fork_server
 from laneweave.protocol.config.loading import to_tables
 from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.errors import BadInputError, CommandFailedError
+from laneweave.protocol.runtime.message_faults import SENDER_OF_ROLE
 from laneweave.protocol.scenario.deployment import Security
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.security.rights import access_of
@@ -39,52 +42,54 @@ from laneweave.protocol.wire.topics import Keys
 from laneweave.sim_bridge.road.demand import arrivals
 
 MAX_TEMPORARY_BYTES = 70
-"""Sockets lie up to 37 characters below TMPDIR, and their paths have at most 107 bytes."""
+"""Sockets are up to 37 characters below TMPDIR, and their paths have at most 107 bytes."""
 ROUTER_START_S = 20.0
 STALL_S = 90.0
-"""A run whose road clock stands still for this long has failed."""
-MOST_FAILED_AGENTS = 5
-"""A run in which more agents than that end by themselves with an error is given up."""
+"""A run fails if its road clock stands still for longer than this."""
+MAX_FAILED_AGENTS = 5
+"""A run is given up if more agents than this end with an error."""
 LEADER_S = 5.0
-"""How long a run waits for a leader beyond the election time before it begins without one."""
+"""Time to wait for a leader, beyond the election time, before the run starts without one."""
 POLL_S = 0.1
+_GROUP_OF_SENDER = {sender: group for group, sender in SENDER_OF_GROUP.items()}
 
 
 @define
-class _Stall:
-    """Notices a road clock that stands still."""
+class _StallDetector:
+    """Detects a road clock that stands still."""
 
     scenario: Scenario
     advanced_s: float
     road_s: float = -1.0
 
-    def lasts(self, road_s: float, now_s: float) -> bool:
-        """Tell whether the clock has stood still for too long."""
+    def is_stalled(self, road_s: float, now_s: float) -> bool:
+        """Return whether the clock has stood still for too long."""
         if road_s != self.road_s:
             self.road_s, self.advanced_s = road_s, now_s
-        # An entrance that waits for an agent stands still in good order.
+        # The clock also waits for the agent of a vehicle that is about to enter.
         patience_s = max(STALL_S, 2 * self.scenario.runtime.agent_start_s)
         return now_s - self.advanced_s > patience_s
 
 
 @define
 class LocalRun:
-    """One run under supervision; `run` does it all."""
+    """One run with its own processes; call `run` once."""
 
     scenario: Scenario
     folder: Path
     method: str = "formation"
-    faults: Faults = field(factory=Faults)
+    faults: FaultSpec = field(factory=FaultSpec)
     show_progress: bool = True
     pace: float | None = None
     watch: Callable[[RoadView, Mapping[str, int]], None] | None = None
-    """Called ten times a second with what is known and the process id of each role."""
+    """Called ten times per second with the view of the run and the process ids of the roles."""
     _processes: RoleProcesses = field(init=False)
     _options: dict[str, Any] = field(init=False)
-    """What every role needs beside the scenario."""
-    _active_faults: ProcessFaults | None = None
+    """Options of all roles."""
+    _injection: FaultInjection | None = None
+    _board: SharedBoard = field(init=False)
     _group_of: dict[str, int] = field(init=False)
-    """Which vehicles share a process: neighbours in the order of their arrival."""
+    """Group of each vehicle; a group of successive arrivals shares a process."""
     _started_groups: set[int] = field(factory=set)
     _problems: list[str] = field(factory=list)
     _failed_agents: int = 0
@@ -99,14 +104,13 @@ class LocalRun:
         }
 
     def run(self) -> Outcome:
-        """Run the scenario and return what came of it.
+        """Run the scenario and return its outcome.
 
         Raises:
             BadInputError: the environment does not allow the run.
         """
         check_temporary_folder()
-        # Compiled once, if need be, and not by each coordinator.
-        warm_up()
+        warm_up()  # compile once, not in each coordinator
         self.folder.mkdir(parents=True, exist_ok=True)
         with (
             tempfile.TemporaryDirectory(prefix="laneweave-") as temporary,
@@ -118,7 +122,7 @@ class LocalRun:
                 endpoint=f"unixsock-stream/{temporary}/router.sock",
                 listen=(),
             )
-            # A socket in a folder of its own: nobody else gets at it.
+            # No encryption is needed: only this user can reach a socket in this folder.
             self.scenario = attrs.evolve(self.scenario, network=network, security=Security())
             self._options = {
                 "folder": str(self.folder),
@@ -129,77 +133,63 @@ class LocalRun:
             names = coordinator_names(self.scenario)
             self._processes = RoleProcesses(fork_server(), self._prepare, names)
             try:
-                self._open_faults(Path(temporary))
+                if self.faults:
+                    self._board = SharedBoard(Path(temporary) / "board")
+                    self._injection = fault_injection(self.faults, self.scenario, self._processes)
                 self._supervise(progress)
             except CommandFailedError as error:
                 self._problems.append(str(error))
             finally:
                 self._processes.end_all()
-                if self._active_faults is not None:
-                    self._active_faults.close()
-            return self._outcome()
-
-    def _outcome(self) -> Outcome:
-        """Return what came of the run; its temporary folder is still there."""
-        faults = self._active_faults
-        return complete_summary(
-            self.folder,
-            problems=self._problems,
-            processes=self._processes.peak,
-            failover=faults.injection.failover if faults is not None else None,
-            dropped=faults.board.dropped if faults is not None else 0,
-            faults=faults.summary() if faults is not None else None,
-        )
-
-    def _prepare(self, order: Order) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return the tables and options for the start of a role."""
-        tables, options = to_tables(self.scenario), self._options | dict(order.options)
-        if self._active_faults is None:
-            return tables, options
-        return self._active_faults.equip(order, tables, options)
-
-    def _open_faults(self, temporary: Path) -> None:
-        if self.faults:
-            self._active_faults = ProcessFaults.open(
-                self.faults, self.scenario, self._processes, temporary
+                if self._injection is not None:
+                    self._injection.close()
+            injection, processes = self._injection, self._processes.peak
+            results = {} if injection is None else injection.results(self._board.dropped)
+            return complete_summary(
+                self.folder, problems=self._problems, processes=processes, **results
             )
+
+    def _prepare(self, order: StartOrder) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Return the tables of the scenario and the options for a start of a role."""
+        tables, options = to_tables(self.scenario), self._options | dict(order.options)
+        if self._injection is not None:
+            add_faults(self._injection, self._board, order, tables, options)
+        return tables, options
 
     # --- supervision --------------------------------------------------------------------------
 
     def _supervise(self, progress: RunProgress) -> None:
-        processes, faults = self._processes, self._active_faults
+        processes, injection = self._processes, self._injection
         processes.start("router", ROUTER)
         observer = Observer(Keys(self.scenario.network.realm))
         with contextlib.closing(self._connect(observer)) as transport:
             observer.subscribe(transport)
             for name in processes.coordinators:
                 processes.start("coordinator", name)
-            # Road time must not begin before somebody can plan.
+            # Road time must not begin before a coordinator can plan.
             self._await_leader(observer)
             processes.start("bridge", "bridge")
-            stall = _Stall(self.scenario, time.monotonic())
-            while not self._stop and self._processes_fine():
+            stall = _StallDetector(self.scenario, time.monotonic())
+            while not self._stop and self._check_processes():
                 observer.wait(POLL_S)
                 view, now = observer.view, time.monotonic()
                 progress.update(view)
                 for group in self._agents_to_start(observer):
                     processes.start("agent", f"agent-{group[0]}", vehicles=group)
-                if faults is not None:
-                    faults.step(now, view)
+                road_s = view.t_s
+                if injection is not None:
+                    injection.step(self._board.road_s, now, view)
+                    # A fault may keep the road clock's messages from the launcher.
+                    road_s = max(road_s, self._board.road_s)
                 if self.watch is not None:
                     self.watch(view, processes.ids)
-                if stall.lasts(self._road_s(view), now):
+                if stall.is_stalled(road_s, now):
                     self._problems.append(f"the road clock stands still at {view.t_s:.1f} s")
                     return
             if self._stop:
                 self._problems.append("interrupted")
-            if faults is not None:
-                self._problems += faults.injection.never_happened()
-
-    def _road_s(self, view: RoadView) -> float:
-        """Return the road time, also where a fault keeps its news from the supervisor."""
-        faults = self._active_faults
-        return max(view.t_s, faults.board.road_s) if faults is not None else view.t_s
+            if injection is not None:
+                self._problems += injection.unused_faults()
 
     def _connect(self, observer: Observer) -> ZenohTransport:
         access = access_of(self.scenario, "observer.run")
@@ -219,28 +209,28 @@ class LocalRun:
         while observer.view.leader is None and not self._stop and time.monotonic() < give_up:
             observer.wait(POLL_S)
 
-    def _processes_fine(self) -> bool:
-        """Take note of processes that ended; false when the run is over."""
+    def _check_processes(self) -> bool:
+        """Record processes that ended; return False if the run is over."""
         for end in self._processes.ended():
             if end.name in ("bridge", ROUTER):
                 if end.status != 0 or end.name == ROUTER:
-                    self._note_end(f"the {end.name}", end)
+                    self._record_end(f"the {end.name}", end)
                 return False
             if end.status != 0:
-                self._note_end(end.name, end)
+                self._record_end(end.name, end)
                 self._failed_agents += end.name.startswith("agent-")
-        if self._failed_agents > MOST_FAILED_AGENTS:
+        if self._failed_agents > MAX_FAILED_AGENTS:
             self._problems.append("agents cannot start or stay up")
             return False
         return True
 
-    def _note_end(self, who: str, end: RoleEnd) -> None:
-        words = last_error(self.folder / "log.jsonl", end.name)
-        reason = f": {words}" if words else ""
-        self._problems.append(f"{who} ended with status {end.status}{reason}")
+    def _record_end(self, subject: str, end: RoleEnd) -> None:
+        error = last_error(self.folder / "log.jsonl", end.name)
+        reason = f": {error}" if error else ""
+        self._problems.append(f"{subject} ended with status {end.status}{reason}")
 
     def _agents_to_start(self, observer: Observer) -> Iterator[list[str]]:
-        """Return groups of vehicles that share a process, when its first one is announced."""
+        """Yield each group of vehicles when its first vehicle is announced."""
         census = observer.view.census
         for announced in census.announced if census is not None else ():
             index = self._group_of.get(announced.vehicle)
@@ -248,10 +238,10 @@ class LocalRun:
                 self._started_groups.add(index)
                 yield [name for name, group in self._group_of.items() if group == index]
 
-    # --- the end ------------------------------------------------------------------------------
-
     @contextlib.contextmanager
     def _signals(self) -> Iterator[None]:
+        """Turn SIGINT and SIGTERM into an orderly end."""
+
         def stop(_number: int, _frame: object) -> None:
             self._stop = True
 
@@ -263,11 +253,50 @@ class LocalRun:
                 signal.signal(number, handler)
 
 
-def check_temporary_folder() -> None:
-    """Check that sockets can be made in the temporary folder.
+def fault_injection(
+    faults: FaultSpec, scenario: Scenario, processes: RoleProcesses
+) -> FaultInjection:
+    """Return the fault engine of a run, before its processes are started.
 
     Raises:
-        BadInputError: its path is too long.
+        BadInputError: a partition requires namespaces, and they cannot be created.
+    """
+    network, reason = open_network(faults, processes.context)
+    lease_s = scenario.network.lease_s
+    return FaultInjection(faults, scenario.seed, processes, lease_s, network, reason)
+
+
+def add_faults(
+    injection: FaultInjection,
+    board: SharedBoard,
+    order: StartOrder,
+    tables: dict[str, Any],
+    options: dict[str, Any],
+) -> None:
+    """Add message faults and the network namespace to the tables and options of a role."""
+    network, sender = injection.network, SENDER_OF_ROLE.get(order.role)
+    if network is not None and order.role == ROUTER:
+        options |= {"namespace": network.process_id(HUB), "listen": (network.listen,)}
+    if sender is None:
+        return
+    group = _GROUP_OF_SENDER[sender]
+    if network is not None and group in network.groups:
+        options["namespace"] = network.process_id(group)
+        tables["network"] = tables["network"] | {"endpoint": network.endpoint}
+    options["faults"] = MessageFaults(
+        injection.message_rules(),
+        board.path,
+        board.new_word(),
+        receiver=sender,
+        seed=injection.seed_of_start(order.name),
+    )
+
+
+def check_temporary_folder() -> None:
+    """Check that the path of the temporary folder is short enough for sockets in it.
+
+    Raises:
+        BadInputError: it is too long.
     """
     folder = tempfile.gettempdir()
     if len(os.fsencode(folder)) > MAX_TEMPORARY_BYTES:

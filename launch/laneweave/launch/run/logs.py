@@ -1,4 +1,4 @@
-"""Structured logs: JSON lines in the run's folder or for a collector, or readable lines."""
+"""Structured logs as JSON lines, in the run's folder or for a log collector, or as text."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from structlog.typing import EventDict, Processor
 
 
 class LogFormat(StrEnum):
-    """How a role writes its log to stderr."""
+    """Format of a role's log on stderr."""
 
     text = "text"
     json = "json"
 
 
 class LogLevel(StrEnum):
-    """The least important entries that a role writes."""
+    """Lowest level of the entries that a role logs."""
 
     debug = "debug"
     info = "info"
@@ -34,7 +34,7 @@ class LogLevel(StrEnum):
 
 
 def log_role(role: str, name: str, form: LogFormat, level: LogLevel | None) -> None:
-    """Write a role's log to stderr; without a `level` from `info` on as JSON, else `warning`."""
+    """Write a role's log to stderr; the default level is `info` as JSON, `warning` as text."""
     if form is LogFormat.text:
         log_to_terminal(level or LogLevel.warning)
         return
@@ -44,7 +44,7 @@ def log_role(role: str, name: str, form: LogFormat, level: LogLevel | None) -> N
     def on_failure(kind: type[BaseException], error: BaseException | None, trace: Any) -> None:  # noqa: ANN401 (a traceback)
         log.error("role failed", exc_info=(kind, error, trace))
 
-    # What nobody catches is a line like all others; a collector takes no lines together.
+    # Uncaught exceptions become one line too, because a collector does not join lines.
     sys.excepthook = on_failure
     threading.excepthook = lambda args: on_failure(
         args.exc_type, args.exc_value, args.exc_traceback
@@ -52,7 +52,7 @@ def log_role(role: str, name: str, form: LogFormat, level: LogLevel | None) -> N
 
 
 def log_to_terminal(level: LogLevel = LogLevel.warning) -> None:
-    """Write warnings and errors to stderr, one readable line each; or from `level` on."""
+    """Write log entries from `level` on to stderr, one readable line each."""
     structlog.configure(
         processors=[
             structlog.processors.TimeStamper(fmt="%H:%M:%S"),
@@ -61,20 +61,20 @@ def log_to_terminal(level: LogLevel = LogLevel.warning) -> None:
             structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty()),
         ],
         wrapper_class=structlog.make_filtering_bound_logger(_number(level)),
-        # Whatever stderr is by then.
+        # Look stderr up for each entry: it may have been replaced.
         logger_factory=lambda *_: _stderr_logger(),
         cache_logger_on_first_use=False,
     )
 
 
 def last_error(path: Path, name: str) -> str:
-    """Return the last error that a process of a run logged, as one line; empty: none."""
+    """Return the last error logged by a process of a run as one line; empty if there is none."""
     found = ""
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
     for line in lines:
         try:
             entry = json.loads(line)
-        except ValueError:  # cut off when its process was killed
+        except ValueError:  # cut off when the process was killed
             continue
         if entry.get("level") == "error" and entry.get("name") == name:
             text = entry.get("reason") or entry.get("exception") or entry.get("event") or ""
@@ -84,45 +84,42 @@ def last_error(path: Path, name: str) -> str:
 
 def log_to_file(path: Path, role: str, name: str) -> None:
     """Append JSON lines to a file that all processes of a run share."""
-    # Unbuffered appends of whole lines do not mix, whoever writes them.
+    # Appended lines of several processes do not mix, since each is one write.
     stream = path.open("a", buffering=1, encoding="utf-8")
-    _log_json(lambda *_: structlog.WriteLogger(_patient(stream)), role, name, LogLevel.info)
+    _log_json(lambda *_: structlog.WriteLogger(_lossy(stream)), role, name, LogLevel.info)
 
 
-class _Patient(io.TextIOBase):
-    """A stream that loses what cannot be written.
-
-    A full disk, or a collector that has gone, must not end a role that has something to say.
-    """
+class _LossyStream(io.TextIOBase):
+    """Stream that ignores write errors: a full disk must not end a role that logs."""
 
     def __init__(self, stream: TextIO) -> None:
         """Write to `stream`."""
         self._stream = stream
 
     def write(self, text: str) -> int:
-        """Write, or lose it."""
+        """Write the text; ignore errors."""
         with contextlib.suppress(OSError, ValueError):
             self._stream.write(text)
         return len(text)
 
     def flush(self) -> None:
-        """Flush, or lose it."""
+        """Flush; ignore errors."""
         with contextlib.suppress(OSError, ValueError):
             self._stream.flush()
 
 
-def _patient(stream: TextIO) -> TextIO:
-    return cast("TextIO", _Patient(stream))
+def _lossy(stream: TextIO) -> TextIO:
+    return cast("TextIO", _LossyStream(stream))
 
 
 def _stderr_logger() -> structlog.PrintLogger:
-    return structlog.PrintLogger(_patient(sys.stderr))
+    return structlog.PrintLogger(_lossy(sys.stderr))
 
 
 def _log_json(make_logger: Callable[..., Any], role: str, name: str, level: LogLevel) -> None:
     structlog.configure(
         processors=[
-            _signed(role, name),
+            _with_origin(role, name),
             structlog.processors.TimeStamper(fmt="iso"),
             structlog.processors.add_log_level,
             structlog.processors.format_exc_info,
@@ -134,15 +131,15 @@ def _log_json(make_logger: Callable[..., Any], role: str, name: str, level: LogL
     )
 
 
-def _signed(role: str, name: str) -> Processor:
-    """Return what puts role and name into every entry, whichever thread writes it."""
+def _with_origin(role: str, name: str) -> Processor:
+    """Return a processor that adds role and name to the entries of all threads."""
 
-    def sign(_logger: object, _method: str, entry: EventDict) -> EventDict:
+    def add(_logger: object, _method: str, entry: EventDict) -> EventDict:
         entry.setdefault("role", role)
         entry.setdefault("name", name)
         return entry
 
-    return sign
+    return add
 
 
 def _number(level: LogLevel) -> int:

@@ -14,10 +14,10 @@ from laneweave.protocol.scenario.tables import Scenario
 
 
 class RunProgress:
-    """Shows simulated time, vehicles on the road, the leader and its term, real-time factor."""
+    """Progress bar with simulated time, vehicles on the road, leader and real-time factor."""
 
     def __init__(self, scenario: Scenario, *, show: bool) -> None:
-        """Prepare a bar that ends when the last vehicle may leave; `show` false shows nothing."""
+        """Create a bar up to the time at which the last vehicle can leave; hidden if not `show`."""
         free_flow_s = scenario.road.length_m / scenario.formation.speed_mps
         self._total_s = scenario.demand.duration_s + free_flow_s
         self._bar = Progress(
@@ -37,7 +37,7 @@ class RunProgress:
         self._began: tuple[float, float] | None = None
 
     def __enter__(self) -> Self:
-        """Show the bar."""
+        """Start the display."""
         self._bar.start()
         return self
 
@@ -47,11 +47,11 @@ class RunProgress:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Take the bar away."""
+        """Remove the bar."""
         self._bar.stop()
 
     def update(self, view: RoadView) -> None:
-        """Show what is known now."""
+        """Show the current state of the run."""
         clock = view.clock
         if clock is None:
             return

@@ -27,7 +27,7 @@ PROGRESS_EVERY_TICKS = 50
 
 @define
 class ReferenceRun:
-    """One run of a reference method, as fast as it goes; `run` does it all."""
+    """One run of a reference method, as fast as possible; call `run` once."""
 
     scenario: Scenario
     folder: Path
@@ -35,7 +35,7 @@ class ReferenceRun:
     show_progress: bool = True
 
     def run(self) -> Outcome:
-        """Run the scenario and return what came of it."""
+        """Run the scenario and return its outcome."""
         self.folder.mkdir(parents=True, exist_ok=True)
         with (
             self._traffic() as traffic,
@@ -64,10 +64,10 @@ class ReferenceRun:
 
 
 def check_reference(scenario: Scenario, method: str) -> None:
-    """Check what a reference method asks of a scenario beyond what all methods do.
+    """Check the requirements of a reference method on a scenario.
 
     Raises:
-        BadInputError: names the field that does not fit.
+        BadInputError: the method does not support the value of a field.
     """
     if method == RULE:
         check_rule(scenario)

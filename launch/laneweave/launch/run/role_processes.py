@@ -1,4 +1,4 @@
-"""The processes of a local run: started, watched, killed and paused by name, and ended for sure."""
+"""The role processes of a local run: starts, watches, kills, pauses and ends them by name."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from laneweave.launch.run.roles import start_role
 log = structlog.get_logger(__name__)
 
 STOP_S = 5.0
-"""How long processes get to end by themselves."""
+"""Time for processes to end after SIGTERM, before they are killed."""
 ROUTER = "router"
 
 
 @frozen
-class Order:
-    """How a role is started, the first time and again."""
+class StartOrder:
+    """Arguments with which a role is started and restarted."""
 
     role: str
     name: str
@@ -33,7 +33,7 @@ class Order:
 
 @frozen
 class RoleEnd:
-    """A process that has ended."""
+    """Name and exit status of a process that has ended."""
 
     name: str
     status: int | None
@@ -41,18 +41,18 @@ class RoleEnd:
 
 @define
 class RoleProcesses:
-    """All role processes of a run, by name; a `Stage` for faults."""
+    """All role processes of a run by name; the `RoleControl` of faults."""
 
     context: ForkServerContext
-    prepare: Callable[[Order], tuple[dict[str, Any], dict[str, Any]]]
-    """Returns the scenario's tables and the options for each start of a role."""
+    prepare: Callable[[StartOrder], tuple[dict[str, Any], dict[str, Any]]]
+    """Returns the tables of the scenario and the options for a start of a role."""
     coordinators: tuple[str, ...]
     peak: int = 0
-    """Most processes at one time."""
+    """Largest number of simultaneous processes."""
     _running: dict[str, ForkServerProcess] = field(factory=dict)
-    _orders: dict[str, Order] = field(factory=dict)
+    _orders: dict[str, StartOrder] = field(factory=dict)
     _process_of: dict[str, str] = field(factory=dict)
-    """Which role drives each vehicle."""
+    """Name of the agent process of each vehicle."""
     _paused: set[str] = field(factory=set)
 
     def start(self, role: str, name: str, **options: object) -> None:
@@ -60,13 +60,13 @@ class RoleProcesses:
 
         Args:
             role: `router`, `coordinator`, `bridge` or `agent`.
-            name: of the process; nothing else of this name runs.
-            **options: what only this one needs, such as the `vehicles` of an agent.
+            name: name of the process; no other process of this name may run.
+            **options: options of this role only, such as the `vehicles` of an agent.
 
         Raises:
-            CommandFailedError: no process can be made.
+            CommandFailedError: no process can be created.
         """
-        order = self._orders[name] = Order(role, name, options)
+        order = self._orders[name] = StartOrder(role, name, options)
         for vehicle in order.options.get("vehicles", ()):
             self._process_of[vehicle] = name
         tables, all_options = self.prepare(order)
@@ -79,12 +79,12 @@ class RoleProcesses:
         return {name: process.pid or 0 for name, process in self._running.items()}
 
     def is_alive(self, name: str) -> bool:
-        """Tell whether a role is up."""
+        """Return whether a role is running."""
         process = self._running.get(name)
         return process is not None and process.is_alive()
 
     def ended(self) -> Iterator[RoleEnd]:
-        """Yield the processes that have ended by themselves since the last call."""
+        """Yield the processes that have ended on their own since the last call."""
         names = {process.sentinel: name for name, process in self._running.items()}
         for sentinel in wait_for_sentinels(list(names), timeout=0):
             assert isinstance(sentinel, int)  # noqa: S101 (narrows the type)
@@ -94,15 +94,15 @@ class RoleProcesses:
             self._paused.discard(name)
             yield RoleEnd(name, process.exitcode)
 
-    # --- what faults do -----------------------------------------------------------------------
+    # --- control by faults --------------------------------------------------------------------
 
     @property
     def running(self) -> Collection[str]:
-        """Roles that are up, as far as is known."""
+        """Roles that run, as far as is known."""
         return self._running.keys()
 
     def agent_of(self, vehicle: str) -> str | None:
-        """Return the agent process that drives a vehicle, if one has been started."""
+        """Return the agent process of a vehicle; None: it has not been started."""
         return self._process_of.get(vehicle)
 
     def kill(self, name: str) -> None:
@@ -113,21 +113,21 @@ class RoleProcesses:
         process.join(STOP_S)
 
     def pause(self, name: str) -> None:
-        """Stop a role with SIGSTOP."""
+        """Suspend a role with SIGSTOP."""
         self._paused.add(name)
         self._signal(name, signal.SIGSTOP)
 
     def resume(self, name: str) -> None:
-        """Let a role go on with SIGCONT, if it has been paused."""
+        """Resume a role with SIGCONT if it is paused."""
         if name in self._paused:
             self._paused.discard(name)
             self._signal(name, signal.SIGCONT)
 
-    def start_again(self, name: str) -> None:
-        """Start a role that has ended as it was started before.
+    def restart(self, name: str) -> None:
+        """Start a role that has ended with its original arguments.
 
         Raises:
-            CommandFailedError: no process can be made.
+            CommandFailedError: no process can be created.
         """
         order = self._orders[name]
         self.start(order.role, name, **order.options)
@@ -140,7 +140,7 @@ class RoleProcesses:
     # --- the end ------------------------------------------------------------------------------
 
     def end_all(self) -> None:
-        """End every process: asked first, then killed. The router goes last."""
+        """End every process with SIGTERM, then SIGKILL if necessary; the router last."""
         for name in list(self._paused):
             self.resume(name)
         router = self._running.pop(ROUTER, None)

@@ -1,13 +1,14 @@
-"""Starting a role in a process of its own.
+"""Role processes from the inside: how a role is started in a process of its own, and runs there.
 
-Processes come from a fork server that has imported and prepared what agents need and opened nothing
-(`preloaded`), so that one more vehicle costs a fork and not the start of an interpreter.
+A fork server has imported and prepared what agents need (`preload`), so that a process for one more
+vehicle costs a fork and not the start of an interpreter.
 """
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
+import gc
 import multiprocessing
 import os
 import signal
@@ -22,60 +23,51 @@ from pathlib import Path
 from typing import Any
 
 import structlog
-from attrs import frozen
 
-from laneweave.launch.faults.control_files import BoardWord
 from laneweave.launch.faults.network_namespaces import join_namespace
 from laneweave.launch.run.logs import log_to_file
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.errors import BadInputError, CommandFailedError
-from laneweave.protocol.runtime.message_faults import FaultyCore, MessageRule, Wrap, bare
-from laneweave.protocol.runtime.node import Core
+from laneweave.protocol.runtime.message_faults import Wrap, bare
 from laneweave.protocol.runtime.processes import die_with_parent
 from laneweave.protocol.security.rights import access_of
 
 log = structlog.get_logger(__name__)
 
-PRELOADED = "laneweave.launch.run.fork_server"
+PRELOADED = "laneweave.launch.run.preload"
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""Environment variables that bound the threads of linear algebra."""
+"""Environment variables that limit the threads of linear algebra libraries."""
 AGENT_NICENESS = 5
-CONNECT_AGAIN_S = 0.1
-"""Where there are faults, a role that cannot connect tries again after this time."""
+RECONNECT_S = 0.1
+"""Time after which a role that cannot connect tries again, in runs with faults."""
 ORPHAN_S = 5.0
-"""How long a process whose supervisor died gets to end in good order."""
+"""Time for an orderly end of a process whose launcher has died."""
+GC_THRESHOLD = 50_000
+"""New objects between garbage collections; the default of 700 costs a run 6 % of its time."""
 _PR_SET_NAME = 15
 
 
-@frozen
-class MessageFaults:
-    """What a role process needs to have message faults; goes to it as an option."""
+def collect_rarely() -> None:
+    """Exclude existing objects from garbage collection, and collect new ones rarely.
 
-    rules: tuple[MessageRule, ...]
-    board: Path
-    """File of the run's `SharedBoard`."""
-    word: int
-    """This process's word in it."""
-    receiver: str
-    seed: str
-
-    def wrap(self, core: Core) -> Core:
-        """Put the faults before a core."""
-        board = BoardWord(self.board, self.word)
-        return FaultyCore(core, self.rules, board, receiver=self.receiver, seed=self.seed)
+    The garbage collector looks for reference cycles, and the roles make hardly any.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(GC_THRESHOLD)
 
 
 def fork_server() -> ForkServerContext:
-    """Return the context whose processes are forked from a server that is ready to drive.
+    """Return a context that forks processes from a prepared server.
 
-    Linear algebra in every process stays on one thread: many processes share few cores.
+    Linear algebra uses one thread in every process, because many processes share few cores.
     """
     for name in THREAD_LIMITS:
         os.environ.setdefault(name, "1")
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([PRELOADED])
-    # Ctrl-C reaches the whole process group: the supervisor ends its processes, in order. They
-    # inherit that they ignore it, so none is caught unprepared.
+    # Ctrl-C reaches the whole process group. Role processes inherit that they ignore it, because
+    # the launcher ends them in the right order.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         forkserver.ensure_running()
@@ -91,19 +83,19 @@ def start_role(
     tables: dict[str, Any],
     options: dict[str, Any],
 ) -> ForkServerProcess:
-    """Start a role.
+    """Start a role in a new process.
 
     Args:
-        context: of `fork_server`.
+        context: result of `fork_server`.
         role: `router`, `coordinator`, `bridge` or `agent`.
-        name: for logs and process lists.
-        tables: the scenario, as `to_tables` gives it.
-        options: what the role needs beside the scenario; `folder` is where its log goes,
-            `temporary` where its temporary files go, `namespace` a process whose network
-            namespace it joins, `faults` its `MessageFaults`; the last two may be missing.
+        name: name for logs and process lists.
+        tables: the scenario, as returned by `to_tables`.
+        options: further settings: `folder` of the log, `temporary` for temporary files, and
+            optionally `namespace`, a process whose network namespace the role joins, and `faults`,
+            its `MessageFaults`.
 
     Raises:
-        CommandFailedError: the fork server is gone, or no process can be made.
+        CommandFailedError: the fork server has ended, or no process can be created.
     """
     process = context.Process(target=run_role, args=(role, name, tables, options), name=name)
     try:
@@ -115,10 +107,10 @@ def start_role(
 
 
 def run_role(role: str, name: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
-    """Run a role in this process until it ends (the target of `start_role`)."""
+    """Run a role in this process until it ends; the target of `start_role`."""
     die_with_parent()
     if "namespace" in options:
-        # A thread belongs to a namespace, not a process: before there are more threads.
+        # Namespaces belong to threads: join before other threads start.
         join_namespace(options["namespace"])
     die_with_supervisor()
     ctypes.CDLL(None).prctl(_PR_SET_NAME, name.encode()[:15], 0, 0, 0)
@@ -126,9 +118,9 @@ def run_role(role: str, name: str, tables: dict[str, Any], options: dict[str, An
     log_to_file(Path(options["folder"]) / "log.jsonl", role, name)
     try:
         while not _run_once(role, name, tables, options):
-            time.sleep(CONNECT_AGAIN_S)
+            time.sleep(RECONNECT_S)
     except BadInputError as error:
-        log.error("cannot start", reason=str(error))  # noqa: TRY400 (the line says it all)
+        log.error("cannot start", reason=str(error))  # noqa: TRY400 (the message is complete)
         sys.exit(2)
     except Exception:
         log.exception("role failed")
@@ -136,11 +128,11 @@ def run_role(role: str, name: str, tables: dict[str, Any], options: dict[str, An
 
 
 def _run_once(role: str, name: str, tables: dict[str, Any], options: dict[str, Any]) -> bool:
-    """Run a role; false when it could not connect because of a fault, and should try again."""
+    """Run a role; return False if it could not connect because of a fault and should try again."""
     try:
         _ROLES[role](name, tables, options)
     except BadInputError as error:
-        # The router may be down, or the way to it cut. The bridge is never started then.
+        # The router may be down, or the link to it cut. The bridge starts before all faults.
         if "faults" not in options or role == "bridge" or error.field != "network.endpoint":
             raise
         return False
@@ -148,9 +140,9 @@ def _run_once(role: str, name: str, tables: dict[str, Any], options: dict[str, A
 
 
 def die_with_supervisor() -> None:
-    """End this process when the one that ordered it dies, however that dies.
+    """End this process when the launcher dies in any way.
 
-    The fork server, which is the parent, lives on as long as one of its processes does.
+    The parent is the fork server, which runs as long as one of its child processes does.
     """
     supervisor = multiprocessing.parent_process()
     if supervisor is None:
@@ -170,7 +162,7 @@ def die_with_supervisor() -> None:
 
 
 def wake_children(parent: int) -> None:
-    """Let go on what a fault has paused: whoever sleeps does not see that its supervisor died."""
+    """Resume processes that a fault has paused, so that they notice the death of the launcher."""
     with contextlib.suppress(OSError):
         children = Path(f"/proc/{parent}/task/{parent}/children").read_text(encoding="ascii")
         for child in children.split():
@@ -211,7 +203,7 @@ def _bridge(_: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
 def _agent(_: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
     from laneweave.agents.process import run_agents
 
-    # Everybody waits for bridge, router and coordinators: they go first.
+    # All roles wait for bridge, router and coordinators, which get a higher priority.
     os.nice(AGENT_NICENESS)
     scenario, vehicles = parse_scenario(tables), options["vehicles"]
     run_agents(

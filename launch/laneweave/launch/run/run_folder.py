@@ -1,44 +1,65 @@
-"""The folder of a run: a new one, and the report in it."""
+"""The folder of a run: its creation, and the report in it."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.scenario.tables import Scenario
 
+LOG = "log.jsonl"
 
-def new_folder(out: Path | None, settings: Scenario, method: str) -> Path:
-    """Return a folder that holds no other run.
+
+@contextmanager
+def new_folder(out: Path | None, settings: Scenario, method: str) -> Iterator[Path]:
+    """Yield a folder that holds no other run; remove it if the run is refused before it begins.
 
     Raises:
-        BadInputError: it does, or it cannot be made.
+        BadInputError: the folder is in use, or cannot be created.
     """
-    if out is None:
-        stamp = time.strftime("%Y%m%d-%H%M%S")
-        volume = f"{settings.demand.volume_veh_per_lane_h:g}"
-        base = Path("runs") / f"{method}-{volume}-seed{settings.seed}-{stamp}"
-        out = base
-        copies = 1
-        while out.exists():
-            copies += 1
-            out = base.with_name(f"{base.name}-{copies}")
+    folder = _free_name(settings, method) if out is None else out
+    existed = folder.is_dir()
+    _claim(folder)
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        if any(out.iterdir()):
-            raise BadInputError("--out", str(out), "a new or empty folder")
-        # Two runs that begin at the same time: the second one fails here.
-        (out / "log.jsonl").touch(exist_ok=False)
+        yield folder
+    except BadInputError:
+        files = list(folder.iterdir())
+        if files == [folder / LOG] and not files[0].stat().st_size:
+            files[0].unlink()
+            if not existed:
+                folder.rmdir()
+        raise
+
+
+def _free_name(settings: Scenario, method: str) -> Path:
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    volume = f"{settings.demand.volume_veh_per_lane_h:g}"
+    base = folder = Path("runs") / f"{method}-{volume}-seed{settings.seed}-{stamp}"
+    copies = 1
+    while folder.exists():
+        copies += 1
+        folder = base.with_name(f"{base.name}-{copies}")
+    return folder
+
+
+def _claim(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if any(folder.iterdir()):
+            raise BadInputError("--out", str(folder), "a new or empty folder")
+        # Of two runs that start at the same time, the second one fails here.
+        (folder / LOG).touch(exist_ok=False)
     except FileExistsError as error:
-        raise BadInputError("--out", str(out), "a new or empty folder") from error
+        raise BadInputError("--out", str(folder), "a new or empty folder") from error
     except OSError as error:
-        raise BadInputError("--out", str(out), f"a folder ({error.strerror})") from error
-    return out
+        raise BadInputError("--out", str(folder), f"a folder ({error.strerror})") from error
 
 
-def draw_own(folder: Path) -> None:
-    """Draw the pictures and write the page of the run that has just ended.
+def draw_report(folder: Path) -> None:
+    """Write the figures and the page of a finished run.
 
     Raises:
         CommandFailedError: they cannot be written.

@@ -4,26 +4,25 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 from attrs import define, field
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost
 from laneweave.coordinator.core import CoordinatorCore
-from laneweave.launch.faults.simulated_faults import (
-    SimulatedFaults,
-    SimulatedRoles,
-    check_simulated,
-)
-from laneweave.launch.faults.specification import Faults
+from laneweave.launch.faults.board import LocalBoard
+from laneweave.launch.faults.injection import FaultInjection
+from laneweave.launch.faults.specification import ROUTER, FaultSpec
 from laneweave.launch.observe.observer import TOPICS
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.outcome import Outcome, complete_summary
 from laneweave.launch.run.progress import RunProgress
 from laneweave.protocol.config.participants import coordinator_names
+from laneweave.protocol.runtime.message_faults import FaultyCore
 from laneweave.protocol.runtime.node import Arrived, Core, Effect, Event, Listen, Started
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
@@ -34,23 +33,23 @@ from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
 from laneweave.sim_bridge.sumo.world import SumoWorld
 
 STALL_S = 600.0
-"""A road clock that stands still for this much virtual time has stopped for good."""
+"""A run fails if its road clock stands still for this much virtual time."""
 STRIDE_S = 0.02
-"""Virtual time in which nobody has to look what happens, if there are no faults.
+"""Virtual time between two checks of the run without faults.
 
-So much may go on after the bridge has ended, too; it changes nothing that is recorded."""
+The network may go on for this long after the bridge has ended, which changes no result."""
 PROGRESS_EVERY_TICKS = 20
 AGENT_PREFIX = "agent-"
 
 
-class _Watcher:
-    """A core that fills a view and reports each message."""
+class _ObserverCore:
+    """Core that updates a view and calls `on_message` after each message."""
 
     wakeup_s = None
 
-    def __init__(self, view: RoadView, on_news: Callable[[], None]) -> None:
+    def __init__(self, view: RoadView, on_message: Callable[[], None]) -> None:
         self._view = view
-        self._on_news = on_news
+        self._on_message = on_message
 
     def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
         if isinstance(event, Started):
@@ -58,40 +57,94 @@ class _Watcher:
                 yield Listen(topic)
         elif isinstance(event, Arrived):
             self._view.take(event, now_s)
-            self._on_news()
+            self._on_message()
+
+
+@define
+class SimulatedRoles:
+    """The roles of a simulated run by name; the `RoleControl` of faults."""
+
+    network: SimulatedNetwork
+    coordinators: tuple[str, ...]
+    start: Callable[[str], None]
+    """Starts a coordinator or an agent by name."""
+    agents: dict[str, str] = field(factory=dict)
+    """Name of the agent of each vehicle."""
+    _router_runs: bool = True
+
+    @property
+    def running(self) -> Collection[str]:
+        """Roles that run."""
+        router = (ROUTER,) if self._router_runs else ()
+        roles = (*self.coordinators, *self.agents.values())
+        return [*(name for name in roles if name in self.network), *router]
+
+    def agent_of(self, vehicle: str) -> str | None:
+        """Return the agent of a vehicle; None: it has not been started."""
+        return self.agents.get(vehicle)
+
+    def kill(self, name: str) -> None:
+        """End a role at once, without cleaning up."""
+        if name == ROUTER:
+            self._router_runs = False
+            self.network.lose_router()
+        else:
+            self.network.kill(name)
+
+    def pause(self, name: str) -> None:
+        """Suspend a role."""
+        self.network.pause(name)
+
+    def resume(self, name: str) -> None:
+        """Resume a role if it still exists."""
+        if name in self.network:
+            self.network.resume(name)
+
+    def restart(self, name: str) -> None:
+        """Start a killed role again."""
+        if name == ROUTER:
+            self._router_runs = True
+            self.network.restore_router()
+        else:
+            self.start(name)
 
 
 @define
 class SimulatedRun:
-    """One run over the simulated network; `run` does it all."""
+    """One run over the simulated network; call `run` once."""
 
     scenario: Scenario
     folder: Path
     method: str = "formation"
-    faults: Faults = field(factory=Faults)
+    faults: FaultSpec = field(factory=FaultSpec)
     conditions: Conditions = field(factory=Conditions)
     show_progress: bool = True
     _view: RoadView = field(factory=RoadView)
     _roles: SimulatedRoles = field(init=False)
-    _active_faults: SimulatedFaults | None = None
+    _injection: FaultInjection | None = None
+    _board: LocalBoard = field(factory=LocalBoard)
+    _injected_road_s: float = -1.0
+    """Road time up to which faults have been applied."""
     _incarnations: Iterator[int] = field(factory=lambda: count(1))
-    """Of agents and caretakers: each number once."""
+    """Unique incarnations of agents and caretakers."""
     _coordinator_incarnations: Iterator[int] = field(factory=lambda: count(1))
     _problems: list[str] = field(factory=list)
 
     def run(self) -> Outcome:
-        """Run the scenario and return what came of it.
+        """Run the scenario and return its outcome.
 
         Raises:
-            BadInputError: the faults are not for the simulated network.
+            BadInputError: the simulated network does not support one of the faults.
         """
         scenario = self.scenario
-        check_simulated(self.faults)
+        self.faults.check_simulated()
         self.folder.mkdir(parents=True, exist_ok=True)
         network = SimulatedNetwork(scenario.seed, self.conditions, in_kind=True)
         self._roles = SimulatedRoles(network, coordinator_names(scenario), self._start)
         if self.faults:
-            self._active_faults = SimulatedFaults.open(self.faults, scenario, self._roles)
+            self._injection = FaultInjection(
+                self.faults, scenario.seed, self._roles, self.conditions.lease_s
+            )
         record = RunRecord(self.folder, scenario, self.method, time.perf_counter)
         with (
             tempfile.TemporaryDirectory(prefix="laneweave-sumo-") as sumo_folder,
@@ -109,37 +162,27 @@ class SimulatedRun:
                 self._drive(network, bridge, progress)
             finally:
                 record.close(bridge.t_s, Ending.INTERRUPTED)
-        return self._outcome(network)
-
-    def _outcome(self, network: SimulatedNetwork) -> Outcome:
-        faults = self._active_faults
-        if faults is None:
-            return complete_summary(
-                self.folder, problems=self._problems, processes=1, dropped=network.dropped
-            )
-        return complete_summary(
-            self.folder,
-            problems=[*self._problems, *faults.injection.never_happened()],
-            processes=1,
-            failover=faults.injection.failover,
-            dropped=network.dropped + faults.board.dropped,
-            faults=faults.summary(),
-        )
+        dropped = network.dropped + self._board.dropped
+        results: dict[str, Any] = {"dropped": dropped}
+        if self._injection is not None:
+            self._problems += self._injection.unused_faults()
+            results = self._injection.results(dropped)
+        return complete_summary(self.folder, problems=self._problems, processes=1, **results)
 
     def _drive(self, network: SimulatedNetwork, bridge: BridgeCore, progress: RunProgress) -> None:
-        realm, faults = self.scenario.network.realm, self._active_faults
-        network.add("watcher", _Watcher(self._view, self._start_agents), realm)
+        realm = self.scenario.network.realm
+        network.add("watcher", _ObserverCore(self._view, self._start_agents), realm)
         for name in self._roles.coordinators:
             self._start(name)
         self._add("bridge", bridge, "bridge")
         shown = advanced_tick = 0
         advanced_s = 0.0
         while bridge.phase is not Phase.ENDED and network.queue:
-            if faults is None:
+            if self._injection is None:
                 network.run(network.now_s + STRIDE_S)
             else:
                 network.step()
-                faults.step(network.now_s, self._view)
+                self._inject(self._injection, network.now_s)
             if bridge.tick != advanced_tick:
                 advanced_tick, advanced_s = bridge.tick, network.now_s
             elif network.now_s - advanced_s > STALL_S:
@@ -149,6 +192,13 @@ class SimulatedRun:
                 shown = bridge.tick
                 progress.update(self._view)
 
+    def _inject(self, injection: FaultInjection, now_s: float) -> None:
+        """Apply faults if the road time has advanced or a role is to resume or restart."""
+        wakeup_s, road_s = injection.wakeup_s, self._board.road_s
+        if road_s != self._injected_road_s or (wakeup_s is not None and wakeup_s <= now_s):
+            self._injected_road_s = road_s
+            injection.step(road_s, now_s, self._view)
+
     def _start_agents(self) -> None:
         agents, census = self._roles.agents, self._view.census
         for announced in census.announced if census is not None else ():
@@ -157,7 +207,7 @@ class SimulatedRun:
                 self._start(agents[announced.vehicle])
 
     def _start(self, name: str) -> None:
-        """Start a coordinator or an agent, the first time or again."""
+        """Start or restart a coordinator or an agent."""
         if name in self._roles.coordinators:
             incarnation = next(self._coordinator_incarnations)
             core = CoordinatorCore(Name(name), incarnation, self.scenario)
@@ -167,9 +217,11 @@ class SimulatedRun:
             self._add(name, AgentHost(self._make_agent, [vehicle]), "vehicle")
 
     def _add(self, name: str, core: Core, receiver: str) -> None:
-        faults = self._active_faults
-        faulty = core if faults is None else faults.wrap(core, name, receiver)
-        self._roles.network.add(name, faulty, self.scenario.network.realm)
+        injection = self._injection
+        if injection is not None:
+            rules, seed = injection.message_rules(), injection.seed_of_start(name)
+            core = FaultyCore(core, rules, self._board, receiver=receiver, seed=seed)
+        self._roles.network.add(name, core, self.scenario.network.realm)
 
     def _make_agent(self, vehicle: Name) -> AgentCore:
         return AgentCore(vehicle, self._incarnations.__next__, self.scenario)

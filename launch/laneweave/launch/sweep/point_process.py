@@ -8,8 +8,8 @@ import signal
 import sys
 from pathlib import Path
 
-from laneweave.launch.run.garbage_collection import collect_seldom
 from laneweave.launch.run.logs import log_to_terminal
+from laneweave.launch.run.roles import collect_rarely
 from laneweave.launch.sweep.execution import JOB_FILE, RESULT_FILE
 from laneweave.launch.sweep.run_point import run_method
 from laneweave.protocol.config.loading import parse_scenario
@@ -30,7 +30,7 @@ def main(folder: Path, parent: int) -> None:
     if os.getppid() != parent:
         sys.exit("nobody waits for this run")
     log_to_terminal()
-    collect_seldom()
+    collect_rarely()
     job = json.loads((folder / JOB_FILE).read_text(encoding="utf-8"))
     outcome = run_method(parse_scenario(job["tables"]), job["method"], folder)
     write_atomically(folder / RESULT_FILE, json.dumps({"problems": outcome.problems}))

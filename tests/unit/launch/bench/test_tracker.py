@@ -7,8 +7,8 @@ import json
 import pytest
 
 from laneweave.agents.driving.tracker import Tracker
+from laneweave.launch.bench.measurements import measure_tracker
 from laneweave.launch.bench.tracker import SITUATIONS, bench_tracker, drive, tracker_table
-from laneweave.launch.cli.bench_command import measure_tracker
 from laneweave.protocol.scenario.tables import Scenario
 
 SCENARIO = Scenario()

@@ -1,4 +1,4 @@
-"""Parts of the command line that need no process: folders, the road ahead, and the last words."""
+"""Parts of the command line that need no process: run folders, options, last errors."""
 
 import json
 import tempfile
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from laneweave.launch.cli import role_commands
+from laneweave.launch.cli.options import check_pace
 from laneweave.launch.run import run_folder
 from laneweave.launch.run.local_run import MAX_TEMPORARY_BYTES, check_temporary_folder
 from laneweave.launch.run.logs import last_error
@@ -17,12 +17,19 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.tables import Scenario
 
 
-def test_a_new_folder_tells_what_is_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def new_folder(out: Path | None, settings: Scenario | None = None) -> Path:
+    with run_folder.new_folder(out, settings or Scenario(), "formation") as folder:
+        return folder
+
+
+def test_the_name_of_a_new_folder_describes_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(time, "strftime", lambda _: "20260102-030405")
     settings = load_scenario(None, seed=7, demand__volume_veh_per_lane_h=1450.5)
 
-    folders = [run_folder.new_folder(None, settings, "formation") for _ in range(3)]
+    folders = [new_folder(None, settings) for _ in range(3)]
 
     name = "formation-1450.5-seed7-20260102-030405"
     assert [str(folder) for folder in folders] == [
@@ -33,33 +40,54 @@ def test_a_new_folder_tells_what_is_in_it(tmp_path: Path, monkeypatch: pytest.Mo
     assert all(folder.is_dir() for folder in folders)
 
 
-def test_an_empty_folder_will_do_once(tmp_path: Path) -> None:
+def test_an_empty_folder_can_be_used_once(tmp_path: Path) -> None:
     out = tmp_path / "a" / "b"
     out.mkdir(parents=True)
-    assert run_folder.new_folder(out, Scenario(), "formation").is_dir()
+    assert new_folder(out).is_dir()
     with pytest.raises(BadInputError, match="a new or empty folder"):
-        run_folder.new_folder(out, Scenario(), "formation")
+        new_folder(out)
 
 
-def test_a_folder_with_something_in_it_will_not(tmp_path: Path) -> None:
+def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for out in (tmp_path, tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(BadInputError, match="--out: got "):
-            run_folder.new_folder(out, Scenario(), "formation")
+            new_folder(out)
+
+
+@pytest.mark.parametrize("existed", [True, False])
+def test_a_refused_run_leaves_its_folder_unused(tmp_path: Path, existed: bool) -> None:
+    out = tmp_path / "out"
+    if existed:
+        out.mkdir()
+    refusal = pytest.raises(BadInputError, match="faults")
+    with refusal, run_folder.new_folder(out, Scenario(), "formation"):
+        raise BadInputError("faults", "", "others")
+    assert list(tmp_path.iterdir()) == ([out] if existed else [])
+    assert new_folder(out) == out
+
+
+def test_a_run_that_fails_later_keeps_its_files(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    failure = pytest.raises(BadInputError)
+    with failure, run_folder.new_folder(out, Scenario(), "formation") as folder:
+        (folder / "events.jsonl").touch()
+        raise BadInputError("network.endpoint", "", "a router")
+    assert {path.name for path in out.iterdir()} == {"log.jsonl", "events.jsonl"}
 
 
 @pytest.mark.parametrize("pace", [None, 0.01, 1, 1000])
 def test_paces(pace: float | None) -> None:
-    role_commands.check_pace(pace)
+    check_pace(pace)
 
 
 @pytest.mark.parametrize("pace", [0, -1, 1001, float("nan"), float("inf")])
 def test_impossible_paces(pace: float) -> None:
     with pytest.raises(BadInputError, match="--pace"):
-        role_commands.check_pace(pace)
+        check_pace(pace)
 
 
-def test_coordinators_are_named_in_their_order() -> None:
+def test_coordinators_are_numbered() -> None:
     assert coordinator_names(load_scenario(None, runtime__coordinators=2)) == ("c1", "c2")
 
 

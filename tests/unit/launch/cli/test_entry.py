@@ -1,4 +1,4 @@
-"""The entry point: Ctrl-C arrives, whatever the process is doing."""
+"""The entry point: Ctrl-C is delivered whatever the process does."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import time
 
 INTERRUPTS = 60
 
-# All is loaded behind the entry point, as in the real command: threads inherit what it set.
+# The entry point loads everything, as in the real command: threads inherit its signal mask.
 SOLVING = """
 import signal, sys
 from laneweave.launch.cli import entry
@@ -21,7 +21,7 @@ def solve() -> None:
     from laneweave.protocol.vehicle.motion import cell_state
     from laneweave.protocol.scenario.tables import Scenario
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    signal.alarm(90)  # whoever started it may be gone
+    signal.alarm(90)  # end even if the test has died
     scenario = Scenario()
     tracker, window = Tracker(scenario), Reference.hold(scenario, (3, 1)).window(0)
     s, *rest = cell_state(scenario.lattice, (3, 1), 0.0)
@@ -43,7 +43,7 @@ entry.main()
 
 
 def test_no_interrupt_is_lost_while_osqp_solves() -> None:
-    """Without the watcher one in eight would be forgotten."""
+    """Without the forwarding thread one in eight would be lost."""
     command = [sys.executable, "-c", SOLVING, str(INTERRUPTS)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None

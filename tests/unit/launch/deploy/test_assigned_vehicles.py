@@ -1,10 +1,10 @@
-"""Whom an agent process drives, and as whom."""
+"""The vehicles that an agent process drives, and its identity."""
 
 from __future__ import annotations
 
 import pytest
 
-from laneweave.launch.deploy.assigned_vehicles import Crew, crew_of
+from laneweave.launch.deploy.assigned_vehicles import AssignedVehicles, assigned_vehicles
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.deployment import Security, Shard
 
@@ -13,18 +13,30 @@ OPEN, SECURED = Security(fleets=FLEETS), Security(mode="mtls", fleets=FLEETS)
 
 
 @pytest.mark.parametrize("security", [OPEN, SECURED])
-def test_fleets(security: Security) -> None:
-    assert crew_of(security, (), None, "odd") == Crew("fleet.odd", (), Shard(1, 2))
-    assert crew_of(security, (), None, "two") == Crew("fleet.two", ("a", "b"), None)
-    assert crew_of(security, ["b"], None, "two") == Crew("fleet.two", ("b",), None)
-    assert crew_of(security, (), "0/2", None) == Crew("fleet.even", (), Shard(0, 2))
-    assert crew_of(security, ["a"], None, None) == Crew("vehicle.a", ("a",), None)
+@pytest.mark.parametrize(
+    ("vehicles", "shard", "fleet", "expected"),
+    [
+        ((), None, "odd", AssignedVehicles("fleet.odd", (), Shard(1, 2))),
+        ((), None, "two", AssignedVehicles("fleet.two", ("a", "b"), None)),
+        (("b",), None, "two", AssignedVehicles("fleet.two", ("b",), None)),
+        ((), "0/2", None, AssignedVehicles("fleet.even", (), Shard(0, 2))),
+        (("a",), None, None, AssignedVehicles("vehicle.a", ("a",), None)),
+    ],
+)
+def test_fleets(
+    security: Security,
+    vehicles: tuple[str, ...],
+    shard: str | None,
+    fleet: str | None,
+    expected: AssignedVehicles,
+) -> None:
+    assert assigned_vehicles(security, vehicles, shard, fleet) == expected
 
 
 def test_an_open_deployment_needs_no_fleets() -> None:
-    assert crew_of(Security(), (), None, None).shard == Shard(0, 1)
-    assert crew_of(Security(), (), "2/3", None).shard == Shard(2, 3)
-    assert crew_of(Security(), ["a", "b"], None, None).vehicles == ("a", "b")
+    assert assigned_vehicles(Security(), (), None, None).shard == Shard(0, 1)
+    assert assigned_vehicles(Security(), (), "2/3", None).shard == Shard(2, 3)
+    assert assigned_vehicles(Security(), ["a", "b"], None, None).vehicles == ("a", "b")
 
 
 @pytest.mark.parametrize(
@@ -40,17 +52,17 @@ def test_an_open_deployment_needs_no_fleets() -> None:
         (OPEN, (), "3/2", None, "--shard"),
     ],
 )
-def test_what_does_not_fit(
+def test_contradictions_are_refused(
     security: Security, vehicles: tuple[str, ...], shard: str | None, fleet: str | None, field: str
 ) -> None:
     with pytest.raises(BadInputError) as caught:
-        crew_of(security, vehicles, shard, fleet)
+        assigned_vehicles(security, vehicles, shard, fleet)
     assert caught.value.field == field
 
 
-def test_a_vehicle_of_another_shard_is_not_of_the_fleet() -> None:
+def test_a_vehicle_of_another_shard_is_refused() -> None:
     vehicles = [f"v{number}" for number in range(20)]
     even = [vehicle for vehicle in vehicles if Shard(0, 2).takes(vehicle)]
-    assert crew_of(SECURED, even, None, "even").vehicles == tuple(even)
+    assert assigned_vehicles(SECURED, even, None, "even").vehicles == tuple(even)
     with pytest.raises(BadInputError, match="a vehicle of the fleet even"):
-        crew_of(SECURED, vehicles, None, "even")
+        assigned_vehicles(SECURED, vehicles, None, "even")

@@ -9,7 +9,7 @@ from laneweave.coordinator.planning import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.explanation import explain
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.instances import traffic_request
-from laneweave.launch.cli.plan_command import explain_request
+from laneweave.launch.cli.plan_answers import explain_request
 from laneweave.launch.drawing.tappa_process import explanation_figure
 from laneweave.launch.drawing.tappa_text import IMPROVED, LITERAL, explanation_text
 from laneweave.protocol.errors import BadInputError

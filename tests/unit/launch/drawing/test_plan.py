@@ -15,8 +15,8 @@ from PIL import Image
 
 from laneweave.coordinator.planning import PlanRequest, PlanResponse
 from laneweave.launch.cli import main as cli
-from laneweave.launch.cli import plan_command
-from laneweave.launch.cli.plan_command import answer_request
+from laneweave.launch.cli import plan_answers
+from laneweave.launch.cli.plan_answers import answer_request
 from laneweave.launch.drawing import plan as plan_drawing
 from laneweave.launch.drawing.plan import check_drawing, plan_figure, write_gif, write_png
 from laneweave.protocol.errors import BadInputError
@@ -199,7 +199,7 @@ def test_bad_places_are_refused_before_planning(
 ) -> None:
     (tmp_path / "folder.png").mkdir()
     (tmp_path / "file").touch()
-    monkeypatch.setattr(plan_command, "checked_plan", None)
+    monkeypatch.setattr(plan_answers, "checked_plan", None)
     assert cli._status(["plan", str(CASE_STUDY), "--draw", str(tmp_path / name)]) == 2
     told = capsys.readouterr()
     assert told.out == ""
@@ -227,8 +227,8 @@ def test_the_answer_is_printed_and_drawn(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(plan_command, "checked_plan", lambda *_, **__: PLAN)
-    monkeypatch.setattr(plan_command, "_ask", lambda *_: PLAN)
+    monkeypatch.setattr(plan_answers, "checked_plan", lambda *_, **__: PLAN)
+    monkeypatch.setattr(plan_answers, "_ask", lambda *_: PLAN)
     arguments = ["plan", str(CASE_STUDY), "--draw", str(tmp_path / "plan.png")]
     arguments += [] if endpoint is None else ["--connect", endpoint]
     assert cli._status(arguments) == 0
@@ -242,7 +242,7 @@ def test_a_drawing_that_fails_after_all_is_told(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(plan_command, "checked_plan", lambda *_, **__: PLAN)
+    monkeypatch.setattr(plan_answers, "checked_plan", lambda *_, **__: PLAN)
     monkeypatch.setattr(plan_drawing, "draw_plan", full)
     assert cli._status(["plan", str(CASE_STUDY), "--draw", str(tmp_path / "plan.png")]) == 1
     told = capsys.readouterr()
@@ -252,7 +252,7 @@ def test_a_drawing_that_fails_after_all_is_told(
 
 
 def test_without_draw_nothing_is_drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(plan_command, "checked_plan", lambda *_, **__: PLAN)
+    monkeypatch.setattr(plan_answers, "checked_plan", lambda *_, **__: PLAN)
     monkeypatch.setattr(plan_drawing, "draw_plan", None)
     monkeypatch.chdir(tmp_path)
     answer_request(CASE_STUDY, None, None, "tappa", as_table=True)

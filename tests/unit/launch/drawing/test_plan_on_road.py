@@ -15,7 +15,7 @@ from PIL import Image
 
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan
 from laneweave.launch.cli import main as cli
-from laneweave.launch.cli import plan_command
+from laneweave.launch.cli import plan_answers
 from laneweave.launch.drawing import figures as drawing
 from laneweave.launch.drawing import plan_on_road as road_drawing
 from laneweave.launch.drawing.plan_driving import Drive, drive_plan
@@ -195,7 +195,7 @@ def test_what_cannot_be_drawn_is_refused_in_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "fast.toml").write_text("[formation]\nmove_s = 1.0", encoding="utf-8")
-    monkeypatch.setattr(plan_command, "checked_plan", None)
+    monkeypatch.setattr(plan_answers, "checked_plan", None)
     assert cli._status(["plan", str(CASE_STUDY), *options]) == 2
     told = capsys.readouterr()
     assert (told.out, len(told.err.splitlines())) == ("", 1)

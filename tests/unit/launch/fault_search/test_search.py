@@ -22,7 +22,7 @@ from laneweave.launch.fault_search.search import (
     describe,
     run_seeds,
     search,
-    tell_story,
+    story_of,
 )
 from laneweave.launch.fault_search.simulated_run import Outcome, Totals
 from laneweave.protocol.errors import BadInputError
@@ -94,7 +94,7 @@ def test_failures_are_described_with_the_command_that_replays_them() -> None:
 
 
 def test_the_story_of_a_run() -> None:
-    lines = list(tell_story(1, CALM))
+    lines = list(story_of(1, CALM))
     assert lines[0] == "seed 1, profile calm:"
     told = "\n".join(lines)
     for word in (

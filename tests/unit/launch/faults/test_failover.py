@@ -1,6 +1,6 @@
-"""What a fault of the leader costs until the next plan, on hand-made histories.
+"""Failover times until the next plan, measured on hand-made histories.
 
-When somebody leads again is tested with the faults that strike leaders (test_fault_injection).
+test_injection has the times until the next leader.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ START_S = 100.0
 
 
 class History:
-    """A road clock that began at 100 s of the wall clock, and what is seen of the coordinators."""
+    """A road clock that started at 100 s of the wall clock, and messages of the coordinators."""
 
     def __init__(self, pace: float = 1.0) -> None:
-        """Begin with c1 leading."""
+        """Start with c1 as leader."""
         self.view = RoadView()
         self.failover = Failover(lease_s=1.0)
         self.pace = pace
@@ -44,15 +44,15 @@ class History:
         self.look(now_s)
 
 
-def struck(at_s: float, for_s: float | None = None, pace: float = 1.0) -> History:
+def leader_fault(at_s: float, for_s: float | None = None, pace: float = 1.0) -> History:
     history = History(pace)
     history.look_until(at_s)
-    history.failover.on_struck(history.view, at_s, for_s)
+    history.failover.on_leader_fault(history.view, at_s, for_s)
     return history
 
 
 def test_the_next_plan_counts_from_the_fault() -> None:
-    history = struck(110.0)
+    history = leader_fault(110.0)
     history.leads(C2, 2, 110.03)
     history.plan(C2, 9.0, 110.25)
     history.plan(C2, 9.0, 110.5)
@@ -61,8 +61,8 @@ def test_the_next_plan_counts_from_the_fault() -> None:
 
 
 @pytest.mark.parametrize("pace", [1.0, 4.0])
-def test_a_formation_that_closes_later_counts_from_its_closing(pace: float) -> None:
-    history = struck(101.0, pace=pace)
+def test_time_counts_from_the_closing_of_a_formation_that_closes_later(pace: float) -> None:
+    history = leader_fault(101.0, pace=pace)
     history.leads(C2, 2, 101.05)
     closing_s = START_S + 30.0 / pace
     history.look_until(closing_s)
@@ -70,8 +70,8 @@ def test_a_formation_that_closes_later_counts_from_its_closing(pace: float) -> N
     assert history.failover.plan_recovery_s == [pytest.approx(0.2, abs=0.11)]
 
 
-def test_what_the_dead_leader_had_sent_does_not_count() -> None:
-    history = struck(110.0)
+def test_messages_in_flight_of_a_killed_leader_do_not_count() -> None:
+    history = leader_fault(110.0)
     history.plan(C1, 9.0, 110.3)
     assert history.failover.plan_recovery_s == []
     history.leads(C2, 2, 110.4)
@@ -79,16 +79,16 @@ def test_what_the_dead_leader_had_sent_does_not_count() -> None:
     assert history.failover.plan_recovery_s == [pytest.approx(0.5)]
 
 
-def test_a_leader_that_was_stopped_shortly_goes_on_by_itself() -> None:
-    history = struck(110.0, for_s=0.2)
+def test_a_leader_that_was_paused_shortly_continues() -> None:
+    history = leader_fault(110.0, for_s=0.2)
     history.plan(C1, 9.0, 110.01)
     history.plan(C1, 9.0, 110.3)
     assert history.failover.plan_recovery_s == [pytest.approx(0.3)]
     assert history.failover.recovery_s == []
 
 
-def test_other_events_say_nothing() -> None:
-    history = struck(110.0)
+def test_other_events_are_ignored() -> None:
+    history = leader_fault(110.0)
     history.view.take(LogEvent(Name("coordinator"), C2, 0.0, Name("plan-made"), {}), 0.0)
     history.look(110.2)
     assert history.failover.plan_recovery_s == []

@@ -1,4 +1,4 @@
-"""Faults made ready for a run: for processes, and for the simulated network."""
+"""Fault injection into role processes and into the simulated network."""
 
 from __future__ import annotations
 
@@ -9,14 +9,20 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
-from laneweave.launch.faults.control_files import SharedBoard
+from laneweave.launch.faults.board import MessageFaults, SharedBoard
 from laneweave.launch.faults.injection import FaultInjection
-from laneweave.launch.faults.local_faults import ProcessFaults
 from laneweave.launch.faults.network_namespaces import GroupNetwork, NamespacesUnavailableError
-from laneweave.launch.faults.specification import Faults, Kill, Partition, Pause, load_faults
+from laneweave.launch.faults.specification import (
+    FaultSpec,
+    Kill,
+    Partition,
+    Pause,
+    load_faults,
+)
+from laneweave.launch.run.local_run import add_faults, fault_injection
 from laneweave.launch.run.outcome import Outcome
-from laneweave.launch.run.role_processes import Order, RoleProcesses
-from laneweave.launch.run.roles import MessageFaults, fork_server
+from laneweave.launch.run.role_processes import RoleProcesses, StartOrder
+from laneweave.launch.run.roles import fork_server
 from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.loading import load_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
@@ -28,13 +34,13 @@ CUT = Partition(between=("coordinators", "others"), from_s=5.0)
 
 
 def processes() -> RoleProcesses:
-    """Return processes of which none is ever started."""
+    """Return role processes, none of which is started."""
     return RoleProcesses(fork_server(), lambda _: ({}, {}), ("c1", "c2"))
 
 
 def without_namespaces(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(_: GroupNetwork) -> None:
-        raise NamespacesUnavailableError("nobody may")
+        raise NamespacesUnavailableError("not permitted")
 
     monkeypatch.setattr(GroupNetwork, "open", refuse)
 
@@ -42,14 +48,28 @@ def without_namespaces(monkeypatch: pytest.MonkeyPatch) -> None:
 # --- processes ------------------------------------------------------------------------------------
 
 
-def equip(faults: ProcessFaults, role: str, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    return faults.equip(Order(role, name, {}), to_tables(faults.scenario), {"folder": "f"})
+def injection_of(faults: FaultSpec) -> FaultInjection:
+    return fault_injection(faults, Scenario(), processes())
 
 
-def test_each_start_of_a_role_gets_rules_and_a_fate_of_its_own(tmp_path: Path) -> None:
-    faults = ProcessFaults.open(Faults(messages=(LOSS,), seed=9), Scenario(), processes(), tmp_path)
+@pytest.fixture
+def board(tmp_path: Path) -> SharedBoard:
+    return SharedBoard(tmp_path / "board")
+
+
+def prepared(
+    injection: FaultInjection, board: SharedBoard, role: str, name: str
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return tables and options of a role with faults."""
+    tables, options = to_tables(Scenario()), {"folder": "f"}
+    add_faults(injection, board, StartOrder(role, name, {}), tables, options)
+    return tables, options
+
+
+def test_each_start_of_a_role_gets_the_rules_and_its_own_seed(board: SharedBoard) -> None:
+    injection = injection_of(FaultSpec(messages=(LOSS,), seed=9))
     given = [
-        equip(faults, role, name)[1]["faults"]
+        prepared(injection, board, role, name)[1]["faults"]
         for role, name in (
             *(("coordinator", "c1"), ("coordinator", "c1"), ("bridge", "bridge")),
             ("agent", "agent-v0001"),
@@ -61,32 +81,33 @@ def test_each_start_of_a_role_gets_rules_and_a_fate_of_its_own(tmp_path: Path) -
     assert len({one.word for one in given}) == 4
 
 
-def test_the_router_has_no_message_faults(tmp_path: Path) -> None:
-    faults = ProcessFaults.open(Faults(messages=(LOSS,)), Scenario(), processes(), tmp_path)
-    assert equip(faults, "router", "router") == (to_tables(Scenario()), {"folder": "f"})
+def test_the_router_has_no_message_faults(board: SharedBoard) -> None:
+    injection = injection_of(FaultSpec(messages=(LOSS,)))
+    expected = (to_tables(Scenario()), {"folder": "f"})
+    assert prepared(injection, board, "router", "router") == expected
 
 
-def test_without_namespaces_a_partition_takes_messages_and_says_why(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_without_namespaces_a_partition_drops_messages_and_gives_the_reason(
+    board: SharedBoard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     without_namespaces(monkeypatch)
-    faults = ProcessFaults.open(Faults(partition=(CUT,)), Scenario(), processes(), tmp_path)
-    _, options = equip(faults, "coordinator", "c1")
+    injection = injection_of(FaultSpec(partition=(CUT,)))
+    _, options = prepared(injection, board, "coordinator", "c1")
     assert options["faults"].rules == tuple(CUT.message_rules())
-    assert faults.summary() == {
+    assert injection.results(0)["faults"] == {
         "injected": [],
         "partition_methods": {"partition[0]": "messages"},
-        "why_no_namespaces": "nobody may",
+        "why_no_namespaces": "not permitted",
     }
 
 
-def test_without_namespaces_those_who_insist_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_partition_that_requires_namespaces_is_refused_without_them(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     without_namespaces(monkeypatch)
-    insisting = Partition(between=("bridge", "others"), method="namespaces")
-    with pytest.raises(BadInputError, match=r"partition\[1\].method: .*nobody may"):
-        ProcessFaults.open(Faults(partition=(CUT, insisting)), Scenario(), processes(), tmp_path)
+    required = Partition(between=("bridge", "others"), method="namespaces")
+    with pytest.raises(BadInputError, match=r"partition\[1\].method: .*not permitted"):
+        injection_of(FaultSpec(partition=(CUT, required)))
 
 
 class _FakeNetwork(GroupNetwork):
@@ -101,30 +122,25 @@ class _FakeNetwork(GroupNetwork):
         return changed
 
 
-def test_with_namespaces_groups_find_the_router_over_their_link(tmp_path: Path) -> None:
-    stage = processes()
+def test_with_namespaces_groups_reach_the_router_over_their_link(board: SharedBoard) -> None:
+    roles = processes()
     pair = Partition(between=("vehicles", "bridge"))
-    plan = Faults(partition=(CUT, pair))
-    faults = ProcessFaults(
-        plan,
-        Scenario(),
-        SharedBoard(tmp_path / "board"),
-        FaultInjection.of(plan, 1, stage, 1.0),
-        _FakeNetwork(stage.context, ("coordinators",)),
-    )
+    specification = FaultSpec(partition=(CUT, pair))
+    network = _FakeNetwork(roles.context, ("coordinators",))
+    injection = FaultInjection(specification, 1, roles, 1.0, network)
 
-    _, router = equip(faults, "router", "router")
-    tables, coordinator = equip(faults, "coordinator", "c1")
-    bridge_tables, bridge = equip(faults, "bridge", "bridge")
+    _, router = prepared(injection, board, "router", "router")
+    tables, coordinator = prepared(injection, board, "coordinator", "c1")
+    bridge_tables, bridge = prepared(injection, board, "bridge", "bridge")
 
     assert (router["namespace"], router["listen"]) == (11, ("tcp/0.0.0.0:7447",))
     assert coordinator["namespace"] == 12
     assert tables["network"]["endpoint"] == "tcp/10.77.255.1:7447"
     assert "namespace" not in bridge
     assert bridge_tables == to_tables(Scenario())
-    # The pair cannot be cut by a link: its rules are there, the other partition's are not.
+    # A link cannot separate the pair: only its rules are there.
     assert bridge["faults"].rules == tuple(pair.message_rules())
-    methods = faults.summary()["partition_methods"]
+    methods = injection.results(0)["faults"]["partition_methods"]
     assert methods == {"partition[0]": "namespaces", "partition[1]": "messages"}
 
 
@@ -132,7 +148,7 @@ def test_with_namespaces_groups_find_the_router_over_their_link(tmp_path: Path) 
 
 
 @pytest.fixture
-def simulate(tmp_path: Path) -> Callable[[str, Faults], Outcome]:
+def simulate(tmp_path: Path) -> Callable[[str, FaultSpec], Outcome]:
     """Run a few vehicles over the simulated network."""
     scenario = load_scenario(
         None,
@@ -142,14 +158,14 @@ def simulate(tmp_path: Path) -> Callable[[str, Faults], Outcome]:
         demand__duration_s=12.0,
     )
 
-    def run(name: str, faults: Faults) -> Outcome:
+    def run(name: str, faults: FaultSpec) -> Outcome:
         return SimulatedRun(scenario, tmp_path / name, faults=faults, show_progress=False).run()
 
     return run
 
 
-def test_a_simulated_run_with_everything_repeats_itself(
-    simulate: Callable[[str, Faults], Outcome], tmp_path: Path
+def test_a_simulated_run_with_all_faults_is_repeatable(
+    simulate: Callable[[str, FaultSpec], Outcome], tmp_path: Path
 ) -> None:
     faults = load_faults("everything", ("c1", "c2", "c3"))
 
@@ -167,12 +183,12 @@ def test_a_simulated_run_with_everything_repeats_itself(
     assert tables[0].equals(tables[1])
 
 
-def test_a_simulated_run_can_do_all_but_two(
-    simulate: Callable[[str, Faults], Outcome],
+def test_a_simulated_run_supports_almost_all_faults(
+    simulate: Callable[[str, FaultSpec], Outcome],
 ) -> None:
     found = simulate(
         "all",
-        Faults(
+        FaultSpec(
             kill=(
                 Kill(at_s=5.0, restart_after_s=1.0),
                 Kill(at_s=8.0, target="router", restart_after_s=1.0),
@@ -187,7 +203,8 @@ def test_a_simulated_run_can_do_all_but_two(
     assert found.summary is not None
     assert found.summary["safety"]["overlaps"] == 0
     done = [one["fault"] for one in found.summary["faults"]["injected"]]
-    assert done == ["kill[0]", "kill[1]", "kill[2]", "kill[2]", "kill[3]", "pause[0]"]
+    kills = ["kill[0]", "kill[1]", "kill[2]", "kill[2]", "kill[3]"]
+    assert done == [*kills, "pause[0]", "partition[0]", "partition[0]"]
     assert found.summary["faults"]["partition_methods"] == {"partition[0]": "messages"}
     assert len(found.summary["failover"]["recovery_s"]) == 1
 
@@ -195,15 +212,23 @@ def test_a_simulated_run_can_do_all_but_two(
 @pytest.mark.parametrize(
     ("faults", "name"),
     [
-        (Faults(pause=(Pause(at_s=1.0, target="router", for_s=1.0),)), "pause[0].target"),
         (
-            Faults(partition=(CUT, Partition(between=("bridge", "others"), method="namespaces"))),
+            FaultSpec(pause=(Pause(at_s=1.0, target="router", for_s=1.0),)),
+            "pause[0].target",
+        ),
+        (
+            FaultSpec(
+                partition=(CUT, Partition(between=("bridge", "others"), method="namespaces"))
+            ),
             "partition[1].method",
         ),
     ],
 )
-def test_what_the_simulated_network_cannot_do_is_refused(
-    simulate: Callable[[str, Faults], Outcome], tmp_path: Path, faults: Faults, name: str
+def test_unsupported_faults_are_refused(
+    simulate: Callable[[str, FaultSpec], Outcome],
+    tmp_path: Path,
+    faults: FaultSpec,
+    name: str,
 ) -> None:
     with pytest.raises(BadInputError) as caught:
         simulate("out", faults)

@@ -1,4 +1,4 @@
-"""Who is struck by kills and pauses, what is put right again, and how recoveries are measured."""
+"""Targets of kills and pauses, resumes and restarts, and measured failover times."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 from attrs import define, field
 
 from laneweave.launch.faults.injection import FaultInjection
-from laneweave.launch.faults.specification import Faults, Kill, Pause
+from laneweave.launch.faults.specification import FaultSpec, Kill, Pause
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.protocol.wire.messages import Census, CensusEntry, Heartbeat, Name
 
@@ -15,8 +15,8 @@ LEASE_S = 1.0
 
 
 @define
-class FakeStage:
-    """Roles that are only names; writes down what is done to them."""
+class FakeRoles:
+    """Role control that only records the calls."""
 
     coordinators: tuple[str, ...] = ("c1", "c2", "c3")
     agents: tuple[str, ...] = ("v1", "v2", "v3", "v4")
@@ -43,7 +43,7 @@ class FakeStage:
     def resume(self, name: str) -> None:
         self.done.append(("resume", name))
 
-    def start_again(self, name: str) -> None:
+    def restart(self, name: str) -> None:
         assert name in self.dead
         self.dead.discard(name)
         self.done.append(("start", name))
@@ -63,102 +63,102 @@ def leads(view: RoadView, name: str, incarnation: int = 1) -> None:
     view.take(heartbeat, 0.0)
 
 
-def injection(stage: FakeStage, seed: int = 1, **faults: Any) -> FaultInjection:  # noqa: ANN401
-    return FaultInjection.of(Faults(**faults), seed, stage, LEASE_S)
+def injection(roles: FakeRoles, seed: int = 1, **faults: Any) -> FaultInjection:  # noqa: ANN401
+    return FaultInjection(FaultSpec(**faults), seed, roles, LEASE_S)
 
 
-def test_the_leader_of_the_moment_is_killed() -> None:
-    stage, view = FakeStage(), on_road(leader="c2")
-    faults = injection(stage, kill=(Kill(at_s=5.0),))
+def test_the_current_leader_is_killed() -> None:
+    roles, view = FakeRoles(), on_road(leader="c2")
+    faults = injection(roles, kill=(Kill(at_s=5.0),))
     faults.step(4.9, 0.0, view)
-    assert stage.done == []
+    assert roles.done == []
     faults.step(5.0, 0.1, view)
-    assert stage.done == [("kill", "c2")]
+    assert roles.done == [("kill", "c2")]
     assert view.leader is None
     assert faults.injected == [{"t_s": 5.0, "fault": "kill[0]", "killed": "c2"}]
 
 
-def test_who_has_no_target_waits_for_one() -> None:
-    stage, view = FakeStage(), on_road(leader=None)
-    faults = injection(stage, kill=(Kill(at_s=5.0),))
+def test_a_fault_without_a_target_waits_for_one() -> None:
+    roles, view = FakeRoles(), on_road(leader=None)
+    faults = injection(roles, kill=(Kill(at_s=5.0),))
     faults.step(5.0, 0.0, view)
-    assert stage.done == []
-    assert faults.never_happened() == ["the run ended before leader was killed at 5 s"]
+    assert roles.done == []
+    assert faults.unused_faults() == ["the run ended before leader was killed at 5 s"]
     leads(view, "c3")
     faults.step(5.5, 0.5, view)
-    assert stage.done == [("kill", "c3")]
-    assert faults.never_happened() == []
+    assert roles.done == [("kill", "c3")]
+    assert faults.unused_faults() == []
 
 
-def test_targets_by_name() -> None:
-    stage = FakeStage()
+def test_targets_are_found_by_name() -> None:
+    roles = FakeRoles()
     kills = tuple(Kill(at_s=1.0, target=name) for name in ("c3", "router", "v2"))
-    injection(stage, kill=kills).step(1.0, 0.0, on_road("v2"))
-    assert stage.done == [("kill", "c3"), ("kill", "router"), ("kill", "agent-v2")]
+    injection(roles, kill=kills).step(1.0, 0.0, on_road("v2"))
+    assert roles.done == [("kill", "c3"), ("kill", "router"), ("kill", "agent-v2")]
 
 
-def test_agents_are_chosen_among_those_on_the_road_each_once() -> None:
-    stage, view = FakeStage(), on_road("v1", "v3", "v4")
-    faults = injection(stage, kill=(Kill(at_s=1.0, target="agent", count=4, restart_after_s=0.5),))
+def test_each_agent_on_the_road_is_chosen_at_most_once() -> None:
+    roles, view = FakeRoles(), on_road("v1", "v3", "v4")
+    faults = injection(roles, kill=(Kill(at_s=1.0, target="agent", count=4, restart_after_s=0.5),))
     for step in range(10):
         faults.step(1.0 + step, float(step), view)
-    killed = [name for verb, name in stage.done if verb == "kill"]
+    killed = [name for verb, name in roles.done if verb == "kill"]
     assert sorted(killed) == ["agent-v1", "agent-v3", "agent-v4"]
-    assert sorted(name for verb, name in stage.done if verb == "start") == sorted(killed)
+    assert sorted(name for verb, name in roles.done if verb == "start") == sorted(killed)
 
 
 def test_the_choice_among_agents_is_drawn_from_the_seed() -> None:
     def killed(seed: int) -> list[tuple[str, str]]:
-        stage = FakeStage()
-        faults = injection(stage, seed, kill=(Kill(at_s=1.0, target="agent", count=4),))
+        roles = FakeRoles()
+        faults = injection(roles, seed, kill=(Kill(at_s=1.0, target="agent", count=4),))
         faults.step(1.0, 0.0, on_road("v1", "v2", "v3", "v4"))
-        return stage.done
+        return roles.done
 
     assert killed(1) == killed(1)
     assert len({tuple(killed(seed)) for seed in range(10)}) > 1
 
 
 def test_a_coordinator_is_chosen_among_those_that_run() -> None:
-    stage = FakeStage(dead={"c1", "c3"})
-    injection(stage, kill=(Kill(at_s=1.0, target="coordinator"),)).step(1.0, 0.0, on_road())
-    assert stage.done == [("kill", "c2")]
+    roles = FakeRoles(dead={"c1", "c3"})
+    injection(roles, kill=(Kill(at_s=1.0, target="coordinator"),)).step(1.0, 0.0, on_road())
+    assert roles.done == [("kill", "c2")]
 
 
 def test_a_restart_comes_after_wall_clock_time() -> None:
-    stage, view = FakeStage(), on_road()
-    faults = injection(stage, kill=(Kill(at_s=5.0, target="router", restart_after_s=3.0),))
+    roles, view = FakeRoles(), on_road()
+    faults = injection(roles, kill=(Kill(at_s=5.0, target="router", restart_after_s=3.0),))
     assert faults.wakeup_s is None
     faults.step(5.0, 100.0, view)
     assert faults.wakeup_s == 103.0
     faults.step(5.0, 102.9, view)  # road time stands still without a router
-    assert stage.done == [("kill", "router")]
+    assert roles.done == [("kill", "router")]
     faults.step(5.0, 103.0, view)
-    assert stage.done == [("kill", "router"), ("start", "router")]
+    assert roles.done == [("kill", "router"), ("start", "router")]
     assert faults.wakeup_s is None
 
 
-def test_a_pause_ends_after_wall_clock_time_and_nobody_is_struck_during_it() -> None:
-    stage, view = FakeStage(), on_road()
+def test_a_pause_ends_after_wall_clock_time_and_a_paused_role_is_no_target() -> None:
+    roles, view = FakeRoles(), on_road()
     faults = injection(
-        stage,
+        roles,
         pause=(Pause(at_s=5.0, target="c2", for_s=2.0),),
         kill=(Kill(at_s=5.5, target="c2"),),
     )
     faults.step(5.0, 100.0, view)
     faults.step(5.5, 100.5, view)
-    assert stage.done == [("pause", "c2")]
+    assert roles.done == [("pause", "c2")]
     faults.step(7.0, 102.0, view)
-    assert stage.done == [("pause", "c2"), ("resume", "c2"), ("kill", "c2")]
+    assert roles.done == [("pause", "c2"), ("resume", "c2"), ("kill", "c2")]
 
 
 # --- recovery -------------------------------------------------------------------------------------
 
 
 def test_recovery_is_measured_until_another_process_leads() -> None:
-    stage, view = FakeStage(), on_road(leader="c1")
-    faults = injection(stage, kill=(Kill(at_s=5.0),))
+    roles, view = FakeRoles(), on_road(leader="c1")
+    faults = injection(roles, kill=(Kill(at_s=5.0),))
     faults.step(5.0, 100.0, view)
-    leads(view, "c1")  # was still under way
+    leads(view, "c1")  # in flight
     faults.step(5.1, 100.1, view)
     assert view.leader is None
     assert faults.failover.recovery_s == []
@@ -169,9 +169,9 @@ def test_recovery_is_measured_until_another_process_leads() -> None:
     assert faults.failover.recovery_s == [0.3]
 
 
-def test_a_new_process_of_the_same_name_is_another_one() -> None:
-    stage, view = FakeStage(coordinators=("c1",)), on_road(leader="c1", incarnation=1)
-    faults = injection(stage, kill=(Kill(at_s=5.0, restart_after_s=0.5),))
+def test_a_restarted_leader_counts_as_another_one() -> None:
+    roles, view = FakeRoles(coordinators=("c1",)), on_road(leader="c1", incarnation=1)
+    faults = injection(roles, kill=(Kill(at_s=5.0, restart_after_s=0.5),))
     faults.step(5.0, 100.0, view)
     faults.step(5.5, 100.5, view)
     leads(view, "c1", incarnation=2)
@@ -180,17 +180,17 @@ def test_a_new_process_of_the_same_name_is_another_one() -> None:
 
 
 def test_a_pause_longer_than_the_lease_is_a_failover() -> None:
-    stage, view = FakeStage(), on_road(leader="c1")
-    faults = injection(stage, pause=(Pause(at_s=5.0, for_s=4.0),))
+    roles, view = FakeRoles(), on_road(leader="c1")
+    faults = injection(roles, pause=(Pause(at_s=5.0, for_s=4.0),))
     faults.step(5.0, 100.0, view)
     leads(view, "c2")
     faults.step(6.2, 101.2, view)
     assert faults.failover.recovery_s == [1.2]
 
 
-def test_a_pause_within_the_lease_is_none() -> None:
-    stage, view = FakeStage(), on_road(leader="c1")
-    faults = injection(stage, pause=(Pause(at_s=5.0, for_s=LEASE_S),))
+def test_a_pause_within_the_lease_is_no_failover() -> None:
+    roles, view = FakeRoles(), on_road(leader="c1")
+    faults = injection(roles, pause=(Pause(at_s=5.0, for_s=LEASE_S),))
     faults.step(5.0, 100.0, view)
     assert view.leader == "c1"
     leads(view, "c2")
@@ -198,9 +198,9 @@ def test_a_pause_within_the_lease_is_none() -> None:
     assert faults.failover.recovery_s == []
 
 
-def test_a_leader_that_woke_before_anybody_took_over_is_no_failover() -> None:
-    stage, view = FakeStage(), on_road(leader="c1")
-    faults = injection(stage, pause=(Pause(at_s=5.0, for_s=1.5),))
+def test_a_leader_that_resumes_before_another_one_leads_is_no_failover() -> None:
+    roles, view = FakeRoles(), on_road(leader="c1")
+    faults = injection(roles, pause=(Pause(at_s=5.0, for_s=1.5),))
     faults.step(5.0, 100.0, view)
     faults.step(6.5, 101.5, view)
     leads(view, "c1")

@@ -1,4 +1,4 @@
-"""Faults: what a file may say, which presets there are, and that the reference tells it all."""
+"""Fault files, presets, and the completeness of their reference."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 from laneweave.launch.faults.specification import (
     GROUPS,
-    Faults,
+    FaultSpec,
     Kill,
     Partition,
     Pause,
@@ -29,18 +29,18 @@ VEHICLES = ("v0001", "v0002")
 PRESETS = ("blackout", "everything", "leader-chaos", "lossy10", "lossy50", "router-restart")
 
 
-def load(tmp_path: Path, text: str) -> Faults:
+def load(tmp_path: Path, text: str) -> FaultSpec:
     path = tmp_path / "faults.toml"
     path.write_text(text, encoding="utf-8")
     return load_faults(path, COORDINATORS, VEHICLES)
 
 
-def test_no_file_is_no_faults() -> None:
-    assert load_faults(None, COORDINATORS) == Faults()
-    assert not Faults()
+def test_without_a_file_there_are_no_faults() -> None:
+    assert load_faults(None, COORDINATORS) == FaultSpec()
+    assert not FaultSpec()
 
 
-def test_a_file_says_all_there_is(tmp_path: Path) -> None:
+def test_a_file_may_have_every_field(tmp_path: Path) -> None:
     found = load(
         tmp_path,
         """
@@ -77,7 +77,7 @@ def test_a_file_says_all_there_is(tmp_path: Path) -> None:
         until_s = 6
         """,
     )
-    assert found == Faults(
+    assert found == FaultSpec(
         seed=7,
         messages=(
             MessageRule(
@@ -148,13 +148,13 @@ def test_a_file_says_all_there_is(tmp_path: Path) -> None:
         ("seed = -1", "seed"),
     ],
 )
-def test_what_is_wrong_is_named(tmp_path: Path, text: str, field: str) -> None:
+def test_an_error_names_the_field(tmp_path: Path, text: str, field: str) -> None:
     with pytest.raises(BadInputError) as caught:
         load(tmp_path, text)
     assert str(caught.value).startswith(f"{field}: got ")
 
 
-def test_the_allowed_targets_are_told(tmp_path: Path) -> None:
+def test_an_error_lists_the_allowed_targets(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="allowed: leader, c1, c2, coordinator, router, agent"):
         load(tmp_path, '[[kill]]\ntarget = "bridge"\nat_s = 1.0')
 
@@ -162,21 +162,21 @@ def test_the_allowed_targets_are_told(tmp_path: Path) -> None:
 # --- partitions -----------------------------------------------------------------------------------
 
 
-def ways(partition: Partition) -> set[tuple[str | None, str | None]]:
+def routes(partition: Partition) -> set[tuple[str | None, str | None]]:
     return {(rule.sender, rule.receiver) for rule in partition.message_rules()}
 
 
 def test_a_partition_of_two_groups_loses_messages_both_ways() -> None:
     partition = Partition(between=("vehicles", "coordinators"), from_s=5.0, until_s=8.0)
-    assert ways(partition) == {("vehicle", "coordinator"), ("coordinator", "vehicle")}
+    assert routes(partition) == {("vehicle", "coordinator"), ("coordinator", "vehicle")}
     for rule in partition.message_rules():
         assert (rule.loss, rule.topics, rule.from_s, rule.until_s) == (1.0, (), 5.0, 8.0)
     assert not partition.may_use_links
 
 
-def test_a_group_that_is_cut_off_still_hears_itself() -> None:
+def test_messages_within_a_separated_group_arrive() -> None:
     partition = Partition(between=("vehicles", "others"))
-    assert ways(partition) == {
+    assert routes(partition) == {
         *(("vehicle", "coordinator"), ("coordinator", "vehicle")),
         *(("vehicle", "bridge"), ("bridge", "vehicle")),
     }
@@ -193,7 +193,7 @@ def test_a_partition_has_a_window() -> None:
 # --- presets --------------------------------------------------------------------------------------
 
 
-def test_the_presets_are_those_that_are_promised() -> None:
+def test_the_presets_are_those_of_the_reference() -> None:
     assert preset_names() == PRESETS
 
 
@@ -204,11 +204,11 @@ def test_a_preset_loads_for_any_run(name: str) -> None:
 
 @pytest.mark.parametrize(("name", "loss"), [("lossy10", 0.1), ("lossy50", 0.5)])
 def test_lossy_presets_take_every_message_of_the_whole_run(name: str, loss: float) -> None:
-    assert load_faults(name, COORDINATORS) == Faults(messages=(MessageRule(loss=loss),))
+    assert load_faults(name, COORDINATORS) == FaultSpec(messages=(MessageRule(loss=loss),))
 
 
 def test_blackout_begins_after_a_minute() -> None:
-    expected = Faults(messages=(MessageRule(loss=1.0, from_s=60.0),))
+    expected = FaultSpec(messages=(MessageRule(loss=1.0, from_s=60.0),))
     assert load_faults("blackout", COORDINATORS) == expected
 
 
@@ -221,10 +221,12 @@ def test_an_unknown_name_gives_one_line_with_the_presets() -> None:
     assert "\n" not in line
 
 
-def test_a_file_goes_before_a_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_takes_precedence_over_a_preset(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "lossy10").write_text("seed = 3\n", encoding="utf-8")
-    assert load_faults("lossy10", COORDINATORS) == Faults(seed=3)
+    assert load_faults("lossy10", COORDINATORS) == FaultSpec(seed=3)
 
 
 # --- docs/FAULTS.md -------------------------------------------------------------------------------

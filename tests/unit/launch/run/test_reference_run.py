@@ -150,7 +150,7 @@ def test_an_interrupted_run_leaves_its_summary(
 @each_method
 def test_the_command_leaves_all_files(tmp_path: Path, method: str) -> None:
     out = tmp_path / "run"
-    options = ("--duration", "5", "--volume", "600", "--transport", "zenoh", "--out", str(out))
+    options = ("--duration", "5", "--volume", "600", "--out", str(out))
     done = CliRunner().invoke(app, ["run", "--method", method, *options])
     assert done.exit_code == 0
     assert {path.name for path in out.iterdir()} == {

@@ -1,11 +1,10 @@
-"""The shared file: every process counts in a word of its own, all see the road time."""
+"""The shared file: each process has its own counter, and all of them read the road time."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from laneweave.launch.faults.control_files import BoardWord, LocalBoard, SharedBoard
-from laneweave.launch.run.roles import MessageFaults
+from laneweave.launch.faults.board import BoardWord, LocalBoard, MessageFaults, SharedBoard
 from laneweave.protocol.runtime.message_faults import FaultBoard, FaultyCore, MessageRule, bare
 
 
@@ -18,7 +17,7 @@ def test_road_time_passes_from_one_process_to_all(tmp_path: Path) -> None:
     assert (board.road_s, early.road_s, late.road_s) == (12.5, 12.5, 12.5)
 
 
-def test_counters_add_up_also_when_words_come_later(tmp_path: Path) -> None:
+def test_counters_add_up_when_processes_start_later(tmp_path: Path) -> None:
     board = SharedBoard(tmp_path / "board")
     assert board.dropped == 0
     words: list[FaultBoard] = []
@@ -30,7 +29,7 @@ def test_counters_add_up_also_when_words_come_later(tmp_path: Path) -> None:
     assert board.dropped == 16
 
 
-def test_a_local_board_is_one_too() -> None:
+def test_a_local_board_is_a_fault_board() -> None:
     board: FaultBoard = LocalBoard()
     board.dropped += 1
     assert (board.road_s, board.dropped) == (0.0, 1)
@@ -43,7 +42,7 @@ class _Silent:
         return ()
 
 
-def test_a_process_gets_its_faults_as_an_option(tmp_path: Path) -> None:
+def test_a_role_process_puts_message_faults_before_its_core(tmp_path: Path) -> None:
     board = SharedBoard(tmp_path / "board")
     faults = MessageFaults(
         rules=(MessageRule(loss=1.0),),

@@ -1,8 +1,7 @@
-"""What the processes of a run with faults share without messages: a small file that all map.
+"""The fault board: road time and message loss counters that the processes of a run share.
 
-It holds the road time, which says which faults are in force, and for each process how many messages
-it has lost to faults. Messages could not tell this: they are what gets lost. The file is a row of
-8-byte words in the machine's own order: road time as a float64, then one counter for each process.
+Messages could not carry this, because faults drop them. The board of real processes is a file that
+all of them map: road time as a float64, then one 8-byte counter per process, in native byte order.
 """
 
 from __future__ import annotations
@@ -11,29 +10,32 @@ import mmap
 import struct
 from pathlib import Path
 
-from attrs import define, field
+from attrs import define, field, frozen
+
+from laneweave.protocol.runtime.message_faults import FaultyCore, MessageRule
+from laneweave.protocol.runtime.node import Core
 
 WORD = 8
 
 
 @define
 class LocalBoard:
-    """The board of a run within one process; a `FaultBoard`."""
+    """Board of a run in one process; a `FaultBoard`."""
 
     road_s: float = 0.0
     dropped: int = 0
 
 
 class SharedBoard:
-    """The supervisor's side of the file: gives each process a word, and reads them all."""
+    """The launcher's side of the shared file: assigns counters to processes and reads them all."""
 
     def __init__(self, path: Path) -> None:
-        """Make the file; the road time is 0."""
+        """Create the file with road time 0."""
         self.path = path
         path.write_bytes(bytes(WORD))
 
     def new_word(self) -> int:
-        """Return the index of a word that is nobody's yet, for one process."""
+        """Return the index of a new counter, for one process."""
         with self.path.open("ab") as file:
             index = file.tell() // WORD
             file.write(bytes(WORD))
@@ -47,24 +49,24 @@ class SharedBoard:
 
     @property
     def dropped(self) -> int:
-        """Messages that faults took from all processes, also from those that have ended."""
+        """Number of messages dropped by faults in all processes, including those that ended."""
         content = self.path.read_bytes()[WORD:]
         return sum(struct.unpack(f"={len(content) // WORD}Q", content))
 
 
 @define
 class BoardWord:
-    """One process's side of the file; a `FaultBoard`."""
+    """One role process's side of the shared file; a `FaultBoard`."""
 
     path: Path
     index: int
-    """Of this process's word."""
+    """Index of this process's counter."""
     _memory: mmap.mmap = field(init=False)
     _times: memoryview[float] = field(init=False)
     _counters: memoryview[int] = field(init=False)
 
     def __attrs_post_init__(self) -> None:
-        """Map the file; the mapping ends with the process."""
+        """Map the file until the process ends."""
         with self.path.open("r+b") as file:
             self._memory = mmap.mmap(file.fileno(), 0)
         whole = memoryview(self._memory)
@@ -81,9 +83,27 @@ class BoardWord:
 
     @property
     def dropped(self) -> int:
-        """Messages that faults took from this process."""
+        """Number of messages dropped by faults in this process."""
         return self._counters[self.index]
 
     @dropped.setter
     def dropped(self, value: int) -> None:
         self._counters[self.index] = value
+
+
+@frozen
+class MessageFaults:
+    """Message faults of one role process; passed to it as an option."""
+
+    rules: tuple[MessageRule, ...]
+    board: Path
+    """File of the run's `SharedBoard`."""
+    word: int
+    """Index of this process's counter."""
+    receiver: str
+    seed: str
+
+    def wrap(self, core: Core) -> Core:
+        """Return the core behind message faults."""
+        board = BoardWord(self.board, self.word)
+        return FaultyCore(core, self.rules, board, receiver=self.receiver, seed=self.seed)

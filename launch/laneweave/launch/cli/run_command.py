@@ -1,0 +1,164 @@
+"""`laneweave run`: one run on this machine."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+
+from laneweave.launch.cli.options import (
+    Duration,
+    NoProgress,
+    RunFolder,
+    ScenarioArgument,
+    Solver,
+    check_pace,
+    refuse_inert,
+    shows_progress,
+)
+from laneweave.launch.methods import FORMATION, LC2013, RULE
+from laneweave.launch.run.run_folder import draw_report, new_folder
+from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.scenario.tables import Scenario
+
+if TYPE_CHECKING:
+    from laneweave.launch.run.outcome import Outcome
+
+
+class Transport(StrEnum):
+    """Network between the roles of a run."""
+
+    zenoh = "zenoh"
+    simulated = "simulated"
+
+
+class Method(StrEnum):
+    """Method that controls the vehicles."""
+
+    formation = FORMATION
+    rule = RULE
+    lc2013 = LC2013
+
+
+class Operation(StrEnum):
+    """Operation of formation control; `paper`: formations as in the paper's simulation."""
+
+    formations = "formations"
+    paper = "paper"
+    rolling = "rolling"
+
+
+def run(
+    scenario: ScenarioArgument = None,
+    volume: Annotated[
+        float | None, typer.Option("--volume", help="Vehicles per lane and hour.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Seed of all random draws.")] = None,
+    duration: Duration = None,
+    method: Annotated[
+        Method, typer.Option("--method", help="Method that controls the vehicles.")
+    ] = Method.formation,
+    operation: Annotated[
+        Operation | None,
+        typer.Option("--operation", help="Default: formation.operation of the scenario."),
+    ] = None,
+    solver: Solver = None,
+    vehicles_per_process: Annotated[
+        int | None, typer.Option("--vehicles-per-process", help="Agents that share a process.")
+    ] = None,
+    coordinators: Annotated[
+        int | None, typer.Option("--coordinators", help="Number of coordinators.")
+    ] = None,
+    transport: Annotated[
+        Transport | None,
+        typer.Option("--transport", help="Default: zenoh; simulated: virtual time, repeatable."),
+    ] = None,
+    faults: Annotated[
+        str | None,
+        typer.Option("--faults", metavar="FILE|PRESET", help="Faults to inject: docs/FAULTS.md."),
+    ] = None,
+    out: RunFolder = None,
+    pace: Annotated[
+        float | None,
+        typer.Option("--pace", help="Maximum road seconds per second; default: runtime.max_pace."),
+    ] = None,
+    no_progress: NoProgress = False,
+) -> None:
+    """Run a scenario on this machine and write its folder."""
+    settings = load_scenario(
+        scenario,
+        seed=seed,
+        demand__volume_veh_per_lane_h=volume,
+        demand__duration_s=duration,
+        formation__operation=operation.value if operation is not None else None,
+        formation__solver=solver,
+        runtime__vehicles_per_process=vehicles_per_process,
+        runtime__coordinators=coordinators,
+    )
+    check_pace(pace)
+    show = shows_progress(no_progress)
+    if method is Method.formation:
+        if settings.formation.rolling:
+            refuse_inert("with the rolling operation", solver=solver)
+        simulated = transport is Transport.simulated
+        if simulated:
+            refuse_inert("with --transport simulated", pace=pace)
+        outcome = _run_formations(settings, out, faults, pace, simulated=simulated, show=show)
+    else:
+        refuse_inert(
+            f"with --method {method.value}",
+            operation=operation,
+            solver=solver,
+            vehicles_per_process=vehicles_per_process,
+            coordinators=coordinators,
+            faults=faults,
+            pace=pace,
+            transport=transport,
+        )
+        outcome = _run_reference(settings, out, method, show=show)
+
+    from laneweave.launch.run.outcome import print_outcome
+
+    print_outcome(outcome, Console())
+    if outcome.summary is not None:
+        draw_report(outcome.folder)
+    raise typer.Exit(outcome.exit_status)
+
+
+def _run_formations(
+    settings: Scenario,
+    out: Path | None,
+    faults: str | None,
+    pace: float | None,
+    *,
+    simulated: bool,
+    show: bool,
+) -> Outcome:
+    from laneweave.agents.driving.trajectory import check_moves
+    from laneweave.launch.faults.specification import load_faults
+    from laneweave.launch.run.local_run import LocalRun
+    from laneweave.protocol.config.participants import coordinator_names
+    from laneweave.sim_bridge.road.demand import arrivals
+
+    check_moves(settings)
+    vehicles = {arrival.vehicle for arrival in arrivals(settings)}
+    specification = load_faults(faults, coordinator_names(settings), vehicles)
+    with new_folder(out, settings, FORMATION) as folder:
+        if simulated:
+            from laneweave.launch.run.roles import collect_rarely
+            from laneweave.launch.run.simulated_run import SimulatedRun
+
+            collect_rarely()
+            return SimulatedRun(settings, folder, faults=specification, show_progress=show).run()
+        return LocalRun(settings, folder, FORMATION, specification, show, pace).run()
+
+
+def _run_reference(settings: Scenario, out: Path | None, method: Method, *, show: bool) -> Outcome:
+    from laneweave.launch.run.reference_run import ReferenceRun, check_reference
+
+    check_reference(settings, method.value)
+    with new_folder(out, settings, method.value) as folder:
+        return ReferenceRun(settings, folder, method.value, show_progress=show).run()

@@ -1,0 +1,22 @@
+"""Preparation of the fork server before its first fork; only the fork server imports this module.
+
+It loads libraries, generates the code that reads and writes messages and scenarios, and computes
+the reference motions for the default limits, once for all role processes. It opens no session,
+thread or file.
+
+Finally it excludes all existing objects from garbage collection: a collection writes to every
+object it visits, so each process would soon have its own copy of all of them.
+"""
+
+from __future__ import annotations
+
+import laneweave.coordinator.process
+import laneweave.launch.cli.entry  # noqa: F401 (loaded by every process)
+from laneweave.agents.process import warm_up
+from laneweave.launch.run.roles import collect_rarely
+from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.wire import codec
+
+codec.warm_up()
+warm_up(parse_scenario({}))
+collect_rarely()
