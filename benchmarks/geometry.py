@@ -32,7 +32,7 @@ from laneweave.coordinator.planning.grid import displacements
 from laneweave.coordinator.planning.instances import formation_request
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import cell_state
-from laneweave.sim_bridge.bodies.footprints import Bodies, pose_of
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, pose_of
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "evidence" / "geometry.json"
 MODELS: dict[str, Geometry | None] = {

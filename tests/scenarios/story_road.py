@@ -244,7 +244,7 @@ class CaretakerProcess:
     def sense(self, tick: int) -> None:
         self.tick = tick
         self.vehicle.place_body(tick)
-        self._note(self._attendance.show(tick))
+        self._note(self._attendance.states(tick))
 
     def get(self, message: Prepare | Plan, tick: int) -> None:
         self.vehicle.place_body(tick)

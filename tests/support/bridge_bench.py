@@ -38,8 +38,8 @@ from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.codec import encode
 from laneweave.protocol.wire.messages import Ballot, Command, Name, Plan, Prepare, Report, Sense
 from laneweave.protocol.wire.topics import COMMAND, PLAN, PREPARE, REPORT, VEHICLE_ALIVE, Keys
-from laneweave.sim_bridge.bodies.footprints import Pose, pose_of
-from laneweave.sim_bridge.core import BRIDGE, BridgeCore, Phase
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose, pose_of
+from laneweave.sim_bridge.core import BRIDGE, BridgeCore, TickPhase
 from laneweave.sim_bridge.recording.run_record import RunRecord
 from laneweave.sim_bridge.road.demand import Arrival
 
@@ -210,7 +210,7 @@ class Desk:
             if until():
                 return
             awaited = sorted(self.core._answers.awaited - set(deaf))
-            if self.core.phase is Phase.ANSWERS and awaited:
+            if self.core.phase is TickPhase.ANSWERS and awaited:
                 self.answer(awaited[0])
             else:
                 self.wake()
@@ -218,19 +218,21 @@ class Desk:
 
     def drive_to(self, tick: int, *deaf: str) -> None:
         """Go on until a tick has been opened and its vehicles have been asked."""
-        self.drive(lambda: self.core.tick >= tick and self.core.phase is Phase.ANSWERS, *deaf)
+        self.drive(lambda: self.core.tick >= tick and self.core.phase is TickPhase.ANSWERS, *deaf)
 
     def drive_to_silence(self, *silent: str) -> None:
         """Go on without a word of some agents until they count as silent."""
         answers = self.core._answers
         self.drive(
-            lambda: answers.silent >= set(silent) and self.core.phase is Phase.ANSWERS, *silent
+            lambda: answers.silent >= set(silent) and self.core.phase is TickPhase.ANSWERS, *silent
         )
 
     def drive_to_entry(self, *vehicles: str) -> None:
         """Go on until vehicles are on the road and wait for their agents' answers."""
         self.drive(
-            lambda: self.core.phase is Phase.ANSWERS and set(vehicles) <= set(self.core.vehicles)
+            lambda: (
+                self.core.phase is TickPhase.ANSWERS and set(vehicles) <= set(self.core.vehicles)
+            )
         )
 
 
@@ -357,7 +359,7 @@ class Street:
 
     def run(self, until: Callable[[], bool] | None = None) -> None:
         """Let the network run until the bridge has ended, or until something is so."""
-        stop = until or (lambda: self.bridge.phase is Phase.ENDED)
+        stop = until or (lambda: self.bridge.phase is TickPhase.ENDED)
         self.network.run(self.network.now_s + FOR_EVER_S, stop)
         assert stop()
 

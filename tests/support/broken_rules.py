@@ -37,7 +37,7 @@ from laneweave.protocol.wire.messages import (
     VehicleState,
 )
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
-from laneweave.sim_bridge.road.caretaker import Caretaker
+from laneweave.sim_bridge.road.attendance import Caretaker
 from laneweave.sim_bridge.road.formation_building import ColumnBlocks
 
 LEASE_S = 2.0
@@ -351,7 +351,7 @@ def accept_moves(patch: pytest.MonkeyPatch) -> None:
 
     def mutant(self: Caretaker, message: Prepare | Plan, tick: int) -> VehicleState | None:
         if isinstance(message, Plan):
-            return self.show(tick) if self._execution.on_plan(message) else None
+            return self.state(tick) if self._execution.on_plan(message) else None
         return on_message(self, message, tick)
 
     patch.setattr(Caretaker, "on_message", mutant)

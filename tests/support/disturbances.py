@@ -29,8 +29,8 @@ from laneweave.protocol.scenario.tables import Scenario, Vehicle
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.wire.messages import Name
-from laneweave.sim_bridge.bodies.footprints import Bodies
 from laneweave.sim_bridge.bodies.motion_controller import MotionController, Rung
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, pose_of
 from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.road.demand import Arrival
 from support.bridge_bench import Street
@@ -220,7 +220,7 @@ class _Run:
 
     def _watch(self) -> None:
         vehicles, size = self.street.bridge.vehicles, self.street.scenario.vehicle
-        poses = {str(name): one.controller.plant.pose for name, one in vehicles.items()}
+        poses = {str(name): pose_of(one.state) for name, one in vehicles.items()}
         bodies = Bodies(poses, size.length_m, size.width_m)
         self.least_gap_m = min(self.least_gap_m, bodies.least_gaps().gap_m)
         self.overlaps += len(bodies.overlapping_pairs())

@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 from laneweave.agents.driving.driver import TrackingDriver
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.lattice import Cell, PlannedMove, stretch_of
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.tables import Scenario, Vehicle
 from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.wire.messages import Command, Motion, Name
-from laneweave.sim_bridge.bodies.footprints import Bodies, Pose
 from laneweave.sim_bridge.bodies.motion_controller import Rung
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, Pose, pose_of
+from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
@@ -82,6 +83,8 @@ class Road:
         self.late = 0
         """Moves that began before the one under way had ended."""
         self.record = Record()
+        self._emergencies: set[Name] = set()
+        """Vehicles that brake past the jerk limit, or have not recovered from that."""
         self.driven: dict[Name, Driven] = {}
         for name, cell in cells.items():
             admission = Admission(Arrival(name, cell[1], cell[1], 0.0), cell, 0.0)
@@ -121,12 +124,17 @@ class Road:
         exempt = []
         for name, vehicle in self.vehicles.items():
             plant = vehicle.controller.plant
-            before = plant.in_emergency
+            before = name in self._emergencies
             if name in braking:
                 plant.brake(0.0)
             else:
                 vehicle.step(self.tick)
-            exempt.append(before or plant.in_emergency)
+            braked = name in braking or vehicle.controller.rung is Rung.EMERGENCY
+            if braked:
+                self._emergencies.add(name)
+            elif not recovering(plant, self.scenario.vehicle):
+                self._emergencies.discard(name)
+            exempt.append(before or name in self._emergencies)
         self.record.exempt.append(exempt)
         self.tick += 1
         self._show()
@@ -169,9 +177,7 @@ class Road:
 
     def _show(self) -> None:
         road, size = self.scenario.road, self.scenario.vehicle
-        poses: dict[str, Pose] = {
-            name: one.controller.plant.pose for name, one in self.vehicles.items()
-        }
+        poses: dict[str, Pose] = {name: pose_of(one.state) for name, one in self.vehicles.items()}
         bodies = Bodies(poses, size.length_m, size.width_m)
         record = self.record
         record.states.append([one.controller.plant.state for one in self.vehicles.values()])
@@ -181,6 +187,12 @@ class Road:
         around = bodies.glimpses(road.lanes, road.lane_width_m, accels_mps2)
         for name, vehicle in self.vehicles.items():
             vehicle.perceive(around[name])
+
+
+def recovering(plant: Plant, limits: Vehicle) -> bool:
+    """Return whether a body's acceleration changes faster than the jerk limit, after braking."""
+    lag = limits.max_jerk_mps3 * limits.actuator_lag_s
+    return abs(plant.setpoint[0] - plant.state[2]) > lag + 1e-6
 
 
 # --- what is measured -----------------------------------------------------------------------------

@@ -10,10 +10,9 @@ from attrs import define, field
 
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.sim_bridge.baselines.entrance import Entrance
-from laneweave.sim_bridge.baselines.rule_traffic import RuleTraffic
-from laneweave.sim_bridge.baselines.vehicle import Vehicle
-from laneweave.sim_bridge.bodies.footprints import Bodies
+from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle
+from laneweave.sim_bridge.baselines.rule_based import RuleTraffic
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies
 from laneweave.sim_bridge.road.demand import Arrival
 from support.bridge_bench import PlainWorld, arrival
 
@@ -30,9 +29,9 @@ def vehicle(
     lane: int = 0,
     preferred_lane: int | None = None,
     speed_mps: float = 15.0,
-) -> Vehicle:
+) -> ReferenceVehicle:
     wanted = lane if preferred_lane is None else preferred_lane
-    return Vehicle(
+    return ReferenceVehicle(
         arrival=arrival(name, 0.0, lane, wanted),
         entered_s=0.0,
         s_m=s_m,
@@ -47,10 +46,10 @@ class RuleRoad:
     """A road of the rule-based method in which bodies are shown where they are."""
 
     scenario: Scenario
-    vehicles: Iterable[Vehicle] = ()
+    vehicles: Iterable[ReferenceVehicle] = ()
     entrance: Entrance = field(init=False)
     traffic: RuleTraffic = field(init=False)
-    left: list[Vehicle] = field(factory=list)
+    left: list[ReferenceVehicle] = field(factory=list)
     tick: int = 0
 
     def __attrs_post_init__(self) -> None:
@@ -68,7 +67,7 @@ class RuleRoad:
         """Road time."""
         return self.tick * self.scenario.runtime.tick_s
 
-    def step(self) -> Sequence[Vehicle]:
+    def step(self) -> Sequence[ReferenceVehicle]:
         """Advance by one tick; who passes the end leaves. Return who entered."""
         self.tick += 1
         entered = self.traffic.step(self.t_s, self.entrance)

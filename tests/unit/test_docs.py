@@ -35,7 +35,7 @@ from laneweave.protocol.vehicle.motion import cell_state
 from laneweave.protocol.wire import messages
 from laneweave.protocol.wire.codec import KINDS, field_names
 from laneweave.protocol.wire.topics import TOPICS
-from laneweave.sim_bridge.bodies.footprints import Bodies, pose_of
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, pose_of
 from laneweave.sim_bridge.recording.run_record import Ending
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -54,8 +54,7 @@ from laneweave.protocol.wire.topics import (
 )
 from laneweave.sim_bridge.metrics import BridgeMetrics
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
-from laneweave.sim_bridge.road.attendance import Attendance
-from laneweave.sim_bridge.road.leaving import Leaving, tell_left
+from laneweave.sim_bridge.road.attendance import Attendance, Departures, notify_left
 from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from laneweave.sim_bridge.road.world import World, show_bodies
@@ -67,7 +66,7 @@ WIND_UP_S = 2.0
 """How long the bridge waits for last reports at the end of a run."""
 
 
-class Phase(Enum):
+class TickPhase(Enum):
     """What the bridge waits for."""
 
     STARTING = "starting"
@@ -107,7 +106,7 @@ class BridgeCore:
         """
         self.scenario = scenario
         self.tick = 0
-        self.phase = Phase.STARTING
+        self.phase = TickPhase.STARTING
         self.vehicles: dict[Name, RoadVehicle] = {}
         self._world = world
         self._record = record
@@ -118,7 +117,7 @@ class BridgeCore:
         self._attendance = Attendance(scenario, new_incarnation)
         self._answers = self._attendance.answers
         self._at_entrance: list[RoadVehicle] = []
-        self._leaving = Leaving()
+        self._departures = Departures()
         self._unreported: set[str] = {BRIDGE}
         """Whose last report is still to come."""
         self._patience_s = scenario.runtime.agent_start_s
@@ -157,9 +156,9 @@ class BridgeCore:
     def wakeup_s(self) -> float | None:
         """Next resend, deadline, or tick."""
         match self.phase:
-            case Phase.ANSWERS:
+            case TickPhase.ANSWERS:
                 return min(self._answers.resend_s, self._answers.deadline_s)
-            case Phase.AGENTS | Phase.PACE | Phase.WIND_UP:
+            case TickPhase.AGENTS | TickPhase.PACE | TickPhase.WIND_UP:
                 return self._until_s
             case _:
                 return None
@@ -170,7 +169,7 @@ class BridgeCore:
             effects = self._on_command(event.message)  # nearly every event is one
         else:
             effects = list(self._on_event(event, now_s))
-        if self.phase is not Phase.ANSWERS or self._answers.complete(now_s):
+        if self.phase is not TickPhase.ANSWERS or self._answers.complete(now_s):
             effects += self._proceed(now_s)
         return effects
 
@@ -185,12 +184,12 @@ class BridgeCore:
                 self._on_agent_up(Name(parameters["vehicle"]))
             case PeerDown(topic, parameters) if topic is VEHICLE_ALIVE:
                 if self._attendance.link_up:
-                    self._leaving.forget(Name(parameters["vehicle"]))
-            case Wakeup() if self.phase is Phase.ANSWERS:
+                    self._departures.forget(Name(parameters["vehicle"]))
+            case Wakeup() if self.phase is TickPhase.ANSWERS:
                 yield from self._send_again(now_s)
             case Stopping():
                 # Who is asked to end while the last reports come in has ended already.
-                winding_up = self.phase is Phase.WIND_UP
+                winding_up = self.phase is TickPhase.WIND_UP
                 self._finish(self._ending if winding_up else Ending.INTERRUPTED)
             case _:
                 pass
@@ -230,7 +229,7 @@ class BridgeCore:
         cared_for = name in self._attendance
         if self._attendance.hear(vehicle, command):
             effects.append(self._sense_of(vehicle))
-        if command.tick != self.tick or self.phase is not Phase.ANSWERS:
+        if command.tick != self.tick or self.phase is not TickPhase.ANSWERS:
             # A late answer was made for a state that is past: played now, from its middle, it
             # would end somewhere else.
             if command.tick < self.tick and command.incarnation == attendant:
@@ -263,13 +262,13 @@ class BridgeCore:
 
     def _proceed(self, now_s: float) -> Iterator[Effect]:
         """Go on from phase to phase as far as nothing has to be waited for, one tick at most."""
-        if self.phase is Phase.PACE and now_s >= self._until_s:
+        if self.phase is TickPhase.PACE and now_s >= self._until_s:
             self._open_tick(now_s)
-        if self.phase is Phase.AGENTS and self._entrance_clear(now_s):
+        if self.phase is TickPhase.AGENTS and self._entrance_clear(now_s):
             yield from self._begin_tick(now_s)
-        if self.phase is Phase.ANSWERS and self._answers.complete(now_s):
+        if self.phase is TickPhase.ANSWERS and self._answers.complete(now_s):
             yield from self._end_tick(now_s)
-        if self.phase is Phase.WIND_UP and (now_s >= self._until_s or not self._unreported):
+        if self.phase is TickPhase.WIND_UP and (now_s >= self._until_s or not self._unreported):
             self._finish(self._ending)
             yield End()
 
@@ -283,7 +282,7 @@ class BridgeCore:
             self._at_entrance.append(
                 RoadVehicle.entering(admission, self.t_s, self.scenario, self._incarnation)
             )
-        self.phase = Phase.AGENTS
+        self.phase = TickPhase.AGENTS
         self._until_s = now_s + self._patience_s
 
     def _entrance_clear(self, now_s: float) -> bool:
@@ -299,10 +298,10 @@ class BridgeCore:
         yield from self._take_care(now_s)
         for vehicle in self.vehicles.values():
             yield self._sense_of(vehicle)
-        yield from self._attendance.show(self.tick)
-        yield from self._leaving.tell(self.tick, self._answers.up)
+        yield from self._attendance.states(self.tick)
+        yield from self._departures.notify(self.tick, self._answers.up)
         self._attendance.ask(self.vehicles, now_s)
-        self.phase = Phase.ANSWERS
+        self.phase = TickPhase.ANSWERS
 
     def _let_enter(self) -> None:
         for vehicle in self._at_entrance:
@@ -360,7 +359,7 @@ class BridgeCore:
             # Nobody can answer: do not race ahead of the vehicles while the network is away.
             lasts_s = max(lasts_s, self.scenario.runtime.tick_s)
         self._until_s = max(now_s, self._opened_s + lasts_s)
-        self.phase = Phase.PACE
+        self.phase = TickPhase.PACE
 
     def _let_leave(self) -> Iterator[Effect]:
         length_m = self.scenario.road.length_m
@@ -370,7 +369,7 @@ class BridgeCore:
                 self._world.remove(name)
                 self._roadside.count_left()
                 self._record.on_left(vehicle, self.t_s, attended=name not in self._attendance)
-                self._leaving.add(vehicle)
+                self._departures.add(vehicle)
                 yield from self._attendance.forget(name)
 
     def _over(self) -> bool:
@@ -386,9 +385,9 @@ class BridgeCore:
     def _wind_up(self, now_s: float) -> Iterator[Effect]:
         on_road = self.vehicles.values()
         yield from self._roadside.news(self.tick, self.t_s, on_road, ended=True)
-        yield from self._leaving.tell(self.tick, self._answers.up)
+        yield from self._departures.notify(self.tick, self._answers.up)
         for vehicle in self.vehicles.values():
-            yield tell_left(vehicle, self.tick)
+            yield notify_left(vehicle, self.tick)
         # Last, so that it counts all, and through the network, like everybody's: the node fills in
         # what it has counted.
         yield Send(
@@ -396,12 +395,12 @@ class BridgeCore:
             Report(role=Name("bridge"), name=BRIDGE),
             {"role": "bridge", "name": BRIDGE},
         )
-        self.phase = Phase.WIND_UP
+        self.phase = TickPhase.WIND_UP
         self._until_s = now_s + WIND_UP_S
 
     def _finish(self, ending: Ending) -> None:
-        if self.phase is not Phase.ENDED:
-            self.phase = Phase.ENDED
+        if self.phase is not TickPhase.ENDED:
+            self.phase = TickPhase.ENDED
             for vehicle in self.vehicles.values():
                 self._record.on_still_on_road(vehicle)
             self._record.close(self.t_s, ending)

@@ -12,7 +12,7 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.wire.messages import Name
-from laneweave.sim_bridge.core import Phase
+from laneweave.sim_bridge.core import TickPhase
 from laneweave.sim_bridge.road.demand import Arrival
 from support import bridge_bench as bench
 from support.bridge_bench import Street, make_scenario, read_summary
@@ -46,7 +46,7 @@ def watched(street: Street) -> Callable[[], bool]:
             for cell in cells:
                 assert cell not in owners, f"{cell} is of {owners[cell]} and of {name}"
                 owners[cell] = name
-        return street.bridge.phase is Phase.ENDED
+        return street.bridge.phase is TickPhase.ENDED
 
     return look
 

@@ -11,7 +11,7 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.bodies.motion_controller import Rung
-from laneweave.sim_bridge.core import Phase
+from laneweave.sim_bridge.core import TickPhase
 from support.bridge_bench import Sleeper, Street, arrival, make_scenario, read_events, read_summary
 
 LONG_ROAD = make_scenario(road={"lanes": 3, "s1_m": 20.0, "s2_m": 20.0, "s3_m": 400.0})
@@ -253,7 +253,7 @@ def check_all_gone(street: Street) -> None:
     """Check that nothing is kept of vehicles that are no more."""
     bridge = street.bridge
     # The last one's token may vanish after its report, with which the run is over.
-    assert set(bridge._leaving.repeats) <= bridge._answers.up <= {MANY[-1].vehicle}
+    assert set(bridge._departures.repeats) <= bridge._answers.up <= {MANY[-1].vehicle}
     assert not bridge._unreported
     for node in street.nodes:
         assert not getattr(node.core, "_agents", None)
@@ -295,10 +295,10 @@ def test_little_is_kept_of_vehicles_that_left(tmp_path: Path) -> None:
 
     def look() -> bool:
         nonlocal most
-        most = max(most, len(bridge._leaving.repeats))
-        if bridge.phase is Phase.WIND_UP and not ended_s:
+        most = max(most, len(bridge._departures.repeats))
+        if bridge.phase is TickPhase.WIND_UP and not ended_s:
             ended_s.append(street.network.now_s)
-        return bridge.phase is Phase.ENDED
+        return bridge.phase is TickPhase.ENDED
 
     street.run(look)
     assert most == 1  # until its agent's token is gone, not for all the repeats

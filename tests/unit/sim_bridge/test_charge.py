@@ -13,7 +13,7 @@ from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.wire.identities import above
 from laneweave.protocol.wire.messages import Ballot, Name, Plan, Prepare, Sense, VehicleState
 from laneweave.protocol.wire.topics import COMMAND, PLAN, PREPARE, STATE
-from laneweave.sim_bridge.core import Phase
+from laneweave.sim_bridge.core import TickPhase
 from laneweave.sim_bridge.road.answers import LATE_SHARE
 from support.bridge_bench import (
     Desk,
@@ -72,7 +72,7 @@ def next_tick(desk: Desk, *answering: Name) -> list[Effect]:
     for name in answering:
         desk.answer(name)
     deaf = {A, B} - set(answering)
-    desk.drive(lambda: desk.core.tick > tick and desk.core.phase is Phase.ANSWERS, *deaf)
+    desk.drive(lambda: desk.core.tick > tick and desk.core.phase is TickPhase.ANSWERS, *deaf)
     return desk.effects
 
 
@@ -179,7 +179,7 @@ def test_what_is_new_to_the_controller_is_confirmed_at_once(attended: Desk) -> N
 def test_it_is_confirmed_at_once_whatever_the_tick_and_then_not_played(attended: Desk) -> None:
     attended.answer(B, incarnation=AGENT)
     attended.answer(A)
-    assert attended.core.phase is Phase.PACE  # the next tick is not due yet
+    assert attended.core.phase is TickPhase.PACE  # the next tick is not due yet
     before = known(attended, B)
     for tick, ballot in ((-1, BALLOT), (0, BALLOT._replace(seq=2))):
         late = {"incarnation": AGENT, "tick": attended.core.tick + tick, "accepted": ballot}
@@ -479,7 +479,7 @@ def test_vehicles_that_leave_off_their_lane_are_reported(tmp_path: Path) -> None
     ]
     desk = Desk(SCENARIO, tmp_path, arrivals)
     desk.start(A, "C")
-    desk.drive(lambda: desk.core.phase is Phase.WIND_UP)
+    desk.drive(lambda: desk.core.phase is TickPhase.WIND_UP)
     found = {
         event["vehicle"]: (event["lane"], event["preferred_lane"], event["attended"])
         for event in read_events(tmp_path, "left-off-lane")

@@ -29,10 +29,10 @@ from laneweave.protocol.wire.topics import (
     REPORT,
     VEHICLE_ALIVE,
 )
-from laneweave.sim_bridge.bodies.footprints import pose_of
 from laneweave.sim_bridge.bodies.motion_controller import Rung
-from laneweave.sim_bridge.core import WIND_UP_S, Phase
-from laneweave.sim_bridge.road.leaving import LEFT_REPEATS
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import pose_of
+from laneweave.sim_bridge.core import WIND_UP_S, TickPhase
+from laneweave.sim_bridge.road.attendance import LEFT_REPEATS
 from support.bridge_bench import (
     Desk,
     arrival,
@@ -96,7 +96,7 @@ def test_start(tmp_path: Path) -> None:
     clock, census = (send.message for send in effects[6:] if isinstance(send, Send))
     assert (clock.tick, clock.t_s, clock.on_road, clock.ended) == (0, 0.0, 0, False)
     assert [one.vehicle for one in census.announced] == [A, B]
-    assert (desk.core.phase, desk.core.tick) == (Phase.PACE, 1)  # nobody had to be waited for
+    assert (desk.core.phase, desk.core.tick) == (TickPhase.PACE, 1)  # nobody had to be waited for
 
 
 def test_the_census_is_sent_on_changes_and_now_and_then(tmp_path: Path) -> None:
@@ -117,7 +117,7 @@ def test_a_tick_ends_when_all_have_answered(desk: Desk) -> None:
     assert desk.answer(B) == []
     assert desk.core.tick == tick
     assert desk.answer(A) == []  # the next tick is not due yet
-    assert (desk.core.phase, desk.core.tick) == (Phase.PACE, tick + 1)
+    assert (desk.core.phase, desk.core.tick) == (TickPhase.PACE, tick + 1)
     assert desk.world.positions() == {
         name: pose_of(vehicle.state) for name, vehicle in desk.core.vehicles.items()
     }
@@ -283,7 +283,7 @@ def test_an_answer_to_another_tick_changes_nothing(desk: Desk, apart: int) -> No
 def test_an_answer_between_two_ticks_changes_nothing(desk: Desk) -> None:
     desk.answer(A)
     desk.answer(B)
-    assert desk.core.phase is Phase.PACE
+    assert desk.core.phase is TickPhase.PACE
     known = record_of(desk, A)
     early = desk.command(A, hold_cell=(-1, 0), jerks=jerks((9.0, 9.0), ticks=9))
     assert early.tick == desk.core.tick  # nobody has been asked about it yet
@@ -350,7 +350,7 @@ def test_a_network_without_any_answers_does_not_stop_the_road(tmp_path: Path) ->
     desk.start(*names)
     desk.drive_to_entry(names[0])
     began_s, tick = desk.now_s, desk.core.tick
-    desk.drive(lambda: desk.core.phase is Phase.WIND_UP, *names)
+    desk.drive(lambda: desk.core.phase is TickPhase.WIND_UP, *names)
     road_s = (desk.core.tick - tick) * TICK_S
     # Real time, and not faster, though the pace would allow it.
     paid_s = SILENT_S - MISSES * TICK_S
@@ -365,9 +365,9 @@ def test_a_network_without_any_answers_does_not_stop_the_road(tmp_path: Path) ->
 
 
 def test_the_network_may_come_back(desk: Desk) -> None:
-    desk.drive(lambda: desk.core._answers.deaf and desk.core.phase is Phase.PACE, A, B)
+    desk.drive(lambda: desk.core._answers.deaf and desk.core.phase is TickPhase.PACE, A, B)
     desk.wake()
-    assert desk.core.phase is Phase.PACE  # nobody was waited for
+    assert desk.core.phase is TickPhase.PACE  # nobody was waited for
     for name in (A, B):
         desk.answer(name, tick=desk.core.tick - 1)
     desk.wake()
@@ -380,7 +380,7 @@ def test_the_network_may_come_back(desk: Desk) -> None:
 def test_the_entrance_waits_for_agents(tmp_path: Path) -> None:
     desk = Desk(SCENARIO, tmp_path, TWO)
     desk.start(A)
-    desk.drive(lambda: desk.core.phase is Phase.AGENTS)
+    desk.drive(lambda: desk.core.phase is TickPhase.AGENTS)
     tick, opened_s = desk.core.tick, desk.now_s
     assert desk.core.wakeup_s == opened_s + PATIENCE_S
     desk.now_s += 0.9 * PATIENCE_S
@@ -399,7 +399,7 @@ def test_the_entrance_gives_up_once_and_has_little_patience_until_somebody_comes
     desk.start()
     waited = []
     for name in names:
-        desk.drive(lambda: desk.core.phase is Phase.AGENTS)
+        desk.drive(lambda: desk.core.phase is TickPhase.AGENTS)
         opened_s = desk.now_s
         if name == "v2":
             desk.now_s += 0.5 * LITTLE_PATIENCE_S
@@ -408,7 +408,7 @@ def test_the_entrance_gives_up_once_and_has_little_patience_until_somebody_comes
             desk.wake()
         assert Name(name) in desk.core.vehicles
         waited.append(desk.now_s - opened_s)
-        desk.drive(lambda: desk.core.phase is Phase.PACE)
+        desk.drive(lambda: desk.core.phase is TickPhase.PACE)
     little_s = LITTLE_PATIENCE_S
     assert waited == pytest.approx([PATIENCE_S, little_s, 0.5 * little_s, PATIENCE_S, little_s])
     missing = [event["vehicle"] for event in read_events(tmp_path, "agent-missing")]
@@ -431,17 +431,17 @@ def test_a_vehicle_that_left_is_told_so_until_its_agent_is_gone(tmp_path: Path) 
     desk.effects.clear()
     desk.drive_to(desk.core.tick + 2)
     assert not any(sense.left for sense in sent(desk.effects, Sense))
-    assert len(desk.core._leaving.repeats) == 0
+    assert len(desk.core._departures.repeats) == 0
 
 
 def test_a_vehicle_that_left_is_not_told_for_ever(tmp_path: Path) -> None:
     desk = Desk(SCENARIO, tmp_path, [arrival(A, 0.5), arrival(B, 8.5)])
     desk.start(A, B)
-    desk.drive(lambda: desk.core.phase is Phase.WIND_UP)
+    desk.drive(lambda: desk.core.phase is TickPhase.WIND_UP)
     told = [sense.vehicle for sense in sent(desk.effects, Sense) if sense.left]
     assert told.count(A) == LEFT_REPEATS
     assert told.count(B) == 1  # it was the last one
-    assert A not in desk.core._leaving.repeats
+    assert A not in desk.core._departures.repeats
 
 
 # --- the end ----------------------------------------------------------------------------------
@@ -450,7 +450,7 @@ def test_a_vehicle_that_left_is_not_told_for_ever(tmp_path: Path) -> None:
 def wound_up(tmp_path: Path, scenario: Scenario = SCENARIO) -> Desk:
     desk = Desk(scenario, tmp_path, TWO)
     desk.start(A, B)
-    desk.drive(lambda: desk.core.phase is Phase.WIND_UP)
+    desk.drive(lambda: desk.core.phase is TickPhase.WIND_UP)
     return desk
 
 
@@ -472,7 +472,7 @@ def test_winds_up_until_all_have_reported(tmp_path: Path) -> None:
     assert desk.report("coordinator", B) == []  # another role of that name
     assert desk.core.wakeup_s == ends_s
     assert ended(desk.report("agent", B))
-    assert desk.core.phase is Phase.ENDED
+    assert desk.core.phase is TickPhase.ENDED
     assert desk.now_s < ends_s
     assert desk.core.wakeup_s is None
     assert read_summary(tmp_path)["ending"] == "complete"
@@ -484,10 +484,10 @@ def test_reports_about_vehicles_of_an_earlier_run_do_not_count(tmp_path: Path) -
     desk.start(A, B)
     for name in (A, B, "v0099"):
         desk.report("agent", name, solves=1000)
-    desk.drive(lambda: desk.core.phase is Phase.WIND_UP)
+    desk.drive(lambda: desk.core.phase is TickPhase.WIND_UP)
     desk.report_own()
     desk.report("agent", A, solves=1)
-    assert desk.core.phase is Phase.WIND_UP
+    assert desk.core.phase is TickPhase.WIND_UP
     assert ended(desk.report("agent", B, solves=2))
     assert read_summary(tmp_path)["tracking"]["solves"] == 3
 
@@ -506,15 +506,15 @@ def test_reports_are_awaited_of_agents_that_came_late_and_of_no_others(tmp_path:
     desk.start()
     desk.drive(lambda: desk.core.tick >= 40)
     desk.up(B)
-    desk.drive(lambda: desk.core.phase is Phase.WIND_UP)
+    desk.drive(lambda: desk.core.phase is TickPhase.WIND_UP)
     desk.report_own()
-    assert desk.core.phase is Phase.WIND_UP
+    assert desk.core.phase is TickPhase.WIND_UP
     assert ended(desk.report("agent", B))
 
 
 def test_a_run_that_is_stopped_was_interrupted(desk: Desk) -> None:
     desk.give(Stopping())
-    assert desk.core.phase is Phase.ENDED
+    assert desk.core.phase is TickPhase.ENDED
     assert desk.core.wakeup_s is None
     found = read_summary(desk.folder)
     assert found["ending"] == "interrupted"
@@ -552,20 +552,20 @@ def test_nothing_is_left_over_at_the_end(tmp_path: Path) -> None:
     desk.start(A, B, "C")
     desk.drive(lambda: desk.core.tick > 60, B)
     assert desk.core._answers.silent == {B}
-    desk.drive(lambda: desk.core.phase is Phase.WIND_UP, B)
+    desk.drive(lambda: desk.core.phase is TickPhase.WIND_UP, B)
     for name in (A, B, "C"):
         desk.report("agent", name)
         desk.down(name)
     desk.report_own()
     core = desk.core
-    assert core.phase is Phase.ENDED
+    assert core.phase is TickPhase.ENDED
     for left_over in (
         core._attendance._caretakers,
         core._answers._unheard,
         core._answers._unheard_s,
         *(
             core.vehicles,
-            core._leaving.repeats,
+            core._departures.repeats,
             core._answers.silent,
             core._answers.awaited,
             core._at_entrance,
@@ -578,7 +578,7 @@ def test_nothing_is_left_over_at_the_end(tmp_path: Path) -> None:
 def test_a_run_without_vehicles_ends(tmp_path: Path) -> None:
     desk = Desk(SCENARIO, tmp_path, [])
     desk.start()
-    assert desk.core.phase is Phase.WIND_UP
+    assert desk.core.phase is TickPhase.WIND_UP
     assert ended(desk.report_own())
     assert read_summary(tmp_path)["vehicles"]["demanded"] == 0
 

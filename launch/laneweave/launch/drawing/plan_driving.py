@@ -22,7 +22,7 @@ from laneweave.agents.driving.trajectory import check_moves
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import cell_state, commanded_state
-from laneweave.sim_bridge.bodies.footprints import Bodies, pose_of
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, pose_of
 from laneweave.sim_bridge.bodies.plant import Plant
 
 

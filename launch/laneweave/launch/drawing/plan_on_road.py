@@ -29,7 +29,7 @@ from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK, new_figure, sa
 from laneweave.launch.drawing.plan import short_name, team_colours
 from laneweave.launch.drawing.plan_driving import Drive, drive_plan
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.sim_bridge.bodies.footprints import corners, pose_of
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import corners, pose_of
 
 MAX_INSTANTS: Final = 8
 """Of a plan with more steps only some instants are drawn."""

@@ -51,10 +51,9 @@ from laneweave.protocol.wire.topics import (
 )
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
 from laneweave.sim_bridge.bodies.plant import Plant
-from laneweave.sim_bridge.road.attendance import Absence, Attendance
+from laneweave.sim_bridge.road.attendance import Absence, Attendance, Departures
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
-from laneweave.sim_bridge.road.leaving import Leaving
 from laneweave.sim_bridge.road.roadside import CENSUS_EVERY_TICKS
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
@@ -244,7 +243,7 @@ class LightRoad:
         self._move_lasts_s = move_lasts_s
         self._lost = lost
         self._attendance = Attendance(scenario, new_incarnation)
-        self._leaving = Leaving()
+        self._departures = Departures()
         self._census_due_tick = 0
 
     @property
@@ -316,7 +315,7 @@ class LightRoad:
         for name, vehicle in self.vehicles.items():
             if not self._lost():
                 yield self._sense_of(name, vehicle)
-        yield from self._attendance.show(self.tick)
+        yield from self._attendance.states(self.tick)
         yield from self._tell_road(t_s)
 
     def _sense_of(self, name: Name, vehicle: LightVehicle) -> Effect:
@@ -362,11 +361,11 @@ class LightRoad:
             if each.leaves_by(now_s) or each.body.state[0] > length_m
         ]
         for name in leaving:
-            self._leaving.add(self.vehicles.pop(name))
+            self._departures.add(self.vehicles.pop(name))
             yield from self._attendance.forget(name)
             self._watcher.leave(now_s, name)
             self._census_due_tick = 0
-        yield from self._leaving.tell(self.tick, self._attendance.answers.up)
+        yield from self._departures.notify(self.tick, self._attendance.answers.up)
 
     def _look_after(self, now_s: float) -> Iterator[Effect]:
         """Let caretakers take charge of vehicles whose agents are gone or silent."""

@@ -28,7 +28,7 @@ from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.wire.messages import Name
-from laneweave.sim_bridge.core import BridgeCore, Phase
+from laneweave.sim_bridge.core import BridgeCore, TickPhase
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
 from laneweave.sim_bridge.sumo.world import SumoWorld
 
@@ -177,7 +177,7 @@ class SimulatedRun:
         self._add("bridge", bridge, "bridge")
         shown = advanced_tick = 0
         advanced_s = 0.0
-        while bridge.phase is not Phase.ENDED and network.queue:
+        while bridge.phase is not TickPhase.ENDED and network.queue:
             if self._injection is None:
                 network.run(network.now_s + STRIDE_S)
             else:

@@ -1,7 +1,7 @@
 """SUMO's own lane changing and car following: LC2013 and Krauss, as automated vehicles.
 
-Headway and desired speed are those of the other methods, all vehicles are alike and drive without
-imperfection. On the route to its exit SUMO makes each vehicle want its preferred lane; in S1 and S2
+Headway and desired speed are those of the other methods; all vehicles are equal and drive without
+imperfection. The route to its exit makes SUMO choose each vehicle's preferred lane; in S1 and S2
 lane changes are switched off unless the scenario allows them everywhere.
 """
 
@@ -11,23 +11,22 @@ from collections.abc import Collection
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.sim_bridge.baselines.entrance import Entrance
-from laneweave.sim_bridge.baselines.vehicle import Vehicle
-from laneweave.sim_bridge.bodies.footprints import Pose
+from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 from laneweave.sim_bridge.sumo.traffic import SumoTraffic
 
 
 class Lc2013Traffic:
-    """Everybody on the road, driven by SUMO; see `Traffic`."""
+    """The vehicles on the road, driven by SUMO; see `Traffic`."""
 
     def __init__(self, scenario: Scenario, sumo: SumoTraffic) -> None:
         """Begin with an empty road."""
         self._sumo = sumo
-        self._vehicles: dict[str, Vehicle] = {}
+        self._vehicles: dict[str, ReferenceVehicle] = {}
         self._offered: dict[str, int] = {}
-        """Who waits in SUMO for room, at most one on each lane, and its lane."""
-        self._kept_on_lane: set[Vehicle] = set()
-        """Who may not change lanes yet."""
+        """Lane of each vehicle that waits in SUMO for room, at most one per lane."""
+        self._kept_on_lane: set[ReferenceVehicle] = set()
+        """Vehicles that may not change lanes yet."""
         self._poses: dict[str, Pose] = {}
         self._road = scenario.road
         self._everywhere = scenario.lc2013.lane_changes == "everywhere"
@@ -35,14 +34,14 @@ class Lc2013Traffic:
         self._tick_s = scenario.runtime.tick_s
 
     @property
-    def vehicles(self) -> Collection[Vehicle]:
-        """All on the road, in order of entry."""
+    def vehicles(self) -> Collection[ReferenceVehicle]:
+        """All vehicles on the road, in order of entry."""
         return self._vehicles.values()
 
-    def step(self, t_s: float, entrance: Entrance) -> list[Vehicle]:
-        """Let SUMO move everybody on to `t_s`, and let enter for whom there is room then."""
+    def step(self, t_s: float, entrance: Entrance) -> list[ReferenceVehicle]:
+        """Let SUMO move all vehicles on to `t_s` and insert those for which there is room."""
         self._offer(t_s, entrance)
-        entered = self._sumo.step()
+        entered = self._sumo.advance()
         self._poses = self._sumo.positions()
         came = [self._entered(name, t_s, entrance) for name in sorted(entered)]
         for vehicle in self._vehicles.values():
@@ -51,21 +50,21 @@ class Lc2013Traffic:
         return came
 
     def poses(self) -> dict[str, Pose]:
-        """Return where SUMO has each vehicle."""
+        """Return the pose of each vehicle in SUMO."""
         return self._poses
 
     def collisions(self) -> list[tuple[str, str]]:
-        """Return the pairs that SUMO takes for colliding."""
+        """Return the pairs that SUMO reports as colliding."""
         return self._sumo.collisions()
 
-    def remove(self, vehicle: Vehicle) -> None:
+    def remove(self, vehicle: ReferenceVehicle) -> None:
         """Take a vehicle off the road."""
         del self._vehicles[vehicle.name]
         self._kept_on_lane.discard(vehicle)
         self._sumo.remove(vehicle.name)
 
     def _offer(self, t_s: float, entrance: Entrance) -> None:
-        """Offer SUMO who is next on each lane, once: it knows when there is room."""
+        """Offer SUMO the next vehicle of each lane once; SUMO inserts it when there is room."""
         for arrival in entrance.firsts():
             if arrival.vehicle not in self._offered:
                 s_m = entrance.furthest_m(arrival, t_s)
@@ -74,10 +73,10 @@ class Lc2013Traffic:
                     self._sumo.allow_lane_changes(arrival.vehicle, allowed=False)
                 self._offered[arrival.vehicle] = arrival.lane
 
-    def _entered(self, name: str, t_s: float, entrance: Entrance) -> Vehicle:
+    def _entered(self, name: str, t_s: float, entrance: Entrance) -> ReferenceVehicle:
         s_m, y_m, _, speed_mps = self._poses[name]
         lane = self._offered.pop(name)
-        vehicle = Vehicle(
+        vehicle = ReferenceVehicle(
             arrival=entrance.take(lane),
             entered_s=t_s - s_m / self._speed_mps,
             s_m=s_m,
@@ -90,15 +89,15 @@ class Lc2013Traffic:
             self._kept_on_lane.add(vehicle)
         return vehicle
 
-    def _look(self, vehicle: Vehicle) -> None:
-        """Take over where SUMO has a vehicle."""
+    def _look(self, vehicle: ReferenceVehicle) -> None:
+        """Read a vehicle's position from SUMO."""
         s_m, y_m, _, speed_mps = self._poses[vehicle.name]
         vehicle.accel_mps2 = (speed_mps - vehicle.speed_mps) / self._tick_s
         vehicle.s_m, vehicle.y_m, vehicle.speed_mps = s_m, y_m, speed_mps
         vehicle.lane = int(y_m // self._road.lane_width_m)
 
     def _release(self) -> None:
-        """Let those who are in S3 now change lanes."""
+        """Allow lane changes of vehicles that have reached S3."""
         for vehicle in [
             each for each in self._kept_on_lane if each.s_m >= self._road.sorting_start_m
         ]:

@@ -1,5 +1,5 @@
-"""Bodies and what moves them: plant, motion controller, sensors, footprints and overlaps.
+"""One vehicle's body and what moves it; overlaps and gaps of bodies.
 
-Entry points: `plant.Plant`, `motion_controller.MotionController`, `footprints`. Imported by `road`,
-`baselines` and `recording`.
+Entry points: `plant.Plant`, `motion_controller.MotionController`, `sensors.Sensors`,
+`overlaps_and_gaps.Bodies`. Imported by the other sub-packages of `sim_bridge` and by launch.
 """

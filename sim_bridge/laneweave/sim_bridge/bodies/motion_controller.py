@@ -42,7 +42,7 @@ from laneweave.protocol.vehicle.motion import (
     limited_accel,
 )
 from laneweave.protocol.wire.messages import Ballot, Command, Deed, Neighbour
-from laneweave.sim_bridge.bodies.footprints import NOBODY_AROUND, Around
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import NOBODY_AROUND, Around
 from laneweave.sim_bridge.bodies.plant import Plant
 
 MAX_COLUMN = 2**31 - 1

@@ -13,7 +13,7 @@ import numpy as np
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import Name, Neighbour
-from laneweave.sim_bridge.bodies.footprints import Around, Glimpses
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Around, Glimpses
 
 _DRAWN = 1024
 """Numbers that are drawn at once."""

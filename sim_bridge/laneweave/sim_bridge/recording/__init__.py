@@ -1,5 +1,5 @@
-"""What a run leaves behind: trajectories, trips, events and the world's part of the summary.
+"""The files of a run: trajectories, trips, events, ticks and the world's part of the summary.
 
-Entry points: `recorder.Recorder`, `run_record.RunRecord`. Imported by `sim_bridge.core`,
-`baselines` and launch.
+Entry point: `run_record.RunRecord`; `recorder` writes the Parquet files. Imported by
+`sim_bridge.core`, `baselines` and launch.
 """

@@ -24,7 +24,7 @@ import pyarrow.parquet as pq
 
 from laneweave.protocol.config.loading import to_tables
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.sim_bridge.bodies.footprints import LeastGaps
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import LeastGaps
 from laneweave.sim_bridge.road.demand import Arrival
 
 SCENARIO_KEY = b"laneweave.scenario"

@@ -32,8 +32,8 @@ from laneweave.protocol.wire.events import (
     RUN_ENDED,
 )
 from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, LogEvent, Name, Report
-from laneweave.sim_bridge.bodies.footprints import LeastGaps
 from laneweave.sim_bridge.bodies.motion_controller import Rung
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import LeastGaps
 from laneweave.sim_bridge.recording.recorder import Recorder
 from laneweave.sim_bridge.road.demand import Arrival
 

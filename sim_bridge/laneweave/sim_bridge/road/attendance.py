@@ -1,39 +1,114 @@
-"""Who is in charge of the vehicles: their agents, or caretakers in place of these.
+"""Attendance: which process acts for each vehicle, its agent or a caretaker in place of it.
 
-These are the rules of every road, whether its bodies are SUMO's or a simulated run's: who counts as
-there, who as silent, when a caretaker takes charge and when it gives way.
+These rules hold on every road, whether its bodies are SUMO's or those of the fault simulation: when
+an agent counts as present or silent, when a caretaker takes charge and when it ends, and how agents
+learn that their vehicles have left.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping
 from enum import StrEnum
+
+from attrs import define, field
 
 from laneweave.protocol.runtime.node import Effect, Event, Listen, PeerDown, PeerUp, Send, Unlisten
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.vehicle.execution import PlanExecution
 from laneweave.protocol.wire.identities import above
 from laneweave.protocol.wire.messages import Command, Name, Plan, Prepare, VehicleState
-from laneweave.protocol.wire.topics import PLAN, PREPARE, STATE, VEHICLE_ALIVE
+from laneweave.protocol.wire.topics import PLAN, PREPARE, SENSE, STATE, VEHICLE_ALIVE
 from laneweave.sim_bridge.road.answers import Answers
-from laneweave.sim_bridge.road.caretaker import Caretaker
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
+
+LEFT_REPEATS = 20
+"""Ticks for which the agent of a vehicle that left is notified."""
 
 
 class Absence(StrEnum):
     """Why a vehicle needs a caretaker."""
 
     ABSENT = "absent"
-    """Its agent's token is not there."""
+    """Its agent has no token."""
     SILENT = "silent"
-    """Its agent's token is there, but nothing else is heard of it."""
+    """Its agent has a token but sends nothing."""
     LATE = "late"
-    """Its agent answers, but always too late."""
+    """Its agent always answers too late."""
+
+
+class Caretaker:
+    """Acts for one vehicle whose agent died, fell silent, or never came.
+
+    It runs the same plan execution as an agent and publishes the same states, with two differences:
+    it never starts a move, and it accepts only plans in which its own vehicle has none. So the
+    coordinator that plans for the vehicle's formation does not have to wait for the agent or guess:
+    the vehicle promises where it stays, and the others are planned around it.
+
+    It does not drive: the motion controller finishes the trajectory that it has and holds. The
+    caretaker ends when an agent claims the vehicle with a COMMAND.
+    """
+
+    def __init__(self, vehicle: RoadVehicle, incarnation: int, tick: int) -> None:
+        """Take charge of a vehicle, whatever its motion.
+
+        Args:
+            vehicle: the vehicle.
+            incarnation: greater than that of every process that was in charge before.
+            tick: number of the tick that begins.
+
+        Raises:
+            ValueError: the incarnation is not greater than that of the process in charge.
+        """
+        controller = vehicle.controller
+        controller.hand_over(incarnation)
+        self._vehicle = vehicle
+        self._execution = PlanExecution(
+            vehicle=vehicle.name,
+            incarnation=incarnation,
+            hold_cell=controller.hold_cell,
+            lattice=controller.lattice,
+            joined=controller.joined,
+            moving=controller.moving(tick),
+            estate=frozenset(controller.estate) if controller.rolling else None,
+        )
+        self._execution.on_estate(vehicle.sense(tick, caretaker=True))
+
+    def on_message(self, message: Prepare | Plan, tick: int) -> VehicleState | None:
+        """V2 and V3: promise, or accept a plan in which this vehicle only holds.
+
+        Returns:
+            The state to publish at once; None: the message changes nothing.
+        """
+        execution, controller = self._execution, self._vehicle.controller
+        if isinstance(message, Prepare):
+            accepted = execution.on_prepare(message)
+            controller.join(execution.wanted_joined)
+            execution.on_joined(controller.joined)
+            if execution.promised is not None:
+                controller.promise(execution.promised)
+        else:
+            execution.on_estate(self._vehicle.sense(tick, caretaker=True))
+            accepted = not message.moves.get(execution.vehicle) and execution.on_plan(message)
+            if accepted:
+                if execution.deed is not None:
+                    controller.draw_up(execution.deed)
+                controller.accept(message.ballot)
+                execution.on_noted(controller.accepted)
+        return self.state(tick) if accepted else None
+
+    def state(self, tick: int) -> VehicleState:
+        """Return the state to publish at a tick; V7 when the controller's motion has ended."""
+        vehicle, execution = self._vehicle, self._execution
+        if execution.moving and not vehicle.controller.moving(tick):
+            execution.end_motion()
+        sense = vehicle.sense(tick, caretaker=True)
+        return execution.state(sense, vehicle.block, attended=False)
 
 
 class Attendance:
-    """Agents and caretakers of a road, and what goes between the latter and the network.
+    """Agents and caretakers of a road, and the messages of the caretakers.
 
     PREPARE and PLAN of a vehicle are subscribed to only while its caretaker is in charge.
     """
@@ -42,31 +117,31 @@ class Attendance:
         """Begin without agents and without caretakers.
 
         Args:
-            scenario: how long who may be away.
+            scenario: timeouts.
             new_incarnation: returns a number that no process has used before.
         """
         self.answers = Answers(scenario.runtime)
         self.link_up = True
-        """Whether the road itself is connected to the network."""
+        """Whether the bridge is connected to the network."""
         self._lease_s = scenario.network.lease_s
         self._new_incarnation = new_incarnation
         self._caretakers: dict[Name, Caretaker] = {}
         self._absence_counts_s = -math.inf
-        """From when on a token that is not there means that its agent is not there."""
+        """From this time on a missing token means that the agent is absent."""
 
     def __contains__(self, vehicle: Name) -> bool:
-        """Tell whether a vehicle's caretaker is in charge."""
+        """Return whether a vehicle's caretaker is in charge."""
         return vehicle in self._caretakers
 
     @property
     def cared_for(self) -> int:
-        """How many vehicles have a caretaker in charge."""
+        """Number of vehicles whose caretaker is in charge."""
         return len(self._caretakers)
 
     # --- agents -------------------------------------------------------------------------------
 
     def on_network(self, event: Event, now_s: float) -> None:
-        """Take note of agents' tokens and of the road's own connection; ignore other events."""
+        """Process agents' tokens and the bridge's own connection; ignore other events."""
         match event:
             case PeerUp(topic, parameters) if topic is VEHICLE_ALIVE:
                 self.answers.agent_up(Name(parameters["vehicle"]))
@@ -75,7 +150,7 @@ class Attendance:
                     self.answers.agent_down(Name(parameters["vehicle"]))
             case LinkUp():
                 self.link_up = True
-                # The others come back to the network about now, too, and need a moment for it.
+                # Other processes reconnect at about the same time.
                 self._absence_counts_s = now_s + self._lease_s
             case LinkDown():
                 self.link_up = False
@@ -84,29 +159,29 @@ class Attendance:
                 pass
 
     def ask(self, vehicles: Mapping[Name, RoadVehicle], now_s: float) -> None:
-        """A tick is sent to all vehicles on the road."""
+        """Begin a tick that is sent to all vehicles on the road."""
         self.answers.ask(vehicles, now_s, link_up=self.link_up)
 
     def hear(self, vehicle: RoadVehicle, command: Command) -> bool:
-        """Take note of who a COMMAND comes from, and of what its agent has joined and accepted.
+        """Register a COMMAND as a sign of life, and note what its agent has joined and accepted.
 
         Returns:
-            Whether its agent waits to be told that the vehicle has noted something.
+            Whether the vehicle has noted something that its agent waits for.
         """
-        # Whoever answers late is there: the next tick waits for it, and it catches up. But one that
-        # another agent has taken the vehicle from says nothing about that other one.
+        # An agent that answers late is present: the next tick waits for it, and it catches up. An
+        # agent that is no longer in charge is no evidence for the one that is.
         if command.incarnation >= vehicle.controller.attendant or vehicle.name in self:
             self.answers.heard(vehicle.name)
         return vehicle.controller.note(command)
 
     def take(self, vehicle: RoadVehicle, command: Command) -> Generator[Effect, None, bool]:
-        """Hand a COMMAND to the vehicle's motion controller; its caretaker gives way to an agent.
+        """Hand a COMMAND to the vehicle's motion controller; a claim ends its caretaker.
 
         Returns:
             Whether the controller obeys it.
 
         Raises:
-            BadInputError: the command makes no sense.
+            BadInputError: the command is invalid.
         """
         controller = vehicle.controller
         attendant = controller.attendant
@@ -114,24 +189,24 @@ class Attendance:
             return False
         self.answers.effective(vehicle.name)
         if controller.attendant != attendant:
-            # Who claims a vehicle is there, whether or not its token has been seen.
+            # An agent that claims a vehicle is present even if its token has not been seen.
             self.answers.agent_up(vehicle.name)
-            yield from self._give_way(vehicle.name)
+            yield from self._end_caretaker(vehicle.name)
         return True
 
     def forget(self, vehicle: Name) -> Iterator[Effect]:
         """Forget a vehicle that left the road."""
         self.answers.forget(vehicle)
-        yield from self._give_way(vehicle)
+        yield from self._end_caretaker(vehicle)
 
     # --- caretakers ---------------------------------------------------------------------------
 
     def unattended(
         self, vehicles: Mapping[Name, RoadVehicle], now_s: float
     ) -> Iterator[tuple[RoadVehicle, Absence]]:
-        """Return the vehicles of which nobody is in charge any more, and why."""
+        """Yield the vehicles without a process in charge, and why."""
         if not self.link_up:
-            return  # nobody can be seen or heard: that says nothing about them
+            return  # without a connection, silence is no evidence
         absence_counts = now_s >= self._absence_counts_s
         answers, caretakers = self.answers, self._caretakers
         for name, vehicle in vehicles.items():
@@ -145,30 +220,61 @@ class Attendance:
                 yield vehicle, Absence.LATE
 
     def take_charge(self, vehicle: RoadVehicle, tick: int) -> Iterator[Effect]:
-        """Put a caretaker in charge of a vehicle that has none."""
+        """Put a caretaker in charge of a vehicle."""
         incarnation = above(self._new_incarnation(), vehicle.controller.attendant)
         self._caretakers[vehicle.name] = Caretaker(vehicle, incarnation, tick)
         yield Listen(PREPARE, {"vehicle": vehicle.name})
         yield Listen(PLAN, {"vehicle": vehicle.name})
 
     def on_message(self, vehicle: Name, message: Prepare | Plan, tick: int) -> Iterator[Effect]:
-        """Hand a message on to the caretaker that it concerns; it answers at once."""
+        """Dispatch a message to the caretaker that it concerns, and send its answer."""
         caretaker = self._caretakers.get(vehicle)
         state = None if caretaker is None else caretaker.on_message(message, tick)
         if state is not None:
-            yield _shown(state)
+            yield _state_effect(state)
 
-    def show(self, tick: int) -> Iterator[Effect]:
-        """Show the states of all vehicles that have caretakers."""
+    def states(self, tick: int) -> Iterator[Effect]:
+        """Publish the states of all vehicles that have caretakers."""
         for caretaker in self._caretakers.values():
-            yield _shown(caretaker.show(tick))
+            yield _state_effect(caretaker.state(tick))
 
-    def _give_way(self, vehicle: Name) -> Iterator[Effect]:
+    def _end_caretaker(self, vehicle: Name) -> Iterator[Effect]:
         """End a vehicle's caretaker, if it has one: an agent is in charge, or the vehicle left."""
         if self._caretakers.pop(vehicle, None) is not None:
             yield Unlisten(PREPARE, {"vehicle": vehicle})
             yield Unlisten(PLAN, {"vehicle": vehicle})
 
 
-def _shown(state: VehicleState) -> Effect:
+def _state_effect(state: VehicleState) -> Effect:
     return Send(STATE, state, {"formation": state.formation, "vehicle": state.vehicle})
+
+
+@define
+class Departures:
+    """Vehicles that have left the road and whose agents must be notified."""
+
+    repeats: dict[Name, tuple[RoadVehicle, int]] = field(factory=dict)
+    """Vehicle and remaining notifications, by name."""
+
+    def add(self, vehicle: RoadVehicle) -> None:
+        """Add a vehicle that left the road."""
+        self.repeats[vehicle.name] = (vehicle, LEFT_REPEATS)
+
+    def forget(self, vehicle: Name) -> None:
+        """Stop notifying an agent, because its token has vanished."""
+        self.repeats.pop(vehicle, None)
+
+    def notify(self, tick: int, up: Collection[Name]) -> Iterator[Effect]:
+        """Notify the agents that are up once more."""
+        for name, (vehicle, repeats) in list(self.repeats.items()):
+            if name not in up or repeats == 0:
+                del self.repeats[name]
+                continue
+            self.repeats[name] = (vehicle, repeats - 1)
+            yield notify_left(vehicle, tick)
+
+
+def notify_left(vehicle: RoadVehicle, tick: int) -> Effect:
+    """Return the message upon which an agent reports and ends."""
+    sense = vehicle.sense(tick, caretaker=False, left=True)
+    return Send(SENSE, sense, {"vehicle": vehicle.name})

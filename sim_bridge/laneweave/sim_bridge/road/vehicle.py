@@ -10,8 +10,8 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.wire.messages import ClosedFormation, Name, Sense
-from laneweave.sim_bridge.bodies.footprints import Glimpses
 from laneweave.sim_bridge.bodies.motion_controller import MotionController, Rung
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Glimpses
 from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.bodies.sensors import Sensors
 from laneweave.sim_bridge.road.demand import Arrival

@@ -8,7 +8,7 @@ from typing import Protocol
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import Name
-from laneweave.sim_bridge.bodies.footprints import Bodies, Pose
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, Pose
 from laneweave.sim_bridge.recording.run_record import RunRecord
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 

@@ -1,5 +1,5 @@
-"""SUMO: the network it loads, bodies that it shows, and vehicles that it drives.
+"""SUMO: the road's network, bodies that it shows (`world`), vehicles that it drives (`traffic`).
 
-Entry points: `world.SumoWorld`, `traffic`. `simulation` is the only module that imports libsumo.
-Imported by `sim_bridge.process`, `baselines` and launch.
+Entry points: `world.SumoWorld`, `traffic.SumoTraffic`. `simulation` is the only module that imports
+libsumo. Imported by `sim_bridge.process`, `baselines` and launch.
 """

@@ -1,46 +1,34 @@
-"""The files that SUMO starts from: hand-written networks of one straight road, and its routes.
+"""SUMO's input files: hand-written networks of one straight road, and its routes.
 
 The road runs along x: s = x, and lane i has its centre line at y = (i + 1/2) lane width. SUMO's
 edge is longer than the road by `margin_m` at both ends, so that the bodies of vehicles that have
 just entered, and vehicles that are about to be removed behind the end, lie on it. Writing the
-network by hand spares `netconvert`, which comes with a much larger package than `libsumo`.
+network directly avoids `netconvert`, which needs a much larger package than `libsumo`.
 
 Where SUMO drives (`write_network_with_exits`) the edge ends with the road, and behind it each lane
-has an exit of its own: on the route to an exit SUMO wants that lane before the road ends.
+has an exit of its own: SUMO chooses the lane of a vehicle's exit before the road ends.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from attrs import evolve, frozen
-
 from laneweave.protocol.scenario.tables import Scenario
 
 EDGE = "road"
 ROUTE = "road"
 VEHICLE_TYPE = "vehicle"
-LEAST_MARGIN_M = 30.0
-
-
-@frozen
-class NetworkFiles:
-    """Where the files are, and the command line that loads them."""
-
-    network: Path
-    routes: Path
-    options: tuple[str, ...]
-    """SUMO's whole argument list, program name first."""
+MIN_MARGIN_M = 30.0
 
 
 def margin_m(scenario: Scenario) -> float:
-    """Return how much further than the road SUMO's edge reaches, at each end.
+    """Return by how much SUMO's edge exceeds the road at each end.
 
-    A vehicle is removed at the first tick after the end: it may be a tick's way beyond it.
+    A vehicle is removed at the first tick after the end: it may have driven one tick beyond it.
     """
     vehicle = scenario.vehicle
-    tick_way_m = vehicle.max_speed_mps * scenario.runtime.tick_s
-    return max(LEAST_MARGIN_M, tick_way_m + vehicle.length_m)
+    tick_m = vehicle.max_speed_mps * scenario.runtime.tick_s
+    return max(MIN_MARGIN_M, tick_m + vehicle.length_m)
 
 
 def exit_route(lane: int) -> str:
@@ -48,40 +36,40 @@ def exit_route(lane: int) -> str:
     return f"{ROUTE}-{lane}"
 
 
-def write_network(scenario: Scenario, folder: Path) -> NetworkFiles:
-    """Write network and route file of a road on which SUMO drives nobody.
+def write_network(scenario: Scenario, folder: Path) -> tuple[str, ...]:
+    """Write network and route file of a road on which SUMO drives no vehicle.
 
     Args:
         scenario: road, vehicle size and tick.
-        folder: where to write; it is made if it is missing.
+        folder: target folder; created if missing.
 
     Returns:
-        The files and SUMO's options.
+        SUMO's argument list, program name first.
     """
     return _write(scenario, folder, _network_xml(scenario), _routes_xml(scenario))
 
 
-def write_network_with_exits(scenario: Scenario, folder: Path) -> NetworkFiles:
+def write_network_with_exits(scenario: Scenario, folder: Path) -> tuple[str, ...]:
     """Write network and route file of a road on which SUMO drives, with LC2013 and Krauss.
 
     Args:
         scenario: road, vehicles, tick, and the table `lc2013`.
-        folder: where to write; it is made if it is missing.
+        folder: target folder; created if missing.
 
     Returns:
-        The files and SUMO's options.
+        SUMO's argument list, program name first.
     """
-    files = _write(scenario, folder, _exits_network_xml(scenario), _exits_routes_xml(scenario))
+    options = _write(scenario, folder, _exits_network_xml(scenario), _exits_routes_xml(scenario))
     duration = ("--lanechange.duration", f"{scenario.lc2013.lane_change_s:.6f}")
-    return evolve(files, options=(*files.options, *duration))
+    return (*options, *duration)
 
 
-def _write(scenario: Scenario, folder: Path, network_xml: str, routes_xml: str) -> NetworkFiles:
+def _write(scenario: Scenario, folder: Path, network_xml: str, routes_xml: str) -> tuple[str, ...]:
     folder.mkdir(parents=True, exist_ok=True)
     network, routes = folder / "road.net.xml", folder / "road.rou.xml"
     network.write_text(network_xml, encoding="utf-8")
     routes.write_text(routes_xml, encoding="utf-8")
-    return NetworkFiles(network, routes, _options(scenario, network, routes))
+    return _options(scenario, network, routes)
 
 
 def _network_xml(scenario: Scenario) -> str:
@@ -113,7 +101,7 @@ def _exits_network_xml(scenario: Scenario) -> str:
     west_m, east_m = -margin, end_m + margin
     lanes = range(road.lanes)
     incoming = " ".join(f"{EDGE}_{lane}" for lane in lanes)
-    nobody = "0" * road.lanes
+    none = "0" * road.lanes
     exits = "".join(
         f"""  <edge id="exit{lane}" from="end" to="east{lane}" priority="1">
 {_lane_xml(scenario, f"exit{lane}", 0, lane, end_m, east_m, speed_mps)}
@@ -122,8 +110,7 @@ def _exits_network_xml(scenario: Scenario) -> str:
         for lane in lanes
     )
     requests = "\n".join(
-        f'    <request index="{lane}" response="{nobody}" foes="{nobody}" cont="0"/>'
-        for lane in lanes
+        f'    <request index="{lane}" response="{none}" foes="{none}" cont="0"/>' for lane in lanes
     )
     dead_ends = "\n".join(
         f'  <junction id="east{lane}" type="dead_end" x="{east_m:.6f}"'
@@ -164,7 +151,7 @@ def _location_xml(scenario: Scenario) -> str:
 
 
 def _entrance_xml(scenario: Scenario) -> str:
-    """Return the dead end from which the road comes."""
+    """Return the dead end where the road begins."""
     west_m, width_m = -margin_m(scenario), scenario.road.lanes * scenario.road.lane_width_m
     return (
         f'<junction id="west" type="dead_end" x="{west_m:.6f}" y="{width_m:.6f}" incLanes=""'
@@ -189,7 +176,7 @@ def _lane_xml(
     east_m: float,
     speed_mps: float,
 ) -> str:
-    """Return a lane of an edge, which lies on a lane of the road."""
+    """Return a lane of an edge, at the position of a lane of the road."""
     centre_m = (lane + 0.5) * scenario.road.lane_width_m
     return (
         f'    <lane id="{edge}_{index}" index="{index}" speed="{speed_mps:.6f}"'
@@ -201,7 +188,7 @@ def _lane_xml(
 def _routes_xml(scenario: Scenario) -> str:
     """Return the vehicle type and the only route.
 
-    `tau` and `minGap` are next to nothing because SUMO does not drive these vehicles; with its
+    `tau` and `minGap` are close to zero because SUMO does not drive these vehicles; with its
     defaults it would delay their insertion.
     """
     return f"""<routes>
@@ -228,7 +215,7 @@ def _exits_routes_xml(scenario: Scenario) -> str:
 
 
 def _type_xml(scenario: Scenario, tau_s: float, min_gap_m: float, models: str = "") -> str:
-    """Return the vehicle type: no imperfection (sigma), everybody's speed the same (speedDev)."""
+    """Return the vehicle type: no imperfection (sigma), equal speeds (speedDev)."""
     vehicle = scenario.vehicle
     return f"""<vType id="{VEHICLE_TYPE}"
          length="{vehicle.length_m:.6f}" width="{vehicle.width_m:.6f}"

@@ -1,18 +1,20 @@
 """SUMO in this process; the only module that imports libsumo.
 
 libsumo holds its simulation in global variables: there is one `SumoSession` per process at a time.
-It is imported when the first session opens, so that everything else works without it.
+It is imported when the first session opens, so that other code works without it.
 """
 
 from __future__ import annotations
 
 import ctypes
+import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from types import TracebackType
 from typing import Any, Self
 
 from laneweave.protocol.errors import CommandFailedError
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 
 DEBIAN_PACKAGES = {
     "libX11.so.6": "libx11-6",
@@ -21,26 +23,27 @@ DEBIAN_PACKAGES = {
     "libGL.so.1": "libgl1",
     "libatomic.so.1": "libatomic1",
 }
-"""System libraries that libsumo loads and a slim container lacks, and what brings them."""
+"""System libraries that libsumo loads and a slim container lacks, and their Debian packages."""
 
 _IMPORT_SWITCH = "LIBSUMO_AS_TRACI"
 
 
 class SumoUnavailableError(CommandFailedError):
-    """libsumo or a system library that it needs cannot be loaded; the message says what to do."""
+    """libsumo or a system library that it needs cannot be loaded; the message gives the remedy."""
 
 
 class SumoSession:
-    """SUMO, started. Close it, or use it as a context manager."""
+    """A running SUMO simulation. Close it, or use it as a context manager."""
 
     _open: SumoSession | None = None
 
-    def __init__(self, options: Callable[[], tuple[str, ...]]) -> None:
+    def __init__(self, options: Callable[[], tuple[str, ...]], body_length_m: float) -> None:
         """Load libsumo and start SUMO.
 
         Args:
-            options: writes SUMO's input files and returns its whole argument list; called when
-                SUMO can be started.
+            options: writes SUMO's input files and returns its argument list; called after libsumo
+                has been loaded.
+            body_length_m: length of every vehicle.
 
         Raises:
             SumoUnavailableError: libsumo cannot be loaded.
@@ -50,16 +53,17 @@ class SumoSession:
             raise RuntimeError("libsumo holds one simulation per process, and one is open")
         self._sumo: Any = _load_libsumo()
         self._sumo.start([*options()])
+        self._half_body_m = 0.5 * body_length_m
         SumoSession._open = self
 
     @property
     def vehicle(self) -> Any:  # noqa: ANN401 - libsumo has no types
-        """Libsumo's functions on vehicles."""
+        """The vehicle functions of libsumo."""
         return self._sumo.vehicle
 
     @property
     def is_open(self) -> bool:
-        """Whether SUMO runs in it."""
+        """Whether SUMO is running."""
         return SumoSession._open is self
 
     def step(self) -> None:
@@ -67,14 +71,14 @@ class SumoSession:
         self._sumo.simulationStep()
 
     def departed(self) -> tuple[str, ...]:
-        """Return the vehicles that SUMO has put on the road in the last step."""
+        """Return the vehicles that SUMO has inserted in the last step."""
         departed: tuple[str, ...] = self._sumo.simulation.getDepartedIDList()
         return departed
 
     def collisions(self) -> list[tuple[str, str]]:
         """Return the pairs that SUMO reports as colliding in the last step, sorted, each once.
 
-        SUMO misses pairs that overlap between lanes: `Bodies.overlapping_pairs` is the truth.
+        SUMO misses pairs that overlap between lanes; `Bodies.overlapping_pairs` is exact.
         """
         return sorted(
             {
@@ -82,6 +86,18 @@ class SumoSession:
                 for found in self._sumo.simulation.getCollisions()
             }
         )
+
+    def poses(self, vehicles: Iterable[str]) -> dict[str, Pose]:
+        """Return (s m, y m, heading rad, speed m/s) of vehicles after the last step."""
+        api = self.vehicle
+        position, angle, speed = api.getPosition, api.getAngle, api.getSpeed
+        poses = {}
+        for vehicle in vehicles:
+            s_m, front_y_m = position(vehicle)
+            heading = math.radians(90.0 - angle(vehicle))
+            y_m = front_y_m - self._half_body_m * math.sin(heading)
+            poses[vehicle] = (s_m, y_m, heading, speed(vehicle))
+        return poses
 
     def close(self) -> None:
         """End SUMO; a second call does nothing."""
@@ -106,8 +122,8 @@ class SumoSession:
 def _load_libsumo() -> Any:  # noqa: ANN401 - libsumo has no types
     """Import libsumo.
 
-    Its complaint about another version of pyarrow is switched off: it concerns SUMO's own Parquet
-    output, which is not used; both were tried together, imported in either order.
+    Its warning about another version of pyarrow is switched off: it concerns SUMO's own Parquet
+    output, which is not used. Both were tested together, imported in either order.
     """
     previous = os.environ.get(_IMPORT_SWITCH)
     os.environ[_IMPORT_SWITCH] = "quiet"
@@ -135,7 +151,7 @@ def _advice(error: Exception) -> str:
 
 
 def _loads(library: str) -> bool:
-    """Tell whether the dynamic loader finds a shared library."""
+    """Return whether the dynamic loader finds a shared library."""
     try:
         ctypes.CDLL(library)
     except OSError:

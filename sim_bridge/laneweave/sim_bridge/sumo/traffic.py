@@ -1,25 +1,22 @@
-"""Vehicles that SUMO itself drives: its car following, its lane changing.
+"""Vehicles that SUMO itself drives, with its own car following and lane changing.
 
-Each tick goes
+Each tick runs
 
-    offer() whom the road shall take  ->  step() returns whom it took  ->  shown()
+    offer() vehicles that should enter  ->  advance() returns those that did  ->  positions()
 
-A vehicle that is offered waits in SUMO until there is room for it, then stands where it was
-offered. Each vehicle is on the route that leaves the road on its preferred lane, which is what
-SUMO's lane changing goes by; one that does not reach that lane stops at the end of the road.
+An offered vehicle waits in SUMO until there is room for it at the position where it was offered.
+Each vehicle has the route that leaves the road on its preferred lane, which SUMO's lane changing
+follows; a vehicle that does not reach that lane stops at the end of the road.
 
-There is one `SumoTraffic` per process at a time, see `sumo/simulation.py`.
+There is one `SumoTraffic` per process at a time, see `simulation`.
 """
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.sim_bridge.bodies.footprints import Pose
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 from laneweave.sim_bridge.sumo.network import (
     VEHICLE_TYPE,
     exit_route,
@@ -30,10 +27,10 @@ from laneweave.sim_bridge.sumo.simulation import SumoSession
 
 _NO_LANE_CHANGES = 0
 _ALL_LANE_CHANGES = 0b011001010101
-"""SUMO's default lane change mode: it changes lanes for every reason that it has."""
+"""SUMO's default lane change mode: all kinds of lane changes."""
 
 
-class SumoTraffic:
+class SumoTraffic(SumoSession):
     """One road with vehicles that SUMO drives. Close it, or use it as a context manager."""
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
@@ -41,28 +38,29 @@ class SumoTraffic:
 
         Args:
             scenario: road, vehicles, tick, and the table `lc2013`.
-            folder: where to write SUMO's input files.
+            folder: folder for SUMO's input files.
 
         Raises:
             SumoUnavailableError: libsumo cannot be loaded.
             RuntimeError: another simulation is open in this process.
         """
-        self._sumo = SumoSession(lambda: write_network_with_exits(scenario, folder).options)
+        super().__init__(
+            lambda: write_network_with_exits(scenario, folder), scenario.vehicle.length_m
+        )
         self._margin_m = margin_m(scenario)
-        self._half_body_m = 0.5 * scenario.vehicle.length_m
         self._speed_mps = scenario.formation.speed_mps
         self._on_road: dict[str, None] = {}
 
     def offer(self, vehicle: str, lane: int, preferred_lane: int, s_m: float) -> None:
-        """Let SUMO put a vehicle on the road at v_F in the first step in which there is room.
+        """Let SUMO insert a vehicle at v_F in the first step in which there is room.
 
         Args:
             vehicle: its name.
             lane: lane on which it enters.
             preferred_lane: lane on which it leaves.
-            s_m: where its front is then.
+            s_m: position of its front bumper then.
         """
-        self._sumo.vehicle.add(
+        self.vehicle.add(
             vehicle,
             exit_route(preferred_lane),
             typeID=VEHICLE_TYPE,
@@ -73,52 +71,27 @@ class SumoTraffic:
         )
 
     def allow_lane_changes(self, vehicle: str, *, allowed: bool) -> None:
-        """Say whether a vehicle may change lanes from now on; on its own it may."""
+        """Allow or forbid lane changes of a vehicle; they are allowed by default."""
         mode = _ALL_LANE_CHANGES if allowed else _NO_LANE_CHANGES
-        self._sumo.vehicle.setLaneChangeMode(vehicle, mode)
+        self.vehicle.setLaneChangeMode(vehicle, mode)
 
-    def step(self) -> tuple[str, ...]:
+    def advance(self) -> tuple[str, ...]:
         """Advance by one tick and return the vehicles that have entered the road."""
-        self._sumo.step()
-        entered = self._sumo.departed()
+        self.step()
+        entered = self.departed()
         self._on_road.update(dict.fromkeys(entered))
         return entered
 
     def positions(self) -> dict[str, Pose]:
-        """Return where each vehicle is: (s m, y m, heading rad, speed m/s), in order of entry."""
-        api = self._sumo.vehicle
-        position, angle, speed = api.getPosition, api.getAngle, api.getSpeed
-        poses = {}
-        for vehicle in self._on_road:
-            s_m, front_y_m = position(vehicle)
-            heading = math.radians(90.0 - angle(vehicle))
-            y_m = front_y_m - self._half_body_m * math.sin(heading)
-            poses[vehicle] = (s_m, y_m, heading, speed(vehicle))
-        return poses
-
-    def collisions(self) -> list[tuple[str, str]]:
-        """Return the pairs that SUMO reports as colliding in the last step, sorted, each once."""
-        return self._sumo.collisions()
+        """Return the pose of each vehicle, in order of entry."""
+        return self.poses(self._on_road)
 
     def remove(self, vehicle: str) -> None:
         """Take a vehicle off the road."""
         del self._on_road[vehicle]
-        self._sumo.vehicle.remove(vehicle)
+        self.vehicle.remove(vehicle)
 
     def close(self) -> None:
         """End SUMO; a second call does nothing."""
         self._on_road.clear()
-        self._sumo.close()
-
-    def __enter__(self) -> Self:
-        """Return this traffic."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close this traffic."""
-        self.close()
+        super().close()

@@ -1,32 +1,30 @@
-"""The road in SUMO, with bodies that SUMO shows and does not drive.
+"""The road in SUMO, with bodies that SUMO shows but does not drive.
 
 SUMO shows every vehicle exactly where the plant says it is: position, lateral position, heading
-and speed, between lanes as well. It drives none of them. Each tick goes
+and speed, between lanes as well. It drives none of them. Each tick runs
 
     place() every vehicle  ->  step()  ->  positions(), collisions()
 
 `place` gives SUMO the middle of the front bumper and the angle (moveToXY with keepRoute=2, which
-takes both as they are). During its step SUMO derives a speed of its own from the displacement;
+keeps both unchanged). During its step SUMO derives a speed of its own from the displacement;
 `step` replaces it by the vehicle's (setPreviousSpeed), so the speed read back is exact, too.
 
-There is one `SumoWorld` per process at a time, see `sumo/simulation.py`.
+There is one `SumoWorld` per process at a time, see `simulation`.
 """
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import State
-from laneweave.sim_bridge.bodies.footprints import Pose, pose_of
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose, pose_of
 from laneweave.sim_bridge.sumo.network import EDGE, ROUTE, VEHICLE_TYPE, margin_m, write_network
 from laneweave.sim_bridge.sumo.simulation import SumoSession
 
 
-class SumoWorld:
+class SumoWorld(SumoSession):
     """One road with vehicles in SUMO. Close it, or use it as a context manager."""
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
@@ -34,19 +32,18 @@ class SumoWorld:
 
         Args:
             scenario: road, vehicle size and tick.
-            folder: where to write SUMO's input files.
+            folder: folder for SUMO's input files.
 
         Raises:
             SumoUnavailableError: libsumo cannot be loaded.
             RuntimeError: another world is open in this process.
         """
-        self._sumo = SumoSession(lambda: write_network(scenario, folder).options)
+        super().__init__(lambda: write_network(scenario, folder), scenario.vehicle.length_m)
         margin = margin_m(scenario)
         self._range_m = (-margin, scenario.road.length_m + margin)
-        """Where SUMO can show vehicles."""
+        """Positions at which SUMO can show vehicles."""
         self._lane_width_m = scenario.road.lane_width_m
         self._lanes = scenario.road.lanes
-        self._half_body_m = 0.5 * scenario.vehicle.length_m
         self._states: dict[str, State] = {}
         self._placed: set[str] = set()
         self._shown: list[str] = []
@@ -64,7 +61,7 @@ class SumoWorld:
         if vehicle in self._states:
             raise ValueError(f"{vehicle} is on the road already")
         self._check(vehicle, state)
-        api = self._sumo.vehicle
+        api = self.vehicle
         api.add(vehicle, ROUTE, typeID=VEHICLE_TYPE, depart="now", departPos="0", departSpeed="0")
         api.setSpeedMode(vehicle, 0)
         api.setLaneChangeMode(vehicle, 0)
@@ -72,7 +69,7 @@ class SumoWorld:
         self._move(vehicle, state)
 
     def place(self, vehicle: str, state: State) -> None:
-        """Say where a vehicle is at the end of the next step.
+        """Set the state of a vehicle at the end of the next step.
 
         Args:
             vehicle: a vehicle that was added.
@@ -90,7 +87,7 @@ class SumoWorld:
     def step(self) -> None:
         """Advance SUMO by one tick.
 
-        A vehicle that was not placed since the last step stays where it is: SUMO drives nobody.
+        A vehicle that was not placed since the last step stays where it is.
 
         Raises:
             RuntimeError: SUMO shows other vehicles than those that were added (it never should).
@@ -100,8 +97,8 @@ class SumoWorld:
                 if vehicle not in self._placed:
                     self._move(vehicle, state)
         self._placed.clear()
-        self._sumo.step()
-        api = self._sumo.vehicle
+        super().step()
+        api = self.vehicle
         if api.getIDCount() != len(self._states):
             raise RuntimeError(f"SUMO shows {api.getIDCount()} of {len(self._states)} vehicles")
         set_previous_speed = api.setPreviousSpeed
@@ -110,27 +107,8 @@ class SumoWorld:
         self._shown = list(self._states)
 
     def positions(self) -> dict[str, Pose]:
-        """Read back where SUMO shows each vehicle after the last step.
-
-        Returns:
-            (s m, y m, heading rad, speed m/s) of each vehicle, in the order of addition.
-        """
-        api = self._sumo.vehicle
-        position, angle, speed = api.getPosition, api.getAngle, api.getSpeed
-        poses = {}
-        for vehicle in self._shown:
-            s_m, front_y_m = position(vehicle)
-            heading = math.radians(90.0 - angle(vehicle))
-            y_m = front_y_m - self._half_body_m * math.sin(heading)
-            poses[vehicle] = (s_m, y_m, heading, speed(vehicle))
-        return poses
-
-    def collisions(self) -> list[tuple[str, str]]:
-        """Return the pairs that SUMO reports as colliding in the last step, sorted, each once.
-
-        SUMO misses pairs that overlap between lanes: `Bodies.overlapping_pairs` is the truth.
-        """
-        return self._sumo.collisions()
+        """Return the pose of each vehicle after the last step, in the order of addition."""
+        return self.poses(self._shown)
 
     def remove(self, vehicle: str) -> None:
         """Take a vehicle off the road.
@@ -142,30 +120,17 @@ class SumoWorld:
             raise ValueError(f"{vehicle} is not on the road")
         self._placed.discard(vehicle)
         self._shown = [other for other in self._shown if other != vehicle]
-        self._sumo.vehicle.remove(vehicle)
+        self.vehicle.remove(vehicle)
 
     def close(self) -> None:
         """End SUMO; a second call does nothing."""
-        if self._sumo.is_open:
+        if self.is_open:
             self._states.clear()
             self._shown.clear()
-            self._sumo.close()
-
-    def __enter__(self) -> Self:
-        """Return this world."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close this world."""
-        self.close()
+            super().close()
 
     def _check(self, vehicle: str, state: State) -> None:
-        """Refuse a state that SUMO would map to some other place."""
+        """Reject a state that SUMO would map to another place."""
         if not math.isfinite(sum(state)):
             raise ValueError(f"{vehicle} must be at a finite state, not {state}")
         low_m, high_m = self._range_m
@@ -182,5 +147,5 @@ class SumoWorld:
             front_y_m += self._half_body_m * math.sin(heading)
             degrees -= math.degrees(heading)
         lane = min(max(int(front_y_m // self._lane_width_m), 0), self._lanes - 1)
-        self._sumo.vehicle.moveToXY(vehicle, EDGE, lane, s_m, front_y_m, degrees, 2)
+        self.vehicle.moveToXY(vehicle, EDGE, lane, s_m, front_y_m, degrees, 2)
         self._placed.add(vehicle)

@@ -17,7 +17,7 @@ from laneweave.protocol.config.loading import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.sim_bridge.baselines import run as road
-from laneweave.sim_bridge.bodies.footprints import Bodies
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
 from laneweave.sim_bridge.road.demand import Arrival
 from support.bridge_bench import read_events, read_summary

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from laneweave.sim_bridge.baselines.car_following import Following
+from laneweave.sim_bridge.baselines.rules import Following
 from support.rule_road import PAPER, rule_scenario
 
 SPEEDS = st.floats(0.0, 15.0)

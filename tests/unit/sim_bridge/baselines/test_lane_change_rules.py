@@ -6,21 +6,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from laneweave.sim_bridge.baselines.lane_change_rules import Lanes, Rules
-from laneweave.sim_bridge.baselines.vehicle import Vehicle
+from laneweave.sim_bridge.baselines.reference_road import ReferenceVehicle
+from laneweave.sim_bridge.baselines.rules import Lanes, Rules
 from support.rule_road import PAPER, rule_scenario, vehicle
 
 NEEDED_M = 5.0 + 15.0 * 0.66
 
 
-def lanes_of(*vehicles: Vehicle) -> Lanes:
+def lanes_of(*vehicles: ReferenceVehicle) -> Lanes:
     lanes = Lanes(3)
     for one in vehicles:
         lanes.enter(one, one.lane)
     return lanes
 
 
-def sort(*vehicles: Vehicle, **rule: str) -> set[str]:
+def sort(*vehicles: ReferenceVehicle, **rule: str) -> set[str]:
     """Apply the rules once and return the names of those who slow down."""
     return {one.name for one in Rules(rule_scenario(**rule)).sort(lanes_of(*vehicles))}
 
@@ -78,7 +78,7 @@ def test_who_is_behind_gives_way() -> None:
 
 
 def test_who_is_on_its_lane_gives_way_only_if_everybody_does() -> None:
-    def pair() -> tuple[Vehicle, Vehicle]:
+    def pair() -> tuple[ReferenceVehicle, ReferenceVehicle]:
         return vehicle("a", 500.0, 0, 1), vehicle("b", 495.0, 1, 1)
 
     assert sort(*pair()) == {"a"}

@@ -12,8 +12,8 @@ from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.braking import EmergencyBrake, last_tick_m
 from laneweave.protocol.vehicle.motion import Jerk, commanded_state, limited_jerk
 from laneweave.protocol.wire.messages import Command, Name, Neighbour
-from laneweave.sim_bridge.bodies.footprints import Around
 from laneweave.sim_bridge.bodies.motion_controller import MotionController, Rung
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Around
 from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.bodies.sensors import Sensors
 

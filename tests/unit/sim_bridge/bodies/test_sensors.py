@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from laneweave.protocol.scenario.tables import Scenario, Sensing
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import Name, Neighbour
-from laneweave.sim_bridge.bodies.footprints import NOBODY_AROUND, Around, Glimpses
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import NOBODY_AROUND, Around, Glimpses
 from laneweave.sim_bridge.bodies.sensors import Sensors
 
 # All different, so that none can stand in for another.

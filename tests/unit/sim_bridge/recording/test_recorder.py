@@ -12,7 +12,7 @@ import pytest
 
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.sim_bridge.bodies.footprints import LeastGaps
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import LeastGaps
 from laneweave.sim_bridge.recording.recorder import SCENARIO_KEY, Recorder, Sample
 from laneweave.sim_bridge.road.demand import Arrival
 

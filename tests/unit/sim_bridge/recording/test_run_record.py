@@ -12,8 +12,8 @@ import pytest
 
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.wire.messages import Heartbeat, LogEvent, Name, Report
-from laneweave.sim_bridge.bodies.footprints import LeastGaps
 from laneweave.sim_bridge.bodies.motion_controller import Rung
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import LeastGaps
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord, write_summary
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission

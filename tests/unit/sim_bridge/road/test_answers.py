@@ -7,7 +7,7 @@ from attrs import evolve
 
 from laneweave.protocol.scenario.tables import Runtime
 from laneweave.protocol.wire.messages import Name
-from laneweave.sim_bridge.road.answers import LATE_SHARE, MOST_STRETCH, Answers
+from laneweave.sim_bridge.road.answers import LATE_SHARE, MAX_STRETCH, Answers
 
 RUNTIME = Runtime()
 DEADLINE_S, SILENT_S = RUNTIME.tick_deadline_s, RUNTIME.agent_silent_s
@@ -265,12 +265,12 @@ def test_ticks_get_more_time_while_answers_are_late_and_less_again() -> None:
         answers.agent_up(name)
     assert slow_ticks(answers, names, 3, late=False) == pytest.approx(DEADLINE_S)
     assert slow_ticks(answers, names, 1, late=True) == pytest.approx(1.5 * DEADLINE_S)
-    assert slow_ticks(answers, names, 30, late=True) == pytest.approx(MOST_STRETCH * DEADLINE_S)
-    assert answers.resend_s - (answers.deadline_s - MOST_STRETCH * DEADLINE_S) == pytest.approx(
-        MOST_STRETCH * RUNTIME.tick_resend_s
+    assert slow_ticks(answers, names, 30, late=True) == pytest.approx(MAX_STRETCH * DEADLINE_S)
+    assert answers.resend_s - (answers.deadline_s - MAX_STRETCH * DEADLINE_S) == pytest.approx(
+        MAX_STRETCH * RUNTIME.tick_resend_s
     )
     relaxed_s = slow_ticks(answers, names, 30, late=False)
-    assert DEADLINE_S < relaxed_s < MOST_STRETCH * DEADLINE_S
+    assert DEADLINE_S < relaxed_s < MAX_STRETCH * DEADLINE_S
     assert slow_ticks(answers, names, 200, late=False) == pytest.approx(DEADLINE_S)
 
 

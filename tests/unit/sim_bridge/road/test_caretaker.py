@@ -10,7 +10,7 @@ from attrs import evolve
 
 from laneweave.protocol.lattice import Cell, PlannedMove, territory
 from laneweave.protocol.wire.messages import Ballot, Command, Name, Plan, Prepare, VehicleState
-from laneweave.sim_bridge.road.caretaker import Caretaker
+from laneweave.sim_bridge.road.attendance import Caretaker
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
@@ -84,7 +84,7 @@ def told(caretaker: Caretaker, message: Prepare | Plan, tick: int = 0) -> Vehicl
 
 def test_shows_what_the_vehicle_does(caretaker: Caretaker, vehicle: RoadVehicle) -> None:
     drive(vehicle, range(10))
-    assert caretaker.show(10) == VehicleState(
+    assert caretaker.state(10) == VehicleState(
         vehicle=A,
         incarnation=CARETAKER,
         formation=FORMATION,
@@ -121,7 +121,7 @@ def test_promises_the_highest_ballot(caretaker: Caretaker) -> None:
 
 def test_promises_nothing_that_is_not_for_its_vehicle(caretaker: Caretaker) -> None:
     assert caretaker.on_message(evolve(prepare(), roster=(B,)), 0) is None
-    assert caretaker.show(0).promised is None
+    assert caretaker.state(0).promised is None
 
 
 def test_accepts_a_plan_in_which_its_vehicle_holds(caretaker: Caretaker) -> None:
@@ -129,7 +129,7 @@ def test_accepts_a_plan_in_which_its_vehicle_holds(caretaker: Caretaker) -> None
     state = told(caretaker, plan())
     assert (state.accepted, state.ready, state.done, state.go) == (True, True, True, False)
     assert caretaker.on_message(plan(), 0) is None
-    assert caretaker.show(1).accepted
+    assert caretaker.state(1).accepted
 
 
 def test_what_it_accepts_is_noted_as_that_of_an_agent_is(
@@ -149,7 +149,7 @@ def test_what_the_agent_before_it_accepted_is_not_its_own(vehicle: RoadVehicle) 
     vehicle.controller.accept(SECOND)
     caretaker = Caretaker(vehicle, CARETAKER, 0)
     told(caretaker, prepare())
-    assert not caretaker.show(0).accepted
+    assert not caretaker.state(0).accepted
     assert told(caretaker, plan()).accepted
     assert vehicle.controller.accepted == FIRST
 
@@ -170,7 +170,7 @@ def test_what_the_agent_before_it_accepted_is_not_its_own(vehicle: RoadVehicle) 
 def test_accepts_no_other_plan(caretaker: Caretaker, refused: Plan) -> None:
     told(caretaker, prepare())
     assert caretaker.on_message(refused, 0) is None
-    assert not caretaker.show(0).accepted
+    assert not caretaker.state(0).accepted
     assert told(caretaker, plan()).accepted  # the right one may still come
 
 
@@ -197,7 +197,7 @@ def test_never_moves_whatever_it_has_promised_and_accepted(
     told(caretaker, plan())
     for tick in range(200):
         drive(vehicle, (tick,))
-        state = caretaker.show(tick + 1)
+        state = caretaker.state(tick + 1)
         assert (state.hold_cell, state.moving, state.go, state.overdue) == (
             HOME,
             False,
@@ -218,7 +218,7 @@ def test_the_move_of_the_agent_before_it_counts_until_its_end(vehicle: RoadVehic
     ends = []
     for tick in range(5, 150):
         drive(vehicle, (tick,))
-        state = caretaker.show(tick + 1)
+        state = caretaker.state(tick + 1)
         assert state.ready != state.moving
         assert state.completed == 0
         if state.moving:
@@ -232,8 +232,8 @@ def test_a_body_that_gives_way_to_somebody_is_not_moving_again(
     caretaker: Caretaker, vehicle: RoadVehicle
 ) -> None:
     """It keeps its claim to the cell, and comes back to it."""
-    caretaker.show(0)
+    caretaker.state(0)
     state = vehicle.state
     vehicle.controller.plant._state = (state[0] - 3.0, *state[1:])
     assert vehicle.controller.moving(0)
-    assert not caretaker.show(0).moving
+    assert not caretaker.state(0).moving

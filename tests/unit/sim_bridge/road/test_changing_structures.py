@@ -12,7 +12,7 @@ from typing import Any
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.sim_bridge.core import Phase
+from laneweave.sim_bridge.core import TickPhase
 from laneweave.sim_bridge.road.demand import Arrival
 from support.bridge_bench import EXACT, Street, arrival, read_summary
 
@@ -30,7 +30,7 @@ def drive(scenario: Scenario, folder: Path, arrivals: tuple[Arrival, ...]) -> li
     def ended() -> bool:
         bridge = street.bridge
         cells[round(bridge.t_s, 1)] = {str(n): v.cell for n, v in bridge.vehicles.items()}
-        return bridge.phase is Phase.ENDED
+        return bridge.phase is TickPhase.ENDED
 
     street.run(ended)
     summary = read_summary(folder)

@@ -13,7 +13,7 @@ from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import Ballot, Command, Deed, Name, Prepare
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
-from laneweave.sim_bridge.road.caretaker import Caretaker
+from laneweave.sim_bridge.road.attendance import Caretaker
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
@@ -277,5 +277,5 @@ def test_the_caretaker_is_bound_by_what_the_agent_promised() -> None:
     controller = make_controller()
     controller.note(order(HIGH))
     caretaker = make_caretaker(controller)
-    shown = caretaker.show(0)
+    shown = caretaker.state(0)
     assert (shown.promised, shown.estate) == (HIGH, tuple(sorted(BEFORE[A])))

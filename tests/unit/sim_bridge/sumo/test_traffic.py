@@ -13,16 +13,21 @@ from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.sim_bridge.baselines.lc2013 import check_lc2013
-from laneweave.sim_bridge.sumo.network import NetworkFiles, write_network_with_exits
+from laneweave.sim_bridge.sumo.network import write_network_with_exits
 from laneweave.sim_bridge.sumo.traffic import SumoTraffic
 from laneweave.sim_bridge.sumo.world import SumoWorld
 
 
-def written(folder: Path, **tables: dict[str, Any]) -> tuple[NetworkFiles, ET.Element, ET.Element]:
-    """Return the files and what is in them."""
-    files = write_network_with_exits(parse_scenario(tables), folder)
-    network, routes = (ET.parse(path).getroot() for path in (files.network, files.routes))  # noqa: S314 (our own)
-    return files, network, routes
+def written(
+    folder: Path, **tables: dict[str, Any]
+) -> tuple[tuple[str, ...], ET.Element, ET.Element]:
+    """Return SUMO's options, the network and the routes."""
+    options = write_network_with_exits(parse_scenario(tables), folder)
+    network, routes = (
+        ET.parse(folder / name).getroot()  # noqa: S314 (our own)
+        for name in ("road.net.xml", "road.rou.xml")
+    )
+    return options, network, routes
 
 
 # --- the files --------------------------------------------------------------------------------
@@ -53,7 +58,7 @@ def test_the_parameters_are_those_of_the_scenario(tmp_path: Path) -> None:
     kind = next(routes.iter("vType")).attrib
     assert (kind["carFollowModel"], kind["laneChangeModel"]) == ("Krauss", "LC2013")
     assert [float(kind[name]) for name in ("tau", "minGap", "accel", "decel")] == [0.8, 0.5, 5, 10]
-    assert files.options[-2:] == ("--lanechange.duration", "4.000000")
+    assert files[-2:] == ("--lanechange.duration", "4.000000")
 
 
 def test_a_headway_within_a_tick_is_refused() -> None:
@@ -72,18 +77,18 @@ def traffic(tmp_path: Path) -> Iterator[SumoTraffic]:
 
 def test_who_is_offered_stands_where_it_was_offered(traffic: SumoTraffic) -> None:
     traffic.offer("v1", 2, 0, 0.6)
-    assert traffic.step() == ("v1",)
+    assert traffic.advance() == ("v1",)
     assert traffic.positions()["v1"] == pytest.approx((0.6, 8.75, 0.0, 15.0), abs=1e-6)
-    assert traffic.step() == ()
+    assert traffic.advance() == ()
     assert traffic.positions()["v1"] == pytest.approx((2.1, 8.75, 0.0, 15.0), abs=1e-6)
 
 
 def test_who_finds_no_room_waits(traffic: SumoTraffic) -> None:
     traffic.offer("v1", 0, 0, 0.0)
-    traffic.step()
+    traffic.advance()
     traffic.offer("v2", 0, 0, 0.0)
     ticks = 1
-    while "v2" not in traffic.step():
+    while "v2" not in traffic.advance():
         ticks += 1
     # 0.66 s and a body, at 15 m/s.
     assert ticks == 10
@@ -93,13 +98,13 @@ def test_who_may_not_change_lanes_stays_and_waits_at_the_end(traffic: SumoTraffi
     traffic.offer("v1", 0, 1, 0.0)
     traffic.allow_lane_changes("v1", allowed=False)
     for _ in range(900):
-        traffic.step()
+        traffic.advance()
     s_m, y_m, _, speed_mps = traffic.positions()["v1"]
     assert (y_m, speed_mps) == (1.75, 0.0)
     assert 900.0 < s_m <= 1000.0
     traffic.allow_lane_changes("v1", allowed=True)
     while s_m < 1000.0:
-        traffic.step()
+        traffic.advance()
         s_m, y_m, _, _ = traffic.positions()["v1"]
     assert y_m == pytest.approx(5.25)
 

@@ -16,7 +16,7 @@ import pytest
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import State
-from laneweave.sim_bridge.bodies.footprints import pose_of
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import pose_of
 from laneweave.sim_bridge.sumo import simulation as sumo
 from laneweave.sim_bridge.sumo.simulation import SumoUnavailableError
 from laneweave.sim_bridge.sumo.world import SumoWorld

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.errors import BadInputError
-from laneweave.sim_bridge.baselines.rule_traffic import check_rule
+from laneweave.sim_bridge.baselines.rule_based import check_rule
 from laneweave.sim_bridge.road.demand import arrivals
 from support.bridge_bench import arrival
 from support.rule_road import PAPER, RuleRoad, rule_scenario, vehicle

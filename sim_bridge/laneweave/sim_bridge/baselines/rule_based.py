@@ -1,7 +1,7 @@
-"""The rule-based method: vehicles move as the rules say, SUMO shows them.
+"""The rule-based method: vehicles move by `rules`, SUMO shows them.
 
 Along the road accelerations are constant during a tick and within the vehicle's limits. Across it a
-lane change has constant speed, no faster than the slip limit allows, or takes no time at all.
+lane change has constant speed within the slip limit, or takes no time at all.
 """
 
 from __future__ import annotations
@@ -11,17 +11,16 @@ from collections.abc import Collection, Iterable
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.sim_bridge.baselines.entrance import Entrance
-from laneweave.sim_bridge.baselines.lane_change_rules import Lanes, Rules, priority
-from laneweave.sim_bridge.baselines.vehicle import Vehicle
-from laneweave.sim_bridge.bodies.footprints import Pose
+from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle
+from laneweave.sim_bridge.baselines.rules import Lanes, Rules, priority
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 from laneweave.sim_bridge.road.world import World
 
 _ROUNDING_M = 1e-9
 
 
 class RuleTraffic:
-    """Everybody on the road, moved by the rules; see `Traffic`."""
+    """The vehicles on the road, moved by the rules; see `Traffic`."""
 
     def __init__(self, scenario: Scenario, world: World) -> None:
         """Begin with an empty road.
@@ -33,7 +32,7 @@ class RuleTraffic:
         self._world = world
         self._rules = Rules(scenario)
         self._lanes = Lanes(scenario.road.lanes)
-        self._vehicles: dict[str, Vehicle] = {}
+        self._vehicles: dict[str, ReferenceVehicle] = {}
         self._limits = scenario.vehicle
         self._rule = scenario.rule
         self._road = scenario.road
@@ -41,12 +40,12 @@ class RuleTraffic:
         self._tick_s = scenario.runtime.tick_s
 
     @property
-    def vehicles(self) -> Collection[Vehicle]:
-        """All on the road, in order of entry."""
+    def vehicles(self) -> Collection[ReferenceVehicle]:
+        """All vehicles on the road, in order of entry."""
         return self._vehicles.values()
 
-    def step(self, t_s: float, entrance: Entrance) -> list[Vehicle]:
-        """Move everybody on to `t_s`, then let enter for whom there is room."""
+    def step(self, t_s: float, entrance: Entrance) -> list[ReferenceVehicle]:
+        """Move all vehicles on to `t_s`, then admit those for which there is room."""
         slowing = self._rules.sort(self._lanes)
         leaders = self._lanes.leaders()
         for vehicle in sorted(self._vehicles.values(), key=priority):
@@ -59,21 +58,23 @@ class RuleTraffic:
         return entered
 
     def poses(self) -> dict[str, Pose]:
-        """Return where each vehicle is shown."""
+        """Return the pose of each vehicle."""
         return self._world.positions()
 
     def collisions(self) -> list[tuple[str, str]]:
-        """Return the pairs that the world takes for colliding."""
+        """Return the pairs that the world reports as colliding."""
         return self._world.collisions()
 
-    def remove(self, vehicle: Vehicle) -> None:
+    def remove(self, vehicle: ReferenceVehicle) -> None:
         """Take a vehicle off the road."""
         del self._vehicles[vehicle.name]
         self._lanes.leave(vehicle)
         self._world.remove(vehicle.name)
 
-    def _drive(self, vehicle: Vehicle, leaders: Iterable[Vehicle], *, slows_down: bool) -> None:
-        """Move a vehicle along the road by one tick; whom it follows has been moved."""
+    def _drive(
+        self, vehicle: ReferenceVehicle, leaders: Iterable[ReferenceVehicle], *, slows_down: bool
+    ) -> None:
+        """Move a vehicle along the road by one tick, after the vehicles ahead of it."""
         s_m, before_mps, tick_s = vehicle.s_m, vehicle.speed_mps, self._tick_s
         wanted_mps = min(
             self._rules.approach_speed_mps(vehicle),
@@ -88,29 +89,29 @@ class RuleTraffic:
             safe_mps = follow(s_m, before_mps, ahead.s_m, ahead.speed_mps)
             if safe_mps < wanted_mps:
                 wanted_mps = safe_mps
-        least_mps = before_mps + self._limits.min_accel_mps2 * tick_s
-        after_mps = max(wanted_mps, least_mps, 0.0)
+        min_mps = before_mps + self._limits.min_accel_mps2 * tick_s
+        after_mps = max(wanted_mps, min_mps, 0.0)
         vehicle.speed_mps = after_mps
         vehicle.s_m = s_m + 0.5 * (before_mps + after_mps) * tick_s
         vehicle.accel_mps2 = (after_mps - before_mps) / tick_s
 
-    def _shift(self, vehicle: Vehicle) -> None:
+    def _shift(self, vehicle: ReferenceVehicle) -> None:
         """Move a vehicle across the road by one tick."""
         target_m = self._centre_m(vehicle.lane)
         if vehicle.previous_lane is None:
             vehicle.y_m, vehicle.lateral_speed_mps = target_m, 0.0
             return
-        way_m = target_m - vehicle.y_m
+        distance_m = target_m - vehicle.y_m
         slip_mps = self._limits.max_slip_ratio * vehicle.speed_mps
-        most_mps = min(self._road.lane_width_m / self._rule.lane_change_s, slip_mps)
-        if abs(way_m) <= most_mps * self._tick_s + _ROUNDING_M:
+        max_mps = min(self._road.lane_width_m / self._rule.lane_change_s, slip_mps)
+        if abs(distance_m) <= max_mps * self._tick_s + _ROUNDING_M:
             vehicle.y_m, vehicle.lateral_speed_mps = target_m, 0.0
             self._lanes.end_change(vehicle)
         else:
-            vehicle.lateral_speed_mps = math.copysign(most_mps, way_m)
+            vehicle.lateral_speed_mps = math.copysign(max_mps, distance_m)
             vehicle.y_m += vehicle.lateral_speed_mps * self._tick_s
 
-    def _let_enter(self, t_s: float, entrance: Entrance) -> list[Vehicle]:
+    def _let_enter(self, t_s: float, entrance: Entrance) -> list[ReferenceVehicle]:
         entered = []
         for lane in range(self._road.lanes):
             while (arrival := entrance.first(lane)) is not None:
@@ -118,7 +119,7 @@ class RuleTraffic:
                 if s_m is None:
                     break
                 entrance.take(lane)
-                vehicle = Vehicle(
+                vehicle = ReferenceVehicle(
                     arrival=arrival,
                     entered_s=t_s - s_m / self._speed_mps,
                     s_m=s_m,
@@ -148,20 +149,20 @@ class RuleTraffic:
 
 
 def check_rule(scenario: Scenario) -> None:
-    """Check that the rules can be followed on a road.
+    """Check that the rules can be followed in a scenario.
 
     Raises:
         BadInputError: names the field that does not fit.
     """
     rule, road, speed_mps = scenario.rule, scenario.road, scenario.formation.speed_mps
-    # The speed falls in proportion to what is left of the road, seen once in a tick.
+    # The speed falls in proportion to the remaining distance, updated once per tick.
     braking_m = speed_mps**2 / -scenario.vehicle.min_accel_mps2
-    least_m = braking_m + 3.0 * speed_mps * scenario.runtime.tick_s
-    if not least_m <= rule.stop_distance_m < road.s3_m:
+    min_m = braking_m + 3.0 * speed_mps * scenario.runtime.tick_s
+    if not min_m <= rule.stop_distance_m < road.s3_m:
         raise BadInputError(
             "rule.stop_distance_m",
             rule.stop_distance_m,
-            f"at least {least_m:g}, to stop there from formation.speed_mps = {speed_mps:g}, and "
+            f"at least {min_m:g}, to stop there from formation.speed_mps = {speed_mps:g}, and "
             f"less than road.s3_m = {road.s3_m:g}",
         )
     changes_m = (road.lanes - 1) * speed_mps * rule.lane_change_s

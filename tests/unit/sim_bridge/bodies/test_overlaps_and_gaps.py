@@ -15,8 +15,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laneweave.protocol.wire.messages import Neighbour
-from laneweave.sim_bridge.bodies import footprints as overlap
-from laneweave.sim_bridge.bodies.footprints import Around, Bodies, LeastGaps, Pose, corners, pose_of
+from laneweave.sim_bridge.bodies import overlaps_and_gaps as overlap
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import (
+    Around,
+    Bodies,
+    LeastGaps,
+    Pose,
+    corners,
+    pose_of,
+)
 
 LENGTH_M, WIDTH_M, LANE_M = 5.0, 1.8, 3.5
 

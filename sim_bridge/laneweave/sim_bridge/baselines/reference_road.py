@@ -1,0 +1,233 @@
+"""The road of a reference method, tick by tick: demand, entrance, traffic, measurement, record."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Collection, Iterator, Mapping
+from typing import Protocol
+
+from attrs import define
+
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.vehicle.motion import State
+from laneweave.protocol.wire.messages import RoadClock
+from laneweave.sim_bridge.bodies.motion_controller import Rung
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, Pose
+from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
+from laneweave.sim_bridge.road.demand import Arrival, arrivals
+from laneweave.sim_bridge.road.entry import TIME_TOLERANCE_S
+
+
+@define(eq=False)
+class ReferenceVehicle:
+    """A vehicle on the road: position and lane, without formation and motion controller."""
+
+    arrival: Arrival
+    entered_s: float
+    """Road time at which its front passed s = 0."""
+    s_m: float
+    """Position of the front bumper."""
+    speed_mps: float
+    y_m: float
+    """Position of the body's centre."""
+    lane: int
+    """Its lane; during a lane change the new one."""
+    accel_mps2: float = 0.0
+    lateral_speed_mps: float = 0.0
+    previous_lane: int | None = None
+    """During a lane change the old lane."""
+    formation: None = None
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return self.arrival.vehicle
+
+    @property
+    def preferred_lane(self) -> int:
+        """Lane on which it wants to leave the road."""
+        return self.arrival.preferred_lane
+
+    @property
+    def finished(self) -> bool:
+        """Whether all its lane changes are finished."""
+        return self.lane == self.preferred_lane and self.previous_lane is None
+
+    @property
+    def state(self) -> State:
+        """(s m, v m/s, a m/s2, y m, v_y m/s, a_y m/s2)."""
+        return (
+            self.s_m,
+            self.speed_mps,
+            self.accel_mps2,
+            self.y_m,
+            self.lateral_speed_mps,
+            0.0,
+        )
+
+    @property
+    def cell(self) -> tuple[None, int]:
+        """(None, lane): it is in no column."""
+        return None, self.lane
+
+    @property
+    def rung_ticks(self) -> Mapping[Rung, int]:
+        """Empty: it has no motion controller."""
+        return {}
+
+
+class Entrance:
+    """Queues of vehicles that wait to enter, by lane, in order of arrival."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Begin with empty queues."""
+        self._queues: list[deque[Arrival]] = [deque() for _ in range(scenario.road.lanes)]
+        self._speed_mps = scenario.formation.speed_mps
+        self._tick_s = scenario.runtime.tick_s
+
+    def __len__(self) -> int:
+        """Number of waiting vehicles."""
+        return sum(map(len, self._queues))
+
+    def queue(self, arrival: Arrival) -> None:
+        """Add a vehicle to the queue of its lane."""
+        self._queues[arrival.lane].append(arrival)
+
+    def first(self, lane: int) -> Arrival | None:
+        """Return the next vehicle of a lane."""
+        return self._queues[lane][0] if self._queues[lane] else None
+
+    def firsts(self) -> Iterator[Arrival]:
+        """Yield the next vehicle of each lane."""
+        for queue in self._queues:
+            if queue:
+                yield queue[0]
+
+    def furthest_m(self, arrival: Arrival, t_s: float) -> float:
+        """Return how far beyond s = 0 a vehicle can be at the tick at which it enters.
+
+        Vehicles arrive between ticks: one that does not wait has driven at v_F since its arrival.
+        """
+        return self._speed_mps * min(max(t_s - arrival.t_s, 0.0), self._tick_s)
+
+    def take(self, lane: int) -> Arrival:
+        """Remove and return the next vehicle of a lane."""
+        return self._queues[lane].popleft()
+
+
+class Traffic(Protocol):
+    """The vehicles on the road, and the method that moves them."""
+
+    @property
+    def vehicles(self) -> Collection[ReferenceVehicle]:
+        """All vehicles on the road."""
+
+    def step(self, t_s: float, entrance: Entrance) -> list[ReferenceVehicle]:
+        """Move all vehicles on to `t_s`; return those that entered from the entrance."""
+
+    def poses(self) -> dict[str, Pose]:
+        """Return the pose of each vehicle."""
+
+    def collisions(self) -> list[tuple[str, str]]:
+        """Return the pairs that SUMO reports as colliding."""
+
+    def remove(self, vehicle: ReferenceVehicle) -> None:
+        """Take a vehicle off the road."""
+
+
+class ReferenceRoad:
+    """The road of a reference method; `advance` it until it has ended."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        traffic: Traffic,
+        record: RunRecord,
+        stopwatch: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        """Set the road up before the first tick.
+
+        Args:
+            scenario: road, demand, vehicles.
+            traffic: an empty road.
+            record: receives the measurements.
+            stopwatch: measures the duration of ticks [s]; has no other effect.
+        """
+        self.tick = 0
+        self._scenario = scenario
+        self._traffic = traffic
+        self._record = record
+        self._stopwatch = stopwatch
+        self._arrivals = arrivals(scenario)
+        self._demanded = 0
+        self._left = 0
+        self._entrance = Entrance(scenario)
+
+    @property
+    def t_s(self) -> float:
+        """Road time."""
+        return self.tick * self._scenario.runtime.tick_s
+
+    @property
+    def ending(self) -> Ending | None:
+        """Why the run has ended; None: it has not."""
+        if self._left == len(self._arrivals):
+            return Ending.COMPLETE
+        if self.t_s >= self._scenario.runtime.max_road_s:
+            return Ending.LIMIT
+        return None
+
+    @property
+    def clock(self) -> RoadClock:
+        """Counts and road time, for the progress bar."""
+        on_road = len(self._traffic.vehicles)
+        return RoadClock(
+            tick=self.tick,
+            t_s=self.t_s,
+            demanded=self._demanded,
+            entered=self._left + on_road,
+            on_road=on_road,
+            left=self._left,
+            ended=self.ending is not None,
+        )
+
+    def advance(self) -> None:
+        """Advance by one tick."""
+        began = self._stopwatch()
+        self.tick += 1
+        self._demand()
+        for vehicle in self._traffic.step(self.t_s, self._entrance):
+            self._record.on_entered(vehicle)
+        self._measure()
+        self._let_leave()
+        self._record.on_tick(self.t_s, len(self._traffic.vehicles), self._stopwatch() - began)
+
+    def _demand(self) -> None:
+        """Queue the vehicles that arrived since the last tick."""
+        while self._demanded < len(self._arrivals):
+            arrival = self._arrivals[self._demanded]
+            if arrival.t_s > self.t_s + TIME_TOLERANCE_S:
+                return
+            self._record.on_demanded(arrival)
+            self._entrance.queue(arrival)
+            self._demanded += 1
+
+    def _measure(self) -> None:
+        """Record positions, overlaps and gaps."""
+        size = self._scenario.vehicle
+        bodies = Bodies(self._traffic.poses(), size.length_m, size.width_m)
+        self._record.on_shown(
+            self.t_s,
+            self._traffic.vehicles,
+            overlaps=bodies.overlapping_pairs(),
+            collisions=self._traffic.collisions(),
+            gaps=bodies.least_gaps(),
+        )
+
+    def _let_leave(self) -> None:
+        length_m = self._scenario.road.length_m
+        for vehicle in [each for each in self._traffic.vehicles if each.s_m >= length_m]:
+            self._traffic.remove(vehicle)
+            self._left += 1
+            self._record.on_left(vehicle, self.t_s, attended=True)

@@ -1,0 +1,244 @@
+"""The rules of the rule-based method (paper, Section 5.2.2; decision 20 says how they are read).
+
+Rule 1. Vehicles drive at v_F on the lane on which they are in S1 and S2, and in S3 once they are
+        on their preferred lane.
+Rule 2. A vehicle changes to the next lane towards the preferred one when the gaps there, to the
+        vehicle ahead and to the vehicle behind, satisfy the constant time headway policy.
+Rule 3. When a gap is too small, the vehicle with lower priority slows down: the nearer to the end,
+        the slower.
+
+Everything here is pure: positions go in, lane changes and speeds come out.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.sim_bridge.baselines.reference_road import ReferenceVehicle
+
+
+def priority(vehicle: ReferenceVehicle) -> tuple[float, str]:
+    """Return the sort key: vehicles closer to the end come first.
+
+    The name breaks ties. Without it three vehicles side by side would wait for each other forever.
+    """
+    return -vehicle.s_m, vehicle.name
+
+
+class Following:
+    """Car following: gaps and speeds behind a vehicle ahead.
+
+    Positions are those of front bumpers. A follower knows where the vehicle ahead will be at the
+    end of the tick, since speeds are chosen from the front to the back. Both move at constant
+    acceleration during a tick.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Take the parameters from the tables `rule` and `vehicle`."""
+        rule, vehicle = scenario.rule, scenario.vehicle
+        self._standstill_m = rule.standstill_gap_m
+        if rule.gap == "net":
+            self._standstill_m += vehicle.length_m
+        self._headway_s = rule.headway_s
+        self._min_distance_m = vehicle.length_m + rule.min_gap_m
+        self._braking_mps2 = -vehicle.min_accel_mps2
+        self._tick_s = scenario.runtime.tick_s
+
+    def gap_m(self, speed_mps: float) -> float:
+        """Return the required gap d_R = d_0 + v tau, front to front.
+
+        Args:
+            speed_mps: v, of the follower.
+        """
+        return max(self._standstill_m + self._headway_s * speed_mps, self._min_distance_m)
+
+    def suits(self, s_m: float, speed_mps: float, ahead_s_m: float, ahead_speed_mps: float) -> bool:
+        """Return whether a vehicle may begin to follow: the gap is d_R, with room to brake.
+
+        d_R alone is not enough behind a much slower vehicle.
+        """
+        distance_m = ahead_s_m - s_m
+        if distance_m < self.gap_m(speed_mps):
+            return False
+        stopping_m = (speed_mps**2 - ahead_speed_mps**2) / (2.0 * self._braking_mps2)
+        return stopping_m <= distance_m - self._min_distance_m
+
+    def speed_mps(
+        self, s_m: float, speed_mps: float, ahead_s_m: float, ahead_speed_mps: float
+    ) -> float:
+        """Return the highest safe speed of a follower at the end of a tick.
+
+        It is the lower of two speeds v', reached over the distance (v + v') / 2 dt:
+
+        - the speed at which the gap is d_R at the end of the tick. Where all vehicles keep d_R,
+          speeds follow the speed ahead as a first-order lag of tau does, without harder braking;
+        - the speed from which the follower can still stop behind the vehicle ahead if both brake
+          as hard as they can from then on. This is Krauss' condition for a follower that reacts
+          within the tick.
+
+        Args:
+            s_m: follower, at the beginning of the tick.
+            speed_mps: its speed then.
+            ahead_s_m: vehicle ahead, at the end of the tick.
+            ahead_speed_mps: its speed then.
+        """
+        half_s, braking = 0.5 * self._tick_s, self._braking_mps2
+        room_m = ahead_s_m - s_m - speed_mps * half_s
+        keeping = (room_m - self._standstill_m) / (self._headway_s + half_s)
+        braking_room_m = room_m - self._min_distance_m + ahead_speed_mps**2 / (2.0 * braking)
+        if keeping <= 0.0 or braking_room_m <= 0.0:
+            return 0.0
+        slack = braking * half_s
+        return min(keeping, math.sqrt(slack * slack + 2.0 * braking * braking_room_m) - slack)
+
+
+class Lanes:
+    """The vehicles on each lane, by priority; a vehicle that changes lanes is on two."""
+
+    def __init__(self, lanes: int) -> None:
+        """Begin with an empty road."""
+        self._lanes: list[list[ReferenceVehicle]] = [[] for _ in range(lanes)]
+
+    def __getitem__(self, lane: int) -> Sequence[ReferenceVehicle]:
+        """Return the vehicles on a lane, from front to back."""
+        return self._lanes[lane]
+
+    def __iter__(self) -> Iterator[Sequence[ReferenceVehicle]]:
+        """Yield lane by lane."""
+        return iter(self._lanes)
+
+    def around(
+        self, vehicle: ReferenceVehicle, lane: int
+    ) -> tuple[ReferenceVehicle | None, ReferenceVehicle | None]:
+        """Return the next vehicles ahead and behind on a lane on which a vehicle is not."""
+        there = self._lanes[lane]
+        place = bisect_left(there, priority(vehicle), key=priority)
+        return (
+            there[place - 1] if place > 0 else None,
+            there[place] if place < len(there) else None,
+        )
+
+    def enter(self, vehicle: ReferenceVehicle, lane: int) -> None:
+        """Add a vehicle to a lane, at its position along the road."""
+        there = self._lanes[lane]
+        there.insert(bisect_left(there, priority(vehicle), key=priority), vehicle)
+
+    def leave(self, vehicle: ReferenceVehicle) -> None:
+        """Take a vehicle off the road."""
+        self.end_change(vehicle)
+        self._lanes[vehicle.lane].remove(vehicle)
+
+    def begin_change(self, vehicle: ReferenceVehicle, lane: int) -> None:
+        """Begin a lane change; the vehicle is on both lanes until it ends."""
+        self.enter(vehicle, lane)
+        vehicle.previous_lane, vehicle.lane = vehicle.lane, lane
+
+    def end_change(self, vehicle: ReferenceVehicle) -> None:
+        """Take a vehicle off its previous lane, if it is still there."""
+        if vehicle.previous_lane is not None:
+            self._lanes[vehicle.previous_lane].remove(vehicle)
+            vehicle.previous_lane = None
+
+    def leaders(self) -> dict[ReferenceVehicle, list[ReferenceVehicle]]:
+        """Return the next vehicles ahead of each vehicle, on each lane on which it is.
+
+        A vehicle that changes lanes follows two: the nearer one need not be the slower one.
+        """
+        found: dict[ReferenceVehicle, list[ReferenceVehicle]] = {}
+        for lane in self._lanes:
+            for ahead, vehicle in pairwise(lane):
+                found.setdefault(vehicle, []).append(ahead)
+        return found
+
+
+class Rules:
+    """Lane changes and speeds by rules 1 to 3."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Take the parameters from the tables `rule`, `road`, `formation` and `vehicle`."""
+        self.following = Following(scenario)
+        rule, road = scenario.rule, scenario.road
+        self._sorting_start_m = road.sorting_start_m
+        self._sorting_m = road.s3_m
+        self._end_m = road.length_m
+        self._stop_m = rule.stop_distance_m
+        self._speed_mps = scenario.formation.speed_mps
+        self._all_yield = rule.yielding == "all"
+        self._change_m = self._speed_mps * rule.lane_change_s
+
+    def sort(self, lanes: Lanes) -> set[ReferenceVehicle]:
+        """Apply rules 2 and 3 to every vehicle that is not on its preferred lane, by priority.
+
+        A vehicle that begins a lane change is on the new lane at once, so no other takes its gap.
+
+        Returns:
+            The vehicles that slow down, for another vehicle or to find a gap behind it.
+        """
+        unsorted = sorted(
+            {
+                vehicle
+                for lane in lanes
+                for vehicle in lane
+                if vehicle.lane != vehicle.preferred_lane
+                and vehicle.previous_lane is None
+                and vehicle.s_m >= self._sorting_start_m
+            },
+            key=priority,
+        )
+        slowing: set[ReferenceVehicle] = set()
+        for vehicle in unsorted:
+            lane = self.next_lane(vehicle)
+            hindered = list(self._hindered(vehicle, *lanes.around(vehicle, lane)))
+            if not hindered:
+                lanes.begin_change(vehicle, lane)
+                if self._change_m == 0.0:
+                    lanes.end_change(vehicle)
+            slowing.update(hindered)
+        return slowing
+
+    def next_lane(self, vehicle: ReferenceVehicle) -> int:
+        """Return the next lane towards the preferred one."""
+        return vehicle.lane + (1 if vehicle.preferred_lane > vehicle.lane else -1)
+
+    def _hindered(
+        self,
+        vehicle: ReferenceVehicle,
+        ahead: ReferenceVehicle | None,
+        behind: ReferenceVehicle | None,
+    ) -> Iterator[ReferenceVehicle]:
+        """Yield the vehicles that must slow down before a vehicle can change lanes."""
+        suits = self.following.suits
+        if ahead is not None and not suits(
+            vehicle.s_m, vehicle.speed_mps, ahead.s_m, ahead.speed_mps
+        ):
+            yield vehicle
+        if behind is not None and not suits(
+            behind.s_m, behind.speed_mps, vehicle.s_m, vehicle.speed_mps
+        ):
+            # By rule 1 a vehicle that has finished continues at v_F: then the other one waits. One
+            # that is still changing has not: it may be blocked on its old lane by the other one.
+            yields = self._all_yield or not behind.finished
+            yield behind if yields else vehicle
+
+    def slow_speed_mps(self, s_m: float) -> float:
+        """Return v_slow, the speed of a vehicle that slows down for others (rule 3)."""
+        beyond_stop_m = self._end_m - s_m - self._stop_m
+        share = beyond_stop_m / (self._sorting_m - self._stop_m)
+        return self._speed_mps * min(max(share, 0.0), 1.0)
+
+    def approach_speed_mps(self, vehicle: ReferenceVehicle) -> float:
+        """Return the maximum speed near the end of the road: v_F on the preferred lane.
+
+        On another lane a vehicle leaves room for its remaining lane changes and slows down in
+        proportion over the distance d_stop before that point. So it is slow when it is near, a
+        vehicle beside it that yields stops farther behind, and the gap opens.
+        """
+        to_come = abs(vehicle.preferred_lane - vehicle.lane)
+        if to_come == 0:
+            return self._speed_mps
+        left_m = self._end_m - vehicle.s_m - to_come * self._change_m
+        return self._speed_mps * min(max(left_m / self._stop_m, 0.0), 1.0)
