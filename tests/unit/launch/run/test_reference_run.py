@@ -16,7 +16,7 @@ from laneweave.launch.run.reference_run import ReferenceRun, check_reference
 from laneweave.protocol.config.loading import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.sim_bridge.baselines import run as road
+from laneweave.sim_bridge.baselines import reference_road as road
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
 from laneweave.sim_bridge.road.demand import Arrival
