@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from attrs import define, field
@@ -11,11 +12,13 @@ from attrs import define, field
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime import message_faults as faulty_core
 from laneweave.protocol.runtime.message_faults import FaultyCore, MessageRule, bare
+from laneweave.protocol.runtime.metrics import RouterMetrics
 from laneweave.protocol.runtime.node import (
     Arrived,
     Asked,
     Effect,
     Event,
+    Node,
     PeerDown,
     PeerUp,
     Send,
@@ -32,6 +35,7 @@ from laneweave.protocol.wire.topics import (
     HEARTBEAT,
     REPORT,
     STATE,
+    Keys,
     Topic,
 )
 
@@ -57,6 +61,19 @@ class Listener:
     @property
     def numbers(self) -> list[int]:
         return [event.message for event, _ in self.heard if isinstance(event, Arrived)]
+
+
+def test_metrics_of_the_wrapped_core_are_visible() -> None:
+    @define
+    class Counting(Listener):
+        @property
+        def metrics(self) -> list[RouterMetrics]:
+            return [RouterMetrics(7)]
+
+    core = FaultyCore(Counting(), (), Board(), receiver="vehicle", seed="1")
+    node = Node(core, Mock(), Keys("test"), lambda _: None, Name("1"))
+    assert node.metrics()[1:] == [RouterMetrics(7)]
+    assert list(faulty()[0].metrics) == []
 
 
 def arrived(number: int, topic: Topic = STATE, **parameters: str) -> Arrived:

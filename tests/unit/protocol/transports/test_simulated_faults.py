@@ -18,16 +18,17 @@ from laneweave.protocol.runtime.node import (
     Event,
     Listen,
     PeerDown,
+    Serve,
     Started,
     Wakeup,
     Watch,
 )
-from laneweave.protocol.runtime.transport import LinkDown, LinkUp
+from laneweave.protocol.runtime.transport import Answer, LinkDown, LinkUp
 from laneweave.protocol.transports.simulated.member import INJECTED_FAILURE
 from laneweave.protocol.transports.simulated.network import REJOIN_S, SimulatedNetwork
 from laneweave.protocol.transports.simulated.virtual_time import Clock, Conditions, Item
 from laneweave.protocol.wire.codec import encode
-from laneweave.protocol.wire.topics import HEARTBEAT, VEHICLE_ALIVE
+from laneweave.protocol.wire.topics import HEARTBEAT, SERVICE, VEHICLE_ALIVE, Keys
 from support.node_recorder import (
     CALM,
     REALM,
@@ -477,3 +478,29 @@ def test_a_node_may_end_when_it_loses_the_router() -> None:
     network.restore_router()
     network.run(3.0)
     assert sorted(cores["a"].tokens[4:]) == ["+a", "+c", "+d"]
+
+
+# --- questions --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fault", ["kill", "disconnect", "pause", "stop"])
+def test_a_question_is_settled_when_no_server_can_answer_it(fault: str) -> None:
+    network = SimulatedNetwork(1, Conditions(lease_s=0.5))
+    for name in "ab":
+        network.add(name, Recorder(at_start(Serve(SERVICE))), REALM)
+    network.run(0.1)
+    answers: list[Answer | None] = []
+    network.ask(Keys(REALM).key(SERVICE), b"?", answers.append)
+    network.run(0.2)
+    getattr(network, fault)("a")
+    network.run(1.0)
+    assert answers == []
+    getattr(network, fault)("b")
+    network.run(2.0)
+    assert answers == [None]
+    if fault == "pause":
+        # An answer that comes after the lease is ignored.
+        network.resume("a")
+        network.node("a")._transport.answer(1, b"!", ok=True)
+        network.run(3.0)
+        assert answers == [None]

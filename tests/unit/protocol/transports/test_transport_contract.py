@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Protocol
+from unittest.mock import Mock
 
 import pytest
 from attrs import define, field
@@ -119,7 +120,7 @@ class Bed(Protocol):
         """Add a participant."""
 
     def join_process(self, name: str) -> None:
-        """Add a participant with a process of its own that shows the token of its name."""
+        """Add a participant in its own process that serves and shows the token of its name."""
 
     def kill(self, name: str) -> None:
         """Kill such a process, without a word."""
@@ -186,7 +187,7 @@ class SimulatedBed:
         return party
 
     def join_process(self, name: str) -> None:
-        core = Recorder(first=(Announce(VEHICLE_ALIVE, {"vehicle": name}),))
+        core = Recorder(first=(Serve(SERVICE), Announce(VEHICLE_ALIVE, {"vehicle": name})))
         self.network.add(name, core, REALM)
         self.network.run(self.network.now_s)
 
@@ -224,8 +225,9 @@ run_router([sys.argv[1]], float(sys.argv[2]), ready=lambda: print("ready", flush
 MEMBER = """
 import sys, time
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
-from laneweave.protocol.security.rights import Access
+from laneweave.protocol.security.access import Access
 transport = ZenohTransport(Access(sys.argv[1], lease_s=float(sys.argv[2])), lambda delivery: None)
+transport.serve(sys.argv[4])
 transport.announce(sys.argv[3])
 print("ready", flush=True)
 time.sleep(60)
@@ -294,7 +296,7 @@ class ZenohBed:
 
     def join_process(self, name: str) -> None:
         self._processes[name] = start_process(
-            MEMBER, self.router.endpoint, str(LEASE_S), token_key(name)
+            MEMBER, self.router.endpoint, str(LEASE_S), token_key(name), PLAN_SERVICE
         )
 
     def kill(self, name: str) -> None:
@@ -666,6 +668,16 @@ def test_a_question_that_all_leave_is_answered_by_nobody(bed: Bed) -> None:
     assert answers == [None]
 
 
+def test_a_question_is_settled_when_its_only_server_is_killed(bed: Bed) -> None:
+    bed.join_process("server")
+    answers = bed.ask(b"?")
+    bed.quiet()
+    assert answers == []
+    bed.kill("server")
+    bed.until(lambda: answers)
+    assert answers == [None]
+
+
 # --- the end ----------------------------------------------------------------------------------
 
 
@@ -727,6 +739,19 @@ def test_without_the_link_everybody_vanishes_and_comes_back(breakable_bed: Bed) 
 
 
 # --- what Zenoh alone has ---------------------------------------------------------------------
+
+
+def test_after_close_nothing_of_the_closed_session_is_used(router: Router) -> None:
+    transport = ZenohTransport(Access(router.endpoint), lambda _: None)
+    transport.subscribe(BEATS)
+    transport.announce(token_key("a"))
+    declarations = [Mock(), Mock()]
+    transport._subscriptions[BEATS], transport._tokens[token_key("a")] = declarations
+    transport.close()
+    transport.unsubscribe(BEATS)
+    transport.withdraw(token_key("a"))
+    for declaration in declarations:
+        declaration.undeclare.assert_not_called()
 
 
 @pytest.mark.parametrize(

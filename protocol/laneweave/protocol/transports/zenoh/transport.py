@@ -248,6 +248,9 @@ class ZenohTransport:
         """Close the session; without it a callback subscriber hangs the interpreter at exit."""
         if not self._closed:
             self._closed = True
+            # Closing undeclares everything; later calls must not touch the closed session.
+            self._subscriptions.clear()
+            self._tokens.clear()
             self._session.close()  # type: ignore[no-untyped-call]
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
