@@ -7,12 +7,15 @@ the case study is solved are drawn, too.
 
 from __future__ import annotations
 
+import ast
+import inspect
 import json
 import re
 import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 if __name__ == "__main__":  # run as a program: as `pythonpath` in pyproject.toml
@@ -40,6 +43,8 @@ from laneweave.protocol.runtime.metrics import (
 from laneweave.protocol.security.rights import rights_table
 from laneweave.protocol.state_machine import markdown_table, mermaid_diagram
 from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES, Stage
+from laneweave.protocol.wire import events, messages
+from laneweave.protocol.wire.topics import TOPICS
 from laneweave.sim_bridge.metrics import BridgeMetrics
 from support.planted_bugs import BUGS
 
@@ -83,6 +88,58 @@ SNAPSHOTS: dict[type[MetricsSnapshot], str] = {
 
 def _diagram(text: str) -> str:
     return f"```mermaid\n{text}\n```"
+
+
+def _topics() -> str:
+    """Return the table of topics."""
+    lines = [
+        "| Topic | Key | Message | Sender | Quality | Readers | Remark |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for topic in TOPICS:
+        message = "none" if topic.kind is None else f"`{topic.kind.__name__}`"
+        sender = f"{topic.sender}, {topic.deputy} in its place" if topic.deputy else topic.sender
+        own = [f"own {topic.addressee}"] if topic.addressee else []
+        lines.append(
+            f"| `{topic.name}` | `{topic.pattern}` | {message} | {sender} "
+            f"| `{topic.quality.name}` | {', '.join([*own, *topic.readers])} | {topic.remark} |"
+        )
+    return "\n".join(lines)
+
+
+def _messages() -> str:
+    """Return a section for each class of the messages: its docstring, and a table of its fields."""
+    sections = []
+    for node in _syntax(messages).body:
+        if isinstance(node, ast.ClassDef):
+            lines = [f"### {node.name}\n\n{ast.get_docstring(node)}\n"]
+            lines += ["| Field | Meaning |", "|---|---|"]
+            lines += [f"| `{name}` | {text} |" for name, text in _documented(node)]
+            sections.append("\n".join(lines))
+    return "\n\n".join(sections)
+
+
+def _events() -> str:
+    """Return the table of events that roles log."""
+    lines = ["| Event | Meaning |", "|---|---|"]
+    for name, text in _documented(_syntax(events)):
+        if isinstance(getattr(events, name), str):
+            lines.append(f"| `{getattr(events, name)}` | {text} |")
+    return "\n".join(lines)
+
+
+def _syntax(module: ModuleType) -> ast.Module:
+    return ast.parse(inspect.getsource(module))
+
+
+def _documented(node: ast.Module | ast.ClassDef) -> Iterator[tuple[str, str]]:
+    """Yield the annotated names of a module or class, each with the docstring below it."""
+    for statement, below in zip(node.body, [*node.body[1:], None], strict=True):
+        if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
+            text = ""
+            if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
+                text = " ".join(str(below.value.value).split()).removesuffix(".")
+            yield statement.target.id, text
 
 
 def _planted_bugs() -> str:
@@ -367,6 +424,9 @@ def _workers(run: dict[str, Any]) -> str:
 def parts() -> dict[str, str]:
     """Return each generated part by its name."""
     return {
+        "topics": _topics(),
+        "messages": _messages(),
+        "events": _events(),
         "vehicle rules": markdown_table(VEHICLE_RULES),
         "vehicle phases": _diagram(mermaid_diagram(VEHICLE_RULES, Stage.FREE)),
         "leader rules": markdown_table(LEADER_RULES),

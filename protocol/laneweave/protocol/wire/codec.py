@@ -10,7 +10,6 @@ import math
 from typing import Any
 
 import msgpack
-from attrs import fields
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.structuring import first_problem, strict_converter
@@ -25,7 +24,7 @@ KINDS: dict[str, type] = {
 }
 _MIN_INT, _MAX_INT = -(2**63), 2**63 - 1
 _MIN_FLOAT, _MAX_FLOAT = -1e12, 1e12
-"""Far beyond every position, speed and time, and small enough to calculate with."""
+"""Beyond every position, speed and time, and small enough for calculations."""
 _MAX_DEPTH = 8
 
 
@@ -101,7 +100,7 @@ _DETAILED = _make_converter(detailed=True)
 
 
 def warm_up() -> None:
-    """Generate the code for all messages, as the first one of each kind would."""
+    """Generate the conversion code of all message classes in advance."""
     for kind in KINDS.values():
         _FAST.get_structure_hook(kind)
         _FAST.get_unstructure_hook(kind)
@@ -119,16 +118,16 @@ def decode(payload: bytes, expected: type | None = None) -> object:
     """Return the message in `payload`.
 
     Args:
-        payload: any bytes.
-        expected: the message class that this key carries; None: any.
+        payload: arbitrary bytes.
+        expected: message class of the key; None: any.
 
     Raises:
-        BadInputError: the bytes are not exactly one well-formed message of the expected kind.
+        BadInputError: the bytes are not one well-formed message of the expected kind.
     """
     kind, body = _open_envelope(payload, expected)
     try:
         return _FAST.structure(body, kind)
-    except Exception:  # noqa: BLE001 (whatever it was, the slow converter names the field)
+    except Exception:  # noqa: BLE001 (the slow converter names the field)
         return _explain(body, kind)
 
 
@@ -158,8 +157,3 @@ def _explain(body: dict[str, Any], kind: type) -> object:
         return _DETAILED.structure(body, kind)
     except Exception as error:
         raise first_problem(error).within(kind.__name__) from error
-
-
-def field_names(kind: type) -> tuple[str, ...]:
-    """Return the field names of a message class, for the documentation."""
-    return tuple(attribute.name for attribute in fields(kind))

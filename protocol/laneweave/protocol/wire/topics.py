@@ -90,6 +90,8 @@ class Topic:
     deputy: Party | None = None
     """Party that may send in place of any sender."""
     exchange: Exchange = Exchange.MESSAGES
+    remark: str = ""
+    """For the table of docs/PROTOCOL.md."""
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -104,6 +106,7 @@ CLOCK = Topic(
 CENSUS = Topic(
     "census", "census", messages.Census, Party.BRIDGE, Quality.LATEST,
     readers=(Party.COORDINATOR, Party.FLEET, Party.OBSERVER),
+    remark="of fleets those with a shard",
 )  # fmt: skip
 SENSE = Topic(
     "sense", "sense/{vehicle}", messages.Sense, Party.BRIDGE, Quality.LOCKSTEP,
@@ -118,18 +121,22 @@ COMMAND = Topic(
 STATE = Topic(
     "state", "state/{formation}/{vehicle}", messages.VehicleState, Party.VEHICLE, Quality.LATEST,
     readers=(Party.COORDINATOR, Party.VEHICLE, Party.OBSERVER), deputy=Party.BRIDGE,
+    remark="of coordinators the leader; of vehicles those of the formation that wait",
 )  # fmt: skip
 MOTION = Topic(
     "motion", "motion/{stretch}/{vehicle}", messages.Motion, Party.VEHICLE, Quality.LATEST,
     readers=(Party.VEHICLE, Party.OBSERVER),
+    remark="vehicles in this stretch of columns and in both adjacent ones",
 )  # fmt: skip
 PREPARE = Topic(
     "prepare", "prepare/{vehicle}", messages.Prepare, Party.COORDINATOR, Quality.ASSURED,
     addressee=Party.VEHICLE, readers=(Party.BRIDGE,),
+    remark="the bridge for vehicles without an agent",
 )  # fmt: skip
 PLAN = Topic(
     "plan", "plan/{vehicle}", messages.Plan, Party.COORDINATOR, Quality.ASSURED,
     addressee=Party.VEHICLE, readers=(Party.BRIDGE, Party.OBSERVER),
+    remark="the bridge for vehicles without an agent",
 )  # fmt: skip
 HEARTBEAT = Topic(
     "heartbeat", "heartbeat/{coordinator}", messages.Heartbeat, Party.COORDINATOR, Quality.LATEST,
@@ -138,10 +145,12 @@ HEARTBEAT = Topic(
 REPORT = Topic(
     "report", "report/{role}/{name}", messages.Report, ANY_SENDER, Quality.ASSURED,
     readers=(Party.BRIDGE, Party.OBSERVER),
+    remark="the bridge's recorder",
 )  # fmt: skip
 EVENT = Topic(
     "event", "event/{role}/{name}", messages.LogEvent, ANY_SENDER, Quality.ASSURED,
     readers=(Party.BRIDGE, Party.OBSERVER),
+    remark="the bridge's recorder; so far only coordinators send events",
 )  # fmt: skip
 COORDINATOR_ALIVE = Topic(
     "coordinator-alive", "alive/coordinator/{coordinator}/{incarnation}", None, Party.COORDINATOR,
@@ -158,6 +167,7 @@ BRIDGE_ALIVE = Topic(
 SERVICE = Topic(
     "service", "service/plan", None, Party.CLIENT, Quality.ASSURED,
     readers=(Party.COORDINATOR,), exchange=Exchange.QUESTIONS,
+    remark="a query",
 )  # fmt: skip
 
 TOPICS = (

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.validators import NAME_PATTERN
-from laneweave.protocol.wire.codec import KINDS, MAX_BYTES, VERSION, decode, encode, field_names
+from laneweave.protocol.wire.codec import KINDS, MAX_BYTES, VERSION, decode, encode
 from laneweave.protocol.wire.messages import (
     Announcement,
     Ballot,
@@ -202,16 +202,12 @@ def accepts_only_well_typed(payload: bytes) -> bool:
 # --- round trip -------------------------------------------------------------------------------
 
 
-def test_there_is_a_sample_of_every_kind() -> None:
-    assert {type(sample) for sample in SAMPLES} == set(KINDS.values())
-
-
 @pytest.mark.parametrize("sample", SAMPLES, ids=lambda sample: type(sample).__name__)
 def test_a_sample_comes_back_equal_and_well_typed(sample: object) -> None:
     decoded = decode(encode(sample), type(sample))
     assert decoded == sample
     assert is_well_typed(decoded, type(sample))
-    assert set(envelope(sample)[2]) == set(field_names(type(sample)))
+    assert set(envelope(sample)[2]) == set(attrs.fields_dict(type(sample)))
 
 
 @pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
@@ -297,7 +293,7 @@ def test_bytes_after_the_message_are_refused() -> None:
 FIELDS = [
     pytest.param(sample, name, id=f"{type(sample).__name__}.{name}")
     for sample in SAMPLES
-    for name in field_names(type(sample))
+    for name in attrs.fields_dict(type(sample))
 ]
 NUMBERS_NOT_ALLOWED = (math.nan, math.inf, -math.inf, 1.1e12, -1e300)
 NOT_INTS: tuple[Any, ...] = (True, False, 1.0, "1", None, [], {}, b"1", 2**63, 2**64 - 1, -math.inf)
