@@ -47,7 +47,7 @@ from laneweave.sim_bridge.recording.run_record import RunRecord
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
-from laneweave.sim_bridge.road.world import show_bodies
+from laneweave.sim_bridge.world import show_bodies
 
 FORMATIONS = 3
 VEHICLES = 6

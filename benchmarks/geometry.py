@@ -141,7 +141,7 @@ def _gaps_m(pair: Pair, most_late: int) -> NDArray[np.float64]:
         one, other = (a[late:], b[: len(b) - late]) if late > 0 else (a[: len(a) + late], b[-late:])
         near = np.abs(one[:, 3] - other[:, 3]) < sum(body) / 2.0
         for x, y in zip(one[near], other[near], strict=True):
-            found = Bodies({"a": pose_of(x), "b": pose_of(y)}, *body).least_gaps().gap_m
+            found = Bodies({"a": pose_of(x), "b": pose_of(y)}, *body).min_gaps().gap_m
             gaps[late + most_late] = min(gaps[late + most_late], found)
     return gaps
 

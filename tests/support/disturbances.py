@@ -222,7 +222,7 @@ class _Run:
         vehicles, size = self.street.bridge.vehicles, self.street.scenario.vehicle
         poses = {str(name): pose_of(one.state) for name, one in vehicles.items()}
         bodies = Bodies(poses, size.length_m, size.width_m)
-        self.least_gap_m = min(self.least_gap_m, bodies.least_gaps().gap_m)
+        self.least_gap_m = min(self.least_gap_m, bodies.min_gaps().gap_m)
         self.overlaps += len(bodies.overlapping_pairs())
         self.braked += sum(one.controller.rung is Rung.EMERGENCY for one in vehicles.values())
         self.motions |= {

@@ -181,7 +181,7 @@ class Road:
         bodies = Bodies(poses, size.length_m, size.width_m)
         record = self.record
         record.states.append([one.controller.plant.state for one in self.vehicles.values()])
-        record.gaps_m.append(bodies.least_gaps().gap_m)
+        record.gaps_m.append(bodies.min_gaps().gap_m)
         record.overlaps += [(self.tick, *pair) for pair in bodies.overlapping_pairs()]
         accels_mps2: dict[str, float] = {name: one.state[2] for name, one in self.vehicles.items()}
         around = bodies.glimpses(road.lanes, road.lane_width_m, accels_mps2)

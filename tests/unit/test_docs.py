@@ -268,7 +268,7 @@ def _gaps_of_pairs(scenario: Scenario, late_ticks: Sequence[int]) -> Iterator[fl
         near = np.abs(first[:, 3] - second[:, 3]) < 3.0  # no turned body is wider
         for one, other in zip(first[near][::2], second[near][::2], strict=True):
             if abs(one[0] - other[0]) < 16.0:
-                yield Bodies({"a": pose_of(one), "b": pose_of(other)}, *body).least_gaps().gap_m
+                yield Bodies({"a": pose_of(one), "b": pose_of(other)}, *body).min_gaps().gap_m
 
 
 @lru_cache(maxsize=1024)

@@ -1,10 +1,10 @@
 """The bridge's core: lockstep ticks between the simulated world and the vehicles' agents.
 
-A tick: the census admits vehicles, every vehicle on the road is told what its sensors see, its
-agent answers with a trajectory, all bodies move on by one tick, the world shows them, and what it
-shows is measured. A tick is sent again to those who have not answered (`answers`); after the
-deadline their motion controllers go on with the trajectory that they have. A vehicle without an
-agent, or with a silent one, gets a caretaker (`attendance`).
+In a tick the roadside admits vehicles, every vehicle on the road receives a SENSE, its agent
+answers with a trajectory, all bodies move by one tick, the world shows them, and gaps and overlaps
+are measured. SENSE is repeated to agents that have not answered (`answers`); after the deadline
+their motion controllers continue with the trajectory that they have. A vehicle whose agent is
+absent or silent gets a caretaker (`attendance`).
 """
 
 from __future__ import annotations
@@ -57,24 +57,24 @@ from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
 from laneweave.sim_bridge.road.attendance import Attendance, Departures, notify_left
 from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
-from laneweave.sim_bridge.road.world import World, show_bodies
+from laneweave.sim_bridge.world import World, show_bodies
 
 log = structlog.get_logger(__name__)
 
 BRIDGE = Name("bridge")
 WIND_UP_S = 2.0
-"""How long the bridge waits for last reports at the end of a run."""
+"""How long the bridge waits for final reports at the end of a run."""
 
 
 class TickPhase(Enum):
-    """What the bridge waits for."""
+    """State of the current tick: what the bridge waits for."""
 
     STARTING = "starting"
     AGENTS = "agents"
-    """Vehicles are at the entrance whose agents are not up yet."""
+    """The agents of vehicles at the entrance."""
     ANSWERS = "answers"
     PACE = "pace"
-    """The next tick is not due yet."""
+    """The time of the next tick."""
     WIND_UP = "wind-up"
     ENDED = "ended"
 
@@ -98,11 +98,11 @@ class BridgeCore:
         Args:
             scenario: road, demand, vehicles.
             world: an empty world.
-            record: where measurements go.
+            record: receives the measurements.
             new_incarnation: returns a number that no process has used before, for caretakers.
-            pace: most road seconds per second of the node's clock; None: the scenario's maximum.
-            incarnation: tells this run of the road from earlier ones of the same deployment.
-            stopwatch: measures the duration of ticks, in s; decides nothing.
+            pace: maximum road seconds per second of the node's clock; None: the scenario's.
+            incarnation: distinguishes this road from earlier ones of the same deployment.
+            stopwatch: measures the duration of ticks [s]; has no other effect.
         """
         self.scenario = scenario
         self.tick = 0
@@ -119,20 +119,20 @@ class BridgeCore:
         self._at_entrance: list[RoadVehicle] = []
         self._departures = Departures()
         self._unreported: set[str] = {BRIDGE}
-        """Whose last report is still to come."""
+        """Processes whose final report is awaited."""
         self._patience_s = scenario.runtime.agent_start_s
-        """How long to wait for the next agent that is not up."""
+        """How long to wait for the next agent that is not up yet."""
         self._ending = Ending.COMPLETE
         self._tick_began = 0.0
         self._opened_s = 0.0
         self._until_s = 0.0
-        """When to go on, whatever is waited for; answers have a deadline of their own."""
+        """Deadline of every phase but ANSWERS, which has its own."""
 
     # --- as a core ----------------------------------------------------------------------------
 
     @property
     def metrics(self) -> tuple[MetricsSnapshot, ...]:
-        """What the bridge has counted."""
+        """Counters of the bridge."""
         counts = self._roadside.counts(len(self.vehicles))
         return (
             BridgeMetrics(
@@ -188,7 +188,7 @@ class BridgeCore:
             case Wakeup() if self.phase is TickPhase.ANSWERS:
                 yield from self._send_again(now_s)
             case Stopping():
-                # Who is asked to end while the last reports come in has ended already.
+                # Stopped while it waits for final reports: the run itself has ended.
                 winding_up = self.phase is TickPhase.WIND_UP
                 self._finish(self._ending if winding_up else Ending.INTERRUPTED)
             case _:
@@ -230,8 +230,7 @@ class BridgeCore:
         if self._attendance.hear(vehicle, command):
             effects.append(self._sense_of(vehicle))
         if command.tick != self.tick or self.phase is not TickPhase.ANSWERS:
-            # A late answer was made for a state that is past: played now, from its middle, it
-            # would end somewhere else.
+            # A late answer was computed for a past state: executed now, it would end elsewhere.
             if command.tick < self.tick and command.incarnation == attendant:
                 self._answers.late(name)
             return effects
@@ -240,7 +239,7 @@ class BridgeCore:
         except BadInputError as error:
             log.warning("command ignored", vehicle=name, reason=str(error))
             return effects
-        # Only a command that was taken puts somebody else in charge.
+        # Only an accepted command changes the process in charge.
         if attendant not in (0, vehicle.controller.attendant):
             previous = "caretaker" if cared_for else "agent"
             self._record.on_agent_took_over(self.t_s, name, previous)
@@ -261,7 +260,7 @@ class BridgeCore:
     # --- the tick -----------------------------------------------------------------------------
 
     def _proceed(self, now_s: float) -> Iterator[Effect]:
-        """Go on from phase to phase as far as nothing has to be waited for, one tick at most."""
+        """Proceed through the phases until one has to wait, for one tick at most."""
         if self.phase is TickPhase.PACE and now_s >= self._until_s:
             self._open_tick(now_s)
         if self.phase is TickPhase.AGENTS and self._entrance_clear(now_s):
@@ -291,10 +290,10 @@ class BridgeCore:
         )
 
     def _begin_tick(self, now_s: float) -> Iterator[Effect]:
-        self._let_enter()
+        self._enter()
         self._close_formations()
-        self._roadside.hand_out(self.vehicles)
-        yield from self._roadside.news(self.tick, self.t_s, self.vehicles.values())
+        self._roadside.assign_empty_cells(self.vehicles)
+        yield from self._roadside.publish(self.tick, self.t_s, self.vehicles.values())
         yield from self._take_care(now_s)
         for vehicle in self.vehicles.values():
             yield self._sense_of(vehicle)
@@ -303,7 +302,7 @@ class BridgeCore:
         self._attendance.ask(self.vehicles, now_s)
         self.phase = TickPhase.ANSWERS
 
-    def _let_enter(self) -> None:
+    def _enter(self) -> None:
         for vehicle in self._at_entrance:
             self.vehicles[vehicle.name] = vehicle
             self._world.add(vehicle.name, vehicle.state)
@@ -312,7 +311,7 @@ class BridgeCore:
                 self._unreported.add(vehicle.name)
             else:
                 self._record.note(self.t_s, AGENT_MISSING, vehicle=vehicle.name)
-                # Where one did not come, the next are not worth a long wait, until one does.
+                # After a missing agent, do not wait long for the next ones until one appears.
                 self._patience_s = self.scenario.network.resend_s
         self._at_entrance.clear()
 
@@ -325,7 +324,7 @@ class BridgeCore:
             self._record.on_closed(closed, [vehicle.name for vehicle in members])
 
     def _take_care(self, now_s: float) -> Iterator[Effect]:
-        """Put caretakers in charge of vehicles whose agents are silent or not there."""
+        """Put caretakers in charge of vehicles whose agents are absent, silent or too late."""
         for name in self._answers.settle(now_s):
             self._record.note(self.t_s, AGENT_SILENT, vehicle=name)
         for vehicle, absence in self._attendance.unattended(self.vehicles, now_s):
@@ -348,7 +347,7 @@ class BridgeCore:
             vehicle.step(tick)
         self.tick += 1
         show_bodies(self._world, self.vehicles, self.scenario, self._record, self.t_s)
-        yield from self._let_leave()
+        yield from self._remove_departed()
         duration_s = self._stopwatch() - self._tick_began
         self._record.on_tick(self.t_s, len(self.vehicles), duration_s)
         if self._over():
@@ -356,12 +355,12 @@ class BridgeCore:
             return
         lasts_s = self._tick_lasts_s
         if self._answers.deaf or not self._attendance.link_up:
-            # Nobody can answer: do not race ahead of the vehicles while the network is away.
+            # No agent can answer: do not run ahead of the vehicles during a network failure.
             lasts_s = max(lasts_s, self.scenario.runtime.tick_s)
         self._until_s = max(now_s, self._opened_s + lasts_s)
         self.phase = TickPhase.PACE
 
-    def _let_leave(self) -> Iterator[Effect]:
+    def _remove_departed(self) -> Iterator[Effect]:
         length_m = self.scenario.road.length_m
         for name, vehicle in list(self.vehicles.items()):
             if vehicle.state[0] >= length_m:
@@ -384,12 +383,12 @@ class BridgeCore:
 
     def _wind_up(self, now_s: float) -> Iterator[Effect]:
         on_road = self.vehicles.values()
-        yield from self._roadside.news(self.tick, self.t_s, on_road, ended=True)
+        yield from self._roadside.publish(self.tick, self.t_s, on_road, ended=True)
         yield from self._departures.notify(self.tick, self._answers.up)
         for vehicle in self.vehicles.values():
             yield notify_left(vehicle, self.tick)
-        # Last, so that it counts all, and through the network, like everybody's: the node fills in
-        # what it has counted.
+        # Last, so that it counts everything, and through the network like the others: the node adds
+        # its own counters.
         yield Send(
             REPORT,
             Report(role=Name("bridge"), name=BRIDGE),

@@ -1,4 +1,4 @@
-"""What a bridge offers to whoever looks at it."""
+"""Metrics of a bridge."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from laneweave.protocol.runtime.metrics import metric
 
 @frozen
 class BridgeMetrics:
-    """The road as the bridge counts it."""
+    """Counters of the road."""
 
     ABOUT: ClassVar[str] = "bridge"
 

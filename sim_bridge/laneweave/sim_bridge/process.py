@@ -29,14 +29,14 @@ def run_bridge(
 
     Args:
         scenario: road, demand, vehicles, endpoint.
-        folder: where the run's files go.
-        method: how vehicles are controlled, for the summary.
-        pace: most road seconds per second; None: the scenario's maximum.
-        wrap: may put faults before the core.
-        observe: is told where its numbers come from.
+        folder: the run's folder.
+        method: name of the control method, for the summary.
+        pace: maximum road seconds per second; None: the scenario's.
+        wrap: wraps the core, to inject faults.
+        observe: registers the metrics source.
 
     Raises:
-        BadInputError: nobody answers at the scenario's endpoint.
+        BadInputError: there is no answer at the scenario's endpoint.
         SumoUnavailableError: libsumo cannot be loaded.
     """
     record = RunRecord(folder, scenario, method, time.perf_counter)
@@ -56,5 +56,5 @@ def run_bridge(
         try:
             run_core(wrap(core), access_of(scenario, "bridge"), observe=observe)
         finally:
-            # After an error, too: what was recorded is kept.
+            # Also after an error, to keep what was recorded.
             record.close(core.t_s, Ending.INTERRUPTED)

@@ -83,7 +83,7 @@ def drive_plan(scenario: Scenario, names: Sequence[str], paths: Sequence[Sequenc
         poses = {name: pose_of(state) for name, state in zip(names, now.tolist(), strict=True)}
         bodies = Bodies(poses, *size_m)
         overlaps.update(bodies.overlapping_pairs())
-        min_gap_m = min(min_gap_m, bodies.least_gaps().gap_m)
+        min_gap_m = min(min_gap_m, bodies.min_gaps().gap_m)
     return Drive(scenario, states, slot_ticks, tuple(sorted(overlaps)), float(min_gap_m))
 
 

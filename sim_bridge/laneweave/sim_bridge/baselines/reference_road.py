@@ -222,7 +222,7 @@ class ReferenceRoad:
             self._traffic.vehicles,
             overlaps=bodies.overlapping_pairs(),
             collisions=self._traffic.collisions(),
-            gaps=bodies.least_gaps(),
+            gaps=bodies.min_gaps(),
         )
 
     def _let_leave(self) -> None:

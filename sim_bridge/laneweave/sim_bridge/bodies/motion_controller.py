@@ -1,20 +1,20 @@
-"""A vehicle's own motion controller: it outlives the vehicle's agent process.
+"""A vehicle's motion controller, which outlives the vehicle's agent process.
 
-What it drives by is a ladder, `Rung`, and on its own it only ever goes down:
+It drives on one of the rungs of a fallback ladder, `Rung`, and on its own only moves down:
 
-    play        the trajectory of the newest command, as far as it goes
-    hold        to rest in the cell that the last command named, and stay there at v_F
-    give way    the same, with comfortable braking behind whoever is ahead
-    emergency   brakes as hard as the vehicle can, for as long as `EmergencyBrake` says so
+    play        executes the trajectory of the newest command until it ends
+    hold        comes to rest in the cell that the last command named, and stays there at v_F
+    give way    does the same, with comfortable braking behind a vehicle ahead
+    emergency   brakes as hard as the vehicle can, as long as `EmergencyBrake` requires
 
-Play is what a vehicle does whose agent is well, or died, or whose commands were lost a moment ago.
-A trajectory that ran out or that an emergency interrupted is not taken up again: only a command
-that comes now leads back up. The emergency brake acts on every rung, on local sensing alone.
+A vehicle whose agent has just died, or whose commands have just been lost, still plays. A
+trajectory that has ended or that an emergency interrupted is not resumed: only a new command leads
+back up. The emergency brake acts on every rung and uses local sensing only.
 
-It also keeps what must survive the agent, or must not be believed of one that has been replaced:
-who is in charge of the vehicle, which formations it has joined, which plan the process in charge
-has accepted, and in the rolling operation what any process has promised and which cells the vehicle
-owns. Nobody but the process in charge changes where the vehicle holds or what it plays.
+The controller also stores what must survive the agent, and what a replaced agent must not change:
+the process in charge of the vehicle, the formations that it has joined, the plan that the process
+in charge has accepted, and in the rolling operation the highest promise and the cells that the
+vehicle owns. Only the process in charge changes where the vehicle holds or what it plays.
 """
 
 from __future__ import annotations
@@ -42,21 +42,19 @@ from laneweave.protocol.vehicle.motion import (
     limited_accel,
 )
 from laneweave.protocol.wire.messages import Ballot, Command, Deed, Neighbour
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import NOBODY_AROUND, Around
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import NONE_AROUND, Around
 from laneweave.sim_bridge.bodies.plant import Plant
 
 MAX_COLUMN = 2**31 - 1
-"""Columns are recorded with 32 bits; no vehicle gets this far. Formations have lesser numbers."""
-
-
+"""Columns are recorded with 32 bits; no vehicle gets this far. Formation numbers are smaller."""
 RELEASE_M = 1.0
-"""An emergency is over when this much would be to spare beyond the way of a tick, which every tick
-of braking gains. Were it nothing, the brake would be released at each favourable error of
-measurement, and these would add up."""
+"""An emergency ends when the spare distance exceeds that of one tick, which every tick of braking
+gains, by this margin. Without a margin each favourable measurement error would release the brake,
+and these errors would add up."""
 
 
 class Rung(IntEnum):
-    """What a vehicle drives by; see the module."""
+    """What a vehicle executes; see the module."""
 
     PLAY = 0
     HOLD = 1
@@ -66,7 +64,7 @@ class Rung(IntEnum):
 
 @define
 class MotionController:
-    """What the controller of one vehicle has been told last."""
+    """The motion controller of one vehicle."""
 
     plant: Plant
     _scenario: Scenario
@@ -78,40 +76,40 @@ class MotionController:
     accepted: Ballot | None = None
     """Newest plan that the process in charge has accepted."""
     promised: Ballot | None = None
-    """Highest ballot that any process in charge has promised (rolling operation): a promise binds
-    those who come after, so what is shown with it stays true."""
+    """Highest ballot that any process in charge has promised (rolling operation): a promise also
+    binds later processes."""
     estate: tuple[Cell, ...] = ()
     """Cells that the vehicle owns, ascending (rolling operation)."""
     deed: Deed | None = None
-    """Newest plan by which cells change hands."""
+    """Newest plan that transfers cells."""
     _granted: frozenset[Cell] = frozenset()
-    """Cells that the roadside has given and that no plan has mentioned yet."""
+    """Cells from the roadside that no plan contains yet."""
     motion_origin: Cell = field(init=False)
     motion_end_tick: int = 0
     motion_ticks: int = 0
-    """How many ticks the move under way was to take; 0: it settles, or holds."""
+    """Planned duration of the current move; 0: it settles, or holds."""
     command_tick: int = -1
     """Tick of the newest command; -1: none yet."""
     rung: Rung = Rung.HOLD
-    """What it drove by in the last tick."""
+    """Rung of the last tick."""
     rung_ticks: dict[Rung, int] = field(init=False)
     """Ticks on each rung."""
-    around: Around = NOBODY_AROUND
-    """Whom its sensors see."""
+    around: Around = NONE_AROUND
+    """Its measured neighbours."""
     _measured: State | None = None
     _jerks: array[float] = field(init=False)
-    """Along and across, one pair for each tick."""
+    """Pairs (along, across), one for each tick."""
     _jerks_tick: int = 0
-    """Tick that the first of the jerks is for."""
+    """Tick of the first pair."""
     lattice: Lattice = field(init=False)
     tick_s: float = field(init=False)
     _brake: EmergencyBrake = field(init=False)
 
     def __attrs_post_init__(self) -> None:
-        """Begin with nothing to play, in the formation of the cell."""
+        """Begin without a trajectory, in the formation of the cell."""
         self.lattice = self._scenario.lattice
         self.tick_s = self._scenario.runtime.tick_s
-        # Its formation's other blocks are not known before that is closed.
+        # The other blocks of its formation are known when that is closed.
         self.joined = (self.lattice.block_of(self.hold_cell[0]),)
         self.motion_origin = self.hold_cell
         self.rung_ticks = dict.fromkeys(Rung, 0)
@@ -125,24 +123,24 @@ class MotionController:
 
     @property
     def measured(self) -> State:
-        """State of the body as its sensors measure it; the true one before they have."""
+        """Measured state of the body; the exact one before the first measurement."""
         return self.plant.state if self._measured is None else self._measured
 
     def perceive(self, measured: State, around: Around) -> None:
-        """Take what its sensors measure now."""
+        """Set the measurements of this tick."""
         self._measured, self.around = measured, around
 
     def take(self, command: Command) -> bool:
         """Take a command of the process in charge, or of one that takes charge with it.
 
-        A command is refused when its incarnation is less than the attendant's, when one of this
-        tick or of a later one has been taken, or when it names a cell that the vehicle does not own
-        (where vehicles own cells). A greater incarnation takes charge; it must name the
-        cell in which the vehicle holds already: it could not speak for the vehicle before, so it
-        cannot have got leave to move. Refused as well, it may try again with the next tick.
+        A command is refused when its incarnation is lower than that of the process in charge, when
+        one of this tick or a later one has been taken, or when it names a cell that the vehicle
+        does not own (where vehicles own cells). A higher incarnation takes charge. It must name the
+        cell in which the vehicle already holds: before, it could not act for the vehicle, so no
+        plan can allow it to move. A refused process may try again at the next tick.
 
-        A command without jerks that names the cell in which the vehicle holds leaves the motion
-        under way as it is.
+        A command without jerks that names the cell in which the vehicle holds does not change the
+        current motion.
 
         Returns:
             Whether it was taken.
@@ -172,10 +170,10 @@ class MotionController:
         return True
 
     def hand_over(self, incarnation: int) -> None:
-        """Put a process in charge that does not drive: what is under way goes on as it is.
+        """Put another process in charge; the current motion continues.
 
         Raises:
-            ValueError: the incarnation is not greater than the attendant's.
+            ValueError: the incarnation is not higher than that of the process in charge.
         """
         if incarnation <= self.attendant:
             raise ValueError(f"incarnation {incarnation} is not above {self.attendant}")
@@ -183,16 +181,16 @@ class MotionController:
         self.accepted = None
 
     def note(self, command: Command) -> bool:
-        """Note what the process in charge asks for, whatever the tick of its command.
+        """Note what the process in charge requests, whatever the tick of its command.
 
         Returns:
-            Whether anything was new.
+            Whether anything has changed.
         """
         if command.incarnation != self.attendant:
             return False
         asked = command.joined, command.accepted, command.promised, command.deed
         if asked == (self.joined, self.accepted, self.promised, self.deed):
-            return False  # in nearly every tick
+            return False  # the usual case
         if not _in_range(command.joined):
             return False
         before = self.joined, self.accepted, self.promised, self.deed
@@ -208,22 +206,22 @@ class MotionController:
         return (self.joined, self.accepted, self.promised, self.deed) != before
 
     def accept(self, ballot: Ballot) -> None:
-        """Note a plan that the process in charge has accepted; an older one changes nothing.
+        """Note a plan that the process in charge has accepted, unless it is older.
 
-        Nor does one whose deed has not been drawn up, where vehicles own cells.
+        Where vehicles own cells, its transfer must be pending.
         """
         if self.rolling and (self.deed is None or self.deed.ballot != ballot):
             return
         self.accepted = ballot if self.accepted is None else max(self.accepted, ballot)
 
     def promise(self, ballot: Ballot) -> None:
-        """Note a promise; an older one changes nothing."""
+        """Note a promise, unless it is older."""
         self.promised = ballot if self.promised is None else max(self.promised, ballot)
 
     def draw_up(self, deed: Deed) -> None:
-        """Note the deed of an accepted plan, unless more has been promised since.
+        """Note the pending transfer of an accepted plan, unless a higher ballot is promised.
 
-        The plan may have been made before the roadside gave a cell, which is kept all the same.
+        Cells that the roadside has assigned since the plan was made stay with the vehicle.
         """
         newer = self.deed is None or deed.ballot > self.deed.ballot
         if newer and self.promised is not None and deed.ballot >= self.promised:
@@ -232,25 +230,25 @@ class MotionController:
             self.estate = self.deed.before
 
     def take_possession(self, ballot: Ballot) -> None:
-        """Note that the start gate of the newest deed's plan is open."""
+        """Complete the pending transfer: the start gate of its plan is open."""
         if self.deed is not None and self.deed.ballot == ballot and not self.deed.open:
             self.estate, self.deed = self.deed.after, Deed(ballot, open=True)
 
     def own(self, cell: Cell) -> None:
-        """Own a cell that nobody has entered in: the roadside says so."""
+        """Add an empty cell that the roadside has assigned to the vehicle."""
         self._granted |= {cell}
         self.estate = tuple(sorted({*self.estate, cell}))
         if self.deed is not None and not self.deed.open:
             self.deed = _with_cells(self.deed, {cell})
 
     def join(self, formations: Iterable[int]) -> None:
-        """Remember formations as joined, for the process in charge."""
+        """Note formations as joined."""
         self.joined = tuple(sorted({*self.joined, *formations}))
 
     def moving(self, tick: int) -> bool:
-        """Tell whether the motion under way has not ended at `tick`.
+        """Return whether the current motion has not ended at `tick`.
 
-        A body that is late still moves, though the time of its motion is over.
+        A late body is still moving although the time of its motion is over.
         """
         return tick < self.motion_end_tick or not at_rest_in_cell(
             self.measured, self.lattice, self.hold_cell, tick * self.tick_s
@@ -262,11 +260,10 @@ class MotionController:
         near: Sequence[Neighbour] = self.around.ahead
         if near:
             near = self._in_the_way(near, measured[3])
-        rung, jerk = self._way(tick, near)
-        # Who has nobody before it has nothing to brake for.
+        rung, jerk = self._next(tick, near)
         if near and self._must_brake(measured, jerk, near):
             rung = Rung.EMERGENCY
-            # The body is not where the trajectory would have it any more.
+            # The body leaves its trajectory.
             self._jerks = self._jerks[:0]
             plant.brake(jerk[1])
         else:
@@ -286,13 +283,13 @@ class MotionController:
         jerks = array("f", command.jerks)
         if sys.byteorder == "big":
             jerks.byteswap()
-        # Finite numbers of 32 bits have a finite sum: one that is not tells of one that is not.
+        # Finite 32-bit numbers have a finite sum.
         if not math.isfinite(sum(jerks)):
             raise BadInputError("Command.jerks", "NaN or infinity", "finite numbers")
         return jerks
 
-    def _way(self, tick: int, near: Iterable[Neighbour]) -> tuple[Rung, Jerk]:
-        """Return what to drive by, and the jerk, if there is no emergency."""
+    def _next(self, tick: int, near: Iterable[Neighbour]) -> tuple[Rung, Jerk]:
+        """Return rung and jerk of a tick without an emergency."""
         index = 2 * (tick - self._jerks_tick)
         if 0 <= index < len(self._jerks):
             return Rung.PLAY, (self._jerks[index], self._jerks[index + 1])
@@ -309,15 +306,15 @@ class MotionController:
             )
             for other in near
         ]
-        least_m = self._scenario.tracking.min_gap_m
-        careful = keep_gap(state, jerk, ahead, limits, least_m, self.tick_s)
+        min_gap_m = self._scenario.tracking.min_gap_m
+        careful = keep_gap(state, jerk, ahead, limits, min_gap_m, self.tick_s)
         return (Rung.HOLD if careful == jerk else Rung.GIVE_WAY), careful
 
     def _must_brake(self, measured: State, jerk: Jerk, near: Iterable[Neighbour]) -> bool:
-        """Tell whether there is an emergency, or one that goes on."""
+        """Return whether an emergency begins or continues."""
         limits, tick_s = self._scenario.vehicle, self.tick_s
         accel = self.plant.setpoint[0]
-        # What the body will make of the jerk: whoever commands it cannot wish it braked.
+        # The jerk that the body will execute: a command cannot brake harder than its limits.
         speed = measured[1] + limits.actuator_lag_s * measured[2]
         allowed = (limited_accel(speed, accel, jerk[0], limits, tick_s) - accel) / tick_s
         spare_m = self._brake.spare_m(measured, accel, (allowed, 0.0), near)
@@ -326,14 +323,14 @@ class MotionController:
         return spare_m < 0.0
 
     def _in_the_way(self, others: Iterable[Neighbour], y_m: float) -> list[Neighbour]:
-        """Return who is on a lane that the body touches or that it steers for."""
+        """Return the neighbours on lanes that the body touches or moves to."""
         first, last = self.lattice.lanes_touched(y_m, self._scenario.vehicle.width_m)
         goal = self.hold_cell[1]
         return [other for other in others if first <= other.lane <= last or other.lane == goal]
 
 
 def _with_cells(deed: Deed, cells: Iterable[Cell]) -> Deed:
-    """Return a deed with cells that it leaves with the vehicle."""
+    """Return a transfer with additional cells that stay with the vehicle."""
     return evolve(
         deed,
         before=tuple(sorted({*deed.before, *cells})),

@@ -1,17 +1,16 @@
-"""Where bodies are on the road, whether they overlap, how close they are, and what they see.
+"""Overlaps of bodies, the gaps between them, and the neighbours that exact sensors would see.
 
-A vehicle's body is a rectangle of its length L and width W. Its pose says
+A vehicle's body is a rectangle of length L and width W. Its pose consists of
 
-    s        where the middle of its front bumper is along the road,
-    y        where its body's centre is across the road,
-    heading  the angle of its body, atan2(v_y, v): a body points where it goes.
+    s        position of the middle of its front bumper along the road,
+    y        position of its centre across the road,
+    heading  angle of its body, atan2(v_y, v): a body points in its direction of motion.
 
 So the body's centre is (s - L/2 cos heading, y). The overlap test is exact for these rectangles. It
-is the ground truth of a run's safety; SUMO's collision list misses pairs that overlap between two
-lanes and is only a second opinion.
+decides about a run's safety; SUMO's collision list misses pairs that overlap between two lanes and
+is recorded beside it.
 
-`Bodies` sorts the vehicles along the road once, for all that is asked about them, and looks at near
-ones only.
+`Bodies` sorts the vehicles along the road once, for all queries, and compares near ones only.
 """
 
 from __future__ import annotations
@@ -28,11 +27,11 @@ Pose = tuple[float, float, float, float]
 _Point = tuple[float, float]
 
 _TOUCH_M = 1e-9
-"""Bodies that touch do not overlap, and a body that touches a lane border is not across it."""
+"""Bodies that touch do not overlap, and a body that touches a lane border does not cross it."""
 
 
-class LeastGaps(NamedTuple):
-    """The closest that any two vehicles are, one behind the other; infinite if there are none."""
+class MinGaps(NamedTuple):
+    """Smallest gap and headway of two vehicles in line; infinite if there are none."""
 
     gap_m: float
     """Bumper to bumper, along the road."""
@@ -41,20 +40,19 @@ class LeastGaps(NamedTuple):
 
 
 class Around(NamedTuple):
-    """Whom a vehicle sees, by lane."""
+    """The neighbours of a vehicle, by lane."""
 
     ahead: tuple[Neighbour, ...]
     behind: tuple[Neighbour, ...]
 
 
-NOBODY_AROUND = Around((), ())
+NONE_AROUND = Around((), ())
 
 Glimpse = tuple[int, float, float, float]
-"""(lane, gap m, speed m/s, acceleration m/s2): a `Neighbour` as plain numbers, of which sensors are
-to make one."""
+"""(lane, gap m, speed m/s, acceleration m/s2): a `Neighbour` without measurement errors."""
 
 Glimpses = tuple[Sequence[Glimpse], Sequence[Glimpse]]
-"""(ahead, behind), by lane: an `Around` as plain numbers."""
+"""(ahead, behind), by lane: an `Around` without measurement errors."""
 
 
 def pose_of(state: Sequence[float]) -> Pose:
@@ -101,7 +99,7 @@ class Bodies:
     def overlapping_pairs(self) -> list[tuple[str, str]]:
         """Return all pairs of vehicles whose bodies overlap.
 
-        Sorted pairs of names, the lesser name first. Bodies that merely touch are not among them.
+        Sorted pairs of names, each in alphabetical order. Bodies that only touch are not included.
         """
         names, poses, extents = self._names, self._poses, self._extents
         length_m, width_m = self._length_m, self._width_m
@@ -116,29 +114,30 @@ class Bodies:
                     break
                 _, _, other_low, other_high = extents[ahead]
                 if other_low >= high or other_high <= low:
-                    continue  # side by side: nearly all that are near
+                    continue  # side by side: nearly all near pairs
                 if _intersect(one, other, length_m, width_m):
                     name, other_name = names[index], names[ahead]
                     pairs.append((min(name, other_name), max(name, other_name)))
         return sorted(pairs)
 
-    def least_gaps(self) -> LeastGaps:
-        """Return the least gap and the least time headway between vehicles in line.
+    def min_gaps(self) -> MinGaps:
+        """Return the smallest gap and time headway between vehicles in line.
 
-        Two vehicles are in line if their bodies overlap laterally. The gap is how far the one
-        behind would have to move along the road to touch the other: exact for rotated bodies,
-        negative if and only if the bodies overlap. The one behind is the one whose front is behind.
+        Two vehicles are in line if their bodies overlap laterally. The gap is the distance along
+        the road by which the follower would have to move to touch the other: exact for rotated
+        bodies, negative if and only if the bodies overlap. The follower is the one whose front is
+        behind.
         """
         length_m, width_m = self._length_m, self._width_m
-        # Of two with equal fronts names do not decide who is behind.
+        # With equal fronts, names do not decide which one is behind.
         bodies = sorted(zip(self._poses, self._extents, strict=True))
-        # Of two leaders in line the one whose front is farther can only have the lesser gap if
-        # their fronts are closer than the most that rotation adds to a body.
+        # Of two leaders in line the farther one can only have the smaller gap if their fronts are
+        # closer than rotation can extend a body.
         slack_m = length_m + width_m
         count = len(bodies)
-        turned = []
-        """Least possible gap and indices of pairs of which one body is turned."""
-        least_gap = least_headway = math.inf
+        rotated = []
+        """(Lower bound of the gap, indices) of pairs with a rotated body."""
+        min_gap = min_headway = math.inf
         for index, ((s_m, _, heading, speed_mps), (rear, front, low, high)) in enumerate(bodies):
             low, high = low + _TOUCH_M, high - _TOUCH_M  # noqa: PLW2901
             horizon_m = math.inf
@@ -152,29 +151,29 @@ class Bodies:
                 if horizon_m == math.inf:
                     horizon_m = distance_m + slack_m
                     if speed_mps > 0.0:
-                        least_headway = min(least_headway, distance_m / speed_mps)
+                        min_headway = min(min_headway, distance_m / speed_mps)
                 bound_m = max(other_rear - front, rear - other_front)
                 if heading != 0.0 or other[2] != 0.0:
-                    turned.append((bound_m, index, ahead))
-                elif bound_m < least_gap:
-                    least_gap = bound_m  # of unturned bodies it is the gap itself
-        for bound_m, index, ahead in sorted(turned):
-            if bound_m >= least_gap:
+                    rotated.append((bound_m, index, ahead))
+                elif bound_m < min_gap:
+                    min_gap = bound_m  # exact for unrotated bodies
+        for bound_m, index, ahead in sorted(rotated):
+            if bound_m >= min_gap:
                 break
             gap_m = _gap_m(bodies[index][0], bodies[ahead][0], length_m, width_m)
-            least_gap = min(least_gap, gap_m)
-        return LeastGaps(least_gap, least_headway)
+            min_gap = min(min_gap, gap_m)
+        return MinGaps(min_gap, min_headway)
 
     def glimpses(
         self, lanes: int, lane_width_m: float, accels_mps2: Mapping[str, float]
     ) -> dict[str, Glimpses]:
-        """Return whom each vehicle's local sensing would see around it if it were exact.
+        """Return the neighbours that each vehicle's sensors would see if they were exact.
 
         In each lane that its body touches or that is adjacent to such a lane, a vehicle sees the
         nearest vehicle ahead that touches the lane, and the nearest one behind. A vehicle that
         straddles two lanes is seen in both. The gap is bumper to bumper, with bodies taken as
         unrotated; it is negative for vehicles side by side, of which the one with the front ahead
-        is ahead (at equal positions: the one with the greater name).
+        is ahead (at equal positions: the one with the later name).
 
         Args:
             lanes: number of lanes.
@@ -194,7 +193,7 @@ class Bodies:
         accels = [accels_mps2.get(name, 0.0) for name in names]
 
         def nearest(order: Iterable[int], sign: float) -> list[list[Glimpse]]:
-            """Return whom each one sees of those before it in an order, by lane."""
+            """Return the neighbours of each vehicle among those before it in an order."""
             last_seen = [-1] * lanes
             seen: list[list[Glimpse]] = [[]] * len(names)
             for index in order:
@@ -218,7 +217,7 @@ class Bodies:
 
 
 def _extent(pose: Pose, length_m: float, width_m: float) -> tuple[float, float, float, float]:
-    """Return a body's bounds: (least x, greatest x, least y, greatest y)."""
+    """Return a body's bounds: (min x, max x, min y, max y)."""
     s_m, y_m, heading, _ = pose
     if heading == 0.0:
         return s_m - length_m, s_m, y_m - 0.5 * width_m, y_m + 0.5 * width_m
@@ -229,7 +228,7 @@ def _extent(pose: Pose, length_m: float, width_m: float) -> tuple[float, float, 
 
 
 def _intersect(one: Pose, other: Pose, length_m: float, width_m: float) -> bool:
-    """Tell whether two bodies overlap, by the separating axis theorem."""
+    """Return whether two bodies overlap, by the separating axis theorem."""
     if one[2] == 0.0 == other[2]:
         aside_m = abs(other[1] - one[1])
         return abs(other[0] - one[0]) < length_m - _TOUCH_M and aside_m < width_m - _TOUCH_M
@@ -254,8 +253,8 @@ def _gap_m(behind: Pose, ahead: Pose, length_m: float, width_m: float) -> float:
     """Return the distance along the road between two bodies that overlap laterally.
 
     Over the y that both bodies cover, the rear boundary of a body is convex and the front boundary
-    is concave, both with kinks at corners: the least difference of the one ahead and the one behind
-    is at a corner or at an end of the common range.
+    is concave, both with kinks at corners: their smallest difference is at a corner or at an end of
+    the common range.
     """
     if behind[2] == 0.0 and ahead[2] == 0.0:
         return ahead[0] - length_m - behind[0]
@@ -266,7 +265,7 @@ def _gap_m(behind: Pose, ahead: Pose, length_m: float, width_m: float) -> float:
     crossings = [(_crossings(one, y), _crossings(other, y)) for y in levels]
     return max(
         min(min(rear) - max(front) for front, rear in crossings),
-        # Where two turned bodies overlap laterally the one with its front ahead can be behind.
+        # Of two rotated bodies in line the one whose front is ahead can be behind.
         min(min(rear) - max(front) for rear, front in crossings),
     )
 
@@ -279,5 +278,5 @@ def _crossings(shape: Sequence[_Point], level_y: float) -> list[float]:
         if min(y, other_y) <= level_y <= max(y, other_y):
             share = (level_y - y) / (other_y - y) if other_y != y else 0.0
             found += [x + share * (other_x - x)] if other_y != y else [x, other_x]
-    # Rounding can put the end of the common range just outside; its nearest corner is meant.
+    # Rounding can put the end of the common range just outside the polygon.
     return found or [min(shape, key=lambda point: abs(point[1] - level_y))[0]]

@@ -1,7 +1,7 @@
-"""What a vehicle's sensors make of the truth: every measurement with an error of its own.
+"""A vehicle's sensors: every measurement has an independent error.
 
-Errors are normally distributed, independent of each other and of those before (`sensing` of the
-scenario), and drawn from the scenario's seed and the vehicle's name: equal seeds, equal runs.
+Errors are normally distributed (table `sensing` of the scenario) and drawn from the scenario's seed
+and the vehicle's name, so equal seeds give equal runs.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from laneweave.protocol.wire.messages import Name, Neighbour
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Around, Glimpses
 
 _DRAWN = 1024
-"""Numbers that are drawn at once."""
+"""Random numbers drawn at once."""
 
 
 class Sensors:
     """The sensors of one vehicle."""
 
     def __init__(self, scenario: Scenario, vehicle: Name) -> None:
-        """Prepare the errors of a vehicle."""
+        """Seed the errors of a vehicle."""
         noise = scenario.sensing
         self._random = np.random.default_rng([scenario.seed, zlib.crc32(vehicle.encode())])
         self._normal: list[float] = []
-        """Drawn ahead of their use: numbers one at a time would be dear."""
+        """Drawn in advance: drawing one number at a time is slow."""
         self._used = 0
         self._state_noise = (
             noise.position_noise_m,
@@ -44,7 +44,7 @@ class Sensors:
         )
 
     def measure(self, state: State) -> State:
-        """Return what the vehicle takes for its state (s, v, a, y, v_y, a_y), in m and s."""
+        """Return the measured state (s, v, a, y, v_y, a_y) in m and s."""
         s, v, a, y, v_y, a_y = state
         s_m, v_mps, a_mps2, y_m, vy_mps, ay_mps2 = self._state_noise
         e_s, e_v, e_a, e_y, e_vy, e_ay = self._draw(6)
@@ -58,10 +58,10 @@ class Sensors:
         )
 
     def look(self, around: Glimpses) -> Around:
-        """Return what the vehicle sees of those around it."""
+        """Return the measured neighbours."""
         ahead, behind = around
         sigma_m, sigma_mps, sigma_mps2 = self._other_noise
-        # Drawn at once for all, in their order: the same numbers as one by one.
+        # Drawn for all at once, in their order.
         errors = self._draw(3 * (len(ahead) + len(behind)))
         seen = []
         index = 0
@@ -81,7 +81,7 @@ class Sensors:
         return Around(tuple(seen[: len(ahead)]), tuple(seen[len(ahead) :]))
 
     def _draw(self, count: int) -> list[float]:
-        """Return the next numbers of the standard normal distribution."""
+        """Return the next samples of the standard normal distribution."""
         first, self._used = self._used, self._used + count
         if self._used > len(self._normal):
             self._normal = self._normal[first:] + self._random.standard_normal(_DRAWN).tolist()

@@ -1,11 +1,11 @@
-"""What happened on the road: trajectories, trips, events, and the world's part of the summary.
+"""The recorder: files of trajectories, trips and events, and the world's part of the summary.
 
     trajectories.parquet   one row per vehicle and tick, written in row groups as the run goes on
     trips.parquet          one row per demanded vehicle, written at the end
     events.jsonl           one JSON object per line, flushed line by line
 
-Both Parquet files carry the scenario as JSON in their metadata (key `SCENARIO_KEY`), so that a
-picture can be drawn from them alone.
+Both Parquet files contain the scenario as JSON in their metadata (key `SCENARIO_KEY`), so that
+figures can be drawn from them alone.
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ import json
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import attrs
 import numpy as np
@@ -24,14 +23,16 @@ import pyarrow.parquet as pq
 
 from laneweave.protocol.config.loading import to_tables
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import LeastGaps
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
 from laneweave.sim_bridge.road.demand import Arrival
 
 SCENARIO_KEY = b"laneweave.scenario"
 WARM_UP_S = 60.0
-"""Vehicles that enter before this road time find an emptier road than the others: not counted."""
+"""Vehicles that enter before this road time are not counted: the road is emptier for them."""
+ROWS_PER_GROUP = 100_000
+"""Rows of trajectories that are buffered before they are written."""
 EMERGENCY_SHARE = 0.9
-"""Braking harder than this share of the limit is an emergency brake."""
+"""Braking harder than this share of the limit counts as an emergency brake."""
 
 _TRAJECTORIES: list[pa.Field[Any]] = [
     pa.field("t_s", pa.float64(), nullable=False),
@@ -68,7 +69,7 @@ s is the front bumper, y the body's centre from the right road edge; column and 
 
 @attrs.define
 class _Trip:
-    """What became of one vehicle."""
+    """The trip of one vehicle."""
 
     arrival: Arrival
     entered_s: float | None = None
@@ -88,11 +89,11 @@ class _Trip:
 
     @property
     def on_preferred_lane(self) -> bool | None:
-        """Whether it left the road on the lane that it wanted."""
+        """Whether it left the road on its preferred lane."""
         return None if self.final_lane is None else self.final_lane == self.arrival.preferred_lane
 
     def counted(self, last_arrival_s: float) -> bool:
-        """Whether its travel time counts: it left, and entered in the undisturbed part."""
+        """Whether its travel time counts: it left, and entered in the counted period."""
         return (
             self.entered_s is not None
             and self.left_s is not None
@@ -117,16 +118,15 @@ class _Safety:
 class Recorder:
     """Writes a run's files and computes the world's part of its summary.
 
-    Use it as a context manager, or close it: what was recorded is complete in the files then.
+    Its files are complete when it is closed.
     """
 
-    def __init__(self, folder: Path, scenario: Scenario, *, rows_per_group: int = 100_000) -> None:
+    def __init__(self, folder: Path, scenario: Scenario) -> None:
         """Open the files of a run.
 
         Args:
-            folder: the run's folder; it is made if it is missing.
-            scenario: what is run.
-            rows_per_group: rows of trajectories that are kept in memory before they are written.
+            folder: the run's folder; created if missing.
+            scenario: of the run.
         """
         folder.mkdir(parents=True, exist_ok=True)
         self._folder = folder
@@ -135,10 +135,9 @@ class Recorder:
             SCENARIO_KEY: json.dumps(to_tables(scenario)).encode()
         }
         self._schema = pa.schema(_TRAJECTORIES, self._metadata)
-        self._rows_per_group = rows_per_group
         self._times: list[float] = []
         self._rows: list[Sample] = []
-        """What is not written yet; each row has its time."""
+        """Buffered rows; `_times` has the time of each."""
         self._trips: dict[str, _Trip] = {}
         self._safety = _Safety()
         self._brake_accel = EMERGENCY_SHARE * scenario.vehicle.min_accel_mps2
@@ -172,7 +171,7 @@ class Recorder:
         trip.entered_s, trip.formation = t_s, formation
 
     def assign(self, vehicle: str, formation: int) -> None:
-        """Record in whose formation a vehicle is; it has entered."""
+        """Record the formation of a vehicle that has entered."""
         self._trips[vehicle].formation = formation
 
     def left(self, vehicle: str, t_s: float, lane: int) -> None:
@@ -192,18 +191,18 @@ class Recorder:
         """Record where all vehicles on the road are at a road time, once per tick."""
         self._check_open()
         safety, last_accels, brake_accel = self._safety, self._last_accels, self._brake_accel
-        most_jerk = safety.max_jerk_mps3
+        max_jerk = safety.max_jerk_mps3
         rows = list(samples)
         for vehicle, _, _, _, accel, _, _ in rows:
             last = last_accels.get(vehicle)
             if last is not None and t_s > last[0]:
                 jerk = abs(accel - last[1]) / (t_s - last[0])
-                if jerk > most_jerk:
-                    most_jerk = jerk
+                if jerk > max_jerk:
+                    max_jerk = jerk
             if accel < brake_accel and (last is None or last[1] >= brake_accel):
                 safety.emergency_brakes += 1
             last_accels[vehicle] = (t_s, accel)
-        safety.max_jerk_mps3 = most_jerk
+        safety.max_jerk_mps3 = max_jerk
         if rows:
             accels = [sample[4] for sample in rows]
             safety.min_accel_mps2 = min(safety.min_accel_mps2, *accels)
@@ -211,21 +210,21 @@ class Recorder:
         self._times += [t_s] * len(rows)
         self._rows += rows
         self._peak = max(self._peak, len(rows))
-        if len(self._rows) >= self._rows_per_group:
+        if len(self._rows) >= ROWS_PER_GROUP:
             self._write_rows()
 
     def safety(
         self,
         overlaps: Iterable[tuple[str, str]],
         collisions: Iterable[tuple[str, str]],
-        gaps: LeastGaps,
+        gaps: MinGaps,
     ) -> None:
         """Record how close the vehicles are in one tick.
 
         Args:
             overlaps: pairs of `Bodies.overlapping_pairs`.
             collisions: pairs that SUMO reports.
-            gaps: least gap and headway of `Bodies.least_gaps`.
+            gaps: result of `Bodies.min_gaps`.
         """
         self._check_open()
         self._safety.overlaps.update(overlaps)
@@ -234,27 +233,27 @@ class Recorder:
         self._safety.min_headway_s = min(self._safety.min_headway_s, gaps.headway_s)
 
     def event(self, t_s: float, kind: str, /, **data: Any) -> None:  # noqa: ANN401 - any JSON
-        """Write a line to `events.jsonl` at once.
+        """Write a line to `events.jsonl` immediately.
 
         Args:
             t_s: road time.
-            kind: what happened.
-            **data: more about it; values that JSON does not know are written as text, and keys
-                `t_s` and `kind` are not written.
+            kind: kind of event.
+            **data: its data; values unknown to JSON are written as text, and the keys `t_s` and
+                `kind` are ignored.
         """
         self._check_open()
         own: dict[str, Any] = {"t_s": t_s, "kind": kind}
         self._events.write(json.dumps(own | data | own, default=str) + "\n")
 
     def summarise(self, method: str, simulated_s: float) -> dict[str, Any]:
-        """Return the world's part of `summary.json`; may be called at any time, closed or not.
+        """Return the world's part of `summary.json`, at any time.
 
-        Travel times and throughput are those of the counted vehicles, and null if there are none,
-        as in a run that is too short. Throughput is the rate at which vehicles pass the end of the
+        Travel times and throughput are those of the counted vehicles; null if there are none, as in
+        a short run. Throughput is the rate at which vehicles pass the end of the
         road between the first and the last counted one.
 
         Args:
-            method: how vehicles were controlled.
+            method: name of the control method.
             simulated_s: road time at the end.
         """
         scenario = self._scenario
@@ -289,7 +288,7 @@ class Recorder:
         }
 
     def close(self) -> None:
-        """Write what is left and close all files; a second call does nothing."""
+        """Write buffered rows and close all files; a second call does nothing."""
         if self._closed:
             return
         self._closed = True
@@ -300,21 +299,8 @@ class Recorder:
             self._events.close()
             self._write_trips()
 
-    def __enter__(self) -> Self:
-        """Return this recorder."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close this recorder."""
-        self.close()
-
     def _check_open(self) -> None:
-        """Refuse to record what could not be written."""
+        """Raise RuntimeError if the files are closed."""
         if self._closed:
             raise RuntimeError("the recorder is closed")
 
@@ -341,7 +327,7 @@ class Recorder:
         }
 
     def _throughput(self) -> float | None:
-        """Return vehicles per lane and hour at the end of the road, None if it cannot be told."""
+        """Return vehicles per lane and hour at the end of the road, None if undefined."""
         last_s = self._last_arrival_s
         trips = self._trips.values()
         counted = [t.left_s for t in trips if t.left_s is not None and t.counted(last_s)]

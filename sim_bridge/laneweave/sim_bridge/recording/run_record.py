@@ -1,4 +1,4 @@
-"""What a run leaves behind: the recorder's files plus what all roles reported, in summary.json."""
+"""The record of a run: the recorder's files, and reports of all roles, in `summary.json`."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ from laneweave.protocol.wire.events import (
 )
 from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, LogEvent, Name, Report
 from laneweave.sim_bridge.bodies.motion_controller import Rung
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import LeastGaps
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
 from laneweave.sim_bridge.recording.recorder import Recorder
 from laneweave.sim_bridge.road.demand import Arrival
 
 
 class RecordedVehicle(Protocol):
-    """What is recorded of a vehicle on the road, whatever moves it."""
+    """The recorded properties of a vehicle on the road."""
 
     @property
     def name(self) -> str:
@@ -72,7 +72,7 @@ class RecordedVehicle(Protocol):
 
 @define
 class _Leadership:
-    """Who leads, as heard in heartbeats."""
+    """The leader, as seen in heartbeats."""
 
     leader: tuple[Name, int] | None = None
     heard_s: float = 0.0
@@ -86,7 +86,7 @@ class Ending(Enum):
     COMPLETE = "complete"
     """All demanded vehicles have left."""
     INTERRUPTED = "interrupted"
-    """Somebody asked for it, or something failed."""
+    """It was stopped, or something failed."""
     LIMIT = "limit"
     """The road time limit was reached."""
 
@@ -123,19 +123,19 @@ class RunRecord:
         self._left_unattended = 0
         self._closed = False
 
-    # --- what the bridge sees -----------------------------------------------------------------
+    # --- the road -----------------------------------------------------------------
 
     def note(self, t_s: float, kind: str, **data: object) -> None:
-        """Write an event of the bridge's own."""
+        """Write an event of the bridge."""
         if not self._closed:
             self._recorder.event(t_s, kind, role="bridge", **data)
 
     def on_demanded(self, arrival: Arrival) -> None:
-        """A vehicle wants to enter."""
+        """Record a vehicle that wants to enter."""
         self._recorder.demanded(arrival)
 
     def on_entered(self, vehicle: RecordedVehicle) -> None:
-        """A vehicle entered the road."""
+        """Record a vehicle that has entered the road."""
         self._recorder.entered(vehicle.name, vehicle.entered_s, vehicle.formation)
         self.note(
             vehicle.entered_s,
@@ -147,7 +147,7 @@ class RunRecord:
         )
 
     def on_closed(self, closed: ClosedFormation, members: Sequence[Name]) -> None:
-        """A formation was closed."""
+        """Record a closed formation."""
         number, columns = closed.first_block, closed.columns(self._scenario.lattice)
         for vehicle in members:
             self._recorder.assign(vehicle, number)
@@ -160,9 +160,9 @@ class RunRecord:
         )
 
     def on_left(self, vehicle: RecordedVehicle, t_s: float, *, attended: bool) -> None:
-        """A vehicle passed the end of the road since the last tick.
+        """Record a vehicle that has passed the end of the road since the last tick.
 
-        `attended`: an agent was in charge of it, not its caretaker.
+        `attended`: its agent was in charge, not its caretaker.
         """
         s_m, v_mps, _, y_m, _, _ = vehicle.state
         beyond_m = s_m - self._scenario.road.length_m
@@ -191,25 +191,25 @@ class RunRecord:
             )
 
     def on_still_on_road(self, vehicle: RecordedVehicle) -> None:
-        """The run ends while a vehicle is on the road."""
+        """Record a vehicle that is on the road at the end of the run."""
         self._count_rungs(vehicle)
 
     @property
     def missed_ticks(self) -> int:
-        """Answers that had not come when their tick's deadline passed."""
+        """Answers that had not come by their tick's deadline."""
         return self._missed_ticks
 
     def on_missed(self, agents: int) -> None:
-        """So many agents have not answered a tick by its deadline."""
+        """Record the number of agents that have not answered a tick by its deadline."""
         self._missed_ticks += agents
 
     def on_caretaker_took_over(self, t_s: float, vehicle: Name, reason: str) -> None:
-        """A vehicle's caretaker is in charge, since its agent is `absent` or `silent`."""
+        """Record that a caretaker has taken charge, and why: see `Absence`."""
         self._caretaker_takeovers += 1
         self.note(t_s, CARETAKER_TOOK_OVER, vehicle=vehicle, reason=reason)
 
     def on_agent_took_over(self, t_s: float, vehicle: Name, previous: str) -> None:
-        """A vehicle's agent has taken charge from the `caretaker`, or from an earlier `agent`."""
+        """Record that an agent has taken charge from the `caretaker` or an earlier `agent`."""
         self._agent_takeovers += 1
         self.note(t_s, AGENT_TOOK_OVER, vehicle=vehicle, previous=previous)
 
@@ -220,9 +220,9 @@ class RunRecord:
         *,
         overlaps: Iterable[tuple[str, str]],
         collisions: Iterable[tuple[str, str]],
-        gaps: LeastGaps,
+        gaps: MinGaps,
     ) -> None:
-        """All bodies were shown at a tick."""
+        """Record positions, overlaps, collisions and gaps at a tick."""
         overlaps = list(overlaps)
         for pair in overlaps:
             self.note(t_s, OVERLAP, vehicles=pair)
@@ -230,16 +230,16 @@ class RunRecord:
         self._recorder.tick(t_s, [_sample(vehicle) for vehicle in vehicles])
 
     def on_tick(self, t_s: float, on_road: int, duration_s: float) -> None:
-        """A tick took this long."""
+        """Record the duration of a tick."""
         self._ticks.append((t_s, on_road, duration_s * 1e3))
 
-    # --- what others say ----------------------------------------------------------------------
+    # --- the other roles ----------------------------------------------------------------------
 
     def on_event(self, event: LogEvent) -> None:
-        """A role had something to say."""
+        """Record an event of another role."""
         if self._closed:
             return
-        # The sender's own words about who it is do not count.
+        # Role and name of the message replace those in its data.
         data = event.data | {"role": event.role, "name": event.name}
         self._recorder.event(event.t_s, event.kind, **data)
         if event.kind in PLAN_EVENTS:
@@ -249,11 +249,11 @@ class RunRecord:
                 self._plans_by_solver[solver] += 1
 
     def on_report(self, report: Report) -> None:
-        """A role reported its counters; the newest of a sender counts."""
+        """Record the counters of a role; the newest report of a sender counts."""
         self._reports[report.role, report.name] = report
 
     def on_heartbeat(self, heartbeat: Heartbeat, t_s: float, now_s: float) -> None:
-        """Follow the leadership: how often it changes, and for how long nobody leads.
+        """Record changes of the leader and the times without one.
 
         `now_s` is the node's clock.
         """
@@ -272,7 +272,7 @@ class RunRecord:
     # --- the end ------------------------------------------------------------------------------
 
     def close(self, t_s: float, ending: Ending) -> None:
-        """Write everything down. Idempotent: the first ending counts."""
+        """Write all files. Idempotent: the first ending counts."""
         if self._closed:
             return
         self.note(t_s, RUN_ENDED, ending=ending.value)
@@ -358,7 +358,7 @@ def _sample(vehicle: RecordedVehicle) -> tuple[str, float, float, float, float, 
 
 
 def _per_process(reports: Iterable[Report], counter: str) -> int:
-    """Add up a counter that processes report so far, each perhaps for several vehicles."""
+    """Return the sum over processes of a counter that each may report for several vehicles."""
     newest: dict[Name, int] = {}
     for report in reports:
         newest[report.process] = max(newest.get(report.process, 0), getattr(report, counter))
@@ -370,7 +370,7 @@ def _number(value: object) -> float:
 
 
 def _milliseconds(packed: Iterable[bytes]) -> NDArray[np.float64]:
-    """Return the durations that can be durations: what comes from others may be anything."""
+    """Return the valid durations: reports come from other processes."""
     whole = b"".join(each for each in packed if len(each) % 4 == 0)
     values = np.frombuffer(whole, dtype="<f4").astype(np.float64)
     return values[np.isfinite(values) & (values >= 0.0)]

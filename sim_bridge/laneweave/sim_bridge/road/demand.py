@@ -4,7 +4,7 @@ On each lane the headway between two arrivals is
 
     min_headway + Exp(3600 / volume - min_headway)      (mean 3600 / volume seconds),
 
-and each vehicle draws the lane it prefers from the scenario's lane shares. Every lane has its own
+and each vehicle draws its preferred lane from the scenario's lane shares. Every lane has its own
 random generator for headways and another for preferences, all derived from the scenario's seed.
 So equal seeds give equal arrivals, a lane's arrivals do not depend on the number of other lanes,
 and the stream of a longer duration begins with that of a shorter one, names included.
@@ -35,7 +35,7 @@ class Arrival:
     preferred_lane: int
     """Lane on which it wants to leave the road."""
     t_s: float
-    """Road time at which it would pass the start of the road if it were free."""
+    """Road time at which it would pass the start of an empty road."""
 
 
 def arrivals(scenario: Scenario) -> tuple[Arrival, ...]:
@@ -64,7 +64,7 @@ def _arrivals_on(lane: int, scenario: Scenario) -> list[tuple[float, int]]:
     mean_excess_s = max(0.0, 3600.0 / demand.volume_veh_per_lane_h - demand.min_headway_s)
     headways = _generator(scenario.seed, _HEADWAYS, lane)
     preferences = _generator(scenario.seed, _PREFERENCES, lane)
-    # The last bound is one, whatever the rounding of the sum: a draw in [0, 1) finds a lane.
+    # The last bound is exactly one despite rounding: every draw in [0, 1) finds a lane.
     bounds = np.array([*accumulate(scenario.lane_shares)][:-1])
     result: list[tuple[float, int]] = []
     t_s = 0.0

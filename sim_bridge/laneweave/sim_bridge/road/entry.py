@@ -1,15 +1,15 @@
 """Entry metering at the start of the road.
 
-A vehicle enters at s = 0 with the lattice speed v_F. Its cell is the first free one on its lane,
-behind its lane predecessor, that passes s = 0 at most `spread_s` before or after the vehicle; from
-there it settles in its cell on the first stretch of road. With interlaced entry only every other
+A vehicle enters at s = 0 with the lattice speed v_F. It gets the first free cell on its lane,
+behind its predecessor, that passes s = 0 at most `spread_s` before or after the vehicle, and
+settles in that cell on the first stretch of road. With interlaced entry only every other
 cell may be entered ("checkerboard", the paper's structure for driving). Vehicles of a lane enter in
 order of arrival, at least a column's time apart.
 
-Where there are formations, `formation_building` says whether a formation takes a vehicle.
+In the operations with formations, `formation_building` decides whether a formation takes a vehicle.
 
-Decisions are causal: they are taken in the order of time, and at one moment the lanes from the
-right, so nothing depends on arrivals that are still to come.
+Decisions are causal: they are made in order of time, and at equal times from the right lane to the
+left, so nothing depends on later arrivals.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.formation_building import FormationBuilder
 
 TIME_TOLERANCE_S = 1e-9
-"""Ticks and passing times are the same instants computed in two ways."""
+"""Ticks and passing times are equal instants computed in two ways."""
 
 
 @frozen
@@ -36,7 +36,7 @@ class Admission:
     t_s: float
     """Road time at which it passes s = 0."""
     offset_m: float = 0.0
-    """How far ahead of its cell it is."""
+    """Distance by which it is ahead of its cell."""
 
 
 class EntryMeter:
@@ -53,8 +53,8 @@ class EntryMeter:
         """Start with an empty road at road time 0.
 
         Args:
-            lattice: the lattice whose cells are given out.
-            spread_s: most time between a vehicle and its cell at s = 0.
+            lattice: the lattice whose cells are assigned.
+            spread_s: maximum time between a vehicle and its cell at s = 0.
             builder: builds formations of the vehicles that enter; None: there are none.
             interlaced: whether only every other cell may be entered.
         """
@@ -65,17 +65,17 @@ class EntryMeter:
         self._queues: list[list[Arrival]] = [[] for _ in range(lattice.lanes)]
         self._names: set[str] = set()
         self._columns = [0] * lattice.lanes
-        """The next column of each lane that may be entered."""
+        """The next column of each lane that can be entered."""
         self._free_s = [-math.inf] * lattice.lanes
-        """When the next vehicle of each lane may follow the one before."""
+        """Earliest time at which the next vehicle of each lane may enter."""
 
     @property
     def waiting(self) -> tuple[Arrival, ...]:
-        """Vehicles that were demanded and not admitted yet, lane by lane."""
+        """Vehicles that were demanded and not yet admitted, by lane."""
         return tuple(arrival for queue in self._queues for arrival in queue)
 
     def closed_column(self, lane: int) -> int:
-        """Return the last column of a lane that nobody will enter any more."""
+        """Return the last column of a lane that no vehicle can enter any more."""
         return self._columns[lane] + 1
 
     def demand(self, arrival: Arrival) -> None:
@@ -85,18 +85,18 @@ class EntryMeter:
         possible cell from then on.
 
         Raises:
-            ValueError: the lattice lacks its lane or its preferred lane, or it waits already.
+            ValueError: the lattice lacks its lane or its preferred lane, or it already waits.
         """
         lanes = range(self._lattice.lanes)
         if arrival.lane not in lanes or arrival.preferred_lane not in lanes:
             raise ValueError(f"{arrival} needs lanes 0 to {self._lattice.lanes - 1}")
         if arrival.vehicle in self._names:
-            raise ValueError(f"{arrival.vehicle} is waiting already")
+            raise ValueError(f"{arrival.vehicle} is already waiting")
         self._names.add(arrival.vehicle)
         insort(self._queues[arrival.lane], arrival, key=lambda other: other.t_s)
 
     def admit(self, until_s: float) -> list[Admission]:
-        """Decide on all entries up to a road time that were not decided on before.
+        """Decide on all entries since the last call, up to a road time.
 
         Args:
             until_s: road time, usually now; a vehicle demanded later enters later.
@@ -117,13 +117,13 @@ class EntryMeter:
                 admissions.append(Admission(arrival, cell, t_s, offset_m))
                 self._free_s[lane] = t_s + self._lattice.pitch_m / self._lattice.speed_mps
             self._columns[lane] -= 1
-        # A column that has passed is not for those who are demanded later.
+        # A column that has passed is not available to later demand.
         for lane in range(self._lattice.lanes):
             self._skip(lane, until_s - TIME_TOLERANCE_S)
         return admissions
 
     def _entry_s(self, lane: int) -> float:
-        """Return when the first of a queue enters, if its next cell is free for it."""
+        """Return when the first vehicle of a queue enters if its next cell is free."""
         queue = self._queues[lane]
         if not queue:
             return math.inf
@@ -132,7 +132,7 @@ class EntryMeter:
         return max(ready_s, self._lattice.passing_time_s(self._columns[lane]) - self._spread_s)
 
     def _skip(self, lane: int, t_s: float) -> None:
-        """Go on to the first column of a lane that can still be entered at a time."""
+        """Advance to the first column of a lane that can still be entered at a time."""
         lattice, column = self._lattice, self._columns[lane]
         if self._builder is not None:
             column = int(min(column, self._builder.first_open_column))
@@ -143,7 +143,7 @@ class EntryMeter:
         self._columns[lane] = column
 
     def _takes(self, cell: Cell, t_s: float) -> Arrival | None:
-        """Return the first of the queue, if a formation takes it, or there are none."""
+        """Remove and return the first of the queue, unless no formation takes it."""
         builder, queue = self._builder, self._queues[cell[1]]
         if builder is not None and not builder.takes(cell, queue[0].preferred_lane, t_s):
             return None

@@ -1,19 +1,19 @@
 """Formation building at the entrance: which columns become one formation, and when it is closed.
 
-A formation is *closed* when no vehicle can enter its columns any more, so its members are known for
-certain. The roadside gives each column to at most one closed formation, and never again: that is
-what plans of different formations rely on.
+A formation is *closed* when no vehicle can enter its columns any more, so its members are final.
+The roadside assigns each column to at most one closed formation, once: plans of different
+formations rely on this.
 
 - `ColumnBlocks`, as in the paper: all formations have the same number of columns.
 - `GrowingFormations`, the default: the length follows the traffic. A formation begins with the
-  column of its first vehicle. It ends when it has its most vehicles, when another vehicle would ask
-  for more places on a lane than the shortest formation has, or at its greatest length, so that few
-  vehicles do not wait for each other. It gets columns behind its last vehicle where it needs them
-  for sorting: one free column beside the cells of its vehicles, and as many columns as vehicles
+  column of its first vehicle. It ends when it has its maximum number of vehicles, when another
+  vehicle would need more places on a lane than the shortest formation has, or at its maximum
+  length, so that few vehicles do not wait for each other. Behind its last vehicle it gets the
+  columns that sorting needs: one free column's worth of cells, and as many columns as vehicles
   prefer the same lane.
 
-Both close a formation rather than let it ask for more places on a lane than it has. **This refines
-the paper's operation**, which groups vehicles without looking at their preferences.
+Both close a formation before it needs more places on a lane than it has. **This refines the
+paper's operation**, which groups vehicles regardless of their preferences.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ from laneweave.protocol.wire.messages import ClosedFormation
 
 
 class FormationBuilder(Protocol):
-    """Decides in order of time what belongs together."""
+    """Assigns entering vehicles to formations, in order of time."""
 
     first_open_column: float
-    """The foremost column that may still be entered; infinite: any."""
+    """The foremost column that can still be entered; infinite: any."""
 
     @property
     def closed_to(self) -> int:
         """All blocks up to this number are closed; -1: none."""
 
     def takes(self, cell: Cell, preferred_lane: int, t_s: float) -> bool:
-        """Take a vehicle into the formation of its cell; false where it must go further back.
+        """Take a vehicle into the formation of its cell; False: it needs a cell further back.
 
         Args:
             cell: where it would enter.
-            preferred_lane: lane that it needs.
+            preferred_lane: its preferred lane.
             t_s: road time at which it would enter.
         """
 
@@ -59,11 +59,11 @@ class ColumnBlocks:
     lattice: Lattice
     max_vehicles: int
     spread_s: float
-    """Most time between a vehicle and its cell as they pass the start of the road."""
+    """Maximum time between a vehicle and its cell at the start of the road."""
     first_open_column: float = math.inf
     _taken: Counter[int] = field(factory=Counter)
     _preferring: Counter[tuple[int, int]] = field(factory=Counter)
-    """(block, lane): how many vehicles of the block prefer the lane."""
+    """Vehicles by (block, preferred lane)."""
     _next: int = 0
     """The next block to be closed."""
 
@@ -107,7 +107,7 @@ class GrowingFormations:
     max_vehicles: int
     max_columns: int
     spread_s: float
-    """Most time between a vehicle and its cell as they pass the start of the road."""
+    """Maximum time between a vehicle and its cell at the start of the road."""
     first_open_column: float = 0
     _front: int | None = None
     """Foremost column of the open formation; None: there is none."""
@@ -120,7 +120,7 @@ class GrowingFormations:
 
     @property
     def shortest_length(self) -> int:
-        """Columns of a full formation that has no more room than it needs."""
+        """Columns of a full formation with no more cells than it needs."""
         return self._length_for(self.max_vehicles)
 
     def takes(self, cell: Cell, preferred_lane: int, t_s: float) -> bool:
@@ -148,7 +148,7 @@ class GrowingFormations:
         return self.lattice.block_of(int(self.first_open_column)) - 1
 
     def closed(self, t_s: float) -> list[ClosedFormation]:
-        """Return what has been closed; see `FormationBuilder`."""
+        """Return the formations that have been closed; see `FormationBuilder`."""
         if self._front is not None:
             rear = self._front - self.max_columns + 1
             closed_s = self.lattice.passing_time_s(rear) + self.spread_s
@@ -158,7 +158,7 @@ class GrowingFormations:
         return closed
 
     def _close(self, last_column: int, t_s: float) -> None:
-        """Close the open formation at a column, or behind it where it needs the room."""
+        """Close the open formation at a column, or behind it if it needs more cells."""
         if self._front is None:
             return
         length = max(
@@ -175,18 +175,18 @@ class GrowingFormations:
 
     @property
     def _columns_ahead(self) -> int:
-        """How far ahead of one that has just been entered a column may still be entered."""
+        """Columns ahead of the one just entered that can still be entered."""
         spread_m = self.spread_s * self.lattice.speed_mps
         return math.floor(2.0 * spread_m / self.lattice.pitch_m + 1e-6)
 
     def _length_for(self, vehicles: int) -> int:
-        """Return how many columns hold so many vehicles and one free column's worth of cells."""
+        """Return the columns that hold some vehicles and one free column's worth of cells."""
         lanes = self.lattice.lanes
         return math.ceil((vehicles + lanes) / lanes) if lanes > 1 else vehicles
 
 
 def formation_builder(scenario: Scenario) -> FormationBuilder | None:
-    """Return what builds a scenario's formations; None: there are none."""
+    """Return the builder of a scenario's formations; None: there are none."""
     formation, lattice = scenario.formation, scenario.lattice
     spread_s = formation.entry_spread_s
     if formation.rolling:

@@ -1,6 +1,6 @@
-"""The roadside at the entrance: it meters vehicles in, counts them, and tells who is there.
+"""The roadside at the entrance: admits vehicles, counts them, and publishes clock and census.
 
-Its census is complete, which is what lets a coordinator know a roster for certain.
+The census is complete, so coordinators know every roster exactly.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from laneweave.sim_bridge.road.formation_building import formation_builder
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 CENSUS_EVERY_TICKS = 10
-MOST_EMPTY = 12
-"""A vehicle gets at most so many empty cells behind it; fewer where moves begin soon, since it must
-have them all before it is asked for any."""
+MAX_EMPTY = 12
+"""Maximum number of empty cells that a vehicle gets behind it; fewer where moves begin soon, since
+it must own all of them before a plan can transfer any."""
 
 
 @frozen
 class Counts:
-    """How many vehicles were demanded (up to now), entered, are on the road, have left."""
+    """Numbers of vehicles demanded so far, entered, on the road, and departed."""
 
     demanded: int
     entered: int
@@ -61,12 +61,12 @@ class Roadside:
     """Demand, entry metering and census."""
 
     def __init__(self, scenario: Scenario, bridge: int = 0) -> None:
-        """Draw the demand of a scenario; `bridge` is the incarnation of whoever sends the news."""
+        """Draw the demand of a scenario; `bridge` is the incarnation of the bridge."""
         self._bridge = bridge
         self._announce_s = scenario.runtime.announce_s
         self._tick_s = scenario.runtime.tick_s
         self._lanes = scenario.road.lanes
-        # A tick and one more, so that nobody comes unannounced.
+        # One more, so that no vehicle enters without an announcement.
         lattice, formation = scenario.lattice, scenario.formation
         ahead_s = self._announce_s + self._tick_s
         self._announced_per_lane = math.ceil(ahead_s / formation.entry_spacing_s) + 1
@@ -79,18 +79,18 @@ class Roadside:
             interlaced=formation.interlaced,
         )
         self._closed: list[ClosedFormation] = []
-        """All that have been closed, as long as one of their vehicles is on the road."""
+        """Closed formations with a vehicle on the road."""
         self._closed_to = -1
         self._recent: list[tuple[int, int, Name]] = []
-        """Column, lane and name of those who have entered, as far as they are near."""
+        """Column, lane and name of recently entered vehicles."""
         self._next: list[list[tuple[int, Name]]] = [[] for _ in range(self._lanes)]
-        """Who has entered behind them since cells were handed out, foremost first."""
+        """By lane: vehicles that have entered since cells were assigned, foremost first."""
         self._left_over: list[Cell] = []
-        """Empty cells that nobody has got yet."""
-        self._handed_out = [1 + MOST_EMPTY] * self._lanes
-        """The last column of each lane that was handed out."""
+        """Empty cells that no vehicle owns yet."""
+        self._assigned_to = [1 + MAX_EMPTY] * self._lanes
+        """By lane: the last column whose cells were assigned."""
         columns = int(scenario.moves_from_m / lattice.pitch_m)
-        self._most_empty = max(0, min(MOST_EMPTY, columns - 2))
+        self._max_empty = max(0, min(MAX_EMPTY, columns - 2))
         self._arrivals = arrivals(scenario)
         self._demanded = 0
         self._queued = 0
@@ -113,7 +113,7 @@ class Roadside:
 
     def admit(self, t_s: float) -> list[Admission]:
         """Return the vehicles whose cells pass the start of the road up to now."""
-        # Queue those who arrive until the next tick: their cell may pass between two ticks.
+        # Queue arrivals up to the next tick: their cell may pass between two ticks.
         while (
             self._queued < len(self._arrivals)
             and self._arrivals[self._queued].t_s <= t_s + self._tick_s
@@ -142,32 +142,31 @@ class Roadside:
             self._census_changed = True
         return closed
 
-    def hand_out(self, vehicles: Mapping[Name, RoadVehicle]) -> None:
-        """Give empty cells at the entrance to vehicles near them.
+    def assign_empty_cells(self, vehicles: Mapping[Name, RoadVehicle]) -> None:
+        """Assign empty cells at the entrance to vehicles near them (rolling operation).
 
-        Nothing happens where formations own blocks. A cell becomes somebody's when nobody can
-        enter in it any more. Those that nobody is near to wait for the next vehicles; what is
-        too far ahead of these, too, stays nobody's.
+        A cell is assigned when no vehicle can enter in it any more. Cells without a near vehicle
+        wait for the next vehicles; those too far ahead of these stay without an owner.
         """
         if not self._rolling:
             return
         for lane in range(self._lanes):
             closed = self._meter.closed_column(lane)
-            for column in range(self._handed_out[lane] - 1, closed - 1, -1):
+            for column in range(self._assigned_to[lane] - 1, closed - 1, -1):
                 if self._next[lane] and self._next[lane][0][0] == column:
-                    self._meet(column, lane, self._next[lane].pop(0)[1])
+                    self._remember(column, lane, self._next[lane].pop(0)[1])
                 else:
-                    self._hand_over((column, lane), vehicles)
-            self._handed_out[lane] = closed
+                    self._assign((column, lane), vehicles)
+            self._assigned_to[lane] = closed
         left_over, self._left_over = self._left_over, []
         for cell in left_over:
-            if cell[0] <= max(self._handed_out) + 2 * self._most_empty:
-                self._hand_over(cell, vehicles)
+            if cell[0] <= max(self._assigned_to) + 2 * self._max_empty:
+                self._assign(cell, vehicles)
 
-    def _hand_over(self, cell: Cell, vehicles: Mapping[Name, RoadVehicle]) -> None:
-        """Give an empty cell to whoever is near; best to whoever is ahead, on the same lane."""
+    def _assign(self, cell: Cell, vehicles: Mapping[Name, RoadVehicle]) -> None:
+        """Assign an empty cell to a near vehicle, preferably ahead of it on the same lane."""
         column, lane = cell
-        first, last = column - self._most_empty, column + self._most_empty
+        first, last = column - self._max_empty, column + self._max_empty
         near = [
             (entered < column, number != lane, abs(entered - column), name)
             for entered, number, name in self._recent
@@ -178,9 +177,9 @@ class Roadside:
         else:
             self._left_over.append(cell)
 
-    def _meet(self, column: int, lane: int, name: Name) -> None:
-        """Take note of a vehicle in its cell, and forget what is far ahead of it."""
-        far = column + 2 * self._most_empty
+    def _remember(self, column: int, lane: int, name: Name) -> None:
+        """Remember an entered vehicle, and forget those far ahead of it."""
+        far = column + 2 * self._max_empty
         self._recent = [one for one in self._recent if one[0] <= far]
         self._recent.append((column, lane, name))
 
@@ -189,23 +188,23 @@ class Roadside:
         self._left += 1
         self._census_changed = True
 
-    def news(
+    def publish(
         self, tick: int, t_s: float, on_road: Collection[RoadVehicle], *, ended: bool = False
     ) -> Iterator[Effect]:
-        """Send the clock, and the census on every change, every 10 ticks, and at the end.
+        """Publish the clock, and the census on every change, every 10 ticks, and at the end.
 
-        That a formation has closed is a change, too: now its roster is known.
+        The closing of a formation is a change, too: its roster is final then.
 
         Args:
             tick: number of the tick that begins.
             t_s: its road time.
             on_road: all vehicles on the road.
-            ended: whether it is the last one.
+            ended: whether it is the last tick.
         """
         counts = self.counts(len(on_road))
         yield Send(CLOCK, counts.clock(tick, t_s, ended=ended, bridge=self._bridge))
         due = ended or tick >= self._census_sent_tick + CENSUS_EVERY_TICKS
-        announced = self.announcements_changed(t_s)
+        announced = self.update_announcements(t_s)
         if announced or due or self._census_changed:
             self._census_changed = False
             self._census_sent_tick = tick
@@ -216,21 +215,21 @@ class Roadside:
         return Counts(self._demanded, self._entered, on_road, self._left)
 
     def exhausted(self, t_s: float) -> bool:
-        """Tell whether nobody waits and nobody will arrive any more."""
+        """Return whether no vehicle waits and no further one will arrive."""
         return (
             self._queued == len(self._arrivals)
             and not self._meter.waiting
             and (not self._arrivals or self._arrivals[-1].t_s <= t_s)
         )
 
-    def announcements_changed(self, t_s: float) -> bool:
-        """Look who is about to arrive; tell whether that has changed."""
+    def update_announcements(self, t_s: float) -> bool:
+        """Update the vehicles that are about to arrive; return whether they have changed."""
         before = self._announced
         self._announced = self._announcements(t_s)
         return self._announced != before
 
     def census(self, t_s: float, on_road: Iterable[RoadVehicle]) -> Census:
-        """Return the vehicles on the road, those announced, and the closed formations."""
+        """Return the census: vehicles on the road, announcements, and closed formations."""
         vehicles = tuple(on_road)
         present = {vehicle.formation for vehicle in vehicles}
         self._closed = [closed for closed in self._closed if closed.first_block in present]
@@ -252,7 +251,7 @@ class Roadside:
         )
 
     def _announcements(self, t_s: float) -> tuple[Announcement, ...]:
-        """Return those who may enter within the announced time, however long the queue is."""
+        """Return the vehicles that may enter within the announced time."""
         room = [self._announced_per_lane] * self._lanes
         coming = []
         for arrival in chain(self._meter.waiting, self._upcoming(t_s)):

@@ -1,4 +1,4 @@
-"""A vehicle on the road."""
+"""A vehicle on the road: its body, motion controller and sensors."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
 
 NEAR_M = 0.01
-"""A vehicle that enters this near to its cell is there."""
+"""A vehicle that enters this close to its cell need not settle."""
 
 
 @define
@@ -29,7 +29,7 @@ class RoadVehicle:
     admission: Admission
     controller: MotionController
     sensors: Sensors | None = None
-    """None: it knows itself exactly, and sees nobody."""
+    """None: it measures its own state exactly and sees no neighbours."""
     formation: int | None = None
     """Number of its formation, of its block in the rolling operation; None: not known yet."""
     bridge: int = 0
@@ -41,7 +41,7 @@ class RoadVehicle:
     ) -> RoadVehicle:
         """Return a vehicle that has driven at v_F since it was admitted, at road time `t_s`.
 
-        It is to settle in its cell within `formation.settle_s`.
+        It settles in its cell within `formation.settle_s`.
         """
         lattice, tick_s = scenario.lattice, scenario.runtime.tick_s
         rest = cell_state(lattice, admission.cell, t_s)
@@ -68,7 +68,7 @@ class RoadVehicle:
         return self.controller.lattice.block_of(self.admission.cell[0])
 
     def join(self, closed: ClosedFormation) -> None:
-        """Take note that its formation is closed: plans must be for all of its blocks."""
+        """Join its closed formation: plans must cover all of its blocks."""
         self.formation = closed.first_block
         self.controller.join(closed.blocks)
 
@@ -89,21 +89,21 @@ class RoadVehicle:
 
     @property
     def rung_ticks(self) -> Mapping[Rung, int]:
-        """Ticks on each rung of the ladder."""
+        """Ticks on each rung of the fallback ladder."""
         return self.controller.rung_ticks
 
     def perceive(self, around: Glimpses) -> None:
-        """Let its sensors measure where it is now, and whom it sees.
+        """Measure its own state and its neighbours.
 
         Args:
-            around: whom exact sensors would see.
+            around: neighbours as exact sensors would see them.
         """
         sensors = self.sensors
         if sensors is not None:
             self.controller.perceive(sensors.measure(self.state), sensors.look(around))
 
     def sense(self, tick: int, *, caretaker: bool, left: bool = False) -> Sense:
-        """Return what its sensors and its motion controller know at a tick.
+        """Return its SENSE: measurements and the state of its motion controller.
 
         Args:
             tick: number of the tick that begins.

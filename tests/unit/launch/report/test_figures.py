@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,7 @@ from laneweave.sim_bridge.road.demand import Arrival
 def make_run(folder: Path, lanes: int = 3, vehicles: int = 12, *, lattice: bool = True) -> Path:
     """Record vehicles that drive straight on, one per second, from 55 s on."""
     scenario = parse_scenario({"road": {"lanes": lanes}})
-    with Recorder(folder, scenario) as recorder:
+    with closing(Recorder(folder, scenario)) as recorder:
         for number in range(vehicles):
             lane = number % lanes
             recorder.demanded(Arrival(f"v{number}", lane, lane, 55.0 + number))

@@ -45,7 +45,7 @@ def driven(controller: MotionController) -> dict[Rung, int]:
 
 def plays(controller: MotionController, tick: int) -> Jerk | None:
     """Return the jerk that it would play at a tick; None: it would play nothing."""
-    rung, jerk = controller._way(tick, ())
+    rung, jerk = controller._next(tick, ())
     return jerk if rung is Rung.PLAY else None
 
 

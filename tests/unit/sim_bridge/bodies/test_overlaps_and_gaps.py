@@ -19,7 +19,7 @@ from laneweave.sim_bridge.bodies import overlaps_and_gaps as overlap
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import (
     Around,
     Bodies,
-    LeastGaps,
+    MinGaps,
     Pose,
     corners,
     pose_of,
@@ -131,7 +131,7 @@ def brute_gap(road: dict[str, Pose]) -> float:
 def test_least_gap_agrees_with_slices(poses: list[Pose]) -> None:
     poses = [(s, y, 0.0 if abs(heading) < 1e-3 else heading, v) for s, y, heading, v in poses]
     road = {str(number): pose for number, pose in enumerate(poses)}
-    gap = bodies(road).least_gaps().gap_m
+    gap = bodies(road).min_gaps().gap_m
     expected = brute_gap(road)
     if math.isinf(expected):
         assert math.isinf(gap) or len(poses) > 2 or gap > -1e9
@@ -143,7 +143,7 @@ def test_least_gap_agrees_with_slices(poses: list[Pose]) -> None:
 @given(ROADS)
 @settings(max_examples=150, deadline=None)
 def test_a_negative_gap_means_an_overlap(road: dict[str, Pose]) -> None:
-    gap = bodies(road).least_gaps().gap_m
+    gap = bodies(road).min_gaps().gap_m
     overlaps = bool(bodies(road).overlapping_pairs())
     if abs(gap) > 1e-6:
         assert (gap < 0.0) == overlaps
@@ -156,13 +156,13 @@ def test_gap_and_headway_of_a_simple_queue() -> None:
         "third": (76.0, 1.75, 0.0, 5.0),
         "other lane": (84.0, 5.25, 0.0, 15.0),
     }
-    assert bodies(road).least_gaps() == LeastGaps(4.0, 1.0)
+    assert bodies(road).min_gaps() == MinGaps(4.0, 1.0)
 
 
 def test_nobody_in_line_is_infinitely_far() -> None:
     road = {"a": (10.0, 1.75, 0.0, 15.0), "b": (10.0, 5.25, 0.0, 15.0)}
-    assert bodies(road).least_gaps() == LeastGaps(math.inf, math.inf)
-    assert bodies({}).least_gaps() == LeastGaps(math.inf, math.inf)
+    assert bodies(road).min_gaps() == MinGaps(math.inf, math.inf)
+    assert bodies({}).min_gaps() == MinGaps(math.inf, math.inf)
 
 
 def sense(road: dict[str, Pose], accels_mps2: dict[str, float] | None = None) -> dict[str, Around]:
@@ -270,7 +270,7 @@ def steps_taken(work: Callable[[], object]) -> int:
     return taken
 
 
-@pytest.mark.parametrize("work", [Bodies.overlapping_pairs, Bodies.least_gaps, Bodies.glimpses])
+@pytest.mark.parametrize("work", [Bodies.overlapping_pairs, Bodies.min_gaps, Bodies.glimpses])
 def test_the_effort_grows_with_the_vehicles_and_not_with_their_pairs(
     work: Callable[..., object],
 ) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from laneweave.protocol.scenario.tables import Scenario, Sensing
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import Name, Neighbour
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import NOBODY_AROUND, Around, Glimpses
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import NONE_AROUND, Around, Glimpses
 from laneweave.sim_bridge.bodies.sensors import Sensors
 
 # All different, so that none can stand in for another.
@@ -73,7 +73,7 @@ def test_what_is_seen_keeps_its_lane_and_its_side() -> None:
     seen = Sensors(SCENARIO, A).look(AROUND)
     assert [other.lane for other in seen.ahead] == [1, 2]
     assert [other.lane for other in seen.behind] == [0]
-    assert Sensors(SCENARIO, A).look(([], [])) == NOBODY_AROUND
+    assert Sensors(SCENARIO, A).look(([], [])) == NONE_AROUND
 
 
 def test_equal_seeds_give_equal_errors() -> None:

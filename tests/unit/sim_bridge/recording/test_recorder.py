@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,8 @@ import pytest
 
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import LeastGaps
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
+from laneweave.sim_bridge.recording import recorder as recorder_module
 from laneweave.sim_bridge.recording.recorder import SCENARIO_KEY, Recorder, Sample
 from laneweave.sim_bridge.road.demand import Arrival
 
@@ -36,10 +38,11 @@ def trip(
         recorder.left(vehicle, left_s, lanes[2])
 
 
-def test_trajectories_come_back(tmp_path: Path) -> None:
+def test_trajectories_come_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
     expected = []
-    with Recorder(tmp_path, SCENARIO, rows_per_group=25) as recorder:
+    monkeypatch.setattr(recorder_module, "ROWS_PER_GROUP", 25)
+    with closing(Recorder(tmp_path, SCENARIO)) as recorder:
         for tick in range(40):
             samples: list[Sample] = []
             for n in range(tick % 5):
@@ -68,7 +71,7 @@ def test_the_files_carry_the_scenario(tmp_path: Path) -> None:
 
 
 def test_trips_come_back_in_every_state(tmp_path: Path) -> None:
-    with Recorder(tmp_path, SCENARIO) as recorder:
+    with closing(Recorder(tmp_path, SCENARIO)) as recorder:
         trip(recorder, 1, 1.0, 3.0, 70.0)
         trip(recorder, 2, 62.0, 64.5, 131.5, lanes=(2, 0, 1))
         trip(recorder, 3, 70.0, 71.0)
@@ -95,7 +98,7 @@ def test_trips_come_back_in_every_state(tmp_path: Path) -> None:
 
 
 def test_only_vehicles_between_warm_up_and_last_arrival_count(tmp_path: Path) -> None:
-    with Recorder(tmp_path, SCENARIO) as recorder:
+    with closing(Recorder(tmp_path, SCENARIO)) as recorder:
         trip(recorder, 1, 58.0, 59.9, 900.0)  # enters during the warm-up
         for number in range(2, 12):
             entered_s = 60.0 + 10.0 * (number - 2)
@@ -122,7 +125,7 @@ def test_only_vehicles_between_warm_up_and_last_arrival_count(tmp_path: Path) ->
 
 
 def test_a_short_run_says_null(tmp_path: Path) -> None:
-    with Recorder(tmp_path, SCENARIO) as recorder:
+    with closing(Recorder(tmp_path, SCENARIO)) as recorder:
         trip(recorder, 1, 1.0, 2.0, 70.0)
         summary = recorder.summarise("rule", 70.0)
     assert summary["travel_time_s"] == {"mean": None, "p50": None, "p95": None, "max": None}
@@ -135,7 +138,7 @@ def test_a_short_run_says_null(tmp_path: Path) -> None:
 
 
 def test_the_summary_has_the_agreed_fields(tmp_path: Path) -> None:
-    with Recorder(tmp_path, SCENARIO) as recorder:
+    with closing(Recorder(tmp_path, SCENARIO)) as recorder:
         summary = recorder.summarise("lc2013", 12.0)
     world = ["schema", "method", "seed", "volume_veh_per_lane_h", "lanes", "road_m", "simulated_s"]
     parts = ["vehicles", "travel_time_s", "throughput_veh_per_lane_h", "safety"]
@@ -156,10 +159,10 @@ def test_the_summary_has_the_agreed_fields(tmp_path: Path) -> None:
 
 
 def test_safety_is_the_worst_of_the_run(tmp_path: Path) -> None:
-    with Recorder(tmp_path, SCENARIO) as recorder:
-        recorder.safety([("a", "b")], [], LeastGaps(4.0, 1.2))
-        recorder.safety([("a", "b"), ("a", "c")], [("a", "b")], LeastGaps(3.25, 1.5))
-        recorder.safety([], [], LeastGaps(math.inf, math.inf))
+    with closing(Recorder(tmp_path, SCENARIO)) as recorder:
+        recorder.safety([("a", "b")], [], MinGaps(4.0, 1.2))
+        recorder.safety([("a", "b"), ("a", "c")], [("a", "b")], MinGaps(3.25, 1.5))
+        recorder.safety([], [], MinGaps(math.inf, math.inf))
         safety = recorder.summarise("formation", 1.0)["safety"]
     assert (safety["overlaps"], safety["sumo_collisions"]) == (2, 1)
     assert (safety["min_gap_m"], safety["min_headway_s"]) == (3.25, 1.2)
@@ -167,7 +170,7 @@ def test_safety_is_the_worst_of_the_run(tmp_path: Path) -> None:
 
 def test_emergency_brakes_are_counted_by_episode(tmp_path: Path) -> None:
     accels = {"a": [0.0, -9.5, -10.0, -8.0, -9.1, 0.0], "b": [0.0, 1.0, 1.5, 1.5, -8.9, -9.0]}
-    with Recorder(tmp_path, SCENARIO) as recorder:
+    with closing(Recorder(tmp_path, SCENARIO)) as recorder:
         for tick in range(6):
             recorder.tick(
                 0.1 * tick, [(v, 0.0, 1.0, 15.0, accels[v][tick], None, 0) for v in accels]
@@ -182,7 +185,7 @@ def test_emergency_brakes_are_counted_by_episode(tmp_path: Path) -> None:
 
 def test_events_are_there_at_once_and_begin_with_the_time(tmp_path: Path) -> None:
     path = tmp_path / "events.jsonl"
-    with Recorder(tmp_path, SCENARIO) as recorder:
+    with closing(Recorder(tmp_path, SCENARIO)) as recorder:
         recorder.event(1.5, "agent-missing", vehicle="v1", path=tmp_path)
         (line,) = path.read_text().splitlines()
         assert list(json.loads(line)) == ["t_s", "kind", "vehicle", "path"]
@@ -208,7 +211,7 @@ def test_closing_twice_keeps_everything_and_ends_recording(tmp_path: Path) -> No
 
 def test_an_exception_keeps_what_was_recorded(tmp_path: Path) -> None:
     def fail() -> None:
-        with Recorder(tmp_path, Scenario()) as recorder:
+        with closing(Recorder(tmp_path, Scenario())) as recorder:
             recorder.tick(0.0, [("v0001", 0.0, 1.75, 15.0, 0.0, -1, 0)])
             recorder.entered("nobody", 0.0)
 

@@ -13,7 +13,7 @@ import pytest
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.wire.messages import Heartbeat, LogEvent, Name, Report
 from laneweave.sim_bridge.bodies.motion_controller import Rung
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import LeastGaps
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord, write_summary
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
@@ -21,7 +21,7 @@ from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from support.bridge_bench import read_events, read_summary
 
 SCENARIO = Scenario()
-NO_GAPS = LeastGaps(30.0, 2.0)
+NO_GAPS = MinGaps(30.0, 2.0)
 
 
 class Watch:

@@ -10,7 +10,7 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.vehicle.motion import State, cell_state, commanded_state, hold_law
 from laneweave.protocol.wire.messages import Command, Name, Neighbour
 from laneweave.sim_bridge.bodies.motion_controller import RELEASE_M, MotionController, Rung
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import NOBODY_AROUND, Around
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import NONE_AROUND, Around
 from laneweave.sim_bridge.bodies.plant import Plant
 from support.paper import PAPER
 
@@ -47,7 +47,7 @@ class Track:
         assert taken
 
     def step(self) -> Rung:
-        around = NOBODY_AROUND
+        around = NONE_AROUND
         if np.isfinite(self.rear_m):
             around = Around((Neighbour(self.lane, self.gap_m, self.speed_mps),), ())
         self.controller.perceive(self.plant.state, around)
@@ -251,7 +251,7 @@ def test_it_steers_on_while_it_brakes(track: Track) -> None:
 def test_it_drives_by_what_its_sensors_measure() -> None:
     track = Track()
     s, *rest = track.plant.state
-    track.controller.perceive((s - 2.0, *rest), NOBODY_AROUND)  # type: ignore[arg-type]
+    track.controller.perceive((s - 2.0, *rest), NONE_AROUND)  # type: ignore[arg-type]
     assert track.controller.measured[0] == s - 2.0
     assert track.controller.moving(0)
     track.controller.step(0)
@@ -261,6 +261,6 @@ def test_it_drives_by_what_its_sensors_measure() -> None:
 def test_a_measurement_is_of_one_tick_only() -> None:
     track = Track()
     s, *rest = track.plant.state
-    track.controller.perceive((s - 2.0, *rest), NOBODY_AROUND)  # type: ignore[arg-type]
+    track.controller.perceive((s - 2.0, *rest), NONE_AROUND)  # type: ignore[arg-type]
     track.controller.step(0)
     assert track.controller.measured == track.plant.state

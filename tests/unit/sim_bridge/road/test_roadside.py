@@ -81,7 +81,7 @@ class Watch:
             self.entered.append(vehicle)
         counts = roadside.counts(on_road=0)
         assert (counts.demanded, counts.entered) == (len(self.demanded), len(self.entered))
-        roadside.announcements_changed(t_s)
+        roadside.update_announcements(t_s)
         announced = roadside.census(t_s, ()).announced
         assert [(a.arrival_s, a.vehicle) for a in announced] == sorted(
             (a.arrival_s, a.vehicle) for a in announced
@@ -132,8 +132,8 @@ def test_announcements_come_in_time_and_say_what_is_known() -> None:
         t_s = 0.1 * tick
         roadside.newly_demanded(t_s)
         roadside.admit(t_s)
-        roadside.announcements_changed(t_s)
-        assert not roadside.announcements_changed(t_s)
+        roadside.update_announcements(t_s)
+        assert not roadside.update_announcements(t_s)
         for announcement in roadside.census(t_s, ()).announced:
             seen.setdefault(announcement.vehicle, t_s)
             arrival = next(a for a in roadside._arrivals if a.vehicle == announcement.vehicle)
@@ -173,7 +173,7 @@ def test_counts_make_the_clock() -> None:
 
 @pytest.mark.parametrize("ended", [False, True])
 def test_all_news_name_the_bridge_that_they_come_from(*, ended: bool) -> None:
-    news = list(Roadside(Scenario(), 17).news(0, 0.0, (), ended=ended))
+    news = list(Roadside(Scenario(), 17).publish(0, 0.0, (), ended=ended))
     messages = [effect.message for effect in news if isinstance(effect, Send)]
     assert [type(message) for message in messages] == [RoadClock, Census]
     assert [message.bridge for message in messages] == [17, 17]
@@ -198,7 +198,7 @@ def test_a_census_tells_at_once_that_a_block_has_closed() -> None:
     tick_s, told = scenario.runtime.tick_s, {}
     for tick in range(100):
         roadside.close_formations(tick * tick_s)
-        for effect in roadside.news(tick, tick * tick_s, []):
+        for effect in roadside.publish(tick, tick * tick_s, []):
             if isinstance(effect, Send) and isinstance(effect.message, Census):
                 told[tick] = effect.message.closed_to
     for block in range(2):
@@ -242,7 +242,7 @@ class CensusWatch:
                 self.left += 1
         censuses = [
             effect.message
-            for effect in roadside.news(tick, t_s, self.vehicles.values())
+            for effect in roadside.publish(tick, t_s, self.vehicles.values())
             if isinstance(effect, Send) and isinstance(effect.message, Census)
         ]
         assert censuses or not closed, "a formation has closed, and nobody is told"

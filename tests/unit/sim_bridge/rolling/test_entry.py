@@ -16,7 +16,7 @@ from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.road.demand import Arrival, arrivals
 from laneweave.sim_bridge.road.entry import Admission, EntryMeter
 from laneweave.sim_bridge.road.formation_building import ColumnBlocks
-from laneweave.sim_bridge.road.roadside import MOST_EMPTY, Roadside
+from laneweave.sim_bridge.road.roadside import MAX_EMPTY, Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 LANES = 3
@@ -148,7 +148,7 @@ class Entrance:
             for admission in self.roadside.admit(t_s):
                 vehicle = RoadVehicle.entering(admission, t_s, self.scenario)
                 self.vehicles[vehicle.name] = vehicle
-            self.roadside.hand_out(self.vehicles)
+            self.roadside.assign_empty_cells(self.vehicles)
             self.tick += 1
         return self
 
@@ -179,8 +179,8 @@ def test_every_cell_near_behind_a_vehicle_of_the_lane_is_its(
             if vehicle.admission.cell[1] == lane
         )
         for index, (column, name) in enumerate(columns):
-            rear = columns[index - 1][0] if index else column - MOST_EMPTY - 1
-            for each in range(column, max(rear, column - MOST_EMPTY - 1), -1):
+            rear = columns[index - 1][0] if index else column - MAX_EMPTY - 1
+            for each in range(column, max(rear, column - MAX_EMPTY - 1), -1):
                 assert owners[each, lane] == name
 
 
@@ -193,19 +193,19 @@ def test_every_cell_that_is_near_to_somebody_has_an_owner(
     entrance = Entrance(stream, tick_s=tick_s).run(120.0)
     owners = entrance.owners()
     entered = [vehicle.admission.cell[0] for vehicle in entrance.vehicles.values()]
-    for column in range(MOST_EMPTY, -100, -1):
-        if any(0 <= one - column <= MOST_EMPTY for one in entered):
+    for column in range(MAX_EMPTY, -100, -1):
+        if any(0 <= one - column <= MAX_EMPTY for one in entered):
             assert all((column, lane) in owners for lane in range(LANES)), column
 
 
 def test_cells_ahead_of_the_first_vehicle_are_its_as_far_as_they_are_near() -> None:
     entrance = Entrance([Arrival("first", 1, 0, 20.2)]).run(20.3)
     estate = entrance.estate("first")
-    assert estate[0][0] == -20 + MOST_EMPTY
+    assert estate[0][0] == -20 + MAX_EMPTY
     assert {lane for _, lane in estate} == {0, 1, 2}
 
 
-def test_a_cell_is_handed_out_when_nobody_can_enter_it_any_more() -> None:
+def test_a_cell_is_assigned_to_when_nobody_can_enter_it_any_more() -> None:
     entrance = Entrance([Arrival("first", 1, 0, 0.0)]).run(1.4)
     assert min(entrance.estate("first")) == (0, 0)
     entrance.run(1.6)
@@ -214,8 +214,8 @@ def test_a_cell_is_handed_out_when_nobody_can_enter_it_any_more() -> None:
 
 def test_most_get_no_more_than_some_cells() -> None:
     entrance = Entrance([Arrival("first", 1, 0, 0.0), Arrival("next", 1, 0, 50.0)]).run(60.0)
-    assert min(entrance.estate("first"))[0] == -MOST_EMPTY
-    assert max(entrance.estate("next"))[0] == -50 + MOST_EMPTY
+    assert min(entrance.estate("first"))[0] == -MAX_EMPTY
+    assert max(entrance.estate("next"))[0] == -50 + MAX_EMPTY
 
 
 def test_cells_behind_a_vehicle_that_has_left_are_nobody_s() -> None:
@@ -227,7 +227,7 @@ def test_cells_behind_a_vehicle_that_has_left_are_nobody_s() -> None:
     assert entrance.owners() == {}
 
 
-def test_where_formations_own_blocks_nothing_is_handed_out() -> None:
+def test_where_formations_own_blocks_nothing_is_assigned_to() -> None:
     entrance = Entrance([Arrival("first", 1, 0, 0.0)], make_scenario(operation="paper")).run(9.0)
     assert entrance.estate("first") == []
 

@@ -1,4 +1,4 @@
-"""Where the bodies are shown, and what is measured and sensed there."""
+"""The world in which bodies are shown, measured and sensed."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 
 class World(Protocol):
-    """Where the bodies are shown; `SumoWorld` in every real run."""
+    """Shows bodies; `SumoWorld` outside tests."""
 
     def add(self, vehicle: str, state: State) -> None:
         """Put a vehicle on the road."""
 
     def place(self, vehicle: str, state: State) -> None:
-        """Say where a vehicle is at the end of the next step."""
+        """Set the state of a vehicle at the end of the next step."""
 
     def step(self) -> None:
         """Advance by one tick."""
 
     def positions(self) -> dict[str, Pose]:
-        """Return where each vehicle is shown."""
+        """Return the pose of each vehicle."""
 
     def collisions(self) -> list[tuple[str, str]]:
-        """Return the pairs that the world itself takes for colliding."""
+        """Return the pairs that the world itself reports as colliding."""
 
     def remove(self, vehicle: str) -> None:
         """Take a vehicle off the road."""
@@ -42,11 +42,11 @@ def show_bodies(
     record: RunRecord,
     t_s: float,
 ) -> None:
-    """Let the world show all bodies, record what it shows, and let each vehicle's sensors look.
+    """Show all bodies, record their poses, and update every vehicle's sensors.
 
     Args:
         world: advanced by one tick.
-        vehicles: all on the road, moved on already.
+        vehicles: all vehicles on the road, already moved by one tick.
         scenario: size of vehicles and lanes.
         record: takes overlaps, collisions, gaps and samples.
         t_s: road time after the tick.
@@ -66,5 +66,5 @@ def show_bodies(
         vehicles.values(),
         overlaps=bodies.overlapping_pairs(),
         collisions=world.collisions(),
-        gaps=bodies.least_gaps(),
+        gaps=bodies.min_gaps(),
     )
