@@ -261,7 +261,7 @@ class Road:
                 yield key, payload
 
     def _look(self) -> None:
-        """Let everybody's sensors see who is around."""
+        """Update the sensors of all vehicles."""
         vehicles = {name: stand.vehicle for name, stand in self.stands.items()}
         record = cast("RunRecord", self.world)
         t_s = self.tick * self.scenario.runtime.tick_s

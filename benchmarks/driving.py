@@ -1,12 +1,12 @@
-"""How well vehicles drive: goals of the lower level, on random formations.
+"""Goals of the lower level, on random formations.
 
     python benchmarks/driving.py switches [--count 1000] [--seed 0] [--json]
     python benchmarks/driving.py emergencies [--count 2000] [--seed 0] [--json]
 
 In closed loop without network and SUMO (`tests/support/driving.py`). `switches`: formation
 switches on the timetable, half in each mode, against lattice points, limits and gaps.
-`emergencies`: the vehicle ahead brakes to a stand while all messages stop; bodies must not touch.
-`--json` prints JSON; `--first N --count 1` plays one again. The exit status is 1 if a goal is
+`emergencies`: the vehicle ahead brakes to a stop while all messages stop; bodies must not touch.
+`--json` prints JSON; `--first N --count 1` repeats one. The exit status is 1 if a goal is
 missed.
 """
 
@@ -31,7 +31,7 @@ T = TypeVar("T")
 
 
 def played(play: Callable[[int], T], numbers: Sequence[int], jobs: int) -> list[T]:
-    """Return what becomes of each number, in order; says on a terminal how far it is."""
+    """Return the result of each number, in order; show the progress on a terminal."""
     results = []
     with ProcessPoolExecutor(jobs) as pool:
         for result in pool.map(play, numbers, chunksize=4):

@@ -1,8 +1,8 @@
-"""How vehicles enter and formations are built, without driving: `python benchmarks/entry.py`.
+"""Entry and formation building without driving: `python benchmarks/entry.py`.
 
 For each volume: the time from a vehicle's arrival to the moment at which its cell passes the start
 of the road (negative where it takes a cell ahead), and how long and how full formations are. Where
-this time grows with the duration, more vehicles arrive than the entrance can take in.
+this time grows with the duration, more vehicles arrive than can enter.
 """
 
 from __future__ import annotations

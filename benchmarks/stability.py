@@ -1,6 +1,6 @@
 """How a disturbance of speed travels: `python benchmarks/stability.py [--json FILE]`.
 
-One vehicle brakes for 2 s whatever it is told, in a column that holds its cells and in formations
+One vehicle brakes for 2 s whatever its commands, in a column that holds its cells and in formations
 that switch, with and without message loss (`tests/support/disturbances.py`). Writes peaks and
 amplification from vehicle to vehicle, a figure, and prints a table. The exit status is 1 if bodies
 overlap.

@@ -63,7 +63,7 @@ def arrival(vehicle: str, t_s: float, lane: int = 0, preferred_lane: int = 0) ->
 
 
 class PlainWorld:
-    """Shows every body where it was placed, and remembers all that it has shown."""
+    """Shows every body where it was placed, and records all poses."""
 
     def __init__(self) -> None:
         """Begin with an empty road."""
@@ -134,7 +134,7 @@ def read_events(folder: Path, kind: str) -> list[dict[str, Any]]:
 
 @define
 class Desk:
-    """A bridge that is driven event by event, and what it has said."""
+    """A bridge that is driven event by event, and its effects."""
 
     scenario: Scenario
     folder: Path
@@ -178,7 +178,7 @@ class Desk:
         return self.give(Arrived(COMMAND, {"vehicle": vehicle}, self.command(vehicle, **changes)))
 
     def command(self, vehicle: str, **changes: Any) -> Command:  # noqa: ANN401 (fields)
-        """Return an answer to the current tick: go on as you are.
+        """Return an answer to the current tick that does not change the motion.
 
         As agents do, it comes with a new incarnation when the caretaker is in charge.
         """
@@ -205,7 +205,7 @@ class Desk:
         return self.report("bridge", BRIDGE)
 
     def drive(self, until: Callable[[], bool], *deaf: str) -> None:
-        """Answer for all agents that are up, but for some, until something is so."""
+        """Answer for all agents that are up, except some, until a condition is met."""
         for _ in range(20_000):
             if until():
                 return
@@ -214,14 +214,14 @@ class Desk:
                 self.answer(awaited[0])
             else:
                 self.wake()
-        raise AssertionError("it never is")
+        raise AssertionError("the condition was never met")
 
     def drive_to(self, tick: int, *deaf: str) -> None:
-        """Go on until a tick has been opened and its vehicles have been asked."""
+        """Go on until a tick has begun and its vehicles have been asked."""
         self.drive(lambda: self.core.tick >= tick and self.core.phase is TickPhase.ANSWERS, *deaf)
 
     def drive_to_silence(self, *silent: str) -> None:
-        """Go on without a word of some agents until they count as silent."""
+        """Go on without answers of some agents until they count as silent."""
         answers = self.core._answers
         self.drive(
             lambda: answers.silent >= set(silent) and self.core.phase is TickPhase.ANSWERS, *silent
@@ -250,7 +250,7 @@ def sent(effects: Iterable[Effect], kind: type) -> list[Any]:
 
 
 def asked(effects: Iterable[Effect]) -> list[str]:
-    """Return who was told what its sensors see."""
+    """Return the vehicles to which a SENSE was sent."""
     return [sense.vehicle for sense in sent(effects, Sense) if not sense.left]
 
 
@@ -261,7 +261,7 @@ def ended(effects: Iterable[Effect]) -> bool:
 # --- with agents ------------------------------------------------------------------------------
 
 CATCH_UP_S = 0.015
-"""What a process takes for each event that it has missed."""
+"""Time that a process needs for each event that it has missed."""
 
 
 class Sleeper:
@@ -341,7 +341,7 @@ class Street:
         return host
 
     def start_shard(self, index: int = 0, count: int = 1) -> AgentHost:
-        """Start a process for all vehicles that fall to it."""
+        """Start a process for all vehicles of its shard."""
         host = AgentHost(self._make_agent, shard=Shard(index, count))
         self._add(f"shard-{index}", host)
         return host
@@ -358,7 +358,7 @@ class Street:
         self.nodes.append(self.network.add(name, core, REALM))
 
     def run(self, until: Callable[[], bool] | None = None) -> None:
-        """Let the network run until the bridge has ended, or until something is so."""
+        """Run the network until the bridge has ended, or until a condition is met."""
         stop = until or (lambda: self.bridge.phase is TickPhase.ENDED)
         self.network.run(self.network.now_s + FOR_EVER_S, stop)
         assert stop()

@@ -74,7 +74,7 @@ class Case:
         return parse_scenario({"seed": self.seed, **tables})
 
     def arrivals(self) -> list[Arrival]:
-        """Return who arrives when: each with a cell that may be entered."""
+        """Return the arrivals, each with a cell that can be entered."""
         scenario = self.scenario
         lanes, spacing_s = scenario.road.lanes, scenario.formation.entry_spacing_s
         rng = np.random.default_rng(self.seed)

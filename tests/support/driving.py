@@ -2,7 +2,7 @@
 
 A `Road` carries the bridge's vehicles (body, motion controller, sensors), each driven by an agent's
 real driver. A tick is what it is in a run: sense, begin a move, drive, COMMAND, step, and look
-around. There is no protocol: who uses the road says when which move begins, and when messages stop.
+around. There is no protocol: the caller decides when moves begin and when messages stop.
 """
 
 from __future__ import annotations
@@ -76,10 +76,9 @@ class Road:
         """How long each move takes."""
         self.tick = 0
         self.messages = True
-        """Whether drivers hear and are heard; if not, motion controllers go on with what they have.
-        """
+        """Whether messages arrive; otherwise motion controllers continue with what they have."""
         self.broadcast = True
-        """Whether vehicles tell each other of their motions."""
+        """Whether vehicles publish their motions."""
         self.late = 0
         """Moves that began before the one under way had ended."""
         self.record = Record()
@@ -114,13 +113,13 @@ class Road:
 
         Args:
             begins: moves that begin with this tick; none without messages.
-            braking: who brakes as hard as it can, whatever it was told.
+            braking: vehicles that brake as hard as they can, whatever their commands.
         """
         if self.messages:
             for name, one in self.driven.items():
                 self._drive(one, (begins or {}).get(name))
             if self.broadcast:
-                self._tell_motions()
+                self._publish_motions()
         exempt = []
         for name, vehicle in self.vehicles.items():
             plant = vehicle.controller.plant
@@ -140,7 +139,7 @@ class Road:
         self._show()
 
     def _drive(self, one: Driven, move: PlannedMove | None) -> None:
-        """Hear the vehicle's sensors and answer with a COMMAND, as its agent does."""
+        """Take the SENSE and answer with a COMMAND, as its agent does."""
         sense = one.vehicle.sense(self.tick, caretaker=False)
         one.moving = one.moving and not one.driver.at_rest(sense)
         if move is not None:
@@ -161,8 +160,8 @@ class Road:
         if not one.vehicle.controller.take(command):
             raise RuntimeError(f"the motion controller refused {command}")
 
-    def _tell_motions(self) -> None:
-        """Tell everybody of the others' motions, as their agents do after a tick."""
+    def _publish_motions(self) -> None:
+        """Publish motions to the other vehicles, as agents do after a tick."""
         for name, one in self.driven.items():
             course = one.driver.motion(self.tick)
             if course is None:

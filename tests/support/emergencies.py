@@ -1,7 +1,7 @@
-"""Random emergencies: somebody ahead brakes to a stand, and at that moment all messages stop.
+"""Random emergencies: the vehicle ahead brakes to a stop, and at that moment all messages stop.
 
-The one ahead brakes as hard as a vehicle can. Nobody drives the others from then on: their motion
-controllers have the rest of the last trajectory, their hold law, and what their sensors see. Bodies
+It brakes as hard as a vehicle can. From then on the other vehicles have no commands: their motion
+controllers have the rest of the last trajectory, their hold law, and their sensors. Bodies
 must not touch.
 
 The kinds are `holding`, one cell behind in the same lane; `closing`, a move from two cells behind
@@ -55,7 +55,7 @@ class Situation:
 
     @property
     def ahead(self) -> Name:
-        """Who brakes."""
+        """The vehicle that brakes."""
         return next(iter(self.cells))
 
     @property
@@ -72,20 +72,20 @@ class Situation:
 
 
 @frozen
-class Outcome:
-    """What became of a situation."""
+class EmergencyResult:
+    """Result of a situation."""
 
     index: int
     kind: str
     diagonal: bool
     phase_ticks: int
-    """When braking began, after the move did or, where nobody moves, was to."""
+    """Begin of braking relative to `MOVE_TICK`."""
     impact: tuple[str, str] | None
     """Lesser and greater name of the first two bodies that overlapped, if any."""
     impact_mps: float
     """How fast these two were, one relative to the other; 0: no impact."""
     least_gap_m: float
-    """Since braking began; infinite: nobody was behind anybody else."""
+    """Since braking began; infinite: no vehicle was behind another."""
     standing: bool
     """All stood still in the end."""
     braked: int
@@ -150,14 +150,14 @@ def _standing(road: Road) -> bool:
     return all(state[1] <= STANDING_MPS for state in road.record.states[-1])
 
 
-def outcome(seed: int, index: int) -> Outcome:
+def outcome(seed: int, index: int) -> EmergencyResult:
     """Make, play and measure a situation."""
     situation = random_situation(seed, index)
     road = play(situation)
     record, names = road.record, list(situation.cells)
     impact = record.overlaps[0][1:] if record.overlaps else None
     speeds = dict(zip(names, (state[1] for state in record.states[-1]), strict=True))
-    return Outcome(
+    return EmergencyResult(
         index=index,
         kind=situation.kind,
         diagonal=situation.diagonal,
@@ -171,8 +171,8 @@ def outcome(seed: int, index: int) -> Outcome:
     )
 
 
-def summary(outcomes: Iterable[Outcome]) -> dict[str, Any]:
-    """Return the figures of some situations, of one kind say."""
+def summary(outcomes: Iterable[EmergencyResult]) -> dict[str, Any]:
+    """Return the figures of some situations."""
     outcomes = list(outcomes)
     impacts = [one for one in outcomes if one.impact]
     gaps = [one.least_gap_m for one in outcomes if isfinite(one.least_gap_m)]
@@ -200,7 +200,7 @@ def summary(outcomes: Iterable[Outcome]) -> dict[str, Any]:
     }
 
 
-def _with_the_first(one: Outcome) -> bool:
+def _with_the_first(one: EmergencyResult) -> bool:
     return one.impact is not None and any(name.endswith("v0") for name in one.impact)
 
 

@@ -68,7 +68,7 @@ class RuleRoad:
         return self.tick * self.scenario.runtime.tick_s
 
     def step(self) -> Sequence[ReferenceVehicle]:
-        """Advance by one tick; who passes the end leaves. Return who entered."""
+        """Advance by one tick; return the vehicles that entered."""
         self.tick += 1
         entered = self.traffic.step(self.t_s, self.entrance)
         limits = self.scenario.vehicle
@@ -91,7 +91,7 @@ class RuleRoad:
             self.step()
 
     def run(self, seconds: float) -> None:
-        """Advance until everybody has left, for so long at most."""
+        """Advance until all vehicles have left, for at most this time."""
         end_s = self.t_s + seconds
         while self.traffic.vehicles and self.t_s < end_s:
             self.step()

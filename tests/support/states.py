@@ -1,4 +1,4 @@
-"""What vehicles show, in tests: somebody who holds, and has nothing to say."""
+"""VEHICLE_STATE messages for tests."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ class Switch:
 
 @frozen
 class SwitchResult:
-    """What became of a switch."""
+    """Result of a switch."""
 
     index: int
     mode: int
@@ -114,7 +114,7 @@ def random_switch(
 def _request(rng: Random, scenario: Scenario, names: tuple[Name, ...], grid: Grid) -> PlanRequest:
     cells = [(column, lane) for column in range(grid.columns) for lane in range(grid.lanes)]
     starts, targets = rng.sample(cells, len(names)), rng.sample(cells, len(names))
-    # Half of the formations want lanes, as on the road; in the others everybody has its target.
+    # Half of the formations want lanes, as on the road; otherwise every vehicle has a target.
     by_lane = rng.random() < 0.5
     requests = [
         VehicleRequest(name, cell, lane=targets[i][1])
@@ -212,7 +212,7 @@ def switch_result(
 
 
 def summary(results: Iterable[SwitchResult]) -> dict[str, Any]:
-    """Return the figures of some switches, of one mode say."""
+    """Return the figures of some switches."""
     results = list(results)
     # A switch from a formation into itself has no points.
     errors = np.array([error for one in results for error in one.errors_m]).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""Who acts for a vehicle: an agent claims it, speaks once it is in charge, and gives way."""
+"""Claims: an agent claims its vehicle, publishes once it is in charge, and gives way."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from support.agent_rig import BALLOT, HOME, LATTICE, ME, OTHER, TICK_S, Rig, mak
 
 
 class Passenger:
-    """A driver that drives nothing and keeps a diary."""
+    """A driver that drives nothing and records calls."""
 
     solver_stats = SolverStats()
 
     def __init__(self, _: Scenario) -> None:
-        """Begin with an empty diary."""
+        """Begin without calls."""
         self.taken_over: list[int] = []
         self.begun: list[PlannedMove] = []
         self.resting = True
@@ -53,10 +53,10 @@ class Passenger:
         return Drive(sense.tick + 1 if moving else 0, HOME, 0, b"")
 
     def motion(self, tick: int) -> None:
-        """Tell others nothing."""
+        """Publish nothing."""
 
     def on_motion(self, motion: Motion) -> None:
-        """Ignore others' motions."""
+        """Ignore motions."""
 
 
 class Seat:
@@ -93,7 +93,7 @@ class Seat:
         accepted: Ballot | None = None,
         cell: Cell = HOME,
     ) -> list[Effect]:
-        """Show it the next tick, with somebody in charge."""
+        """Send it the next tick, with a process in charge."""
         self.tick += 1
         self.last = Sense(
             ME, self.tick, self.tick * TICK_S, cell_state(LATTICE, cell, self.tick * TICK_S),
@@ -150,7 +150,7 @@ def command_of(effects: Iterable[Effect]) -> Command:
 # --- claiming ---------------------------------------------------------------------------------
 
 
-def test_the_first_answer_claims_the_vehicle_and_says_nothing_to_others() -> None:
+def test_the_first_answer_is_only_a_claim() -> None:
     seat = Seat()
     effects = seat.feel(0)
     assert kinds(effects) == [Command]
@@ -179,7 +179,7 @@ def test_it_promises_and_accepts_nothing_before_it_is_in_charge() -> None:
     assert (seat.shown.promised, seat.shown.accepted) == (None, False)
 
 
-def test_it_speaks_once_a_sense_has_shown_that_it_is_in_charge() -> None:
+def test_it_publishes_states_once_a_sense_shows_that_it_is_in_charge() -> None:
     seat = Seat()
     seat.feel(0)
     effects = seat.feel(1)
@@ -188,11 +188,11 @@ def test_it_speaks_once_a_sense_has_shown_that_it_is_in_charge() -> None:
     assert (seat.shown.incarnation, seat.shown.attended) == (1, True)
     assert kinds(seat.prepare()) == [VehicleState]
     assert seat.shown.promised == BALLOT
-    assert kinds(seat.repeat()) == [Command]  # what others have been told once is enough
+    assert kinds(seat.repeat()) == [Command]  # the state is not published again
 
 
 def test_v1_is_repeated_while_a_claim_is_under_way() -> None:
-    """Until it is granted, somebody else may have moved the vehicle."""
+    """Until the claim is granted, another process may have moved the vehicle."""
     seat = Seat()
     cells: tuple[Cell, ...] = ((-1, 1), (-2, 1), (-2, 2), (-3, 2), (-3, 1))
     for attendant, cell in zip((0, 0, 0, 1, 1), cells, strict=True):
@@ -203,7 +203,7 @@ def test_v1_is_repeated_while_a_claim_is_under_way() -> None:
     assert seat.shown.hold_cell == cells[3]
 
 
-def test_what_moves_when_it_takes_charge_counts_as_moving() -> None:
+def test_a_vehicle_that_moves_when_it_takes_charge_counts_as_moving() -> None:
     seat = Seat()
     seat.feel(0)
     seat.driver.resting = False
@@ -254,7 +254,7 @@ def test_superseded_by_the_caretaker_it_claims_with_a_new_incarnation_and_no_mem
     assert seat.shown.accepted
 
 
-def test_a_claim_that_was_not_heard_is_made_again_with_the_same_incarnation() -> None:
+def test_a_lost_claim_is_repeated_with_the_same_incarnation() -> None:
     seat = Seat()
     seat.take_charge()
     caretaker = seat.rig.new_incarnation()
@@ -271,7 +271,7 @@ def test_after_another_agent_has_died_it_claims_the_vehicle_from_its_caretaker()
     assert command_of(seat.feel(caretaker, caretaker=True)).incarnation == 4 > caretaker
 
 
-def test_who_finds_that_nobody_is_in_charge_begins_anew() -> None:
+def test_without_a_process_in_charge_the_agent_starts_anew() -> None:
     seat = Seat()
     seat.take_charge()
     seat.prepare()
@@ -281,7 +281,7 @@ def test_who_finds_that_nobody_is_in_charge_begins_anew() -> None:
     assert seat.shown.promised is None
 
 
-def test_it_leaves_with_its_vehicle_whoever_is_in_charge() -> None:
+def test_it_ends_with_its_vehicle_whatever_process_is_in_charge() -> None:
     seat = Seat()
     seat.take_charge()
     seat.feel(9)
@@ -303,7 +303,7 @@ def taken() -> Seat:
     return seat
 
 
-def test_an_acceptance_is_asked_for_at_once_and_shown_when_it_has_been_noted() -> None:
+def test_an_acceptance_is_requested_at_once_and_published_when_noted() -> None:
     seat = taken()
     assert kinds(seat.repeat()) == [Command]  # a SENSE from before it was noted
     assert kinds(seat.feel(1)) == [Command, VehicleState]
@@ -323,7 +323,7 @@ def test_a_note_may_come_with_the_next_tick() -> None:
 
 
 @pytest.mark.parametrize("noted", [None, BALLOT._replace(seq=0), BALLOT._replace(seq=2)])
-def test_what_was_noted_of_another_plan_is_no_acceptance(noted: Ballot | None) -> None:
+def test_a_note_for_another_plan_is_no_acceptance(noted: Ballot | None) -> None:
     seat = taken()
     assert kinds(seat.note(noted)) == [Command]
     seat.feel(1, accepted=noted)
@@ -331,7 +331,7 @@ def test_what_was_noted_of_another_plan_is_no_acceptance(noted: Ballot | None) -
 
 
 @pytest.mark.parametrize("attendant", [0, 2])
-def test_what_was_noted_for_another_process_is_no_acceptance(attendant: int) -> None:
+def test_a_note_for_another_process_is_no_acceptance(attendant: int) -> None:
     """A process that has been replaced without knowing it shows nothing that counts."""
     seat = taken()
     assert kinds(seat.note(attendant=attendant)) == [Command]
@@ -342,7 +342,7 @@ def test_what_was_noted_for_another_process_is_no_acceptance(attendant: int) -> 
     assert not seat.agent.in_charge
 
 
-def test_an_acceptance_of_the_process_before_is_not_its_own() -> None:
+def test_an_acceptance_of_the_previous_process_does_not_count() -> None:
     seat = Seat()
     seat.feel(0)
     seat.feel(1, accepted=BALLOT)
@@ -352,7 +352,7 @@ def test_an_acceptance_of_the_process_before_is_not_its_own() -> None:
     assert (seat.shown.promised, seat.shown.accepted) == (BALLOT, False)
 
 
-def test_a_higher_promise_ends_what_was_asked_for() -> None:
+def test_a_higher_promise_cancels_a_requested_note() -> None:
     seat = taken()
     effects = seat.prepare(ballot=BALLOT._replace(seq=2))
     assert kinds(effects) == [Command, VehicleState]
@@ -385,7 +385,7 @@ def test_a_joint_plan_is_accepted_once_the_controller_has_confirmed_its_formatio
     assert wanted(seat) == (0, 1)
 
 
-def test_what_the_controller_has_joined_outlives_the_agent() -> None:
+def test_joined_formations_outlive_the_agent() -> None:
     seat = Seat()
     for _ in range(2):
         command = command_of(seat.feel(1, joined=(0, 3)))
@@ -393,7 +393,7 @@ def test_what_the_controller_has_joined_outlives_the_agent() -> None:
     assert seat.shown.joined == (0, 3)
 
 
-def test_what_was_promised_before_the_charge_was_lost_is_not_asked_for_any_more() -> None:
+def test_promises_of_a_lost_charge_are_no_longer_requested() -> None:
     seat = Seat()
     seat.take_charge()
     seat.prepare(0, 1)

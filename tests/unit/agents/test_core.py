@@ -58,7 +58,7 @@ def test_starts_with_its_own_topics_and_the_token_last() -> None:
     assert agent.wanted_states == ()
 
 
-def test_the_state_says_what_it_sensed_and_where_it_entered() -> None:
+def test_the_state_contains_measurements_and_the_block_of_entry() -> None:
     rig = Rig()
     rig.formation, rig.joined = 5, (5, 6)
     rig.claim()
@@ -136,7 +136,7 @@ def test_older_ticks_and_other_vehicles_are_ignored() -> None:
     assert rig.run().t_s == pytest.approx((rig.tick - 1) * TICK_S)
 
 
-def test_a_newer_bridge_has_another_road_on_which_the_agent_starts_anew() -> None:
+def test_an_agent_starts_anew_on_the_road_of_a_newer_bridge() -> None:
     rig = up_and_running()
     rig.accept((0, HOME, (-1, 2)))
     rig.run(20)
@@ -175,7 +175,7 @@ def test_a_promise_is_shown_at_once_and_an_acceptance_as_soon_as_it_is_noted() -
     assert rig.hand(PREPARE, Prepare(BALLOT, (0,), (OTHER,))) == []
 
 
-def test_an_acceptance_whose_note_was_lost_is_asked_for_with_each_tick() -> None:
+def test_a_lost_note_is_requested_again_with_each_tick() -> None:
     rig = up_and_running()
     rig.hand(PREPARE, Prepare(BALLOT, (0,), (ME,)))
     plan = make_plan({ME: ((0, HOME, (-1, 2)),)}, {ME: HOME}, {ME: 1})
@@ -241,7 +241,7 @@ def test_v7_only_when_the_body_is_there() -> None:
     rig = up_and_running()
     rig.accept((0, HOME, (0, 1)))
     rig.run(10)
-    for _ in range(60):  # somebody stays 4 m ahead of the place it has now
+    for _ in range(60):  # a vehicle stays 4 m ahead of its current position
         rig.ahead = (Neighbour(1, 4.0, SCENARIO.formation.speed_mps),)
         state = rig.run()
     assert rig.off((0, 1)) > ARRIVED_ALONG_M

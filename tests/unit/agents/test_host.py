@@ -1,4 +1,4 @@
-"""Several agents in one process: who gets which event, shards, and when the process ends."""
+"""Several agents in one process: dispatch of events, shards, and the end of the process."""
 
 from __future__ import annotations
 
@@ -175,7 +175,7 @@ def test_states_of_other_formations_are_not_handed_on() -> None:
     assert not state.go
 
 
-def test_listens_to_a_formation_only_while_somebody_waits() -> None:
+def test_host_subscribes_to_a_formation_only_while_an_agent_waits() -> None:
     host = make_host(A, B)
     cells: dict[Name, Cell] = {A: FRONT, B: (-1, 1)}
     for name, cell in cells.items():
@@ -190,7 +190,7 @@ def test_listens_to_a_formation_only_while_somebody_waits() -> None:
     assert Unlisten(STATE, {"formation": 0}) in hand(host, SENSE, B, sense(B, (-1, 1), 2))
 
 
-def test_listens_to_all_formations_of_a_joint_plan_while_somebody_waits() -> None:
+def test_host_subscribes_to_all_formations_of_a_joint_plan_while_an_agent_waits() -> None:
     host = make_host(A, B)
     cells: dict[Name, Cell] = {A: FRONT, B: (-4, 0)}
     for name, cell in cells.items():
@@ -211,7 +211,7 @@ def test_listens_to_all_formations_of_a_joint_plan_while_somebody_waits() -> Non
     ]
 
 
-def test_who_is_not_in_charge_any_more_waits_for_nobody() -> None:
+def test_an_agent_that_lost_charge_waits_for_no_states() -> None:
     host = make_host(A)
     hand(host, SENSE, A, sense(A, FRONT))
     assert Listen(STATE, {"formation": 0}) in accept(host, {A: FRONT, B: (-1, 1)})
@@ -322,7 +322,7 @@ def census_of(*vehicles: Name, t_s: float = 1.0, bridge: int = 0) -> Arrived:
 
 
 @pytest.mark.parametrize("other", [6, 8])
-def test_a_shard_hears_the_census_of_the_bridge_that_it_knows(other: int) -> None:
+def test_a_shard_accepts_the_census_of_its_own_bridge(other: int) -> None:
     """That of an earlier road may come late, that of a newer one before its token."""
     host = make_host(shard=Shard(0, 1))
     assert give(host, census_of(A, bridge=7)) == []
@@ -366,7 +366,7 @@ def test_a_shard_takes_announced_vehicles_and_those_on_the_road_once() -> None:
     assert sorted(up) == sorted(names)
 
 
-def test_a_shard_goes_on_without_vehicles_and_takes_nobody_twice() -> None:
+def test_a_shard_continues_without_vehicles_and_takes_none_twice() -> None:
     host = make_host(shard=Shard(0, 1))
     give(host, Arrived(CENSUS, {}, census(A)))
     hand(host, SENSE, A, sense(A, FRONT))
@@ -375,5 +375,5 @@ def test_a_shard_goes_on_without_vehicles_and_takes_nobody_twice() -> None:
     assert give(host, Wakeup(), 1e6) == []
 
 
-def test_without_a_shard_the_census_is_nothing_to_it() -> None:
+def test_without_a_shard_the_census_is_ignored() -> None:
     assert give(make_host(A), Arrived(CENSUS, {}, census(B))) == []

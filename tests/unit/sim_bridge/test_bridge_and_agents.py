@@ -27,7 +27,7 @@ MISSES = round(SILENT_S / LONG_ROAD.runtime.tick_deadline_s)
 """Deadlines that an agent misses before it is silent."""
 MOVE_TICKS = round(LONG_ROAD.move_s / TICK_S)
 PACE = 5.0
-"""A tick takes 20 ms, if everybody answers: hardly more than one that was missed."""
+"""A tick takes 20 ms if all agents answer."""
 PLAY_M = 0.5
 A, B = Name("A"), Name("B")
 
@@ -171,7 +171,7 @@ def test_an_agent_that_slept_in_its_move_finds_the_body_further_on(
         check_in_charge_without_plan(street, target)
 
 
-def test_nobody_waits_long_for_an_agent_that_sleeps(street: Street, agent: Sleeper) -> None:
+def test_ticks_do_not_wait_long_for_an_agent_that_sleeps(street: Street, agent: Sleeper) -> None:
     street.run_to(90)  # B is there, too
     agent.asleep = True
     began_s = street.network.now_s
@@ -261,7 +261,7 @@ def check_all_gone(street: Street) -> None:
 
 @pytest.mark.parametrize("shards", [1, 2])
 def test_a_whole_run_counts_every_message_once(tmp_path: Path, shards: int) -> None:
-    """However many vehicles share a process, the summary says what all processes published."""
+    """However many vehicles share a process, the summary counts what all processes published."""
     street = Street(SHORT_ROAD, tmp_path, MANY)
     for index in range(shards):
         street.start_shard(index, shards)
@@ -319,7 +319,7 @@ def test_a_bad_network_slows_a_run_down_and_nothing_else(tmp_path: Path) -> None
 
 def test_the_clock_does_not_race_while_the_bridge_is_off_the_network(tmp_path: Path) -> None:
     street = Street(SHORT_ROAD, tmp_path, MANY)
-    street.bridge._tick_lasts_s = 1e-3  # as fast as everybody answers
+    street.bridge._tick_lasts_s = 1e-3  # as fast as agents answer
     street.start_shard()
     street.run_to(60)
     street.network.disconnect("bridge")
@@ -335,7 +335,7 @@ def test_the_clock_does_not_race_while_the_bridge_is_off_the_network(tmp_path: P
 
 
 @pytest.mark.parametrize("end_of_first", ["in good order", "killed"])
-def test_everybody_starts_afresh_with_the_next_bridge(tmp_path: Path, end_of_first: str) -> None:
+def test_all_roles_start_anew_with_the_next_bridge(tmp_path: Path, end_of_first: str) -> None:
     """Its vehicles have the names of the last ones, and its road time begins at 0 again."""
     street = Street(SHORT_ROAD, tmp_path / "first", MANY)
     street.start_coordinators(2)

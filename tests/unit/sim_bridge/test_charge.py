@@ -1,4 +1,4 @@
-"""Who is in charge of a vehicle at the bridge: its agent, or a caretaker that speaks for it."""
+"""The process in charge of a vehicle: its agent, or a caretaker in its place."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def sense_of(effects: Iterable[Effect], vehicle: Name, tick: int) -> Sense:
 
 
 def sensed(desk: Desk, vehicle: Name) -> Sense:
-    """Return what a vehicle was told in this tick."""
+    """Return the SENSE of a vehicle in this tick."""
     return sense_of(desk.effects, vehicle, desk.core.tick)
 
 
@@ -171,7 +171,7 @@ def test_what_is_new_to_the_controller_is_confirmed_at_once(attended: Desk) -> N
     assert (sense.joined, sense.accepted) == ((block, block + 1), BALLOT)
     assert (sense.attendant, sense.caretaker) == (AGENT, False)
     again = attended.answer(B, incarnation=AGENT, joined=(block + 1,), accepted=BALLOT)
-    assert sent(again, Sense) == []  # it is told with the next tick, as ever
+    assert sent(again, Sense) == []  # the next tick confirms it
     next_tick(attended, A)
     assert sensed(attended, B).accepted == BALLOT
 
@@ -202,7 +202,7 @@ def test_nothing_is_noted_for_an_agent_that_has_been_replaced(attended: Desk) ->
     assert (sensed(attended, B).attendant, sensed(attended, B).accepted) == (AGENT + 1, None)
 
 
-def test_a_caretaker_takes_no_acceptance_over(attended: Desk) -> None:
+def test_a_caretaker_inherits_no_acceptance(attended: Desk) -> None:
     attended.answer(B, incarnation=AGENT, accepted=BALLOT)
     attended.down(B)
     (state,) = sent(next_tick(attended, A), VehicleState)
@@ -245,7 +245,7 @@ def late_answer(desk: Desk) -> None:
 
 
 def test_the_caretaker_takes_charge_when_no_answer_comes_in_time(attended: Desk) -> None:
-    """It is alive, but it does not drive the vehicle: somebody has to say that it holds."""
+    """It is alive, but it does not drive the vehicle: the caretaker must publish that it holds."""
     # Ticks last longer while answers are late, so it takes no more of them than deadlines.
     for tick in range(round(LATE_SHARE * MISSES)):  # noqa: B007 (counts)
         late_answer(attended)
@@ -264,7 +264,7 @@ def test_the_caretaker_takes_charge_when_no_answer_comes_in_time(attended: Desk)
     check_takes_back(attended)
 
 
-def test_an_agent_that_claims_its_vehicle_is_there_though_its_token_was_not_seen(
+def test_an_agent_that_claims_its_vehicle_is_present_without_a_token(
     tmp_path: Path,
 ) -> None:
     desk = Desk(SCENARIO, tmp_path, TWO)
@@ -279,7 +279,7 @@ def test_an_agent_that_claims_its_vehicle_is_there_though_its_token_was_not_seen
         assert desk.core._answers.awaited == {A, B}
 
 
-def test_who_does_not_get_the_vehicle_is_not_there(desk: Desk) -> None:
+def test_a_refused_claim_is_no_presence(desk: Desk) -> None:
     desk.down(B)
     desk.answer(B, incarnation=AGENT, hold_cell=(-1, 1))  # a move is no claim
     assert B not in desk.core._answers.up
@@ -329,12 +329,12 @@ def test_there_are_no_caretakers_while_the_bridge_is_off_the_network(attended: D
     attended.give(LinkUp())
     came_s, lease_s = attended.now_s, SCENARIO.network.lease_s
     attended.drive(lambda: B in attended.core._attendance, B)
-    # The others come back about now, too: only a little later it says something that B did not.
+    # The others reconnect about now, too: only later is B's silence evidence.
     assert came_s + lease_s <= attended.now_s <= came_s + lease_s + 2 * TICK_S
     assert A not in attended.core._attendance
 
 
-# --- what caretakers say ----------------------------------------------------------------------
+# --- messages of caretakers -------------------------------------------------------------------
 
 
 def ballot_for(desk: Desk) -> tuple[Prepare, Plan]:
@@ -385,7 +385,7 @@ def test_a_caretaker_accepts_no_plan_that_moves_its_vehicle(cared_for: Desk) -> 
     assert not state.accepted
 
 
-def test_nobody_at_the_bridge_speaks_for_a_vehicle_with_an_agent(attended: Desk) -> None:
+def test_the_bridge_publishes_no_state_of_a_vehicle_with_an_agent(attended: Desk) -> None:
     prepare, plan = ballot_for(attended)
     assert attended.give(Arrived(PREPARE, OF_B, prepare)) == []
     assert attended.give(Arrived(PLAN, OF_B, plan)) == []
@@ -436,7 +436,7 @@ def test_an_agent_cannot_move_its_vehicle_with_the_claim(cared_for: Desk) -> Non
     assert cared_for.core._answers.awaited == {A, B}
 
 
-def test_a_caretaker_that_has_given_way_says_nothing_more(cared_for: Desk) -> None:
+def test_a_caretaker_that_has_ended_publishes_nothing(cared_for: Desk) -> None:
     prepare, _ = ballot_for(cared_for)
     cared_for.up(B)
     next_tick(cared_for, A)

@@ -96,7 +96,7 @@ def test_start(tmp_path: Path) -> None:
     clock, census = (send.message for send in effects[6:] if isinstance(send, Send))
     assert (clock.tick, clock.t_s, clock.on_road, clock.ended) == (0, 0.0, 0, False)
     assert [one.vehicle for one in census.announced] == [A, B]
-    assert (desk.core.phase, desk.core.tick) == (TickPhase.PACE, 1)  # nobody had to be waited for
+    assert (desk.core.phase, desk.core.tick) == (TickPhase.PACE, 1)  # no answer had to be awaited
 
 
 def test_the_census_is_sent_on_changes_and_now_and_then(tmp_path: Path) -> None:
@@ -156,7 +156,7 @@ def test_ticks_keep_the_pace_and_do_not_make_up_for_lost_time(desk: Desk) -> Non
     assert desk.now_s == pytest.approx(late_s + TICK_S)  # only one
 
 
-def test_everybody_sees_who_is_ahead(tmp_path: Path) -> None:
+def test_every_vehicle_senses_the_one_ahead(tmp_path: Path) -> None:
     desk = Desk(SCENARIO, tmp_path, [arrival(A, 0.1), arrival(B, 2.1)])
     desk.start(A, B)
     desk.drive_to_entry(B)
@@ -171,7 +171,7 @@ def test_everybody_sees_who_is_ahead(tmp_path: Path) -> None:
     assert senses[B].behind == ()
 
 
-def test_everybody_sees_with_errors_of_measurement_that_are_the_same_whenever_asked(
+def test_measurement_errors_are_the_same_in_repeated_senses(
     tmp_path: Path,
 ) -> None:
     desk = Desk(make_scenario(sensing={}), tmp_path, [arrival(A, 0.1), arrival(B, 2.1)])
@@ -192,10 +192,10 @@ def test_everybody_sees_with_errors_of_measurement_that_are_the_same_whenever_as
     assert {sense.vehicle: sense for sense in sent(desk.wake(), Sense)} == senses
 
 
-# --- who does not answer ----------------------------------------------------------------------
+# --- missing answers --------------------------------------------------------------------------
 
 
-def test_who_has_not_answered_is_asked_again_and_nobody_else(desk: Desk) -> None:
+def test_only_agents_that_have_not_answered_are_asked_again(desk: Desk) -> None:
     began_s, tick = desk.now_s, desk.core.tick
     desk.answer(A)
     for times in (1, 2, 3):
@@ -208,7 +208,7 @@ def test_who_has_not_answered_is_asked_again_and_nobody_else(desk: Desk) -> None
     assert desk.core.tick == tick + 1
 
 
-def test_nobody_is_asked_again_too_early(desk: Desk) -> None:
+def test_no_agent_is_asked_again_too_early(desk: Desk) -> None:
     desk.now_s += 0.99 * RESEND_S
     assert desk.give(Wakeup()) == []
 
@@ -226,7 +226,7 @@ def test_at_the_deadline_the_road_goes_on_and_the_next_tick_waits_for_all(desk: 
     assert B not in desk.core._attendance
 
 
-def test_who_misses_a_tick_plays_what_it_has(desk: Desk) -> None:
+def test_a_vehicle_without_an_answer_continues_its_trajectory(desk: Desk) -> None:
     pairs = [(2.0, 0.0), (-1.0, 0.0), (0.0, 0.0)]
     before = desk.core.vehicles[B].controller.plant.setpoint[0]
     desk.answer(A)
@@ -240,14 +240,14 @@ def test_who_misses_a_tick_plays_what_it_has(desk: Desk) -> None:
     assert controller.rung is Rung.PLAY
 
 
-def test_who_has_not_answered_for_long_is_silent_and_not_waited_for(desk: Desk) -> None:
+def test_an_agent_without_answers_becomes_silent_and_is_not_awaited(desk: Desk) -> None:
     began_s, tick = desk.now_s, desk.core.tick
     desk.drive_to_silence(B)
     assert desk.now_s == pytest.approx(began_s + SILENT_S)
     assert desk.core.tick == tick + MISSES
     (event,) = read_events(desk.folder, "agent-silent")
     assert (event["vehicle"], event["t_s"]) == (B, pytest.approx(desk.core.t_s))
-    # Everybody is still asked, but nobody waits for the silent one any more.
+    # All agents are still asked, but the tick does not wait for the silent one.
     began_s, tick = desk.now_s, desk.core.tick
     desk.effects.clear()
     desk.drive_to(tick + 6, B)
@@ -286,7 +286,7 @@ def test_an_answer_between_two_ticks_changes_nothing(desk: Desk) -> None:
     assert desk.core.phase is TickPhase.PACE
     known = record_of(desk, A)
     early = desk.command(A, hold_cell=(-1, 0), jerks=jerks((9.0, 9.0), ticks=9))
-    assert early.tick == desk.core.tick  # nobody has been asked about it yet
+    assert early.tick == desk.core.tick  # no agent has been asked about it yet
     desk.give(Arrived(COMMAND, {"vehicle": A}, early))
     assert record_of(desk, A) == known
     desk.wake()
@@ -314,7 +314,7 @@ def test_an_answer_that_makes_no_sense_is_none(desk: Desk) -> None:
     assert desk.core._answers.awaited == {B}
 
 
-def test_answers_for_nobody_are_ignored(desk: Desk) -> None:
+def test_answers_for_unknown_vehicles_are_ignored(desk: Desk) -> None:
     ghost = Command(Name("ghost"), 1, desk.core.tick, (0, 0), 0, (0, 0), b"")
     assert desk.give(Arrived(COMMAND, {"vehicle": "ghost"}, ghost)) == []
 
@@ -367,7 +367,7 @@ def test_a_network_without_any_answers_does_not_stop_the_road(tmp_path: Path) ->
 def test_the_network_may_come_back(desk: Desk) -> None:
     desk.drive(lambda: desk.core._answers.deaf and desk.core.phase is TickPhase.PACE, A, B)
     desk.wake()
-    assert desk.core.phase is TickPhase.PACE  # nobody was waited for
+    assert desk.core.phase is TickPhase.PACE  # no agent was awaited
     for name in (A, B):
         desk.answer(name, tick=desk.core.tick - 1)
     desk.wake()
@@ -390,7 +390,7 @@ def test_the_entrance_waits_for_agents(tmp_path: Path) -> None:
     assert read_events(tmp_path, "agent-missing") == []
 
 
-def test_the_entrance_gives_up_once_and_has_little_patience_until_somebody_comes(
+def test_after_one_timeout_the_entrance_waits_only_briefly_until_an_agent_comes(
     tmp_path: Path,
 ) -> None:
     """A deployment without agents must not take fifteen seconds for each vehicle."""
@@ -418,7 +418,7 @@ def test_the_entrance_gives_up_once_and_has_little_patience_until_somebody_comes
 # --- leaving ----------------------------------------------------------------------------------
 
 
-def test_a_vehicle_that_left_is_told_so_until_its_agent_is_gone(tmp_path: Path) -> None:
+def test_departures_are_notified_until_the_agent_is_gone(tmp_path: Path) -> None:
     desk = Desk(SCENARIO, tmp_path, [arrival(A, 0.5), arrival(B, 8.5)])
     desk.start(A, B)
     desk.drive(lambda: A in desk.core.vehicles)
@@ -434,13 +434,13 @@ def test_a_vehicle_that_left_is_told_so_until_its_agent_is_gone(tmp_path: Path) 
     assert len(desk.core._departures.repeats) == 0
 
 
-def test_a_vehicle_that_left_is_not_told_for_ever(tmp_path: Path) -> None:
+def test_departures_are_notified_a_limited_number_of_times(tmp_path: Path) -> None:
     desk = Desk(SCENARIO, tmp_path, [arrival(A, 0.5), arrival(B, 8.5)])
     desk.start(A, B)
     desk.drive(lambda: desk.core.phase is TickPhase.WIND_UP)
-    told = [sense.vehicle for sense in sent(desk.effects, Sense) if sense.left]
-    assert told.count(A) == LEFT_REPEATS
-    assert told.count(B) == 1  # it was the last one
+    notified = [sense.vehicle for sense in sent(desk.effects, Sense) if sense.left]
+    assert notified.count(A) == LEFT_REPEATS
+    assert notified.count(B) == 1  # it was the last one
     assert A not in desk.core._departures.repeats
 
 
@@ -454,7 +454,7 @@ def wound_up(tmp_path: Path, scenario: Scenario = SCENARIO) -> Desk:
     return desk
 
 
-def test_the_end_is_said_to_everybody(tmp_path: Path) -> None:
+def test_the_end_is_published_to_all_vehicles(tmp_path: Path) -> None:
     desk = wound_up(tmp_path)
     clocks = sent(desk.effects, RoadClock)
     assert [clock.ended for clock in clocks] == [False] * (len(clocks) - 1) + [True]
@@ -492,7 +492,7 @@ def test_reports_about_vehicles_of_an_earlier_run_do_not_count(tmp_path: Path) -
     assert read_summary(tmp_path)["tracking"]["solves"] == 3
 
 
-def test_does_not_wind_up_for_ever(tmp_path: Path) -> None:
+def test_winding_up_has_a_deadline(tmp_path: Path) -> None:
     desk = wound_up(tmp_path)
     desk.report("agent", A)
     began_s = desk.now_s
@@ -534,7 +534,7 @@ def test_a_run_ends_at_the_limit(tmp_path: Path) -> None:
     scenario = make_scenario(runtime={"max_road_s": 5.0})
     desk = wound_up(tmp_path, scenario)
     assert desk.core.t_s == 5.0
-    # Who is on the road will not be driven any further.
+    # Vehicles on the road are not driven any further.
     assert {sense.vehicle for sense in sent(desk.effects, Sense) if sense.left} == {A, B}
     desk.wake()
     assert read_summary(tmp_path)["ending"] == "limit"

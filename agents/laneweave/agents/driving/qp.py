@@ -1,11 +1,11 @@
-"""Quadratic programs: the one place that knows OSQP, and that does not trust it.
+"""Quadratic programs: the only module that imports OSQP; it checks every answer.
 
     minimise    1/2 x' P x + q' x
     subject to  lower <= A x <= upper
 
-P and A are set up once, the vectors change between solutions. What OSQP 1.1 leaves to its caller
-is done here: it accepts vectors of the wrong length, prints and goes on with stale data when
-lower > upper, keeps a NaN for ever in its warm start, and returns a finite x for an infeasible
+P and A are set up once; the vectors change between solutions. This module makes up for checks that
+OSQP 1.1 leaves to its caller: it accepts vectors of the wrong length, prints a message and uses old
+data when lower > upper, keeps a NaN in its warm start, and returns a finite x for an infeasible
 problem.
 """
 
@@ -27,40 +27,40 @@ SOLVED = 1
 SOLVED_INACCURATE = 2
 MAX_ITERATIONS = 7
 INTERRUPTED = 10
-"""OSQP took a SIGINT for itself."""
+"""OSQP has caught a SIGINT."""
 
 _INFINITY = float(ext_builtin.OSQP_INFTY)
 
 
 @frozen
 class QPSettings:
-    """How hard OSQP tries. There is no time limit: equal inputs must give equal results."""
+    """Settings of OSQP. There is no time limit: equal inputs must give equal results."""
 
     eps_abs: float = 1e-3
     """Largest residual, primal (in the rows' units) and dual, at which an iterate is accepted."""
     max_iter: int = 400
     check_termination: int = 5
-    """Iterations between two tests for termination."""
+    """Iterations between two termination tests."""
     rho: float = 0.1
-    """First step size of the iteration (ADMM)."""
+    """Initial step size of the iteration (ADMM)."""
     adaptive_rho_interval: int = 50
-    """Iterations between two changes of rho; 0 keeps it."""
+    """Iterations between two changes of rho; 0: rho is fixed."""
     alpha: float = 1.6
     """Over-relaxation of the iteration, in (0, 2)."""
     eps_infeasible: float = 1e-4
-    """Accuracy of the certificate by which a program is given up as infeasible."""
+    """Accuracy of the certificate of infeasibility."""
     polishing: bool = False
-    """Whether a solution is refined on its active rows (to machine accuracy when it works)."""
+    """Whether a solution is refined on its active rows, usually to machine accuracy."""
     row_tolerance: float = 2e-3
-    """A result that violates a row by more is not usable, whatever OSQP says about it."""
+    """A result that violates a row by more is not usable, whatever OSQP's status."""
 
 
 @frozen(eq=False)
 class QPScale:
-    """Units in which OSQP sees a program, its own balancing (Ruiz) coming on top.
+    """Units in which OSQP receives a program, in addition to its own scaling (Ruiz).
 
-    They decide how fast it is: a row with a large factor is enforced with a large step size, and
-    both say how much a residual counts at the end.
+    They determine its speed: a row with a large factor is enforced with a large step size, and both
+    weight the residuals in the termination test.
     """
 
     rows: Vector
@@ -71,12 +71,12 @@ class QPScale:
 
 @frozen
 class QPResult:
-    """What came out of one solution."""
+    """Result of one solution."""
 
     x: Vector
     """The solution, shape (n,); meaningless unless `usable`."""
     usable: bool
-    """Whether OSQP came to an end and x keeps all rows within the tolerance."""
+    """Whether OSQP terminated and x keeps all rows within the tolerance."""
     status: int
     """OSQP's status: 1 solved, 2 inaccurate, 7 out of iterations, others: no solution."""
     iterations: int
@@ -85,7 +85,7 @@ class QPResult:
 
 
 class QuadraticProgram:
-    """One quadratic program, set up once and solved again and again with changing vectors.
+    """One quadratic program, set up once and solved repeatedly with changing vectors.
 
     Use one object per thread. Equal sequences of calls give bit-identical results.
     """
@@ -109,7 +109,7 @@ class QuadraticProgram:
             upper: upper bounds (m,); +inf for none.
             linear: q (n,); None for zero.
             settings: None for the defaults.
-            scale: units in which OSQP sees the program; None for those of the caller.
+            scale: units in which OSQP receives the program; None: those of the caller.
 
         Raises:
             ValueError: the matrices or vectors do not fit, are not finite, lower > upper, or a
@@ -169,7 +169,7 @@ class QuadraticProgram:
         solver = self._solver
         solver.solve()
         if int(solver.info.status_val) == INTERRUPTED:
-            # It was meant for the process, which would not learn of it otherwise.
+            # The signal was meant for the process.
             signal.raise_signal(signal.SIGINT)
             solver.solve()
         info = solver.info
@@ -186,7 +186,7 @@ class QuadraticProgram:
         return result
 
     def reset(self) -> None:
-        """Forget the previous solution: the next one starts from zero."""
+        """Discard the previous solution: the next one starts from zero."""
         self._solver.warm_start(self._zero_x, self._zero_y)
         if self._settings.adaptive_rho_interval:
             self._solver.update_rho(self._settings.rho)
@@ -197,7 +197,7 @@ class QuadraticProgram:
         np.subtract(self._lower, values, out=self._below)
         np.maximum(self._above, self._below, out=self._above)
         self._above /= self._scale.rows
-        # A NaN anywhere stays NaN and fails every comparison.
+        # A NaN anywhere propagates and fails every comparison.
         return max(float(self._above.max()), 0.0) if self._above.size else 0.0
 
     def _checked_linear(self, linear: Vector) -> Vector:
@@ -218,7 +218,7 @@ class QuadraticProgram:
         np.minimum(self._new_upper, _INFINITY, out=self._new_upper)
         if not (self._new_lower <= self._new_upper).all():
             row = int(np.argmin(self._new_lower <= self._new_upper))
-            raise ValueError(f"row {row}: bounds [{lower[row]}, {upper[row]}] admit nothing")
+            raise ValueError(f"row {row}: bounds [{lower[row]}, {upper[row]}] contain no value")
         self._lower, self._new_lower = self._new_lower, self._lower
         self._upper, self._new_upper = self._new_upper, self._upper
 

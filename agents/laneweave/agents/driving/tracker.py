@@ -8,9 +8,9 @@ w_k = -K e_k: one precomputed matrix times e_0, and so are the values of all row
 every row it is the solution, and OSQP does not run, unless `tracking.always_solve` asks for it.
 
 A reference that runs into the vehicle ahead yields (`reference.yield_behind`). Far from the
-reference (after an emergency brake, say), or when the program has no usable answer, the hold law's
-path back is the reference: zero is then a solution whatever the state, since bounds are widened to
-admit it. Both keep the errors small, and with them OSQP fast.
+reference (for example after an emergency brake), or when the program has no usable answer, the hold
+law's path back is the reference: zero is then a solution whatever the state, since bounds are
+widened to admit it. Both keep the errors small, and with them OSQP fast.
 
 The solver's answer is checked: the jerks that are returned have been integrated exactly and held
 within the limits by `limited_jerk`, tick by tick where that is needed.

@@ -99,7 +99,7 @@ class Roadside:
         self._announced: tuple[Announcement, ...] = ()
         self._census_sent_tick = -CENSUS_EVERY_TICKS
         self._census_changed = True
-        """Somebody entered or left since the last census, or a block has closed."""
+        """A vehicle entered or left since the last census, or a block has closed."""
 
     def newly_demanded(self, t_s: float) -> tuple[Arrival, ...]:
         """Return the vehicles that arrived since the last call."""

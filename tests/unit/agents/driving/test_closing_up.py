@@ -60,7 +60,9 @@ def test_a_body_is_in_its_cell_when_the_move_is_over_and_closer_when_the_slot_is
 
 
 @pytest.mark.parametrize(("dx", "dy"), MOVES)
-def test_every_move_leaves_room_to_brake_behind_who_holds_beyond(dx: int, dy: int) -> None:
+def test_every_move_leaves_room_to_brake_behind_a_vehicle_that_holds_beyond(
+    dx: int, dy: int
+) -> None:
     """One column beyond the target, or beyond the origin where the vehicle falls back."""
     own, other = mover((0, 1)), mover((max(dx, 0) + 1, 1))
     least_m = float("inf")
@@ -76,7 +78,7 @@ def test_every_move_leaves_room_to_brake_behind_who_holds_beyond(dx: int, dy: in
 
 
 @pytest.mark.parametrize("dy", [-1, 0, 1])
-def test_who_holds_behind_has_room_to_brake_when_somebody_falls_back(dy: int) -> None:
+def test_a_vehicle_that_holds_behind_has_room_to_brake_when_another_falls_back(dy: int) -> None:
     own, other = mover((0, 1)), mover((2, 1))
     for tick in range(SLOT_TICKS):
         assert spare_m(own, (0.0, 0.0), other) > 3.0

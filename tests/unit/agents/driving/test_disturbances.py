@@ -29,7 +29,7 @@ def test_the_disturbed_vehicle_loses_its_speed_and_gets_it_back() -> None:
     assert np.abs(speeds[:, 1:]).max() < NOISE_MPS
 
 
-def test_a_disturbance_that_takes_the_gap_makes_those_behind_brake() -> None:
+def test_a_disturbance_that_takes_the_gap_makes_followers_brake() -> None:
     response = respond(Case("column", drop_mps=6.0, vehicles=4))
     assert response.braked > 0
     assert response.overlaps == 0

@@ -34,7 +34,7 @@ MOVE: PlannedMove = (0, HOME, (-1, 2))
 
 
 class Probe(Tracker):
-    """A tracker that can be broken, and remembers what it was told of the others."""
+    """A tracker that can be broken, and records the gaps that it was given."""
 
     def __init__(self, scenario: Scenario) -> None:
         """Begin unbroken."""
@@ -110,7 +110,7 @@ def play(state: State, drive: Drive) -> State:
 # --- references -------------------------------------------------------------------------------
 
 
-def test_holding_has_no_end_and_a_whole_horizon_to_play() -> None:
+def test_holding_has_no_end_and_jerks_for_a_whole_horizon() -> None:
     drive = driver().drive(sense(), moving=False)
     assert (drive.motion_end_tick, drive.motion_origin) == (0, HOME)
     assert jerks(drive) == pytest.approx(np.zeros((N, 2)), abs=1e-4)
@@ -224,8 +224,8 @@ def test_at_rest_is_meant_for_the_target_and_not_for_where_it_came_from() -> Non
     assert not made.at_rest(sense(10 + MOVE_TICKS, HOME))
 
 
-def test_a_late_motion_says_that_it_goes_on() -> None:
-    """Whoever takes the vehicle over must not take the time's end for the motion's end."""
+def test_a_late_motion_has_an_end_in_the_future() -> None:
+    """A process that takes over must not mistake the end of the time for the end of the motion."""
     made = driver()
     made.begin(MOVE, 10, MOVE_TICKS)
     tick = 10 + MOVE_TICKS + 5
@@ -259,9 +259,11 @@ LEAST_M = SCENARIO.tracking.min_gap_m
         ((Neighbour(0, 3.5, 15.0), Neighbour(2, 4.0, 15.0)), None),
         ((Neighbour(0, 3.5, 15.0), Neighbour(1, 4.5, 15.0), Neighbour(2, 4.0, 15.0)), 4.5),
     ],
-    ids=["nobody", "own lane", "beside", "own lane counts only"],
+    ids=["none", "own lane", "beside", "own lane counts only"],
 )
-def test_who_holds_minds_its_own_lane(ahead: tuple[Neighbour, ...], gap_m: float | None) -> None:
+def test_a_holding_vehicle_keeps_gaps_on_its_own_lane(
+    ahead: tuple[Neighbour, ...], gap_m: float | None
+) -> None:
     made, probe = probed()
     felt = sense(ahead=ahead, behind=ahead)
     made.drive(felt, moving=False)
@@ -274,7 +276,7 @@ def test_who_holds_minds_its_own_lane(ahead: tuple[Neighbour, ...], gap_m: float
         assert probe.gaps.earliest[0] == pytest.approx(felt.state[0] - gap_m + LEAST_M)
 
 
-def test_who_changes_lanes_minds_the_lane_that_it_enters_from_the_start() -> None:
+def test_a_lane_change_keeps_gaps_on_the_target_lane_from_the_start() -> None:
     made, probe = probed()
     made.begin(MOVE, 10, MOVE_TICKS)
     felt = sense(ahead=(Neighbour(0, 3.0, 15.0), Neighbour(1, 4.5, 15.0), Neighbour(2, 4.0, 15.0)))

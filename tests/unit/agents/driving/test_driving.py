@@ -70,14 +70,14 @@ EMERGENCIES = 20
 
 
 @pytest.mark.parametrize("kind", emergencies.KINDS)
-def test_nobody_runs_into_who_brakes_to_a_stand_while_messages_stop(kind: str) -> None:
+def test_no_vehicle_hits_one_that_brakes_to_a_stop_while_messages_stop(kind: str) -> None:
     first, every = emergencies.KINDS.index(kind), len(emergencies.KINDS)
     numbers = range(first, EMERGENCIES * every, every)
     outcomes = [emergencies.outcome(0, number) for number in numbers]
     assert {outcome.kind for outcome in outcomes} == {kind}
     figures = emergencies.summary(outcomes)
     assert emergencies.missed_goals(figures) == []
-    # In a lane-entry, who has not begun to move when messages stop drives past.
+    # In a lane-entry, a vehicle that has not begun to move when messages stop drives past.
     assert kind == "lane-entry" or figures["standing"] == EMERGENCIES
 
 
@@ -107,7 +107,7 @@ def test_equal_seeds_give_equal_emergencies() -> None:
     assert emergencies.outcome(3, 5) != emergencies.outcome(4, 5)
 
 
-def test_one_brakes_and_the_others_are_on_their_way() -> None:
+def test_one_vehicle_brakes_while_others_move() -> None:
     chosen = (emergencies.random_situation(0, number) for number in range(1, 300, 3))
     situation = next(one for one in chosen if 15 <= one.braking_tick - emergencies.MOVE_TICK <= 20)
     assert situation.kind == "closing"
@@ -149,7 +149,7 @@ def test_closing_up_head_on_in_one_slot_does() -> None:
 
 
 def test_a_body_that_is_late_is_measured_as_late() -> None:
-    """It holds where its path says that it should have moved ahead and to the left."""
+    """It holds although its path leads ahead and to the left."""
     road = Road(SCENARIO, {ME: (0, 0), OTHER: (3, 2)})
     for _ in range(SLOT_TICKS):
         road.step()

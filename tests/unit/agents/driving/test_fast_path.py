@@ -1,4 +1,4 @@
-"""The tracker's fast path is the program's solution, and gaps on both sides are minded."""
+"""The tracker's fast path is the program's solution, and gaps on both sides are kept."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def regulated(problem: Problem) -> np.ndarray:
     return jerks
 
 
-def test_the_fast_path_gives_the_programs_solution_and_only_where_no_row_is_in_the_way(
+def test_the_fast_path_gives_the_programs_solution_where_no_row_binds(
     exact: Tracker,
 ) -> None:
     fast = Tracker(SCENARIO)
@@ -161,7 +161,7 @@ def test_without_the_fast_path_osqp_gives_nearly_the_same() -> None:
         (0.0, 0.0, 0.0, 2.0, 0.0, 0.0),
     ],
 )
-def test_it_is_not_taken_where_a_limit_is_in_the_way(change: tuple[float, ...]) -> None:
+def test_the_fast_path_is_not_taken_where_a_limit_binds(change: tuple[float, ...]) -> None:
     window = Reference.hold(SCENARIO, (0, 1)).window(0)
     state = tuple(a + b for a, b in zip(cell_state(LATTICE, (0, 1), 0.0), change, strict=True))
     assert Tracker(SCENARIO).solve(state, window).iterations > 0  # type: ignore[arg-type]
@@ -183,14 +183,14 @@ def first_metres(gaps: Gaps, ticks: int = 15) -> float:
     return float(states_of(problem, result)[ticks - 1, 0] - window.states[ticks, 0])
 
 
-def test_those_behind_push() -> None:
+def test_vehicles_behind_push() -> None:
     _, window = at_rest()
     s = window.states[:, 0]
     assert first_metres(Gaps(earliest=s - 0.5)) == 0.0
     assert first_metres(Gaps(earliest=s + 0.8)) > 0.3
 
 
-def test_they_do_not_push_far() -> None:
+def test_vehicles_behind_do_not_push_far() -> None:
     state, window = at_rest()
     s = window.states[:, 0]
     one, far = (Tracker(SCENARIO).solve(state, window, Gaps(earliest=s + by)) for by in (1.0, 9.0))
@@ -198,7 +198,7 @@ def test_they_do_not_push_far() -> None:
     assert first_metres(Gaps(earliest=s + 9.0), N) < 1.1
 
 
-def test_those_ahead_win_when_it_is_squeezed() -> None:
+def test_gaps_ahead_take_precedence_over_gaps_behind() -> None:
     state, window = at_rest()
     s = window.states[:, 0]
     alone = Tracker(SCENARIO).solve(state, window, Gaps(latest=s - 1.5))
@@ -210,13 +210,13 @@ def test_those_ahead_win_when_it_is_squeezed() -> None:
     assert max(ends) < -1.0
 
 
-def test_both_are_kept_where_there_is_room() -> None:
+def test_gaps_on_both_sides_are_kept_where_possible() -> None:
     _, window = at_rest()
     s = window.states[:, 0]
     assert first_metres(Gaps(earliest=s + 0.2, latest=s + 0.7), N) == pytest.approx(0.2, abs=0.1)
 
 
-def test_rows_of_those_behind_leave_nothing_behind() -> None:
+def test_rows_of_vehicles_behind_have_no_lasting_effect() -> None:
     state, window = at_rest()
     used = Tracker(ALWAYS)
     assert used.solve(state, window, Gaps(earliest=window.states[:, 0] + 0.9)).jerk[0, 0] > 0.2
@@ -235,7 +235,7 @@ def _as_state(values: tuple[float, ...]) -> State:
     st.sampled_from([(0, 0), (-40, 1), (7, 2)]),
     st.integers(0, 4000),
 )
-def test_who_rests_in_its_cell_gets_the_same_jerks_without_the_program(
+def test_at_rest_the_jerks_are_the_same_without_the_program(
     shares: tuple[float, ...], cell: tuple[int, int], tick: int
 ) -> None:
     """Whatever the errors for which rows are not looked at: none of them binds."""
@@ -253,7 +253,7 @@ def test_who_rests_in_its_cell_gets_the_same_jerks_without_the_program(
     np.testing.assert_allclose(quick.jerk, whole.jerk, atol=1e-9)
 
 
-def test_who_is_farther_from_its_cell_is_not_at_rest() -> None:
+def test_a_vehicle_farther_from_its_cell_is_not_at_rest() -> None:
     scenario = Scenario()
     tracker = Tracker(scenario)
     goal = cell_state(scenario.lattice, (0, 0), 0.0)

@@ -50,7 +50,7 @@ def keepable_states() -> st.SearchStrategy[State]:
 
 @settings(max_examples=150, deadline=None)
 @given(keepable_states(), st.tuples(JERK, JERK))
-def test_limited_jerk_keeps_every_limit_for_ever(state: State, wanted: Jerk) -> None:
+def test_limited_jerk_keeps_every_limit(state: State, wanted: Jerk) -> None:
     for _ in range(40):
         jerk = limited_jerk(state, wanted, LIMITS, TICK_S)
         state = integrate(state, jerk, TICK_S)

@@ -1,4 +1,4 @@
-"""Motions are told when they begin and while they last, and heard of beside what is sensed."""
+"""Motions are published while they last, and combined with what is sensed."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ KNOWN = round(SENSED_S / TICK_S)
 """Ticks for which local sensing is extrapolated."""
 BEGIN = 10
 BACK: tuple[Cell, Cell] = ((1, 1), (0, 1))
-"""Somebody ahead of the home cell falls back to the next cell."""
+"""A vehicle ahead of the home cell falls back to the next cell."""
 
 
-# --- what an agent tells --------------------------------------------------------------------------
+# --- what an agent publishes ----------------------------------------------------------------------
 
 
-def told(rig: Rig, ticks: int) -> list[Motion]:
+def published(rig: Rig, ticks: int) -> list[Motion]:
     """Run and return the motions that were sent."""
     found: list[Motion] = []
     for _ in range(ticks):
@@ -54,11 +54,11 @@ def told(rig: Rig, ticks: int) -> list[Motion]:
     return found
 
 
-def test_a_motion_is_told_when_it_begins_and_every_ten_ticks_while_it_lasts() -> None:
+def test_a_motion_is_published_when_it_begins_and_every_ten_ticks() -> None:
     rig = up_and_running()
     rig.accept((0, HOME, (-1, 2)))
     begin = rig.tick
-    motions = told(rig, MOVE_TICKS + 15)
+    motions = published(rig, MOVE_TICKS + 15)
     assert motions == [
         Motion(ME, 1, 0, HOME, (-1, 2), begin, MOVE_TICKS, tick)
         for tick in range(begin, begin + MOVE_TICKS, REPEAT_TICKS)
@@ -75,39 +75,39 @@ def test_the_motion_goes_out_after_command_and_state_on_a_key_of_its_own() -> No
     assert effects[-1].parameters == {"stretch": 0, "vehicle": ME}
 
 
-def test_who_holds_tells_nothing() -> None:
-    assert told(up_and_running(), 25) == []
+def test_a_holding_vehicle_publishes_no_motion() -> None:
+    assert published(up_and_running(), 25) == []
 
 
-def test_who_is_not_in_charge_tells_nothing() -> None:
+def test_an_agent_that_is_not_in_charge_publishes_no_motion() -> None:
     """A new process takes a motion over, and speaks only once a SENSE has put it in charge."""
     rig = up_and_running()
     rig.accept((0, HOME, (-1, 2)))
     begin = rig.tick
-    assert len(told(rig, REPEAT_TICKS)) == 1
+    assert len(published(rig, REPEAT_TICKS)) == 1
     rig.restart()
-    assert told(rig, 1) == []  # it claims the vehicle, at a tick at which a motion is repeated
-    motions = told(rig, REPEAT_TICKS)
+    assert published(rig, 1) == []  # it claims the vehicle, at a tick at which a motion is repeated
+    motions = published(rig, REPEAT_TICKS)
     assert [(m.incarnation, m.begin_tick, m.tick) for m in motions] == [
         (2, begin, begin + 2 * REPEAT_TICKS)
     ]
 
 
-def test_a_light_driver_tells_nothing() -> None:
+def test_a_light_driver_publishes_no_motion() -> None:
     rig = up_and_running(LightDriver)
     rig.accept((0, HOME, (-1, 2)))
-    assert told(rig, 20) == []
+    assert published(rig, 20) == []
     assert rig.shown[-1].moving
 
 
-# --- whom a host listens to -----------------------------------------------------------------------
+# --- subscriptions of a host ----------------------------------------------------------------------
 
 
 class Listener(LightDriver):
-    """A driver that keeps what it hears."""
+    """A driver that records motions."""
 
     heard: dict[str, list[Motion]]
-    """Of all drivers, by where they are; the test empties it."""
+    """Motions by vehicle, of all drivers; the test empties it."""
 
     def take_over(self, sense: Sense) -> None:
         super().take_over(sense)
@@ -146,12 +146,12 @@ def of_motions(effects: list[Effect]) -> list[tuple[type, int]]:
     ]
 
 
-def tell(host: AgentHost, vehicle: Name, stretch: int) -> None:
+def send_motion(host: AgentHost, vehicle: Name, stretch: int) -> None:
     motion = Motion(vehicle, 1, stretch, *BACK, BEGIN, MOVE_TICKS, BEGIN)
     list(host.handle(Arrived(MOTION, {"stretch": str(stretch), "vehicle": vehicle}, motion), 0))
 
 
-def test_listens_to_the_stretches_around_its_vehicles_while_they_are_in_charge() -> None:
+def test_host_subscribes_to_stretches_around_vehicles_in_charge() -> None:
     host = host_of(A, B)
     assert of_motions(put(host, A, 4, charge=0)) == []
     assert of_motions(put(host, A, 4, 2)) == [(Listen, 3), (Listen, 4), (Listen, 5)]
@@ -161,29 +161,29 @@ def test_listens_to_the_stretches_around_its_vehicles_while_they_are_in_charge()
     assert of_motions(put(host, B, 5, 2, charge=9)) == [(Unlisten, 4), (Unlisten, 5), (Unlisten, 6)]
 
 
-def test_who_has_left_wants_nothing_any_more() -> None:
+def test_an_agent_that_has_left_wants_no_motions() -> None:
     rig = up_and_running()
     assert rig.agent.wanted_motions == (-1, 0, 1)
     rig.hand(SENSE, rig.sense(left=True))
     assert not rig.agent.wanted_motions
 
 
-def test_hands_motions_to_all_but_the_sender_whose_stretches_are_near() -> None:
+def test_motions_go_to_near_agents_except_the_sender() -> None:
     host = host_of(A, B, C)
     for vehicle, stretch in ((A, 4), (B, 5), (C, 6)):
         put(host, vehicle, stretch)
-    tell(host, B, 5)
-    tell(host, A, 4)
-    tell(host, Name("D"), 7)
+    send_motion(host, B, 5)
+    send_motion(host, A, 4)
+    send_motion(host, Name("D"), 7)
     heard = {name: [motion.vehicle for motion in each] for name, each in Listener.heard.items()}
     assert heard == {A: [B], B: [A], C: [B, "D"]}
 
 
-def test_who_is_not_in_charge_hears_nothing() -> None:
+def test_an_agent_that_is_not_in_charge_receives_no_motions() -> None:
     host = host_of(A, B)
     put(host, A, 4, charge=0)
     put(host, B, 4)
-    tell(host, C, 4)
+    send_motion(host, C, 4)
     assert set(Listener.heard) == {B}
 
 
@@ -197,14 +197,14 @@ def motion(
 
 
 def path(tick: int, cells: tuple[Cell, Cell] = BACK) -> Array:
-    """Return the reference (N + 1, 6) of somebody else's motion from a tick on."""
+    """Return the reference (N + 1, 6) of another vehicle's motion from a tick on."""
     return Reference.move(SCENARIO, *cells, BEGIN).window(tick).states
 
 
 def neighbour(
     states: Array, lane: int, tick: int, *, off_m: float = 0.0, off_mps: float = 0.0
 ) -> Neighbour:
-    """Return how somebody is seen from the home cell whose commanded state is off its reference."""
+    """Return a neighbour of the home cell whose commanded state is off its reference."""
     s, v, a = states[0, :3].tolist()
     lag_s = SCENARIO.vehicle.actuator_lag_s
     speed_mps = v + off_mps - lag_s * a
@@ -234,7 +234,9 @@ def hearing(*motions: Motion) -> Surroundings:
 
 
 @pytest.mark.parametrize("off_m", [0.0, 0.8, -0.8])
-def test_who_is_ahead_is_predicted_along_its_motion_from_where_it_is_sensed(off_m: float) -> None:
+def test_a_vehicle_ahead_is_predicted_along_its_motion_from_its_sensed_position(
+    off_m: float,
+) -> None:
     states = path(20)
     found = gaps(hearing(motion()), 20, (neighbour(states, 1, 20, off_m=off_m),)).latest
     assert found is not None
@@ -244,7 +246,7 @@ def test_who_is_ahead_is_predicted_along_its_motion_from_where_it_is_sensed(off_
     assert (found <= expected + 1e-9).all()
 
 
-def test_who_is_behind_is_predicted_likewise() -> None:
+def test_a_vehicle_behind_is_predicted_along_its_motion() -> None:
     cells = ((-3, 1), (-2, 1))
     states = path(20, cells)
     found = gaps(hearing(motion(cells)), 20, behind=(neighbour(states, 1, 20),)).earliest
@@ -259,7 +261,7 @@ def beyond_sensing(around: Surroundings, tick: int, *seen: Neighbour, lane: int 
     return latest is not None and bool(np.isfinite(latest[KNOWN + 1 :]).any())
 
 
-def test_a_motion_counts_only_for_who_is_where_it_should_be() -> None:
+def test_a_motion_counts_only_for_a_vehicle_at_its_place() -> None:
     around, states = hearing(motion()), path(20)
     assert beyond_sensing(around, 20, neighbour(states, 1, 20))
     for off_m in (2.0, -2.0):
@@ -269,8 +271,8 @@ def test_a_motion_counts_only_for_who_is_where_it_should_be() -> None:
     assert not beyond_sensing(around, 20, neighbour(states, 2, 20), lane=2)
 
 
-def test_who_is_sensed_counts_whatever_was_said() -> None:
-    """A forged motion, at the place of somebody who slows down: it says that he drives away."""
+def test_a_sensed_vehicle_counts_whatever_its_motion() -> None:
+    """A forged motion, at the place of a vehicle that slows down, claims that it drives away."""
     scenario = attrs.evolve(SCENARIO, tracking=attrs.evolve(SCENARIO.tracking, min_gap_m=9.0))
     away: tuple[Cell, Cell] = ((0, 1), (1, 1))
     seen = neighbour(path(BEGIN, away), 1, BEGIN, off_m=-0.5, off_mps=-0.8)
@@ -343,7 +345,7 @@ def test_a_motion_counts_while_its_body_touches_a_lane_that_counts() -> None:
     left_lane_m = 2 * SCENARIO.road.lane_width_m
     assert np.isfinite(found[right_m < left_lane_m]).all()
     assert np.isinf(found[-1])
-    # For who enters that lane, too, it does not leave at all.
+    # For a vehicle that enters that lane, it does not leave at all.
     found = gaps(hearing(motion(out)), tick, (seen,), lane=2).latest
     assert found is not None
     assert np.isfinite(found).all()
@@ -374,11 +376,11 @@ def test_nonsense_changes_nothing(nonsense: Motion) -> None:
 
 FIRST, SECOND = Name("first"), Name("second")
 LEAST_APART_M = 12.0
-"""More than two leave who hold one behind the other: the second one has to give way."""
+"""Larger than the distance between two holding vehicles: the second one has to give way."""
 
 
 def follow(seed: int, *, broadcast: bool) -> tuple[Array, Array]:
-    """Return accelerations of who follows and the gap, by tick, while the first one falls back."""
+    """Return the follower's accelerations and the gap, by tick, while the first one falls back."""
     scenario = road_scenario(seed)
     scenario = attrs.evolve(
         scenario, tracking=attrs.evolve(scenario.tracking, min_gap_m=LEAST_APART_M)
@@ -392,7 +394,7 @@ def follow(seed: int, *, broadcast: bool) -> tuple[Array, Array]:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_who_hears_that_somebody_falls_back_brakes_earlier_and_less(seed: int) -> None:
+def test_a_known_motion_makes_the_follower_brake_earlier_and_less(seed: int) -> None:
     surprised, _ = follow(seed, broadcast=False)
     warned, gap_m = follow(seed, broadcast=True)
     assert gap_m.min() > LEAST_APART_M

@@ -1,4 +1,4 @@
-"""Whom a vehicle minds, where they will be, and who may be left out."""
+"""Which neighbours count, where they are predicted, and which are left out."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def sense(
     return Sense(Name("me"), 0, 0.0, state, HOME, 0, HOME, 0, ahead, behind, setpoint)
 
 
-def minded(felt: Sense, lane: int = HOME[1], *, all_of_them: bool = False) -> Gaps:
+def gaps_of(felt: Sense, lane: int = HOME[1], *, all_of_them: bool = False) -> Gaps:
     """Return the gaps; if wished, also those that the module takes to be out of question."""
     surroundings = Surroundings(SCENARIO)
     if all_of_them:
@@ -73,21 +73,21 @@ def test_it_minds_the_lanes_that_it_touches_and_the_one_that_it_enters(
     across_m: float, lane: int, gap_m: float
 ) -> None:
     s, v, a, y, v_y, a_y = AT_HOME
-    gaps = minded(sense(EVERYWHERE, EVERYWHERE, (s, v, a, y + across_m, v_y, a_y)), lane)
+    gaps = gaps_of(sense(EVERYWHERE, EVERYWHERE, (s, v, a, y + across_m, v_y, a_y)), lane)
     assert off(gaps.latest)[0] == pytest.approx(gap_m - LEAST_M)
     assert off(gaps.earliest)[0] == pytest.approx(LEAST_M - gap_m)
 
 
-def test_without_anybody_there_is_nothing_to_mind() -> None:
-    assert minded(sense()) is NO_GAPS
+def test_without_neighbours_there_are_no_gaps() -> None:
+    assert gaps_of(sense()) is NO_GAPS
     beside = (Neighbour(0, 1.0, V_F), Neighbour(2, 1.0, V_F))
-    assert minded(sense(beside, beside)) is NO_GAPS
+    assert gaps_of(sense(beside, beside)) is NO_GAPS
 
 
-def test_those_ahead_and_those_behind_are_told_apart() -> None:
+def test_vehicles_ahead_and_behind_are_distinguished() -> None:
     near = (Neighbour(1, 4.0, V_F),)
-    assert minded(sense(near)).earliest is None
-    assert minded(sense((), near)).latest is None
+    assert gaps_of(sense(near)).earliest is None
+    assert gaps_of(sense((), near)).latest is None
 
 
 # --- where they will be ---------------------------------------------------------------------------
@@ -95,7 +95,7 @@ def test_those_ahead_and_those_behind_are_told_apart() -> None:
 
 def test_they_go_on_at_constant_speed_as_long_as_that_may_be_believed() -> None:
     slow, fast = Neighbour(1, 20.0, 2.0), Neighbour(1, 14.0, 24.0)
-    gaps = minded(sense((slow,), (fast,)))
+    gaps = gaps_of(sense((slow,), (fast,)))
     lag_m = LAG_S * (2.0 - V_F)
     expected = 20.0 - LEAST_M + lag_m + 2.0 * TIMES_S[KNOWN]
     assert off(gaps.latest)[KNOWN] == pytest.approx(expected)
@@ -106,22 +106,22 @@ def test_they_go_on_at_constant_speed_as_long_as_that_may_be_believed() -> None:
     assert 0 < KNOWN.sum() < N
 
 
-def test_positions_are_those_that_the_other_body_pursues() -> None:
+def test_positions_are_commanded_positions_of_the_other_body() -> None:
     """Of equal lag, bodies keep the distance that their commanded states keep."""
     other = Plant((AT_HOME[0] + 10.0 + LIMITS.length_m, 12.0, 0.0, 5.25, 0.0, 0.0), LIMITS, TICK_S)
     for _ in range(3):
         other.step(-12.0, 0.0)
     s, v, a, *_ = other.state
     gap_m = s - LIMITS.length_m - AT_HOME[0]
-    gaps = minded(sense((Neighbour(1, gap_m, v, a),)), all_of_them=True)
+    gaps = gaps_of(sense((Neighbour(1, gap_m, v, a),)), all_of_them=True)
     pursued = commanded_state(other.state, other.setpoint, LIMITS, V_F)
     rear_m = pursued[0] - LIMITS.length_m - AT_HOME[0]
     expected = rear_m - LEAST_M + pursued[1] * TIMES_S[KNOWN]
     assert off(gaps.latest)[KNOWN] == pytest.approx(expected)
 
 
-def test_nobody_is_expected_to_go_backwards() -> None:
-    gaps = minded(sense((Neighbour(1, 6.0, 0.5, -8.0),)))
+def test_no_vehicle_is_predicted_to_go_backwards() -> None:
+    gaps = gaps_of(sense((Neighbour(1, 6.0, 0.5, -8.0),)))
     known = off(gaps.latest)[KNOWN]
     assert known == pytest.approx(np.full(known.shape, known[0]))
 
@@ -130,22 +130,22 @@ def test_of_two_the_nearer_one_counts_at_each_moment() -> None:
     """While it changes lanes: the one behind is faster and passes the other's place."""
     felt = sense((Neighbour(1, 10.0, 5.0), Neighbour(2, 6.0, V_F)))
     each = [
-        off(minded(evolve(felt, ahead=(one,)), 2, all_of_them=True).latest) for one in felt.ahead
+        off(gaps_of(evolve(felt, ahead=(one,)), 2, all_of_them=True).latest) for one in felt.ahead
     ]
-    both = off(minded(felt, 2, all_of_them=True).latest)
+    both = off(gaps_of(felt, 2, all_of_them=True).latest)
     assert (both == np.minimum(*each)).all()
     assert both[0] == each[1][0] != both[10] == each[0][10]
     felt = evolve(felt, ahead=(), behind=(Neighbour(1, 10.0, 22.0), Neighbour(2, 6.0, V_F)))
     each = [
-        off(minded(evolve(felt, behind=(one,)), 2, all_of_them=True).earliest)
+        off(gaps_of(evolve(felt, behind=(one,)), 2, all_of_them=True).earliest)
         for one in felt.behind
     ]
-    both = off(minded(felt, 2, all_of_them=True).earliest)
+    both = off(gaps_of(felt, 2, all_of_them=True).earliest)
     assert (both == np.maximum(*each)).all()
     assert both[0] == each[1][0] != both[10] == each[0][10]
 
 
-# --- who is left out ------------------------------------------------------------------------------
+# --- neighbours that are left out -----------------------------------------------------------------
 
 
 def reach(state: State, accel_mps2: float) -> np.ndarray:
@@ -153,7 +153,7 @@ def reach(state: State, accel_mps2: float) -> np.ndarray:
     return state[0] + state[1] * TIMES_S + accel_mps2 * TIMES_S**2 / 2.0
 
 
-def test_who_is_left_out_cannot_matter() -> None:
+def test_neighbours_that_are_left_out_cannot_matter() -> None:
     rng = random.Random(9)
     left_out = {"latest": 0, "earliest": 0}
     counted = dict(left_out)
@@ -165,8 +165,8 @@ def test_who_is_left_out_cannot_matter() -> None:
         ahead, behind = ((other,), ()) if side == "latest" else ((), (other,))
         felt = sense(ahead, behind, state, (state[2], 0.0))
         pursued = commanded_state(state, felt.setpoint, LIMITS, V_F)
-        every = getattr(minded(felt, all_of_them=True), side)
-        found = getattr(minded(felt), side)
+        every = getattr(gaps_of(felt, all_of_them=True), side)
+        found = getattr(gaps_of(felt), side)
         if found is not None:
             counted[side] += 1
             assert (found == every).all()
@@ -180,8 +180,8 @@ def test_who_is_left_out_cannot_matter() -> None:
 
 
 @pytest.mark.parametrize("side", ["ahead", "behind"])
-def test_who_is_too_close_counts_even_while_the_gap_opens(side: str) -> None:
+def test_a_too_close_neighbour_counts_even_while_the_gap_opens(side: str) -> None:
     opens = Neighbour(1, 2.2, 18.0) if side == "ahead" else Neighbour(1, 1.5, 9.0)
-    gaps = minded(sense((opens,), ()) if side == "ahead" else sense((), (opens,)))
+    gaps = gaps_of(sense((opens,), ()) if side == "ahead" else sense((), (opens,)))
     assert gaps is not NO_GAPS
     assert (off(gaps.latest)[0] < 0.0) if side == "ahead" else (off(gaps.earliest)[0] > 0.0)

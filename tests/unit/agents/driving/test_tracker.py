@@ -56,7 +56,7 @@ def error(state: State, cell: Cell, tick: int) -> np.ndarray:
 
 
 def behind_of(rear_m: np.ndarray) -> Gaps:
-    """Return what somebody ahead leaves whose rear bumper will be there."""
+    """Return the gaps that a vehicle ahead leaves whose rear bumper will be there."""
     return Gaps(latest=rear_m - SCENARIO.tracking.min_gap_m)
 
 

@@ -32,13 +32,13 @@ def test_the_net_gap_has_a_body_more() -> None:
     assert following.gap_m(0.0) == pytest.approx(5.0 + 5.0)
 
 
-def test_who_drives_at_its_gap_goes_on_as_before() -> None:
+def test_a_vehicle_at_its_gap_keeps_its_speed() -> None:
     following = Following(PAPER)
     ahead_m = following.gap_m(12.0) + 12.0 * TICK_S
     assert following.speed_mps(0.0, 12.0, ahead_m, 12.0) == pytest.approx(12.0)
 
 
-def test_a_gap_that_is_too_small_or_behind_somebody_slow_does_not_suit() -> None:
+def test_a_small_gap_or_one_behind_a_slow_vehicle_does_not_suit() -> None:
     following = Following(PAPER)
     assert following.suits(0.0, 15.0, 14.91, 15.0)
     assert not following.suits(0.0, 15.0, 14.89, 15.0)
@@ -54,7 +54,7 @@ def test_a_gap_that_is_too_small_or_behind_somebody_slow_does_not_suit() -> None
     more_m=st.floats(0.0, 30.0),
     wishes=st.lists(st.floats(-10.0, 5.0), min_size=1, max_size=80),
 )
-def test_who_follows_from_a_gap_that_suits_never_touches(
+def test_following_from_a_suitable_gap_never_touches(
     gap: str, speed_mps: float, ahead_mps: float, more_m: float, wishes: list[float]
 ) -> None:
     following = Following(rule_scenario(gap=gap))
@@ -65,7 +65,7 @@ def test_who_follows_from_a_gap_that_suits_never_touches(
         ahead_m, ahead_mps = moved(ahead_m, ahead_mps, min(ahead_mps + accel * TICK_S, 15.0))
         safe_mps = following.speed_mps(s_m, speed_mps, ahead_m, ahead_mps)
         s_m, speed_mps = moved(s_m, speed_mps, min(safe_mps, 15.0, speed_mps + 0.5))
-        # Who stops within a tick goes up to b dt^2 / 8 farther than braking to the end would.
+        # Stopping within a tick takes up to b dt^2 / 8 more than braking to the end.
         assert ahead_m - s_m - 5.0 >= 1.0 - 0.05
 
 

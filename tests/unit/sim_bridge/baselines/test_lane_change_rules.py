@@ -1,4 +1,4 @@
-"""Rules 1 to 3 of the rule-based method: who changes lanes, who slows down, how much."""
+"""Rules 1 to 3 of the rule-based method: lane changes and slowing down."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ def lanes_of(*vehicles: ReferenceVehicle) -> Lanes:
 
 
 def sort(*vehicles: ReferenceVehicle, **rule: str) -> set[str]:
-    """Apply the rules once and return the names of those who slow down."""
+    """Apply the rules once and return the names of the vehicles that slow down."""
     return {one.name for one in Rules(rule_scenario(**rule)).sort(lanes_of(*vehicles))}
 
 
 # --- rule 1 -----------------------------------------------------------------------------------
 
 
-def test_nobody_changes_lanes_before_s3_or_on_its_lane() -> None:
+def test_no_vehicle_changes_lanes_before_s3_or_on_its_preferred_lane() -> None:
     early, sorted_one = vehicle("a", 399.0, 0, 2), vehicle("b", 600.0, 1, 1)
     assert sort(early, sorted_one) == set()
     assert (early.lane, sorted_one.lane) == (0, 1)
@@ -72,12 +72,12 @@ def test_two_do_not_take_the_same_gap() -> None:
 # --- rule 3 -----------------------------------------------------------------------------------
 
 
-def test_who_is_behind_gives_way() -> None:
+def test_the_vehicle_behind_yields() -> None:
     assert sort(vehicle("a", 500.0, 0, 1), vehicle("b", 495.0, 1, 2)) == {"b"}
     assert sort(vehicle("a", 500.0, 0, 1), vehicle("b", 505.0, 1, 1)) == {"a"}
 
 
-def test_who_is_on_its_lane_gives_way_only_if_everybody_does() -> None:
+def test_a_vehicle_on_its_preferred_lane_yields_only_if_all_do() -> None:
     def pair() -> tuple[ReferenceVehicle, ReferenceVehicle]:
         return vehicle("a", 500.0, 0, 1), vehicle("b", 495.0, 1, 1)
 
@@ -85,7 +85,7 @@ def test_who_is_on_its_lane_gives_way_only_if_everybody_does() -> None:
     assert sort(*pair(), yielding="all") == {"b"}
 
 
-def test_names_break_ties_of_two_that_want_each_others_lane() -> None:
+def test_names_break_ties_of_two_vehicles_that_swap_lanes() -> None:
     assert sort(vehicle("a", 500.0, 0, 1), vehicle("b", 500.0, 1, 0)) == {"b"}
 
 
@@ -93,10 +93,10 @@ def test_names_break_ties_of_two_that_want_each_others_lane() -> None:
     offsets=st.tuples(*[st.sampled_from([0.0, 0.5, 3.0])] * 3),
     preferred=st.tuples(*[st.integers(0, 2)] * 3),
 )
-def test_of_three_abreast_somebody_goes_on(
+def test_of_three_abreast_one_continues(
     offsets: tuple[float, float, float], preferred: tuple[int, int, int]
 ) -> None:
-    """Who is first slows down for nobody."""
+    """The first one does not slow down."""
     abreast = [
         vehicle(f"v{lane}", 700.0 + offsets[lane], lane, preferred[lane]) for lane in range(3)
     ]
@@ -114,7 +114,7 @@ def test_the_slow_speed_falls_to_nothing_at_the_stop_distance() -> None:
     assert rules.slow_speed_mps(850.0) == rules.slow_speed_mps(990.0) == 0.0
 
 
-def test_who_is_not_on_its_lane_comes_slowly_near_the_end() -> None:
+def test_a_vehicle_on_another_lane_approaches_the_end_slowly() -> None:
     rules = Rules(PAPER)
     assert rules.approach_speed_mps(vehicle("a", 990.0, 1, 1)) == 15.0
     assert rules.approach_speed_mps(vehicle("a", 850.0, 0, 2)) == 15.0

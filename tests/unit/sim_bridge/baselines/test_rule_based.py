@@ -1,4 +1,4 @@
-"""Vehicles that the rules move: everybody gets to its lane, within limits, without touching."""
+"""The rule-based method: all vehicles reach their lanes, within limits, without touching."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ METHODS: list[dict[str, Any]] = [
 # --- entering ---------------------------------------------------------------------------------
 
 
-def test_who_need_not_wait_is_where_it_would_be_had_it_driven_on() -> None:
+def test_a_vehicle_that_does_not_wait_enters_where_it_would_have_driven() -> None:
     road = RuleRoad(PAPER)
     road.entrance.queue(arrival("v1", 0.04))
     (entered,) = road.step()
@@ -46,7 +46,7 @@ def test_a_lone_vehicle_takes_as_long_as_the_road_is() -> None:
     assert one.lane == 2
 
 
-def test_who_finds_no_room_waits_as_short_as_possible() -> None:
+def test_a_vehicle_without_room_waits_as_briefly_as_possible() -> None:
     road = RuleRoad(rule_scenario(gap="net"))
     road.entrance.queue(arrival("v1", 0.1))
     road.entrance.queue(arrival("v2", 0.1))
@@ -58,7 +58,7 @@ def test_who_finds_no_room_waits_as_short_as_possible() -> None:
     assert entered[0].entered_s == pytest.approx(0.1 + needed_m / 15.0)
 
 
-def test_nobody_enters_behind_somebody_who_stands_near() -> None:
+def test_no_vehicle_enters_close_behind_a_standing_one() -> None:
     road = RuleRoad(PAPER, [vehicle("v1", 15.0, speed_mps=0.0), vehicle("v0", 21.5, speed_mps=0.0)])
     road.entrance.queue(arrival("v2", 0.0))
     assert road.step() == []
@@ -93,7 +93,7 @@ def test_three_abreast_that_want_to_change_round_all_do(rule: dict[str, Any], s_
         unique_by=lambda place: (place[0], place[2]),
     ),
 )
-def test_everybody_leaves_on_its_lane_and_nobody_touches(
+def test_all_vehicles_leave_on_their_preferred_lanes_without_touching(
     rule: dict[str, Any], places: list[tuple[int, int, int, float]]
 ) -> None:
     """A crowd that enters S3 so dense that it cannot sort itself without giving way."""
@@ -126,7 +126,7 @@ def test_a_jam_clears_up(gap: str, lane_change_s: float) -> None:
 
 
 @pytest.mark.parametrize("yielding", ["unsorted", "all"])
-def test_who_is_stuck_in_its_lane_change_gives_way(yielding: str) -> None:
+def test_a_vehicle_blocked_in_its_lane_change_yields(yielding: str) -> None:
     """`v1` cannot finish before `v0` is gone, and `v0` cannot change while `v1` is so near."""
     waiting = vehicle("v0", 860.0, 1, 0, speed_mps=0.0)
     stuck = vehicle("v1", 860.0 - 5.99, 1, 0, speed_mps=0.0)
@@ -149,8 +149,8 @@ def test_a_lane_change_takes_its_time_and_counts_on_both_lanes() -> None:
     assert [len(lane) for lane in road.traffic._lanes] == [0, 1, 0]
 
 
-def test_who_changes_lanes_follows_the_slower_of_two() -> None:
-    """On the old lane somebody near drives on; on the new one somebody farther ahead stands."""
+def test_a_lane_change_follows_the_slower_of_two_vehicles() -> None:
+    """On the old lane a near vehicle drives on; on the new one a farther vehicle stands."""
     changing, standing = vehicle("v2", 500.0, 0, 1), vehicle("v1", 560.0, 1)
     road = RuleRoad(rule_scenario(lane_change_s=4.0), [changing, standing, vehicle("v0", 515.0, 0)])
     road.traffic._lanes.begin_change(changing, 1)
@@ -160,7 +160,7 @@ def test_who_changes_lanes_follows_the_slower_of_two() -> None:
     assert standing.s_m - changing.s_m >= 5.0 + 1.0 - 0.05
 
 
-def test_nobody_slides_sideways() -> None:
+def test_no_vehicle_slides_sideways() -> None:
     road = RuleRoad(
         rule_scenario(lane_change_s=4.0),
         [vehicle("v1", 500.0, 0, 1, speed_mps=0.0), vehicle("v0", 506.0, 0, 0, speed_mps=0.0)],

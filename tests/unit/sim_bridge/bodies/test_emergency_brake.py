@@ -81,7 +81,7 @@ JERKS = st.lists(st.sampled_from((-15.0, -5.0, 0.0, 5.0, 15.0)), min_size=1, max
 @example((16.5, -6.0), (16.0, 0.0), 0.0, [-15.0], [-15.0], 0)
 @example((20.8, -8.48), (19.45, 0.1), 0.0, [-15.0], [-15.0], 0)
 @settings(max_examples=150, deadline=None)
-def test_nobody_runs_into_who_brakes_as_hard_as_it_can_at_any_time(
+def test_no_vehicle_hits_one_that_brakes_as_hard_as_it_can(
     own_motion: tuple[float, float],
     other_motion: tuple[float, float],
     extra_m: float,
@@ -89,7 +89,7 @@ def test_nobody_runs_into_who_brakes_as_hard_as_it_can_at_any_time(
     other_jerks: list[float],
     braking_tick: int,
 ) -> None:
-    """Whatever it was told to do, from wherever there was room for it at all."""
+    """For every command, from every state that leaves room to brake."""
     assume(keepable(*own_motion))
     assume(keepable(*other_motion))
     own, other = plant_at(0.0, *own_motion), plant_at(LIMITS.length_m, *other_motion)
@@ -107,8 +107,8 @@ def test_nobody_runs_into_who_brakes_as_hard_as_it_can_at_any_time(
             own.brake(0.0)
         else:
             own.step(*jerk)
-        # The margin is what is left at the end. On the way it is less where somebody begins so near
-        # while it is faster and brakes already.
+        # The margin is what is left at the end. Before, it is less where a faster vehicle begins
+        # near while it already brakes.
         assert seen(own, other).gap_m >= 0.3 * MARGIN_M
     assert seen(own, other).gap_m >= MARGIN_M - 2.0 * WITHIN_A_TICK_M
     assert other.state[1] == pytest.approx(0.0, abs=0.05)
@@ -117,7 +117,7 @@ def test_nobody_runs_into_who_brakes_as_hard_as_it_can_at_any_time(
 def drive_behind(
     scenario: Scenario, number: int, gap_m: float, *, braking_tick: int
 ) -> tuple[float, MotionController]:
-    """Let somebody speed up behind one that holds and then brakes; return the least gap."""
+    """Let a vehicle speed up behind one that holds and then brakes; return the smallest gap."""
     own, other = plant_at(0.0, 15.0), plant_at(LIMITS.length_m + gap_m, 15.0)
     controller = MotionController(own, scenario, (0, 0))
     sensors = Sensors(scenario, Name(f"v{number}"))
@@ -137,7 +137,7 @@ def drive_behind(
 
 
 @pytest.mark.parametrize("jerk", [-40.0, -1000.0, -3e38])
-def test_who_commands_braking_that_the_body_cannot_do_has_not_braked(jerk: float) -> None:
+def test_commanding_more_than_the_body_can_brake_does_not_count_as_braking(jerk: float) -> None:
     own, wall = plant_at(0.0, 15.0), plant_at(24.0, 0.0)
     controller = MotionController(own, SCENARIO, (0, 0))
     for tick in range(40):
@@ -151,14 +151,14 @@ def test_who_commands_braking_that_the_body_cannot_do_has_not_braked(jerk: float
 
 @pytest.mark.parametrize("number", range(24))
 def test_errors_of_measurement_do_not_make_it_too_late(number: int) -> None:
-    """An agent gone mad speeds up behind somebody who brakes sooner or later."""
+    """A faulty agent speeds up behind a vehicle that brakes sooner or later."""
     least_m, controller = drive_behind(SCENARIO, number, 4.0 + number, braking_tick=3 * number)
     assert least_m > 0.0
     assert controller.rung_ticks[Rung.EMERGENCY] > 0
 
 
 def test_it_is_not_more_careful_than_it_has_to_be() -> None:
-    """Exact sensors: who brakes behind one that stops comes to rest little more than its margin."""
+    """With exact sensors a vehicle stops little more than its margin behind the one ahead."""
     exact = {field.name: 0.0 for field in attrs.fields(type(SCENARIO.sensing))}
     scenario = attrs.evolve(SCENARIO, sensing=type(SCENARIO.sensing)(**exact))
     least_m, _ = drive_behind(scenario, 0, 12.0, braking_tick=12)

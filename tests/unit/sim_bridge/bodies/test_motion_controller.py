@@ -1,4 +1,4 @@
-"""The motion controller plays what it was told, then brings its vehicle to rest."""
+"""The motion controller executes commands, then brings its vehicle to rest."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_a_command_without_jerks_that_names_another_cell_goes_there_by_the_hold_
     assert driven(controller) == {Rung.HOLD: 1}
 
 
-# --- who is in charge -------------------------------------------------------------------------
+# --- the process in charge --------------------------------------------------------------------
 
 
 def known(controller: MotionController) -> tuple[object, ...]:
@@ -127,14 +127,14 @@ def known(controller: MotionController) -> tuple[object, ...]:
     )
 
 
-def test_nobody_is_in_charge_of_a_new_vehicle() -> None:
+def test_a_new_vehicle_has_no_process_in_charge() -> None:
     plant = Plant(cell_state(LATTICE, HOME, 0.0), SCENARIO.vehicle, TICK_S)
     controller = MotionController(plant, SCENARIO, (-9, 1))
     assert (controller.attendant, controller.joined) == (0, (LATTICE.block_of(-9),))
     assert controller.accepted is None
 
 
-def test_an_older_process_is_refused_whatever_it_says(controller: MotionController) -> None:
+def test_an_older_process_is_refused(controller: MotionController) -> None:
     controller.take(command(3, (1.0, 0.0)))
     before = known(controller)
     for cell in (HOME, (1, 1)):
@@ -153,8 +153,8 @@ def test_a_newer_process_takes_charge_with_its_command(controller: MotionControl
     assert plays(controller, 4) == (2.0, 0.0)
 
 
-def test_who_takes_charge_cannot_move_with_the_same_command(controller: MotionController) -> None:
-    """It could not speak for the vehicle yet, so nobody has made room for its move."""
+def test_a_claim_cannot_move_the_vehicle(controller: MotionController) -> None:
+    """It could not act for the vehicle before, so no plan can allow its move."""
     controller.take(command(3, (1.0, 0.0)))
     before = known(controller)
     assert not controller.take(command(4, (2.0, 0.0), hold_cell=(1, 1), incarnation=AGENT + 1))
@@ -185,7 +185,7 @@ def test_handing_over_leaves_the_motion_as_it_is(controller: MotionController) -
             controller.hand_over(incarnation)
 
 
-def test_formations_are_joined_for_ever_and_only_by_who_is_in_charge(
+def test_formations_stay_joined_and_only_the_process_in_charge_joins(
     controller: MotionController,
 ) -> None:
     own = LATTICE.block_of(HOME[0])
@@ -216,7 +216,7 @@ def test_an_acceptance_is_noted_with_a_command(controller: MotionController) -> 
     assert controller.accepted == LOW
 
 
-def test_what_the_one_in_charge_asks_for_is_noted_whatever_the_tick(
+def test_requests_of_the_process_in_charge_are_noted_whatever_the_tick(
     controller: MotionController,
 ) -> None:
     controller.take(command(5, (1.0, 0.0)))
@@ -237,7 +237,7 @@ def test_the_newest_acceptance_counts(controller: MotionController) -> None:
 
 
 @pytest.mark.parametrize("incarnation", [AGENT - 1, AGENT + 1])
-def test_nothing_is_noted_for_who_is_not_in_charge(
+def test_nothing_is_noted_for_a_process_that_is_not_in_charge(
     controller: MotionController, incarnation: int
 ) -> None:
     """Neither for one that has been replaced nor, before its claim, for its successor."""
@@ -316,7 +316,7 @@ def test_the_body_has_its_own_limits(controller: MotionController) -> None:
         assert abs(v_y) <= SCENARIO.vehicle.max_slip_ratio * v + 1e-9
 
 
-# --- when nobody drives -----------------------------------------------------------------------
+# --- without commands -------------------------------------------------------------------------
 
 
 def test_a_motion_is_over_when_its_time_is_and_the_body_is_there(

@@ -92,7 +92,7 @@ def test_rotation_counts() -> None:
     assert bodies({"a": straight, "b": turned}).overlapping_pairs() == [("a", "b")]
 
 
-def test_corners_of_a_turned_body_keep_bumper_and_centre_where_the_pose_says() -> None:
+def test_corners_of_a_rotated_body_match_its_pose() -> None:
     pose = (20.0, 5.0, 0.3, 15.0)
     shape = np.array(corners(pose, LENGTH_M, WIDTH_M))
     assert shape.mean(axis=0) == pytest.approx([20.0 - LENGTH_M / 2 * math.cos(0.3), 5.0])
@@ -159,7 +159,7 @@ def test_gap_and_headway_of_a_simple_queue() -> None:
     assert bodies(road).min_gaps() == MinGaps(4.0, 1.0)
 
 
-def test_nobody_in_line_is_infinitely_far() -> None:
+def test_without_vehicles_in_line_the_gap_is_infinite() -> None:
     road = {"a": (10.0, 1.75, 0.0, 15.0), "b": (10.0, 5.25, 0.0, 15.0)}
     assert bodies(road).min_gaps() == MinGaps(math.inf, math.inf)
     assert bodies({}).min_gaps() == MinGaps(math.inf, math.inf)

@@ -1,4 +1,4 @@
-"""The plant keeps its limits, follows its set-points with their lag, exactly, and brakes."""
+"""The plant keeps its limits, follows its set-points with exact lags, and brakes."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_it_follows_its_set_point_as_a_first_order_lag_does(
 def test_what_it_pursues_moves_as_if_there_were_no_lag(
     jerks: list[Jerk], lag_s: float, lateral_lag_s: float, speed_mps: float
 ) -> None:
-    """And the body follows that, as far behind it as the lag and its relative speed say."""
+    """The body follows it with the distance of lag times relative speed."""
     limits = evolve(LIMITS, actuator_lag_s=lag_s, lateral_actuator_lag_s=lateral_lag_s)
     plant = Plant(CRUISE, limits, TICK_S)
     expected = commanded_state(plant.state, plant.setpoint, limits, 0.0)
@@ -102,7 +102,7 @@ def test_what_it_pursues_moves_as_if_there_were_no_lag(
     assert relative[3] - y == pytest.approx(lateral_lag_s * v_y, abs=1e-9)
 
 
-def test_a_body_at_rest_in_the_lattice_is_where_it_is_told_to_be() -> None:
+def test_a_body_at_rest_in_the_lattice_is_at_its_commanded_position() -> None:
     assert commanded_state(CRUISE, (0.0, 0.0), LIMITS, V_F) == CRUISE
     assert commanded_state((0.0, 16.0, 1.0, 2.0, 0.5, -1.0), (2.0, 0.3), LIMITS, V_F) == (
         pytest.approx((0.2, 16.2, 2.0, 2.05, 0.4, 0.3))

@@ -1,4 +1,4 @@
-"""Sensors err as the scenario says: each its own way, the same way in equal runs."""
+"""Measurement errors follow the scenario, differ by vehicle, and repeat in equal runs."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ def others(around: Around) -> list[tuple[float, float, float]]:
     return [(n.gap_m, n.speed_mps, n.accel_mps2) for n in (*around.ahead, *around.behind)]
 
 
-def test_its_own_state_is_right_on_average_and_as_exact_as_is_said() -> None:
+def test_its_own_state_is_unbiased_with_the_configured_error() -> None:
     errors = states(samples=SAMPLES) - STATE
     deviations = np.array([0.5, 0.2, 0.3, 0.04, 0.2, 0.3])
     assert errors.std(axis=0) == pytest.approx(deviations, rel=0.05)
     assert (np.abs(errors.mean(axis=0)) < 4.0 * deviations / SAMPLES**0.5).all()
 
 
-def test_others_are_right_on_average_and_as_exact_as_is_said() -> None:
+def test_neighbours_are_unbiased_with_the_configured_error() -> None:
     sensors = Sensors(SCENARIO, A)
     seen = np.array([others(sensors.look(AROUND)) for _ in range(SAMPLES)])
     errors = seen - np.array(others(EXACT))
@@ -58,7 +58,7 @@ def test_others_are_right_on_average_and_as_exact_as_is_said() -> None:
     assert (np.abs(errors.mean(axis=0)) < 4.0 * deviations / SAMPLES**0.5).all()
 
 
-def test_errors_are_independent_of_each_other_and_of_those_before() -> None:
+def test_errors_are_independent_of_each_other_and_over_time() -> None:
     sensors = Sensors(SCENARIO, A)
     rows = [
         np.concatenate([sensors.measure(STATE), *others(sensors.look(AROUND))])
@@ -94,7 +94,7 @@ def test_without_noise_sensors_are_exact() -> None:
     assert sensors.look(AROUND) == EXACT
 
 
-def test_nobody_is_measured_to_go_backwards() -> None:
+def test_no_measured_speed_is_negative() -> None:
     sensors = Sensors(SCENARIO, A)
     standing = [sensors.measure((0.0,) * 6) for _ in range(200)]
     assert min(state[1] for state in standing) == 0.0

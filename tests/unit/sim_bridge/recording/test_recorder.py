@@ -124,7 +124,7 @@ def test_only_vehicles_between_warm_up_and_last_arrival_count(tmp_path: Path) ->
     }
 
 
-def test_a_short_run_says_null(tmp_path: Path) -> None:
+def test_a_short_run_has_null_results(tmp_path: Path) -> None:
     with closing(Recorder(tmp_path, SCENARIO)) as recorder:
         trip(recorder, 1, 1.0, 2.0, 70.0)
         summary = recorder.summarise("rule", 70.0)

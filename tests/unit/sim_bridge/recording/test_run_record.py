@@ -66,7 +66,7 @@ def floats(*values: float) -> bytes:
 
 
 @pytest.mark.parametrize("ending", Ending)
-def test_the_summary_says_how_the_run_ended(
+def test_the_summary_contains_how_the_run_ended(
     record: RunRecord, tmp_path: Path, ending: Ending
 ) -> None:
     record.close(12.0, ending)
@@ -167,7 +167,7 @@ def test_plans_are_counted_from_events(record: RunRecord, tmp_path: Path) -> Non
 # --- leadership -------------------------------------------------------------------------------
 
 
-def test_recovery_is_the_time_in_which_nobody_was_heard_leading(
+def test_recovery_is_the_time_without_a_heartbeat_of_a_leader(
     record: RunRecord, tmp_path: Path
 ) -> None:
     def beat(name: str, incarnation: int = 1, *, leading: bool = True) -> Heartbeat:

@@ -1,4 +1,4 @@
-"""Whom a tick waits for, and who counts as silent."""
+"""Which agents a tick waits for, and which count as silent."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def answers() -> Answers:
 
 
 def tick(answers: Answers, now_s: float, *heard: Name, lasts_s: float = DEADLINE_S) -> list[Name]:
-    """Ask everybody, let some answer; return who has become silent when the next tick begins."""
+    """Ask all agents, let some answer; return those that are silent when the next tick begins."""
     answers.ask((A, B, C), now_s, link_up=True)
     for name in heard:
         answers.heard(name)
@@ -43,7 +43,7 @@ def test_waits_for_agents_that_are_up(answers: Answers) -> None:
     assert answers.complete(5.0)
 
 
-def test_the_deadline_ends_a_tick_and_tells_how_many_missed_it(answers: Answers) -> None:
+def test_the_deadline_ends_a_tick_and_counts_missing_answers(answers: Answers) -> None:
     answers.ask((A, B), 5.0, link_up=True)
     answers.awaited.discard(A)
     assert not answers.complete(5.0 + 0.99 * DEADLINE_S)
@@ -52,7 +52,7 @@ def test_the_deadline_ends_a_tick_and_tells_how_many_missed_it(answers: Answers)
     assert answers.awaited == set()
 
 
-def test_asks_again_at_intervals_and_only_who_is_awaited(answers: Answers) -> None:
+def test_awaited_agents_are_asked_again_at_intervals(answers: Answers) -> None:
     answers.ask((A, B, C), 5.0, link_up=True)
     resend_s = RUNTIME.tick_resend_s
     assert answers.ask_again(5.0 + 0.99 * resend_s) == []
@@ -71,7 +71,7 @@ def test_one_miss_is_no_silence(answers: Answers) -> None:
     assert answers.awaited == {A, B}
 
 
-def test_who_is_asked_for_long_without_an_answer_is_silent(answers: Answers) -> None:
+def test_an_agent_without_answers_for_long_is_silent(answers: Answers) -> None:
     fallen = [tick(answers, number * DEADLINE_S, A) for number in range(TICKS + 3)]
     assert fallen == [[]] * (TICKS - 1) + [[B], [], [], []]
     answers.ask((A, B), 100.0, link_up=True)
@@ -92,7 +92,7 @@ def test_a_sign_of_life_ends_the_silence(answers: Answers, sign: str) -> None:
     assert tick(answers, 99.0, A) == [B]
 
 
-def test_what_the_road_waits_for_otherwise_is_nobodys_silence(answers: Answers) -> None:
+def test_other_waits_of_the_road_do_not_count_as_silence(answers: Answers) -> None:
     """An entrance that waits for an agent, or a slow pace."""
     for number in range(TICKS - 1):
         assert tick(answers, 20.0 * number, A, lasts_s=20.0) == []
@@ -106,7 +106,7 @@ def test_silence_is_counted_in_time_and_not_in_ticks(answers: Answers) -> None:
     assert fallen == [[]] * (10 * TICKS - 1) + [[B]]
 
 
-def test_nobody_is_silent_who_has_no_token_or_left(answers: Answers) -> None:
+def test_agents_without_a_token_and_departed_ones_are_not_silent(answers: Answers) -> None:
     for number in range(2 * TICKS):
         answers.ask((A, C), number * DEADLINE_S, link_up=True)
         answers.heard(A)
@@ -117,7 +117,7 @@ def test_nobody_is_silent_who_has_no_token_or_left(answers: Answers) -> None:
     assert tick(answers, 99.0, A) == []
 
 
-def test_without_a_connection_nobody_is_awaited_or_to_blame(answers: Answers) -> None:
+def test_without_a_connection_no_agent_is_awaited_or_becomes_silent(answers: Answers) -> None:
     for number in range(2 * TICKS):
         answers.ask((A, B), number * DEADLINE_S, link_up=False)
         assert answers.awaited == set()
@@ -147,7 +147,7 @@ def late_tick(answers: Answers, number: int, *effective: Name) -> None:
     assert answers.settle((number + 1) * DEADLINE_S) == []
 
 
-def test_who_never_answers_in_time_is_ineffective_though_not_silent(answers: Answers) -> None:
+def test_an_agent_that_always_answers_late_is_ineffective_but_not_silent(answers: Answers) -> None:
     for number in range(LATE_TICKS - 1):
         late_tick(answers, number, A)
         assert not answers.ineffective(B)
@@ -181,7 +181,7 @@ def test_what_ends_being_ineffective(answers: Answers, sign: str) -> None:
     assert not answers.ineffective(B)
 
 
-def test_time_off_the_network_makes_nobody_ineffective(answers: Answers) -> None:
+def test_time_off_the_network_makes_no_agent_ineffective(answers: Answers) -> None:
     for number in range(2 * LATE_TICKS):
         answers.ask((A, B), number * DEADLINE_S, link_up=number % 2 == 0)
         answers.link_down()
@@ -189,7 +189,7 @@ def test_time_off_the_network_makes_nobody_ineffective(answers: Answers) -> None
     assert not answers.ineffective(A)
 
 
-# --- nobody answers at all --------------------------------------------------------------------
+# --- no agent answers -------------------------------------------------------------------------
 
 
 def make_deaf(answers: Answers) -> None:
@@ -199,7 +199,7 @@ def make_deaf(answers: Answers) -> None:
     assert answers.deaf
 
 
-def test_when_nobody_has_answered_for_long_nobody_is_awaited(answers: Answers) -> None:
+def test_a_deaf_network_awaits_no_agent(answers: Answers) -> None:
     make_deaf(answers)
     answers.agent_up(C)  # tokens come through when messages do not
     answers.ask((A, B, C), 100.0, link_up=True)
@@ -207,7 +207,7 @@ def test_when_nobody_has_answered_for_long_nobody_is_awaited(answers: Answers) -
     assert answers.complete(100.0)
 
 
-def test_who_comes_to_a_deaf_network_becomes_silent_all_the_same(answers: Answers) -> None:
+def test_an_agent_that_joins_a_deaf_network_becomes_silent(answers: Answers) -> None:
     make_deaf(answers)
     answers.agent_up(C)
     short_s = 0.25 * DEADLINE_S

@@ -76,7 +76,7 @@ def plan(
     )
 
 
-def told(caretaker: Caretaker, message: Prepare | Plan, tick: int = 0) -> VehicleState:
+def answer_of(caretaker: Caretaker, message: Prepare | Plan, tick: int = 0) -> VehicleState:
     state = caretaker.on_message(message, tick)
     assert state is not None
     return state
@@ -106,7 +106,7 @@ def test_shows_what_the_vehicle_does(caretaker: Caretaker, vehicle: RoadVehicle)
     )
 
 
-def test_is_in_charge_with_an_incarnation_above_all_before(vehicle: RoadVehicle) -> None:
+def test_takes_charge_with_an_incarnation_above_all_earlier_ones(vehicle: RoadVehicle) -> None:
     with pytest.raises(ValueError, match="not above"):
         Caretaker(vehicle, AGENT, 0)
     Caretaker(vehicle, AGENT + 1, 0)
@@ -114,9 +114,9 @@ def test_is_in_charge_with_an_incarnation_above_all_before(vehicle: RoadVehicle)
 
 
 def test_promises_the_highest_ballot(caretaker: Caretaker) -> None:
-    assert told(caretaker, prepare(SECOND)).promised == SECOND
-    assert told(caretaker, prepare(SECOND)).promised == SECOND
-    assert told(caretaker, prepare(FIRST)).promised == SECOND
+    assert answer_of(caretaker, prepare(SECOND)).promised == SECOND
+    assert answer_of(caretaker, prepare(SECOND)).promised == SECOND
+    assert answer_of(caretaker, prepare(FIRST)).promised == SECOND
 
 
 def test_promises_nothing_that_is_not_for_its_vehicle(caretaker: Caretaker) -> None:
@@ -125,8 +125,8 @@ def test_promises_nothing_that_is_not_for_its_vehicle(caretaker: Caretaker) -> N
 
 
 def test_accepts_a_plan_in_which_its_vehicle_holds(caretaker: Caretaker) -> None:
-    told(caretaker, prepare())
-    state = told(caretaker, plan())
+    answer_of(caretaker, prepare())
+    state = answer_of(caretaker, plan())
     assert (state.accepted, state.ready, state.done, state.go) == (True, True, True, False)
     assert caretaker.on_message(plan(), 0) is None
     assert caretaker.state(1).accepted
@@ -135,22 +135,22 @@ def test_accepts_a_plan_in_which_its_vehicle_holds(caretaker: Caretaker) -> None
 def test_what_it_accepts_is_noted_as_that_of_an_agent_is(
     caretaker: Caretaker, vehicle: RoadVehicle
 ) -> None:
-    told(caretaker, prepare())
+    answer_of(caretaker, prepare())
     caretaker.on_message(plan(own_moves=((1, HOME, NEXT),)), 0)
     assert vehicle.controller.accepted is None
-    told(caretaker, plan())
+    answer_of(caretaker, plan())
     assert vehicle.controller.accepted == FIRST
-    told(caretaker, prepare(SECOND))
-    told(caretaker, plan(SECOND))
+    answer_of(caretaker, prepare(SECOND))
+    answer_of(caretaker, plan(SECOND))
     assert vehicle.controller.accepted == SECOND
 
 
 def test_what_the_agent_before_it_accepted_is_not_its_own(vehicle: RoadVehicle) -> None:
     vehicle.controller.accept(SECOND)
     caretaker = Caretaker(vehicle, CARETAKER, 0)
-    told(caretaker, prepare())
+    answer_of(caretaker, prepare())
     assert not caretaker.state(0).accepted
-    assert told(caretaker, plan()).accepted
+    assert answer_of(caretaker, plan()).accepted
     assert vehicle.controller.accepted == FIRST
 
 
@@ -168,33 +168,33 @@ def test_what_the_agent_before_it_accepted_is_not_its_own(vehicle: RoadVehicle) 
     ids=["it moves", "ballot", "cell", "incarnation", "not joined", "territory", "not in it"],
 )
 def test_accepts_no_other_plan(caretaker: Caretaker, refused: Plan) -> None:
-    told(caretaker, prepare())
+    answer_of(caretaker, prepare())
     assert caretaker.on_message(refused, 0) is None
     assert not caretaker.state(0).accepted
-    assert told(caretaker, plan()).accepted  # the right one may still come
+    assert answer_of(caretaker, plan()).accepted  # the right one may still come
 
 
 def test_a_new_ballot_ends_the_plan(caretaker: Caretaker) -> None:
-    told(caretaker, prepare())
-    told(caretaker, plan())
-    state = told(caretaker, prepare(SECOND))
+    answer_of(caretaker, prepare())
+    answer_of(caretaker, plan())
+    state = answer_of(caretaker, prepare(SECOND))
     assert (state.promised, state.accepted) == (SECOND, False)
 
 
 def test_joins_formations_for_the_vehicle(caretaker: Caretaker, vehicle: RoadVehicle) -> None:
     both = (FORMATION, FORMATION + 1)
-    assert told(caretaker, prepare(FIRST, *both)).joined == both
+    assert answer_of(caretaker, prepare(FIRST, *both)).joined == both
     assert vehicle.controller.joined == both
-    assert told(caretaker, prepare(SECOND)).joined == both
+    assert answer_of(caretaker, prepare(SECOND)).joined == both
     wide = evolve(plan(SECOND), formations=both)
-    assert told(caretaker, wide).accepted
+    assert answer_of(caretaker, wide).accepted
 
 
 def test_never_moves_whatever_it_has_promised_and_accepted(
     caretaker: Caretaker, vehicle: RoadVehicle
 ) -> None:
-    told(caretaker, prepare())
-    told(caretaker, plan())
+    answer_of(caretaker, prepare())
+    answer_of(caretaker, plan())
     for tick in range(200):
         drive(vehicle, (tick,))
         state = caretaker.state(tick + 1)
@@ -211,10 +211,10 @@ def test_the_move_of_the_agent_before_it_counts_until_its_end(vehicle: RoadVehic
     begin_move(vehicle)
     drive(vehicle, range(5))
     caretaker = Caretaker(vehicle, CARETAKER, 5)
-    state = told(caretaker, prepare(), 5)
+    state = answer_of(caretaker, prepare(), 5)
     assert (state.hold_cell, state.moving, state.promised) == (NEXT, True, FIRST)
-    state = told(caretaker, plan(start=NEXT), 5)
-    assert (state.accepted, state.ready) == (True, False)  # nobody begins before it has ended
+    state = answer_of(caretaker, plan(start=NEXT), 5)
+    assert (state.accepted, state.ready) == (True, False)  # no move begins before it has ended
     ends = []
     for tick in range(5, 150):
         drive(vehicle, (tick,))
@@ -228,7 +228,7 @@ def test_the_move_of_the_agent_before_it_counts_until_its_end(vehicle: RoadVehic
     assert vehicle.state[0] == pytest.approx(SCENARIO.lattice.cell_s_m(NEXT[0], 15.0), abs=0.1)
 
 
-def test_a_body_that_gives_way_to_somebody_is_not_moving_again(
+def test_a_body_that_gives_way_does_not_count_as_moving(
     caretaker: Caretaker, vehicle: RoadVehicle
 ) -> None:
     """It keeps its claim to the cell, and comes back to it."""

@@ -152,7 +152,7 @@ def test_a_late_demand_takes_no_column_that_has_passed() -> None:
 def test_impossible_demands_are_refused() -> None:
     meter = interlaced_meter(lattice())
     meter.demand(Arrival("twice", 0, 0, 0.0))
-    with pytest.raises(ValueError, match="waiting already"):
+    with pytest.raises(ValueError, match="already waiting"):
         meter.demand(Arrival("twice", 1, 0, 0.0))
     with pytest.raises(ValueError, match="lanes 0 to 2"):
         meter.demand(Arrival("off", 3, 0, 0.0))

@@ -58,7 +58,7 @@ class Entrance:
         return math.floor(2.0 * self.spread_s)
 
     def run(self, stream: list[Arrival]) -> None:
-        """Run until everybody has entered, and the last formation is closed."""
+        """Run until all vehicles have entered and the last formation is closed."""
         meter = EntryMeter(self.grid, self.spread_s, self.builder, interlaced=self.interlaced)
         pending, tick, rest = list(stream), 0, 0
         while rest < 400:
@@ -74,7 +74,7 @@ class Entrance:
         closed_to = self.builder.closed_to
         entered = meter.admit(t_s)
         blocks = [self.grid.block_of(admission.cell[0]) for admission in entered]
-        assert all(block > closed_to for block in blocks), "somebody enters a closed column"
+        assert all(block > closed_to for block in blocks), "a vehicle enters a closed column"
         self.admissions += entered
         for closed in self.builder.closed(t_s):
             assert closed.closed_s <= t_s + 1e-9
@@ -84,13 +84,13 @@ class Entrance:
         assert self.builder.closed_to >= closed_to
 
     def members(self, closed: ClosedFormation) -> list[Admission]:
-        """Return who entered in the columns of a formation."""
+        """Return the vehicles that entered in the columns of a formation."""
         columns = closed.columns(self.grid)
         return [admission for admission in self.admissions if admission.cell[0] in columns]
 
 
 def check(entrance: Entrance, most_vehicles: int, most_columns: int) -> None:
-    """Check formations when all are closed: whose the columns are, and who fits in."""
+    """Check the columns and members of formations when all are closed."""
     lanes = entrance.grid.lanes
     for one, other in pairwise(entrance.formations):
         assert one.last_block < other.first_block
@@ -98,7 +98,7 @@ def check(entrance: Entrance, most_vehicles: int, most_columns: int) -> None:
     found = [each for closed in entrance.formations for each in entrance.members(closed)]
     assert Counter(each.arrival.vehicle for each in found) == Counter(
         each.arrival.vehicle for each in entrance.admissions
-    ), "not everybody is in one formation"
+    ), "a vehicle is not in exactly one formation"
     for closed in entrance.formations:
         members, length = entrance.members(closed), len(closed.columns(entrance.grid))
         preferring = Counter(each.arrival.preferred_lane for each in members)
@@ -111,7 +111,7 @@ def check(entrance: Entrance, most_vehicles: int, most_columns: int) -> None:
 
 @frozen
 class Case:
-    """An entrance, and who comes."""
+    """An entrance and its demand."""
 
     lanes: int
     most_vehicles: int
@@ -191,11 +191,11 @@ class GivesAColumnTwice(GrowingFormations):
 
 
 class ClosesTooEarly(GrowingFormations):
-    """The census tells that a formation is closed when its first vehicle has entered."""
+    """The census reports a formation as closed when its first vehicle has entered."""
 
     @property
     def closed_to(self) -> int:
-        """All blocks up to the rear of the open formation are closed, it says."""
+        """All blocks up to the rear of the open formation."""
         return max(super().closed_to, self.lattice.block_of(self._rear))
 
 
@@ -239,7 +239,7 @@ def test_a_formation_is_closed_when_it_has_its_most_vehicles() -> None:
     (closed,) = builder.closed(0.0)
     assert closed == ClosedFormation(0, 3, builder.lattice.passing_time_s(-3))
     assert (builder.closed_to, builder.first_open_column) == (3, -4)
-    # Its columns are nobody else's.
+    # Its columns belong to no other formation.
     assert take(builder, (-3, 0, 0), (-4, 0, 0)) == [False, True]
 
 
@@ -270,10 +270,10 @@ def test_with_as_many_columns_as_vehicles_prefer_a_lane() -> None:
 
 
 def test_a_formation_is_closed_at_its_greatest_length() -> None:
-    """Few vehicles do not wait for each other, and nobody is told of them too early."""
+    """Few vehicles do not wait for each other, and are not reported too early."""
     builder = growing()
     assert take(builder, (-20, 1, 0)) == [True]
-    # From another lane somebody may still enter a column further ahead.
+    # On another lane a vehicle may still enter a column further ahead.
     rear_s = builder.lattice.passing_time_s(-19 - 6) + SPREAD_S
     assert columns(builder, rear_s - 0.01) == []
     (closed,) = builder.closed(rear_s + 3.0)
@@ -281,14 +281,14 @@ def test_a_formation_is_closed_at_its_greatest_length() -> None:
     assert builder.closed_to == 25
 
 
-def test_who_comes_behind_the_greatest_length_begins_another_formation() -> None:
+def test_a_vehicle_behind_the_maximum_length_begins_another_formation() -> None:
     builder = growing()
     assert take(builder, (-20, 1, 0), (-26, 0, 0)) == [True, True]
     assert columns(builder) == [(-19, -25)]
     assert columns(builder, 100.0) == [(-26, -32)]
 
 
-def test_columns_between_two_formations_are_nobody_s() -> None:
+def test_columns_between_two_formations_belong_to_none() -> None:
     builder = growing()
     take(builder, (-20, 1, 0))
     columns(builder, 100.0)
@@ -321,7 +321,7 @@ def test_a_block_is_closed_when_its_last_column_has_passed() -> None:
     assert builder.closed(4.4) == []
     assert builder.closed_to == -1
     assert builder.closed(4.5) == [ClosedFormation(0, 0, 4.5)]
-    assert builder.closed(8.5) == []  # nobody is in block 1
+    assert builder.closed(8.5) == []  # block 1 is empty
     assert builder.closed_to == 1
     assert builder.closed(13.0) == [ClosedFormation(2, 2, 12.5)]
 
@@ -329,7 +329,7 @@ def test_a_block_is_closed_when_its_last_column_has_passed() -> None:
 # --- which one a scenario has -----------------------------------------------------------------
 
 
-def test_the_scenario_says_who_builds() -> None:
+def test_the_scenario_selects_the_builder() -> None:
     grows = formation_builder(Scenario())
     assert isinstance(grows, GrowingFormations)
     assert (grows.max_vehicles, grows.max_columns, grows.spread_s) == (6, 7, 0.75)

@@ -21,10 +21,10 @@ HOME: Cell = (0, 1)
 
 
 class Track:
-    """A vehicle with exact sensors, and perhaps somebody ahead with a speed that never changes."""
+    """A vehicle with exact sensors, and perhaps one ahead at constant speed."""
 
     def __init__(self, state: State | None = None) -> None:
-        """Put it into its cell; nobody is there."""
+        """Put it into its cell, alone."""
         self.plant = Plant(state or cell_state(LATTICE, HOME, 0.0), LIMITS, TICK_S)
         self.controller = MotionController(self.plant, SCENARIO, HOME)
         self.tick = 0
@@ -64,7 +64,7 @@ class Track:
 @pytest.fixture
 def track() -> Track:
     made = Track()
-    made.command(hold_cell=HOME)  # somebody is in charge, but says nothing
+    made.command(hold_cell=HOME)  # a process is in charge but sends no jerks
     made.tick += 1
     return made
 
@@ -72,7 +72,7 @@ def track() -> Track:
 # --- the rungs ------------------------------------------------------------------------------------
 
 
-def test_what_it_is_told_to_play_it_plays_whoever_is_ahead_if_it_could_still_brake(
+def test_it_plays_a_command_as_long_as_it_could_still_brake(
     track: Track,
 ) -> None:
     """Four metres behind one that is as fast: nothing that it would do by itself."""
@@ -102,7 +102,7 @@ def test_holding_is_the_hold_law_for_the_commanded_state(track: Track) -> None:
 
 
 @pytest.mark.parametrize("speed_mps", [0.0, 7.0])
-def test_who_holds_gives_way_with_comfort_and_keeps_its_distance(
+def test_a_holding_vehicle_gives_way_comfortably_and_keeps_its_distance(
     track: Track, speed_mps: float
 ) -> None:
     track.put_ahead(40.0, speed_mps)
@@ -115,14 +115,14 @@ def test_who_holds_gives_way_with_comfort_and_keeps_its_distance(
     assert ticks[Rung.EMERGENCY] == ticks[Rung.PLAY] == 0
 
 
-def test_nobody_on_another_lane_is_in_its_way(track: Track) -> None:
+def test_vehicles_on_other_lanes_are_not_in_its_way(track: Track) -> None:
     for lane in (0, 2):
         track.put_ahead(40.0, 0.0, lane)
         assert set(track.run(60)) == {Rung.HOLD}
         assert track.gap_m < -20.0
 
 
-def test_somebody_on_the_lane_that_it_steers_for_is_in_its_way(track: Track) -> None:
+def test_a_vehicle_on_the_target_lane_is_in_its_way(track: Track) -> None:
     track.command(hold_cell=(0, 2))
     track.put_ahead(40.0, 0.0, lane=2)
     gaps = [track.gap_m for _ in range(200) if track.step()]
@@ -133,7 +133,7 @@ def test_somebody_on_the_lane_that_it_steers_for_is_in_its_way(track: Track) -> 
 # --- emergencies ----------------------------------------------------------------------------------
 
 
-def test_it_brakes_as_hard_as_it_can_whatever_it_is_told_to_play(track: Track) -> None:
+def test_an_emergency_overrides_the_command(track: Track) -> None:
     track.put_ahead(16.0, 0.0)
     track.command(*[(0.0, 0.0)] * 40)
     rungs = track.run(40)
@@ -157,7 +157,7 @@ def test_an_emergency_ends_in_a_hold_and_an_interrupted_trajectory_is_not_taken_
     assert track.run(30) == [Rung.HOLD] * 30  # the trajectory would have gone on all the time
 
 
-def test_after_an_emergency_it_gives_way_behind_who_goes_on_slowly(track: Track) -> None:
+def test_after_an_emergency_it_gives_way_behind_a_slow_vehicle(track: Track) -> None:
     track.command(*[(0.0, 0.0)] * 40)
     track.put_ahead(8.0, 6.0)
     rungs = track.run(120)
@@ -231,7 +231,7 @@ def test_it_brakes_for_a_lane_that_the_body_touches(across_m: float, *, brakes: 
     assert (track.step() is Rung.EMERGENCY) == brakes
 
 
-def test_who_is_behind_is_no_emergency(track: Track) -> None:
+def test_a_vehicle_behind_is_no_emergency(track: Track) -> None:
     track.controller.perceive(track.plant.state, Around((), (Neighbour(HOME[1], -2.0, 25.0),)))
     track.controller.step(track.tick)
     assert track.controller.rung is Rung.HOLD

@@ -1,4 +1,4 @@
-"""Who is announced, who enters, and who has been counted when."""
+"""Announcements, entries, counts and censuses of the roadside."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ class Watch:
 
 @pytest.mark.parametrize("announce_s", [0.0, 0.05, 6.0, 30.0])
 @pytest.mark.parametrize(("operation", "columns"), [("paper", 2), ("rolling", 1)])
-def test_everybody_is_announced_before_entering_and_never_too_many_at_once(
+def test_every_vehicle_is_announced_before_entering_and_never_too_many_at_once(
     announce_s: float, operation: str, columns: int
 ) -> None:
     scenario = crowded(operation, announce_s=announce_s)
@@ -142,7 +142,7 @@ def test_announcements_come_in_time_and_say_what_is_known() -> None:
             assert announcement.arrival_s == arrival.t_s
     assert len(seen) == len(roadside._arrivals) > 5
     for arrival in roadside._arrivals:
-        # The queues are short here: nobody waits for room among the announced.
+        # The queues are short here: no vehicle waits for an announcement.
         assert arrival.t_s - seen[arrival.vehicle] > min(arrival.t_s, 5.9) - 0.2
 
 
@@ -179,42 +179,42 @@ def test_all_news_name_the_bridge_that_they_come_from(*, ended: bool) -> None:
     assert [message.bridge for message in messages] == [17, 17]
 
 
-def test_is_not_exhausted_while_somebody_is_still_to_come() -> None:
+def test_is_not_exhausted_before_the_last_arrival() -> None:
     scenario = parse_scenario({"demand": {"volume_veh_per_lane_h": 60, "duration_s": 60}})
     roadside = Roadside(scenario)
     last_s = roadside._arrivals[-1].t_s
-    assert not roadside.exhausted(last_s + 1.0)  # nobody has been queued
+    assert not roadside.exhausted(last_s + 1.0)  # none has been queued
     roadside.admit(last_s - 0.01)
-    assert not roadside.exhausted(last_s + 1.0)  # somebody waits
+    assert not roadside.exhausted(last_s + 1.0)  # a vehicle waits
     roadside.admit(last_s + 60.0)
     assert not roadside.exhausted(last_s - 0.01)
     assert roadside.exhausted(last_s)
 
 
-def test_a_census_tells_at_once_that_a_block_has_closed() -> None:
-    """Who leads need not wait for the next second to know a roster for certain."""
+def test_a_census_reports_a_closed_block_at_once() -> None:
+    """The leader need not wait for the next second to know a roster."""
     scenario = paper(load_scenario(None, seed=1, demand__duration_s=0.001))
     roadside = Roadside(scenario)
-    tick_s, told = scenario.runtime.tick_s, {}
+    tick_s, reported = scenario.runtime.tick_s, {}
     for tick in range(100):
         roadside.close_formations(tick * tick_s)
         for effect in roadside.publish(tick, tick * tick_s, []):
             if isinstance(effect, Send) and isinstance(effect.message, Census):
-                told[tick] = effect.message.closed_to
+                reported[tick] = effect.message.closed_to
     for block in range(2):
-        first = min(tick for tick in told if told[tick] >= block)
+        first = min(tick for tick in reported if reported[tick] >= block)
         assert first == math.ceil(closing_time_s(block, scenario) / tick_s - 1e-6)
-    assert len(told) < 20
+    assert len(reported) < 20
 
 
 @define
 class CensusWatch:
-    """Lets vehicles in and out, and checks what each census tells of formations."""
+    """Lets vehicles in and out, and checks the formations of each census."""
 
     scenario: Scenario
     vehicles: dict[Name, RoadVehicle] = field(factory=dict)
-    told: dict[int, ClosedFormation] = field(factory=dict)
-    """What censuses have told, by number."""
+    reported: dict[int, ClosedFormation] = field(factory=dict)
+    """Closed formations in censuses, by number."""
     closed_to: int = -1
     left: int = 0
 
@@ -227,7 +227,7 @@ class CensusWatch:
         for admission in roadside.admit(t_s):
             vehicle = RoadVehicle.entering(admission, t_s, self.scenario)
             self.vehicles[vehicle.name] = vehicle
-            assert vehicle.block > self.closed_to, "a census said that nobody would"
+            assert vehicle.block > self.closed_to, "a vehicle entered a closed block"
             assert vehicle.formation is None
             assert vehicle.controller.joined == (vehicle.block,)
         closed = roadside.close_formations(t_s)
@@ -245,7 +245,7 @@ class CensusWatch:
             for effect in roadside.publish(tick, t_s, self.vehicles.values())
             if isinstance(effect, Send) and isinstance(effect.message, Census)
         ]
-        assert censuses or not closed, "a formation has closed, and nobody is told"
+        assert censuses or not closed, "a formation has closed without a census"
         for census in censuses:
             self._check(census)
 
@@ -257,7 +257,7 @@ class CensusWatch:
         for formation in census.formations:
             assert formation.closed_s <= census.t_s
             assert formation.last_block <= census.closed_to
-            assert self.told.setdefault(formation.first_block, formation) == formation
+            assert self.reported.setdefault(formation.first_block, formation) == formation
         present = set()
         for vehicle in self.vehicles.values():
             if vehicle.block > census.closed_to:
@@ -271,7 +271,7 @@ class CensusWatch:
 
 
 @pytest.mark.parametrize("volume", [30.0, 1000.0, 2000.0])
-def test_a_census_tells_whose_the_columns_are_and_which_are_closed(volume: float) -> None:
+def test_a_census_reports_owners_of_columns_and_closed_ones(volume: float) -> None:
     scenario = load_scenario(
         None, seed=3, demand__duration_s=200.0, demand__volume_veh_per_lane_h=volume
     )
@@ -279,11 +279,11 @@ def test_a_census_tells_whose_the_columns_are_and_which_are_closed(volume: float
     watch.run(300.0)
     assert watch.left > 0
     assert not watch.vehicles
-    used = [block for formation in watch.told.values() for block in formation.blocks]
+    used = [block for formation in watch.reported.values() for block in formation.blocks]
     assert len(set(used)) == len(used), "a column has two formations"
 
 
-def test_a_census_of_the_rolling_operation_tells_of_no_formations() -> None:
+def test_a_census_of_the_rolling_operation_has_no_formations() -> None:
     roadside = Roadside(load_scenario(None, formation__operation="rolling"))
     for tick in range(600):
         roadside.admit(0.1 * tick)

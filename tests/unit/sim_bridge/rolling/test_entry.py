@@ -1,4 +1,4 @@
-"""Entry in the rolling operation, and who owns the cells at the entrance."""
+"""Entry in the rolling operation, and the owners of the cells at the entrance."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def rolling_meter() -> EntryMeter:
 
 @given(streams(), st.sampled_from([(0.5, False), (1.0, True), (0.25, True), (0.7, False)]))
 @settings(max_examples=100, deadline=None)
-def test_nobody_is_far_from_its_cell_or_close_to_another(
+def test_no_vehicle_is_far_from_its_cell_or_close_to_another(
     stream: list[Arrival], how: tuple[float, bool]
 ) -> None:
     spread_s, interlaced = how
@@ -85,12 +85,12 @@ def test_nobody_is_far_from_its_cell_or_close_to_another(
 
 @given(streams(headway_s=COLUMN_S))
 @settings(max_examples=100, deadline=None)
-def test_nobody_waits_who_comes_a_column_behind_the_one_before(stream: list[Arrival]) -> None:
+def test_a_vehicle_one_column_behind_its_predecessor_does_not_wait(stream: list[Arrival]) -> None:
     for admission in admitted(rolling_meter(), stream):
         assert admission.t_s == pytest.approx(admission.arrival.t_s, abs=SMALL_S)
 
 
-def test_who_comes_too_close_waits_until_it_may_follow() -> None:
+def test_a_vehicle_that_arrives_too_close_waits() -> None:
     meter = rolling_meter()
     for number in range(3):
         meter.demand(Arrival(f"v{number}", 0, 0, 0.4 + 0.1 * number))
@@ -98,7 +98,7 @@ def test_who_comes_too_close_waits_until_it_may_follow() -> None:
     assert entries == [((0, 0), 0.4), ((-1, 0), pytest.approx(1.4)), ((-2, 0), pytest.approx(2.4))]
 
 
-def test_a_column_closes_when_nobody_can_enter_it_any_more() -> None:
+def test_a_column_closes_when_no_vehicle_can_enter_it() -> None:
     meter = rolling_meter()
     closed = [1]
     for tick in range(40):
@@ -128,7 +128,7 @@ def make_scenario(**formation: object) -> Scenario:
 
 @define
 class Entrance:
-    """A roadside with a demand by hand, and everybody who has entered."""
+    """A roadside with a given demand, and all vehicles that have entered."""
 
     stream: list[Arrival]
     scenario: Scenario = field(factory=make_scenario)
@@ -186,10 +186,8 @@ def test_every_cell_near_behind_a_vehicle_of_the_lane_is_its(
 
 @given(streams(), st.sampled_from([0.1, 1.0]))
 @settings(max_examples=60, deadline=None)
-def test_every_cell_that_is_near_to_somebody_has_an_owner(
-    stream: list[Arrival], tick_s: float
-) -> None:
-    """Also on lanes on which nobody enters, and ahead of the first vehicle."""
+def test_every_cell_near_a_vehicle_has_an_owner(stream: list[Arrival], tick_s: float) -> None:
+    """Also on lanes without entries, and ahead of the first vehicle."""
     entrance = Entrance(stream, tick_s=tick_s).run(120.0)
     owners = entrance.owners()
     entered = [vehicle.admission.cell[0] for vehicle in entrance.vehicles.values()]
@@ -205,7 +203,7 @@ def test_cells_ahead_of_the_first_vehicle_are_its_as_far_as_they_are_near() -> N
     assert {lane for _, lane in estate} == {0, 1, 2}
 
 
-def test_a_cell_is_assigned_to_when_nobody_can_enter_it_any_more() -> None:
+def test_a_cell_is_assigned_when_no_vehicle_can_enter_it() -> None:
     entrance = Entrance([Arrival("first", 1, 0, 0.0)]).run(1.4)
     assert min(entrance.estate("first")) == (0, 0)
     entrance.run(1.6)
@@ -218,7 +216,7 @@ def test_most_get_no_more_than_some_cells() -> None:
     assert max(entrance.estate("next"))[0] == -50 + MAX_EMPTY
 
 
-def test_cells_behind_a_vehicle_that_has_left_are_nobody_s() -> None:
+def test_cells_behind_a_departed_vehicle_have_no_owner() -> None:
     entrance = Entrance([Arrival("first", 1, 0, 0.0)]).run(3.0)
     gone = entrance.vehicles.pop(Name("first"))
     owned = gone.controller.estate

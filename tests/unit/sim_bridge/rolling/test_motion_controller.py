@@ -44,7 +44,7 @@ OPEN = Deed(MID, open=True)
 PROMISE = order(MID)
 ACCEPTANCE = order(MID, deed_of(A), MID)
 POSSESSION = order(MID, OPEN, MID)
-"""What an agent says one after the other; each time it says all that it has to say."""
+"""Successive commands of an agent, each with everything that it requests."""
 NEXT_PROMISE = order(HIGH, OPEN)
 """It has taken possession, and then promised more."""
 
@@ -155,7 +155,7 @@ CELLS: list[Cell] = [(column, lane) for column in (0, 1, 2) for lane in (0, 1)]
 
 @st.composite
 def histories(draw: st.DrawFn) -> list[Command | Cell]:
-    """What an honest agent says over several ballots, each thing in any place, more than once."""
+    """Commands of a correct agent over several ballots, in any order, with repetitions."""
     said: list[Command | Cell] = []
     deed: Deed | None = None
     estate = set(BEFORE[A])

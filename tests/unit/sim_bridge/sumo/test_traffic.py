@@ -75,7 +75,7 @@ def traffic(tmp_path: Path) -> Iterator[SumoTraffic]:
         yield traffic
 
 
-def test_who_is_offered_stands_where_it_was_offered(traffic: SumoTraffic) -> None:
+def test_an_offered_vehicle_enters_where_it_was_offered(traffic: SumoTraffic) -> None:
     traffic.offer("v1", 2, 0, 0.6)
     assert traffic.advance() == ("v1",)
     assert traffic.positions()["v1"] == pytest.approx((0.6, 8.75, 0.0, 15.0), abs=1e-6)
@@ -83,7 +83,7 @@ def test_who_is_offered_stands_where_it_was_offered(traffic: SumoTraffic) -> Non
     assert traffic.positions()["v1"] == pytest.approx((2.1, 8.75, 0.0, 15.0), abs=1e-6)
 
 
-def test_who_finds_no_room_waits(traffic: SumoTraffic) -> None:
+def test_a_vehicle_without_room_waits(traffic: SumoTraffic) -> None:
     traffic.offer("v1", 0, 0, 0.0)
     traffic.advance()
     traffic.offer("v2", 0, 0, 0.0)
@@ -94,7 +94,7 @@ def test_who_finds_no_room_waits(traffic: SumoTraffic) -> None:
     assert ticks == 10
 
 
-def test_who_may_not_change_lanes_stays_and_waits_at_the_end(traffic: SumoTraffic) -> None:
+def test_a_vehicle_that_may_not_change_lanes_waits_at_the_end(traffic: SumoTraffic) -> None:
     traffic.offer("v1", 0, 1, 0.0)
     traffic.allow_lane_changes("v1", allowed=False)
     for _ in range(900):

@@ -1,4 +1,4 @@
-"""SUMO shows exactly what it is told, and drives nobody."""
+"""SUMO shows every vehicle exactly where it was placed, and drives none."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ class Broken:
             raise ImportError("libX11.so.6: cannot open shared object file: No such file")
 
 
-def test_a_missing_libsumo_says_what_to_install(
+def test_a_missing_libsumo_error_names_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "libsumo", None)
