@@ -133,16 +133,16 @@ class BridgeCore:
     @property
     def metrics(self) -> tuple[MetricsSnapshot, ...]:
         """Counters of the bridge."""
-        counts = self._roadside.counts(len(self.vehicles))
+        clock = self._roadside.clock(self.tick, self.t_s, len(self.vehicles))
         return (
             BridgeMetrics(
                 road_seconds=self.t_s,
                 ticks_total=self.tick,
                 missed_answers_total=self._record.missed_ticks,
-                vehicles_demanded_total=counts.demanded,
-                vehicles_entered_total=counts.entered,
-                vehicles_left_total=counts.left,
-                vehicles_on_road=counts.on_road,
+                vehicles_demanded_total=clock.demanded,
+                vehicles_entered_total=clock.entered,
+                vehicles_left_total=clock.left,
+                vehicles_on_road=clock.on_road,
                 vehicles_unattended=self._attendance.cared_for,
             ),
         )

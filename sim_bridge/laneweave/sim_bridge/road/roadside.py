@@ -9,8 +9,6 @@ import math
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from itertools import chain
 
-from attrs import frozen
-
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Effect, Send
 from laneweave.protocol.scenario.tables import Scenario
@@ -32,29 +30,6 @@ CENSUS_EVERY_TICKS = 10
 MAX_EMPTY = 12
 """Maximum number of empty cells that a vehicle gets behind it; fewer where moves begin soon, since
 it must own all of them before a plan can transfer any."""
-
-
-@frozen
-class Counts:
-    """Numbers of vehicles demanded so far, entered, on the road, and departed."""
-
-    demanded: int
-    entered: int
-    on_road: int
-    left: int
-
-    def clock(self, tick: int, t_s: float, *, ended: bool, bridge: int = 0) -> RoadClock:
-        """Return the clock message of a tick."""
-        return RoadClock(
-            tick=tick,
-            t_s=t_s,
-            demanded=self.demanded,
-            entered=self.entered,
-            on_road=self.on_road,
-            left=self.left,
-            ended=ended,
-            bridge=bridge,
-        )
 
 
 class Roadside:
@@ -201,8 +176,7 @@ class Roadside:
             on_road: all vehicles on the road.
             ended: whether it is the last tick.
         """
-        counts = self.counts(len(on_road))
-        yield Send(CLOCK, counts.clock(tick, t_s, ended=ended, bridge=self._bridge))
+        yield Send(CLOCK, self.clock(tick, t_s, len(on_road), ended=ended))
         due = ended or tick >= self._census_sent_tick + CENSUS_EVERY_TICKS
         announced = self.update_announcements(t_s)
         if announced or due or self._census_changed:
@@ -210,9 +184,18 @@ class Roadside:
             self._census_sent_tick = tick
             yield Send(CENSUS, self.census(t_s, on_road))
 
-    def counts(self, on_road: int) -> Counts:
-        """Return the counts."""
-        return Counts(self._demanded, self._entered, on_road, self._left)
+    def clock(self, tick: int, t_s: float, on_road: int, *, ended: bool = False) -> RoadClock:
+        """Return the clock of a tick, with the numbers of vehicles."""
+        return RoadClock(
+            tick=tick,
+            t_s=t_s,
+            demanded=self._demanded,
+            entered=self._entered,
+            on_road=on_road,
+            left=self._left,
+            ended=ended,
+            bridge=self._bridge,
+        )
 
     def exhausted(self, t_s: float) -> bool:
         """Return whether no vehicle waits and no further one will arrive."""

@@ -15,7 +15,7 @@ from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.structuring import structure
 from laneweave.protocol.wire.messages import Census, ClosedFormation, Name, RoadClock
 from laneweave.sim_bridge.road.entry import Admission
-from laneweave.sim_bridge.road.roadside import Counts, Roadside
+from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from support.paper import closing_time_s, paper
 
@@ -68,7 +68,7 @@ class Watch:
             self.tick(tick)
             tick += 1
             assert tick < 1_000_000
-        counts = self.roadside.counts(on_road=0)
+        counts = self.roadside.clock(tick, 0.0, on_road=0)
         assert counts.demanded == counts.entered == len(self.entered) == len(set(self.entered))
 
     def tick(self, tick: int) -> None:
@@ -79,7 +79,7 @@ class Watch:
             assert vehicle in self.demanded
             assert vehicle in self.announced
             self.entered.append(vehicle)
-        counts = roadside.counts(on_road=0)
+        counts = roadside.clock(tick, t_s, on_road=0)
         assert (counts.demanded, counts.entered) == (len(self.demanded), len(self.entered))
         roadside.update_announcements(t_s)
         announced = roadside.census(t_s, ()).announced
@@ -163,12 +163,11 @@ def test_the_census_lists_the_road_as_it_was_entered() -> None:
     ]
 
 
-def test_counts_make_the_clock() -> None:
+def test_the_clock_has_the_counts() -> None:
     roadside = Roadside(Scenario())
     roadside.count_left()
-    assert roadside.counts(on_road=7) == Counts(demanded=0, entered=0, on_road=7, left=1)
-    clock = roadside.counts(on_road=7).clock(5, 0.5, ended=True)
-    assert (clock.tick, clock.t_s, clock.on_road, clock.left, clock.ended) == (5, 0.5, 7, 1, True)
+    clock = roadside.clock(5, 0.5, 7, ended=True)
+    assert clock == RoadClock(5, 0.5, demanded=0, entered=0, on_road=7, left=1, ended=True)
 
 
 @pytest.mark.parametrize("ended", [False, True])
