@@ -1,4 +1,4 @@
-"""Errors that a person reads."""
+"""Errors that are shown to the user."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 80
 
 
 class BadInputError(ValueError):
-    """Something a user or a peer supplied is not acceptable.
+    """A value supplied by a user or a peer is not acceptable.
 
     The message is one line that names the field, the value and what is allowed. The command line
-    prints it and ends with exit status 2; a running process counts it and goes on.
+    prints it and exits with status 2; a running process counts it and continues.
     """
 
     def __init__(self, field: str, value: object, allowed: str) -> None:
-        """Store the three parts; `value` is shortened so that the line stays readable."""
+        """Store the three parts; `value` is shortened in the message."""
         self.field = field
         self.value = value
         self.allowed = allowed
         super().__init__(field, value, allowed)
 
     def __str__(self) -> str:
-        """Return the one line, whatever the value and the name are."""
+        """Return the message as one line, for any value and name."""
         try:
             shown = _SHORT.repr(self.value)
         except ValueError:  # an integer of thousands of digits
@@ -34,21 +34,21 @@ class BadInputError(ValueError):
         return f"{field}: got {value}; allowed: {one_line(allowed)}"
 
     def within(self, parent: str) -> BadInputError:
-        """Return the same error with `parent` put before the field's name."""
+        """Return the same error with the field's name prefixed by `parent`."""
         separator = "." if parent and self.field and not self.field.startswith("[") else ""
         return BadInputError(f"{parent}{separator}{self.field}", self.value, self.allowed)
 
 
 def one_line(text: str, length: int = 500) -> str:
-    """Return text as one readable line, or as part of one."""
+    """Return text as one printable line of limited length."""
     words = "".join(char if char.isprintable() else " " for char in text).split()
     line = " ".join(words)
     return line if len(line) <= length else line[: length - 3] + "..."
 
 
 class RefusedError(Exception):
-    """Somebody else refused the input; the message is their line. Exit status 2."""
+    """Another process refused the input; the message is its line. Exit status 2."""
 
 
 class CommandFailedError(RuntimeError):
-    """The input is good and yet the command cannot be done; the message says why. Status 1."""
+    """The command failed although its input is valid; the message says why. Exit status 1."""

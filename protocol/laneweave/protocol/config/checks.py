@@ -1,4 +1,4 @@
-"""How the fields of a scenario fit together."""
+"""Checks between the fields of a scenario."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from laneweave.protocol.config.participants import identities_of, max_vehicles
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.validators import is_tls
+from laneweave.protocol.vehicle.braking import min_pitch_m
 from laneweave.protocol.wire.identities import MAX_COMMON_NAME
 
-LEAST_GAP_M = 1.0
-"""Between bumpers of neighbouring cells: bodies turn to change lanes, and track with some error."""
-LEAST_SIDE_M = 0.5
-"""Between bodies side by side, for the same reasons."""
-MOST_TICKS = 200
-"""Of the tracker's horizon."""
-MOST_SECURED_VEHICLES = 5000
-"""Vehicles of a demand for which a router has rules."""
+MIN_GAP_M = 1.0
+"""Minimum gap between bumpers of neighbouring cells: bodies turn, and track with some error."""
+MIN_SIDE_GAP_M = 0.5
+"""Minimum gap between bodies side by side, for the same reasons."""
+MAX_TICKS = 200
+"""Maximum horizon of the tracker."""
+MAX_SECURED_VEHICLES = 5000
+"""Maximum number of vehicles for which a router has rules."""
 
 
 ROLLING_ONLY = ("sort_in_s2", "reward_drift")
@@ -42,10 +43,10 @@ FORMATIONS_ONLY = (
 
 
 def check_scenario(scenario: Scenario) -> None:
-    """Check how the fields fit together.
+    """Check the fields against each other.
 
     Raises:
-        BadInputError: names the first field that does not fit.
+        BadInputError: the first field that violates a rule.
     """
     _check_lanes(scenario)
     _check_motion(scenario)
@@ -58,14 +59,14 @@ def check_scenario(scenario: Scenario) -> None:
 
 
 def check_effects(data: Mapping[str, Any], scenario: Scenario) -> None:
-    """Check that every value that a file sets has an effect beside the file's other values.
+    """Check that each value of a file has an effect with the file's other values.
 
     Args:
-        data: the tables of the file.
-        scenario: what they mean.
+        data: tables of the file.
+        scenario: the scenario that they define.
 
     Raises:
-        BadInputError: names the first field that has none.
+        BadInputError: the first field without an effect.
     """
     formation, given = scenario.formation, data.get("formation", {})
     for fields, has_effect, allowed in (
@@ -108,11 +109,11 @@ def _check_lanes(scenario: Scenario) -> None:
         "numbers >= 0, not all 0, with a finite sum",
     )
     _require(
-        road.lane_width_m >= vehicle.width_m + LEAST_SIDE_M,
+        road.lane_width_m >= vehicle.width_m + MIN_SIDE_GAP_M,
         "road.lane_width_m",
         road.lane_width_m,
-        f"at least {vehicle.width_m + LEAST_SIDE_M:g}: vehicle.width_m = {vehicle.width_m:g} and "
-        f"{LEAST_SIDE_M:g} between bodies side by side",
+        f"at least {vehicle.width_m + MIN_SIDE_GAP_M:g}: vehicle.width_m = {vehicle.width_m:g} and "
+        f"{MIN_SIDE_GAP_M:g} between bodies side by side",
     )
     _require(
         3600.0 / demand.volume_veh_per_lane_h >= demand.min_headway_s,
@@ -125,13 +126,13 @@ def _check_lanes(scenario: Scenario) -> None:
 def _check_motion(scenario: Scenario) -> None:
     formation, vehicle, road = scenario.formation, scenario.vehicle, scenario.road
     min_gap_m = scenario.tracking.min_gap_m
-    least_pitch_m = vehicle.length_m + max(min_gap_m, LEAST_GAP_M)
+    shortest_m = vehicle.length_m + max(min_gap_m, MIN_GAP_M)
     _require(
-        formation.gap_m >= least_pitch_m,
+        formation.gap_m >= shortest_m,
         "formation.gap_m",
         formation.gap_m,
-        f"at least {least_pitch_m:g}: vehicle.length_m = {vehicle.length_m:g} and between two "
-        f"bumpers tracking.min_gap_m = {min_gap_m:g}, at least {LEAST_GAP_M:g}",
+        f"at least {shortest_m:g}: vehicle.length_m = {vehicle.length_m:g} and between two "
+        f"bumpers tracking.min_gap_m = {min_gap_m:g}, at least {MIN_GAP_M:g}",
     )
     cycle_s, move_s = formation.cycle_s, formation.move_s
     if move_s is not None:
@@ -166,7 +167,7 @@ def _check_motion(scenario: Scenario) -> None:
 
 
 def _check_structures(scenario: Scenario) -> None:
-    """Check that structures follow one another on the road before S3, on lanes that it has."""
+    """Check that structures are in order along the road, before S3, and on existing lanes."""
     road, before_m = scenario.road, -1.0
     for number, structure in enumerate(scenario.formation.structures):
         name = f"formation.structures[{number}]"
@@ -229,13 +230,13 @@ def _check_timing(scenario: Scenario) -> None:
         scenario.horizon_ticks * runtime.tick_s >= longest_move_s - 1e-6,
         "tracking.horizon_ticks",
         scenario.horizon_ticks,
-        f"long enough to hold a whole move of {longest_move_s:g} s, at most {MOST_TICKS}",
+        f"long enough to hold a whole move of {longest_move_s:g} s, at most {MAX_TICKS}",
     )
     _require(
-        scenario.horizon_ticks <= MOST_TICKS,
+        scenario.horizon_ticks <= MAX_TICKS,
         "runtime.tick_s",  # a horizon that is given has its own bound
         runtime.tick_s,
-        f"long enough for the longest T_F, {longest_s:g} s, to have at most {MOST_TICKS} ticks",
+        f"long enough for the longest T_F, {longest_s:g} s, to have at most {MAX_TICKS} ticks",
     )
     _require(
         runtime.tick_resend_s < runtime.tick_deadline_s,
@@ -259,9 +260,6 @@ def _check_timing(scenario: Scenario) -> None:
 
 
 def _check_braking(scenario: Scenario) -> None:
-    # The emergency brake is made from scenarios, so its module imports theirs.
-    from laneweave.protocol.vehicle.braking import least_pitch_m  # noqa: PLC0415
-
     reaction_s, tick_s = scenario.braking.reaction_s, scenario.runtime.tick_s
     ticks = reaction_s / tick_s
     _require(
@@ -271,38 +269,38 @@ def _check_braking(scenario: Scenario) -> None:
         f"a multiple of runtime.tick_s = {tick_s:g}, at least once it: a vehicle looks once in a "
         "tick",
     )
-    gap_m, least_m = scenario.formation.gap_m, least_pitch_m(scenario)
+    gap_m, min_m = scenario.formation.gap_m, min_pitch_m(scenario)
     _require(
-        gap_m >= least_m,
+        gap_m >= min_m,
         "formation.gap_m",
         gap_m,
-        f"at least {math.ceil(1000.0 * least_m) / 1000.0:g}: who holds one cell behind another at "
+        f"at least {math.ceil(1000.0 * min_m) / 1000.0:g}: a vehicle that holds behind another at "
         f"formation.speed_mps = {scenario.formation.speed_mps:g} must not brake in emergency "
         "(vehicle.length_m, the tables braking and sensing)",
     )
 
 
 def _check_settling(scenario: Scenario) -> None:
-    """Who settles in its cell with the least jerk must stay within the vehicle's limits.
+    """Check that a vehicle can settle in its cell within its limits.
 
-    From rest to rest over d in T that takes a speed of 15/8 d/T, an acceleration of 10/sqrt(3) d/T2
-    and a jerk of 60 d/T3.
+    The minimum-jerk motion from rest to rest over d in T takes a speed of 15/8 d/T, an acceleration
+    of 10/sqrt(3) d/T2 and a jerk of 60 d/T3.
     """
     formation, vehicle = scenario.formation, scenario.vehicle
-    way_m = formation.entry_spread_s * formation.speed_mps
+    offset_m = formation.entry_spread_s * formation.speed_mps
     speed_mps = min(vehicle.max_speed_mps - formation.speed_mps, formation.speed_mps)
     accel_mps2 = min(vehicle.max_accel_mps2, -vehicle.min_accel_mps2)
-    least_s = max(
-        15.0 / 8.0 * way_m / speed_mps,
-        math.sqrt(10.0 / math.sqrt(3.0) * way_m / accel_mps2),
-        math.cbrt(60.0 * way_m / vehicle.max_jerk_mps3),
+    min_s = max(
+        15.0 / 8.0 * offset_m / speed_mps,
+        math.sqrt(10.0 / math.sqrt(3.0) * offset_m / accel_mps2),
+        math.cbrt(60.0 * offset_m / vehicle.max_jerk_mps3),
     )
     _require(
-        formation.settle_s >= least_s,
+        formation.settle_s >= min_s,
         "formation.settle_s",
         formation.settle_s,
-        f"at least {math.ceil(10.0 * least_s) / 10.0:g}: whoever enters up to {way_m:g} m beside "
-        "its cell settles there within the vehicle's limits",
+        f"at least {math.ceil(10.0 * min_s) / 10.0:g}: a vehicle that enters up to "
+        f"{offset_m:g} m beside its cell settles there within its limits",
     )
 
 
@@ -323,10 +321,10 @@ def _check_security(scenario: Scenario) -> None:
     _require(bool(security.folder), "security.folder", "", "the folder of the certificates")
     count = max_vehicles(scenario.demand, scenario.road.lanes)
     _require(
-        count <= MOST_SECURED_VEHICLES,
+        count <= MAX_SECURED_VEHICLES,
         "demand.duration_s",
         scenario.demand.duration_s,
-        f"a demand of at most {MOST_SECURED_VEHICLES} vehicles where security.mode is mtls, this "
+        f"a demand of at most {MAX_SECURED_VEHICLES} vehicles where security.mode is mtls, this "
         f"one may have {count}: the router has rules for each of them",
     )
     for identity in identities_of(scenario):

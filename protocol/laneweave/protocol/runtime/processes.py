@@ -1,4 +1,4 @@
-"""What processes of one machine owe each other."""
+"""Signals: die with the parent, stop on SIGINT and SIGTERM."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 def die_with_parent() -> None:
-    """Have the kernel end this process when its parent dies, however that dies."""
+    """Make the kernel send SIGTERM to this process when its parent dies."""
     parent = os.getppid()
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
     if os.getppid() != parent:
@@ -22,17 +22,16 @@ def die_with_parent() -> None:
 
 @contextlib.contextmanager
 def stop_signals(stop: Callable[[], None]) -> Iterator[None]:
-    """Have SIGINT and SIGTERM call `stop`, which must take no lock, until the block ends."""
+    """Call `stop` on SIGINT and SIGTERM until the block ends; it must not take a lock."""
 
-    # A handler may interrupt anything, a thread that holds a lock too: `stop` takes none, and
-    # whoever it wakes writes the log.
+    # A handler may interrupt code that holds a lock, so `stop` takes none and does not log.
     def on_signal(_number: int, _frame: object) -> None:
         stop()
 
     before = {
         number: signal.signal(number, on_signal)
         for number in (signal.SIGINT, signal.SIGTERM)
-        # What is ignored stays ignored: a supervisor takes Ctrl-C for all its processes.
+        # Ignored signals stay ignored: a supervisor handles Ctrl-C for all its processes.
         if signal.getsignal(number) is not signal.SIG_IGN
     }
     try:

@@ -1,8 +1,8 @@
-"""The seam to the network: one small interface, two peers behind it.
+"""The interface to the network.
 
-`zenoh_transport` implements it over Zenoh, `simulated_network` in virtual time. Both hand over
-`Delivery` values through one callable, may lose, duplicate and reorder what they carry (the
-simulated one does all of it on purpose), and pass the same contract tests.
+`transports.zenoh` implements it over Zenoh, `transports.simulated` in virtual time. Both pass
+`Delivery` values to one callable, may lose, duplicate and reorder messages (the simulated one does
+so on purpose), and pass the same contract tests.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from laneweave.protocol.wire.topics import Quality
 
 @frozen
 class Received:
-    """A payload that somebody published on a key."""
+    """A payload published on a key."""
 
     key: str
     payload: bytes
@@ -25,16 +25,16 @@ class Received:
 
 @frozen
 class TokenUp:
-    """A liveliness token appeared: its process is there and connected."""
+    """A liveliness token appeared: its process is connected."""
 
     key: str
 
 
 @frozen
 class TokenDown:
-    """A liveliness token vanished: its process ended, fell silent, or *we* lost the network.
+    """A liveliness token vanished: its process ended, fell silent, or this node lost the network.
 
-    In the last case a `LinkDown` comes with it, at the same time, before it or after it.
+    In the last case a `LinkDown` comes at the same time, before or after it.
     """
 
     key: str
@@ -47,23 +47,23 @@ class LinkUp:
 
 @frozen
 class LinkDown:
-    """The connection to the network is gone; what is published now is lost."""
+    """The connection to the network is lost; messages published now are lost."""
 
 
 @frozen
 class Question:
-    """A query on a key that this node answers; `token` goes back with the answer."""
+    """A query on a key that this node serves; the answer must carry its `token`."""
 
     key: str
     payload: bytes
     token: int
     encoding: str = ""
-    """MIME type of the payload; empty: not told."""
+    """MIME type of the payload; empty: unknown."""
 
 
 @frozen
 class Answer:
-    """What a question was answered."""
+    """Answer to a question."""
 
     payload: bytes
     ok: bool
@@ -72,7 +72,7 @@ class Answer:
 
 
 def learn(seen: dict[str, None], news: TokenUp | TokenDown) -> bool:
-    """Note in the keys that are seen what became of a token; false when that is nothing new."""
+    """Update the visible tokens; return False if the event repeats what is known."""
     known = news.key in seen
     if isinstance(news, TokenUp):
         seen[news.key] = None
@@ -86,22 +86,22 @@ Deliver = Callable[[Delivery], None]
 
 
 class Transport(Protocol):
-    """What a node may ask of the network. No call blocks for long; none raises on a lost link."""
+    """Network operations of a node. No call blocks for long; none raises on a lost link."""
 
     def publish(self, key: str, payload: bytes, quality: Quality) -> None:
-        """Send a payload to all who subscribed to the key, this node included."""
+        """Send a payload to all subscribers of the key, this node included."""
 
     def subscribe(self, key_expression: str) -> None:
-        """Deliver from now on what is published on matching keys (`*` is one part, `**` any)."""
+        """Deliver messages on matching keys from now on (`*` is one part, `**` any number)."""
 
     def unsubscribe(self, key_expression: str) -> None:
         """Undo `subscribe`; unknown expressions are ignored."""
 
     def announce(self, key: str) -> None:
-        """Show a liveliness token on this key for as long as this node lives and is connected."""
+        """Show a liveliness token on this key while this node is alive and connected."""
 
     def withdraw(self, key: str) -> None:
-        """Take a liveliness token back; unknown ones are ignored."""
+        """Withdraw a liveliness token; unknown ones are ignored."""
 
     def watch(self, key_expression: str) -> None:
         """Deliver tokens that appear or vanish, beginning with those that are there.
@@ -119,7 +119,7 @@ class Transport(Protocol):
         """Answer a question once; unknown tokens are ignored."""
 
     def decline(self, token: int) -> None:
-        """Leave a question to the others who serve its key; unknown tokens are ignored."""
+        """Leave a question to the other servers of its key; unknown tokens are ignored."""
 
     def close(self) -> None:
-        """Leave the network. Idempotent; whatever is called after it does nothing."""
+        """Leave the network. Idempotent; all later calls do nothing."""

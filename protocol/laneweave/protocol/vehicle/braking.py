@@ -162,7 +162,7 @@ class EmergencyBrake:
         return ahead_m + speed * speed / (2.0 * self._brake_mps2) + self._last_tick_m
 
 
-def least_pitch_m(scenario: Scenario) -> float:
+def min_pitch_m(scenario: Scenario) -> float:
     """Return the column pitch with which two that hold one cell apart do not brake, nearly ever.
 
     Errors of measurement are less than what is to spare, up to `ERROR_SIGMAS`.

@@ -19,7 +19,7 @@ from laneweave.protocol.vehicle.braking import (
     ERROR_SIGMAS,
     EmergencyBrake,
     lead_way_m,
-    least_pitch_m,
+    min_pitch_m,
     spare_error_m,
     stopping_distance_m,
 )
@@ -175,7 +175,7 @@ def with_pitch(gap_m: float, **sensing: float) -> Scenario:
 
 
 def test_the_least_pitch_leaves_room_for_errors_of_measurement_and_for_nothing_more() -> None:
-    least_m = least_pitch_m(SCENARIO)
+    least_m = min_pitch_m(SCENARIO)
     assert with_pitch(least_m + 1e-6).formation.gap_m == pytest.approx(least_m)
     state, ahead = body(V_F), Neighbour(0, least_m - LIMITS.length_m, V_F)
     spare_m = BRAKE.spare_m(state, 0.0, NO_JERK, [ahead])
@@ -191,4 +191,4 @@ def test_the_least_pitch_leaves_room_for_errors_of_measurement_and_for_nothing_m
 
 def test_worse_sensors_ask_for_a_greater_pitch() -> None:
     noisy = with_pitch(15.0, other_speed_noise_mps=0.5)
-    assert least_pitch_m(noisy) > least_pitch_m(SCENARIO) + 1.0
+    assert min_pitch_m(noisy) > min_pitch_m(SCENARIO) + 1.0
