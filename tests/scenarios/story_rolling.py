@@ -121,7 +121,7 @@ class RollingPlayer(Player):
         for name, vehicle in self.vehicles.items():
             controller = vehicle.road.controller
             body = frozenset(vehicle.occupied)
-            self._estates.show(0.0, name, controller.estate, controller.deed, body)
+            self._estates.show(0.0, name, controller.owned, controller.transfer, body)
         if self._wrong:
             wrong, self._wrong = self._wrong, []
             raise CollisionError(f"{command}: {wrong[0]}")
@@ -133,7 +133,7 @@ class RollingPlayer(Player):
     ) -> None:
         vehicle = Vehicle.entering(name, cell_of(cell), int(lane), self.t_s, ROLLING)
         for each in (owned or "").split():
-            vehicle.road.controller.own(cell_of(each))
+            vehicle.road.controller.assign_cell(cell_of(each))
         if origin is not None:
             vehicle.at = cell_of(origin)
         self.vehicles[name] = vehicle

@@ -22,53 +22,53 @@ def obey(patch: Patch) -> None:
     take = MotionController.take
 
     def mutant(self: MotionController, command: Command) -> bool:
-        estate = self.estate
-        self.estate = tuple(sorted({*estate, command.hold_cell}))
+        owned = self.owned
+        self.owned = tuple(sorted({*owned, command.hold_cell}))
         taken = take(self, command)
-        self.estate = estate
+        self.owned = owned
         return taken
 
     patch.setattr(MotionController, "take", mutant)
 
 
 def possess_at_once(patch: Patch) -> None:
-    draw_up = MotionController.draw_up
+    begin_transfer = MotionController.begin_transfer
 
     def mutant(self: MotionController, deed: Deed) -> None:
-        draw_up(self, deed)
-        self.take_possession(deed.ballot)
+        begin_transfer(self, deed)
+        self.complete_transfer(deed.ballot)
 
-    patch.setattr(MotionController, "draw_up", mutant)
+    patch.setattr(MotionController, "begin_transfer", mutant)
 
 
 def draw_up_anything(patch: Patch) -> None:
     def mutant(self: MotionController, deed: Deed) -> None:
-        if deed != self.deed:
-            self.deed, self.estate = deed, deed.before
+        if deed != self.transfer:
+            self.transfer, self.owned = deed, deed.before
 
-    patch.setattr(MotionController, "draw_up", mutant)
+    patch.setattr(MotionController, "begin_transfer", mutant)
 
 
 def forget_promise(patch: Patch) -> None:
-    hand_over = MotionController.hand_over
+    put_in_charge = MotionController.put_in_charge
 
     def mutant(self: MotionController, incarnation: int) -> None:
-        hand_over(self, incarnation)
+        put_in_charge(self, incarnation)
         self.promised = None
 
-    patch.setattr(MotionController, "hand_over", mutant)
+    patch.setattr(MotionController, "put_in_charge", mutant)
 
 
 def forget_estate(patch: Patch) -> None:
-    hand_over = MotionController.hand_over
+    put_in_charge = MotionController.put_in_charge
 
     def mutant(self: MotionController, incarnation: int) -> None:
         first = self.attendant == 0
-        hand_over(self, incarnation)
+        put_in_charge(self, incarnation)
         if not first:
-            self.estate = (self.hold_cell,)
+            self.owned = (self.hold_cell,)
 
-    patch.setattr(MotionController, "hand_over", mutant)
+    patch.setattr(MotionController, "put_in_charge", mutant)
 
 
 def show_estate_at_once(patch: Patch) -> None:

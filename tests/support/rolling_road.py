@@ -54,7 +54,7 @@ def controller_of(cells: Iterable[Cell]) -> MotionController:
     plant = Plant(cell_state(LATTICE, first, 0.0), ROLLING.vehicle, TICK_S)
     controller = MotionController(plant, ROLLING, first)
     for cell in (first, *others):
-        controller.own(cell)
+        controller.assign_cell(cell)
     return controller
 
 
@@ -82,7 +82,7 @@ class Car:
     def start(self, *, attended: bool = True) -> None:
         """Put a new process in charge: an agent, or one that never moves the vehicle."""
         self.attended = attended
-        self.controller.hand_over(self.controller.attendant + 1)
+        self.controller.put_in_charge(self.controller.attendant + 1)
         self.sense = self.sense_now()
         self.execution = PlanExecution(
             vehicle=self.name,
@@ -92,7 +92,7 @@ class Car:
             joined=(),
             moving=self.under_way,
             rules=self.rules,
-            estate=frozenset(self.controller.estate),
+            estate=frozenset(self.controller.owned),
         )
         self.execution.on_estate(self.sense)
 
@@ -102,7 +102,7 @@ class Car:
             self.name, self.tick, LATER_S + self.tick, controller.plant.state, controller.hold_cell,
             controller.motion_end_tick, controller.motion_origin, 0, (), (),
             attendant=controller.attendant, accepted=controller.accepted,
-            estate=controller.estate, promised=controller.promised, deed=controller.deed,
+            estate=controller.owned, promised=controller.promised, deed=controller.transfer,
         )  # fmt: skip
 
     def command(self) -> Command:
@@ -299,8 +299,8 @@ class Road:
         before = car.controller.hold_cell
         car.obey(command)
         self.moves += car.controller.hold_cell != before
-        if car.controller.deed is not None and car.controller.deed.open:
-            self.opened.add(car.controller.deed.ballot)
+        if car.controller.transfer is not None and car.controller.transfer.open:
+            self.opened.add(car.controller.transfer.ballot)
 
     def tick(self) -> None:
         car = self.car()
@@ -341,15 +341,15 @@ class Road:
     def grant(self) -> None:
         if self.granted < 4 and self.rng.random() < 0.1:
             self.granted += 1
-            self.car().controller.own((5 + self.granted, 0))
+            self.car().controller.assign_cell((5 + self.granted, 0))
 
     # --- what must be -------------------------------------------------------------------------
 
     def owned(self, car: Car) -> frozenset[Cell]:
         """Return what a car owns, as somebody knows who has seen all."""
-        deed = car.controller.deed
+        deed = car.controller.transfer
         if deed is None or deed.open:
-            return frozenset(car.controller.estate)
+            return frozenset(car.controller.owned)
         return frozenset(deed.after if deed.ballot in self.opened else deed.before)
 
     def check(self) -> None:

@@ -53,7 +53,7 @@ def test_a_leader_never_errs_about_what_somebody_owns() -> None:
             road.run(5)
             for leader in road.leaders:
                 for car in road.cars.values():
-                    deed, state = car.controller.deed, car.state_now()
+                    deed, state = car.controller.transfer, car.state_now()
                     if not state.estate:
                         continue  # a promise that its controller has not noted
                     estate = estate_of(state, leader.states)
@@ -76,16 +76,16 @@ def test_a_leader_never_errs_about_what_somebody_owns() -> None:
 
 def forget_promise(patch: pytest.MonkeyPatch) -> None:
     """A promise does not bind the next process, and plans are accepted without deeds."""
-    hand_over = MotionController.hand_over
+    put_in_charge = MotionController.put_in_charge
 
     def mutant(self: MotionController, incarnation: int) -> None:
-        hand_over(self, incarnation)
+        put_in_charge(self, incarnation)
         self.promised = None
 
     def accept(self: MotionController, ballot: Ballot) -> None:
         self.accepted = ballot if self.accepted is None else max(self.accepted, ballot)
 
-    patch.setattr(MotionController, "hand_over", mutant)
+    patch.setattr(MotionController, "put_in_charge", mutant)
     patch.setattr(MotionController, "accept", accept)
 
 

@@ -36,10 +36,10 @@ def watched(street: Street) -> Callable[[], bool]:
         owners: dict[Cell, Name] = {}
         controllers = {name: each.controller for name, each in street.bridge.vehicles.items()}
         for controller in controllers.values():
-            if controller.deed is not None and controller.deed.open:
-                opened.add(controller.deed.ballot)
+            if controller.transfer is not None and controller.transfer.open:
+                opened.add(controller.transfer.ballot)
         for name, controller in controllers.items():
-            deed, cells = controller.deed, set(controller.estate)
+            deed, cells = controller.transfer, set(controller.owned)
             if deed is not None and not deed.open and deed.ballot in opened:
                 cells = set(deed.after)
             assert controller.hold_cell in cells

@@ -163,7 +163,7 @@ class LightVehicle(RoadVehicle):
             MotionController(self.body, scenario, visit.cell),
         )
         if scenario.formation.rolling:
-            self.controller.own(visit.cell)
+            self.controller.assign_cell(visit.cell)
         self._visit = visit
         self._speed_mps = scenario.lattice.speed_mps
 
@@ -346,12 +346,12 @@ class LightRoad:
             grant = self._grants.pop(0)
             owner = self.vehicles.get(grant.owner)
             if owner is not None:
-                owner.controller.own(grant.cell)
+                owner.controller.assign_cell(grant.cell)
                 self._show_estate(grant.owner, now_s)
 
     def _show_estate(self, name: Name, now_s: float) -> None:
         controller = self.vehicles[name].controller
-        self._watcher.own(now_s, name, controller.estate, controller.deed)
+        self._watcher.own(now_s, name, controller.owned, controller.transfer)
 
     def _let_leave(self, now_s: float) -> Iterator[Effect]:
         length_m = self._scenario.road.length_m

@@ -78,10 +78,10 @@ class MotionController:
     promised: Ballot | None = None
     """Highest ballot that any process in charge has promised (rolling operation): a promise also
     binds later processes."""
-    estate: tuple[Cell, ...] = ()
+    owned: tuple[Cell, ...] = ()
     """Cells that the vehicle owns, ascending (rolling operation)."""
-    deed: Deed | None = None
-    """Newest plan that transfers cells."""
+    transfer: Deed | None = None
+    """Newest transfer of cells, pending or completed."""
     _granted: frozenset[Cell] = frozenset()
     """Cells from the roadside that no plan contains yet."""
     motion_origin: Cell = field(init=False)
@@ -155,11 +155,11 @@ class MotionController:
         if command.incarnation > self.attendant and command.hold_cell != self.hold_cell:
             return False
         if command.incarnation > self.attendant:
-            self.hand_over(command.incarnation)
+            self.put_in_charge(command.incarnation)
         self.command_tick = command.tick
         self.note(command)
         leaves = command.hold_cell != self.hold_cell
-        if self.rolling and leaves and command.hold_cell not in self.estate:
+        if self.rolling and leaves and command.hold_cell not in self.owned:
             return False
         if len(jerks) > 0 or leaves:
             self._jerks, self._jerks_tick = jerks, command.tick
@@ -169,7 +169,7 @@ class MotionController:
             self.motion_ticks = command.motion_ticks
         return True
 
-    def hand_over(self, incarnation: int) -> None:
+    def put_in_charge(self, incarnation: int) -> None:
         """Put another process in charge; the current motion continues.
 
         Raises:
@@ -189,28 +189,28 @@ class MotionController:
         if command.incarnation != self.attendant:
             return False
         asked = command.joined, command.accepted, command.promised, command.deed
-        if asked == (self.joined, self.accepted, self.promised, self.deed):
+        if asked == (self.joined, self.accepted, self.promised, self.transfer):
             return False  # the usual case
         if not _in_range(command.joined):
             return False
-        before = self.joined, self.accepted, self.promised, self.deed
+        before = self.joined, self.accepted, self.promised, self.transfer
         self.join(command.joined)
         if command.deed is not None and command.deed.open:
-            self.take_possession(command.deed.ballot)
+            self.complete_transfer(command.deed.ballot)
         if command.promised is not None:
             self.promise(command.promised)
         if command.deed is not None and not command.deed.open:
-            self.draw_up(command.deed)
+            self.begin_transfer(command.deed)
         if command.accepted is not None:
             self.accept(command.accepted)
-        return (self.joined, self.accepted, self.promised, self.deed) != before
+        return (self.joined, self.accepted, self.promised, self.transfer) != before
 
     def accept(self, ballot: Ballot) -> None:
         """Note a plan that the process in charge has accepted, unless it is older.
 
         Where vehicles own cells, its transfer must be pending.
         """
-        if self.rolling and (self.deed is None or self.deed.ballot != ballot):
+        if self.rolling and (self.transfer is None or self.transfer.ballot != ballot):
             return
         self.accepted = ballot if self.accepted is None else max(self.accepted, ballot)
 
@@ -218,28 +218,28 @@ class MotionController:
         """Note a promise, unless it is older."""
         self.promised = ballot if self.promised is None else max(self.promised, ballot)
 
-    def draw_up(self, deed: Deed) -> None:
+    def begin_transfer(self, deed: Deed) -> None:
         """Note the pending transfer of an accepted plan, unless a higher ballot is promised.
 
         Cells that the roadside has assigned since the plan was made stay with the vehicle.
         """
-        newer = self.deed is None or deed.ballot > self.deed.ballot
+        newer = self.transfer is None or deed.ballot > self.transfer.ballot
         if newer and self.promised is not None and deed.ballot >= self.promised:
             self._granted -= set(deed.before)
-            self.deed = _with_cells(deed, self._granted)
-            self.estate = self.deed.before
+            self.transfer = _with_cells(deed, self._granted)
+            self.owned = self.transfer.before
 
-    def take_possession(self, ballot: Ballot) -> None:
+    def complete_transfer(self, ballot: Ballot) -> None:
         """Complete the pending transfer: the start gate of its plan is open."""
-        if self.deed is not None and self.deed.ballot == ballot and not self.deed.open:
-            self.estate, self.deed = self.deed.after, Deed(ballot, open=True)
+        if self.transfer is not None and self.transfer.ballot == ballot and not self.transfer.open:
+            self.owned, self.transfer = self.transfer.after, Deed(ballot, open=True)
 
-    def own(self, cell: Cell) -> None:
+    def assign_cell(self, cell: Cell) -> None:
         """Add an empty cell that the roadside has assigned to the vehicle."""
         self._granted |= {cell}
-        self.estate = tuple(sorted({*self.estate, cell}))
-        if self.deed is not None and not self.deed.open:
-            self.deed = _with_cells(self.deed, {cell})
+        self.owned = tuple(sorted({*self.owned, cell}))
+        if self.transfer is not None and not self.transfer.open:
+            self.transfer = _with_cells(self.transfer, {cell})
 
     def join(self, formations: Iterable[int]) -> None:
         """Note formations as joined."""

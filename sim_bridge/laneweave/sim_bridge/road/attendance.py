@@ -62,7 +62,7 @@ class Caretaker:
             ValueError: the incarnation is not greater than that of the process in charge.
         """
         controller = vehicle.controller
-        controller.hand_over(incarnation)
+        controller.put_in_charge(incarnation)
         self._vehicle = vehicle
         self._execution = PlanExecution(
             vehicle=vehicle.name,
@@ -71,7 +71,7 @@ class Caretaker:
             lattice=controller.lattice,
             joined=controller.joined,
             moving=controller.moving(tick),
-            estate=frozenset(controller.estate) if controller.rolling else None,
+            estate=frozenset(controller.owned) if controller.rolling else None,
         )
         self._execution.on_estate(vehicle.sense(tick, caretaker=True))
 
@@ -93,7 +93,7 @@ class Caretaker:
             accepted = not message.moves.get(execution.vehicle) and execution.on_plan(message)
             if accepted:
                 if execution.deed is not None:
-                    controller.draw_up(execution.deed)
+                    controller.begin_transfer(execution.deed)
                 controller.accept(message.ballot)
                 execution.on_noted(controller.accepted)
         return self.state(tick) if accepted else None

@@ -148,7 +148,7 @@ class Roadside:
             if first <= entered <= last and name in vehicles
         ]
         if near:
-            vehicles[min(near)[-1]].controller.own(cell)
+            vehicles[min(near)[-1]].controller.assign_cell(cell)
         else:
             self._left_over.append(cell)
 

@@ -53,7 +53,7 @@ class RoadVehicle:
         if abs(admission.offset_m) > NEAR_M:
             controller.motion_end_tick = round((t_s + scenario.formation.settle_s) / tick_s)
         if scenario.formation.rolling:
-            controller.own(admission.cell)
+            controller.assign_cell(admission.cell)
         formation = None if scenario.formation.closes_by_vehicles else controller.joined[0]
         return cls(name, admission, controller, Sensors(scenario, name), formation, bridge)
 
@@ -131,9 +131,9 @@ class RoadVehicle:
             joined=controller.joined,
             accepted=controller.accepted,
             left=left,
-            estate=controller.estate,
+            estate=controller.owned,
             promised=controller.promised,
-            deed=controller.deed,
+            deed=controller.transfer,
             bridge=self.bridge,
         )
 

@@ -27,7 +27,7 @@ AGENT = 5
 def controller() -> MotionController:
     plant = Plant(cell_state(LATTICE, HOME, 0.0), SCENARIO.vehicle, TICK_S)
     controller = MotionController(plant, SCENARIO, HOME)
-    controller.hand_over(AGENT)
+    controller.put_in_charge(AGENT)
     return controller
 
 
@@ -178,11 +178,11 @@ def test_a_claim_that_came_second_is_tried_again_with_the_next_tick(
 def test_handing_over_leaves_the_motion_as_it_is(controller: MotionController) -> None:
     controller.take(command(3, *[(1.0, 0.0)] * 9, hold_cell=(1, 1)))
     before = known(controller)
-    controller.hand_over(AGENT + 7)
+    controller.put_in_charge(AGENT + 7)
     assert known(controller) == (AGENT + 7, *before[1:])
     for incarnation in (AGENT, AGENT + 7):
         with pytest.raises(ValueError, match="not above"):
-            controller.hand_over(incarnation)
+            controller.put_in_charge(incarnation)
 
 
 def test_formations_stay_joined_and_only_the_process_in_charge_joins(
@@ -261,7 +261,7 @@ def test_an_acceptance_is_forgotten_when_another_takes_charge(
     if claim == "command":
         assert controller.take(asking(None, tick=4, incarnation=AGENT + 1))
     else:
-        controller.hand_over(AGENT + 1)
+        controller.put_in_charge(AGENT + 1)
     assert (controller.accepted, controller.joined) == (None, joined)
     assert not controller.note(asking(HIGH, tick=4))  # its time is over
     assert controller.accepted is None

@@ -32,7 +32,7 @@ def vehicle() -> RoadVehicle:
     """A vehicle that an agent was in charge of; road time is 0."""
     admission = Admission(Arrival("A", 0, 1, 0.0), HOME, 0.0)
     vehicle = RoadVehicle.entering(admission, 0.0, SCENARIO)
-    vehicle.controller.hand_over(AGENT)
+    vehicle.controller.put_in_charge(AGENT)
     return vehicle
 
 

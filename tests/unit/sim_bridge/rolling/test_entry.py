@@ -153,12 +153,12 @@ class Entrance:
         return self
 
     def estate(self, name: str) -> list[Cell]:
-        return sorted(self.vehicles[Name(name)].controller.estate, reverse=True)
+        return sorted(self.vehicles[Name(name)].controller.owned, reverse=True)
 
     def owners(self) -> dict[Cell, Name]:
         owners: dict[Cell, Name] = {}
         for name, vehicle in self.vehicles.items():
-            for cell in vehicle.controller.estate:
+            for cell in vehicle.controller.owned:
                 assert cell not in owners, f"{cell} is of {owners[cell]} and of {name}"
                 owners[cell] = name
         return owners
@@ -219,9 +219,9 @@ def test_most_get_no_more_than_some_cells() -> None:
 def test_cells_behind_a_departed_vehicle_have_no_owner() -> None:
     entrance = Entrance([Arrival("first", 1, 0, 0.0)]).run(3.0)
     gone = entrance.vehicles.pop(Name("first"))
-    owned = gone.controller.estate
+    owned = gone.controller.owned
     entrance.run(8.0)
-    assert gone.controller.estate == owned
+    assert gone.controller.owned == owned
     assert entrance.owners() == {}
 
 

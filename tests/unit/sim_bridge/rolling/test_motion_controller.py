@@ -25,7 +25,7 @@ AGENT = 7
 
 def make_controller() -> MotionController:
     controller = controller_of(BEFORE[A])
-    controller.hand_over(AGENT)
+    controller.put_in_charge(AGENT)
     return controller
 
 
@@ -50,8 +50,8 @@ NEXT_PROMISE = order(HIGH, OPEN)
 
 
 def kept(controller: MotionController) -> tuple[object, ...]:
-    deed = controller.deed
-    return controller.promised, controller.accepted, deed, frozenset(controller.estate)
+    deed = controller.transfer
+    return controller.promised, controller.accepted, deed, frozenset(controller.owned)
 
 
 def test_an_estate_is_what_the_roadside_gave() -> None:
@@ -83,7 +83,7 @@ def test_without_its_deed_a_plan_is_not_accepted() -> None:
     controller.note(order(MID, None, MID))
     assert controller.accepted is None
     controller.note(order(MID, deed_of(A, LOW), MID))
-    assert (controller.accepted, controller.deed) == (None, None)
+    assert (controller.accepted, controller.transfer) == (None, None)
 
 
 def test_only_the_newest_deed_can_be_opened() -> None:
@@ -92,35 +92,35 @@ def test_only_the_newest_deed_can_be_opened() -> None:
     newer = Deed(HIGH, BEFORE[A], BEFORE[A], (A,))
     controller.note(order(HIGH, newer, HIGH))
     controller.note(POSSESSION)
-    assert controller.deed == newer
-    assert set(controller.estate) == set(BEFORE[A])
+    assert controller.transfer == newer
+    assert set(controller.owned) == set(BEFORE[A])
 
 
 def test_a_promise_binds_the_next_process() -> None:
     controller = make_controller()
     controller.note(order(HIGH))
-    controller.hand_over(AGENT + 1)
+    controller.put_in_charge(AGENT + 1)
     assert (controller.promised, controller.accepted) == (HIGH, None)
     controller.note(evolve(ACCEPTANCE, incarnation=AGENT + 1))
-    assert (controller.promised, controller.deed) == (HIGH, None)
+    assert (controller.promised, controller.transfer) == (HIGH, None)
 
 
 def test_a_deed_outlives_the_process_and_its_acceptance_does_not() -> None:
     controller = make_controller()
     controller.note(ACCEPTANCE)
-    controller.hand_over(AGENT + 1)
+    controller.put_in_charge(AGENT + 1)
     assert kept(controller) == (MID, None, deed_of(A), frozenset(BEFORE[A]))
     assert not controller.note(POSSESSION)  # of the process that was replaced
-    assert controller.deed == deed_of(A)
+    assert controller.transfer == deed_of(A)
 
 
 def test_where_formations_own_blocks_acceptance_needs_no_deed() -> None:
     admission = Admission(Arrival("A", 0, 0, 0.0), HOME, 0.0)
     paper = parse_scenario({"formation": {"operation": "paper"}})
     controller = RoadVehicle.entering(admission, 0.0, paper).controller
-    controller.hand_over(AGENT)
+    controller.put_in_charge(AGENT)
     controller.note(order(accepted=MID))
-    assert (controller.accepted, controller.estate) == (MID, ())
+    assert (controller.accepted, controller.owned) == (MID, ())
 
 
 # --- any order --------------------------------------------------------------------------------
@@ -138,9 +138,9 @@ def test_any_order_of_one_plan_ends_sound(orders: tuple[Command, ...]) -> None:
 
 def check(controller: MotionController) -> None:
     """Check that what is kept fits together."""
-    deed = controller.deed
+    deed = controller.transfer
     if deed is not None and not deed.open:
-        assert set(controller.estate) == set(deed.before)
+        assert set(controller.owned) == set(deed.before)
     if controller.accepted is not None:
         assert deed is not None
         assert deed.ballot >= controller.accepted
@@ -185,21 +185,21 @@ def test_however_orders_arrive_what_is_kept_is_sound(
     granted = set()
     for index, each in enumerate(history):
         if index == restart:
-            controller.hand_over(AGENT + 1)
-        before = controller.promised, controller.deed
+            controller.put_in_charge(AGENT + 1)
+        before = controller.promised, controller.transfer
         if isinstance(each, Command):
             controller.note(each)
         else:
-            controller.own(each)
+            controller.assign_cell(each)
             granted.add(each)
         check(controller)
-        assert granted <= set(controller.estate)
+        assert granted <= set(controller.owned)
         assert before[0] is None or (controller.promised or LOW) >= before[0]
         if before[1] is not None:
-            assert controller.deed is not None
-            assert controller.deed.ballot >= before[1].ballot
+            assert controller.transfer is not None
+            assert controller.transfer.ballot >= before[1].ballot
         # With a promise, which deed is the newest of the older ones is final.
-        promised, deed = controller.promised, controller.deed
+        promised, deed = controller.promised, controller.transfer
         if promised is not None and (deed is None or deed.ballot < promised):
             newest = final.setdefault(promised, deed)
             assert (newest and newest.ballot) == (deed and deed.ballot)
@@ -216,34 +216,34 @@ def test_a_cell_that_comes_at_any_time_is_kept(when: int) -> None:
     controller = make_controller()
     for step, each in enumerate((PROMISE, ACCEPTANCE, POSSESSION)):
         if when == step:
-            controller.own(GIVEN)
+            controller.assign_cell(GIVEN)
         controller.note(each)
     if when == 3:
-        controller.own(GIVEN)
-    assert set(controller.estate) == {*AFTER[A], GIVEN}
+        controller.assign_cell(GIVEN)
+    assert set(controller.owned) == {*AFTER[A], GIVEN}
 
 
 @pytest.mark.parametrize(("when", "opened"), list(product(range(2), (False, True))))
 def test_a_cell_that_a_plan_knew_is_not_kept_by_force(when: int, *, opened: bool) -> None:
     controller = make_controller()
-    controller.own(GIVEN)
+    controller.assign_cell(GIVEN)
     if when:
         controller.note(PROMISE)
     given_away = Deed(MID, (*BEFORE[A], GIVEN), AFTER[A], (A, B))
     controller.note(order(MID, given_away, MID))
     if opened:
         controller.note(POSSESSION)
-    assert (GIVEN in controller.estate) is not opened
+    assert (GIVEN in controller.owned) is not opened
     later = Deed(HIGH, AFTER[A], AFTER[A], (A,))
     controller.note(order(HIGH, later, HIGH))
-    assert GIVEN not in controller.estate
+    assert GIVEN not in controller.owned
 
 
 def test_a_closed_deed_shows_the_cell_on_both_sides() -> None:
     controller = make_controller()
     controller.note(ACCEPTANCE)
-    controller.own(GIVEN)
-    deed = controller.deed
+    controller.assign_cell(GIVEN)
+    deed = controller.transfer
     assert deed is not None
     assert GIVEN in deed.before
     assert GIVEN in deed.after
@@ -265,11 +265,11 @@ def test_the_caretaker_hands_cells_over_and_moves_nothing() -> None:
     plan = make_plan()
     state = caretaker.on_message(Prepare(MID, (), (A, B)), 0)
     assert state is not None
-    assert (state.promised, state.estate) == (MID, controller.estate)
+    assert (state.promised, state.estate) == (MID, controller.owned)
     state = caretaker.on_message(plan, 0)
     assert state is not None
     assert state.accepted
-    assert state.deed == controller.deed == deed_of(B)
+    assert state.deed == controller.transfer == deed_of(B)
     assert controller.accepted == MID
 
 
