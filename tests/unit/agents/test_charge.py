@@ -25,6 +25,7 @@ from laneweave.protocol.wire.messages import (
 )
 from laneweave.protocol.wire.topics import PLAN, PREPARE, SENSE, STATE
 from support.agent_rig import BALLOT, HOME, LATTICE, ME, OTHER, TICK_S, Rig, make_plan, sent
+from support.states import holding
 
 
 class Passenger:
@@ -417,9 +418,5 @@ def test_states_matter_only_while_a_plan_waits_for_them() -> None:
 
 
 def state_of(name: Name) -> VehicleState:
-    """Return what a member shows that has accepted the plan and is ready."""
-    return VehicleState(
-        name, 1, 0, (0,), BALLOT, accepted=True, ready=True, completed=0, hold_cell=(0, 0),
-        moving=False, go=False, done=True, overdue=False, attended=True, s_m=0.0, y_m=0.0,
-        speed_mps=15.0, t_s=0.0,
-    )  # fmt: skip
+    """Return the state of a member that has accepted the plan and is ready."""
+    return holding(name, BALLOT, accepted=True, ready=True, done=True, speed_mps=15.0)

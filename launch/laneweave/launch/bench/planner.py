@@ -24,7 +24,7 @@ from laneweave.coordinator.planning.instances import (
     traffic_request,
 )
 from laneweave.protocol.errors import BadInputError
-from laneweave.sim_bridge.recording.run_record import spread
+from laneweave.sim_bridge.recording.recorder import spread
 
 
 @attrs.frozen

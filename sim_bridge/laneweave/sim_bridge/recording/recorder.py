@@ -20,6 +20,7 @@ import attrs
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from laneweave.protocol.config.loading import to_tables
 from laneweave.protocol.scenario.tables import Scenario
@@ -317,14 +318,8 @@ class Recorder:
             for trip in self._trips.values()
             if trip.travel_time_s is not None and trip.counted(last_s)
         ]
-        if not times:
-            return {"mean": None, "p50": None, "p95": None, "max": None}
-        return {
-            "mean": _finite(float(np.mean(times))),
-            "p50": _finite(float(np.percentile(times, 50))),
-            "p95": _finite(float(np.percentile(times, 95))),
-            "max": _finite(max(times)),
-        }
+        mean = float(np.mean(times)) if times else math.nan
+        return {"mean": _finite(mean), **spread(np.array(times), 50, 95, largest=True)}
 
     def _throughput(self) -> float | None:
         """Return vehicles per lane and hour at the end of the road, None if undefined."""
@@ -376,3 +371,19 @@ class Recorder:
 def _finite(value: float) -> float | None:
     """Return a number for JSON, rounded to a thousandth; None for infinities and NaN."""
     return round(value, 3) if math.isfinite(value) else None
+
+
+def spread(
+    values: NDArray[Any], *percentiles: int, largest: bool = False
+) -> dict[str, float | None]:
+    """Return percentiles by name, `max` too if it is wanted; None where there are no values."""
+    ranks = {f"p{percentile}": percentile for percentile in percentiles}
+    if largest:
+        ranks["max"] = 100
+    return {name: _percentile(values, rank) for name, rank in ranks.items()}
+
+
+def _percentile(values: NDArray[Any], rank: int) -> float | None:
+    with np.errstate(all="ignore"):
+        value = float(np.percentile(values, rank)) if len(values) else math.nan
+    return _finite(value)

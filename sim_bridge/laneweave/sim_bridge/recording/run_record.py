@@ -34,7 +34,7 @@ from laneweave.protocol.wire.events import (
 from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, LogEvent, Name, Report
 from laneweave.sim_bridge.bodies.motion_controller import Rung
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
-from laneweave.sim_bridge.recording.recorder import Recorder
+from laneweave.sim_bridge.recording.recorder import Recorder, spread
 from laneweave.sim_bridge.road.demand import Arrival
 
 
@@ -374,19 +374,3 @@ def _milliseconds(packed: Iterable[bytes]) -> NDArray[np.float64]:
     whole = b"".join(each for each in packed if len(each) % 4 == 0)
     values = np.frombuffer(whole, dtype="<f4").astype(np.float64)
     return values[np.isfinite(values) & (values >= 0.0)]
-
-
-def spread(
-    values: NDArray[Any], *percentiles: int, largest: bool = False
-) -> dict[str, float | None]:
-    """Return percentiles by name, `max` too if it is wanted; None where there are no values."""
-    ranks = {f"p{percentile}": percentile for percentile in percentiles}
-    if largest:
-        ranks["max"] = 100
-    return {name: _percentile(values, rank) for name, rank in ranks.items()}
-
-
-def _percentile(values: NDArray[Any], rank: int) -> float | None:
-    with np.errstate(all="ignore"):
-        value = float(np.percentile(values, rank)) if len(values) else math.nan
-    return round(value, 3) if math.isfinite(value) else None
