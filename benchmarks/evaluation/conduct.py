@@ -25,10 +25,9 @@ from evaluation.trials import (
     is_finished,
     run_trial,
 )
-from laneweave.launch.report.runs import is_sweep, runs_of
-from laneweave.launch.sweep.execution import StoppedError
-from laneweave.launch.sweep.folder import FAILED, SweepFolder
-from laneweave.launch.sweep.local_workers import run_locally
+from laneweave.launch.recordings.runs import is_sweep, runs_of
+from laneweave.launch.sweep.execution import StoppedError, run_locally
+from laneweave.launch.sweep.folder import SweepFolder
 from laneweave.launch.sweep.sweep import conduct
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.errors import BadInputError, CommandFailedError
@@ -78,10 +77,8 @@ class Rounds:
                 say(f"sweep, seed {seed}")
                 conduct(points, folder, partial(run_locally, workers=self.jobs), show=True)
                 last_s = time.monotonic() - began_s
-                kept &= all(
-                    folder.records[point.name].status != FAILED
-                    for point in points
-                    if point.label in FORMATIONS
+                kept &= not any(
+                    folder.runs[point.name].reason for point in points if point.label in FORMATIONS
                 )
         return kept
 

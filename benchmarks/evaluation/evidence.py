@@ -12,7 +12,7 @@ from attrs import asdict, evolve, frozen
 from evaluation.points import Key, PointRow
 from evaluation.programme import FORMATIONS
 from evaluation.trials import AgreementRow, CostRow, FactorRow
-from laneweave.launch.report.runs import Run
+from laneweave.launch.recordings.runs import Run
 from laneweave.protocol.files import write_atomically
 from laneweave.protocol.structuring import structure
 

@@ -19,7 +19,7 @@ import numpy as np
 from attrs import frozen
 from numpy.typing import NDArray
 
-from laneweave.launch.report.trajectories import OFF_LATTICE, Floats, Ints, Tracks
+from laneweave.launch.recordings.trajectories import OFF_LATTICE, Floats, Ints, Tracks
 from laneweave.protocol.scenario.tables import Scenario
 
 Bools = NDArray[np.bool_]

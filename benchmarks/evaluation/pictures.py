@@ -11,12 +11,11 @@ from attrs import frozen
 from evaluation.evidence import Picture
 from evaluation.programme import LABELS, VOLUMES
 from evaluation.statements import PAPER_STRETCH_M, PAPER_VOLUMES
-from laneweave.launch.report.comparison_figures import draw_flows, draw_speeds, draw_travel_times
-from laneweave.launch.report.distribution_figures import draw_spacings
-from laneweave.launch.report.distributions import Counts, count
-from laneweave.launch.report.runs import Comparison, Run
+from laneweave.launch.recordings.runs import Comparison, Run
+from laneweave.launch.recordings.trajectories import read_tracks
+from laneweave.launch.report.distributions import Counts, count, draw_spacings
+from laneweave.launch.report.figures import draw_flows, draw_speeds, draw_travel_times
 from laneweave.launch.report.snapshots import road_snapshots
-from laneweave.launch.report.trajectories import read_tracks
 
 DPI: Final = 110
 SHOWN_VOLUME: Final = 1600.0

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Iterable, Sequence
+from typing import Final
 
 import numpy as np
 from attrs import frozen
 
 from evaluation.lattice_points import lattice_spacing
 from laneweave.launch.observe.column_owners import PLANNED, read_events
-from laneweave.launch.report.runs import Run
-from laneweave.launch.report.trajectories import Tracks, read_tracks
+from laneweave.launch.recordings.results import results_table
+from laneweave.launch.recordings.runs import Run
+from laneweave.launch.recordings.trajectories import Tracks, read_tracks
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.sim_bridge.recording.recorder import WARM_UP_S
@@ -145,40 +146,40 @@ def check_comparable(runs: Sequence[Run]) -> None:
 
 
 def _row(key: Key, runs: Sequence[Run]) -> PointRow:
-    complete = [run for run in runs if run.summary.get("ending") == "complete"]
-    scenario = runs[0].scenario
+    complete = [run for run in runs if run.summary and run.summary.ending == "complete"]
+    scenario, results = runs[0].scenario, results_table(complete)
 
-    def values(*way: str) -> list[float]:
-        found = (_number(run.summary, way) for run in complete)
-        return [value for value in found if value is not None]
+    def values(column: str) -> list[float]:
+        found = results[column].to_pylist() if column in results.column_names else []
+        return [float(value) for value in found if value is not None]
 
-    times_s = values("travel_time_s", "mean")
-    low = min(values("safety", "min_accel_mps2"), default=None)
-    high = max(values("safety", "max_accel_mps2"), default=None)
+    times_s = values("travel_time_s_mean")
+    low = min(values("safety_min_accel_mps2"), default=None)
+    high = max(values("safety_max_accel_mps2"), default=None)
     return PointRow(
         label=key[0],
         volume_veh_per_lane_h=key[1],
         seeds=tuple(run.scenario.seed for run in complete),
         failed=tuple((run.scenario.seed, run.reason) for run in runs if run.reason),
-        demanded=int(sum(values("vehicles", "demanded"))),
-        left=int(sum(values("vehicles", "left"))),
-        on_preferred_lane=int(sum(values("vehicles", "on_preferred_lane"))),
+        demanded=int(sum(values("vehicles_demanded"))),
+        left=int(sum(values("vehicles_left"))),
+        on_preferred_lane=int(sum(values("vehicles_on_preferred_lane"))),
         travel_s=_mean(times_s),
         travel_sd_s=round(float(np.std(times_s, ddof=1)), 3) if len(times_s) > 1 else None,
-        travel_p95_s=_mean(values("travel_time_s", "p95")),
+        travel_p95_s=_mean(values("travel_time_s_p95")),
         throughput_veh_per_lane_h=_mean(values("throughput_veh_per_lane_h")),
-        overlaps=int(sum(values("safety", "overlaps"))),
-        emergency_brakes=int(sum(values("safety", "emergency_brakes"))),
-        min_gap_m=min(values("safety", "min_gap_m"), default=None),
-        min_headway_s=min(values("safety", "min_headway_s"), default=None),
+        overlaps=int(sum(values("safety_overlaps"))),
+        emergency_brakes=int(sum(values("safety_emergency_brakes"))),
+        min_gap_m=min(values("safety_min_gap_m"), default=None),
+        min_headway_s=min(values("safety_min_headway_s"), default=None),
         min_accel_mps2=low,
         max_accel_mps2=high,
         within_limits=within_limits(low, high, scenario),
-        largest_formation=int(max(values("planning", "largest_formation"), default=0)),
-        planning_p95_ms=max(values("planning", "solve_ms", "p95"), default=None),
+        largest_formation=int(max(values("planning_largest_formation"), default=0)),
+        planning_p95_ms=max(values("planning_solve_ms_p95"), default=None),
         traced=_traced([run for run in complete if run.has_trajectories]),
-        plans=int(sum(values("planning", "plans"))),
-        fallbacks=int(sum(values("planning", "fallbacks"))),
+        plans=int(sum(values("planning_plans"))),
+        fallbacks=int(sum(values("planning_fallbacks"))),
         planning=planning_times(complete),
     )
 
@@ -285,11 +286,3 @@ def slow_stretch(
 
 def _mean(values: Sequence[float]) -> float | None:
     return round(float(np.mean(values)), 3) if values else None
-
-
-def _number(summary: Mapping[str, Any], way: Sequence[str]) -> float | None:
-    """Return a number of a summary; None where a method has none."""
-    found: Any = summary
-    for key in way:
-        found = found.get(key) if isinstance(found, Mapping) else None
-    return float(found) if isinstance(found, (int, float)) else None

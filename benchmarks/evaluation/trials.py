@@ -16,17 +16,17 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from attrs import frozen
 
 from evaluation.agreement import Agreement, agreement, read_trips
-from laneweave.launch.drawing.figures import scenario_of
+from laneweave.launch.recordings.runs import scenario_of
 from laneweave.launch.sweep.execution import StoppedError, follow
-from laneweave.launch.sweep.folder import read_summary
 from laneweave.protocol.errors import CommandFailedError
+from laneweave.protocol.summary import RunSummary, read_summary
 
 ZENOH_VOLUMES: Final = (1000, 1600, 2000)
 """Those that are repeated over Zenoh, in vehicles/(lane h)."""
@@ -155,8 +155,8 @@ def run_trial(trial: Trial, out: Path, root: Path, stopped: Callable[[], bool]) 
             raise CommandFailedError(late) from error
         words.seek(0)
         said = " ".join(words.read().decode(errors="replace").split())
-    summary = read_summary(folder) or {}
-    if summary.get("ending") != trial.ending:
+    summary = read_summary(folder)
+    if summary is None or summary.ending != trial.ending:
         raise CommandFailedError(f"{trial.command}: status {process.returncode}: {said[-400:]}")
     (folder / COMMAND_FILE).write_text(json.dumps(trial.options), encoding="utf-8")
 
@@ -187,10 +187,10 @@ def agreement_rows(out: Path) -> list[AgreementRow]:
         rows.append(
             AgreementRow(
                 volume_veh_per_lane_h=float(volume),
-                seed=int(summary["seed"]),
+                seed=summary.seed,
                 duration_s=scenario.demand.duration_s,
-                overlaps=int(summary["safety"]["overlaps"]),
-                processes=summary["runtime"]["processes"],
+                overlaps=summary.safety.overlaps,
+                processes=summary.runtime.processes,
                 agreement=agreement(read_trips(real), read_trips(simulated), tick_s),
             )
         )
@@ -206,16 +206,16 @@ def factor_rows(out: Path) -> list[FactorRow]:
     rows = []
     for trial in _finished("speed", out):
         summary = _summary(out / trial.part / trial.name)
-        runtime = summary["runtime"]
+        runtime = summary.runtime
         rows.append(
             FactorRow(
                 trial=trial.name,
                 command=trial.command,
-                processes=runtime["processes"],
-                vehicles_peak=int(summary["vehicles"]["peak"]),
-                real_time_factor=float(runtime["real_time_factor"]),
-                tick_p50_ms=runtime["tick_ms"]["p50"],
-                tick_p99_ms=runtime["tick_ms"]["p99"],
+                processes=runtime.processes,
+                vehicles_peak=summary.vehicles.peak,
+                real_time_factor=runtime.real_time_factor,
+                tick_p50_ms=runtime.tick_ms.p50,
+                tick_p99_ms=runtime.tick_ms.p99,
             )
         )
     return rows
@@ -237,9 +237,9 @@ def cost_rows(out: Path) -> list[CostRow]:
             CostRow(
                 trial=trial.name,
                 command=trial.command,
-                road_m=float(summary["road_m"]),
-                vehicles_peak=int(summary["vehicles"]["peak"]),
-                cost_ms=round(1e3 * summary["runtime"]["wall_s"] / max(1, driven), 4),
+                road_m=summary.road_m,
+                vehicles_peak=summary.vehicles.peak,
+                cost_ms=round(1e3 * summary.runtime.wall_s / max(1, driven), 4),
             )
         )
     return rows
@@ -253,8 +253,8 @@ def _trial(part: str, name: str) -> Trial:
     return next(trial for trial in TRIALS if (trial.part, trial.name) == (part, name))
 
 
-def _summary(folder: Path) -> dict[str, Any]:
+def _summary(folder: Path) -> RunSummary:
     summary = read_summary(folder)
     if summary is None:
-        raise ValueError(f"{folder}: summary.json is missing or not whole")
+        raise ValueError(f"{folder}: summary.json is missing or incomplete")
     return summary

@@ -148,8 +148,8 @@ def bridge(
     print_outcome(outcome, Console())
     draw_report(folder)
     # A role that ends because of a signal has not failed, even if its run is incomplete.
-    interrupted = outcome.summary is not None and outcome.summary["ending"] == "interrupted"
-    broken = outcome.summary is None or outcome.summary["safety"]["overlaps"]
+    interrupted = outcome.summary is not None and outcome.summary.ending == "interrupted"
+    broken = outcome.summary is None or outcome.summary.safety.overlaps
     raise typer.Exit(1 if broken else 0 if interrupted else outcome.exit_status)
 
 

@@ -1,4 +1,4 @@
-"""The commands about many runs: `sweep` makes them, `report` shows them."""
+"""`laneweave sweep` makes many runs, `laneweave report` shows finished ones."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from rich.console import Console
 from laneweave.launch.cli.options import check_jobs, parse_seeds
 from laneweave.launch.methods import METHODS, KeepTrajectories
 from laneweave.protocol.config.loading import load_scenario
-from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.errors import BadInputError, CommandFailedError
 
 VOLUMES = "1000,1150,1300,1450,1600"
-"""Those of the paper (Section 5.2.3), in vehicles/(lane h)."""
+"""The paper's volumes (Section 5.2.3), in vehicles/(lane h)."""
 
 
 def sweep(
@@ -25,7 +25,7 @@ def sweep(
         Path | None, typer.Argument(metavar="[SCENARIO.toml]", help="Default: the paper's road.")
     ] = None,
     methods: Annotated[
-        str, typer.Option("--methods", metavar="LIST", help=f"Of {', '.join(METHODS)}.")
+        str, typer.Option("--methods", metavar="LIST", help=f"Some of {', '.join(METHODS)}.")
     ] = "formation",
     volumes: Annotated[
         str, typer.Option("--volumes", metavar="LIST", help="Vehicles per lane and hour.")
@@ -44,22 +44,24 @@ def sweep(
         typer.Option(
             "--out",
             metavar="DIR",
-            help="Default: a new folder in runs/. That of a sweep: goes on with it.",
+            help="Default: a new folder in runs/. The folder of a sweep: continue it.",
         ),
     ] = None,
     keep_trajectories: Annotated[
-        KeepTrajectories, typer.Option("--keep-trajectories", help="Of which runs.")
+        KeepTrajectories, typer.Option("--keep-trajectories", help="Which runs keep them.")
     ] = KeepTrajectories.first_seed,
     dask: Annotated[
         str | None,
-        typer.Option("--dask", metavar="ADDRESS", help="Run on a Dask cluster: its scheduler."),
+        typer.Option(
+            "--dask", metavar="ADDRESS", help="Run on the Dask cluster of this scheduler."
+        ),
     ] = None,
     no_progress: Annotated[bool, typer.Option("--no-progress", help="Show no progress.")] = False,
 ) -> None:
-    """Run methods x volumes x seeds in parallel, in virtual time; what is finished stays."""
+    """Run methods x volumes x seeds in parallel, in virtual time; finished runs are kept."""
     from laneweave.launch.methods import parse_methods
+    from laneweave.launch.sweep.execution import run_locally
     from laneweave.launch.sweep.folder import SweepFolder
-    from laneweave.launch.sweep.local_workers import run_locally
     from laneweave.launch.sweep.points import parse_volumes, plan_points
     from laneweave.launch.sweep.sweep import Runner, conduct, print_results
 
@@ -95,20 +97,24 @@ def report(
     ],
     formation: Annotated[
         int | None,
-        typer.Option("--formation", metavar="N", help="Whose path map; default: moves most."),
+        typer.Option(
+            "--formation",
+            metavar="N",
+            help="Draw its path map; default: the one with the most moves.",
+        ),
     ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
             "--out",
             metavar="DIR",
-            help="Where several folders are compared; default: a new folder in runs/.",
+            help="Folder of a comparison; default: a new folder in runs/.",
         ),
     ] = None,
 ) -> None:
-    """Draw finished runs: figures and one page for each run, or for a sweep as a whole."""
+    """Draw finished runs: figures and a page for each run, and for a sweep or several runs."""
+    from laneweave.launch.recordings.runs import Comparison, is_sweep, runs_of, single_run
     from laneweave.launch.report.build import REPORT_DPI, report_comparison, report_run
-    from laneweave.launch.report.runs import Comparison, is_sweep, runs_of, single_run
 
     if out is not None and len(folders) == 1:
         raise BadInputError("--out", str(out), "only with several folders")
@@ -125,8 +131,5 @@ def report(
             title = "laneweave: " + ", ".join(folder.resolve().name for folder in folders)
             page = report_comparison(Comparison.of(runs), place, title, formation=formation)
             Console().print(f"{page}: written", highlight=False, soft_wrap=True)
-    except BadInputError:
-        raise
-    except (OSError, ValueError, KeyError) as error:
-        names = ", ".join(map(str, folders))
-        raise BadInputError("DIR", names, f"folders of finished runs ({error})") from error
+    except OSError as error:
+        raise CommandFailedError(f"the report cannot be written: {error}") from error

@@ -1,14 +1,6 @@
-"""Reports of finished runs: figures as PNG, and one page that needs nothing else.
+"""Reports of finished runs: pictures as PNG, and one page that needs no other file.
 
-runs                  which folders hold which runs
-tracks                a run's trajectories as arrays
-distributions         spacings, headways, decelerations, ...: counts over a run
-styling               colours of labels, small panels
-comparison_figures    travel times, throughput, shares, speeds: labels side by side
-distribution_figures  what `distributions` counts
-path_maps             the relative path map of a formation, and its figure
-animation             the moving road: compact data for the player
-tables                tables of a page
-page                  the page: `templates/`
-make                  all of it, of one run or of many
+Entry points: `build.report_run`, `build.report_comparison`; `summary_table.summary_rows` is the
+table at the end of a run. `figures`, `distributions`, `path_maps` and `snapshots` draw, `animation`
+prepares the moving road, `page` renders `templates/`. Imported by `run`, `cli`, benchmarks/.
 """

@@ -18,8 +18,8 @@ from attrs import frozen
 
 from laneweave.launch.drawing.road_scene import road_scene
 from laneweave.launch.observe.column_owners import Formations, recorded_formations
-from laneweave.launch.report.runs import Run
-from laneweave.launch.report.trajectories import Floats, Tracks
+from laneweave.launch.recordings.runs import Run
+from laneweave.launch.recordings.trajectories import Floats, Tracks
 
 FORMAT: Final = "laneweave.animation/1"
 KINDS: Final = {"s_m": "<u2", "y_m": "<u2", "speed_mps": "u1"}

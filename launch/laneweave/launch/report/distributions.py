@@ -1,42 +1,57 @@
-"""How vehicles drive, as counts over a run: spacing and headway, deceleration and comfort.
+"""Distributions over a run: spacing and headway, deceleration and comfort; counts and figures.
 
-Counted are the times at which traffic is neither building up nor thinning out: from the end of the
-warm-up (`recorder.py: WARM_UP_S`) to the end of the demand; the whole run where that is too short.
+Counted are the times of steady traffic: from the end of the warm-up (`recorder.py: WARM_UP_S`) to
+the end of the demand; the whole run where that is too short.
 """
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from attrs import field, frozen
 from numpy.typing import NDArray
 
-from laneweave.launch.report.trajectories import Floats, Tracks
+from laneweave.launch.drawing.figures import INK, new_figure, save
+from laneweave.launch.recordings.trajectories import Floats, Tracks
+from laneweave.launch.report.style import (
+    label_colours,
+    legend_above,
+    note,
+    plain,
+    spread_evenly,
+    volume_title,
+)
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.sim_bridge.recording.recorder import WARM_UP_S
 
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+
 Bools = NDArray[np.bool_]
 
-LOOK_S: Final = 1.0
-"""Spacings are looked at this often; they change slowly."""
-LEAST_STEADY_S: Final = 10.0
-"""A shorter time between warm-up and last arrival tells nothing."""
+SAMPLE_S: Final = 1.0
+"""Period at which spacings are sampled; they change slowly."""
+MIN_STEADY_S: Final = 10.0
+"""A shorter time between warm-up and last arrival has too few samples."""
 STANDING_MPS: Final = 0.5
-"""Who is slower has no time headway."""
+"""A slower vehicle has no time headway."""
 
 
 @frozen(eq=False)
 class Quantity:
-    """Something that is counted, and how it is shown."""
+    """A quantity that is counted, and how it is shown."""
 
     name: str
     unit: str
     edges: Floats
-    """Of its bins; the last one takes all that is beyond, too."""
+    """Edges of its bins; the last bin contains all larger values, too."""
     exceedance: bool
-    """Shown as the share of driving time in which it is at least so large; else as the share of
-    vehicles that have less."""
+    """Shown as the share of driving time with at least this value; else as the share of vehicles
+    with less."""
 
 
 def _centred(step: float, last: float) -> Floats:
@@ -47,24 +62,24 @@ def _centred(step: float, last: float) -> Floats:
 SPACING: Final = Quantity("spacing", "m", _centred(0.5, 90.0), exceedance=False)
 """Front bumper to front bumper of the next vehicle ahead on the lane."""
 HEADWAY: Final = Quantity("time headway", "s", _centred(0.05, 6.0), exceedance=False)
-"""Spacing over the speed of the one behind."""
+"""Spacing over the speed of the following vehicle."""
 DECELERATION: Final = Quantity("deceleration", "m/s²", np.linspace(0.0, 10.0, 201), exceedance=True)
 JERK: Final = Quantity("jerk", "m/s³", np.linspace(0.0, 20.0, 201), exceedance=True)
 """Change of acceleration along the road from tick to tick."""
 LATERAL: Final = Quantity(
     "lateral acceleration", "m/s²", np.linspace(0.0, 5.0, 201), exceedance=True
 )
-"""Second difference of the place across the road over three ticks."""
+"""Second difference of the lateral position over three ticks."""
 
 
 @frozen
 class Counts:
-    """Of each quantity, how often it was in each of its bins."""
+    """The counts of each quantity in its bins."""
 
     of: dict[str, Floats] = field(factory=dict)
 
     def __add__(self, other: Counts) -> Counts:
-        """Return the counts of both."""
+        """Return the sums of both counts."""
         names = dict.fromkeys([*self.of, *other.of])
         return Counts(
             {name: np.asarray(self.of.get(name, 0.0) + other.of.get(name, 0.0)) for name in names}
@@ -104,22 +119,22 @@ def count(tracks: Tracks, scenario: Scenario) -> Counts:
 
 
 def _steady(tracks: Tracks, scenario: Scenario) -> Bools:
-    if scenario.demand.duration_s < WARM_UP_S + LEAST_STEADY_S:
+    if scenario.demand.duration_s < WARM_UP_S + MIN_STEADY_S:
         return np.ones(len(tracks.t_s), dtype=np.bool_)
     return (tracks.t_s >= WARM_UP_S) & (tracks.t_s <= scenario.demand.duration_s)
 
 
 def _spacings(tracks: Tracks, scenario: Scenario, steady: Bools) -> tuple[Floats, Floats]:
-    """Return (spacings m, time headways s) of all that have somebody ahead on their lane."""
-    look = np.rint(tracks.t_s / LOOK_S)
-    chosen = steady & (np.abs(tracks.t_s - look * LOOK_S) < 0.5 * scenario.runtime.tick_s)
+    """Return (spacings m, time headways s) of all vehicles with another one ahead on their lane."""
+    sample = np.rint(tracks.t_s / SAMPLE_S)
+    chosen = steady & (np.abs(tracks.t_s - sample * SAMPLE_S) < 0.5 * scenario.runtime.tick_s)
     lane = np.clip(tracks.y_m // scenario.road.lane_width_m, 0, scenario.road.lanes - 1)
-    look, lane, s_m, speed_mps = (
-        values[chosen] for values in (look, lane, tracks.s_m, tracks.speed_mps)
+    sample, lane, s_m, speed_mps = (
+        values[chosen] for values in (sample, lane, tracks.s_m, tracks.speed_mps)
     )
-    order = np.lexsort((s_m, lane, look))
-    look, lane, s_m, speed_mps = (values[order] for values in (look, lane, s_m, speed_mps))
-    follows = (np.diff(look) == 0) & (np.diff(lane) == 0)
+    order = np.lexsort((s_m, lane, sample))
+    sample, lane, s_m, speed_mps = (values[order] for values in (sample, lane, s_m, speed_mps))
+    follows = (np.diff(sample) == 0) & (np.diff(lane) == 0)
     spacing_m, behind_mps = np.diff(s_m)[follows], speed_mps[:-1][follows]
     moving = behind_mps > STANDING_MPS
     return spacing_m, spacing_m[moving] / behind_mps[moving]
@@ -128,3 +143,91 @@ def _spacings(tracks: Tracks, scenario: Scenario, steady: Bools) -> tuple[Floats
 def _histogram(values: Floats, edges: Floats) -> Floats:
     last = 0.5 * (edges[-2] + edges[-1])
     return np.histogram(np.clip(values, edges[0], last), edges)[0].astype(np.float64)
+
+
+Counted = Mapping[tuple[str, float], Counts]
+"""The counts of each label and volume."""
+
+MIN_SHARE = 1e-5
+"""Lower end of the exceedance scale."""
+
+
+def draw_spacings(counted: Counted, scenario: Scenario, out: Path, dpi: int) -> None:
+    """Draw spacings and time headways: quantities below each other, volumes side by side."""
+    _draw(counted, (SPACING, HEADWAY), scenario, out, dpi)
+
+
+def draw_comfort(counted: Counted, scenario: Scenario, out: Path, dpi: int) -> None:
+    """Draw decelerations, jerks and lateral accelerations, arranged likewise."""
+    _draw(counted, (DECELERATION, JERK, LATERAL), scenario, out, dpi)
+
+
+def _draw(
+    counted: Counted, quantities: Sequence[Quantity], scenario: Scenario, out: Path, dpi: int
+) -> None:
+    labels = list(dict.fromkeys(label for label, _ in counted))
+    volumes = spread_evenly(sorted({volume for _, volume in counted}))
+    colours = label_colours(labels)
+    if len(volumes) == 1:
+        # Quantities side by side: a single column of panels would be too tall.
+        figure = new_figure(3.2 * len(quantities), 3.0)
+        panels = figure.subplots(1, len(quantities), squeeze=False).T
+    else:
+        figure = new_figure(1.0 + 2.1 * len(volumes), 0.6 + 1.95 * len(quantities))
+        panels = figure.subplots(
+            len(quantities), len(volumes), sharex="row", sharey="row", squeeze=False
+        )
+    for row, quantity in enumerate(quantities):
+        for column, volume in enumerate(volumes):
+            axes = panels[row, column]
+            for label in labels:
+                if (label, volume) in counted:
+                    _draw_one(axes, counted[label, volume], quantity, label, colours[label])
+            if not axes.lines:
+                note(axes, "no trajectories")
+            _draw_limits(axes, quantity, scenario)
+            plain(axes)
+            axes.set_xlabel(f"{quantity.name} ({quantity.unit})", fontsize=8.5, color=INK)
+            if column == 0 or len(volumes) == 1:
+                axes.set_ylabel(_axis_label(quantity), fontsize=8.5, color=INK)
+            if row == 0 and len(volumes) > 1:
+                axes.set_title(volume_title(volume), fontsize=9, color=INK)
+    if len(labels) > 1:
+        handles: dict[str, Artist] = {}
+        for axes in panels.flat:
+            drawn, names = axes.get_legend_handles_labels()
+            handles |= dict(zip(names, drawn, strict=True))
+        legend_above(figure, [handles[label] for label in labels], labels)
+    save(figure, out, dpi)
+
+
+def _draw_one(axes: Axes, counts: Counts, quantity: Quantity, label: str, colour: str) -> None:
+    if quantity.exceedance:
+        edges, shares = quantity.edges[:-1], counts.exceedance(quantity)
+        seen = shares > 0.0
+        axes.plot(edges[seen], shares[seen], color=colour, linewidth=1.4, label=label)
+        axes.set_yscale("log")
+        axes.set_ylim(MIN_SHARE, 1.3)
+        axes.set_xlim(0.0, quantity.edges[-1])
+        return
+    axes.plot(quantity.edges[1:-1], counts.cumulative(quantity), color=colour, label=label)
+    axes.lines[-1].set_linewidth(1.4)
+    axes.set_xlim(0.0, quantity.edges[-2])
+    axes.set_ylim(0.0, 1.03)
+
+
+def _draw_limits(axes: Axes, quantity: Quantity, scenario: Scenario) -> None:
+    """Draw the upper limit of a quantity, or the formation's set value."""
+    vehicle, formation = scenario.vehicle, scenario.formation
+    place = {
+        SPACING.name: formation.gap_m,
+        HEADWAY.name: formation.gap_m / formation.speed_mps,
+        DECELERATION.name: -vehicle.min_accel_mps2,
+        JERK.name: vehicle.max_jerk_mps3,
+        LATERAL.name: vehicle.max_lateral_accel_mps2,
+    }[quantity.name]
+    axes.axvline(place, color="#8a9099", linewidth=1.0, linestyle="--", zorder=1)
+
+
+def _axis_label(quantity: Quantity) -> str:
+    return "share of time with more" if quantity.exceedance else "share of vehicles with less"

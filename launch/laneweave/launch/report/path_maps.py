@@ -26,8 +26,8 @@ from laneweave.launch.observe.column_owners import (
     read_events,
     recorded_formations,
 )
-from laneweave.launch.report.runs import Run
-from laneweave.launch.report.trajectories import OFF_LATTICE, Floats, Ints, Tracks
+from laneweave.launch.recordings.runs import Run
+from laneweave.launch.recordings.trajectories import OFF_LATTICE, Floats, Ints, Tracks
 from laneweave.protocol.errors import BadInputError
 
 if TYPE_CHECKING:

@@ -17,8 +17,9 @@ from laneweave.launch.drawing.colours import (
     lane_colours,
     lane_names,
 )
-from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK, new_figure, save, scenario_of
+from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK, new_figure, save
 from laneweave.launch.observe.column_owners import Formations, recorded_formations
+from laneweave.launch.recordings.runs import scenario_of
 from laneweave.protocol.scenario.tables import Scenario
 
 if TYPE_CHECKING:

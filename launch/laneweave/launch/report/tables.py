@@ -1,160 +1,131 @@
-"""The tables of a report, as HTML; everything in them is escaped."""
+"""The tables of a report."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from html import escape
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
 
-import numpy as np
+from attrs import frozen
 
-from laneweave.launch.report.comparison_figures import preferred_share
-from laneweave.launch.report.runs import Comparison, Run
-from laneweave.launch.run.outcome import summary_rows
+from laneweave.launch.recordings.results import KEYS, PREFERRED, over_seeds, results_table
+from laneweave.launch.recordings.runs import Comparison, Run
+from laneweave.launch.report.summary_table import summary_rows
 
-_Column = tuple[str, tuple[str, ...], Callable[[Iterable[float]], float], int]
-"""Heading, place in summary.json, how the values of several runs become one, digits."""
+_Column = tuple[str, str, str, int]
+"""Heading, column of the results, its aggregation over seeds, digits."""
 
-_COLUMNS = (
-    ("travel time mean (s)", ("travel_time_s", "mean"), 2),
-    ("p95 (s)", ("travel_time_s", "p95"), 2),
-    ("throughput (veh/(lane·h))", ("throughput_veh_per_lane_h",), 0),
+_TRAFFIC: Final = (
+    ("travel time mean (s)", "travel_time_s_mean", 2),
+    ("p95 (s)", "travel_time_s_p95", 2),
+    ("throughput (veh/(lane·h))", "throughput_veh_per_lane_h", 0),
+    ("on the preferred lane (%)", PREFERRED, 2),
 )
-_SAFETY = (
-    ("least gap (m)", ("safety", "min_gap_m"), min, 2),
-    ("hardest braking (m/s²)", ("safety", "min_accel_mps2"), min, 2),
-    ("emergency brakes", ("safety", "emergency_brakes"), sum, 0),
-    ("overlaps", ("safety", "overlaps"), sum, 0),
+_SAFETY: Final[tuple[_Column, ...]] = (
+    ("smallest gap (m)", "safety_min_gap_m", "min", 2),
+    ("hardest braking (m/s²)", "safety_min_accel_mps2", "min", 2),
+    ("emergency brakes", "safety_emergency_brakes", "sum", 0),
+    ("overlaps", "safety_overlaps", "sum", 0),
+    ("real-time factor", "runtime_real_time_factor", "min", 1),
 )
-_WORK = (("real-time factor", ("runtime", "real_time_factor"), min, 1),)
-_PLANNING = (
-    ("largest formation", ("planning", "largest_formation"), max, 0),
-    ("plans", ("planning", "plans"), sum, 0),
-    ("fallbacks", ("planning", "fallbacks"), sum, 0),
-    ("p50 (ms)", ("planning", "solve_ms", "p50"), max, 1),
-    ("p95 (ms)", ("planning", "solve_ms", "p95"), max, 1),
-    ("max (ms)", ("planning", "solve_ms", "max"), max, 1),
+_PLANNING: Final[tuple[_Column, ...]] = (
+    ("largest formation", "planning_largest_formation", "max", 0),
+    ("plans", "planning_plans", "sum", 0),
+    ("fallbacks", "planning_fallbacks", "sum", 0),
+    ("p50 (ms)", "planning_solve_ms_p50", "max", 1),
+    ("p95 (ms)", "planning_solve_ms_p95", "max", 1),
+    ("max (ms)", "planning_solve_ms_max", "max", 1),
 )
+_BY_SOLVER: Final = "planning_by_solver_"
 
 
-def table(
-    headings: Sequence[str], rows: Iterable[Sequence[str]], caption: str, text_columns: int = 1
-) -> str:
-    """Return a table; the first columns are text, the others numbers.
+@frozen
+class Table:
+    """A table of a page; without rows it is not shown."""
 
-    Args:
-        headings: of the columns.
-        rows: cells as text; the first one heads its row.
-        caption: what the table shows.
-        text_columns: so many columns are aligned to the left.
-    """
-    head = "".join(
-        f'<th scope="col"{_kind(number, text_columns)}>{escape(heading)}</th>'
-        for number, heading in enumerate(headings)
-    )
-    body = []
-    for first, *others in rows:
-        cells = [f'<th scope="row">{escape(first)}</th>']
-        for number, cell in enumerate(others, start=1):
-            cells.append(f"<td{_kind(number, text_columns)}>{escape(cell)}</td>")
-        body.append(f"<tr>{''.join(cells)}</tr>")
-    return (
-        f'<div class="scroll"><table><caption>{escape(caption)}</caption>'
-        f"<thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table></div>"
-    )
+    headings: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    """Cells as text; the first one is the heading of its row."""
+    caption: str
+    text_columns: int = 1
+    """The first columns are text, the others numbers."""
 
 
-def _kind(column: int, text_columns: int) -> str:
-    return ' class="text"' if column < text_columns else ""
+def tables_of(comparison: Comparison) -> list[Table]:
+    """Return the tables of a report: of its only run, or of runs side by side."""
+    if len(comparison.runs) == 1 and not comparison.failed:
+        return [run_table(comparison.runs[0])]
+    results = results_table(comparison.runs)
+    extremes = [(column, function) for _, column, function, _ in (*_SAFETY, *_PLANNING)]
+    solvers = [name for name in results.column_names if name.startswith(_BY_SOLVER)]
+    extremes += [(name, "sum") for name in solvers]
+    extremes += [(column, function) for _, column, _ in _TRAFFIC for function in ("mean", "stddev")]
+    rows = over_seeds(results, extremes)
+    return [traffic_table(rows), safety_table(rows), planning_table(rows), failed_table(comparison)]
 
 
-def run_table(run: Run) -> str:
-    """Return the numbers of one run."""
-    rows = [("method", run.label), *summary_rows(run.summary)]
-    return table(("", "value"), rows, "What came of the run (summary.json has it all).", 2)
+def run_table(run: Run) -> Table:
+    """Return the figures of one run."""
+    rows = summary_rows(run.summary) if run.summary else []
+    caption = "Results of the run; summary.json has all figures."
+    return Table(("", "value"), [("method", run.label), *rows], caption, 2)
 
 
-def traffic_table(comparison: Comparison) -> str:
+def traffic_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     """Return travel times, throughput and shares: means over seeds with standard deviations."""
-    headings = ("label", "veh/(lane·h)", "runs", *(name for name, _, _ in _COLUMNS))
-    rows = []
-    for label, volume, runs in _groups(comparison):
-        cells = [label, f"{volume:g}", str(len(runs))]
-        for _, way, digits in _COLUMNS:
-            cells.append(mean_and_spread([_number(run.summary, way) for run in runs], digits))
-        cells.append(mean_and_spread([preferred_share(run) for run in runs], 2))
-        rows.append(cells)
-    caption = "Means over the seeds, ± their standard deviation."
-    return table((*headings, "on the preferred lane (%)"), rows, caption)
+    cells = [
+        [*_key(row), str(row["runs"]), *(_mean(row, column, n) for _, column, n in _TRAFFIC)]
+        for row in rows
+    ]
+    headings = ("label", "veh/(lane·h)", "runs", *(name for name, *_ in _TRAFFIC))
+    return Table(headings, cells, "Means over the seeds, ± their standard deviation.")
 
 
-def safety_table(comparison: Comparison) -> str:
+def safety_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     """Return the extremes over all seeds."""
-    headings = ("label", "veh/(lane·h)", *(name for name, *_ in (*_SAFETY, *_WORK)))
-    rows = []
-    for label, volume, runs in _groups(comparison):
-        rows.append([label, f"{volume:g}", *_extremes(runs, (*_SAFETY, *_WORK))])
-    return table(headings, rows, "Extremes or sums over the seeds, not means.")
+    cells = [[*_key(row), *_cells(row, _SAFETY)] for row in rows]
+    headings = ("label", "veh/(lane·h)", *(name for name, *_ in _SAFETY))
+    return Table(headings, cells, "Extremes or sums over the seeds, not means.")
 
 
-def planning_table(comparison: Comparison) -> str:
-    """Return how long planning took, and which solver planned; empty without any plan."""
-    headings = ("label", "veh/(lane·h)", "solvers", *(name for name, *_ in _PLANNING))
-    rows = []
-    for label, volume, runs in _groups(comparison):
-        if not any(_number(run.summary, ("planning", "plans")) for run in runs):
-            continue
-        solvers: Counter[str] = Counter()
-        for run in runs:
-            solvers.update(run.summary["planning"].get("by_solver", {}))
-        named = ", ".join(f"{name} {plans}" for name, plans in sorted(solvers.items()) if plans)
-        cells = [label, f"{volume:g}", named or "-"]
-        rows.append([*cells, *_extremes(runs, _PLANNING)])
-    caption = "Planning: sums over the seeds, and the worst of them for sizes and times."
-    return table(headings, rows, caption, 1) if rows else ""
-
-
-def _extremes(runs: Sequence[Run], columns: Sequence[_Column]) -> list[str]:
-    """Return cells with what columns combine over some runs."""
+def planning_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Return planning times and solvers of the rows that have plans."""
     cells = []
-    for _, way, combine, digits in columns:
-        values = [_number(run.summary, way) for run in runs]
-        known = [value for value in values if value is not None]
-        cells.append(f"{combine(known):.{digits}f}" if known else "-")
-    return cells
+    for row in rows:
+        if row["planning_plans_sum"]:
+            solvers = {
+                name.removeprefix(_BY_SOLVER).removesuffix("_sum"): plans
+                for name, plans in row.items()
+                if name.startswith(_BY_SOLVER) and plans
+            }
+            named = ", ".join(f"{name} {plans}" for name, plans in sorted(solvers.items()))
+            cells.append([*_key(row), named or "-", *_cells(row, _PLANNING)])
+    headings = ("label", "veh/(lane·h)", "solvers", *(name for name, *_ in _PLANNING))
+    return Table(headings, cells, "Planning: sums over the seeds; sizes and times are maxima.")
 
 
-def failed_table(comparison: Comparison) -> str:
-    """Return the runs that failed; empty if none did."""
+def failed_table(comparison: Comparison) -> Table:
+    """Return the runs that failed."""
     rows = [
         (run.label, f"{run.volume_veh_per_lane_h:g}", str(run.scenario.seed), run.reason)
         for run in comparison.failed
     ]
     caption = "Runs that failed; no figure and no mean contains them."
-    return table(("label", "veh/(lane·h)", "seed", "why"), rows, caption, 4) if rows else ""
+    return Table(("label", "veh/(lane·h)", "seed", "reason"), rows, caption, 4)
 
 
-def mean_and_spread(values: Iterable[float | None], digits: int) -> str:
-    """Return `mean ± standard deviation` of the values that there are."""
-    known = np.array([value for value in values if value is not None], dtype=np.float64)
-    if not len(known):
+def _key(row: Mapping[str, Any]) -> list[str]:
+    return [row[KEYS[0]], f"{row[KEYS[1]]:g}"]
+
+
+def _cells(row: Mapping[str, Any], columns: Sequence[_Column]) -> list[str]:
+    values = ((row[f"{column}_{function}"], digits) for _, column, function, digits in columns)
+    return ["-" if value is None else f"{value:.{digits}f}" for value, digits in values]
+
+
+def _mean(row: Mapping[str, Any], column: str, digits: int) -> str:
+    """Return `mean ± standard deviation` of the seeds that have the figure."""
+    mean, deviation = row[f"{column}_mean"], row[f"{column}_stddev"]
+    if mean is None:
         return "-"
-    mean = f"{known.mean():.{digits}f}"
-    return f"{mean} ± {known.std(ddof=1):.{digits}f}" if len(known) > 1 else mean
-
-
-def _groups(comparison: Comparison) -> Iterable[tuple[str, float, tuple[Run, ...]]]:
-    for label in comparison.labels:
-        for volume in comparison.volumes:
-            runs = comparison.at(label, volume)
-            if runs:
-                yield label, volume, runs
-
-
-def _number(summary: Mapping[str, Any], way: Sequence[str]) -> float | None:
-    """Return a number of a summary; None where a method has none."""
-    found: Any = summary
-    for key in way:
-        found = found.get(key) if isinstance(found, Mapping) else None
-    return float(found) if isinstance(found, (int, float)) else None
+    text = f"{mean:.{digits}f}"
+    return text if deviation is None else f"{text} ± {deviation:.{digits}f}"

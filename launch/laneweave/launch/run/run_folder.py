@@ -64,8 +64,8 @@ def draw_report(folder: Path) -> None:
     Raises:
         CommandFailedError: they cannot be written.
     """
+    from laneweave.launch.recordings.runs import single_run
     from laneweave.launch.report.build import report_run
-    from laneweave.launch.report.runs import single_run
 
     try:
         report_run(single_run(folder))

@@ -1,8 +1,8 @@
-"""The points of a sweep as tasks of a Dask cluster that is there already.
+"""The points of a sweep as tasks of an existing Dask cluster.
 
-Workers need laneweave and nothing else: no shared disk. A point's few files come back as the result
-of its task, and the client writes them. Each task starts a process of its own, as on this machine,
-since a worker may run several tasks in one process and SUMO may take its process along.
+Workers need laneweave, but no shared disk: the task returns a point's files, and the client writes
+them. Each task starts a process, as on this machine, since a worker may run several tasks in one
+process and SUMO may crash.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ RETURNED = ("summary.json", "trips.parquet", "events.jsonl", "log.txt")
 
 @frozen
 class Returned:
-    """What a task brings back."""
+    """The result of a task."""
 
     problems: tuple[str, ...]
     wall_s: float
@@ -35,19 +35,19 @@ class Returned:
 def run_on_dask(
     jobs: Sequence[Job], unfinished: Path, address: str
 ) -> Generator[Ended, None, None]:
-    """Run all jobs on a cluster, and yield each when it has ended; close this to end them.
+    """Run all jobs on a cluster, and yield each at its end; closing the generator ends them.
 
     Args:
         jobs: the points.
-        unfinished: folder in which the points' folders are made, on this side.
+        unfinished: folder on this machine in which the points' folders are created.
         address: of the cluster's scheduler.
 
     Raises:
-        BadInputError: no scheduler answers there.
+        BadInputError: there is no scheduler at the address.
         OSError: files cannot be written.
     """
     sweep = f"laneweave-{uuid.uuid4().hex}"
-    # A client that finds nobody complains about it once more when it is collected.
+    # A client that does not connect logs a second error when it is garbage-collected.
     try:
         asyncio.run(_greet(address))
     except (OSError, ValueError) as error:
@@ -62,7 +62,7 @@ def run_on_dask(
             for future in as_completed(futures, loop=client.loop):
                 yield _received(future, futures[future], unfinished)
         finally:
-            # Tasks that wait are given up with their futures; those that run look for this.
+            # Waiting tasks are cancelled with their futures; running ones check this event.
             stop.set()
 
 
@@ -83,7 +83,7 @@ async def _greet(address: str) -> None:
 
 
 def _received(future: Future[Returned], job: Job, unfinished: Path) -> Ended:
-    """Write what a task brought back; one that failed is a failed run."""
+    """Write the files that a task returned; a failed task is a failed run."""
     folder = unfinished / job.name
     folder.mkdir(parents=True)
     if future.status != "finished":
@@ -92,7 +92,7 @@ def _received(future: Future[Returned], job: Job, unfinished: Path) -> Ended:
         future.release()
         return Ended(job.name, folder, (f"its task failed: {' '.join(reason.split())}",), 0.0)
     returned = future.result()
-    # The cluster need not keep it any longer.
+    # Lets the cluster drop the result.
     future.release()
     for name, content in returned.files.items():
         (folder / name).write_bytes(content)

@@ -1,7 +1,7 @@
-"""One point in a process of its own: libsumo holds one simulation, and may take its process along.
+"""Runs points, each in a process of its own: libsumo holds one simulation, and may crash.
 
-The process finds its job in `job.json` of its folder, writes the run's files there, and last of all
-`result.json`. Whatever else becomes of it is a failed run with a reason.
+The process reads its job from `job.json` in its folder, and writes the run's files there, last of
+all `result.json`. A process that ends without a result is a failed run with a reason.
 """
 
 from __future__ import annotations
@@ -11,8 +11,10 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
@@ -22,20 +24,20 @@ from laneweave.launch.run.roles import THREAD_LIMITS
 
 JOB_FILE, RESULT_FILE, LOG_FILE = "job.json", "result.json", "log.txt"
 POINT_PROCESS = "laneweave.launch.sweep.point_process"
-LOOK_S = 0.2
-"""How often a worker looks whether the sweep has been ended."""
+POLL_S = 0.2
+"""Period at which a worker checks whether the sweep was stopped."""
 END_S = 10.0
-"""How long a process gets to end in good order."""
+"""Time that a process has to end after SIGTERM."""
 
 
 @frozen
 class Job:
-    """What a process is told to do."""
+    """The order for a process."""
 
     name: str
     method: str
     tables: dict[str, Any]
-    """The scenario, as `to_tables` gives it."""
+    """The scenario, as of `to_tables`."""
     keep_trajectories: bool
 
 
@@ -51,20 +53,20 @@ class Ended:
 
 
 class StoppedError(Exception):
-    """What ordered this run was ended before it was finished."""
+    """The sweep was stopped before this run was finished."""
 
 
 def run_in_process(job: Job, folder: Path, stopped: Callable[[], bool]) -> Ended:
-    """Run a point and return what became of it.
+    """Run a point in a new process and return its result.
 
     Args:
         job: the point.
-        folder: where its files go; it is made.
-        stopped: whether the sweep has been ended meanwhile.
+        folder: where its files go; it is created.
+        stopped: whether the sweep was stopped meanwhile.
 
     Raises:
-        StoppedError: it has, and the process with it.
-        OSError: files or processes cannot be made.
+        StoppedError: it was, and the process has ended.
+        OSError: files or processes cannot be created.
     """
     if stopped():
         raise StoppedError(job.name)
@@ -78,7 +80,7 @@ def run_in_process(job: Job, folder: Path, stopped: Callable[[], bool]) -> Ended
             stdout=log,
             stderr=log,
             env=_environment(folder),
-            # Ctrl-C reaches the whole group: the sweep ends its processes, in order.
+            # Ctrl-C would reach the whole group; the sweep ends its processes itself.
             process_group=0,
         )
     follow(process, job.name, stopped)
@@ -86,21 +88,47 @@ def run_in_process(job: Job, folder: Path, stopped: Callable[[], bool]) -> Ended
     return Ended(job.name, folder, _problems(folder, process.returncode), wall_s)
 
 
-def follow(process: subprocess.Popen[bytes], name: str, stopped: Callable[[], bool]) -> None:
-    """Wait until a process has ended; it has when this returns or raises.
+def run_locally(
+    jobs: Sequence[Job], unfinished: Path, workers: int
+) -> Generator[Ended, None, None]:
+    """Run all jobs on this machine, and yield each at its end; closing the generator ends them.
 
     Args:
-        process: what is waited for.
-        name: of its run.
-        stopped: whether nobody waits for it any more.
+        jobs: the points.
+        unfinished: folder in which the points' folders are created.
+        workers: number of processes at a time.
 
     Raises:
-        StoppedError: nobody does, and it was ended.
+        OSError: files or processes cannot be created.
+    """
+    stop = threading.Event()
+    pool = ThreadPoolExecutor(min(workers, max(1, len(jobs))), "point")
+    try:
+        futures = [
+            pool.submit(run_in_process, job, unfinished / job.name, stop.is_set) for job in jobs
+        ]
+        for future in as_completed(futures):
+            yield future.result()
+    finally:
+        stop.set()
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def follow(process: subprocess.Popen[bytes], name: str, stopped: Callable[[], bool]) -> None:
+    """Wait for a process; it has ended when this returns or raises.
+
+    Args:
+        process: the process.
+        name: of its run.
+        stopped: whether the result is no longer wanted.
+
+    Raises:
+        StoppedError: it is not, and the process was ended.
     """
     try:
         while process.poll() is None:
             try:
-                process.wait(LOOK_S)
+                process.wait(POLL_S)
             except subprocess.TimeoutExpired:
                 if stopped():
                     raise StoppedError(name) from None
@@ -109,7 +137,7 @@ def follow(process: subprocess.Popen[bytes], name: str, stopped: Callable[[], bo
 
 
 def _environment(folder: Path) -> dict[str, str]:
-    """Linear algebra on one thread, and temporary files where they vanish with the folder."""
+    """Return an environment: single-threaded linear algebra, temporary files in the folder."""
     limits = dict.fromkeys(THREAD_LIMITS, "1")
     return {**os.environ, **limits, "TMPDIR": str(folder.absolute())}
 
@@ -136,5 +164,5 @@ def _problems(folder: Path, status: int) -> tuple[str, ...]:
             name = f"signal {-status}"
         return (f"its process was ended by {name}",)
     lines = (folder / LOG_FILE).read_text(encoding="utf-8", errors="replace").split("\n")
-    last = next((line.strip() for line in reversed(lines) if line.strip()), "no word")
+    last = next((line.strip() for line in reversed(lines) if line.strip()), "no output")
     return (f"its process ended with status {status}: {last[:300]}",)

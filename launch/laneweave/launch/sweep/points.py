@@ -12,7 +12,7 @@ from laneweave.protocol.config.loading import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.tables import Scenario
 
-MOST_POINTS = 100_000
+MAX_POINTS = 100_000
 
 
 @frozen
@@ -41,12 +41,12 @@ class Point:
 
 
 def volume_text(volume_veh_per_lane_h: float) -> str:
-    """Return a volume as it stands in names."""
+    """Return a volume as it is written in names."""
     return f"{volume_veh_per_lane_h:.10g}"
 
 
 def parse_volumes(text: str, base: Scenario) -> tuple[float, ...]:
-    """Return the volumes of a list with commas, in vehicles/(lane h).
+    """Return the volumes of a comma-separated list, in vehicles/(lane h).
 
     Raises:
         BadInputError: one is not a number, not possible in this scenario, or named twice.
@@ -56,7 +56,7 @@ def parse_volumes(text: str, base: Scenario) -> tuple[float, ...]:
         try:
             volume = float(entry)
         except ValueError:
-            raise BadInputError("--volumes", entry, "numbers with commas between") from None
+            raise BadInputError("--volumes", entry, "comma-separated numbers") from None
         try:
             _with_volume(base, volume)
         except BadInputError as error:
@@ -74,14 +74,14 @@ def plan_points(
     seeds: Sequence[int],
     keep: KeepTrajectories,
 ) -> tuple[Point, ...]:
-    """Return all points, in the order in which they are run: a whole set for each seed.
+    """Return all points in the order in which they are run: seed by seed.
 
     Raises:
-        BadInputError: there are too many, or the settings of a label do not fit the scenario.
+        BadInputError: there are too many, or a label's settings do not fit the scenario.
     """
     count = len(labels) * len(volumes) * len(seeds)
-    if count > MOST_POINTS:
-        raise BadInputError("--seeds", len(seeds), f"at most {MOST_POINTS} runs, not {count}")
+    if count > MAX_POINTS:
+        raise BadInputError("--seeds", len(seeds), f"at most {MAX_POINTS} runs, not {count}")
     return tuple(_points(base, labels, volumes, seeds, keep))
 
 

@@ -2,33 +2,35 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from laneweave.launch.recordings.results import PREFERRED, over_seeds, results_table
+from laneweave.launch.recordings.runs import Run
 from laneweave.launch.sweep.execution import Ended, Job
-from laneweave.launch.sweep.folder import FAILED, PointRecord, SweepFolder, read_summary
+from laneweave.launch.sweep.folder import SweepFolder
 from laneweave.launch.sweep.points import Point, volume_text
 from laneweave.protocol.config.loading import to_tables
 from laneweave.protocol.errors import CommandFailedError
 
 Runner = Callable[[Sequence[Job], Path], Generator[Ended, None, None]]
-"""Runs jobs in a folder, and yields each when it has ended; closing it ends all of them."""
+"""Runs jobs in a folder and yields each at its end; closing the generator ends all of them."""
 
 
 def conduct(points: Sequence[Point], folder: SweepFolder, run: Runner, *, show: bool) -> int:
-    """Run the points that are not finished, and return how many of all points have failed.
+    """Run the points that are not finished, and return the number of failed points.
 
     Args:
         points: the sweep.
-        folder: where finished points are, and new ones go.
-        run: how they are run.
+        folder: where the points are recorded.
+        run: runs the jobs.
         show: whether to show progress on stderr.
 
     Raises:
@@ -46,11 +48,10 @@ def conduct(points: Sequence[Point], folder: SweepFolder, run: Runner, *, show: 
             closing(run(jobs, folder.unfinished)) as ends,
         ):
             for ended in ends:
-                record = folder.take(waiting[ended.name], ended)
-                progress.count(ended.name, record)
+                progress.count(ended.name, folder.take(waiting[ended.name], ended))
     except OSError as error:
         raise CommandFailedError(f"the sweep cannot go on: {error}") from error
-    return sum(folder.records[point.name].status == FAILED for point in points)
+    return sum(bool(folder.runs[point.name].reason) for point in points)
 
 
 class _Progress(Progress):
@@ -74,52 +75,42 @@ class _Progress(Progress):
         if show and finished:
             console.print(f"{finished} of {total} runs were finished before", highlight=False)
 
-    def count(self, name: str, record: PointRecord) -> None:
-        """One more has ended."""
-        self._failed += record.status == FAILED
+    def count(self, name: str, run: Run) -> None:
+        """Count a point that has ended."""
+        self._failed += bool(run.reason)
         self.update(self._task, advance=1, failed=self._failed)
         if self._show:
-            reason = f": {escape(record.reason)}" if record.reason else ""
-            line = f"{escape(name)}: {record.status} in {record.wall_s:.1f} s{reason}"
+            reason = f": {escape(run.reason)}" if run.reason else ""
+            line = f"{escape(name)}: {run.status} in {run.wall_s:.1f} s{reason}"
             self.console.print(line, highlight=False, soft_wrap=True)
 
 
 def print_results(points: Sequence[Point], folder: SweepFolder, console: Console) -> None:
-    """Print what came of a sweep: means over its seeds, and what failed."""
+    """Print the results of a sweep: means over its seeds, and the reasons of failed runs."""
+    runs = [folder.runs[point.name] for point in points]
+    done = [folder.runs[point.name] for point in points if folder.is_finished(point)]
+    columns = ("travel_time_s_mean", "throughput_veh_per_lane_h", PREFERRED)
+    found = over_seeds(results_table(done), [(column, "mean") for column in columns])
+    means = {(row["label"], row["volume_veh_per_lane_h"]): row for row in found}
     table = Table(title=f"laneweave sweep: {folder.out}")
     table.add_column("label")
     for heading in ("veh/(lane h)", "done", "failed", "travel time", "throughput", "on lane"):
         table.add_column(heading, justify="right")
-    groups: dict[tuple[str, float], list[Point]] = {}
-    for point in points:
-        groups.setdefault((point.label, point.volume_veh_per_lane_h), []).append(point)
-    for (label, volume), group in groups.items():
-        done = [point for point in group if folder.is_finished(point)]
-        summaries = [read_summary(folder.out / point.name) or {} for point in done]
-        times = [summary["travel_time_s"]["mean"] for summary in summaries]
-        rates = [summary["throughput_veh_per_lane_h"] for summary in summaries]
-        shares = [
-            100.0 * summary["vehicles"]["on_preferred_lane"] / summary["vehicles"]["left"]
-            for summary in summaries
-            if summary["vehicles"]["left"]
-        ]
+    for key, count in Counter((run.label, run.volume_veh_per_lane_h) for run in runs).items():
+        row = means.get(key, {"runs": 0})
         table.add_row(
-            label,
-            volume_text(volume),
-            str(len(done)),
-            str(len(group) - len(done)),
-            _mean(times, " s"),
-            _mean(rates, ""),
-            _mean(shares, " %"),
+            key[0],
+            volume_text(key[1]),
+            str(row["runs"]),
+            str(count - row["runs"]),
+            *(
+                "-" if row.get(f"{column}_mean") is None else f"{row[f'{column}_mean']:.2f}{unit}"
+                for column, unit in zip(columns, (" s", "", " %"), strict=True)
+            ),
         )
     console.print(table)
     for point in points:
-        record = folder.records[point.name]
-        if record.status == FAILED:
-            line = f"FAILED: {point.name}: {record.reason}"
+        run = folder.runs[point.name]
+        if run.reason:
+            line = f"FAILED: {point.name}: {run.reason}"
             console.print(line, style="bold red", highlight=False, markup=False, soft_wrap=True)
-
-
-def _mean(values: Sequence[float | None], unit: str) -> str:
-    known = [value for value in values if value is not None]
-    return f"{np.mean(known):.2f}{unit}" if known else "-"

@@ -18,8 +18,8 @@ from attrs import frozen
 from numpy.typing import NDArray
 
 from laneweave.launch.observe.column_owners import JOINED, Formations, recorded_formations
-from laneweave.launch.report.runs import Run, single_run
-from laneweave.launch.report.trajectories import OFF_LATTICE, Tracks, read_tracks
+from laneweave.launch.recordings.runs import Run, single_run
+from laneweave.launch.recordings.trajectories import OFF_LATTICE, Tracks, read_tracks
 from laneweave.launch.watch.frames import MOVING, EventFeed, Row, compact, plan_row, scene_of
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
@@ -189,5 +189,8 @@ def _moments(folder: Path) -> Iterator[_Moment]:
 
 def _losses(run: Run) -> dict[str, int]:
     """Return the summary's counts of messages published, and dropped by injected faults."""
-    messages = run.summary.get("messages") or {}
-    return {name: int(messages.get(name) or 0) for name in ("published", "dropped_by_faults")}
+    messages = run.summary.messages if run.summary else None
+    return {
+        "published": messages.published if messages else 0,
+        "dropped_by_faults": messages.dropped_by_faults if messages else 0,
+    }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -16,8 +15,8 @@ import pyarrow.parquet as pq
 from attrs import define, field
 from numpy.typing import NDArray
 
-from laneweave.protocol.files import write_atomically
 from laneweave.protocol.scenario.tables import SOLVERS, Scenario, solver_of_event
+from laneweave.protocol.summary import RunSummary, write_summary
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.events import (
     AGENT_TOOK_OVER,
@@ -89,12 +88,6 @@ class Ending(Enum):
     """It was stopped, or something failed."""
     LIMIT = "limit"
     """The road time limit was reached."""
-
-
-def write_summary(folder: Path, summary: dict[str, Any]) -> None:
-    """Write summary.json completely or not at all, even if this process is killed."""
-    text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
-    write_atomically(folder / "summary.json", text)
 
 
 class RunRecord:
@@ -284,7 +277,7 @@ class RunRecord:
             "left_off_lane": self._left_off_lane,
             "left_unattended": self._left_unattended,
         }
-        write_summary(self._folder, summary | self._rest(t_s))
+        write_summary(self._folder, RunSummary.from_json(summary | self._rest(t_s)))
 
     def _write_ticks(self) -> None:
         """Write ticks.parquet: how long each tick took, with how many vehicles on the road."""

@@ -9,9 +9,12 @@ from attrs import evolve
 
 from evaluation.evidence import Evidence, setting_of
 from evaluation.points import PointRow, Traced
-from laneweave.launch.report.runs import Run
+from laneweave.launch.methods import METHODS
+from laneweave.launch.recordings.runs import Run
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.summary import RunSummary
+from support.summaries import make_summary
 
 BASE = load_scenario(None, demand__duration_s=600.0)
 
@@ -22,33 +25,23 @@ def scenario(volume: float, seed: int, base: Scenario = BASE) -> Scenario:
     return evolve(base, demand=demand, seed=seed)
 
 
-def summary(travel_s: float | None, **changed: Any) -> dict[str, Any]:  # noqa: ANN401 - any JSON
-    """Return a summary; keys of `changed` replace whole tables in part."""
-    made: dict[str, Any] = {
-        "ending": "complete",
-        "vehicles": {"demanded": 100, "left": 100, "on_preferred_lane": 100},
-        "travel_time_s": {"mean": travel_s, "p95": None if travel_s is None else travel_s + 1.0},
-        "throughput_veh_per_lane_h": 990.0,
-        "safety": {
-            "overlaps": 0,
-            "emergency_brakes": 0,
-            "min_gap_m": 9.8,
-            "min_headway_s": 0.86,
-            "min_accel_mps2": -6.8,
-            "max_accel_mps2": 4.8,
-        },
-        "planning": {"largest_formation": 6, "solve_ms": {"p95": 10.0}},
-    }
-    for key, value in changed.items():
-        made[key] = made[key] | value if isinstance(value, dict) else value
-    return made
+def summary(travel_s: float | None, **changed: Any) -> RunSummary:  # noqa: ANN401 - any JSON
+    """Return a summary with a travel time; keys of `changed` replace tables in part."""
+    times_s = {"mean": travel_s, "p95": None if travel_s is None else travel_s + 1.0}
+    return make_summary(travel_time_s=times_s, **changed)
 
 
 def run(
-    label: str, volume: float, seed: int, found: dict[str, Any], reason: str = "", folder: str = "x"
+    label: str,
+    volume: float,
+    seed: int,
+    found: RunSummary | None,
+    reason: str = "",
+    folder: str = "x",
 ) -> Run:
     """Return a run without files."""
-    return Run(Path("nowhere") / folder, label, scenario(volume, seed), found, reason)
+    place = Path("nowhere") / folder
+    return Run(place, label, METHODS[label].method, scenario(volume, seed), found, reason)
 
 
 TRACED = Traced(
@@ -91,4 +84,4 @@ def point(label: str, volume: float, travel_s: float, traced: Traced | None = TR
 
 def evidence(*points: PointRow) -> Evidence:
     """Return evidence of some points, in the setting of the evaluation."""
-    return Evidence(setting=setting_of([run("rule", 1000.0, 1, {})]), points=points)
+    return Evidence(setting=setting_of([run("rule", 1000.0, 1, None)]), points=points)

@@ -8,7 +8,7 @@ from attrs import evolve
 
 from evaluation.lattice_points import TOLERANCE_M, lattice_spacing
 from evaluation.points import slow_stretch, within_limits
-from laneweave.launch.report.trajectories import OFF_LATTICE, Tracks
+from laneweave.launch.recordings.trajectories import OFF_LATTICE, Tracks
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.scenario.tables import Scenario
 

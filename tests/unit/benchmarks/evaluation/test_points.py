@@ -53,7 +53,7 @@ def test_runs_that_were_cut_off_are_in_no_figure() -> None:
         [
             run("rule", 1600.0, 1, summary(70.0)),
             run("rule", 1600.0, 2, cut, "the run is not complete: limit"),
-            run("rule", 1600.0, 3, {}, "its process was ended by SIGKILL"),
+            run("rule", 1600.0, 3, None, "its process was ended by SIGKILL"),
         ]
     )
     assert row.seeds == (1,)
@@ -62,7 +62,16 @@ def test_runs_that_were_cut_off_are_in_no_figure() -> None:
 
 
 def test_what_no_run_has_is_none() -> None:
-    (row,) = point_rows([run("lc2013", 1000.0, 1, summary(None, planning={"solve_ms": {}}))])
+    (row,) = point_rows(
+        [
+            run(
+                "lc2013",
+                1000.0,
+                1,
+                summary(None, planning={"solve_ms": {"p50": None, "p95": None, "max": None}}),
+            )
+        ]
+    )
     assert (row.travel_s, row.travel_p95_s, row.planning_p95_ms) == (None, None, None)
 
 

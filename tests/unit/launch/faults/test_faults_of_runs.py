@@ -173,11 +173,12 @@ def test_a_simulated_run_with_all_faults_is_repeatable(
 
     assert first.summary is not None
     assert second.summary is not None
-    assert first.summary["safety"]["overlaps"] == 0
-    assert first.summary["messages"]["dropped_by_faults"] > 0
-    assert len(first.summary["faults"]["injected"]) >= 3
+    assert first.summary.safety.overlaps == 0
+    assert first.summary.messages.dropped_by_faults > 0
+    assert first.summary.faults is not None
+    assert len(first.summary.faults["injected"]) >= 3
     for part in ("faults", "messages", "vehicles", "failover"):
-        assert first.summary[part] == second.summary[part]
+        assert getattr(first.summary, part) == getattr(second.summary, part)
     name = "trajectories.parquet"
     tables = [pq.read_table(tmp_path / folder / name) for folder in ("first", "second")]
     assert tables[0].equals(tables[1])
@@ -201,12 +202,13 @@ def test_a_simulated_run_supports_almost_all_faults(
     )
     assert found.problems == ()
     assert found.summary is not None
-    assert found.summary["safety"]["overlaps"] == 0
-    done = [one["fault"] for one in found.summary["faults"]["injected"]]
+    assert found.summary.safety.overlaps == 0
+    assert found.summary.faults is not None
+    done = [one["fault"] for one in found.summary.faults["injected"]]
     kills = ["kill[0]", "kill[1]", "kill[2]", "kill[2]", "kill[3]"]
     assert done == [*kills, "pause[0]", "partition[0]", "partition[0]"]
-    assert found.summary["faults"]["partition_methods"] == {"partition[0]": "messages"}
-    assert len(found.summary["failover"]["recovery_s"]) == 1
+    assert found.summary.faults["partition_methods"] == {"partition[0]": "messages"}
+    assert len(found.summary.failover.recovery_s) == 1
 
 
 @pytest.mark.parametrize(

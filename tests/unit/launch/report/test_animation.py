@@ -15,11 +15,11 @@ import pytest
 from attrs import evolve
 from numpy.typing import NDArray
 
+from laneweave.launch.recordings.runs import Run, single_run
+from laneweave.launch.recordings.trajectories import Tracks, read_tracks
 from laneweave.launch.report import animation
 from laneweave.launch.report.animation import KINDS, animation_data
-from laneweave.launch.report.runs import Run, single_run
 from laneweave.launch.report.snapshots import _shade
-from laneweave.launch.report.trajectories import Tracks, read_tracks
 from laneweave.launch.web import road_script
 
 NODE = shutil.which("node")

@@ -14,7 +14,8 @@ import pytest
 from numpy.typing import ArrayLike
 
 from laneweave.launch.observe.column_owners import read_events
-from laneweave.launch.report.comparison_figures import _break
+from laneweave.launch.recordings.runs import Run, single_run
+from laneweave.launch.recordings.trajectories import Tracks, read_tracks
 from laneweave.launch.report.distributions import (
     DECELERATION,
     HEADWAY,
@@ -25,10 +26,9 @@ from laneweave.launch.report.distributions import (
     Quantity,
     count,
 )
+from laneweave.launch.report.figures import _break
 from laneweave.launch.report.path_maps import driven_map
-from laneweave.launch.report.runs import Run, single_run
 from laneweave.launch.report.style import label_colours, spread_evenly
-from laneweave.launch.report.trajectories import Tracks, read_tracks
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.errors import BadInputError
 from support.older_recordings import older_recording
@@ -191,7 +191,7 @@ def formations_of_two_lengths(folder: Path) -> tuple[Run, Tracks]:
         # Who is no bridge says nothing about formations.
         forged = {"kind": "formation-closed", "formation": 0, "columns": [-9, 0]}
         lines.write(json.dumps({"t_s": 5.0, "role": "agent"} | forged) + "\n")
-    return Run(folder, "formation", load_scenario(None), {}), driven
+    return Run(folder, "formation", "formation", load_scenario(None), None), driven
 
 
 def test_path_maps_of_formations_of_different_lengths(tmp_path: Path) -> None:

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from laneweave.launch.drawing.colours import lane_colours
-from laneweave.launch.report.figures import speed_heatmap, travel_time_boxplot
+from laneweave.launch.recordings.runs import Comparison, Run, scenario_of
+from laneweave.launch.report.figures import draw_speeds, draw_travel_times
 from laneweave.launch.report.snapshots import road_snapshots
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.sim_bridge.recording.recorder import Recorder
@@ -45,9 +46,17 @@ def is_picture(path: Path) -> bool:
     return path.read_bytes().startswith(b"\x89PNG") and path.stat().st_size > 2000
 
 
+def comparison(*folders: Path) -> Comparison:
+    return Comparison.of(
+        Run(folder, folder.name, "formation", scenario_of(folder / "trips.parquet"), None)
+        for folder in folders
+    )
+
+
 def draw_all(folder: Path) -> None:
-    travel_time_boxplot([folder], folder / "box.png", dpi=60)
-    speed_heatmap(folder, folder / "heat.png", dpi=60)
+    runs = comparison(folder)
+    draw_travel_times(runs, folder / "box.png", dpi=60)
+    draw_speeds(runs, folder / "heat.png", dpi=60)
     road_snapshots(folder, folder / "road.png", dpi=60)
     assert all(is_picture(folder / name) for name in ("box.png", "heat.png", "road.png"))
 
@@ -72,7 +81,7 @@ def test_given_times_and_stretch_and_resolution(tmp_path: Path) -> None:
 
 def test_runs_side_by_side(tmp_path: Path) -> None:
     folders = [make_run(tmp_path / name, vehicles=n) for name, n in (("a", 12), ("b", 8), ("c", 2))]
-    travel_time_boxplot(folders, tmp_path / "new folder" / "box.png", dpi=60)
+    draw_travel_times(comparison(*folders), tmp_path / "new folder" / "box.png", dpi=60)
     assert is_picture(tmp_path / "new folder" / "box.png")
 
 

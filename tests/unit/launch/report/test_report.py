@@ -11,18 +11,14 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from attrs import evolve
 from PIL import Image
 
 from laneweave.launch.cli import main as cli
-from laneweave.launch.report.runs import Comparison, runs_of
-from laneweave.launch.report.tables import (
-    failed_table,
-    mean_and_spread,
-    planning_table,
-    table,
-    traffic_table,
-)
-from laneweave.launch.sweep.folder import POINT_FILE
+from laneweave.launch.recordings.runs import POINT_FILE, Comparison, runs_of
+from laneweave.launch.report.page import Animation, Section, render_page
+from laneweave.launch.report.tables import Table, tables_of
+from support.summaries import make_summary
 
 FIGURES = {
     "travel_times.png",
@@ -154,8 +150,9 @@ def test_runs_that_failed_are_listed_and_not_averaged(swept: Path, tmp_path: Pat
     record.write_text(json.dumps(data | {"status": "failed", "reason": "<its process ended>"}))
     comparison = Comparison.of(runs_of([out]))
     assert [run.volume_veh_per_lane_h for run in comparison.runs] == [1600.0]
-    assert "&lt;its process ended&gt;" in failed_table(comparison)
-    assert ">1000<" not in traffic_table(comparison)
+    traffic, *_, failed = tables_of(comparison)
+    assert failed.rows == [("formation", "1000", "1", "<its process ended>")]
+    assert {row[1] for row in traffic.rows} == {"1600"}
 
 
 @pytest.mark.parametrize(
@@ -164,6 +161,7 @@ def test_runs_that_failed_are_listed_and_not_averaged(swept: Path, tmp_path: Pat
         (["missing"], "DIR: got 'missing'; allowed: the folder of a run"),
         (["empty"], "DIR: got 'empty'; allowed: the folder of a run"),
         (["torn"], "DIR: got 'torn'; allowed: the folder of a finished run"),
+        (["short"], "DIR: got 'short'; allowed: the folder of a finished run"),
         (["unfinished"], "DIR: got 'unfinished'; allowed: the folder of a finished run"),
         (["begun"], "DIR: got 'begun'; allowed: a sweep with a finished run"),
         (["run", "--formation", "99"], "--formation: got 99; allowed: a formation of run: "),
@@ -182,6 +180,10 @@ def test_one_line_says_what_is_wrong(
     shutil.copytree(swept / "formation-1000-1", "run")
     shutil.copytree(swept / "formation-1000-1", "unfinished")
     Path("unfinished", "summary.json").write_text('{"schema"')
+    shutil.copytree(swept / "formation-1000-1", "short")
+    whole = Path("short", "trajectories.parquet").read_bytes()
+    Path("short", "trips.parquet").unlink()
+    Path("short", "trajectories.parquet").write_bytes(whole)
     for name in ("empty", "torn", "begun"):
         Path(name).mkdir()
     Path("torn", "trajectories.parquet").write_bytes(b"PAR1")
@@ -192,29 +194,47 @@ def test_one_line_says_what_is_wrong(
     assert said in shown.err
 
 
-def test_tables_escape_what_is_in_them() -> None:
-    html = table(("<h>", "n"), [("<script>", "&")], "<c>")
-    assert "<script>" not in html
-    assert "&lt;script&gt;" in html
-    assert "&lt;h&gt;" in html
-    assert "&lt;c&gt;" in html
+def test_an_error_of_the_report_is_not_reported_as_bad_input(
+    swept: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise KeyError("a bug")
+
+    monkeypatch.setattr("laneweave.launch.report.build.report_run", fail)
+    with pytest.raises(KeyError, match="a bug"):
+        report(swept / "formation-1000-1")
 
 
-def test_means_with_their_spread() -> None:
-    assert mean_and_spread([1.0, 3.0, None], 2) == "2.00 ± 1.41"
-    assert mean_and_spread([1.0], 1) == "1.0"
-    assert mean_and_spread([None], 1) == "-"
+def test_a_page_escapes_its_texts() -> None:
+    road = {"road": {"lanes": 1}, "colours": ["#000000"], "lattice": {"speed_mps": 15.0}}
+    texts = "</script><b>"
+    page = render_page(
+        texts,
+        texts,
+        [
+            Section(
+                texts,
+                tables=[Table((texts, "n"), [(texts, "&")], texts)],
+                animations=[Animation({"title": texts} | road)],
+            )
+        ],
+    )
+    assert texts not in page
+    assert page.count("&lt;/script&gt;&lt;b&gt;") == 9
+    assert page.count("</script>") == 2
 
 
 def test_planning_times_of_a_comparison(swept: Path) -> None:
-    comparison = Comparison.of(runs_of([swept]))
-    (run,) = comparison.at("formation", 1600.0)
-    planning = run.summary["planning"]
-    assert "by_solver" not in planning or planning["by_solver"]
-    planning |= {"by_solver": {"tappa": 4, "branching": 1, "none": 0}, "fallbacks": 1, "plans": 5}
-    text = planning_table(comparison)
-    cells = [f"<td>{value}</td>" for value in ("5", "1", f"{planning['solve_ms']['p50']:.1f}")]
-    assert "<td>branching 1, tappa 4</td>" in text
-    assert "".join(cells) in text
-    planning |= {"plans": 0}
-    assert text.count("<tr>") == planning_table(comparison).count("<tr>") + 1
+    runs = sorted(runs_of([swept]), key=lambda run: run.order)
+    assert runs[-1].volume_veh_per_lane_h == 1600.0
+    by_solver = {"tappa": 4, "branching": 1, "none": 0}
+    runs[-1] = evolve(
+        runs[-1],
+        summary=make_summary(planning={"by_solver": by_solver, "fallbacks": 1, "plans": 5}),
+    )
+    *_, planning, _ = tables_of(Comparison.of(runs))
+    assert [row[2] for row in planning.rows][-1] == "branching 1, tappa 4"
+    assert planning.rows[-1][3:] == ["6", "5", "1", "5.0", "10.0", "12.0"]
+    runs[-1] = evolve(runs[-1], summary=make_summary(planning={"plans": 0}))
+    *_, without, _ = tables_of(Comparison.of(runs))
+    assert len(without.rows) == len(planning.rows) - 1

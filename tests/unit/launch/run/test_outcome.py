@@ -1,4 +1,4 @@
-"""The verdict on a run, and the table at its end."""
+"""The problems that fail a run, and the table at its end."""
 
 import io
 import json
@@ -9,91 +9,61 @@ import pytest
 from rich.console import Console
 
 from laneweave.launch.faults.failover import Failover
-from laneweave.launch.run.outcome import Outcome, complete_summary, print_outcome, summary_rows
+from laneweave.launch.report.summary_table import summary_rows
+from laneweave.launch.run.outcome import Outcome, complete_summary, print_outcome
+from laneweave.protocol.summary import RunSummary, write_summary
+from support.summaries import make_summary
+
+MEASURED = ("min_gap_m", "min_headway_s", "max_accel_mps2", "min_accel_mps2", "max_jerk_mps3")
 
 
 def summary(
     *, overlaps: int = 0, left: int = 5, measured: float | None = 1.5, ending: str = "complete"
-) -> dict[str, Any]:
-    return {
-        "ending": ending,
-        "volume_veh_per_lane_h": 1300.0,
-        "seed": 1,
-        "simulated_s": 80.0,
-        "vehicles": {
-            "demanded": 5,
-            "entered": 5,
-            "left": left,
-            "on_preferred_lane": left,
-            "peak": 4,
-        },
-        "travel_time_s": dict.fromkeys(("mean", "p50", "p95", "max"), measured),
-        "safety": {
-            "overlaps": overlaps,
-            "sumo_collisions": 0,
-            "min_gap_m": measured,
-            "min_headway_s": measured,
-            "max_accel_mps2": measured,
-            "min_accel_mps2": measured,
-        },
-        "planning": {
-            "plans": 1,
-            "optimal": 1,
-            "largest_formation": 3,
-            "solve_ms": dict.fromkeys(("p50", "p95", "max"), measured),
-        },
-        "tracking": {
-            "osqp_solves": 17,
-            "unconstrained_steps": 50_383,
-            "hold_law_ticks": 0,
-            "emergency_ticks": 0,
-            "solve_ms": dict.fromkeys(("p50", "p99"), measured),
-        },
-        "runtime": {
-            "real_time_factor": 2.0,
-            "processes": 1,
-            "tick_ms": dict.fromkeys(("p50", "p99"), measured),
-        },
-        "messages": {"published": 7, "dropped_by_faults": 0},
-        "failover": {"leader_changes": 0, "recovery_s": []},
-    }
+) -> RunSummary:
+    return make_summary(
+        ending=ending,
+        vehicles={"demanded": 5, "entered": 5, "left": left, "on_preferred_lane": left, "peak": 4},
+        travel_time_s=dict.fromkeys(("mean", "p50", "p95", "max"), measured),
+        safety={"overlaps": overlaps} | dict.fromkeys(MEASURED, measured),
+        tracking={"osqp_solves": 17, "unconstrained_steps": 50_383},
+    )
 
 
-def judge(folder: Path, found: dict[str, Any], **more: Any) -> Outcome:  # noqa: ANN401
-    (folder / "summary.json").write_text(json.dumps(found), encoding="utf-8")
+def judge(folder: Path, found: RunSummary, **more: Any) -> Outcome:  # noqa: ANN401
+    write_summary(folder, found)
     return complete_summary(folder, **{"problems": (), "processes": 9, **more})
 
 
-def test_a_run_that_kept_its_promises(tmp_path: Path) -> None:
+def test_a_run_without_problems(tmp_path: Path) -> None:
     outcome = judge(tmp_path, summary(), dropped=3)
 
     assert outcome.exit_status == 0
     written = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
-    assert written == outcome.summary
+    assert outcome.summary == RunSummary.from_json(written)
     assert written["runtime"]["processes"] == 9
     assert written["messages"] == {"published": 7, "dropped_by_faults": 3}
 
 
-def test_the_number_of_processes_is_unknown_where_nobody_says_it(tmp_path: Path) -> None:
+def test_an_unknown_number_of_processes(tmp_path: Path) -> None:
     outcome = judge(tmp_path, summary(), processes=None)
     assert outcome.summary is not None
-    assert outcome.summary["runtime"]["processes"] is None
+    assert outcome.summary.runtime.processes is None
     assert "(? processes)" in printed(outcome)
 
 
-def test_ticks_solved_by_osqp_are_told_apart(tmp_path: Path) -> None:
+def test_ticks_solved_by_osqp_are_counted_apart(tmp_path: Path) -> None:
     assert "17 / 50,383 ticks" in printed(judge(tmp_path, summary()))
 
 
-def test_recoveries_seen_by_the_launcher_count(tmp_path: Path) -> None:
+def test_recoveries_measured_by_the_launcher_replace_those_of_the_bridge(tmp_path: Path) -> None:
     outcome = judge(tmp_path, summary(), failover=Failover(1.0, [0.25], [0.5]))
     assert outcome.summary is not None
-    assert outcome.summary["failover"]["recovery_s"] == [0.25]
-    assert outcome.summary["failover"]["plan_recovery_s"] == [0.5]
+    assert outcome.summary.failover.recovery_s == [0.25]
+    assert outcome.summary.failover.plan_recovery_s == [0.5]
     assert "(0.250 s)" in printed(outcome)
 
 
-def test_many_recoveries_are_two_numbers(tmp_path: Path) -> None:
+def test_many_recoveries_are_summarised(tmp_path: Path) -> None:
     times_s = [0.1, 0.2, 0.3, 0.4, 0.5, 0.9]
     outcome = judge(tmp_path, summary(), failover=Failover(1.0, times_s, []))
     assert "(p50 0.350, max 0.900 s without)" in printed(outcome)
@@ -108,7 +78,7 @@ def test_many_recoveries_are_two_numbers(tmp_path: Path) -> None:
         (summary(ending="limit"), "the run is not complete: limit"),
     ],
 )
-def test_a_broken_promise_fails_a_run(tmp_path: Path, found: dict[str, Any], problem: str) -> None:
+def test_a_broken_promise_fails_a_run(tmp_path: Path, found: RunSummary, problem: str) -> None:
     outcome = judge(tmp_path, found)
     assert outcome.exit_status == 1
     assert outcome.problems == (problem,)
@@ -162,8 +132,7 @@ def test_all_reasons_are_printed(tmp_path: Path) -> None:
     ids=["old", "none", "some"],
 )
 def test_the_table_says_which_solvers_planned(more: dict[str, Any], shown: str) -> None:
-    found = summary()
-    found["planning"] |= more
+    found = make_summary(planning=more)
     assert dict(summary_rows(found))["plans by solver"] == shown
 
 
@@ -179,6 +148,5 @@ def test_the_table_says_which_solvers_planned(more: dict[str, Any], shown: str) 
 def test_accelerations_that_are_not_comfortable(
     low: float | None, high: float | None, said: str
 ) -> None:
-    found = summary()
-    found["safety"] |= {"min_accel_mps2": low, "max_accel_mps2": high}
+    found = make_summary(safety={"min_accel_mps2": low, "max_accel_mps2": high})
     assert dict(summary_rows(found))["acceleration"] == said

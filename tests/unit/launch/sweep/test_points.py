@@ -123,7 +123,7 @@ def test_too_many_points() -> None:
     ("arguments", "said"),
     [
         (["--methods", "magic"], "--methods: got 'magic'; allowed: some of formation"),
-        (["--volumes", "1000,x"], "--volumes: got 'x'; allowed: numbers with commas between"),
+        (["--volumes", "1000,x"], "--volumes: got 'x'; allowed: comma-separated numbers"),
         (["--seeds", "3"], "--seeds: got '3'; allowed: A:B with A < B"),
         (["--jobs", "0"], "--jobs: got 0; allowed: [1, 256]"),
         (["--duration", "0"], "demand.duration_s: got 0.0"),

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from laneweave.launch.cli.main import app
-from laneweave.launch.report.runs import single_run
-from laneweave.launch.report.trajectories import read_tracks
+from laneweave.launch.recordings.runs import single_run
+from laneweave.launch.recordings.trajectories import read_tracks
 from laneweave.launch.watch.frames import MOVING
 from laneweave.launch.watch.recorded_run import Recording
 from laneweave.protocol.errors import BadInputError
@@ -48,13 +48,14 @@ def test_everybody_is_where_they_were(recorded: Path) -> None:
 def test_counts_lanes_and_leaders_are_those_of_the_run(recorded: Path) -> None:
     recording, summary = Recording(recorded), single_run(recorded).summary
     last = frames(recording)[-1]
-    vehicles = summary["vehicles"]
-    assert last["counts"] == [vehicles["demanded"], vehicles["entered"], 0, vehicles["left"]]
+    assert summary is not None
+    vehicles = summary.vehicles
+    assert last["counts"] == [vehicles.demanded, vehicles.entered, 0, vehicles.left]
     assert last["leader"] == ["c1", 1]
     assert last["plan"] is not None
     assert [event[2] for event in last["news"]][:2] == ["leader-elected", "leader"]
     assert frames(recording)[0]["leader"] is None
-    assert recording.scene["losses"]["published"] == summary["messages"]["published"]
+    assert recording.scene["losses"]["published"] == summary.messages.published
     lanes = {row[0]: row[4] for frame in frames(recording) for row in frame["vehicles"]}
     assert set(lanes.values()) == {0, 1, 2}
 

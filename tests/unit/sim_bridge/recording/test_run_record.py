@@ -14,7 +14,7 @@ from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.wire.messages import Heartbeat, LogEvent, Name, Report
 from laneweave.sim_bridge.bodies.motion_controller import Rung
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
-from laneweave.sim_bridge.recording.run_record import Ending, RunRecord, write_summary
+from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
@@ -84,15 +84,6 @@ def test_the_first_ending_counts_and_nothing_follows_it(record: RunRecord, tmp_p
     record.on_event(LogEvent(Name("agent"), Name("A"), 15.0, Name("late")))
     record.on_heartbeat(Heartbeat(Name("c0"), 1, 1, leading=True, formations=0), 15.0, 1.0)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
-
-
-def test_a_summary_is_written_whole(tmp_path: Path) -> None:
-    write_summary(tmp_path, {"old": 1})
-    with pytest.raises(ValueError, match="JSON"):
-        write_summary(tmp_path, {"bad": float("nan")})
-    assert read_summary(tmp_path) == {"old": 1}
-    write_summary(tmp_path, {"new": 2})
-    assert [path.name for path in tmp_path.iterdir()] == ["summary.json"]
 
 
 # --- messages ---------------------------------------------------------------------------------

@@ -1,9 +1,9 @@
 "use strict";
-// The moving road. Data: laneweave/launch/report/animation.py. Times in s, lengths in m.
+// The data of the moving road (laneweave/launch/report/animation.py). Times in s, lengths in m.
 // It is drawn by laneweave/launch/web/road.js.
 
 const laneweave = (() => {
-  /** Whole numbers of `bytes` bytes each, little-endian, from base64. */
+  /** Decode integers of `bytes` bytes each, little-endian, from base64. */
   function unpack(text, bytes) {
     const raw = Uint8Array.from(atob(text), (char) => char.charCodeAt(0));
     if (bytes === 1) return raw;
@@ -11,7 +11,7 @@ const laneweave = (() => {
     return Uint16Array.from({ length: raw.length / 2 }, (_, i) => view.getUint16(2 * i, true));
   }
 
-  /** A run that can be asked where everybody is. */
+  /** Decode a run's data for `stateAt` and `allAt`. */
   function decode(data) {
     let offset = 0;
     const vehicles = data.vehicles.map((vehicle) => {
@@ -28,7 +28,7 @@ const laneweave = (() => {
     };
   }
 
-  /** Where a vehicle is: {s, y, v, slope}, null when it is not on the road. */
+  /** Return the state of a vehicle, {s, y, v, slope}; null when it is not on the road. */
   function stateAt(run, vehicle, t) {
     const place = t / run.step_s - vehicle.first;
     if (place < -1e-9 || place > vehicle.count - 1 + 1e-9) return null;
@@ -47,7 +47,7 @@ const laneweave = (() => {
     };
   }
 
-  /** Everybody on the road: [[vehicle, state], ...]. */
+  /** Return all vehicles on the road: [[vehicle, state], ...]. */
   function allAt(run, t) {
     const found = [];
     for (const vehicle of run.vehicles) {
@@ -58,14 +58,14 @@ const laneweave = (() => {
     return found;
   }
 
-  /** Middle of a formation's columns at a time, on the road or not. */
+  /** Return the middle of a formation's columns at a time, on the road or not. */
   function formationCentre(run, formation, t) {
     const [, rear, front] = run.formations.find(([number]) => number === formation);
     const column = (rear + front) / 2;
     return run.lattice.speed_mps * t + column * run.lattice.pitch_m - run.body_m[0] / 2;
   }
 
-  /** Stretches [from, to] of road that are shown below each other; `follow` null: the whole road. */
+  /** Return the stretches [from, to] of road to show below each other; `follow` null: all of it. */
   function stretches(run, follow, t, windowLength) {
     const length = run.road.length_m;
     if (follow === null) return laneweaveRoad.wholeRoad(length);
@@ -76,19 +76,19 @@ const laneweave = (() => {
     return [laneweaveRoad.windowAround(length, centre, windowLength)];
   }
 
-  /** What can be followed: formations, or vehicles where there are none. */
-  function followable(run, most) {
+  /** Return what can be followed: formations, or vehicles where there are none. */
+  function followable(run, max) {
     const shown = new Set(run.vehicles.map((vehicle) => vehicle.formation));
     const formations = run.formations.map(([number]) => number).filter((number) => shown.has(number));
     if (formations.length > 0) {
       return formations
-        .slice(0, most)
+        .slice(0, max)
         .map((formation) => ({ name: `formation ${formation}`, formation }));
     }
-    return run.vehicles.slice(0, most).map((vehicle) => ({ name: vehicle.name, vehicle }));
+    return run.vehicles.slice(0, max).map((vehicle) => ({ name: vehicle.name, vehicle }));
   }
 
-  /** When what is followed is at the middle of the window as lane sorting begins. */
+  /** Return the time at which the followed object is at the beginning of lane sorting. */
   function arrivalTime(run, follow) {
     if (follow.vehicle) return follow.vehicle.first * run.step_s;
     const ahead = run.road.sorting_start_m - 20 - formationCentre(run, follow.formation, 0);

@@ -10,11 +10,13 @@ import pyarrow.parquet as pq
 from attrs import frozen
 from numpy.typing import NDArray
 
+from laneweave.protocol.errors import BadInputError
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 OFF_LATTICE = np.iinfo(np.int64).min
-"""Column of a vehicle that has none."""
+"""Column of a vehicle off the lattice."""
 
 
 @frozen
@@ -22,16 +24,16 @@ class Tracks:
     """All rows of trajectories.parquet, sorted by vehicle, then time; arrays of shape (rows,)."""
 
     names: tuple[str, ...]
-    """Of the vehicles."""
+    """Names of the vehicles."""
     starts: Ints
-    """Of each vehicle the first row, and behind the last one the number of rows."""
+    """The first row of each vehicle, and last of all the number of rows."""
     t_s: Floats
     s_m: Floats
     y_m: Floats
     speed_mps: Floats
     accel_mps2: Floats
     column: Ints
-    """`OFF_LATTICE` where there is none."""
+    """`OFF_LATTICE`: none."""
     lane: Ints
 
     @property
@@ -48,9 +50,14 @@ def read_tracks(folder: Path) -> Tracks:
     """Return a run's trajectories.
 
     Raises:
-        OSError, ValueError, KeyError: it has none that can be read.
+        BadInputError: it has none that can be read.
     """
-    table = pq.read_table(folder / "trajectories.parquet")
+    columns = ["vehicle", "t_s", "s_m", "y_m", "speed_mps", "accel_mps2", "column", "lane"]
+    try:
+        table = pq.read_table(folder / "trajectories.parquet", columns=columns)
+    except (OSError, ValueError, KeyError) as error:
+        allowed = f"the folder of a finished run ({error})"
+        raise BadInputError("DIR", str(folder), allowed) from error
     codes = table["vehicle"].combine_chunks().dictionary_encode()
     names = [str(name) for name in codes.dictionary.to_pylist()]
     vehicle = codes.indices.to_numpy(zero_copy_only=False).astype(np.int64)

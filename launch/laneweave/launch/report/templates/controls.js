@@ -1,9 +1,9 @@
-// Controls of the moving road: what needs a browser.
+// The controls of the moving road; needs a browser.
 
-const WINDOW_M = 150; // of road that is shown when something is followed
-const MOST_FOLLOWED = 400;
+const WINDOW_M = 150; // length of road shown when something is followed
+const MAX_FOLLOWED = 400;
 
-class Stage {
+class Player {
   constructor(box, run) {
     this.run = run;
     this.t = run.start_s;
@@ -31,7 +31,7 @@ class Stage {
     part("pace").addEventListener("change", (event) => {
       this.pace = Number(event.target.value);
     });
-    const choices = laneweave.followable(this.run, MOST_FOLLOWED);
+    const choices = laneweave.followable(this.run, MAX_FOLLOWED);
     const view = part("view");
     for (const choice of choices) view.add(new Option(`follow ${choice.name}`));
     view.addEventListener("change", () => {
@@ -60,17 +60,17 @@ class Stage {
 
   draw() {
     const { run } = this;
-    const everybody = laneweave.allAt(run, this.t);
-    const bodies = everybody.map(([vehicle, state]) => ({ ...state, name: vehicle.name, lane: vehicle.lane }));
+    const present = laneweave.allAt(run, this.t);
+    const bodies = present.map(([vehicle, state]) => ({ ...state, name: vehicle.name, lane: vehicle.lane }));
     this.painter.paint(laneweave.stretches(run, this.follow, this.t, WINDOW_M), bodies);
     this.slider.value = this.t;
-    const mean = everybody.reduce((sum, [, state]) => sum + state.v, 0) / (everybody.length || 1);
-    const speed = everybody.length ? `, mean ${mean.toFixed(1)} m/s` : "";
-    this.output.textContent = `${this.t.toFixed(1)} s: ${everybody.length} vehicles${speed}`;
+    const mean = present.reduce((sum, [, state]) => sum + state.v, 0) / (present.length || 1);
+    const speed = present.length ? `, mean ${mean.toFixed(1)} m/s` : "";
+    this.output.textContent = `${this.t.toFixed(1)} s: ${present.length} vehicles${speed}`;
   }
 }
 
 for (const box of document.querySelectorAll(".player")) {
   const data = document.getElementById(box.dataset.animation);
-  new Stage(box, laneweave.decode(JSON.parse(data.textContent)));
+  new Player(box, laneweave.decode(JSON.parse(data.textContent)));
 }

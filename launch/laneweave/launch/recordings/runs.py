@@ -1,19 +1,28 @@
-"""The runs that a report is about."""
+"""The runs in folders of runs and sweeps, and several of them side by side."""
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import pyarrow.parquet as pq
 from attrs import evolve, frozen
 
-from laneweave.launch.drawing.figures import scenario_of
 from laneweave.launch.methods import rank
-from laneweave.launch.sweep.folder import DONE, MARK_FILE, point_folders, read_record, read_summary
+from laneweave.protocol.config.loading import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.summary import RunSummary, read_summary
+
+SCENARIO_KEY = b"laneweave.scenario"
+"""Metadata of a run's Parquet files."""
+SWEEP_FILE, POINT_FILE = "sweep.json", "point.json"
+"""They mark the folder of a sweep, and of a point in it."""
+POINT_SCHEMA = "laneweave.sweep.point/1"
+TRAJECTORIES = "trajectories.parquet"
 
 
 @frozen
@@ -23,11 +32,20 @@ class Run:
     folder: Path
     label: str
     """Its method with settings, as sweeps name it; of other runs the method."""
+    method: str
+    """As `laneweave run --method` names it."""
     scenario: Scenario
-    summary: dict[str, Any]
-    """Empty for a failed run that left none."""
+    summary: RunSummary | None
+    """None: the run failed and left none."""
     reason: str = ""
     """Why it failed; empty: it did not."""
+    wall_s: float | None = None
+    """How long its process ran; None: not known."""
+
+    @property
+    def status(self) -> str:
+        """`done` or `failed`."""
+        return "failed" if self.reason else "done"
 
     @property
     def volume_veh_per_lane_h(self) -> float:
@@ -37,11 +55,11 @@ class Run:
     @property
     def has_trajectories(self) -> bool:
         """Whether its trajectories were kept."""
-        return (self.folder / "trajectories.parquet").is_file()
+        return (self.folder / TRAJECTORIES).is_file()
 
     @property
     def order(self) -> tuple[tuple[int, str], float, int]:
-        """By what runs are sorted: label, volume, seed."""
+        """The sort key of runs: label, volume, seed."""
         return rank(self.label), self.volume_veh_per_lane_h, self.scenario.seed
 
 
@@ -50,11 +68,12 @@ class Comparison:
     """Runs of one or several labels and volumes, sorted."""
 
     runs: tuple[Run, ...]
+    """Those that did not fail."""
     failed: tuple[Run, ...]
 
     @classmethod
     def of(cls, runs: Iterable[Run]) -> Comparison:
-        """Sort runs; those that cannot be told apart are named by their folders."""
+        """Sort runs; those of the same label, volume and seed are labelled by their folders."""
         listed = list(runs)
         counts = Counter(run.order for run in listed)
         named = [
@@ -86,19 +105,27 @@ class Comparison:
         )
 
     def shown(self, label: str, volume_veh_per_lane_h: float) -> Run | None:
-        """Return the run that stands for a label at a volume: the first with trajectories."""
+        """Return the run that represents a label at a volume: the first with trajectories."""
         runs = self.at(label, volume_veh_per_lane_h)
         return next((run for run in runs if run.has_trajectories), None)
 
     def busiest(self, label: str) -> Run | None:
-        """Return the run that shows a label at its highest volume with trajectories."""
+        """Return the run that represents a label at its highest volume with trajectories."""
         found = (self.shown(label, volume) for volume in reversed(self.volumes))
         return next((run for run in found if run is not None), None)
 
 
+def scenario_of(path: Path) -> Scenario:
+    """Return the scenario in the metadata of a run's Parquet file; without it the default one."""
+    metadata = pq.read_schema(path).metadata or {}
+    text = metadata.get(SCENARIO_KEY)
+    data: dict[str, Any] = json.loads(text) if text else {}
+    return parse_scenario(data)
+
+
 def is_sweep(folder: Path) -> bool:
     """Return whether a folder is that of a sweep."""
-    return (folder / MARK_FILE).is_file()
+    return (folder / SWEEP_FILE).is_file()
 
 
 def single_run(folder: Path) -> Run:
@@ -107,20 +134,21 @@ def single_run(folder: Path) -> Run:
     Raises:
         BadInputError: it is not the folder of a finished run with trajectories.
     """
-    if not (folder / "trajectories.parquet").is_file():
+    if not (folder / TRAJECTORIES).is_file():
         raise BadInputError("DIR", str(folder), "the folder of a run, with trajectories.parquet")
     try:
-        scenario = scenario_of(folder / "trajectories.parquet")
+        scenario = scenario_of(folder / TRAJECTORIES)
+        pq.read_schema(folder / "trips.parquet")
     except (OSError, ValueError) as error:
         raise _not_a_run(folder, error) from error
     summary = read_summary(folder)
     if summary is None:
-        raise _not_a_run(folder, "its summary.json is missing or not whole")
-    return Run(folder, str(summary.get("method", "run")), scenario, summary)
+        raise _not_a_run(folder, "its summary.json is missing or incomplete")
+    return Run(folder, summary.method, summary.method, scenario, summary)
 
 
 def runs_of(folders: Sequence[Path]) -> Iterator[Run]:
-    """Yield the runs in some folders, which are those of runs and sweeps.
+    """Yield the runs in some folders of runs and sweeps.
 
     Raises:
         BadInputError: a folder is neither, or a sweep has no finished run.
@@ -129,13 +157,49 @@ def runs_of(folders: Sequence[Path]) -> Iterator[Run]:
         if not is_sweep(folder):
             yield single_run(folder)
             continue
-        points = point_folders(folder)
-        records = [(path, read_record(path)) for path in points]
-        if not any(record.status == DONE for _, record in records):
+        points = sweep_runs(folder)
+        if all(run.reason for run in points):
             raise BadInputError("DIR", str(folder), "a sweep with a finished run")
-        for path, record in records:
-            summary = read_summary(path) or {}
-            yield Run(path, record.label, record.scenario, summary, record.reason)
+        yield from points
+
+
+def sweep_runs(out: Path) -> list[Run]:
+    """Return the runs of a sweep, by the names of their folders.
+
+    Raises:
+        BadInputError: a point's record cannot be read.
+    """
+    return [_read_point(path) for path in sorted(out.glob(f"*/{POINT_FILE}"))]
+
+
+def write_point(run: Run, folder: Path) -> None:
+    """Write the record of a sweep's run into a folder."""
+    data = {
+        "schema": POINT_SCHEMA,
+        "label": run.label,
+        "method": run.method,
+        "status": run.status,
+        "reason": run.reason,
+        "wall_s": run.wall_s,
+        "scenario": to_tables(run.scenario),
+    }
+    (folder / POINT_FILE).write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+
+
+def _read_point(path: Path) -> Run:
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        return Run(
+            folder=path.parent,
+            label=str(data["label"]),
+            method=str(data["method"]),
+            scenario=parse_scenario(data["scenario"]),
+            summary=read_summary(path.parent),
+            reason=str(data["reason"]),
+            wall_s=float(data["wall_s"]),
+        )
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise BadInputError(str(path), "something else", f"a point's record ({error})") from error
 
 
 def _not_a_run(folder: Path, why: object) -> BadInputError:

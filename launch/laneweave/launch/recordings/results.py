@@ -1,0 +1,95 @@
+"""One table over runs: a row per run, a column per number of its summary; and its aggregation.
+
+The column of a number has its path in the summary as name: `travel_time_s.mean` is
+`travel_time_s_mean`. A sweep writes the table as `results.parquet`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from laneweave.launch.recordings.runs import Run
+from laneweave.protocol.files import write_atomically
+from laneweave.protocol.summary import RunSummary
+
+SCHEMA_KEY, SCHEMA = b"laneweave.schema", b"laneweave.sweep.results/1"
+KEYS = ["label", "volume_veh_per_lane_h"]
+"""Runs with the same values differ by their seeds only."""
+PREFERRED = "preferred_percent"
+"""Column of the share of vehicles that left on their preferred lane."""
+
+
+def results_table(runs: Iterable[Run]) -> pa.Table:
+    """Return the table of some runs, in their order.
+
+    Columns of counts are integers, the others floats; figures that a run does not have are null.
+    """
+    listed = list(runs)
+    arrays = {
+        "label": pa.array([run.label for run in listed], pa.string()),
+        "method": pa.array([run.method for run in listed], pa.string()),
+        KEYS[1]: pa.array([run.volume_veh_per_lane_h for run in listed], pa.float64()),
+        "seed": pa.array([run.scenario.seed for run in listed], pa.int64()),
+        "status": pa.array([run.status for run in listed], pa.string()),
+        "reason": pa.array([run.reason for run in listed], pa.string()),
+        "wall_s": pa.array([run.wall_s for run in listed], pa.float64()),
+    }
+    flat = [_figures(run.summary) if run.summary else {} for run in listed]
+    for name in dict.fromkeys(name for one in flat for name in one if name not in arrays):
+        values = [one.get(name) for one in flat]
+        counts = all(isinstance(value, int) for value in values if value is not None)
+        known = any(value is not None for value in values)
+        arrays[name] = pa.array(values, pa.int64() if counts and known else pa.float64())
+    return pa.table(arrays).replace_schema_metadata({SCHEMA_KEY: SCHEMA})
+
+
+def write_results(runs: Iterable[Run], path: Path) -> None:
+    """Write the table of some runs atomically."""
+    table = results_table(runs)
+    write_atomically(path, lambda part: pq.write_table(table, part, compression="zstd"))
+
+
+def over_seeds(table: pa.Table, wanted: Iterable[tuple[str, str]]) -> list[dict[str, Any]]:
+    """Aggregate a table of results over seeds: a row for each label and volume, in their order.
+
+    Args:
+        table: as of `results_table`.
+        wanted: columns, each with an aggregation function of pyarrow; `stddev` is that of a sample.
+
+    Returns:
+        Rows with `KEYS`, `runs` (their number), and `COLUMN_FUNCTION` for each column and function:
+        null where no run has the figure.
+    """
+    pairs = list(wanted)
+    for column in dict.fromkeys(column for column, _ in pairs):
+        if column not in table.column_names:
+            table = table.append_column(column, pa.nulls(table.num_rows, pa.float64()))
+    sample = pc.VarianceOptions(ddof=1)
+    aggregations: list[Any] = [
+        (column, function, sample if function == "stddev" else None) for column, function in pairs
+    ]
+    grouped = table.group_by(KEYS, use_threads=False)
+    rows = grouped.aggregate([("seed", "count"), *aggregations]).to_pylist()
+    return [{"runs": row.pop("seed_count"), **row} for row in rows]
+
+
+def _figures(summary: RunSummary) -> dict[str, float | int | None]:
+    return flat_numbers(summary.to_json()) | {PREFERRED: summary.preferred_percent}
+
+
+def flat_numbers(tables: Mapping[str, Any], parent: str = "") -> dict[str, float | int | None]:
+    """Return all numbers of nested tables by their path, joined with `_`; null stays null."""
+    flat: dict[str, float | int | None] = {}
+    for key, value in tables.items():
+        name = f"{parent}{key}"
+        if isinstance(value, Mapping):
+            flat |= flat_numbers(value, f"{name}_")
+        elif value is None or (isinstance(value, (int, float)) and not isinstance(value, bool)):
+            flat[name] = value
+    return flat

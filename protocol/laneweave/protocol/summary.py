@@ -1,0 +1,207 @@
+"""`summary.json`: the figures of one run.
+
+The bridge writes it at the end of a run; the launcher adds what only it knows. Fields with a
+default are missing from summaries of earlier versions, or of runs without such figures.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import attrs
+from attrs import frozen
+from cattrs import Converter
+
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.files import write_atomically
+
+SUMMARY_FILE = "summary.json"
+SCHEMA = "laneweave.summary/1"
+
+
+@frozen(kw_only=True)
+class VehicleCounts:
+    """Numbers of vehicles."""
+
+    demanded: int
+    entered: int
+    left: int
+    on_preferred_lane: int
+    """Left the road on the lane that they prefer."""
+    peak: int
+    """Highest number on the road at one time."""
+    left_off_lane: int | None = None
+    left_unattended: int | None = None
+
+
+@frozen(kw_only=True)
+class TravelTime:
+    """Travel times of the counted vehicles in s; None: no vehicle was counted."""
+
+    mean: float | None
+    p50: float | None
+    p95: float | None
+    max: float | None
+
+
+@frozen(kw_only=True)
+class Safety:
+    """Counts and extremes over all vehicles and ticks; None: nothing was measured."""
+
+    overlaps: int
+    """Pairs of bodies that ever intersected."""
+    sumo_collisions: int
+    min_gap_m: float | None
+    min_headway_s: float | None
+    emergency_brakes: int
+    max_accel_mps2: float | None
+    min_accel_mps2: float | None
+    max_jerk_mps3: float | None
+
+
+@frozen(kw_only=True)
+class PlanningMs:
+    """Planning times in ms."""
+
+    p50: float | None
+    p95: float | None
+    max: float | None
+
+
+@frozen(kw_only=True)
+class DurationMs:
+    """Durations in ms."""
+
+    p50: float | None
+    p99: float | None
+
+
+@frozen(kw_only=True)
+class Planning:
+    """Plans of all coordinators."""
+
+    plans: int
+    optimal: int
+    largest_formation: int
+    by_solver: dict[str, int] | None = None
+    fallbacks: int | None = None
+    solve_ms: PlanningMs
+
+
+@frozen(kw_only=True)
+class Tracking:
+    """Tracking by agents, and what caretakers did instead."""
+
+    solves: int
+    osqp_solves: int | None = None
+    unconstrained_steps: int | None = None
+    unusable: int
+    hold_law_ticks: int | None = None
+    emergency_ticks: int | None = None
+    missed_ticks: int | None = None
+    caretaker_takeovers: int | None = None
+    agent_takeovers: int | None = None
+    solve_ms: DurationMs
+
+
+@frozen(kw_only=True)
+class RuntimeFigures:
+    """Processes and their speed."""
+
+    real_time_factor: float
+    wall_s: float
+    processes: int | None
+    """Highest number at one time; None: not known."""
+    vehicles_per_process: int
+    tick_ms: DurationMs
+
+
+@frozen(kw_only=True)
+class Messages:
+    """Message counts over all processes."""
+
+    published: int
+    dropped_by_faults: int
+    rejected: int | None = None
+
+
+@frozen(kw_only=True)
+class LeaderChanges:
+    """Changes of the leader."""
+
+    leader_changes: int
+    recovery_s: list[float]
+    """Times without a leader; with faults: from each fault of a leader until another one led."""
+    plan_recovery_s: list[float] | None = None
+    """From each fault of a leader until the next plan was in force."""
+
+
+@frozen(kw_only=True)
+class RunSummary:
+    """The figures of one run, as in `summary.json`."""
+
+    schema: str
+    method: str
+    seed: int
+    volume_veh_per_lane_h: float
+    lanes: int
+    road_m: float
+    simulated_s: float
+    vehicles: VehicleCounts
+    travel_time_s: TravelTime
+    throughput_veh_per_lane_h: float | None
+    safety: Safety
+    ending: str | None = None
+    """`complete`, `interrupted` or `limit`."""
+    planning: Planning
+    tracking: Tracking
+    runtime: RuntimeFigures
+    messages: Messages
+    failover: LeaderChanges
+    faults: dict[str, Any] | None = None
+    """Injected faults; None: none were asked for."""
+
+    @classmethod
+    def from_json(cls, data: object) -> RunSummary:
+        """Return the summary of a JSON object.
+
+        Raises:
+            BadInputError: it is not a summary.
+        """
+        try:
+            return _CONVERTER.structure(data, cls)
+        except Exception as error:
+            raise BadInputError(SUMMARY_FILE, type(data).__name__, "a run's summary") from error
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the summary as a JSON object."""
+        return attrs.asdict(self, filter=_is_written)
+
+    @property
+    def preferred_percent(self) -> float | None:
+        """Share of the vehicles that left which did so on the lane that they prefer, in %."""
+        left = self.vehicles.left
+        return 100.0 * self.vehicles.on_preferred_lane / left if left else None
+
+
+def read_summary(folder: Path) -> RunSummary | None:
+    """Return a run's summary; None: there is none, or it is incomplete."""
+    try:
+        return RunSummary.from_json(json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8")))
+    except (OSError, ValueError):
+        return None
+
+
+def write_summary(folder: Path, summary: RunSummary) -> None:
+    """Write `summary.json`, atomically, also if this process is killed."""
+    text = json.dumps(summary.to_json(), indent=2, allow_nan=False) + "\n"
+    write_atomically(folder / SUMMARY_FILE, text)
+
+
+def _is_written(one: attrs.Attribute[Any], value: object) -> bool:
+    return one.default is attrs.NOTHING or value is not None
+
+
+_CONVERTER = Converter(detailed_validation=False)
