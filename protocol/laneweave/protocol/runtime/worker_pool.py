@@ -1,9 +1,9 @@
-"""Processes that compute for a core: the shell of its `Delegate` effects.
+"""Worker processes that run the `Delegate` effects of a core.
 
-A thread for each worker takes the next job, hands it to its process and waits: for the result, for
-the process's death, or until the job is long overdue. In the last two cases another process takes
-its place, and only that job has failed. (The pools of the standard library and of pebble end as a
-whole when a worker is killed while it waits for work.)
+One thread per worker passes the next job to its process and waits for the result, for the death of
+the process, or until the job is long overdue. In the last two cases the process is replaced, and
+only that job fails. (The pools of the standard library and of pebble break down as a whole when an
+idle worker is killed.)
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from laneweave.protocol.runtime.processes import die_with_parent
 log = structlog.get_logger(__name__)
 
 OVERDUE_S = 5.0
-"""A worker that goes on for so long after its job's deadline is killed."""
+"""A worker that exceeds its job's deadline by this time is killed."""
 END_S = 2.0
-"""How long a killed process may take to be gone."""
-LOOK_S = 1.0
-"""How often a thread that has no job looks whether its process lives."""
+"""Longest wait for the end of a killed process."""
+CHECK_S = 1.0
+"""Interval at which an idle thread checks that its process is alive."""
 PAUSE_S = 0.5
-"""A process that died so soon after its start is not replaced at once: one that cannot start must
-not keep the machine busy."""
+"""Delay before the replacement of a process that died this soon after its start, so that one that
+cannot start does not keep the machine busy."""
 
 # A fork would take over threads and sockets of the network.
 _CONTEXT = multiprocessing.get_context("spawn")
@@ -43,14 +43,14 @@ _Order = tuple[Delegate, Callable[[Computed], None]]
 
 
 class WorkerPool:
-    """Workers of a process; they die with it, however it dies."""
+    """Workers of a process; they die with it."""
 
     def __init__(self, workers: int, warm_up: Callable[[], None] | None = None) -> None:
-        """Prepare; no process is started before the first job, or `start`.
+        """Prepare; processes start with the first job, or with `start`.
 
         Args:
-            workers: how many jobs run at a time.
-            warm_up: what each worker does when it starts; can be pickled.
+            workers: number of jobs that run at a time.
+            warm_up: picklable function that each worker calls at its start.
         """
         self._orders: queue.SimpleQueue[_Order | None] = queue.SimpleQueue()
         self._workers = [_Worker(self._orders, warm_up) for _ in range(workers)]
@@ -58,23 +58,23 @@ class WorkerPool:
 
     @property
     def process_ids(self) -> list[int]:
-        """Ids of the processes that are up."""
+        """Ids of the running processes."""
         return [worker.process_id for worker in self._workers if worker.process_id]
 
     def start(self) -> None:
-        """Start the workers now, not with the first job; returns at once."""
+        """Start the workers now; return at once."""
         if not self._started:
             self._started = True
             for worker in self._workers:
                 worker.thread.start()
 
     def order(self, job: Delegate, done: Callable[[Computed], None]) -> None:
-        """Have a job done after those that were ordered before; `done` is called from a thread."""
+        """Queue a job; `done` is called from a thread."""
         self.start()
         self._orders.put((job, done))
 
     def close(self) -> None:
-        """End the workers at once, whatever they are doing; what they had is not heard of again."""
+        """End the workers at once; results of their jobs are discarded."""
         for worker in self._workers:
             worker.end()
         for _ in self._workers:
@@ -85,7 +85,7 @@ class WorkerPool:
 
 
 class _Worker:
-    """One process at a time, and the thread that looks after it."""
+    """One process at a time, and the thread that manages it."""
 
     def __init__(
         self, orders: queue.SimpleQueue[_Order | None], warm_up: Callable[[], None] | None
@@ -101,12 +101,12 @@ class _Worker:
 
     @property
     def process_id(self) -> int:
-        """Id of the process; 0: there is none."""
+        """Id of the process; 0 if there is none."""
         process = self._process
         return 0 if process is None or process.pid is None else process.pid
 
     def end(self) -> None:
-        """Kill the process, and have the thread end."""
+        """Kill the process and end the thread."""
         with self._lock:
             self._ending.set()
             process = self._process  # the thread may let go of it meanwhile
@@ -117,7 +117,7 @@ class _Worker:
         self._begin()
         while not self._ending.is_set():
             try:
-                order = self._orders.get(timeout=LOOK_S)
+                order = self._orders.get(timeout=CHECK_S)
             except queue.Empty:
                 if self._process is None or not self._process.is_alive():
                     self._begin()
@@ -128,7 +128,7 @@ class _Worker:
             try:
                 result = self._do(job)
             except Exception as error:
-                # Whatever it is, the thread goes on: without it a share of the requests would wait.
+                # The thread must go on, or a share of the requests would wait forever.
                 log.exception("a worker is given up", job=job.job)
                 self._forget()
                 result = Computed(job.job, None, _described(error))
@@ -139,10 +139,10 @@ class _Worker:
         self._forget()
 
     def _begin(self) -> Connection | None:
-        """Start a process in the place of the one that was.
+        """Start a process, replacing the previous one.
 
         Returns:
-            The connection to it. None: the pool is ending, or the machine gives no process.
+            The connection to it; None if the pool is ending or the process cannot be started.
         """
         self._forget()
         if time.monotonic() < self._begun_s + PAUSE_S:
@@ -158,7 +158,7 @@ class _Worker:
             return self._connection
 
     def _forget(self) -> None:
-        """Let go of a process that is dead, or is to die."""
+        """Kill the process, if any, and close its connection."""
         if self._connection is not None:
             self._connection.close()
             self._connection = None
@@ -168,7 +168,7 @@ class _Worker:
             self._process = None
 
     def _do(self, job: Delegate) -> Computed:
-        """Do a job, where its process dies once more in another one."""
+        """Run a job; retry once in a new process if the worker dies."""
         for _ in range(2):
             connection = self._connection or self._begin()
             done = None if connection is None else self._try(connection, job)
@@ -180,11 +180,11 @@ class _Worker:
         return Computed(job.job, None, "the worker died")
 
     def _try(self, connection: Connection, job: Delegate) -> Computed | None:
-        """Return what came of a job; None: the process died."""
+        """Return the result of a job; None if the process died."""
         left_s = max(0.0, job.deadline_s - time.monotonic())
         try:
             connection.send((job.work, job.deadline_s))
-            # A process that has just begun gets ready first; its pipe has room for a job.
+            # A new process warms up first; its pipe has room for a job.
             if connection.poll(left_s + OVERDUE_S):
                 result, error = connection.recv()
                 return Computed(job.job, result, error)
@@ -212,9 +212,9 @@ def _start(warm_up: Callable[[], None] | None) -> tuple[SpawnProcess, Connection
 
 
 def _work(connection: Connection, warm_up: Callable[[], None] | None) -> None:
-    """Do jobs until the other end is closed (the target of a worker's process)."""
+    """Run jobs until the other end is closed: the main function of a worker process."""
     die_with_parent()
-    # Ctrl-C reaches the whole group; the process that has the pool ends it.
+    # Ctrl-C reaches the whole process group; the owner of the pool ends its workers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if warm_up is not None:
@@ -225,7 +225,7 @@ def _work(connection: Connection, warm_up: Callable[[], None] | None) -> None:
 
 
 def _do_next(connection: Connection) -> None:
-    """Do a job.
+    """Run one job.
 
     Raises:
         EOFError, OSError: the other end is closed.
@@ -241,7 +241,7 @@ def _do_next(connection: Connection) -> None:
 
 
 def _result(work: Callable[[float], Any], deadline_s: float) -> tuple[Any, str]:
-    # The clock of `time.monotonic` is one for all processes of a machine.
+    # All processes of a machine share the clock of `time.monotonic`.
     try:
         return in_time(work, deadline_s, time.monotonic), ""
     except TimeoutError as error:

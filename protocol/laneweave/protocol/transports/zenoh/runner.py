@@ -1,4 +1,4 @@
-"""Drives a core over Zenoh: the shell of every role."""
+"""Runner that drives a core over Zenoh in real time: the shell of every role."""
 
 from __future__ import annotations
 
@@ -44,12 +44,11 @@ def run_core(
 ) -> None:
     """Drive a core over Zenoh until it ends or the process gets SIGINT or SIGTERM.
 
-    To be called from the main thread. Computations run in a thread of their own, those that are
-    delegated in `pool`, which only a core that delegates needs. `observe` is told where the numbers
-    of node and core come from.
+    Call it from the main thread. `Compute` jobs run in a thread, `Delegate` jobs in `pool`, which
+    only a core that delegates needs. `observe` registers the metrics source of node and core.
 
     Raises:
-        BadInputError: the realm is malformed, or nobody has answered at the endpoint for
+        BadInputError: the realm is malformed, or no router has answered at the endpoint within
             `connect_timeout_s`.
     """
     keys = Keys(access.realm)
@@ -65,7 +64,7 @@ def run_core(
             inbox.put(Computed(job.job, None, "this process has no workers"))
 
     with stop_signals(lambda: inbox.put(Stopping())):
-        # Nothing else can be in there before: nobody is connected.
+        # Before the connection, the inbox can contain nothing but `Stopping`.
         transport = connect(access, inbox.put, lambda wait_s: any(inbox.take(wait_s)))
         if transport is None:
             return
@@ -107,9 +106,9 @@ def _hand_over(node: Node, item: Item) -> None:
 
 
 class _Worker:
-    """A thread that computes.
+    """Thread that computes.
 
-    Started when first needed, and a daemon: a process that is asked to end does not wait for it.
+    Started when first needed, and a daemon, so that the process can end without waiting for it.
     """
 
     def __init__(self, done: Callable[[Computed], None]) -> None:
@@ -118,7 +117,7 @@ class _Worker:
         self._jobs: queue.SimpleQueue[Compute] | None = None
 
     def order(self, job: Compute) -> None:
-        """Have a job computed after those that were ordered before it."""
+        """Queue a job."""
         if self._jobs is None:
             self._jobs = queue.SimpleQueue()
             threading.Thread(target=self._work, args=(self._jobs,), daemon=True).start()

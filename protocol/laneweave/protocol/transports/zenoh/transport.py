@@ -65,13 +65,13 @@ _QUALITY: dict[Quality, dict[str, Any]] = {
 
 
 MAX_QUESTIONS = 4096
-"""Open questions beyond which more are left to others."""
+"""Maximum number of open questions; more are declined."""
 TOO_LONG = bytes(MAX_BYTES + 1)
-"""Stands for each question that is too long: nobody looks at it."""
+"""Payload that replaces one that is too long, which is not read."""
 ROUTER_RUNTIME = "(rx: (worker_threads: 64))"
 """Zenoh's default are two threads that receive. Each connection that has run into its lease holds
 one of them while it is closed, for up to 10 s (the linger of its socket): with two of them gone,
-nobody's messages go on. So many processes may vanish with a host at one time."""
+no messages are forwarded. As many processes may vanish with a host at once."""
 _RUNTIME_VARIABLE = "ZENOH_RUNTIME"
 CLIENT_RUNTIME = (
     "(app: (worker_threads: 1), acc: (handover: app), tx: (handover: app), rx: (handover: app), "
@@ -80,7 +80,7 @@ CLIENT_RUNTIME = (
 """A single thread for all of Zenoh's task pools in a client. With one process per vehicle, passing
 each message between threads costs about a tenth of the time of two cores."""
 CONNECT_AGAIN_S = 0.5
-"""Between two attempts of a role that waits for its router."""
+"""Interval between attempts to connect."""
 
 
 def _open(settings: Iterable[Setting], runtime: str) -> zenoh.Session:
@@ -92,7 +92,7 @@ def _open(settings: Iterable[Setting], runtime: str) -> zenoh.Session:
             first session of a process only.
 
     Raises:
-        zenoh.ZError: nobody answers, or it cannot listen.
+        zenoh.ZError: no router answers, or it cannot listen.
     """
     config = zenoh.Config()
     for path, value in settings:
@@ -172,7 +172,7 @@ class ZenohTransport:
             self._tokens[key] = self._session.liveliness().declare_token(key)
 
     def withdraw(self, key: str) -> None:
-        """Take a liveliness token back."""
+        """Withdraw a liveliness token."""
         token = self._tokens.pop(key, None)
         if token is not None:
             token.undeclare()
@@ -202,7 +202,7 @@ class ZenohTransport:
             query.drop()  # type: ignore[no-untyped-call]
 
     def decline(self, token: int) -> None:
-        """Leave a query to the others who serve its key."""
+        """Leave a query to the other servers of its key."""
         query = self._take_question(token)
         if query is not None:
             query.drop()  # type: ignore[no-untyped-call]
@@ -214,14 +214,14 @@ class ZenohTransport:
     def ask(
         self, key: str, payload: bytes, timeout_s: float, encoding: str = ""
     ) -> Future[Answer | None]:
-        """Ask those who serve a key.
+        """Ask the servers of a key.
 
         Returns:
-            The first answer, whoever gives it. None: nobody serves the key, or all who do have left
-            the question to others, died, or were cut off.
+            The first answer. None: the key has no server, or each has declined, died or been cut
+            off.
 
         Raises:
-            TimeoutError: as the future's result, when nobody has answered in time.
+            TimeoutError: as the future's result, if no server has answered in time.
         """
         first: Future[Answer | None] = Future()
         first.set_running_or_notify_cancel()
@@ -229,8 +229,8 @@ class ZenohTransport:
         def take(reply: zenoh.Reply) -> None:
             _settle(first, _answer_of(reply))
 
-        # Without consolidation each reply is handed over as it comes: one server that hangs must
-        # not hold back the answers of the others.
+        # Without consolidation each reply is delivered as it comes: a server that hangs must not
+        # delay the answers of the others.
         try:
             self._session.get(
                 key,
@@ -315,13 +315,13 @@ def connect(
 
 
 def connect_patiently(access: Access, deliver: Deliver) -> ZenohTransport:
-    """Connect as `connect` does, for who is not asked to end meanwhile.
+    """Connect as `connect` does, without a way to stop.
 
     Raises:
         BadInputError: as `connect`.
     """
     transport = connect(access, deliver, time.sleep)
-    assert transport is not None  # noqa: S101 (nobody asks `sleep` to end)
+    assert transport is not None  # noqa: S101 (`sleep` returns None)
     return transport
 
 
@@ -339,9 +339,9 @@ def run_router(
         listen: endpoints where it listens. A socket file that a killed router left is replaced.
         lease_s: after this time of silence the others give the router up.
         ready: called when it listens.
-        told_by: the field that says where it listens, for errors.
-        guard: who may do what; None: anybody anything.
-        observe: is told where its numbers come from, when it listens.
+        told_by: name of the field with the endpoints, for errors.
+        guard: rights and credentials; None: all clients may do everything.
+        observe: registers the metrics source, once it listens.
 
     Raises:
         BadInputError: it cannot listen at an endpoint, or its credentials are not in order.
