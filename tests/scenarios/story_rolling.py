@@ -25,7 +25,7 @@ from collections.abc import Callable, Iterator
 from attrs import define, evolve, field
 
 from laneweave.coordinator.rolling.ballot import Handover, Phase
-from laneweave.launch.fault_search.cell_ownership import Estates
+from laneweave.launch.fault_search.cell_ownership import CellOwnership
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import Ballot, Command, Heartbeat, Name, VehicleState
 from scenarios.story_leaders import RESEND_S, Mail, post
@@ -99,7 +99,7 @@ class RollingPlayer(Player):
         self.streams: dict[str, StreamLeader] = {}
         self._late: dict[str, Command] = {}
         self._wrong: list[str] = []
-        self._estates = Estates(self._tell)
+        self._estates = CellOwnership(self._tell)
         mine: tuple[tuple[str, Callable[..., Lines | None]], ...] = (
             (r"vehicle (\w+) at (\S+)(?: from (\S+))? wants (\d+)(?:, owns (.+))?", self._enter),
             (r"stream (\w+) term (\d+)", self._stream),

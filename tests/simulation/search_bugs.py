@@ -20,9 +20,9 @@ from attrs import frozen
 if __name__ == "__main__":  # run as a program: as `pythonpath` in pyproject.toml
     sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from laneweave.launch.fault_search.fault_run import FaultRun
 from laneweave.launch.fault_search.profiles import PROFILES
 from laneweave.launch.fault_search.search import quiet_logs
-from laneweave.launch.fault_search.simulated_run import World
 from support.planted_bugs import BUGS, PlantedBug
 
 SEEDS = 500
@@ -50,7 +50,7 @@ def first_catch(
         RuntimeError: the same run fails without the bug, too, so it shows nothing about the bug.
     """
     catch = _first_failure(bug, seeds, profiles)
-    if catch is not None and World(catch.seed, PROFILES[catch.profile]).run().violations:
+    if catch is not None and FaultRun(catch.seed, PROFILES[catch.profile]).run().violations:
         raise RuntimeError(f"{catch.profile} {catch.seed} fails without {bug.name}, too")
     return catch
 
@@ -60,7 +60,7 @@ def _first_failure(bug: PlantedBug, seeds: Iterable[int], profiles: Sequence[str
         bug.plant(patch)
         for profile in profiles:
             for seed in seeds:
-                world = World(seed, PROFILES[profile], bug.vehicle_rules, bug.leader_rules)
+                world = FaultRun(seed, PROFILES[profile], bug.vehicle_rules, bug.leader_rules)
                 violations = world.run().violations
                 if violations:
                     kinds = tuple(dict.fromkeys(violation.kind for violation in violations))

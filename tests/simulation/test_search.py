@@ -16,10 +16,10 @@ from collections.abc import Iterator
 
 import pytest
 
+from laneweave.launch.fault_search.fault_run import FaultRun, SeedResult, Totals
 from laneweave.launch.fault_search.profiles import PROFILES
 from laneweave.launch.fault_search.search import replay_command
 from laneweave.launch.fault_search.setup import SLOT_S
-from laneweave.launch.fault_search.simulated_run import Outcome, Totals, World
 
 SEEDS = 300
 BATCH = 20
@@ -39,10 +39,10 @@ def search(profile: str, seeds: range) -> Totals:
     return sum((outcome.totals for outcome in outcomes(profile, seeds)), Totals())
 
 
-def outcomes(profile: str, seeds: range, *, digest: bool = False) -> Iterator[Outcome]:
+def outcomes(profile: str, seeds: range, *, digest: bool = False) -> Iterator[SeedResult]:
     """Run seeds, in each of which no rule must be broken."""
     for seed in seeds:
-        outcome = World(seed, PROFILES[profile], digest=digest).run()
+        outcome = FaultRun(seed, PROFILES[profile], digest=digest).run()
         told = "\n".join(map(str, outcome.violations))
         assert not told, f"{told}\n{replay_command(seed, PROFILES[profile])}"
         yield outcome
@@ -110,7 +110,7 @@ def test_every_kind_of_fault_happens() -> None:
 
 @pytest.mark.parametrize("seed", range(10))
 def test_without_faults_the_last_plan_is_not_late(seed: int) -> None:
-    outcome = World(seed, PROFILES["calm"]).run()
+    outcome = FaultRun(seed, PROFILES["calm"]).run()
     assert not outcome.violations
     # The last wishes come at most so long before the end of the phase; then one census, the margin
     # of a plan, and the steps: of the plan under way one, of the last one at most eight.

@@ -53,11 +53,17 @@ DEMAND = ("--volume", "1300", "--duration", "14", "--seed", "1")
 
 @frozen
 class Ended:
-    """How a process ended."""
+    """Exit status and output of a process."""
 
     status: int
     out: str
     err: str
+
+    @property
+    def complaints(self) -> list[str]:
+        """Lines of stderr without warnings of the log or of Zenoh: a slow machine causes some."""
+        lines = self.err.splitlines()
+        return [line for line in lines if "[warning" not in line and " WARN " not in line]
 
 
 @define

@@ -103,7 +103,8 @@ workers = 1
         for name in tuple(self.coordinators):
             self.stop(name)
         router.terminate()
-        assert self.lab.finish(router, END_S) == Ended(0, "", "")
+        ended = self.lab.finish(router, END_S)
+        assert (ended.status, ended.out, ended.complaints) == (0, "", []), ended
         self.lab.check_nothing_left()
 
     def _watcher(self) -> ZenohTransport:

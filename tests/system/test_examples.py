@@ -61,6 +61,6 @@ def test_a_plan_waits_for_router_and_coordinator(lab: Lab) -> None:
 
     ended = lab.finish(asked)
 
-    assert (ended.status, ended.err) == (0, "")
+    assert (ended.status, ended.complaints) == (0, []), ended
     assert json.loads(ended.out)["status"] == "optimal"
     stop(lab, coordinator, router)

@@ -357,7 +357,7 @@ def test_a_role_says_in_one_line_what_is_wrong_with_its_certificate(
         "LANEWEAVE_PRIVATE_KEY": (ours / f"{name}.key").read_text(encoding="ascii"),
     }
     ended = lab.run("ping", "--config", config, within_s=END_S, **good)
-    assert (ended.status, ended.out, ended.err) == (0, "", "")
+    assert (ended.status, ended.out, ended.complaints) == (0, "", []), ended
 
 
 # --- a whole deployment ---------------------------------------------------------------------------
@@ -388,11 +388,11 @@ def test_a_secured_deployment_runs_to_its_end(lab: Lab) -> None:
         lab.wait_until(lambda: ask().status == 0)
         assert json.loads(ask().out)["cost"] == 7
         looked = lab.finish(lab.start("status", "--config", config, "--json"), END_S)
-        assert (looked.status, looked.err) == (0, "")
+        assert (looked.status, looked.complaints) == (0, []), looked
         assert json.loads(looked.out)["leader"] == "c1"
         bridge = lab.start("bridge", "--config", config, "--pace", "20", "--out", "out")
         ended = lab.finish(bridge, RUN_S)
-    assert (ended.status, ended.err) == (0, "")
+    assert (ended.status, ended.complaints) == (0, []), ended
     for process in (*roles, router):
         process.send_signal(signal.SIGTERM)
         assert lab.finish(process, END_S).status == 0

@@ -1,7 +1,7 @@
-"""Bodies for the checker: rectangles in metres that move in straight lines; own geometry.
+"""The checker's own geometry of bodies: rectangles in metres that move in straight lines.
 
-Positions are those on the road less the way of the lattice, so that a vehicle which holds stands
-still: x = column * pitch, y = (lane + 1/2) * lane width.
+Positions are relative to the moving lattice, so that a vehicle which holds its cell stands still:
+x = column * pitch, y = (lane + 1/2) * lane width.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ Cells = frozenset[tuple[int, int]]
 
 DONE_ALONG_M = 1.0
 DONE_ACROSS_M = 0.5
-"""A motion is over for the checker when the body is this close to its end: sooner than for those
-who drive it, whose tolerances are half of it."""
+"""The checker considers a motion ended at this distance from its end, twice the tolerance of the
+agents."""
 
 
 @frozen
@@ -30,14 +30,14 @@ class Geometry:
     width_m: float
 
     def point(self, cell: tuple[float, float]) -> Point:
-        """Return where a body is whose place in the lattice is (column, lane)."""
+        """Return the position of (column, lane)."""
         return cell[0] * self.pitch_m, (cell[1] + 0.5) * self.lane_width_m
 
     def swept(self, origin: Point, target: Point) -> Cells:
-        """Return all cells of the bounding box of the way from one point to another one."""
+        """Return all cells of the bounding box of a path from one point to another."""
         low = [min(pair) for pair in zip(origin, target, strict=True)]
         high = [max(pair) for pair in zip(origin, target, strict=True)]
-        # Who has nearly arrived is in that cell, and in no other one.
+        # A body that has nearly arrived occupies only its target cell.
         columns = range(
             math.floor((low[0] + DONE_ALONG_M) / self.pitch_m),
             math.ceil((high[0] - DONE_ALONG_M) / self.pitch_m) + 1,
@@ -51,25 +51,25 @@ class Geometry:
 
 @define(eq=False)
 class Body:
-    """One vehicle's body, and the motion that it is in."""
+    """One vehicle's body and its current motion."""
 
     geometry: Geometry
     origin: Point
     target: Point
     begin_s: float
     end_s: float
-    """When it reaches the target; equal to `begin_s` when it only ever stood there."""
+    """Arrival time at the target; `begin_s` if the body has never moved."""
     cells: Cells
-    """What it occupies."""
+    """Occupied cells."""
 
     @classmethod
     def standing(cls, geometry: Geometry, cell: tuple[int, int], t_s: float) -> Body:
-        """Return a body that holds a cell."""
+        """Return a body at rest in a cell."""
         point = geometry.point(cell)
         return cls(geometry, point, point, t_s, t_s, frozenset({cell}))
 
     def at(self, t_s: float) -> Point:
-        """Return where it is at a time."""
+        """Return the position at a time."""
         if t_s >= self.end_s:
             return self.target
         share = max(0.0, (t_s - self.begin_s) / (self.end_s - self.begin_s))
@@ -79,38 +79,36 @@ class Body:
         )
 
     def go(self, cell: tuple[int, int], t_s: float, duration_s: float) -> None:
-        """Begin a motion from where it is."""
+        """Begin a motion from the current position."""
         self.origin, self.target = self.at(t_s), self.geometry.point(cell)
         self.begin_s, self.end_s = t_s, t_s + duration_s
         self.cells = self.geometry.swept(self.origin, self.target)
 
     def rest(self, cell: tuple[int, int]) -> None:
-        """Occupy no more than the cell in which it has (nearly) arrived."""
+        """Occupy only the cell in which the body has (nearly) arrived."""
         self.cells = frozenset({cell})
 
     @property
     def done_s(self) -> float:
-        """When it is so close to the target that the motion is over."""
+        """Time at which the body is close enough to the target to end the motion."""
         shares = [
-            tolerance_m / abs(way_m)
-            for tolerance_m, way_m in (
+            tolerance_m / abs(path_m)
+            for tolerance_m, path_m in (
                 (DONE_ALONG_M, self.target[0] - self.origin[0]),
                 (DONE_ACROSS_M, self.target[1] - self.origin[1]),
             )
-            if way_m
+            if path_m
         ]
         share = min(1.0, *shares) if shares else 1.0
         return self.end_s - share * (self.end_s - self.begin_s)
 
 
 def overlap_between(mine: Body, other: Body, from_s: float, to_s: float) -> float | None:
-    """Return when two bodies first overlap in a time in which neither begins a motion.
+    """Return the first time at which two bodies overlap, or None.
 
-    A motion may end in it. Exact: of two rectangles that move in straight lines, the time in which
-    they overlap along the road and that in which they overlap across it are intervals.
-
-    Returns:
-        A time in s; None: they do not.
+    Neither body may begin a motion between `from_s` and `to_s`; motions may end. The result is
+    exact: two rectangles that move in straight lines overlap along the road during one interval,
+    and across the road during another.
     """
     ends = sorted({end for end in (mine.end_s, other.end_s) if from_s < end < to_s})
     starts = [from_s, *ends]

@@ -1,9 +1,10 @@
-"""Who owns which cells in a simulated run of the rolling operation; part of the checker.
+"""Cell ownership in a simulated run of the rolling operation; part of the checker.
 
-It looks into the motion controllers. Whose newest deed is not open may not know what it owns; the
-checker does: what the deed gives if anybody in its roster has taken possession, else what was
-before. So for the checker a cell has one owner at most, always. (An agent may have opened its gate
-and died before its controller knew: nobody has moved then, and nothing has changed hands.)
+It reads the motion controllers. A vehicle whose newest transfer is pending does not know what it
+owns, but the checker does: the result of the transfer if any vehicle of its roster has taken
+possession, otherwise the cells before it. Therefore the checker always expects at most one owner
+per cell. (An agent that opens its gate and ends before its controller knows of it has not moved,
+and no cell has been transferred.)
 """
 
 from __future__ import annotations
@@ -16,104 +17,105 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import Ballot, Deed
 
 Cells = frozenset[Cell]
-Tell = Callable[[str, float, list[str], str], None]
-"""Reports a violation: kind, virtual time, vehicles, text."""
+Report = Callable[[str, float, list[str], str], None]
+"""Receives a violation: kind, virtual time, vehicles, text."""
 
 
 @frozen
 class Holding:
-    """What a motion controller says that its vehicle owns."""
+    """Owned cells and newest transfer of one vehicle, as its motion controller shows them."""
 
-    estate: Cells
-    deed: Deed | None
+    cells: Cells
+    transfer: Deed | None
 
-    def certain(self, opened: set[Ballot]) -> Cells:
-        """Return what the vehicle owns, for somebody who knows who has taken possession."""
-        deed = self.deed
-        if deed is None or deed.open:
-            return self.estate
-        return frozenset(deed.after) if deed.ballot in opened else self.estate
+    def owned(self, opened: set[Ballot]) -> Cells:
+        """Return the owned cells, given the ballots under which possession has been taken."""
+        transfer = self.transfer
+        if transfer is None or transfer.open or transfer.ballot not in opened:
+            return self.cells
+        return frozenset(transfer.after)
 
 
-class Estates:
-    """All holdings of a run; `tell` is told of what must not be."""
+class CellOwnership:
+    """Checks the ownership of all cells of a run."""
 
-    def __init__(self, tell: Tell) -> None:
-        """Begin without vehicles."""
-        self._tell = tell
+    def __init__(self, report: Report) -> None:
+        """Start without vehicles; `report` receives the violations."""
+        self._report = report
         self._holdings: dict[str, Holding] = {}
         self._owner: dict[Cell, str] = {}
         self._owned: dict[str, Cells] = {}
-        """What each vehicle owns; the inverse of `_owner`."""
+        """Owned cells of each vehicle; the inverse of `_owner`."""
         self._opened: set[Ballot] = set()
-        """Ballots of which somebody has taken possession."""
+        """Ballots under which a vehicle has taken possession."""
         self._bodies: dict[str, Cells] = {}
-        """Cells that each body occupies."""
+        """Cells occupied by each body."""
 
     def show(
         self,
         t_s: float,
         vehicle: str,
-        estate: tuple[Cell, ...],
-        deed: Deed | None,
+        cells: tuple[Cell, ...],
+        transfer: Deed | None,
         body: Cells | None = None,
     ) -> None:
-        """A motion controller shows what its vehicle owns.
+        """Update what a motion controller shows.
 
         Args:
             t_s: virtual time.
-            vehicle: which.
-            estate: its cells.
-            deed: its newest deed.
-            body: the cells that its body occupies from now on, where that changes, too.
+            vehicle: name of the vehicle.
+            cells: its owned cells.
+            transfer: its newest transfer.
+            body: cells that its body occupies from now on; None: unchanged.
         """
         known = self._holdings.get(vehicle)
+        holding = Holding(frozenset(cells), transfer)
         if body is not None:
             self._bodies[vehicle] = body
-        elif known is not None and known.deed == deed and known.estate == frozenset(estate):
+        elif known == holding:
             return
-        self._holdings[vehicle] = Holding(frozenset(estate), deed)
-        concerned = [vehicle]
-        if deed is not None and deed.open and deed.ballot not in self._opened:
-            self._opened.add(deed.ballot)
-            concerned += [
+        self._holdings[vehicle] = holding
+        changed = [vehicle]
+        if transfer is not None and transfer.open and transfer.ballot not in self._opened:
+            self._opened.add(transfer.ballot)
+            changed += [
                 name
-                for name, holding in self._holdings.items()
-                if name != vehicle and holding.deed and holding.deed.ballot == deed.ballot
+                for name, other in self._holdings.items()
+                if name != vehicle and other.transfer and other.transfer.ballot == transfer.ballot
             ]
-        self._settle(t_s, concerned)
+        self._update_owners(t_s, changed)
 
     def occupy(self, t_s: float, vehicle: str, cells: Cells) -> None:
-        """A body occupies other cells than before."""
+        """Update the cells that a body occupies."""
         self._bodies[vehicle] = cells
         self._check_body(t_s, vehicle)
 
     def move(self, t_s: float, vehicle: str, ballot: Ballot) -> None:
-        """A body begins a motion of a plan."""
+        """Check the start of a motion under a ballot."""
         if ballot not in self._opened:
-            self._tell("gate", t_s, [vehicle], "moves, and nobody has taken possession")
+            self._report("gate", t_s, [vehicle], "moves, but no vehicle has taken possession")
 
     def leave(self, vehicle: str) -> None:
-        """A vehicle left the road, and its cells are nobody's."""
+        """Remove a vehicle that has left the road, and free its cells."""
         self._holdings.pop(vehicle, None)
         self._bodies.pop(vehicle, None)
+        self._free(vehicle)
+
+    def _free(self, vehicle: str) -> None:
         for cell in self._owned.pop(vehicle, frozenset()):
             if self._owner.get(cell) == vehicle:
                 del self._owner[cell]
 
-    def _settle(self, t_s: float, vehicles: list[str]) -> None:
-        """Look what some vehicles own now: nobody else may own it."""
+    def _update_owners(self, t_s: float, vehicles: list[str]) -> None:
         for vehicle in vehicles:
-            for cell in self._owned.pop(vehicle, frozenset()):
-                if self._owner.get(cell) == vehicle:
-                    del self._owner[cell]
+            self._free(vehicle)
         for vehicle in vehicles:
-            owned = self._holdings[vehicle].certain(self._opened)
+            owned = self._holdings[vehicle].owned(self._opened)
             self._owned[vehicle] = owned
             for cell in sorted(owned):
                 other = self._owner.setdefault(cell, vehicle)
                 if other != vehicle:
-                    self._tell("owner", t_s, [vehicle, other], f"both own {cell}")
+                    self._report("owner", t_s, [vehicle, other], f"both own {cell}")
             self._check_body(t_s, vehicle)
 
     def _check_body(self, t_s: float, vehicle: str) -> None:
@@ -121,7 +123,7 @@ class Estates:
         holding = self._holdings.get(vehicle)
         if body is None or holding is None:
             return
-        foreign = body - (holding.estate & self._owned[vehicle])
+        foreign = body - (holding.cells & self._owned[vehicle])
         if foreign:
-            text = f"its body is in {sorted(foreign)}, and it does not own that"
-            self._tell("trespass", t_s, [vehicle], text)
+            text = f"its body is in {sorted(foreign)}, which it does not own"
+            self._report("trespass", t_s, [vehicle], text)

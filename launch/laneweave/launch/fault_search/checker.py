@@ -1,20 +1,20 @@
-"""The checker: what must be true of every run, whatever happens to the network.
+"""The checker: properties that hold in every run, whatever happens to the network.
 
-It sees the bodies on the road and what every process says when it says it. It knows nothing of the
+It observes the bodies on the road and every message when it is sent. It does not know the state
 machines inside the processes and shares no code with them.
 
-| kind | what must not happen |
+| kind | violation |
 |---|---|
-| `overlap` | two bodies, as rectangles, share a place at any time |
+| `overlap` | two bodies, as rectangles, overlap |
 | `cell` | two vehicles occupy one cell: both ends of a motion and its corners, or the cell held |
-| `motion` | a body begins a motion that is not its next move of the plan that its agent shows |
-| `interleaved` | of two plans with a common vehicle, both have motions before one has ended |
-| `owner` | a cell has two owners (rolling operation; `estates` tells who owns what) |
+| `motion` | a body begins a motion that is not the next move of the plan that its agent shows |
+| `interleaved` | two plans with a common vehicle have motions at the same time |
+| `owner` | a cell has two owners (rolling operation; see `cell_ownership`) |
 | `trespass` | a body is in a cell that its vehicle does not own (likewise) |
-| `gate` | a body begins a motion of a plan by which nobody has taken possession (likewise) |
-| `monotone` | somebody takes back what it has said: promise, acceptance, progress, joined, charge |
+| `gate` | a body begins a motion of a plan under which no vehicle has taken possession (likewise) |
+| `monotone` | a process revokes a promise, an acceptance, progress, joined formations or charge |
 | `two-plans` | two different plans are sent under one ballot |
-| `stuck` | a vehicle is not on its lane long after everything was whole again |
+| `stuck` | a vehicle is not on its preferred lane long after all faults have ended |
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from typing import Any
 from attrs import define, frozen
 
 from laneweave.launch.fault_search.bodies import Body, Geometry, overlap_between
-from laneweave.launch.fault_search.cell_ownership import Estates
+from laneweave.launch.fault_search.cell_ownership import CellOwnership
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import Ballot, Deed, Name, Plan, Sense, VehicleState
 
-MOST_VIOLATIONS = 20
-"""After so many a run has been told enough about."""
+MAX_VIOLATIONS = 20
+"""Number of violations recorded per run."""
 
 
 @frozen
 class Violation:
-    """Something that must not happen happened."""
+    """A violated property."""
 
     kind: str
     t_s: float
@@ -49,8 +49,8 @@ class Violation:
 
 
 @define
-class _Shown:
-    """What one process has shown of one vehicle, at its most."""
+class _Published:
+    """The newest state that one process has published of one vehicle."""
 
     promised: Ballot | None = None
     accepted: bool = False
@@ -70,7 +70,7 @@ class _Run:
 
 
 class Checker:
-    """Watches one run; `violations` says what it saw."""
+    """Checks one run and collects its violations."""
 
     def __init__(
         self,
@@ -79,33 +79,33 @@ class Checker:
         *,
         rolling: bool = False,
     ) -> None:
-        """Watch an empty road.
+        """Start with an empty road.
 
         Args:
             geometry: sizes of cells and bodies.
-            note: is told of what happens on the road.
+            note: callback for events on the road.
             rolling: whether vehicles own cells.
         """
-        self._estates = Estates(self._tell) if rolling else None
+        self._ownership = CellOwnership(self._report) if rolling else None
         self.violations: list[Violation] = []
         self.motions = 0
         self.plans: dict[Ballot, Plan] = {}
-        """Every plan that was sent."""
+        """Every plan sent so far."""
         self._geometry = geometry
         self._note = note
         self._bodies: dict[str, Body] = {}
         self._moving: dict[str, tuple[float, Cell, Ballot | None]] = {}
-        """For each body in motion when it is over, where, and of which plan it is."""
+        """End time, target cell and ballot of the motion of each moving body."""
         self._checked_s = 0.0
-        self._shown: dict[str, dict[int, _Shown]] = {}
-        """For each vehicle what each of its processes has shown."""
+        self._published: dict[str, dict[int, _Published]] = {}
+        """Newest states of each vehicle, by the incarnation of the process."""
         self._begun: dict[tuple[str, int, Cell], Ballot | None] = {}
-        """Ballots under which (vehicle, process) has shown that it moves to a cell."""
+        """Ballot under which (vehicle, process, cell) has been published as a move."""
         self._done: dict[tuple[Ballot, str], int] = {}
-        """How many motions of a plan each vehicle has begun."""
+        """Number of motions of a plan that each vehicle has begun."""
         self._runs: dict[Ballot, _Run] = {}
         self._charge: dict[str, tuple[int, frozenset[int]]] = {}
-        """Attendant and joined formations that each motion controller has shown."""
+        """Newest attendant and joined formations of each motion controller."""
         self._listeners: dict[type, Callable[[float, Any], None]] = {
             VehicleState: self._on_state,
             Plan: self._on_plan,
@@ -115,61 +115,63 @@ class Checker:
     # --- the road -----------------------------------------------------------------------------
 
     def enter(self, t_s: float, vehicle: str, cell: Cell) -> None:
-        """A vehicle entered the road."""
-        self._tell_of(t_s, f"{vehicle} enters in {cell}")
+        """Record that a vehicle enters the road."""
+        self._log(t_s, f"{vehicle} enters in {cell}")
         self.advance(t_s)
         self._bodies[vehicle] = Body.standing(self._geometry, cell, t_s)
         self._check_cells(t_s, vehicle)
 
     def own(self, t_s: float, vehicle: str, estate: tuple[Cell, ...], deed: Deed | None) -> None:
-        """A motion controller shows what its vehicle owns."""
-        if self._estates is not None:
-            self._estates.show(t_s, vehicle, estate, deed)
+        """Record what a motion controller shows as owned."""
+        if self._ownership is not None:
+            self._ownership.show(t_s, vehicle, estate, deed)
 
     def leave(self, t_s: float, vehicle: str) -> None:
-        """A vehicle left the road."""
-        self._tell_of(t_s, f"{vehicle} leaves the road")
+        """Record that a vehicle leaves the road."""
+        self._log(t_s, f"{vehicle} leaves the road")
         self.advance(t_s)
         self._end_motion(vehicle)
         del self._bodies[vehicle]
-        if self._estates is not None:
-            self._estates.leave(vehicle)
+        if self._ownership is not None:
+            self._ownership.leave(vehicle)
 
     def begin(
-        self, t_s: float, vehicle: str, incarnation: int, way: tuple[Cell, Cell], lasts_s: float
+        self, t_s: float, vehicle: str, incarnation: int, move: tuple[Cell, Cell], lasts_s: float
     ) -> None:
-        """A body began to move.
+        """Record that a body begins to move.
 
         Args:
             t_s: virtual time.
-            vehicle: which.
-            incarnation: of the process that commanded it.
-            way: the cell in which the vehicle held, and that in which it will.
-            lasts_s: how long it takes.
+            vehicle: name of the vehicle.
+            incarnation: incarnation of the process that commands the motion.
+            move: the cell that the vehicle held, and the cell that it will hold.
+            lasts_s: duration of the motion.
         """
-        self._tell_of(t_s, f"{vehicle} moves from {way[0]} to {way[1]} in {lasts_s:.2f} s")
+        self._log(t_s, f"{vehicle} moves from {move[0]} to {move[1]} in {lasts_s:.2f} s")
         self.advance(t_s)
         self.motions += 1
         body = self._bodies[vehicle]
         if vehicle in self._moving:
-            self._tell("motion", t_s, [vehicle], f"turned off to {way[1]} before it had arrived")
+            self._report("motion", t_s, [vehicle], f"turned off to {move[1]} before it had arrived")
             self._end_motion(vehicle)
-        body.go(way[1], t_s, lasts_s)
+        body.go(move[1], t_s, lasts_s)
         self._check_cells(t_s, vehicle)
-        ballot = self._begun.get((vehicle, incarnation, way[1]))
-        self._moving[vehicle] = body.done_s, way[1], ballot
+        ballot = self._begun.get((vehicle, incarnation, move[1]))
+        self._moving[vehicle] = body.done_s, move[1], ballot
         if ballot is None or ballot not in self.plans:
-            self._tell("motion", t_s, [vehicle], f"moves from {way[0]} to {way[1]} without a plan")
+            self._report(
+                "motion", t_s, [vehicle], f"moves from {move[0]} to {move[1]} without a plan"
+            )
             return
-        self._check_order(t_s, vehicle, ballot, way)
-        if self._estates is None:
+        self._check_order(t_s, vehicle, ballot, move)
+        if self._ownership is None:
             self._check_serial(t_s, vehicle, ballot)
         else:
-            self._estates.move(t_s, vehicle, ballot)
+            self._ownership.move(t_s, vehicle, ballot)
             self._check_members(t_s, vehicle, ballot)
 
     def advance(self, t_s: float) -> None:
-        """Look at all that moved since the last time: no two bodies overlapped."""
+        """Check for overlaps of bodies since the last call."""
         from_s = self._checked_s
         self._checked_s = t_s
         movers = [name for name, body in self._bodies.items() if body.end_s > from_s]
@@ -182,41 +184,41 @@ class Checker:
                     continue
                 at_s = overlap_between(body, its, from_s, t_s)
                 if at_s is not None:
-                    self._tell("overlap", at_s, [vehicle, other], "their bodies overlap")
+                    self._report("overlap", at_s, [vehicle, other], "their bodies overlap")
         for vehicle in [name for name, (end_s, _, _) in self._moving.items() if end_s <= t_s]:
             self._end_motion(vehicle)
 
     def stuck(self, t_s: float, vehicle: str, text: str) -> None:
-        """A vehicle has not arrived, though nothing was in its way for long."""
-        self._tell("stuck", t_s, [vehicle], text)
+        """Record that a vehicle has not arrived though there have been no faults for long."""
+        self._report("stuck", t_s, [vehicle], text)
 
     def _end_motion(self, vehicle: str) -> None:
         if vehicle in self._moving:
             _, cell, ballot = self._moving.pop(vehicle)
             self._bodies[vehicle].rest(cell)
-            if self._estates is not None:
-                self._estates.occupy(self._checked_s, vehicle, self._bodies[vehicle].cells)
+            if self._ownership is not None:
+                self._ownership.occupy(self._checked_s, vehicle, self._bodies[vehicle].cells)
             if ballot in self._runs:
                 self._runs[ballot].under_way -= 1
 
     def _check_cells(self, t_s: float, vehicle: str) -> None:
         mine = self._bodies[vehicle].cells
-        if self._estates is not None:
-            self._estates.occupy(t_s, vehicle, mine)
+        if self._ownership is not None:
+            self._ownership.occupy(t_s, vehicle, mine)
         for other, body in self._bodies.items():
             if other != vehicle and not mine.isdisjoint(body.cells):
                 shared = sorted(mine & body.cells)
-                self._tell("cell", t_s, [vehicle, other], f"both occupy {shared}")
+                self._report("cell", t_s, [vehicle, other], f"both occupy {shared}")
 
     def _check_order(
-        self, t_s: float, vehicle: str, ballot: Ballot, way: tuple[Cell, Cell]
+        self, t_s: float, vehicle: str, ballot: Ballot, move: tuple[Cell, Cell]
     ) -> None:
         index = self._done.get((ballot, vehicle), 0)
         self._done[ballot, vehicle] = index + 1
         moves = self.plans[ballot].moves.get(Name(vehicle), ())
-        if index >= len(moves) or moves[index][1:] != way:
-            text = f"{way[0]} to {way[1]} is not move {index} of its plan {_short(ballot)}"
-            self._tell("motion", t_s, [vehicle], text)
+        if index >= len(moves) or moves[index][1:] != move:
+            text = f"{move[0]} to {move[1]} is not move {index} of its plan {short(ballot)}"
+            self._report("motion", t_s, [vehicle], text)
 
     def _check_serial(self, t_s: float, vehicle: str, ballot: Ballot) -> None:
         run = self._runs.get(ballot)
@@ -226,22 +228,22 @@ class Checker:
             if its is run or its.roster.isdisjoint(run.roster):
                 continue
             if its.under_way or its.first_s > run.first_s:
-                text = f"a motion of {_short(ballot)} amid those of {_short(other)}"
-                self._tell("interleaved", t_s, [vehicle], text)
+                text = f"a motion of {short(ballot)} amid those of {short(other)}"
+                self._report("interleaved", t_s, [vehicle], text)
         run.under_way += 1
 
     def _check_members(self, t_s: float, vehicle: str, ballot: Ballot) -> None:
-        """Rosters differ from plan to plan: look at those whom both plans concern."""
+        """Check the motions of the other vehicles in the roster of a plan (rolling operation)."""
         for other in self.plans[ballot].roster:
             _, _, its = self._moving.get(other, (0.0, (0, 0), ballot))
             if its is not None and its < ballot:
-                text = f"a motion of {_short(ballot)}, and {other} is in one of {_short(its)}"
-                self._tell("interleaved", t_s, [vehicle, other], text)
+                text = f"a motion of {short(ballot)}, and {other} is in one of {short(its)}"
+                self._report("interleaved", t_s, [vehicle, other], text)
 
     # --- the network --------------------------------------------------------------------------
 
     def sent(self, t_s: float, message: object) -> None:
-        """A process says something."""
+        """Check a message when it is sent."""
         listener = self._listeners.get(type(message))
         if listener is not None:
             listener(t_s, message)
@@ -249,70 +251,71 @@ class Checker:
     def _on_plan(self, t_s: float, plan: Plan) -> None:
         known = self.plans.setdefault(plan.ballot, plan)
         if known is not plan and known != plan:
-            self._tell("two-plans", t_s, plan.roster, f"under ballot {_short(plan.ballot)}")
+            self._report("two-plans", t_s, plan.roster, f"under ballot {short(plan.ballot)}")
 
     def _on_sense(self, t_s: float, sense: Sense) -> None:
         attendant, joined = self._charge.get(sense.vehicle, (0, frozenset()))
         if sense.attendant < attendant:
             text = f"{sense.attendant} is in charge after {attendant}"
-            self._tell("monotone", t_s, [sense.vehicle], text)
+            self._report("monotone", t_s, [sense.vehicle], text)
         if not joined.issubset(sense.joined):
             text = f"its controller has joined {sense.joined} after {sorted(joined)}"
-            self._tell("monotone", t_s, [sense.vehicle], text)
+            self._report("monotone", t_s, [sense.vehicle], text)
         if sense.attendant != attendant or len(joined) != len(sense.joined):
             self._charge[sense.vehicle] = sense.attendant, frozenset(sense.joined)
 
     def _on_state(self, t_s: float, state: VehicleState) -> None:
-        processes = self._shown.setdefault(state.vehicle, {})
-        shown = processes.get(state.incarnation)
-        if shown is None:
-            shown = processes[state.incarnation] = _Shown()
-            # What earlier processes had joined is joined for this one.
-            earlier = [
-                its.joined for number, its in processes.items() if number < state.incarnation
+        processes = self._published.setdefault(state.vehicle, {})
+        published = processes.get(state.incarnation)
+        if published is None:
+            published = processes[state.incarnation] = _Published()
+            # A new process inherits the joined formations of earlier ones.
+            inherited = [
+                one.joined for number, one in processes.items() if number < state.incarnation
             ]
-            shown.joined = frozenset().union(*earlier)
-        for text in _taken_back(shown, state):
-            self._tell("monotone", t_s, [state.vehicle], text)
-        if state.moving and shown.hold_cell not in (None, state.hold_cell):
+            published.joined = frozenset().union(*inherited)
+        for text in _revoked(published, state):
+            self._report("monotone", t_s, [state.vehicle], text)
+        if state.moving and published.hold_cell not in (None, state.hold_cell):
             key = (state.vehicle, state.incarnation, state.hold_cell)
             self._begun[key] = state.promised if state.accepted else None
-        if state.promised != shown.promised:
-            shown.completed, shown.go = 0, False
-        shown.promised, shown.accepted = state.promised, state.accepted
-        shown.completed, shown.go = state.completed, state.go
-        shown.hold_cell = state.hold_cell
-        if len(shown.joined) != len(state.joined):
-            shown.joined = frozenset(state.joined)
+        if state.promised != published.promised:
+            published.completed, published.go = 0, False
+        published.promised, published.accepted = state.promised, state.accepted
+        published.completed, published.go = state.completed, state.go
+        published.hold_cell = state.hold_cell
+        if len(published.joined) != len(state.joined):
+            published.joined = frozenset(state.joined)
 
-    def _tell_of(self, t_s: float, event: str) -> None:
+    def _log(self, t_s: float, event: str) -> None:
         if self._note is not None:
             self._note(t_s, f"*** {event}")
 
-    def _tell(self, kind: str, t_s: float, vehicles: Iterable[str], text: str) -> None:
-        if len(self.violations) < MOST_VIOLATIONS:
+    def _report(self, kind: str, t_s: float, vehicles: Iterable[str], text: str) -> None:
+        if len(self.violations) < MAX_VIOLATIONS:
             self.violations.append(Violation(kind, t_s, tuple(vehicles), text))
 
 
-def _taken_back(shown: _Shown, state: VehicleState) -> list[str]:
-    """Return what a process says now that contradicts what it has said before."""
+def _revoked(published: _Published, state: VehicleState) -> list[str]:
+    """Return the contradictions between a new state and the one published before."""
     texts = []
-    if not shown.joined.issubset(state.joined):
-        texts.append(f"it has joined {state.joined} after {sorted(shown.joined)}")
-    if shown.promised is None:
+    if not published.joined.issubset(state.joined):
+        texts.append(f"it has joined {state.joined} after {sorted(published.joined)}")
+    if published.promised is None:
         return texts
-    if state.promised is None or state.promised < shown.promised:
-        return [*texts, f"it promises {_short(state.promised)} after {_short(shown.promised)}"]
-    if state.promised > shown.promised:
+    if state.promised is None or state.promised < published.promised:
+        return [*texts, f"it promises {short(state.promised)} after {short(published.promised)}"]
+    if state.promised > published.promised:
         return texts
-    if shown.accepted and not state.accepted:
-        texts.append(f"it has not accepted {_short(state.promised)} any more")
-    if state.completed < shown.completed:
-        texts.append(f"it has completed {state.completed} moves after {shown.completed}")
-    if shown.go and not state.go:
-        texts.append(f"its gate for {_short(state.promised)} closes again")
+    if published.accepted and not state.accepted:
+        texts.append(f"it has not accepted {short(state.promised)} any more")
+    if state.completed < published.completed:
+        texts.append(f"it has completed {state.completed} moves after {published.completed}")
+    if published.go and not state.go:
+        texts.append(f"its gate for {short(state.promised)} closes again")
     return texts
 
 
-def _short(ballot: Ballot | None) -> str:
+def short(ballot: Ballot | None) -> str:
+    """Return a ballot as text."""
     return "nothing" if ballot is None else ".".join(str(part) for part in ballot)

@@ -1,4 +1,4 @@
-"""Faults of a simulated run: drawn from its seed, done to its network, and counted."""
+"""Random faults of a simulated run: drawn from its seed, applied to its network, and counted."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ from laneweave.protocol.wire.codec import decode
 from laneweave.protocol.wire.topics import TOPICS
 
 ROAD = "road"
-"""Name of the road's node."""
+"""Node of the road."""
 FIRST_S = 0.3
-"""No single event before this time."""
+"""Earliest time of a fault event."""
 SHORT_S = (0.05, 2.5)
-"""How long a process is away, or a node cut off."""
+"""Duration of the absence of a process or node."""
 LONG_S = (0.3, 4.0)
-"""How long nobody is heard."""
-NEVER_AGAIN = 0.25
-"""Share of killed agents that are not restarted before everything is made whole."""
+"""Duration of a fault of the network."""
+NO_RESTART = 0.25
+"""Share of killed agents that are not restarted during the fault phase."""
 LEASE_S = 0.5
 COMPUTE_S = 0.05
 GARBAGE = 20
 """Malformed payloads in one event."""
 REPLAYED = 20
 """Old messages in one event."""
-_CONCERNS_ONE = ("leader", "coordinator", "agent", "cut")
-"""How the kinds begin that strike one process."""
+_TARGETED = ("leader", "coordinator", "agent", "cut")
+"""Prefixes of the kinds that have one target."""
 CLOCK_OFFSET_S = 0.05
 CLOCK_DRIFT = 0.05
 
 
 @frozen
-class Mix:
-    """How hard one run is, all the time; single events come on top."""
+class FaultMix:
+    """The lasting faults of one run, and the number of its fault events."""
 
     conditions: Conditions
     command_loss: float
@@ -52,8 +52,8 @@ class Mix:
     fault_s: float
 
     @classmethod
-    def drawn(cls, profile: Profile, rng: random.Random) -> Mix:
-        """Draw from a profile."""
+    def drawn(cls, profile: Profile, rng: random.Random) -> FaultMix:
+        """Draw a mix from a profile."""
         return cls(
             conditions=Conditions(
                 loss=rng.choice(profile.loss),
@@ -72,7 +72,7 @@ class Mix:
         )
 
     def kinds(self) -> Counter[str]:
-        """Return which kinds of lasting faults it has."""
+        """Return the kinds of lasting faults, each with count 1."""
         conditions = self.conditions
         present = {
             "loss": conditions.loss,
@@ -84,15 +84,15 @@ class Mix:
             "slow-moves": self.slow_moves,
             "wrong-clocks": self.wrong_clocks,
         }
-        return Counter(kind for kind, is_there in present.items() if is_there)
+        return Counter(kind for kind, is_present in present.items() if is_present)
 
 
-WHOLE = Conditions(lease_s=LEASE_S, compute_s=COMPUTE_S)
-"""Conditions once everything is whole again."""
+HEALTHY = Conditions(lease_s=LEASE_S, compute_s=COMPUTE_S)
+"""Conditions after the fault phase."""
 
 
 class Processes(Protocol):
-    """What faults need to know of the processes of a world."""
+    """The processes of a run, as fault events need them."""
 
     coordinators: tuple[str, ...]
 
@@ -102,33 +102,33 @@ class Processes(Protocol):
 
     @property
     def leaders(self) -> tuple[str, ...]:
-        """Coordinators that take themselves for the leader."""
+        """Coordinators that consider themselves the leader."""
 
     def start(self, name: str) -> None:
-        """Start a process, unless it runs."""
+        """Start a process if it does not run."""
 
     def start_twin(self, name: str) -> str:
-        """Start a second process for an agent's vehicle, and return the name of its node."""
+        """Start a second process for an agent's vehicle and return the name of its node."""
 
     def old_payload(self, rng: random.Random) -> tuple[str, bytes] | None:
-        """Return a message that was sent some time ago, with its key."""
+        """Return key and payload of a message sent some time ago."""
 
 
-class Injector:
-    """Does harm to the network and its nodes, and makes all of it good again."""
+class RandomFaults:
+    """Applies fault events to the network and its nodes, and ends all of them."""
 
     def __init__(
         self,
         network: SimulatedNetwork,
         processes: Processes,
-        mix: Mix,
+        mix: FaultMix,
         rng: random.Random,
         realm: str,
         note: Callable[[str], None],
     ) -> None:
-        """Prepare the lasting faults; nothing happens to a process yet."""
+        """Prepare the faults of a run."""
         self.counts = mix.kinds()
-        """How often each kind of fault was done."""
+        """Number of applied faults of each kind."""
         self.healed = False
         self._network = network
         self._processes = processes
@@ -141,41 +141,41 @@ class Injector:
         self._twins: list[str] = []
 
     def plan(self, kinds: Sequence[str]) -> None:
-        """Draw the single events of a run and when they happen."""
+        """Draw the kinds and times of the fault events."""
         for _ in range(self._mix.events):
             time_s = self._rng.uniform(FIRST_S, self._mix.fault_s - 0.3)
-            self._network.at(time_s, self._harm, self._rng.choice(kinds))
+            self._network.at(time_s, self._apply, self._rng.choice(kinds))
 
     def heal(self) -> None:
-        """Make everything whole: only clocks stay wrong."""
+        """End all faults; only clocks stay wrong."""
         self.healed = True
-        self._note("--- everything is made whole")
+        self._note("--- all faults end")
         network = self._network
-        network.conditions = WHOLE
+        network.conditions = HEALTHY
         network.cut(None)
         network.restore_router()
         for name in self._twins:
             network.kill(name)
         for name in network.names:
-            # Who wakes handles what has come meanwhile, and may leave for good.
+            # A resumed node handles its queued messages, and may end.
             network.resume(name)
-            self._if_there(name, network.reconnect)
+            self._if_present(name, network.reconnect)
         for name in (*self._processes.coordinators, *self._processes.agents):
             self._processes.start(name)
 
-    def _harm(self, kind: str) -> None:
+    def _apply(self, kind: str) -> None:
         target = self._target(kind)
-        whom = f" of {target}" if kind.startswith(_CONCERNS_ONE) else ""
-        self._note(f"--- fault: {kind}{whom}")
+        of = f" of {target}" if kind.startswith(_TARGETED) else ""
+        self._note(f"--- fault: {kind}{of}")
         match kind:
             case "leader-kill" | "coordinator-kill" | "agent-kill":
-                done = self._kill(target, for_ever=kind == "agent-kill")
+                done = self._kill(target, may_stay_dead=kind == "agent-kill")
             case "agent-twin":
-                done = self._double(target)
+                done = self._start_twin(target)
             case "leader-pause" | "coordinator-pause" | "agent-pause":
                 done = self._pause(target)
             case "cut":
-                done = self._unplug(target)
+                done = self._disconnect(target)
             case "partition":
                 done = self._partition()
             case "blackout":
@@ -195,13 +195,13 @@ class Injector:
         if kind.startswith("leader"):
             return rng.choice(processes.leaders or processes.coordinators)
         if kind.startswith("agent"):
-            return rng.choice(processes.agents or ("nobody",))
+            return rng.choice(processes.agents or ("none",))
         if kind == "cut":
             return rng.choice(self._network.names)
         return rng.choice(processes.coordinators)
 
     def _later(self, span_s: tuple[float, float], action: Callable[[], None], what: str) -> None:
-        """Do something more after a while, unless everything has been made whole before."""
+        """End a fault after a while, unless all faults have ended before."""
         time_s = self._network.now_s + self._rng.uniform(*span_s)
         self._network.at(time_s, self._undo, action, what)
 
@@ -212,11 +212,11 @@ class Injector:
 
     # --- processes ----------------------------------------------------------------------------
 
-    def _kill(self, name: str, *, for_ever: bool) -> bool:
+    def _kill(self, name: str, *, may_stay_dead: bool) -> bool:
         if name not in self._network:
             return False
         self._network.kill(name)
-        if not (for_ever and self._rng.random() < NEVER_AGAIN):
+        if not (may_stay_dead and self._rng.random() < NO_RESTART):
             self._later(SHORT_S, partial(self._processes.start, name), f"{name} is restarted")
         return True
 
@@ -224,12 +224,12 @@ class Injector:
         if name not in self._network:
             return False
         self._network.pause(name)
-        resume = partial(self._if_there, name, self._network.resume)
-        self._later(SHORT_S, resume, f"{name} wakes")
+        resume = partial(self._if_present, name, self._network.resume)
+        self._later(SHORT_S, resume, f"{name} resumes")
         return True
 
-    def _double(self, name: str) -> bool:
-        """Start a second process for a vehicle; the first one goes on, and may not sense that."""
+    def _start_twin(self, name: str) -> bool:
+        """Start a second process for a vehicle; the first one continues without SENSE messages."""
         if name not in self._network:
             return False
         twin = self._processes.start_twin(name)
@@ -242,26 +242,26 @@ class Injector:
 
         self._cuts.append(blocked)
         self._apply_cuts()
-        self._later(LONG_S, partial(self._join, blocked), f"{name} senses its vehicle again")
+        self._later(LONG_S, partial(self._join, blocked), f"{name} receives SENSE again")
         victim = self._rng.choice((name, twin))
-        kill = partial(self._if_there, victim, self._network.kill)
+        kill = partial(self._if_present, victim, self._network.kill)
         self._later(LONG_S, kill, f"{victim} is killed")
         return True
 
-    def _unplug(self, name: str) -> bool:
+    def _disconnect(self, name: str) -> bool:
         self._network.disconnect(name)
-        reconnect = partial(self._if_there, name, self._network.reconnect)
-        self._later(SHORT_S, reconnect, f"{name} is on the network again")
+        reconnect = partial(self._if_present, name, self._network.reconnect)
+        self._later(SHORT_S, reconnect, f"{name} is connected again")
         return True
 
-    def _if_there(self, name: str, action: Callable[[str], None]) -> None:
+    def _if_present(self, name: str, action: Callable[[str], None]) -> None:
         if name in self._network:
             action(name)
 
     # --- the network --------------------------------------------------------------------------
 
     def _partition(self) -> bool:
-        """Part the nodes in two groups that do not hear each other, or only one way."""
+        """Separate the nodes into two groups, in both directions or in one."""
         rng = self._rng
         names = self._network.names
         inside = frozenset(rng.sample(names, rng.randint(1, len(names) - 1)))
@@ -274,9 +274,9 @@ class Injector:
 
         self._cuts.append(blocked)
         self._apply_cuts()
-        heard = "not heard by" if one_way else "apart from"
-        self._note(f"--- {heard} the others: {' '.join(sorted(inside))}")
-        self._later(LONG_S, partial(self._join, blocked), "a partition is over")
+        relation = "not heard by" if one_way else "separated from"
+        self._note(f"--- {relation} the others: {' '.join(sorted(inside))}")
+        self._later(LONG_S, partial(self._join, blocked), "a partition ends")
         return True
 
     def _join(self, blocked: Callable[[str, str], bool]) -> None:
@@ -290,10 +290,10 @@ class Injector:
         )
 
     def _blackout(self) -> bool:
-        """Lose every message for a while."""
+        """Drop every message for a while."""
         self._blackouts += 1
         self._network.conditions = attrs.evolve(self._mix.conditions, loss=1.0)
-        self._later(LONG_S, self._end_blackout, "a blackout is over")
+        self._later(LONG_S, self._end_blackout, "a blackout ends")
         return True
 
     def _end_blackout(self) -> None:
@@ -303,20 +303,20 @@ class Injector:
 
     def _lose_router(self) -> bool:
         self._network.lose_router()
-        self._later(LONG_S, self._network.restore_router, "the router is back")
+        self._later(LONG_S, self._network.restore_router, "the router returns")
         return True
 
     def _garbage(self) -> bool:
-        """Put bytes on keys that are no messages, or not on these keys."""
+        """Publish payloads that are not valid messages for their keys."""
         for _ in range(GARBAGE):
             self._network.inject(*self._malformed())
         return True
 
     def _malformed(self) -> tuple[str, bytes]:
-        """Return random bytes, or a real message that was damaged so that it is none any more.
+        """Return random bytes, or a real message that has been damaged until it is invalid.
 
-        A damaged message that still is well formed would be a lie: the protocol does not promise
-        to survive those, and senders are trusted (docs/SAFETY.md).
+        A damaged message that is still valid would be a forgery. The protocol trusts its senders
+        and does not tolerate forgeries (docs/SAFETY.md).
         """
         rng = self._rng
         old = self._processes.old_payload(rng)
@@ -344,7 +344,7 @@ class Injector:
         return "/".join(("laneweave", self._realm, *parts))
 
     def _replay(self) -> bool:
-        """Deliver old messages once more: a network that keeps duplicates for very long."""
+        """Deliver old messages again, like a network with very late duplicates."""
         done = False
         for _ in range(REPLAYED):
             old = self._processes.old_payload(self._rng)

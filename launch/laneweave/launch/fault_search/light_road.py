@@ -1,9 +1,9 @@
-"""The light road: the bridge of a simulated run, without a world and without waiting.
+"""The light road: a bridge without SUMO that does not wait for agents.
 
-Ticks just happen. Every vehicle is told what it senses at each tick, a COMMAND counts whenever it
-arrives, and a body moves in a straight line to the cell that its motion controller was told to
-hold. Who may command a vehicle, what it has joined, who is silent and what a caretaker says are
-decided by the real `MotionController`, `Answers` and `Attendance`.
+At each tick every vehicle gets its SENSE; a COMMAND counts whenever it arrives; and a body moves in
+a straight line to the cell that its motion controller holds. The real `MotionController`, `Answers`
+and `Attendance` decide who may command a vehicle, which agents are silent, and what a caretaker
+publishes.
 """
 
 from __future__ import annotations
@@ -59,11 +59,11 @@ from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 CLOCK_EVERY_TICKS = 2
 AGENT_START_S = 1.0
-"""How long after its entrance a vehicle waits for its agent before its caretaker takes charge."""
+"""Time after its entry at which the caretaker of a vehicle without an agent takes charge."""
 NONE_CLOSED = -(2**31)
-"""Below the number of every block."""
+"""Less than the number of any block."""
 SYNC_S = 1.0
-"""A vehicle's clock is set anew this often; in between it drifts."""
+"""Interval between synchronizations of a vehicle's clock, which drifts in between."""
 
 
 @frozen
@@ -72,50 +72,50 @@ class Visit:
 
     vehicle: Name
     cell: Cell
-    """In which it enters."""
+    """Cell in which it enters."""
     enters_s: float
     leaves_s: float | None
-    """None: it stays to the end."""
+    """None: it stays until the end."""
     clock_offset_s: float = 0.0
     clock_drift: float = 0.0
-    """Seconds that its clock gains in a second."""
+    """Seconds that its clock gains per second."""
 
 
 @frozen
 class Grant:
-    """An empty cell becomes somebody's, as the roadside does it (rolling operation)."""
+    """Assignment of an empty cell to an owner, as by the roadside (rolling operation)."""
 
     t_s: float
     owner: Name
     cell: Cell
 
 
-class Watcher(Protocol):
-    """Is told what happens on the road; the checker is one."""
+class RoadObserver(Protocol):
+    """Receives the events on the road; the checker is one."""
 
     def own(self, t_s: float, vehicle: str, estate: tuple[Cell, ...], deed: Deed | None) -> None:
-        """A motion controller shows what its vehicle owns."""
+        """Record what a motion controller shows as owned."""
 
     def enter(self, t_s: float, vehicle: str, cell: Cell) -> None:
-        """A vehicle entered."""
+        """Record that a vehicle enters."""
 
     def leave(self, t_s: float, vehicle: str) -> None:
-        """A vehicle left."""
+        """Record that a vehicle leaves."""
 
     def begin(
-        self, t_s: float, vehicle: str, incarnation: int, way: tuple[Cell, Cell], lasts_s: float
+        self, t_s: float, vehicle: str, incarnation: int, move: tuple[Cell, Cell], lasts_s: float
     ) -> None:
-        """A body began to move."""
+        """Record that a body begins to move."""
 
     def advance(self, t_s: float) -> None:
-        """Time went on."""
+        """Advance the time."""
 
 
 class LightBody(Plant):
-    """A body that moves in a straight line of the lattice, in the time that it is given."""
+    """A body that moves in a straight line of the lattice in a given time."""
 
     def __init__(self, scenario: Scenario, cell: Cell) -> None:
-        """Stand in a cell."""
+        """Start at rest in a cell."""
         super().__init__((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), scenario.vehicle, scenario.runtime.tick_s)
         self.t_s = 0.0
         """Time of the newest tick."""
@@ -134,12 +134,12 @@ class LightBody(Plant):
         return (s_m, lattice.speed_mps, 0.0, y_m, 0.0, 0.0)
 
     def go(self, cell: Cell, now_s: float, lasts_s: float) -> None:
-        """Begin a motion to a cell from wherever it is."""
+        """Begin a motion to a cell from the current position."""
         self._origin, self._goal = self._place(now_s), cell
         self._begin_s, self._end_s = now_s, now_s + lasts_s
 
     def has_arrived(self, now_s: float) -> bool:
-        """Tell whether it is in the middle of the cell to which it was sent."""
+        """Return whether it is in the centre of its target cell."""
         return now_s >= self._end_s
 
     def _place(self, t_s: float) -> tuple[float, float]:
@@ -151,10 +151,10 @@ class LightBody(Plant):
 
 
 class LightVehicle(RoadVehicle):
-    """A vehicle with a light body, a clock of its own, and wishes that change."""
+    """A vehicle with a light body, its own clock, and a preferred lane that changes."""
 
     def __init__(self, visit: Visit, preferred_lane: int, scenario: Scenario) -> None:
-        """Hold the cell of a visit."""
+        """Start in the cell of a visit."""
         self.body = LightBody(scenario, visit.cell)
         arrival = Arrival(visit.vehicle, visit.cell[1], preferred_lane, visit.enters_s)
         super().__init__(
@@ -169,23 +169,23 @@ class LightVehicle(RoadVehicle):
 
     @property
     def preferred_lane(self) -> int:
-        """Where it wants to be in the end."""
+        """Preferred lane."""
         return self.admission.arrival.preferred_lane
 
     def leaves_by(self, t_s: float) -> bool:
-        """Tell whether it leaves the road at a time or before."""
+        """Return whether it leaves the road by a time."""
         return self._visit.leaves_s is not None and t_s >= self._visit.leaves_s
 
     def prefer(self, lane: int) -> None:
-        """Change its mind."""
+        """Change the preferred lane."""
         arrival = attrs.evolve(self.admission.arrival, preferred_lane=lane)
         self.admission = attrs.evolve(self.admission, arrival=arrival)
 
     def sense(self, tick: int, *, caretaker: bool, left: bool = False) -> Sense:
-        """Return what it knows, by its own clock.
+        """Return its SENSE message, by its own clock.
 
-        Where it is in the lattice it knows from the vehicles around it: a wrong clock makes it late
-        or early with what it does, but does not shift its cell.
+        It knows its position in the lattice from the vehicles around it: a wrong clock makes it act
+        late or early, but does not shift its cell.
         """
         sense = super().sense(tick, caretaker=caretaker, left=left)
         visit = self._visit
@@ -198,39 +198,39 @@ class LightVehicle(RoadVehicle):
 
 
 class LightRoad:
-    """The core of the road's process."""
+    """The core of the road."""
 
     def __init__(
         self,
         scenario: Scenario,
         visits: Iterable[Visit],
         preferred_lanes: dict[Name, int],
-        watcher: Watcher,
+        observer: RoadObserver,
         new_incarnation: Callable[[], int],
         move_lasts_s: Callable[[], float],
         lost: Callable[[], bool],
         formations: Iterable[ClosedFormation] = (),
         grants: Iterable[Grant] = (),
     ) -> None:
-        """Make a road without vehicles; they enter when their time comes.
+        """Create a road without vehicles, which enter at their times.
 
         Args:
             scenario: lattice and timing.
-            visits: who enters when.
-            preferred_lanes: of each vehicle; read when it enters.
-            watcher: is told of the bodies.
-            new_incarnation: numbers for caretakers.
-            move_lasts_s: draws how long the next motion takes.
-            lost: draws whether the next SENSE or COMMAND is lost beside what the network loses.
-            formations: which blocks are whose, and when each formation closes.
-            grants: which empty cells are whose, and from when on.
+            visits: the vehicles and their times.
+            preferred_lanes: preferred lane of each vehicle when it enters.
+            observer: receives the events on the road.
+            new_incarnation: returns incarnations for caretakers.
+            move_lasts_s: draws the duration of the next motion.
+            lost: draws whether the next SENSE or COMMAND is lost, in addition to network loss.
+            formations: blocks and closing time of each formation.
+            grants: owners of the empty cells, and their times.
         """
         self.tick = -1
         self.vehicles: dict[Name, LightVehicle] = {}
         self.takeovers = 0
-        """Vehicles of which a caretaker has taken charge, each time counted."""
+        """Number of times that a caretaker has taken charge."""
         self.refused = 0
-        """COMMANDs that motion controllers have refused."""
+        """Number of COMMANDs refused by motion controllers."""
         self._scenario = scenario
         self._tick_s = scenario.runtime.tick_s
         self._visits = sorted(visits, key=lambda visit: (visit.enters_s, visit.vehicle))
@@ -239,7 +239,7 @@ class LightRoad:
         self._closed: list[ClosedFormation] = []
         self._closed_to = NONE_CLOSED
         self._preferred_lanes = preferred_lanes
-        self._watcher = watcher
+        self._observer = observer
         self._move_lasts_s = move_lasts_s
         self._lost = lost
         self._attendance = Attendance(scenario, new_incarnation)
@@ -252,7 +252,7 @@ class LightRoad:
         return (self.tick + 1) * self._tick_s
 
     def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
-        """Take an event; see `Core`."""
+        """Handle an event; see `Core`."""
         self._attendance.on_network(event, now_s)
         match event:
             case Arrived(_, _, Command() as command):
@@ -261,7 +261,7 @@ class LightRoad:
                 name = Name(parameters["vehicle"])
                 yield from self._attendance.on_message(name, message, self.tick)
                 if name in self.vehicles:
-                    self._show_estate(name, now_s)
+                    self._report_ownership(name, now_s)
             case Wakeup() if now_s >= self.wakeup_s:
                 yield from self._on_tick(now_s)
             case Started():
@@ -272,7 +272,7 @@ class LightRoad:
                 pass
 
     def prefer(self, preferred_lanes: dict[Name, int]) -> None:
-        """Vehicles change their minds."""
+        """Change the preferred lanes of all vehicles."""
         self._preferred_lanes = preferred_lanes
         for vehicle in self.vehicles.values():
             vehicle.prefer(preferred_lanes[vehicle.name])
@@ -291,11 +291,11 @@ class LightRoad:
         except BadInputError:
             taken = False
         self.refused += not taken
-        self._show_estate(command.vehicle, now_s)
+        self._report_ownership(command.vehicle, now_s)
         if controller.hold_cell != held:
             lasts_s = self._move_lasts_s()
-            way = (held, controller.hold_cell)
-            self._watcher.begin(now_s, command.vehicle, command.incarnation, way, lasts_s)
+            move = (held, controller.hold_cell)
+            self._observer.begin(now_s, command.vehicle, command.incarnation, move, lasts_s)
             vehicle.body.go(controller.hold_cell, now_s, lasts_s)
 
     # --- the tick -----------------------------------------------------------------------------
@@ -303,20 +303,20 @@ class LightRoad:
     def _on_tick(self, now_s: float) -> Iterator[Effect]:
         self.tick += 1
         t_s = self.tick * self._tick_s
-        self._watcher.advance(now_s)
+        self._observer.advance(now_s)
         self._let_enter(now_s)
         self._close_formations(t_s)
-        self._hand_out(now_s)
+        self._grant_cells(now_s)
         yield from self._let_leave(now_s)
         for vehicle in self.vehicles.values():
             vehicle.body.t_s = t_s
-        yield from self._look_after(now_s)
+        yield from self._attend(now_s)
         self._attendance.ask(self.vehicles, now_s)
         for name, vehicle in self.vehicles.items():
             if not self._lost():
                 yield self._sense_of(name, vehicle)
         yield from self._attendance.states(self.tick)
-        yield from self._tell_road(t_s)
+        yield from self._publish_road(t_s)
 
     def _sense_of(self, name: Name, vehicle: LightVehicle) -> Effect:
         sense = vehicle.sense(self.tick, caretaker=name in self._attendance)
@@ -327,8 +327,8 @@ class LightRoad:
             visit = self._visits.pop(0)
             lane = self._preferred_lanes[visit.vehicle]
             self.vehicles[visit.vehicle] = LightVehicle(visit, lane, self._scenario)
-            self._watcher.enter(now_s, visit.vehicle, visit.cell)
-            self._show_estate(visit.vehicle, now_s)
+            self._observer.enter(now_s, visit.vehicle, visit.cell)
+            self._report_ownership(visit.vehicle, now_s)
             self._census_due_tick = 0
 
     def _close_formations(self, t_s: float) -> None:
@@ -341,17 +341,17 @@ class LightRoad:
                     vehicle.join(closed)
             self._census_due_tick = 0
 
-    def _hand_out(self, now_s: float) -> None:
+    def _grant_cells(self, now_s: float) -> None:
         while self._grants and self._grants[0].t_s <= now_s + 1e-6:
             grant = self._grants.pop(0)
             owner = self.vehicles.get(grant.owner)
             if owner is not None:
                 owner.controller.assign_cell(grant.cell)
-                self._show_estate(grant.owner, now_s)
+                self._report_ownership(grant.owner, now_s)
 
-    def _show_estate(self, name: Name, now_s: float) -> None:
+    def _report_ownership(self, name: Name, now_s: float) -> None:
         controller = self.vehicles[name].controller
-        self._watcher.own(now_s, name, controller.owned, controller.transfer)
+        self._observer.own(now_s, name, controller.owned, controller.transfer)
 
     def _let_leave(self, now_s: float) -> Iterator[Effect]:
         length_m = self._scenario.road.length_m
@@ -363,12 +363,12 @@ class LightRoad:
         for name in leaving:
             self._departures.add(self.vehicles.pop(name))
             yield from self._attendance.forget(name)
-            self._watcher.leave(now_s, name)
+            self._observer.leave(now_s, name)
             self._census_due_tick = 0
         yield from self._departures.notify(self.tick, self._attendance.answers.up)
 
-    def _look_after(self, now_s: float) -> Iterator[Effect]:
-        """Let caretakers take charge of vehicles whose agents are gone or silent."""
+    def _attend(self, now_s: float) -> Iterator[Effect]:
+        """Let caretakers take charge of vehicles with absent or silent agents."""
         self._attendance.answers.settle(now_s)
         for vehicle, absence in self._attendance.unattended(self.vehicles, now_s):
             if absence is Absence.ABSENT and now_s < vehicle.admission.t_s + AGENT_START_S:
@@ -376,7 +376,7 @@ class LightRoad:
             self.takeovers += 1
             yield from self._attendance.take_charge(vehicle, self.tick)
 
-    def _tell_road(self, t_s: float) -> Iterator[Effect]:
+    def _publish_road(self, t_s: float) -> Iterator[Effect]:
         count = len(self.vehicles)
         if self.tick % CLOCK_EVERY_TICKS == 0:
             yield Send(CLOCK, RoadClock(self.tick, t_s, count, count, count, 0, ended=False))

@@ -1,7 +1,7 @@
-"""Profiles: how hard the runs of a search are, and on what they lay stress.
+"""Profiles: kinds and severity of the faults in the runs of a search.
 
-A profile gives the range or the choices from which each seed draws. Shares are probabilities, times
-virtual seconds.
+A profile has the ranges or choices from which each seed draws. Shares are probabilities, times are
+in virtual seconds.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from attrs import evolve, frozen
 from laneweave.protocol.errors import BadInputError
 
 Span = tuple[int, int]
-"""Least and greatest, both included."""
+"""Minimum and maximum, both included."""
 
 COORDINATOR_HARM = ("leader-kill", "leader-pause", "coordinator-kill", "coordinator-pause")
 AGENT_HARM = ("agent-kill", "agent-kill", "agent-pause", "agent-twin")
@@ -21,15 +21,15 @@ NOISE = ("garbage", "replay")
 
 @frozen(kw_only=True)
 class Profile:
-    """What the seeds of a search draw from."""
+    """The ranges and choices from which the seeds of a search draw."""
 
     name: str
     text: str
-    """What it is for, in one line."""
+    """Purpose in one line."""
     rolling: bool = False
-    """Vehicles own cells and are planned as one stream, not in formations."""
+    """Use the rolling operation: vehicles own cells and are planned as one stream."""
     density: tuple[float, float] = (0.3, 0.7)
-    """Share of the cells of a stretch that vehicles enter in (rolling operation)."""
+    """Share of the cells of a stretch in which vehicles enter (rolling operation)."""
     vehicles: Span = (2, 16)
     blocks: Span = (1, 4)
     lanes: Span = (2, 4)
@@ -37,35 +37,35 @@ class Profile:
     """Share of runs in which formations have different lengths."""
     max_joined: Span = (1, 2)
     crowding: float = 0.5
-    """Share of runs in which more vehicles may want a lane of a block than it has cells."""
+    """Share of runs in which more vehicles may prefer a lane of a block than it has cells."""
     leavers: float = 0.15
-    """Share of vehicles that leave the road while faults happen."""
+    """Share of vehicles that leave the road during the fault phase."""
     loss: tuple[float, ...] = (0.0, 0.0, 0.1, 0.3, 0.5, 0.8)
-    """Share of messages that do not reach a receiver."""
+    """Probability that a receiver does not get a message."""
     duplication: tuple[float, ...] = (0.0, 0.0, 0.3)
     jitter_s: tuple[float, ...] = (0.003, 0.003, 0.003, 0.05, 0.05, 0.3, 0.3, 1.0, 5.0)
-    """Greatest delay of a message; the least is 2 ms."""
+    """Maximum delay of a message; the minimum is 2 ms."""
     command_loss: tuple[float, ...] = (0.0, 0.0, 0.0, 0.3)
-    """Share of SENSE and COMMAND messages that are lost beside."""
+    """Additional loss of SENSE and COMMAND messages."""
     slow_moves: tuple[float, ...] = (0.0, 0.2, 0.5)
     """Share of motions that take up to three slots."""
     compute_failure: tuple[float, ...] = (0.0, 0.0, 0.0, 0.3)
     compute_jitter_s: tuple[float, ...] = (0.0, 0.0, 0.3, 2.0)
-    """Planning takes up to this much longer."""
+    """Maximum additional planning time."""
     wrong_clocks: float = 0.7
-    """Share of runs in which every clock is wrong: by up to 50 ms, its rate by up to 5 %."""
+    """Share of runs with wrong clocks: offsets up to 50 ms, rate errors up to 5 %."""
     harm: tuple[str, ...] = COORDINATOR_HARM + AGENT_HARM + NETWORK_HARM + NOISE
-    """Kinds of single events, each as likely as the others; `faults` does them."""
+    """Kinds of fault events, equally likely; see `faults`."""
     events: Span = (0, 12)
-    """Single events in a run."""
+    """Number of fault events in a run."""
     fault_s: tuple[float, float] = (10.0, 12.0)
-    """How long faults happen; then everything is whole and everybody must arrive."""
+    """Length of the fault phase, after which all vehicles must arrive."""
 
 
-_MIXED = Profile(name="mixed", text="everything that can go wrong, in every mixture")
+_MIXED = Profile(name="mixed", text="all kinds of faults in all combinations")
 _CALM = Profile(
     name="calm",
-    text="no faults at all: what a run looks like",
+    text="no faults: what a run looks like",
     loss=(0.0,),
     duplication=(0.0,),
     jitter_s=(0.003,),
@@ -84,7 +84,7 @@ _ALL = (
     evolve(
         _CALM,
         name="loss",
-        text="messages are lost (also all of them), doubled, delayed and overtaken",
+        text="messages are lost (sometimes all), duplicated, delayed and reordered",
         loss=(0.3, 0.5, 0.8, 0.9),
         duplication=(0.0, 0.3),
         jitter_s=(0.003, 0.3, 5.0),
@@ -95,7 +95,7 @@ _ALL = (
     evolve(
         _CALM,
         name="coordinators",
-        text="coordinators are killed, restarted, paused and woken as zombies; plannings fail",
+        text="coordinators are killed, restarted, paused and resumed; planning fails",
         loss=(0.0, 0.2),
         jitter_s=(0.003, 0.3),
         compute_failure=(0.0, 0.3),
@@ -106,7 +106,7 @@ _ALL = (
     evolve(
         _CALM,
         name="agents",
-        text="agents are killed, restarted or not, paused and woken; motions are slow",
+        text="agents are killed, sometimes restarted, paused and resumed; motions are slow",
         loss=(0.0, 0.2),
         jitter_s=(0.003, 0.3),
         command_loss=(0.0, 0.3),
@@ -117,7 +117,7 @@ _ALL = (
     evolve(
         _CALM,
         name="partitions",
-        text="groups that do not hear each other, nodes cut off, the router lost",
+        text="separated groups, disconnected nodes, loss of the router",
         loss=(0.0, 0.3),
         jitter_s=(0.003, 0.3),
         harm=NETWORK_HARM,
@@ -126,14 +126,14 @@ _ALL = (
     evolve(
         _MIXED,
         name="clocks",
-        text="every clock is wrong, in offset and rate",
+        text="every clock has a wrong offset and rate",
         wrong_clocks=1.0,
         events=(0, 4),
     ),
     evolve(
         _MIXED,
         name="joint",
-        text="two neighbouring formations, lanes too small for one: joint ballots",
+        text="two neighbouring formations with lanes too short for one: joint ballots",
         vehicles=(6, 9),
         blocks=(2, 2),
         lanes=(3, 4),
@@ -144,7 +144,7 @@ _ALL = (
     evolve(
         _MIXED,
         name="dense",
-        text="twelve vehicles in few blocks, for the speed of the simulation, too",
+        text="twelve vehicles in few blocks; also a measure of simulation speed",
         vehicles=(12, 12),
         blocks=(2, 2),
         lanes=(4, 4),
@@ -154,7 +154,7 @@ _ALL = (
     evolve(
         _MIXED,
         name="rolling",
-        text="the rolling operation: vehicles own cells, which change hands; everything goes wrong",
+        text="the rolling operation, in which vehicles transfer cells, with all kinds of faults",
         rolling=True,
         vehicles=(3, 14),
         fault_s=(9.0, 14.0),
@@ -162,7 +162,7 @@ _ALL = (
     evolve(
         _MIXED,
         name="rolling-dense",
-        text="the same with up to nine of ten cells taken",
+        text="the rolling operation with up to nine of ten cells occupied",
         rolling=True,
         vehicles=(8, 18),
         density=(0.6, 0.9),
@@ -174,10 +174,10 @@ PROFILES = {profile.name: profile for profile in _ALL}
 
 
 def profile_named(name: str) -> Profile:
-    """Return a profile.
+    """Return the profile of a name.
 
     Raises:
-        BadInputError: there is none of this name.
+        BadInputError: there is no such profile.
     """
     if name not in PROFILES:
         raise BadInputError("--profile", name, ", ".join(PROFILES))

@@ -1,4 +1,4 @@
-"""The search: many seeds on all cores, and what is printed about them."""
+"""The search: runs many seeds on several processes, and describes the results."""
 
 from __future__ import annotations
 
@@ -18,68 +18,68 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from laneweave.launch.fault_search.checker import Violation
+from laneweave.launch.fault_search.fault_run import FaultRun, SeedResult, Totals
 from laneweave.launch.fault_search.profiles import Profile
-from laneweave.launch.fault_search.simulated_run import Outcome, Totals, World
 from laneweave.launch.fault_search.story import Story
 from laneweave.launch.run.roles import collect_rarely, die_with_supervisor
 from laneweave.protocol.errors import CommandFailedError
 
 BATCH = 20
-"""Seeds that a process takes at a time."""
+"""Seeds per task of a worker process."""
 SHOWN_VIOLATIONS = 5
-"""Of one seed."""
+"""Number of violations printed per seed."""
 SHOWN_SEEDS = 20
-"""Failed seeds that are described; the others are only counted."""
+"""Number of failed seeds described in detail."""
 
 
 @frozen
-class Result:
-    """What the seeds of a search came to."""
+class SearchResult:
+    """Result of a search."""
 
     totals: Totals = field(factory=Totals)
-    failed: tuple[Outcome, ...] = ()
-    """Outcomes of the seeds with violations, ascending."""
+    failed: tuple[SeedResult, ...] = ()
+    """Results of the seeds with violations, in ascending order."""
     digests: dict[int, str] = field(factory=dict)
-    """Of each seed, if asked for."""
+    """Digest of each seed, if requested."""
 
     @property
     def passed(self) -> int:
-        """Seeds without violations."""
+        """Number of seeds without violations."""
         return self.totals.runs - len(self.failed)
 
     @property
     def digest(self) -> str:
-        """One digest of all seeds."""
+        """Digest of all seeds."""
         lines = "".join(f"{seed} {digest}\n" for seed, digest in sorted(self.digests.items()))
         return hashlib.blake2b(lines.encode(), digest_size=16).hexdigest()
 
 
-def run_seeds(seeds: Sequence[int], profile: Profile, *, digest: bool = False) -> list[Outcome]:
-    """Run some seeds in this process; one that crashes is a failed one, too."""
+def run_seeds(seeds: Sequence[int], profile: Profile, *, digest: bool = False) -> list[SeedResult]:
+    """Run seeds in this process; a crash counts as a violation."""
     return [_run_seed(seed, profile, digest=digest) for seed in seeds]
 
 
-def _run_seed(seed: int, profile: Profile, *, digest: bool) -> Outcome:
+def _run_seed(seed: int, profile: Profile, *, digest: bool) -> SeedResult:
     try:
-        return World(seed, profile, digest=digest).run()
-    except Exception as error:  # noqa: BLE001 (whatever a core does, the search goes on)
+        return FaultRun(seed, profile, digest=digest).run()
+    except Exception as error:  # noqa: BLE001 (the search continues whatever a core raises)
         text = f"{type(error).__name__}: {error}"
-        return Outcome(seed, (Violation("crash", 0.0, (), text),), Totals(runs=1))
+        return SeedResult(seed, (Violation("crash", 0.0, (), text),), Totals(runs=1))
 
 
 def search(
     seeds: range, profile: Profile, jobs: int, *, digest: bool = False, show: bool = False
-) -> Result:
+) -> SearchResult:
     """Run all seeds.
 
     Args:
-        seeds: which.
-        profile: what they draw from.
-        jobs: processes to use.
-        digest: whether to make digests of what is delivered.
+        seeds: seeds to run.
+        profile: profile from which they draw.
+        jobs: number of processes.
+        digest: whether to compute digests of the delivered messages.
         show: whether to show a progress bar.
     """
-    result = Result()
+    result = SearchResult()
     bar = Progress(
         TextColumn("{task.description}"),
         BarColumn(bar_width=None),
@@ -98,20 +98,22 @@ def search(
     return result
 
 
-def _batches(seeds: range, profile: Profile, jobs: int, *, digest: bool) -> Iterator[list[Outcome]]:
+def _batches(
+    seeds: range, profile: Profile, jobs: int, *, digest: bool
+) -> Iterator[list[SeedResult]]:
     batches = [seeds[first : first + BATCH] for first in range(0, len(seeds), BATCH)]
     if jobs == 1 or len(batches) == 1:
         collect_rarely()
         for batch in batches:
             yield run_seeds(batch, profile, digest=digest)
         return
-    # Spawned: a fork would copy locks that the progress bar's thread holds.
+    # A fork would copy locks that the thread of the progress bar holds.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(jobs, len(batches)), context, _quiet) as pool:
         waiting = iter(batches)
-        running: set[Future[list[Outcome]]] = set()
+        running: set[Future[list[SeedResult]]] = set()
         try:
-            # Only a few batches at a time: a long search is soon under way, and soon ended.
+            # Submit only a few batches at a time, so that a long search starts and ends fast.
             for batch in islice(waiting, 2 * jobs):
                 running.add(pool.submit(run_seeds, batch, profile, digest=digest))
             while running:
@@ -130,10 +132,7 @@ def _batches(seeds: range, profile: Profile, jobs: int, *, digest: bool) -> Iter
 
 
 def _quiet() -> None:
-    """In a worker: Ctrl-C is the parent's business, and expected warnings are nobody's.
-
-    A worker ends with its parent, however that ends.
-    """
+    """Prepare a worker process: ignore Ctrl-C, log errors only, and end with the parent."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     die_with_supervisor()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -142,27 +141,27 @@ def _quiet() -> None:
 
 
 def quiet_logs() -> None:
-    """Log errors only: refused messages and failing plannings are what a search consists of."""
+    """Log only critical errors, since a search consists of refused messages and failed plans."""
     structlog.configure(
         wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL),
         logger_factory=structlog.PrintLoggerFactory(sys.stderr),
     )
 
 
-def _with(result: Result, outcomes: Sequence[Outcome]) -> Result:
+def _with(result: SearchResult, outcomes: Sequence[SeedResult]) -> SearchResult:
     failed = [*result.failed, *(outcome for outcome in outcomes if outcome.violations)]
-    return Result(
+    return SearchResult(
         sum((outcome.totals for outcome in outcomes), result.totals),
         tuple(sorted(failed, key=lambda outcome: outcome.seed)),
         result.digests | {outcome.seed: outcome.digest for outcome in outcomes if outcome.digest},
     )
 
 
-# --- what is printed ------------------------------------------------------------------------------
+# --- output ---------------------------------------------------------------------------------------
 
 
-def describe(result: Result, profile: Profile) -> Iterator[str]:
-    """Return the lines that tell what a search came to; the last one counts."""
+def describe(result: SearchResult, profile: Profile) -> Iterator[str]:
+    """Yield the lines that describe the result of a search, with the counts in the last one."""
     for outcome in result.failed[:SHOWN_SEEDS]:
         yield f"seed {outcome.seed} failed:"
         for violation in outcome.violations[:SHOWN_VIOLATIONS]:
@@ -176,12 +175,12 @@ def describe(result: Result, profile: Profile) -> Iterator[str]:
 
 
 def replay_command(seed: int, profile: Profile) -> str:
-    """Return the command that runs one seed again and tells its story."""
+    """Return the command that runs one seed again and prints its story."""
     return f"laneweave simulate --seeds {seed}:{seed + 1} --profile {profile.name} --verbose"
 
 
 def describe_totals(totals: Totals) -> Iterator[str]:
-    """Return lines from which one sees that a search was not idle."""
+    """Yield lines that show how much happened in a search."""
     pace = totals.virtual_s / totals.cpu_s if totals.cpu_s else 0.0
     yield (
         f"{totals.runs} runs, {totals.virtual_s:.0f} s of virtual time in {totals.cpu_s:.0f} s of "
@@ -201,8 +200,8 @@ def describe_totals(totals: Totals) -> Iterator[str]:
 
 
 def story_of(seed: int, profile: Profile) -> Iterator[str]:
-    """Run one seed again and return what happened around its first violation."""
+    """Run one seed again and yield the story around its first violation."""
     story = Story()
-    outcome = World(seed, profile, story=story).run()
+    outcome = FaultRun(seed, profile, story=story).run()
     yield f"seed {seed}, profile {profile.name}:"
     yield from story.around(outcome.violations)

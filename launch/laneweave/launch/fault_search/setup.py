@@ -1,60 +1,98 @@
-"""What a seed draws before a run begins: the road, who visits it, the faults, and all wishes."""
+"""The setup of a run, drawn from its seed: road, vehicles, faults, and preferred lanes.
+
+Rolling operation: the road is short, because its whole rest is planned in each slot. Some vehicles
+are in S3 at the start, the others enter behind them, and all leave at its end.
+"""
 
 from __future__ import annotations
 
+import math
 import random
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
-from attrs import frozen
+from attrs import evolve, frozen
 
-from laneweave.launch.fault_search.faults import CLOCK_DRIFT, CLOCK_OFFSET_S, LEASE_S, Mix
+from laneweave.launch.fault_search.faults import CLOCK_DRIFT, CLOCK_OFFSET_S, LEASE_S, FaultMix
 from laneweave.launch.fault_search.light_road import Grant, Visit
 from laneweave.launch.fault_search.profiles import Profile
-from laneweave.launch.fault_search.rolling_setup import Stretch, grants, make_rolling_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.deployment import Network
 from laneweave.protocol.scenario.tables import FormationSettings, Road, Runtime, Scenario
 from laneweave.protocol.wire.messages import ClosedFormation, Name
 
-SLOT_S, MOVE_S, TICK_S = 1.0, 0.8, 0.1
+TICK_S = 0.1
+LEAVES_S = (2.0, 9.0)
+"""Time on the road of a vehicle that leaves during the fault phase."""
+
+# Operation in formations
+SLOT_S, MOVE_S = 1.0, 0.8
 LAST_COLUMNS = (1, 1, -3, -7)
 """Rear column of the rearmost formation. Columns above 0 are on the road at the start; the others
-enter cell by cell, so that it is closed after 3 or 7 s."""
+enter cell by cell, so that the formation closes after 3 or 7 s."""
 BLOCK_COLUMNS = 4
 LENGTHS = (2, 7)
-"""Columns of formations whose lengths differ."""
+"""Range of columns of formations with different lengths."""
 GAPS = (0, 0, 1)
-"""Columns of no formation between two of these."""
-LEAVES_S = (2.0, 9.0)
+"""Columns between two such formations."""
+MAX_SIZE = 6
+"""Vehicles in a formation; that of the paper's largest formation."""
+MAX_JOINED_SIZE = 10
+"""Vehicles in two formations that may join; more often take the planner too long."""
+
+# Rolling operation
+SLOTS_S = (1.0, 1.0, 1.0, 2.0)
+"""Choice of slot lengths. In the shortest one, ballots are often aborted."""
+MODES = (1, 1, 2)
+MOVE_SHARE = 0.8
+"""Share of a slot that a move takes."""
+SLOTS_ON_ROAD = 45
+"""Slots in which a column passes the road."""
+MAX_BEHIND = 3
+"""Empty columns behind the last vehicle of a lane that become its own."""
 THOROUGH = 0.05
-"""Share of runs of the rolling operation with the stream planner; it costs ten times the rest."""
-LARGEST = 6
-"""Vehicles in a formation, as many as the paper's largest one has."""
-LARGEST_JOINED = 10
-"""In two formations that may be joined: more are too much work for the planner, often."""
+"""Share of runs with the stream planner, which takes ten times as long as all the rest."""
 
 
 def make_scenario(lanes: int, max_joined: int, *, growing: bool = False) -> Scenario:
-    """Return the scenario of a run: a long road, and short times so that seeds are cheap.
+    """Return a scenario with formations: a long road, and short times so that runs are cheap.
 
     Args:
-        lanes: of the road.
-        max_joined: most formations that plan together.
+        lanes: number of lanes.
+        max_joined: maximum number of formations that plan together.
         growing: whether formations have different lengths.
     """
+    formation = FormationSettings(
+        operation="formations",
+        close="vehicles" if growing else "columns",
+        block_columns=BLOCK_COLUMNS,
+        cycle_s=SLOT_S,
+        move_s=MOVE_S,
+        max_joined=max_joined,
+        # The number of nodes limits a search, since a deadline would depend on the machine.
+        planning_deadline_s=3600.0,
+        max_nodes=500,
+    )
+    return _scenario(Road(lanes=lanes, s1_m=0.0, s2_m=0.0, s3_m=20_000.0), formation)
+
+
+def make_rolling_scenario(lanes: int, rng: random.Random) -> Scenario:
+    """Return a scenario of the rolling operation."""
+    slot_s = rng.choice(SLOTS_S)
+    formation = FormationSettings(
+        operation="rolling",
+        cycle_s=slot_s,
+        move_s=round(MOVE_SHARE * slot_s / TICK_S) * TICK_S,
+        mode=rng.choice(MODES),
+    )
+    length_m = SLOTS_ON_ROAD * slot_s * formation.speed_mps
+    scenario = _scenario(Road(lanes=lanes, s1_m=0.0, s2_m=0.0, s3_m=length_m), formation)
+    return evolve(scenario, seed=rng.randrange(2**31))
+
+
+def _scenario(road: Road, formation: FormationSettings) -> Scenario:
     return Scenario(
-        road=Road(lanes=lanes, s1_m=0.0, s2_m=0.0, s3_m=20_000.0),
-        formation=FormationSettings(
-            operation="formations",
-            close="vehicles" if growing else "columns",
-            block_columns=BLOCK_COLUMNS,
-            cycle_s=SLOT_S,
-            move_s=MOVE_S,
-            max_joined=max_joined,
-            # The bound on nodes ends a search; the clock of a busy machine must not.
-            planning_deadline_s=3600.0,
-            max_nodes=500,
-        ),
+        road=road,
+        formation=formation,
         network=Network(heartbeat_s=0.2, election_s=0.6, lease_s=LEASE_S),
         runtime=Runtime(tick_s=TICK_S, agent_silent_s=1.5),
     )
@@ -62,25 +100,25 @@ def make_scenario(lanes: int, max_joined: int, *, growing: bool = False) -> Scen
 
 @frozen
 class Setup:
-    """Everything that is fixed before a run begins."""
+    """Everything that is fixed before a run starts."""
 
     scenario: Scenario
-    mix: Mix
+    mix: FaultMix
     formations: tuple[ClosedFormation, ...]
     """Foremost first."""
     visits: tuple[Visit, ...]
     crowded: bool
-    """Now and then more vehicles want a lane of a block than it has cells."""
+    """Sometimes more vehicles prefer a lane of a block than it has cells."""
     grants: tuple[Grant, ...] = ()
-    """Which empty cells are whose (rolling operation)."""
+    """Owners of the empty cells (rolling operation)."""
     stretch_columns: int = 0
     """Length of the stretch in which vehicles enter (rolling operation)."""
     thorough: bool = False
-    """The stream planner plans, not the light one (rolling operation)."""
+    """Use the stream planner instead of the light one (rolling operation)."""
 
     @property
     def adjoin(self) -> bool:
-        """Whether there are two formations, with no column between them: these can be joined."""
+        """Whether there are two formations without a column between them, which can join."""
         if len(self.formations) != 2:
             return False
         ahead, behind = self.formations
@@ -88,25 +126,29 @@ class Setup:
 
     @classmethod
     def drawn(cls, profile: Profile, rng: random.Random) -> Setup:
-        """Draw from a profile."""
+        """Draw a setup from a profile."""
         lanes = rng.randint(*profile.lanes)
         if profile.rolling:
             return cls._drawn_rolling(profile, lanes, rng)
         growing = rng.random() < profile.growing
         scenario = make_scenario(lanes, rng.randint(*profile.max_joined), growing=growing)
         formations = tuple(_draw_formations(profile, scenario, rng))
-        mix = Mix.drawn(profile, rng)
+        mix = FaultMix.drawn(profile, rng)
         visits = tuple(_draw_visits(profile, scenario, formations, mix, rng))
         return cls(scenario, mix, formations, visits, rng.random() < profile.crowding)
 
     @classmethod
     def _drawn_rolling(cls, profile: Profile, lanes: int, rng: random.Random) -> Setup:
-        scenario = make_rolling_scenario(lanes, TICK_S, rng)
-        mix = Mix.drawn(profile, rng)
-        stretch = Stretch.drawn(profile, scenario, rng)
+        scenario = make_rolling_scenario(lanes, rng)
+        mix = FaultMix.drawn(profile, rng)
+        # At least the foremost column is in S3 at the start.
+        count = rng.randint(*profile.vehicles)
+        columns = max(2, math.ceil(count / (lanes * rng.uniform(*profile.density))))
+        first = rng.randint(1, columns + 1)
+        cells = [(first - index, lane) for index in range(columns) for lane in range(lanes)]
         visits = tuple(
             _visit(Name(f"v{number:02}"), cell, rng.random() < profile.leavers, scenario, mix, rng)
-            for number, cell in enumerate(stretch.cells, start=1)
+            for number, cell in enumerate(sorted(rng.sample(cells, count), reverse=True), start=1)
         )
         return cls(
             scenario,
@@ -114,16 +156,16 @@ class Setup:
             (),
             visits,
             rng.random() < profile.crowding,
-            tuple(grants(scenario, stretch, visits)),
-            stretch.columns,
+            tuple(_grants(scenario, first, columns, visits)),
+            columns,
             rng.random() < THOROUGH,
         )
 
-    def wishes(self, rng: random.Random, *, last: bool) -> dict[Name, int]:
-        """Draw the lane that each vehicle prefers.
+    def preferences(self, rng: random.Random, *, last: bool) -> dict[Name, int]:
+        """Draw the preferred lane of each vehicle.
 
-        The last wishes can be fulfilled: in each block at most as many vehicles want a lane as it
-        has cells there. Where two formations may be joined, that holds for both together.
+        The last preferences can be satisfied: in each block at most as many vehicles prefer a lane
+        as it has cells there. If two formations may join, this holds for both together.
         """
         lanes, lattice = self.scenario.road.lanes, self.scenario.lattice
         columns = [len(one.columns(lattice)) for one in self.formations]
@@ -134,40 +176,40 @@ class Setup:
             return _draw_lanes(vehicles, room, weights, rng)
         may_join = self.adjoin and self.scenario.formation.max_joined >= 2
         if self.crowded and (may_join or not last):
-            # One lane that everybody likes best.
+            # One lane is more popular than the others.
             room = [sum(columns)] * lanes if last else [99] * lanes
             favourite = rng.randrange(lanes)
             weights = [6.0 if lane == favourite else 1.0 for lane in range(lanes)]
             return _draw_lanes([visit.vehicle for visit in self.visits], room, weights, rng)
-        wishes: dict[Name, int] = {}
+        preferences: dict[Name, int] = {}
         for formation, length in zip(self.formations, columns, strict=True):
             members = [
                 visit.vehicle
                 for visit in self.visits
                 if lattice.block_of(visit.cell[0]) in formation.blocks
             ]
-            wishes |= _draw_lanes(members, [length] * lanes, [1.0] * lanes, rng)
-        return wishes
+            preferences |= _draw_lanes(members, [length] * lanes, [1.0] * lanes, rng)
+        return preferences
 
 
 def _draw_lanes(
     vehicles: list[Name], room: list[int], weights: list[float], rng: random.Random
 ) -> dict[Name, int]:
     left, lanes = list(room), range(len(room))
-    wishes: dict[Name, int] = {}
+    preferences: dict[Name, int] = {}
     for vehicle in vehicles:
         (lane,) = rng.choices(
             lanes, [weight if left[lane] else 0.0 for lane, weight in enumerate(weights)]
         )
         left[lane] -= 1
-        wishes[vehicle] = lane
-    return wishes
+        preferences[vehicle] = lane
+    return preferences
 
 
 def _draw_formations(
     profile: Profile, scenario: Scenario, rng: random.Random
 ) -> list[ClosedFormation]:
-    """Draw which columns are whose, from the rearmost formation to the foremost one."""
+    """Draw the columns of each formation, from the rearmost to the foremost one."""
     lattice, growing = scenario.lattice, scenario.formation.closes_by_vehicles
     rear, formations = rng.choice(LAST_COLUMNS), []
     for _ in range(rng.randint(*profile.blocks)):
@@ -183,23 +225,22 @@ def _draw_visits(
     profile: Profile,
     scenario: Scenario,
     formations: tuple[ClosedFormation, ...],
-    mix: Mix,
+    mix: FaultMix,
     rng: random.Random,
 ) -> Iterator[Visit]:
-    """Draw who is in which cell: in each formation at least one, in none more than half full."""
+    """Draw the vehicles: each formation has at least one and is at most half full."""
     lattice = scenario.lattice
     cells = [
         [(column, lane) for column in one.columns(lattice) for lane in range(lattice.lanes)]
         for one in formations
     ]
     blocks = range(len(formations))
-    room = [min(len(each) // 2, LARGEST) for each in cells]
+    room = [min(len(each) // 2, MAX_SIZE) for each in cells]
     if scenario.formation.max_joined > 1:
-        # Every other one is small.
+        # Every second formation is small.
         for block in blocks[rng.randrange(2) :: 2]:
-            room[block] = min(room[block], LARGEST_JOINED - LARGEST)
-    least, most = profile.vehicles
-    wanted = min(max(rng.randint(least, most), len(blocks)), sum(room))
+            room[block] = min(room[block], MAX_JOINED_SIZE - MAX_SIZE)
+    wanted = min(max(rng.randint(*profile.vehicles), len(blocks)), sum(room))
     counts = [1] * len(blocks)
     while sum(counts) < wanted:
         counts[rng.choice([block for block in blocks if counts[block] < room[block]])] += 1
@@ -207,13 +248,13 @@ def _draw_visits(
     for block in blocks:
         for index, cell in enumerate(rng.sample(cells[block], counts[block])):
             number += 1
-            # The first one stays: without anybody a formation is gone, and so is its room.
+            # The first one stays, because a formation without vehicles does not exist.
             leaves = index > 0 and rng.random() < profile.leavers
             yield _visit(Name(f"v{number:02}"), cell, leaves, scenario, mix, rng)
 
 
 def _visit(
-    name: Name, cell: Cell, leaves: bool, scenario: Scenario, mix: Mix, rng: random.Random
+    name: Name, cell: Cell, leaves: bool, scenario: Scenario, mix: FaultMix, rng: random.Random
 ) -> Visit:
     enters_s = max(0.0, scenario.lattice.passing_time_s(cell[0]))
     wrong = 1.0 if mix.wrong_clocks else 0.0
@@ -225,3 +266,25 @@ def _visit(
         clock_offset_s=wrong * rng.uniform(-CLOCK_OFFSET_S, CLOCK_OFFSET_S),
         clock_drift=wrong * rng.uniform(-CLOCK_DRIFT, CLOCK_DRIFT),
     )
+
+
+def _grants(
+    scenario: Scenario, first: int, columns: int, visits: Sequence[Visit]
+) -> Iterator[Grant]:
+    """Yield the owners of the empty cells: the vehicle that entered last on their lane.
+
+    A cell is granted when no vehicle can enter in it any more. Cells ahead of all vehicles belong
+    to the first one; on a real road they would have no owner, but a short stretch needs the room.
+    """
+    lattice, spread_s = scenario.lattice, scenario.formation.entry_spread_s
+    by_cell = {visit.cell: visit for visit in visits}
+    for lane in range(lattice.lanes):
+        on_lane = [visit for visit in visits if visit.cell[1] == lane]
+        owner = max(on_lane or visits, key=lambda visit: visit.cell)
+        for column in range(first, first - columns - MAX_BEHIND, -1):
+            visit = by_cell.get((column, lane))
+            if visit is not None:
+                owner = visit
+                continue
+            closed_s = max(0.0, lattice.passing_time_s(column) + spread_s)
+            yield Grant(max(closed_s, owner.enters_s), owner.vehicle, (column, lane))

@@ -1,13 +1,12 @@
-"""The story of a run for the person who looks for a cause: what was said, moved and broken."""
+"""The story of a run: a readable log of its messages, motions and violations, to find a cause."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from laneweave.launch.fault_search.checker import Violation
+from laneweave.launch.fault_search.checker import Violation, short
 from laneweave.protocol.runtime.node import Send
 from laneweave.protocol.wire.messages import (
-    Ballot,
     Command,
     Heartbeat,
     LogEvent,
@@ -17,60 +16,57 @@ from laneweave.protocol.wire.messages import (
 )
 
 BEFORE_S = 4.0
-"""How much is told from before a violation."""
+"""Time before a violation from which the story is printed."""
 AFTER_S = 0.2
 
 
 class Story:
-    """Collects lines; repeated states and commands are left out."""
+    """Collects lines, without repeated states and commands."""
 
     def __init__(self) -> None:
-        """Begin with nothing."""
+        """Start without lines."""
         self._lines: list[tuple[float, str]] = []
-        self._said: dict[tuple[str, str], str] = {}
+        self._last: dict[tuple[str, str], str] = {}
 
-    def tell(self, t_s: float, text: str) -> None:
-        """Something happened that is no message."""
+    def add(self, t_s: float, text: str) -> None:
+        """Add an event that is not a message."""
         self._lines.append((t_s, text))
 
-    def said(self, t_s: float, sender: str, effect: Send) -> None:
-        """A process says something."""
-        text = _words(effect)
+    def add_message(self, t_s: float, sender: str, effect: Send) -> None:
+        """Add a message, unless the sender has just sent the same one."""
+        text = _text_of(effect)
         if text is None:
             return
         key = (sender, effect.topic.name + str(effect.parameters))
-        if self._said.get(key) != text:
-            self._said[key] = text
+        if self._last.get(key) != text:
+            self._last[key] = text
             self._lines.append((t_s, f"{sender}: {text}"))
 
     def around(self, violations: Iterable[Violation]) -> Iterator[str]:
-        """Return the lines around the first violation; without violations all."""
+        """Yield the lines around the first violation; all lines if there is none."""
         first = next(iter(violations), None)
         for t_s, text in self._lines:
             if first is None or first.t_s - BEFORE_S <= t_s <= first.t_s + AFTER_S:
                 yield f"{t_s:8.3f}  {text}"
 
 
-def _words(effect: Send) -> str | None:
+def _text_of(effect: Send) -> str | None:
     match effect.message:
         case VehicleState() as state:
-            marks = [
-                mark
-                for mark, is_so in (
-                    ("accepted", state.accepted),
-                    ("ready", state.ready),
-                    ("go", state.go),
-                    ("moving", state.moving),
-                    ("done", state.done),
-                    ("overdue", state.overdue),
-                    ("unattended", not state.attended),
-                )
-                if is_so
-            ]
+            flags = {
+                "accepted": state.accepted,
+                "ready": state.ready,
+                "go": state.go,
+                "moving": state.moving,
+                "done": state.done,
+                "overdue": state.overdue,
+                "unattended": not state.attended,
+            }
+            marks = " ".join(mark for mark, is_set in flags.items() if is_set)
             return (
-                f"STATE of {state.vehicle}/{state.incarnation} promised {_short(state.promised)} "
-                f"k={state.completed} at {state.hold_cell} joined {state.joined} {' '.join(marks)}"
-                f"{_owned(state)}"
+                f"STATE of {state.vehicle}/{state.incarnation} promised {short(state.promised)} "
+                f"k={state.completed} at {state.hold_cell} joined {state.joined} {marks}"
+                f"{_ownership(state)}"
             )
         case Command() as command:
             return (
@@ -79,13 +75,13 @@ def _words(effect: Send) -> str | None:
             )
         case Prepare() as prepare:
             return (
-                f"PREPARE {_short(prepare.ballot)} of {prepare.formations} "
+                f"PREPARE {short(prepare.ballot)} of {prepare.formations} "
                 f"to {effect.parameters['vehicle']}, roster {' '.join(prepare.roster)}"
             )
         case Plan() as plan:
             moves = {name: list(each) for name, each in plan.moves.items() if each}
             return (
-                f"PLAN {_short(plan.ballot)} of {plan.formations} to {effect.parameters['vehicle']}"
+                f"PLAN {short(plan.ballot)} of {plan.formations} to {effect.parameters['vehicle']}"
                 f" t0={plan.t0_s:.1f} moves {moves}"
             )
         case LogEvent() as event:
@@ -96,16 +92,11 @@ def _words(effect: Send) -> str | None:
             return None
 
 
-def _owned(state: VehicleState) -> str:
-    """Return what a vehicle of the rolling operation shows to own."""
-    if not state.estate and state.deed is None:
-        return ""
-    deed = state.deed
-    if deed is None:
-        return f" owns {list(state.estate)}"
-    word = "open" if deed.open else f"waits for {list(deed.after)} with {' '.join(deed.roster)}"
-    return f" owns {list(state.estate)}, deed {_short(deed.ballot)} {word}"
-
-
-def _short(ballot: Ballot | None) -> str:
-    return "nothing" if ballot is None else ".".join(str(part) for part in ballot)
+def _ownership(state: VehicleState) -> str:
+    """Return the owned cells and the pending transfer of a vehicle (rolling operation)."""
+    transfer = state.deed
+    if transfer is None:
+        return f" owns {list(state.estate)}" if state.estate else ""
+    change = f"{list(transfer.after)} with {' '.join(transfer.roster)}"
+    status = "open" if transfer.open else f"pending, then {change}"
+    return f" owns {list(state.estate)}, transfer {short(transfer.ballot)} {status}"

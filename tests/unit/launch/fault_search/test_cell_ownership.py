@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from laneweave.launch.fault_search.cell_ownership import Estates
+from laneweave.launch.fault_search.cell_ownership import CellOwnership
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import Ballot, Deed, Name
 
@@ -20,7 +20,7 @@ class Watched:
     def __init__(self) -> None:
         """Begin without vehicles."""
         self.kinds: list[str] = []
-        self.estates = Estates(self._tell)
+        self.estates = CellOwnership(self._tell)
 
     def _tell(self, kind: str, t_s: float, vehicles: list[str], text: str) -> None:
         del t_s, vehicles, text

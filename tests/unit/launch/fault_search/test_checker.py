@@ -6,7 +6,7 @@ import attrs
 import pytest
 
 from laneweave.launch.fault_search.bodies import Geometry
-from laneweave.launch.fault_search.checker import MOST_VIOLATIONS, Checker, Violation
+from laneweave.launch.fault_search.checker import MAX_VIOLATIONS, Checker, Violation
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.wire.messages import Ballot, Name, Plan, Sense, VehicleState
 from support.states import holding
@@ -266,9 +266,9 @@ def test_a_stuck_vehicle_is_told() -> None:
 
 def test_violations_are_limited() -> None:
     checker = Checker(GEOMETRY)
-    for _ in range(2 * MOST_VIOLATIONS):
+    for _ in range(2 * MAX_VIOLATIONS):
         checker.stuck(1.0, A, "")
-    assert len(checker.violations) == MOST_VIOLATIONS
+    assert len(checker.violations) == MAX_VIOLATIONS
 
 
 def test_a_violation_is_data() -> None:

@@ -6,9 +6,9 @@ import random
 
 import pytest
 
-from laneweave.launch.fault_search.faults import WHOLE, Mix
+from laneweave.launch.fault_search.fault_run import FaultRun
+from laneweave.launch.fault_search.faults import HEALTHY, FaultMix
 from laneweave.launch.fault_search.profiles import PROFILES
-from laneweave.launch.fault_search.simulated_run import World
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.node import Node
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
@@ -17,21 +17,21 @@ from laneweave.protocol.wire.topics import Keys
 
 
 @pytest.fixture
-def world() -> World:
+def world() -> FaultRun:
     """A calm world that has run for two seconds."""
-    world = World(3, PROFILES["calm"])
+    world = FaultRun(3, PROFILES["calm"])
     world.network.run(2.0)
     return world
 
 
-def harm(world: World, kind: str) -> None:
-    world.injector._harm(kind)
+def harm(world: FaultRun, kind: str) -> None:
+    world.faults._apply(kind)
 
 
-def test_malformed_bytes_are_malformed(world: World) -> None:
+def test_malformed_bytes_are_malformed(world: FaultRun) -> None:
     keys = Keys(world.setup.scenario.network.realm)
     for _ in range(2000):
-        key, payload = world.injector._malformed()
+        key, payload = world.faults._malformed()
         known = keys.read(key)
         kind = known[0].kind if known is not None else None
         if kind is not None:
@@ -39,7 +39,7 @@ def test_malformed_bytes_are_malformed(world: World) -> None:
                 decode(payload, kind)
 
 
-def test_malformed_bytes_arrive_and_are_dropped(world: World) -> None:
+def test_malformed_bytes_arrive_and_are_dropped(world: FaultRun) -> None:
     before = _rejected(world.network)
     for _ in range(10):
         harm(world, "garbage")
@@ -48,46 +48,46 @@ def test_malformed_bytes_arrive_and_are_dropped(world: World) -> None:
     assert world.checker.violations == []
 
 
-def test_old_messages_are_delivered_once_more(world: World) -> None:
+def test_old_messages_are_delivered_once_more(world: FaultRun) -> None:
     delivered = world.network.delivered
     world.network.run(2.0001)
     harm(world, "replay")
-    assert world.injector.counts["replay"] == 1
+    assert world.faults.counts["replay"] == 1
     world.network.run(2.05)
     assert world.network.delivered > delivered
 
 
 @pytest.mark.parametrize("kind", ["leader-kill", "coordinator-kill", "agent-kill"])
-def test_killed_processes_are_started_again(world: World, kind: str) -> None:
+def test_killed_processes_are_started_again(world: FaultRun, kind: str) -> None:
     everybody = set(world.network.names)
     harm(world, kind)
     assert len(everybody - set(world.network.names)) == 1
-    world.injector.heal()
+    world.faults.heal()
     assert set(world.network.names) == everybody
 
 
-def test_the_leader_is_whoever_leads(world: World) -> None:
+def test_the_leader_is_whoever_leads(world: FaultRun) -> None:
     assert world.leaders == ("c1",)
     harm(world, "leader-kill")
     assert "c1" not in world.network
 
 
 @pytest.mark.parametrize("kind", ["blackout", "partition", "router-loss", "cut"])
-def test_a_network_that_was_broken_becomes_whole(world: World, kind: str) -> None:
+def test_a_network_that_was_broken_becomes_whole(world: FaultRun, kind: str) -> None:
     network = world.network
     dropped = network.dropped
     harm(world, kind)
     network.run(network.now_s + 0.3)
     assert network.dropped > dropped
-    world.injector.heal()
+    world.faults.heal()
     network.run(network.now_s + 1.0)
-    assert network.conditions == WHOLE
+    assert network.conditions == HEALTHY
     dropped = network.dropped
     network.run(network.now_s + 1.0)
     assert network.dropped == dropped
 
 
-def test_faults_end_by_themselves(world: World) -> None:
+def test_faults_end_by_themselves(world: FaultRun) -> None:
     conditions = world.network.conditions
     harm(world, "blackout")
     harm(world, "partition")
@@ -100,25 +100,25 @@ def test_faults_end_by_themselves(world: World) -> None:
     assert world.network.dropped == dropped
 
 
-def test_an_unknown_fault_is_an_error(world: World) -> None:
+def test_an_unknown_fault_is_an_error(world: FaultRun) -> None:
     with pytest.raises(ValueError, match="no such fault: rain"):
         harm(world, "rain")
 
 
 def test_lasting_faults_are_counted() -> None:
-    mix = Mix.drawn(PROFILES["clocks"], random.Random(1))
+    mix = FaultMix.drawn(PROFILES["clocks"], random.Random(1))
     kinds = mix.kinds()
     assert kinds["wrong-clocks"] == 1
     assert ("loss" in kinds) == (mix.conditions.loss > 0)
-    assert Mix.drawn(PROFILES["calm"], random.Random(1)).kinds() == {}
+    assert FaultMix.drawn(PROFILES["calm"], random.Random(1)).kinds() == {}
 
 
 def test_every_kind_in_a_profile_can_be_done() -> None:
     for kind in sorted({kind for profile in PROFILES.values() for kind in profile.harm}):
-        world = World(3, PROFILES["calm"])
+        world = FaultRun(3, PROFILES["calm"])
         world.network.run(2.0)
         harm(world, kind)
-        assert world.injector.counts[kind] == 1, kind
+        assert world.faults.counts[kind] == 1, kind
 
 
 def _rejected(network: SimulatedNetwork) -> int:

@@ -15,16 +15,16 @@ from attrs import evolve
 
 from laneweave.launch.cli.options import check_jobs, parse_seeds
 from laneweave.launch.fault_search.checker import Violation
+from laneweave.launch.fault_search.fault_run import SeedResult, Totals
 from laneweave.launch.fault_search.profiles import PROFILES
 from laneweave.launch.fault_search.search import (
     BATCH,
-    Result,
+    SearchResult,
     describe,
     run_seeds,
     search,
     story_of,
 )
-from laneweave.launch.fault_search.simulated_run import Outcome, Totals
 from laneweave.protocol.errors import BadInputError
 
 CALM = PROFILES["calm"]
@@ -83,8 +83,8 @@ def test_profiles_and_seeds_make_different_runs() -> None:
 
 def test_failures_are_described_with_the_command_that_replays_them() -> None:
     violation = Violation("cell", 3.25, ("v01", "v02"), "both occupy [(0, 0)]")
-    failed = (Outcome(17, (violation,), Totals(runs=1)),)
-    lines = list(describe(Result(Totals(runs=20), failed), CALM))
+    failed = (SeedResult(17, (violation,), Totals(runs=1)),)
+    lines = list(describe(SearchResult(Totals(runs=20), failed), CALM))
     assert lines[:3] == [
         "seed 17 failed:",
         "     3.250 s  cell: v01, v02: both occupy [(0, 0)]",
@@ -103,7 +103,7 @@ def test_the_story_of_a_run() -> None:
         "STATE",
         "COMMAND",
         "moves",
-        "everything is made whole",
+        "all faults end",
         "*** v01",
     ):
         assert word in told

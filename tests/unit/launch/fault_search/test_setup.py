@@ -83,7 +83,7 @@ def test_in_every_formation_somebody_stays(name: str) -> None:
 @EVERY
 def test_the_last_wishes_can_be_fulfilled(name: str) -> None:
     for setup, rng in draw(name):
-        wishes = setup.wishes(rng, last=True)
+        wishes = setup.preferences(rng, last=True)
         if asks_for_too_much(setup, wishes):
             assert setup.scenario.formation.max_joined > 1
             assert setup.adjoin
@@ -94,7 +94,7 @@ def test_the_last_wishes_can_be_fulfilled(name: str) -> None:
 def test_lanes_are_crowded_now_and_then() -> None:
     crowded = 0
     for setup, rng in draw("joint"):
-        crowded += asks_for_too_much(setup, setup.wishes(rng, last=True))
+        crowded += asks_for_too_much(setup, setup.preferences(rng, last=True))
     assert crowded > 5
 
 
@@ -122,7 +122,7 @@ def test_a_stretch_of_the_rolling_operation_has_one_owner_for_each_cell(name: st
         enters = {visit.vehicle: visit.enters_s for visit in setup.visits}
         for grant in setup.grants:
             assert grant.t_s >= enters[grant.owner]
-        wanted = Counter(setup.wishes(rng, last=True).values())
+        wanted = Counter(setup.preferences(rng, last=True).values())
         assert max(wanted.values()) <= setup.stretch_columns
 
 

@@ -1,7 +1,7 @@
-"""One simulated run: real cores, a light road, a network full of faults, and a checker.
+"""One simulated run with many faults: real cores, a light road, random faults, and the checker.
 
-First a phase of faults, in which wishes change so that plans never end; then everything is made
-whole, and everybody must arrive. Equal seeds give equal runs.
+During the fault phase, preferred lanes change so that there is always something to plan. After it
+all faults end, and all vehicles must arrive. Equal seeds give equal runs.
 """
 
 from __future__ import annotations
@@ -9,28 +9,28 @@ from __future__ import annotations
 import random
 import time
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from itertools import count
 
+import attrs
 from attrs import field, frozen
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.formations.leader_rules import LEADER_RULES
+from laneweave.coordinator.planning.rolling.planner import StreamPlan, StreamVehicle
 from laneweave.coordinator.rolling.planner import Planner, stream_planner
 from laneweave.launch.fault_search.bodies import Geometry
 from laneweave.launch.fault_search.checker import Checker, Violation
-from laneweave.launch.fault_search.faults import CLOCK_DRIFT, CLOCK_OFFSET_S, ROAD, Injector
-from laneweave.launch.fault_search.light_driver import LightDriver
+from laneweave.launch.fault_search.faults import CLOCK_DRIFT, CLOCK_OFFSET_S, ROAD, RandomFaults
 from laneweave.launch.fault_search.light_road import LightRoad
-from laneweave.launch.fault_search.message_tap import Tap
-from laneweave.launch.fault_search.planners import LightPlanner, Watched
 from laneweave.launch.fault_search.profiles import Profile
 from laneweave.launch.fault_search.setup import Setup
+from laneweave.launch.fault_search.stand_ins import LightDriver, LightPlanner
 from laneweave.launch.fault_search.story import Story
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.runtime.node import Core, Send
+from laneweave.protocol.runtime.node import Core, Effect, Event, Send
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
@@ -41,29 +41,29 @@ from laneweave.protocol.wire.messages import Command, Name, Plan, Prepare, Sense
 from laneweave.protocol.wire.topics import Keys
 
 TWIN = ".2"
-"""Of the name of a second process of a vehicle."""
+"""Suffix of the name of a second process of a vehicle."""
 COORDINATORS = ("c1", "c2", "c3")
-SLOWEST_SLOTS = 3.0
-"""A slow motion takes at most this many slots."""
-NEW_WISHES_S = (0.8, 3.0)
-"""While faults happen vehicles change their minds after such times."""
+MAX_MOTION_SLOTS = 3.0
+"""Maximum duration of a slow motion in slots."""
+NEW_PREFERENCES_S = (0.8, 3.0)
+"""Interval between changes of the preferred lanes during the fault phase."""
 PATIENCE_S = 90.0
-"""Time that everybody has to arrive once everything is whole."""
-FUTILE = 5
-"""A vehicle that does not move though so many plans would move it is stuck."""
-SLOTS_WHOLE = 8
-"""Slots that a run of the rolling operation goes on for once everything is whole."""
-LOOK_S = 0.5
-"""How often it is looked whether a run is over."""
+"""Time for all vehicles to arrive after the fault phase."""
+MAX_FUTILE_PLANS = 5
+"""A vehicle that does not move though this many plans move it is stuck."""
+HEALTHY_SLOTS = 8
+"""Slots after the fault phase of a run of the rolling operation."""
+CHECK_S = 0.5
+"""Interval between checks whether a run is over."""
 KEPT = 400
-"""Old messages that may be replayed or damaged."""
+"""Number of old messages that may be replayed or damaged."""
 KEEP_EVERY = 7
 _REPLAYABLE = (Prepare, Plan, VehicleState, Command, Sense)
 
 
 @frozen
 class Totals:
-    """What a run, or many of them, consisted of."""
+    """What one run, or many of them, consisted of."""
 
     runs: int = 0
     virtual_s: float = 0.0
@@ -73,43 +73,75 @@ class Totals:
     plans: int = 0
     joint_plans: int = 0
     takeovers: int = 0
-    """Of vehicles by caretakers."""
+    """Number of times that a caretaker has taken charge of a vehicle."""
     delivered: int = 0
     dropped: int = 0
     longest_healing_s: float = 0.0
     faults: Counter[str] = field(factory=Counter)
 
     def __add__(self, other: Totals) -> Totals:
-        """Return the sum."""
-        return Totals(
-            self.runs + other.runs,
-            self.virtual_s + other.virtual_s,
-            self.cpu_s + other.cpu_s,
-            self.vehicles + other.vehicles,
-            self.motions + other.motions,
-            self.plans + other.plans,
-            self.joint_plans + other.joint_plans,
-            self.takeovers + other.takeovers,
-            self.delivered + other.delivered,
-            self.dropped + other.dropped,
-            max(self.longest_healing_s, other.longest_healing_s),
-            self.faults + other.faults,
-        )
+        """Return the sum, with the maximum of the healing times."""
+        names = [attribute.name for attribute in attrs.fields(Totals)]
+        sums = {name: getattr(self, name) + getattr(other, name) for name in names}
+        sums["longest_healing_s"] = max(self.longest_healing_s, other.longest_healing_s)
+        return Totals(**sums)
 
 
 @frozen
-class Outcome:
-    """What a run came to."""
+class SeedResult:
+    """Result of one run."""
 
     seed: int
     violations: tuple[Violation, ...]
     totals: Totals
     digest: str = ""
-    """Of everything that was delivered, if asked for."""
+    """Digest of all delivered messages, if requested."""
 
 
-class World:
-    """One run; `run` does it all."""
+class _ListenedCore:
+    """A core that passes the messages it sends to a listener."""
+
+    def __init__(self, core: Core, name: str, listener: Callable[[str, Send], None]) -> None:
+        self.core = core
+        self._name = name
+        self._listener = listener
+
+    @property
+    def wakeup_s(self) -> float | None:
+        return self.core.wakeup_s
+
+    def handle(self, event: Event, now_s: float) -> list[Effect]:
+        effects = list(self.core.handle(event, now_s))
+        for effect in effects:
+            if type(effect) is Send:
+                self._listener(self._name, effect)
+        return effects
+
+
+class _ListenedPlanner:
+    """A rolling planner that passes the vehicles that it moves or holds to a listener."""
+
+    def __init__(self, planner: Planner, listener: Callable[[Sequence[str]], None]) -> None:
+        self._planner = planner
+        self._listener = listener
+
+    def plan(
+        self,
+        slot: int,
+        vehicles: Sequence[StreamVehicle],
+        before: StreamPlan | None = None,
+        blocked: Collection[Cell] = (),
+    ) -> StreamPlan:
+        plan = self._planner.plan(slot, vehicles, before, blocked)
+        held = [vehicle.vehicle for vehicle in vehicles if vehicle.held]
+        paths = plan.ways.items()
+        moved = [name for name, path in paths if len(path) > 1 and path[0] != path[1]]
+        self._listener([*held, *moved])
+        return plan
+
+
+class FaultRun:
+    """One run; call `run` once."""
 
     coordinators: tuple[str, ...] = COORDINATORS
 
@@ -123,15 +155,15 @@ class World:
         *,
         digest: bool = False,
     ) -> None:
-        """Draw road, vehicles and faults, and start all processes.
+        """Draw the setup and start all processes.
 
         Args:
-            seed: decides everything, together with the profile's name.
-            profile: what to draw from.
-            vehicle_rules: of plan execution; others only to plant a bug.
-            leader_rules: of leaders; likewise.
-            story: collects what happens.
-            digest: whether to make a digest of all that is delivered.
+            seed: determines all draws, together with the name of the profile.
+            profile: profile from which the setup is drawn.
+            vehicle_rules: rules of plan execution; others plant a bug.
+            leader_rules: rules of leaders; others plant a bug.
+            story: log to write.
+            digest: whether to compute a digest of all delivered messages.
         """
         self.seed = seed
         self.profile = profile
@@ -146,7 +178,7 @@ class World:
             Geometry(
                 scenario.formation.gap_m, scenario.road.lane_width_m, size.length_m, size.width_m
             ),
-            story.tell if story is not None else None,
+            story.add if story is not None else None,
             rolling=profile.rolling,
         )
         self._rules = vehicle_rules, leader_rules
@@ -154,22 +186,21 @@ class World:
         self._keys = Keys(scenario.network.realm)
         self._incarnations = count(1)
         self._kept: deque[Send] = deque(maxlen=KEPT)
-        self._said = 0
-        self.injector = Injector(
+        self._sent = 0
+        self.faults = RandomFaults(
             self.network, self, mix, self._rng, scenario.network.realm, self._note
         )
         self._proposed: Counter[str] = Counter()
-        """How often a planner meant to move each vehicle since everything was made whole, or was
-        told that it must hold."""
+        """Number of plans since the fault phase in which each vehicle moves or is held."""
         self._first_cells: dict[Name, Cell] = {}
-        """Where each vehicle was found first since then (rolling operation)."""
+        """First cell of each vehicle after the fault phase (rolling operation)."""
         self._moved: set[Name] = set()
-        """Who has been found elsewhere since."""
-        self._wishes = self.setup.wishes(self._rng, last=False)
+        """Vehicles that have moved since then."""
+        self._preferences = self.setup.preferences(self._rng, last=False)
         self.road = LightRoad(
             scenario,
             self.setup.visits,
-            self._wishes,
+            self._preferences,
             self.checker,
             self._incarnations.__next__,
             self._move_lasts_s,
@@ -178,30 +209,32 @@ class World:
             self.setup.grants,
         )
         self._set_clocks()
-        self.network.add(ROAD, Tap(self.road, ROAD, self._on_sent), scenario.network.realm)
+        self.network.add(
+            ROAD, _ListenedCore(self.road, ROAD, self._on_message), scenario.network.realm
+        )
         for name in (*COORDINATORS, *self.agents):
             self.start(name)
 
-    def run(self) -> Outcome:
-        """Run the faults, heal everything, and wait until all have arrived; end on a violation."""
+    def run(self) -> SeedResult:
+        """Run the fault phase, then wait until all vehicles have arrived; stop at a violation."""
         began_s = time.process_time()
         network, fault_s = self.network, self.setup.mix.fault_s
-        self.injector.plan(self.profile.harm)
+        self.faults.plan(self.profile.harm)
         change_s, last = 0.0, False
         while not last:
-            change_s += self._rng.uniform(*NEW_WISHES_S)
-            last = change_s + NEW_WISHES_S[1] > fault_s
-            network.at(change_s, self._change_wishes, last)
-        network.at(fault_s, self.injector.heal)
+            change_s += self._rng.uniform(*NEW_PREFERENCES_S)
+            last = change_s + NEW_PREFERENCES_S[1] > fault_s
+            network.at(change_s, self._change_preferences, last)
+        network.at(fault_s, self.faults.heal)
         end_s = fault_s + self._patience_s
         while network.now_s < end_s and not self._is_over():
-            network.run(network.now_s + LOOK_S)
+            network.run(network.now_s + CHECK_S)
         self.checker.advance(network.now_s)
-        for name in self._astray():
+        for name in self._not_arrived():
             vehicle = self.road.vehicles[name]
-            text = f"in {vehicle.controller.hold_cell}, wants lane {vehicle.preferred_lane}"
+            text = f"in {vehicle.controller.hold_cell}, prefers lane {vehicle.preferred_lane}"
             self.checker.stuck(network.now_s, name, text)
-        return self._outcome(time.process_time() - began_s)
+        return self._result(time.process_time() - began_s)
 
     # --- processes ----------------------------------------------------------------------------
 
@@ -217,17 +250,17 @@ class World:
 
     @property
     def leaders(self) -> tuple[str, ...]:
-        """Coordinators that take themselves for the leader."""
+        """Coordinators that consider themselves the leader."""
         return tuple(name for name in COORDINATORS if self._leads(name))
 
     def start_twin(self, name: str) -> str:
-        """Start a second process for an agent's vehicle, and return the name of its node."""
+        """Start a second process for an agent's vehicle and return the name of its node."""
         twin = f"{name}{TWIN}"
         self.start(twin)
         return twin
 
     def start(self, name: str) -> None:
-        """Start a process, unless it runs."""
+        """Start a process if it does not run."""
         if name in self.network:
             return
         vehicle = Name(name.removesuffix(TWIN))
@@ -243,18 +276,18 @@ class World:
                 vehicle, self._incarnations.__next__, scenario, LightDriver, vehicle_rules
             )
             core = AgentHost(lambda _: agent, [vehicle])
-        self.network.add(name, Tap(core, name, self._on_sent), scenario.network.realm)
+        self.network.add(name, _ListenedCore(core, name, self._on_message), scenario.network.realm)
 
     def _make_planner(self, scenario: Scenario) -> Planner:
         planner = stream_planner(scenario) if self.setup.thorough else LightPlanner(scenario)
-        return Watched(planner, self._on_planned)
+        return _ListenedPlanner(planner, self._on_planned)
 
-    def _on_planned(self, movers: Sequence[str]) -> None:
-        if self.injector.healed:
-            self._proposed.update(movers)
+    def _on_planned(self, vehicles: Sequence[str]) -> None:
+        if self.faults.healed:
+            self._proposed.update(vehicles)
 
     def old_payload(self, rng: random.Random) -> tuple[str, bytes] | None:
-        """Return a message that was sent some time ago, with its key."""
+        """Return key and payload of a message sent some time ago."""
         if not self._kept:
             return None
         old = rng.choice(self._kept)
@@ -263,8 +296,8 @@ class World:
     def _leads(self, name: str) -> bool:
         if name not in self.network:
             return False
-        tap = self.network.node(name).core
-        core = tap.core if isinstance(tap, Tap) else tap
+        core = self.network.node(name).core
+        core = core.core if isinstance(core, _ListenedCore) else core
         return isinstance(core, CoordinatorCore) and core.election.leading
 
     def _set_clocks(self) -> None:
@@ -275,81 +308,81 @@ class World:
             rate = 1.0 + self._rng.uniform(-CLOCK_DRIFT, CLOCK_DRIFT)
             self.network.set_clock(name, offset_s, rate)
 
-    # --- what the road asks for ---------------------------------------------------------------
+    # --- draws for the road -------------------------------------------------------------------
 
     def _move_lasts_s(self) -> float:
         rng = self._rng
-        if not self.injector.healed and rng.random() < self.setup.mix.slow_moves:
+        if not self.faults.healed and rng.random() < self.setup.mix.slow_moves:
             slot_s = self.setup.scenario.cycles_s[0]
-            return rng.uniform(slot_s, SLOWEST_SLOTS * slot_s)
+            return rng.uniform(slot_s, MAX_MOTION_SLOTS * slot_s)
         return self.setup.scenario.move_s
 
     def _loses_command(self) -> bool:
         share = self.setup.mix.command_loss
-        return share > 0.0 and not self.injector.healed and self._rng.random() < share
+        return share > 0.0 and not self.faults.healed and self._rng.random() < share
 
-    def _change_wishes(self, last: bool) -> None:
-        self._wishes = self.setup.wishes(self._rng, last=last)
-        self.road.prefer(self._wishes)
-        self._note(f"new wishes: {self._wishes}")
+    def _change_preferences(self, last: bool) -> None:
+        self._preferences = self.setup.preferences(self._rng, last=last)
+        self.road.prefer(self._preferences)
+        self._note(f"new preferred lanes: {self._preferences}")
 
-    # --- what is said -------------------------------------------------------------------------
+    # --- messages -----------------------------------------------------------------------------
 
-    def _on_sent(self, sender: str, effect: Send) -> None:
+    def _on_message(self, sender: str, effect: Send) -> None:
         now_s = self.network.now_s
         self.checker.sent(now_s, effect.message)
-        self._said += 1
-        if self._said % KEEP_EVERY == 0 and isinstance(effect.message, _REPLAYABLE):
+        self._sent += 1
+        if self._sent % KEEP_EVERY == 0 and isinstance(effect.message, _REPLAYABLE):
             self._kept.append(effect)
         if self._story is not None:
-            self._story.said(now_s, sender, effect)
+            self._story.add_message(now_s, sender, effect)
 
     def _note(self, text: str) -> None:
         if self._story is not None:
-            self._story.tell(self.network.now_s, text)
+            self._story.add(self.network.now_s, text)
 
     # --- the end ------------------------------------------------------------------------------
 
     def _is_over(self) -> bool:
         if self.profile.rolling:
-            self._astray()
+            self._not_arrived()
             return bool(self.checker.violations)
-        return bool(self.checker.violations) or (self.injector.healed and not self._astray())
+        return bool(self.checker.violations) or (self.faults.healed and not self._not_arrived())
 
     @property
     def _patience_s(self) -> float:
         scenario = self.setup.scenario
         if scenario.formation.rolling:
-            return SLOTS_WHOLE * scenario.cycles_s[0]
+            return HEALTHY_SLOTS * scenario.cycles_s[0]
         return PATIENCE_S
 
-    def _astray(self) -> list[Name]:
-        """Return who is on the road but does not rest on the lane that it prefers."""
-        if self.checker.violations or not self.injector.healed:
+    def _not_arrived(self) -> list[Name]:
+        """Return the vehicles on the road that are not at rest on their preferred lane."""
+        if self.checker.violations or not self.faults.healed:
             return []
         now_s = self.network.now_s
-        astray = [
+        not_arrived = [
             name
             for name, vehicle in self.road.vehicles.items()
             if vehicle.controller.hold_cell[1] != vehicle.preferred_lane
             or not vehicle.body.has_arrived(now_s)
         ]
         if not self.profile.rolling:
-            return astray
-        return [name for name in astray if not self._has_done_its_part(name)]
+            return not_arrived
+        return [name for name in not_arrived if not self._is_not_stuck(name)]
 
-    def _has_done_its_part(self, name: Name) -> bool:
-        """Tell whether a vehicle of the rolling operation moves, or nobody means to move it.
+    def _is_not_stuck(self, name: Name) -> bool:
+        """Return whether a vehicle of the rolling operation has moved, or no plan moves it.
 
-        Who has been on its lane may have made room for others since, and some lanes are full.
+        It need not be on its preferred lane: it may have made room for others, or the lane is full.
         """
         cell = self.road.vehicles[name].controller.hold_cell
         moved = self._first_cells.setdefault(name, cell) != cell
         if moved:
             self._moved.add(name)
-        return name in self._moved or self._proposed[name] < FUTILE
+        return name in self._moved or self._proposed[name] < MAX_FUTILE_PLANS
 
-    def _outcome(self, cpu_s: float) -> Outcome:
+    def _result(self, cpu_s: float) -> SeedResult:
         network, checker = self.network, self.checker
         plans = checker.plans.values()
         totals = Totals(
@@ -364,7 +397,7 @@ class World:
             delivered=network.delivered,
             dropped=network.dropped,
             longest_healing_s=network.now_s - self.setup.mix.fault_s,
-            faults=self.injector.counts,
+            faults=self.faults.counts,
         )
         digest = self._trace.hexdigest() if self._trace is not None else ""
-        return Outcome(self.seed, tuple(checker.violations), totals, digest)
+        return SeedResult(self.seed, tuple(checker.violations), totals, digest)
