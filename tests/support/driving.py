@@ -183,7 +183,7 @@ class Road:
         record.gaps_m.append(bodies.min_gaps().gap_m)
         record.overlaps += [(self.tick, *pair) for pair in bodies.overlapping_pairs()]
         accels_mps2: dict[str, float] = {name: one.state[2] for name, one in self.vehicles.items()}
-        around = bodies.glimpses(road.lanes, road.lane_width_m, accels_mps2)
+        around = bodies.exact_neighbours(road.lanes, road.lane_width_m, accels_mps2)
         for name, vehicle in self.vehicles.items():
             vehicle.perceive(around[name])
 

@@ -48,10 +48,10 @@ class Around(NamedTuple):
 
 NONE_AROUND = Around((), ())
 
-Glimpse = tuple[int, float, float, float]
+ExactNeighbour = tuple[int, float, float, float]
 """(lane, gap m, speed m/s, acceleration m/s2): a `Neighbour` without measurement errors."""
 
-Glimpses = tuple[Sequence[Glimpse], Sequence[Glimpse]]
+ExactNeighbours = tuple[Sequence[ExactNeighbour], Sequence[ExactNeighbour]]
 """(ahead, behind), by lane: an `Around` without measurement errors."""
 
 
@@ -164,9 +164,9 @@ class Bodies:
             min_gap = min(min_gap, gap_m)
         return MinGaps(min_gap, min_headway)
 
-    def glimpses(
+    def exact_neighbours(
         self, lanes: int, lane_width_m: float, accels_mps2: Mapping[str, float]
-    ) -> dict[str, Glimpses]:
+    ) -> dict[str, ExactNeighbours]:
         """Return the neighbours that each vehicle's sensors would see if they were exact.
 
         In each lane that its body touches or that is adjacent to such a lane, a vehicle sees the
@@ -192,10 +192,10 @@ class Bodies:
         names, poses, length_m = self._names, self._poses, self._length_m
         accels = [accels_mps2.get(name, 0.0) for name in names]
 
-        def nearest(order: Iterable[int], sign: float) -> list[list[Glimpse]]:
+        def nearest(order: Iterable[int], sign: float) -> list[list[ExactNeighbour]]:
             """Return the neighbours of each vehicle among those before it in an order."""
             last_seen = [-1] * lanes
-            seen: list[list[Glimpse]] = [[]] * len(names)
+            seen: list[list[ExactNeighbour]] = [[]] * len(names)
             for index in order:
                 first, last = touched[index]
                 s_m = poses[index][0]

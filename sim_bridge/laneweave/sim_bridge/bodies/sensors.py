@@ -13,7 +13,7 @@ import numpy as np
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import Name, Neighbour
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import Around, Glimpses
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Around, ExactNeighbours
 
 _DRAWN = 1024
 """Random numbers drawn at once."""
@@ -57,7 +57,7 @@ class Sensors:
             a_y + e_ay * ay_mps2,
         )
 
-    def look(self, around: Glimpses) -> Around:
+    def measure_neighbours(self, around: ExactNeighbours) -> Around:
         """Return the measured neighbours."""
         ahead, behind = around
         sigma_m, sigma_mps, sigma_mps2 = self._other_noise

@@ -11,7 +11,7 @@ from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.wire.messages import ClosedFormation, Name, Sense
 from laneweave.sim_bridge.bodies.motion_controller import MotionController, Rung
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import Glimpses
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import ExactNeighbours
 from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.bodies.sensors import Sensors
 from laneweave.sim_bridge.road.demand import Arrival
@@ -92,7 +92,7 @@ class RoadVehicle:
         """Ticks on each rung of the fallback ladder."""
         return self.controller.rung_ticks
 
-    def perceive(self, around: Glimpses) -> None:
+    def perceive(self, around: ExactNeighbours) -> None:
         """Measure its own state and its neighbours.
 
         Args:
@@ -100,7 +100,9 @@ class RoadVehicle:
         """
         sensors = self.sensors
         if sensors is not None:
-            self.controller.perceive(sensors.measure(self.state), sensors.look(around))
+            self.controller.perceive(
+                sensors.measure(self.state), sensors.measure_neighbours(around)
+            )
 
     def sense(self, tick: int, *, caretaker: bool, left: bool = False) -> Sense:
         """Return its SENSE: measurements and the state of its motion controller.

@@ -125,7 +125,7 @@ def drive_behind(
     for tick in range(braking_tick + 60):
         jerks = np.array([(15.0, 0.0)], dtype="<f4").tobytes()
         controller.take(Command(Name("v"), 1, tick, (0, 0), tick + 1, (0, 0), jerks))
-        around = sensors.look(([attrs.astuple(seen(own, other))], []))
+        around = sensors.measure_neighbours(([attrs.astuple(seen(own, other))], []))
         controller.perceive(sensors.measure(own.state), around)
         controller.step(tick)
         if tick >= braking_tick:

@@ -166,7 +166,7 @@ def test_without_vehicles_in_line_the_gap_is_infinite() -> None:
 
 
 def sense(road: dict[str, Pose], accels_mps2: dict[str, float] | None = None) -> dict[str, Around]:
-    seen = bodies(road).glimpses(3, LANE_M, accels_mps2 or {})
+    seen = bodies(road).exact_neighbours(3, LANE_M, accels_mps2 or {})
     return {
         name: Around(*(tuple(Neighbour(*each) for each in others) for others in sides))
         for name, sides in seen.items()
@@ -270,13 +270,15 @@ def steps_taken(work: Callable[[], object]) -> int:
     return taken
 
 
-@pytest.mark.parametrize("work", [Bodies.overlapping_pairs, Bodies.min_gaps, Bodies.glimpses])
+@pytest.mark.parametrize(
+    "work", [Bodies.overlapping_pairs, Bodies.min_gaps, Bodies.exact_neighbours]
+)
 def test_the_effort_grows_with_the_vehicles_and_not_with_their_pairs(
     work: Callable[..., object],
 ) -> None:
     def steps(vehicles: int) -> int:
         road = {f"v{n:04d}": (11.0 * n, (n % 3 + 0.5) * LANE_M, 0.1, 15.0) for n in range(vehicles)}
-        more: tuple[object, ...] = (3, LANE_M, {}) if work is Bodies.glimpses else ()
+        more: tuple[object, ...] = (3, LANE_M, {}) if work is Bodies.exact_neighbours else ()
         return steps_taken(lambda: work(bodies(road), *more))
 
     few = steps(90)

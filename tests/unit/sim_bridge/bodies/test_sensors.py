@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from laneweave.protocol.scenario.tables import Scenario, Sensing
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import Name, Neighbour
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import NONE_AROUND, Around, Glimpses
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import NONE_AROUND, Around, ExactNeighbours
 from laneweave.sim_bridge.bodies.sensors import Sensors
 
 # All different, so that none can stand in for another.
@@ -25,7 +25,7 @@ NOISE = Sensing(
 )
 SCENARIO = Scenario(seed=5, sensing=NOISE)
 STATE: State = (120.0, 15.0, -1.0, 5.25, 0.5, 0.25)
-AROUND: Glimpses = ([(1, 10.0, 14.0, -2.0), (2, 7.0, 13.0, 1.0)], [(0, 9.0, 16.0, 0.0)])
+AROUND: ExactNeighbours = ([(1, 10.0, 14.0, -2.0), (2, 7.0, 13.0, 1.0)], [(0, 9.0, 16.0, 0.0)])
 EXACT = Around(
     (Neighbour(1, 10.0, 14.0, -2.0), Neighbour(2, 7.0, 13.0, 1.0)), (Neighbour(0, 9.0, 16.0),)
 )
@@ -51,7 +51,7 @@ def test_its_own_state_is_unbiased_with_the_configured_error() -> None:
 
 def test_neighbours_are_unbiased_with_the_configured_error() -> None:
     sensors = Sensors(SCENARIO, A)
-    seen = np.array([others(sensors.look(AROUND)) for _ in range(SAMPLES)])
+    seen = np.array([others(sensors.measure_neighbours(AROUND)) for _ in range(SAMPLES)])
     errors = seen - np.array(others(EXACT))
     deviations = np.array([0.6, 0.7, 0.8])
     assert errors.std(axis=0) == pytest.approx(np.tile(deviations, (3, 1)), rel=0.05)
@@ -61,7 +61,7 @@ def test_neighbours_are_unbiased_with_the_configured_error() -> None:
 def test_errors_are_independent_of_each_other_and_over_time() -> None:
     sensors = Sensors(SCENARIO, A)
     rows = [
-        np.concatenate([sensors.measure(STATE), *others(sensors.look(AROUND))])
+        np.concatenate([sensors.measure(STATE), *others(sensors.measure_neighbours(AROUND))])
         for _ in range(SAMPLES)
     ]
     errors = np.array(rows) - rows[0]
@@ -70,16 +70,20 @@ def test_errors_are_independent_of_each_other_and_over_time() -> None:
 
 
 def test_what_is_seen_keeps_its_lane_and_its_side() -> None:
-    seen = Sensors(SCENARIO, A).look(AROUND)
+    seen = Sensors(SCENARIO, A).measure_neighbours(AROUND)
     assert [other.lane for other in seen.ahead] == [1, 2]
     assert [other.lane for other in seen.behind] == [0]
-    assert Sensors(SCENARIO, A).look(([], [])) == NONE_AROUND
+    assert Sensors(SCENARIO, A).measure_neighbours(([], [])) == NONE_AROUND
 
 
 def test_equal_seeds_give_equal_errors() -> None:
     assert (states() == states()).all()
     one, other = Sensors(SCENARIO, A), Sensors(SCENARIO, A)
-    assert one.look(AROUND) == other.look(AROUND) != one.look(AROUND)
+    assert (
+        one.measure_neighbours(AROUND)
+        == other.measure_neighbours(AROUND)
+        != one.measure_neighbours(AROUND)
+    )
 
 
 def test_every_vehicle_and_every_seed_errs_in_its_own_way() -> None:
@@ -91,7 +95,7 @@ def test_without_noise_sensors_are_exact() -> None:
     exact = Sensing(**dict.fromkeys((field.name for field in attrs.fields(Sensing)), 0.0))
     sensors = Sensors(attrs.evolve(SCENARIO, sensing=exact), A)
     assert sensors.measure(STATE) == STATE
-    assert sensors.look(AROUND) == EXACT
+    assert sensors.measure_neighbours(AROUND) == EXACT
 
 
 def test_no_measured_speed_is_negative() -> None:
@@ -99,5 +103,10 @@ def test_no_measured_speed_is_negative() -> None:
     standing = [sensors.measure((0.0,) * 6) for _ in range(200)]
     assert min(state[1] for state in standing) == 0.0
     assert min(state[4] for state in standing) < 0.0  # across the road it has no direction
-    stopped: Glimpses = ([(0, 4.0, 0.0, 0.0)], [(0, 4.0, 0.0, 0.0)])
-    assert min(speed for _ in range(200) for _, speed, _ in others(sensors.look(stopped))) == 0.0
+    stopped: ExactNeighbours = ([(0, 4.0, 0.0, 0.0)], [(0, 4.0, 0.0, 0.0)])
+    assert (
+        min(
+            speed for _ in range(200) for _, speed, _ in others(sensors.measure_neighbours(stopped))
+        )
+        == 0.0
+    )
