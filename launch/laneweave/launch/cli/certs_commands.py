@@ -1,4 +1,4 @@
-"""`laneweave certs`: an authority and certificates to try a secured deployment with."""
+"""`laneweave certs`: a test authority and certificates for a secured deployment."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from laneweave.protocol.wire.topics import Party
 app = typer.Typer(help="Make test certificates.", add_completion=False)
 
 DEFAULT_DAYS = 365.0
-MOST_DAYS = 3650.0
+MAX_DAYS = 3650.0
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the certificates.")]
 Hosts = Annotated[
     list[str] | None,
-    typer.Option("--host", metavar="NAME_OR_IP", help="Where the router is found; repeatable."),
+    typer.Option("--host", metavar="NAME_OR_IP", help="Host of the router; repeatable."),
 ]
-Days = Annotated[float, typer.Option("--days", metavar="N", help="How long they are valid.")]
-Force = Annotated[bool, typer.Option("--force", help="Replace what is there.")]
+Days = Annotated[float, typer.Option("--days", metavar="N", help="Validity.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 
 
 @app.command()
@@ -35,23 +35,23 @@ def init(
     folder: Folder,
     config: Annotated[
         Path | None,
-        typer.Option("--config", metavar="DEPLOYMENT.toml", help="Whose names are taken."),
+        typer.Option("--config", metavar="DEPLOYMENT.toml", help="Deployment of the roles."),
     ] = None,
     host: Hosts = None,
     days: Days = DEFAULT_DAYS,
     client: Annotated[
-        list[str] | None, typer.Option("--client", metavar="NAME", help="One more client.")
+        list[str] | None, typer.Option("--client", metavar="NAME", help="An additional client.")
     ] = None,
     vehicle: Annotated[
         list[str] | None,
-        typer.Option("--vehicle", metavar="NAME", help="A vehicle with a process of its own."),
+        typer.Option("--vehicle", metavar="NAME", help="A vehicle with its own process."),
     ] = None,
     force: Force = False,
     keep: Annotated[
-        bool, typer.Option("--keep", help="Leave what is there, and make what is missing.")
+        bool, typer.Option("--keep", help="Keep existing files and make only missing ones.")
     ] = False,
 ) -> None:
-    """Make a test authority, and a certificate for each process of a deployment."""
+    """Make a test authority and a certificate for each process of a deployment."""
     from laneweave.launch.deploy.certificate_authority import (
         CA_DAYS,
         host_names,
@@ -69,7 +69,7 @@ def init(
     settings = load_scenario(config)
     identities = list(dict.fromkeys(_wanted(settings, client or [], vehicle or [])))
     hosts = [*(host or ()), *_hosts(settings)]
-    host_names(hosts)  # before anything is written
+    host_names(hosts)  # check before writing
     if keep and ca_path(folder).exists():
         authority = load_authority(folder)
         identities = [
@@ -84,7 +84,7 @@ def init(
     typer.echo(f"{folder}: a test authority and {len(identities)} certificates:")
     for identity in identities:
         typer.echo(f"  {identity.common_name}")
-    typer.echo(f"Keep {folder}/ca.key away from all hosts: whoever has it can be anybody.")
+    typer.echo(f"Keep {folder}/ca.key away from all hosts: it can impersonate all processes.")
 
 
 @app.command()
@@ -97,7 +97,7 @@ def add(
     days: Days = DEFAULT_DAYS,
     force: Force = False,
 ) -> None:
-    """Make one more certificate with the authority that is there."""
+    """Make another certificate with the existing authority."""
     from laneweave.launch.deploy.certificate_authority import issue, load_authority
 
     _check_days(days)
@@ -109,8 +109,8 @@ def add(
 
 
 def _check_days(days: float) -> None:
-    if not 0.0 < days <= MOST_DAYS:
-        raise BadInputError("--days", days, f"(0, {MOST_DAYS:g}]")
+    if not 0.0 < days <= MAX_DAYS:
+        raise BadInputError("--days", days, f"(0, {MAX_DAYS:g}]")
 
 
 def _wanted(settings: Scenario, clients: list[str], vehicles: list[str]) -> Iterator[Identity]:

@@ -1,4 +1,4 @@
-"""`laneweave config`: look at a configuration before somebody runs with it."""
+"""`laneweave config`: check a configuration before it is used."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.wire.identities import Identity, parse_identity
 from laneweave.protocol.wire.topics import Party
 
-app = typer.Typer(help="Look at a configuration.", add_completion=False)
+app = typer.Typer(help="Check a configuration.", add_completion=False)
 BAD_INPUT = 2
 
 
 @app.callback()
 def _group() -> None:
-    """Look at a configuration."""
+    """Check a configuration."""
 
 
 @app.command()
 def check(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A DEPLOYMENT.toml.")],
     role: Annotated[
-        Party | None, typer.Option("--role", help="Whose certificate to look at, too.")
+        Party | None, typer.Option("--role", help="Also check the certificate of this role.")
     ] = None,
     name: Annotated[str, typer.Option("--name", metavar="NAME", help="Name in that role.")] = "",
 ) -> None:
-    """Check a configuration, and with --role the files that this role would use here."""
+    """Check a configuration, and with --role the files that this role uses here."""
     settings = load_scenario(file)
     if name and role is None:
         raise BadInputError("--name", name, "a name beside --role")

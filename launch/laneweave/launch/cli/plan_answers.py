@@ -1,4 +1,4 @@
-"""`laneweave plan`: one request, planned here or by a running coordinator."""
+"""Answers of `laneweave plan`: a request is read, planned or explained, printed and drawn."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ from laneweave.protocol.errors import BadInputError, CommandFailedError, Refused
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.security.access import Access
 
-MOST_WAIT_S = 3600.0
+MAX_WAIT_S = 3600.0
 ANSWER_MARGIN_S = 8.0
-"""A coordinator gets this much longer than the request's deadline, so that it can tell of a worker
-that hangs (`worker_pool.OVERDUE_S`)."""
+"""Time to wait beyond the deadline, so that the coordinator can report a worker that hangs
+(`worker_pool.OVERDUE_S`)."""
 
 
 def access_for(
     endpoint: str | None, realm: str | None, config: Path | None, client: str | None
 ) -> Access | None:
-    """Return how to get to a coordinator; None: none is to be asked.
+    """Return the access to a coordinator; None: plan here.
 
     Args:
-        endpoint: of the router; goes before that of the configuration.
-        realm: of the coordinators, where there is no configuration; None: the default one.
-        config: of the deployment.
-        client: as whom, where the deployment is secured; None: as `plan`.
+        endpoint: endpoint of the router; overrides that of the configuration.
+        realm: realm of the coordinators without a configuration; None: the default realm.
+        config: configuration of the deployment.
+        client: client name in a secured deployment; None: `plan`.
 
     Raises:
-        BadInputError: the configuration is not valid or names no router, or something is given
-            that would have no effect.
+        BadInputError: the configuration is not valid or has no endpoint, or an argument would have
+            no effect.
     """
     if config is not None:
         if realm is not None:
@@ -71,22 +71,20 @@ def answer_request(
     scenario: Scenario | None = None,
     wait_s: float = 0.0,
 ) -> None:
-    """Read a request, have it planned, print the answer and draw it.
+    """Read a request, plan it here or with `access` at a coordinator, print and draw the answer.
 
-    `drawing` shows the relative coordinate system, `road_drawing` the road of `scenario`.
-
-    Without `access` it is planned here; with it, a coordinator is waited for up to `wait_s`. A
-    deadline and a solver replace those of the request.
+    `drawing` shows the relative coordinate system, `road_drawing` the road of `scenario`. `wait_s`
+    is the time to wait for a coordinator. A deadline and a solver override those of the request.
 
     Raises:
-        BadInputError: the request cannot be read or is not valid, nobody is at the endpoint, or
+        BadInputError: the request cannot be read or is not valid, no coordinator is reachable, or
             the drawing cannot be written.
         RefusedError: the coordinator refused the request.
-        CommandFailedError: the coordinator failed or did not answer in time, or the drawing could
-            not be written after all.
+        CommandFailedError: the coordinator failed or did not answer in time, or writing the drawing
+            failed.
     """
-    if not 0 <= wait_s <= MOST_WAIT_S:
-        raise BadInputError("--wait", wait_s, f"[0, {MOST_WAIT_S:g}]")
+    if not 0 <= wait_s <= MAX_WAIT_S:
+        raise BadInputError("--wait", wait_s, f"[0, {MAX_WAIT_S:g}]")
     request = _request(path, deadline_s, solver)
     drawers = []
     if drawing is not None:
@@ -108,12 +106,12 @@ def answer_request(
 
 
 def explain_request(path: Path, deadline_s: float | None, drawing: Path | None = None) -> None:
-    """Read a request, run TAPPA on it here, print what it did and draw it.
+    """Read a request, run TAPPA on it here, print its steps and draw them.
 
     Raises:
-        BadInputError: the request cannot be read or is not valid, or the drawing is no picture
-            or cannot be written.
-        CommandFailedError: the drawing could not be written after all.
+        BadInputError: the request cannot be read or is not valid, or the drawing cannot be written
+            or is not a PNG file.
+        CommandFailedError: writing the drawing failed.
     """
     if drawing is not None:
         from laneweave.launch.drawing.plan import check_drawing
@@ -142,7 +140,7 @@ def _request(path: Path, deadline_s: float | None, solver: str | None = None) ->
 
 
 _Drawer = tuple[Callable[[PlanRequest, PlanResponse], None], Path]
-"""What draws an answer, and where."""
+"""Function that draws an answer, and its file."""
 
 
 def _checked_drawer(out: Path) -> _Drawer:

@@ -1,4 +1,5 @@
-"""Help for deployments: certificates, configuration checks, which vehicles an agent process drives.
+"""Help for deployments: certificates, configuration checks, vehicles of an agent process.
 
-Entry points: `config_check`, `certificate_authority`. Imported by `cli`.
+Entry points: `config_check.check_deployment`, `certificate_authority.make_authority` and
+`assigned_vehicles.assigned_vehicles`. Imported by `cli`.
 """

@@ -1,7 +1,7 @@
-"""A certificate authority for tests and first steps: X.509 with keys on P-256, as files in PEM.
+"""A certificate authority for tests: X.509 certificates with P-256 keys, as PEM files.
 
-Whoever has its key can take part as anybody. It is made to try a deployment out, or for a test
-bed; where there is an authority already, use that one, with the same common names.
+The holder of its key can impersonate every process. Use it to try out a deployment or for a test
+bed; if you already have an authority, use that one with the same common names.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from laneweave.protocol.wire.topics import Party
 CA_NAME = "laneweave test authority"
 CA_DAYS = 3650.0
 CLOCKS_APART = dt.timedelta(minutes=10)
-"""Certificates are valid from so long ago, since clocks of hosts differ."""
+"""Certificates are valid from this long before now, because the clocks of hosts differ."""
 LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
 
 
 @frozen
 class Authority:
-    """A certificate and the key that belongs to it."""
+    """The certificate and private key of an authority."""
 
     certificate: x509.Certificate
     key: ec.EllipticCurvePrivateKey
@@ -43,13 +43,12 @@ def make_authority(folder: Path, *, days: float = CA_DAYS, replace: bool = False
     """Make an authority and write its files.
 
     Args:
-        folder: where; made if it is not there.
-        days: how long its certificate is valid.
-        replace: whether an authority that is there is replaced, with which all its certificates
-            are worth nothing.
+        folder: folder of the files; created if necessary.
+        days: validity of its certificate.
+        replace: replace an existing authority, which invalidates all its certificates.
 
     Raises:
-        BadInputError: there is one already, or the files cannot be written.
+        BadInputError: an authority exists, or the files cannot be written.
     """
     if not replace and (ca_path(folder).exists() or authority_key_path(folder).exists()):
         raise BadInputError("DIR", str(folder), "a folder without an authority, or --force")
@@ -74,7 +73,7 @@ def load_authority(folder: Path) -> Authority:
     """Read the authority of a folder.
 
     Raises:
-        BadInputError: there is none, or it cannot be read.
+        BadInputError: there is no authority, or it cannot be read.
     """
     path = ca_path(folder)
     try:
@@ -104,15 +103,15 @@ def issue(
     """Make a certificate and its key, and write their files.
 
     Args:
-        authority: who signs it.
-        folder: where the files go.
-        identity: whose it is.
-        days: how long it is valid.
-        hosts: names and addresses under which a router is found; of no use for others.
-        replace: whether a certificate that is there is replaced.
+        authority: the authority that signs it.
+        folder: folder of the files.
+        identity: identity of the process.
+        days: validity.
+        hosts: names and addresses of the router; ignored for other processes.
+        replace: replace an existing certificate.
 
     Raises:
-        BadInputError: there is one already, or the files cannot be written.
+        BadInputError: a certificate exists, or the files cannot be written.
     """
     name = identity.common_name
     path = certificate_path(folder, name)
@@ -120,7 +119,7 @@ def issue(
         raise BadInputError("IDENTITY", name, f"one without a certificate in {folder}, or --force")
     key = ec.generate_private_key(ec.SECP256R1())
     builder = _builder(_name(name), authority.certificate.subject, key.public_key(), days)
-    # Nobody's certificate but the router's serves to be found under a host's name.
+    # Only the router is a server.
     serves = identity.party is Party.ROUTER
     usage = ExtendedKeyUsageOID.SERVER_AUTH if serves else ExtendedKeyUsageOID.CLIENT_AUTH
     builder = (
@@ -138,7 +137,7 @@ def issue(
 
 
 def authority_key_path(folder: Path) -> Path:
-    """Return where a folder has its authority's key, which no role needs."""
+    """Return the path of the authority's key, which no role needs."""
     return folder / "ca.key"
 
 
@@ -178,10 +177,10 @@ def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:
 
 
 def host_names(hosts: Sequence[str]) -> x509.SubjectAlternativeName:
-    """Return hosts as they stand in a certificate.
+    """Return hosts as the alternative names of a certificate.
 
     Raises:
-        BadInputError: one of them is no host.
+        BadInputError: one of them is not a host.
     """
     return x509.SubjectAlternativeName([_general_name(host) for host in dict.fromkeys(hosts)])
 
@@ -211,7 +210,7 @@ def _write(
     public = certificate.public_bytes(serialization.Encoding.PEM)
     try:
         for path, content, mode in ((key_file, secret, 0o600), (certificate_file, public, 0o644)):
-            # Anew each time: a file that is there may have other rights.
+            # An existing file may have other permissions.
             path.unlink(missing_ok=True)
             number = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
             with os.fdopen(number, "wb") as file:

@@ -1,4 +1,4 @@
-"""What is wrong with a deployment's configuration, or odd, and what a role would do with it."""
+"""Checks of a deployment's configuration: problems, warnings, and the values in use."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from laneweave.protocol.wire.topics import Party
 
 @define
 class Report:
-    """What a check found; one line each."""
+    """Result of a check, with one line per item."""
 
     problems: list[str] = field(factory=list)
     warnings: list[str] = field(factory=list)
     facts: list[tuple[str, str]] = field(factory=list)
-    """What is used, and what it is."""
+    """Names and values of settings in use."""
 
 
 def check_deployment(
     scenario: Scenario, identity: Identity | None, environment: Mapping[str, str] = os.environ
 ) -> Report:
-    """Check what loading a configuration does not.
+    """Check what loading a configuration does not check.
 
     Args:
         scenario: the deployment.
-        identity: whose files are looked at, too; None: nobody's.
-        environment: where secrets may be.
+        identity: identity whose files are checked too; None: no files.
+        environment: environment variables, which may contain secrets.
     """
     report = Report()
     _check_network(scenario, report)
@@ -59,10 +59,10 @@ def _check_network(scenario: Scenario, report: Report) -> None:
             report.problems.append(str(error))
     if network.listen and host_of(network.endpoint) in EVERYWHERE:
         report.warnings.append(
-            f"network.endpoint: {network.endpoint} is where nobody finds the router"
+            f"network.endpoint: {network.endpoint} is not reachable by other roles"
         )
     if scenario.security.mode == "off" and _leaves_the_host(scenario):
-        report.warnings.append("security.mode: off, anybody who reaches the router may do anything")
+        report.warnings.append("security.mode: off, all who reach the router have all rights")
     report.facts += [
         ("realm", network.realm),
         ("router at", network.endpoint),
@@ -73,7 +73,7 @@ def _check_network(scenario: Scenario, report: Report) -> None:
 
 
 def _check_moves(scenario: Scenario, report: Report) -> None:
-    """Check what agents check when they start, where agents can start."""
+    """Check what agents check at their start, if the extra `agent` is installed."""
     try:
         from laneweave.agents.driving.trajectory import check_moves  # noqa: PLC0415 (an extra)
     except ModuleNotFoundError:
@@ -90,11 +90,11 @@ def _leaves_the_host(scenario: Scenario) -> bool:
 
 
 def _shared_vehicles(scenario: Scenario) -> Iterator[str]:
-    """Yield a line for fleets that drive the same vehicles."""
+    """Yield a warning if fleets have vehicles in common."""
     fleets = scenario.security.fleets
-    everybody = demanded_vehicles(scenario) if fleets else ()
+    demanded = demanded_vehicles(scenario) if fleets else ()
     drivers = Counter(
-        vehicle for members in fleets.values() for vehicle in members_of(members, everybody)
+        vehicle for members in fleets.values() for vehicle in members_of(members, demanded)
     )
     shared = sorted(vehicle for vehicle, count in drivers.items() if count > 1)
     if shared:

@@ -1,5 +1,6 @@
-"""Pictures of plans and what all pictures share: colours, figure files.
+"""Figures of plans, and the parts that all figures share: colours and figure files.
 
-Entry points: `plan`, `plan_on_road`, `tappa_process`, `figures`. Imported by `cli`, `report` and
-`watch`.
+Entry points: `plan` (relative coordinate system), `plan_on_road` (driven by vehicles),
+`tappa_process` and `tappa_text` (explanation), `figures`, `colours`. Imported by `cli`, `report`
+and `watch`.
 """

@@ -1,6 +1,10 @@
-"""Colours and names of lanes: the same in pictures, in reports and on the live page."""
+"""The look of a road in figures, reports and on the live page: lane colours, names, scene."""
 
 from __future__ import annotations
+
+from typing import Any
+
+from laneweave.protocol.scenario.tables import Scenario
 
 _THREE_LANES = ("#2f6fc4", "#3f9b4f", "#cf3f3a")
 """Right to left: blue, green, red, the paper's colours."""
@@ -15,7 +19,7 @@ _MORE_LANES = (
     "#808080",
 )
 SPEED_SPAN_MPS = 5.0
-"""Speeds this far below or above the lattice's have the darkest and lightest shade."""
+"""Difference from the lattice speed with the darkest or lightest shade."""
 SHADE_STRENGTH = 0.45
 
 
@@ -27,7 +31,7 @@ def lane_colours(lanes: int) -> tuple[str, ...]:
 
 
 def lane_names(lanes: int) -> tuple[str, ...]:
-    """Return what people call the lanes, from the right."""
+    """Return the names of the lanes, from the right."""
     if lanes == 1:
         return ("the lane",)
     if lanes == 2:
@@ -35,3 +39,23 @@ def lane_names(lanes: int) -> tuple[str, ...]:
     if lanes == 3:
         return ("right", "middle", "left")
     return tuple(f"lane {lane}" for lane in range(lanes))
+
+
+def road_scene(scenario: Scenario) -> dict[str, Any]:
+    """Return road, bodies, lattice and colours in the format of `web/road.js`."""
+    road, formation = scenario.road, scenario.formation
+    return {
+        "road": {
+            "length_m": road.length_m,
+            "lanes": road.lanes,
+            "lane_width_m": road.lane_width_m,
+            "sorting_start_m": road.sorting_start_m,
+        },
+        "body_m": [scenario.vehicle.length_m, scenario.vehicle.width_m],
+        "lattice": {
+            "speed_mps": formation.speed_mps,
+            "pitch_m": formation.gap_m,
+        },
+        "shade": {"span_mps": SPEED_SPAN_MPS, "strength": SHADE_STRENGTH},
+        "colours": list(lane_colours(road.lanes)),
+    }

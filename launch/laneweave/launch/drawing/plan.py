@@ -1,6 +1,6 @@
-"""Pictures of a planned formation switching: a panel for each time point, or an animation.
+"""Figures of a plan in the relative coordinate system: one panel per time point, or an animation.
 
-This module needs matplotlib: import it only to draw.
+This module needs matplotlib; import it only to draw.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ Place = tuple[float, float]
 
 ENDINGS: Final = (".png", ".gif")
 MAX_PANELS: Final = 120
-"""A longer plan is drawn up to here."""
+"""Longer plans are drawn up to this number of time points."""
 FRAMES_PER_STEP: Final = 10
 MAX_MOVING_FRAMES: Final = 300
-"""A longer plan moves in larger leaps: all frames are in memory at once."""
+"""Longer plans have fewer frames per step, because all frames are in memory at once."""
 FRAMES_PER_S: Final = 12
 HELD_FRAMES: Final = (4, 18)
 """Additional frames for the start and for the end."""
 
 _PALETTE = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#f0e442")
-"""Okabe and Ito's colours, which colour-blind people can tell apart."""
+"""The colour-blind safe palette of Okabe and Ito."""
 _SHADES = ((0.0, 0.0), (0.45, 0.0), (0.5, 1.0))
-"""The palette as it is, darker, lighter: how much is mixed in of which grey."""
+"""Shades of the palette (plain, darker, lighter): share and brightness of the grey mixed in."""
 _CELL, _BORDER, _BLOCKED = "#f1f2f4", "#d3d6db", "#a3a9b1"
 _LANE_HEIGHT, _BODY_LENGTH, _BODY_WIDTH, _OUTLINE = 0.8, 0.68, 0.46, 0.9
 """In lengths of a cell; the outline is a share of the cell."""
@@ -78,26 +78,26 @@ def check_drawing(out: Path, option: str = "--draw") -> None:
 
 
 def draw_plan(request: PlanRequest, response: PlanResponse, out: Path) -> None:
-    """Write the kind of drawing that the ending of `out` tells."""
+    """Write a figure or an animation, depending on the suffix of `out`."""
     write = write_gif if out.suffix.lower() == ".gif" else write_png
     write(request, response, out)
 
 
 def write_png(request: PlanRequest, response: PlanResponse, out: Path, dpi: int = DPI) -> None:
-    """Write a picture with one panel for each time point."""
+    """Write a figure with one panel per time point."""
     figure = plan_figure(request, response)
-    save(figure, out, _affordable_dpi(figure, dpi, _MAX_PIXELS))
+    save(figure, out, _limited_dpi(figure, dpi, _MAX_PIXELS))
 
 
 def write_gif(request: PlanRequest, response: PlanResponse, out: Path, dpi: int = 100) -> None:
-    """Write an animation of the plan that begins again and again."""
+    """Write an animation of the plan in an endless loop."""
     layout = _Layout.of(request.grid, 1)
     figure = layout.new_figure(response)
     axes = layout.new_panel(figure, 0)
     _draw_lattice(axes, request)
     vehicles = _Vehicles.draw(axes, request, layout)
     writer = PillowWriter(fps=FRAMES_PER_S)
-    with writer.saving(figure, str(out), _affordable_dpi(figure, dpi, _MAX_FRAME_PIXELS)):
+    with writer.saving(figure, str(out), _limited_dpi(figure, dpi, _MAX_FRAME_PIXELS)):
         for time in _frame_times(_steps(response)):
             vehicles.move(_places(request, response, time))
             _name_time(axes, math.floor(time))
@@ -105,9 +105,9 @@ def write_gif(request: PlanRequest, response: PlanResponse, out: Path, dpi: int 
 
 
 def plan_figure(request: PlanRequest, response: PlanResponse) -> Figure:
-    """Return a figure with one panel for each time point, with arrows for the moves made next.
+    """Return a figure with one panel per time point and arrows for the next moves.
 
-    Without a plan there is one panel, the start.
+    Without a plan there is one panel with the start cells.
     """
     times = range(min(_steps(response) + 1, MAX_PANELS))
     layout = _Layout.of(request.grid, len(times))
@@ -130,7 +130,7 @@ def team_colours(request: PlanRequest) -> dict[frozenset[int], str]:
 
 @attrs.frozen
 class _Layout:
-    """Where the panels are; they fill rows from the left."""
+    """Layout of the panels, which fill rows from the left."""
 
     grid: Grid
     across: int
@@ -139,12 +139,12 @@ class _Layout:
 
     @classmethod
     def of(cls, grid: Grid, panels: int) -> _Layout:
-        least_in, most_in = _CELL_RANGE_IN
-        fitting = int(_MAX_WIDTH_IN / (grid.columns * least_in + _LEFT_IN))
+        min_in, max_in = _CELL_RANGE_IN
+        fitting = int(_MAX_WIDTH_IN / (grid.columns * min_in + _LEFT_IN))
         rows = math.ceil(panels / max(1, min(_MAX_ACROSS, fitting)))
         across = math.ceil(panels / rows)
         room_in = (_MAX_WIDTH_IN / across - _LEFT_IN) / grid.columns
-        return cls(grid, across, rows, max(least_in, min(most_in, room_in)))
+        return cls(grid, across, rows, max(min_in, min(max_in, room_in)))
 
     @property
     def panel_in(self) -> tuple[float, float]:
@@ -195,7 +195,7 @@ class _Layout:
 
 @attrs.frozen
 class _Vehicles:
-    """The vehicles of a panel, which can be moved."""
+    """The movable vehicles of a panel."""
 
     bodies: list[FancyBboxPatch]
     labels: list[Text]
@@ -217,7 +217,7 @@ class _Vehicles:
         return drawn
 
     def move(self, places: Sequence[Place]) -> None:
-        """Put each vehicle in its place."""
+        """Move each vehicle to its position."""
         for body, label, place in zip(self.bodies, self.labels, places, strict=True):
             x, y = _point(place)
             body.set_x(x - _BODY_LENGTH / 2)
@@ -230,7 +230,7 @@ def _steps(response: PlanResponse) -> int:
 
 
 def _places(request: PlanRequest, response: PlanResponse, time: float) -> list[Place]:
-    """Return the vehicles' places at a time in steps; from the end on they stay."""
+    """Return the positions of the vehicles at a time in steps; after the end they do not change."""
     if not response.paths:
         return [vehicle.cell for vehicle in request.vehicles]
     step = min(math.floor(time), _steps(response))
@@ -301,7 +301,7 @@ def _number_cells(axes: Axes, grid: Grid) -> None:
 
 
 def _draw_target(axes: Axes, cell: Place, colours: Sequence[str]) -> None:
-    """Outline a target; dashes take turns where it is one of several teams."""
+    """Outline a target, with alternating dashes if several teams may take it."""
     for number, colour in enumerate(colours or [_BLOCKED]):
         outline = _rectangle(cell, _OUTLINE, facecolor="none", edgecolor=colour)
         outline.set(label="target", linewidth=1.8, zorder=2, capstyle="butt")
@@ -312,7 +312,7 @@ def _draw_target(axes: Axes, cell: Place, colours: Sequence[str]) -> None:
 
 
 def _draw_moves(axes: Axes, here: Sequence[Place], there: Sequence[Place]) -> None:
-    """Draw arrows that leave the names of vehicles readable."""
+    """Draw arrows that do not cover the names of vehicles."""
     for a, b in zip(here, there, strict=True):
         if a == b:
             continue
@@ -345,7 +345,7 @@ def _body(colour: str) -> FancyBboxPatch:
 
 
 def _text(axes: Axes, text: str, size_pt: float, ink: str) -> Text:
-    # Names come from anywhere; a dollar sign must not begin a formula.
+    # Names may contain dollar signs, which must not start formulas.
     return axes.text(
         0,
         0,
@@ -360,7 +360,7 @@ def _text(axes: Axes, text: str, size_pt: float, ink: str) -> Text:
 
 
 def short_name(name: str) -> str:
-    """Return a short name; where one is too long, its end tells more than its beginning."""
+    """Return a short name; of long names the end is kept, which usually differs most."""
     plain = "".join(char if char.isprintable() else "?" for char in name)
     return plain if len(plain) <= _MAX_LABEL_LENGTH else "…" + plain[1 - _MAX_LABEL_LENGTH :]
 
@@ -375,13 +375,13 @@ def _colour(team: int) -> str:
 
 
 def _ink_on(colour: str) -> str:
-    """Return what can be read on a colour."""
+    """Return a text colour that is readable on a colour."""
     red, green, blue = to_rgb(colour)
     return "#ffffff" if 0.3 * red + 0.59 * green + 0.11 * blue < 0.5 else "#000000"
 
 
-def _affordable_dpi(figure: Figure, dpi: float, most_pixels: float) -> float:
-    """Return a resolution with which the picture of the longest road stays within memory."""
+def _limited_dpi(figure: Figure, dpi: float, max_pixels: float) -> float:
+    """Return a resolution that limits the memory of figures of long roads."""
     width_in, height_in = map(float, figure.get_size_inches())
-    by_area = math.sqrt(most_pixels / (width_in * height_in))
+    by_area = math.sqrt(max_pixels / (width_in * height_in))
     return min(dpi, by_area, _MAX_SIDE_PIXELS / max(width_in, height_in))

@@ -1,9 +1,9 @@
-"""A plan driven on the road: its relative paths, followed by the vehicles' own controllers.
+"""A plan driven on the road: the vehicles' own controllers follow its relative paths.
 
 Step k begins at k T_F. Each vehicle follows its path as an agent drives it: the reference of
 `agents.driving`, its tracker, and the simulated body (`sim_bridge.bodies.plant`). All hold
-their start cells at time 0. There is no noise and no other traffic, and nobody keeps a distance:
-what is driven is the plan, with all that its conflict kinds allow.
+their start cells at time 0. There is no noise, no other traffic and no distance control:
+vehicles drive the plan with all that its conflict kinds allow.
 
 This module needs OSQP.
 """
@@ -46,7 +46,7 @@ class Drive:
 
     @property
     def ticks(self) -> int:
-        """Ticks that it lasts."""
+        """Duration in ticks."""
         return int(self.states.shape[1]) - 1
 
     def time_s(self, tick: int) -> float:

@@ -1,10 +1,10 @@
-"""Pictures of a plan on the road, as vehicles drive it: at successive instants, and over time.
+"""Figures of a plan as vehicles drive it on the road: at successive instants, and over time.
 
-The upper panels show the road in the geodetic coordinate system after each step, with the way of
+The upper panels show the road in the geodetic coordinate system after each step, with the path of
 each vehicle since the start; the lower ones the vehicles' positions over time, along the road
 relative to the moving formation, and across it. An animation shows the road alone.
 
-This module needs matplotlib and OSQP: import it only to draw.
+This module needs matplotlib and OSQP; import it only to draw.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from laneweave.protocol.scenario.tables import Scenario
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import corners, pose_of
 
 MAX_INSTANTS: Final = 8
-"""Of a plan with more steps only some instants are drawn."""
+"""Plans with more steps are drawn at only this number of instants."""
 MAX_FRAMES: Final = 240
 GIF_DPI: Final = 90
 _HELD_FRAMES: Final = 8
@@ -45,9 +45,9 @@ _ROAD, _MARKING = "#e3e5e8", "#ffffff"
 
 
 def draw_road(request: PlanRequest, response: PlanResponse, scenario: Scenario, out: Path) -> None:
-    """Drive a plan and draw it, as a picture or an animation by the ending of `out`.
+    """Drive a plan and draw it as a figure or an animation, depending on the suffix of `out`.
 
-    Without a plan the start is drawn. `scenario` says how fast, how far and with which vehicles.
+    Without a plan the start is drawn. `scenario` has the road, speeds and vehicles.
     """
     picture = _Picture.of(request, response, scenario)
     if out.suffix.lower() == ".gif":
@@ -58,7 +58,7 @@ def draw_road(request: PlanRequest, response: PlanResponse, scenario: Scenario, 
 
 @attrs.frozen(eq=False)
 class _Picture:
-    """What is drawn."""
+    """The driven plan, with labels and colours of the vehicles."""
 
     drive: Drive
     labels: list[str]
@@ -110,7 +110,7 @@ def road_figure(picture: _Picture) -> Figure:
 
 
 def _draw_instant(axes: Axes, picture: _Picture, tick: int) -> None:
-    """Draw the road at a tick, with the way of each vehicle since the start."""
+    """Draw the road at a tick, with the path of each vehicle since the start."""
     _draw_empty_road(axes, picture)
     _name_time(axes, picture.drive.time_s(tick))
     for number, colour in enumerate(picture.colours):
@@ -243,7 +243,7 @@ def _name_places(
 
 
 def _title(response: PlanResponse, drive: Drive) -> str:
-    """Return what is drawn, and how near bodies come."""
+    """Return the title, with the smallest gap between bodies."""
     formation, slot_s = drive.scenario.formation, drive.scenario.cycles_s[0]
     if not response.paths:
         return f"{response.status}: the start"
@@ -260,7 +260,7 @@ def _title(response: PlanResponse, drive: Drive) -> str:
 
 
 def _write_gif(picture: _Picture, out: Path) -> None:
-    """Write an animation of the road that begins again and again."""
+    """Write an animation of the road in an endless loop."""
     drive = picture.drive
     figure = new_figure(_WIDTH_IN, 0.8 + 1.6 * picture.lanes * _LANE_IN)
     figure.suptitle(picture.title, fontsize=9, color=INK)

@@ -1,7 +1,8 @@
-"""A picture of how TAPPA solves a request, as the paper draws the process of its case study.
+"""A figure of the steps of TAPPA on a request, in the style of the paper's case study.
 
-From above: the chain of assignments with C_k and C'_k, the constraint tree of the assignment with
-the best path set, relative path maps of some of its nodes. This module needs matplotlib.
+From top to bottom: the sequence of assignments with C_k and C'_k, the constraint tree of the
+assignment with the best path set, and relative path maps of some nodes. This module needs
+matplotlib.
 """
 
 from __future__ import annotations
@@ -37,12 +38,12 @@ _SMALL, _NORMAL = 7.5, 9.0
 
 
 def draw_explanation(explanation: Explanation, out: Path) -> None:
-    """Write the picture."""
+    """Write the figure."""
     save(explanation_figure(explanation), out, DPI)
 
 
 def explanation_figure(explanation: Explanation) -> Figure:
-    """Return the picture as a figure, drawn in inches."""
+    """Return the figure; its axes are in inches."""
     best = _best(explanation.assignments)
     layers = [] if best is None else _layers(best[1].nodes)
     maps = [] if best is None else _chosen_maps(best[1].nodes, layers)
@@ -273,5 +274,5 @@ def _write(
     right: bool = False,
 ) -> None:
     where = "center" if centred else "right" if right else "left"
-    # Names come from anywhere; a dollar sign must not begin a formula.
+    # Names may contain dollar signs, which must not start formulas.
     axes.text(x, y, text, size=size, color=colour, ha=where, va="center", parse_math=False)

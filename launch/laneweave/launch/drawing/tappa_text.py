@@ -1,4 +1,4 @@
-"""The run of TAPPA as text, for `laneweave plan --explain`."""
+"""The steps of TAPPA as text, for `laneweave plan --explain`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _COUNTING = (
 
 
 def explanation_text(explanation: Explanation) -> str:
-    """Return all assignments in a table, why there are no more, and their trees."""
+    """Return a table of all assignments, the reason for the end, and the constraint trees."""
     lines = [
         f"TAPPA with {trees_shown(explanation)}.",
         _COUNTING,
@@ -48,7 +48,7 @@ def explanation_text(explanation: Explanation) -> str:
 
 
 def trees_shown(explanation: Explanation) -> str:
-    """Return which trees these are, in words."""
+    """Return a description of the kind of the constraint trees."""
     return LITERAL if explanation.literal else IMPROVED
 
 
@@ -58,7 +58,7 @@ def vector(targets: Sequence[int]) -> str:
 
 
 def number(cost: float | None) -> str:
-    """Return a cost, or a dash if there is none."""
+    """Return a cost as text; a dash if there is none."""
     return "-" if cost is None or math.isinf(cost) else f"{cost:g}"
 
 
@@ -86,7 +86,7 @@ def _assignments(assignments: Sequence[ExplainedAssignment]) -> list[str]:
 
 
 def _tree(k: int, assignment: ExplainedAssignment) -> Iterator[str]:
-    """Yield the tree of A_k, indented by depth, the first nodes that were made."""
+    """Yield the constraint tree of A_k, indented by depth, up to a number of nodes."""
     ending = "no path set below C'*" if assignment.best_cost is None else "solution"
     yield f"Constraint tree of A_{k}: {len(assignment.nodes)} nodes, {ending}"
     shown = assignment.nodes[:MAX_NODES_PRINTED]
@@ -103,7 +103,7 @@ def _tree(k: int, assignment: ExplainedAssignment) -> Iterator[str]:
 def _branch(
     nodes: Sequence[ExplainedNode], node: ExplainedNode, lead: str, below: str
 ) -> Iterator[str]:
-    """Yield a node and what is below it."""
+    """Yield a node and its descendants."""
     added = f"  {node.constraint}" if node.constraint else ""
     conflicts = "; ".join(node.conflicts) if node.conflicts else "no conflicts"
     solution = ", solution" if node.status == "solution" else ""

@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow.parquet as pq
 from attrs import frozen
 
-from laneweave.launch.drawing.road_scene import road_scene
+from laneweave.launch.drawing.colours import road_scene
 from laneweave.launch.observe.column_owners import Formations, recorded_formations
 from laneweave.launch.recordings.runs import Run
 from laneweave.launch.recordings.trajectories import Floats, Tracks

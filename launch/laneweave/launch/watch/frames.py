@@ -56,8 +56,7 @@ from typing import Any, Final, Protocol
 
 from attrs import define, field, frozen
 
-from laneweave.launch.drawing.colours import lane_names
-from laneweave.launch.drawing.road_scene import road_scene
+from laneweave.launch.drawing.colours import lane_names, road_scene
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.tables import Scenario, solver_of_event
 from laneweave.protocol.wire.events import (
