@@ -3,8 +3,8 @@
 programme        which methods at which volumes; the goals
 lattice_points   how far apart vehicles are at the fixed time points of the lattice
 points           one row for each label and volume, over its seeds
-agreement        two runs of the same demand, vehicle by vehicle
-trials           single runs: over Zenoh, for real-time factors, on a long road
+trials           single runs: over Zenoh (and their agreement with simulated ones), for
+                 real-time factors, on a long road
 evidence         all of it in one JSON file
 tables, goals, statements
                  from the file to Markdown

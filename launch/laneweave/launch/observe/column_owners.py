@@ -1,4 +1,4 @@
-"""Which columns are whose: formations as the census lists them, and as a recorded run has them."""
+"""The columns of formations, from a census or from a recorded run."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class FormationColumns:
     number: int
     rear: int
     front: int
-    """Its first and its last column, both its own."""
+    """The last of its columns; `rear` is the first."""
     closed_s: float = -math.inf
-    """Road time from which on this is known; recordings without such events: always."""
+    """Road time at which it closed; recordings without such events: -inf."""
 
     @classmethod
     def of(cls, closed: ClosedFormation, lattice: Lattice) -> FormationColumns:
@@ -44,7 +44,7 @@ def _rearmost_first(found: Iterable[FormationColumns]) -> tuple[FormationColumns
 
 @frozen
 class Formations:
-    """Formations, none of which has a column of another one."""
+    """Formations without common columns."""
 
     listed: tuple[FormationColumns, ...] = field(converter=_rearmost_first)
     """The rearmost first."""
@@ -65,18 +65,18 @@ class Formations:
         return {one.number: one for one in reversed(self.listed)}
 
     def at(self, column: int) -> FormationColumns | None:
-        """Return whose column it is; None: of none of these."""
+        """Return the formation of a column; None: it belongs to none of these."""
         place = bisect_left(self._fronts, column)
         if place == len(self.listed) or self.listed[place].rear > column:
             return None
         return self.listed[place]
 
     def joined(self, groups: Iterable[Collection[int]], lattice: Lattice) -> list[list[int]]:
-        """Return the numbers of formations that plan together, in groups of at least two.
+        """Return groups of at least two formations that plan together, by their numbers.
 
         Args:
             groups: numbers of blocks whose vehicles plan together; groups may overlap.
-            lattice: whose blocks these are.
+            lattice: defines the blocks.
         """
         found: list[set[int]] = []
         for blocks in groups:
@@ -93,7 +93,7 @@ def read_events(folder: Path, *kinds: str) -> Iterator[Mapping[str, Any]]:
     """Yield a recorded run's events of some kinds, in the order in which they were written.
 
     Raises:
-        OSError, ValueError, TypeError: there are events that cannot be read.
+        OSError, ValueError, TypeError: the events cannot be read.
     """
     path = folder / "events.jsonl"
     if not path.is_file():
@@ -107,8 +107,8 @@ def read_events(folder: Path, *kinds: str) -> Iterator[Mapping[str, Any]]:
 def recorded_formations(folder: Path, lattice: Lattice) -> Formations:
     """Return the formations of a recorded run that had vehicles.
 
-    Recordings without events that say which columns are whose have one formation for each block
-    of the lattice; so have runs of the rolling operation, whose blocks are no formations.
+    In recordings without `formation-closed` events, and in those of the rolling operation, each
+    block of the lattice counts as a formation.
 
     Raises:
         OSError, ValueError, KeyError, TypeError: a file of the run cannot be read.

@@ -1,4 +1,4 @@
-"""Metrics of a process in the Prometheus text format, over HTTP, where they are asked for."""
+"""An HTTP server for the metrics of a process, in the Prometheus text format."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ FIELD = "observation.metrics"
 PROCESS = "laneweave_process_info"
 PROCESS_MEANING = "1, with what this process is"
 REQUEST_S = 5.0
-"""Whoever asks gets this long to say what for."""
+"""Timeout for reading a request."""
 POLL_S = 0.05
-"""How soon the server notices that it is to end."""
+"""Period at which the server checks whether it is to end."""
 
 
-class NumbersCollector(Collector):
-    """Asks a process for its numbers whenever somebody wants to see them."""
+class MetricsCollector(Collector):
+    """Reads the metrics of a process at each request."""
 
     def __init__(self, labels: dict[str, str]) -> None:
-        """Begin without numbers; `labels` tell what the process is."""
+        """Begin without a source; `labels` describe the process."""
         self._labels = labels
         self._source: Source | None = None
 
-    def look_at(self, source: Source) -> None:
-        """Take numbers from a source from now on: the process is up."""
+    def register(self, source: Source) -> None:
+        """Read metrics from a source from now on; called when the process is up."""
         self._source = source
 
     def collect(self) -> Iterator[Metric]:
@@ -52,7 +52,7 @@ class NumbersCollector(Collector):
 
 
 def families(snapshot: MetricsSnapshot) -> Iterator[Metric]:
-    """Yield the numbers of a snapshot as Prometheus knows them."""
+    """Yield the metrics of a snapshot as Prometheus metric families."""
     for metric in metrics_of(type(snapshot)):
         kind = CounterMetricFamily if metric.counts else GaugeMetricFamily
         family = kind(metric.name, metric.meaning, labels=[metric.label] if metric.label else [])
@@ -71,33 +71,32 @@ class _Server(ThreadingHTTPServer):
         super().__init__((host, port), Handler)
 
     def server_bind(self) -> None:
-        # Not the base class's: that one looks up this machine's name, which may take its time.
+        # The base class also looks up this machine's name, which may be slow.
         socketserver.TCPServer.server_bind(self)
         self.server_name, self.server_port = str(self.server_address[0]), self.server_address[1]
 
     def handle_error(self, *_: object) -> None:
-        # One who has gone away, or a process that hangs: no reason to write a traceback.
-        log.warning("metrics not told", reason=repr(sys.exc_info()[1]))
+        # A client that disconnects is no reason to log a traceback.
+        log.warning("metrics not sent", reason=repr(sys.exc_info()[1]))
 
 
 @contextlib.contextmanager
 def shown_metrics(address: str, **labels: str) -> Iterator[Observe]:
     """Serve metrics while the context lasts.
 
-    The thread that serves is a daemon, as those that answer are: nobody who asks, or asks for
-    nothing and stays, keeps the process from ending.
+    All its threads are daemons, so that no client, active or idle, keeps the process from ending.
 
     Args:
-        address: HOST:PORT, where it listens and nowhere else.
-        labels: what the process is.
+        address: HOST:PORT, the only address that it listens at.
+        labels: describe the process.
 
     Yields:
-        What is to be told where the numbers come from.
+        A function that registers the source of the metrics.
 
     Raises:
-        BadInputError: it cannot listen there.
+        BadInputError: the address cannot be used.
     """
-    collector = NumbersCollector(labels)
+    collector = MetricsCollector(labels)
     registry = CollectorRegistry()
     registry.register(collector)
     ProcessCollector(registry=registry)
@@ -111,7 +110,7 @@ def shown_metrics(address: str, **labels: str) -> Iterator[Observe]:
     )
     serving.start()
     try:
-        yield collector.look_at
+        yield collector.register
     finally:
         server.shutdown()
         server.server_close()

@@ -1,9 +1,9 @@
 """The moving road: a run's trajectories as compact data for the player (`templates/player.js`).
 
 Every vehicle is sampled on a common grid of times, `step_s` apart, from its first to its last
-sample. A sample is three whole numbers, little-endian: place along the road and across it (16 bits
-each) and speed (8 bits), each in units of its own. The samples of all vehicles follow each other;
-each of the three columns is one base64 text. Between samples the player interpolates.
+sample. A sample is three integers, little-endian: longitudinal and lateral position (16 bits each)
+and speed (8 bits), each in a unit of its own. The samples of all vehicles follow each other; each
+of the three columns is one base64 text. The player interpolates between samples.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from laneweave.launch.recordings.trajectories import Floats, Tracks
 
 FORMAT: Final = "laneweave.animation/1"
 KINDS: Final = {"s_m": "<u2", "y_m": "<u2", "speed_mps": "u1"}
-"""The columns, and the numbers that they consist of."""
+"""The columns and their data types."""
 STEPS_S: Final = (0.2, 0.5, 1.0)
-MOST_SAMPLES: Final = 600_000
-"""Makes 4 MB of text. A run with more is sampled more coarsely, or ends earlier."""
+MAX_SAMPLES: Final = 600_000
+"""4 MB of text. A longer run is sampled more coarsely, or ends earlier."""
 
 
 def animation_data(run: Run, tracks: Tracks, title: str) -> dict[str, Any]:
-    """Return what the player needs to show a run, as JSON has it.
+    """Return the data of the player as a JSON object.
 
     Args:
         run: the run.
         tracks: its trajectories.
-        title: what the run is called on the page.
+        title: of the run on the page.
     """
     scenario, road = run.scenario, run.scenario.road
     formations = Formations(())
@@ -82,7 +82,7 @@ def _sample(run: Run, tracks: Tracks, formations: Formations) -> _Samples:
     trip_of = {trip["vehicle"]: trip for trip in trips}
     known = formations.by_number
     driven_s = len(tracks.t_s) * run.scenario.runtime.tick_s
-    step_s = next((step for step in STEPS_S if driven_s / step <= MOST_SAMPLES), STEPS_S[-1])
+    step_s = next((step for step in STEPS_S if driven_s / step <= MAX_SAMPLES), STEPS_S[-1])
     end_s = float(tracks.t_s.max(initial=0.0))
     vehicles: list[dict[str, Any]] = []
     columns: dict[str, list[Floats]] = {name: [] for name in KINDS}
@@ -94,8 +94,8 @@ def _sample(run: Run, tracks: Tracks, formations: Formations) -> _Samples:
         count = math.floor(t_s[-1] / step_s + 1e-6) - first + 1
         if count < 1:
             continue
-        if samples + count > MOST_SAMPLES:
-            # In order of entry: up to here everybody is there.
+        if samples + count > MAX_SAMPLES:
+            # Vehicles are in order of entry, so all are complete up to here.
             end_s = first * step_s
             break
         samples += count

@@ -1,4 +1,4 @@
-"""What the figures of a report share: colours of labels, grids of small panels."""
+"""The style of a report's figures: colours of labels, axes, legends."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ _PALETTE: Final = (
     "#a8a13a",
 )
 GRID: Final = "#e4e6e9"
-MOST_COLUMNS: Final = 6
-"""More volumes than this do not fit side by side."""
+MAX_COLUMNS: Final = 6
+"""Volumes that fit side by side."""
 
 
 def label_colours(labels: Iterable[str]) -> dict[str, str]:
-    """Return the colour of each label: that of its place in the table of methods.
+    """Return the colour of each label, by its place in the table of methods.
 
-    A label that is not there takes a colour that none of the others has, as long as there are some.
+    Other labels have unused colours, as long as there are some.
     """
     colours = dict(zip(METHODS, _PALETTE, strict=False))
     chosen = {label: colours[label] for label in labels if label in colours}
@@ -44,20 +44,20 @@ def label_colours(labels: Iterable[str]) -> dict[str, str]:
 
 
 def spread_evenly(volumes: Sequence[float]) -> tuple[float, ...]:
-    """Return at most `MOST_COLUMNS` volumes, the first and the last among them."""
-    if len(volumes) <= MOST_COLUMNS:
+    """Return at most `MAX_COLUMNS` volumes, the first and the last among them."""
+    if len(volumes) <= MAX_COLUMNS:
         return tuple(volumes)
-    step = (len(volumes) - 1) / (MOST_COLUMNS - 1)
-    return tuple(volumes[round(number * step)] for number in range(MOST_COLUMNS))
+    step = (len(volumes) - 1) / (MAX_COLUMNS - 1)
+    return tuple(volumes[round(number * step)] for number in range(MAX_COLUMNS))
 
 
 def volume_title(volume_veh_per_lane_h: float) -> str:
-    """Return a volume as it stands above a panel."""
+    """Return the title of a panel for a volume."""
     return f"{volume_veh_per_lane_h:g} veh/(lane·h)"
 
 
 def plain(axes: Axes, *, grid: str = "both") -> None:
-    """Give axes a light grid, and no frame but the two axes."""
+    """Give axes a light grid, and hide the upper and right spines."""
     axes.grid(axis="y" if grid == "y" else "both", color=GRID, linewidth=0.7)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
@@ -81,7 +81,7 @@ def legend_above(figure: Figure, handles: Sequence[Artist], labels: Sequence[str
 
 
 def note(axes: Axes, text: str) -> None:
-    """Write into the middle of empty axes why they are."""
+    """Write the reason into the middle of empty axes."""
     axes.text(
         0.5,
         0.5,

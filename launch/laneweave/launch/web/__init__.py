@@ -1,4 +1,4 @@
-"""What reports and the live page share: how a road is drawn on a canvas (`road.js`)."""
+"""The script that draws a road on a canvas (`road.js`), shared by reports and the live page."""
 
 from __future__ import annotations
 

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 from attrs import evolve
 
-from evaluation.agreement import agreement
 from evaluation.points import PlanningTimes, point_rows
 from evaluation.programme import (
     FORMATIONS,
@@ -20,7 +19,7 @@ from evaluation.programme import (
     planned,
     points_of,
 )
-from evaluation.trials import TRIALS, agreement_rows, is_finished
+from evaluation.trials import TRIALS, agreement, agreement_rows, is_finished
 from laneweave.launch.methods import METHODS
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.errors import BadInputError

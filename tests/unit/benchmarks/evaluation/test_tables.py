@@ -10,14 +10,13 @@ from pathlib import Path
 import pytest
 from attrs import evolve
 
-from evaluation.agreement import Agreement
 from evaluation.evidence import Evidence, Picture, read_evidence, write_evidence
 from evaluation.goals import goals_table, meets
 from evaluation.points import PlanningTimes
 from evaluation.programme import FORMATIONS, GOALS, LABELS, VOLUMES, Goal, planned
 from evaluation.statements import PAPER_VOLUMES, statements_table
 from evaluation.tables import document_parts
-from evaluation.trials import AgreementRow, CostRow, FactorRow
+from evaluation.trials import Agreement, AgreementRow, CostRow, FactorRow
 from laneweave.protocol.errors import BadInputError
 from unit.benchmarks.evaluation.recorded import TRACED, evidence, point
 

@@ -45,7 +45,7 @@ def shown(road: LiveRoad, wall_s: float = 2.0) -> dict[str, Any]:
     return frame
 
 
-def test_before_anything_is_heard() -> None:
+def test_before_the_first_message() -> None:
     road = LiveRoad(ROLLING, wall_s=5.0)
     frame = shown(road, 6.0)
     assert (frame["n"], frame["run"], frame["t"], frame["w"]) == (7, 0, None, 6.0)
@@ -54,7 +54,7 @@ def test_before_anything_is_heard() -> None:
     assert (frame["loss"], frame["counts"], frame["plan"]) == (None, None, None)
 
 
-def test_everybody_is_where_they_show_that_they_are() -> None:
+def test_vehicles_are_shown_at_their_published_positions() -> None:
     frame = shown(watched())
     assert (frame["status"], frame["t"]) == ("live", round((START + 20) / 10, 3))
     assert frame["counts"] == [9, 9, 9, 0]
@@ -83,14 +83,14 @@ def test_targets_are_those_of_accepted_plans() -> None:
         assert shown(road)["vehicles"][0][7] == 0
 
 
-def test_between_two_states_vehicles_drive_on() -> None:
+def test_positions_are_extrapolated_between_states() -> None:
     road = watched()
     before = shown(road)["vehicles"][0][1]
     road.take(CONVOY.clock(START + 22), 2.0)
     assert shown(road)["vehicles"][0][1] == pytest.approx(before + 0.2 * 15.0)
 
 
-def test_who_is_not_heard_is_shown_in_its_cell_and_marked() -> None:
+def test_a_vehicle_that_is_not_heard_is_shown_in_its_cell_and_marked() -> None:
     road = watched()
     for tick in range(START + 21, START + 40):
         road.take(CONVOY.clock(tick), 2.0)
@@ -113,14 +113,14 @@ def test_a_vehicle_without_an_agent_is_marked() -> None:
     assert [row[8] for row in shown(road)["vehicles"]] == [0, 0, 0, UNATTENDED, 0, 0, 0, 0, 0]
 
 
-def test_who_has_left_is_gone() -> None:
+def test_vehicles_that_have_left_are_not_shown() -> None:
     road = watched()
     road.take(CONVOY.clock(START + 21), 2.0)
     road.take(CONVOY.census(START + 21, without=frozenset(CONVOY.names[:4])), 2.0)
     assert [row[0] for row in shown(road)["vehicles"]] == CONVOY.names[4:]
 
 
-def test_who_is_heard_before_it_is_listed_is_shown_without_a_lane() -> None:
+def test_a_vehicle_that_is_not_listed_yet_is_shown_without_a_lane() -> None:
     road, more = watched(), Convoy(10, scenario=ROLLING)
     road.take(CONVOY.clock(START + 21), 2.0)
     road.take(more.state(9, START + 21), 2.0)
@@ -166,7 +166,7 @@ def test_formations_of_equal_length_and_those_that_are_joined() -> None:
     assert shown(road)["joined"] == [[0, 1, 2], [5, 6]]
 
 
-def test_who_is_not_listed_yet_is_in_the_formation_of_its_block() -> None:
+def test_a_vehicle_that_is_not_listed_yet_is_in_the_formation_of_its_block() -> None:
     road, _ = with_formations(FORMATIONS, 9, ClosedFormation(0, 2, 5.0))
     entering = Convoy(10, scenario=FORMATIONS).state(9, START + 22)
     for block, formation in ((2, 0), (3, -1)):
@@ -186,21 +186,21 @@ def test_leader_and_candidates() -> None:
     frame = shown(road)
     assert frame["leader"] == ["c1", 3]
     assert frame["candidates"] == [["c1", 3, True, False], ["c2", 3, False, False]]
-    # A new leader; the old one has fallen silent.
+    # A new leader; the old one is silent.
     road.take(Heartbeat(Name("c2"), 18, 4, True, 0), 10.0)
     frame = shown(road, 10.1)
     assert frame["leader"] == ["c2", 4]
     assert frame["candidates"] == [["c1", 3, False, True], ["c2", 4, True, False]]
-    # Later than that nobody is heard, and after a while nobody is remembered.
+    # Later all are silent, and after a while they are forgotten.
     assert shown(road, 30.0)["leader"] is None
     assert shown(road, 100.0)["candidates"] == []
 
 
-def test_another_road_begins_anew() -> None:
+def test_a_newer_bridge_begins_a_new_road() -> None:
     road, later = watched(), Convoy(4, bridge=2, scenario=ROLLING)
     road.take(later.clock(1), 3.0)
     road.take(later.census(1), 3.0)
-    # What is still under way from the earlier road is not mistaken for the new one's.
+    # Late messages of the earlier road are ignored.
     road.take(CONVOY.clock(START + 21), 3.0)
     road.take(CONVOY.census(START + 21), 3.0)
     road.take(CONVOY.state(0, START + 100), 3.0)
@@ -210,7 +210,7 @@ def test_another_road_begins_anew() -> None:
     assert {row[8] for row in frame["vehicles"]} == {UNHEARD}
 
 
-def test_the_status_and_since_when() -> None:
+def test_the_status_and_its_beginning() -> None:
     road = watched()
 
     def status(wall_s: float) -> list[Any]:
@@ -230,7 +230,7 @@ def test_the_status_and_since_when() -> None:
     assert status(20.0) == ["ended", 20.0]
 
 
-def test_frames_are_made_when_something_has_changed() -> None:
+def test_frames_are_made_after_changes() -> None:
     road = watched()
     assert road.changed(2.0)
     road.frame(0, 2.0)
@@ -242,7 +242,7 @@ def test_frames_are_made_when_something_has_changed() -> None:
     assert road.changed(2.1)
 
 
-def test_news_and_plans() -> None:
+def test_events_and_plans() -> None:
     road = watched()
     data = {"slot": 3, "vehicles": 9, "moves": 2, "solve_ms": 4.25, "status": "feasible"}
     for kind, more in (
@@ -265,7 +265,7 @@ def test_news_and_plans() -> None:
 @pytest.mark.parametrize(
     "value", ["a", None, [1], {"b": 2}, True, -(2**63), 10**400], ids=lambda value: str(value)[:20]
 )
-def test_nonsense_in_events_does_no_harm(value: object) -> None:
+def test_malformed_events_do_no_harm(value: object) -> None:
     road = watched()
     data = {"vehicles": value, "solve_ms": value, "solver": value, "fallback": value}
     for kind in ("plan-made", "odd"):
