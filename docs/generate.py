@@ -22,14 +22,17 @@ if __name__ == "__main__":  # run as a program: as `pythonpath` in pyproject.tom
     sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
+
 from conflict_drawing import counts, draw_conflicts
 from evaluation.evidence import read_evidence
 from evaluation.tables import document_parts
 from laneweave.agents.metrics import AgentMetrics
-from laneweave.coordinator.formations.leader_rules import LEADER_RULES, Phase
+from laneweave.coordinator.ballots.ballot_round import BallotPhase
+from laneweave.coordinator.formations.leader import LEADER_RULES
 from laneweave.coordinator.metrics import CoordinatorMetrics
 from laneweave.coordinator.planning import PlanRequest
 from laneweave.coordinator.planning.explanation import explain
+from laneweave.coordinator.rolling.transfer import TRANSFER_RULES
 from laneweave.coordinator.service.server import ServiceMetrics
 from laneweave.launch.drawing.tappa_process import draw_explanation
 from laneweave.launch.fault_search.profiles import PROFILES
@@ -42,7 +45,7 @@ from laneweave.protocol.runtime.metrics import (
 )
 from laneweave.protocol.security.rights import rights_table
 from laneweave.protocol.state_machine import markdown_table, mermaid_diagram
-from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES, Stage
+from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES, ExecutionPhase
 from laneweave.protocol.wire import events, messages
 from laneweave.protocol.wire.topics import TOPICS
 from laneweave.sim_bridge.metrics import BridgeMetrics
@@ -428,9 +431,11 @@ def parts() -> dict[str, str]:
         "messages": _messages(),
         "events": _events(),
         "vehicle rules": markdown_table(VEHICLE_RULES),
-        "vehicle phases": _diagram(mermaid_diagram(VEHICLE_RULES, Stage.FREE)),
+        "vehicle phases": _diagram(mermaid_diagram(VEHICLE_RULES, ExecutionPhase.FREE)),
         "leader rules": markdown_table(LEADER_RULES),
-        "leader phases": _diagram(mermaid_diagram(LEADER_RULES, Phase.OBSERVING)),
+        "leader phases": _diagram(mermaid_diagram(LEADER_RULES, BallotPhase.OBSERVING)),
+        "transfer rules": markdown_table(TRANSFER_RULES),
+        "transfer phases": _diagram(mermaid_diagram(TRANSFER_RULES, BallotPhase.PREPARING)),
         "planted bugs": _planted_bugs(),
         "profiles": _profiles(),
         "resilience": _resilience(),

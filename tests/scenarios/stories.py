@@ -70,7 +70,7 @@ from pathlib import Path
 
 from attrs import frozen
 
-from laneweave.coordinator.formations.leader_rules import LEADER_RULES
+from laneweave.coordinator.formations.leader import LEADER_RULES
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
 from scenarios.story_player import Player

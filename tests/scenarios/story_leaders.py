@@ -9,7 +9,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from attrs import define, field
 
 from laneweave.coordinator.core import CoordinatorCore
-from laneweave.coordinator.formations.control import FormationControl
+from laneweave.coordinator.formations.leader import FormationLeader
+from laneweave.coordinator.formations.operation import FormationsOperation
 from laneweave.coordinator.formations.roster import Formation
 from laneweave.protocol.lattice import PlannedMove, territory
 from laneweave.protocol.runtime.node import (
@@ -50,7 +51,7 @@ class Leader:
     """A coordinator that has taken a formation over; the story plans for it."""
 
     name: str
-    control: FormationControl
+    control: FormationLeader
     incarnation: int
 
     @classmethod
@@ -67,12 +68,12 @@ class Leader:
         core = CoordinatorCore(Name(name), incarnation, PAPER)
         core.election.term = term
         rng = random.Random(0)
-        control = FormationControl(formation, core._new_ballot, rng, RESEND_S, rules)
+        control = FormationLeader(formation, core._new_ballot, rng, resend_s=RESEND_S, rules=rules)
         control.begin(now_s)
         return cls(name, control, incarnation)
 
     @property
-    def controls(self) -> tuple[FormationControl, ...]:
+    def controls(self) -> tuple[FormationLeader, ...]:
         return (self.control,)
 
     def wake(self, mail: Mail, now_s: float) -> Iterator[str]:
@@ -136,8 +137,14 @@ class Candidate:
         return candidate
 
     @property
-    def controls(self) -> tuple[FormationControl, ...]:
-        return tuple(self.core.controls.values())
+    def leaders(self) -> dict[int, FormationLeader]:
+        operation = self.core.operation
+        assert isinstance(operation, FormationsOperation)
+        return operation.leaders
+
+    @property
+    def controls(self) -> tuple[FormationLeader, ...]:
+        return tuple(self.leaders.values())
 
     def wake(self, mail: Mail, now_s: float) -> Iterator[str]:
         """Let timers run; list what is sent."""
@@ -174,7 +181,7 @@ class Candidate:
 
     def about(self) -> list[str]:
         lines = []
-        for control in self.core.controls.values():
+        for control in self.leaders.values():
             numbers = " ".join(map(str, control.formation.numbers))
             line = f"{about(self.name, control)} for {numbers}"
             if control.plan is not None:
@@ -231,7 +238,7 @@ def formation_of(vehicles: Mapping[str, Vehicle], roster: str) -> Formation:
     return Formation(numbers, members)
 
 
-def written_plan(text: str, control: FormationControl, ballot: Ballot) -> Plan:
+def written_plan(text: str, control: FormationLeader, ballot: Ballot) -> Plan:
     """Return the plan that a story gives, as the leader would issue it.
 
     Args:
@@ -276,7 +283,7 @@ def post(mail: Mail, message: Prepare | Plan, vehicle: str) -> str:
     return f"{kind} {written(message.ballot)} to {vehicle}"
 
 
-def about(name: str, control: FormationControl) -> str:
+def about(name: str, control: FormationLeader) -> str:
     """Tell what a leader is about."""
     ballot = f" {written(control.ballot)}" if control.ballot is not None else ""
     return f"{name} {control.phase.value}{ballot}"

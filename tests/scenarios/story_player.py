@@ -7,8 +7,7 @@ from collections.abc import Callable, Iterator
 
 from attrs import frozen
 
-from laneweave.coordinator.formations.control import FormationControl
-from laneweave.coordinator.formations.leader_rules import LEADER_RULES
+from laneweave.coordinator.formations.leader import LEADER_RULES, FormationLeader
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import PeerDown, PeerUp
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
@@ -224,14 +223,14 @@ class Player:
             list(self._hear_all(name, control))
             yield f"{' '.join(sorted(control.accepted)) or 'none'} accept {_ballot(control)}"
 
-    def _hear_all(self, name: str, control: FormationControl) -> Lines:
+    def _hear_all(self, name: str, control: FormationLeader) -> Lines:
         for process in self._members(control):
             yield from self._hear(name, process.shown)
 
-    def _members(self, control: FormationControl) -> list[Process]:
+    def _members(self, control: FormationLeader) -> list[Process]:
         return [self._in_charge_of(each) for each in control.formation.roster]
 
-    def _deliver(self, kind: str, control: FormationControl, process: Process) -> None:
+    def _deliver(self, kind: str, control: FormationLeader, process: Process) -> None:
         message = self._mail.get((kind, _ballot(control), process.vehicle.name))
         if message is not None:
             process.get(message, self.tick)
@@ -380,7 +379,7 @@ class _Snapshot:
         return cls(execution, execution.hold_cell, execution.moving, execution.go)
 
 
-def _ballot(control: FormationControl) -> str:
+def _ballot(control: FormationLeader) -> str:
     return written(control.ballot) if control.ballot else "nothing"
 
 

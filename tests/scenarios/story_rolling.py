@@ -24,7 +24,8 @@ from collections.abc import Callable, Iterator
 
 from attrs import define, evolve, field
 
-from laneweave.coordinator.rolling.ballot import Handover, Phase
+from laneweave.coordinator.ballots.ballot_round import BallotPhase
+from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.launch.fault_search.cell_ownership import CellOwnership
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import Ballot, Command, Heartbeat, Name, VehicleState
@@ -43,7 +44,7 @@ class StreamLeader:
     name: str
     term: int
     states: dict[Name, VehicleState] = field(factory=dict)
-    handover: Handover | None = None
+    handover: CellTransfer | None = None
     claims: tuple[Cell, ...] = ()
     """Cells that it takes for the mover's, whoever owns them."""
     ballots: int = 0
@@ -54,7 +55,7 @@ class StreamLeader:
         """Begin a ballot over a mover and others."""
         self.ballots += 1
         roster = tuple(sorted({mover, *others}))
-        self.handover = Handover(
+        self.handover = CellTransfer(
             ballot=Ballot(self.term, Name(self.name), 1, self.ballots),
             roster=roster,
             moves={mover: (self.states[mover].hold_cell, target)},
@@ -70,7 +71,7 @@ class StreamLeader:
             for vehicle, message in self.handover.outgoing(now_s):
                 yield post(mail, message, vehicle)
 
-    def hear(self, state: VehicleState) -> Lines:
+    def hear(self, state: VehicleState, now_s: float) -> Lines:
         handover = self.handover
         if self.claims and handover is not None and state.vehicle in handover.moves:
             state = evolve(state, estate=tuple(sorted({*state.estate, *self.claims})))
@@ -78,7 +79,7 @@ class StreamLeader:
         if handover is None:
             return
         before = handover.phase
-        handover.on_state(state, self.states)
+        handover.on_state(state, self.states, now_s)
         if handover.phase is not before:
             yield self.about()
 
@@ -86,7 +87,7 @@ class StreamLeader:
         handover = self.handover
         if handover is None:
             return f"{self.name} has no ballot"
-        why = f": {handover.why}" if handover.phase is Phase.GIVEN_UP else ""
+        why = f": {handover.why}" if handover.phase is BallotPhase.GIVEN_UP else ""
         return f"{self.name} {handover.phase.value} {written(handover.ballot)}{why}"
 
 
@@ -177,7 +178,7 @@ class RollingPlayer(Player):
     ) -> None:
         leader = self.streams[name]
         for each in (mover, *(others or "").split()):
-            list(leader.hear(self._shown_by(each)))
+            list(leader.hear(self._shown_by(each), self.t_s))
         leader.claims = tuple(map(cell_of, (claimed or "").split()))
         names = tuple(map(Name, (others or "").split()))
         leader.begin(Name(mover), cell_of(target), names, self.t_s)
@@ -194,7 +195,7 @@ class RollingPlayer(Player):
         told: list[str] = []
         for vehicle in handover.roster:
             self._deliver_to(vehicle, "PREPARE", handover)
-            told += leader.hear(self._shown_by(vehicle))
+            told += leader.hear(self._shown_by(vehicle), self.t_s)
         yield f"{' '.join(sorted(handover.promises)) or 'none'} promise {written(handover.ballot)}"
         yield from told
 
@@ -207,7 +208,7 @@ class RollingPlayer(Player):
             accepts = state.accepted and state.promised == handover.ballot
             yield f"{vehicle} accepts" if accepts else f"{vehicle} does not accept"
 
-    def _deliver_to(self, vehicle: str, kind: str, handover: Handover) -> None:
+    def _deliver_to(self, vehicle: str, kind: str, handover: CellTransfer) -> None:
         message = self._mail.get((kind, written(handover.ballot), vehicle))
         if message is not None:
             self._in_charge_of(vehicle).get(message, self.tick)
@@ -220,14 +221,14 @@ class RollingPlayer(Player):
 
     def _hear(self, name: str, what: VehicleState | Heartbeat | None) -> Lines:
         if name in self.streams and isinstance(what, VehicleState):
-            yield from self.streams[name].hear(what)
+            yield from self.streams[name].hear(what, self.t_s)
         else:
             yield from super()._hear(name, what)
 
     def _show(self, name: str) -> Lines:
         yield from [self.streams[name].about()] if name in self.streams else super()._show(name)
 
-    def _handover_of(self, name: str) -> Handover:
+    def _handover_of(self, name: str) -> CellTransfer:
         handover = self.streams[name].handover
         if handover is None:
             raise StoryError(f"{name} has no ballot")

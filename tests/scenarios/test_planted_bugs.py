@@ -6,13 +6,15 @@ from pathlib import Path
 
 import pytest
 
-from laneweave.coordinator.formations.leader_rules import LEADER_RULES
+from laneweave.coordinator.formations.leader import LEADER_RULES
+from laneweave.coordinator.rolling.transfer import TRANSFER_RULES
 from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
 from scenarios.stories import check_story, ends_in_collision, player_of
 from scenarios.story_text import StoryError
-from support.planted_bugs import BUGS, NOT_A_SAFETY_MATTER, ROWS_OF_OTHERS, PlantedBug
+from support.planted_bugs import BUGS, NOT_A_SAFETY_MATTER, ROWS_OF_OTHERS, PlantedBug, unchanged
 
 HERE = Path(__file__).parent
+BOOKS = (VEHICLE_RULES, LEADER_RULES, TRANSFER_RULES)
 
 
 @pytest.mark.parametrize("bug", BUGS, ids=lambda bug: bug.name)
@@ -30,16 +32,15 @@ def test_names_tell_bugs_apart() -> None:
 
 
 def test_every_bug_breaks_a_rule_that_exists() -> None:
-    rules = {row.rule for book in (VEHICLE_RULES, LEADER_RULES) for row in book.table}
+    rules = {row.rule for book in BOOKS for row in book.table}
     assert {bug.rule for bug in BUGS} <= rules | set(ROWS_OF_OTHERS)
     assert rules <= {bug.rule for bug in BUGS}, "each rule is broken at least once"
     for bug in BUGS:
-        replaced = {*bug.vehicle, *bug.leader}
-        assert replaced or bug.vehicle_row is not None or bug.rule in ROWS_OF_OTHERS
+        assert bug.replaced or bug.vehicle_row is not None or bug.plant is not unchanged
 
 
 def test_every_guard_and_action_is_broken_or_excused() -> None:
-    names = {*VEHICLE_RULES.functions, *LEADER_RULES.functions}
-    broken = {name for bug in BUGS for name in (*bug.vehicle, *bug.leader)}
-    assert names == broken | set(NOT_A_SAFETY_MATTER)
+    used = {function for book in BOOKS for function in book.functions}
+    broken = {function for bug in BUGS for function in bug.replaced}
+    assert used == broken | set(NOT_A_SAFETY_MATTER)
     assert not broken & set(NOT_A_SAFETY_MATTER)

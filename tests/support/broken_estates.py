@@ -7,8 +7,9 @@ from collections.abc import Collection, Mapping
 import pytest
 from attrs import evolve
 
-from laneweave.coordinator.rolling import ballot as handover
-from laneweave.coordinator.rolling.ballot import Handover, States
+from laneweave.coordinator.rolling import ownership, transfer
+from laneweave.coordinator.rolling.ownership import States
+from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.vehicle import execution_rules as vehicle_rules
 from laneweave.protocol.vehicle.execution import PlanExecution
@@ -88,11 +89,11 @@ def void_shut_deeds(patch: Patch) -> None:
         del states, gone
         return frozenset(state.estate)
 
-    patch.setattr(handover, "estate_of", mutant)
+    patch.setattr(transfer, "owned_cells", mutant)
 
 
 def void_by_common_promise(patch: Patch) -> None:
-    estate_of = handover.estate_of
+    owned_cells = ownership.owned_cells
 
     def mutant(
         state: VehicleState, states: States, gone: Collection[Name]
@@ -102,38 +103,38 @@ def void_by_common_promise(patch: Patch) -> None:
             promised = {states[name].promised for name in deed.roster if name in states}
             if promised == {state.promised} and state.promised != deed.ballot:
                 return frozenset(deed.before)
-        return estate_of(state, states, gone)
+        return owned_cells(state, states, gone)
 
-    patch.setattr(handover, "estate_of", mutant)
+    patch.setattr(transfer, "owned_cells", mutant)
 
 
 def forget_motion(patch: Patch) -> None:
-    estate_of = handover.estate_of
+    owned_cells = ownership.owned_cells
 
     def mutant(
         state: VehicleState, states: States, gone: Collection[Name]
     ) -> frozenset[Cell] | None:
-        return estate_of(evolve(state, moving=False), states, gone)
+        return owned_cells(evolve(state, moving=False), states, gone)
 
-    patch.setattr(handover, "estate_of", mutant)
+    patch.setattr(transfer, "owned_cells", mutant)
 
 
 def check_no_estates(patch: Patch) -> None:
-    patch.setattr(handover, "estate_problems", _no_problems)
-    patch.setattr(vehicle_rules, "estate_problems", _no_problems)
+    patch.setattr(transfer, "ownership_problems", _no_problems)
+    patch.setattr(vehicle_rules, "ownership_problems", _no_problems)
 
 
 def keep_what_is_given(patch: Patch) -> None:
-    make = Handover._plan
+    make = CellTransfer._plan
 
-    def mutant(self: Handover, before: Mapping[Name, frozenset[Cell]]) -> Plan:
+    def mutant(self: CellTransfer, before: Mapping[Name, frozenset[Cell]]) -> Plan:
         plan = make(self, before)
         after = {
             name: tuple(sorted({*cells, *plan.before[name]})) for name, cells in plan.after.items()
         }
         return evolve(plan, after=after)
 
-    patch.setattr(Handover, "_plan", mutant)
+    patch.setattr(CellTransfer, "_plan", mutant)
     check_no_estates(patch)
 
 

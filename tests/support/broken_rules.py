@@ -9,21 +9,20 @@ import pytest
 from attrs import evolve
 
 from laneweave.agents.core import AgentCore
-from laneweave.coordinator import core as coordinator_core
+from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.election import Election
-from laneweave.coordinator.formations import roster as formation_module
-from laneweave.coordinator.formations.control import FormationControl
-from laneweave.coordinator.formations.groups import Groups
-from laneweave.coordinator.formations.leader_rules import Phase
-from laneweave.coordinator.formations.roster import Formation
+from laneweave.coordinator.formations import operation, roster
+from laneweave.coordinator.formations.leader import FormationLeader
+from laneweave.coordinator.formations.roster import Formation, Groups
 from laneweave.launch.fault_search.light_road import LightRoad
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Effect
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.state_machine import Transition
+from laneweave.protocol.vehicle import execution_rules
 from laneweave.protocol.vehicle.execution import PlanExecution
-from laneweave.protocol.vehicle.execution_rules import PLAN, Stage
+from laneweave.protocol.vehicle.execution_rules import PLAN, ExecutionPhase
 from laneweave.protocol.vehicle.plans import Needs, dependencies
 from laneweave.protocol.wire.messages import (
     Ballot,
@@ -65,7 +64,7 @@ def skip(*_: object) -> None:
 
 
 def plan_in_any_phase(row: Transition) -> Transition:
-    return evolve(row, sources=tuple(Stage)) if row.event == PLAN else row
+    return evolve(row, sources=tuple(ExecutionPhase)) if row.event == PLAN else row
 
 
 def accept_anew(me: PlanExecution, plan: Plan) -> None:
@@ -121,8 +120,8 @@ def hear_moves_under_way(me: PlanExecution, state: VehicleState) -> None:
         me.heard[state.vehicle] = max(me.heard.get(state.vehicle, -1), shown)
 
 
-def has_plan(me: PlanExecution, _: object) -> bool:
-    return me.plan is not None
+def ready_with_plan(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(PlanExecution, "ready", property(lambda me: me.plan is not None))
 
 
 def all_but_one_are_ready(me: PlanExecution, _: object) -> bool:
@@ -142,6 +141,14 @@ def one_less(plan: Plan, vehicle: Name) -> tuple[Needs, ...]:
         {other: count - 1 for other, count in needs.items()}
         for needs in dependencies(plan, vehicle)
     )
+
+
+def need_one_less(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(execution_rules, "dependencies", one_less)
+
+
+def forget_corners(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(execution_rules, "dependencies", without_corners)
 
 
 def without_corners(plan: Plan, vehicle: Name) -> tuple[Needs, ...]:
@@ -166,46 +173,58 @@ def start_and_count(me: PlanExecution, _: object) -> None:
 # --- a leader ---------------------------------------------------------------------------------
 
 
-def whoever_is_heard(me: FormationControl) -> tuple[Name, ...]:
-    return tuple(name for name in me.formation.roster if name in me.states)
+def roster_of_heard(patch: pytest.MonkeyPatch) -> None:
+    def mutant(me: FormationLeader) -> tuple[Name, ...]:
+        return tuple(name for name in me.formation.roster if name in me.states)
+
+    patch.setattr(FormationLeader, "roster", property(mutant))
 
 
-def majority(me: FormationControl) -> tuple[Name, ...]:
-    roster = me.formation.roster
-    promised = tuple(name for name in roster if name in me.promises)
-    return promised if 2 * len(promised) > len(roster) else roster
+def roster_of_majority(patch: pytest.MonkeyPatch) -> None:
+    def mutant(me: FormationLeader) -> tuple[Name, ...]:
+        everybody = me.formation.roster
+        promised = tuple(name for name in everybody if name in me.promises)
+        return promised if 2 * len(promised) > len(everybody) else everybody
+
+    patch.setattr(FormationLeader, "roster", property(mutant))
 
 
-def anybody_has_promised(me: FormationControl, _: object) -> bool:
+def roster_of_promised(patch: pytest.MonkeyPatch) -> None:
+    def mutant(me: FormationLeader) -> tuple[Name, ...]:
+        return tuple(me.promises) or me.formation.roster
+
+    patch.setattr(FormationLeader, "roster", property(mutant))
+
+
+def anybody_has_promised(me: FormationLeader, _: object) -> bool:
     return bool(me.promises)
 
 
-def whoever_has_promised(me: FormationControl) -> tuple[Name, ...]:
-    return tuple(me.promises) or me.formation.roster
+def take_old_states(patch: pytest.MonkeyPatch) -> None:
+    def mutant(me: FormationLeader, state: VehicleState) -> bool:
+        return state.vehicle in me.formation.roster
+
+    patch.setattr(FormationLeader, "_is_news", mutant)
 
 
-def any_member(me: FormationControl, state: VehicleState) -> bool:
-    return state.vehicle in me.formation.roster
-
-
-def heard_have_accepted(me: FormationControl, _: object) -> bool:
+def heard_have_accepted(me: FormationLeader, _: object) -> bool:
     return all(state.accepted for state in me.states.values())
 
 
-def all_have_accepted(me: FormationControl, _: object) -> bool:
+def all_have_accepted(me: FormationLeader, _: object) -> bool:
     return all(me.states[name].accepted for name in me.formation.roster)
 
 
-def one_ballot(me: FormationControl, _: object) -> bool:
+def one_ballot(me: FormationLeader, _: object) -> bool:
     ballots = {me.states[name].promised for name in me.formation.roster}
     return len(ballots) == 1 and all_have_accepted(me, None)
 
 
-def adopt_the_ballot_only(me: FormationControl, _: object) -> None:
+def adopt_the_ballot_only(me: FormationLeader, _: object) -> None:
     me.ballot = next(iter(me.states.values())).promised
 
 
-def prepare_the_same(me: FormationControl, _: object) -> None:
+def prepare_the_same(me: FormationLeader, _: object) -> None:
     if me.ballot is None:
         me.ballot = me.new_ballot(me.highest)
     else:
@@ -219,29 +238,29 @@ def prepare_the_same(me: FormationControl, _: object) -> None:
     me.plan, me.accepted, me.failures, me.due_s = None, set(), 0, me.now_s
 
 
-def prepare_anew(me: FormationControl, _: object) -> None:
+def prepare_anew(me: FormationLeader, _: object) -> None:
     me.ballot = me.new_ballot(me.highest)
     me.promises, me.due_s = {}, me.now_s
 
 
-def promised_something(_: FormationControl, state: VehicleState) -> bool:
+def promised_something(_: FormationLeader, state: VehicleState) -> bool:
     return state.promised is not None and not state.accepted
 
 
-def count_entry_cell(me: FormationControl, state: VehicleState) -> None:
+def count_entry_cell(me: FormationLeader, state: VehicleState) -> None:
     cells = {member.vehicle: member.cell for member in me.formation.members}
     me.promises[state.vehicle] = evolve(state, hold_cell=cells[state.vehicle])
 
 
-def time_is_up_unless_issuing(me: FormationControl, _: object) -> bool:
-    return me.now_s >= me.until_s and me.phase is not Phase.ISSUING
+def time_is_up_unless_issuing(me: FormationLeader, _: object) -> bool:
+    return me.now_s >= me.until_s and me.phase is not BallotPhase.ISSUING
 
 
-def shows_another_ballot(me: FormationControl, state: VehicleState) -> bool:
+def shows_another_ballot(me: FormationLeader, state: VehicleState) -> bool:
     return state.promised != me.ballot
 
 
-def promised_b(me: FormationControl, state: VehicleState) -> bool:
+def promised_b(me: FormationLeader, state: VehicleState) -> bool:
     return state.promised == me.ballot
 
 
@@ -275,7 +294,7 @@ def forget_incarnation(patch: pytest.MonkeyPatch) -> None:
 
 
 def close_at_once(patch: pytest.MonkeyPatch) -> None:
-    closed_formations = formation_module.closed_formations
+    closed_formations = roster.closed_formations
 
     def mutant(
         census: Census, t_s: float, scenario: Scenario, groups: Groups
@@ -285,7 +304,7 @@ def close_at_once(patch: pytest.MonkeyPatch) -> None:
         early = evolve(census, formations=closed, closed_to=FAR_BEHIND)
         return closed_formations(early, t_s, scenario, groups)
 
-    patch.setattr(coordinator_core, "closed_formations", mutant)
+    patch.setattr(operation, "closed_formations", mutant)
 
 
 def close_early(patch: pytest.MonkeyPatch) -> None:

@@ -12,26 +12,28 @@ from collections.abc import Callable, Mapping
 import pytest
 from attrs import field, frozen
 
-from laneweave.coordinator.formations.leader_rules import LEADER_RULES
+from laneweave.coordinator.ballots import ballot_round as ballot
+from laneweave.coordinator.formations import leader
+from laneweave.coordinator.rolling import transfer
 from laneweave.protocol.state_machine import Function, RuleBook, Transition
-from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
+from laneweave.protocol.vehicle import execution_rules as vehicle
 from support import broken_estates as rolling
 from support import broken_rules as broken
 
 ROWS_OF_OTHERS = {
     "L1": "election: coordinator.election",
     "L3": "ballots: CoordinatorCore",
-    "census": "which formations are closed: roadside, coordinator.formation",
-    "joining": "which formations are joined: coordinator.groups",
+    "census": "which formations are closed: roadside, coordinator.formations.roster",
+    "joining": "which formations are joined: coordinator.formations.roster",
     "charge": "who acts for a vehicle: AgentCore, MotionController",
     "caretaker": "who acts for a vehicle without agent: sim_bridge.caretaker",
     "estate": "which cells are whose in the rolling operation: MotionController, plans",
-    "handover": "how a leader hands cells over: coordinator.handover",
+    "handover": "how a leader hands cells over: coordinator.rolling.transfer",
 }
 """Rules that are not, or not only, in the rule books, and where they are."""
 
 
-def _nothing(_: pytest.MonkeyPatch) -> None:
+def unchanged(_: pytest.MonkeyPatch) -> None:
     """Change nothing outside the rule books."""
 
 
@@ -50,166 +52,172 @@ class PlantedBug:
     """The spoilt story ends with two vehicles in one cell (in the rolling operation also: with two
     owners of one, or with a body in a cell that is not its own); otherwise nothing worse than
     disorder, or a vehicle that waits for ever."""
-    vehicle: Mapping[str, Function] = field(factory=dict)
-    """Guards and actions of a vehicle that are replaced."""
-    leader: Mapping[str, Function] = field(factory=dict)
-    """Guards and actions of a leader that are replaced."""
+    replaced: Mapping[Function, Function] = field(factory=dict)
+    """Guards and actions of a vehicle or a leader, and what stands for them."""
     vehicle_row: Callable[[Transition], Transition] | None = None
     """Changes rows of a vehicle's table."""
-    plant: Callable[[pytest.MonkeyPatch], None] = _nothing
+    plant: Callable[[pytest.MonkeyPatch], None] = unchanged
     """Changes what is in no rule book."""
 
     @property
     def vehicle_rules(self) -> RuleBook:
         """A vehicle's rules with this bug."""
-        book = VEHICLE_RULES.planted(**self.vehicle)
-        if self.vehicle_row is None:
-            return book
-        return RuleBook(map(self.vehicle_row, book.table), book.functions)
+        book = self._broken(vehicle.VEHICLE_RULES)
+        return book if self.vehicle_row is None else RuleBook(map(self.vehicle_row, book.table))
 
     @property
     def leader_rules(self) -> RuleBook:
         """A leader's rules with this bug."""
-        return LEADER_RULES.planted(**self.leader)
+        return self._broken(leader.LEADER_RULES)
+
+    def _broken(self, book: RuleBook) -> RuleBook:
+        used = book.functions
+        return book.replacing({rule: bug for rule, bug in self.replaced.items() if rule in used})
 
 
 BUGS: tuple[PlantedBug, ...] = (
     # --- V2: promises
     PlantedBug(
         "lower-ballot-promised", "V2", "A lower ballot than the promised one is promised, too.",
-        "late_duplicate_plan", collides=False, vehicle={"is_above_promise": broken.always},
+        "late_duplicate_plan", collides=False, replaced={vehicle.is_above_promise: broken.always},
     ),
     PlantedBug(
         "promise-keeps-count", "V2", "A promise does not begin the count of moves anew.",
-        "count_begins_anew", vehicle={"drop_plan": broken.keep_count},
+        "count_begins_anew", replaced={vehicle.drop_plan: broken.keep_count},
     ),
     PlantedBug(
         "promise-keeps-plan", "V2", "A promise does not end the part in the old plan.",
-        "prepare_while_moving", vehicle={"drop_plan": broken.skip},
+        "prepare_while_moving", replaced={vehicle.drop_plan: broken.skip},
     ),
     PlantedBug(
         "promise-keeps-heard", "V2", "What was heard of the old plan counts in the new one.",
-        "heard_begins_anew", vehicle={"forget_heard": broken.skip},
+        "heard_begins_anew", replaced={vehicle.forget_heard: broken.skip},
     ),
     PlantedBug(
         "joining-not-asked", "V2", "A promise does not ask the controller to join formations.",
-        "joint_ballot", collides=False, vehicle={"promise": broken.promise_without_joining},
+        "joint_ballot", collides=False, replaced={vehicle.promise: broken.promise_without_joining},
     ),
     # --- V3: acceptance
     PlantedBug(
         "no-promise-check", "V3", "Any plan that names the vehicle is accepted at any time.",
         "plan_of_a_zombie", collides=False,
-        vehicle={"is_promised_ballot": broken.always, "accept": broken.accept_anew},
+        replaced={vehicle.is_promised_ballot: broken.always, vehicle.accept: broken.accept_anew},
         vehicle_row=broken.plan_in_any_phase,
     ),
     PlantedBug(
         "acceptance-not-noted", "V3", "A plan is accepted without the motion controller's word.",
         "zombie_takes_a_newer_plan",
-        vehicle={"is_noted": broken.always}, plant=broken.note_by_itself,
+        replaced={vehicle.is_noted: broken.always}, plant=broken.note_by_itself,
     ),
     PlantedBug(
         "zombie-plan-accepted", "V3", "A plan of a lower ballot than the promised one is accepted.",
-        "plan_of_a_lower_ballot", vehicle={"is_promised_ballot": broken.always},
+        "plan_of_a_lower_ballot", replaced={vehicle.is_promised_ballot: broken.always},
     ),
     PlantedBug(
         "plan-taken-twice", "V3", "A repeated PLAN begins the plan anew.",
-        "plan_repeated", vehicle={"accept": broken.accept_anew},
+        "plan_repeated", replaced={vehicle.accept: broken.accept_anew},
         vehicle_row=broken.plan_in_any_phase,
     ),
     PlantedBug(
         "incarnation-not-checked", "V3", "A plan for an earlier process is accepted.",
-        "plan_for_an_earlier_process", vehicle={"names_my_incarnation": broken.always},
+        "plan_for_an_earlier_process", replaced={vehicle.names_my_incarnation: broken.always},
     ),
     PlantedBug(
         "start-cell-not-checked", "V3", "A plan that begins in another cell is accepted.",
-        "planner_mistakes_a_cell", vehicle={"starts_in_my_cell": broken.always},
+        "planner_mistakes_a_cell", replaced={vehicle.starts_in_my_cell: broken.always},
     ),
     PlantedBug(
         "plan-not-checked", "V3", "A plan in which two vehicles meet is accepted.",
-        "planner_lets_two_meet", vehicle={"is_executable": broken.always},
+        "planner_lets_two_meet", replaced={vehicle.is_executable: broken.always},
     ),
     PlantedBug(
         "territory-not-checked", "V3", "A plan beyond the blocks of its formations is accepted.",
-        "planner_leaves_its_block", vehicle={"keeps_to_its_blocks": broken.always},
+        "planner_leaves_its_block", replaced={vehicle.keeps_to_its_blocks: broken.always},
     ),
     PlantedBug(
         "joined-not-checked", "V3", "A plan for formations that were not joined is accepted.",
-        "planner_claims_another_block", vehicle={"has_joined": broken.always},
+        "planner_claims_another_block", replaced={vehicle.has_joined: broken.always},
     ),
     PlantedBug(
         "part-of-blocks-accepted", "V3", "A plan for some of the joined blocks is accepted.",
-        "planner_leaves_a_block_out", vehicle={"has_joined": broken.plans_for_some_of_its_blocks},
+        "planner_leaves_a_block_out",
+        replaced={vehicle.has_joined: broken.plans_for_some_of_its_blocks},
     ),
     # --- V4, V5: news and the start gate
     PlantedBug(
         "no-gate", "V5", "A vehicle moves as soon as it has the plan, whoever else has it.",
-        "start_gate_guards_a_moving_vehicle", vehicle={"all_are_ready": broken.always},
+        "start_gate_guards_a_moving_vehicle", replaced={vehicle.all_are_ready: broken.always},
     ),
     PlantedBug(
         "gate-minus-one", "V5", "The gate opens when all other members but one are ready.",
-        "gate_minus_one", vehicle={"all_are_ready": broken.all_but_one_are_ready},
+        "gate_minus_one", replaced={vehicle.all_are_ready: broken.all_but_one_are_ready},
     ),
     PlantedBug(
         "gate-on-promise", "V4", "The promises of all others open the gate.",
         "gate_on_promise",
-        vehicle={"is_of_my_plan": broken.promised_my_ballot, "hear": broken.hear_whoever},
+        replaced={
+            vehicle.is_of_my_plan: broken.promised_my_ballot,
+            vehicle.hear: broken.hear_whoever,
+        },
     ),
     PlantedBug(
         "ready-while-moving", "V4", "Who has accepted counts as ready, though it still moves.",
-        "prepare_while_moving", vehicle={"is_ready": broken.has_plan},
+        "prepare_while_moving", plant=broken.ready_with_plan,
     ),
     PlantedBug(
         "one-acceptance-opens-the-gate", "V4", "Any other member's acceptance opens the gate.",
-        "gate_minus_one", vehicle={"shows_open_gate": broken.always},
+        "gate_minus_one", replaced={vehicle.shows_open_gate: broken.always},
     ),
     PlantedBug(
         "go-of-another-ballot", "V4", "An open gate in another ballot opens this one.",
-        "gate_is_open_for_all", vehicle={"is_of_my_plan": broken.accepted_mine_or_goes},
+        "gate_is_open_for_all", replaced={vehicle.is_of_my_plan: broken.accepted_mine_or_goes},
     ),
     PlantedBug(
         "release-on-any-ballot", "V4", "Moves completed in any plan count for this one.",
-        "newer_ballot_releases_nothing", vehicle={"is_of_my_plan": broken.accepted_anything},
+        "newer_ballot_releases_nothing", replaced={vehicle.is_of_my_plan: broken.accepted_anything},
     ),
     PlantedBug(
         "release-on-a-newer-ballot", "V4", "Moves completed in a newer plan count for this one.",
-        "newer_ballot_releases_nothing", vehicle={"is_of_my_plan": broken.accepted_mine_or_newer},
+        "newer_ballot_releases_nothing",
+        replaced={vehicle.is_of_my_plan: broken.accepted_mine_or_newer},
     ),
     PlantedBug(
         "move-under-way-counts", "V4", "A move that has begun counts as completed.",
-        "dependency", vehicle={"hear": broken.hear_moves_under_way},
+        "dependency", replaced={vehicle.hear: broken.hear_moves_under_way},
     ),
     # --- V6, V7: moves
     PlantedBug(
         "timetable", "V6", "The clock alone releases moves.",
-        "dependency", vehicle={"is_released": broken.always},
+        "dependency", replaced={vehicle.is_released: broken.always},
     ),
     PlantedBug(
         "lease", "V6", "A move is released when it has been due for long: `it must have stopped`.",
-        "lease", vehicle={"is_released": broken.is_released_after_a_while},
+        "lease", replaced={vehicle.is_released: broken.is_released_after_a_while},
     ),
     PlantedBug(
         "need-minus-one", "V6", "A move waits for one completed move less than it needs.",
-        "dependency", vehicle={"dependencies": broken.one_less},
+        "dependency", plant=broken.need_one_less,
     ),
     PlantedBug(
         "corners-forgotten", "V6", "The corner cells of diagonal moves are nobody's.",
-        "corner", vehicle={"dependencies": broken.without_corners},
+        "corner", plant=broken.forget_corners,
     ),
     PlantedBug(
         "start-while-moving", "V6", "A move begins before the one under way has ended.",
-        "one_motion_at_a_time", vehicle={"is_holding": broken.always},
+        "one_motion_at_a_time", replaced={vehicle.is_holding: broken.always},
     ),
     PlantedBug(
         "no-pacing", "V6", "Moves begin before their time.",
-        "paced_by_the_clock", collides=False, vehicle={"is_time": broken.always},
+        "paced_by_the_clock", collides=False, replaced={vehicle.is_time: broken.always},
     ),
     PlantedBug(
         "counted-at-the-start", "V7", "A move is counted when it begins.",
-        "dependency", vehicle={"start_move": broken.start_and_count, "count_move": broken.skip},
+        "dependency",
+        replaced={vehicle.start_move: broken.start_and_count, vehicle.count_move: broken.skip},
     ),
     PlantedBug(
         "old-motion-counts", "V7", "A motion of an older plan is counted in the new one.",
-        "motion_of_an_old_plan", vehicle={"moved_in_plan": broken.always},
+        "motion_of_an_old_plan", replaced={vehicle.moved_in_plan: broken.always},
     ),
     # --- a leader
     PlantedBug(
@@ -223,20 +231,24 @@ BUGS: tuple[PlantedBug, ...] = (
     PlantedBug(
         "adoption-by-hearsay", "L2", "A plan is adopted though not everybody was heard.",
         "leader_killed_after_half_of_the_plans", collides=False,
-        leader={"all_are_heard": broken.always, "one_plan_is_in_force": broken.heard_have_accepted},
+        replaced={
+            leader.all_are_heard: broken.always,
+            leader.one_plan_is_in_force: broken.heard_have_accepted,
+        },
     ),
     PlantedBug(
         "mixed-ballots-adopted", "L2", "A plan is adopted though some accepted another one.",
-        "mixed_ballots", collides=False, leader={"one_plan_is_in_force": broken.all_have_accepted},
+        "mixed_ballots", collides=False,
+        replaced={leader.one_plan_is_in_force: broken.all_have_accepted},
     ),
     PlantedBug(
         "overdue-plan-adopted", "L2", "A plan that stalls is adopted.",
         "overdue_is_not_adopted", collides=False,
-        leader={"one_plan_is_in_force": broken.one_ballot},
+        replaced={leader.one_plan_is_in_force: broken.one_ballot},
     ),
     PlantedBug(
         "adoption-interrupts", "L2", "Adopted promises are forgotten, so everybody seems new.",
-        "adoption", collides=False, leader={"adopt": broken.adopt_the_ballot_only},
+        "adoption", collides=False, replaced={leader.adopt: broken.adopt_the_ballot_only},
     ),
     PlantedBug(
         "ballot-reused-after-restart", "L3", "Ballots do not tell processes of one name apart.",
@@ -244,90 +256,93 @@ BUGS: tuple[PlantedBug, ...] = (
     ),
     PlantedBug(
         "second-plan-under-one-ballot", "L3", "The roster is asked again under the same ballot.",
-        "one_plan_per_ballot", leader={"prepare": broken.prepare_the_same},
+        "one_plan_per_ballot", replaced={leader.prepare: broken.prepare_the_same},
     ),
     PlantedBug(
         "old-states-are-news", "L4", "A late state of an earlier process counts as a promise.",
-        "late_promise_of_an_earlier_process", collides=False, leader={"is_news": broken.any_member},
+        "late_promise_of_an_earlier_process", collides=False, plant=broken.take_old_states,
     ),
     PlantedBug(
         "promise-of-any-ballot", "L4", "A promise of another ballot is counted for this one.",
-        "leader_restarts", collides=False, leader={"is_promise": broken.promised_something},
+        "leader_restarts", collides=False, replaced={ballot.is_promise: broken.promised_something},
     ),
     PlantedBug(
         "joined-ignored", "L4", "A promise counts whatever its vehicle has joined.",
-        "joint_ballot_needs_all", collides=False, leader={"has_joined": broken.always},
+        "joint_ballot_needs_all", collides=False, replaced={leader.has_joined: broken.always},
     ),
     PlantedBug(
         "part-of-blocks-planned", "L4", "Leaders plan for some of the joined blocks; all accept.",
-        "joint_ballot_needs_all", leader={"has_joined": broken.always},
-        vehicle={"has_joined": broken.plans_for_some_of_its_blocks}, plant=broken.join_nothing,
+        "joint_ballot_needs_all",
+        replaced={
+            leader.has_joined: broken.always,
+            vehicle.has_joined: broken.plans_for_some_of_its_blocks,
+        },
+        plant=broken.join_nothing,
     ),
     PlantedBug(
         "void-promise-counted", "L4", "The promise of a process that has gone is kept.",
-        "promise_forgotten", collides=False, leader={"void_promise": broken.skip},
+        "promise_forgotten", collides=False, replaced={leader.void_promise: broken.skip},
     ),
     PlantedBug(
         "promise-without-cell", "L4", "The leader plans from other cells than were promised.",
-        "late_duplicate_plan", collides=False, leader={"count_promise": broken.count_entry_cell},
+        "late_duplicate_plan", collides=False,
+        replaced={ballot.count_promise: broken.count_entry_cell},
     ),
     PlantedBug(
         "roster-by-hearsay", "L5", "The roster is whoever was heard.",
-        "roster_by_hearsay", leader={"roster": broken.whoever_is_heard},
+        "roster_by_hearsay", plant=broken.roster_of_heard,
     ),
     PlantedBug(
         "early-exclusion", "L5", "The promises of a majority are enough.",
-        "silent_vehicle", leader={"roster": broken.majority},
+        "silent_vehicle", plant=broken.roster_of_majority,
     ),
     PlantedBug(
         "promises-not-awaited", "L5", "The first promises are enough to plan for them.",
         "silent_vehicle",
-        leader={
-            "all_have_promised": broken.anybody_has_promised,
-            "roster": broken.whoever_has_promised,
-        },
+        replaced={ballot.all_have_promised: broken.anybody_has_promised},
+        plant=broken.roster_of_promised,
     ),
     PlantedBug(
         "prepared-again-after-failure", "L5", "After failed planning a new ballot is prepared.",
-        "planning_fails", collides=False, leader={"keep_ballot": broken.prepare_anew},
+        "planning_fails", collides=False, replaced={leader.keep_ballot: broken.prepare_anew},
     ),
     PlantedBug(
         "failed-planning-repeated-at-once", "L5", "Failed planning is repeated without a pause.",
-        "planning_fails", collides=False, leader={"may_try": broken.always},
+        "planning_fails", collides=False, replaced={ballot.may_try: broken.always},
     ),
     PlantedBug(
         "promise-taken-for-acceptance", "L6", "Who has promised counts as having the plan.",
-        "plan_lost_for_one", collides=False, leader={"is_acceptance": broken.promised_b},
+        "plan_lost_for_one", collides=False, replaced={ballot.is_acceptance: broken.promised_b},
     ),
     PlantedBug(
         "one-acceptance-is-enough", "L6", "The leader rests when the first vehicle has the plan.",
-        "plan_lost_for_one", collides=False, leader={"is_the_last": broken.always},
+        "plan_lost_for_one", collides=False, replaced={ballot.is_the_last: broken.always},
     ),
     PlantedBug(
         "outbid-not-noticed", "L7", "A leader that was outbid goes on.",
-        "two_leaders", collides=False, leader={"shows_higher_promise": broken.never},
+        "two_leaders", collides=False, replaced={ballot.shows_higher_promise: broken.never},
     ),
     PlantedBug(
         "restart-not-noticed", "L8", "A vehicle whose process changed counts as if it had not.",
         "restart_hidden_by_a_duplicate", collides=False,
-        leader={"restarted": broken.shows_another_ballot},
+        replaced={ballot.restarted: broken.shows_another_ballot},
     ),
     PlantedBug(
         "refused-plan-sent-for-ever", "L8", "A plan that nobody accepts is never given up.",
         "planner_lets_two_meet", collides=False,
-        leader={"time_is_up": broken.time_is_up_unless_issuing},
+        replaced={leader.time_is_up: broken.time_is_up_unless_issuing},
     ),
     PlantedBug(
         "stall-not-noticed", "L8", "A plan that stalls is watched for ever.",
-        "adopted_plan_stalls", collides=False, leader={"stalls": broken.never},
+        "adopted_plan_stalls", collides=False, replaced={leader.stalls: broken.never},
     ),
     PlantedBug(
         "wrong-lane-not-noticed", "L8", "A vehicle that an old plan left on a wrong lane stays.",
-        "adopted_for_other_targets", collides=False, leader={"is_astray": broken.never},
+        "adopted_for_other_targets", collides=False, replaced={leader.is_astray: broken.never},
     ),
     PlantedBug(
         "new-targets-not-noticed", "L8", "New members or wishes change nothing.",
-        "new_member", collides=False, leader={"has_new_targets": broken.never},
+        "new_member", collides=False, replaced={leader.has_new_targets: broken.never},
     ),
     # --- outside the books
     PlantedBug(
@@ -365,15 +380,15 @@ BUGS: tuple[PlantedBug, ...] = (
     # --- the rolling operation
     PlantedBug(
         "estate-not-checked", "V3", "A plan that takes a cell for the vehicle's is accepted.",
-        "rolling_false_claim", vehicle={"keeps_to_its_estates": broken.always},
+        "rolling_false_claim", replaced={vehicle.transfers_only_owned_cells: broken.always},
     ),
     PlantedBug(
         "possession-not-taken", "V5", "Who opens its gate moves, and takes no possession.",
-        "rolling_handover", collides=False, vehicle={"take_possession": broken.skip},
+        "rolling_handover", collides=False, replaced={vehicle.take_ownership: broken.skip},
     ),
     PlantedBug(
         "moves-off-its-estate", "V5", "Without possession, and the controller obeys all the same.",
-        "rolling_handover", vehicle={"take_possession": broken.skip}, plant=rolling.obey,
+        "rolling_handover", replaced={vehicle.take_ownership: broken.skip}, plant=rolling.obey,
     ),
     PlantedBug(
         "possession-without-gate", "estate", "A vehicle owns what a plan gives when it accepts.",
@@ -409,27 +424,31 @@ BUGS: tuple[PlantedBug, ...] = (
     ),
     PlantedBug(
         "owner-left-out", "handover", "A cell is taken from an owner that is not in the roster.",
-        "rolling_owner_left_out", vehicle={"keeps_to_its_estates": broken.always},
+        "rolling_owner_left_out", replaced={vehicle.transfers_only_owned_cells: broken.always},
         plant=rolling.check_no_estates,
     ),
     PlantedBug(
         "cell-kept-by-both", "handover", "Who gives a cell keeps it, too.",
-        "rolling_handover", vehicle={"keeps_to_its_estates": broken.always},
+        "rolling_handover", replaced={vehicle.transfers_only_owned_cells: broken.always},
         plant=rolling.keep_what_is_given,
     ),
 )  # fmt: skip
 
-NOT_A_SAFETY_MATTER: Mapping[str, str] = {
-    "is_in_roster": "a PREPARE is sent to its roster only; to promise more means to hold",
-    "show": "what is not shown now is shown at the next tick",
-    "is_moving": "a motion that is not under way cannot end",
-    "has_next_move": "without a next move there is nothing to begin",
-    "rest": "who never rests never moves again",
-    "observe": "how long a leader listens is a matter of progress",
-    "back_off": "the length of a pause is a matter of progress",
-    "had_promised": "it only guards `void_promise`",
-    "order_plan": "the planning itself is the leader's work; vehicles check the plan",
-    "issue": "to send the plan is all that there is to it",
-    "count_acceptance": "it only saves messages",
+NOT_A_SAFETY_MATTER: Mapping[Function, str] = {
+    vehicle.is_in_roster: "a PREPARE is sent to its roster only; to promise more means to hold",
+    vehicle.show: "what is not shown now is shown at the next tick",
+    vehicle.is_moving: "a motion that is not under way cannot end",
+    vehicle.has_next_move: "without a next move there is nothing to begin",
+    vehicle.rest: "a vehicle that never rests never moves again",
+    leader.observe_members: "how long a leader listens is a matter of progress",
+    leader.back_off: "the length of a pause is a matter of progress",
+    ballot.had_promised: "it only guards `void_promise` and `note_restart`",
+    ballot.order_plan: "the planning itself is the leader's work; vehicles check the plan",
+    ballot.issue: "it only sends the plan",
+    ballot.count_acceptance: "it only saves messages",
+    transfer.shows_owned_cells: "a plan that transfers no cells is refused by all vehicles",
+    transfer.note_outbid: "it only says why the ballot was given up",
+    transfer.note_restart: "likewise",
+    transfer.note_reason: "likewise",
 }
 """Guards and actions that no bug is planted in, and why."""

@@ -12,8 +12,9 @@ from random import Random
 
 from attrs import define, field, frozen
 
-from laneweave.coordinator.rolling.ballot import Handover, estate_of
 from laneweave.coordinator.rolling.observed import is_older
+from laneweave.coordinator.rolling.ownership import owned_cells
+from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.scenario.tables import FormationSettings, Scenario
 from laneweave.protocol.state_machine import RuleBook
@@ -92,9 +93,9 @@ class Car:
             joined=(),
             moving=self.under_way,
             rules=self.rules,
-            estate=frozenset(self.controller.owned),
+            owned=frozenset(self.controller.owned),
         )
-        self.execution.on_estate(self.sense)
+        self.execution.on_owned(self.sense)
 
     def sense_now(self) -> Sense:
         controller = self.controller
@@ -110,7 +111,7 @@ class Car:
         return Command(
             self.name, execution.incarnation, self.tick, execution.hold_cell, 0,
             self.controller.hold_cell, b"", accepted=execution.wanted_accepted,
-            promised=execution.wanted_promised, deed=execution.deed,
+            promised=execution.wanted_promised, deed=execution.transfer,
         )  # fmt: skip
 
     def state(self) -> VehicleState:
@@ -126,7 +127,7 @@ class Car:
             return
         self.sense = sense
         self.execution.on_noted(sense.accepted)
-        self.execution.on_estate(sense)
+        self.execution.on_owned(sense)
 
     def act(self) -> None:
         """Open the gate and begin a move, if they may."""
@@ -167,7 +168,7 @@ class Leader:
     name: Name
     seq: int = 0
     states: dict[Name, VehicleState] = field(factory=dict)
-    handovers: list[Handover] = field(factory=list)
+    handovers: list[CellTransfer] = field(factory=list)
 
     def hear(self, state: VehicleState) -> None:
         known = self.states.get(state.vehicle)
@@ -176,13 +177,13 @@ class Leader:
         self.states[state.vehicle] = state
         for handover in self.handovers:
             if state.vehicle in handover.roster and handover.wakeup_s is not None:
-                handover.on_state(state, self.states)
+                handover.on_state(state, self.states, 0.0)
 
     def owners(self) -> dict[Cell, Name]:
         return {
             cell: name
             for name, state in self.states.items()
-            for cell in (estate_of(state, self.states) or ())
+            for cell in (owned_cells(state, self.states) or ())
         }
 
     def think(self, rng: Random, term: int) -> None:
@@ -208,7 +209,14 @@ class Leader:
         move = ((column, lane), target)
         self.handovers = [
             *self.handovers[-2:],
-            Handover(ballot, roster, {name: move}, LONG_AGO_S, SLOT_S, 0.0, 0.0),
+            CellTransfer(
+                ballot=ballot,
+                roster=roster,
+                moves={name: move},
+                t0_s=LONG_AGO_S,
+                slot_s=SLOT_S,
+                resend_s=0.0,
+            ),
         ]
 
 
@@ -284,9 +292,9 @@ class Road:
             self.obey(car, message)
             self.post(car.name, car.sense_now())
         elif isinstance(message, Sense):
-            shown = car.execution.shown, car.execution.accepted
+            shown = car.execution.promise_noted, car.execution.accepted
             car.take(message)
-            if (car.execution.shown, car.execution.accepted) != shown:
+            if (car.execution.promise_noted, car.execution.accepted) != shown:
                 self.show(car)
         elif isinstance(message, Prepare | Plan | VehicleState):
             car.told(message)

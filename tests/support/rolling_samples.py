@@ -47,7 +47,7 @@ def deed_of(name: Name, ballot: Ballot = MID, roster: tuple[Name, ...] = (A, B))
 def vehicle(name: Name = A, rules: RuleBook = VEHICLE_RULES) -> PlanExecution:
     cell = make_plan().start_cells[name]
     return PlanExecution(
-        name, INCARNATION, cell, LATTICE, (), rules=rules, estate=frozenset(BEFORE[name])
+        name, INCARNATION, cell, LATTICE, (), rules=rules, owned=frozenset(BEFORE[name])
     )
 
 

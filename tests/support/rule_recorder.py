@@ -12,7 +12,7 @@ class RuleRecorder(RuleBook):
 
     def __init__(self, book: RuleBook) -> None:
         """Begin with nothing taken."""
-        super().__init__(book.table, book.functions)
+        super().__init__(book.table)
         self.taken: list[int] = []
         """Indices of rows in the table, in the order in which they were taken."""
 

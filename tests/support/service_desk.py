@@ -7,6 +7,8 @@ from collections.abc import Collection, Iterable
 from attrs import evolve
 
 from laneweave.coordinator.core import CoordinatorCore
+from laneweave.coordinator.formations.leader import FormationLeader
+from laneweave.coordinator.formations.operation import FormationsOperation
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Arrived, Compute, Effect, Send, Started, Wakeup
 from laneweave.protocol.scenario.tables import Scenario
@@ -66,8 +68,14 @@ class Desk:
         return self.give(Arrived(CENSUS, {}, message))
 
     @property
+    def leaders(self) -> dict[int, FormationLeader]:
+        operation = self.core.operation
+        assert isinstance(operation, FormationsOperation)
+        return operation.leaders
+
+    @property
     def ballot(self) -> Ballot:
-        ballot = self.core.controls[0].ballot
+        ballot = self.leaders[0].ballot
         assert ballot is not None
         return ballot
 

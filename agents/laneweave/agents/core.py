@@ -217,7 +217,7 @@ class AgentCore:
         if in_charge:
             execution.on_joined(sense.joined)
             execution.on_noted(sense.accepted)
-            execution.on_estate(sense)
+            execution.on_owned(sense)
             self._decide(sense, execution)
         drive = self._driver.drive(sense, moving=execution.moving)
         self._command = Command(
@@ -232,7 +232,7 @@ class AgentCore:
             joined=execution.wanted_joined,
             accepted=execution.wanted_accepted,
             promised=execution.wanted_promised,
-            deed=execution.deed,
+            deed=execution.transfer,
         )
         effects: list[Effect] = [Send(COMMAND, self._command, self._own)]
         if in_charge:
@@ -251,7 +251,7 @@ class AgentCore:
         changes = [
             execution.on_joined(sense.joined),
             execution.on_noted(sense.accepted),
-            execution.on_estate(sense),
+            execution.on_owned(sense),
         ]
         return [self._state()] if any(changes) else []
 
@@ -264,7 +264,7 @@ class AgentCore:
             joined=execution.wanted_joined,
             accepted=execution.wanted_accepted,
             promised=execution.wanted_promised,
-            deed=execution.deed,
+            deed=execution.transfer,
         )
         return [Send(COMMAND, self._command, self._own)] if self._command != command else []
 
@@ -287,7 +287,7 @@ class AgentCore:
             joined=sense.joined,
             moving=not self._driver.at_rest(sense),
             rules=self._rules,
-            estate=frozenset(sense.estate) if self._scenario.formation.rolling else None,
+            owned=frozenset(sense.estate) if self._scenario.formation.rolling else None,
         )
 
     def _decide(self, sense: Sense, execution: PlanExecution) -> None:

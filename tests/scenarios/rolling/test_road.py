@@ -8,10 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from laneweave.coordinator.rolling import ballot as handover_module
-from laneweave.coordinator.rolling.ballot import _Sign, estate_of
-from laneweave.protocol.state_machine import RuleBook
-from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
+from laneweave.coordinator.rolling import ownership, transfer
+from laneweave.coordinator.rolling.ownership import _Sign, owned_cells
+from laneweave.protocol.state_machine import Function, RuleBook
+from laneweave.protocol.vehicle.execution_rules import (
+    VEHICLE_RULES,
+    all_are_ready,
+    take_ownership,
+)
 from laneweave.protocol.wire.messages import Ballot, Deed, VehicleState
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
 from support.rolling_road import Road, WrongError
@@ -56,7 +60,7 @@ def test_a_leader_never_errs_about_what_somebody_owns() -> None:
                     deed, state = car.controller.transfer, car.state_now()
                     if not state.estate:
                         continue  # a promise that its controller has not noted
-                    estate = estate_of(state, leader.states)
+                    estate = owned_cells(state, leader.states)
                     if estate is None:
                         not_told += 1
                     elif estate == road.owned(car):
@@ -91,13 +95,13 @@ def forget_promise(patch: pytest.MonkeyPatch) -> None:
 
 def newer_deed_is_no_news(patch: pytest.MonkeyPatch) -> None:
     """Whoever has promised more had no open deed, though it may have had one in between."""
-    sign = handover_module._sign
+    sign = ownership._sign
 
     def mutant(state: VehicleState | None, deed: Deed) -> _Sign:
         found = sign(state, deed)
         return _Sign.CLOSED if found is _Sign.NEWER else found
 
-    patch.setattr(handover_module, "_sign", mutant)
+    patch.setattr(ownership, "_sign", mutant)
 
 
 def never_open(patch: pytest.MonkeyPatch) -> None:
@@ -106,7 +110,7 @@ def never_open(patch: pytest.MonkeyPatch) -> None:
     def mutant(state: VehicleState, *_: object) -> frozenset[tuple[int, int]]:
         return frozenset(state.estate)
 
-    patch.setattr(handover_module, "estate_of", mutant)
+    patch.setattr(transfer, "owned_cells", mutant)
 
 
 @pytest.mark.parametrize("plant", [forget_promise, newer_deed_is_no_news, never_open])
@@ -116,9 +120,6 @@ def test_a_planted_bug_is_found(plant: object, monkeypatch: pytest.MonkeyPatch) 
     assert first_wrong() is not None
 
 
-@pytest.mark.parametrize(
-    "broken", [{"all_are_ready": lambda *_: True}, {"take_possession": lambda *_: None}],
-    ids=lambda broken: next(iter(broken)),
-)  # fmt: skip
-def test_a_broken_rule_is_found(broken: dict[str, object]) -> None:
-    assert first_wrong(VEHICLE_RULES.planted(**broken)) is not None  # type: ignore[arg-type]
+@pytest.mark.parametrize("rule", [all_are_ready, take_ownership], ids=lambda rule: rule.__name__)
+def test_a_broken_rule_is_found(rule: Function) -> None:
+    assert first_wrong(VEHICLE_RULES.replacing({rule: lambda *_: True})) is not None

@@ -7,8 +7,8 @@ from attrs import evolve
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.formations import planner as formation_planner
-from laneweave.coordinator.formations.leader_rules import Phase
 from laneweave.coordinator.formations.planner import START_MARGIN_S
 from laneweave.coordinator.formations.roster import start_time_s
 from laneweave.coordinator.formations.sorting import Sorting, SortingTask, sort_lanes
@@ -17,6 +17,7 @@ from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.runtime.node import (
     Announce,
     Asked,
+    Compute,
     Computed,
     Delegate,
     Effect,
@@ -97,9 +98,9 @@ def test_a_new_bridge_has_a_new_road() -> None:
     desk = Desk()
     desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}))
     (order,) = jobs(desk.collect_promises({A: (0, 0)}, {A: 1}))
-    assert desk.core.controls
+    assert desk.leaders
     desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "8"}))
-    assert (desk.core.controls, desk.core.census, desk.core.t_s) == ({}, None, 0.0)
+    assert (desk.leaders, desk.core.census, desk.core.t_s) == ({}, None, 0.0)
     assert desk.give(run_job(order)) == []  # a plan for the road that is no more
     desk.tell(census({}, t_s=1.0))  # of an earlier road time than what it knew
     assert desk.core.census is not None
@@ -114,7 +115,7 @@ def test_what_is_no_newer_bridge_changes_nothing(other: str) -> None:
     desk.collect_promises({A: (0, 0)}, {A: 1})
     for news in (PeerDown, PeerUp, PeerDown):
         desk.give(news(BRIDGE_ALIVE, {"incarnation": other}))
-    assert list(desk.core.controls) == [0]
+    assert list(desk.leaders) == [0]
     assert desk.core.t_s == T_S
 
 
@@ -147,7 +148,7 @@ def test_a_newer_bridge_is_met_by_its_news_before_its_token_is_seen() -> None:
         desk.collect_promises({A: (0, 0)}, {A: 1})
         newer = news_of(8, {B: (0, 0)}, 1.0)
         desk.tell(newer[index])
-        assert (desk.core.controls, desk.core.t_s) == ({}, 1.0)
+        assert (desk.leaders, desk.core.t_s) == ({}, 1.0)
         desk.tell(newer[1 - index])
         assert road(desk) == ([B], 1.0)
         desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "8"}))  # nothing new
@@ -168,11 +169,11 @@ def test_states_of_vehicles_that_the_census_does_not_list_are_ignored() -> None:
         evolve(state(B, (-5, 0), theirs, joined=(0, 1)), formation=0),
     ):
         desk.tell(stranger)
-    assert set(desk.core.controls) == {0, 1}  # not joined
-    for control in desk.core.controls.values():
+    assert set(desk.leaders) == {0, 1}  # not joined
+    for control in desk.leaders.values():
         assert (control.states, control.highest) == ({}, None)
     desk.tell(state(A, (0, 0), theirs))
-    assert desk.core.controls[0].highest == theirs
+    assert desk.leaders[0].highest == theirs
 
 
 def test_heartbeats_are_periodic_and_say_who_leads() -> None:
@@ -193,13 +194,13 @@ def test_leads_and_steps_down() -> None:
     assert Listen(STATE) in effects
     assert logged(effects) == ["leader-elected"]
     desk.tell(census({A: (0, 0)}))
-    assert set(desk.core.controls) == {0}
+    assert set(desk.leaders) == {0}
     better = Heartbeat(Name("c1"), 1, 1, leading=False, formations=0)
     assert logged(desk.tell(better)) == []  # it waits until the newcomer leads
     effects = desk.tell(evolve(better, leading=True))
     assert Unlisten(STATE) in effects
     assert logged(effects) == ["leader-stepped-down"]
-    assert desk.core.controls == {}
+    assert desk.leaders == {}
     assert messages(desk.tell(state(A)), Prepare) == []
 
 
@@ -231,9 +232,9 @@ def test_an_older_census_is_ignored() -> None:
     desk.lead()
     desk.tell(census({A: (0, 0), B: (-1, 1)}))
     desk.tell(census({A: (0, 0)}, t_s=T_S - 0.1))
-    assert list(desk.core.controls[0].formation.roster) == [A, B]
+    assert list(desk.leaders[0].formation.roster) == [A, B]
     desk.tell(census({B: (-1, 1)}, t_s=T_S + 0.1))
-    assert list(desk.core.controls[0].formation.roster) == [B]
+    assert list(desk.leaders[0].formation.roster) == [B]
 
 
 def test_a_formation_that_is_not_closed_is_not_touched() -> None:
@@ -241,9 +242,9 @@ def test_a_formation_that_is_not_closed_is_not_touched() -> None:
     desk.lead()
     desk.tell(census({A: (0, 0)}, t_s=4.4))
     desk.tell(RoadClock(99, 9.9, 1, 1, 1, 0, ended=False))
-    assert desk.core.controls == {}  # the census is too old to be complete
+    assert desk.leaders == {}  # the census is too old to be complete
     desk.tell(census({A: (0, 0)}, t_s=4.6))
-    assert set(desk.core.controls) == {0}
+    assert set(desk.leaders) == {0}
 
 
 def test_a_formation_that_has_left_is_forgotten() -> None:
@@ -251,7 +252,7 @@ def test_a_formation_that_has_left_is_forgotten() -> None:
     desk.lead()
     desk.tell(census({A: (0, 0)}))
     desk.tell(census({}, t_s=T_S + 1.0))
-    assert desk.core.controls == {}
+    assert desk.leaders == {}
 
 
 def test_road_time_never_goes_back() -> None:
@@ -281,7 +282,7 @@ def test_prepare_promise_plan_acceptance() -> None:
     told: list[Effect] = []
     for name, cell in cells.items():
         told += desk.tell(state(name, cell, desk.ballot, accepted=True, t_s=2.0))
-    assert desk.core.controls[0].phase is Phase.WATCHING
+    assert desk.leaders[0].phase is BallotPhase.IN_FORCE
     (note,) = messages(told, LogEvent)
     assert (note.message.kind, note.message.data) == (
         "plan-in-force", {"formation": 0, "closed_s": 4.5}
@@ -323,47 +324,80 @@ def test_a_result_for_an_older_ballot_is_dropped_while_the_newer_one_is_planned(
     cells: Cells = {A: (0, 0), B: (-1, 1)}
     (old,) = jobs(desk.collect_promises(cells, {A: 1, B: 0}))
     desk.tell(census(cells, {A: 2, B: 0}, t_s=T_S + 1.0))
-    (new,) = jobs(desk.promise(cells))
-    assert desk.core.controls[0].phase is Phase.PLANNING
-    assert messages(desk.give(run_job(old)), LogEvent) == []
+    assert jobs(desk.promise(cells)) == []
+    assert desk.leaders[0].phase is BallotPhase.PLANNING
+    effects = desk.give(run_job(old))
+    assert messages(effects, LogEvent) == []
+    (new,) = jobs(effects)
     plan: Plan = messages(desk.give(run_job(new)), Plan)[0].message
     assert plan.moves[A][-1][2][1] == 2
 
 
+def lead_two_formations(desk: Desk) -> tuple[Compute, list[Effect]]:
+    """Return the order of the first formation, and the effects of the second one's promise."""
+    desk.lead()
+    desk.tell(census(APART, {A: 1, B: 1}))
+    for name, cell in APART.items():
+        desk.tell(state(name, cell))
+    (first,) = jobs(promise(desk, A))
+    return first, promise(desk, B)
+
+
+APART: Cells = {A: (0, 0), B: (-5, 0)}
+
+
+def promise(desk: Desk, name: Name, t_s: float = 1.0) -> list[Effect]:
+    cell = APART[name]
+    ballot = desk.leaders[LATTICE.block_of(cell[0])].ballot
+    return desk.tell(state(name, cell, ballot, t_s=t_s))
+
+
+def test_one_formation_is_planned_after_the_other() -> None:
+    desk = Desk()
+    first, effects = lead_two_formations(desk)
+    assert jobs(effects) == []
+    (second,) = jobs(desk.give(run_job(first)))
+    assert desk.leaders[0].phase is BallotPhase.ISSUING
+    assert jobs(desk.give(run_job(second))) == []
+    assert desk.leaders[1].phase is BallotPhase.ISSUING
+
+
 def test_an_order_that_is_replaced_before_its_turn_comes_is_not_worked_on() -> None:
-    """It may wait behind others; a hard one for nothing would keep the new one waiting."""
+    """A hard one that is worked on for nothing would keep the new one waiting."""
+    desk = Desk()
+    first, _ = lead_two_formations(desk)
+    desk.tell(census(APART, {A: 1, B: 2}, t_s=T_S + 1.0))
+    assert jobs(promise(desk, B, t_s=2.0)) == []
+    (second,) = jobs(desk.give(run_job(first)))
+    plan: Plan = messages(desk.give(run_job(second)), Plan)[0].message
+    assert plan.moves[B][-1][2][1] == 2
+    assert jobs(desk.wait(0.1)) == []
+
+
+def test_an_order_whose_leader_has_been_outbid_is_not_worked_on() -> None:
+    desk = Desk()
+    first, _ = lead_two_formations(desk)
+    desk.tell(state(B, APART[B], desk.ballot._replace(term=9), t_s=2.0))
+    assert jobs(desk.give(run_job(first))) == []
+
+
+def test_a_computation_depends_on_its_order_only() -> None:
+    """It runs in another thread, beside a core that goes on."""
     desk = Desk()
     cells: Cells = {A: (0, 0), B: (-1, 1)}
     (old,) = jobs(desk.collect_promises(cells, {A: 1, B: 0}))
-    assert isinstance(old.work(), Sorting)
+    before = old.work()
+    assert isinstance(before, Sorting)
     desk.tell(census(cells, {A: 2, B: 0}, t_s=T_S + 1.0))
-    (new,) = jobs(desk.promise(cells))
-    assert old.work() is None
-    assert isinstance(new.work(), Sorting)
-    assert messages(desk.give(run_job(old)), LogEvent) == []
-    assert list(desk.core._planner._ordered) == [new.job]
-
-
-def test_orders_of_other_formations_stay() -> None:
-    desk = Desk()
-    cells: Cells = {A: (0, 0), B: (-5, 0)}
-    desk.lead()
-    desk.tell(census(cells, {A: 1, B: 1}))
-    orders = []
-    for number, (name, cell) in enumerate(cells.items()):
-        desk.tell(state(name, cell))
-        ballot = desk.core.controls[number].ballot
-        orders += jobs(desk.tell(state(name, cell, ballot, t_s=1.0)))
-    assert [isinstance(order.work(), Sorting) for order in orders] == [True, True]
-    desk.core._planner.forget()
-    assert [order.work() for order in orders] == [None, None]
+    desk.promise(cells)
+    assert old.work().moves == before.moves
 
 
 def test_a_result_that_comes_while_the_leader_backs_off_is_dropped() -> None:
     desk = Desk()
     (job,) = jobs(desk.collect_promises({A: (0, 0)}, {A: 1}))
     desk.tell(state(A, promised=desk.ballot._replace(term=9), t_s=2.0))
-    assert desk.core.controls[0].phase is Phase.BACKING_OFF
+    assert desk.leaders[0].phase is BallotPhase.BACKING_OFF
     effects = desk.give(run_job(job))
     assert messages(effects, Plan) == messages(effects, LogEvent) == []
 
@@ -427,7 +461,7 @@ def test_too_late_for_any_step_settles() -> None:
     effects = desk.tell(state(A, (0, 0), desk.ballot, t_s=1.0))
     assert jobs(effects) == []
     assert logged(effects) == ["formation-too-late"]
-    assert desk.core.controls[0].phase is Phase.SETTLED
+    assert desk.leaders[0].phase is BallotPhase.GIVEN_UP
     assert logged(desk.wait(5.0)) == []
 
 
@@ -519,7 +553,7 @@ def test_ballots_never_repeat() -> None:
             desk.tell(census(both, t_s=T_S + round_))
             for number, name in ((0, A), (1, B)):
                 desk.tell(state(name, both[name]))
-                ballot = desk.core.controls[number].ballot
+                ballot = desk.leaders[number].ballot
                 assert ballot is not None
                 seen.append(ballot)
             desk.tell(Heartbeat(Name("c1"), 1, 9, leading=True, formations=0))

@@ -11,10 +11,10 @@ from laneweave.protocol.state_machine import (
     RuleBook,
     Transition,
     markdown_table,
+    meaning,
     mermaid_diagram,
-    named,
 )
-from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES, Stage
+from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES, ExecutionPhase
 
 
 class Lamp(Enum):
@@ -34,7 +34,7 @@ class Machine:
     powered: bool = True
 
 
-def _is_powered(machine: Machine, _: object) -> bool:
+def is_powered(machine: Machine, _: object) -> bool:
     """There is current.
 
     A second paragraph is for the reader of the code.
@@ -42,36 +42,33 @@ def _is_powered(machine: Machine, _: object) -> bool:
     return machine.powered
 
 
-def _is_rough(_: Machine, message: object) -> bool:
+def is_rough(_: Machine, message: object) -> bool:
     """The switch is hit hard."""
     return message == "hard"
 
 
-def _glow(machine: Machine, _: object) -> None:
+def glow(machine: Machine, _: object) -> None:
     """Glow."""
     machine.done.append("glow")
 
 
-def _click(machine: Machine, message: object) -> None:
+def click(machine: Machine, message: object) -> None:
     """Click."""
     machine.done.append(f"click {message}")
 
 
-def _unused(_: Machine, __: object) -> None:
+def unused(_: Machine, __: object) -> None:
     """Be of no use to the table."""
 
 
 TABLE = (
-    Transition(
-        "S1", "switch", (Lamp.OFF, Lamp.ON), ("is_powered", "is_rough"), ("click",), Lamp.BROKEN
-    ),
-    Transition("S2", "switch", (Lamp.OFF,), ("is_powered",), ("click", "glow"), Lamp.ON),
+    Transition("S1", "switch", (Lamp.OFF, Lamp.ON), (is_powered, is_rough), (click,), Lamp.BROKEN),
+    Transition("S2", "switch", (Lamp.OFF,), (is_powered,), (click, glow), Lamp.ON),
     Transition("S3", "switch", (Lamp.ON,), (), (), Lamp.OFF),
-    Transition("S4", "switch", tuple(Lamp), (), ("click",)),
+    Transition("S4", "switch", tuple(Lamp), (), (click,)),
     Transition("S5", "replace", (Lamp.BROKEN, Lamp.OFF), (), (), Lamp.OFF),
 )
-FUNCTIONS = named(_is_powered, _is_rough, _glow, _click, _unused)
-BOOK = RuleBook(TABLE, FUNCTIONS)
+BOOK = RuleBook(TABLE)
 
 
 # --- which row --------------------------------------------------------------------------------
@@ -99,7 +96,7 @@ def test_the_first_row_whose_source_and_guards_fit_is_taken_and_no_other(
 
 
 def test_the_order_of_the_table_decides() -> None:
-    backwards = RuleBook(TABLE[::-1], FUNCTIONS)
+    backwards = RuleBook(TABLE[::-1])
     machine = Machine()
     taken = backwards.take(machine, "switch", "softly")
     assert taken is TABLE[3]
@@ -124,64 +121,48 @@ def test_actions_see_the_phase_before_and_guards_stop_at_the_first_that_fails() 
     def look(machine: Machine, _: object) -> None:
         seen.append(machine.phase)
 
-    book = BOOK.planted(is_rough=never, click=look)
+    book = BOOK.replacing({is_rough: never, click: look})
     book.take(Machine(powered=False), "switch", None)
     assert seen == [Lamp.OFF]
-    RuleBook([Transition("X", "go", (Lamp.OFF,), (), ("look",), Lamp.ON)], {"look": look}).take(
-        Machine(), "go", None
-    )
+    RuleBook([Transition("X", "go", (Lamp.OFF,), (), (look,), Lamp.ON)]).take(Machine(), "go", None)
     assert seen == [Lamp.OFF, Lamp.OFF]
 
 
-# --- what a book refuses ----------------------------------------------------------------------
+# --- other functions in the places of some ----------------------------------------------------
 
 
-@pytest.mark.parametrize("missing", ["is_powered", "is_rough", "glow", "click"])
-def test_a_table_that_names_what_does_not_exist_is_refused(missing: str) -> None:
-    functions = {name: function for name, function in FUNCTIONS.items() if name != missing}
-    with pytest.raises(ValueError, match=rf"rule S\d: no function {missing}"):
-        RuleBook(TABLE, functions)
-
-
-def test_names_have_no_leading_underscore() -> None:
-    assert set(FUNCTIONS) == {"is_powered", "is_rough", "glow", "click", "unused"}
-
-
-# --- planted bugs -----------------------------------------------------------------------------
-
-
-def test_a_planted_function_replaces_one_name_in_a_copy_only() -> None:
-    book = BOOK.planted(is_powered=lambda machine, message: True)  # noqa: ARG005
+def test_a_function_is_replaced_in_a_copy_only() -> None:
+    book = BOOK.replacing({is_powered: lambda machine, message: True})  # noqa: ARG005
     machine = Machine(powered=False)
     taken = book.take(machine, "switch", "softly")
-    assert taken is TABLE[1]
-    assert book.table == BOOK.table
-    assert book.functions["click"] is BOOK.functions["click"]
+    assert taken is book.table[1]
+    assert [row.rule for row in book.table] == [row.rule for row in TABLE]
+    assert book.functions - BOOK.functions != set()
+    assert BOOK.table == TABLE
     machine = Machine(powered=False)
     assert BOOK.take(machine, "switch", "softly") is TABLE[3]
 
 
-def test_functions_beside_the_table_can_be_planted_too() -> None:
-    def other(_: Machine, __: object) -> None:
-        """Do something else."""
-
-    assert BOOK.planted(unused=other).functions["unused"] is other
+def test_a_function_is_replaced_in_all_of_its_rows() -> None:
+    book = BOOK.replacing({click: unused})
+    assert book.functions == {is_powered, is_rough, glow, unused}
 
 
-@pytest.mark.parametrize("name", ["is_power", "_is_powered", "S1"])
-def test_a_bug_cannot_be_planted_where_there_is_no_rule(name: str) -> None:
-    with pytest.raises(ValueError, match=f"no rule {name}"):
-        BOOK.planted(**{name: _click})
+def test_a_function_that_no_rule_uses_cannot_be_replaced() -> None:
+    with pytest.raises(ValueError, match="no rule uses unused"):
+        BOOK.replacing({unused: click})
 
 
 # --- printed tables ---------------------------------------------------------------------------
 
 
 def test_words_are_the_first_line_without_a_full_stop() -> None:
-    assert BOOK.words("is_powered") == "There is current"
-    assert BOOK.words("glow") == "Glow"
-    silent = BOOK.planted(glow=lambda machine, message: None)  # noqa: ARG005
-    assert silent.words("glow") == "glow"
+    def silent() -> None:
+        pass
+
+    assert meaning(is_powered) == "There is current"
+    assert meaning(glow) == "Glow"
+    assert meaning(silent) == "silent"
 
 
 def test_the_markdown_table_has_a_line_for_each_row_in_order() -> None:
@@ -213,7 +194,7 @@ def test_the_diagram_writes_phases_as_single_words() -> None:
         TWO_WORDS = "backing off"
         HYPHEN = "half-done"
 
-    book = RuleBook([Transition("O", "go", (Odd.TWO_WORDS,), (), (), Odd.HYPHEN)], {})
+    book = RuleBook([Transition("O", "go", (Odd.TWO_WORDS,), (), (), Odd.HYPHEN)])
     assert "  backing_off --> half_done: O go" in mermaid_diagram(book, Odd.HYPHEN).splitlines()
 
 
@@ -223,7 +204,7 @@ def test_rows_with_the_same_arrow_share_it_and_are_named_once() -> None:
         Transition("T1", "push", (Lamp.OFF,), (), (), Lamp.ON),
         Transition("T2", "pull", (Lamp.OFF,), (), (), Lamp.ON),
     ]
-    assert mermaid_diagram(RuleBook(rows, {}), Lamp.ON).splitlines()[1:] == [
+    assert mermaid_diagram(RuleBook(rows), Lamp.ON).splitlines()[1:] == [
         "  [*] --> on",
         "  off --> on: T1 push, T2 pull",
     ]
@@ -234,6 +215,6 @@ def test_the_vehicles_rules_print_with_every_rule_and_phase() -> None:
     assert len(lines) == len(VEHICLE_RULES.table)
     assert {line.split("|")[1].strip() for line in lines} == {f"V{n}" for n in range(2, 8)}
     assert all(line.count("|") == 7 for line in lines)
-    diagram = mermaid_diagram(VEHICLE_RULES, Stage.FREE)
-    for stage in Stage:
+    diagram = mermaid_diagram(VEHICLE_RULES, ExecutionPhase.FREE)
+    for stage in ExecutionPhase:
         assert stage.value in diagram

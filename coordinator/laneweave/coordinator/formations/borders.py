@@ -13,7 +13,7 @@ from attrs import evolve
 
 from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.grid import Move
-from laneweave.protocol.vehicle.execution import TIME_TOLERANCE_S
+from laneweave.protocol.vehicle.execution_rules import TIME_TOLERANCE_S
 from laneweave.protocol.wire.messages import Plan
 
 _MODEL = ConflictModel(("closing",))

@@ -8,12 +8,11 @@ roster is known for certain from that census on.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from itertools import pairwise
 
-from attrs import frozen
+from attrs import define, field, frozen
 
-from laneweave.coordinator.formations.groups import Groups, Numbers
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.wire.messages import Census, CensusEntry, Name
@@ -21,6 +20,10 @@ from laneweave.protocol.wire.messages import Census, CensusEntry, Name
 STAGE_LEAD_S = 5.0
 """How long before a change of structure its plan is made: longer than planning takes. The plan
 before it has ended by then."""
+
+
+Numbers = tuple[int, ...]
+"""Numbers of joined formations, ascending."""
 
 
 @frozen
@@ -46,6 +49,30 @@ class Formation:
     def roster(self) -> tuple[Name, ...]:
         """Names of the members."""
         return tuple(member.vehicle for member in self.members)
+
+
+@define
+class Groups:
+    """What one leader knows of joined formations; it only grows."""
+
+    _group: dict[int, Numbers] = field(factory=dict)
+
+    def of(self, number: int) -> Numbers:
+        """Return all formations that are joined with one, itself included."""
+        return self._group.get(number, (number,))
+
+    def join(self, numbers: Iterable[int]) -> bool:
+        """Take note that formations are joined; true when that is new."""
+        union = tuple(sorted({other for number in numbers for other in self.of(number)}))
+        if not union or self.of(union[0]) == union:
+            return False
+        for number in union:
+            self._group[number] = union
+        return True
+
+    def forget(self) -> None:
+        """Begin anew: another road has other formations."""
+        self._group.clear()
 
 
 def closed_formations(

@@ -17,10 +17,10 @@ from typing import Any
 
 from attrs import evolve, frozen
 
-from laneweave.coordinator.formations.groups import Numbers
-from laneweave.coordinator.formations.targets import placements
+from laneweave.coordinator.formations.roster import Numbers
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, Weights, checked_plan
 from laneweave.coordinator.planning.budget import Clock
+from laneweave.coordinator.planning.targets import placements
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.tables import DrivingStructure, Scenario

@@ -15,10 +15,10 @@ from collections.abc import Sequence
 
 import attrs
 
-from laneweave.coordinator.formations.targets import place
 from laneweave.coordinator.planning.conflicts import DEFAULT_KINDS
 from laneweave.coordinator.planning.grid import Cell, Grid, Mode
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
+from laneweave.coordinator.planning.targets import place
 from laneweave.protocol.wire.messages import Name
 
 _SPARE_COLUMNS = (2, 4)

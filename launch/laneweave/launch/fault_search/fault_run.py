@@ -18,7 +18,7 @@ from attrs import field, frozen
 from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost
 from laneweave.coordinator.core import CoordinatorCore
-from laneweave.coordinator.formations.leader_rules import LEADER_RULES
+from laneweave.coordinator.formations.leader import LEADER_RULES
 from laneweave.coordinator.planning.rolling.planner import StreamPlan, StreamVehicle
 from laneweave.coordinator.rolling.planner import Planner, stream_planner
 from laneweave.launch.fault_search.bodies import Geometry

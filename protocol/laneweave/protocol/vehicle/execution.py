@@ -6,17 +6,17 @@ gate), and every vehicle whose earlier move interferes has shown that it complet
 paces; silence always means hold. `VEHICLE_RULES` is the table; docs/PROTOCOL.md shows it,
 docs/SAFETY.md has the argument.
 
-Whoever is in charge of a vehicle runs this machine: its agent, or its caretaker, which never moves.
+The process in charge of a vehicle runs this machine: its agent, or its caretaker, which never
+moves it.
 """
 
 from __future__ import annotations
 
-from attrs import define, field
+from attrs import define
 
-from laneweave.protocol.lattice import Cell, Lattice, PlannedMove
+from laneweave.protocol.lattice import PlannedMove
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.vehicle.execution_rules import (
-    ACCEPTED,
     GATE,
     NOTED,
     PLAN,
@@ -25,12 +25,11 @@ from laneweave.protocol.vehicle.execution_rules import (
     STATE,
     TICK,
     VEHICLE_RULES,
-    Stage,
+    ExecutionPhase,
+    ExecutionState,
 )
-from laneweave.protocol.vehicle.plans import Needs
-from laneweave.protocol.wire.messages import Ballot, Deed, Name, Plan, Prepare, Sense, VehicleState
+from laneweave.protocol.wire.messages import Ballot, Plan, Prepare, Sense, VehicleState
 
-TIME_TOLERANCE_S = 1e-6
 LISTEN_S = 1.0
 """A vehicle receives the states of its predecessors from this time before a move is due."""
 OVERDUE_SLOTS = 1.5
@@ -39,46 +38,10 @@ OVERDUE_S = 2.0
 
 
 @define
-class PlanExecution:
-    """What one vehicle remembers of the protocol (V1: nothing promised, no plan).
+class PlanExecution(ExecutionState):
+    """The machine of one vehicle: takes messages and ticks, returns what to do and to publish."""
 
-    `hold_cell`, `moving` and `joined` mirror the motion controller, which outlives this object.
-    """
-
-    vehicle: Name
-    incarnation: int
-    hold_cell: Cell
-    lattice: Lattice
-    joined: tuple[int, ...]
-    """Formations whose blocks plans may use, as the motion controller has confirmed; ascending."""
-    moving: bool = False
-    rules: RuleBook = field(factory=lambda: VEHICLE_RULES)
-    phase: Stage = Stage.FREE
-    promised: Ballot | None = None
-    plan: Plan | None = None
-    completed: int = 0
-    heard: dict[Name, int] = field(factory=dict)
-    """Completed moves of my plan that each other member has shown; -1: not ready yet."""
-    wanted_joined: tuple[int, ...] = field(init=False)
-    """What the motion controller should remember as joined."""
-    moving_in_plan: bool = False
-    """The motion under way is a move of the accepted plan."""
-    needs: tuple[Needs, ...] = ()
-    """For each of my moves what it needs of the others."""
-    t_s: float = 0.0
-    """Road time of the tick."""
-    shown: bool = False
-    """The controller has noted what is promised, so that the promise counts."""
-    estate: frozenset[Cell] | None = None
-    """Cells that the vehicle owns, as its controller has said last; None: formations own blocks."""
-    deed: Deed | None = None
-    """By which cells change hands: of the newest plan that was taken."""
-    noted: Deed | None = None
-    """The newest deed of the vehicle, as its controller has said last."""
-
-    def __attrs_post_init__(self) -> None:
-        """Want no more than the controller has."""
-        self.wanted_joined = self.joined
+    rules: RuleBook = VEHICLE_RULES
 
     def on_prepare(self, prepare: Prepare) -> bool:
         """V2: promise a ballot; true when a state should be shown at once."""
@@ -107,20 +70,20 @@ class PlanExecution:
         self.wanted_joined = tuple(sorted({*self.joined, *self.wanted_joined}))
         return True
 
-    def on_estate(self, sense: Sense) -> bool:
+    def on_owned(self, sense: Sense) -> bool:
         """The controller says what the vehicle owns; true when it has noted a promise by now.
 
         What an earlier process has promised binds this one: it is taken for a PREPARE. Without
         effect where formations own blocks.
         """
-        if self.estate is None:
+        if self.owned is None:
             return False
         if sense.promised is not None and sense.promised != self.promised:
             self.on_prepare(Prepare(sense.promised, (), (self.vehicle,)))
-        before = self.shown
-        self.estate, self.noted = frozenset(sense.estate), sense.deed
-        self.shown = sense.promised == self.promised
-        return self.shown and not before
+        before = self.promise_noted
+        self.owned, self.noted_transfer = frozenset(sense.estate), sense.deed
+        self.promise_noted = sense.promised == self.promised
+        return self.promise_noted and not before
 
     def on_state(self, state: VehicleState) -> None:
         """V4: remember what another member of the same plan has shown."""
@@ -139,13 +102,6 @@ class PlanExecution:
         self.rules.take(self, REST, None)
 
     @property
-    def next_move(self) -> PlannedMove | None:
-        """The first move of the plan that is not completed."""
-        if self.plan is None or self.completed >= len(self.plan.moves[self.vehicle]):
-            return None
-        return self.plan.moves[self.vehicle][self.completed]
-
-    @property
     def wanted_accepted(self) -> Ballot | None:
         """The plan that the motion controller should note as accepted."""
         return self.plan.ballot if self.plan is not None else None
@@ -153,17 +109,12 @@ class PlanExecution:
     @property
     def wanted_promised(self) -> Ballot | None:
         """The promise that the motion controller should note, where it must."""
-        return self.promised if self.estate is not None else None
-
-    @property
-    def accepted(self) -> bool:
-        """It has a plan, and its motion controller has noted that."""
-        return self.phase in ACCEPTED
+        return self.promised if self.owned is not None else None
 
     @property
     def go(self) -> bool:
         """The start gate is open."""
-        return self.phase is Stage.GOING
+        return self.phase is ExecutionPhase.GOING
 
     @property
     def done(self) -> bool:
@@ -173,7 +124,7 @@ class PlanExecution:
     @property
     def ready(self) -> bool:
         """Accepted, and not moving or moving in a move of this plan."""
-        return bool(self.rules.functions["is_ready"](self, None))
+        return self.accepted and (not self.moving or self.moving_in_plan)
 
     def overdue(self, t_s: float) -> bool:
         """Tell whether the next move has been due for too long."""
@@ -181,16 +132,6 @@ class PlanExecution:
         if plan is None or self.moving or not self.accepted:
             return False
         return self.is_due(t_s - min(OVERDUE_SLOTS * plan.slot_s, plan.slot_s + OVERDUE_S))
-
-    def is_due(self, t_s: float) -> bool:
-        """Tell whether the time of the next move has come."""
-        plan = self.plan
-        if plan is None:
-            return False
-        moves, completed = plan.moves[self.vehicle], self.completed
-        if completed >= len(moves):
-            return False
-        return t_s + TIME_TOLERANCE_S >= plan.t0_s + moves[completed][0] * plan.slot_s
 
     def state(self, sense: Sense, formation: int, *, attended: bool) -> VehicleState:
         """Return what to show to others.
@@ -232,7 +173,7 @@ class PlanExecution:
         plan = self.plan
         if plan is None:
             return False
-        if self.phase is not Stage.GOING:
+        if self.phase is not ExecutionPhase.GOING:
             return True
         if self.next_move is None or not self.is_due(t_s + LISTEN_S):
             return False

@@ -67,7 +67,7 @@ def plan_problems(plan: Plan) -> list[str]:
     return problems
 
 
-def estate_problems(plan: Plan) -> list[str]:
+def ownership_problems(plan: Plan) -> list[str]:
     """Return what is wrong with how a plan hands cells over; empty when nothing is.
 
     Checked: the maps cover the roster; no cell has two owners, before or after; no owner appears

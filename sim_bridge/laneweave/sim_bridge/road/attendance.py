@@ -71,9 +71,9 @@ class Caretaker:
             lattice=controller.lattice,
             joined=controller.joined,
             moving=controller.moving(tick),
-            estate=frozenset(controller.owned) if controller.rolling else None,
+            owned=frozenset(controller.owned) if controller.rolling else None,
         )
-        self._execution.on_estate(vehicle.sense(tick, caretaker=True))
+        self._execution.on_owned(vehicle.sense(tick, caretaker=True))
 
     def on_message(self, message: Prepare | Plan, tick: int) -> VehicleState | None:
         """V2 and V3: promise, or accept a plan in which this vehicle only holds.
@@ -89,11 +89,11 @@ class Caretaker:
             if execution.promised is not None:
                 controller.promise(execution.promised)
         else:
-            execution.on_estate(self._vehicle.sense(tick, caretaker=True))
+            execution.on_owned(self._vehicle.sense(tick, caretaker=True))
             accepted = not message.moves.get(execution.vehicle) and execution.on_plan(message)
             if accepted:
-                if execution.deed is not None:
-                    controller.begin_transfer(execution.deed)
+                if execution.transfer is not None:
+                    controller.begin_transfer(execution.transfer)
                 controller.accept(message.ballot)
                 execution.on_noted(controller.accepted)
         return self.state(tick) if accepted else None

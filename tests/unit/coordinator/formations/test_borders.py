@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from attrs import evolve
 
+from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.formations.borders import kept_apart, steps_of
-from laneweave.coordinator.formations.leader_rules import Phase
 from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.protocol.lattice import PlannedMove
 from laneweave.protocol.runtime.node import Compute, Effect, run_job
@@ -123,23 +123,24 @@ BEHIND: Cells = {G: (-5, 1), H: (-4, 2), J: (-7, 1), K: (-4, 0), L: (-6, 2)}
 LANES = {A: 1, B: 0, C: 0, D: 2, E: 0, F: 1, G: 1, H: 0, J: 2, K: 1, L: 1}
 
 
-def two_formations(scenario: Scenario = SCENARIO) -> tuple[Desk, Compute, Compute]:
-    """Lead up to the orders for both blocks."""
+def two_formations(scenario: Scenario = SCENARIO, first: int = 0) -> tuple[Desk, Compute]:
+    """Collect the promises of both blocks, of one block first; return the order for that one."""
     desk = Desk(scenario=scenario)
     desk.lead()
     desk.tell(census(AHEAD | BEHIND, LANES))
     for name, cell in (AHEAD | BEHIND).items():
         desk.tell(state(name, cell))
-    (ahead,) = jobs(desk.promise(AHEAD))
-    ballot, effects = desk.core.controls[1].ballot, list[Effect]()
-    for name, cell in BEHIND.items():
-        effects += desk.tell(state(name, cell, ballot, t_s=1.0))
-    (behind,) = jobs(effects)
-    return desk, ahead, behind
+    effects: list[Effect] = []
+    for number in (first, 1 - first):
+        ballot = desk.leaders[number].ballot
+        for name, cell in (AHEAD, BEHIND)[number].items():
+            effects += desk.tell(state(name, cell, ballot, t_s=1.0))
+    (job,) = jobs(effects)
+    return desk, job
 
 
 def plans(desk: Desk) -> tuple[Plan, Plan]:
-    one, other = desk.core.controls[0].plan, desk.core.controls[1].plan
+    one, other = desk.leaders[0].plan, desk.leaders[1].plan
     assert one is not None
     assert other is not None
     assert plan_problems(one) == plan_problems(other) == []
@@ -151,30 +152,28 @@ def awaited(effects: list[Effect]) -> list[dict[str, object]]:
     return [message.data for message in found if message.kind == "neighbours-awaited"]
 
 
-def test_the_later_plan_of_two_neighbours_pauses() -> None:
-    desk, ahead, behind = two_formations()
-    assert awaited(desk.give(run_job(ahead))) == []
-    assert awaited(desk.give(run_job(behind))) == [{"formation": 1, "slots": 1}]
+@pytest.mark.parametrize("first", [0, 1])
+def test_the_later_plan_of_two_neighbours_pauses(first: int) -> None:
+    desk, job = two_formations(first=first)
+    effects = desk.give(run_job(job))
+    assert awaited(effects) == []
+    (later,) = jobs(effects)
+    assert awaited(desk.give(run_job(later))) == [{"formation": 1 - first, "slots": 1}]
     assert closing_pairs(*plans(desk)) == []
 
 
-def test_so_does_that_of_the_block_ahead_if_it_is_made_later() -> None:
-    desk, ahead, behind = two_formations()
-    assert awaited(desk.give(run_job(behind))) == []
-    assert awaited(desk.give(run_job(ahead))) == [{"formation": 0, "slots": 1}]
-    assert closing_pairs(*plans(desk)) == []
-
-
-def test_nobody_pauses_for_a_plan_that_was_outbid() -> None:
-    desk, ahead, behind = two_formations()
-    desk.give(run_job(ahead))
+def test_no_formation_pauses_for_a_plan_that_was_outbid() -> None:
+    desk, job = two_formations()
+    (later,) = jobs(desk.give(run_job(job)))
     desk.tell(state(A, AHEAD[A], Ballot(4, Name("c0"), 3, 2), t_s=2.0))
-    assert desk.core.controls[0].phase is Phase.BACKING_OFF
-    assert awaited(desk.give(run_job(behind))) == []
+    assert desk.leaders[0].phase is BallotPhase.BACKING_OFF
+    assert awaited(desk.give(run_job(later))) == []
 
 
 def test_a_scenario_whose_plans_may_close_up_has_no_pauses() -> None:
     formation = evolve(SCENARIO.formation, conflicts=("node", "edge", "special-1"))
-    desk, ahead, behind = two_formations(evolve(SCENARIO, formation=formation))
-    assert awaited(desk.give(run_job(ahead), run_job(behind))) == []
+    desk, job = two_formations(evolve(SCENARIO, formation=formation))
+    effects = desk.give(run_job(job))
+    (later,) = jobs(effects)
+    assert awaited([*effects, *desk.give(run_job(later))]) == []
     assert closing_pairs(*plans(desk))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from laneweave.coordinator.formations.groups import Groups, Numbers
+from laneweave.coordinator.formations.roster import Groups, Numbers
 
 JOINS = st.lists(st.lists(st.integers(-3, 9), max_size=4), max_size=8)
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from attrs import evolve
 
-from laneweave.coordinator.core import JUST_CLOSED_S
-from laneweave.coordinator.formations.leader_rules import Phase
+from laneweave.coordinator.ballots.ballot_round import BallotPhase
+from laneweave.coordinator.formations.operation import JUST_CLOSED_S
 from laneweave.protocol.runtime.node import Compute, Effect, PeerUp, run_job
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.plans import plan_problems
@@ -75,10 +75,12 @@ def behind_of_one(desk: Desk, t_s: float) -> list[Effect]:
     desk.tell(census(cells, dict.fromkeys(cells, 1), t_s=t_s))
     for name, cell in cells.items():
         desk.tell(state(name, cell))
-    desk.promise({F: (0, 0)})
-    ballot, effects = desk.core.controls[1].ballot, list[Effect]()
+    ahead = jobs(desk.promise({F: (0, 0)}))
+    ballot, effects = desk.leaders[1].ballot, list[Effect]()
     for name, cell in BEHIND.items():
         effects += desk.tell(state(name, cell, ballot, t_s=1.0))
+    for job in ahead:
+        effects += desk.give(run_job(job))
     return effects
 
 
@@ -94,18 +96,16 @@ def test_without_joining_all_but_one_get_their_lane_and_that_is_logged() -> None
     missed = [name for name, cell in ends.items() if cell[1] != 1]
     assert len(missed) == 1
     assert notes(effects, "lane-out-of-reach") == [{"formation": 0, "vehicles": missed}]
-    assert desk.core.controls[0].out_of_reach == {*missed}
+    assert desk.leaders[0].out_of_reach == {*missed}
 
 
 def test_an_overfull_lane_is_sorted_by_a_joint_ballot_of_two_formations() -> None:
     desk, job = overfull(JOINING)
-    separate = desk.core.controls[1].ballot
+    separate = desk.leaders[1].ballot
     effects = desk.give(run_job(job))
     assert notes(effects, "formations-joined") == [{"formations": [0, 1]}]
     assert messages(effects, Plan) == []
-    assert {number: each.formation.numbers for number, each in desk.core.controls.items()} == {
-        0: (0, 1)
-    }
+    assert {number: each.formation.numbers for number, each in desk.leaders.items()} == {0: (0, 1)}
     everybody = FULL | NEXT
     prepares = []
     for name, cell in everybody.items():
@@ -128,17 +128,23 @@ def test_an_overfull_lane_is_sorted_by_a_joint_ballot_of_two_formations() -> Non
     assert notes(effects, "lane-out-of-reach") == []
     for name, cell in everybody.items():
         desk.tell(state(name, cell, desk.ballot, accepted=True, t_s=2.0, joined=(0, 1)))
-    assert desk.core.controls[0].phase is Phase.WATCHING
+    assert desk.leaders[0].phase is BallotPhase.IN_FORCE
 
 
 def test_a_result_for_a_formation_that_has_been_joined_meanwhile_is_dropped() -> None:
     desk, job = overfull(JOINING)
-    ballot = desk.core.controls[1].ballot
-    (other,) = jobs(desk.tell(state(F, NEXT[F], ballot, t_s=1.0)))
-    desk.give(run_job(job))
-    effects = desk.give(run_job(other))
+    desk.tell(state(F, NEXT[F], joined=(0, 1), t_s=1.0))
+    effects = desk.give(run_job(job))
     assert messages(effects, Plan) == []
     assert logged(effects) == []
+
+
+def test_an_order_for_a_formation_that_has_been_joined_meanwhile_is_not_worked_on() -> None:
+    desk, job = overfull(JOINING)
+    assert jobs(desk.tell(state(F, NEXT[F], desk.leaders[1].ballot, t_s=1.0))) == []
+    effects = desk.give(run_job(job))
+    assert logged(effects) == ["formations-joined"]
+    assert jobs(effects) == []
 
 
 def test_with_nobody_near_a_formation_is_planned_alone() -> None:
@@ -153,7 +159,7 @@ def test_the_last_formation_is_joined_with_the_one_before_it() -> None:
     desk = Desk(scenario=JOINING)
     (job,) = jobs(behind_of_one(desk, T_S))
     assert notes(desk.give(run_job(job)), "formations-joined") == [{"formations": [0, 1]}]
-    assert desk.core.controls[0].formation.roster == (*FULL, F)
+    assert desk.leaders[0].formation.roster == (*FULL, F)
 
 
 def test_formations_are_not_joined_when_together_they_are_too_late() -> None:
@@ -169,9 +175,9 @@ def test_nobody_is_joined_who_has_settled() -> None:
     """Block 0 is about to leave; behind it there is an overfull lane."""
     desk = Desk(scenario=JOINING)
     (job,) = jobs(behind_of_one(desk, 63.0))
-    assert desk.core.controls[0].phase is Phase.SETTLED
+    assert desk.leaders[0].phase is BallotPhase.GIVEN_UP
     assert plan_of(desk.give(run_job(job))).formations == (1,)
-    assert sorted(desk.core.controls) == [0, 1]
+    assert sorted(desk.leaders) == [0, 1]
 
 
 def test_no_more_formations_are_joined_than_the_scenario_allows() -> None:
@@ -198,13 +204,13 @@ def test_a_group_is_learned_from_a_state_of_any_member() -> None:
     desk = Desk()
     desk.lead()
     desk.tell(census(FULL | NEXT, LANES))
-    assert sorted(desk.core.controls) == [0, 1]
+    assert sorted(desk.leaders) == [0, 1]
     desk.tell(state(F, NEXT[F], joined=(0, 1)))
-    assert sorted(desk.core.controls) == [0]
-    control = desk.core.controls[0]
+    assert sorted(desk.leaders) == [0]
+    control = desk.leaders[0]
     assert (control.formation.numbers, control.formation.roster) == ((0, 1), (*FULL, F))
     desk.tell(state(F, NEXT[F], joined=(1,), t_s=9.0))  # nobody takes that back
-    assert desk.core.controls[0] is control
+    assert desk.leaders[0] is control
 
 
 def test_a_ballot_is_widened_when_a_promise_shows_more_formations() -> None:
@@ -213,8 +219,8 @@ def test_a_ballot_is_widened_when_a_promise_shows_more_formations() -> None:
     desk.tell(state(A, FULL[A], ballot, joined=(0, 1), t_s=2.0))
     for name, cell in (FULL | NEXT).items():
         desk.tell(state(name, cell, ballot, joined=(0, 1), t_s=3.0))
-    control = desk.core.controls[0]
-    assert (control.phase, control.formation.numbers) == (Phase.PREPARING, (0, 1))
+    control = desk.leaders[0]
+    assert (control.phase, control.formation.numbers) == (BallotPhase.PREPARING, (0, 1))
     assert desk.ballot > ballot
 
 
@@ -224,8 +230,8 @@ def test_an_acceptance_that_shows_more_formations_puts_no_plan_in_force() -> Non
     desk.give(run_job(job))
     accepted = state(A, (0, 0), desk.ballot, accepted=True, t_s=2.0, joined=(0, 1))
     assert logged(desk.tell(accepted)) == []
-    control = desk.core.controls[0]
-    assert (control.formation.numbers, control.phase) == ((0, 1), Phase.OBSERVING)
+    control = desk.leaders[0]
+    assert (control.formation.numbers, control.phase) == ((0, 1), BallotPhase.OBSERVING)
 
 
 def test_groups_that_overlap_become_one() -> None:
@@ -233,10 +239,10 @@ def test_groups_that_overlap_become_one() -> None:
     desk.lead()
     cells: Cells = {A: (0, 0), B: (-5, 1), C: (-9, 1)}
     desk.tell(census(cells))
-    assert sorted(desk.core.controls) == [0, 1, 2]
+    assert sorted(desk.leaders) == [0, 1, 2]
     desk.tell(state(A, cells[A], joined=(0, 1)))
     desk.tell(evolve(state(C, cells[C]), formation=2, joined=(1, 2)))
-    assert {number: each.formation.numbers for number, each in desk.core.controls.items()} == {
+    assert {number: each.formation.numbers for number, each in desk.leaders.items()} == {
         0: (0, 1, 2)
     }
 
@@ -248,14 +254,14 @@ def test_a_group_is_planned_only_once_its_later_block_has_closed_in_the_census()
     cells: Cells = {A: (0, 0), B: (-4, 0)}
     late_s = closing_time_s(1)
     desk.tell(census({A: cells[A]}, t_s=late_s - 3.0))
-    assert sorted(desk.core.controls) == [0]
+    assert sorted(desk.leaders) == [0]
     desk.tell(state(A, cells[A], joined=(0, 1)))
-    assert desk.core.controls == {}
+    assert desk.leaders == {}
     desk.tell(census(cells, t_s=late_s - 0.1))
     desk.tell(RoadClock(99, late_s + 5.0, 2, 2, 2, 0, ended=False))
-    assert desk.core.controls == {}
+    assert desk.leaders == {}
     desk.tell(census(cells, t_s=late_s))
-    assert desk.core.controls[0].formation.roster == (A, B)
+    assert desk.leaders[0].formation.roster == (A, B)
 
 
 def test_those_who_are_left_of_a_group_stay_joined() -> None:
@@ -264,7 +270,7 @@ def test_those_who_are_left_of_a_group_stay_joined() -> None:
     desk.tell(census({A: (0, 0), B: (-4, 0)}))
     desk.tell(state(A, joined=(0, 1)))
     desk.tell(census({B: (-4, 0)}, t_s=T_S + 1.0))
-    control = desk.core.controls[0]
+    control = desk.leaders[0]
     assert (control.formation.numbers, control.formation.roster) == ((0, 1), (B,))
 
 
@@ -274,10 +280,10 @@ def test_another_road_has_other_groups() -> None:
     desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}))
     desk.tell(census({A: (0, 0), B: (-4, 0)}))
     desk.tell(state(A, joined=(0, 1)))
-    assert sorted(desk.core.controls) == [0]
+    assert sorted(desk.leaders) == [0]
     desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "8"}))
     desk.tell(census({A: (0, 0), B: (-4, 0)}))
-    assert sorted(desk.core.controls) == [0, 1]
+    assert sorted(desk.leaders) == [0, 1]
 
 
 # --- who is observed first --------------------------------------------------------------------
@@ -303,7 +309,7 @@ def test_a_formation_that_closed_before_the_leader_saw_it_is_observed() -> None:
     assert messages(desk.tell(census({A: (0, 0)}, t_s=seen_s)), Prepare) == []
     theirs = Ballot(4, Name("c0"), 3, 2)
     desk.tell(state(A, (0, 0), theirs, accepted=True))
-    assert desk.core.controls[0].phase is Phase.WATCHING
+    assert desk.leaders[0].phase is BallotPhase.IN_FORCE
     assert desk.ballot == theirs
 
 
@@ -312,7 +318,7 @@ def test_a_leader_that_has_just_begun_observes_every_formation() -> None:
     desk.watch(2 * ELECTION_S - 0.2)  # of which it has led for the last 0.8 s
     assert desk.core.election.leading
     assert messages(desk.tell(census({A: (0, 0)}, t_s=just_closed())), Prepare) == []
-    assert desk.core.controls[0].phase is Phase.OBSERVING
+    assert desk.leaders[0].phase is BallotPhase.OBSERVING
 
 
 def test_a_leader_that_was_paused_observes_every_formation() -> None:
@@ -322,7 +328,7 @@ def test_a_leader_that_was_paused_observes_every_formation() -> None:
     desk.watch(2 * ELECTION_S)
     desk.wait(ELECTION_S)
     assert messages(desk.tell(census({A: (0, 0)}, t_s=just_closed())), Prepare) == []
-    assert desk.core.controls[0].phase is Phase.OBSERVING
+    assert desk.leaders[0].phase is BallotPhase.OBSERVING
     desk.watch(ELECTION_S + 0.1)
     later = census({A: (0, 0), B: (-4, 0)}, t_s=just_closed(1))
     assert [send.parameters["vehicle"] for send in messages(desk.tell(later), Prepare)] == [B]
@@ -376,7 +382,7 @@ def test_when_nobody_can_be_moved_the_plan_has_no_moves() -> None:
         shown = state(name, cell, desk.ballot, accepted=True, t_s=2.0)
         desk.tell(evolve(shown, attended=False, done=True))
     desk.watch(3.0)
-    assert desk.core.controls[0].phase is Phase.WATCHING  # and it is not planned again for ever
+    assert desk.leaders[0].phase is BallotPhase.IN_FORCE  # and it is not planned again for ever
 
 
 def test_a_lane_that_only_those_without_agents_miss_is_no_reason_to_join() -> None:

@@ -8,16 +8,15 @@ from collections.abc import Callable, Iterable
 import pytest
 from attrs import evolve
 
-from laneweave.coordinator.formations.control import FormationControl
-from laneweave.coordinator.formations.leader_rules import (
+from laneweave.coordinator.ballots.ballot_round import ISSUE_S, BallotPhase, all_have_promised
+from laneweave.coordinator.formations.leader import (
     BACK_OFF_S,
-    ISSUE_S,
     LEADER_RULES,
     LONGEST_RETRY_S,
-    MOST_BACK_OFFS,
+    MAX_BACK_OFFS,
     OBSERVE_S,
     RETRY_S,
-    Phase,
+    FormationLeader,
 )
 from laneweave.coordinator.formations.roster import Formation
 from laneweave.protocol.lattice import Cell
@@ -28,7 +27,7 @@ A, B, C = Name("A"), Name("B"), Name("C")
 OTHERS = Ballot(1, Name("other"), 1, 1)
 RESEND_S = 0.2
 RNG = random.Random(1)
-Reach = Callable[..., tuple[FormationControl, Ballot]]
+Reach = Callable[..., tuple[FormationLeader, Ballot]]
 
 
 def formation(*names: Name, lane: int = 1, numbers: tuple[int, ...] = (0,)) -> Formation:
@@ -49,8 +48,8 @@ class Ballots:
         return Ballot(self.term, Name("me"), 1, self.given)
 
 
-def control(*names: Name, numbers: tuple[int, ...] = (0,)) -> FormationControl:
-    made = FormationControl(formation(*names, numbers=numbers), Ballots(), RNG, RESEND_S)
+def control(*names: Name, numbers: tuple[int, ...] = (0,)) -> FormationLeader:
+    made = FormationLeader(formation(*names, numbers=numbers), Ballots(), RNG, resend_s=RESEND_S)
     made.begin(0.0)
     return made
 
@@ -90,11 +89,11 @@ def state(
     )
 
 
-def phase(leader: FormationControl) -> Phase:
+def phase(leader: FormationLeader) -> BallotPhase:
     return leader.phase
 
 
-def hear(leader: FormationControl, *states: VehicleState, now_s: float = 0.0) -> None:
+def hear(leader: FormationLeader, *states: VehicleState, now_s: float = 0.0) -> None:
     for each in states:
         leader.on_state(each, now_s)
 
@@ -103,22 +102,22 @@ def to(sent: Iterable[tuple[Name, Prepare | Plan]]) -> list[Name]:
     return [name for name, _ in sent]
 
 
-def preparing(*names: Name) -> tuple[FormationControl, Ballot]:
+def preparing(*names: Name) -> tuple[FormationLeader, Ballot]:
     leader = control(*names)
     hear(leader, *(state(name) for name in names))
-    assert phase(leader) is Phase.PREPARING
+    assert phase(leader) is BallotPhase.PREPARING
     assert leader.ballot is not None
     return leader, leader.ballot
 
 
-def planning(*names: Name) -> tuple[FormationControl, Ballot]:
+def planning(*names: Name) -> tuple[FormationLeader, Ballot]:
     leader, ballot = preparing(*names)
     hear(leader, *(state(name, ballot) for name in names))
     assert leader.take_planning_order(0.0)
     return leader, ballot
 
 
-def plan_of(leader: FormationControl) -> Plan:
+def plan_of(leader: FormationLeader) -> Plan:
     assert leader.ballot is not None
     cells = leader.hold_cells
     return Plan(
@@ -127,16 +126,16 @@ def plan_of(leader: FormationControl) -> Plan:
     )  # fmt: skip
 
 
-def issuing(*names: Name) -> tuple[FormationControl, Ballot]:
+def issuing(*names: Name) -> tuple[FormationLeader, Ballot]:
     leader, ballot = planning(*names)
     leader.on_plan(plan_of(leader), 0.0)
     return leader, ballot
 
 
-def watching(*names: Name) -> tuple[FormationControl, Ballot]:
+def watching(*names: Name) -> tuple[FormationLeader, Ballot]:
     leader, ballot = issuing(*names)
     hear(leader, *(state(name, ballot, accepted=True) for name in names))
-    assert phase(leader) is Phase.WATCHING
+    assert phase(leader) is BallotPhase.IN_FORCE
     return leader, ballot
 
 
@@ -146,7 +145,7 @@ def watching(*names: Name) -> tuple[FormationControl, Ballot]:
 def test_l2_adopts_a_plan_that_all_have_accepted_and_sends_nothing() -> None:
     leader = control(A, B)
     hear(leader, state(A, OTHERS, accepted=True), state(B, OTHERS, accepted=True))
-    assert (leader.phase, leader.ballot, leader.plan) == (Phase.WATCHING, OTHERS, None)
+    assert (leader.phase, leader.ballot, leader.plan) == (BallotPhase.IN_FORCE, OTHERS, None)
     leader.on_time(100.0)
     assert list(leader.outgoing(100.0)) == []
     assert not leader.take_planning_order(100.0)
@@ -166,9 +165,9 @@ def test_l2_adopts_a_plan_that_all_have_accepted_and_sends_nothing() -> None:
 def test_l2_mixed_states_lead_to_a_new_ballot(last: VehicleState) -> None:
     leader = control(A, B)
     hear(leader, state(A, OTHERS, accepted=True))
-    assert phase(leader) is Phase.OBSERVING
+    assert phase(leader) is BallotPhase.OBSERVING
     hear(leader, last)
-    assert phase(leader) is Phase.PREPARING
+    assert phase(leader) is BallotPhase.PREPARING
     assert leader.ballot is not None
     assert leader.ballot > OTHERS
 
@@ -177,16 +176,16 @@ def test_l2_waits_for_the_states_of_the_roster_but_not_for_ever() -> None:
     leader = control(A, B)
     hear(leader, state(A, OTHERS, accepted=True))
     leader.on_time(OBSERVE_S - 0.01)
-    assert phase(leader) is Phase.OBSERVING
+    assert phase(leader) is BallotPhase.OBSERVING
     assert leader.wakeup_s == OBSERVE_S
     leader.on_time(OBSERVE_S)
-    assert phase(leader) is Phase.PREPARING
+    assert phase(leader) is BallotPhase.PREPARING
 
 
 def test_strangers_say_nothing() -> None:
     leader = control(A)
     hear(leader, state(C, OTHERS._replace(term=9)))
-    assert phase(leader) is Phase.OBSERVING
+    assert phase(leader) is BallotPhase.OBSERVING
     hear(leader, state(A))
     assert leader.ballot == Ballot(1, Name("me"), 1, 1)
 
@@ -199,23 +198,23 @@ def test_l2_an_adopted_plan_is_watched_by_its_promises() -> None:
 
 def test_without_observing_it_prepares_at_once_whatever_it_would_hear() -> None:
     """A formation that has closed under this leader has no plan that could be adopted."""
-    leader = FormationControl(formation(A, B), Ballots(), RNG, RESEND_S)
+    leader = FormationLeader(formation(A, B), Ballots(), RNG, resend_s=RESEND_S)
     leader.begin(5.0, observe=False)
-    assert (leader.phase, leader.wakeup_s) == (Phase.PREPARING, 5.0)
+    assert (leader.phase, leader.wakeup_s) == (BallotPhase.PREPARING, 5.0)
     assert to(leader.outgoing(5.0)) == [A, B]
     hear(leader, state(A, OTHERS._replace(term=0)), now_s=5.0)
-    assert phase(leader) is Phase.PREPARING  # a lower ballot is overruled
+    assert phase(leader) is BallotPhase.PREPARING  # a lower ballot is overruled
     hear(leader, state(B, OTHERS._replace(term=3)), now_s=5.0)
-    assert phase(leader) is Phase.BACKING_OFF
+    assert phase(leader) is BallotPhase.BACKING_OFF
 
 
 def test_begin_observes_from_its_own_time_on() -> None:
-    leader = FormationControl(formation(A), Ballots(), RNG, RESEND_S)
+    leader = FormationLeader(formation(A), Ballots(), RNG, resend_s=RESEND_S)
     leader.begin(100.0)
     leader.on_time(100.0 + OBSERVE_S - 0.01)
-    assert phase(leader) is Phase.OBSERVING
+    assert phase(leader) is BallotPhase.OBSERVING
     leader.on_time(100.0 + OBSERVE_S)
-    assert phase(leader) is Phase.PREPARING
+    assert phase(leader) is BallotPhase.PREPARING
 
 
 # --- L3 and L4 --------------------------------------------------------------------------------
@@ -275,7 +274,7 @@ def test_a_late_state_takes_no_promise_back(newer: VehicleState, older: VehicleS
 
 
 def test_prepare_of_a_joint_ballot_names_all_formations() -> None:
-    leader = FormationControl(formation(A, B, numbers=(3, 4)), Ballots(), RNG, RESEND_S)
+    leader = FormationLeader(formation(A, B, numbers=(3, 4)), Ballots(), RNG, resend_s=RESEND_S)
     leader.begin(0.0, observe=False)
     assert leader.ballot is not None
     expected = Prepare(leader.ballot, (3, 4), (A, B))
@@ -314,7 +313,7 @@ def test_l5_needs_the_whole_roster_and_orders_once() -> None:
     hear(leader, state(C, ballot))
     assert leader.take_planning_order(0.0)
     assert not leader.take_planning_order(0.0)
-    assert (leader.phase, leader.wakeup_s) == (Phase.PLANNING, None)
+    assert (leader.phase, leader.wakeup_s) == (BallotPhase.PLANNING, None)
     assert list(leader.outgoing(9.0)) == []
 
 
@@ -360,7 +359,7 @@ def test_results_that_nobody_waits_for_change_nothing(reach: Reach) -> None:
     leader, ballot = reach(A, B)
     before = (leader.phase, leader.plan, leader.failures)
     leader.on_planning_failed(3.0)
-    leader.settle(3.0)
+    leader.give_up(3.0)
     assert (leader.phase, leader.plan, leader.failures) == before
     assert leader.ballot == ballot
 
@@ -386,9 +385,9 @@ def test_l6_the_plan_goes_to_those_who_have_not_accepted() -> None:
     assert list(leader.outgoing(RESEND_S - 0.01)) == []
     assert list(leader.outgoing(RESEND_S)) == [(B, plan)]
     hear(leader, state(B, ballot))  # still only promised
-    assert phase(leader) is Phase.ISSUING
+    assert phase(leader) is BallotPhase.ISSUING
     hear(leader, state(B, ballot, accepted=True))
-    assert (leader.phase, leader.ballot) == (Phase.WATCHING, ballot)
+    assert (leader.phase, leader.ballot) == (BallotPhase.IN_FORCE, ballot)
     assert list(leader.outgoing(99.0)) == []
 
 
@@ -398,17 +397,17 @@ def test_l6_acceptances_count_once_and_of_this_ballot_only() -> None:
         hear(leader, state(A, ballot, accepted=True))
     hear(leader, state(B, ballot._replace(seq=0), accepted=True))
     assert leader.accepted == {A}
-    assert phase(leader) is Phase.ISSUING
+    assert phase(leader) is BallotPhase.ISSUING
 
 
 def test_l8_a_plan_that_somebody_refuses_is_given_up() -> None:
     leader, ballot = issuing(A, B)
     hear(leader, state(A, ballot, accepted=True))
     leader.on_time(ISSUE_S - 0.01)
-    assert phase(leader) is Phase.ISSUING
+    assert phase(leader) is BallotPhase.ISSUING
     assert to(leader.outgoing(ISSUE_S - 0.01)) == [B]
     leader.on_time(ISSUE_S)
-    assert phase(leader) is Phase.PREPARING
+    assert phase(leader) is BallotPhase.PREPARING
     assert leader.ballot is not None
     assert leader.ballot > ballot
     assert to(leader.outgoing(ISSUE_S)) == [A, B]
@@ -424,15 +423,15 @@ def test_l7_outbid_backs_off_then_looks_and_takes_a_higher_term(
 ) -> None:
     leader, ballot = reach(A, B)
     hear(leader, state(A, higher, t_s=1.0), now_s=5.0)
-    assert phase(leader) is Phase.BACKING_OFF
+    assert phase(leader) is BallotPhase.BACKING_OFF
     pause_s = (leader.wakeup_s or 0.0) - 5.0
     assert BACK_OFF_S[0] <= pause_s <= BACK_OFF_S[1]
     assert list(leader.outgoing(9.0)) == []
     assert not leader.take_planning_order(9.0)
     leader.on_time(5.0 + pause_s)
-    assert phase(leader) is Phase.OBSERVING
+    assert phase(leader) is BallotPhase.OBSERVING
     hear(leader, state(A, higher, t_s=2.0), state(B, ballot, t_s=2.0), now_s=6.0)
-    assert phase(leader) is Phase.PREPARING
+    assert phase(leader) is BallotPhase.PREPARING
     assert leader.ballot is not None
     assert leader.ballot.term > higher.term
 
@@ -444,10 +443,10 @@ def test_l7_adopts_the_others_plan_if_it_is_in_force_after_the_pause() -> None:
     leader.on_time(1.0)
     for name in (A, B):
         hear(leader, state(name, higher, accepted=True, incarnation=2, t_s=2.0))
-    assert (leader.phase, leader.ballot) == (Phase.WATCHING, higher)
+    assert (leader.phase, leader.ballot) == (BallotPhase.IN_FORCE, higher)
     # The incarnations that promised this leader's own ballot are history.
     hear(leader, state(A, higher, accepted=True, incarnation=2, t_s=3.0))
-    assert phase(leader) is Phase.WATCHING
+    assert phase(leader) is BallotPhase.IN_FORCE
 
 
 class Longest(random.Random):
@@ -458,23 +457,23 @@ class Longest(random.Random):
         return b
 
 
-def outbid(leader: FormationControl, now_s: float) -> tuple[float, Ballot]:
+def outbid(leader: FormationLeader, now_s: float) -> tuple[float, Ballot]:
     """Show a leader a higher ballot; return how long it pauses, and the new ballot after that."""
     assert leader.ballot is not None
     higher = leader.ballot._replace(term=leader.ballot.term + 1)
     hear(leader, state(A, higher, t_s=now_s), now_s=now_s)
-    assert phase(leader) is Phase.BACKING_OFF
+    assert phase(leader) is BallotPhase.BACKING_OFF
     pause_s = (leader.wakeup_s or 0.0) - now_s
     leader.on_time(now_s + pause_s - 1e-6)
-    assert phase(leader) is Phase.BACKING_OFF
+    assert phase(leader) is BallotPhase.BACKING_OFF
     leader.on_time(now_s + pause_s)
     hear(leader, state(A, higher, t_s=now_s), state(B, t_s=now_s), now_s=now_s + pause_s)
-    assert phase(leader) is Phase.PREPARING
+    assert phase(leader) is BallotPhase.PREPARING
     assert leader.ballot > higher
     return pause_s, leader.ballot
 
 
-def promise_and_plan(leader: FormationControl, ballot: Ballot, now_s: float) -> None:
+def promise_and_plan(leader: FormationLeader, ballot: Ballot, now_s: float) -> None:
     hear(leader, state(A, ballot, t_s=now_s), state(B, ballot, t_s=now_s), now_s=now_s)
     assert leader.take_planning_order(now_s)
     leader.on_plan(plan_of(leader), now_s)
@@ -484,12 +483,12 @@ def test_l7_pauses_grow_so_that_one_of_two_leaders_gets_the_time_to_plan() -> No
     leader, _ = preparing(A, B)
     leader.rng = Longest()
     pauses = []
-    for now_s in range(0, 30 * (MOST_BACK_OFFS + 3), 30):
+    for now_s in range(0, 30 * (MAX_BACK_OFFS + 3), 30):
         pause_s, ballot = outbid(leader, float(now_s))
         pauses.append(pause_s / BACK_OFF_S[1])
         promise_and_plan(leader, ballot, now_s + 25.0)  # promises and a plan are no success yet
-    growing = [2.0**number for number in range(MOST_BACK_OFFS)]
-    assert pauses == pytest.approx([*growing, *[2.0**MOST_BACK_OFFS] * 3])
+    growing = [2.0**number for number in range(MAX_BACK_OFFS)]
+    assert pauses == pytest.approx([*growing, *[2.0**MAX_BACK_OFFS] * 3])
 
 
 @pytest.mark.parametrize("success", ["accepted", "adopted"])
@@ -508,7 +507,7 @@ def test_l7_after_a_success_the_pauses_are_short_again(success: str) -> None:
         leader.on_time(100.0)
         for name in (A, B):
             hear(leader, state(name, theirs, accepted=True, t_s=101.0), now_s=101.0)
-        assert (phase(leader), leader.ballot) == (Phase.WATCHING, theirs)
+        assert (phase(leader), leader.ballot) == (BallotPhase.IN_FORCE, theirs)
     pause_s, _ = outbid(leader, 120.0)
     assert pause_s == pytest.approx(BACK_OFF_S[1])
 
@@ -520,7 +519,7 @@ def test_l7_after_a_success_the_pauses_are_short_again(success: str) -> None:
 def test_l8_a_restarted_agent_leads_to_a_new_ballot(reach: Reach) -> None:
     leader, ballot = reach(A, B)
     hear(leader, state(A, incarnation=2))
-    assert phase(leader) is Phase.PREPARING
+    assert phase(leader) is BallotPhase.PREPARING
     assert leader.ballot is not None
     assert leader.ballot > ballot
 
@@ -531,31 +530,31 @@ def test_l8_a_restarted_agent_in_an_adopted_plan(promised: Ballot | None) -> Non
     leader = control(A, B)
     hear(leader, state(A, OTHERS, accepted=True), state(B, OTHERS, accepted=True))
     hear(leader, state(A, promised, incarnation=2))
-    assert phase(leader) is Phase.PREPARING
+    assert phase(leader) is BallotPhase.PREPARING
 
 
 def test_l8_overdue_leads_to_a_new_ballot() -> None:
     leader, ballot = watching(A, B)
     hear(leader, state(A, ballot, accepted=True, overdue=True))
-    assert phase(leader) is Phase.PREPARING
+    assert phase(leader) is BallotPhase.PREPARING
 
 
 def test_l8_new_targets_lead_to_a_new_ballot() -> None:
     leader, _ = watching(A, B)
     leader.on_members(formation(A, B), 1.0)
-    assert phase(leader) is Phase.WATCHING
+    assert phase(leader) is BallotPhase.IN_FORCE
     leader.on_members(formation(A, B, lane=2), 1.0)
-    assert phase(leader) is Phase.PREPARING
+    assert phase(leader) is BallotPhase.PREPARING
 
 
 def test_l8_an_adopted_plan_that_ended_on_the_wrong_lane_was_for_other_targets() -> None:
     leader = control(A)
     hear(leader, state(A, OTHERS, accepted=True, cell=(0, 2)))
-    assert phase(leader) is Phase.WATCHING
+    assert phase(leader) is BallotPhase.IN_FORCE
     hear(leader, state(A, OTHERS, accepted=True, cell=(0, 1), done=True, t_s=1.0))
-    assert phase(leader) is Phase.WATCHING
+    assert phase(leader) is BallotPhase.IN_FORCE
     hear(leader, state(A, OTHERS, accepted=True, cell=(0, 2), done=True, t_s=2.0))
-    assert phase(leader) is Phase.PREPARING
+    assert phase(leader) is BallotPhase.PREPARING
 
 
 def astray(**changes: object) -> VehicleState:
@@ -567,21 +566,21 @@ def astray(**changes: object) -> VehicleState:
 @pytest.mark.parametrize(
     ("shown", "out_of_reach", "then"),
     [
-        (astray(), (), Phase.PREPARING),
-        (astray(done=False), (), Phase.WATCHING),
-        (astray(hold_cell=(5, 1)), (), Phase.WATCHING),
-        (astray(), (A,), Phase.WATCHING),
-        (astray(), (B,), Phase.PREPARING),
+        (astray(), (), BallotPhase.PREPARING),
+        (astray(done=False), (), BallotPhase.IN_FORCE),
+        (astray(hold_cell=(5, 1)), (), BallotPhase.IN_FORCE),
+        (astray(), (A,), BallotPhase.IN_FORCE),
+        (astray(), (B,), BallotPhase.PREPARING),
     ],
     ids=["astray", "on its way", "on its lane", "out of reach", "another is out of reach"],
 )
 def test_l8_who_ends_on_the_wrong_lane_needs_a_new_plan_unless_that_was_the_plan(
-    shown: VehicleState, out_of_reach: tuple[Name, ...], then: Phase
+    shown: VehicleState, out_of_reach: tuple[Name, ...], then: BallotPhase
 ) -> None:
     leader, ballot = planning(A, B)
     leader.on_plan(plan_of(leader), 0.0, out_of_reach)
     hear(leader, *(state(name, ballot, accepted=True) for name in (A, B)))
-    assert phase(leader) is Phase.WATCHING
+    assert phase(leader) is BallotPhase.IN_FORCE
     hear(leader, shown)
     assert phase(leader) is then
 
@@ -594,9 +593,9 @@ def test_l8_who_was_out_of_reach_of_an_own_plan_may_be_astray_in_an_adopted_one(
     hear(leader, state(A, higher, t_s=1.0))
     leader.on_time(1.0)
     hear(leader, state(A, higher, accepted=True, t_s=2.0), now_s=1.0)
-    assert phase(leader) is Phase.WATCHING
+    assert phase(leader) is BallotPhase.IN_FORCE
     hear(leader, astray(promised=higher, t_s=3.0))
-    assert phase(leader) is Phase.PREPARING
+    assert phase(leader) is BallotPhase.PREPARING
 
 
 def test_l8_who_cannot_be_moved_is_not_astray() -> None:
@@ -608,7 +607,7 @@ def test_l8_who_cannot_be_moved_is_not_astray() -> None:
     leader.on_plan(plan_of(leader), 0.0)
     hear(leader, *(state(name, ballot, accepted=True, attended=name is B) for name in (A, B)))
     hear(leader, astray(attended=False))
-    assert phase(leader) is Phase.WATCHING
+    assert phase(leader) is BallotPhase.IN_FORCE
 
 
 def test_l8_an_agent_that_takes_over_from_the_caretaker_leads_to_a_new_ballot() -> None:
@@ -617,9 +616,9 @@ def test_l8_an_agent_that_takes_over_from_the_caretaker_leads_to_a_new_ballot() 
     assert leader.take_planning_order(0.0)
     leader.on_plan(plan_of(leader), 0.0)
     hear(leader, state(A, ballot, accepted=True, attended=False))
-    assert phase(leader) is Phase.WATCHING
+    assert phase(leader) is BallotPhase.IN_FORCE
     hear(leader, state(A, incarnation=2))
-    assert phase(leader) is Phase.PREPARING
+    assert phase(leader) is BallotPhase.PREPARING
 
 
 # --- the roster -------------------------------------------------------------------------------
@@ -629,7 +628,7 @@ def test_l8_an_agent_that_takes_over_from_the_caretaker_leads_to_a_new_ballot() 
 def test_who_leaves_takes_the_ballot_along(reach: Reach) -> None:
     leader, ballot = reach(A, B)
     leader.on_members(formation(A), 1.0)
-    assert phase(leader) is Phase.PREPARING
+    assert phase(leader) is BallotPhase.PREPARING
     assert leader.ballot is not None
     assert leader.ballot > ballot
     assert list(leader.outgoing(1.0)) == [(A, Prepare(leader.ballot, (0,), (A,)))]
@@ -641,14 +640,14 @@ def test_who_leaves_takes_the_ballot_along(reach: Reach) -> None:
 def test_who_leaves_a_plan_in_force_stops_nobody() -> None:
     leader, ballot = watching(A, B)
     leader.on_members(formation(A), 1.0)
-    assert (leader.phase, leader.ballot) == (Phase.WATCHING, ballot)
+    assert (leader.phase, leader.ballot) == (BallotPhase.IN_FORCE, ballot)
 
 
 def test_who_leaves_while_observing_is_not_waited_for() -> None:
     leader = control(A, B)
     leader.on_members(formation(A), 0.1)
     hear(leader, state(A, OTHERS, accepted=True))
-    assert phase(leader) is Phase.WATCHING
+    assert phase(leader) is BallotPhase.IN_FORCE
 
 
 @pytest.mark.parametrize("reach", [preparing, planning, issuing, watching])
@@ -658,23 +657,23 @@ def test_what_those_showed_who_left_is_forgotten(reach: Reach) -> None:
     assert set(leader.states) == {A}
     hear(leader, state(B, OTHERS._replace(term=9), t_s=2.0))
     assert set(leader.states) == {A}
-    assert leader.phase in (Phase.PREPARING, Phase.WATCHING)
+    assert leader.phase in (BallotPhase.PREPARING, BallotPhase.IN_FORCE)
 
 
 def test_who_joins_a_plan_in_force_leads_to_a_new_ballot_for_all() -> None:
     leader, _ = watching(A, B)
     leader.on_members(formation(A, B, C), 1.0)
-    assert phase(leader) is Phase.PREPARING
+    assert phase(leader) is BallotPhase.PREPARING
     assert to(leader.outgoing(1.0)) == [A, B, C]
 
 
 def test_settled_is_the_end() -> None:
     leader, ballot = planning(A)
-    leader.settle(0.0)
+    leader.give_up(0.0)
     hear(leader, state(A, ballot, incarnation=2, overdue=True))
     leader.on_time(1e6)
     leader.on_members(formation(A, lane=2), 1e6)
-    assert (leader.phase, leader.wakeup_s) == (Phase.SETTLED, None)
+    assert (leader.phase, leader.wakeup_s) == (BallotPhase.GIVEN_UP, None)
     assert list(leader.outgoing(1e6)) == []
 
 
@@ -684,7 +683,7 @@ def test_settled_is_the_end() -> None:
 def test_a_history_takes_every_row_of_the_table() -> None:
     """No row is hidden behind an earlier one."""
     book = RuleRecorder(LEADER_RULES)
-    leader = FormationControl(formation(A, B), Ballots(), RNG, RESEND_S, book)
+    leader = FormationLeader(formation(A, B), Ballots(), RNG, resend_s=RESEND_S, rules=book)
     clock = iter(range(1, 1000))
 
     def show(name: Name, promised: Ballot | None, **changes: object) -> None:
@@ -730,7 +729,7 @@ def test_a_history_takes_every_row_of_the_table() -> None:
     leader.on_time(leader.now_s + ISSUE_S)  # somebody refuses
     leader.on_members(formation(A, B, lane=1), leader.now_s)  # new targets, unfinished
     promise_and_plan()
-    leader.settle(leader.now_s)
+    leader.give_up(leader.now_s)
     names = {f"{row.rule} {row.event} {row.guards}" for row in LEADER_RULES.table}
     taken = {
         f"{row.rule} {row.event} {row.guards}"
@@ -739,10 +738,25 @@ def test_a_history_takes_every_row_of_the_table() -> None:
     assert names - taken == set()
 
 
+def test_a_vehicle_that_restarts_while_its_ballot_is_outbid_is_asked_again() -> None:
+    leader, ballot = issuing(A, B)
+    higher = ballot._replace(term=ballot.term + 5)
+    hear(leader, state(A, higher, incarnation=2, t_s=1.0))
+    assert phase(leader) is BallotPhase.BACKING_OFF  # outbid comes first
+    hear(leader, state(A, incarnation=3, t_s=2.0))
+    assert phase(leader) is BallotPhase.BACKING_OFF
+    leader.on_time(leader.until_s)
+    hear(leader, state(A, incarnation=3, t_s=3.0), state(B, ballot, accepted=True, t_s=3.0))
+    assert phase(leader) is BallotPhase.PREPARING
+    assert leader.ballot is not None
+    assert leader.ballot > higher
+    assert leader.promises == {}
+
+
 def test_a_bug_is_planted_in_one_leader_and_in_no_other() -> None:
-    book = LEADER_RULES.planted(roster=lambda me: me.formation.roster[:1])
+    book = LEADER_RULES.replacing({all_have_promised: lambda me, _: bool(me.promises)})
     for rules, ordered in ((book, True), (LEADER_RULES, False)):
-        leader = FormationControl(formation(A, B), Ballots(), RNG, RESEND_S, rules)
+        leader = FormationLeader(formation(A, B), Ballots(), RNG, resend_s=RESEND_S, rules=rules)
         leader.begin(0.0, observe=False)
         hear(leader, state(A, leader.ballot))
         assert leader.take_planning_order(0.0) is ordered

@@ -9,8 +9,8 @@ import pytest
 from attrs import evolve
 
 from laneweave.coordinator.planning.rolling.planner import StreamPlan, StreamVehicle
-from laneweave.coordinator.rolling.ballot import estate_of, partners, sure_of
-from laneweave.coordinator.rolling.control import StreamControl
+from laneweave.coordinator.rolling.operation import RollingOperation
+from laneweave.coordinator.rolling.ownership import certain_cells, owned_cells, partners
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Computed
 from laneweave.protocol.scenario.tables import FormationSettings, Road, Scenario
@@ -42,12 +42,12 @@ GIVER = state(B, 1, (4, 1), (3, 1), deed=GIVES, accepted=True, ready=True, done=
 
 
 def told(giver: VehicleState, *others: VehicleState) -> frozenset[Cell] | None:
-    return estate_of(giver, {other.vehicle: other for other in (giver, *others)})
+    return owned_cells(giver, {other.vehicle: other for other in (giver, *others)})
 
 
 def test_nothing_can_be_told_while_both_may_open_their_gates() -> None:
     assert told(GIVER, TAKER) is None
-    assert sure_of(GIVER, {A: TAKER, B: GIVER}) == {(4, 1)}
+    assert certain_cells(GIVER, {A: TAKER, B: GIVER}) == {(4, 1)}
     assert partners(GIVER, {A: TAKER, B: GIVER}) == {A, B}
 
 
@@ -68,7 +68,7 @@ def test_what_one_shows_tells_what_the_other_owns(taker: VehicleState, estate: s
 def test_who_has_left_tells_nothing_and_is_not_waited_for() -> None:
     giver = evolve(GIVER, promised=ballot(2), accepted=False)
     assert told(giver) is None  # it may be there, and was not heard yet
-    assert estate_of(giver, {B: giver}, {A}) == frozenset({(4, 1)})
+    assert owned_cells(giver, {B: giver}, {A}) == frozenset({(4, 1)})
     assert partners(giver, {B: giver}) == {B}
 
 
@@ -101,16 +101,16 @@ class Orders:
         return StreamPlan(slot, ways, ())
 
 
-def plan_once(planner: Orders, *states: VehicleState) -> StreamControl:
+def plan_once(planner: Orders, *states: VehicleState) -> RollingOperation:
     """Let a leader hear states and plan one slot."""
     numbers = count(10)
-    control = StreamControl(SCENARIO, lambda _: ballot(next(numbers)), planner)
+    control = RollingOperation(SCENARIO, lambda _: ballot(next(numbers)), lambda: 1, planner)
     entries = tuple(CensusEntry(each.vehicle, each.hold_cell, 0, 0.0) for each in states)
     control.on_census(Census(0.0, entries, ()))
     for each in states:
-        control.on_state(each)
-    assert not list(control.order(lambda: 1, 0.0, 0.0))
-    (order,) = control.order(lambda: 1, 9.5, 9.5)
+        control.on_state(each, 0.0)
+    assert not list(control.order(0.0, 0.0))
+    (order,) = control.order(9.5, 9.5)
     list(control.finish(Computed(order.job, order.work()), 9.6, 9.6))
     return control
 
@@ -120,7 +120,7 @@ def test_who_may_know_what_a_member_owns_is_asked_too() -> None:
     giver = evolve(GIVER, deed=deed(1, ((4, 1), (3, 1), (4, 0)), ((4, 1), (4, 0))))
     giver = evolve(giver, estate=((4, 1), (3, 1), (4, 0)))
     control = plan_once(Orders({B: (4, 0)}), TAKER, giver, other)
-    assert [handover.roster for handover in control.handovers] == [(A, B)]
+    assert [handover.roster for handover in control.transfers] == [(A, B)]
 
 
 def test_who_waits_at_a_gate_that_never_opens_is_planned_for() -> None:
@@ -129,7 +129,7 @@ def test_who_waits_at_a_gate_that_never_opens_is_planned_for() -> None:
     planner = Orders({A: (2, 0)})
     control = plan_once(planner, taker, GIVER)
     assert not planner.held
-    assert [set(handover.moves) for handover in control.handovers] == [{A}]
+    assert [set(handover.moves) for handover in control.transfers] == [{A}]
 
 
 def test_who_is_about_to_move_is_left_alone() -> None:

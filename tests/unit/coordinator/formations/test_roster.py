@@ -9,9 +9,9 @@ from attrs import evolve
 from hypothesis import given
 from hypothesis import strategies as st
 
-from laneweave.coordinator.formations.groups import Groups
 from laneweave.coordinator.formations.roster import (
     Formation,
+    Groups,
     closed_formations,
     start_time_s,
     steps_left,

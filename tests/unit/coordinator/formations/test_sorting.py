@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laneweave.coordinator.formations import sorting as sorting_module
-from laneweave.coordinator.formations.groups import Numbers
+from laneweave.coordinator.formations.roster import Numbers
 from laneweave.coordinator.formations.sorting import Sorting, SortingTask, plan_requests, sort_lanes
 from laneweave.coordinator.planning import PlanRequest, PlanResponse, Weights, checked_plan
 from laneweave.protocol.errors import BadInputError

@@ -5,9 +5,11 @@ from __future__ import annotations
 import pytest
 from attrs import evolve
 
-from laneweave.coordinator.rolling.ballot import Handover, Phase, estate_of, partners, sure_of
+from laneweave.coordinator.ballots.ballot_round import BallotPhase
+from laneweave.coordinator.rolling.ownership import certain_cells, owned_cells, partners
+from laneweave.coordinator.rolling.transfer import TRANSFER_RULES, CellTransfer
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.vehicle.plans import estate_problems, plan_problems
+from laneweave.protocol.vehicle.plans import ownership_problems, plan_problems
 from laneweave.protocol.wire.messages import Ballot, Deed, Name, Plan, Prepare, VehicleState
 from support.rolling_samples import (
     AFTER,
@@ -24,6 +26,7 @@ from support.rolling_samples import (
     make_plan,
     state,
 )
+from support.rule_recorder import RuleRecorder
 
 RESEND_S = 0.2
 OWNED_BEFORE, OWNED_AFTER = frozenset(BEFORE[A]), frozenset(AFTER[A])
@@ -32,8 +35,8 @@ BETWEEN = Ballot(2, Name("c1"), 10, 2)
 """Above MID, below HIGH."""
 
 
-def make_handover(moves: dict[Name, tuple[Cell, Cell]] | None = None) -> Handover:
-    return Handover(
+def make_handover(moves: dict[Name, tuple[Cell, Cell]] | None = None) -> CellTransfer:
+    return CellTransfer(
         ballot=MID,
         roster=(A, B),
         moves=moves or {A: (HOME, TARGET)},
@@ -44,18 +47,18 @@ def make_handover(moves: dict[Name, tuple[Cell, Cell]] | None = None) -> Handove
     )
 
 
-def tell(handover: Handover, *states: VehicleState) -> None:
+def tell(handover: CellTransfer, *states: VehicleState) -> None:
     known: dict[Name, VehicleState] = {}
     for each in states:
         known[each.vehicle] = each
         if each.vehicle in handover.roster:
-            handover.on_state(each, known)
+            handover.on_state(each, known, 0.0)
 
 
-def issued() -> Handover:
+def issued() -> CellTransfer:
     handover = make_handover()
     tell(handover, state(A, MID), state(B, MID))
-    assert handover.phase is Phase.ISSUING
+    assert handover.phase is BallotPhase.ISSUING
     return handover
 
 
@@ -67,24 +70,24 @@ CLOSED = state(A, HIGH, DEED)
 
 
 def test_without_a_deed_or_with_an_open_one_the_estate_is_what_is_shown() -> None:
-    assert estate_of(state(A, HIGH), {}) == OWNED_BEFORE
+    assert owned_cells(state(A, HIGH), {}) == OWNED_BEFORE
     taken = state(A, HIGH, Deed(MID, open=True), estate=AFTER[A])
-    assert estate_of(taken, {}) == OWNED_AFTER
+    assert owned_cells(taken, {}) == OWNED_AFTER
 
 
 def test_one_that_knows_the_open_gate_is_enough() -> None:
     knows = state(C, MID, Deed(MID, open=True))
-    assert estate_of(CLOSED, {C: knows}) == OWNED_AFTER
+    assert owned_cells(CLOSED, {C: knows}) == OWNED_AFTER
     # Also while A still could open its own gate.
-    assert estate_of(state(A, MID, DEED), {C: knows}) == OWNED_AFTER
+    assert owned_cells(state(A, MID, DEED), {C: knows}) == OWNED_AFTER
 
 
 @pytest.mark.parametrize("older", [None, Deed(LOW, open=True)])
 def test_one_that_has_promised_more_without_the_deed_keeps_the_gate_closed(
     older: Deed | None,
 ) -> None:
-    assert estate_of(CLOSED, {C: state(C, BETWEEN, older)}) == OWNED_BEFORE
-    assert estate_of(state(A, MID, DEED), {C: state(C, BETWEEN, older)}) == OWNED_BEFORE
+    assert owned_cells(CLOSED, {C: state(C, BETWEEN, older)}) == OWNED_BEFORE
+    assert owned_cells(state(A, MID, DEED), {C: state(C, BETWEEN, older)}) == OWNED_BEFORE
 
 
 @pytest.mark.parametrize(
@@ -99,17 +102,17 @@ def test_one_that_has_promised_more_without_the_deed_keeps_the_gate_closed(
 )  # fmt: skip
 def test_what_may_still_come_tells_nothing(silent: VehicleState) -> None:
     others = {B: state(B, HIGH, DEED), C: silent}
-    assert estate_of(CLOSED, others) is None
-    assert sure_of(CLOSED, others) == SURE
+    assert owned_cells(CLOSED, others) is None
+    assert certain_cells(CLOSED, others) == SURE
     assert partners(CLOSED, others) == {B, C}
 
 
 def test_all_have_turned_away_with_closed_gates() -> None:
     others = {B: state(B, BETWEEN, DEED), C: state(C, HIGH, DEED)}
-    assert estate_of(CLOSED, others) == sure_of(CLOSED, others) == OWNED_BEFORE
+    assert owned_cells(CLOSED, others) == certain_cells(CLOSED, others) == OWNED_BEFORE
     assert partners(CLOSED, others) == frozenset()
-    assert estate_of(state(A, MID, DEED), others) is None  # A may open its own gate
-    assert estate_of(evolve(CLOSED, estate=()), others) is None
+    assert owned_cells(state(A, MID, DEED), others) is None  # A may open its own gate
+    assert owned_cells(evolve(CLOSED, estate=()), others) is None
 
 
 @pytest.mark.parametrize("newer", [None, state(C, HIGH, Deed(BETWEEN, open=True))])
@@ -119,29 +122,29 @@ def test_where_nobody_will_tell_some_cells_are_certain_either_way(
     """Somebody opened the gate or did not, and has gone, or taken part in another plan since."""
     there = {} if newer is None else {C: newer}
     gone = {C} if newer is None else set[Name]()
-    assert estate_of(CLOSED, {B: state(B, HIGH, DEED), **there}, gone) == SURE
-    assert estate_of(CLOSED, {B: state(B, MID, DEED), **there}, gone) == SURE
+    assert owned_cells(CLOSED, {B: state(B, HIGH, DEED), **there}, gone) == SURE
+    assert owned_cells(CLOSED, {B: state(B, MID, DEED), **there}, gone) == SURE
     assert (
-        estate_of(CLOSED, {B: state(B, HIGH, Deed(MID, open=True)), **there}, gone) == OWNED_AFTER
+        owned_cells(CLOSED, {B: state(B, HIGH, Deed(MID, open=True)), **there}, gone) == OWNED_AFTER
     )
-    assert estate_of(CLOSED, {B: state(B, HIGH), **there}, gone) == OWNED_BEFORE
+    assert owned_cells(CLOSED, {B: state(B, HIGH), **there}, gone) == OWNED_BEFORE
     assert partners(CLOSED, {B: state(B, HIGH, DEED), **there}) == {B, *there}
     # Under way it may still be in a cell that it is about to give.
     moving = evolve(CLOSED, moving=True)
-    assert estate_of(moving, there, gone) is None
-    assert sure_of(moving, there, gone) == SURE
+    assert owned_cells(moving, there, gone) is None
+    assert certain_cells(moving, there, gone) == SURE
 
 
 def test_strangers_and_older_states_of_oneself_tell_nothing() -> None:
     stranger, others = Name("X"), {B: state(B, MID, DEED), C: state(C, MID, DEED)}
-    assert estate_of(CLOSED, {stranger: state(stranger, HIGH), **others}) is None
-    assert estate_of(CLOSED, {A: state(A, HIGH, Deed(MID, open=True)), **others}) is None
+    assert owned_cells(CLOSED, {stranger: state(stranger, HIGH), **others}) is None
+    assert owned_cells(CLOSED, {A: state(A, HIGH, Deed(MID, open=True)), **others}) is None
 
 
 def test_whoever_was_alone_in_a_plan_knows() -> None:
     alone = deed_of(A, MID, (A,))
-    assert estate_of(state(A, HIGH, alone), {}) == OWNED_BEFORE
-    assert estate_of(state(A, MID, alone), {}) is None
+    assert owned_cells(state(A, HIGH, alone), {}) == OWNED_BEFORE
+    assert owned_cells(state(A, MID, alone), {}) is None
 
 
 # --- promises ---------------------------------------------------------------------------------
@@ -167,7 +170,7 @@ def test_prepares_until_all_have_promised() -> None:
 def test_what_is_no_promise_does_not_count(no_promise: VehicleState) -> None:
     handover = make_handover()
     tell(handover, state(A, MID), no_promise)
-    assert (handover.phase, set(handover.promises)) == (Phase.PREPARING, {A})
+    assert (handover.phase, set(handover.promises)) == (BallotPhase.PREPARING, {A})
 
 
 def test_the_plan_is_made_from_the_promises() -> None:
@@ -177,13 +180,13 @@ def test_the_plan_is_made_from_the_promises() -> None:
         make_plan(), formations=plan.formations if plan else (), incarnations={A: 7, B: 7}
     )
     assert plan is not None
-    assert plan_problems(plan) == estate_problems(plan) == []
+    assert plan_problems(plan) == ownership_problems(plan) == []
     assert handover.outgoing(1.0) == [(A, plan), (B, plan)]
     assert handover.outgoing(1.1) == []
     tell(handover, state(B, MID, accepted=True))
     assert handover.outgoing(1.2) == [(A, plan)]
     tell(handover, state(A, MID, accepted=True))
-    assert handover.phase is Phase.IN_FORCE
+    assert handover.phase is BallotPhase.IN_FORCE
     assert handover.wakeup_s is None
     assert handover.outgoing(9.0) == []
 
@@ -201,10 +204,10 @@ def test_two_that_move_behind_each_other_need_more_than_one_slot() -> None:
     """A cell that somebody leaves in this slot is its own in it."""
     handover = make_handover({A: (HOME, TARGET), B: ((2, 1), (1, 1))})
     tell(handover, state(A, MID), state(B, MID))
-    assert handover.phase is Phase.ISSUING
+    assert handover.phase is BallotPhase.ISSUING
     handover = make_handover({A: (HOME, (1, 1)), B: ((2, 1), (1, 1))})
     tell(handover, state(A, MID), state(B, MID))
-    assert handover.phase is Phase.GIVEN_UP
+    assert handover.phase is BallotPhase.GIVEN_UP
     assert "meet in step 0" in handover.why
 
 
@@ -237,7 +240,7 @@ WRONG = {
 def test_is_given_up_when_it_cannot_come_about(why: str) -> None:
     handover = make_handover()
     tell(handover, *WRONG[why])
-    assert handover.phase is Phase.GIVEN_UP
+    assert handover.phase is BallotPhase.GIVEN_UP
     assert why in handover.why
     assert handover.plan is None
     assert handover.wakeup_s is None
@@ -250,13 +253,13 @@ def test_nobody_moves_whom_nobody_drives() -> None:
     assert handover.why == "A is not where it was planned from"
     handover = make_handover()
     tell(handover, state(A, MID), evolve(state(B, MID), attended=False))
-    assert handover.phase is Phase.ISSUING  # who only hands cells over need not be driven
+    assert handover.phase is BallotPhase.ISSUING  # who only hands cells over need not be driven
 
 
 def test_whoever_restarts_cannot_accept() -> None:
     handover = issued()
     tell(handover, evolve(state(B, MID), incarnation=8))
-    assert (handover.phase, handover.why) == (Phase.GIVEN_UP, "B has restarted")
+    assert (handover.phase, handover.why) == (BallotPhase.GIVEN_UP, "B has restarted")
 
 
 def test_outbid_while_the_plan_is_sent() -> None:
@@ -269,8 +272,39 @@ def test_what_is_in_force_or_given_up_stays_so() -> None:
     handover = issued()
     tell(handover, state(A, MID, accepted=True), state(B, MID, accepted=True))
     tell(handover, state(A, HIGH))
-    assert handover.phase is Phase.IN_FORCE
+    assert handover.phase is BallotPhase.IN_FORCE
     handover = make_handover()
     handover.give_up("no reason")
     tell(handover, state(A, MID), state(B, MID))
-    assert (handover.phase, handover.why) == (Phase.GIVEN_UP, "no reason")
+    assert (handover.phase, handover.why) == (BallotPhase.GIVEN_UP, "no reason")
+
+
+# --- the table as a whole ---------------------------------------------------------------------
+
+
+def test_histories_take_every_row_of_the_table() -> None:
+    """No row is hidden behind an earlier one."""
+    book = RuleRecorder(TRANSFER_RULES)
+
+    def begun(*states: VehicleState) -> CellTransfer:
+        transfer = evolve(make_handover(), rules=book)
+        tell(transfer, *states)
+        return transfer
+
+    promised = state(A, MID), state(B, MID)
+    begun(*promised, state(A, MID, accepted=True), state(B, MID, accepted=True))  # in force
+    begun(state(A, HIGH))  # outbid
+    begun(*promised, evolve(state(A, MID), incarnation=9))  # restarted
+    begun(evolve(state(A, MID), attended=False), state(B, MID))  # cannot be planned
+    begun(*promised).give_up("late")
+    begun(*promised).on_left(A)
+    assert {*book.taken} == {*range(len(TRANSFER_RULES.table))}
+
+
+def test_a_vehicle_that_restarts_while_the_ballot_is_outbid_does_not_revive_it() -> None:
+    transfer = issued()
+    tell(transfer, evolve(state(A, HIGH), incarnation=9))
+    assert (transfer.phase, transfer.why) == (BallotPhase.GIVEN_UP, "outbid")
+    tell(transfer, evolve(state(A, MID), incarnation=9), evolve(state(A, MID), incarnation=10))
+    assert (transfer.phase, transfer.why) == (BallotPhase.GIVEN_UP, "outbid")
+    assert list(transfer.outgoing(1e6)) == []

@@ -10,16 +10,16 @@ from typing import Any
 import pytest
 from attrs import define, evolve, field
 
+from laneweave.coordinator.ballots.ballot_round import BallotPhase
+from laneweave.coordinator.operation import LogEntry
 from laneweave.coordinator.planning.rolling.planner import StreamPlan, StreamVehicle
-from laneweave.coordinator.rolling.ballot import Phase
-from laneweave.coordinator.rolling.control import (
+from laneweave.coordinator.rolling.operation import (
     AHEAD_M,
     BESIDE,
     LATEST_S,
     PATIENCE_S,
     SHOWN_S,
-    Note,
-    StreamControl,
+    RollingOperation,
     _clusters,
 )
 from laneweave.coordinator.rolling.planner import CheckedPlanner, stream_planner, stream_road
@@ -81,11 +81,11 @@ class Bench:
     seq: Iterable[int] = field(factory=lambda: count(1))
     jobs: Iterable[int] = field(factory=lambda: count(100))
     asked_above: list[Ballot | None] = field(factory=list)
-    control: StreamControl = field(init=False)
+    control: RollingOperation = field(init=False)
 
     def __attrs_post_init__(self) -> None:
         """Be the planner."""
-        self.control = StreamControl(ROLLING, self.new_ballot, self)
+        self.control = RollingOperation(ROLLING, self.new_ballot, self.new_job, self)
 
     def new_ballot(self, above: Ballot | None) -> Ballot:
         self.asked_above.append(above)
@@ -102,28 +102,26 @@ class Bench:
         self.calls.append(Call(slot, asked, before, frozenset(blocked)))
         return StreamPlan(slot, self.ways, ())
 
-    def hear(self, *states: State) -> list[Note]:
-        return [
-            note
-            for each in states
-            if self.control.on_state(each)
-            for note in self.control.on_awaited(each)
-        ]
+    def new_job(self) -> int:
+        return next(iter(self.jobs))
+
+    def hear(self, *states: State) -> list[LogEntry]:
+        return [entry for each in states for entry in self.control.on_state(each, 0.0) or ()]
 
     def order(self, t_s: float = LOOK_S, now_s: float | None = None) -> Compute | None:
         """Order at a road time; the node's clock is alike, unless it is given."""
         clock_s = t_s if now_s is None else now_s
-        orders = list(self.control.order(lambda: next(iter(self.jobs)), t_s, clock_s))
+        orders = list(self.control.order(t_s, clock_s))
         assert len(orders) <= 1
         return orders[0] if orders else None
 
-    def think(self, t_s: float = LOOK_S) -> list[Note]:
+    def think(self, t_s: float = LOOK_S) -> list[LogEntry]:
         """Order a plan, compute it, and take it at once."""
         compute = self.order(t_s)
         assert compute is not None
         return self.finish(compute, t_s)
 
-    def finish(self, compute: Compute, t_s: float) -> list[Note]:
+    def finish(self, compute: Compute, t_s: float) -> list[LogEntry]:
         computed = Computed(compute.job, compute.work())
         return list(self.control.finish(computed, t_s, 50.0))
 
@@ -188,7 +186,7 @@ def test_who_leads_again_listens_again_and_leaves_alone_what_was_begun() -> None
     desk.ways = {A: ((0, 0), (0, 1))}
     desk.think()
     desk.control.take_over()
-    assert (desk.control.handovers, desk.control.wakeups) == ([], [])
+    assert (desk.control.transfers, desk.control.wakeups) == ([], [])
     assert set(desk.control.shown.states) == {A, B}  # what they have shown stays true
     later_s = LOOK_S + SLOT_S
     assert desk.order(later_s + PATIENCE_S) is None  # it needs a census, too
@@ -213,7 +211,7 @@ def test_a_plan_that_comes_late_is_dropped() -> None:
     assert [note.kind for note in desk.finish(compute, begins_s + LATEST_S + 0.1)] == [
         "planning-late"
     ]
-    assert desk.control.handovers == []
+    assert desk.control.transfers == []
     desk = bench(A)
     desk.ways = {A: ((0, 0), (1, 0))}
     compute = desk.order()
@@ -221,7 +219,7 @@ def test_a_plan_that_comes_late_is_dropped() -> None:
     assert [note.kind for note in desk.finish(compute, begins_s + LATEST_S - 0.1)] == [
         "stream-planned"
     ]
-    assert len(desk.control.handovers) == 1
+    assert len(desk.control.transfers) == 1
 
 
 def test_results_of_others_and_failures_change_nothing() -> None:
@@ -320,18 +318,18 @@ def test_who_has_gone_on_since_takes_nobody_along() -> None:
     desk.hear(evolve(shown(A, OLD, moving=True), hold_cell=(1, 0), t_s=LOOK_S))
     desk.hear(evolve(shown(B), estate=(*ESTATES[B], (2, 2)), t_s=LOOK_S))
     desk.finish(compute, LOOK_S)
-    assert [set(handover.moves) for handover in desk.control.handovers] == [{B}]
+    assert [set(handover.moves) for handover in desk.control.transfers] == [{B}]
 
 
 def test_what_has_not_come_about_is_given_up_when_its_slot_has_begun() -> None:
     desk = bench(A)
     desk.ways = {A: ((0, 0), (1, 0))}
     desk.think()
-    (handover,) = desk.control.handovers
+    (handover,) = desk.control.transfers
     desk.order(handover.t0_s + LATEST_S)
     assert handover.wakeup_s is not None
     desk.order(handover.t0_s + LATEST_S + 0.1)
-    assert handover.phase is Phase.GIVEN_UP
+    assert handover.phase is BallotPhase.GIVEN_UP
 
 
 @pytest.mark.parametrize("late", [True, False])
@@ -339,14 +337,14 @@ def test_a_plan_that_is_not_used_ends_what_was_begun_all_the_same(*, late: bool)
     desk = bench(A)
     desk.ways = {A: ((0, 0), (1, 0))}
     desk.think()
-    (handover,) = desk.control.handovers
+    (handover,) = desk.control.transfers
     compute = desk.order(LOOK_S + SLOT_S)
     assert compute is not None
     if late:
         desk.finish(compute, (SLOT + 2) * SLOT_S + LATEST_S + 0.1)
     else:
         list(desk.control.finish(Computed(compute.job, None, "out of memory"), LOOK_S, 0.0))
-    assert handover.phase is Phase.GIVEN_UP
+    assert handover.phase is BallotPhase.GIVEN_UP
 
 
 def test_whoever_has_shown_nothing_in_time_is_held() -> None:
@@ -385,7 +383,7 @@ def test_whoever_waits_at_a_closed_gate_is_asked_for_something_newer() -> None:
 def test_whoever_is_far_from_where_moves_begin_is_not_planned_for() -> None:
     road = parse_scenario({"formation": {"operation": "rolling"}, "road": {"s2_m": 2000.0}})
     desk = Bench()
-    desk.control = StreamControl(road, desk.new_ballot, desk)
+    desk.control = RollingOperation(road, desk.new_ballot, desk.new_job, desk)
     far_s = (road.moves_from_m - AHEAD_M) / 15.0
     slot = math.ceil(far_s / SLOT_S)
     desk.control.on_census(census(A, D))  # D is 120 m behind A
@@ -412,7 +410,7 @@ def test_whoever_was_not_heard_stays_where_it_entered_and_owns_nothing() -> None
     (call,) = desk.calls
     assert call.vehicles[B] == StreamVehicle(B, HOMES[B], 1, held=True)
     assert set(ESTATES[B]) <= call.blocked
-    assert desk.control.handovers == []  # A would need a cell that is B's
+    assert desk.control.transfers == []  # A would need a cell that is B's
 
 
 def test_cells_of_which_nobody_can_tell_whose_they_are_are_blocked() -> None:
@@ -468,7 +466,7 @@ def test_one_ballot_for_the_mover_and_the_owners_of_its_cells() -> None:
     desk = bench(A, B, C)
     desk.ways = {A: ((0, 0), (0, 1)), B: ((2, 1), (2, 1)), C: ((-4, 0),)}
     (note,) = desk.think()
-    (handover,) = desk.control.handovers
+    (handover,) = desk.control.transfers
     assert handover.roster == (A, B)
     assert handover.moves == {A: ((0, 0), (0, 1))}
     assert (handover.t0_s, handover.slot_s) == ((SLOT + 1) * SLOT_S, SLOT_S)
@@ -485,8 +483,8 @@ def test_moves_that_share_an_owner_share_a_ballot() -> None:
         D: ((-8, 2), (-8, 2)),
     }
     desk.think()
-    assert [handover.roster for handover in desk.control.handovers] == [(A, B), (C,)]
-    assert set(desk.control.handovers[0].moves) == {A, B}
+    assert [handover.roster for handover in desk.control.transfers] == [(A, B), (C,)]
+    assert set(desk.control.transfers[0].moves) == {A, B}
 
 
 def test_whose_promises_would_tell_what_somebody_owns_are_asked_for() -> None:
@@ -500,11 +498,11 @@ def test_whose_promises_would_tell_what_somebody_owns_are_asked_for() -> None:
     )
     desk.ways = {C: ((-4, 0), (-5, 0))}
     desk.think()
-    assert [handover.roster for handover in desk.control.handovers] == [(B, C)]
+    assert [handover.roster for handover in desk.control.transfers] == [(B, C)]
     desk = bench(A, B, C, D)
     desk.ways = {C: ((-4, 0), (-5, 0))}
     desk.think()
-    assert [handover.roster for handover in desk.control.handovers] == [(C,)]
+    assert [handover.roster for handover in desk.control.transfers] == [(C,)]
 
 
 def test_clusters_are_what_hangs_together() -> None:
@@ -517,7 +515,7 @@ def run_ballot(desk: Bench) -> Plan:
     """Let A and B promise what they are asked; return the plan that A is sent."""
     sent = dict(desk.control.outgoing(50.0))
     assert {type(message) for message in sent.values()} == {Prepare}
-    ballot = desk.control.handovers[0].ballot
+    ballot = desk.control.transfers[0].ballot
     desk.hear(*(evolve(shown(name, ballot), t_s=BEGUN_S + 1.0) for name in sent))
     plan = dict(desk.control.outgoing(50.0))[A]
     assert isinstance(plan, Plan)
@@ -537,7 +535,7 @@ def test_from_the_plan_to_a_ballot_in_force() -> None:
     ]
     assert desk.hear(accepted[0]) == []
     assert desk.hear(accepted[1]) == [
-        Note("plan-in-force", {"slot": SLOT + 1, "closed_s": BEGUN_S + SHOWN_S})
+        LogEntry("plan-in-force", {"slot": SLOT + 1, "closed_s": BEGUN_S + SHOWN_S})
     ]
     assert desk.control.in_force == 1
     assert desk.control.wakeups == []
@@ -547,11 +545,11 @@ def test_what_has_not_come_about_is_given_up_with_the_next_plan() -> None:
     desk = bench(A, B)
     desk.ways = {A: ((0, 0), (0, 1))}
     desk.think()
-    (old,) = desk.control.handovers
+    (old,) = desk.control.transfers
     desk.think(LOOK_S + SLOT_S)
-    assert old.phase is Phase.GIVEN_UP
-    assert old not in desk.control.handovers
-    assert desk.control.handovers[0].ballot > old.ballot
+    assert old.phase is BallotPhase.GIVEN_UP
+    assert old not in desk.control.transfers
+    assert desk.control.transfers[0].ballot > old.ballot
 
 
 def test_a_ballot_that_fails_is_noted() -> None:
@@ -570,21 +568,21 @@ def test_whoever_leaves_is_forgotten_and_its_ballot_given_up() -> None:
     desk = bench(A, B, C)
     desk.ways = {A: ((0, 0), (0, 1)), C: ((-4, 0), (-5, 0))}
     desk.think()
-    first, second = desk.control.handovers
+    first, second = desk.control.transfers
     desk.control.on_census(census(A, C))
     assert set(desk.control.shown.states) == {A, C}
-    assert (first.phase, first.why) == (Phase.GIVEN_UP, "B has left")
-    assert second.phase is Phase.PREPARING
+    assert (first.phase, first.why) == (BallotPhase.GIVEN_UP, "B has left")
+    assert second.phase is BallotPhase.PREPARING
 
 
 def test_what_is_in_force_stays_so_when_somebody_leaves() -> None:
     desk = bench(A, B)
     desk.ways = {A: ((0, 0), (0, 1))}
     desk.think()
-    (handover,) = desk.control.handovers
-    handover.phase = Phase.IN_FORCE
+    (handover,) = desk.control.transfers
+    handover.phase = BallotPhase.IN_FORCE
     desk.control.on_census(census(A))
-    assert handover.phase is Phase.IN_FORCE
+    assert handover.phase is BallotPhase.IN_FORCE
 
 
 def test_another_road_begins_with_nothing() -> None:
@@ -593,7 +591,7 @@ def test_another_road_begins_with_nothing() -> None:
     desk.ways = {A: ((0, 0), (0, 1))}
     desk.think()
     desk.control.forget()
-    assert (desk.control.shown.states, desk.control.handovers, desk.control.wakeups) == ({}, [], [])
+    assert (desk.control.shown.states, desk.control.transfers, desk.control.wakeups) == ({}, [], [])
     assert desk.order(LOOK_S + SLOT_S) is None
     desk.control.on_census(evolve(census(A), t_s=0.0))
     assert desk.order(0.0, now_s=100.0) is None  # it listens first
@@ -620,12 +618,13 @@ def test_nothing_is_kept_of_those_that_have_left() -> None:
 
 def test_the_real_planner_takes_what_it_is_given() -> None:
     """Also somebody who was not heard, whose own cell is blocked."""
-    control = StreamControl(ROLLING, lambda _: Ballot(7, Name("c1"), 1, 1), stream_planner(ROLLING))
+    new_ballot = Ballot(7, Name("c1"), 1, 1)
+    control = RollingOperation(ROLLING, lambda _: new_ballot, lambda: 1, stream_planner(ROLLING))
     control.on_census(census(A, B, C))
-    assert list(control.order(lambda: 1, BEGUN_S - 2.0, 0.0)) == []
+    assert list(control.order(BEGUN_S - 2.0, 0.0)) == []
     for name in (A, B):
-        assert not control.on_state(shown(name))
-    (compute,) = control.order(lambda: 1, LOOK_S, 9.0)
+        assert control.on_state(shown(name), 0.0) is None
+    (compute,) = control.order(LOOK_S, 9.0)
     plan = compute.work()
     assert isinstance(plan, StreamPlan)
     assert set(plan.ways) == {A, B, C}
@@ -640,7 +639,7 @@ def test_a_wrong_plan_is_no_plan() -> None:
     """The planner is not trusted: a way that ends on the road is not issued."""
     bench = Bench(ways={A: (HOMES[A], HOMES[A])})
     planner = CheckedPlanner(stream_road(ROLLING), bench)
-    bench.control = StreamControl(ROLLING, bench.new_ballot, planner)
+    bench.control = RollingOperation(ROLLING, bench.new_ballot, bench.new_job, planner)
     bench.control.on_census(census(A))
     bench.hear(shown(A))
     assert bench.order(BEGUN_S - 2.0) is None
@@ -649,5 +648,5 @@ def test_a_wrong_plan_is_no_plan() -> None:
     with pytest.raises(ValueError, match=f"the plan of slot {SLOT + 1} is wrong: .* on the road"):
         compute.work()
     (note,) = bench.control.finish(Computed(compute.job, None, "wrong"), LOOK_S, 0.0)
-    assert note == Note("planning-failed", {"slot": SLOT + 1, "error": "wrong"})
-    assert bench.control.handovers == []
+    assert note == LogEntry("planning-failed", {"slot": SLOT + 1, "error": "wrong"})
+    assert bench.control.transfers == []

@@ -9,8 +9,13 @@ import pytest
 from attrs import evolve
 
 from laneweave.protocol.vehicle.execution import PlanExecution
-from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES, Stage
-from laneweave.protocol.vehicle.plans import estate_problems, plan_problems
+from laneweave.protocol.vehicle.execution_rules import (
+    VEHICLE_RULES,
+    ExecutionPhase,
+    take_ownership,
+    transfers_only_owned_cells,
+)
+from laneweave.protocol.vehicle.plans import ownership_problems, plan_problems
 from laneweave.protocol.wire.messages import Deed, Plan, Prepare
 from support.rolling_samples import (
     AFTER,
@@ -37,7 +42,7 @@ PREPARE = Prepare(MID, (), (A, B))
 def promised() -> PlanExecution:
     execution = vehicle()
     assert execution.on_prepare(PREPARE)
-    assert execution.on_estate(sense(promised=MID))
+    assert execution.on_owned(sense(promised=MID))
     return execution
 
 
@@ -47,7 +52,7 @@ def accepted() -> PlanExecution:
     assert execution.on_plan(make_plan())
     noted = sense(promised=MID, deed=deed_of(A), accepted=MID)
     assert execution.on_noted(noted.accepted)
-    execution.on_estate(noted)
+    execution.on_owned(noted)
     return execution
 
 
@@ -82,13 +87,13 @@ UNSOUND = {
 
 
 def test_a_sound_plan_has_no_problems() -> None:
-    assert estate_problems(make_plan()) == plan_problems(make_plan()) == []
+    assert ownership_problems(make_plan()) == plan_problems(make_plan()) == []
 
 
 @pytest.mark.parametrize("problem", UNSOUND)
 def test_an_unsound_plan_is_refused(problem: str) -> None:
     plan = UNSOUND[problem](make_plan())
-    assert problem in estate_problems(plan)
+    assert problem in ownership_problems(plan)
     assert plan_problems(plan) == []
     execution = promised()
     assert not execution.on_plan(plan)
@@ -97,7 +102,9 @@ def test_an_unsound_plan_is_refused(problem: str) -> None:
 
 
 def test_without_its_guard_any_estates_are_accepted() -> None:
-    execution = vehicle(rules=VEHICLE_RULES.planted(keeps_to_its_estates=lambda *_: True))
+    execution = vehicle(
+        rules=VEHICLE_RULES.replacing({transfers_only_owned_cells: lambda *_: True})
+    )
     execution.on_prepare(PREPARE)
     assert execution.on_plan(changed("before", A=(HOME, (7, 7)))(make_plan()))
 
@@ -117,9 +124,9 @@ def test_what_a_closed_deed_would_give_me_may_be_mine() -> None:
     deed = Deed(LOW, BEFORE[A], (*BEFORE[A], (7, 0)), (A, C))
     execution = vehicle()
     execution.on_prepare(Prepare(HIGH, (), (A, B)))
-    execution.on_estate(sense(promised=HIGH))
+    execution.on_owned(sense(promised=HIGH))
     assert not execution.on_plan(plan)
-    execution.on_estate(sense(promised=HIGH, deed=deed))
+    execution.on_owned(sense(promised=HIGH, deed=deed))
     assert execution.on_plan(plan)
 
 
@@ -139,18 +146,18 @@ def test_a_promise_shows_an_estate_only_when_the_controller_has_noted_it() -> No
     assert execution.state(old, 0, attended=True).estate == BEFORE[A]
     execution.on_prepare(PREPARE)
     assert execution.wanted_promised == MID
-    assert not execution.on_estate(old)
+    assert not execution.on_owned(old)
     assert execution.state(old, 0, attended=True).estate == ()
     noted = sense(promised=MID)
-    assert execution.on_estate(noted)
+    assert execution.on_owned(noted)
     assert execution.state(noted, 0, attended=True).estate == BEFORE[A]
-    assert not execution.on_estate(noted)  # nothing new
+    assert not execution.on_owned(noted)  # nothing new
 
 
 def test_what_an_earlier_process_promised_binds_the_next_one() -> None:
     execution = vehicle()
-    assert execution.on_estate(sense(promised=MID))
-    assert (execution.promised, execution.phase) == (MID, Stage.PROMISED)
+    assert execution.on_owned(sense(promised=MID))
+    assert (execution.promised, execution.phase) == (MID, ExecutionPhase.PROMISED)
     assert execution.on_prepare(Prepare(LOW, (), (A, B)))  # it shows what it has promised
     assert execution.promised == MID
     assert execution.on_prepare(Prepare(HIGH, (), (A, B)))
@@ -165,7 +172,7 @@ def test_a_later_promise_drops_the_plan_and_keeps_the_gate_closed() -> None:
     execution.on_state(evolve(state(B, MID, accepted=True), go=True))
     execution.tick(T0_S)
     assert execution.go is False
-    assert execution.deed == deed_of(A)  # it says no more than what was accepted
+    assert execution.transfer == deed_of(A)  # it says no more than what was accepted
 
 
 def test_an_unnoted_plan_is_not_accepted() -> None:
@@ -182,32 +189,32 @@ def test_an_unnoted_plan_is_not_accepted() -> None:
 
 def test_the_deed_says_what_the_plan_says() -> None:
     execution = promised()
-    assert execution.deed is None
+    assert execution.transfer is None
     execution.on_plan(make_plan())
-    assert execution.deed == Deed(MID, BEFORE[A], AFTER[A], (A, B))
+    assert execution.transfer == Deed(MID, BEFORE[A], AFTER[A], (A, B))
 
 
 def test_takes_possession_when_all_are_ready() -> None:
     execution = accepted()
     assert execution.tick(T0_S) is None
-    assert execution.deed == deed_of(A)
+    assert execution.transfer == deed_of(A)
     execution.on_state(state(B, MID, accepted=True))
-    assert execution.deed == deed_of(A)
+    assert execution.transfer == deed_of(A)
     assert execution.tick(T0_S) == (0, HOME, TARGET)
-    assert execution.deed == Deed(MID, open=True)
+    assert execution.transfer == Deed(MID, open=True)
 
 
 def test_takes_possession_before_the_moves_are_due() -> None:
     execution = accepted()
     execution.on_state(state(B, MID, accepted=True))
     assert execution.tick(T0_S - 1.0) is None
-    assert execution.deed == Deed(MID, open=True)
+    assert execution.transfer == Deed(MID, open=True)
 
 
 def test_takes_possession_when_another_has() -> None:
     execution = accepted()
     execution.on_state(evolve(state(B, MID, accepted=True), ready=False, go=True))
-    assert execution.deed == Deed(MID, open=True)
+    assert execution.transfer == Deed(MID, open=True)
     assert execution.go
 
 
@@ -218,27 +225,27 @@ def test_does_not_take_possession_while_it_moves() -> None:
     execution.on_noted(MID)
     execution.on_state(state(B, MID, accepted=True))
     execution.tick(T0_S)
-    assert execution.deed == deed_of(A)
+    assert execution.transfer == deed_of(A)
     execution.end_motion()
     execution.tick(T0_S)
-    assert execution.deed == Deed(MID, open=True)
+    assert execution.transfer == Deed(MID, open=True)
 
 
 def test_without_possession_the_deed_stays_closed() -> None:
-    execution = vehicle(rules=VEHICLE_RULES.planted(take_possession=lambda *_: None))
+    execution = vehicle(rules=VEHICLE_RULES.replacing({take_ownership: lambda *_: None}))
     execution.on_prepare(PREPARE)
     execution.on_plan(make_plan())
     execution.on_noted(MID)
     execution.on_state(state(B, MID, accepted=True))
     assert execution.tick(T0_S) is not None
-    assert execution.deed == deed_of(A)
+    assert execution.transfer == deed_of(A)
 
 
 def test_where_formations_own_blocks_there_are_no_deeds() -> None:
-    execution = evolve(vehicle(), estate=None, joined=(-1, 0))
+    execution = evolve(vehicle(), owned=None, joined=(-1, 0))
     execution.on_prepare(Prepare(MID, (-1, 0), (A, B)))
     assert execution.wanted_promised is None
-    assert not execution.on_estate(sense(promised=HIGH))
+    assert not execution.on_owned(sense(promised=HIGH))
     assert execution.promised == MID
     assert execution.on_plan(evolve(make_plan(), formations=(-1, 0), before={}, after={}))
-    assert execution.deed is None
+    assert execution.transfer is None

@@ -1,9 +1,10 @@
-"""The rolling operation under a leader: the whole stream is planned anew in each slot.
+"""The rolling operation under a leader: all vehicles on the road are planned anew in each slot.
 
-Shortly after a slot has begun, everybody's hold cell at its end is known. From there the stream
-planner lays complete ways for all vehicles; what they do in the next slot is put into force by
-ballots over exactly the vehicles that it concerns (`handover`), while the moves of this slot are
-under way. Nobody stops for a replan: who is not reached holds, and is planned from there.
+Shortly after a slot has begun, the hold cell of every vehicle at its end is known. From there the
+rolling planner makes complete paths for all vehicles; their moves in the next slot are put into
+force by ballots over exactly the vehicles that are concerned (`transfer`), while the moves of this
+slot are under way. No vehicle stops for a new plan: one that is not reached holds, and is planned
+from there.
 """
 
 from __future__ import annotations
@@ -13,22 +14,18 @@ from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import Any
 
-from attrs import field, frozen
+from attrs import frozen
 
+from laneweave.coordinator.ballots.ballot_round import BallotPhase
+from laneweave.coordinator.operation import LogEntry, to_vehicle
 from laneweave.coordinator.planning.rolling.planner import StreamPlan, StreamVehicle
-from laneweave.coordinator.rolling.ballot import Handover, Phase, partners, sure_of
 from laneweave.coordinator.rolling.observed import Shown
+from laneweave.coordinator.rolling.ownership import certain_cells, partners
 from laneweave.coordinator.rolling.planner import Planner
+from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.lattice import Cell, footprint
-from laneweave.protocol.runtime.node import Compute, Computed
+from laneweave.protocol.runtime.node import Compute, Computed, Effect
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.wire.events import (
-    HANDOVER_GIVEN_UP,
-    PLAN_IN_FORCE,
-    PLANNING_FAILED,
-    PLANNING_LATE,
-    STREAM_PLANNED,
-)
 from laneweave.protocol.wire.messages import Ballot, Census, Name, Plan, Prepare, VehicleState
 
 SHOWN_S = 0.5
@@ -49,15 +46,7 @@ BESIDE = 10
 
 
 @frozen
-class Note:
-    """Something worth a line in `events.jsonl`."""
-
-    kind: str
-    data: dict[str, Any] = field(factory=dict)
-
-
-@frozen
-class _Order:
+class _Request:
     """What is planned."""
 
     slot: int
@@ -66,13 +55,14 @@ class _Order:
     before: StreamPlan | None
 
 
-class StreamControl:
-    """All vehicles under one leader."""
+class RollingOperation:
+    """All vehicles under one leader; see `Operation`."""
 
     def __init__(
         self,
         scenario: Scenario,
         new_ballot: Callable[[Ballot | None], Ballot],
+        new_job: Callable[[], int],
         planner: Planner,
     ) -> None:
         """Begin with nothing known.
@@ -80,15 +70,17 @@ class StreamControl:
         Args:
             scenario: road, lattice, timing.
             new_ballot: returns a ballot never used before and above the given one, if one is given.
-            planner: plans the stream.
+            new_job: returns the number of a new computation.
+            planner: plans all vehicles.
         """
         self._scenario = scenario
         self._new_ballot = new_ballot
+        self._new_job = new_job
         self._planner = planner
         self._slot_s = scenario.cycles_s[0]
         self.shown = Shown()
-        self.handovers: list[Handover] = []
-        self._of: dict[Name, Handover] = {}
+        self.transfers: list[CellTransfer] = []
+        self._transfer_of: dict[Name, CellTransfer] = {}
         self._highest: Ballot | None = None
         self._since: tuple[float, float] | None = None
         """Since when states have been heard: road time, node clock."""
@@ -97,13 +89,11 @@ class StreamControl:
         self._newest_slot = -1
         self._table: StreamPlan | None = None
 
-    # --- inputs -------------------------------------------------------------------------------
-
     def forget(self) -> None:
         """Begin anew: another road."""
         self.shown.forget()
-        self.handovers.clear()
-        self._of.clear()
+        self.transfers.clear()
+        self._transfer_of.clear()
         self._table = self._ordered = self._since = None
         self._newest_slot = -1
 
@@ -113,60 +103,69 @@ class StreamControl:
         What vehicles have shown stays true of what they own, but not of where they are; what was
         begun under an earlier lead is left alone.
         """
-        self.handovers.clear()
-        self._of.clear()
+        self.transfers.clear()
+        self._transfer_of.clear()
         self.shown.take_over()
         self._ordered = self._since = None
 
-    def on_census(self, census: Census) -> None:
-        """Take note of who is on the road."""
-        for name in self.shown.on_census(census):
-            handover = self._of.pop(name, None)
-            if handover is not None:
-                handover.give_up(f"{name} has left")
+    def on_clock(self, t_s: float, now_s: float) -> None:
+        """Ignore it: a plan is due in each slot, whatever the pace of the road."""
 
-    def on_state(self, state: VehicleState) -> bool:
-        """Take a vehicle's state, unless a newer one is known.
+    def on_state(self, state: VehicleState, now_s: float) -> list[LogEntry] | None:
+        """Take the state of a vehicle, unless a newer one is known.
 
         Returns:
-            Whether a ballot under way waits for it: then `on_awaited` has to take it, too.
+            None: no ballot under way waits for it, as for most states.
         """
         if not self.shown.on_state(state):
-            return False
+            return None
         if state.promised is not None:
             self._highest = max(self._highest or state.promised, state.promised)
-        handover = self._of.get(state.vehicle)
-        return handover is not None and handover.wakeup_s is not None
+        transfer = self._transfer_of.get(state.vehicle)
+        if transfer is None or not transfer.unfinished:
+            return None
+        transfer.on_state(state, self.shown.states, now_s)
+        if transfer.phase is BallotPhase.GIVEN_UP:
+            data = {"roster": list(transfer.roster), "why": transfer.why}
+            return [LogEntry("handover-given-up", data)]
+        if transfer.phase is BallotPhase.IN_FORCE and self.in_force == 1:
+            slot = round(transfer.t0_s / self._slot_s)
+            begun_s = transfer.t0_s - self._slot_s
+            return [LogEntry("plan-in-force", {"slot": slot, "closed_s": begun_s + SHOWN_S})]
+        return []
 
-    def on_awaited(self, state: VehicleState) -> Iterator[Note]:
-        """Let the ballot under way of a vehicle go on with its newest state."""
-        handover = self._of[state.vehicle]
-        handover.on_state(state, self.shown.states)
-        if handover.phase is Phase.GIVEN_UP:
-            yield Note(HANDOVER_GIVEN_UP, {"roster": list(handover.roster), "why": handover.why})
-        elif handover.phase is Phase.IN_FORCE and self.in_force == 1:
-            slot = round(handover.t0_s / self._slot_s)
-            begun_s = handover.t0_s - self._slot_s
-            yield Note(PLAN_IN_FORCE, {"slot": slot, "closed_s": begun_s + SHOWN_S})
+    def lead(
+        self, census: Census, t_s: float, now_s: float, *, changed: bool
+    ) -> Iterator[Effect | LogEntry]:
+        """Order the plan of the next slot when it is time for it; send messages."""
+        if changed:
+            self.on_census(census)
+            yield from self.order(t_s, now_s)
+        for vehicle, message in self.outgoing(now_s):
+            yield to_vehicle(vehicle, message)
 
-    # --- the slot -----------------------------------------------------------------------------
+    def on_census(self, census: Census) -> None:
+        """Take which vehicles are on the road."""
+        for name in self.shown.on_census(census):
+            transfer = self._transfer_of.pop(name, None)
+            if transfer is not None:
+                transfer.on_left(name)
 
-    def order(self, job: Callable[[], int], t_s: float, now_s: float) -> Iterator[Compute]:
-        """Order the planning of the next slot when it is time for it.
+    def outgoing(self, now_s: float) -> Iterator[tuple[Name, Prepare | Plan]]:
+        """Yield what has to be sent (again) now, and to which vehicle."""
+        for transfer in self.transfers:
+            yield from transfer.outgoing(now_s)
 
-        Args:
-            job: returns the number of a new computation.
-            t_s: road time.
-            now_s: node clock.
-        """
+    def order(self, t_s: float, now_s: float) -> Iterator[Compute]:
+        """Order the plan of the next slot when it is time for it."""
         census = self.shown.census
         if census is None:
             return
         if self._since is None:
             self._since = t_s, now_s
-        for handover in self.handovers:
-            if t_s > handover.t0_s + LATEST_S:
-                handover.give_up("its slot has begun")
+        for transfer in self.transfers:
+            if t_s > transfer.t0_s + LATEST_S:
+                transfer.give_up("its slot has begun")
         if not census.on_road or self._ordered is not None:
             return
         slot = math.floor(t_s / self._slot_s + 1e-9)
@@ -175,16 +174,13 @@ class StreamControl:
             return
         if max(self._since[0], t_s - 1.5 * self._scenario.runtime.tick_s) > look_s:
             look_s = t_s  # it could not look in time: the newest is the best
-        order = self._order(slot + 1, look_s)
+        request = self._request(slot + 1, look_s)
         self._newest_slot = slot + 1
-        number = job()
-        self._ordered = (number, slot + 1)
-        yield Compute(number, partial(self._plan, order))
+        job = self._new_job()
+        self._ordered = (job, slot + 1)
+        yield Compute(job, partial(_plan, self._planner, request))
 
-    def _plan(self, order: _Order) -> StreamPlan:
-        return self._planner.plan(order.slot, order.vehicles, order.before, order.blocked)
-
-    def _order(self, slot: int, look_s: float) -> _Order:
+    def _request(self, slot: int, look_s: float) -> _Request:
         """Lay down what is to be planned: what was the case at a time, by now known."""
         vehicles: dict[Cell, StreamVehicle] = {}
         owned, taken = set[Cell](), set[Cell]()
@@ -207,7 +203,7 @@ class StreamControl:
             # Its move begins at any moment. Without an open gate it may never: who takes part in
             # something newer is asked, and then it does not.
             late = state.go and not state.done and not state.moving
-            owned |= sure_of(state, then.states, then.gone)
+            owned |= certain_cells(state, then.states, then.gone)
             if late:
                 taken |= {*state.estate} - {state.hold_cell}
             held = late or not state.attended or state.t_s < since_s
@@ -220,9 +216,9 @@ class StreamControl:
             for lane in range(self._scenario.road.lanes)
             if (column, lane) not in owned or (column, lane) in taken
         }
-        return _Order(slot, tuple(vehicles.values()), frozenset(blocked), self._table)
+        return _Request(slot, tuple(vehicles.values()), frozenset(blocked), self._table)
 
-    def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterator[Note]:
+    def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterator[LogEntry]:
         """Take a plan, and begin to put its first moves into force.
 
         Args:
@@ -234,38 +230,42 @@ class StreamControl:
             return
         slot = self._ordered[1]
         self._ordered = None
-        for handover in self.handovers:
-            handover.give_up("the next slot is planned")
+        for transfer in self.transfers:
+            transfer.give_up("the next slot is planned")
         table = computed.result
         if not isinstance(table, StreamPlan):
-            yield Note(PLANNING_FAILED, {"slot": slot, "error": computed.error})
+            yield LogEntry("planning-failed", {"slot": slot, "error": computed.error})
             return
         self._table = table
         t0_s = slot * self._slot_s
         if t_s > t0_s + LATEST_S:
-            yield Note(PLANNING_LATE, {"slot": slot})
+            yield LogEntry("planning-late", {"slot": slot})
             return
-        self.handovers = list(self._handovers(table, t0_s, now_s))
-        self._of = {name: each for each in self.handovers for name in each.roster}
-        yield Note(STREAM_PLANNED, self._facts(table))
+        self.transfers = list(self._make_transfers(table, t0_s, now_s))
+        self._transfer_of = {name: each for each in self.transfers for name in each.roster}
+        yield LogEntry("stream-planned", self._facts(table))
 
     def _facts(self, table: StreamPlan) -> dict[str, Any]:
-        sizes = [len(handover.roster) for handover in self.handovers]
+        sizes = [len(transfer.roster) for transfer in self.transfers]
         return {
             "slot": table.slot,
             "vehicles": len(table.ways),
             "missed": len(table.missed),
-            "moves": sum(len(handover.moves) for handover in self.handovers),
+            "moves": sum(len(transfer.moves) for transfer in self.transfers),
             "ballots": len(sizes),
             "largest": max(sizes, default=0),
             "status": "feasible",
             "solve_ms": table.solve_ms,
         }
 
-    def _handovers(self, table: StreamPlan, t0_s: float, now_s: float) -> Iterator[Handover]:
+    def _make_transfers(
+        self, table: StreamPlan, t0_s: float, now_s: float
+    ) -> Iterator[CellTransfer]:
         states, gone = self.shown.states, self.shown.gone
         owner = {
-            cell: name for name, state in states.items() for cell in sure_of(state, states, gone)
+            cell: name
+            for name, state in states.items()
+            for cell in certain_cells(state, states, gone)
         }
         moves: dict[Name, tuple[Cell, Cell]] = {}
         concerned: dict[Name, set[Name]] = {}
@@ -281,7 +281,7 @@ class StreamControl:
                 moves[name] = (way[0], way[1])
                 concerned[name] = self._with_partners({owner[cell] for cell in cells} | {name})
         for roster in _clusters(concerned.values()):
-            yield Handover(
+            yield CellTransfer(
                 ballot=self._new_ballot(self._highest),
                 roster=tuple(sorted(roster)),
                 moves={name: moves[name] for name in sorted(roster) if name in moves},
@@ -301,22 +301,19 @@ class StreamControl:
             waiting += sorted(new)
         return roster
 
-    # --- outputs ------------------------------------------------------------------------------
-
-    def outgoing(self, now_s: float) -> Iterator[tuple[Name, Prepare | Plan]]:
-        """Return what has to be sent (again) now, and to whom."""
-        for handover in self.handovers:
-            yield from handover.outgoing(now_s)
-
     @property
     def wakeups(self) -> list[float]:
-        """When `outgoing` has something to send."""
-        return [each.wakeup_s for each in self.handovers if each.wakeup_s is not None]
+        """Times at which messages are to be sent again."""
+        return [each.wakeup_s for each in self.transfers if each.wakeup_s is not None]
 
     @property
     def in_force(self) -> int:
         """Ballots of this slot that are in force."""
-        return sum(handover.phase is Phase.IN_FORCE for handover in self.handovers)
+        return sum(transfer.phase is BallotPhase.IN_FORCE for transfer in self.transfers)
+
+
+def _plan(planner: Planner, request: _Request) -> StreamPlan:
+    return planner.plan(request.slot, request.vehicles, request.before, request.blocked)
 
 
 def _clusters(groups: Iterable[set[Name]]) -> list[set[Name]]:

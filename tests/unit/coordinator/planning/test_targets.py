@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from laneweave.coordinator.formations.targets import Targets, place
+from laneweave.coordinator.planning.targets import Targets, place
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import Name
 

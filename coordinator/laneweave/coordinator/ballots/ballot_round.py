@@ -1,0 +1,262 @@
+"""One ballot of a leader: prepare, promise, plan, accept (rules L4 to L8).
+
+The leader asks every vehicle of the roster for a promise, has a plan made from the cells in which
+they will hold, and issues that one plan under the ballot. Nothing here is needed for safety, except
+that a ballot is never used twice and that a plan is made only from the promises of the *whole*
+roster; vehicles check the rest.
+
+The operations differ in three points. Each is a parameter of `ballot_rules`, which returns the rows
+of the transition table that both share:
+
+- outbid: back off and try again (formations), or give up until the next slot (rolling);
+- a vehicle restarted: prepare a new ballot, or give up;
+- planning failed: keep the ballot and try again, or give up.
+
+How the plan is made is up to the operation, between the events `PROMISED` and `PLANNED`: by the
+planner, beside the core (formations), or at once from the promises (rolling).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from enum import Enum
+
+from attrs import define, field, frozen
+
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.state_machine import Function, RuleBook, Transition
+from laneweave.protocol.wire.messages import Ballot, Name, Plan, Prepare, VehicleState
+
+ISSUE_S = 30.0
+"""A plan that is not accepted by all in this time is given up: a vehicle refuses it (L8)."""
+
+
+class BallotPhase(Enum):
+    """Where a leader stands with its newest ballot."""
+
+    OBSERVING = "observing"
+    """L2: is a plan in force that can be adopted?"""
+    PREPARING = "preparing"
+    """L3, L4: collecting promises."""
+    PLANNING = "planning"
+    """L5: the whole roster has promised."""
+    ISSUING = "issuing"
+    """L6: the plan is being sent until all have accepted."""
+    IN_FORCE = "in force"
+    """All have accepted the plan."""
+    BACKING_OFF = "backing off"
+    """L7: a vehicle promised a higher ballot."""
+    GIVEN_UP = "given up"
+    """Nothing more is sent; the vehicles hold, or follow the plan that is in force."""
+
+
+UNFINISHED = (BallotPhase.PREPARING, BallotPhase.PLANNING, BallotPhase.ISSUING)
+
+STATE, TIME, MEMBERS = "STATE", "time", "census"
+PROMISED, PLANNED, FAILED, TOO_LATE = "promised", "planned", "planning failed", "too late"
+
+
+@define(kw_only=True)
+class BallotRound:
+    """A leader's state of one ballot at a time; subclasses say for whom, and feed it events."""
+
+    rules: RuleBook
+    resend_s: float
+    """Period of sending PREPARE and PLAN again."""
+    phase: BallotPhase = BallotPhase.PREPARING
+    ballot: Ballot | None = None
+    plan: Plan | None = None
+    promises: dict[Name, VehicleState] = field(factory=dict)
+    accepted: set[Name] = field(factory=set)
+    failures: int = 0
+    """Plannings that failed under this ballot."""
+    back_offs: int = 0
+    """Pauses in a row without an acceptance between them."""
+    now_s: float = 0.0
+    """Time of the current event (node clock)."""
+    due_s: float = 0.0
+    """When the phase's timer fires, or something is to be sent again (node clock)."""
+    until_s: float = 0.0
+    """When the phase has lasted for long enough (node clock)."""
+
+    @property
+    def roster(self) -> tuple[Name, ...]:
+        """All vehicles whose promises and acceptances the ballot needs."""
+        raise NotImplementedError
+
+    @property
+    def blocks(self) -> tuple[int, ...]:
+        """Blocks of columns that the plan may use; empty where vehicles own cells."""
+        return ()
+
+    @property
+    def hold_cells(self) -> dict[Name, Cell]:
+        """Where each vehicle will hold, from its promise."""
+        return {name: self.promises[name].hold_cell for name in self.roster}
+
+    @property
+    def incarnations(self) -> dict[Name, int]:
+        """Incarnation of the process of each vehicle that promised."""
+        return {name: self.promises[name].incarnation for name in self.roster}
+
+    def outgoing(self, now_s: float) -> Iterable[tuple[Name, Prepare | Plan]]:
+        """Return what has to be sent (again) now, and to which vehicle."""
+        if now_s < self.due_s or self.ballot is None:
+            return []
+        if self.phase is BallotPhase.PREPARING:
+            missing = [name for name in self.roster if name not in self.promises]
+            message = Prepare(self.ballot, self.blocks, self.roster)
+            if missing:
+                self.due_s = now_s + self.resend_s
+            return [(name, message) for name in missing]
+        if self.phase is BallotPhase.ISSUING and self.plan is not None:
+            plan = self.plan
+            self.due_s = now_s + self.resend_s
+            return [(name, plan) for name in plan.roster if name not in self.accepted]
+        return []
+
+    @property
+    def wakeup_s(self) -> float | None:
+        """When a timer fires, or `outgoing` has something to send; None: never."""
+        if self.phase in _WITHOUT_TIMER:
+            return None
+        return self.due_s
+
+
+_WITHOUT_TIMER = (BallotPhase.PLANNING, BallotPhase.IN_FORCE, BallotPhase.GIVEN_UP)
+
+
+# --- guards and actions -----------------------------------------------------------------------
+
+
+def shows_higher_promise(me: BallotRound, state: VehicleState) -> bool:
+    """It promised more than b."""
+    return me.ballot is not None and state.promised is not None and state.promised > me.ballot
+
+
+def had_promised(me: BallotRound, state: VehicleState) -> bool:
+    """Its promise was counted."""
+    return state.vehicle in me.promises
+
+
+def restarted(me: BallotRound, state: VehicleState) -> bool:
+    """Its incarnation is not the one that promised."""
+    promise = me.promises.get(state.vehicle)
+    return promise is None or promise.incarnation != state.incarnation
+
+
+def is_promise(me: BallotRound, state: VehicleState) -> bool:
+    """It promised b and has not accepted."""
+    return state.promised == me.ballot and not state.accepted
+
+
+def count_promise(me: BallotRound, state: VehicleState) -> None:
+    """Count the promise, with hold cell and incarnation."""
+    me.promises[state.vehicle] = state
+    if len(me.promises) == len(me.roster) and not me.failures:
+        me.due_s = me.now_s
+
+
+def all_have_promised(me: BallotRound, _: object) -> bool:
+    """The whole roster has promised."""
+    return set(me.promises) == set(me.roster)
+
+
+def may_try(me: BallotRound, _: object) -> bool:
+    """The pause after failed planning is over."""
+    return not me.failures or me.now_s >= me.due_s
+
+
+def order_plan(me: BallotRound, _: object) -> None:
+    """Plan from the hold cells."""
+
+
+def issue(me: BallotRound, plan: Plan) -> None:
+    """PLAN, the one and only of b."""
+    me.plan = plan
+    me.failures = 0
+    me.accepted = set()
+    me.due_s = me.now_s
+    me.until_s = me.now_s + ISSUE_S
+
+
+def is_acceptance(me: BallotRound, state: VehicleState) -> bool:
+    """It accepted b."""
+    return state.promised == me.ballot and state.accepted
+
+
+def is_the_last(me: BallotRound, state: VehicleState) -> bool:
+    """All others have accepted."""
+    return me.accepted | {state.vehicle} >= set(me.roster)
+
+
+def count_acceptance(me: BallotRound, state: VehicleState) -> None:
+    """Count the acceptance."""
+    me.accepted.add(state.vehicle)
+    me.back_offs = 0
+
+
+# --- the table --------------------------------------------------------------------------------
+
+
+@frozen
+class Reaction:
+    """What a leader does where a ballot cannot go on."""
+
+    sources: tuple[BallotPhase, ...]
+    """Phases in which it reacts at all."""
+    actions: tuple[Function, ...]
+    target: BallotPhase
+    guards: tuple[Function, ...] = ()
+    """Beside those of the shared row."""
+
+
+def ballot_rules(
+    *,
+    outbid: Reaction,
+    restart: Reaction,
+    failure: Reaction,
+    promise_guards: tuple[Function, ...] = (),
+) -> tuple[Transition, ...]:
+    """Return the rows that both operations share.
+
+    Args:
+        outbid: reaction to a vehicle that promised a higher ballot.
+        restart: reaction to a vehicle whose process is not the one that promised.
+        failure: reaction to failed planning.
+        promise_guards: what a state must show beside the promise to be counted.
+    """
+    preparing, planning, issuing = UNFINISHED
+    return (
+        Transition(
+            "L7",
+            STATE,
+            outbid.sources,
+            (shows_higher_promise, *outbid.guards),
+            outbid.actions,
+            outbid.target,
+        ),
+        Transition(
+            "L8",
+            STATE,
+            restart.sources,
+            (*restart.guards, restarted),
+            restart.actions,
+            restart.target,
+        ),
+        Transition("L4", STATE, (preparing,), (is_promise, *promise_guards), (count_promise,)),
+        Transition(
+            "L5", PROMISED, (preparing,), (all_have_promised, may_try), (order_plan,), planning
+        ),
+        Transition("L5", PLANNED, (planning,), (), (issue,), issuing),
+        Transition("L5", FAILED, failure.sources, failure.guards, failure.actions, failure.target),
+        Transition(
+            "L6",
+            STATE,
+            (issuing,),
+            (is_acceptance, is_the_last),
+            (count_acceptance,),
+            BallotPhase.IN_FORCE,
+        ),
+        Transition("L6", STATE, (issuing,), (is_acceptance,), (count_acceptance,)),
+    )

@@ -1,0 +1,291 @@
+"""One formation under a leader: its ballots, one after the other (rules L2 to L8).
+
+A leader observes the formation first and adopts the plan that is in force (L2). Otherwise, and
+whenever that plan stalls or no longer fits, it prepares a new ballot. `LEADER_RULES` is the table;
+docs/PROTOCOL.md shows it. L1 is `election.Election`.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Iterable
+
+from attrs import define, field
+
+from laneweave.coordinator.ballots.ballot_round import (
+    FAILED,
+    MEMBERS,
+    PLANNED,
+    PROMISED,
+    STATE,
+    TIME,
+    TOO_LATE,
+    UNFINISHED,
+    BallotPhase,
+    BallotRound,
+    Reaction,
+    ballot_rules,
+    had_promised,
+)
+from laneweave.coordinator.formations.roster import Formation
+from laneweave.protocol.state_machine import RuleBook, Transition
+from laneweave.protocol.wire.messages import Ballot, Name, Plan, VehicleState
+
+OBSERVE_S = 1.0
+"""How long a new leader waits for the states of a roster before it prepares (L2)."""
+BACK_OFF_S = (0.05, 0.3)
+"""Random pause before a leader outbids another one (L7); twice as long each time in a row, so that
+one of two leaders gets the time to plan."""
+MAX_BACK_OFFS = 6
+"""The pause grows this often at most."""
+RETRY_S = 1.0
+"""First pause after failed planning; doubles with each failure (L5)."""
+LONGEST_RETRY_S = 8.0
+
+
+@define
+class FormationLeader(BallotRound):
+    """The leader's state for one formation, or for several that are joined."""
+
+    formation: Formation
+    new_ballot: Callable[[Ballot | None], Ballot]
+    """Returns a ballot never used before and above the given one, if one is given."""
+    rng: random.Random
+    rules: RuleBook = field(factory=lambda: LEADER_RULES, kw_only=True)
+    phase: BallotPhase = field(default=BallotPhase.OBSERVING, kw_only=True)
+    out_of_reach: frozenset[Name] = frozenset()
+    """Members that the plan in force does not bring to their lanes, because it cannot."""
+    states: dict[Name, VehicleState] = field(factory=dict)
+    """The newest state of each member."""
+    highest: Ballot | None = None
+    """Highest ballot that a member has shown; a new one must be above it to be promised."""
+
+    @property
+    def roster(self) -> tuple[Name, ...]:
+        """All members on the road."""
+        return self.formation.roster
+
+    @property
+    def blocks(self) -> tuple[int, ...]:
+        """Blocks of the formation."""
+        return self.formation.numbers
+
+    @property
+    def unattended(self) -> frozenset[Name]:
+        """Members that no agent drives: they promised to hold."""
+        return frozenset(name for name in self.roster if not self.promises[name].attended)
+
+    def begin(self, now_s: float, *, observe: bool = True) -> None:
+        """Take the formation over (L2), or prepare at once where there can be no plan yet (L3)."""
+        self.now_s = now_s
+        observe_members(self, None)
+        self.phase = BallotPhase.OBSERVING
+        if not observe:
+            self.until_s = now_s
+            self.on_time(now_s)
+
+    def on_members(self, formation: Formation, now_s: float) -> None:
+        """Take the formation as a newer census shows it (L8).
+
+        Vehicles that have left can neither promise nor accept; targets may be new.
+        """
+        if formation == self.formation:
+            return
+        self.now_s = now_s
+        for vehicle in set(self.formation.roster) - set(formation.roster):
+            self.states.pop(vehicle, None)
+        self.rules.take(self, MEMBERS, formation)
+        self.formation = formation
+
+    def on_state(self, state: VehicleState, now_s: float) -> None:
+        """Take the state of a member (L2, L4, L6, L7, L8)."""
+        self.now_s = now_s
+        if self._is_news(state):
+            self.states[state.vehicle] = state
+            if state.promised is not None:
+                self.highest = max(self.highest or state.promised, state.promised)
+            self.rules.take(self, STATE, state)
+
+    def on_time(self, now_s: float) -> None:
+        """Let timers run out."""
+        self.now_s = now_s
+        self.rules.take(self, TIME, None)
+
+    def take_planning_order(self, now_s: float) -> bool:
+        """Return true, once, when the whole roster has promised and planning should begin (L5)."""
+        self.now_s = now_s
+        return self.rules.take(self, PROMISED, None) is not None
+
+    def on_plan(self, plan: Plan, now_s: float, out_of_reach: Iterable[Name] = ()) -> None:
+        """Issue the plan under the ballot that was promised (L5)."""
+        self.now_s = now_s
+        self.out_of_reach = frozenset(out_of_reach)
+        self.rules.take(self, PLANNED, plan)
+
+    def on_planning_failed(self, now_s: float) -> None:
+        """Keep the ballot and try again later (L5)."""
+        self.now_s = now_s
+        self.rules.take(self, FAILED, None)
+
+    def give_up(self, now_s: float) -> None:
+        """Plan no more: no step fits in before the end of the road."""
+        self.now_s = now_s
+        self.rules.take(self, TOO_LATE, None)
+
+    def _is_news(self, state: VehicleState) -> bool:
+        """Return whether a state is from a member and not older than its newest one."""
+        known = self.states.get(state.vehicle)
+        return state.vehicle in self.formation.roster and (
+            known is None or _age(state) >= _age(known)
+        )
+
+
+def _age(state: VehicleState) -> tuple[object, ...]:
+    """Return what orders the states of one vehicle, older ones first.
+
+    Between two ticks it shows states with equal times; it never promises less or takes back an
+    acceptance, so a late state cannot pass for a newer one.
+    """
+    return (state.incarnation, state.t_s, state.promised or (), state.accepted)
+
+
+# --- guards and actions -----------------------------------------------------------------------
+
+
+def observe_members(me: FormationLeader, _: object) -> None:
+    """Listen to all members."""
+    me.states.clear()
+    me.promises = {}
+    me.until_s = me.due_s = me.now_s + OBSERVE_S
+
+
+def all_are_heard(me: FormationLeader, _: object) -> bool:
+    """All members have shown their states."""
+    return all(name in me.states for name in me.roster)
+
+
+def one_plan_is_in_force(me: FormationLeader, _: object) -> bool:
+    """All show the same ballot as accepted, no member is overdue."""
+    states = [me.states[name] for name in me.roster]
+    return len({state.promised for state in states}) == 1 and all(
+        state.accepted and not state.overdue for state in states
+    )
+
+
+def adopt(me: FormationLeader, _: object) -> None:
+    """Adopt: send nothing, watch."""
+    me.ballot = next(iter(me.states.values())).promised
+    # The promises were given to another leader; a vehicle that has accepted has promised.
+    me.promises = dict(me.states)
+    me.back_offs = 0
+    # This plan may bring members to their lanes that an earlier one could not.
+    me.out_of_reach = frozenset()
+
+
+def time_is_up(me: FormationLeader, _: object) -> bool:
+    """The phase has lasted for long enough."""
+    return me.now_s >= me.until_s
+
+
+def prepare(me: FormationLeader, _: object) -> None:
+    """PREPARE a new ballot, above all that members have shown."""
+    me.ballot = me.new_ballot(me.highest)
+    me.plan = None
+    me.promises = {}
+    me.accepted = set()
+    me.failures = 0
+    me.due_s = me.now_s
+
+
+def back_off(me: FormationLeader, _: object) -> None:
+    """Pause for 0.05 to 0.3 s, twice as long each time in a row."""
+    pause_s = me.rng.uniform(*BACK_OFF_S) * 2.0 ** min(me.back_offs, MAX_BACK_OFFS)
+    me.back_offs += 1
+    me.until_s = me.due_s = me.now_s + pause_s
+
+
+def has_joined(me: FormationLeader, state: VehicleState) -> bool:
+    """It has joined the formations of b and no others."""
+    return state.joined == me.formation.numbers
+
+
+def void_promise(me: FormationLeader, state: VehicleState) -> None:
+    """Void the promise: it has lost its memory since."""
+    del me.promises[state.vehicle]
+
+
+def keep_ballot(me: FormationLeader, _: object) -> None:
+    """Keep the ballot, try again after 1, 2, 4, 8, 8, ... s."""
+    me.due_s = me.now_s + min(RETRY_S * 2.0**me.failures, LONGEST_RETRY_S)
+    me.failures += 1
+
+
+def stalls(_: FormationLeader, state: VehicleState) -> bool:
+    """Its next move is overdue."""
+    return state.overdue
+
+
+def is_astray(me: FormationLeader, state: VehicleState) -> bool:
+    """It is done on a lane that it does not prefer, though it could reach its own.
+
+    An adopted plan may have been made for targets that this leader never saw.
+    """
+    return (
+        me.formation.sorts
+        and state.done
+        and state.attended
+        and state.vehicle not in me.out_of_reach
+        and any(
+            member.vehicle == state.vehicle and member.preferred_lane != state.hold_cell[1]
+            for member in me.formation.members
+        )
+    )
+
+
+def has_new_targets(me: FormationLeader, formation: Formation) -> bool:
+    """There are new targets, new members, or another structure to take on."""
+    return formation.stage != me.formation.stage or not (
+        set(formation.members) <= set(me.formation.members)
+    )
+
+
+_OBSERVING, _IN_FORCE = (BallotPhase.OBSERVING,), (BallotPhase.IN_FORCE,)
+_PREPARING, _PLANNING, _ISSUING = ((phase,) for phase in UNFINISHED)
+_PREPARE = (prepare,), BallotPhase.PREPARING
+
+LEADER_RULES: RuleBook = RuleBook(
+    (
+        Transition(
+            "L2",
+            STATE,
+            _OBSERVING,
+            (all_are_heard, one_plan_is_in_force),
+            (adopt,),
+            BallotPhase.IN_FORCE,
+        ),
+        Transition("L3", STATE, _OBSERVING, (all_are_heard,), *_PREPARE),
+        Transition("L3", TIME, _OBSERVING, (time_is_up,), *_PREPARE),
+        *ballot_rules(
+            outbid=Reaction((*UNFINISHED, *_IN_FORCE), (back_off,), BallotPhase.BACKING_OFF),
+            restart=Reaction((*_PLANNING, *_ISSUING, *_IN_FORCE), *_PREPARE),
+            failure=Reaction(_PLANNING, (keep_ballot,), BallotPhase.PREPARING),
+            promise_guards=(has_joined,),
+        ),
+        Transition(
+            "L7",
+            TIME,
+            (BallotPhase.BACKING_OFF,),
+            (time_is_up,),
+            (observe_members,),
+            BallotPhase.OBSERVING,
+        ),
+        Transition("L4", STATE, _PREPARING, (had_promised,), (void_promise,)),
+        Transition("L5", TOO_LATE, _PLANNING, (), (), BallotPhase.GIVEN_UP),
+        Transition("L8", TIME, _ISSUING, (time_is_up,), *_PREPARE),
+        Transition("L8", STATE, _IN_FORCE, (stalls,), *_PREPARE),
+        Transition("L8", STATE, _IN_FORCE, (is_astray,), *_PREPARE),
+        Transition("L8", MEMBERS, UNFINISHED, (), *_PREPARE),
+        Transition("L8", MEMBERS, _IN_FORCE, (has_new_targets,), *_PREPARE),
+    )
+)
+"""Rules L2 to L8 of formations."""

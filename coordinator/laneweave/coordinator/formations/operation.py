@@ -1,0 +1,145 @@
+"""The paper's operation: every formation on the road is led by ballots of its own."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Iterator
+
+from laneweave.coordinator.ballots.ballot_round import BallotPhase
+from laneweave.coordinator.formations.leader import LEADER_RULES, FormationLeader
+from laneweave.coordinator.formations.planner import FormationPlanner
+from laneweave.coordinator.formations.roster import Formation, Groups, closed_formations, with_room
+from laneweave.coordinator.operation import LogEntry, to_vehicle
+from laneweave.protocol.runtime.node import Compute, Computed, Effect
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.state_machine import RuleBook
+from laneweave.protocol.wire.messages import Ballot, Census, VehicleState
+
+JUST_CLOSED_S = 1.0
+"""For this much road time after it has closed, no leader can have made a plan for a formation."""
+
+
+class FormationsOperation:
+    """All formations under one leader; see `Operation`."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        new_ballot: Callable[[Ballot | None], Ballot],
+        new_job: Callable[[], int],
+        has_watched: Callable[[float], bool],
+        rng: random.Random,
+        rules: RuleBook = LEADER_RULES,
+    ) -> None:
+        """Begin without formations.
+
+        Args:
+            scenario: road, formations, timing.
+            new_ballot: returns a ballot never used before and above the given one, if one is given.
+            new_job: returns the number of a new computation.
+            has_watched: returns whether this leader has missed nothing for an election time, at a
+                time of the node's clock.
+            rng: for pauses.
+            rules: of a leader; others than `LEADER_RULES` only in tests.
+        """
+        self.leaders: dict[int, FormationLeader] = {}
+        """Each under the lowest number of its blocks."""
+        self._scenario = scenario
+        self._new_ballot = new_ballot
+        self._has_watched = has_watched
+        self._rng = rng
+        self._rules = rules
+        self._groups = Groups()
+        self._planner = FormationPlanner(scenario, self._groups, self.leaders, new_job)
+        self._groups_changed = False
+
+    def forget(self) -> None:
+        """Forget all formations, and which of them are joined."""
+        self._groups.forget()
+        self.take_over()
+
+    def take_over(self) -> None:
+        """Forget all formations; what vehicles have joined stays joined."""
+        self.leaders.clear()
+        self._planner.forget()
+
+    def on_clock(self, t_s: float, now_s: float) -> None:
+        """Measure the pace of the road."""
+        self._planner.on_clock(t_s, now_s)
+
+    def on_state(self, state: VehicleState, now_s: float) -> list[LogEntry]:
+        """Pass the state on to the leader of its formation."""
+        # Formations that a vehicle has joined stay joined, under any leader.
+        self._groups_changed |= self._groups.join((state.formation, *state.joined))
+        group = self._groups.of(state.formation)
+        leader = self.leaders.get(group[0])
+        if leader is None or leader.formation.numbers != group:
+            return []
+        issuing = leader.phase is BallotPhase.ISSUING
+        leader.on_state(state, now_s)
+        if issuing and leader.phase is BallotPhase.IN_FORCE:
+            data = {"formation": group[0], "closed_s": leader.formation.closed_s}
+            return [LogEntry("plan-in-force", data)]
+        return []
+
+    def lead(
+        self, census: Census, t_s: float, now_s: float, *, changed: bool
+    ) -> Iterator[Effect | LogEntry]:
+        """Update members, let timers run out, order plans, send messages."""
+        if changed or self._groups_changed:
+            self._groups_changed = False
+            yield from self._update_members(census, t_s, now_s)
+        for leader in self.leaders.values():
+            if leader.wakeup_s is None or leader.wakeup_s > now_s:
+                continue
+            leader.on_time(now_s)
+            if leader.take_planning_order(now_s):
+                yield from self._planner.order(leader, t_s, now_s)
+            for vehicle, message in leader.outgoing(now_s):
+                yield to_vehicle(vehicle, message)
+
+    def _update_members(self, census: Census, t_s: float, now_s: float) -> Iterator[LogEntry]:
+        formations = closed_formations(census, t_s, self._scenario, self._groups)
+        for numbers in with_room(formations, t_s, self._scenario):
+            self._groups.join(numbers)
+            yield LogEntry("formations-joined", {"formations": list(numbers), "why": "room"})
+            formations = closed_formations(census, t_s, self._scenario, self._groups)
+        for number in set(self.leaders) - set(formations):
+            del self.leaders[number]
+        for number, formation in formations.items():
+            leader = self.leaders.get(number)
+            if leader is None or leader.formation.numbers != formation.numbers:
+                self.leaders[number] = self._lead_formation(formation, t_s, now_s)
+            else:
+                leader.on_members(formation, now_s)
+
+    def _lead_formation(self, formation: Formation, t_s: float, now_s: float) -> FormationLeader:
+        leader = FormationLeader(
+            formation,
+            self._new_ballot,
+            self._rng,
+            resend_s=self._scenario.network.resend_s,
+            rules=self._rules,
+        )
+        # There is no plan to adopt for a formation that this leader has seen close a moment ago.
+        just_closed = t_s - formation.closed_s <= JUST_CLOSED_S
+        leader.begin(now_s, observe=not (just_closed and self._has_watched(now_s)))
+        return leader
+
+    def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterator[Compute | LogEntry]:
+        """Issue a plan that was made, or try again later."""
+        for outcome in self._planner.finish(computed, t_s, now_s):
+            if isinstance(outcome, LogEntry):
+                self._groups_changed |= outcome.kind == "formations-joined"
+            yield outcome
+
+    @property
+    def wakeups(self) -> list[float]:
+        """Times of the leaders' timers."""
+        times = (leader.wakeup_s for leader in self.leaders.values())
+        return [time for time in times if time is not None]
+
+    @property
+    def in_force(self) -> int:
+        """Number of formations with a plan in force."""
+        return sum(leader.phase is BallotPhase.IN_FORCE for leader in self.leaders.values())

@@ -1,0 +1,151 @@
+"""One ballot of the rolling operation: some vehicles move, and cells are transferred for it.
+
+The roster is the vehicles that move and those that own a cell that is moved through. The plan is
+short: at most one move of each vehicle, in one slot. A ballot that is outbid, whose vehicles
+restart, or that is not in force in time is given up: its vehicles hold, and the next slot is
+planned from there. `TRANSFER_RULES` is the table; docs/PROTOCOL.md shows it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from attrs import define, field
+
+from laneweave.coordinator.ballots.ballot_round import (
+    FAILED,
+    MEMBERS,
+    PLANNED,
+    PROMISED,
+    STATE,
+    TOO_LATE,
+    UNFINISHED,
+    BallotPhase,
+    BallotRound,
+    Reaction,
+    ballot_rules,
+    had_promised,
+)
+from laneweave.coordinator.rolling.ownership import States, owned_cells
+from laneweave.protocol.lattice import Cell, PlannedMove, footprint, territory
+from laneweave.protocol.state_machine import RuleBook, Transition
+from laneweave.protocol.vehicle.plans import ownership_problems, plan_problems
+from laneweave.protocol.wire.messages import Ballot, Name, Plan, VehicleState
+
+Steps = Mapping[Name, tuple[Cell, Cell]]
+"""(from, to) of each vehicle that moves."""
+
+
+@define(kw_only=True)
+class CellTransfer(BallotRound):
+    """A leader's state of one ballot, and of no other after it."""
+
+    rules: RuleBook = field(factory=lambda: TRANSFER_RULES)
+    ballot: Ballot
+    roster: tuple[Name, ...]
+    moves: Steps
+    t0_s: float
+    """Road time at which the moves begin."""
+    slot_s: float
+    gone: frozenset[Name] = frozenset()
+    """Vehicles that have left the road, of those in pending transfers of members."""
+    why: str = ""
+    """Why it was given up."""
+
+    @property
+    def unfinished(self) -> bool:
+        """Whether it may still come into force."""
+        return self.phase in UNFINISHED
+
+    def on_state(self, state: VehicleState, states: States, now_s: float) -> None:
+        """Take a newer state of a member; `states` has the newest one of every vehicle."""
+        self.now_s = now_s
+        self.rules.take(self, STATE, state)
+        if self.rules.take(self, PROMISED, None) is not None:
+            plan = self._make_plan(states)
+            self.rules.take(self, PLANNED if isinstance(plan, Plan) else FAILED, plan)
+
+    def on_left(self, vehicle: Name) -> None:
+        """Give up: a member has left the road."""
+        self.rules.take(self, MEMBERS, f"{vehicle} has left")
+
+    def give_up(self, why: str) -> None:
+        """Give up, unless it is in force or given up already: no time is left."""
+        self.rules.take(self, TOO_LATE, why)
+
+    def _make_plan(self, states: States) -> Plan | str:
+        """Return the plan from the promises, or why it cannot be made any more."""
+        before: dict[Name, frozenset[Cell]] = {}
+        for name, promise in self.promises.items():
+            owned = owned_cells(promise, dict(states) | self.promises, self.gone)
+            if owned is None:
+                return f"nobody can tell what {name} owns"
+            before[name] = owned
+        for name, (origin, _) in self.moves.items():
+            promise = self.promises[name]
+            if promise.hold_cell != origin or not promise.attended:
+                return f"{name} is not where it was planned from"
+        plan = self._plan(before)
+        return "; ".join([*plan_problems(plan), *ownership_problems(plan)]) or plan
+
+    def _plan(self, before: Mapping[Name, frozenset[Cell]]) -> Plan:
+        needed = {name: footprint(*move) for name, move in self.moves.items()}
+        given = {cell for cells in needed.values() for cell in cells}
+        after = {name: (cells - given) | needed.get(name, set()) for name, cells in before.items()}
+        moves: dict[Name, tuple[PlannedMove, ...]] = dict.fromkeys(self.roster, ())
+        moves |= {name: ((0, *move),) for name, move in self.moves.items()}
+        every_move = [move for each in moves.values() for move in each]
+        return Plan(
+            ballot=self.ballot,
+            formations=tuple(sorted({promise.formation for promise in self.promises.values()})),
+            roster=self.roster,
+            incarnations=self.incarnations,
+            start_cells=self.hold_cells,
+            moves=moves,
+            t0_s=self.t0_s,
+            slot_s=self.slot_s,
+            territory=tuple(sorted(territory(self.hold_cells.values(), every_move))),
+            before={name: tuple(sorted(before[name])) for name in self.roster},
+            after={name: tuple(sorted(after[name])) for name in self.roster},
+        )
+
+
+# --- guards and actions -----------------------------------------------------------------------
+
+
+def shows_owned_cells(_: CellTransfer, state: VehicleState) -> bool:
+    """It shows the cells that it owns: its controller has noted the promise."""
+    return bool(state.estate)
+
+
+def note_outbid(me: CellTransfer, _: object) -> None:
+    """Give up until the next slot."""
+    me.why = "outbid"
+
+
+def note_restart(me: CellTransfer, state: VehicleState) -> None:
+    """Give up until the next slot."""
+    me.why = f"{state.vehicle} has restarted"
+
+
+def note_reason(me: CellTransfer, why: str) -> None:
+    """Give up until the next slot."""
+    me.why = why
+
+
+_PREPARING, _PLANNING, _ISSUING = UNFINISHED
+_WAITING = (_PREPARING, _ISSUING)
+
+TRANSFER_RULES: RuleBook = RuleBook(
+    (
+        *ballot_rules(
+            outbid=Reaction(_WAITING, (note_outbid,), BallotPhase.GIVEN_UP),
+            restart=Reaction(_WAITING, (note_restart,), BallotPhase.GIVEN_UP, (had_promised,)),
+            failure=Reaction((_PLANNING,), (note_reason,), BallotPhase.GIVEN_UP),
+            promise_guards=(shows_owned_cells,),
+        ),
+        Transition("L8", MEMBERS, _WAITING, (), (note_reason,), BallotPhase.GIVEN_UP),
+        Transition("L8", TOO_LATE, _WAITING, (), (note_reason,), BallotPhase.GIVEN_UP),
+    )
+)
+"""Rules L4 to L8 of cell transfers."""
