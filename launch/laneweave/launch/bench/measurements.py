@@ -28,14 +28,11 @@ class Report:
     benchmark: str
     rows: list[dict[str, Any]]
     table: Table
-    goals: dict[str, Any] | None = None
 
     def show(self, *, as_json: bool) -> None:
         """Print it."""
         if as_json:
             result = {"benchmark": self.benchmark, "machine": machine(), "results": self.rows}
-            if self.goals is not None:
-                result["goals"] = self.goals
             sys.stdout.write(json.dumps(result, indent=2) + "\n")
         else:
             Console().print(self.table)
@@ -84,8 +81,7 @@ def measure_runtime(vehicles: str | None, seconds: float, per_process: int, seed
 def measure_tracker(instances: int, seed: int) -> Report:
     """Measure a tick of tracking, on `instances` recorded episodes of each situation."""
     rows = tracker_bench.bench_tracker(load_scenario(None), instances=instances, seed=seed)
-    goals = {"cpu_ms": tracker_bench.GOALS_MS}
-    return Report("tracker", rows, tracker_bench.tracker_table(rows), goals)
+    return Report("tracker", rows, tracker_bench.tracker_table(rows))
 
 
 def _counts(text: str) -> list[int]:

@@ -28,9 +28,6 @@ from laneweave.sim_bridge.recording.recorder import spread
 
 Array = NDArray[np.float64]
 
-GOALS_MS: Final = {"p50": 0.2, "p99": 1.0, "max": 4.0}
-"""Goals for every situation."""
-
 _REPEATS = 3
 _NOISE = (0.05, 0.02, 0.05, 0.05, 0.02, 0.05)
 """Standard deviations of the measured (s, v, a, y, v_y, a_y)."""
@@ -143,7 +140,6 @@ def _replay(scenario: Scenario, ticks: Sequence[Tick]) -> Array:
 
 def tracker_table(rows: Sequence[dict[str, Any]]) -> Table:
     """Return the results of `bench_tracker` as a table."""
-    goals = " / ".join(f"{GOALS_MS[name]:g}" for name in ("p50", "p99", "max"))
     table = Table(
         "situation",
         "ticks",
@@ -152,7 +148,7 @@ def tracker_table(rows: Sequence[dict[str, Any]]) -> Table:
         "p50",
         "p99",
         "max",
-        caption=f"CPU ms of one thread; goals: p50 / p99 / max {goals}",
+        caption="CPU ms of one thread",
         box=box.SIMPLE_HEAD,
     )
     for row in rows:
