@@ -69,7 +69,7 @@ def test_long_runs_are_sampled_more_coarsely_and_then_cut(
 ) -> None:
     samples = len(tracks.t_s) * run.scenario.runtime.tick_s
     for most, step_s in ((samples / 0.5 + 200, 0.5), (samples / 4, 1.0)):
-        monkeypatch.setattr(animation, "MOST_SAMPLES", most)
+        monkeypatch.setattr(animation, "MAX_SAMPLES", most)
         data = animation_data(run, tracks, "")
         assert data["step_s"] == step_s
         assert len(column(data, "s_m")) <= most
