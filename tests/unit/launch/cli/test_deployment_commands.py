@@ -160,7 +160,7 @@ def test_a_file_that_does_not_load(run: Cli, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("identity", "problem"),
     [
-        ("coordinator.c9", "whom this configuration knows"),
+        ("coordinator.c9", "an identity of this configuration"),
         ("vehicle.v0001", "No such file"),
         ("router", "No such file"),
     ],
