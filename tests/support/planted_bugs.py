@@ -17,7 +17,7 @@ from laneweave.coordinator.formations import leader
 from laneweave.coordinator.rolling import transfer
 from laneweave.protocol.state_machine import Function, RuleBook, Transition
 from laneweave.protocol.vehicle import execution_rules as vehicle
-from support import broken_estates as rolling
+from support import broken_cell_ownership as rolling
 from support import broken_rules as broken
 
 ROWS_OF_OTHERS = {

@@ -144,7 +144,7 @@ class CoordinatorCore:
     def handle(self, event: Event, now_s: float) -> list[Effect]:
         """Take an event; see `Core`."""
         if now_s > self._handled_s + self.election.election_s / 2:
-            # A leader that wakes up from a pause knows no more than one that has just begun.
+            # A leader that wakes up from a pause knows no more than one that has just been elected.
             self._awake_since_s = now_s
         self._handled_s = now_s
         if isinstance(event, Arrived) and isinstance(event.message, VehicleState):
@@ -319,8 +319,6 @@ class CoordinatorCore:
                 yield self._log(outcome.kind, **outcome.data)
             else:
                 yield outcome
-
-    # --- small things -------------------------------------------------------------------------
 
     def _new_job(self) -> int:
         self._last_job += 1

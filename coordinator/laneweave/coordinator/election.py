@@ -15,9 +15,9 @@ from attrs import define, field
 from laneweave.protocol.wire.messages import Heartbeat, Name
 
 NEWCOMER_SHARE = 1.5
-"""A better-ranked newcomer is waited for by the leader for this many election times."""
+"""A leader waits this many election times for a better-ranked newcomer to lead."""
 MAX_TERM = 2**62
-"""A term beyond it is nonsense; following it would leave no room to count on."""
+"""Higher terms are ignored: following one would leave no room to count on."""
 
 
 @define
@@ -25,7 +25,7 @@ class _Peer:
     incarnation: int
     heard_s: float
     since_s: float
-    """When this process was heard first."""
+    """When this process was first heard."""
     leading: bool = False
 
 
@@ -42,12 +42,12 @@ class Election:
     leading: bool = False
     link_up: bool = True
     won: int = 0
-    """Times that it has begun to lead."""
+    """How often it has begun to lead."""
     _peers: dict[str, _Peer] = field(factory=dict)
     _dead: set[tuple[str, int]] = field(factory=set)
 
     def on_heartbeat(self, heartbeat: Heartbeat, now_s: float) -> None:
-        """Note that a candidate lives, unless its process is known to be gone.
+        """Record that a candidate is alive, unless its process is known to be gone.
 
         A heartbeat that was still in flight when its sender's connection closed must not revive it.
         """
@@ -62,7 +62,7 @@ class Election:
         self._hear(heartbeat.coordinator, heartbeat.incarnation, now_s).leading = heartbeat.leading
 
     def on_token_up(self, coordinator: str, incarnation: int, now_s: float) -> None:
-        """A process is connected (again, if it had only been paused)."""
+        """Record that a process has connected, or has woken up from a pause."""
         if coordinator == self.name:
             return
         self._dead.discard((coordinator, incarnation))
@@ -82,10 +82,11 @@ class Election:
         return peer
 
     def on_token_down(self, coordinator: str, incarnation: int) -> None:
-        """A process is gone; forget it at once.
+        """Forget a process that is gone.
 
-        Losing the own connection makes every token vanish, before or after the news of it. Known to
-        be disconnected, nothing is concluded; for the moment before, leading twice is harmless.
+        When this candidate loses its own connection, every token vanishes, before or after the
+        news of it. While it knows that it is disconnected it concludes nothing; in the moment
+        before, two leaders are harmless.
         """
         if not self.link_up or coordinator == self.name:
             return
@@ -95,18 +96,18 @@ class Election:
             del self._peers[coordinator]
 
     def on_link(self, *, up: bool, now_s: float) -> None:
-        """The own connection was lost or came back: count the own age from here."""
+        """Count the own age anew: the own connection was lost or has come back."""
         self.link_up = up
         self.started_s = now_s
 
     def see_term(self, term: int) -> None:
-        """Remember the highest term that anybody showed."""
+        """Remember the highest term seen."""
         if self.term < term <= MAX_TERM:
-            # A leader that slept through another one's time must not go on below its term.
+            # A leader that was paused while another one led must not go on below its term.
             self.term = term + 1 if self.leading else term
 
     def update(self, now_s: float) -> bool:
-        """Decide whether to lead now; true when this has changed."""
+        """Decide whether to lead now; return whether this has changed."""
         rival = any(
             name < self.name
             and now_s < peer.heard_s + self.election_s
@@ -127,15 +128,16 @@ class Election:
         self.term = max(self.term, above + 1)
 
     def living(self, now_s: float) -> Iterator[str]:
-        """Yield the other candidates that were heard of late."""
+        """Yield the other candidates heard within the election time."""
         for name, peer in self._peers.items():
             if now_s < peer.heard_s + self.election_s:
                 yield name
 
     def _patience_s(self, peer: _Peer) -> float:
-        """Return until when a leader waits for a better-ranked newcomer to say that it leads.
+        """Return until when a leader waits for a better-ranked newcomer to lead.
 
-        A newcomer may not lead before it is old enough; stepping down at once would leave nobody.
+        A newcomer may not lead before it is old enough; stepping down at once would leave no
+        leader.
         """
         return peer.since_s + NEWCOMER_SHARE * self.election_s
 

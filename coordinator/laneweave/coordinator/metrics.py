@@ -1,4 +1,4 @@
-"""What a coordinator offers to whoever looks at it."""
+"""Metrics of a coordinator."""
 
 from __future__ import annotations
 

@@ -37,17 +37,18 @@ def run_coordinator(
 ) -> None:
     """Run a coordinator candidate until SIGINT or SIGTERM.
 
-    It stands for election when it is able to plan at once, so the planner is loaded before.
+    The planner is loaded first, so that a leader can plan at once.
 
     Args:
         scenario: the road, and the deployment.
         name: by which candidates are ranked.
         wrap: may put faults before the core.
         observe: is told where its numbers come from.
-        workers_at_once: start the processes that plan for others now, not when somebody asks.
+        workers_at_once: start the worker processes of the planning service now, not with its first
+            request.
 
     Raises:
-        BadInputError: nobody answers at the scenario's endpoint.
+        BadInputError: no router answers at the scenario's endpoint.
     """
     with _ends_at_once(), _told_when_long():
         warm_up()
@@ -61,10 +62,10 @@ def run_coordinator(
 
 @contextlib.contextmanager
 def _ends_at_once() -> Iterator[None]:
-    """Have SIGTERM end the process with status 0: it has nothing to complete yet.
+    """Let SIGTERM end the process with status 0: it has nothing to complete yet.
 
-    Compilers call back: an exception that a handler raises in there is printed and forgotten. So a
-    thread waits for the byte that Python writes where a signal comes.
+    An exception that a handler raises inside a callback of the compiler would only be printed. So
+    a thread waits for the byte that Python writes when a signal arrives.
     """
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
@@ -87,7 +88,7 @@ def _ends_at_once() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _told_when_long() -> Iterator[None]:
-    """Say so when the planner is not only loaded but compiled."""
+    """Warn if the planner has to be compiled, not only loaded."""
     timer = threading.Timer(LONG_S, log.warning, ("compiling the planner: once, for a minute",))
     timer.daemon = True
     timer.start()

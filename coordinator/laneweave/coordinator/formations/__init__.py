@@ -1,6 +1,7 @@
-"""The paper's operation: formations that sort themselves by lanes, each under one ballot.
+"""The paper's operation: formations that sort themselves by lanes, each under its own ballots.
 
-Entry points: `control.FormationControl` (the leader's rules for one formation), `planner`
-(what a leader has planned for its formations), `sorting` (lane sorting, paper Section 5.2.1).
-Imported by `coordinator.core`.
+Entry point: `operation.FormationsOperation` (all formations). `leader` has the rules for one of
+them, `roster` the formations as the census describes them; `planner` orders lane sorting
+(`sorting`, paper Section 5.2.1) and turns the results into plans, `pacing` chooses their slots.
+Imported by `core` only.
 """

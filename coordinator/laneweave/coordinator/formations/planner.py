@@ -11,11 +11,11 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import partial
 from typing import Any
 
+from attrs import define, field
+
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
-from laneweave.coordinator.formations.borders import steps_of
 from laneweave.coordinator.formations.leader import FormationLeader
-from laneweave.coordinator.formations.pacing import comfortable_steps, paced
-from laneweave.coordinator.formations.road_pace import RoadPace
+from laneweave.coordinator.formations.pacing import comfortable_steps, paced, steps_of
 from laneweave.coordinator.formations.roster import (
     STAGE_LEAD_S,
     Formation,
@@ -37,15 +37,44 @@ from laneweave.protocol.vehicle.plans import plan_problems
 from laneweave.protocol.wire.messages import Ballot, Plan
 
 START_MARGIN_S = 0.5
-"""A plan made late starts this much road time after it is ready."""
+"""A plan that is made late starts this much road time after it is ready."""
 ROOM_S = 2.5
-"""A formation that lacks room waits at most so long for the next one to close (road time)."""
+"""Longest wait of a formation that lacks room for the next one to close (road time)."""
 SHORTEST_DEADLINE_S = 1.0
 """Deadline of planning where the first move could begin at once."""
 LONGEST_DEADLINE_S = 15.0
 """Deadline of planning where the first move is far off: the other formations wait meanwhile."""
 MAX_DOUBLINGS = 4
 """The bound on search nodes doubles with each failed planning, this often."""
+PACE_WINDOW_S = 2.0
+"""Measurement window of the road's pace (node clock)."""
+MIN_PACE = 0.1
+"""Lowest pace, so that deadlines stay finite while the road stands still."""
+
+
+@define
+class RoadPace:
+    """Ratio of road time to the node's clock, measured from the messages of the road's clock."""
+
+    pace: float = field(default=1.0, init=False)
+    """Road seconds per second of the node's clock, as measured last."""
+    _since: tuple[float, float] | None = field(default=None, init=False)
+    """Road time and node clock when the measurement under way began."""
+
+    def on_clock(self, t_s: float, now_s: float) -> None:
+        """Process a clock message.
+
+        Args:
+            t_s: road time; a smaller one than before restarts the measurement.
+            now_s: node clock.
+        """
+        if self._since is None or t_s < self._since[0]:
+            self._since = t_s, now_s
+            return
+        road_s, node_s = t_s - self._since[0], now_s - self._since[1]
+        if node_s >= PACE_WINDOW_S:
+            self.pace = max(road_s / node_s, MIN_PACE)
+            self._since = t_s, now_s
 
 
 class FormationPlanner:
@@ -94,7 +123,7 @@ class FormationPlanner:
         given_s = self._scenario.formation.planning_deadline_s
         if given_s is not None:
             return given_s
-        until_start_s = self._pace.node_s(start_s - t_s)
+        until_start_s = (start_s - t_s) / self._pace.pace
         return min(max(until_start_s, SHORTEST_DEADLINE_S), LONGEST_DEADLINE_S)
 
     def order(
@@ -162,7 +191,7 @@ class FormationPlanner:
         )
 
     def _end_s(self, formation: Formation) -> float:
-        """Return the road time by which a formation should have done what it does now.
+        """Return the road time by which the plan of a formation should have ended.
 
         That is when its next plan is to be made, or when its foremost column leaves the road.
         """
@@ -250,7 +279,7 @@ class FormationPlanner:
                 yield neighbour
 
     def _room_is_coming(self, numbers: Numbers, t_s: float) -> bool:
-        """Tell whether the next formation, which may be joined, is closed in a moment."""
+        """Return whether the next formation, which may be joined, is about to close."""
         formation, lattice = self._scenario.formation, self._scenario.lattice
         if formation.closes_by_vehicles or len(numbers) >= formation.max_joined:
             return False
@@ -285,7 +314,7 @@ class FormationPlanner:
         return paced(plan, others, not_before_s, end_s, self._scenario)
 
     def _plans_beside(self, plan: Plan) -> list[Plan]:
-        """Return the plans of the neighbours that this leader has made, and that are driven."""
+        """Return the plans of the neighbours that this leader has made and that are driven."""
         if "closing" not in self._scenario.formation.conflict_kinds:
             return []
         return [

@@ -1,8 +1,15 @@
-"""Formations as the census tells of them, and the time that they have on the road.
+"""Formations as the census describes them, and the time that they have on the road.
 
 The roadside builds formations out of the stream of arrivals and says which blocks of columns belong
 to which formation. A formation is *closed* when no vehicle can enter its blocks any more: its
 roster is known for certain from that census on.
+
+**Joined formations** plan under one ballot. Such a plan may use the blocks of all of them, and its
+roster is all vehicles that entered there. Once a plan has used two blocks, a vehicle of either may
+be in the other one, so no later plan may use one of them without the vehicles of both: joined
+formations stay joined until their vehicles have left. Every vehicle remembers with which blocks its
+formation is joined (`VehicleState.joined`), so any leader learns it from the promises that it needs
+anyway.
 """
 
 from __future__ import annotations
@@ -18,12 +25,11 @@ from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.wire.messages import Census, CensusEntry, Name
 
 STAGE_LEAD_S = 5.0
-"""How long before a change of structure its plan is made: longer than planning takes. The plan
-before it has ended by then."""
-
+"""How long before a change of structure its plan is made: longer than planning takes. The previous
+plan has ended by then."""
 
 Numbers = tuple[int, ...]
-"""Numbers of joined formations, ascending."""
+"""Numbers of blocks, ascending."""
 
 
 @frozen
@@ -39,11 +45,11 @@ class Formation:
     """How many formations these are."""
     deserted: Numbers = ()
     """Blocks of joined formations whose vehicles have all left the road. Plans avoid them: they may
-    hold vehicles of formations that joined under another leader."""
+    hold vehicles of formations that were joined under another leader."""
     stage: int = 0
     """Which of the scenario's structures it is to take on now."""
     sorts: bool = True
-    """There is none left: it sorts."""
+    """It has taken on all of them, and sorts its lanes."""
 
     @property
     def roster(self) -> tuple[Name, ...]:
@@ -53,16 +59,16 @@ class Formation:
 
 @define
 class Groups:
-    """What one leader knows of joined formations; it only grows."""
+    """Which blocks plan together, as far as one leader knows; groups only grow."""
 
     _group: dict[int, Numbers] = field(factory=dict)
 
     def of(self, number: int) -> Numbers:
-        """Return all formations that are joined with one, itself included."""
+        """Return all blocks that plan together with one, itself included."""
         return self._group.get(number, (number,))
 
     def join(self, numbers: Iterable[int]) -> bool:
-        """Take note that formations are joined; true when that is new."""
+        """Join blocks and all that they are joined with; return whether that is new."""
         union = tuple(sorted({other for number in numbers for other in self.of(number)}))
         if not union or self.of(union[0]) == union:
             return False
@@ -71,7 +77,7 @@ class Groups:
         return True
 
     def forget(self) -> None:
-        """Begin anew: another road has other formations."""
+        """Forget all groups: another road has other formations."""
         self._group.clear()
 
 
@@ -90,7 +96,7 @@ def closed_formations(
         groups: which blocks plan together; the blocks of each closed formation are added.
 
     Returns:
-        Each formation under its least number.
+        Each formation under the lowest number of its blocks.
     """
     lattice = scenario.lattice
     closed_s: dict[int, list[float]] = {}

@@ -1,8 +1,8 @@
 """Lane sorting of one formation, or of joined ones: from promises to moves.
 
-Before it sorts, a formation may take on other structures; then any vehicle may have any place.
+Before it sorts, a formation may take on other structures, in which any vehicle may have any place.
 
-The grid is the blocks of the formations. Vehicles that no agent drives block their cells. When the
+The grid is the blocks of the formations. Vehicles without an agent block their cells. When the
 whole sorting is impossible, one vehicle at a time is excused from reaching its lane, so that one
 vehicle in a corner does not keep all others from theirs.
 """
@@ -26,15 +26,15 @@ from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.tables import DrivingStructure, Scenario
 from laneweave.protocol.wire.messages import Name
 
-MOST_PLACEMENTS = 6
-"""Structures that are tried where the first one takes too many steps."""
-SHORTEST_S = 0.05
+MAX_PLACEMENTS = 6
+"""Placements of the targets that are tried where the first one takes too many steps."""
+MIN_DEADLINE_S = 0.05
 """Shortest deadline of one attempt."""
 
 
 @frozen
 class SortingTask:
-    """What is to be sorted."""
+    """Input of a sorting."""
 
     numbers: Numbers
     """The formations whose blocks may be used."""
@@ -47,13 +47,13 @@ class SortingTask:
     scenario: Scenario
     """Mode, conflict kinds, lattice."""
     deadline_s: float
-    """For all attempts together."""
+    """For all attempts together [s]."""
     steps: int = 1_000_000
-    """How many steps the road has room for; where a plan has more, other targets are tried."""
+    """Steps that fit on the road; if a plan has more, other targets are tried."""
     deserted: Numbers = ()
     """Blocks of `numbers` in which only the cells that members hold may be used."""
     structure: DrivingStructure | None = None
-    """What the vehicles should form, wherever each of them is in it; None: they sort."""
+    """Structure that the vehicles should form, each in any place of it; None: they sort."""
 
     @property
     def columns(self) -> range:
@@ -100,13 +100,13 @@ class Sorting:
     """The result of a sorting."""
 
     response: PlanResponse | None
-    """Of the planner; None: there is nobody to move."""
+    """Of the planner; None: no vehicle can be moved."""
     moves: dict[Name, tuple[PlannedMove, ...]]
     """Moves of every member, on the lattice."""
     out_of_reach: tuple[Name, ...]
-    """Members that do not get to their lanes."""
+    """Members that do not reach their lanes."""
     short_of_room: bool
-    """Somebody who could be moved does not get to its lane: more blocks could help."""
+    """A member that could be moved does not reach its lane: more blocks could help."""
     impossible: str = ""
     """Why the structure has too few cells; then no member moves. Empty: it has enough."""
 
@@ -121,7 +121,7 @@ def plan_requests(task: SortingTask, excused: Name | None = None) -> Iterator[Pl
 
     Args:
         task: with at least one vehicle that can be moved.
-        excused: a vehicle that need not get to its lane.
+        excused: a vehicle that need not reach its lane.
     """
     scenario = task.scenario
     wanted = {
@@ -174,7 +174,7 @@ def _plan_request(
 def sort_lanes(
     task: SortingTask, max_nodes: int, weights: Weights, clock: Clock = time.monotonic
 ) -> Sorting:
-    """Plan a sorting; if that is impossible, with one member excused from reaching its lane.
+    """Plan a sorting; if that is impossible, excuse one member from reaching its lane.
 
     Args:
         task: what is to be sorted.
@@ -189,11 +189,11 @@ def sort_lanes(
     ends_s = clock() + task.deadline_s
     for excused in (None, *task.movers):
         best: PlanResponse | None = None
-        for request in islice(plan_requests(task, excused), MOST_PLACEMENTS):
+        for request in islice(plan_requests(task, excused), MAX_PLACEMENTS):
             left_s = ends_s - clock()
-            if best is not None and left_s <= SHORTEST_S:
+            if best is not None and left_s <= MIN_DEADLINE_S:
                 break
-            hurried = evolve(request, deadline_s=max(left_s, SHORTEST_S))
+            hurried = evolve(request, deadline_s=max(left_s, MIN_DEADLINE_S))
             response = checked_plan(hurried, max_nodes=max_nodes, weights=weights)
             if best is None or _steps(response) < _steps(best):
                 best = response
@@ -240,7 +240,7 @@ def _sorting(task: SortingTask, response: PlanResponse | None) -> Sorting:
     missed: tuple[Name, ...] = ()
     if task.structure is None:
         missed = tuple(name for name, cell in ends.items() if cell[1] != task.preferred_lanes[name])
-    # Without a result in time nothing is known of the room; with more blocks it would take longer.
+    # After a timeout nothing is known of the room, and planning more blocks would take longer.
     known = response is not None and response.status != "timeout"
     short_of_room = known and any(name not in task.unattended for name in missed)
     return Sorting(response, moves, missed, short_of_room)

@@ -1,5 +1,6 @@
-"""The rolling operation: the whole stream is planned anew in each slot.
+"""The rolling operation: all vehicles on the road are planned anew in each slot.
 
-Entry points: `control.StreamControl` (the leader's side), `ballot` (one transfer of cells).
-Imported by `coordinator.core`.
+Entry point: `operation.RollingOperation` (the leader's side). `transfer` is one ballot that moves
+vehicles and transfers cells, `ownership` what a leader knows of who owns which cell, `observed` the
+states that it has received, `planner` the planner of a scenario's road. Imported by `core` only.
 """

@@ -1,8 +1,8 @@
-"""What vehicles have shown, and who the census has listed, as of now and of a moment ago.
+"""The states and the census that a leader has received, as of now and of a moment ago.
 
-Plans are made from what was the case at one time, whatever has arrived since: so they do not
-depend on how fast messages are. It is enough to keep the newest state of each vehicle and the
-newest one with an earlier time, since that moment is no more than a tick ago.
+Plans are made from what was the case at one road time, so they do not depend on how fast messages
+are. That time is at most one tick ago, so the newest state of each vehicle and the newest one with
+an earlier time suffice.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ _News = TypeVar("_News", Census, VehicleState)
 
 @frozen
 class Snapshot:
-    """What was known at a time."""
+    """What was known at one road time."""
 
     census: Census
     states: Mapping[Name, VehicleState]
-    """Of those who had shown themselves."""
+    """Of the vehicles on the road that had been heard."""
     gone: frozenset[Name]
-    """Who shared deeds with somebody and had left the road."""
+    """Vehicles in the roster of a pending transfer that had left the road."""
 
 
-class Shown:
+class ObservedRoad:
     """The newest states and the newest census, and those before them."""
 
     def __init__(self) -> None:
@@ -40,22 +40,22 @@ class Shown:
         self._before: dict[Name, VehicleState] = {}
         """The newest state with an earlier time."""
         self._left: dict[Name, VehicleState] = {}
-        """The newest state of each that has left since it was looked at last."""
+        """The newest state of each vehicle that has left since the last snapshot."""
         self._census_before: Census | None = None
 
     def forget(self) -> None:
-        """Begin anew: another road."""
+        """Forget everything: there is another road."""
         self.states.clear()
         self.take_over()
 
     def take_over(self) -> None:
-        """Forget what says where vehicles are; what they have shown of what they own stays true."""
+        """Forget where vehicles are; what they have shown of what they own stays true."""
         self._before.clear()
         self._left.clear()
         self.census = self._census_before = None
 
     def on_census(self, census: Census) -> list[Name]:
-        """Take note of who is on the road; return who has left it."""
+        """Take a newer census; return the vehicles that have left the road."""
         if self.census is not None and census.t_s > self.census.t_s:
             self._census_before = self.census
         self.census = census
@@ -66,7 +66,7 @@ class Shown:
         return gone
 
     def on_state(self, state: VehicleState) -> bool:
-        """Take a vehicle's state; return whether it is the newest of it."""
+        """Take the state of a vehicle; return whether it is its newest one."""
         known = self.states.get(state.vehicle)
         if known is not None and is_older(state, known):
             if state.t_s < known.t_s:
@@ -79,14 +79,14 @@ class Shown:
 
     @property
     def gone(self) -> frozenset[Name]:
-        """Who shares deeds with somebody and has left the road."""
+        """Vehicles in the roster of a pending transfer that have left the road."""
         return _gone(self.states.values(), self.census)
 
     def at(self, t_s: float) -> Snapshot:
-        """Return what was known at a road time [s], and forget those who have left.
+        """Return what was known at a road time [s], and forget the vehicles that have left.
 
         Raises:
-            ValueError: there has not been any census.
+            ValueError: no census has been received.
         """
         census = _at(t_s, self.census, self._census_before) or self.census
         if census is None:
@@ -112,30 +112,32 @@ class Shown:
 
 
 def is_older(state: VehicleState, other: VehicleState) -> bool:
-    """Tell whether a state of a vehicle was sent before another one of it."""
+    """Return whether a state of a vehicle was sent before another one of it."""
     if state.incarnation == other.incarnation and state.t_s != other.t_s:
         return state.t_s < other.t_s
     return _age(state) < _age(other)
 
 
 def _age(state: VehicleState) -> tuple[object, ...]:
-    deed = state.deed
+    transfer = state.deed
     return (
         state.incarnation,
         state.t_s,
         state.promised or (),
         bool(state.estate),
         state.accepted,
-        (deed.ballot, deed.open) if deed is not None else (),
+        (transfer.ballot, transfer.open) if transfer is not None else (),
     )
 
 
 def _at(t_s: float, newest: _News | None, before: _News | None) -> _News | None:
-    """Return what was known at a time (road time); None: nothing yet."""
+    """Return what was known at a road time; None: nothing yet."""
     return newest if newest is not None and newest.t_s <= t_s else before
 
 
 def _gone(states: Iterable[VehicleState], census: Census | None) -> frozenset[Name]:
     listed = {entry.vehicle for entry in census.on_road} if census else set[Name]()
-    deeds = [state.deed for state in states if state.deed is not None]
-    return frozenset(name for deed in deeds for name in deed.roster if name not in listed)
+    transfers = [state.deed for state in states if state.deed is not None]
+    return frozenset(
+        name for transfer in transfers for name in transfer.roster if name not in listed
+    )

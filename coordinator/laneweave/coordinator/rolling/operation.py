@@ -19,7 +19,7 @@ from attrs import frozen
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.operation import LogEntry, to_vehicle
 from laneweave.coordinator.planning.rolling.planner import StreamPlan, StreamVehicle
-from laneweave.coordinator.rolling.observed import Shown
+from laneweave.coordinator.rolling.observed import ObservedRoad
 from laneweave.coordinator.rolling.ownership import certain_cells, partners
 from laneweave.coordinator.rolling.planner import Planner
 from laneweave.coordinator.rolling.transfer import CellTransfer
@@ -29,25 +29,25 @@ from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.wire.messages import Ballot, Census, Name, Plan, Prepare, VehicleState
 
 SHOWN_S = 0.5
-"""Who moves in a slot has begun, and shown it, this long after the slot has.
+"""Vehicles that move in a slot have begun, and shown it, this long after the slot has begun.
 
-Planned is from what was shown up to then, once road time has gone on and all of it has arrived: so
-plans do not depend on how fast messages are."""
+Plans are made from the states up to then, one tick later, when all of them have arrived: so plans
+do not depend on how fast messages are."""
 PATIENCE_S = 0.5
-"""A new leader listens for so long (node clock). One that leads only for a moment, because it has
-not heard another one, must not outbid what that one has begun."""
+"""How long a new leader listens before it plans (node clock). One that leads only for a moment,
+because it has not heard another leader, must not outbid the ballots of that one."""
 LATEST_S = 1.0
-"""A plan that is ready later than this after its slot has begun is not put into force any more."""
+"""A plan that is ready later than this after its slot has begun is dropped."""
 AHEAD_M = 600.0
-"""Vehicles are planned for from so far before the place where moves begin: as far as S3 is long, so
-that whoever can come near each other there is known in time."""
+"""How far before the place where moves begin vehicles are planned for: the length of S3, so that
+all vehicles that can come near each other there are known in time."""
 BESIDE = 10
-"""Columns ahead of the foremost vehicle and behind the rearmost one that planning looks at."""
+"""Columns ahead of the foremost vehicle and behind the rearmost one that may be planned with."""
 
 
 @frozen
 class _Request:
-    """What is planned."""
+    """Input of a planning."""
 
     slot: int
     vehicles: tuple[StreamVehicle, ...]
@@ -78,34 +78,34 @@ class RollingOperation:
         self._new_job = new_job
         self._planner = planner
         self._slot_s = scenario.cycles_s[0]
-        self.shown = Shown()
+        self.observed = ObservedRoad()
         self.transfers: list[CellTransfer] = []
         self._transfer_of: dict[Name, CellTransfer] = {}
         self._highest: Ballot | None = None
         self._since: tuple[float, float] | None = None
-        """Since when states have been heard: road time, node clock."""
+        """When this leader began to receive states: road time, node clock."""
         self._ordered: tuple[int, int] | None = None
-        """Number of the computation under way, and of the slot that it plans."""
+        """Numbers of the computation under way and of the slot that it plans."""
         self._newest_slot = -1
         self._table: StreamPlan | None = None
 
     def forget(self) -> None:
-        """Begin anew: another road."""
-        self.shown.forget()
+        """Forget everything: there is another road."""
+        self.observed.forget()
         self.transfers.clear()
         self._transfer_of.clear()
         self._table = self._ordered = self._since = None
         self._newest_slot = -1
 
     def take_over(self) -> None:
-        """Lead, again or for the first time: listen for a while before anything is planned.
+        """Begin anew: listen for a while before anything is planned.
 
-        What vehicles have shown stays true of what they own, but not of where they are; what was
-        begun under an earlier lead is left alone.
+        What vehicles have shown of what they own stays true, but not where they are. Ballots of an
+        earlier term are not pursued.
         """
         self.transfers.clear()
         self._transfer_of.clear()
-        self.shown.take_over()
+        self.observed.take_over()
         self._ordered = self._since = None
 
     def on_clock(self, t_s: float, now_s: float) -> None:
@@ -117,14 +117,14 @@ class RollingOperation:
         Returns:
             None: no ballot under way waits for it, as for most states.
         """
-        if not self.shown.on_state(state):
+        if not self.observed.on_state(state):
             return None
         if state.promised is not None:
             self._highest = max(self._highest or state.promised, state.promised)
         transfer = self._transfer_of.get(state.vehicle)
         if transfer is None or not transfer.unfinished:
             return None
-        transfer.on_state(state, self.shown.states, now_s)
+        transfer.on_state(state, self.observed.states, now_s)
         if transfer.phase is BallotPhase.GIVEN_UP:
             data = {"roster": list(transfer.roster), "why": transfer.why}
             return [LogEntry("handover-given-up", data)]
@@ -146,7 +146,7 @@ class RollingOperation:
 
     def on_census(self, census: Census) -> None:
         """Take which vehicles are on the road."""
-        for name in self.shown.on_census(census):
+        for name in self.observed.on_census(census):
             transfer = self._transfer_of.pop(name, None)
             if transfer is not None:
                 transfer.on_left(name)
@@ -158,7 +158,7 @@ class RollingOperation:
 
     def order(self, t_s: float, now_s: float) -> Iterator[Compute]:
         """Order the plan of the next slot when it is time for it."""
-        census = self.shown.census
+        census = self.observed.census
         if census is None:
             return
         if self._since is None:
@@ -173,7 +173,7 @@ class RollingOperation:
         if slot < self._newest_slot or t_s <= look_s or now_s < self._since[1] + PATIENCE_S:
             return
         if max(self._since[0], t_s - 1.5 * self._scenario.runtime.tick_s) > look_s:
-            look_s = t_s  # it could not look in time: the newest is the best
+            look_s = t_s  # too late for that time: take the newest states
         request = self._request(slot + 1, look_s)
         self._newest_slot = slot + 1
         job = self._new_job()
@@ -181,14 +181,14 @@ class RollingOperation:
         yield Compute(job, partial(_plan, self._planner, request))
 
     def _request(self, slot: int, look_s: float) -> _Request:
-        """Lay down what is to be planned: what was the case at a time, by now known."""
+        """Return the input of a planning: what was the case at a road time."""
         vehicles: dict[Cell, StreamVehicle] = {}
         owned, taken = set[Cell](), set[Cell]()
-        # Where vehicles were in an earlier lead says nothing of where they are.
+        # States received while this coordinator led before do not tell where vehicles are now.
         since_s = self._since[0] - 1e-6 if self._since is not None else 0.0
         far_m = self._scenario.moves_from_m - AHEAD_M
-        then = self.shown.at(look_s)
-        # Whoever was not heard may be elsewhere by now, and somebody else in its cell.
+        then = self.observed.at(look_s)
+        # A vehicle that was not heard may be elsewhere by now, and another one in its cell.
         for entry in sorted(
             then.census.on_road, key=lambda entry: entry.vehicle not in then.states
         ):
@@ -200,8 +200,8 @@ class RollingOperation:
                 unheard = StreamVehicle(entry.vehicle, entry.cell, entry.preferred_lane, held=True)
                 vehicles.setdefault(entry.cell, unheard)
                 continue
-            # Its move begins at any moment. Without an open gate it may never: who takes part in
-            # something newer is asked, and then it does not.
+            # With an open gate its move may begin at any moment. With a closed one it never will
+            # if the vehicle promises a newer ballot, which it is asked for.
             late = state.go and not state.done and not state.moving
             owned |= certain_cells(state, then.states, then.gone)
             if late:
@@ -219,7 +219,7 @@ class RollingOperation:
         return _Request(slot, tuple(vehicles.values()), frozenset(blocked), self._table)
 
     def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterator[LogEntry]:
-        """Take a plan, and begin to put its first moves into force.
+        """Take a plan, and begin ballots for its first moves.
 
         Args:
             computed: the result of the newest computation, or of another one, which is ignored.
@@ -261,7 +261,7 @@ class RollingOperation:
     def _make_transfers(
         self, table: StreamPlan, t0_s: float, now_s: float
     ) -> Iterator[CellTransfer]:
-        states, gone = self.shown.states, self.shown.gone
+        states, gone = self.observed.states, self.observed.gone
         owner = {
             cell: name
             for name, state in states.items()
@@ -275,7 +275,7 @@ class RollingOperation:
             name = Name(vehicle)
             state = states.get(name)
             if state is None or state.hold_cell != way[0]:
-                continue  # it has gone on meanwhile
+                continue  # it has moved meanwhile
             cells = footprint(way[0], way[1])
             if all(cell in owner for cell in cells):
                 moves[name] = (way[0], way[1])
@@ -293,8 +293,8 @@ class RollingOperation:
             )
 
     def _with_partners(self, names: set[Name]) -> set[Name]:
-        """Add those without whose promises nobody could tell what some vehicles own."""
-        roster, waiting, states = set(names), sorted(names), self.shown.states
+        """Add the vehicles whose promises are needed to tell what the others own."""
+        roster, waiting, states = set(names), sorted(names), self.observed.states
         while waiting:
             new = partners(states[waiting.pop()], states) - roster
             roster |= new
@@ -308,7 +308,7 @@ class RollingOperation:
 
     @property
     def in_force(self) -> int:
-        """Ballots of this slot that are in force."""
+        """Number of ballots of this slot that are in force."""
         return sum(transfer.phase is BallotPhase.IN_FORCE for transfer in self.transfers)
 
 

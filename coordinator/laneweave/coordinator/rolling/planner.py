@@ -1,4 +1,4 @@
-"""What plans the stream of a scenario, and the check that every plan has to pass."""
+"""The rolling planner of a scenario's road, and the check that every plan has to pass."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.tables import Scenario
 
 REWARD = -0.5
-"""Cost of a column gained, where drift is rewarded; a move costs 0.3."""
+"""Cost of a column gained if drift is rewarded; a move costs 0.3."""
 
 
 class Planner(Protocol):
-    """Plans the stream; `StreamPlanner` wherever vehicles are real."""
+    """Plans all vehicles on the road; `StreamPlanner` except in fault searches and tests."""
 
     def plan(
         self,
@@ -32,11 +32,11 @@ class Planner(Protocol):
         before: StreamPlan | None = None,
         blocked: Collection[Cell] = (),
     ) -> StreamPlan:
-        """Return ways for all vehicles from the beginning of a slot on."""
+        """Return paths for all vehicles from the beginning of a slot on."""
 
 
 class CheckedPlanner:
-    """Lets no plan pass that breaks a rule: it costs half a millisecond."""
+    """Refuses plans that break a rule; a check takes half a millisecond."""
 
     def __init__(self, road: StreamRoad, planner: Planner) -> None:
         """Check what a planner plans for a road."""
@@ -49,10 +49,10 @@ class CheckedPlanner:
         before: StreamPlan | None = None,
         blocked: Collection[Cell] = (),
     ) -> StreamPlan:
-        """Return ways for all vehicles from the beginning of a slot on.
+        """Return paths for all vehicles from the beginning of a slot on.
 
         Raises:
-            ValueError: the vehicles cannot be as they are said to be, or the plan is wrong.
+            ValueError: the vehicles contradict each other, or the plan is wrong.
         """
         table = self._planner.plan(slot, vehicles, before, blocked)
         problems = problems_of_ways(self._road, table, vehicles, blocked)
@@ -68,7 +68,7 @@ def stream_planner(scenario: Scenario) -> Planner:
 
 
 def stream_road(scenario: Scenario) -> StreamRoad:
-    """Return the road of a scenario as the stream planner sees it."""
+    """Return the road of a scenario as the rolling planner needs it."""
     formation, road = scenario.formation, scenario.road
     mode: Mode = 1 if formation.mode == 1 else 2
     return StreamRoad(

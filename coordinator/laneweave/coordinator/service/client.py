@@ -1,4 +1,4 @@
-"""Clients of the planning service: have plans made by whatever coordinators a network has.
+"""Clients of the planning service of a network's coordinators.
 
     with PlanClient("tcp/127.0.0.1:7447") as client:
         response = client.plan(request, timeout_s=10.0)
@@ -10,7 +10,7 @@ On a network that is described by a file, secured or not, a client is named:
 
     PlanClient(client_access(Path("deployment.toml"), "dispatch"))
 
-A client may be used by many threads, or tasks, at a time. A request is asked again, under its id,
+A client may be used by many threads, or tasks, at a time. A request is sent again, under its id,
 when the coordinator that had it dies.
 """
 
@@ -61,16 +61,16 @@ __all__ = [
 
 DEFAULT_TIMEOUT_S = 10.0
 LONGEST_ATTEMPT_S = 86_400.0
-"""Zenoh takes no timeouts of centuries."""
+"""Zenoh does not accept arbitrarily long timeouts."""
 
 
 def client_access(config: Path, name: str = "plan", endpoint: str | None = None) -> Access:
-    """Return how a client gets onto the network of a deployment, secured or not.
+    """Return the access of a client to the network of a deployment, secured or not.
 
     Args:
         config: the DEPLOYMENT.toml.
         name: of the client, whose certificate is `client.NAME` where the deployment is secured.
-        endpoint: of the router; goes before that of the file.
+        endpoint: of the router; overrides that of the file.
 
     Raises:
         BadInputError: the file is not valid, or there is no endpoint.
@@ -82,17 +82,17 @@ def client_access(config: Path, name: str = "plan", endpoint: str | None = None)
 
 
 class _Connection:
-    """A session at a router, and the key of the service."""
+    """A session with a router, and the key of the service."""
 
     def __init__(self, access: Access | str, patience_s: float = ABSENT_S) -> None:
         """Connect.
 
         Args:
-            access: how to get onto the network, or only the endpoint of its router.
-            patience_s: where nobody answers for so long, there is no service.
+            access: to the network, or only the endpoint of its router.
+            patience_s: without any answer for so long, there is no service.
 
         Raises:
-            BadInputError: nobody answers there.
+            BadInputError: no router answers there.
         """
         access = Access(access) if isinstance(access, str) else access
         self._patience_s = patience_s
@@ -118,10 +118,10 @@ class _Connection:
 
 
 class PlanClient(_Connection):
-    """Asks and waits."""
+    """Blocking client."""
 
     def plan(self, request: PlanRequest, timeout_s: float = DEFAULT_TIMEOUT_S) -> PlanResponse:
-        """Have a request planned.
+        """Send a request and return the plan.
 
         Args:
             request: what to plan; one without an id gets one.
@@ -130,8 +130,8 @@ class PlanClient(_Connection):
         Raises:
             RequestRefusedError: the request is not valid.
             ServiceUnavailableError: there is no coordinator, or this client is closed.
-            ServiceOverloadedError: the coordinators had too much to do, all the time.
-            DeadlinePassedError: it was not begun before its deadline.
+            ServiceOverloadedError: the coordinators were overloaded at every attempt.
+            DeadlinePassedError: no worker was free before its deadline.
             PlanningFailedError: the service made an error.
             TimeoutError: no answer within `timeout_s`.
         """
@@ -144,7 +144,7 @@ class PlanClient(_Connection):
             time.sleep(outcome.pause_s)
 
     def close(self) -> None:
-        """Leave the network; whoever waits for a plan is told that there is no service."""
+        """Leave the network; calls that wait for a plan raise `ServiceUnavailableError`."""
         self._close()
 
     def __enter__(self) -> Self:
@@ -162,12 +162,12 @@ class PlanClient(_Connection):
 
 
 class AsyncPlanClient(_Connection):
-    """Asks and awaits."""
+    """Client for asyncio."""
 
     async def plan(
         self, request: PlanRequest, timeout_s: float = DEFAULT_TIMEOUT_S
     ) -> PlanResponse:
-        """Have a request planned; as `PlanClient.plan`."""
+        """Send a request and return the plan; as `PlanClient.plan`."""
         inquiry = self._begin(request, timeout_s)
         while True:
             answer = await asyncio.wrap_future(self._ask(inquiry))
@@ -177,7 +177,7 @@ class AsyncPlanClient(_Connection):
             await asyncio.sleep(outcome.pause_s)
 
     async def close(self) -> None:
-        """Leave the network; whoever awaits a plan is told that there is no service."""
+        """Leave the network; calls that wait for a plan raise `ServiceUnavailableError`."""
         await asyncio.to_thread(self._close)
 
     async def __aenter__(self) -> Self:

@@ -1,4 +1,4 @@
-"""How requests and answers are written: JSON or MessagePack, the answer as the request."""
+"""Encoding of requests and answers: JSON or MessagePack, the answer like its request."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ JSON_TYPE: Final = "application/json"
 MSGPACK_TYPE: Final = "application/msgpack"
 
 INVALID: Final = "invalid"
-"""The request is not acceptable; asked again it will not be, either."""
+"""The request is not acceptable; sending it again will not help."""
 OVERLOADED: Final = "overloaded"
-"""Too many requests are in hand; asked again later it may be planned."""
+"""The coordinator is overloaded; sent again later, the request may be planned."""
 LATE: Final = "late"
 """The deadline passed before a worker was free."""
 FAILED: Final = "failed"
@@ -37,7 +37,7 @@ class Refusal:
     message: str
     """One line for a person."""
     field: str
-    """The field of the request that is not acceptable; empty: none is to blame."""
+    """The field of the request that is not acceptable; empty: none in particular."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the error reply as a map."""
@@ -45,7 +45,7 @@ class Refusal:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Refusal:
-        """Read an error reply; one without a code is of the kind that its field tells."""
+        """Read an error reply; without a code: `INVALID` if it names a field, else `FAILED`."""
         field, message = (
             one_line(str(data.get("field", ""))),
             one_line(str(data.get("message", ""))),
@@ -55,7 +55,7 @@ class Refusal:
 
 @frozen
 class Format:
-    """One of the two ways to write a map."""
+    """One of the two encodings of a map."""
 
     encoding: str
     """MIME type."""
@@ -66,12 +66,12 @@ class Format:
         """Return the map in a payload.
 
         Raises:
-            BadInputError: there is none, whatever the bytes are.
+            BadInputError: the payload is not a map in this encoding.
         """
         try:
             data = self.parse(payload)
         except Exception as error:
-            # Whatever a parser makes of bytes: not text, too deep, too many digits, cut off.
+            # Parsers raise many kinds: not text, too deep, too many digits, truncated.
             raise BadInputError("request", payload[:16], f"a map in {self.encoding}") from error
         if not isinstance(data, dict):
             raise BadInputError("request", type(data).__name__, f"a map in {self.encoding}")
@@ -97,14 +97,14 @@ MSGPACK: Final = Format(MSGPACK_TYPE, msgpack.packb, msgpack.unpackb)
 
 
 def format_of(payload: bytes, encoding: str) -> Format:
-    """Return how a payload is written: as its encoding says, or as it looks.
+    """Return the format of a payload, from its encoding or from its first byte.
 
-    Zenoh's encoding of a payload that nobody gave one to says nothing about maps.
+    Zenoh's default encoding says nothing about maps.
     """
     kind = encoding.partition(";")[0]
     for form in (JSON, MSGPACK):
         if kind == form.encoding:
             return form
-    # A map in MessagePack begins with a byte that no text in JSON begins with, but for a mark.
+    # No JSON text begins with a byte of a MessagePack map, unless with a byte-order mark.
     looks_packed = payload[:1] >= b"\x80" and not payload.startswith(codecs.BOM_UTF8)
     return MSGPACK if looks_packed else JSON

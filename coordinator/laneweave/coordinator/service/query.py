@@ -1,8 +1,8 @@
 """One plan request of a client, and what to do after each attempt: pure, without a clock.
 
-A request may be asked as often as it takes: it has an id, by which a coordinator knows it again,
-and planning it twice does no harm. What is worth another attempt: nobody answered (who it fell to
-was killed, or cut off, and the others do not know yet), or too many requests are in hand there.
+A request may be sent repeatedly: coordinators recognise it by its id, and planning it twice does no
+harm. It is sent again if there is no answer (its coordinator was killed or is cut off, and the
+others do not know yet), or if its coordinator is overloaded.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ class RequestRefusedError(PlanError):
 
 
 class ServiceUnavailableError(PlanError):
-    """Nobody answers: the network has no coordinator that is reached."""
+    """No answer: no coordinator can be reached on this network."""
 
 
 class ServiceOverloadedError(PlanError):
-    """The coordinators had too many requests in hand for as long as was asked."""
+    """The coordinators were overloaded at every attempt."""
 
 
 class DeadlinePassedError(PlanError):
@@ -60,38 +60,38 @@ class PlanningFailedError(PlanError):
 
 @frozen
 class AskAgain:
-    """Ask once more, after a pause."""
+    """Send the request again after a pause."""
 
     pause_s: float
 
 
 @define
 class Inquiry:
-    """What has come of a request so far."""
+    """State of a request over all attempts."""
 
     request: PlanRequest
     timeout_s: float
     begun_s: float
     form: Format = JSON
     patience_s: float = ABSENT_S
-    """Nobody answers for so long: there is no service."""
+    """Without any answer for so long there is no service [s]."""
     _pause_s: float = FIRST_PAUSE_S
     _absent_since_s: float | None = field(default=None)
 
     @property
     def payload(self) -> bytes:
-        """What is asked; the same each time, so that it falls to the same coordinator."""
+        """Bytes of the request; the same each time, so the same coordinator is assigned to it."""
         return self.form.write(self.request.to_dict())
 
     def left_s(self, now_s: float) -> float:
-        """Return how long may still be asked."""
+        """Return the time left [s]."""
         return self.begun_s + self.timeout_s - now_s
 
     def after(self, answer: Answer | None, now_s: float) -> PlanResponse | AskAgain:
-        """Return the plan, or that it is worth asking again.
+        """Return the plan, or that the request should be sent again.
 
         Args:
-            answer: what came of the newest attempt; None: nobody answered.
+            answer: to the newest attempt; None: there was none.
             now_s: on the clock of `begun_s`.
 
         Raises:
@@ -120,7 +120,7 @@ class Inquiry:
         return self._pause(now_s, absent)
 
     def _pause(self, now_s: float, otherwise: PlanError) -> AskAgain:
-        """Ask again after a pause that grows, unless no time is left for it."""
+        """Try again after a growing pause, unless no time is left for it."""
         pause_s, self._pause_s = self._pause_s, min(2 * self._pause_s, LONGEST_PAUSE_S)
         if self.left_s(now_s) <= pause_s:
             raise otherwise

@@ -1,9 +1,9 @@
-"""To which of several coordinators a request falls: rendezvous hashing.
+"""Rendezvous hashing: which of several coordinators a request is assigned to.
 
-Each weighs every name with the request; the heaviest has it. All who know the same names come to
-the same conclusion. When one dies, only its requests fall to others. Where the names that are known
-differ for a moment, a request may fall to two, who make the same plan, or to nobody, and is asked
-again.
+Each coordinator hashes every name with the request; the highest hash wins. Coordinators that know
+the same names agree. When one dies, only its requests are assigned anew. While the known names
+differ, a request may be taken by two coordinators, which make the same plan, or by none, and is
+sent again.
 
 Thaler and Ravishankar, "Using name-based mappings to increase hit rates", IEEE/ACM Transactions on
 Networking 6(1), 1998.
@@ -16,7 +16,7 @@ from hashlib import blake2b
 
 
 def falls_to(name: str, others: Iterable[str], payload: bytes) -> bool:
-    """Tell whether a request falls to `name` rather than to one of the others."""
+    """Return whether a request is assigned to `name` rather than to one of the others."""
     rivals = [other for other in others if other != name]
     if not rivals:
         return True

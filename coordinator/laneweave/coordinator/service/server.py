@@ -1,9 +1,9 @@
 """The planning service: answers plan requests of anyone on the network.
 
-Every coordinator of a network gets every request and takes those that fall to it (`sharing`): so
-any number of them share the load, without a word between them. A request waits until a worker is
-free, at most until its deadline, and is planned in the time that is left then. Asked again by its
-id, it is answered as before, or with the plan that is under way.
+Every coordinator of a network receives every request and takes those that are assigned to it
+(`rendezvous`): so any number of them share the load without messages between them. A request waits
+until a worker is free, at most until its deadline, and is planned in the time that is left then. A
+repeated request, with the same id, gets the same answer, or that of the planning under way.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ from laneweave.protocol.scenario.deployment import Service
 from laneweave.protocol.scenario.tables import DEFAULT_SOLVER
 
 HANDED_OUT_AHEAD = 1
-"""Jobs for each worker beside the one that it does, so that it need not wait for the next."""
+"""Jobs queued for each worker beside its current one, so that it never waits for the next."""
 CACHE_BYTES = 1 << 26
-"""Answers that are kept are not longer, all together."""
+"""Upper bound on the total size of cached answers."""
 
 
 @frozen
 class ServiceMetrics:
-    """What the service has done so far, and has in hand."""
+    """Counters of the service, and its current load."""
 
     ABOUT: ClassVar[str] = "service"
 
@@ -78,15 +78,15 @@ class ServiceMetrics:
 
 @define(eq=False)
 class _Entry:
-    """A request in hand."""
+    """A request that waits or is being planned."""
 
     request: PlanRequest
     came_s: float
     job: int
     askers: list[tuple[int, Format]] = field(factory=list)
-    """Who waits for the answer, and in which format."""
+    """Tokens of the questions that wait for the answer, and their formats."""
     dropped: bool = False
-    """It has been answered before its computation ended."""
+    """It was answered before its computation ended."""
 
     @property
     def deadline_s(self) -> float:
@@ -95,7 +95,7 @@ class _Entry:
 
 @frozen
 class _Kept:
-    """An answer that was given. Packed, since a request in Python is twenty times its bytes."""
+    """A cached answer, packed: in Python it would take twenty times as much memory."""
 
     request: bytes
     """Digest."""
@@ -104,18 +104,18 @@ class _Kept:
 
 
 class PlanningService:
-    """Pure core of the service; its coordinator hands it questions, results and the time."""
+    """Pure core of the service; its coordinator passes it questions, results and the time."""
 
     def __init__(
         self, name: str, settings: Service, workers: int, solver: str = DEFAULT_SOLVER
     ) -> None:
-        """Make a service that has nothing in hand.
+        """Make a service without requests.
 
         Args:
-            name: of the coordinator, among those who share the load.
+            name: of the coordinator, among those that share the load.
             settings: limits.
             workers: how many requests are planned at a time.
-            solver: plans requests that name none.
+            solver: for requests that name none.
         """
         self._name = name
         self._solver = solver
@@ -137,11 +137,11 @@ class PlanningService:
 
     @property
     def wakeup_s(self) -> float | None:
-        """When the deadline of a request that waits passes."""
+        """Earliest deadline of a request that waits."""
         return min((entry.deadline_s for entry in self._not_begun()), default=None)
 
     def _not_begun(self) -> Iterator[_Entry]:
-        """Yield what no worker has begun: they take what is handed out in its order."""
+        """Yield the requests that no worker has begun; workers take jobs in order."""
         ahead = islice(self._planning.values(), self._workers, None)
         yield from (entry for entry in ahead if not entry.dropped)
         yield from self._waiting
@@ -161,10 +161,10 @@ class PlanningService:
 
         Args:
             token: of the question.
-            payload: the request, in whatever form it came.
-            encoding: what the asker says of it.
+            payload: the encoded request.
+            encoding: MIME type that the client gave, if any.
             job: number of the computation that this may become.
-            others: names of the other coordinators that live.
+            others: names of the other live coordinators.
             now_s: node clock.
         """
         if not falls_to(self._name, others, payload):
@@ -210,7 +210,7 @@ class PlanningService:
         return request
 
     def _known(self, request: PlanRequest) -> tuple[_Entry | None, _Kept | None]:
-        """Return what is known of a request that was asked before."""
+        """Return the entry or the cached answer of a repeated request."""
         entry, kept = self._in_hand.get(request.id), self._answers.get(request.id)
         another = (entry is not None and entry.request != request) or (
             kept is not None and kept.request != _digest(request)

@@ -44,25 +44,25 @@ class PlanExecution(ExecutionState):
     rules: RuleBook = VEHICLE_RULES
 
     def on_prepare(self, prepare: Prepare) -> bool:
-        """V2: promise a ballot; true when a state should be shown at once."""
+        """V2: promise a ballot; return whether the state should be published at once."""
         return self.rules.take(self, PREPARE, prepare) is not None
 
     def on_plan(self, plan: Plan) -> bool:
-        """V3: take the plan of the promised ballot, once; true when it was taken now.
+        """V3: take the plan of the promised ballot, once; return whether it was taken now.
 
-        A plan that cannot be executed safely is not taken, whoever sent it. It is accepted, and
-        that is shown, when the motion controller has noted it for this very process (`on_noted`).
+        A plan that cannot be executed safely is never taken. A taken plan is accepted, and shown
+        as accepted, when the motion controller has noted it for this process (`on_noted`).
         """
         return self.rules.take(self, PLAN, plan) is not None
 
     def on_noted(self, ballot: Ballot | None) -> bool:
-        """V3: the controller notes a plan for the process in charge; true when it is mine now."""
+        """V3: the controller has noted a plan; return whether it is newly accepted now."""
         return self.rules.take(self, NOTED, ballot) is not None
 
     def on_joined(self, formations: tuple[int, ...]) -> bool:
-        """The controller has noted formations as joined; true when some were not known yet.
+        """Add the blocks that the controller has noted as joined; return whether any is new.
 
-        What it says may be older than what is known already: nothing that has been joined parts.
+        The report may be older than what is known already: joined blocks never part.
         """
         if formations == self.joined or set(formations) <= set(self.joined):
             return False
@@ -71,10 +71,10 @@ class PlanExecution(ExecutionState):
         return True
 
     def on_owned(self, sense: Sense) -> bool:
-        """The controller says what the vehicle owns; true when it has noted a promise by now.
+        """Take what the controller notes as owned; return whether it newly notes a promise.
 
-        What an earlier process has promised binds this one: it is taken for a PREPARE. Without
-        effect where formations own blocks.
+        A promise of an earlier process binds this one: it is treated like a PREPARE. Without effect
+        where formations own blocks.
         """
         if self.owned is None:
             return False
@@ -98,7 +98,7 @@ class PlanExecution(ExecutionState):
         return self.next_move
 
     def end_motion(self) -> None:
-        """V7: the controller holds again."""
+        """V7: the motion has ended; the controller holds again."""
         self.rules.take(self, REST, None)
 
     @property
@@ -127,18 +127,18 @@ class PlanExecution(ExecutionState):
         return self.accepted and (not self.moving or self.moving_in_plan)
 
     def overdue(self, t_s: float) -> bool:
-        """Tell whether the next move has been due for too long."""
+        """Return whether the next move has been due for too long."""
         plan = self.plan
         if plan is None or self.moving or not self.accepted:
             return False
         return self.is_due(t_s - min(OVERDUE_SLOTS * plan.slot_s, plan.slot_s + OVERDUE_S))
 
     def state(self, sense: Sense, formation: int, *, attended: bool) -> VehicleState:
-        """Return what to show to others.
+        """Return the state to publish.
 
         Args:
             sense: what the vehicle sensed last.
-            formation: in whose block it entered.
+            formation: block in which it entered.
             attended: whether an agent drives it.
         """
         return VehicleState(
@@ -165,7 +165,7 @@ class PlanExecution(ExecutionState):
         )
 
     def needs_states(self, t_s: float) -> bool:
-        """Tell whether the states of other vehicles matter now.
+        """Return whether the states of other vehicles matter now.
 
         They do until the gate is open, and from `LISTEN_S` before the next move is due until that
         is released. States missed in between do no harm: they are published again.

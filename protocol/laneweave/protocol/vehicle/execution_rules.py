@@ -118,7 +118,7 @@ def is_above_promise(me: ExecutionState, prepare: Prepare) -> bool:
 
 
 def promise(me: ExecutionState, prepare: Prepare) -> None:
-    """Promise the ballot, ask the controller to join its formations."""
+    """Promise the ballot, ask the controller to note its blocks as joined."""
     me.promised, me.promise_noted = prepare.ballot, False
     if me.owned is None:
         me.wanted_joined = tuple(sorted({*me.wanted_joined, *prepare.formations}))
@@ -173,12 +173,12 @@ def keeps_to_its_blocks(me: ExecutionState, plan: Plan) -> bool:
 
 
 def has_joined(me: ExecutionState, plan: Plan) -> bool:
-    """My controller has confirmed its formations as joined with mine, these and no others."""
+    """Its blocks are exactly those that my controller has noted as joined."""
     return me.owned is not None or set(plan.formations) == set(me.joined)
 
 
 def transfers_only_owned_cells(me: ExecutionState, plan: Plan) -> bool:
-    """Its cells change hands among their owners, and none is taken for mine that is not."""
+    """It transfers cells among their owners only, and counts no cell as mine that I do not own."""
     if me.owned is None:
         return True
     mine = me.owned | set(me.noted_transfer.after if me.noted_transfer is not None else ())
@@ -235,7 +235,7 @@ def all_are_ready(me: ExecutionState, _: object) -> bool:
 
 
 def take_ownership(me: ExecutionState, _: object) -> None:
-    """Own what the plan gives me, and no more what it takes."""
+    """Own the cells of `after`: the transfer is open."""
     if me.transfer is not None:
         me.transfer = Deed(me.transfer.ballot, open=True)
 

@@ -1,7 +1,7 @@
 """Plans as partial orders: what a move waits for, and what makes a plan executable.
 
 A plan is not a timetable. Its moves are ordered by *dependencies*, which every vehicle derives from
-the same PLAN message, and each dependency is released by a fact that stays true for ever: "A has
+the same PLAN message, and each dependency is released by a fact that stays true: "A has
 completed k moves of this ballot".
 """
 
@@ -68,10 +68,10 @@ def plan_problems(plan: Plan) -> list[str]:
 
 
 def ownership_problems(plan: Plan) -> list[str]:
-    """Return what is wrong with how a plan hands cells over; empty when nothing is.
+    """Return what is wrong with the cell transfers of a plan; empty when nothing is.
 
-    Checked: the maps cover the roster; no cell has two owners, before or after; no owner appears
-    from nowhere; every vehicle owns afterwards what it occupies.
+    Checked: the maps cover the roster; no cell has two owners, before or after; no vehicle gets a
+    cell that no member owned; every vehicle owns afterwards the cells that it occupies.
     """
     problems = [
         f"{name} does not cover the roster"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from laneweave.coordinator.formations.road_pace import EVERY_S, SLOWEST, RoadPace
+from laneweave.coordinator.formations.planner import MIN_PACE, PACE_WINDOW_S, RoadPace
 
 
 def heard(pace: float, ticks: int = 100, t_s: float = 0.0) -> RoadPace:
@@ -16,25 +16,24 @@ def heard(pace: float, ticks: int = 100, t_s: float = 0.0) -> RoadPace:
 
 
 @pytest.mark.parametrize("pace", [0.5, 1.0, 2.5])
-def test_road_time_takes_less_the_faster_the_road_is(pace: float) -> None:
+def test_the_pace_is_road_time_per_time_of_the_node(pace: float) -> None:
     measure = heard(pace)
     assert measure.pace == pytest.approx(pace)
-    assert measure.node_s(20.0) == pytest.approx(20.0 / pace)
 
 
-def test_before_it_is_measured_road_time_is_real_time() -> None:
-    assert heard(3.0, ticks=5).node_s(4.0) == pytest.approx(4.0)
+def test_the_pace_is_1_before_it_is_measured() -> None:
+    assert heard(3.0, ticks=5).pace == 1.0
 
 
-def test_a_road_that_stands_still_is_not_waited_for_without_end() -> None:
+def test_the_pace_of_a_road_that_stands_still_has_a_lower_bound() -> None:
     measure = RoadPace()
-    for now_s in (0.0, EVERY_S, 2 * EVERY_S):
+    for now_s in (0.0, PACE_WINDOW_S, 2 * PACE_WINDOW_S):
         measure.on_clock(7.0, now_s)
-    assert measure.node_s(1.0) == pytest.approx(1.0 / SLOWEST)
+    assert measure.pace == MIN_PACE
 
 
-def test_another_road_begins_a_measurement_of_its_own() -> None:
+def test_another_road_restarts_the_measurement() -> None:
     measure = heard(2.0)
     measure.on_clock(0.0, 1000.0)
-    measure.on_clock(EVERY_S, 1000.0 + EVERY_S)
+    measure.on_clock(PACE_WINDOW_S, 1000.0 + PACE_WINDOW_S)
     assert measure.pace == pytest.approx(1.0)

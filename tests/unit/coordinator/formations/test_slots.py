@@ -6,8 +6,7 @@ import pytest
 from attrs import evolve
 
 from laneweave.coordinator.formations import pacing
-from laneweave.coordinator.formations.borders import kept_apart, steps_of
-from laneweave.coordinator.formations.pacing import LEAST_RESERVE_S, RESERVE_S
+from laneweave.coordinator.formations.pacing import MIN_RESERVE_S, RESERVE_S, kept_apart, steps_of
 from laneweave.coordinator.formations.roster import start_time_s, time_left_s
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.tables import FormationSettings, Scenario
@@ -57,7 +56,7 @@ def test_slots_are_the_longest_that_leave_a_reserve(steps: int) -> None:
             (s for s in SCENARIO.slots_s if steps * s <= left_s(plan) - reserve_s),
             default=SCENARIO.slots_s[0],
         )
-        for reserve_s in (RESERVE_S, LEAST_RESERVE_S)
+        for reserve_s in (RESERVE_S, MIN_RESERVE_S)
     )
     comfortable = leisurely >= SCENARIO.comfortable_cycle_s
     assert chosen.slot_s == pytest.approx(leisurely if comfortable else hasty)
@@ -81,7 +80,7 @@ def test_a_late_plan_has_shorter_slots() -> None:
 
 def test_haste_takes_of_the_reserve() -> None:
     plan = climbing(6)
-    late = evolve(plan, t0_s=plan.t0_s + left_s(plan) - 6 * 5.0 - LEAST_RESERVE_S)
+    late = evolve(plan, t0_s=plan.t0_s + left_s(plan) - 6 * 5.0 - MIN_RESERVE_S)
     assert paced(late).slot_s == pytest.approx(5.0)
 
 

@@ -187,7 +187,7 @@ def test_who_leads_again_listens_again_and_leaves_alone_what_was_begun() -> None
     desk.think()
     desk.control.take_over()
     assert (desk.control.transfers, desk.control.wakeups) == ([], [])
-    assert set(desk.control.shown.states) == {A, B}  # what they have shown stays true
+    assert set(desk.control.observed.states) == {A, B}  # what they have shown stays true
     later_s = LOOK_S + SLOT_S
     assert desk.order(later_s + PATIENCE_S) is None  # it needs a census, too
     desk.control.on_census(census(A, B))
@@ -448,7 +448,7 @@ def test_the_newest_state_counts_in_whichever_order_they_come(older: State, newe
         desk = Bench()
         desk.control.on_census(census(A))
         desk.hear(*states)
-        assert desk.control.shown.states[A] == newer
+        assert desk.control.observed.states[A] == newer
 
 
 def test_ballots_are_above_all_that_was_promised() -> None:
@@ -570,7 +570,7 @@ def test_whoever_leaves_is_forgotten_and_its_ballot_given_up() -> None:
     desk.think()
     first, second = desk.control.transfers
     desk.control.on_census(census(A, C))
-    assert set(desk.control.shown.states) == {A, C}
+    assert set(desk.control.observed.states) == {A, C}
     assert (first.phase, first.why) == (BallotPhase.GIVEN_UP, "B has left")
     assert second.phase is BallotPhase.PREPARING
 
@@ -591,7 +591,11 @@ def test_another_road_begins_with_nothing() -> None:
     desk.ways = {A: ((0, 0), (0, 1))}
     desk.think()
     desk.control.forget()
-    assert (desk.control.shown.states, desk.control.transfers, desk.control.wakeups) == ({}, [], [])
+    assert (desk.control.observed.states, desk.control.transfers, desk.control.wakeups) == (
+        {},
+        [],
+        [],
+    )
     assert desk.order(LOOK_S + SLOT_S) is None
     desk.control.on_census(evolve(census(A), t_s=0.0))
     assert desk.order(0.0, now_s=100.0) is None  # it listens first
@@ -608,7 +612,7 @@ def test_nothing_is_kept_of_those_that_have_left() -> None:
     desk.hear(*(evolve(shown(name), t_s=BEGUN_S + 0.5) for name in (A, B, C)))
     desk.control.on_census(evolve(census(B), t_s=BEGUN_S + 0.5))
     desk.think()
-    kept = desk.control.shown
+    kept = desk.control.observed
     assert set(kept.states) == {B}
     assert (set(kept._before), kept._left) == ({B}, {})
 
