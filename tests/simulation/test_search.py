@@ -56,14 +56,14 @@ def check_something_happens(totals: Totals) -> None:
 
 
 @pytest.mark.parametrize("first", range(DIGESTS, SEEDS, BATCH))
-def test_no_rule_is_broken_and_everybody_arrives(first: int) -> None:
+def test_no_rule_is_broken_and_all_vehicles_arrive(first: int) -> None:
     check_something_happens(search("mixed", range(first, first + BATCH)))
 
 
 @pytest.mark.full
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("first", range(100_000, 102_000, 100))
-def test_no_rule_is_broken_and_everybody_arrives_long(first: int) -> None:
+def test_no_rule_is_broken_and_all_vehicles_arrive_long(first: int) -> None:
     search("mixed", range(first, first + 100))
 
 
@@ -82,7 +82,7 @@ def test_profile_long(profile: str) -> None:
 @pytest.mark.full
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("first", range(100_000, 102_000, 100))
-def test_cells_change_hands_and_everybody_moves_long(first: int) -> None:
+def test_cells_are_transferred_and_all_vehicles_move_long(first: int) -> None:
     totals = search("rolling", range(first, first + 100))
     assert totals.motions > 2000
 

@@ -230,7 +230,7 @@ def test_endpoints_that_cannot_be(lab: Lab, endpoint: str) -> None:
 
 
 @pytest.mark.parametrize("role", ["coordinator", "agent", "bridge", "ping", "plan"])
-def test_nobody_is_there(lab: Lab, role: str) -> None:
+def test_an_endpoint_without_a_router_is_refused(lab: Lab, role: str) -> None:
     request = lab.path("request.json", json.dumps(REQUEST))
     options: dict[str, list[object]] = {
         "plan": [request, "--connect", NOBODY],
@@ -262,7 +262,7 @@ def silent_server() -> Iterator[str]:
             connection.close()
 
 
-def test_somebody_else_is_there(lab: Lab, silent_server: str) -> None:
+def test_an_endpoint_of_another_server_is_refused(lab: Lab, silent_server: str) -> None:
     started = [lab.start(role, "--endpoint", silent_server) for role in ("ping", "router")]
     for process in started:
         assert silent_server in the_line(lab.finish(process, END_S))

@@ -50,9 +50,7 @@ def test_another_leader_takes_over(finished_run: FinishedRun, lab: Lab, road: Pa
     assert [line for line in log_lines(folder) if line["level"] == "error"] == []
 
 
-def test_a_named_coordinator_is_killed_and_nobody_notices(
-    finished_run: FinishedRun, lab: Lab, road: Path
-) -> None:
+def test_a_killed_candidate_has_no_effect(finished_run: FinishedRun, lab: Lab, road: Path) -> None:
     faults = lab.path("faults.toml", f'[[kill]]\ntarget = "c3"\nat_s = {KILLED_AT_S}\n')
     folder = lab.folder / "out"
 

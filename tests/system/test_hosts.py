@@ -89,7 +89,7 @@ def test_a_link_is_cut(make_hosts: MakeHosts, link: str) -> None:
 
 
 @pytest.mark.full
-def test_everybody_is_killed_once(make_hosts: MakeHosts) -> None:
+def test_every_process_is_killed_once(make_hosts: MakeHosts) -> None:
     hosts = make_hosts(pace=2.0)
     hosts.start_all()
     hosts.wait_healthy(*(name for name in hosts.running if name != "bridge"))

@@ -213,7 +213,7 @@ def test_a_refusal_names_the_field(transport: ZenohTransport, client: PlanClient
     assert caught.value.field == "deadline_s"
 
 
-def test_a_client_waits_no_longer_than_it_was_told(client: PlanClient) -> None:
+def test_a_client_waits_at_most_its_timeout(client: PlanClient) -> None:
     slow = PlanRequest.from_dict(slow_request("slow", 1.0))
     for timeout_s in (0.2, 0.0, -1.0, float("nan")):
         with pytest.raises(TimeoutError):

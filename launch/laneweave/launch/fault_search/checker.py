@@ -121,10 +121,10 @@ class Checker:
         self._bodies[vehicle] = Body.standing(self._geometry, cell, t_s)
         self._check_cells(t_s, vehicle)
 
-    def own(self, t_s: float, vehicle: str, estate: tuple[Cell, ...], deed: Deed | None) -> None:
+    def own(self, t_s: float, vehicle: str, owned: tuple[Cell, ...], transfer: Deed | None) -> None:
         """Record what a motion controller shows as owned."""
         if self._ownership is not None:
-            self._ownership.show(t_s, vehicle, estate, deed)
+            self._ownership.show(t_s, vehicle, owned, transfer)
 
     def leave(self, t_s: float, vehicle: str) -> None:
         """Record that a vehicle leaves the road."""

@@ -93,7 +93,7 @@ class Grant:
 class RoadObserver(Protocol):
     """Receives the events on the road; the checker is one."""
 
-    def own(self, t_s: float, vehicle: str, estate: tuple[Cell, ...], deed: Deed | None) -> None:
+    def own(self, t_s: float, vehicle: str, owned: tuple[Cell, ...], transfer: Deed | None) -> None:
         """Record what a motion controller shows as owned."""
 
     def enter(self, t_s: float, vehicle: str, cell: Cell) -> None:

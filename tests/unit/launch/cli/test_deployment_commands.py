@@ -70,7 +70,7 @@ def test_certificates_for_a_deployment(run: Cli, config: Path) -> None:
     assert report.problems == report.warnings == []
 
 
-def test_an_authority_is_not_replaced_unless_told(run: Cli, tmp_path: Path) -> None:
+def test_an_authority_is_replaced_only_on_request(run: Cli, tmp_path: Path) -> None:
     folder = tmp_path / "certs"
     assert run("certs", "init", folder)[0] == 0
     before = (folder / "ca.pem").read_bytes()
@@ -140,7 +140,7 @@ def checked(text: str, identity: str | None, folder: Path) -> Report:
     return check_deployment(load_scenario(path), who, {})
 
 
-def test_all_problems_are_told_at_once(run: Cli, tmp_path: Path) -> None:
+def test_all_problems_are_reported_at_once(run: Cli, tmp_path: Path) -> None:
     path = tmp_path / "deployment.toml"
     path.write_text('[network]\nendpoint = "tcp/x"\nlisten = ["udp/y:1", "tcp/z:1"]\n')
     status, out, errors = run("config", "check", path)
@@ -165,12 +165,12 @@ def test_a_file_that_does_not_load(run: Cli, tmp_path: Path) -> None:
         ("router", "No such file"),
     ],
 )
-def test_whose_files_are_not_in_order(tmp_path: Path, identity: str, problem: str) -> None:
+def test_wrong_files_of_a_role_are_reported(tmp_path: Path, identity: str, problem: str) -> None:
     (found,) = checked(DEPLOYMENT, identity, tmp_path).problems
     assert problem in found
 
 
-def test_what_is_odd(tmp_path: Path) -> None:
+def test_odd_settings_cause_warnings(tmp_path: Path) -> None:
     assert checked('network.endpoint = "tcp/127.0.0.1:1"', None, tmp_path).warnings == []
     (line,) = checked('network.endpoint = "tcp/10.0.0.1:1"', None, tmp_path).warnings
     assert line.startswith("security.mode: off")

@@ -81,7 +81,7 @@ def test_commands_exist_and_read_the_one_configuration(service: str) -> None:
 
 
 @each_service
-def test_whoever_lasts_shows_its_health_and_is_started_again(service: str) -> None:
+def test_permanent_services_have_health_checks_and_restart(service: str) -> None:
     if once(service):
         return
     found = SERVICES[service]

@@ -64,7 +64,7 @@ def _logs_stay_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cli, "log_to_terminal", lambda: None)
 
 
-def test_a_panel_for_each_time_point_shows_where_everybody_is() -> None:
+def test_a_panel_per_time_point_shows_all_vehicles() -> None:
     figure = plan_figure(REQUEST, PLAN)
     assert len(figure.axes) == 4
     for time, axes in enumerate(figure.axes):
@@ -236,7 +236,7 @@ def test_the_answer_is_printed_and_drawn(
     assert (tmp_path / "plan.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_drawing_that_fails_after_all_is_told(
+def test_a_failed_drawing_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> None:

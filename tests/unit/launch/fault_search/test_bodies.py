@@ -40,14 +40,14 @@ def test_a_motion_occupies_its_bounding_box(origin: Cell, target: Cell, cells: s
     assert body(origin, target).cells == cells
 
 
-def test_who_turns_round_half_way_occupies_both_cells() -> None:
+def test_a_body_that_turns_round_half_way_occupies_both_cells() -> None:
     moving = body((0, 0), (1, 0), lasts_s=2.0)
     moving.go((0, 0), 1.0, 1.0)
     assert moving.at(1.0) == pytest.approx((7.5, 1.75))
     assert moving.cells == {(0, 0), (1, 0)}
 
 
-def test_who_has_nearly_arrived_occupies_its_cell_only() -> None:
+def test_a_body_that_has_nearly_arrived_occupies_only_its_cell() -> None:
     moving = body((0, 0), (0, 1), lasts_s=1.0)
     moving.go((1, 1), 0.99, 1.0)  # 35 mm before the middle of the lane
     assert moving.cells == {(0, 1), (1, 1)}

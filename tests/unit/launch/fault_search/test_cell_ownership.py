@@ -15,22 +15,22 @@ OPEN = Deed(BALLOT, open=True)
 
 
 class Watched:
-    """Estates, and what they tell."""
+    """Cell ownership, and the kinds of violations that it reports."""
 
     def __init__(self) -> None:
         """Begin without vehicles."""
         self.kinds: list[str] = []
-        self.estates = CellOwnership(self._tell)
+        self.ownership = CellOwnership(self._tell)
 
     def _tell(self, kind: str, t_s: float, vehicles: list[str], text: str) -> None:
         del t_s, vehicles, text
         self.kinds.append(kind)
 
     def show(self, vehicle: str, *estate: Cell, deed: Deed | None = None) -> None:
-        self.estates.show(0.0, vehicle, estate, deed)
+        self.ownership.show(0.0, vehicle, estate, deed)
 
     def stand(self, vehicle: str, *cells: Cell) -> None:
-        self.estates.occupy(0.0, vehicle, frozenset(cells))
+        self.ownership.occupy(0.0, vehicle, frozenset(cells))
 
 
 @pytest.fixture
@@ -68,7 +68,7 @@ def test_a_cell_has_one_owner(watched: Watched) -> None:
     assert watched.kinds == ["owner"]
 
 
-def test_possession_that_nobody_gave(watched: Watched) -> None:
+def test_possession_without_a_transfer_is_seen(watched: Watched) -> None:
     watched.show("a", HERE, THERE)
     assert watched.kinds == ["owner"]
 
@@ -79,15 +79,15 @@ def test_a_body_stays_in_its_own_cells(watched: Watched) -> None:
     assert watched.kinds == ["trespass", "trespass"]
 
 
-def test_nobody_moves_before_anybody_has_taken_possession(watched: Watched) -> None:
-    watched.estates.move(0.0, "a", BALLOT)
+def test_a_move_before_possession_is_seen(watched: Watched) -> None:
+    watched.ownership.move(0.0, "a", BALLOT)
     assert watched.kinds == ["gate"]
     hand_over(watched)
-    watched.estates.move(0.0, "a", BALLOT)
+    watched.ownership.move(0.0, "a", BALLOT)
     assert watched.kinds == ["gate"]
 
 
-def test_the_cells_of_who_leaves_are_nobodys(watched: Watched) -> None:
-    watched.estates.leave("b")
+def test_the_cells_of_a_vehicle_that_leaves_are_free(watched: Watched) -> None:
+    watched.ownership.leave("b")
     watched.show("a", HERE, THERE)
     assert watched.kinds == []

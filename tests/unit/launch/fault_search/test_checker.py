@@ -88,7 +88,7 @@ def test_a_cell_that_is_still_occupied_is_seen() -> None:
     assert set(scene.checker.violations[0].vehicles) == {A, B}
 
 
-def test_a_cell_in_which_somebody_holds_is_seen() -> None:
+def test_a_cell_that_another_vehicle_holds_is_seen() -> None:
     scene = Scene(a=(0, 0), b=(1, 0))
     scene.issue(0.0, 1, a=((0, (0, 0), (1, 0)),), b=())
     scene.move(1.0, A, 1, (1, 0))
@@ -120,7 +120,7 @@ def test_bodies_that_overlap_are_seen_at_the_time_at_which_they_touch() -> None:
     assert overlap.t_s == pytest.approx(2.0)  # 10 m of net gap at 10 m/s
 
 
-def test_who_has_left_is_in_nobodys_way() -> None:
+def test_a_vehicle_that_has_left_blocks_no_cell() -> None:
     scene = Scene(a=(0, 0), b=(1, 0))
     scene.issue(0.0, 1, a=((0, (0, 0), (1, 0)),), b=())
     scene.checker.leave(0.5, B)
@@ -258,7 +258,7 @@ def test_progress_and_other_processes_are_fine(after: VehicleState) -> None:
     assert checker.violations == []
 
 
-def test_a_stuck_vehicle_is_told() -> None:
+def test_a_stuck_vehicle_is_reported() -> None:
     checker = Checker(GEOMETRY)
     checker.stuck(50.0, A, "in (0, 0), wants lane 1")
     assert str(checker.violations[0]) == "  50.000 s  stuck: a: in (0, 0), wants lane 1"

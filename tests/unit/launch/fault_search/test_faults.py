@@ -66,7 +66,7 @@ def test_killed_processes_are_started_again(world: FaultRun, kind: str) -> None:
     assert set(world.network.names) == everybody
 
 
-def test_the_leader_is_whoever_leads(world: FaultRun) -> None:
+def test_the_leader_is_the_coordinator_that_leads(world: FaultRun) -> None:
     assert world.leaders == ("c1",)
     harm(world, "leader-kill")
     assert "c1" not in world.network
@@ -113,7 +113,7 @@ def test_lasting_faults_are_counted() -> None:
     assert FaultMix.drawn(PROFILES["calm"], random.Random(1)).kinds() == {}
 
 
-def test_every_kind_in_a_profile_can_be_done() -> None:
+def test_every_kind_in_a_profile_can_be_applied() -> None:
     for kind in sorted({kind for profile in PROFILES.values() for kind in profile.harm}):
         world = FaultRun(3, PROFILES["calm"])
         world.network.run(2.0)

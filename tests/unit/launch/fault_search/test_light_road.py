@@ -177,7 +177,7 @@ def test_a_wrong_clock_shifts_no_cell() -> None:
     assert all(one.t_s < other.t_s for one, other in pairwise(senses))
 
 
-def test_who_leaves_is_told_and_is_in_no_census(bench: Bench) -> None:
+def test_a_leaving_vehicle_is_notified_and_in_no_census(bench: Bench) -> None:
     bench = Bench(leaves_s=0.25)
     bench.agent(up=True)
     sent = [bench.tick() for _ in range(4)]
@@ -190,7 +190,7 @@ def test_who_leaves_is_told_and_is_in_no_census(bench: Bench) -> None:
     assert not [message for message in bench.tick() if isinstance(message, Sense)]
 
 
-def test_new_wishes_are_in_the_next_census(bench: Bench) -> None:
+def test_new_preferred_lanes_are_in_the_next_census(bench: Bench) -> None:
     bench.road.prefer({A: 0})
     (census,) = [message for message in bench.tick() if isinstance(message, Census)]
     assert census.on_road[0].preferred_lane == 0

@@ -1,4 +1,4 @@
-"""What a seed draws: roads, visits and wishes that make sense under every profile."""
+"""The setup drawn from a seed is valid under every profile."""
 
 import random
 from collections import Counter
@@ -74,14 +74,14 @@ def test_every_road_is_a_valid_scenario_with_room_for_all(name: str) -> None:
 
 
 @EVERY
-def test_in_every_formation_somebody_stays(name: str) -> None:
+def test_in_every_formation_a_vehicle_stays(name: str) -> None:
     for setup, _ in draw(name):
         stay = {formation_of(setup, visit) for visit in setup.visits if not visit.leaves_s}
         assert stay == set(setup.formations)
 
 
 @EVERY
-def test_the_last_wishes_can_be_fulfilled(name: str) -> None:
+def test_the_last_preferences_can_be_satisfied(name: str) -> None:
     for setup, rng in draw(name):
         wishes = setup.preferences(rng, last=True)
         if asks_for_too_much(setup, wishes):

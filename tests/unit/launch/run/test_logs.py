@@ -68,7 +68,7 @@ def test_levels(arguments: tuple[str, ...], said: set[str]) -> None:
 
 
 @pytest.mark.parametrize("form", ["text", "json"])
-def test_a_log_that_cannot_be_written_ends_nobody(form: str) -> None:
+def test_a_log_that_cannot_be_written_does_not_end_the_process(form: str) -> None:
     program = """
 import sys, structlog
 from laneweave.launch.run.logs import LogFormat, log_role

@@ -49,7 +49,7 @@ def columns(folder: Path, name: str) -> dict[str, list[Any]]:
 
 @each_method
 @pytest.mark.parametrize("lane_change_s", [0.0, 4.0])
-def test_at_low_volume_everybody_leaves_on_its_lane(
+def test_at_low_volume_all_vehicles_leave_on_their_preferred_lanes(
     tmp_path: Path, method: str, lane_change_s: float
 ) -> None:
     settings = parse_scenario(to_tables(scenario()) | {method: {"lane_change_s": lane_change_s}})

@@ -92,7 +92,7 @@ def test_vehicles_need_not_be_where_they_were_planned(stream: Stream) -> None:
         assert problems_of_ways(road, later, moved, blocked) == []
 
 
-def test_nobody_is_there() -> None:
+def test_an_endpoint_without_a_router_is_refused() -> None:
     assert StreamPlanner(ROAD).plan(3, []) == StreamPlan(3, {}, ())
 
 
