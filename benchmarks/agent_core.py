@@ -33,7 +33,7 @@ from laneweave.agents.host import AgentHost
 from laneweave.coordinator.formations.planner import LONGEST_DEADLINE_S
 from laneweave.coordinator.formations.roster import start_time_s, steps_left
 from laneweave.coordinator.formations.sorting import SortingTask, sort_lanes
-from laneweave.coordinator.planning import Weights
+from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.protocol.lattice import territory
 from laneweave.protocol.runtime.node import Node, Started, read_message
 from laneweave.protocol.runtime.transport import Received

@@ -17,11 +17,11 @@ from typing import Any
 import attrs
 import numpy as np
 
-from laneweave.coordinator.planning import checked_plan, warm_up
 from laneweave.coordinator.planning.conflicts import ConflictModel
-from laneweave.coordinator.planning.exact.arrays import lattice
-from laneweave.coordinator.planning.grid import Cell
+from laneweave.coordinator.planning.exact.arrays import move_arrays
+from laneweave.coordinator.planning.facade import checked_plan, warm_up
 from laneweave.launch.bench.planner import FAMILIES
+from laneweave.protocol.lattice import Cell
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "evidence" / "closing.json"
 SIZES = {"block": (6,), "following": (6, 9, 12), "geometric": (6, 9, 12)}
@@ -49,7 +49,7 @@ def measured(name: str, vehicles: int) -> dict[str, Any]:
         for index, family in enumerate((free, kept)):
             request = family.request(seed, vehicles, DEADLINE_S)
             # Lattices are made anew for each request, so that neither profits from the other.
-            lattice.cache_clear()
+            move_arrays.cache_clear()
             began = time.thread_time()
             response = checked_plan(request, solver="branching")
             time_ms.append((time.thread_time() - began) * 1e3)

@@ -22,11 +22,11 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch, Rectangle
 from matplotlib.patheffects import withStroke
 
-from laneweave.coordinator.planning.conflicts import PAPER_KINDS, ConflictModel, footprint
-from laneweave.coordinator.planning.geometry.conflict_table import FARTHEST, Pair, close_pairs
-from laneweave.coordinator.planning.geometry.settings import Geometry
-from laneweave.coordinator.planning.grid import Cell, displacements
+from laneweave.coordinator.planning.conflicts import MAX_OFFSET, PAPER_KINDS, ConflictModel, Pair
+from laneweave.coordinator.planning.geometry.bodies import BodyGeometry
+from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
 from laneweave.launch.drawing.figures import FAINT_INK, INK, new_figure, save
+from laneweave.protocol.lattice import Cell, displacements, footprint
 
 LATENESS_S: Final = 0.5
 """The margin that is told apart in the picture and in the table of counts."""
@@ -66,12 +66,12 @@ _ARROW, _DOT, _WAY = (0.14, 0.4), 0.045, 0.56
 a cell."""
 
 
-def draw_conflicts(out: Path, geometry: Geometry | None = None, dpi: int = 110) -> None:
+def draw_conflicts(out: Path, geometry: BodyGeometry | None = None, dpi: int = 110) -> None:
     """Write the picture of a geometry's table in mode 2."""
-    save(conflict_figure(geometry or Geometry()), out, dpi)
+    save(conflict_figure(geometry or BodyGeometry()), out, dpi)
 
 
-def conflict_figure(geometry: Geometry) -> Figure:
+def conflict_figure(geometry: BodyGeometry) -> Figure:
     """Return the figure."""
     judge = Judge.of(geometry)
     figure = new_figure(_WIDTH_IN, _LEGEND_IN + len(PANELS) // _ACROSS * _pitch_in()[1])
@@ -115,10 +115,10 @@ class Judge:
     any_delay: frozenset[Pair]
 
     @classmethod
-    def of(cls, geometry: Geometry) -> Judge:
+    def of(cls, geometry: BodyGeometry) -> Judge:
         """Compute the tables."""
         tables = (
-            close_pairs(attrs.evolve(geometry, lateness_s=late_s))
+            conflict_table(attrs.evolve(geometry, lateness_s=late_s)).pairs
             for late_s in (0.0, LATENESS_S, None)
         )
         return cls(*tables)
@@ -147,8 +147,8 @@ def counts() -> list[tuple[str, int, int]]:
 
     Of vehicles in different cells; each pair counts twice, as seen from either vehicle.
     """
-    judge = Judge.of(Geometry())
-    near = range(-FARTHEST, FARTHEST + 1)
+    judge = Judge.of(BodyGeometry())
+    near = range(-MAX_OFFSET, MAX_OFFSET + 1)
     offsets = [offset for offset in product(near, near) if offset != (0, 0)]
     steps = displacements(2)
     pairs = list(product(offsets, steps, steps))
@@ -196,7 +196,7 @@ def _new_panel(figure: Figure, row: int, column: int) -> Axes:
 
 
 def _draw_panel(axes: Axes, a: Cell, judge: Judge) -> None:
-    reach = FARTHEST + 0.5
+    reach = MAX_OFFSET + 0.5
     axes.set_xlim(-reach, reach)
     axes.set_ylim(-reach * _LANE_HEIGHT, reach * _LANE_HEIGHT)
     axes.set_facecolor(_CELL)
@@ -204,12 +204,12 @@ def _draw_panel(axes: Axes, a: Cell, judge: Judge) -> None:
     axes.set_yticks([])
     for spine in axes.spines.values():
         spine.set(color=_BORDER, linewidth=0.8)
-    lines = [number - 0.5 for number in range(-FARTHEST + 1, FARTHEST + 1)]
+    lines = [number - 0.5 for number in range(-MAX_OFFSET + 1, MAX_OFFSET + 1)]
     axes.vlines(lines, -reach * _LANE_HEIGHT, reach * _LANE_HEIGHT, colors=_BORDER, linewidth=0.6)
     axes.hlines(
         [line * _LANE_HEIGHT for line in lines], -reach, reach, colors=_BORDER, linewidth=0.6
     )
-    near = range(-FARTHEST, FARTHEST + 1)
+    near = range(-MAX_OFFSET, MAX_OFFSET + 1)
     for offset in product(near, near):
         if offset == (0, 0):
             continue
@@ -243,7 +243,7 @@ def _draw_move(axes: Axes, cell: Cell, step: Cell, verdict: Verdict) -> None:
 
 def _draw_a(axes: Axes, step: Cell) -> None:
     """Draw A in the middle, the cells of its footprint, and its way."""
-    for column, lane in footprint(((0, 0), step)):
+    for column, lane in footprint((0, 0), step):
         corner = (column - 0.5, (lane - 0.5) * _LANE_HEIGHT)
         axes.add_patch(
             Rectangle(corner, 1.0, _LANE_HEIGHT, facecolor=_OWN_CELL, linewidth=0, zorder=0.5)

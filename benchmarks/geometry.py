@@ -23,23 +23,24 @@ from numpy.typing import NDArray
 
 from conflict_drawing import conflict
 from laneweave.agents.driving.trajectory import move_profile
-from laneweave.coordinator.planning import PlanRequest, checked_plan, warm_up
-from laneweave.coordinator.planning.conflict_cliques import row_patterns
-from laneweave.coordinator.planning.conflicts import PAPER_KINDS, ConflictModel
-from laneweave.coordinator.planning.geometry.conflict_table import Pair, close_pairs
-from laneweave.coordinator.planning.geometry.settings import Geometry
-from laneweave.coordinator.planning.grid import displacements
-from laneweave.coordinator.planning.instances import formation_request
+from laneweave.coordinator.planning.conflicts import PAPER_KINDS, ConflictModel, Pair
+from laneweave.coordinator.planning.exact.cliques import clique_patterns
+from laneweave.coordinator.planning.facade import checked_plan, warm_up
+from laneweave.coordinator.planning.geometry.bodies import BodyGeometry
+from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.launch.bench.request_families import formation_request
+from laneweave.protocol.lattice import displacements
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import cell_state
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, pose_of
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "evidence" / "geometry.json"
-MODELS: dict[str, Geometry | None] = {
+MODELS: dict[str, BodyGeometry | None] = {
     "footprints": None,
-    "any delay": Geometry(),
-    "0.5 s late": Geometry(lateness_s=0.5),
-    "on time": Geometry(lateness_s=0.0),
+    "any delay": BodyGeometry(),
+    "0.5 s late": BodyGeometry(lateness_s=0.5),
+    "on time": BodyGeometry(lateness_s=0.0),
 }
 ALLOWING: dict[str, tuple[str, ...]] = {
     "node, edge, special-1": PAPER_KINDS[:3],
@@ -89,10 +90,10 @@ def table_times_ms() -> dict[str, float]:
     times_ms = {}
     for name, geometry in MODELS.items():
         if geometry is not None:
-            close_pairs.cache_clear()
-            row_patterns.cache_clear()
+            conflict_table.cache_clear()
+            clique_patterns.cache_clear()
             began = time.thread_time()
-            row_patterns(2, ConflictModel(["geometric"], geometry))
+            clique_patterns(2, ConflictModel(["geometric"], conflict_table(geometry)))
             times_ms[name] = round((time.thread_time() - began) * 1e3, 1)
     return times_ms
 

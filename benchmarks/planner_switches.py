@@ -18,11 +18,13 @@ from typing import Any
 import attrs
 import numpy as np
 
-from laneweave.coordinator.planning import PlanRequest, Weights, plan, warm_up
 from laneweave.coordinator.planning.budget import Budget
-from laneweave.coordinator.planning.facade import MAX_NODES, new_tappa, problem_of
-from laneweave.coordinator.planning.instances import TRAFFIC_KINDS, block_request, traffic_request
-from laneweave.coordinator.planning.paper.improvements import Improvements
+from laneweave.coordinator.planning.facade import MAX_NODES, plan, warm_up
+from laneweave.coordinator.planning.paper.assignments import Weights
+from laneweave.coordinator.planning.paper.cbs import Improvements
+from laneweave.coordinator.planning.paper.tappa import new_tappa
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.launch.bench.request_families import TRAFFIC_KINDS, block_request, traffic_request
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "evidence" / "planner-switches.json"
 INSTANCES, FEWER_INSTANCES = 200, 60
@@ -54,7 +56,7 @@ def planned(request: PlanRequest, improvements: Improvements) -> tuple[float, in
     began = time.thread_time()
     budget = Budget(deadline=began + DEADLINE_S, max_nodes=MAX_NODES, clock=time.thread_time)
     weights = Weights.for_mode(request.mode)
-    run = new_tappa(problem_of(request), request, weights, budget, improvements)
+    run = new_tappa(request.problem(), request, weights, budget, improvements)
     run.run()
     took_ms = 1e3 * (time.thread_time() - began)
     return took_ms, run.best.cost if run.finished and run.best is not None else None

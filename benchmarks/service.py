@@ -39,9 +39,11 @@ from typing import Any
 import attrs
 from attrs import define, field, frozen
 
-from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan, warm_up
-from laneweave.coordinator.planning.instances import formation_request
+from laneweave.coordinator.planning.facade import checked_plan, warm_up
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.service.client import AsyncPlanClient, PlanClient, PlanError
+from laneweave.launch.bench.request_families import formation_request
 
 LANEWEAVE = str(Path(sys.executable).with_name("laneweave"))
 REQUESTS, CLIENTS = 200, 20

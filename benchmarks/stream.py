@@ -19,9 +19,10 @@ import attrs
 import numpy as np
 from attrs import field, frozen
 
-from laneweave.coordinator.planning import warm_up
 from laneweave.coordinator.planning.conflicts import ConflictModel
-from laneweave.coordinator.planning.geometry.settings import Geometry
+from laneweave.coordinator.planning.facade import warm_up
+from laneweave.coordinator.planning.geometry.bodies import BodyGeometry
+from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
 from laneweave.coordinator.planning.rolling.planner import (
     StreamCosts,
     StreamPlan,
@@ -29,7 +30,7 @@ from laneweave.coordinator.planning.rolling.planner import (
     StreamRoad,
     StreamVehicle,
 )
-from laneweave.coordinator.planning.rolling.validator import problems_of_ways
+from laneweave.coordinator.planning.rolling.validator import problems_of_plan
 from laneweave.coordinator.rolling.planner import REWARD, stream_road
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.scenario.tables import Scenario
@@ -72,7 +73,12 @@ VARIANTS = {
     "drift costs": Variant(costs=StreamCosts(forward=2.0)),
     "trains": Variant(attrs.evolve(ROAD, model=ConflictModel(("node", "edge", "closing")))),
     "0.5 s late": Variant(
-        attrs.evolve(ROAD, model=ConflictModel(("geometric", "closing"), Geometry(lateness_s=0.5)))
+        attrs.evolve(
+            ROAD,
+            model=ConflictModel(
+                ("geometric", "closing"), conflict_table(BodyGeometry(lateness_s=0.5))
+            ),
+        )
     ),
     "mode 2": Variant(
         attrs.evolve(ROAD, mode=2, model=ConflictModel(("geometric", "closing"))),
@@ -166,13 +172,13 @@ class Run:
         began = time.thread_time()
         plan = self.planner.plan(self.number, vehicles, self.plan)
         cpu_ms = (time.thread_time() - began) * 1e3
-        wrong = problems_of_ways(self.road, plan, vehicles)
+        wrong = problems_of_plan(self.road, plan, vehicles)
         check_ms = (time.thread_time() - began) * 1e3 - cpu_ms
         if wrong:
             raise RuntimeError("; ".join(wrong))
         self.slots.append(Slot(cpu_ms, check_ms, plan.rounds, len(plan.missed), len(vehicles)))
         for name, (one, cell) in self.on_road.items():
-            way = plan.ways[name]
+            way = plan.paths[name]
             self.on_road[name] = one, way[1] if len(way) > 1 else cell
         self.plan = plan
         self.number += 1

@@ -30,8 +30,8 @@ from laneweave.agents.metrics import AgentMetrics
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.formations.leader import LEADER_RULES
 from laneweave.coordinator.metrics import CoordinatorMetrics
-from laneweave.coordinator.planning import PlanRequest
-from laneweave.coordinator.planning.explanation import explain
+from laneweave.coordinator.planning.paper.explanation import explain
+from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES
 from laneweave.coordinator.service.server import ServiceMetrics
 from laneweave.launch.drawing.tappa_process import draw_explanation

@@ -6,7 +6,7 @@ It runs beside `laneweave router --endpoint tcp/127.0.0.1:7447` and
 
 import sys
 
-from laneweave.coordinator.planning import PlanRequest
+from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.service.client import PlanClient, PlanError
 
 request = PlanRequest.from_dict(

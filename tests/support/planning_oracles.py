@@ -9,10 +9,12 @@ from functools import lru_cache
 
 from hypothesis import strategies as st
 
-from laneweave.coordinator.planning.conflicts import KINDS, ConflictModel
-from laneweave.coordinator.planning.geometry.settings import Geometry
-from laneweave.coordinator.planning.grid import Cell, Grid, Mode, Move
+from laneweave.coordinator.planning.conflicts import ConflictModel, Move
+from laneweave.coordinator.planning.geometry.bodies import BodyGeometry
+from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
+from laneweave.protocol.lattice import Cell, Mode
+from laneweave.protocol.scenario.tables import CONFLICT_KINDS
 
 
 def moves_from(cell: Cell, grid: Grid, mode: Mode) -> list[Move]:
@@ -82,7 +84,7 @@ def cheapest_plan(request: PlanRequest, fixed: Sequence[int] | None = None) -> i
     return None
 
 
-GEOMETRIES = (None, Geometry(), Geometry(lateness_s=0.0), Geometry(lateness_s=0.5))
+GEOMETRIES = (None, BodyGeometry(), BodyGeometry(lateness_s=0.0), BodyGeometry(lateness_s=0.5))
 
 MODES: st.SearchStrategy[Mode] = st.sampled_from((1, 2))
 
@@ -105,7 +107,7 @@ def requests(
     common = st.sampled_from(
         [("node", "edge", "special-1"), ("node", "edge", "special-1", "closing")]
     )
-    any_kinds = st.lists(st.sampled_from(KINDS), unique=True).map(tuple)
+    any_kinds = st.lists(st.sampled_from(CONFLICT_KINDS), unique=True).map(tuple)
     preference = st.none() | st.lists(
         st.integers(0, len(targets) - 1), unique=True, min_size=1
     ).map(tuple)

@@ -11,19 +11,20 @@ from hypothesis import strategies as st
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_array
 
-from laneweave.coordinator.planning.conflicts import ConflictModel
-from laneweave.coordinator.planning.geometry.settings import Geometry
-from laneweave.coordinator.planning.grid import Cell, Move
+from laneweave.coordinator.planning.conflicts import ConflictModel, Move
+from laneweave.coordinator.planning.geometry.bodies import BodyGeometry
+from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
 from laneweave.coordinator.planning.rolling.planner import (
+    CellPath,
     StreamCosts,
     StreamPlan,
     StreamRoad,
     StreamVehicle,
-    Way,
 )
+from laneweave.protocol.lattice import Cell
 from oracles.path_rules import conflict_kinds
 
-ROAD = StreamRoad(3, 15.0, 60.0, (400.0, 1000.0), 1000.0, 5.0, most_ways=2000)
+ROAD = StreamRoad(3, 15.0, 60.0, (400.0, 1000.0), 1000.0, 5.0, max_paths=2000)
 SHORT = StreamRoad(3, 15.0, 30.0, (-20.0, 150.0), 150.0, 5.0)
 """Everybody sorts from the beginning, in up to five slots."""
 FOLLOWING = ConflictModel(("node", "edge", "special-1", "closing"))
@@ -32,8 +33,8 @@ MODELS = (
     ConflictModel(("node",)),
     ConflictModel(("node", "edge", "special-2", "special-4")),
     ConflictModel(("geometric",)),
-    ConflictModel(("geometric", "closing"), Geometry()),
-    ConflictModel(("geometric",), Geometry(lateness_s=0.5)),
+    ConflictModel(("geometric", "closing"), conflict_table(BodyGeometry())),
+    ConflictModel(("geometric",), conflict_table(BodyGeometry(lateness_s=0.5))),
 )
 COSTS = StreamCosts()
 
@@ -53,7 +54,7 @@ def streams(draw: st.DrawFn) -> Stream:
         5.0,
         draw(st.sampled_from((1, 2))),
         draw(st.sampled_from(MODELS)),
-        most_ways=400,
+        max_paths=400,
     )
     slot = draw(st.integers(0, 9))
     begin = draw(st.integers(-6, 36)) - int(slot * road.advance_m / road.pitch_m)
@@ -108,17 +109,17 @@ def step_cost(vehicle: StreamVehicle, move: Move) -> float:
     return cost + COSTS.backward * (move[1][0] < move[0][0])
 
 
-def cost_of(road: StreamRoad, slot: int, vehicle: StreamVehicle, way: Way) -> float:
+def cost_of(road: StreamRoad, slot: int, vehicle: StreamVehicle, way: CellPath) -> float:
     cost = sum(step_cost(vehicle, move) for move in pairwise(way))
     return cost + missing(road, slot, vehicle) * (way[-1][1] != vehicle.lane)
 
 
 def cost_of_plan(road: StreamRoad, plan: StreamPlan, vehicles: Sequence[StreamVehicle]) -> float:
-    return sum(cost_of(road, plan.slot, v, plan.ways[v.vehicle]) for v in vehicles)
+    return sum(cost_of(road, plan.slot, v, plan.paths[v.vehicle]) for v in vehicles)
 
 
 def conflicts(model: ConflictModel, a: Move, b: Move) -> bool:
-    if model.geometry is not None:
+    if model.table is not None:
         return model.kind(a, b) is not None
     return bool(conflict_kinds(a, b, model.kinds))
 

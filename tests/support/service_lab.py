@@ -15,7 +15,8 @@ from typing import Any, Self
 import psutil
 from attrs import define, field
 
-from laneweave.coordinator.planning import PlanRequest, PlanResponse
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.service.client import PlanClient, PlanError
 from laneweave.coordinator.service.format import JSON
 from laneweave.coordinator.service.rendezvous import falls_to

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from attrs import frozen
 
-from laneweave.coordinator.planning import PlanRequest, VehicleRequest, checked_plan
+from laneweave.coordinator.planning.facade import checked_plan
 from laneweave.coordinator.planning.grid import Grid
+from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.plans import plan_problems

@@ -21,7 +21,7 @@ import msgpack
 import psutil
 import pytest
 
-from laneweave.coordinator.planning import PlanRequest
+from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.service.client import (
     AsyncPlanClient,
     PlanClient,

@@ -22,7 +22,7 @@ import typer
 from numpy.typing import NDArray
 
 from laneweave.agents.driving.trajectory import move_profile
-from laneweave.coordinator.planning import PlanRequest
+from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.launch.cli.main import app
 from laneweave.launch.cli.plan_answers import answer_request
 from laneweave.launch.faults.specification import load_faults

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import structlog
 
 from laneweave.coordinator.core import CoordinatorCore
-from laneweave.coordinator.planning import warm_up
+from laneweave.coordinator.planning.facade import warm_up
 from laneweave.protocol.runtime.message_faults import Wrap, bare
 from laneweave.protocol.runtime.metrics import Observe, unobserved
 from laneweave.protocol.runtime.worker_pool import WorkerPool

@@ -13,11 +13,29 @@ Column c passes the start of the road at t = -c d_F / v_F, so later vehicles hav
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Literal
 
 from attrs import frozen
 
 Cell = tuple[int, int]
 """(column, lane)."""
+
+Mode = Literal[1, 2]
+"""Relative motion mode: a vehicle moves to four neighbouring cells, or to eight."""
+
+WAIT: Cell = (0, 0)
+STRAIGHT: tuple[Cell, ...] = ((1, 0), (-1, 0), (0, 1), (0, -1))
+OBLIQUE: tuple[Cell, ...] = ((1, 1), (1, -1), (-1, 1), (-1, -1))
+
+
+def displacements(mode: Mode) -> tuple[Cell, ...]:
+    """Return what a vehicle may do in one step, in the order in which planners break ties.
+
+    Waiting comes first, then straight moves, then oblique ones: among equally good paths the one
+    with the lowest index is also the simplest.
+    """
+    return (WAIT, *STRAIGHT) if mode == 1 else (WAIT, *STRAIGHT, *OBLIQUE)
+
 
 STRETCH_COLUMNS = 4
 """Columns of a stretch; a vehicle receives the motions of its own and both adjacent ones."""

@@ -19,9 +19,10 @@ from conflict_drawing import (
     counts,
     draw_conflicts,
 )
-from laneweave.coordinator.planning.geometry.conflict_table import Pair, close_pairs
-from laneweave.coordinator.planning.geometry.settings import Geometry
-from laneweave.coordinator.planning.grid import Cell, displacements
+from laneweave.coordinator.planning.conflicts import Pair
+from laneweave.coordinator.planning.geometry.bodies import BodyGeometry
+from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
+from laneweave.protocol.lattice import Cell, displacements
 
 NEAR = range(-2, 3)
 OFFSETS = [offset for offset in product(NEAR, NEAR) if offset != (0, 0)]
@@ -40,8 +41,8 @@ def drawn(axes: Axes) -> Counter[str]:
     return Counter(str(mark.get_label()) for mark in marks)
 
 
-@pytest.mark.parametrize("geometry", [Geometry(), Geometry(clearance_along_m=7.0)])
-def test_each_pair_is_drawn_once_in_the_colour_of_its_verdict(geometry: Geometry) -> None:
+@pytest.mark.parametrize("geometry", [BodyGeometry(), BodyGeometry(clearance_along_m=7.0)])
+def test_each_pair_is_drawn_once_in_the_colour_of_its_verdict(geometry: BodyGeometry) -> None:
     judge = Judge.of(geometry)
     panels = conflict_figure(geometry).axes
     assert [axes.get_title() for axes in panels] == list(PANELS)
@@ -52,7 +53,7 @@ def test_each_pair_is_drawn_once_in_the_colour_of_its_verdict(geometry: Geometry
 
 
 def test_verdicts() -> None:
-    judge = Judge.of(Geometry())
+    judge = Judge.of(BodyGeometry())
     found = {
         judge.verdict(((1, 0), (1, 0), (-1, 0))): Verdict.ON_TIME,
         judge.verdict(((0, 1), (0, 1), (0, 1))): Verdict.LATE,
@@ -65,7 +66,7 @@ def test_verdicts() -> None:
 
 def test_counts_are_those_of_the_tables() -> None:
     rows = {name: (one, two) for name, one, two in counts()}
-    different = [pair for pair in close_pairs(Geometry()) if pair[0] != (0, 0)]
+    different = [pair for pair in conflict_table(BodyGeometry()).pairs if pair[0] != (0, 0)]
     assert rows["geometric with `geometry`, any delay"][1] == len(different) == 344
     assert rows["geometric: footprints"] == (48, 360)
     assert rows["node, edge, special-1 to special-4"] == (48, 280)

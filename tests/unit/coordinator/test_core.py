@@ -12,7 +12,7 @@ from laneweave.coordinator.formations import planner as formation_planner
 from laneweave.coordinator.formations.planner import START_MARGIN_S
 from laneweave.coordinator.formations.roster import start_time_s
 from laneweave.coordinator.formations.sorting import Sorting, SortingTask, sort_lanes
-from laneweave.coordinator.planning import Weights
+from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.runtime.node import (
     Announce,

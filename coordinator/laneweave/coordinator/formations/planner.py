@@ -29,7 +29,8 @@ from laneweave.coordinator.formations.roster import (
 )
 from laneweave.coordinator.formations.sorting import Sorting, SortingTask, sort_lanes
 from laneweave.coordinator.operation import LogEntry
-from laneweave.coordinator.planning import PlanResponse, Weights
+from laneweave.coordinator.planning.paper.assignments import Weights
+from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.protocol.lattice import Cell, territory
 from laneweave.protocol.runtime.node import Compute, Computed
 from laneweave.protocol.scenario.tables import Scenario

@@ -18,8 +18,11 @@ from typing import Any
 from attrs import evolve, frozen
 
 from laneweave.coordinator.formations.roster import Numbers
-from laneweave.coordinator.planning import PlanRequest, PlanResponse, Weights, checked_plan
 from laneweave.coordinator.planning.budget import Clock
+from laneweave.coordinator.planning.facade import checked_plan
+from laneweave.coordinator.planning.paper.assignments import Weights
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.targets import placements
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, PlannedMove
@@ -186,6 +189,7 @@ def sort_lanes(
         return _sorting(task, None)
     if task.structure is not None:
         return _form(task, task.structure, max_nodes, weights)
+    memory_mb = task.scenario.service.worker_memory_mb
     ends_s = clock() + task.deadline_s
     for excused in (None, *task.movers):
         best: PlanResponse | None = None
@@ -194,7 +198,9 @@ def sort_lanes(
             if best is not None and left_s <= MIN_DEADLINE_S:
                 break
             hurried = evolve(request, deadline_s=max(left_s, MIN_DEADLINE_S))
-            response = checked_plan(hurried, max_nodes=max_nodes, weights=weights)
+            response = checked_plan(
+                hurried, max_nodes=max_nodes, max_memory_mb=memory_mb, weights=weights
+            )
             if best is None or _steps(response) < _steps(best):
                 best = response
             if _steps(best) <= task.steps or not response.paths:
@@ -221,7 +227,11 @@ def _form(
         if error.field != "structure":
             raise
         return evolve(_sorting(task, None), impossible=error.allowed)
-    return _sorting(task, checked_plan(request, max_nodes=max_nodes, weights=weights))
+    memory_mb = task.scenario.service.worker_memory_mb
+    return _sorting(
+        task,
+        checked_plan(request, max_nodes=max_nodes, max_memory_mb=memory_mb, weights=weights),
+    )
 
 
 def _sorting(task: SortingTask, response: PlanResponse | None) -> Sorting:

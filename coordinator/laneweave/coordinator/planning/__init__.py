@@ -1,45 +1,27 @@
 """Target assignment and path planning in the relative coordinate system.
 
-`plan` answers one `PlanRequest`. Where the paper's parts are:
+Entry points: `facade.plan` answers one `request.PlanRequest` with a `response.PlanResponse`;
+`rolling.planner.StreamPlanner` plans a whole stream. Imported by the rest of the coordinator and by
+launch; imports the protocol only. Pure: no I/O, no state between calls, and time only through the
+clock that is passed in.
+
+Where the parts of the paper are:
 
 | paper | module |
 |---|---|
-| relative motion modes 1 and 2 | `grid` |
+| relative motion modes 1 and 2 | `protocol.lattice`, `grid` |
 | conflict model | `conflicts` |
-| formation relative distance, cost matrix C | `frd` |
-| preference matrix P | `preference` |
-| assignments in non-decreasing order of cost | `assignments` |
-| TAPPA, Algorithm 1 | `tappa` |
-| CBSA, Algorithm 2 | `cbs` |
-| conflicts and constraints of the tree | `constraints` |
-| SPPA | `diagram` (all shortest paths), `sppa` (the choice among them) |
+| formation relative distance, cost matrix C | `paper.assignments` |
+| preference matrix P | `paper.assignments` |
+| assignments in non-decreasing order of cost | `paper.assignments` |
+| TAPPA, Algorithm 1 | `paper.tappa` |
+| CBSA, Algorithm 2 | `paper.cbs` |
+| conflicts and constraints of the tree | `paper.constraints` |
+| SPPA | `shortest_paths` |
 | relative path map | `path_map` |
 | parallel and interlaced structure | `structures` |
 
-Beyond the paper: what makes TAPPA fast, with a switch for each (`improvements`, `splits`, `joint`);
-what it did (`explanation`); branch and bound, the fallback of TAPPA (`branching`, `relaxation`,
-`rows`); path sets by negotiation (`negotiation`, `repair`) and by joint search (`reachability`);
-conflicts computed from sizes and motions (`geometry`, `bodies`, `clearances`).
-
-The package is pure: no I/O, no state between calls, and time only through the clock it is given.
+Beyond the paper: improvements of TAPPA (`paper.cbs.Improvements`, `paper.joint_search`), a record
+of its run (`paper.explanation`), branch and bound (`exact`), the rolling planner (`rolling`), and
+conflicts computed from sizes and motions (`geometry`).
 """
-
-from laneweave.coordinator.planning.facade import checked_plan, plan, warm_up
-from laneweave.coordinator.planning.frd import Weights
-from laneweave.coordinator.planning.geometry.settings import Geometry
-from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
-from laneweave.coordinator.planning.response import PlanResponse
-from laneweave.coordinator.planning.validator import problems_of_paths, problems_of_response
-
-__all__ = [
-    "Geometry",
-    "PlanRequest",
-    "PlanResponse",
-    "VehicleRequest",
-    "Weights",
-    "checked_plan",
-    "plan",
-    "problems_of_paths",
-    "problems_of_response",
-    "warm_up",
-]

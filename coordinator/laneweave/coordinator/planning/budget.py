@@ -1,4 +1,4 @@
-"""How long a search may go on."""
+"""Limits on a search: a deadline, a number of nodes, and memory."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ import math
 import sys
 import time
 from collections.abc import Callable
+from typing import Final
 
 Clock = Callable[[], float]
 
+DEFAULT_MEMORY_MB: Final = 1500.0
+
 _RELEASE_S_PER_NODE = 3e-6
-"""What it takes to give the memory of a node back, after the answer is known."""
+"""Time to free the memory of a node after the search."""
 
 
 class BudgetSpentError(Exception):
@@ -18,23 +21,25 @@ class BudgetSpentError(Exception):
 
 
 class Budget:
-    """A deadline and a limit on the nodes taken from conflict trees."""
+    """A deadline and limits on the nodes and on the memory of a search."""
 
     def __init__(
         self,
         *,
         deadline: float | None = None,
         max_nodes: int | None = None,
+        max_memory_mb: float = DEFAULT_MEMORY_MB,
         clock: Clock = time.monotonic,
     ) -> None:
         """Set the limits; `deadline` is a time of `clock`."""
         self._deadline = deadline
         self._max_nodes = max_nodes
         self._clock = clock
+        self.max_bytes = 1e6 * max_memory_mb
         self.nodes = 0
 
     def check_time(self, ahead_s: float = 0.0) -> None:
-        """Raise `BudgetSpentError` once the deadline has passed, or will pass so far ahead."""
+        """Raise `BudgetSpentError` if the deadline has passed or is less than `ahead_s` away."""
         if self._deadline is None:
             return
         if self._clock() + ahead_s + self.nodes * _RELEASE_S_PER_NODE >= self._deadline:
@@ -48,14 +53,14 @@ class Budget:
         self.nodes += 1
 
     def take_nodes(self, nodes: int) -> None:
-        """Count nodes that were looked at; raise as `take_node` does."""
+        """Count nodes that were examined; raise as `take_node` does."""
         self.nodes += nodes
         self.check_time()
         if self._max_nodes is not None and self.nodes >= self._max_nodes:
             raise BudgetSpentError
 
     def nodes_left(self, s_per_node: float) -> int:
-        """Return how many nodes may be looked at before the deadline and within the limit."""
+        """Return how many nodes may be examined before the deadline and within the limit."""
         left = math.inf
         if self._max_nodes is not None:
             left = self._max_nodes - self.nodes

@@ -1,4 +1,4 @@
-"""One call that plans one request."""
+"""Plan one request with the solver it asks for, and fall back on the other one."""
 
 from __future__ import annotations
 
@@ -9,48 +9,46 @@ from contextlib import suppress
 from typing import Final, Protocol
 
 import attrs
-import numpy as np
 
-from laneweave.coordinator.planning.assignments import assignments
-from laneweave.coordinator.planning.budget import Budget, BudgetSpentError, Clock
-from laneweave.coordinator.planning.conflict_cliques import vehicles_share_cells
-from laneweave.coordinator.planning.frd import IntMatrix, Weights, cost_matrix
-from laneweave.coordinator.planning.geometry.conflict_table import close_pairs
-from laneweave.coordinator.planning.grid import Cell
-from laneweave.coordinator.planning.paper.improvements import Improvements
-from laneweave.coordinator.planning.paper.tappa import Tappa
+from laneweave.coordinator.planning.budget import (
+    DEFAULT_MEMORY_MB,
+    Budget,
+    BudgetSpentError,
+    Clock,
+)
+from laneweave.coordinator.planning.paper.assignments import Weights
+from laneweave.coordinator.planning.paper.tappa import new_tappa
 from laneweave.coordinator.planning.path_map import RelativePathMap
-from laneweave.coordinator.planning.preference import BoolMatrix, preference_matrix
-from laneweave.coordinator.planning.problem import Problem
+from laneweave.coordinator.planning.problem import Problem, Solution
 from laneweave.coordinator.planning.request import PlanRequest, checked_solver
 from laneweave.coordinator.planning.response import PlanResponse, Status
-from laneweave.coordinator.planning.solution import Solution, tidied
+from laneweave.coordinator.planning.shortest_paths import without_needless_moves
 from laneweave.coordinator.planning.validator import problems_of_response
 from laneweave.protocol.scenario.tables import DEFAULT_SOLVER
 
 TAPPA_SHARE: Final = 0.75
-"""Share of the deadline, and of the node limit, after which branching plans in place of TAPPA.
+"""Share of the deadline, and of the node limit, after which branching replaces TAPPA.
 
 15,000 of the 20,000 nodes of a scenario take TAPPA 3 to 5 s of CPU for six to eight vehicles;
 branching needs 0.1 s for such formations (95th percentile), 0.6 s at most.
 """
 MAX_NODES: Final = 500_000
-"""Bounds the memory to about 1 GB; it takes minutes to get there."""
+"""Bounds the memory of TAPPA's trees to about 1 GB; it takes minutes to get there."""
 
 
 class Search(Protocol):
-    """A search for the best path set, by whatever solver."""
+    """A search for the best path set, by any solver."""
 
     lower_bound: float
     """No path set costs less; infinite: there is none."""
     finished: bool
     """The search is complete: `best` is optimal, or nothing exists."""
     gave_up: bool
-    """Another solver is the better tool for this problem."""
+    """This solver cannot decide the problem within its memory; another one may."""
     tried: int
-    """Assignments that were looked at one by one."""
+    """Number of assignments examined one by one."""
     has_fewest_moves: bool
-    """Nothing as cheap as `best` has fewer moves, for certain."""
+    """It is proven that no path set of the same cost as `best` has fewer moves."""
 
     @property
     def best(self) -> Solution | None:
@@ -62,7 +60,7 @@ class Search(Protocol):
 
 @attrs.frozen
 class _Result:
-    """What a solver found, without the memory of its search."""
+    """The result of a solver, without the memory of its search."""
 
     solver: str
     nodes: int
@@ -78,6 +76,7 @@ def plan(
     request: PlanRequest,
     *,
     max_nodes: int | None = None,
+    max_memory_mb: float = DEFAULT_MEMORY_MB,
     weights: Weights | None = None,
     solver: str | None = None,
     fallback: bool = True,
@@ -90,35 +89,36 @@ def plan(
     Args:
         request: what to plan.
         max_nodes: limit on search nodes, which is repeatable; at most `MAX_NODES`.
+        max_memory_mb: limit on the arrays of branch and bound. Where it is reached the other
+            solver continues; with a path set and no proof the status is `feasible`.
         weights: of the formation relative distance; they must give a lower bound.
         solver: one of `SOLVERS`, instead of the request's; if neither names one, the default.
-        fallback: branching goes on when TAPPA has spent `TAPPA_SHARE`, and the cheaper of both
-            path sets is returned; False: TAPPA may spend all. A solver that cannot treat the
-            request at all is always replaced by the other one.
-        clock: tells the time in s.
+        fallback: branching continues when TAPPA has spent `TAPPA_SHARE`, and the cheaper of both
+            path sets is returned; False: TAPPA may spend everything. A solver that cannot handle
+            the request at all is always replaced by the other one.
+        clock: returns the time in s.
     """
-    if request.geometry is not None:
-        close_pairs(request.geometry)  # the time for its table does not count for the request
     started = clock()
     structured = request.structure is not None
     request = request.settled()
     asked = checked_solver(solver or request.solver or DEFAULT_SOLVER)
     weights = (weights or Weights.for_mode(request.mode)).checked(request.mode)
     nodes = MAX_NODES if max_nodes is None else min(max_nodes, MAX_NODES)
-    problem = problem_of(request)
+    problem = request.problem()
     order = _order(asked, problem, fallback=fallback)
     results: list[_Result] = []
     for name in order:
         if name == "branching":
             began = clock()
             _warm_up_branching()
-            started += clock() - began  # nor does the time for loading it
+            started += clock() - began  # loading compiled code is not part of planning
         shares = name == "tappa" and order[-1] != name
         share = TAPPA_SHARE if shares else 1.0
         left = nodes - sum(result.nodes for result in results)
         budget = Budget(
             deadline=started + share * request.deadline_s,
             max_nodes=math.ceil(share * left),
+            max_memory_mb=max_memory_mb,
             clock=clock,
         )
         results.append(_solve(name, problem, request, weights, budget))
@@ -129,8 +129,8 @@ def plan(
 
 
 def _order(asked: str, problem: Problem, *, fallback: bool) -> tuple[str, ...]:
-    """Return which solvers plan, one after the other."""
-    if vehicles_share_cells(problem.table.model):
+    """Return the solvers to run, one after the other."""
+    if problem.table.model.vehicles_share_cells:
         return ("tappa",)
     if asked == "tappa":
         return ("tappa", "branching") if fallback else ("tappa",)
@@ -140,7 +140,7 @@ def _order(asked: str, problem: Problem, *, fallback: bool) -> tuple[str, ...]:
 def _solve(
     solver: str, problem: Problem, request: PlanRequest, weights: Weights, budget: Budget
 ) -> _Result:
-    """Let one solver search until it has finished, gives up or has spent its budget."""
+    """Run one solver until it has finished, gives up or has spent its budget."""
     search: Search | None = None
     with suppress(BudgetSpentError):
         search = _search(solver, problem, request, weights, budget)
@@ -177,13 +177,13 @@ def _response(
     started: float,
     clock: Clock,
 ) -> PlanResponse:
-    """Combine what the solvers found: the cheapest path set and the highest lower bound."""
+    """Combine the results of the solvers: the cheapest path set and the highest lower bound."""
     found = [result.best for result in reversed(results) if result.best is not None]
     best = min(found, key=lambda solution: solution.cost, default=None)
     if best is not None and not any(result.has_fewest_moves for result in results):
         budget = Budget(deadline=started + request.deadline_s, clock=clock)
-        best = tidied(problem, best, budget)
-    cells = [] if best is None else cells_of(problem, best)
+        best = without_needless_moves(problem, best, budget)
+    cells = [] if best is None else problem.cells_of(best)
     path_map = RelativePathMap.padded([v.id for v in request.vehicles][: len(cells)], cells)
     bound = max(result.lower_bound for result in results)
     cost = None if best is None else best.cost
@@ -204,8 +204,42 @@ def _response(
     )
 
 
+def _status(*, found: bool, finished: bool) -> Status:
+    if found:
+        return "optimal" if finished else "feasible"
+    return "infeasible" if finished else "timeout"
+
+
+def checked_plan(
+    request: PlanRequest,
+    *,
+    max_nodes: int | None = None,
+    max_memory_mb: float = DEFAULT_MEMORY_MB,
+    weights: Weights | None = None,
+    solver: str | None = None,
+    fallback: bool = True,
+) -> PlanResponse:
+    """Plan one request and check the response against it; see `plan`.
+
+    Raises:
+        RuntimeError: the response is wrong, which is an error in the planner.
+    """
+    response = plan(
+        request,
+        max_nodes=max_nodes,
+        max_memory_mb=max_memory_mb,
+        weights=weights,
+        solver=solver,
+        fallback=fallback,
+    )
+    problems = problems_of_response(request, response)
+    if problems:
+        raise RuntimeError("the planner made a wrong plan: " + "; ".join(problems))
+    return response
+
+
 def warm_up() -> None:
-    """Load the compiled parts of the planners; where there are none yet, compile them.
+    """Load the compiled parts of all planners; compile them if there is no cache yet.
 
     Loading takes a second, compiling a minute.
     """
@@ -219,83 +253,3 @@ def _warm_up_branching() -> None:
     from laneweave.coordinator.planning.exact import branching  # noqa: PLC0415
 
     branching.warm_up()
-
-
-def new_tappa(
-    problem: Problem,
-    request: PlanRequest,
-    weights: Weights,
-    budget: Budget,
-    improvements: Improvements | None = None,
-    *,
-    record: bool = False,
-) -> Tappa:
-    """Return Algorithm 1, ready to run; see `Tappa`."""
-    choices = request.choices()
-    costs, allowed = matrices(request, weights, choices, budget)
-    candidates = assignments(costs, allowed, budget)
-    return Tappa(problem, candidates, choices, budget, improvements, record=record)
-
-
-def problem_of(request: PlanRequest) -> Problem:
-    """Return the problem of a request."""
-    cells = [vehicle.cell for vehicle in request.vehicles]
-    return Problem(request.grid, request.mode, request.conflict_model, cells, request.targets)
-
-
-def _status(*, found: bool, finished: bool) -> Status:
-    if found:
-        return "optimal" if finished else "feasible"
-    return "infeasible" if finished else "timeout"
-
-
-def cells_of(problem: Problem, solution: Solution) -> list[list[Cell]]:
-    """Return the paths as cells, each beginning at the vehicle's start."""
-    table = problem.table
-    return [
-        [table.cell(start), *(table.cell(table.landing(move)) for move in path)]
-        for start, path in zip(problem.starts, solution.paths, strict=True)
-    ]
-
-
-def checked_plan(
-    request: PlanRequest,
-    *,
-    max_nodes: int | None = None,
-    weights: Weights | None = None,
-    solver: str | None = None,
-    fallback: bool = True,
-) -> PlanResponse:
-    """Plan one request and check the answer against it; see `plan`.
-
-    Raises:
-        RuntimeError: the answer is wrong, which would be an error in the planner.
-    """
-    response = plan(request, max_nodes=max_nodes, weights=weights, solver=solver, fallback=fallback)
-    problems = problems_of_response(request, response)
-    if problems:
-        raise RuntimeError("the planner made a wrong plan: " + "; ".join(problems))
-    return response
-
-
-def matrices(
-    request: PlanRequest, weights: Weights, choices: list[frozenset[int]], budget: Budget
-) -> tuple[IntMatrix, BoolMatrix]:
-    """Return the cost matrix C and the preference matrix P of a request.
-
-    Blocked cells may make the way longer than the formation relative distance, or cut it off.
-    Both only sharpen the lower bound: C takes the larger number, P drops unreachable targets.
-    """
-    starts = [vehicle.cell for vehicle in request.vehicles]
-    costs = cost_matrix(starts, request.targets, weights)
-    allowed = preference_matrix(choices, len(request.targets))
-    if request.grid.blocked:
-        for i, start in enumerate(starts):
-            budget.check_time()
-            distances = request.grid.distances(start, request.mode, request.targets)
-            for j, target in enumerate(request.targets):
-                if target in distances:
-                    costs[i, j] = max(costs[i, j], distances[target])
-                else:
-                    allowed[i, j] = np.False_
-    return costs, allowed

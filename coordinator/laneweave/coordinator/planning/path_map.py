@@ -11,8 +11,8 @@ from itertools import combinations
 
 import attrs
 
-from laneweave.coordinator.planning.conflicts import ConflictModel
-from laneweave.coordinator.planning.grid import Cell, Move
+from laneweave.coordinator.planning.conflicts import ConflictModel, Move
+from laneweave.protocol.lattice import Cell
 
 
 @attrs.frozen(order=True)
@@ -45,7 +45,7 @@ class RelativePathMap:
         return len(self.rows[0]) - 1 if self.rows else 0
 
     def move(self, row: int, step: int) -> Move:
-        """Return what a vehicle does in a step."""
+        """Return the move of a vehicle (a row) in a step."""
         return self.rows[row][step], self.rows[row][step + 1]
 
     def cost(self) -> int:
@@ -65,7 +65,7 @@ class RelativePathMap:
         """Return the table as text; columns are headed by the time point, from 1."""
         cells = [[f"({c},{lane})" for c, lane in row] for row in self.rows]
         header = ["Vehicle ID", *(f"step {k + 1}" for k in range(self.steps + 1))]
-        # Ids come from anywhere; nothing in them may break the table or talk to the terminal.
+        # Ids are user input: replace characters that would break the table or control the terminal.
         ids = ["".join(c if c.isprintable() else "?" for c in name) for name in self.ids]
         table = [header, *([name, *row] for name, row in zip(ids, cells, strict=True))]
         widths = [max(len(line[k]) for line in table) for k in range(len(header))]
@@ -76,7 +76,7 @@ class RelativePathMap:
 
 
 def final_arrival(path: Sequence[Cell]) -> int:
-    """Return the number of steps after which a vehicle never leaves the path's last cell."""
+    """Return the number of steps until a vehicle reaches the path's last cell to stay."""
     steps = len(path) - 1
     while steps > 0 and path[steps - 1] == path[-1]:
         steps -= 1

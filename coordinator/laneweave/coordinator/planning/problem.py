@@ -1,20 +1,220 @@
-"""One planning problem as the search sees it, with everything that assignments have in common."""
+"""A planning problem as the searches see it: moves as bits, starts, targets, paths.
+
+The planner asks two questions very often: which moves are possible in this step, and with which
+of them does this move conflict. With one bit per move both are answered for all moves at once, and
+a set of moves is one integer.
+
+Cells are numbered column by column, with two unused lanes between columns so that nothing wraps
+around. Each cell has one bit per displacement: bit `cell_bit + d` is the move from that cell with
+displacement `d`, and bit `cell_bit` itself (d = 0) is waiting there. A set of *cells* uses the
+bits of their waits. Ties are broken in the order of bits.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Final
 
-from laneweave.coordinator.planning.conflicts import ConflictModel
-from laneweave.coordinator.planning.grid import Cell, Grid, Mode
-from laneweave.coordinator.planning.moves import MoveTable
-from laneweave.coordinator.planning.paper.path_diagram import Bans, Diagram, shortest_paths
+import attrs
+
+from laneweave.coordinator.planning.conflicts import ConflictModel, Move, conflict_offsets
+from laneweave.coordinator.planning.grid import Grid
+from laneweave.protocol.lattice import Cell, Mode, displacements
+
+Path = tuple[int, ...]
+"""The moves of one vehicle until its final arrival."""
+
+_MAX_CACHED_BITS: Final = 1 << 15
+"""On larger grids conflict sets are computed again instead of being kept."""
+
+
+def bits(mask: int) -> Iterator[int]:
+    """Yield the numbers of the bits that are set, lowest first."""
+    while mask:
+        low = mask & -mask
+        yield low.bit_length() - 1
+        mask ^= low
+
+
+class MoveTable:
+    """The numbering of moves on one grid, and the sets that follow from it."""
+
+    def __init__(self, grid: Grid, mode: Mode, model: ConflictModel) -> None:
+        """Number the moves and store the conflict relation as bit patterns."""
+        self.grid = grid
+        self.mode = mode
+        self.model = model
+        self.steps = displacements(mode)
+        self.fan = len(self.steps)
+        self.width = grid.lanes + model.reach[1]
+        self.every = (1 << self.fan) - 1
+        self.shifts = tuple((c * self.width + lane) * self.fan for c, lane in self.steps)
+        self.cells = self._free_cells()
+        self.valid = 0
+        for d, shift in enumerate(self.shifts):
+            landing = self.cells >> shift if shift >= 0 else self.cells << -shift
+            self.valid |= (self.cells & landing) << d
+        self.cell_count = self.cells.bit_count()
+        self.conflicts = _ConflictSets(self)
+
+    def _free_cells(self) -> int:
+        lane_bits = ((1 << (self.grid.lanes * self.fan)) - 1) // self.every
+        column_size = self.width * self.fan
+        columns = ((1 << (self.grid.columns * column_size)) - 1) // ((1 << column_size) - 1)
+        free = lane_bits * columns
+        for cell in self.grid.blocked:
+            free ^= 1 << self.bit(cell)
+        return free
+
+    def bit(self, cell: Cell) -> int:
+        """Return the bit of a cell, which is also the bit of waiting in it."""
+        return (cell[0] * self.width + cell[1]) * self.fan
+
+    def cell(self, bit: int) -> Cell:
+        """Return the cell in which the move starts."""
+        return divmod(bit // self.fan, self.width)
+
+    def move(self, bit: int) -> Move:
+        """Return the move as two cells."""
+        column, lane = self.cell(bit)
+        step = self.steps[bit % self.fan]
+        return (column, lane), (column + step[0], lane + step[1])
+
+    def number(self, move: Move) -> int:
+        """Return the bit of a move given as two cells."""
+        (column, lane), (to_column, to_lane) = move
+        return self.bit(move[0]) + self.steps.index((to_column - column, to_lane - lane))
+
+    def landing(self, bit: int) -> int:
+        """Return the bit of the cell in which the move ends."""
+        d = bit % self.fan
+        return bit - d + self.shifts[d]
+
+    def starting_in(self, cells: int) -> int:
+        """Return all moves that start in one of the cells."""
+        return (cells * self.every) & self.valid
+
+    def leading_to(self, cells: int) -> int:
+        """Return all moves that end in one of the cells."""
+        moves = 0
+        for d, shift in enumerate(self.shifts):
+            up = d - shift
+            moves |= cells << up if up >= 0 else cells >> -up
+        return moves & self.valid
+
+    def starts(self, moves: int) -> int:
+        """Return the cells in which the moves start."""
+        cells = moves | moves >> 1
+        cells |= cells >> 2
+        if self.fan > 5:
+            cells |= cells >> 4
+        return (cells | moves >> (self.fan - 1)) & self.cells
+
+    def ends(self, moves: int) -> int:
+        """Return the cells in which the moves end."""
+        lattice = self.cells
+        cells = moves & lattice
+        for d, shift in enumerate(self.shifts):
+            part = (moves >> d) & lattice
+            cells |= part << shift if shift >= 0 else part >> -shift
+        return cells
+
+    def common_conflicts(self, moves: int) -> int:
+        """Return the moves that conflict with every one of the given moves."""
+        common = self.valid
+        conflicts = self.conflicts
+        while moves and common:
+            low = moves & -moves
+            common &= conflicts[low.bit_length() - 1]
+            moves ^= low
+        return common
+
+
+class _ConflictSets(dict[int, int]):
+    """The set of moves that conflict with each move, computed on first access."""
+
+    def __init__(self, table: MoveTable) -> None:
+        super().__init__()
+        columns, lanes = table.model.reach
+        self._base = columns * table.width + lanes
+        self._fan = table.fan
+        self._valid = table.valid
+        self._patterns = tuple(
+            sum(
+                1 << ((c * table.width + lane + self._base) * table.fan + e)
+                for c, lane, e in offsets
+            )
+            for offsets in conflict_offsets(table.mode, table.model)
+        )
+        self._cached = table.valid.bit_length() <= _MAX_CACHED_BITS
+
+    def __missing__(self, bit: int) -> int:
+        cell, d = divmod(bit, self._fan)
+        up = (cell - self._base) * self._fan
+        pattern = self._patterns[d]
+        found = (pattern << up if up >= 0 else pattern >> -up) & self._valid
+        if self._cached:
+            self[bit] = found
+        return found
+
+
+@attrs.frozen
+class Bans:
+    """The moves a vehicle must not make; steps count from 0.
+
+    at: sets of moves for single steps.
+    since: sets of moves that are banned in a step and all later ones.
+    earliest, latest: the minimum and maximum number of steps until the final arrival.
+    """
+
+    at: dict[int, int] = attrs.field(factory=dict)
+    since: dict[int, int] = attrs.field(factory=dict)
+    earliest: int = 0
+    latest: int | None = None
+
+
+@attrs.frozen(eq=False)
+class Diagram:
+    """Every path of minimum cost from a start to a target, for one vehicle.
+
+    Known in the literature as a multi-valued decision diagram.
+
+    layers: per step, the moves that lie on at least one such path; there are `cost` steps.
+    target: the bit of the target cell, and so of waiting there after arrival.
+    """
+
+    layers: tuple[int, ...]
+    target: int
+
+    @property
+    def cost(self) -> int:
+        """Return the number of steps until the final arrival."""
+        return len(self.layers)
+
+    def layer(self, step: int) -> int:
+        """Return the possible moves of a step, which after arrival is waiting at the target."""
+        return self.layers[step] if step < len(self.layers) else 1 << self.target
+
+
+@attrs.frozen
+class Solution:
+    """A conflict-free path set for an assignment (0-based targets)."""
+
+    assignment: tuple[int, ...]
+    paths: tuple[Path, ...]
+
+    @property
+    def cost(self) -> int:
+        """Return the cost of the path set."""
+        return sum(len(path) for path in self.paths)
 
 
 class Problem:
     """Vehicles and targets on a grid.
 
-    The unconstrained paths of a vehicle to a target do not depend on the rest of the assignment,
-    so all constraint trees share them.
+    starts, targets: bits of their cells.
+    free_paths: the unconstrained shortest paths of a vehicle to a target, which all constraint
+        trees share; filled in by `shortest_paths.free_paths`.
     """
 
     def __init__(
@@ -29,13 +229,12 @@ class Problem:
         self.table = MoveTable(grid, mode, model)
         self.starts = tuple(self.table.bit(cell) for cell in starts)
         self.targets = tuple(self.table.bit(cell) for cell in targets)
-        self._free: dict[tuple[int, int], Diagram | None] = {}
+        self.free_paths: dict[tuple[int, int], Diagram | None] = {}
 
-    def free_paths(self, vehicle: int, target: int) -> Diagram | None:
-        """Return the shortest paths of a vehicle to a target (an index) without constraints."""
-        key = vehicle, target
-        if key not in self._free:
-            self._free[key] = shortest_paths(
-                self.table, self.starts[vehicle], self.targets[target], Bans()
-            )
-        return self._free[key]
+    def cells_of(self, solution: Solution) -> list[list[Cell]]:
+        """Return the paths as cells, each beginning at the vehicle's start."""
+        table = self.table
+        return [
+            [table.cell(start), *(table.cell(table.landing(move)) for move in path)]
+            for start, path in zip(self.starts, solution.paths, strict=True)
+        ]

@@ -1,33 +1,28 @@
-"""What is asked of the planner, checked before anything is planned.
+"""A planning request: vehicles, targets and rules, checked when it is made.
 
-The JSON form is fixed (`laneweave.plan.request/1`). Whatever is wrong with a request is reported
-as `BadInputError`, which names the field, the value and what is allowed. Unknown keys are errors,
-too: a misspelt preference must not silently become "any target".
+The JSON form is fixed (`laneweave.plan.request/1`). Every error is a `BadInputError` that names the
+field, the value and what is allowed. Unknown keys are errors, too: a misspelt preference must not
+silently become "any target".
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import attrs
 
-from laneweave.coordinator.planning.conflicts import DEFAULT_KINDS, KINDS, ConflictModel
-from laneweave.coordinator.planning.geometry.settings import Geometry
-from laneweave.coordinator.planning.grid import Cell, Grid, Mode
-from laneweave.coordinator.planning.json_fields import (
-    as_cell,
-    as_int,
-    as_list,
-    as_mapping,
-    as_text,
-    require,
-)
-from laneweave.coordinator.planning.preference import eligible_targets
+from laneweave.coordinator.planning.conflicts import DEFAULT_KINDS, ConflictModel
+from laneweave.coordinator.planning.geometry.bodies import BodyGeometry
+from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
+from laneweave.coordinator.planning.grid import Grid
+from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.structures import STRUCTURES, shortage, structure_targets
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.tables import SOLVERS
+from laneweave.protocol.lattice import Cell, Mode
+from laneweave.protocol.scenario.tables import CONFLICT_KINDS, SOLVERS
+from laneweave.protocol.structuring import structure
 
 REQUEST_SCHEMA: Final = "laneweave.plan.request/1"
 DEFAULT_DEADLINE_S: Final = 4.0
@@ -40,20 +35,6 @@ MAX_ID_LENGTH: Final = 100
 MAX_DEADLINE_S: Final = 3600.0
 
 _NOT_BOTH: Final = "structure or targets, not both"
-_KEYS: Final = (
-    "schema",
-    "id",
-    "grid",
-    "mode",
-    "conflicts",
-    "vehicles",
-    "targets",
-    "deadline_s",
-    "geometry",
-    "solver",
-    "structure",
-    "lanes",
-)
 
 
 @attrs.frozen
@@ -65,17 +46,24 @@ class VehicleRequest:
     lane: int | None = None
     eligible: tuple[int, ...] | None = None
 
+    def choice(self, targets: Sequence[Cell]) -> frozenset[int]:
+        """Return the targets on `lane`, those in `eligible`, or else all."""
+        if self.eligible is not None:
+            return frozenset(self.eligible)
+        lane = self.lane
+        return frozenset(j for j, cell in enumerate(targets) if lane is None or cell[1] == lane)
+
 
 @attrs.frozen
 class PlanRequest:
-    """Vehicles, targets and rules of one planning problem; checked when it is made.
+    """Vehicles, targets and rules of one planning problem.
 
     targets: none where a structure is given.
     structure: one of `STRUCTURES`, whose cells are the targets; see `structures`.
     lanes: lanes that the structure uses; None: all.
-    geometry: what `geometric` is computed from; None: footprints.
-    solver: one of `SOLVERS`; None: the default of whoever plans.
-    id: names the request where it is asked again: a service answers it as before. Empty: no name.
+    geometry: from which `geometric` is computed; None: footprints.
+    solver: one of `SOLVERS`; None: the planner's default.
+    id: identifies a repeated request, which a service answers as before. Empty: no identity.
     """
 
     grid: Grid
@@ -84,25 +72,35 @@ class PlanRequest:
     vehicles: tuple[VehicleRequest, ...]
     targets: tuple[Cell, ...] = ()
     deadline_s: float = DEFAULT_DEADLINE_S
-    geometry: Geometry | None = None
+    geometry: BodyGeometry | None = None
     id: str = ""
     solver: str | None = None
     structure: str | None = None
     lanes: tuple[int, ...] | None = None
 
     def __attrs_post_init__(self) -> None:
-        """Reject what is inconsistent, however the request was made."""
+        """Reject inconsistent requests.
+
+        Raises:
+            BadInputError: names the first field that is wrong.
+        """
         _check_grid(self.grid)
         if self.mode not in (1, 2):
             raise BadInputError("mode", self.mode, "1 or 2")
-        _check_conflicts(self.conflicts)
+        for i, kind in enumerate(self.conflicts):
+            if kind not in CONFLICT_KINDS:
+                raise BadInputError(f"conflicts[{i}]", kind, "any of " + ", ".join(CONFLICT_KINDS))
+        _check_unique("conflicts", self.conflicts, "each kind once")
         if self.geometry is not None and "geometric" not in self.conflicts:
             allowed = "none, unless geometric is among conflicts"
-            raise BadInputError("geometry", self.geometry.to_dict(), allowed)
+            raise BadInputError("geometry", attrs.asdict(self.geometry), allowed)
         if self.solver is not None:
             checked_solver(self.solver)
         if self.structure is None:
-            _check_targets(self)
+            _check_count("targets", self.targets, MAX_TARGETS)
+            for i, target in enumerate(self.targets):
+                _check_cell(f"targets[{i}]", target, self.grid)
+            _check_unique("targets", self.targets, "each cell once")
         _check_vehicles(self)
         _check_structure(self)
         if len(self.id) > MAX_ID_LENGTH:
@@ -113,27 +111,32 @@ class PlanRequest:
 
     @property
     def conflict_model(self) -> ConflictModel:
-        """Return which moves must not be made in the same step."""
-        return ConflictModel(self.conflicts, self.geometry)
+        """Which moves must not be made in the same step."""
+        table = None if self.geometry is None else conflict_table(self.geometry)
+        return ConflictModel(self.conflicts, table)
+
+    def problem(self) -> Problem:
+        """Return the request as the searches see it."""
+        starts = [vehicle.cell for vehicle in self.vehicles]
+        return Problem(self.grid, self.mode, self.conflict_model, starts, self.targets)
 
     def choices(self) -> list[frozenset[int]]:
         """Return, per vehicle, the indices of the targets it may be assigned to."""
-        return [eligible_targets(self.targets, v.lane, v.eligible) for v in self.vehicles]
+        return [vehicle.choice(self.targets) for vehicle in self.vehicles]
 
-    def _targets_to_dict(self) -> dict[str, Any]:
-        if self.structure is None:
-            return {"targets": [list(target) for target in self.targets]}
-        lanes = {} if self.lanes is None else {"lanes": list(self.lanes)}
-        return {"structure": self.structure, **lanes}
+    @property
+    def structure_lanes(self) -> Sequence[int]:
+        """The lanes that a structure may use."""
+        return range(self.grid.lanes) if self.lanes is None else self.lanes
 
     def settled(self) -> PlanRequest:
         """Return the request with the targets of its structure; itself if it names targets."""
         if self.structure is None:
             return self
-        lanes, cells = _lanes_of(self), [vehicle.cell for vehicle in self.vehicles]
+        cells = [vehicle.cell for vehicle in self.vehicles]
         preferred = [vehicle.lane for vehicle in self.vehicles]
         return self.with_targets(
-            structure_targets(self.structure, lanes, self.grid, cells, preferred)
+            structure_targets(self.structure, self.structure_lanes, self.grid, cells, preferred)
         )
 
     def with_targets(self, targets: Sequence[Cell]) -> PlanRequest:
@@ -142,55 +145,41 @@ class PlanRequest:
 
     @classmethod
     def from_dict(cls, data: object) -> PlanRequest:
-        """Read the JSON form."""
-        fields = as_mapping("request", data, _KEYS)
-        named = () if "structure" in fields else ("targets",)
-        require(fields, "", ("schema", "grid", "vehicles", *named))
-        if fields["schema"] != REQUEST_SCHEMA:
-            raise BadInputError("schema", fields["schema"], repr(REQUEST_SCHEMA))
-        mode = _read_mode(fields.get("mode", 1))
-        conflicts = DEFAULT_KINDS[mode]
-        if "conflicts" in fields:
-            names = as_list("conflicts", fields["conflicts"], len(KINDS))
-            conflicts = tuple(as_text(f"conflicts[{i}]", name) for i, name in enumerate(names))
-        vehicles = as_list("vehicles", fields["vehicles"], MAX_VEHICLES)
-        targets = as_list("targets", fields.get("targets", ()), MAX_TARGETS)
-        if "structure" in fields and "targets" in fields:
-            raise BadInputError("structure", fields["structure"], _NOT_BOTH)
-        lanes = as_list("lanes", fields["lanes"], MAX_LANES) if "lanes" in fields else None
-        return cls(
-            grid=_read_grid(fields["grid"]),
-            mode=mode,
-            conflicts=conflicts,
-            vehicles=tuple(_read_vehicle(f"vehicles[{i}]", v) for i, v in enumerate(vehicles)),
-            targets=tuple(as_cell(f"targets[{i}]", t) for i, t in enumerate(targets)),
-            deadline_s=_read_deadline(fields.get("deadline_s", DEFAULT_DEADLINE_S)),
-            geometry=Geometry.from_dict(fields["geometry"]) if "geometry" in fields else None,
-            id=as_text("id", fields.get("id", "")),
-            solver=as_text("solver", fields["solver"]) if "solver" in fields else None,
-            structure=as_text("structure", fields["structure"]) if "structure" in fields else None,
-            lanes=None if lanes is None else tuple(lanes),
+        """Read the JSON form.
+
+        Raises:
+            BadInputError: names the first field that is wrong.
+        """
+        if not isinstance(data, Mapping):
+            raise BadInputError("request", data, "an object")
+        if data.get("schema") != REQUEST_SCHEMA:
+            raise BadInputError("schema", data.get("schema"), repr(REQUEST_SCHEMA))
+        _check_no_null("", data)
+        if "targets" not in data and "structure" not in data:
+            raise BadInputError("targets", None, "a list of cells; or a structure instead")
+        if "targets" in data and "structure" in data:
+            raise BadInputError("structure", data["structure"], _NOT_BOTH)
+        document = structure(data, _Document)
+        if document.mode not in (1, 2):
+            raise BadInputError("mode", document.mode, "1 or 2")
+        mode: Mode = 1 if document.mode == 1 else 2
+        conflicts = DEFAULT_KINDS[mode] if document.conflicts is None else document.conflicts
+        fields = attrs.asdict(
+            document, recurse=False, filter=lambda field, _: field.name != "schema"
         )
+        return cls(**fields | {"grid": document.grid.grid(), "mode": mode, "conflicts": conflicts})
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON form."""
-        geometry = {} if self.geometry is None else {"geometry": self.geometry.to_dict()}
-        return {
-            "schema": REQUEST_SCHEMA,
-            **({"id": self.id} if self.id else {}),
-            "grid": {
-                "columns": self.grid.columns,
-                "lanes": self.grid.lanes,
-                "blocked": [list(cell) for cell in sorted(self.grid.blocked)],
-            },
-            "mode": self.mode,
-            "conflicts": list(self.conflicts),
-            "vehicles": [_write_vehicle(vehicle) for vehicle in self.vehicles],
-            **self._targets_to_dict(),
-            "deadline_s": self.deadline_s,
-            **geometry,
-            **({} if self.solver is None else {"solver": self.solver}),
-        }
+        fields = attrs.asdict(self, filter=_is_given, value_serializer=as_json)
+        return {"schema": REQUEST_SCHEMA, **fields}
+
+
+def as_json(_: object, __: object, value: object) -> object:
+    """Return tuples and sorted sets as lists; a serializer for `attrs.asdict`."""
+    if isinstance(value, frozenset):
+        value = tuple(sorted(value))
+    return [as_json(_, __, item) for item in value] if isinstance(value, tuple) else value
 
 
 def checked_solver(name: str, field: str = "solver") -> str:
@@ -204,75 +193,87 @@ def checked_solver(name: str, field: str = "solver") -> str:
     return name
 
 
-def _read_mode(value: object) -> Mode:
-    mode = as_int("mode", value, 1, 2)
-    return 1 if mode == 1 else 2
+@attrs.frozen
+class _GridDocument:
+    """The JSON form of a grid."""
+
+    columns: int
+    lanes: int
+    blocked: tuple[Cell, ...] = ()
+
+    def grid(self) -> Grid:
+        """Return the grid."""
+        _check_grid(Grid(self.columns, self.lanes))
+        for i, cell in enumerate(self.blocked):
+            if not Grid(self.columns, self.lanes).contains(cell):
+                raise BadInputError(f"grid.blocked[{i}]", cell, "a cell in the grid")
+        _check_unique("grid.blocked", self.blocked, "each cell once")
+        return Grid(self.columns, self.lanes, self.blocked)
 
 
-def _read_deadline(value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise BadInputError("deadline_s", value, f"a number above 0, at most {MAX_DEADLINE_S:g}")
-    if isinstance(value, int) and abs(value) > MAX_DEADLINE_S:
-        raise BadInputError("deadline_s", value, f"a number above 0, at most {MAX_DEADLINE_S:g}")
-    return float(value)
+@attrs.frozen
+class _Document:
+    """The JSON form of a request; see `PlanRequest`."""
+
+    schema: str
+    grid: _GridDocument
+    vehicles: tuple[VehicleRequest, ...]
+    mode: int = 1
+    conflicts: tuple[str, ...] | None = None
+    targets: tuple[Cell, ...] = ()
+    deadline_s: float = DEFAULT_DEADLINE_S
+    geometry: BodyGeometry | None = None
+    id: str = ""
+    solver: str | None = None
+    structure: str | None = None
+    lanes: tuple[int, ...] | None = None
 
 
-def _read_grid(value: object) -> Grid:
-    fields = as_mapping("grid", value, ("columns", "lanes", "blocked"))
-    require(fields, "grid", ("columns", "lanes"))
-    columns = as_int("grid.columns", fields["columns"], 1, MAX_COLUMNS)
-    lanes = as_int("grid.lanes", fields["lanes"], 1, MAX_LANES)
-    blocked = as_list("grid.blocked", fields.get("blocked", ()), columns * lanes)
-    whole = Grid(columns, lanes)
-    cells: dict[Cell, None] = {}
-    for i, item in enumerate(blocked):
-        cell = as_cell(f"grid.blocked[{i}]", item)
-        if not whole.contains(cell):
-            raise BadInputError(f"grid.blocked[{i}]", cell, "a cell in the grid")
-        if cell in cells:
-            raise BadInputError(f"grid.blocked[{i}]", cell, "each cell once")
-        cells[cell] = None
-    return Grid(columns, lanes, list(cells))
+def _is_given(attribute: attrs.Attribute[Any], value: object) -> bool:
+    """Return whether the JSON form has a field."""
+    return value is not None and value != "" and (attribute.name != "targets" or value != ())
 
 
-def _read_vehicle(field: str, value: object) -> VehicleRequest:
-    fields = as_mapping(field, value, ("id", "cell", "lane", "eligible"))
-    require(fields, field, ("id", "cell"))
-    lane = as_int(f"{field}.lane", fields["lane"], 0, MAX_LANES - 1) if "lane" in fields else None
-    eligible: tuple[int, ...] | None = None
-    if "eligible" in fields:
-        items = as_list(f"{field}.eligible", fields["eligible"], MAX_TARGETS)
-        eligible = tuple(
-            as_int(f"{field}.eligible[{k}]", item, 0, MAX_TARGETS - 1)
-            for k, item in enumerate(items)
-        )
-    cell = as_cell(f"{field}.cell", fields["cell"])
-    return VehicleRequest(as_text(f"{field}.id", fields["id"]), cell, lane, eligible)
+def _check_no_null(parent: str, value: object) -> None:
+    """Reject null: absent keys have defaults. A geometry may have null for no limit."""
+    items: Any = ()
+    if isinstance(value, Mapping):
+        prefix = f"{parent}." if parent else ""
+        items = ((key, f"{prefix}{key}", item) for key, item in value.items())
+    elif isinstance(value, list | tuple):
+        items = ((i, f"{parent}[{i}]", item) for i, item in enumerate(value))
+    for key, field, item in items:
+        if item is None:
+            raise BadInputError(field, None, "a value, or no such key")
+        if key != "geometry":
+            _check_no_null(field, item)
 
 
-def _write_vehicle(vehicle: VehicleRequest) -> dict[str, Any]:
-    written: dict[str, Any] = {"id": vehicle.id, "cell": list(vehicle.cell)}
-    if vehicle.lane is not None:
-        written["lane"] = vehicle.lane
-    if vehicle.eligible is not None:
-        written["eligible"] = list(vehicle.eligible)
-    return written
+def _check_range(field: str, value: int, low: int, high: int) -> None:
+    if not low <= value <= high:
+        raise BadInputError(field, value, f"a whole number from {low} to {high}")
+
+
+def _check_count(field: str, values: Sequence[object], maximum: int) -> None:
+    if not 1 <= len(values) <= maximum:
+        raise BadInputError(field, f"{len(values)} items", f"1 to {maximum} items")
+
+
+def _check_unique(field: str, values: Sequence[object], allowed: str, name: str = "") -> None:
+    """Reject a value that occurs twice; `name` is that of the field in each item."""
+    first: dict[object, int] = {}
+    for i, value in enumerate(values):
+        if first.setdefault(value, i) != i:
+            other = f"{field}[{first[value]}]"
+            raise BadInputError(f"{field}[{i}]{name}", value, f"{allowed}; {other} has it, too")
 
 
 def _check_grid(grid: Grid) -> None:
-    as_int("grid.columns", grid.columns, 1, MAX_COLUMNS)
-    as_int("grid.lanes", grid.lanes, 1, MAX_LANES)
+    _check_range("grid.columns", grid.columns, 1, MAX_COLUMNS)
+    _check_range("grid.lanes", grid.lanes, 1, MAX_LANES)
     for cell in sorted(grid.blocked):
         if not grid.contains(cell):
             raise BadInputError("grid.blocked", cell, "cells in the grid")
-
-
-def _check_conflicts(conflicts: Sequence[str]) -> None:
-    for i, kind in enumerate(conflicts):
-        if kind not in KINDS:
-            raise BadInputError(f"conflicts[{i}]", kind, "any of " + ", ".join(KINDS))
-        if kind in conflicts[:i]:
-            raise BadInputError(f"conflicts[{i}]", kind, "each kind once")
 
 
 def _check_cell(field: str, cell: Cell, grid: Grid) -> None:
@@ -283,83 +284,49 @@ def _check_cell(field: str, cell: Cell, grid: Grid) -> None:
         raise BadInputError(field, cell, "a cell that is not blocked")
 
 
-def _check_targets(request: PlanRequest) -> None:
-    if not 1 <= len(request.targets) <= MAX_TARGETS:
-        raise BadInputError("targets", len(request.targets), f"1 to {MAX_TARGETS} targets")
-    seen: dict[Cell, int] = {}
-    for i, target in enumerate(request.targets):
-        _check_cell(f"targets[{i}]", target, request.grid)
-        if target in seen:
-            allowed = f"each cell once; it is targets[{seen[target]}], too"
-            raise BadInputError(f"targets[{i}]", target, allowed)
-        seen[target] = i
-
-
-def _lanes_of(request: PlanRequest) -> Sequence[int]:
-    """Return the lanes of a structure."""
-    return range(request.grid.lanes) if request.lanes is None else request.lanes
+def _check_vehicles(request: PlanRequest) -> None:
+    vehicles = request.vehicles
+    _check_count("vehicles", vehicles, MAX_VEHICLES)
+    for i, vehicle in enumerate(vehicles):
+        field = f"vehicles[{i}]"
+        if not 1 <= len(vehicle.id) <= MAX_ID_LENGTH:
+            raise BadInputError(f"{field}.id", vehicle.id, f"1 to {MAX_ID_LENGTH} characters")
+        _check_cell(f"{field}.cell", vehicle.cell, request.grid)
+        if vehicle.lane is not None:
+            if vehicle.eligible is not None:
+                allowed = "lane or eligible, not both"
+                raise BadInputError(f"{field}.eligible", vehicle.eligible, allowed)
+            _check_range(f"{field}.lane", vehicle.lane, 0, request.grid.lanes - 1)
+        eligible = vehicle.eligible or ()
+        for k, target in enumerate(eligible if request.structure is None else ()):
+            _check_range(f"{field}.eligible[{k}]", target, 0, len(request.targets) - 1)
+        _check_unique(f"{field}.eligible", eligible, "each target once")
+    _check_unique("vehicles", [vehicle.id for vehicle in vehicles], "unique ids", ".id")
+    _check_unique("vehicles", [vehicle.cell for vehicle in vehicles], "separate cells", ".cell")
 
 
 def _check_structure(request: PlanRequest) -> None:
-    structure = request.structure
-    if structure is None:
+    name, lanes = request.structure, request.structure_lanes
+    if name is None:
         if request.lanes is not None:
             raise BadInputError("lanes", request.lanes, "none, unless a structure is given")
         return
-    if structure not in STRUCTURES:
-        raise BadInputError("structure", structure, "one of " + ", ".join(STRUCTURES))
+    if name not in STRUCTURES:
+        raise BadInputError("structure", name, "one of " + ", ".join(STRUCTURES))
     if request.targets:
-        raise BadInputError("structure", structure, _NOT_BOTH)
-    lanes = _lanes_of(request)
-    if not lanes:
-        raise BadInputError("lanes", lanes, "at least one lane")
+        raise BadInputError("structure", name, _NOT_BOTH)
+    _check_count("lanes", lanes, MAX_LANES)
     for i, lane in enumerate(lanes):
-        as_int(f"lanes[{i}]", lane, 0, request.grid.lanes - 1)
-        if lane in lanes[:i]:
-            raise BadInputError(f"lanes[{i}]", lane, "each lane once")
+        _check_range(f"lanes[{i}]", lane, 0, request.grid.lanes - 1)
+    _check_unique("lanes", lanes, "each lane once")
     for i, vehicle in enumerate(request.vehicles):
         if vehicle.eligible is not None:
-            allowed = "lane, or neither: a structure's targets have no numbers yet"
+            allowed = "lane, or neither: a structure's targets have no indices yet"
             raise BadInputError(f"vehicles[{i}].eligible", vehicle.eligible, allowed)
         if vehicle.lane is not None and vehicle.lane not in lanes:
             allowed = "one of the structure's lanes " + ", ".join(map(str, lanes))
             raise BadInputError(f"vehicles[{i}].lane", vehicle.lane, allowed)
-    preferred = [vehicle.lane for vehicle in request.vehicles]
-    lacking = shortage(structure, lanes, request.grid, preferred)
+    lacking = shortage(name, lanes, request.grid, [vehicle.lane for vehicle in request.vehicles])
     if lacking is not None:
         allowed = f"a structure with a free cell for each vehicle; {lacking}"
-        raise BadInputError("structure", structure, allowed)
-
-
-def _check_vehicles(request: PlanRequest) -> None:
-    if not 1 <= len(request.vehicles) <= MAX_VEHICLES:
-        raise BadInputError("vehicles", len(request.vehicles), f"1 to {MAX_VEHICLES} vehicles")
-    ids: dict[str, int] = {}
-    cells: dict[Cell, int] = {}
-    for i, vehicle in enumerate(request.vehicles):
-        field = f"vehicles[{i}]"
-        if not 1 <= len(vehicle.id) <= MAX_ID_LENGTH:
-            raise BadInputError(f"{field}.id", vehicle.id, f"1 to {MAX_ID_LENGTH} characters")
-        if vehicle.id in ids:
-            allowed = f"unique ids; vehicles[{ids[vehicle.id]}] has it, too"
-            raise BadInputError(f"{field}.id", vehicle.id, allowed)
-        _check_cell(f"{field}.cell", vehicle.cell, request.grid)
-        if vehicle.cell in cells:
-            allowed = f"a cell of its own; vehicles[{cells[vehicle.cell]}] is there, too"
-            raise BadInputError(f"{field}.cell", vehicle.cell, allowed)
-        ids[vehicle.id] = cells[vehicle.cell] = i
-        _check_preference(field, vehicle, request)
-
-
-def _check_preference(field: str, vehicle: VehicleRequest, request: PlanRequest) -> None:
-    if vehicle.lane is not None:
-        if vehicle.eligible is not None:
-            raise BadInputError(f"{field}.eligible", vehicle.eligible, "lane or eligible, not both")
-        as_int(f"{field}.lane", vehicle.lane, 0, request.grid.lanes - 1)
-    seen: set[int] = set()
-    for k, target in enumerate(vehicle.eligible or ()):
-        if request.structure is None:
-            as_int(f"{field}.eligible[{k}]", target, 0, len(request.targets) - 1)
-        if target in seen:
-            raise BadInputError(f"{field}.eligible[{k}]", target, "each target once")
-        seen.add(target)
+        raise BadInputError("structure", name, allowed)

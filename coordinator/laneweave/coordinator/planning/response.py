@@ -1,44 +1,27 @@
-"""What the planner answers (`laneweave.plan.response/1`)."""
+"""The planner's answer (`laneweave.plan.response/1`)."""
 
 from __future__ import annotations
 
-from typing import Any, Final, Literal
+from collections.abc import Mapping
+from typing import Any, Final, Literal, get_args
 
 import attrs
+from attrs.validators import optional
 
-from laneweave.coordinator.planning.grid import Cell
-from laneweave.coordinator.planning.json_fields import (
-    as_bool,
-    as_cell,
-    as_int,
-    as_list,
-    as_mapping,
-    as_text,
-    require,
-)
 from laneweave.coordinator.planning.path_map import RelativePathMap
-from laneweave.coordinator.planning.request import MAX_TARGETS, MAX_VEHICLES, PlanRequest
+from laneweave.coordinator.planning.request import PlanRequest, as_json
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.structuring import structure
+from laneweave.protocol.validators import within
 
 RESPONSE_SCHEMA: Final = "laneweave.plan.response/1"
 
 Status = Literal["optimal", "feasible", "infeasible", "timeout"]
-STATUSES: Final[tuple[Status, ...]] = ("optimal", "feasible", "infeasible", "timeout")
+STATUSES: Final[tuple[Status, ...]] = get_args(Status)
 
-_MOST: Final = 2**53
-_FIELDS: Final = (
-    "schema",
-    "status",
-    "cost",
-    "lower_bound",
-    "steps",
-    "assignment",
-    "paths",
-    "solve_ms",
-    "assignments_tried",
-    "nodes_expanded",
-)
-_OPTIONAL: Final = ("solver", "fallback", "targets", "waited_ms")
+_count = within(0, 2**53)
+_OPTIONAL: Final = ("solver", "targets", "waited_ms")
 
 
 @attrs.frozen
@@ -46,31 +29,31 @@ class PlanResponse:
     """A plan, or why there is none.
 
     status: `optimal` is proven without any bound on the number of steps, `feasible` means that
-        the budget was spent first, `infeasible` is proven, `timeout` means nothing is known.
+        the budget was spent first, `infeasible` is proven, `timeout` means that nothing is known.
     cost, steps: None without a plan. lower_bound: proven; None if infeasible.
     assignment: per vehicle, the index of its target; empty without a plan.
     paths: per vehicle, its cells at all `steps` + 1 time points; empty without a plan.
-    solver: which one planned last; None: a response from before there was a choice.
-    fallback: it took over, because the solver that was asked for reached its share of the deadline
-        or of the nodes, or cannot treat such requests; `paths` are the cheapest of both.
-    targets: of the structure that the request named, in the order of `assignment`'s indices; None:
-        the request named its targets.
-    waited_ms: at a service, how long the request waited for a worker; None: it was planned here.
+    solver: the last solver that ran; None: a response from a version without a choice of solvers.
+    fallback: `solver` replaced the requested one, which reached its share of the deadline or of
+        the nodes, or cannot solve such requests; `paths` are the cheapest of both.
+    targets: of the requested structure, in the order of `assignment`'s indices; None: the request
+        named its targets.
+    waited_ms: how long the request waited for a worker of a service; None: it was planned locally.
     """
 
     status: Status
-    cost: int | None
-    lower_bound: int | None
-    steps: int | None
+    cost: int | None = attrs.field(validator=optional(_count))
+    lower_bound: int | None = attrs.field(validator=optional(_count))
+    steps: int | None = attrs.field(validator=optional(_count))
     assignment: tuple[int, ...]
     paths: tuple[tuple[Cell, ...], ...]
-    solve_ms: float
-    assignments_tried: int
-    nodes_expanded: int
+    solve_ms: float = attrs.field(validator=_count)
+    assignments_tried: int = attrs.field(validator=_count)
+    nodes_expanded: int = attrs.field(validator=_count)
     solver: str | None = None
     fallback: bool = False
     targets: tuple[Cell, ...] | None = None
-    waited_ms: float | None = None
+    waited_ms: float | None = attrs.field(default=None, validator=optional(_count))
 
     def path_map(self, request: PlanRequest) -> RelativePathMap:
         """Return the plan as a relative path map."""
@@ -79,79 +62,27 @@ class PlanResponse:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON form."""
-        return {
-            "schema": RESPONSE_SCHEMA,
-            "status": self.status,
-            "cost": self.cost,
-            "lower_bound": self.lower_bound,
-            "steps": self.steps,
-            "assignment": list(self.assignment),
-            "paths": [[list(cell) for cell in path] for path in self.paths],
-            "solve_ms": self.solve_ms,
-            "assignments_tried": self.assignments_tried,
-            "nodes_expanded": self.nodes_expanded,
-            **({} if self.solver is None else {"solver": self.solver}),
-            **({"fallback": True} if self.fallback else {}),
-            **(
-                {}
-                if self.targets is None
-                else {"targets": [list(target) for target in self.targets]}
-            ),
-            **({} if self.waited_ms is None else {"waited_ms": self.waited_ms}),
-        }
+        fields = attrs.asdict(self, filter=_is_given, value_serializer=as_json)
+        return {"schema": RESPONSE_SCHEMA, **fields}
 
     @classmethod
     def from_dict(cls, data: object) -> PlanResponse:
-        """Read the JSON form."""
-        fields = as_mapping("response", data, (*_FIELDS, *_OPTIONAL))
-        require(fields, "", _FIELDS)
-        if fields["schema"] != RESPONSE_SCHEMA:
-            raise BadInputError("schema", fields["schema"], repr(RESPONSE_SCHEMA))
-        if fields["status"] not in STATUSES:
-            raise BadInputError("status", fields["status"], "one of " + ", ".join(STATUSES))
-        assignment = as_list("assignment", fields["assignment"], MAX_VEHICLES)
-        return cls(
-            status=fields["status"],
-            cost=_optional_int("cost", fields["cost"]),
-            lower_bound=_optional_int("lower_bound", fields["lower_bound"]),
-            steps=_optional_int("steps", fields["steps"]),
-            assignment=tuple(
-                as_int(f"assignment[{i}]", j, 0, MAX_TARGETS - 1) for i, j in enumerate(assignment)
-            ),
-            paths=_read_paths(fields["paths"]),
-            solve_ms=_milliseconds("solve_ms", fields["solve_ms"]),
-            assignments_tried=as_int("assignments_tried", fields["assignments_tried"], 0, _MOST),
-            nodes_expanded=as_int("nodes_expanded", fields["nodes_expanded"], 0, _MOST),
-            solver=as_text("solver", fields["solver"]) if "solver" in fields else None,
-            fallback=as_bool("fallback", fields.get("fallback", False)),
-            targets=_read_targets(fields["targets"]) if "targets" in fields else None,
-            waited_ms=_milliseconds("waited_ms", fields["waited_ms"])
-            if "waited_ms" in fields
-            else None,
-        )
+        """Read the JSON form.
+
+        Raises:
+            BadInputError: names the first field that is wrong.
+        """
+        if not isinstance(data, Mapping):
+            raise BadInputError("response", data, "an object")
+        if data.get("schema") != RESPONSE_SCHEMA:
+            raise BadInputError("schema", data.get("schema"), repr(RESPONSE_SCHEMA))
+        if data.get("status") not in STATUSES:
+            raise BadInputError("status", data.get("status"), "one of " + ", ".join(STATUSES))
+        return structure({key: data[key] for key in data if key != "schema"}, cls)
 
 
-def _milliseconds(field: str, value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= _MOST:
-        raise BadInputError(field, value, f"a number from 0 to {_MOST}")
-    return float(value)
-
-
-def _optional_int(field: str, value: object) -> int | None:
-    return None if value is None else as_int(field, value, 0, _MOST)
-
-
-def _read_targets(value: object) -> tuple[Cell, ...]:
-    targets = as_list("targets", value, MAX_TARGETS)
-    return tuple(as_cell(f"targets[{j}]", target) for j, target in enumerate(targets))
-
-
-def _read_paths(value: object) -> tuple[tuple[Cell, ...], ...]:
-    paths = as_list("paths", value, MAX_VEHICLES)
-    return tuple(
-        tuple(
-            as_cell(f"paths[{i}][{k}]", cell)
-            for k, cell in enumerate(as_list(f"paths[{i}]", path, 10**6))
-        )
-        for i, path in enumerate(paths)
-    )
+def _is_given(attribute: attrs.Attribute[Any], value: object) -> bool:
+    """Return whether the JSON form has a field."""
+    if attribute.name == "fallback":
+        return bool(value)
+    return value is not None or attribute.name not in _OPTIONAL

@@ -1,8 +1,8 @@
 """Targets of the two formation structures: parallel and interlaced (paper, Sections 2.2 and 5.2.1).
 
-The cells of a structure are free cells of its lanes: all of them if it is parallel; those with even
-column + lane, or those with odd, if it is interlaced. A structure takes as many neighbouring cells
-on each lane as it has vehicles there, without gaps but for blocked cells:
+The cells of a structure are free cells of its lanes: all of them if it is parallel; those with an
+even, or those with an odd, column + lane if it is interlaced. On each lane a structure takes as
+many neighbouring cells as it has vehicles there, without gaps except for blocked cells:
 
 - Where every vehicle names its lane, the cells of each lane are where its vehicles have the
   shortest total distance.
@@ -24,7 +24,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from laneweave.coordinator.planning.grid import Cell, Grid
+from laneweave.coordinator.planning.grid import Grid
+from laneweave.protocol.lattice import Cell
 
 PARALLEL: Final = "parallel"
 INTERLACED: Final = "interlaced"
@@ -50,7 +51,7 @@ def structure_targets(
         lanes: lanes that it uses.
         grid: with cells that are blocked.
         cells: where the vehicles are.
-        preferred: the lane that each of them names, which is one of `lanes`; None: any.
+        preferred: the preferred lane of each vehicle, one of `lanes`; None: any.
 
     Raises:
         ValueError: it has too few cells; see `shortage`.
@@ -69,7 +70,7 @@ def structure_targets(
 def shortage(
     structure: str, lanes: Sequence[int], grid: Grid, preferred: Sequence[int | None]
 ) -> str | None:
-    """Return where a structure has too few cells for its vehicles; None: nowhere."""
+    """Return why a structure has too few cells for its vehicles; None: it has enough."""
     found = [_shortage(columns, preferred) for columns in _variants(structure, lanes, grid)]
     return None if None in found else found[0]
 
@@ -99,7 +100,7 @@ def ranked_runs(
 
 
 def _variants(structure: str, lanes: Sequence[int], grid: Grid) -> list[_Columns]:
-    """Return the cells that a structure may take: once, or with even and with odd numbers."""
+    """Return the possible cells of a structure: one variant if parallel, two if interlaced."""
     parities = ((0, 1),) if structure == PARALLEL else ((0,), (1,))
     return [
         {
@@ -165,7 +166,7 @@ def _filled(
 def _fill(
     front: int, lanes_of: Mapping[int, Sequence[int]], preferred: Sequence[int | None]
 ) -> list[Cell] | None:
-    """Take cells from a front to the rear; None: there are too few of them."""
+    """Take cells from a front to the rear; None: there are too few."""
     named = _named(preferred)
     others = len(preferred) - named.total()
     targets: list[Cell] = []

@@ -1,7 +1,7 @@
-"""Checks a plan against its request, sharing no code with the search.
+"""Check a plan against its request, without code of the search.
 
-Only the definition of a conflict is shared, because it is what a plan is checked against.
-`checked_plan` calls this before a coordinator issues or answers a plan.
+Only the definition of a conflict is shared, because plans are checked against it. `checked_plan`
+calls this before a coordinator issues a plan.
 """
 
 from __future__ import annotations
@@ -9,16 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 
-from laneweave.coordinator.planning.grid import Cell
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanResponse
-
-_FAR_APART = 4
-"""Of vehicles this many columns or lanes apart no two moves conflict."""
+from laneweave.protocol.lattice import Cell
 
 
 def problems_of_response(request: PlanRequest, response: PlanResponse) -> list[str]:
-    """Return what is wrong with a response; nothing is wrong with one that holds no plan."""
+    """Return the errors in a response; a response without a plan has none."""
     if request.structure is not None:
         problems = list(_problems_of_targets(request, response.targets or ()))
         if problems:
@@ -45,7 +42,7 @@ def problems_of_response(request: PlanRequest, response: PlanResponse) -> list[s
 def problems_of_paths(
     request: PlanRequest, assignment: Sequence[int], paths: Sequence[Sequence[Cell]]
 ) -> list[str]:
-    """Return what is wrong with a path set; an empty list means that it may be issued."""
+    """Return the errors in a path set; it may be issued if there are none."""
     problems = list(_problems_of_shape(request, assignment, paths))
     if problems:
         return problems
@@ -59,14 +56,13 @@ def problems_of_paths(
 
 
 def _problems_of_targets(request: PlanRequest, targets: Sequence[Cell]) -> Iterator[str]:
-    """Yield how targets differ from the structure that was asked for."""
-    lanes = range(request.grid.lanes) if request.lanes is None else request.lanes
+    """Yield how targets differ from the requested structure."""
     if len(targets) != len(request.vehicles) or len(set(targets)) != len(targets):
         yield f"{len(set(targets))} targets for {len(request.vehicles)} vehicles"
     for cell in targets:
         if not request.grid.contains(cell) or not request.grid.is_free(cell):
             yield f"target {cell} is blocked or outside the grid"
-        if cell[1] not in lanes:
+        if cell[1] not in request.structure_lanes:
             yield f"target {cell} is not on a lane of the structure"
     if request.structure == "interlaced" and len({sum(cell) % 2 for cell in targets}) > 1:
         yield "targets of an interlaced structure have even and odd column + lane"
@@ -111,11 +107,11 @@ def _problems_of_vehicle(
 
 def _conflicts(request: PlanRequest, paths: Sequence[Sequence[Cell]]) -> Iterator[str]:
     model = request.conflict_model
+    columns, lanes = model.reach
     for (i, a), (j, b) in combinations(enumerate(paths), 2):
         for step in range(len(a) - 1):
-            if abs(a[step][0] - b[step][0]) >= _FAR_APART:
-                continue
-            if abs(a[step][1] - b[step][1]) >= _FAR_APART:
+            # Most pairs are further apart than any two moves conflict.
+            if abs(a[step][0] - b[step][0]) > columns or abs(a[step][1] - b[step][1]) > lanes:
                 continue
             kind = model.kind((a[step], a[step + 1]), (b[step], b[step + 1]))
             if kind is not None:

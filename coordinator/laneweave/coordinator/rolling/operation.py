@@ -249,7 +249,7 @@ class RollingOperation:
         sizes = [len(transfer.roster) for transfer in self.transfers]
         return {
             "slot": table.slot,
-            "vehicles": len(table.ways),
+            "vehicles": len(table.paths),
             "missed": len(table.missed),
             "moves": sum(len(transfer.moves) for transfer in self.transfers),
             "ballots": len(sizes),
@@ -269,7 +269,7 @@ class RollingOperation:
         }
         moves: dict[Name, tuple[Cell, Cell]] = {}
         concerned: dict[Name, set[Name]] = {}
-        for vehicle, way in table.ways.items():
+        for vehicle, way in table.paths.items():
             if len(way) < 2 or way[0] == way[1]:
                 continue
             name = Name(vehicle)

@@ -6,7 +6,6 @@ from collections.abc import Collection, Sequence
 from typing import Protocol
 
 from laneweave.coordinator.planning.conflicts import ConflictModel
-from laneweave.coordinator.planning.grid import Mode
 from laneweave.coordinator.planning.rolling.planner import (
     StreamCosts,
     StreamPlan,
@@ -14,8 +13,8 @@ from laneweave.coordinator.planning.rolling.planner import (
     StreamRoad,
     StreamVehicle,
 )
-from laneweave.coordinator.planning.rolling.validator import problems_of_ways
-from laneweave.protocol.lattice import Cell
+from laneweave.coordinator.planning.rolling.validator import problems_of_plan
+from laneweave.protocol.lattice import Cell, Mode
 from laneweave.protocol.scenario.tables import Scenario
 
 REWARD = -0.5
@@ -55,7 +54,7 @@ class CheckedPlanner:
             ValueError: the vehicles contradict each other, or the plan is wrong.
         """
         table = self._planner.plan(slot, vehicles, before, blocked)
-        problems = problems_of_ways(self._road, table, vehicles, blocked)
+        problems = problems_of_plan(self._road, table, vehicles, blocked)
         if problems:
             raise ValueError(f"the plan of slot {slot} is wrong: {'; '.join(problems)}")
         return table

@@ -26,7 +26,8 @@ from typing import Self
 
 import attrs
 
-from laneweave.coordinator.planning import PlanRequest, PlanResponse
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.service.query import (
     ABSENT_S,
     AskAgain,

@@ -10,7 +10,7 @@ from typing import Any, Final
 import msgpack
 from attrs import frozen
 
-from laneweave.coordinator.planning import PlanResponse
+from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.protocol.errors import BadInputError, one_line
 from laneweave.protocol.runtime.node import Reply
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from attrs import define, field, frozen
 
-from laneweave.coordinator.planning import PlanRequest, PlanResponse
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.service.format import (
     INVALID,
     JSON,

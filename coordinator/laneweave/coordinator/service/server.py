@@ -18,7 +18,9 @@ from typing import ClassVar
 import attrs
 from attrs import define, field, frozen
 
-from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan
+from laneweave.coordinator.planning.facade import checked_plan
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.service.format import (
     FAILED,
     INVALID,
@@ -241,7 +243,9 @@ class PlanningService:
                 yield from self._end(entry, self._late(entry, now_s), now_s)
                 continue
             self._planning[entry.job] = entry
-            job = partial(plan_in_time, entry.request, self._solver)
+            job = partial(
+                plan_in_time, entry.request, self._solver, self._settings.worker_memory_mb
+            )
             yield Delegate(entry.job, job, entry.deadline_s)
 
     def finish(self, job: int, result: object, error: str, now_s: float) -> Iterator[Effect]:
@@ -316,13 +320,15 @@ def _digest(request: PlanRequest) -> bytes:
     return blake2b(JSON.write(request.to_dict()), digest_size=16).digest()
 
 
-def plan_in_time(request: PlanRequest, solver: str, left_s: float) -> PlanResponse:
+def plan_in_time(
+    request: PlanRequest, solver: str, memory_mb: float, left_s: float
+) -> PlanResponse:
     """Plan a request in the time that is left of its deadline; see `checked_plan`.
 
     `solver` plans where the request names none.
     """
     left_s = min(left_s, request.deadline_s)
     hurried = attrs.evolve(request, deadline_s=left_s)
-    response = checked_plan(hurried, solver=request.solver or solver)
+    response = checked_plan(hurried, solver=request.solver or solver, max_memory_mb=memory_mb)
     waited_ms = round(1e3 * (request.deadline_s - left_s), 3)
     return attrs.evolve(response, waited_ms=waited_ms)

@@ -1,7 +1,7 @@
-"""`laneweave bench planner`: seeded formations of growing size (`instances`).
+"""`laneweave bench planner`: seeded formations of growing size (`request_families`).
 
-CPU time of one thread, with the compiled parts loaded. What a size or a family costs is told by the
-median and the 95th percentile of its instances; those that reach the deadline count with it.
+Measures the CPU time of one thread, with the compiled parts loaded: median and 95th percentile over
+the instances of a size and family. Instances that reach the deadline count with it.
 """
 
 from __future__ import annotations
@@ -15,23 +15,25 @@ import attrs
 import numpy as np
 from rich.table import Table
 
-from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan, warm_up
-from laneweave.coordinator.planning.grid import Mode
-from laneweave.coordinator.planning.instances import (
+from laneweave.coordinator.planning.facade import checked_plan, warm_up
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.response import PlanResponse
+from laneweave.launch.bench.request_families import (
     TRAFFIC_KINDS,
     block_request,
     formation_request,
     traffic_request,
 )
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.lattice import Mode
 from laneweave.sim_bridge.recording.recorder import spread
 
 
 @attrs.frozen
 class Family:
-    """A motion mode with conflicts, and where the formations come from.
+    """A motion mode with conflict kinds, and the generator of the formations.
 
-    make: one of `instances`, called with a seed.
+    make: a function of `request_families`, called with a seed.
     """
 
     mode: Mode
@@ -64,7 +66,7 @@ FAMILIES: Final[dict[str, Family]] = {
     "traffic": Family(1, TRAFFIC_KINDS, traffic_request),
 }
 FIRST_ANSWER_S = 0.1
-"""Who decides quickly what to do has a path set by then, though perhaps not the best."""
+"""Short deadline for counting early feasible plans."""
 
 
 def bench_planner(
@@ -81,10 +83,10 @@ def bench_planner(
     Args:
         vehicles: formation sizes.
         families: some of `FAMILIES`.
-        instances: how many of each size and family.
+        instances: number of instances per size and family.
         seed: of the first of them.
         deadline_s: of each request.
-        solver: plans alone, without another one to fall back on; see `plan`.
+        solver: runs without a fallback; see `plan`.
 
     Yields:
         One row per family and size.
@@ -132,7 +134,7 @@ def _measured(requests: Sequence[PlanRequest], solver: str) -> dict[str, Any]:
 
 
 def gap_percent(response: PlanResponse) -> float:
-    """Return by how much the cost may be above the least one, relative to the lower bound."""
+    """Return the gap between cost and lower bound, relative to the lower bound [%]."""
     if response.cost is None or response.lower_bound is None:
         return math.inf
     return 100.0 * (response.cost - response.lower_bound) / max(response.lower_bound, 1)

@@ -10,8 +10,10 @@ from typing import Any
 
 import attrs
 
-from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan
-from laneweave.coordinator.planning.explanation import explain
+from laneweave.coordinator.planning.facade import checked_plan
+from laneweave.coordinator.planning.paper.explanation import explain
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.service.client import (
     PlanClient,
     PlanError,

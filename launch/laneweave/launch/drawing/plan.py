@@ -19,8 +19,9 @@ from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Rectangle
 from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
 
-from laneweave.coordinator.planning import PlanRequest, PlanResponse
 from laneweave.coordinator.planning.grid import Grid
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK, new_figure, save
 from laneweave.protocol.errors import BadInputError
 

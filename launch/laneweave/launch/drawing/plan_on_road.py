@@ -24,7 +24,8 @@ from matplotlib.patheffects import withStroke
 from matplotlib.text import Annotation
 from numpy.typing import NDArray
 
-from laneweave.coordinator.planning import PlanRequest, PlanResponse
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK, new_figure, save
 from laneweave.launch.drawing.plan import short_name, team_colours
 from laneweave.launch.drawing.plan_driving import Drive, drive_plan

@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch
 
-from laneweave.coordinator.planning.explanation import (
+from laneweave.coordinator.planning.paper.explanation import (
     ExplainedAssignment,
     ExplainedNode,
     Explanation,

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from laneweave.coordinator.planning.explanation import (
+from laneweave.coordinator.planning.paper.explanation import (
     MAX_LITERAL_NODES,
     ExplainedAssignment,
     ExplainedNode,

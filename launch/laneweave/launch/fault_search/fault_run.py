@@ -134,7 +134,7 @@ class _ListenedPlanner:
     ) -> StreamPlan:
         plan = self._planner.plan(slot, vehicles, before, blocked)
         held = [vehicle.vehicle for vehicle in vehicles if vehicle.held]
-        paths = plan.ways.items()
+        paths = plan.paths.items()
         moved = [name for name, path in paths if len(path) > 1 and path[0] != path[1]]
         self._listener([*held, *moved])
         return plan

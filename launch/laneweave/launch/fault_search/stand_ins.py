@@ -9,10 +9,9 @@ import random
 from collections.abc import Collection, Sequence
 
 from laneweave.agents.driving.driver import Drive, SolverStats
-from laneweave.coordinator.planning.grid import displacements
-from laneweave.coordinator.planning.rolling.planner import StreamPlan, StreamVehicle, Way
+from laneweave.coordinator.planning.rolling.planner import CellPath, StreamPlan, StreamVehicle
 from laneweave.coordinator.rolling.planner import stream_road
-from laneweave.protocol.lattice import Cell, PlannedMove, footprint
+from laneweave.protocol.lattice import Cell, PlannedMove, displacements, footprint
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import at_rest_in_cell
 from laneweave.protocol.wire.messages import Motion, Sense
@@ -93,7 +92,7 @@ class LightPlanner:
         del before
         rng = random.Random(f"{self._seed}/{slot}")  # noqa: S311 (simulation, no secrets)
         taken = {vehicle.cell for vehicle in vehicles} | set(blocked)
-        paths: dict[str, Way] = {vehicle.vehicle: (vehicle.cell,) for vehicle in vehicles}
+        paths: dict[str, CellPath] = {vehicle.vehicle: (vehicle.cell,) for vehicle in vehicles}
         in_order = sorted(vehicles, key=lambda one: (one.cell[1] == one.lane, rng.random()))
         for vehicle in in_order:
             if vehicle.held or (vehicle.cell[1] == vehicle.lane and rng.random() > RESTLESS):

@@ -18,7 +18,7 @@ from typing import Any
 import attrs
 from attrs import define, field
 
-from laneweave.coordinator.planning import warm_up
+from laneweave.coordinator.planning.facade import warm_up
 from laneweave.launch.faults.board import MessageFaults, SharedBoard
 from laneweave.launch.faults.injection import FaultInjection
 from laneweave.launch.faults.network_namespaces import HUB, open_network

@@ -112,6 +112,9 @@ class Service:
 
     workers: int = field(default=0, validator=within(0, 256))
     """Processes that plan; 0: one less than there are cores, at least one."""
+    worker_memory_mb: float = field(default=1500.0, validator=within(50.0, 1_000_000.0))
+    """Limit on the arrays of branch and bound in each of them. A plan that reaches it is completed
+    by the other solver; without a proof its status is `feasible`."""
     queue_limit: int = field(default=256, validator=within(1, 100_000))
     """Requests in hand, those that are being planned among them; more are refused."""
     max_request_bytes: int = field(default=262_144, validator=within(1024, 1 << 20))

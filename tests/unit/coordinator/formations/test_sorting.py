@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from attrs import evolve
 from hypothesis import given, settings
@@ -10,7 +12,10 @@ from hypothesis import strategies as st
 from laneweave.coordinator.formations import sorting as sorting_module
 from laneweave.coordinator.formations.roster import Numbers
 from laneweave.coordinator.formations.sorting import Sorting, SortingTask, plan_requests, sort_lanes
-from laneweave.coordinator.planning import PlanRequest, PlanResponse, Weights, checked_plan
+from laneweave.coordinator.planning.facade import checked_plan
+from laneweave.coordinator.planning.paper.assignments import Weights
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.scenario.tables import DrivingStructure, Scenario
@@ -247,9 +252,9 @@ def test_a_structure_that_cannot_be_reached_is_planned_once(
     """Excusing one vehicle from its lane, as in a sorting, would plan the same request again."""
     asked = list[PlanRequest]()
 
-    def count(request: PlanRequest, *, max_nodes: int, weights: Weights) -> PlanResponse:
+    def count(request: PlanRequest, **limits: Any) -> PlanResponse:  # noqa: ANN401
         asked.append(request)
-        return checked_plan(request, max_nodes=max_nodes, weights=weights)
+        return checked_plan(request, **limits)
 
     monkeypatch.setattr(sorting_module, "checked_plan", count)
     held: dict[Name, Cell] = {C: (0, 1), D: (-1, 0), E: (-2, 0), F: (-3, 1)}
@@ -263,10 +268,10 @@ def test_all_placements_share_one_deadline(monkeypatch: pytest.MonkeyPatch) -> N
     """Each attempt takes 2 s of a deadline of 5 s, and every plan has too many steps."""
     asked, now_s = list[float](), [100.0]
 
-    def slow_plan(request: PlanRequest, *, max_nodes: int, weights: Weights) -> PlanResponse:
+    def slow_plan(request: PlanRequest, **limits: Any) -> PlanResponse:  # noqa: ANN401
         asked.append(request.deadline_s)
         now_s[0] += 2.0
-        return checked_plan(request, max_nodes=max_nodes, weights=weights)
+        return checked_plan(request, **limits)
 
     monkeypatch.setattr(sorting_module, "checked_plan", slow_plan)
     cells = {A: (0, 0), B: (-1, 1), C: (-2, 0), D: (-3, 1), E: (0, 2), F: (-2, 2)}

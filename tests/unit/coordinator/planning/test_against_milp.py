@@ -8,14 +8,15 @@ from typing import Any
 
 import pytest
 
-from laneweave.coordinator.planning import PlanRequest, plan
-from laneweave.coordinator.planning.grid import Mode
-from laneweave.coordinator.planning.instances import (
+from laneweave.coordinator.planning.facade import plan
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.launch.bench.request_families import (
     TRAFFIC_KINDS,
     block_request,
     formation_request,
     traffic_request,
 )
+from laneweave.protocol.lattice import Mode
 from laneweave.protocol.scenario.tables import SOLVERS
 from oracles import joint_search, milp_oracle
 from oracles.instances import (
@@ -148,9 +149,7 @@ def _closing(seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
 
 @by_oracle
 @pytest.mark.parametrize("first", range(0, CLOSING_INSTANCES, CHUNK))
-def test_planner_agrees_with_the_oracle_where_nobody_may_close_up(
-    first: int, oracle: Oracle
-) -> None:
+def test_planner_agrees_with_the_oracle_with_closing(first: int, oracle: Oracle) -> None:
     wrong, dearer = [], 0
     for seed in range(first, first + CHUNK):
         request, free = _closing(seed)
@@ -175,7 +174,7 @@ def compared() -> Iterator[dict[str, Any]]:
 
 @pytest.mark.full
 @pytest.mark.parametrize("seed", range(LARGE_INSTANCES))
-def test_what_is_proven_of_large_requests_of_every_kind_is_true(seed: int) -> None:
+def test_proofs_on_large_requests_agree_with_the_oracle(seed: int) -> None:
     """Three to five lanes, all conflicts, blocked cells, lists of targets, more than are needed."""
     request = {**large_request(seed), "deadline_s": LARGE_DEADLINE_S}
     response = _plan(request, "branching")
@@ -207,7 +206,7 @@ CROWDED = list(product(range(8), ((3, 2, 2), (4, 1, 2), (3, 2, 3))))
 
 
 @pytest.mark.parametrize("code", range(len(EVERY_VARIANT)))
-def test_planner_agrees_with_joint_search_where_space_is_scarce(code: int) -> None:
+def test_planner_agrees_with_joint_search_on_crowded_grids(code: int) -> None:
     """Many of these have no solution, which the planner must prove."""
     mode, conflicts = EVERY_VARIANT[code]
     wrong = []

@@ -7,9 +7,12 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from laneweave.coordinator.planning.assignments import Assignment, assignments
-from laneweave.coordinator.planning.frd import IntMatrix
-from laneweave.coordinator.planning.preference import BoolMatrix
+from laneweave.coordinator.planning.paper.assignments import (
+    Assignment,
+    BoolMatrix,
+    IntMatrix,
+    assignments,
+)
 
 
 @st.composite

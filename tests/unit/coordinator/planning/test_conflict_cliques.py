@@ -5,10 +5,12 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from laneweave.coordinator.planning.conflict_cliques import Row, row_patterns
-from laneweave.coordinator.planning.conflicts import KINDS, ConflictModel
-from laneweave.coordinator.planning.exact.arrays import lattice
-from laneweave.coordinator.planning.grid import Grid, Mode, Move, displacements
+from laneweave.coordinator.planning.conflicts import ConflictModel, Move
+from laneweave.coordinator.planning.exact.arrays import move_arrays
+from laneweave.coordinator.planning.exact.cliques import Clique, clique_patterns
+from laneweave.coordinator.planning.grid import Grid
+from laneweave.protocol.lattice import Mode, displacements
+from laneweave.protocol.scenario.tables import CONFLICT_KINDS
 from oracles.instances import EVERY_VARIANT
 
 MODELS: list[tuple[Mode, tuple[str, ...]]] = [
@@ -18,7 +20,7 @@ FAR = range(-3, 4)
 NEAR = range(-2, 3)
 
 
-def moves_of(pattern: Row, mode: Mode, column: int, lane: int) -> set[Move]:
+def moves_of(pattern: Clique, mode: Mode, column: int, lane: int) -> set[Move]:
     """Return the moves of a row with its anchor in a cell."""
     steps = displacements(mode)
     moves = set()
@@ -29,11 +31,11 @@ def moves_of(pattern: Row, mode: Mode, column: int, lane: int) -> set[Move]:
 
 
 @pytest.mark.parametrize(("mode", "kinds"), MODELS)
-def test_every_conflict_is_in_a_row_and_every_row_excludes(
+def test_every_conflict_is_in_a_clique_and_every_clique_excludes(
     mode: Mode, kinds: tuple[str, ...]
 ) -> None:
     model = ConflictModel(kinds)
-    patterns = row_patterns(mode, model)
+    patterns = clique_patterns(mode, model)
     rows = [
         moves_of(pattern, mode, column, lane)
         for pattern in patterns
@@ -59,28 +61,28 @@ def test_every_conflict_is_in_a_row_and_every_row_excludes(
 
 
 @pytest.mark.parametrize(("mode", "kinds"), MODELS)
-def test_from_cells_of_a_row_can_be_told_apart(mode: Mode, kinds: tuple[str, ...]) -> None:
-    """See `Lattice.near`."""
+def test_from_cells_of_a_clique_have_different_residues(mode: Mode, kinds: tuple[str, ...]) -> None:
+    """See `MoveArrays.near`."""
     grid, model = Grid(9, 5), ConflictModel(kinds)
-    ways = lattice(grid, mode, model)
-    assert ways.near_count == (12 if "closing" in kinds else 9)
-    assert set(ways.near.tolist()) == set(range(ways.near_count))
+    arrays = move_arrays(grid, mode, model)
+    assert arrays.residue_count == (12 if "closing" in kinds else 9)
+    assert set(arrays.residue.tolist()) == set(range(arrays.residue_count))
     cells: dict[int, set[int]] = {}
-    for d, cell, m in np.argwhere(ways.row >= 0).tolist():
-        cells.setdefault(int(ways.row[d, cell, m]), set()).add(cell)
-    assert len(cells) == ways.row_count
+    for d, cell, m in np.argwhere(arrays.clique >= 0).tolist():
+        cells.setdefault(int(arrays.clique[d, cell, m]), set()).add(cell)
+    assert len(cells) == arrays.clique_count
     for of_row in cells.values():
-        assert len({int(ways.near[cell]) for cell in of_row}) == len(of_row)
+        assert len({int(arrays.residue[cell]) for cell in of_row}) == len(of_row)
 
 
 @pytest.mark.parametrize(
     ("mode", "kinds", "moves"),
     [(1, ("node", "edge", "special-1"), 9), (1, ("geometric",), 9), (2, ("geometric",), 25)],
 )
-def test_of_footprints_there_is_one_row_for_each_cell(
+def test_footprints_have_one_clique_for_each_cell(
     mode: Mode, kinds: tuple[str, ...], moves: int
 ) -> None:
-    (pattern,) = row_patterns(mode, ConflictModel(kinds))
+    (pattern,) = clique_patterns(mode, ConflictModel(kinds))
     assert len(pattern) == moves
 
 
@@ -88,16 +90,14 @@ def test_of_footprints_there_is_one_row_for_each_cell(
     ("mode", "kinds", "moves"),
     [(1, ("node", "edge", "special-1"), 4), (1, ("geometric",), 4), (2, ("geometric",), 20)],
 )
-def test_of_vehicles_that_close_up_there_is_one_row_more(
-    mode: Mode, kinds: tuple[str, ...], moves: int
-) -> None:
-    others = row_patterns(mode, ConflictModel(kinds))
-    *same, pattern = row_patterns(mode, ConflictModel((*kinds, "closing")))
+def test_closing_adds_one_clique(mode: Mode, kinds: tuple[str, ...], moves: int) -> None:
+    others = clique_patterns(mode, ConflictModel(kinds))
+    *same, pattern = clique_patterns(mode, ConflictModel((*kinds, "closing")))
     assert tuple(same) == others
     assert len(pattern) == moves
 
 
-@pytest.mark.parametrize("kind", sorted(set(KINDS) - {"node", "geometric"}))
-def test_there_are_no_rows_where_vehicles_may_share_a_cell(kind: str) -> None:
+@pytest.mark.parametrize("kind", sorted(set(CONFLICT_KINDS) - {"node", "geometric"}))
+def test_cliques_are_refused_where_vehicles_may_share_a_cell(kind: str) -> None:
     with pytest.raises(ValueError, match="share a cell"):
-        row_patterns(2, ConflictModel((kind,)))
+        clique_patterns(2, ConflictModel((kind,)))

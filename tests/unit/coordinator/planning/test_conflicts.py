@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from laneweave.coordinator.planning.conflicts import KINDS, PAPER_KINDS, ConflictModel, footprint
-from laneweave.coordinator.planning.grid import Cell, Move, displacements
+from laneweave.coordinator.planning.conflicts import PAPER_KINDS, ConflictModel, Move
+from laneweave.protocol.lattice import Cell, displacements, footprint
+from laneweave.protocol.scenario.tables import CONFLICT_KINDS
 from oracles.path_rules import conflict_kinds
 
 CELLS = st.tuples(st.integers(0, 4), st.integers(0, 3))
@@ -62,19 +63,19 @@ CASES: list[tuple[Move, Move, set[str]]] = [
 
 @pytest.mark.parametrize(("a", "b", "kinds"), CASES)
 def test_kinds(a: Move, b: Move, kinds: set[str]) -> None:
-    found = {kind for kind in KINDS if ConflictModel([kind]).kind(a, b) is not None}
+    found = {kind for kind in CONFLICT_KINDS if ConflictModel([kind]).kind(a, b) is not None}
     assert found == kinds | {"geometric"}
 
 
 def test_side_by_side_and_apart_is_no_conflict() -> None:
-    everything = ConflictModel(KINDS)
+    everything = ConflictModel(CONFLICT_KINDS)
     assert everything.kind(((0, 0), (1, 0)), ((0, 1), (1, 1))) is None
     assert everything.kind(((0, 0), (1, 1)), ((1, 2), (2, 2))) is None
     assert everything.kind(((0, 0), (0, 0)), ((0, 1), (0, 1))) is None
 
 
 @settings(deadline=None)
-@given(moves(), moves(), st.sampled_from(KINDS))
+@given(moves(), moves(), st.sampled_from(CONFLICT_KINDS))
 def test_every_kind_is_symmetric(a: Move, b: Move, kind: str) -> None:
     model = ConflictModel([kind])
     assert model.kind(a, b) == model.kind(b, a)
@@ -94,7 +95,7 @@ def test_conflicts_do_not_depend_on_the_place(a: Move, b: Move, shift: Cell) -> 
         start, end = ((c + shift[0], lane + shift[1]) for c, lane in move)
         return start, end
 
-    model = ConflictModel(KINDS)
+    model = ConflictModel(CONFLICT_KINDS)
     assert model.kind(a, b) == model.kind(moved(a), moved(b))
 
 
@@ -115,11 +116,13 @@ CLOSING: list[tuple[Move, Move]] = [
 
 
 @pytest.mark.parametrize(("a", "b"), CLOSING)
-def test_closing_is_a_kind_of_its_own(a: Move, b: Move) -> None:
+def test_no_other_kind_contains_closing(a: Move, b: Move) -> None:
     for first, second in ((a, b), (b, a)):
-        found = [kind for kind in KINDS if ConflictModel([kind]).kind(first, second) is not None]
+        found = [
+            kind for kind in CONFLICT_KINDS if ConflictModel([kind]).kind(first, second) is not None
+        ]
         assert found == ["closing"]
-        assert ConflictModel(KINDS).kind(first, second) == "closing"
+        assert ConflictModel(CONFLICT_KINDS).kind(first, second) == "closing"
 
 
 @pytest.mark.parametrize(
@@ -162,19 +165,21 @@ def test_closing_is_the_same_from_either_end_of_the_road_and_from_either_side(
         assert model.kind(a, b) == model.kind(turned(a, *signs), turned(b, *signs))
 
 
-def test_all_kinds_are_those_of_rules_that_share_no_code() -> None:
+def test_all_kinds_agree_with_independent_rules() -> None:
     steps = displacements(2)
     for column, lane in itertools.product(range(-4, 5), range(-3, 4)):
         for step, other in itertools.product(steps, steps):
             a, b = ((0, 0), step), ((column, lane), (column + other[0], lane + other[1]))
-            found = [kind for kind in KINDS if ConflictModel([kind]).kind(a, b) is not None]
+            found = [
+                kind for kind in CONFLICT_KINDS if ConflictModel([kind]).kind(a, b) is not None
+            ]
             assert found == conflict_kinds(a, b)
 
 
 def test_the_reach_of_a_model_holds_all_its_conflicts() -> None:
     near = list(itertools.product(range(-5, 6), repeat=2))
     steps = displacements(2)
-    for kind in KINDS:
+    for kind in CONFLICT_KINDS:
         model = ConflictModel([kind])
         found = {
             (column, lane)
@@ -184,15 +189,15 @@ def test_the_reach_of_a_model_holds_all_its_conflicts() -> None:
         }
         assert max(abs(c) for c, _ in found) <= model.reach[0]
         assert max(abs(lane) for _, lane in found) <= model.reach[1]
-    assert ConflictModel(KINDS).reach == (3, 2)
-    assert ConflictModel([kind for kind in KINDS if kind != "closing"]).reach == (2, 2)
+    assert ConflictModel(CONFLICT_KINDS).reach == (3, 2)
+    assert ConflictModel([kind for kind in CONFLICT_KINDS if kind != "closing"]).reach == (2, 2)
 
 
 def test_footprints() -> None:
     square = set(itertools.product((0, 1), repeat=2))
-    assert footprint(((0, 0), (1, 1))) == square
-    assert footprint(((0, 0), (0, 1))) == {(0, 0), (0, 1)}
-    assert footprint(((0, 0), (0, 0))) == {(0, 0)}
+    assert footprint((0, 0), (1, 1)) == square
+    assert footprint((0, 0), (0, 1)) == {(0, 0), (0, 1)}
+    assert footprint((0, 0), (0, 0)) == {(0, 0)}
 
 
 def test_kinds_are_kept_in_one_order_and_unknown_ones_rejected() -> None:

@@ -7,10 +7,11 @@ from pathlib import Path
 import attrs
 import pytest
 
-from laneweave.coordinator.planning import PlanRequest, VehicleRequest, plan
-from laneweave.coordinator.planning.explanation import ExplainedAssignment, explain
+from laneweave.coordinator.planning.facade import plan
 from laneweave.coordinator.planning.grid import Grid
-from laneweave.coordinator.planning.instances import block_request, traffic_request
+from laneweave.coordinator.planning.paper.explanation import ExplainedAssignment, explain
+from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
+from laneweave.launch.bench.request_families import block_request, traffic_request
 
 CASE_STUDY = Path(__file__).parents[4] / "docs" / "examples" / "case-study.json"
 
@@ -67,7 +68,7 @@ def test_costs_are_those_of_the_plan(seed: int) -> None:
     )
 
 
-def test_without_a_plan_it_says_so() -> None:
+def test_a_run_without_a_plan_is_explained() -> None:
     vehicles = (
         VehicleRequest("a", (0, 0), eligible=(1,)),
         VehicleRequest("b", (1, 0), eligible=(0,)),

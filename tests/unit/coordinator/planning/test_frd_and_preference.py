@@ -4,10 +4,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from laneweave.coordinator.planning.frd import Weights, cost_matrix, frd
-from laneweave.coordinator.planning.grid import Cell, Grid, Mode
-from laneweave.coordinator.planning.preference import eligible_targets, preference_matrix
+from laneweave.coordinator.planning.grid import Grid
+from laneweave.coordinator.planning.paper.assignments import (
+    Weights,
+    cost_matrix,
+    frd,
+    preference_matrix,
+)
+from laneweave.coordinator.planning.request import VehicleRequest
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.lattice import Cell, Mode
 
 CELLS = st.tuples(st.integers(0, 4), st.integers(0, 2))
 
@@ -51,9 +57,9 @@ def test_cost_matrix() -> None:
 
 def test_preferences() -> None:
     targets = [(0, 0), (1, 1), (2, 1)]
-    assert eligible_targets(targets, 1, None) == {1, 2}
-    assert eligible_targets(targets, 2, None) == frozenset()
-    assert eligible_targets(targets, None, (0, 2)) == {0, 2}
-    assert eligible_targets(targets, None, None) == {0, 1, 2}
+    assert VehicleRequest("a", (0, 0), lane=1).choice(targets) == {1, 2}
+    assert VehicleRequest("a", (0, 0), lane=2).choice(targets) == frozenset()
+    assert VehicleRequest("a", (0, 0), eligible=(0, 2)).choice(targets) == {0, 2}
+    assert VehicleRequest("a", (0, 0)).choice(targets) == {0, 1, 2}
     matrix = preference_matrix([frozenset({1}), frozenset()], 3)
     assert matrix.tolist() == [[False, True, False], [False, False, False]]

@@ -1,8 +1,11 @@
 """Cells, moves and distances."""
 
+from itertools import product
+
 import pytest
 
-from laneweave.coordinator.planning.grid import Grid, displacements
+from laneweave.coordinator.planning.grid import Grid
+from laneweave.protocol.lattice import displacements
 
 GRID = Grid(4, 3, [(1, 1)])
 
@@ -19,7 +22,9 @@ def test_neighbours_stay_in_the_grid_and_off_blocked_cells() -> None:
 
 
 def test_distances_go_around_blocked_cells() -> None:
-    everywhere = list(GRID.cells())
+    everywhere = [
+        cell for cell in product(range(GRID.columns), range(GRID.lanes)) if GRID.is_free(cell)
+    ]
     assert GRID.distances((0, 1), 1, everywhere)[2, 1] == 4
     assert GRID.distances((0, 1), 2, everywhere)[2, 1] == 2
     assert (1, 1) not in GRID.distances((0, 1), 2, [*everywhere, (1, 1)])

@@ -1,12 +1,16 @@
 """Moves as bits must say the same as moves as cells."""
 
+from itertools import product
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from laneweave.coordinator.planning.conflicts import KINDS, ConflictModel
-from laneweave.coordinator.planning.grid import Grid, Mode, Move
-from laneweave.coordinator.planning.moves import MoveTable, bits
+from laneweave.coordinator.planning.conflicts import ConflictModel, Move
+from laneweave.coordinator.planning.grid import Grid
+from laneweave.coordinator.planning.problem import MoveTable, bits
+from laneweave.protocol.lattice import Mode
+from laneweave.protocol.scenario.tables import CONFLICT_KINDS
 
 GRIDS = [
     Grid(4, 3, []),
@@ -16,15 +20,18 @@ GRIDS = [
     Grid(7, 2, []),
 ]
 MODELS = [
-    *(ConflictModel([kind]) for kind in KINDS),
+    *(ConflictModel([kind]) for kind in CONFLICT_KINDS),
     ConflictModel(["geometric", "closing"]),
-    ConflictModel(KINDS),
+    ConflictModel(CONFLICT_KINDS),
 ]
 
 
 def _moves(table: MoveTable) -> set[Move]:
     return {
-        (cell, to) for cell in table.grid.cells() for to in table.grid.neighbours(cell, table.mode)
+        (cell, to)
+        for cell in product(range(table.grid.columns), range(table.grid.lanes))
+        if table.grid.is_free(cell)
+        for to in table.grid.neighbours(cell, table.mode)
     }
 
 

@@ -2,14 +2,14 @@
 
 import pytest
 
-from laneweave.coordinator.planning import plan
 from laneweave.coordinator.planning.conflicts import ConflictModel
-from laneweave.coordinator.planning.instances import (
+from laneweave.coordinator.planning.facade import plan
+from laneweave.coordinator.planning.path_map import FoundConflict, RelativePathMap, final_arrival
+from laneweave.launch.bench.request_families import (
     block_request,
     formation_request,
     traffic_request,
 )
-from laneweave.coordinator.planning.path_map import FoundConflict, RelativePathMap, final_arrival
 
 
 def test_paths_are_padded_with_their_last_cell() -> None:
@@ -26,7 +26,7 @@ def test_text() -> None:
     )
 
 
-def test_conflicts_are_read_off_neighbouring_columns() -> None:
+def test_conflicts_follow_from_neighbouring_columns() -> None:
     path_map = RelativePathMap.padded(
         ["a", "b"], [[(0, 0), (1, 0), (2, 0)], [(1, 0), (2, 0), (1, 0)]]
     )

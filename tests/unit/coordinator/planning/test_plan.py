@@ -14,19 +14,17 @@ from hypothesis import strategies as st
 
 import laneweave.coordinator
 import laneweave.protocol
-from laneweave.coordinator.planning import (
-    PlanRequest,
-    PlanResponse,
-    VehicleRequest,
-    Weights,
-    plan,
-    problems_of_response,
-)
-from laneweave.coordinator.planning.conflicts import KINDS
-from laneweave.coordinator.planning.grid import Cell, Grid, Mode
-from laneweave.coordinator.planning.instances import block_request, formation_request
+from laneweave.coordinator.planning.facade import plan
+from laneweave.coordinator.planning.grid import Grid
+from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.path_map import RelativePathMap, final_arrival
+from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
+from laneweave.coordinator.planning.response import PlanResponse
+from laneweave.coordinator.planning.validator import problems_of_response
+from laneweave.launch.bench.request_families import block_request, formation_request
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.lattice import Cell, Mode
+from laneweave.protocol.scenario.tables import CONFLICT_KINDS
 from support.planning_oracles import cheapest_plan, requests
 
 
@@ -73,7 +71,7 @@ def test_block_family_is_solved(seed: int) -> None:
     assert problems_of_response(request, response) == []
 
 
-def test_waiting_and_coming_back_are_paid_for() -> None:
+def test_waiting_and_returning_cost_steps() -> None:
     """The second vehicle stands on its target but must leave it and come back."""
     request = PlanRequest(
         Grid(3, 2, [(0, 1), (2, 1)]),
@@ -135,7 +133,7 @@ class TestInfeasible:
         assert response.status == "infeasible"
         assert response.nodes_expanded == 0
 
-    def test_two_vehicles_that_want_one_target(self) -> None:
+    def test_two_vehicles_with_one_target_are_infeasible(self) -> None:
         request = _corridor(((0, 0), 2), ((1, 0), 3))
         both = tuple(attrs.evolve(vehicle, eligible=(0,)) for vehicle in request.vehicles)
         assert plan(attrs.evolve(request, vehicles=both)).status == "infeasible"
@@ -146,7 +144,7 @@ class TestInfeasible:
         fewer = attrs.evolve(request, vehicles=vehicles, targets=request.targets[1:])
         assert plan(fewer).status == "infeasible"
 
-    def test_unreachable_target_is_noticed_at_once_however_many_assignments_there_are(
+    def test_an_unreachable_target_is_detected_immediately(
         self,
     ) -> None:
         columns = [(c, lane) for c in range(9) for lane in (0, 2)]
@@ -162,7 +160,7 @@ class TestInfeasible:
         assert response.status == "infeasible"
         assert response.assignments_tried == 0
 
-    def test_one_infeasible_assignment_does_not_hold_up_the_others(self) -> None:
+    def test_one_infeasible_assignment_does_not_block_the_others(self) -> None:
         """The cheapest assignment needs an impossible overtaking in a corridor."""
         request = PlanRequest(
             Grid(6, 1),
@@ -185,7 +183,7 @@ class TestInfeasible:
 @pytest.mark.parametrize(
     ("mode", "kinds"), [(1, ("node", "edge", "special-1")), (2, ("geometric",))]
 )
-def test_who_would_close_up_goes_one_after_the_other(
+def test_vehicles_that_would_close_up_move_one_after_the_other(
     solver: str, mode: Mode, kinds: tuple[str, ...]
 ) -> None:
     vehicles = VehicleRequest("a", (0, 0), eligible=(0,)), VehicleRequest("b", (3, 0), lane=0)
@@ -251,8 +249,8 @@ def _without_time(response: PlanResponse) -> PlanResponse:
 
 
 SCRIPT = """
-from laneweave.coordinator.planning import plan
-from laneweave.coordinator.planning.instances import block_request
+from laneweave.coordinator.planning.facade import plan
+from laneweave.launch.bench.request_families import block_request
 for seed in range(6):
     for mode in (1, 2):
         r = plan(block_request(seed, mode=mode, deadline_s=3600.0), max_nodes=60)
@@ -331,10 +329,10 @@ class TestSymmetry:
             costs = [
                 plan(
                     formation_request(
-                        seed, vehicles=5, mode=2, conflicts=KINDS[:count], deadline_s=60.0
+                        seed, vehicles=5, mode=2, conflicts=CONFLICT_KINDS[:count], deadline_s=60.0
                     )
                 ).cost
-                for count in range(1, len(KINDS) + 1)
+                for count in range(1, len(CONFLICT_KINDS) + 1)
             ]
             proven = [cost for cost in costs if cost is not None]
             assert len(proven) == len(costs)

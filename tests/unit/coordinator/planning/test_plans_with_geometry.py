@@ -7,18 +7,24 @@ from itertools import product
 from random import Random
 from typing import Any
 
+import attrs
 import numpy as np
 import pytest
 
 from laneweave.agents.driving.trajectory import move_profile
-from laneweave.coordinator.planning import PlanRequest, checked_plan, plan, problems_of_paths
+from laneweave.coordinator.planning import request as request_module
 from laneweave.coordinator.planning.budget import Budget
+from laneweave.coordinator.planning.conflicts import ConflictTable
 from laneweave.coordinator.planning.exact.reachability import explore
-from laneweave.coordinator.planning.geometry.settings import Geometry
-from laneweave.coordinator.planning.grid import Mode, displacements
-from laneweave.coordinator.planning.instances import formation_request
+from laneweave.coordinator.planning.facade import checked_plan, plan
+from laneweave.coordinator.planning.geometry.bodies import BodyGeometry
+from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
 from laneweave.coordinator.planning.problem import Problem
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.validator import problems_of_paths
+from laneweave.launch.bench.request_families import formation_request
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.lattice import Mode, displacements
 from laneweave.protocol.scenario.tables import SOLVERS, Scenario
 from oracles import joint_search
 from oracles.instances import random_request, small_request
@@ -105,7 +111,7 @@ MODES: tuple[Mode, ...] = (1, 2)
 
 @pytest.mark.parametrize("geometry", [*GEOMETRIES, TIGHT], ids=str)
 @pytest.mark.parametrize("mode", MODES)
-def test_planner_agrees_with_joint_search_where_space_is_scarce(
+def test_planner_agrees_with_joint_search_on_crowded_grids(
     geometry: dict[str, float], mode: Mode
 ) -> None:
     wrong = []
@@ -146,13 +152,29 @@ TRAIN = {
 @pytest.mark.parametrize(
     ("geometry", "cost"), [(None, 10), ({}, 10), ({"lateness_s": 0.8}, 10), (LATE, 4), (ON_TIME, 4)]
 )
-def test_a_train_starts_together_where_nobody_is_too_late(
+def test_a_train_starts_together_with_limited_lateness(
     geometry: dict[str, float] | None, cost: int
 ) -> None:
     more = {} if geometry is None else {"geometry": geometry}
     for solver in SOLVERS:
         response = checked_plan(PlanRequest.from_dict({**TRAIN, **more}), solver=solver)
         assert (response.status, response.cost) == ("optimal", cost)
+
+
+def test_computing_the_conflict_table_counts_for_the_deadline(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now_s = [0.0]
+
+    def slow_table(geometry: BodyGeometry) -> ConflictTable:
+        now_s[0] += 10.0
+        return conflict_table(geometry)
+
+    monkeypatch.setattr(request_module, "conflict_table", slow_table)
+    request = attrs.evolve(
+        formation_request(0, vehicles=4, mode=2), geometry=BodyGeometry(), deadline_s=5.0
+    )
+    assert plan(request, clock=lambda: now_s[0]).status == "timeout"
 
 
 def test_paths_that_are_too_close_are_found() -> None:
@@ -236,10 +258,10 @@ def test_the_limit_of_lateness_keeps_steps_apart(late_s: float, enough: bool) ->
     """The table compares moves of one step; here the one ahead arrives during the next one."""
     paths = [[(-1, 0), (0, 0), (1, 1)], [(0, 0), (1, 0), (1, 0)]]
     if enough:
-        Geometry(lateness_s=late_s)
+        BodyGeometry(lateness_s=late_s)
     else:
         with pytest.raises(BadInputError, match="when the next step begins"):
-            Geometry(lateness_s=late_s)
+            BodyGeometry(lateness_s=late_s)
     bodies = Bodies(lateness_s=late_s)
     gaps_m = [
         least_gap_of_plan_m(

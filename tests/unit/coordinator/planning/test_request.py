@@ -9,9 +9,11 @@ import attrs
 import pytest
 from hypothesis import given, settings
 
-from laneweave.coordinator.planning import PlanRequest, PlanResponse, VehicleRequest, plan
+from laneweave.coordinator.planning.facade import plan
 from laneweave.coordinator.planning.grid import Grid
-from laneweave.coordinator.planning.instances import block_request
+from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
+from laneweave.coordinator.planning.response import PlanResponse
+from laneweave.launch.bench.request_families import block_request
 from laneweave.protocol.errors import BadInputError
 from support.planning_oracles import requests
 
@@ -114,8 +116,8 @@ WRONG: list[tuple[Callable[[Document], None], str]] = [
     (_set("vehicles", 1, "cell", to=[8, 0]), "vehicles[1].cell"),
     (_set("vehicles", 1, "cell", to=[-1, 0]), "vehicles[1].cell"),
     (_set("vehicles", 1, "cell", to=[1, 1, 1]), "vehicles[1].cell"),
-    (_set("vehicles", 1, "cell", to=[1.0, 1]), "vehicles[1].cell"),
-    (_set("vehicles", 1, "cell", to=[True, 1]), "vehicles[1].cell"),
+    (_set("vehicles", 1, "cell", to=[1.0, 1]), "vehicles[1].cell[0]"),
+    (_set("vehicles", 1, "cell", to=[True, 1]), "vehicles[1].cell[0]"),
     (_set("vehicles", 0, "lane", to=3), "vehicles[0].lane"),
     (_set("vehicles", 0, "lane", to=None), "vehicles[0].lane"),
     (_set("vehicles", 0, "eligible", to=[0]), "vehicles[0].eligible"),
@@ -144,7 +146,7 @@ WRONG: list[tuple[Callable[[Document], None], str]] = [
 
 
 @pytest.mark.parametrize(("change", "field"), WRONG)
-def test_what_is_wrong_is_named(change: Callable[[Document], None], field: str) -> None:
+def test_errors_name_the_wrong_field(change: Callable[[Document], None], field: str) -> None:
     wrong = document()
     change(wrong)
     with pytest.raises(BadInputError) as caught:
@@ -205,7 +207,7 @@ class TestResponse:
             ("paths", [[[0]]]),
         ],
     )
-    def test_what_is_wrong_is_named(self, field: str, value: object) -> None:
+    def test_errors_name_the_wrong_field(self, field: str, value: object) -> None:
         wrong = {**plan(block_request(0)).to_dict(), field: value}
         with pytest.raises(BadInputError) as caught:
             PlanResponse.from_dict(wrong)

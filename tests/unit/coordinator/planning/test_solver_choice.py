@@ -7,9 +7,10 @@ import math
 import attrs
 import pytest
 
-from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan, plan
-from laneweave.coordinator.planning.facade import TAPPA_SHARE
-from laneweave.coordinator.planning.instances import block_request, formation_request
+from laneweave.coordinator.planning.facade import TAPPA_SHARE, checked_plan, plan
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.response import PlanResponse
+from laneweave.launch.bench.request_families import block_request, formation_request
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.tables import SOLVERS
 
@@ -54,7 +55,7 @@ def test_a_request_keeps_its_solver_in_json(solver: str | None) -> None:
     assert PlanRequest.from_dict(request.to_dict()) == request
 
 
-def test_responses_from_before_there_was_a_choice_can_be_read() -> None:
+def test_responses_without_a_solver_are_read() -> None:
     written = plan(EASY).to_dict()
     assert written.pop("solver") == "tappa"
     assert "fallback" not in written
@@ -66,7 +67,7 @@ def test_responses_from_before_there_was_a_choice_can_be_read() -> None:
 # --- fallback ---------------------------------------------------------------------------------
 
 
-def test_branching_goes_on_when_tappa_has_spent_its_nodes() -> None:
+def test_branching_continues_when_tappa_has_spent_its_nodes() -> None:
     alone = checked_plan(HARD, max_nodes=NODES, solver="tappa", fallback=False)
     assert (alone.status, alone.solver, alone.fallback) == ("timeout", "tappa", False)
     response = checked_plan(HARD, max_nodes=NODES)
@@ -96,13 +97,13 @@ def test_the_cheaper_path_set_and_the_higher_bound_are_kept(seed: int, nodes: in
     assert (both.lower_bound or 0) >= (alone.lower_bound or 0)
 
 
-def test_branching_goes_on_when_tappa_has_spent_its_time() -> None:
+def test_branching_continues_when_tappa_has_spent_its_time() -> None:
     response = plan(attrs.evolve(HARD, deadline_s=30.0), clock=Clock())
     assert (response.solver, response.fallback) == ("branching", True)
     assert response.solve_ms <= 30.1e3
 
 
-def test_tappa_spends_all_where_branching_cannot_plan() -> None:
+def test_tappa_spends_everything_where_branching_cannot_plan() -> None:
     """Where vehicles may share a cell, branching cannot plan at all."""
     request = attrs.evolve(EASY, conflicts=("edge",))
     asked = [plan(request, solver=solver) for solver in SOLVERS]

@@ -12,15 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
-from laneweave.coordinator.planning import (
-    PlanRequest,
-    PlanResponse,
-    checked_plan,
-    problems_of_response,
-)
-from laneweave.coordinator.planning.grid import Cell, Grid
+from laneweave.coordinator.planning.facade import checked_plan
+from laneweave.coordinator.planning.grid import Grid
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.structures import STRUCTURES, structure_targets
+from laneweave.coordinator.planning.validator import problems_of_response
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.lattice import Cell
 
 INTERLACED = [[5, 1], [4, 0], [4, 2], [3, 1], [2, 0], [2, 2]]
 LANE_DROP: dict[str, Any] = {
@@ -165,7 +164,7 @@ def _assert_filled(
     assert len(targets) == len(preferred)
 
 
-def test_who_names_a_lane_gets_it_and_the_others_fill_the_rest() -> None:
+def test_vehicles_with_a_lane_get_it_and_the_others_fill_the_rest() -> None:
     vehicles = [dict(vehicle) for vehicle in LANE_DROP["vehicles"]]
     for vehicle in vehicles[:4]:
         vehicle["lane"] = 0
@@ -179,7 +178,7 @@ def test_who_names_a_lane_gets_it_and_the_others_fill_the_rest() -> None:
 # --- requests ---------------------------------------------------------------------------------
 
 
-def test_the_answer_names_the_targets_that_its_assignment_is_about() -> None:
+def test_the_response_holds_the_targets_of_the_structure() -> None:
     request = PlanRequest.from_dict(LANE_DROP)
     response = checked_plan(request)
     assert response.status == "optimal"
@@ -195,7 +194,7 @@ def test_the_answer_names_the_targets_that_its_assignment_is_about() -> None:
     )
 
 
-def test_a_structure_that_is_not_the_one_asked_for_is_found_out() -> None:
+def test_targets_of_another_structure_are_detected() -> None:
     request = PlanRequest.from_dict(LANE_DROP | {"structure": "interlaced"})
     response = checked_plan(request)
     assert response.targets is not None
@@ -239,10 +238,10 @@ def test_a_formation_changes_its_structure_twice_in_a_row() -> None:
         ({"structure": 3}, "structure: got 3; allowed: a string"),
         ({"targets": [[0, 0]]}, "allowed: structure or targets, not both"),
         ({"targets": []}, "allowed: structure or targets, not both"),
-        ({"lanes": []}, "lanes: got (); allowed: at least one lane"),
+        ({"lanes": []}, "lanes: got '0 items'; allowed: 1 to 16 items"),
         ({"lanes": 1}, "lanes: got 1; allowed: a list"),
         ({"lanes": [0, 3]}, "lanes[1]: got 3; allowed: a whole number from 0 to 2"),
-        ({"lanes": [[0]]}, "lanes[0]: got [0]; allowed: a whole number"),
+        ({"lanes": [[0]]}, "lanes[0]: got [0]; allowed: an integer"),
         ({"lanes": [1, 1]}, "lanes[1]: got 1; allowed: each lane once"),
         (
             {"vehicles": [{"id": "a", "cell": [0, 0], "lane": 2}]},
@@ -264,7 +263,7 @@ def test_impossible_structures_are_refused(changes: dict[str, Any], line: str) -
     assert line in str(refused.value)
 
 
-def test_a_lane_that_is_named_too_often_is_named() -> None:
+def test_errors_name_a_lane_with_too_many_vehicles() -> None:
     vehicles = [vehicle | {"lane": 1} for vehicle in LANE_DROP["vehicles"]]
     grid = {"columns": 6, "lanes": 3, "blocked": [[0, 1]]}
     with pytest.raises(BadInputError, match="lane 1 has 5 such cells for 6 vehicles"):

@@ -1,19 +1,17 @@
-"""The validator must find whatever is wrong with a plan."""
+"""The validator finds every kind of error in a plan."""
 
 from typing import Any
 
 import attrs
 import pytest
 
-from laneweave.coordinator.planning import (
-    PlanRequest,
-    PlanResponse,
-    VehicleRequest,
-    plan,
-    problems_of_paths,
-    problems_of_response,
-)
-from laneweave.coordinator.planning.grid import Cell, Grid, Mode
+from laneweave.coordinator.planning import conflicts
+from laneweave.coordinator.planning.facade import plan
+from laneweave.coordinator.planning.grid import Grid
+from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
+from laneweave.coordinator.planning.response import PlanResponse
+from laneweave.coordinator.planning.validator import problems_of_paths, problems_of_response
+from laneweave.protocol.lattice import Cell, Mode
 
 REQUEST = PlanRequest(
     Grid(4, 3, [(0, 2)]),
@@ -73,9 +71,7 @@ def test_problems_are_found(
 
 
 @pytest.mark.parametrize(("mode", "kinds"), [(1, REQUEST.conflicts), (2, ("geometric",))])
-def test_vehicles_that_close_up_from_three_columns_are_not_too_far_apart(
-    mode: Mode, kinds: tuple[str, ...]
-) -> None:
+def test_closing_moves_three_columns_apart_are_compared(mode: Mode, kinds: tuple[str, ...]) -> None:
     vehicles = VehicleRequest("a", (0, 0), eligible=(0,)), VehicleRequest("b", (3, 0), lane=0)
     paths = ((0, 0), (1, 0)), ((3, 0), (2, 0))
     targets = ((1, 0), (2, 0))
@@ -84,6 +80,21 @@ def test_vehicles_that_close_up_from_three_columns_are_not_too_far_apart(
     assert found == ["closing conflict of a and b in step 0"]
     free = PlanRequest(Grid(4, 1), mode, kinds, vehicles, targets)
     assert problems_of_paths(free, (0, 1), paths) == []
+
+
+def test_pairs_are_compared_as_far_as_conflicts_reach(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A new conflict kind with a longer reach must not be skipped."""
+    monkeypatch.setitem(conflicts._COLUMNS_OF_KIND, "edge", 6)
+    monkeypatch.setitem(conflicts._PREDICATES, "edge", lambda a, b: b[0][0] - a[0][0] == 6)
+    request = PlanRequest(
+        Grid(8, 1),
+        1,
+        ("node", "edge"),
+        (VehicleRequest("a", (0, 0)), VehicleRequest("b", (6, 0))),
+        ((0, 0), (6, 0)),
+    )
+    paths = (((0, 0), (0, 0)), ((6, 0), (6, 0)))
+    assert problems_of_paths(request, (0, 1), paths) == ["edge conflict of a and b in step 0"]
 
 
 def test_oblique_moves_belong_to_mode_2() -> None:
@@ -117,5 +128,5 @@ def test_a_good_response_has_no_problems() -> None:
         {"assignment": (1, 0)},
     ],
 )
-def test_false_claims_are_found(change: dict[str, Any]) -> None:
+def test_wrong_claims_of_a_response_are_found(change: dict[str, Any]) -> None:
     assert problems_of_response(REQUEST, attrs.evolve(_response(), **change)) != []

@@ -631,10 +631,10 @@ def test_the_real_planner_takes_what_it_is_given() -> None:
     (compute,) = control.order(LOOK_S, 9.0)
     plan = compute.work()
     assert isinstance(plan, StreamPlan)
-    assert set(plan.ways) == {A, B, C}
-    for vehicle, way in plan.ways.items():
+    assert set(plan.paths) == {A, B, C}
+    for vehicle, way in plan.paths.items():
         assert way[0] == HOMES[Name(vehicle)]
-    assert set(plan.ways[C]) == {HOMES[C]}
+    assert set(plan.paths[C]) == {HOMES[C]}
     (note,) = control.finish(Computed(1, plan), LOOK_S, 0.0)
     assert note.kind == "stream-planned"
 

@@ -11,7 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan
+from laneweave.coordinator.planning.facade import checked_plan
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.service.format import (
     FAILED,
     INVALID,

@@ -5,9 +5,9 @@ import math
 import pytest
 from attrs import evolve
 
-from laneweave.coordinator.planning import plan
-from laneweave.coordinator.planning.instances import formation_request
+from laneweave.coordinator.planning.facade import plan
 from laneweave.launch.bench.planner import FAMILIES, bench_planner, gap_percent, planner_table
+from laneweave.launch.bench.request_families import formation_request
 from laneweave.protocol.errors import BadInputError
 
 

@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 from matplotlib.image import imread
 
-from laneweave.coordinator.planning import PlanRequest, VehicleRequest
-from laneweave.coordinator.planning.explanation import explain
 from laneweave.coordinator.planning.grid import Grid
-from laneweave.coordinator.planning.instances import traffic_request
+from laneweave.coordinator.planning.paper.explanation import explain
+from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
+from laneweave.launch.bench.request_families import traffic_request
 from laneweave.launch.cli.plan_answers import explain_request
 from laneweave.launch.drawing.tappa_process import explanation_figure
 from laneweave.launch.drawing.tappa_text import IMPROVED, LITERAL, explanation_text

@@ -13,7 +13,8 @@ from matplotlib.colors import to_hex
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Rectangle
 from PIL import Image
 
-from laneweave.coordinator.planning import PlanRequest, PlanResponse
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.launch.cli import main as cli
 from laneweave.launch.cli import plan_answers
 from laneweave.launch.cli.plan_answers import answer_request

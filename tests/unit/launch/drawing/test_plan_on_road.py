@@ -13,7 +13,9 @@ from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 from PIL import Image
 
-from laneweave.coordinator.planning import PlanRequest, PlanResponse, checked_plan
+from laneweave.coordinator.planning.facade import checked_plan
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.launch.cli import main as cli
 from laneweave.launch.cli import plan_answers
 from laneweave.launch.drawing import figures as drawing

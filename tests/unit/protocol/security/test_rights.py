@@ -7,13 +7,15 @@ from collections.abc import Iterator
 
 import pytest
 
-from laneweave.protocol.config.loading import parse_scenario
+from laneweave.protocol.config.loading import load_scenario, parse_scenario, to_tables
 from laneweave.protocol.config.participants import identities_of
 from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.security.access import Credentials
 from laneweave.protocol.security.rights import (
     Flow,
     Rule,
     access_control,
+    access_of,
     guard_of,
     rights_table,
     rules_of,
@@ -21,6 +23,7 @@ from laneweave.protocol.security.rights import (
 )
 from laneweave.protocol.wire.identities import parse_identity
 from laneweave.protocol.wire.topics import TOPICS, Exchange, Keys, Party, matches
+from support.refusals import refusal
 
 SCENARIO = parse_scenario(
     {
@@ -28,6 +31,7 @@ SCENARIO = parse_scenario(
         "network": {"realm": "r", "endpoint": "tls/router:7447"},
         "security": {
             "mode": "mtls",
+            "folder": "/keys",
             "fleets": {"even": "0/2", "odd": "1/2", "two": ["a", "b"]},
             "vehicles": ["a", "b", "c"],
         },
@@ -213,3 +217,48 @@ def test_the_table_for_people_names_all_who_take_part() -> None:
     for party in set(Party) - {Party.ROUTER}:
         assert f"| `{party}" in table
     assert "serves `service/plan`" in table
+
+
+# --- access ---------------------------------------------------------------------------------------
+
+
+def test_credentials_lie_in_the_folder() -> None:
+    access = access_of(SCENARIO, "coordinator.c1", {})
+    assert access.identity == "coordinator.c1"
+    assert access.credentials == Credentials(
+        "/keys/ca.pem", "/keys/coordinator.c1.pem", "/keys/coordinator.c1.key"
+    )
+    assert access_of(load_scenario(None), "coordinator.c1", {}).credentials is None
+
+
+def test_the_environment_goes_before_the_folder() -> None:
+    environment = {
+        "LANEWEAVE_CA_FILE": "ca",
+        "LANEWEAVE_CERTIFICATE_FILE": "own",
+        "LANEWEAVE_PRIVATE_KEY": "secret words",
+    }
+    credentials = access_of(SCENARIO, "bridge", environment).credentials
+    assert credentials == Credentials("ca", "own", "", "secret words")
+    assert "secret" not in repr(credentials)
+    both = environment | {"LANEWEAVE_PRIVATE_KEY_FILE": "key"}
+    error = refusal(access_of, SCENARIO, "bridge", both)
+    assert error.field == "LANEWEAVE_PRIVATE_KEY_FILE"
+    assert "secret" not in str(error)
+
+
+def test_only_identities_have_credentials() -> None:
+    assert refusal(access_of, SCENARIO, "somebody", {}).field == "identity"
+
+
+@pytest.mark.parametrize("identity", ["coordinator.c9", "client.nobody", "fleet.none"])
+def test_whom_the_configuration_does_not_know_is_refused(identity: str) -> None:
+    # The router would let it in, and let it do nothing.
+    error = refusal(access_of, SCENARIO, identity, {})
+    assert error.field == "identity"
+    assert "security.clients" in str(error)
+    assert access_of(load_scenario(None), identity, {}).credentials is None
+
+
+def test_a_secured_scenario_survives_the_way_to_a_process() -> None:
+    assert parse_scenario(to_tables(SCENARIO)) == SCENARIO
+    hash(SCENARIO)

@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laneweave.protocol.config.loading import parse_scenario
-from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.braking import (
     ERROR_SIGMAS,
@@ -25,6 +24,7 @@ from laneweave.protocol.vehicle.braking import (
 )
 from laneweave.protocol.vehicle.motion import Jerk, State
 from laneweave.protocol.wire.messages import Neighbour
+from support.refusals import refusal
 
 SCENARIO = Scenario()
 LIMITS, ASSUMED, NOISE = SCENARIO.vehicle, SCENARIO.braking, SCENARIO.sensing
@@ -180,10 +180,9 @@ def test_the_least_pitch_leaves_room_for_errors_of_measurement_and_for_nothing_m
     state, ahead = body(V_F), Neighbour(0, least_m - LIMITS.length_m, V_F)
     spare_m = BRAKE.spare_m(state, 0.0, NO_JERK, [ahead])
     assert spare_m == pytest.approx(ERROR_SIGMAS * spare_error_m(SCENARIO, V_F))
-    with pytest.raises(BadInputError) as caught:
-        with_pitch(least_m - 1e-3)
-    assert caught.value.field == "formation.gap_m"
-    allowed = re.search(r"at least (\S+):", caught.value.allowed)
+    error = refusal(with_pitch, least_m - 1e-3)
+    assert error.field == "formation.gap_m"
+    allowed = re.search(r"at least (\S+):", error.allowed)
     assert allowed is not None
     # What is named as allowed is.
     assert with_pitch(float(allowed[1])).formation.gap_m == pytest.approx(least_m, abs=1.1e-3)

@@ -1,8 +1,8 @@
 """A planning problem as arrays, for the compiled parts of the planner.
 
 Cells are numbered column by column; `cell = column * lanes + lane`. A move is a displacement and a
-from-cell. Vehicles with equal eligibility are one *team*: they may swap their targets, so it does
-not matter which of them goes where. A *pair* is a team and a target that it may have.
+from-cell. Vehicles with equal eligibility are one *team*: they may exchange their targets. A *pair*
+is a team and a target that it may have.
 """
 
 from __future__ import annotations
@@ -14,22 +14,21 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from laneweave.coordinator.planning.conflict_cliques import Row, row_patterns
 from laneweave.coordinator.planning.conflicts import ConflictModel
-from laneweave.coordinator.planning.exact.arrays_kernel import UNREACHABLE, least_steps
-from laneweave.coordinator.planning.grid import Cell, Grid, Mode, displacements
+from laneweave.coordinator.planning.exact.cliques import Clique, clique_patterns
+from laneweave.coordinator.planning.exact.relaxation_kernel import min_steps
+from laneweave.coordinator.planning.grid import Grid
+from laneweave.protocol.lattice import Cell, Mode, displacements
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-__all__ = ["UNREACHABLE", "Bools", "Floats", "Ints", "Lattice", "Teams", "lattice", "part", "teams"]
 
-
-class Lattice(NamedTuple):
+class MoveArrays(NamedTuple):
     """The moves of a grid under a conflict model.
 
-    Shapes: D displacements, X cells, M most rows that a move is in.
+    Shapes: D displacements, X cells, M maximum number of cliques that a move is in.
     """
 
     lanes: int
@@ -37,13 +36,13 @@ class Lattice(NamedTuple):
     """(D,) difference of cell numbers."""
     valid: Bools
     """(D, X) whether the move stays on free cells."""
-    row: Ints
-    """(D, X, M) numbers of the rows that a move is in; -1: no more."""
-    row_count: int
-    near: Ints
-    """(X,) a number from 0 to `near_count` - 1 that tells the from-cells of the moves in one row
-    apart: they are no farther away from each other than conflicts reach."""
-    near_count: int
+    clique: Ints
+    """(D, X, M) numbers of the cliques that a move is in; -1: no more."""
+    clique_count: int
+    residue: Ints
+    """(X,) a number from 0 to `residue_count` - 1 that differs between the from-cells of the moves
+    in one clique: column and lane modulo one more than the reach of conflicts."""
+    residue_count: int
 
 
 class Teams(NamedTuple):
@@ -64,13 +63,12 @@ class Teams(NamedTuple):
     pair: Ints
     """(K, J) number of a pair; -1: the team may not have the target."""
     distance: Floats
-    """(X, P) least steps from each cell to a target; `UNREACHABLE`: there is no way."""
+    """(X, P) minimum steps from each cell to a target; `UNREACHABLE`: there is no path."""
 
 
 @lru_cache(maxsize=16)
-def lattice(grid: Grid, mode: Mode, model: ConflictModel) -> Lattice:
-    """Lay the moves and rows of a conflict model on a grid."""
-    patterns = row_patterns(mode, model)
+def move_arrays(grid: Grid, mode: Mode, model: ConflictModel) -> MoveArrays:
+    """Return the moves and conflict cliques of a grid."""
     steps = np.array(displacements(mode), dtype=np.int64)
     free = np.zeros((grid.columns + 2, grid.lanes + 2), dtype=np.bool_)
     free[1:-1, 1:-1] = True
@@ -85,38 +83,39 @@ def lattice(grid: Grid, mode: Mode, model: ConflictModel) -> Lattice:
             for c, across in steps.tolist()
         ]
     )
-    row, row_count = _rows(grid, patterns, len(steps), valid)
+    clique, clique_count = _cliques(grid, clique_patterns(mode, model), len(steps), valid)
     cell = np.arange(grid.columns * grid.lanes)
     columns, lanes = (reach + 1 for reach in model.reach)
-    near = cell // grid.lanes % columns * lanes + cell % grid.lanes % lanes
+    residue = cell // grid.lanes % columns * lanes + cell % grid.lanes % lanes
     step = steps[:, 0] * grid.lanes + steps[:, 1]
-    return Lattice(grid.lanes, step, valid, row, row_count, near, columns * lanes)
+    return MoveArrays(grid.lanes, step, valid, clique, clique_count, residue, columns * lanes)
 
 
-def _rows(
-    grid: Grid, patterns: tuple[Row, ...], displacement_count: int, valid: Bools
+def _cliques(
+    grid: Grid, patterns: tuple[Clique, ...], displacement_count: int, valid: Bools
 ) -> tuple[Ints, int]:
-    """Number the rows; those of a single move do not restrict anything."""
+    """Place the patterns on the grid and number them, except those with a single move."""
     members: dict[tuple[int, int, int], list[tuple[int, int]]] = {}
     for number, pattern in enumerate(patterns):
         for c, across, d in pattern:
             for cell in np.flatnonzero(valid[d]).tolist():
                 column, lane = divmod(cell, grid.lanes)
                 members.setdefault((number, column - c, lane - across), []).append((d, cell))
-    real = sorted(key for key, moves in members.items() if len(moves) > 1)
+    numbered = sorted(key for key, moves in members.items() if len(moves) > 1)
     of_move: dict[tuple[int, int], list[int]] = {}
-    for index, key in enumerate(real):
+    for index, key in enumerate(numbered):
         for move in members[key]:
             of_move.setdefault(move, []).append(index)
-    most = max(map(len, of_move.values()), default=1)
-    row = np.full((displacement_count, grid.columns * grid.lanes, most), -1, dtype=np.int64)
+    max_cliques = max(map(len, of_move.values()), default=1)
+    shape = displacement_count, grid.columns * grid.lanes, max_cliques
+    clique = np.full(shape, -1, dtype=np.int64)
     for (d, cell), indices in of_move.items():
-        row[d, cell, : len(indices)] = indices
-    return row, len(real)
+        clique[d, cell, : len(indices)] = indices
+    return clique, len(numbered)
 
 
 def teams(
-    ways: Lattice,
+    arrays: MoveArrays,
     starts: Sequence[Cell],
     targets: Sequence[Cell],
     choices: Sequence[frozenset[int]],
@@ -130,45 +129,19 @@ def teams(
     for k in range(len(numbers)):
         first, end = pairs_from[k : k + 2]
         pair[k, pair_target[first:end]] = np.arange(first, end)
-    target = _cells(targets, ways)
+    target = _cells(targets, arrays)
     numbered = np.array(pair_target, dtype=np.int64)
     return Teams(
-        start=_cells(starts, ways),
+        start=_cells(starts, arrays),
         team=np.array(team, dtype=np.int64),
         target=target,
         pairs_from=pairs_from.astype(np.int64),
         pair_target=numbered,
         pair_cell=target[numbered],
         pair=pair,
-        distance=least_steps(ways.valid, ways.step, target[numbered]),
+        distance=min_steps(arrays.valid, arrays.step, target[numbered]),
     )
 
 
-def _cells(cells: Sequence[Cell], ways: Lattice) -> Ints:
-    return np.array([column * ways.lanes + lane for column, lane in cells], dtype=np.int64)
-
-
-def part(whole: Teams, vehicles: Ints, targets: Ints) -> Teams:
-    """Return some vehicles (n,) and the targets (m,) that they may share; all must be at one.
-
-    Beyond the steps with prices there is no way to a target any more: `distance` is 0 there, and
-    elsewhere `UNREACHABLE`.
-    """
-    numbers = np.unique(whole.team[vehicles])
-    pair = np.full((len(numbers), len(targets)), -1, dtype=np.int64)
-    may = whole.pair[numbers][:, targets] >= 0
-    pair[may] = np.arange(np.count_nonzero(may))
-    _, pair_target = np.nonzero(may)
-    cell = whole.target[targets]
-    distance = np.full((len(whole.distance), len(pair_target)), UNREACHABLE)
-    distance[cell[pair_target], np.arange(len(pair_target))] = 0.0
-    return Teams(
-        start=whole.start[vehicles],
-        team=np.searchsorted(numbers, whole.team[vehicles]).astype(np.int64),
-        target=cell,
-        pairs_from=np.concatenate([[0], np.cumsum(may.sum(axis=1))]).astype(np.int64),
-        pair_target=pair_target.astype(np.int64),
-        pair_cell=cell[pair_target],
-        pair=pair,
-        distance=distance,
-    )
+def _cells(cells: Sequence[Cell], arrays: MoveArrays) -> Ints:
+    return np.array([column * arrays.lanes + lane for column, lane in cells], dtype=np.int64)

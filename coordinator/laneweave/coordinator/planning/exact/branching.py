@@ -1,24 +1,24 @@
-"""The solver for large formations: branch and bound with prices.
+"""The solver for large formations: branch and bound with Lagrange multipliers.
 
-1. Prices on the conflict rows give a lower bound, and tell what is too dear (`relaxation`).
-2. For the least cost that is still possible a search decides whether it is. In each of its nodes
-   prices are improved and what no solution of this cost contains is forbidden. Either the bound
-   passes the cost, or the vehicles on their cheapest ways happen not to be in conflict, which is a
-   solution, or the moves of one row are told apart: at most one of them is made in its step, so
-   either all moves of a team (or from a cell) are forbidden in this row, or all others
-   (`branching_kernel`; this kind of branching is by Beale and Tomlin, Proc. 5th Int. Conf. on
-   Operational Research, 1970).
-3. If no node is left, the next cost is looked at.
+1. Multipliers of the conflict cliques give a lower bound and reduced costs (`relaxation`).
+2. For the lowest cost that is still possible a search decides whether there is a solution of this
+   cost. In each of its nodes multipliers are improved, and moves that no such solution contains are
+   forbidden by their reduced cost. Then either the lower bound exceeds the cost; or the vehicles on
+   their cheapest paths are not in conflict, which is a solution; or the node is split at a clique:
+   at most one of its moves is made in its step, so either all moves of a team (or from a cell) are
+   forbidden in this clique, or all others (`branching_kernel`; this kind of branching is by Beale
+   and Tomlin, Proc. 5th Int. Conf. on Operational Research, 1970).
+3. If no node is left, the next cost is tried.
 
-The first cost that is possible is the least one. A little price on moves lets the search go on for
-a solution with fewer moves of the same cost, for about half as long as it took until then.
+The first cost with a solution is the minimum. A small cost of moves lets the search continue for a
+solution of the same cost with fewer moves, for about half as long as it took until then.
 
-The budget for what is too dear, the cost less the bound, is small; so few moves are left, and most
-nodes are decided soon. Other than trees of conflicts between single vehicles, it does not matter
-how many vehicles of a team could take one another's place.
+The gap between the cost and the lower bound is small; so few moves remain, and most nodes are
+decided soon. Unlike in trees of conflicts between single vehicles, the number of vehicles in a team
+that could replace one another does not matter.
 
-Between the nodes path sets are made by negotiation (`negotiation`), so that there is an answer when
-the deadline comes first; if that fails, by a joint search (`reachability`), which also finds out
+Between the nodes path sets are made by negotiation (`negotiation`), so that there is an answer if
+the deadline comes first; if that fails, by a joint search (`reachability`), which can also prove
 that there is none.
 """
 
@@ -34,11 +34,16 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
-from laneweave.coordinator.planning.exact.arrays import UNREACHABLE, Floats, Ints, lattice, teams
+from laneweave.coordinator.planning.exact.arrays import Floats, Ints, move_arrays, teams
 from laneweave.coordinator.planning.exact.branching_kernel import FULL, STUCK, search
 from laneweave.coordinator.planning.exact.negotiation import Negotiation
 from laneweave.coordinator.planning.exact.reachability import explore
-from laneweave.coordinator.planning.exact.relaxation import Relaxation, Stack, ceiling_of, stack
+from laneweave.coordinator.planning.exact.relaxation import (
+    Relaxation,
+    Stack,
+    stack,
+    upper_bound_of,
+)
 from laneweave.coordinator.planning.exact.relaxation_kernel import (
     BEST,
     FOUND,
@@ -46,59 +51,55 @@ from laneweave.coordinator.planning.exact.relaxation_kernel import (
     PARKED,
     PER_MOVE,
     REFUTED,
+    UNREACHABLE,
 )
-from laneweave.coordinator.planning.exact.repair import Repair
-from laneweave.coordinator.planning.exact.trial import trial
 from laneweave.coordinator.planning.grid import Grid
-from laneweave.coordinator.planning.problem import Problem
+from laneweave.coordinator.planning.problem import Problem, Solution
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
-from laneweave.coordinator.planning.solution import Solution, tidied
+from laneweave.coordinator.planning.shortest_paths import without_needless_moves
 
 _SPARE_STEPS, _MORE_STEPS = 8, 6
-"""Steps with prices beyond the longest way; more when a solution may need more."""
-_ITERATIONS, _FEW_ITERATIONS, _AT_A_TIME = 40, 10, 10
-"""For first prices, if there are many or few vehicles; iterations between two looks at bounds."""
+"""Steps with multipliers beyond the longest path; more when a solution may need more."""
+_ITERATIONS, _FEW_ITERATIONS, _BATCH = 40, 10, 10
+"""Iterations for the first multipliers with many or few vehicles; iterations between two checks."""
 _FEW_VEHICLES = 11
 _FIRST_STACK = 16
 _CHUNK_S = 0.005
-"""How long the search goes on between two looks at the clock, about."""
+"""Approximate time between two readings of the clock."""
 _NODES_BETWEEN = 8
-"""Nodes between two looks for path sets by other means."""
+"""Nodes between two attempts to find path sets by other means."""
 _MANY_VEHICLES = 20
-"""So many are not decided soon: they get a path set first."""
+"""Formations from this size on take long to decide, so they get a path set first."""
 _FIRST_WORK, _WORK_FOR_GAP, _STALE = 200, 100, 100
-"""How much is negotiated then until there is a path set; later, the more the larger the gap is, and
-half as much after so much work in vain."""
-_EXPLORE_NODES, _EXPLORE_MOVES, _MOST_EXPLORE_MOVES, _GROWTH = 16, 5_000, 1_500_000, 4
-"""When the joint search is tried, if there is no path set yet, and how far; then more of both."""
+"""Passes of negotiation until there is a path set; later, passes for a gap of 100 %, and the number
+of passes without improvement that halves them."""
+_EXPLORE_NODES, _EXPLORE_MOVES, _MAX_EXPLORE_MOVES, _GROWTH = 16, 5_000, 1_500_000, 4
+"""Nodes before the joint search is tried, if there is no path set yet, and its limit of joint
+moves; both grow by `_GROWTH`."""
 _TIE_NODES = 10
 _WARM_UP_WORK = 8
-_MOST_BYTES, _BYTES_PER_S = 1_500_000_000, 1_000_000_000
-"""Larger tables are not made; and how fast they are filled, about."""
+_BYTES_PER_S = 1_000_000_000
+"""Approximate speed at which arrays are filled."""
 
 
 @cache
 def warm_up() -> None:
-    """Load the compiled code; where there is none yet, compile it, which takes half a minute."""
-    # Two who change places, which is not decided at once.
+    """Load the compiled code; compile it if there is no cache yet, which takes half a minute."""
+    # Two vehicles that change places: an instance that needs branching.
     vehicles = (VehicleRequest("a", (0, 0), lane=1), VehicleRequest("b", (0, 1), lane=0))
     request = PlanRequest(Grid(2, 2), 1, ("geometric",), vehicles, ((0, 0), (0, 1)))
-    starts = [vehicle.cell for vehicle in vehicles]
-    model = request.conflict_model
-    problem = Problem(request.grid, request.mode, model, starts, request.targets)
-    search_ = Branching(problem, request.choices(), Budget())
+    search_ = Branching(request.problem(), request.choices(), Budget())
     search_.run()
     search_.negotiate(search_.relaxation(_SPARE_STEPS), _WARM_UP_WORK)
-    search_.repair_once()
 
 
 class Branching:
-    """The state of the search; the same to its caller as `Tappa`.
+    """The state of the search; implements `facade.Search`.
 
     best: the cheapest path set so far.
     lower_bound: no path set costs less; infinite: there is none.
     finished: the search is complete; `best` is optimal, or nothing exists.
-    has_fewest_moves: it is proven, too, that nothing as cheap has fewer moves.
+    has_fewest_moves: it is also proven that no path set of this cost has fewer moves.
     """
 
     def __init__(self, problem: Problem, choices: Sequence[frozenset[int]], budget: Budget) -> None:
@@ -108,14 +109,14 @@ class Branching:
         self.tried = 0
         self.has_fewest_moves = False
         self.gave_up = False
-        """It is stuck (`branching_kernel.STUCK`), or its tables would get too large."""
+        """The search is stuck (`branching_kernel.STUCK`) or reached its memory limit."""
         self.best: Solution | None = None
         self._negotiation: Negotiation | None = None
         self._problem = problem
         self._choices = choices
         self._budget = budget
         self._nodes = 0
-        self._look_around = _NODES_BETWEEN
+        self._next_look = _NODES_BETWEEN
         self._explore_nodes, self._explore_moves = _EXPLORE_NODES, _EXPLORE_MOVES
         self._s_per_node = 0.0
         self._s_per_iteration = 1.0
@@ -123,13 +124,13 @@ class Branching:
         self._best_value = UNREACHABLE
         table = problem.table
         pairs = sum(map(len, set(choices)))
-        if 8 * pairs * table.grid.columns * table.grid.lanes > _MOST_BYTES:
+        if 8 * pairs * table.grid.columns * table.grid.lanes > budget.max_bytes:
             self.gave_up = True
             return
-        self._lattice = lattice(table.grid, table.mode, table.model)
+        self._arrays = move_arrays(table.grid, table.mode, table.model)
         starts = [table.cell(start) for start in problem.starts]
         targets = [table.cell(target) for target in problem.targets]
-        self._teams = teams(self._lattice, starts, targets, choices)
+        self._teams = teams(self._arrays, starts, targets, choices)
 
     def run(self) -> None:
         """Search until the optimum is proven or the budget is spent."""
@@ -145,17 +146,17 @@ class Branching:
         if len(self._teams.target) < len(self._teams.start) or not all(self._choices):
             self.lower_bound, self.finished = math.inf, True
             return
-        steps = self._longest_way() + _SPARE_STEPS
-        if not self._may_make(steps, _FIRST_STACK):
+        steps = self._longest_path() + _SPARE_STEPS
+        if not self._fits(steps, _FIRST_STACK):
             self.gave_up = True
             return
         whole = self.relaxation(steps)
         few = len(self._choices) <= _FEW_VEHICLES
-        for number in range(0, _FEW_ITERATIONS if few else _ITERATIONS, _AT_A_TIME):
-            self._improve(whole, _AT_A_TIME)
+        for number in range(0, _FEW_ITERATIONS if few else _ITERATIONS, _BATCH):
+            self._improve(whole, _BATCH)
             if math.isinf(self.lower_bound) or self._is_proven():
                 break
-            if number == _AT_A_TIME and len(self._choices) >= _MANY_VEHICLES:
+            if number == _BATCH and len(self._choices) >= _MANY_VEHICLES:
                 self.negotiate(whole, _FIRST_WORK, stop_at_first=True)
         nodes = self._stack(whole, _FIRST_STACK)
         while not self.finished and not self.gave_up:
@@ -171,7 +172,7 @@ class Branching:
         return self.best is not None and self.best.cost <= self.lower_bound
 
     def _improve(self, whole: Relaxation, iterations: int) -> None:
-        """Improve the first prices; looks at the clock between a few iterations."""
+        """Improve the first multipliers; check the clock every few iterations."""
         while iterations > 0:
             count = max(1, min(iterations, int(_CHUNK_S / max(self._s_per_iteration, 1e-6))))
             started = time.thread_time()
@@ -179,61 +180,63 @@ class Branching:
             self._s_per_iteration = (time.thread_time() - started) / count
             iterations -= count
             self._budget.check_time()
-        self._take_chance(whole)
-        self.lower_bound = max(self.lower_bound, whole.least_cost)
+        self._keep_relaxed_solution(whole)
+        self.lower_bound = max(self.lower_bound, whole.min_cost)
 
-    def _may_make(self, steps: int, nodes: int) -> bool:
-        """Tell whether tables of so many steps and nodes fit into memory.
+    def _fits(self, steps: int, nodes: int) -> bool:
+        """Return whether arrays of so many steps and nodes fit into the memory limit.
 
         Raises:
             BudgetSpentError: they do, but there is no time left to fill them.
         """
-        displacements, cells = self._lattice.valid.shape
-        groups, rows = len(self._teams.pair), self._lattice.row_count
-        moves, masses = groups * displacements * cells, groups + self._lattice.near_count
+        displacements, cells = self._arrays.valid.shape
+        groups, rows = len(self._teams.pair), self._arrays.clique_count
+        moves, masses = groups * displacements * cells, groups + self._arrays.residue_count
         size = 8 * cells * len(self._teams.pair_cell) + 33 * moves + 8 * rows * (masses + 3)
         size = int(steps * (size + nodes * (moves + 8 * rows)))
-        if size >= _MOST_BYTES:
+        if size >= self._budget.max_bytes:
             return False
         self._budget.check_time(size / _BYTES_PER_S)
         return True
 
     def relaxation(self, steps: int) -> Relaxation:
-        """Return the problem without prices."""
-        return Relaxation(self._lattice, self._teams, steps)
+        """Return the relaxed problem with multipliers of 0."""
+        return Relaxation(self._arrays, self._teams, steps)
 
     def _stack(self, whole: Relaxation, size: int) -> Stack:
-        return stack(self._teams, whole.prices, self._lattice.valid, size)
+        return stack(self._teams, whole.multipliers, self._arrays.valid, size)
 
-    def _longest_way(self) -> int:
-        """Return the steps of the longest way when targets are assigned at least cost."""
+    def _longest_path(self) -> int:
+        """Return the steps of the longest path when targets are assigned at minimum cost."""
         pairs = self._teams.pair[self._teams.team]
-        ways = np.where(
+        distances = np.where(
             pairs >= 0, self._teams.distance[self._teams.start[:, None], pairs], UNREACHABLE
         )
-        steps = ways[linear_sum_assignment(ways)]
+        steps = distances[linear_sum_assignment(distances)]
         return int(max(steps[steps < UNREACHABLE], default=0))
 
     def _decide(self, whole: Relaxation, nodes: Stack, cost: int) -> Stack:
-        """Find a solution of a cost, or show that there is none; or have more steps priced."""
+        """Find a solution of a cost, prove that there is none, or add steps with multipliers."""
         self._budget.check_time()
-        ceiling = ceiling_of(cost)
-        may_be = whole.put(nodes, ceiling)
+        upper_bound = upper_bound_of(cost)
+        may_be = whole.put(nodes, upper_bound)
         if may_be is None:
-            return self._lengthened(whole, nodes)
+            return self._with_more_steps(whole, nodes)
         depth, ending = 1, OPEN if may_be else REFUTED
         first = True
         while ending in (OPEN, FULL):
             if ending == FULL:
-                if not self._may_make(len(whole.prices), 2 * len(nodes.pace)):
+                if not self._fits(len(whole.multipliers), 2 * len(nodes.step_size)):
                     break
                 nodes = _doubled(nodes)
-            ending, depth = self._go_on(whole, nodes, depth, ceiling, 1 if first else None)
+            ending, depth = self._search_nodes(
+                whole, nodes, depth, upper_bound, 1 if first else None
+            )
             if first and depth > 1:
-                whole.take_prices(nodes.prices[0])
+                whole.set_multipliers(nodes.multipliers[0])
             first = False
             if ending == OPEN:
-                self._look_for_others(whole, nodes.prices[depth - 1])
+                self._search_otherwise(whole, nodes.multipliers[depth - 1])
                 if self.finished or (self.best is not None and self.best.cost <= cost):
                     return nodes
         if ending == REFUTED:
@@ -242,40 +245,40 @@ class Branching:
             self._search_fewer_moves(whole, nodes, depth)
             self.finished = True
         elif ending == STUCK and self._stuck_at != cost:
-            # Perhaps somebody must pass another target of its team after the last priced step.
+            # A vehicle may have to cross a target of its team after the last step with multipliers.
             self._stuck_at = cost
-            return self._lengthened(whole, nodes)
+            return self._with_more_steps(whole, nodes)
         else:
             self.gave_up = True
         return nodes
 
-    def _lengthened(self, whole: Relaxation, nodes: Stack) -> Stack:
-        """Have more steps priced; return an empty stack."""
-        more = max(_MORE_STEPS, len(whole.prices) // 2)
-        if not self._may_make(len(whole.prices) + more, len(nodes.pace)):
+    def _with_more_steps(self, whole: Relaxation, nodes: Stack) -> Stack:
+        """Add steps with multipliers; return an empty stack."""
+        more = max(_MORE_STEPS, len(whole.multipliers) // 2)
+        if not self._fits(len(whole.multipliers) + more, len(nodes.step_size)):
             self.gave_up = True
             return nodes
         whole.lengthen(more)
-        return self._stack(whole, len(nodes.pace))
+        return self._stack(whole, len(nodes.step_size))
 
     def _break_ties(self, whole: Relaxation, nodes: Stack) -> Stack:
-        """Look for a solution that costs as much as the best one, with fewer moves."""
-        ceiling = self._best_value - 0.5 * PER_MOVE
-        may_be = whole.put(nodes, ceiling)
+        """Search for a solution of the same cost as the best one with fewer moves."""
+        upper_bound = self._best_value - 0.5 * PER_MOVE
+        may_be = whole.put(nodes, upper_bound)
         if may_be:
-            whole.memory[BEST] = self._best_value
+            whole.state[BEST] = self._best_value
             self._search_fewer_moves(whole, nodes, 1)
         self.has_fewest_moves = self.has_fewest_moves or may_be is False
         return nodes
 
     def _search_fewer_moves(self, whole: Relaxation, nodes: Stack, depth: int) -> None:
-        """Go on with a search for about half as long; the deadline does not matter any more."""
+        """Continue a search for about half as many nodes; ends quietly at the deadline."""
         left = self._nodes // 2 + _TIE_NODES
         try:
             while left > 0 and depth > 0:
-                ceiling = self._best_value - 0.5 * PER_MOVE
+                upper_bound = self._best_value - 0.5 * PER_MOVE
                 before = self._nodes
-                ending, depth = self._go_on(whole, nodes, depth, ceiling, left)
+                ending, depth = self._search_nodes(whole, nodes, depth, upper_bound, left)
                 left -= self._nodes - before
                 if ending not in (OPEN, FOUND):
                     self.has_fewest_moves = ending == REFUTED
@@ -283,43 +286,44 @@ class Branching:
         except BudgetSpentError:
             return
 
-    def _go_on(
-        self, whole: Relaxation, nodes: Stack, depth: int, ceiling: float, most: int | None
+    def _search_nodes(
+        self, whole: Relaxation, nodes: Stack, depth: int, upper_bound: float, max_nodes: int | None
     ) -> tuple[int, int]:
-        """Look at some nodes; return how that ended and the new depth."""
+        """Examine some nodes; return the outcome and the new depth."""
         left = self._budget.nodes_left(self._s_per_node)
         chunk = max(1, int(_CHUNK_S / max(self._s_per_node, 1e-5)))
         if left < 1:
             raise BudgetSpentError
-        # Without a limit until others are looked for, so the same however fast the machine is.
-        most = max(1, self._look_around - self._nodes) if most is None else most
-        count = min(chunk, left, most)
+        # By default up to the next look, which does not depend on the speed of the machine.
+        if max_nodes is None:
+            max_nodes = max(1, self._next_look - self._nodes)
+        count = min(chunk, left, max_nodes)
         started = time.thread_time()
-        ending, depth, looked_at = search(
-            self._lattice, self._teams, nodes, depth, whole.scratch, whole.memory, ceiling, count
+        ending, depth, examined = search(
+            self._arrays, self._teams, nodes, depth, whole.scratch, whole.state, upper_bound, count
         )
-        if looked_at:
-            spent = (time.thread_time() - started) / looked_at
+        if examined:
+            spent = (time.thread_time() - started) / examined
             self._s_per_node = max(spent, 0.5 * (self._s_per_node + spent))
-        self._take_chance(whole)
-        self._nodes += looked_at
-        self._budget.take_nodes(looked_at)
+        self._keep_relaxed_solution(whole)
+        self._nodes += examined
+        self._budget.take_nodes(examined)
         return ending, depth
 
-    def _take_chance(self, whole: Relaxation) -> None:
-        """Keep the best of the relaxed solutions that happened to be free of conflicts."""
-        if whole.memory[BEST] < self._best_value - 0.5 * PER_MOVE:
-            self._prefer(self._solution(whole.scratch.best_way))
+    def _keep_relaxed_solution(self, whole: Relaxation) -> None:
+        """Keep the best relaxed solution without conflicts, if there is one."""
+        if whole.state[BEST] < self._best_value - 0.5 * PER_MOVE:
+            self._prefer(self._solution(whole.scratch.best_path))
 
-    def _look_for_others(self, whole: Relaxation, prices: Floats) -> None:
-        """Every now and then find path sets by other means, or show that there are none."""
-        if self._nodes < self._look_around:
+    def _search_otherwise(self, whole: Relaxation, multipliers: Floats) -> None:
+        """Every few nodes, look for path sets by negotiation and joint search."""
+        if self._nodes < self._next_look:
             return
-        self._look_around = self._nodes + _NODES_BETWEEN
+        self._next_look = self._nodes + _NODES_BETWEEN
         if self._negotiation is None or self._negotiation.cost is None:
             self.negotiate(whole, _FIRST_WORK, stop_at_first=True)
         else:
-            self._negotiation.suggest(prices.copy(), whole.held_targets())
+            self._negotiation.suggest(multipliers.copy(), whole.held_targets())
             hope = 1.0 / (1.0 + self._negotiation.stale / _STALE)
             self.negotiate(whole, 1 + int(_WORK_FOR_GAP * self._gap() * hope))
         if self.best is None and self._nodes >= self._explore_nodes:
@@ -331,43 +335,34 @@ class Branching:
         return min(1.0, (self.best.cost - self.lower_bound) / self.lower_bound)
 
     def negotiate(self, whole: Relaxation, work: int, *, stop_at_first: bool = False) -> None:
-        """Go on with the negotiation for so much work; see `Negotiation.work`."""
+        """Continue the negotiation for so many passes; see `Negotiation.work`."""
         if self._negotiation is None:
             self._negotiation = Negotiation(
-                self._lattice, self._teams, whole.prices, whole.assignment()
+                self._arrays, self._teams, whole.multipliers, whole.assignment()
             )
         for _ in range(work):
             if self._negotiation.work(self._budget.check_time):
-                self._prefer(self._solution(self._negotiation.way))
+                self._prefer(self._solution(self._negotiation.path))
                 if stop_at_first:
                     return
-
-    def repair_once(self) -> None:
-        """Plan the vehicles anew around nobody, in vain: for `warm_up`."""
-        whole = self.relaxation(_SPARE_STEPS)
-        nowhere = np.full((len(self._choices), _SPARE_STEPS), PARKED, dtype=np.int64)
-        parked = trial(self._lattice, nowhere, whole.assignment(), np.zeros_like(whole.prices))
-        repair = Repair(self._lattice, self._teams)
-        repair.begin(whole.prices)
-        repair.attempt(parked, self._budget.check_time)
 
     def _explore(self) -> None:
         verdict = explore(self._problem, self._choices, self._budget, self._explore_moves)
         self._explore_nodes *= _GROWTH
-        self._explore_moves = min(self._explore_moves * _GROWTH, _MOST_EXPLORE_MOVES)
+        self._explore_moves = min(self._explore_moves * _GROWTH, _MAX_EXPLORE_MOVES)
         if verdict.impossible:
             self.lower_bound, self.finished = math.inf, True
         elif verdict.solution is not None:
-            self._prefer(tidied(self._problem, verdict.solution, self._budget))
+            self._prefer(without_needless_moves(self._problem, verdict.solution, self._budget))
 
     def _prefer(self, solution: Solution) -> None:
-        """Keep a path set if it is cheaper than the best so far, or as cheap with fewer moves."""
+        """Keep a path set if it is cheaper than the best so far, or equal with fewer moves."""
         value = self._value(solution)
         if value < self._best_value:
             self.best, self._best_value = solution, value
 
     def _value(self, solution: Solution) -> float:
-        """Return the cost with the price of moves."""
+        """Return the cost including `PER_MOVE`."""
         landing = self._problem.table.landing
         moves = 0
         for start, path in zip(self._problem.starts, solution.paths, strict=True):
@@ -375,27 +370,27 @@ class Branching:
             moves += sum(a != b for a, b in pairwise(cells))
         return solution.cost + PER_MOVE * moves
 
-    def _solution(self, way: Ints) -> Solution:
-        """Walk the vehicles along their ways."""
-        table, lanes = self._problem.table, self._lattice.lanes
-        paths, assignment = [], []
-        for number, displacements in zip(self._teams.start.tolist(), way.tolist(), strict=True):
-            cell = number
-            path: list[int] = []
+    def _solution(self, paths: Ints) -> Solution:
+        """Return paths (N, T) of displacements as a solution."""
+        table, lanes = self._problem.table, self._arrays.lanes
+        moves_of, assignment = [], []
+        for start, path in zip(self._teams.start.tolist(), paths.tolist(), strict=True):
+            cell = start
+            moves: list[int] = []
             arrival = 0
-            for d in displacements:
+            for d in path:
                 if d == PARKED:
                     break
-                then = cell + int(self._lattice.step[d])
-                path.append(table.number((divmod(cell, lanes), divmod(then, lanes))))
+                then = cell + int(self._arrays.step[d])
+                moves.append(table.number((divmod(cell, lanes), divmod(then, lanes))))
                 if then != cell:
-                    arrival = len(path)
+                    arrival = len(moves)
                 cell = then
-            paths.append(tuple(path[:arrival]))
+            moves_of.append(tuple(moves[:arrival]))
             assignment.append(self._problem.targets.index(table.bit(divmod(cell, lanes))))
-        return Solution(tuple(assignment), tuple(paths))
+        return Solution(tuple(assignment), tuple(moves_of))
 
 
 def _doubled(nodes: Stack) -> Stack:
-    """Return a stack with twice the room."""
+    """Return a stack of twice the size."""
     return Stack(*(np.concatenate([array, np.zeros_like(array)]) for array in nodes))

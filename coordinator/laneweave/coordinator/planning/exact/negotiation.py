@@ -1,142 +1,177 @@
-"""Path sets early, for any number of vehicles: ways are negotiated.
+"""Path sets by negotiation: solutions early, for any number of vehicles.
 
-At first vehicles may be in conflict. Then all whose way is contested look for another one, one
-after the other and again and again, while the price of what others use rises, and what stays
-contested gets dearer for good. That settles nearly always (McMurchie and Ebeling, PathFinder,
-FPGA 1995, who route wires in this way).
+At first vehicles may be in conflict. Then all vehicles on contested cliques are rerouted, one after
+the other and repeatedly, while the cost of cliques that others use rises, and the cost of those
+that stay contested rises permanently. That nearly always ends without conflicts (McMurchie and
+Ebeling, PathFinder, FPGA 1995, who route wires in this way).
 
-After that a few vehicles at a time are taken out, perhaps exchange targets, and negotiate again
-around all others; what is not worse is kept (large-neighbourhood search). Where that finds nothing
-any more, neighbourhoods are decided exactly (`repair`). When that has been in vain for long, too,
-all begins anew, from the newest prices and targets that were suggested.
+After that a few vehicles at a time are removed, perhaps exchange targets, and negotiate again
+around all others; the result is kept if it is not worse (large-neighbourhood search). When that has
+found nothing for long, negotiation restarts from the latest suggested multipliers and targets.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from laneweave.coordinator.planning.exact.arrays import UNREACHABLE, Floats, Ints, Lattice, Teams
-from laneweave.coordinator.planning.exact.negotiation_kernel import improve_ways, negotiate
-from laneweave.coordinator.planning.exact.relaxation_kernel import PARKED
-from laneweave.coordinator.planning.exact.repair import Repair
-from laneweave.coordinator.planning.exact.trial import trial
+from laneweave.coordinator.planning.exact.arrays import Floats, Ints, MoveArrays, Teams
+from laneweave.coordinator.planning.exact.negotiation_kernel import improve_paths, negotiate
+from laneweave.coordinator.planning.exact.relaxation_kernel import PARKED, UNREACHABLE
 
-_STRETCH, _MORE_STRETCH, _MOST_STRETCH = 2.0, 1.25, 10.0
-"""The horizon, relative to the steps with prices, and how it grows if it was too short."""
+_HORIZON, _HORIZON_GROWTH, _MAX_HORIZON = 2.0, 1.25, 10.0
+"""The horizon relative to the steps with multipliers, and its growth if it was too short."""
 _PASSES = 300
 _SPARE_STEPS = 4
 _ATTEMPTS = 4
 """Attempts to improve that count as a pass."""
-_MOST_OUT = (6, 12)
-"""Vehicles that are taken out at most, by turns."""
-_EXACT_AFTER = 60
-"""After so many attempts in vain exact ones begin."""
-_IDLE_ATTEMPTS, _IDLE_REPAIRS = 800, 50
-"""After so many attempts in vain, or so many exact ones, all begins anew."""
+_MAX_REMOVED = (6, 12)
+"""Maximum number of vehicles that are removed together, in alternation."""
+_IDLE_ATTEMPTS = 800
+"""Attempts without an improvement after which negotiation restarts."""
+
+
+class CandidatePaths(NamedTuple):
+    """A path set under construction. Shapes: N vehicles, T steps, R cliques, X cells."""
+
+    path: Ints
+    """(N, T) displacements; `PARKED`: arrived."""
+    cost: Ints
+    """(N,)"""
+    target: Ints
+    """(N,) number of the target of each vehicle."""
+    use: Floats
+    """(T, R) number of vehicles in each clique."""
+    own: Floats
+    """(T, R) the same for the removed vehicles."""
+    history: Floats
+    """(T, R) permanent cost of contested cliques."""
+    weight: Floats
+    """(T, R) current cost of each clique."""
+    cost_to_go: Floats
+    """(T + 1, X)"""
+    parked: Floats
+    """(T + 1,) cost of staying at the target from a step on."""
+    random: NDArray[np.uint64]
+    """(1,) state of the random numbers."""
+
+
+def candidate_paths(
+    arrays: MoveArrays, path: Ints, target: Ints, history: Floats
+) -> CandidatePaths:
+    """Return a candidate with paths (N, T), whose uses of cliques are not counted yet."""
+    shape = history.shape
+    return CandidatePaths(
+        path=path,
+        cost=np.count_nonzero(path != PARKED, axis=1).astype(np.int64),
+        target=target,
+        use=np.zeros(shape),
+        own=np.zeros(shape),
+        history=history,
+        weight=np.zeros(shape),
+        cost_to_go=np.zeros((path.shape[1] + 1, arrays.valid.shape[1])),
+        parked=np.zeros(path.shape[1] + 1),
+        random=np.zeros(1, dtype=np.uint64),
+    )
 
 
 class Negotiation:
     """The best path set so far; equal problems and equal work give equal path sets.
 
     cost: of the best path set; None: there is none yet.
-    way: (N, T) its displacements.
-    stale: how often work has been in vain since it was found.
+    path: (N, T) its displacements.
+    stale: number of calls of `work` since it was found.
     """
 
-    def __init__(self, lattice: Lattice, teams: Teams, prices: Floats, target: Ints) -> None:
-        """Begin.
+    def __init__(self, arrays: MoveArrays, teams: Teams, multipliers: Floats, target: Ints) -> None:
+        """Start.
 
         Args:
-            lattice: the moves.
+            arrays: the moves.
             teams: the vehicles.
-            prices: (T, R) of rows, to begin with.
-            target: (N,) number of the target of each vehicle, to begin with.
+            multipliers: (T, R) initial costs of cliques.
+            target: (N,) initial target of each vehicle, by number.
         """
         self.cost: int | None = None
-        self.way: Ints = np.empty((0, 0), dtype=np.int64)
+        self.path: Ints = np.empty((0, 0), dtype=np.int64)
         self.stale = 0
-        self._lattice = lattice
+        self._arrays = arrays
         self._teams = teams
-        self._prices = prices
+        self._multipliers = multipliers
         self._target = target
-        self._repair = Repair(lattice, teams)
         self._rounds = 0
-        self._stretch = _STRETCH
-        self._begin()
+        self._horizon = _HORIZON
+        self._restart()
 
-    def suggest(self, prices: Floats, target: Ints) -> None:
-        """Begin the next round from other prices, and from other targets if they are legal."""
-        self._prices = prices
+    def suggest(self, multipliers: Floats, target: Ints) -> None:
+        """Start the next round from other multipliers, and from other targets if they are legal."""
+        self._multipliers = multipliers
         pair = self._teams.pair[self._teams.team, target]
         reachable = self._teams.distance[self._teams.start, pair] < UNREACHABLE
         if np.all(pair >= 0) and np.all(reachable) and len(np.unique(target)) == len(target):
             self._target = target
 
-    def _begin(self) -> None:
-        """Begin a round."""
-        steps = int(np.ceil(self._stretch * len(self._prices)))
-        memory = np.zeros((steps, self._prices.shape[1]))
-        memory[: len(self._prices)] = self._prices
-        way = np.full((len(self._target), steps), PARKED, dtype=np.int64)
-        self._trial = trial(self._lattice, way, self._target.copy(), memory)
-        self._trial.random[0] = self._rounds
+    def _restart(self) -> None:
+        steps = int(np.ceil(self._horizon * len(self._multipliers)))
+        history = np.zeros((steps, self._multipliers.shape[1]))
+        history[: len(self._multipliers)] = self._multipliers
+        path = np.full((len(self._target), steps), PARKED, dtype=np.int64)
+        self._candidate = candidate_paths(self._arrays, path, self._target.copy(), history)
+        self._candidate.random[0] = self._rounds
         self._rounds += 1
-        self._passes, self._idle, self._idle_repairs = 0, 0, 0
+        self._passes = self._idle = 0
         self._settled = False
-        self._repair.begin(self._prices)
 
     def work(self, check_time: Callable[[], None]) -> bool:
-        """Do a little; return whether there is a better path set now.
+        """Run one pass; return whether there is a better path set now.
 
-        `check_time` may raise an error to end all work.
+        `check_time` may raise an error to end the work.
         """
         check_time()
         self.stale += 1
         if self._settled:
-            return self._improve(check_time)
-        self._settled = negotiate(self._lattice, self._teams, self._trial, self._passes)
+            return self._improve()
+        self._settled = negotiate(self._arrays, self._teams, self._candidate, self._passes)
         self._passes += 1
         if self._settled:
-            self._shorten()
+            self._drop_idle_steps()
             return self._keep()
         if self._passes >= _PASSES:
-            self._stretch = min(_MORE_STRETCH * self._stretch, _MOST_STRETCH)
-            self._begin()
+            self._horizon = min(_HORIZON_GROWTH * self._horizon, _MAX_HORIZON)
+            self._restart()
         return False
 
-    def _improve(self, check_time: Callable[[], None]) -> bool:
-        before = self._trial.cost.sum()
-        most = _MOST_OUT[self._idle // 100 % len(_MOST_OUT)]
-        idle = improve_ways(self._lattice, self._teams, self._trial, _ATTEMPTS, most)
+    def _improve(self) -> bool:
+        before = self._candidate.cost.sum()
+        max_size = _MAX_REMOVED[self._idle // 100 % len(_MAX_REMOVED)]
+        idle = improve_paths(self._arrays, self._teams, self._candidate, _ATTEMPTS, max_size)
         self._idle = self._idle + idle if idle >= _ATTEMPTS else idle
-        if self._idle >= _EXACT_AFTER and self._repair.fits(self._trial):
-            self._idle_repairs += 1
-            if self._repair.attempt(self._trial, check_time):
-                self._idle = _EXACT_AFTER
         better = self._keep()
-        if self._trial.cost.sum() < before:
-            self._idle_repairs = 0
-            self._shorten()
-        if self._idle > _IDLE_ATTEMPTS or self._idle_repairs > _IDLE_REPAIRS:
-            self._begin()
+        if self._candidate.cost.sum() < before:
+            self._drop_idle_steps()
+        if self._idle > _IDLE_ATTEMPTS:
+            self._restart()
         return better
 
     def _keep(self) -> bool:
-        cost = int(self._trial.cost.sum())
+        """Keep the candidate if it is the best; return whether it is."""
+        cost = int(self._candidate.cost.sum())
         if self.cost is not None and cost >= self.cost:
             return False
-        self.cost, self.way, self.stale = cost, self._trial.way.copy(), 0
+        self.cost, self.path, self.stale = cost, self._candidate.path.copy(), 0
         return True
 
-    def _shorten(self) -> None:
-        """Drop the steps in which nobody moves any more, but a few."""
-        old = self._trial
+    def _drop_idle_steps(self) -> None:
+        """Drop the last steps without moves, except a few."""
+        old = self._candidate
         steps = int(old.cost.max()) + _SPARE_STEPS
-        if steps < old.way.shape[1]:
-            way = np.ascontiguousarray(old.way[:, :steps])
-            new = trial(self._lattice, way, old.target, np.zeros((steps, old.use.shape[1])))
+        if steps < old.path.shape[1]:
+            path = np.ascontiguousarray(old.path[:, :steps])
+            history = np.zeros((steps, old.use.shape[1]))
+            new = candidate_paths(self._arrays, path, old.target, history)
             new.use[:] = old.use[:steps]
             new.random[:] = old.random
-            self._trial = new
+            self._candidate = new

@@ -5,90 +5,86 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from laneweave.coordinator.planning.exact.relaxation_kernel import PARKED, PER_MOVE, price_of
+from laneweave.coordinator.planning.exact.relaxation_kernel import PARKED, PER_MOVE, penalty_of
+from laneweave.coordinator.planning.random_kernel import random_below
 
 NOT_IN_TIME = 1_000_000
-"""Cost of a vehicle that does not arrive within the horizon, and price of what is taken."""
+"""Cost of a vehicle that does not arrive within the horizon, and of a clique that is in use."""
 _DETOUR = 10.0
-"""Who does not arrive in time ends near its target."""
-_FIRST_PRICE, _GROWTH, _HIGHEST_PRICE = 2.0, 1.01, 50.0
-"""Of a row that another vehicle uses; it grows with each pass."""
-_MEMORY = 1.0
-"""Added to the price of a row for good, each pass that it is used twice."""
-_ROUNDS, _ROUND_GROWTH, _ROUND_MEMORY = 10, 1.5, 0.5
-"""The same among vehicles that are taken out, which have few passes."""
-_NEARNESS = 15.0
-_DELAY_COUNTS = 0.5
+"""Cost per step to the target at the end of the horizon."""
+_FIRST_COST, _GROWTH, _MAX_COST = 2.0, 1.01, 50.0
+"""Cost of a clique that another vehicle uses; it grows with each pass."""
+_HISTORY = 1.0
+"""Permanently added to the cost of a clique in each pass in which it is used twice."""
+_ROUNDS, _ROUND_GROWTH, _ROUND_HISTORY = 10, 1.5, 0.5
+"""The same for vehicles that are rerouted together, which have few passes."""
+_BLUR = 15.0
+_DELAY_WEIGHT = 0.5
 _SWAP_SHARE = 60
-"""How often targets are exchanged inside teams, of a hundred."""
+"""Percentage of attempts that exchange targets inside teams."""
 
 
 @njit(cache=True)
-def random_below(state, below):
-    """Return a number from 0 to `below` - 1 (a linear congruential generator)."""
-    state[0] = state[0] * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
-    return np.int64((state[0] >> np.uint64(33)) % np.uint64(below))
-
-
-@njit(cache=True)
-def _cheapest_way(lattice, weight, distance, start, target, to_go, parked, way):
-    """Fill in the cheapest way of one vehicle when each use of a row costs; return its steps."""
-    valid, step, row = lattice.valid, lattice.step, lattice.row
+def _cheapest_path(arrays, weight, distance, start, target, cost_to_go, parked, path):
+    """Fill in the cheapest path of one vehicle at given clique costs; return its steps."""
+    valid, step, clique = arrays.valid, arrays.step, arrays.clique
     steps = len(weight)
     displacements, cells = valid.shape
-    most_rows = row.shape[2]
+    max_cliques = clique.shape[2]
     for cell in range(cells):
-        to_go[steps, cell] = NOT_IN_TIME + _DETOUR * distance[cell]
-    to_go[steps, target] = 0.0
+        cost_to_go[steps, cell] = NOT_IN_TIME + _DETOUR * distance[cell]
+    cost_to_go[steps, target] = 0.0
     parked[steps] = 0.0
-    lanes = lattice.lanes
+    lanes = arrays.lanes
     column = start // lanes
     for t in range(steps - 1, -1, -1):
-        parked[t] = parked[t + 1] + price_of(row, weight, t, 0, target)
-        # Nobody gets further than one column a step.
+        parked[t] = parked[t + 1] + penalty_of(clique, weight, t, 0, target)
+        # A vehicle moves at most one column per step.
         for cell in range(max(0, column - t) * lanes, min(cells, (column + t + 1) * lanes)):
             best = np.inf
             for d in range(displacements):
                 if valid[d, cell]:
-                    total = 1.0 + to_go[t + 1, cell + step[d]]
+                    total = 1.0 + cost_to_go[t + 1, cell + step[d]]
                     if d != 0:
                         total += PER_MOVE
-                    # Written out, as in `relaxation_kernel._step_back`.
-                    for m in range(most_rows):
-                        r = row[d, cell, m]
+                    # Inlined, as in `relaxation_kernel._step_back`.
+                    for m in range(max_cliques):
+                        r = clique[d, cell, m]
                         if r < 0:
                             break
                         total += weight[t, r]
                     best = min(best, total)
-            to_go[t, cell] = best
-        to_go[t, target] = min(to_go[t, target], parked[t])
-    way[:] = PARKED
+            cost_to_go[t, cell] = best
+        cost_to_go[t, target] = min(cost_to_go[t, target], parked[t])
+    path[:] = PARKED
     cell = start
     for t in range(steps):
-        if cell == target and parked[t] <= to_go[t, cell]:
+        if cell == target and parked[t] <= cost_to_go[t, cell]:
             return t
         best, choice = np.inf, 0
         for d in range(displacements):
             if valid[d, cell]:
-                total = 1.0 + price_of(row, weight, t, d, cell) + to_go[t + 1, cell + step[d]]
+                total = (
+                    1.0 + penalty_of(clique, weight, t, d, cell) + cost_to_go[t + 1, cell + step[d]]
+                )
                 if d != 0:
                     total += PER_MOVE
                 if total < best:
                     best, choice = total, d
-        way[t] = choice
+        path[t] = choice
         cell += step[choice]
     return steps if cell == target else NOT_IN_TIME
 
 
 @njit(cache=True)
-def add_uses(lattice, start, way, use, times):
-    """Count the rows that a vehicle uses, or take them back."""
-    row, step = lattice.row, lattice.step
+def add_uses(arrays, start, path, use, times):
+    """Add the cliques that a vehicle uses `times` times; -1 removes them."""
+    clique, step = arrays.clique, arrays.step
     cell = start
-    for t in range(len(way)):
-        d = max(way[t], 0)
-        for m in range(row.shape[2]):
-            r = row[d, cell, m]
+    for t in range(len(path)):
+        d = max(path[t], 0)
+        for m in range(clique.shape[2]):
+            r = clique[d, cell, m]
             if r < 0:
                 break
             use[t, r] += times
@@ -96,13 +92,13 @@ def add_uses(lattice, start, way, use, times):
 
 
 @njit(cache=True)
-def _is_contested(lattice, start, way, use):
-    row, step = lattice.row, lattice.step
+def _is_contested(arrays, start, path, use):
+    clique, step = arrays.clique, arrays.step
     cell = start
-    for t in range(len(way)):
-        d = max(way[t], 0)
-        for m in range(row.shape[2]):
-            r = row[d, cell, m]
+    for t in range(len(path)):
+        d = max(path[t], 0)
+        for m in range(clique.shape[2]):
+            r = clique[d, cell, m]
             if r < 0:
                 break
             if use[t, r] > 1.5:
@@ -119,137 +115,137 @@ def _shuffle(items, random):
 
 
 @njit(cache=True, nogil=True)
-def negotiate(lattice, teams, trial, number):
-    """Do one pass of negotiation, counted from 0; return whether it is settled.
+def negotiate(arrays, teams, candidate, number):
+    """Run one pass of negotiation, counted from 0; return whether no clique is used twice.
 
-    All vehicles on contested rows look for other ways, one after the other.
+    All vehicles on contested cliques are rerouted, one after the other.
     """
-    use, memory, weight = trial.use, trial.memory, trial.weight
-    steps, rows = use.shape
-    price = min(_FIRST_PRICE * _GROWTH**number, _HIGHEST_PRICE)
+    use, history, weight = candidate.use, candidate.history, candidate.weight
+    steps, cliques = use.shape
+    cost = min(_FIRST_COST * _GROWTH**number, _MAX_COST)
     order = np.arange(len(teams.start))
-    _shuffle(order, trial.random)
+    _shuffle(order, candidate.random)
     for i in order:
         if number > 0:
-            late = trial.cost[i] >= NOT_IN_TIME
-            if not late and not _is_contested(lattice, teams.start[i], trial.way[i], use):
+            late = candidate.cost[i] >= NOT_IN_TIME
+            if not late and not _is_contested(arrays, teams.start[i], candidate.path[i], use):
                 continue
-            add_uses(lattice, teams.start[i], trial.way[i], use, -1.0)
+            add_uses(arrays, teams.start[i], candidate.path[i], use, -1.0)
         for t in range(steps):
-            for row in range(rows):
-                weight[t, row] = memory[t, row] + price * use[t, row]
-        _find_way(lattice, teams, trial, i)
-        add_uses(lattice, teams.start[i], trial.way[i], use, 1.0)
-    settled = trial.cost.max() < NOT_IN_TIME
+            for clique in range(cliques):
+                weight[t, clique] = history[t, clique] + cost * use[t, clique]
+        _find_path(arrays, teams, candidate, i)
+        add_uses(arrays, teams.start[i], candidate.path[i], use, 1.0)
+    settled = candidate.cost.max() < NOT_IN_TIME
     for t in range(steps):
-        for row in range(rows):
-            if use[t, row] > 1.5:
+        for clique in range(cliques):
+            if use[t, clique] > 1.5:
                 settled = False
-                memory[t, row] += _MEMORY * (use[t, row] - 1.0)
+                history[t, clique] += _HISTORY * (use[t, clique] - 1.0)
     return settled
 
 
 @njit(cache=True)
-def _find_way(lattice, teams, trial, i):
-    pair = teams.pair[teams.team[i], trial.target[i]]
-    trial.cost[i] = _cheapest_way(
-        lattice,
-        trial.weight,
+def _find_path(arrays, teams, candidate, i):
+    pair = teams.pair[teams.team[i], candidate.target[i]]
+    candidate.cost[i] = _cheapest_path(
+        arrays,
+        candidate.weight,
         teams.distance[:, pair],
         teams.start[i],
         teams.pair_cell[pair],
-        trial.to_go,
-        trial.parked,
-        trial.way[i],
+        candidate.cost_to_go,
+        candidate.parked,
+        candidate.path[i],
     )
 
 
 @njit(cache=True, nogil=True)
-def improve_ways(lattice, teams, trial, attempts, most):
-    """Take a few vehicles out, let them negotiate, and keep what is not worse; so many times.
+def improve_paths(arrays, teams, candidate, attempts, max_size):
+    """Remove a few vehicles, let them negotiate, and keep the result if it is not worse.
 
-    Returns how many attempts came after the last one that made it cheaper.
+    Returns how many of the attempts came after the last improvement.
     """
-    start, team, pair, target = teams.start, teams.team, teams.pair, trial.target
-    use, way, cost = trial.use, trial.way, trial.cost
+    start, team, pair, target = teams.start, teams.team, teams.pair, candidate.target
+    use, path, cost = candidate.use, candidate.path, candidate.cost
     vehicles = len(start)
     score = np.empty(vehicles)
-    old_way, old_cost, old_target = way.copy(), cost.copy(), target.copy()
+    old_path, old_cost, old_target = path.copy(), cost.copy(), target.copy()
     idle = 0
     for _ in range(attempts):
         idle += 1
-        size = min(2 + random_below(trial.random, most - 1), vehicles)
-        seed = random_below(trial.random, vehicles)
+        size = min(2 + random_below(candidate.random, max_size - 1), vehicles)
+        seed = random_below(candidate.random, vehicles)
         middle = start[seed] + teams.target[target[seed]]
         for i in range(vehicles):
             delay = cost[i] - teams.distance[start[i], pair[team[i], target[i]]]
             away = 0.5 * abs(start[i] + teams.target[target[i]] - middle)
-            chance = _NEARNESS * random_below(trial.random, 1000) / 1000.0
-            score[i] = away + chance - _DELAY_COUNTS * delay
+            chance = _BLUR * random_below(candidate.random, 1000) / 1000.0
+            score[i] = away + chance - _DELAY_WEIGHT * delay
         score[seed] = -np.inf
         chosen = np.argsort(score)[:size]
         before = 0
         for i in chosen:
             before += cost[i]
-            old_way[i], old_cost[i], old_target[i] = way[i], cost[i], target[i]
-            add_uses(lattice, start[i], way[i], use, -1.0)
-        if random_below(trial.random, 100) < _SWAP_SHARE:
+            old_path[i], old_cost[i], old_target[i] = path[i], cost[i], target[i]
+            add_uses(arrays, start[i], path[i], use, -1.0)
+        if random_below(candidate.random, 100) < _SWAP_SHARE:
             for i in chosen:
-                j = chosen[random_below(trial.random, size)]
+                j = chosen[random_below(candidate.random, size)]
                 if pair[team[i], target[j]] >= 0 and pair[team[j], target[i]] >= 0:
                     target[i], target[j] = target[j], target[i]
-        least = 0.0
+        shortest = 0.0
         for i in chosen:
-            least += teams.distance[start[i], pair[team[i], target[i]]]
-        solved = least <= before and _negotiate_among(lattice, teams, trial, chosen, before)
+            shortest += teams.distance[start[i], pair[team[i], target[i]]]
+        solved = shortest <= before and _negotiate_among(arrays, teams, candidate, chosen, before)
         after = 0
         for i in chosen:
             if not solved:
-                way[i], cost[i], target[i] = old_way[i], old_cost[i], old_target[i]
+                path[i], cost[i], target[i] = old_path[i], old_cost[i], old_target[i]
             after += cost[i]
-            add_uses(lattice, start[i], way[i], use, 1.0)
+            add_uses(arrays, start[i], path[i], use, 1.0)
         if after < before:
             idle = 0
     return idle
 
 
 @njit(cache=True)
-def _negotiate_among(lattice, teams, trial, chosen, most):
-    """Let vehicles that were taken out negotiate; what the others use is taken."""
-    use, own, memory, weight = trial.use, trial.own, trial.memory, trial.weight
-    way, start, cost = trial.way, teams.start, trial.cost
-    steps, rows = use.shape
+def _negotiate_among(arrays, teams, candidate, chosen, max_cost):
+    """Let removed vehicles negotiate; the cliques that the others use are forbidden."""
+    use, own, history, weight = candidate.use, candidate.own, candidate.history, candidate.weight
+    path, start, cost = candidate.path, teams.start, candidate.cost
+    steps, cliques = use.shape
     own[:] = 0.0
-    memory[:] = 0.0
+    history[:] = 0.0
     order = chosen.copy()
-    price = 1.0
+    cost_of_use = 1.0
     for number in range(_ROUNDS):
-        _shuffle(order, trial.random)
+        _shuffle(order, candidate.random)
         for i in order:
             if number > 0:
-                if not _is_contested(lattice, start[i], way[i], own):
+                if not _is_contested(arrays, start[i], path[i], own):
                     continue
-                add_uses(lattice, start[i], way[i], own, -1.0)
+                add_uses(arrays, start[i], path[i], own, -1.0)
             for t in range(steps):
-                for row in range(rows):
-                    taken = NOT_IN_TIME * use[t, row]
-                    weight[t, row] = taken + memory[t, row] + price * own[t, row]
-            _find_way(lattice, teams, trial, i)
-            if trial.to_go[0, start[i]] >= NOT_IN_TIME:
+                for clique in range(cliques):
+                    taken = NOT_IN_TIME * use[t, clique]
+                    weight[t, clique] = taken + history[t, clique] + cost_of_use * own[t, clique]
+            _find_path(arrays, teams, candidate, i)
+            if candidate.cost_to_go[0, start[i]] >= NOT_IN_TIME:
                 return False
-            add_uses(lattice, start[i], way[i], own, 1.0)
+            add_uses(arrays, start[i], path[i], own, 1.0)
         total = 0
         for i in chosen:
             total += cost[i]
-        if total > most:
+        if total > max_cost:
             return False
         solved = True
         for t in range(steps):
-            for row in range(rows):
-                if own[t, row] > 1.5:
+            for clique in range(cliques):
+                if own[t, clique] > 1.5:
                     solved = False
-                    memory[t, row] += _ROUND_MEMORY
+                    history[t, clique] += _ROUND_HISTORY
         if solved:
             return True
-        price *= _ROUND_GROWTH
+        cost_of_use *= _ROUND_GROWTH
     return False

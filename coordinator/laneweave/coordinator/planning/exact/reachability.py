@@ -1,10 +1,10 @@
-"""An exact answer for small joint state spaces: can the vehicles reach their targets at all?
+"""Joint search for small state spaces: find any path set, or prove that there is none.
 
-Conflict trees never end when no path set exists. A search over the cells of all vehicles together
-does: vehicles with the same eligible targets form a team and are interchangeable, so a state is
-which cells each team occupies. States whose vehicles are close to targets of theirs come first, so
-a path set is found soon where there is one, even if the trees take for ever to find it. The search
-is cut off after a given number of joint moves; then it has shown nothing.
+Branch and bound and conflict trees may not end when no path set exists. A search over the cells of
+all vehicles together does: vehicles with the same eligible targets form a team and are
+interchangeable, so a state is the set of cells of each team. States whose vehicles are close to
+their targets come first, so a path set is found soon if there is one. After a given number of joint
+moves the search ends without a result.
 """
 
 from __future__ import annotations
@@ -15,9 +15,7 @@ from collections.abc import Iterator, Sequence
 import attrs
 
 from laneweave.coordinator.planning.budget import Budget
-from laneweave.coordinator.planning.moves import MoveTable, bits
-from laneweave.coordinator.planning.problem import Problem
-from laneweave.coordinator.planning.solution import Solution
+from laneweave.coordinator.planning.problem import MoveTable, Problem, Solution, bits
 
 State = tuple[int, ...]
 """The cells of all vehicles, team by team, sorted within a team."""
@@ -27,10 +25,10 @@ _MOVES_PER_TIME_CHECK = 256
 
 @attrs.frozen
 class Verdict:
-    """What the search showed.
+    """The result of the search.
 
-    solution: a path set, if one was found; not an optimal one.
-    impossible: all states were visited, and in none are all vehicles at their targets.
+    solution: a path set, if one was found; not necessarily optimal.
+    impossible: no state with all vehicles at their targets can be reached.
     """
 
     solution: Solution | None = None
@@ -39,7 +37,7 @@ class Verdict:
 
 @attrs.frozen
 class _Step:
-    """How a state was first reached; `order` tells which mover came to which place in it."""
+    """How a state was first reached; `order` holds the index of each place's vehicle before it."""
 
     state: State
     moves: tuple[int, ...]
@@ -49,7 +47,7 @@ class _Step:
 def explore(
     problem: Problem, choices: Sequence[frozenset[int]], budget: Budget, max_moves: int
 ) -> Verdict:
-    """Search all joint states that can be reached, up to `max_moves` joint moves."""
+    """Search the reachable joint states, up to `max_moves` joint moves."""
     vehicles = sorted(range(len(choices)), key=lambda v: (sorted(choices[v]), v))
     teams = [sorted(choices[v]) for v in vehicles]
     team = [teams.index(t) for t in teams]
@@ -83,7 +81,7 @@ def explore(
 
 
 def _steps_away(table: MoveTable, goals: frozenset[int]) -> dict[int, int]:
-    """Return the least number of steps from each cell to one of some others."""
+    """Return the minimum number of steps from each cell to one of the goals."""
     steps: dict[int, int] = {}
     reached = cells = sum(1 << goal for goal in goals)
     count = 0
@@ -96,18 +94,18 @@ def _steps_away(table: MoveTable, goals: frozenset[int]) -> dict[int, int]:
 
 
 def _can_be_made_one_after_another(table: MoveTable) -> bool:
-    """Tell whether the moves of any one step could also be made in single file.
+    """Return whether the moves of any step could also be made one after another.
 
     True if no vehicle moves into a cell that another one is leaving, and if passing a waiting
-    vehicle is not forbidden unless every overlap of footprints is. A computed table is of this kind
-    if it holds for any lateness: that one vehicle waits until the other has arrived is part of it.
-    If vehicles are not very late it allows some to follow each other that cannot go one by one.
-    `closing` takes two vehicles that both move, so it never stands in the way of a single one.
+    vehicle is forbidden only together with every overlap of footprints. It is true for a computed
+    table that holds for any lateness, because one vehicle may then wait until the other has
+    arrived. With limited lateness vehicles may follow each other that could not move one by one.
+    `closing` needs two vehicles that both move, so it never blocks a single one.
     """
-    kinds, geometry = table.model.kinds, table.model.geometry
+    kinds, conflicts = table.model.kinds, table.model.table
     if "geometric" in kinds:
         passing = table.mode == 1 or "special-4" not in kinds
-        return geometry is None or (geometry.lateness_s is None and passing)
+        return conflicts is None or (conflicts.any_lateness and passing)
     no_following = "node" in kinds and "special-1" in kinds
     return no_following and (table.mode == 1 or "special-4" not in kinds)
 

@@ -1,15 +1,15 @@
 """A lower bound on the cost of all path sets: Lagrangian relaxation of the conflicts.
 
-Without conflicts the problem falls apart: each vehicle takes a shortest path, and targets are
-assigned at least cost. With a price on every row in every step, paid by each move that is in it,
-the shortest paths avoid what is contested, and their cost less the sum of all prices is a lower
-bound on every solution, whatever its number of steps: beyond the last priced step vehicles ignore
-each other. Good prices are found by a subgradient method (Held, Wolfe and Crowder, Mathematical
-Programming 6, 1974) with momentum.
+Without conflicts the problem decomposes: each vehicle takes a shortest path, and targets are
+assigned at minimum cost. Every conflict clique in every step gets a Lagrange multiplier, which each
+move in the clique costs. The shortest paths then avoid contested cliques, and their cost minus the
+sum of all multipliers is a lower bound on every solution, whatever its number of steps: beyond the
+last step with multipliers vehicles ignore each other. Good multipliers are found by a subgradient
+method (Held, Wolfe and Crowder, Mathematical Programming 6, 1974) with momentum.
 
-At given prices each move of a team has a reduced cost: what it adds at least to the bound of every
-solution that contains it. So for a given ceiling, what is too dear is forbidden, which makes the
-rest smaller and its bound higher.
+At given multipliers each move of a team has a reduced cost, a lower bound on what it adds to every
+solution that contains it. So for a given upper bound, moves whose reduced cost is too high are
+forbidden (reduced-cost fixing), which makes the rest smaller and its lower bound higher.
 
 Costs are steps until the final arrival, and `PER_MOVE` for each move that is not a wait.
 """
@@ -22,216 +22,213 @@ from typing import NamedTuple
 import numpy as np
 
 from laneweave.coordinator.planning.exact.arrays import (
-    UNREACHABLE,
     Bools,
     Floats,
     Ints,
-    Lattice,
+    MoveArrays,
     Teams,
 )
 from laneweave.coordinator.planning.exact.relaxation_kernel import (
     BEST,
     BOUND,
-    PACE,
     PER_MOVE,
+    STEP_SIZE,
+    UNREACHABLE,
     evaluate,
-    forbid_dear,
-    forbid_taken,
+    fix_by_reduced_cost,
     improve,
     list_moves,
-    may_be_late,
+    may_need_more_steps,
     start_over,
 )
 
-_GUESS = -1.0
-_LEAST_SHARE = 1e-6
+_ESTIMATE = -1.0
+"""Value for `goal` of `relaxation_kernel.improve`."""
+_TOLERANCE = 1e-6
 
 
 class Scratch(NamedTuple):
-    """What the compiled code writes on. Shapes: T steps, R rows; others as in `arrays`."""
+    """Working memory of the compiled code. Shapes: T steps, R cliques; others as in `arrays`."""
 
-    to_go: Floats
-    """(T + 1, X, P) least priced cost from a cell before a step to the target of a pair."""
+    cost_to_go: Floats
+    """(T + 1, X, P) minimum cost from a cell before a step to the target of a pair."""
     parked: Floats
-    """(T + 1, P) price of waiting on the target from a step on."""
+    """(T + 1, P) multipliers of waiting at the target from a step on."""
     move: Ints
     """(moves, 3) displacement, from-cell and to-cell of the allowed moves, by step and team."""
     move_from: Ints
     """(T, K + 1) where the moves of a step and team begin."""
-    move_price: Floats
+    move_cost: Floats
     """(moves,)"""
     present: Floats
-    """(T, R) prices that are tried."""
+    """(T, R) multipliers of the current iteration."""
     direction: Floats
     """(T, R)"""
     use: Floats
-    """(T, R) of each row, by the vehicles on their cheapest ways."""
+    """(T, R) number of vehicles in each clique on their cheapest paths; then the subgradient."""
     mass: Floats
     """(K, T, D, X) weights of the relaxed solutions that contain a move."""
     mass_of_team: Floats
     """(T, R, K)"""
     mass_of_cell: Floats
-    """(T, R, numbers of from-cells in a row)"""
+    """(T, R, numbers of from-cells in a clique)"""
     reach: Floats
-    """(K, T + 1, X) least reduced cost with which a team gets to a cell before a step."""
-    least: Floats
-    """(K, T + 1, X) least of `to_go`, less the worth of the target."""
+    """(K, T + 1, X) minimum reduced cost at which a team reaches a cell before a step."""
+    min_cost: Floats
+    """(K, T + 1, X) minimum of `cost_to_go` minus the dual value of the target."""
     cost: Floats
     """(N, J)"""
     holder: Ints
     """(J,) the vehicle that has a target; -1: none."""
-    worth: Floats
+    dual: Floats
     """(J,) dual values of the targets."""
-    way: Ints
-    """(N, T) displacements of the vehicles; `PARKED`: none any more."""
-    best_way: Ints
-    """(N, T) of the best solution that was free of conflicts."""
+    path: Ints
+    """(N, T) displacements of the vehicles; `PARKED`: arrived."""
+    best_path: Ints
+    """(N, T) paths of the best relaxed solution without conflicts."""
 
 
 class Stack(NamedTuple):
-    """Parts of the problem that are still to be looked at. Shape: S nodes and those above."""
+    """The open nodes of branch and bound. Shapes: S nodes; others as above."""
 
     allowed: Bools
     """(S, K, T, D, X) moves that a team may make."""
-    first: Ints
-    """(S, P) first step before which a vehicle may arrive for good."""
-    prices: Floats
+    earliest: Ints
+    """(S, P) earliest step before which a vehicle may have finally arrived."""
+    multipliers: Floats
     """(S, T, R)"""
-    pace: Floats
-    """(S,) factor of the step length."""
+    step_size: Floats
+    """(S,) factor of the step size."""
 
 
-def scratch(lattice: Lattice, teams: Teams, steps: int) -> Scratch:
-    """Return scratch arrays for so many steps."""
-    displacements, cells = lattice.valid.shape
+def scratch(arrays: MoveArrays, teams: Teams, steps: int) -> Scratch:
+    """Return working memory for so many steps."""
+    displacements, cells = arrays.valid.shape
     groups, goals = teams.pair.shape
-    vehicles, pairs, rows = len(teams.start), len(teams.pair_cell), lattice.row_count
-    most_moves = groups * steps * int(lattice.valid.sum())
+    vehicles, pairs, cliques = len(teams.start), len(teams.pair_cell), arrays.clique_count
+    max_moves = groups * steps * int(arrays.valid.sum())
     return Scratch(
-        to_go=np.zeros((steps + 1, cells, pairs)),
+        cost_to_go=np.zeros((steps + 1, cells, pairs)),
         parked=np.zeros((steps + 1, pairs)),
-        move=np.zeros((most_moves, 3), dtype=np.int64),
+        move=np.zeros((max_moves, 3), dtype=np.int64),
         move_from=np.zeros((steps, groups + 1), dtype=np.int64),
-        move_price=np.zeros(most_moves),
-        present=np.zeros((steps, rows)),
-        direction=np.zeros((steps, rows)),
-        use=np.zeros((steps, rows)),
+        move_cost=np.zeros(max_moves),
+        present=np.zeros((steps, cliques)),
+        direction=np.zeros((steps, cliques)),
+        use=np.zeros((steps, cliques)),
         mass=np.zeros((groups, steps, displacements, cells)),
-        mass_of_team=np.zeros((steps, rows, groups)),
-        mass_of_cell=np.zeros((steps, rows, lattice.near_count)),
+        mass_of_team=np.zeros((steps, cliques, groups)),
+        mass_of_cell=np.zeros((steps, cliques, arrays.residue_count)),
         reach=np.zeros((groups, steps + 1, cells)),
-        least=np.zeros((groups, steps + 1, cells)),
+        min_cost=np.zeros((groups, steps + 1, cells)),
         cost=np.zeros((vehicles, goals)),
         holder=np.zeros(goals, dtype=np.int64),
-        worth=np.zeros(goals),
-        way=np.zeros((vehicles, steps), dtype=np.int64),
-        best_way=np.zeros((vehicles, steps), dtype=np.int64),
+        dual=np.zeros(goals),
+        path=np.zeros((vehicles, steps), dtype=np.int64),
+        best_path=np.zeros((vehicles, steps), dtype=np.int64),
     )
 
 
-def stack(teams: Teams, prices: Floats, valid: Bools, size: int) -> Stack:
+def stack(teams: Teams, multipliers: Floats, valid: Bools, size: int) -> Stack:
     """Return an empty stack."""
     groups, pairs = len(teams.pair), len(teams.pair_cell)
     return Stack(
-        allowed=np.zeros((size, groups, len(prices), *valid.shape), dtype=np.bool_),
-        first=np.zeros((size, pairs), dtype=np.int64),
-        prices=np.zeros((size, *prices.shape)),
-        pace=np.ones(size),
+        allowed=np.zeros((size, groups, len(multipliers), *valid.shape), dtype=np.bool_),
+        earliest=np.zeros((size, pairs), dtype=np.int64),
+        multipliers=np.zeros((size, *multipliers.shape)),
+        step_size=np.ones(size),
     )
 
 
-def ceiling_of(cost: int) -> float:
-    """Return what no solution of a cost is above, whatever its number of moves.
+def upper_bound_of(cost: int) -> float:
+    """Return an upper bound on the value of solutions of a cost, for any number of moves.
 
-    Values are multiples of the price of a move, so half of it is room for rounding.
+    Values are multiples of `PER_MOVE`, so half of it is a margin for rounding.
     """
     return cost * (1.0 + PER_MOVE) + 0.5 * PER_MOVE
 
 
 class Relaxation:
-    """The whole problem at its best prices so far.
+    """The relaxed problem at its best multipliers so far.
 
-    prices: (T, R); T is the number of steps in which rows have prices.
-    bound: at least what every solution costs; `UNREACHABLE`: there is none.
+    multipliers: (T, R); T is the number of steps in which cliques have multipliers.
+    bound: lower bound on every solution; `UNREACHABLE`: there is none.
     """
 
-    def __init__(
-        self, lattice: Lattice, teams: Teams, steps: int, taken: Bools | None = None
-    ) -> None:
-        """Begin without prices.
-
-        Args:
-            lattice: the moves.
-            teams: the vehicles.
-            steps: in which rows have prices.
-            taken: (steps, R) rows that may not be used.
-        """
-        self.lattice = lattice
+    def __init__(self, arrays: MoveArrays, teams: Teams, steps: int) -> None:
+        """Start with multipliers of 0 in so many steps."""
+        self.arrays = arrays
         self.teams = teams
-        self._taken = taken
-        self.memory = np.zeros(BEST + 1)
-        self.memory[BOUND], self.memory[PACE], self.memory[BEST] = -UNREACHABLE, 1.0, UNREACHABLE
-        self._lay_out(np.zeros((steps, lattice.row_count)))
+        self.state = np.zeros(BEST + 1)
+        self.state[BOUND], self.state[STEP_SIZE], self.state[BEST] = -UNREACHABLE, 1.0, UNREACHABLE
+        self._allocate(np.zeros((steps, arrays.clique_count)))
 
-    def _lay_out(self, prices: Floats) -> None:
-        self.prices = prices
-        self.scratch = scratch(self.lattice, self.teams, len(prices))
-        shape = len(self.teams.pair), len(prices), *self.lattice.valid.shape
+    def _allocate(self, multipliers: Floats) -> None:
+        self.multipliers = multipliers
+        self.scratch = scratch(self.arrays, self.teams, len(multipliers))
+        shape = len(self.teams.pair), len(multipliers), *self.arrays.valid.shape
         self.allowed = np.empty(shape, dtype=np.bool_)
-        self.allowed[:] = self.lattice.valid
-        self.first = np.zeros(len(self.teams.pair_cell), dtype=np.int64)
-        if self._taken is not None:
-            forbid_taken(self.lattice, self.teams, self._taken, self.allowed, self.first)
-        # Where nobody can get in time, nobody moves.
+        self.allowed[:] = self.arrays.valid
+        self.earliest = np.zeros(len(self.teams.pair_cell), dtype=np.int64)
+        # Forbid moves from cells that no vehicle can reach in time.
         self._list()
-        self._forbid(self.allowed, self.first, self.prices, UNREACHABLE)
+        self._fix(self.allowed, self.earliest, self.multipliers, UNREACHABLE)
         self._begin()
 
     def _list(self) -> None:
-        self._span = list_moves(self.lattice, self.allowed, self.scratch)[1]
+        self._span = list_moves(self.arrays, self.allowed, self.scratch)[1]
 
     def _begin(self) -> None:
         self._list()
-        start_over(self.prices, self._span, self.scratch, self.memory)
+        start_over(self.multipliers, self._span, self.scratch, self.state)
 
-    def _forbid(self, allowed: Bools, first: Ints, prices: Floats, ceiling: float) -> float:
-        bound, _ = forbid_dear(
-            self.lattice, self.teams, allowed, first, prices, self._span, self.scratch, ceiling
+    def _fix(
+        self, allowed: Bools, earliest: Ints, multipliers: Floats, upper_bound: float
+    ) -> float:
+        bound, _ = fix_by_reduced_cost(
+            self.arrays,
+            self.teams,
+            allowed,
+            earliest,
+            multipliers,
+            self._span,
+            self.scratch,
+            upper_bound,
         )
         return float(bound)
 
     @property
     def bound(self) -> float:
-        """At least what every solution costs; `UNREACHABLE`: there is none."""
-        return float(self.memory[BOUND])
+        """Lower bound on every solution; `UNREACHABLE`: there is none."""
+        return float(self.state[BOUND])
 
     @property
-    def least_cost(self) -> float:
+    def min_cost(self) -> float:
         """The bound as a number of steps; infinite: there is no solution."""
         if self.bound >= UNREACHABLE:
             return math.inf
-        return math.ceil(self.bound / (1.0 + PER_MOVE) - _LEAST_SHARE)
+        return math.ceil(self.bound / (1.0 + PER_MOVE) - _TOLERANCE)
 
     def improve(self, iterations: int) -> None:
-        """Do some iterations for better prices."""
+        """Run some iterations of the subgradient method."""
         improve(
-            self.lattice,
+            self.arrays,
             self.teams,
             self.allowed,
-            self.first,
-            self.prices,
+            self.earliest,
+            self.multipliers,
             self._span,
             self.scratch,
-            self.memory,
+            self.state,
             iterations,
             UNREACHABLE,
-            _GUESS,
+            _ESTIMATE,
         )
 
     def assignment(self) -> Ints:
-        """Return (N,) the number of the target of each vehicle that is best at the prices."""
+        """Return (N,) the number of the best target of each vehicle at the multipliers."""
         self._begin()
-        evaluate(self.lattice, self.teams, self.first, self.prices, self._span, self.scratch)
+        evaluate(self.arrays, self.teams, self.earliest, self.multipliers, self._span, self.scratch)
         return self.held_targets()
 
     def held_targets(self) -> Ints:
@@ -241,36 +238,31 @@ class Relaxation:
         target[self.scratch.holder[taken]] = taken
         return target
 
-    def put(self, nodes: Stack, ceiling: float) -> bool | None:
-        """Put what solutions below a ceiling may contain at the bottom of a stack.
+    def put(self, nodes: Stack, upper_bound: float) -> bool | None:
+        """Put the moves that solutions below an upper bound may contain at the bottom of a stack.
 
         Returns:
-            Whether there may be one; None: perhaps one that needs more steps than have prices.
+            Whether there may be such a solution; None: perhaps one with more steps than have
+            multipliers.
         """
-        self.put_whole(nodes)
+        nodes.allowed[0], nodes.earliest[0] = self.allowed, self.earliest
+        nodes.multipliers[0], nodes.step_size[0] = self.multipliers, 1.0
         self._begin()
-        bound = self._forbid(nodes.allowed[0], nodes.first[0], nodes.prices[0], ceiling)
-        if bound > ceiling:
+        bound = self._fix(nodes.allowed[0], nodes.earliest[0], nodes.multipliers[0], upper_bound)
+        if bound > upper_bound:
             return False
-        steps = len(self.prices)
-        if self._span == steps and may_be_late(
-            self.teams, steps, self.scratch, ceiling - bound + _LEAST_SHARE
+        steps = len(self.multipliers)
+        if self._span == steps and may_need_more_steps(
+            self.teams, steps, self.scratch, upper_bound - bound + _TOLERANCE
         ):
             return None
         return True
 
-    def put_whole(self, nodes: Stack) -> None:
-        """Put everything that is allowed at the bottom of a stack, at the present prices."""
-        nodes.allowed[0], nodes.first[0] = self.allowed, self.first
-        nodes.prices[0], nodes.pace[0] = self.prices, 1.0
-
-    def take_prices(self, prices: Floats) -> None:
-        """Go on from other prices."""
-        self.prices = prices.copy()
+    def set_multipliers(self, multipliers: Floats) -> None:
+        """Continue from other multipliers."""
+        self.multipliers = multipliers.copy()
 
     def lengthen(self, steps: int) -> None:
-        """Let rows have prices in more steps; the best solution so far is forgotten."""
-        self.memory[BEST] = UNREACHABLE
-        if self._taken is not None:
-            self._taken = np.pad(self._taken, ((0, steps), (0, 0)))
-        self._lay_out(np.pad(self.prices, ((0, steps), (0, 0))))
+        """Add multipliers for more steps; this discards the best relaxed solution so far."""
+        self.state[BEST] = UNREACHABLE
+        self._allocate(np.pad(self.multipliers, ((0, steps), (0, 0))))

@@ -1,8 +1,7 @@
 """Compiled code of `relaxation`.
 
-Types are those of `arrays` and `relaxation`; numba compiles for what it is called with. Arrays are
-taken out of their tuples before loops, and inner loops are functions of their own: without that
-they take five times as long.
+Parameters are the named tuples of `arrays` and `relaxation`. Arrays are taken out of their tuples
+before loops, and inner loops are separate functions: otherwise they take five times as long.
 """
 
 from __future__ import annotations
@@ -10,34 +9,59 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from laneweave.coordinator.planning.exact.arrays_kernel import UNREACHABLE
-
+UNREACHABLE = 1e9
+"""Represents infinity in sums of costs."""
 PER_MOVE = 1e-5
 """Added to the cost of each move that is not a wait: of equal costs the fewest moves win."""
 PARKED = -1
-"""In a way: the vehicle has arrived for good."""
+"""In a path: the vehicle has finally arrived."""
 REFUTED, FOUND, OPEN = 0, 1, 2
-"""No solution below the ceiling; a solution below it; neither is known yet."""
-BOUND, PACE, STALE, WEIGHT, WEIGHTS, BEST = range(6)
-"""Places in the memory of `improve`: the best bound, the factor of the step length, iterations
+"""No solution below the upper bound; a solution below it; neither is known yet."""
+BOUND, STEP_SIZE, STALE, WEIGHT, WEIGHTS, BEST = range(6)
+"""Indices in the state of `improve`: the best lower bound, the factor of the step size, iterations
 without a better bound, the weight of the next relaxed solution, the sum of all weights, the value
-of the best solution that happened to be free of conflicts."""
+of the best relaxed solution without conflicts."""
 _HALF = 0.5 * UNREACHABLE
 _TOLERANCE = 1e-7
 _MOMENTUM = 0.6
 _STEP = 0.6
 _PATIENCE = 12
-"""After so many iterations without a better bound the steps become shorter."""
+"""Iterations without a better bound after which the step size is reduced."""
 _SHORTER, _SHORTEST = 0.6, 0.0005
 _FADING = 0.92
-"""Weight of a relaxed solution, relative to the next one."""
+"""Weight of a relaxed solution relative to the next one."""
 
 
 @njit(cache=True, nogil=True)
-def list_moves(lattice, allowed, scratch):
-    """List the allowed moves of every step; return their number and the steps there are any in."""
+def min_steps(valid, step, targets):
+    """Return (X, P) the minimum steps from every cell to each target, without other vehicles."""
+    displacements, cells = valid.shape
+    found = np.full((cells, len(targets)), UNREACHABLE)
+    queue = np.empty(cells, np.int64)
+    for p in range(len(targets)):
+        found[targets[p], p] = 0.0
+        queue[0] = targets[p]
+        begin, end = 0, 1
+        while begin < end:
+            then = queue[begin]
+            begin += 1
+            for d in range(displacements):
+                cell = then - step[d]
+                if 0 <= cell < cells and valid[d, cell] and found[cell, p] == UNREACHABLE:
+                    found[cell, p] = found[then, p] + 1.0
+                    queue[end] = cell
+                    end += 1
+    return found
+
+
+@njit(cache=True, nogil=True)
+def list_moves(arrays, allowed, scratch):
+    """List the allowed moves of every step.
+
+    Returns their number, and the number of steps up to the last one with any.
+    """
     teams, steps, displacements, cells = allowed.shape
-    move, move_from, step = scratch.move, scratch.move_from, lattice.step
+    move, move_from, step = scratch.move, scratch.move_from, arrays.step
     count, span = 0, 0
     for t in range(steps):
         for k in range(teams):
@@ -56,147 +80,129 @@ def list_moves(lattice, allowed, scratch):
 
 
 @njit(cache=True, nogil=True)
-def forbid_taken(lattice, teams, taken, allowed, first):
-    """Forbid the moves that use a row which is taken, and arrivals before such a wait."""
-    row = lattice.row
-    displacements, cells, most_rows = row.shape
-    for t in range(len(taken)):
-        for d in range(displacements):
-            for cell in range(cells):
-                for m in range(most_rows):
-                    r = row[d, cell, m]
-                    if r < 0:
-                        break
-                    if taken[t, r]:
-                        allowed[:, t, d, cell] = False
-                        if d == 0:
-                            for p in range(len(first)):
-                                if teams.pair_cell[p] == cell:
-                                    first[p] = t + 1
-                        break
-
-
-@njit(cache=True, nogil=True)
-def start_over(prices, span, scratch, memory):
-    """Begin to improve prices; there are none where nobody can move any more."""
-    prices[span:] = 0.0
-    scratch.present[:] = prices
+def start_over(multipliers, span, scratch, state):
+    """Reset the subgradient method; steps without moves have no multipliers."""
+    multipliers[span:] = 0.0
+    scratch.present[:] = multipliers
     scratch.direction[:] = 0.0
     scratch.mass[:] = 0.0
-    memory[BOUND], memory[STALE], memory[WEIGHT], memory[WEIGHTS] = -UNREACHABLE, 0.0, 1.0, 0.0
+    state[BOUND], state[STALE], state[WEIGHT], state[WEIGHTS] = -UNREACHABLE, 0.0, 1.0, 0.0
 
 
 @njit(cache=True, nogil=True)
-def improve(lattice, teams, allowed, first, prices, span, scratch, memory, count, ceiling, goal):
-    """Go on with a subgradient method, until the ceiling is passed or a solution below it is found.
+def improve(
+    arrays, teams, allowed, earliest, multipliers, span, scratch, state, count, upper_bound, goal
+):
+    """Run the subgradient method until the bound passes `upper_bound` or a solution is below it.
 
-    goal: the value that the steps aim at; negative: guess.
+    goal: the value that the step size aims at; negative: estimate it.
     """
-    rows = prices.shape[1]
+    cliques = multipliers.shape[1]
     present, direction, use = scratch.present, scratch.direction, scratch.use
     for _ in range(count):
-        bound = evaluate(lattice, teams, first, present, span, scratch)
+        bound = evaluate(arrays, teams, earliest, present, span, scratch)
         if bound > _HALF:
-            memory[BOUND] = UNREACHABLE
+            state[BOUND] = UNREACHABLE
             return REFUTED
-        memory[STALE] = 0.0 if bound > memory[BOUND] + 0.01 else memory[STALE] + 1.0
-        if bound > memory[BOUND]:
-            memory[BOUND] = bound
-            prices[:] = present
-            if bound > ceiling:
+        state[STALE] = 0.0 if bound > state[BOUND] + 0.01 else state[STALE] + 1.0
+        if bound > state[BOUND]:
+            state[BOUND] = bound
+            multipliers[:] = present
+            if bound > upper_bound:
                 return REFUTED
-        value, arrived = _walk(lattice, teams, allowed, first, present, span, scratch, memory)
+        value, arrived = _walk(arrays, teams, allowed, earliest, present, span, scratch, state)
         clash, square = _excess(present, use, span)
-        if not clash and arrived and value < memory[BEST] - _TOLERANCE:
-            memory[BEST] = value
-            scratch.best_way[:] = scratch.way
-        if memory[BEST] <= ceiling < _HALF:
+        if not clash and arrived and value < state[BEST] - _TOLERANCE:
+            state[BEST] = value
+            scratch.best_path[:] = scratch.path
+        if state[BEST] <= upper_bound < _HALF:
             return FOUND
         if square == 0.0:
             return OPEN
-        if memory[STALE] >= _PATIENCE:
-            memory[PACE] = max(_SHORTER * memory[PACE], _SHORTEST)
-            memory[STALE] = 0.0
-            present[:] = prices
+        if state[STALE] >= _PATIENCE:
+            state[STEP_SIZE] = max(_SHORTER * state[STEP_SIZE], _SHORTEST)
+            state[STALE] = 0.0
+            present[:] = multipliers
             direction[:] = 0.0
             continue
-        aim = goal if goal >= 0.0 else 1.12 * max(memory[BOUND], 0.0) + 2.0
-        factor = _STEP * memory[PACE] * (aim - bound) / square
+        aim = goal if goal >= 0.0 else 1.12 * max(state[BOUND], 0.0) + 2.0
+        factor = _STEP * state[STEP_SIZE] * (aim - bound) / square
         for t in range(span):
-            for row in range(rows):
-                change = _MOMENTUM * direction[t, row] + use[t, row]
-                direction[t, row] = change
+            for clique in range(cliques):
+                change = _MOMENTUM * direction[t, clique] + use[t, clique]
+                direction[t, clique] = change
                 if change != 0.0:
-                    present[t, row] = max(present[t, row] + factor * change, 0.0)
+                    present[t, clique] = max(present[t, clique] + factor * change, 0.0)
     return OPEN
 
 
 @njit(cache=True, nogil=True)
-def evaluate(lattice, teams, first, prices, span, scratch):
-    """Return the bound at some prices; fills in costs to go and the assignment."""
-    _look_back(lattice, teams, first, prices, span, scratch)
+def evaluate(arrays, teams, earliest, multipliers, span, scratch):
+    """Return the bound at some multipliers; fill in costs to go and the assignment."""
+    _look_back(arrays, teams, earliest, multipliers, span, scratch)
     total = 0.0
     for t in range(span):
-        for row in range(prices.shape[1]):
-            total += prices[t, row]
+        for clique in range(multipliers.shape[1]):
+            total += multipliers[t, clique]
     return _match(teams, scratch) - total
 
 
 @njit(cache=True)
-def _look_back(lattice, teams, first, prices, span, scratch):
-    """Fill in the least priced cost from each cell before each step to the target of each pair.
+def _look_back(arrays, teams, earliest, multipliers, span, scratch):
+    """Fill in the minimum cost from each cell before each step to the target of each pair.
 
-    Every step until the final arrival costs 1. Who has arrived waits, which pays for rows, too.
+    Every step until the final arrival costs 1, and each move the multipliers of its cliques. A
+    vehicle that has arrived waits, which also costs multipliers.
     """
-    to_go, parked = scratch.to_go, scratch.parked
-    move, move_from, move_price = scratch.move, scratch.move_from, scratch.move_price
-    row, cell_of, pairs_from = lattice.row, teams.pair_cell, teams.pairs_from
+    cost_to_go, parked = scratch.cost_to_go, scratch.parked
+    move, move_from, move_cost = scratch.move, scratch.move_from, scratch.move_cost
+    clique, cell_of, pairs_from = arrays.clique, teams.pair_cell, teams.pairs_from
     parked[span] = 0.0
-    if span == len(prices):
-        to_go[span] = teams.distance
+    if span == len(multipliers):
+        cost_to_go[span] = teams.distance
     else:
-        to_go[span] = UNREACHABLE
+        cost_to_go[span] = UNREACHABLE
         for p in range(len(cell_of)):
-            if first[p] <= span:
-                to_go[span, cell_of[p], p] = 0.0
+            if earliest[p] <= span:
+                cost_to_go[span, cell_of[p], p] = 0.0
     for t in range(span - 1, -1, -1):
-        to_go[t] = UNREACHABLE
+        cost_to_go[t] = UNREACHABLE
         for k in range(len(pairs_from) - 1):
             _step_back(
                 move,
-                move_price,
+                move_cost,
                 move_from[t, k],
                 move_from[t, k + 1],
                 pairs_from[k],
                 pairs_from[k + 1],
-                row,
-                prices[t],
-                to_go[t],
-                to_go[t + 1],
+                clique,
+                multipliers[t],
+                cost_to_go[t],
+                cost_to_go[t + 1],
             )
         for p in range(len(cell_of)):
             cell = cell_of[p]
-            stay = parked[t + 1, p] + price_of(row, prices, t, 0, cell)
+            stay = parked[t + 1, p] + penalty_of(clique, multipliers, t, 0, cell)
             parked[t, p] = stay
-            if t >= first[p] and stay <= to_go[t, cell, p]:
-                to_go[t, cell, p] = stay
+            if t >= earliest[p] and stay <= cost_to_go[t, cell, p]:
+                cost_to_go[t, cell, p] = stay
 
 
 @njit(cache=True)
-def _step_back(move, move_price, begin, end, first_pair, end_pair, row, prices, here, then):
-    # The sum of prices is written out: as a call it takes four times as long.
-    most_rows = row.shape[2]
+def _step_back(move, move_cost, begin, end, first_pair, end_pair, clique, multipliers, here, then):
+    # The sum of multipliers is inlined: as a call it takes four times as long.
+    max_cliques = clique.shape[2]
     for m in range(begin, end):
         d, cell, next_cell = move[m, 0], move[m, 1], move[m, 2]
         price = 1.0
         if d != 0:
             price += PER_MOVE
-        for n in range(most_rows):
-            r = row[d, cell, n]
+        for n in range(max_cliques):
+            r = clique[d, cell, n]
             if r < 0:
                 break
-            price += prices[r]
-        move_price[m] = price
+            price += multipliers[r]
+        move_cost[m] = price
         for p in range(first_pair, end_pair):
             total = price + then[next_cell, p]
             if total < here[cell, p]:
@@ -204,32 +210,32 @@ def _step_back(move, move_price, begin, end, first_pair, end_pair, row, prices, 
 
 
 @njit(cache=True)
-def price_of(row, prices, t, d, cell):
-    """Return the sum of the prices of the rows that a move is in."""
+def penalty_of(clique, multipliers, t, d, cell):
+    """Return the sum of the multipliers of the cliques that contain a move."""
     total = 0.0
-    for m in range(row.shape[2]):
-        r = row[d, cell, m]
+    for m in range(clique.shape[2]):
+        r = clique[d, cell, m]
         if r < 0:
             break
-        total += prices[t, r]
+        total += multipliers[t, r]
     return total
 
 
 @njit(cache=True)
 def _match(teams, scratch):
-    """Assign targets at least cost; fill in each target's vehicle (or -1) and dual value.
+    """Assign targets at minimum cost; fill in each target's vehicle (or -1) and dual value.
 
     Successive shortest paths with potentials (Jonker and Volgenant, Computing 38, 1987).
     """
-    to_go, start, pair = scratch.to_go, teams.start, teams.pair
-    cost, holder_of, worth_of = scratch.cost, scratch.holder, scratch.worth
+    cost_to_go, start, pair = scratch.cost_to_go, teams.start, teams.pair
+    cost, holder_of, dual_of = scratch.cost, scratch.holder, scratch.dual
     vehicles, goals = cost.shape
     for i in range(vehicles):
         for j in range(goals):
             p = pair[teams.team[i], j]
-            cost[i, j] = to_go[0, start[i], p] if p >= 0 else UNREACHABLE
+            cost[i, j] = cost_to_go[0, start[i], p] if p >= 0 else UNREACHABLE
     value = np.zeros(vehicles + 1)
-    worth = np.zeros(goals + 1)
+    dual = np.zeros(goals + 1)
     holder = np.full(goals + 1, -1)
     came_from = np.zeros(goals + 1, np.int64)
     slack = np.empty(goals + 1)
@@ -242,22 +248,22 @@ def _match(teams, scratch):
         while holder[at] >= 0:
             done[at] = True
             i = holder[at]
-            least, then = np.inf, -1
+            min_slack, then = np.inf, -1
             for j in range(goals):
                 if done[j]:
                     continue
-                length = cost[i, j] - value[i] - worth[j]
+                length = cost[i, j] - value[i] - dual[j]
                 if length < slack[j]:
                     slack[j] = length
                     came_from[j] = at
-                if slack[j] < least:
-                    least, then = slack[j], j
+                if slack[j] < min_slack:
+                    min_slack, then = slack[j], j
             for j in range(goals + 1):
                 if done[j]:
-                    value[holder[j]] += least
-                    worth[j] -= least
+                    value[holder[j]] += min_slack
+                    dual[j] -= min_slack
                 else:
-                    slack[j] -= least
+                    slack[j] -= min_slack
             at = then
         while at != goals:
             before = came_from[at]
@@ -265,23 +271,28 @@ def _match(teams, scratch):
             at = before
     total = 0.0
     for j in range(goals):
-        holder_of[j], worth_of[j] = holder[j], worth[j]
+        holder_of[j], dual_of[j] = holder[j], dual[j]
         if holder[j] >= 0:
             total += cost[holder[j], j]
     return min(total, UNREACHABLE)
 
 
 @njit(cache=True)
-def _walk(lattice, teams, allowed, first, prices, span, scratch, memory):
-    """Let each vehicle take its cheapest way; count the uses of rows and add up masses.
+def _walk(arrays, teams, allowed, earliest, multipliers, span, scratch, state):
+    """Follow each vehicle's cheapest path; count the uses of cliques and add up masses.
 
-    Returns the cost of all, and whether all have arrived in the end.
+    Returns the sum of costs, and whether all vehicles arrive.
     """
-    row, step, to_go, parked = lattice.row, lattice.step, scratch.to_go, scratch.parked
-    use, mass, way = scratch.use, scratch.mass, scratch.way
-    weight = memory[WEIGHT]
+    clique, step, cost_to_go, parked = (
+        arrays.clique,
+        arrays.step,
+        scratch.cost_to_go,
+        scratch.parked,
+    )
+    use, mass, path = scratch.use, scratch.mass, scratch.path
+    weight = state[WEIGHT]
     use[:] = 0.0
-    way[:] = PARKED
+    path[:] = PARKED
     value, all_arrived = 0.0, True
     for j in range(len(scratch.holder)):
         i = scratch.holder[j]
@@ -292,72 +303,83 @@ def _walk(lattice, teams, allowed, first, prices, span, scratch, memory):
         target = teams.pair_cell[p]
         arrived = False
         for t in range(span):
-            if cell == target and t >= first[p] and parked[t, p] <= to_go[t, cell, p]:
+            if cell == target and t >= earliest[p] and parked[t, p] <= cost_to_go[t, cell, p]:
                 arrived = True
             d = 0
             if not arrived:
-                least = np.inf
+                best = np.inf
                 for e in range(len(step)):
                     if allowed[k, t, e, cell]:
-                        total = price_of(row, prices, t, e, cell) + to_go[t + 1, cell + step[e], p]
+                        total = (
+                            penalty_of(clique, multipliers, t, e, cell)
+                            + cost_to_go[t + 1, cell + step[e], p]
+                        )
                         if e != 0:
                             total += PER_MOVE
-                        if total < least - 1e-12:
-                            least, d = total, e
-                way[i, t] = d
+                        if total < best - 1e-12:
+                            best, d = total, e
+                path[i, t] = d
                 value += 1.0
                 if d != 0:
                     value += PER_MOVE
             mass[k, t, d, cell] += weight
-            for m in range(row.shape[2]):
-                r = row[d, cell, m]
+            for m in range(clique.shape[2]):
+                r = clique[d, cell, m]
                 if r < 0:
                     break
                 use[t, r] += 1.0
             cell += step[d]
         all_arrived = all_arrived and cell == target
-    memory[WEIGHTS] += weight
-    memory[WEIGHT] = weight / _FADING
+    state[WEIGHTS] += weight
+    state[WEIGHT] = weight / _FADING
     return value, all_arrived
 
 
 @njit(cache=True)
-def _excess(prices, use, span):
-    """Turn uses of rows into a subgradient; return whether one is used twice, and its square."""
+def _excess(multipliers, use, span):
+    """Turn uses of cliques into a subgradient.
+
+    Returns whether a clique is used twice, and the square of the subgradient.
+    """
     clash, square = False, 0.0
     for t in range(span):
-        for row in range(use.shape[1]):
-            over = use[t, row] - 1.0
+        for clique in range(use.shape[1]):
+            over = use[t, clique] - 1.0
             if over > 0.0:
                 clash = True
-            elif prices[t, row] <= 0.0:
+            elif multipliers[t, clique] <= 0.0:
                 over = 0.0
-            use[t, row] = over
+            use[t, clique] = over
             square += over * over
     return clash, square
 
 
 @njit(cache=True, nogil=True)
-def forbid_dear(lattice, teams, allowed, first, prices, span, scratch, ceiling):
-    """Forbid what no solution below the ceiling contains.
+def fix_by_reduced_cost(arrays, teams, allowed, earliest, multipliers, span, scratch, upper_bound):
+    """Forbid moves and arrivals that no solution below the upper bound contains.
 
-    Returns the bound and how many of the listed moves are still allowed. `scratch.reach` tells then
-    how much more than the bound it costs at least to be in a cell before a step.
+    Returns the lower bound and how many of the listed moves are still allowed. Afterwards
+    `scratch.reach` holds the minimum reduced cost of being in a cell before a step.
     """
     groups, cells = len(allowed), allowed.shape[3]
-    bound = evaluate(lattice, teams, first, prices, span, scratch)
-    budget = ceiling - bound + _TOLERANCE
-    to_go, parked, least, reach = scratch.to_go, scratch.parked, scratch.least, scratch.reach
-    move, move_from, move_price = scratch.move, scratch.move_from, scratch.move_price
-    worth, pair_target = scratch.worth, teams.pair_target
+    bound = evaluate(arrays, teams, earliest, multipliers, span, scratch)
+    budget = upper_bound - bound + _TOLERANCE
+    cost_to_go, parked, min_cost, reach = (
+        scratch.cost_to_go,
+        scratch.parked,
+        scratch.min_cost,
+        scratch.reach,
+    )
+    move, move_from, move_cost = scratch.move, scratch.move_from, scratch.move_cost
+    dual, pair_target = scratch.dual, teams.pair_target
     for k in range(groups):
         begin, end = teams.pairs_from[k], teams.pairs_from[k + 1]
         for t in range(span + 1):
             for cell in range(cells):
                 value = UNREACHABLE
                 for p in range(begin, end):
-                    value = min(value, to_go[t, cell, p] - worth[pair_target[p]])
-                least[k, t, cell] = value
+                    value = min(value, cost_to_go[t, cell, p] - dual[pair_target[p]])
+                min_cost[k, t, cell] = value
     reach[:] = UNREACHABLE
     for i in range(len(teams.start)):
         reach[teams.team[i], 0, teams.start[i]] = 0.0
@@ -366,9 +388,9 @@ def forbid_dear(lattice, teams, allowed, first, prices, span, scratch, ceiling):
         for k in range(groups):
             for m in range(move_from[t, k], move_from[t, k + 1]):
                 d, cell, next_cell = move[m, 0], move[m, 1], move[m, 2]
-                extra = move_price[m] + least[k, t + 1, next_cell] - least[k, t, cell]
+                extra = move_cost[m] + min_cost[k, t + 1, next_cell] - min_cost[k, t, cell]
                 total = reach[k, t, cell] + max(extra, 0.0)
-                if total > budget or least[k, t + 1, next_cell] > _HALF:
+                if total > budget or min_cost[k, t + 1, next_cell] > _HALF:
                     allowed[k, t, d, cell] = False
                     continue
                 kept += 1
@@ -376,28 +398,28 @@ def forbid_dear(lattice, teams, allowed, first, prices, span, scratch, ceiling):
                     reach[k, t + 1, next_cell] = total
     for k in range(groups):
         for p in range(teams.pairs_from[k], teams.pairs_from[k + 1]):
-            cell, worth_of = teams.pair_cell[p], worth[pair_target[p]]
-            t = first[p]
+            cell, dual_of = teams.pair_cell[p], dual[pair_target[p]]
+            t = earliest[p]
             while t < span:
-                extra = parked[t, p] - worth_of - least[k, t, cell]
+                extra = parked[t, p] - dual_of - min_cost[k, t, cell]
                 if reach[k, t, cell] + max(extra, 0.0) <= budget:
                     break
                 t += 1
-            first[p] = t
+            earliest[p] = t
     return bound, kept
 
 
 @njit(cache=True, nogil=True)
-def may_be_late(teams, steps, scratch, budget):
-    """Tell whether some vehicle may be away from its targets after all steps, within a budget."""
+def may_need_more_steps(teams, steps, scratch, budget):
+    """Return whether a vehicle may be away from its targets after all steps, within a budget."""
     reach = scratch.reach
     for k in range(len(reach)):
         for cell in range(reach.shape[2]):
             if reach[k, steps, cell] > budget:
                 continue
-            at_home = False
+            at_target = False
             for p in range(teams.pairs_from[k], teams.pairs_from[k + 1]):
-                at_home = at_home or teams.pair_cell[p] == cell
-            if not at_home:
+                at_target = at_target or teams.pair_cell[p] == cell
+            if not at_target:
                 return True
     return False

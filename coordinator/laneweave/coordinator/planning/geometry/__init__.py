@@ -1,5 +1,5 @@
-"""Conflicts computed from the sizes and motions of vehicles.
+"""Conflicts computed from the sizes and motions of bodies.
 
-Entry point: `conflict_table`. `settings` has sizes, times and clearances, `bodies` where a moving
-body is. Imported by `planning.conflicts`.
+Entry points: `BodyGeometry` in `bodies` (sizes, times, clearances), `conflict_table` in the module
+of that name. Imported by `planning.request`. Imports `planning.conflicts` only, for the types.
 """

@@ -2,12 +2,12 @@
 
 A node N_i of the constraint tree T has the paper's four attributes: constraints, conflicts, path
 set M_i and cost L_i. With all improvements off the tree is the paper's: one child for each entry of
-a node's conflict list. Improvements (`improvements`) change which constraints the children of a
-node get (`splits`), and end the search early (`limit`).
+a node's conflict list. `Improvements` change which constraints the children of a node get, and end
+the search early (`limit`).
 
 Among the shortest paths of a vehicle, SPPA chooses one with the fewest conflicts with the paths of
-the other vehicles (`sppa`); about that the paper says nothing. In the root, paths are planned
-without regard to others.
+the other vehicles (`shortest_paths`); the paper leaves this choice open. In the root, paths are
+planned without regard to others.
 """
 
 from __future__ import annotations
@@ -20,20 +20,53 @@ import attrs
 
 from laneweave.coordinator.planning.budget import Budget
 from laneweave.coordinator.planning.paper.constraints import (
+    CARDINAL,
     Conflict,
     Constraint,
     bans_for,
     constraints_of,
+    disjoint_constraints,
     is_at_node,
+    rises,
 )
-from laneweave.coordinator.planning.paper.improvements import Improvements
-from laneweave.coordinator.planning.paper.path_diagram import Diagram, shortest_paths
-from laneweave.coordinator.planning.paper.splits import CARDINAL, disjoint_constraints, rises
-from laneweave.coordinator.planning.paper.sppa import Path, choose_path, conflicting_moves
-from laneweave.coordinator.planning.problem import Problem
+from laneweave.coordinator.planning.problem import Diagram, Path, Problem
+from laneweave.coordinator.planning.shortest_paths import (
+    choose_path,
+    conflicting_moves,
+    free_paths,
+    shortest_paths,
+)
 
 Limit = Callable[[], float]
-"""Returns the cost that a path set must be below to be of use; asked before each node."""
+"""Returns the cost that a path set must be below; called before each node."""
+
+
+@attrs.frozen
+class Improvements:
+    """Additions to Algorithms 1 and 2; without any of them the algorithms are the paper's.
+
+    Each addition leaves the result exact. `benchmarks/planner_switches.py` measures what each is
+    worth; docs/PLANNING.md has the figures.
+
+    cutoff: CBSA of an assignment ends as soon as it cannot find a path set that costs less than
+        C'* (`tappa`).
+    cardinal: a node gets children for one of its conflicts, the one that raises their costs most,
+        instead of for all of them (`constraints`).
+    bicliques: the constraints of its two children are sets of moves, and no path set satisfies
+        both (`constraints`). Has an effect with `cardinal` only.
+    joint: when a tree grows large, A* over the cells of all vehicles runs in parallel
+        (`joint_search`).
+    """
+
+    cutoff: bool = True
+    cardinal: bool = True
+    bicliques: bool = True
+    joint: bool = True
+
+    @classmethod
+    def none(cls) -> Improvements:
+        """Return the algorithms as the paper prints them."""
+        return cls(cutoff=False, cardinal=False, bicliques=False, joint=False)
 
 
 @attrs.define(eq=False)
@@ -46,7 +79,7 @@ class Node:
     diagrams: all shortest paths of each vehicle under the constraints; M_i is chosen from them.
     number: i; nodes count from 1 in the order in which they are made.
     parent: number of the parent; 0: none.
-    expanded: whether it has got its children.
+    expanded: whether its children have been made.
     """
 
     constraints: tuple[Constraint, ...]
@@ -100,14 +133,14 @@ class ConstraintTree:
 
     @property
     def lower_bound(self) -> float:
-        """Return the least L_i in T; infinite: T is empty."""
+        """Return the lowest L_i in T; infinite: T is empty."""
         return self._open[0][0] if self._open else math.inf
 
     def search(self, limit: Limit) -> Node | None:
         """Apply Algorithm 2; return the node with the optimal path set, or None.
 
-        None: there is no path set, or none that costs less than the limit. Nodes that cost as much
-        are not kept, so the limit must not grow.
+        None: there is no path set, or none that costs less than the limit. Nodes at or above the
+        limit are dropped, so the limit must not grow.
 
         Raises:
             BudgetSpentError: the deadline has passed or too many nodes were taken from T.
@@ -145,7 +178,7 @@ class ConstraintTree:
         diagrams = []
         for vehicle, target in enumerate(self.assignment):
             self._budget.check_time()
-            diagram = problem.free_paths(vehicle, target)
+            diagram = free_paths(problem, vehicle, target)
             if diagram is None:
                 return None
             diagrams.append(diagram)
@@ -177,12 +210,12 @@ class ConstraintTree:
     def _most_expensive(self, node: Node) -> Conflict:
         """Return the conflict that raises the cost of most children; of equal ones the first."""
         table = self._problem.table
-        best, most = node.conflicts[0], -1
+        best, most_rising = node.conflicts[0], -1
         for conflict in node.conflicts:
             rising = rises(table, conflict, node.moves(conflict), node.diagrams)
-            if rising > most:
-                best, most = conflict, rising
-            if most == CARDINAL:
+            if rising > most_rising:
+                best, most_rising = conflict, rising
+            if most_rising == CARDINAL:
                 break
         return best
 
@@ -242,7 +275,7 @@ class ConstraintTree:
 
 
 def _is_among(path: Path, diagram: Diagram) -> bool:
-    """Tell whether a path is one of the diagram's."""
+    """Return whether a path is one of the diagram's."""
     return len(path) == diagram.cost and all(
         layer >> move & 1 for layer, move in zip(diagram.layers, path, strict=True)
     )

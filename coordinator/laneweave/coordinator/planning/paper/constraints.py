@@ -3,22 +3,38 @@
 A conflict C^f of two vehicles has an entry for each of them, written {N | (x, y), step, id} or
 {E | (x1, y1), (x2, y2), step, id}; the constraint C^t made of it is written in the same way and
 forbids that vehicle to arrive at the node, or to travel along the edge, in that step.
+
+The paper's children for all conflicts of a node overlap: a solution may be found below several of
+them. One conflict is enough, since a solution contains at most one of its two moves. Improvements
+of the paper's tree (`cbs.Improvements`) use this:
+
+- Cardinal conflicts first (Boyarski et al., IJCAI 2015): where all shortest paths of both vehicles
+  conflict, both children cost more than their parent (`rises`).
+- Bicliques (Li et al., ICAPS 2019, call them mutex propagation and positive constraints): S_A and
+  S_B may be any sets of moves in the same step such that every move of S_A conflicts with every
+  move of S_B. Either A makes no move of S_A, or it makes one; then no other vehicle makes a move
+  that conflicts with all of S_A, which includes S_B. No solution satisfies both
+  (`disjoint_constraints`).
+- Likewise, either a vehicle has finally arrived before a step, and from then on no vehicle crosses
+  its target, or it has not.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from laneweave.coordinator.planning.grid import Cell
-from laneweave.coordinator.planning.moves import MoveTable, bits
-from laneweave.coordinator.planning.paper.path_diagram import Bans, Diagram
+from laneweave.coordinator.planning.problem import Bans, Diagram, MoveTable, bits
+from laneweave.protocol.lattice import Cell
+
+CARDINAL = 2
+"""Both children cost more than their parent."""
 
 
 class Conflict(NamedTuple):
     """Two vehicles whose moves in a step conflict; `first` < `second`, steps count from 0.
 
-    on_edge: it is no node conflict. In a list, node conflicts come first in each step.
+    on_edge: not a node conflict. In a list, node conflicts come first in each step.
     """
 
     step: int
@@ -28,17 +44,17 @@ class Conflict(NamedTuple):
 
 
 class Constraint(NamedTuple):
-    """What a child adds to the constraints of its parent; steps count from 0.
+    """The constraint that a child adds to those of its parent; steps count from 0.
 
-    The paper's constraints forbid a set of moves to one vehicle: `own`. The others belong to the
-    improvement `splits`.
+    The paper's constraints forbid a set of moves to one vehicle: `own`. `others` and `arrived`
+    belong to the improvement `bicliques`.
 
     arrived is None: in this step `vehicle` must not make a move of `own`, and no other vehicle one
         of `others`.
-    arrived is True: before this step, `vehicle` has reached its target for good, and from this
+    arrived is True: `vehicle` has finally arrived at its target before this step, and from this
         step on, no other vehicle makes a move of `others`.
-    arrived is False: before this step, `vehicle` has not reached its target for good. It may wait
-        there in this step and leave it later.
+    arrived is False: `vehicle` has not finally arrived before this step. It may wait at its target
+        in this step and leave it later.
     """
 
     vehicle: int
@@ -48,7 +64,7 @@ class Constraint(NamedTuple):
     arrived: bool | None = None
 
     def spares(self, vehicle: int, diagram: Diagram) -> bool:
-        """Tell whether all paths of a vehicle's diagram satisfy this constraint."""
+        """Return whether all paths of a vehicle's diagram satisfy this constraint."""
         if vehicle == self.vehicle:
             if self.arrived is not None:
                 return (diagram.cost <= self.step) == self.arrived
@@ -61,11 +77,11 @@ class Constraint(NamedTuple):
         return not any(diagram.layer(step) & self.others for step in later)
 
     def notation(self, table: MoveTable, name: str) -> str:
-        """Return the paper's notation, extended for the constraints of `splits`.
+        """Return the paper's notation, extended for the constraints of the improvements.
 
         Steps count from 1, cells as in requests from 0. {S | edges, step, id}: none of these
-        edges; {U | edges, step, id}: one of these; {A | step, id}: at the target for good before
-        this step; {B | step, id}: not so.
+        edges; {U | edges, step, id}: one of these; {A | step, id}: finally arrived before this
+        step; {B | step, id}: not finally arrived before it.
         """
         end = f"{self.step + 1}, {name}}}"
         if self.arrived is not None:
@@ -136,3 +152,95 @@ def bans_for(vehicle: int, constraints: Iterable[Constraint]) -> Bans:
         else:
             at[step] = at.get(step, 0) | constraint.own
     return Bans(at, since, earliest, latest)
+
+
+def rises(
+    table: MoveTable, conflict: Conflict, moves: tuple[int, int], diagrams: Sequence[Diagram]
+) -> int:
+    """Return how many of the children of a conflict must cost more than their parent.
+
+    2: cardinal, all shortest paths of both conflict in this step. 1: semi-cardinal, all shortest
+    paths of one conflict with the move of the other.
+    """
+    first = diagrams[conflict.first].layer(conflict.step)
+    second = diagrams[conflict.second].layer(conflict.step)
+    against_first = table.common_conflicts(first)
+    if against_first >> moves[1] & 1:
+        return 1 if second & ~against_first else CARDINAL
+    return table.common_conflicts(second) >> moves[0] & 1
+
+
+def disjoint_constraints(
+    table: MoveTable, conflict: Conflict, moves: tuple[int, int], diagrams: Sequence[Diagram]
+) -> tuple[Constraint, Constraint]:
+    """Return two constraints of which every solution satisfies exactly one."""
+    step = conflict.step
+    pair = conflict.first, conflict.second
+    for vehicle in pair:
+        if step >= diagrams[vehicle].cost:
+            crossing = table.conflicts[diagrams[vehicle].target]
+            return (
+                Constraint(vehicle, step, arrived=False),
+                Constraint(vehicle, step, others=crossing, arrived=True),
+            )
+    layers = diagrams[pair[0]].layer(step), diagrams[pair[1]].layer(step)
+    sets = _exclusive_sets(table, moves, layers)
+    side = _side_to_decide(sets, layers)
+    vehicle, chosen = pair[side], sets[side]
+    others = table.common_conflicts(chosen)
+    return (
+        Constraint(vehicle, step, chosen),
+        Constraint(vehicle, step, table.valid & ~chosen, others),
+    )
+
+
+def _side_to_decide(sets: tuple[int, int], layers: tuple[int, int]) -> int:
+    """Return the vehicle (0 or 1) whose set covers the larger share of its shortest paths.
+
+    A share of 1 means that its cost rises.
+    """
+    first, second = (
+        (chosen & layer).bit_count() / layer.bit_count()
+        for chosen, layer in zip(sets, layers, strict=True)
+    )
+    return 0 if first >= second else 1
+
+
+def _exclusive_sets(
+    table: MoveTable, moves: tuple[int, int], layers: tuple[int, int]
+) -> tuple[int, int]:
+    """Return large sets S_A and S_B around two conflicting moves."""
+    a, b = 1 << moves[0], 1 << moves[1]
+    against_first = table.common_conflicts(layers[0])
+    if against_first & b:
+        return table.common_conflicts(against_first), against_first
+    against_second = table.common_conflicts(layers[1])
+    if against_second & a:
+        return against_second, table.common_conflicts(against_second)
+    return _grown(table, moves, layers)
+
+
+def _grown(table: MoveTable, moves: tuple[int, int], layers: tuple[int, int]) -> tuple[int, int]:
+    """Grow both sets greedily among moves on shortest paths, then among all moves."""
+    conflicts = table.conflicts
+    a, b = moves
+    first, second = 1 << a, 1 << b
+    for_first, for_second = conflicts[b], conflicts[a]
+    while True:
+        best = (0, 0, 0)
+        for bit in bits(for_first & layers[0] & ~first):
+            kept = (for_second & conflicts[bit] & layers[1]).bit_count()
+            best = max(best, (kept, 0, -bit))
+        for bit in bits(for_second & layers[1] & ~second):
+            kept = (for_first & conflicts[bit] & layers[0]).bit_count()
+            best = max(best, (kept, 1, -bit))
+        kept, side, bit = best
+        if not kept:
+            break
+        if side == 0:
+            first |= 1 << -bit
+            for_second &= conflicts[-bit]
+        else:
+            second |= 1 << -bit
+            for_first &= conflicts[-bit]
+    return for_first, table.common_conflicts(for_first)

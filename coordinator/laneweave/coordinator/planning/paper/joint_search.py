@@ -1,9 +1,9 @@
 """Improvement of TAPPA: A* over the cells of all vehicles together.
 
-Where vehicles have little room, most path sets of least cost for single vehicles conflict, and
-constraint trees grow beyond all bounds; an unsolvable tree never ends. All vehicles planned
-together (one meta-agent of all, in the terms of Sharon et al., AIJ 219, 2015, section 7) make a
-finite state space, small in just these cases. Vehicles with the same eligible targets are a team
+Where there are few empty cells, most combinations of cheapest paths conflict, and constraint trees
+grow without bound; an unsolvable tree never ends. All vehicles planned together (one meta-agent, in
+the terms of Sharon et al., AIJ 219, 2015, section 7) make a finite state space, which is small in
+these cases. Vehicles with the same eligible targets are a team
 and interchangeable, so one search stands for all assignments: its lower bound holds for every
 C'_k, and its path set is optimal.
 
@@ -25,32 +25,29 @@ from itertools import combinations
 from operator import itemgetter
 
 from laneweave.coordinator.planning.budget import Budget
-from laneweave.coordinator.planning.conflict_cliques import vehicles_share_cells
-from laneweave.coordinator.planning.moves import bits
-from laneweave.coordinator.planning.problem import Problem
-from laneweave.coordinator.planning.solution import Solution
+from laneweave.coordinator.planning.problem import Problem, Solution, bits
 
 Cells = tuple[int, ...]
 Labels = tuple[int, ...]
 """2 * team + (1 if active), for each cell that is occupied."""
 State = tuple[Cells, Labels]
 
-_MOST_GOALS = 2_000
-_MOST_MOVES = 2_000_000
-"""Bounds of the memory, about 1 GB."""
+_MAX_GOALS = 2_000
+_MAX_MOVES = 2_000_000
+"""Limits on memory, about 1 GB."""
 
 
 JointMove = tuple[Cells, Callable[[Labels], Labels]]
-"""The cells before it, sorted, and what picks their labels from those after it: first as they are
-after it, then once more as if all were active; who moves is active before."""
+"""The cells before it, sorted, and a function that picks their labels from those after it, which
+are given twice: as they are, and with all vehicles active. Moving vehicles are active before."""
 
 
 class JointSearch:
-    """The search; it goes on as far as it is asked to.
+    """The search, which continues in portions of work.
 
     lower_bound: no path set of any assignment costs less; infinite: there is none.
     solution: the optimal path set, when it is found.
-    ended: there is nothing more to search, or the search has become too large.
+    ended: the search is complete, or reached its limits.
     """
 
     def __init__(self, problem: Problem, choices: Sequence[frozenset[int]], budget: Budget) -> None:
@@ -60,7 +57,7 @@ class JointSearch:
         self.ended = False
         self._problem = problem
         self._budget = budget
-        self._may_share = vehicles_share_cells(problem.table.model)
+        self._may_share = problem.table.model.vehicles_share_cells
         self._credit = 0
         self._made = 0
         teams = sorted(set(choices), key=sorted)
@@ -85,7 +82,7 @@ class JointSearch:
         self._add_goals(teams, sizes)
 
     def work(self, moves: int) -> None:
-        """Go on until about so many more joint moves are made; what is too much is owed."""
+        """Make about so many more joint moves; the next call makes up for an excess."""
         self._credit += moves
         while self._credit > 0 and not self.ended:
             before = self._made
@@ -93,7 +90,7 @@ class JointSearch:
             self._credit -= 1 + self._made - before
 
     def _add_goals(self, teams: Sequence[frozenset[int]], sizes: Sequence[int]) -> None:
-        """Begin with every choice of targets for the teams."""
+        """Add a goal state for every choice of targets for the teams."""
         targets = self._problem.targets
         goals: list[dict[int, int]] = [{}]
         for k, (team, size) in enumerate(zip(teams, sizes, strict=True)):
@@ -102,7 +99,7 @@ class JointSearch:
                 for goal in goals
                 for chosen in combinations(sorted(team - goal.keys()), size)
             ]
-            if len(goals) > _MOST_GOALS:
+            if len(goals) > _MAX_GOALS:
                 self.ended = True
                 return
         for goal in goals:
@@ -152,7 +149,7 @@ class JointSearch:
             reached = cells_before, before
             if known.get(reached, math.inf) > cost and self._reach(reached, cost):
                 self._next[reached] = state, labels_before
-        if self._made > _MOST_MOVES:
+        if self._made > _MAX_MOVES:
             self.ended = True
 
     def _joint_moves_into(self, cells: Cells) -> list[JointMove]:
@@ -182,7 +179,7 @@ class JointSearch:
         return found
 
     def _moves_to(self, cell: int) -> list[tuple[int, int, int]]:
-        """Return the moves that end in a cell: as a set, its start, and what it excludes."""
+        """Return the moves that end in a cell: as a set, with its start and the excluded moves."""
         found = self._to.get(cell)
         if found is None:
             table = self._problem.table
@@ -194,7 +191,7 @@ class JointSearch:
         return found
 
     def _followed(self, state: State) -> Solution:
-        """Follow the vehicles from the start to their targets."""
+        """Return the paths of the vehicles from the start to their targets."""
         problem, table = self._problem, self._problem.table
         count = len(self._vehicles)
         places = list(range(count))
@@ -228,7 +225,7 @@ def _picker(places: tuple[int, ...]) -> Callable[[Labels], Labels]:
 
 
 def _distances(problem: Problem, starts: Sequence[int]) -> dict[int, int]:
-    """Return the least number of steps to each cell from the nearest of some others."""
+    """Return the minimum number of steps to each cell from the nearest start."""
     table = problem.table
     found: dict[int, int] = {}
     reached = cells = sum({1 << start for start in starts})

@@ -4,9 +4,9 @@ Assignments A_1, A_2, ... are taken in order of their cost C_k. CBSA finds the b
 each, with cost C'_k (`cbs`). As soon as the next assignment costs no less than C'*, the cost of the
 best path set so far, that path set P* is optimal.
 
-Two improvements (`improvements`) end CBSA and the sequence of assignments earlier: CBSA looks only
-for path sets that cost less than C'*; and a search over the cells of all vehicles together
-(`joint`), which goes on beside large constraint trees, has a lower bound for every C'_k.
+Two improvements (`cbs.Improvements`) end CBSA and the sequence of assignments earlier: CBSA looks
+only for path sets that cost less than C'*; and a search over the cells of all vehicles together
+(`joint_search`), which runs beside large constraint trees, has a lower bound for every C'_k.
 """
 
 from __future__ import annotations
@@ -16,25 +16,29 @@ from collections.abc import Iterator, Sequence
 
 import attrs
 
-from laneweave.coordinator.planning.assignments import Assignment
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
-from laneweave.coordinator.planning.paper.cbs import ConstraintTree
-from laneweave.coordinator.planning.paper.improvements import Improvements
+from laneweave.coordinator.planning.paper.assignments import (
+    Assignment,
+    Weights,
+    assignments,
+    matrices,
+)
+from laneweave.coordinator.planning.paper.cbs import ConstraintTree, Improvements
 from laneweave.coordinator.planning.paper.joint_search import JointSearch
-from laneweave.coordinator.planning.problem import Problem
-from laneweave.coordinator.planning.solution import Solution
+from laneweave.coordinator.planning.problem import Problem, Solution
+from laneweave.coordinator.planning.request import PlanRequest
 
 _JOINT_AFTER = 32
-"""So many nodes come before the joint search begins."""
-_MOST_JOINT_MOVES_PER_NODE = 150
-"""Upper bound on the joint moves made at a node; node n makes n of them below it. The joint search
-then takes up to about two thirds of the time. It ends first in crowded blocks, the trees end first
-in others."""
+"""Number of nodes before the joint search begins."""
+_MAX_JOINT_MOVES_PER_NODE = 150
+"""Upper bound on the joint moves made at a node; node n makes min(n, bound) of them. The joint
+search then takes up to about two thirds of the time. It ends first in crowded blocks, the trees
+end first in others."""
 
 
 @attrs.frozen
 class Attempt:
-    """What was recorded of one assignment.
+    """The record of one assignment.
 
     assignment: A_k with its cost C_k.
     tree: the constraint tree of CBSA.
@@ -52,16 +56,16 @@ class Tappa:
     best: the best path set P* so far; its cost is C'*.
     lower_bound: no path set costs less.
     finished: the search is complete; `best` is optimal, or nothing exists.
-    gave_up, has_fewest_moves: never.
+    gave_up, has_fewest_moves: always false.
     tried: k, the number of assignments to which CBSA was applied.
     attempts: what CBSA did for each of them, if that is recorded.
-    next_cost: C_{k+1}, if it was looked at last.
+    next_cost: C_{k+1}, if it was the last cost examined.
     """
 
     def __init__(
         self,
         problem: Problem,
-        candidates: Iterator[Assignment],
+        assignments_: Iterator[Assignment],
         choices: Sequence[frozenset[int]],
         budget: Budget,
         improvements: Improvements | None = None,
@@ -72,7 +76,7 @@ class Tappa:
 
         Args:
             problem: vehicles and targets.
-            candidates: the assignments in order of cost.
+            assignments_: the assignments in order of cost.
             choices: eligible targets of each vehicle.
             budget: deadline and limit on nodes.
             improvements: what is added to the paper's algorithms; None: everything.
@@ -86,7 +90,7 @@ class Tappa:
         self.attempts: list[Attempt] | None = [] if record else None
         self.next_cost: float | None = None
         self._problem = problem
-        self._candidates = candidates
+        self._assignments = assignments_
         self._budget = budget
         self._improvements = improvements or Improvements()
         self._joint = JointSearch(problem, choices, budget) if self._improvements.joint else None
@@ -98,7 +102,7 @@ class Tappa:
 
     @property
     def joint_bound(self) -> float:
-        """Return what the joint search has found to be a lower bound of every C'_k."""
+        """Return the lower bound of every C'_k that the joint search has found."""
         return 0 if self._joint is None else self._joint.lower_bound
 
     def run(self) -> None:
@@ -113,12 +117,12 @@ class Tappa:
 
     def _search(self) -> None:
         """Apply Algorithm 1; k is `tried`."""
-        assignment = next(self._candidates, None)  # lines 2 and 3
+        assignment = next(self._assignments, None)  # lines 2 and 3
         while assignment is not None:  # line 4
             self.tried += 1  # line 14
             self.lower_bound = min(assignment.cost, self.best_cost)
             self._offer(self._cbsa(assignment))  # lines 5 to 8, and 16 to 19 for the last one
-            assignment = next(self._candidates, None)  # line 9
+            assignment = next(self._assignments, None)  # line 9
             self.next_cost = None if assignment is None else assignment.cost
             if self.next_cost is not None and self.best_cost <= self._bound(self.next_cost):
                 return  # lines 10 to 13
@@ -144,11 +148,27 @@ class Tappa:
         return None if node is None else Solution(assignment.targets, node.paths)
 
     def _limit(self) -> float:
-        """Return the cost below which a path set is of use, after some work for it."""
+        """Continue the joint search, then return the cost that a path set must be below."""
         joint = self._joint
         if joint is not None and not joint.ended and self._budget.nodes >= _JOINT_AFTER:
-            joint.work(min(self._budget.nodes, _MOST_JOINT_MOVES_PER_NODE))
+            joint.work(min(self._budget.nodes, _MAX_JOINT_MOVES_PER_NODE))
             self._offer(joint.solution)
         if self.best_cost <= self.joint_bound:
             return -math.inf
         return self.best_cost if self._improvements.cutoff else math.inf
+
+
+def new_tappa(
+    problem: Problem,
+    request: PlanRequest,
+    weights: Weights,
+    budget: Budget,
+    improvements: Improvements | None = None,
+    *,
+    record: bool = False,
+) -> Tappa:
+    """Return Algorithm 1 for a request, ready to run; see `Tappa`."""
+    choices = request.choices()
+    costs, allowed = matrices(request, weights, choices, budget)
+    in_order = assignments(costs, allowed, budget)
+    return Tappa(problem, in_order, choices, budget, improvements, record=record)

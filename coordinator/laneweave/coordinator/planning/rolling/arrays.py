@@ -1,4 +1,4 @@
-"""What the compiled code of `stream` works on: one window of the lattice, as arrays.
+"""One window of the lattice as arrays, for the compiled code of the rolling planner.
 
 A window holds the columns that the vehicles on the road can reach, and the slots until the last of
 them has left the road. Indices: slot s from the current one, column c from the window's lowest,
@@ -14,22 +14,18 @@ from typing import NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from laneweave.coordinator.planning.conflicts import ConflictModel
-from laneweave.coordinator.planning.grid import Cell, Mode, displacements
-from laneweave.coordinator.planning.moves import conflict_offsets
+from laneweave.coordinator.planning.conflicts import ConflictModel, conflict_offsets
+from laneweave.coordinator.planning.rolling.paths_kernel import (
+    ENTERING,
+    FIXED,
+    MAX_EJECTED,
+    PENALTY,
+)
 from laneweave.coordinator.planning.rolling.problem import StreamCosts, StreamRoad, StreamVehicle
+from laneweave.protocol.lattice import Cell, Mode, displacements
 
-FIXED = 100_000
-"""Price of a vehicle that cannot be moved out of the way."""
-PRICE = 8
-"""Least price of a vehicle; prices grow by parts of it."""
-ENTERING = 8
-"""How often the price is paid by moves that conflict with a vehicle; by staying in its cell as
-long as it does: once. So who takes its place does not pay anew with each slot."""
-MOST_EJECTED = 100
-"""Vehicles hit by one chain of ejections."""
-_SAVED = MOST_EJECTED + 32
-"""Ways that are kept while a chain or a new order is tried."""
+_SAVED = MAX_EJECTED + 32
+"""Paths that are saved during a chain or a reordering."""
 ROUNDING_M = 1e-6
 
 Ints = NDArray[np.int64]
@@ -39,30 +35,30 @@ Bools = NDArray[np.bool_]
 
 
 class Table(NamedTuple):
-    """Who makes which moves, and with which moves that conflicts."""
+    """The moves of all vehicles, and the penalties of conflicting moves."""
 
     load: Singles
-    """Sum of the prices of all whose moves conflict with this one, and `FIXED` for moves that
-    nobody may make; (slots, displacements, lanes, columns)."""
-    who: NDArray[np.int32]
-    """Who is in a cell at the beginning of a slot, -1: nobody; (slots, lanes, columns)."""
+    """Sum of the penalties of all vehicles whose moves conflict with this one, and `FIXED` for
+    forbidden moves; (slots, displacements, lanes, columns)."""
+    vehicle: NDArray[np.int32]
+    """The vehicle in a cell at the beginning of a slot, -1: none; (slots, lanes, columns)."""
     made: NDArray[np.int8]
-    """Displacement that it makes in the slot; same shape."""
+    """Its displacement in the slot; same shape."""
     offsets: Ints
-    """Column, lane and displacement of what conflicts with a move, and how often it pays the
-    price; (conflicts, 4)."""
+    """Column, lane and displacement of a conflicting move, and the factor of its penalty;
+    (conflicts, 4)."""
     first: Ints
     """Where in `offsets` the conflicts of each displacement begin; (displacements + 1)."""
     steps: Ints
     """Column and lane of each displacement; (displacements, 2)."""
     opened: Ints
-    """First and last column from which there are moves in a slot; (slots, 2)."""
+    """First and last column with moves in a slot; (slots, 2)."""
     ended: Ints
-    """Column from which on all are beyond the end of the road; (slots + 1)."""
+    """First column beyond the end of the road; (slots + 1)."""
 
 
-class Ways(NamedTuple):
-    """The vehicles, by column, and the way of each; first index: vehicle."""
+class Paths(NamedTuple):
+    """The vehicles, by column, and their paths; first index: vehicle."""
 
     column: Ints
     """At the beginning of each slot; (vehicles, slots + 1)."""
@@ -70,21 +66,20 @@ class Ways(NamedTuple):
     made: NDArray[np.int8]
     """Displacements; (vehicles, slots)."""
     slots: Ints
-    """How many slots the way has until the road ends."""
-    wanted: Ints
-    """Lane that is needed."""
+    """Number of slots of the path up to the end of the road."""
+    target_lane: Ints
     held: Bools
-    missing: Floats
-    """Cost of ending off the lane."""
-    least: Floats
-    """No way that ends on the lane costs less."""
-    able: Bools
-    """Whether there are slots enough to reach the lane, if nobody were in the way."""
-    price: Ints
-    """What it costs another one to be in its way."""
+    missing_cost: Floats
+    """Cost of ending off the target lane."""
+    min_cost: Floats
+    """Lower bound on the cost of paths that end on the target lane."""
+    can_arrive: Bools
+    """Whether there are enough slots to reach the target lane without other vehicles."""
+    penalty: Ints
+    """Cost of a conflict with this vehicle, for others."""
     cost: Floats
     placed: Bools
-    """Whether the way is in the table."""
+    """Whether the path is in the table."""
 
 
 class Costs(NamedTuple):
@@ -96,9 +91,9 @@ class Costs(NamedTuple):
 
 
 class Saved(NamedTuple):
-    """Ways as they were before a change that may be undone."""
+    """Paths as they were before a change that may be undone."""
 
-    who: Ints
+    vehicle: Ints
     slots: Ints
     cost: Floats
     column: Ints
@@ -111,20 +106,20 @@ class Scratch(NamedTuple):
 
     saved: Saved
     queue: Ints
-    victims: Ints
+    hit: Ints
     chosen: Ints
-    failing: Ints
-    dear: Ints
-    """Up to all vehicles, each."""
+    off_lane: Ints
+    costly: Ints
+    """The work lists each hold up to all vehicles."""
     marked: Bools
-    """Vehicles whose ways are saved."""
+    """Vehicles whose paths are saved."""
     value: Singles
-    """Least cost of being somewhere; (slots + 1, lanes, columns about the own one, and one more on
-    either side that nobody leaves)."""
+    """Minimum cost of reaching a cell; (slots + 1, lanes, columns around the start, and one unused
+    column on either side)."""
     delay: Singles
-    """What a move costs more in each slot."""
-    laid: Ints
-    """How many ways were looked for; (1)."""
+    """Extra cost of a move in each slot."""
+    searches: Ints
+    """Number of path searches; (1)."""
 
 
 class Window(NamedTuple):
@@ -133,7 +128,7 @@ class Window(NamedTuple):
     low: int
     """Column of the lattice that is the window's lowest."""
     table: Table
-    ways: Ways
+    paths: Paths
     costs: Costs
     scratch: Scratch
 
@@ -145,30 +140,30 @@ def window(
     vehicles: Sequence[StreamVehicle],
     blocked: Collection[Cell],
 ) -> Window:
-    """Return the arrays for vehicles that are sorted by column and on the road; no way is laid."""
+    """Return the arrays for vehicles that are on the road, sorted by column; no path is set."""
     start_m, end_m = road.sorting_m
-    # Nobody moves in more slots than it takes to pass S3.
+    # A vehicle moves in at most as many slots as it takes to pass S3.
     reach = max(0, int((end_m - start_m) / road.advance_m) + 1)
     low = vehicles[0].cell[0] - reach
     columns = vehicles[-1].cell[0] + reach - low + 1
     now_m = (np.arange(columns) + low) * road.pitch_m + slot * road.advance_m
     rearmost_m = now_m[reach]
     slots = max(1, int(np.ceil((road.length_m - rearmost_m) / road.advance_m)) + 1)
-    # Whoever falls behind has further to go.
+    # A vehicle that falls back needs longer.
     slots += int(np.ceil(reach * road.pitch_m / road.advance_m))
     at_m = now_m + np.arange(slots + 1)[:, None] * road.advance_m
     table = _table(road, at_m, low, blocked)
     return Window(
         low,
         table,
-        _ways(costs, table, low, vehicles),
+        _paths(costs, table, low, vehicles),
         _costs(costs, table.steps),
         _scratch(len(vehicles), slots, reach, road.lanes),
     )
 
 
 def _table(road: StreamRoad, at_m: Floats, low: int, blocked: Collection[Cell]) -> Table:
-    """Return an empty table; `at_m`: where columns are at the beginning of slots."""
+    """Return an empty table; `at_m`: positions of columns at the beginning of slots."""
     slots, columns = at_m.shape[0] - 1, at_m.shape[1]
     offsets, first = _offsets(road.mode, road.model)
     barred = np.zeros((road.lanes, columns), dtype=np.bool_)
@@ -195,9 +190,9 @@ def _table(road: StreamRoad, at_m: Floats, low: int, blocked: Collection[Cell]) 
 
 
 def _may_move(road: StreamRoad, at_m: Floats, barred: Bools) -> Bools:
-    """Tell which moves stay on the road and in S3, and enter nothing that is blocked.
+    """Return which moves stay on the road and in S3, and enter no blocked cell.
 
-    The corners of an oblique move count as entered, except where the vehicle is anyway. Shape:
+    The corners of an oblique move count as entered, except the vehicle's own cell. Shape:
     (slots, displacements without the first, lanes, columns).
     """
     start_m, end_m = road.sorting_m
@@ -219,34 +214,34 @@ def _may_move(road: StreamRoad, at_m: Floats, barred: Bools) -> Bools:
     return allowed
 
 
-def _ways(costs: StreamCosts, table: Table, low: int, vehicles: Sequence[StreamVehicle]) -> Ways:
+def _paths(costs: StreamCosts, table: Table, low: int, vehicles: Sequence[StreamVehicle]) -> Paths:
     slots, count = len(table.load), len(vehicles)
     column = np.zeros((count, slots + 1), dtype=np.int64)
     lane = np.zeros((count, slots + 1), dtype=np.int64)
     column[:, 0] = [vehicle.cell[0] - low for vehicle in vehicles]
     lane[:, 0] = [vehicle.cell[1] for vehicle in vehicles]
-    wanted = np.array([vehicle.lane for vehicle in vehicles], dtype=np.int64)
+    target_lane = np.array([vehicle.lane for vehicle in vehicles], dtype=np.int64)
     held = np.array([vehicle.held for vehicle in vehicles], dtype=np.bool_)
-    # It may move sidewards in these slots, if nothing is in the way.
+    # Slots in which it may change lanes, without other vehicles.
     begin, end = table.opened.T[:, :, None]
     may_move = (begin <= column[:, 0]) & (column[:, 0] <= end)
     chances = may_move.sum(axis=0)
-    # So many slots begin off the lane in any case, and so many moves are made.
-    away = np.abs(lane[:, 0] - wanted)
+    # Lower bounds on the slots off the lane and on the moves.
+    away = np.abs(lane[:, 0] - target_lane)
     waits = np.where(away > 0, may_move.argmax(axis=0), 0)
-    least = away * (costs.move + costs.off_lane) + waits * costs.off_lane
-    least += chances * min(0.0, costs.forward)
-    return Ways(
+    min_cost = away * (costs.move + costs.off_lane) + waits * costs.off_lane
+    min_cost += chances * min(0.0, costs.forward)
+    return Paths(
         column,
         lane,
         np.zeros((count, slots), dtype=np.int8),
         np.zeros(count, dtype=np.int64),
-        wanted,
+        target_lane,
         held,
         costs.missing * (1.0 + 1.0 / (1.0 + chances)),
-        least,
+        min_cost,
         ~held & (chances >= away),
-        np.where(held, FIXED, PRICE),
+        np.where(held, FIXED, PENALTY),
         np.zeros(count),
         np.zeros(count, dtype=np.bool_),
     )
@@ -283,7 +278,7 @@ def _scratch(count: int, slots: int, reach: int, lanes: int) -> Scratch:
 
 @lru_cache(maxsize=16)
 def _offsets(mode: Mode, model: ConflictModel) -> tuple[Ints, Ints]:
-    """Return the conflicts of all displacements in a row, and where those of each begin."""
+    """Return the conflicts of all displacements in one array, and where those of each begin."""
     table = conflict_offsets(mode, model)
     flat = [
         (*entry, 1 if (d, *entry) == (0, 0, 0, 0) else ENTERING)

@@ -1,9 +1,8 @@
-"""Compiled code of `stream`: ways of single vehicles; see `relaxation_kernel` for its style.
+"""Compiled code of the rolling planner: paths of single vehicles.
 
-The table of a window says, for each slot, cell and displacement, what it costs that somebody is in
-the way: the sum of the prices of all vehicles whose own moves conflict (`load`). Putting a vehicle
-into the table and taking it out again changes a few entries; looking one up is all that the search
-for a way needs.
+The style is that of `exact.relaxation_kernel`. The table of a window holds, for each slot, cell and
+displacement, the sum of the penalties of all vehicles whose own moves conflict (`load`). Adding a
+vehicle to the table or removing it changes a few entries; the search for a path only reads them.
 """
 
 from __future__ import annotations
@@ -11,67 +10,82 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from laneweave.coordinator.planning.rolling.arrays import ENTERING, PRICE
-
+FIXED = 100_000
+"""Penalty of a vehicle that cannot be moved."""
+PENALTY = 8
+"""Initial penalty of a vehicle; penalties grow by parts of it."""
+ENTERING = 8
+"""Factor of the penalty for moves that conflict with a vehicle; the factor is 1 for staying in its
+cell as long as it does, so a vehicle that takes its place does not pay again in each slot."""
+MAX_EJECTED = 100
+"""Vehicles hit by one ejection chain."""
 _IMPASSABLE = 5e3
-"""More than all that a way may cost; less than being in the way of what is `FIXED`, in chains for
-somebody who misses its lane. Others have a way at a hundredth of that."""
+"""Higher than the cost of any path; lower than a conflict with a `FIXED` vehicle in the chain of a
+vehicle that misses its lane. The paths of other vehicles cost at most a hundredth of it."""
 _UNREACHED = 1e9
-NO_WAY = 1e9
-"""Cost of a vehicle that has no way."""
+NO_PATH = 1e9
+"""Cost of a vehicle without a path."""
 
 
 @njit(cache=True, nogil=True)
-def put(table, ways, v, sign):
-    """Put a vehicle's way into the table (sign 1), or take it out (sign -1)."""
-    load, who, made, offsets, first = table.load, table.who, table.made, table.offsets, table.first
+def put(table, paths, v, sign):
+    """Add a vehicle's path to the table (sign 1), or remove it (sign -1)."""
+    load, vehicle, made, offsets, first = (
+        table.load,
+        table.vehicle,
+        table.made,
+        table.offsets,
+        table.first,
+    )
     _, _, lanes, columns = load.shape
-    amount = sign * ways.price[v]
-    for s in range(ways.slots[v]):
-        column, lane, d = ways.column[v, s], ways.lane[v, s], ways.made[v, s]
+    amount = sign * paths.penalty[v]
+    for s in range(paths.slots[v]):
+        column, lane, d = paths.column[v, s], paths.lane[v, s], paths.made[v, s]
         if sign > 0:
-            who[s, lane, column] = v
+            vehicle[s, lane, column] = v
             made[s, lane, column] = d
         else:
-            who[s, lane, column] = -1
+            vehicle[s, lane, column] = -1
         for k in range(first[d], first[d + 1]):
             c, n = column + offsets[k, 0], lane + offsets[k, 1]
             if 0 <= c < columns and 0 <= n < lanes:
                 load[s, offsets[k, 2], n, c] += amount * offsets[k, 3]
-    ways.placed[v] = sign > 0
+    paths.placed[v] = sign > 0
 
 
 @njit(cache=True, nogil=True)
 def _relax(here, there, load, base, scale):
-    """Offer what a displacement of neighbouring columns costs; compiled to vector instructions."""
+    """Relax one displacement for neighbouring columns; compiled to vector instructions."""
     for i in range(len(here)):
         there[i] = min(there[i], here[i] + base + scale * load[i])
 
 
 @njit(cache=True, nogil=True)
-def find_way(table, ways, costs, v, softness, ceiling, scratch):
-    """Lay the cheapest way of a vehicle that is not in the table; return what it costs by itself.
+def find_path(table, paths, costs, v, softness, upper_bound, scratch):
+    """Set the cheapest path of a vehicle that is not in the table; return its own cost.
 
-    A way below `ceiling` is looked for, by dynamic programming over slots, lanes and columns. With
-    a softness of 0 nobody may be in its way; otherwise that costs softness for each least price,
-    and only what is `FIXED` is never passed. Without such a way: `NO_WAY`, and nothing is laid.
+    Dynamic programming over slots, lanes and columns, for a path below `upper_bound`. With a
+    softness of 0 conflicts are forbidden; otherwise a conflict costs softness per `PENALTY`, and
+    only `FIXED` vehicles are avoided. Without such a path: returns `NO_PATH` and sets nothing.
     """
     load, steps, of_move, value = table.load, table.steps, costs.of_move, scratch.value
-    scratch.laid[0] += 1
+    scratch.searches[0] += 1
     slots, fan, lanes, _ = load.shape
-    wanted = ways.wanted[v]
-    scale = np.float32(softness / (PRICE * ENTERING) if softness > 0.0 else _IMPASSABLE)
-    # Offsets in `value` are columns less this.
-    shift = ways.column[v, 0] - (value.shape[2] // 2)
+    target_lane = paths.target_lane[v]
+    scale = np.float32(softness / (PENALTY * ENTERING) if softness > 0.0 else _IMPASSABLE)
+    # Offsets in `value` are columns minus this.
+    shift = paths.column[v, 0] - (value.shape[2] // 2)
     value[:] = _UNREACHED
     low = high = value.shape[2] // 2
-    value[0, ways.lane[v, 0], low] = 0.0
-    best, best_s, best_offset, best_lane = min(ceiling, _IMPASSABLE), -1, 0, 0
+    value[0, paths.lane[v, 0], low] = 0.0
+    best, best_s, best_offset, best_lane = min(upper_bound, _IMPASSABLE), -1, 0, 0
     for s in range(slots + 1):
         end = table.ended[s] - shift if s < slots else low
         for lane in range(lanes):
             for offset in range(max(low, end), high + 1):
-                total = value[s, lane, offset] + (0.0 if lane == wanted else ways.missing[v])
+                total = value[s, lane, offset] + (
+                    0.0 if lane == target_lane else paths.missing_cost[v]
+                )
                 if total < best:
                     best, best_s, best_offset, best_lane = total, s, offset, lane
         high = min(high, end - 1)
@@ -84,7 +98,7 @@ def find_way(table, ways, costs, v, softness, ceiling, scratch):
                 to_lane, to = lane + steps[d, 1], low + steps[d, 0]
                 if 0 <= to_lane < lanes:
                     base = of_move[d] + (scratch.delay[s] if d > 0 else np.float32(0.0))
-                    if lane != wanted:
+                    if lane != target_lane:
                         base += costs.off_lane
                     there = value[s + 1, to_lane, to : to + high + 1 - low]
                     loads = load[s, d, lane, low + shift : high + shift + 1]
@@ -92,20 +106,20 @@ def find_way(table, ways, costs, v, softness, ceiling, scratch):
         if moves:
             low, high = max(1, low - 1), min(value.shape[2] - 2, high + 1)
     if best_s < 0:
-        return NO_WAY
-    _trace(table, ways, costs, v, scale, best_s, best_lane, best_offset, scratch)
-    return own_cost(ways, costs, v)
+        return NO_PATH
+    _trace(table, paths, costs, v, scale, best_s, best_lane, best_offset, scratch)
+    return own_cost(paths, costs, v)
 
 
 @njit(cache=True, nogil=True)
-def _trace(table, ways, costs, v, scale, slots, lane, offset, scratch):
-    """Lay the way that `find_way` has found, from its end to its beginning."""
+def _trace(table, paths, costs, v, scale, slots, lane, offset, scratch):
+    """Set the path found by `find_path`, from its end to its beginning."""
     load, steps, value = table.load, table.steps, scratch.value
     fan, lanes = load.shape[1:3]
-    shift = ways.column[v, 0] - (value.shape[2] // 2)
-    ways.slots[v] = slots
+    shift = paths.column[v, 0] - (value.shape[2] // 2)
+    paths.slots[v] = slots
     for s in range(slots - 1, -1, -1):
-        ways.column[v, s + 1], ways.lane[v, s + 1] = offset + shift, lane
+        paths.column[v, s + 1], paths.lane[v, s + 1] = offset + shift, lane
         best, made = np.float32(np.inf), 0
         for d in range(fan):
             before, from_lane = offset - steps[d, 0], lane - steps[d, 1]
@@ -117,41 +131,41 @@ def _trace(table, ways, costs, v, scale, slots, lane, offset, scratch):
             if d > 0:
                 total += scratch.delay[s]
             total += scale * load[s, d, from_lane, before + shift]
-            if from_lane != ways.wanted[v]:
+            if from_lane != paths.target_lane[v]:
                 total += costs.off_lane
             if total < best:
                 best, made = total, d
-        ways.made[v, s] = made
+        paths.made[v, s] = made
         offset, lane = offset - steps[made, 0], lane - steps[made, 1]
 
 
 @njit(cache=True, nogil=True)
-def own_cost(ways, costs, v):
-    """Return what a vehicle's way costs by itself."""
-    total, slots = 0.0, ways.slots[v]
+def own_cost(paths, costs, v):
+    """Return the cost of a vehicle's path without penalties."""
+    total, slots = 0.0, paths.slots[v]
     for s in range(slots):
-        total += costs.of_move[ways.made[v, s]]
-        if ways.lane[v, s] != ways.wanted[v]:
+        total += costs.of_move[paths.made[v, s]]
+        if paths.lane[v, s] != paths.target_lane[v]:
             total += costs.off_lane
-    if ways.lane[v, slots] != ways.wanted[v]:
-        total += ways.missing[v]
+    if paths.lane[v, slots] != paths.target_lane[v]:
+        total += paths.missing_cost[v]
     return total
 
 
 @njit(cache=True, nogil=True)
-def follow(table, ways, costs, v, cells):
-    """Lay an old way, if it still is one, and nobody is in it; tell whether it was laid.
+def follow(table, paths, costs, v, cells):
+    """Set an earlier path if it is still valid and without conflicts; return whether it was set.
 
-    `cells`: columns and lanes at the beginning of each slot. It need not reach the road's end.
+    `cells`: columns and lanes at the beginning of each slot. It must reach the road's end.
     """
     slots, fan = table.load.shape[:2]
-    if len(cells) == 0 or cells[0, 0] != ways.column[v, 0] or cells[0, 1] != ways.lane[v, 0]:
+    if len(cells) == 0 or cells[0, 0] != paths.column[v, 0] or cells[0, 1] != paths.lane[v, 0]:
         return False
     s = 0
-    while s < slots and ways.column[v, s] < table.ended[s]:
+    while s < slots and paths.column[v, s] < table.ended[s]:
         if s + 1 >= len(cells):
             return False
-        column, lane = ways.column[v, s], ways.lane[v, s]
+        column, lane = paths.column[v, s], paths.lane[v, s]
         made = -1
         for d in range(fan):
             step = table.steps[d]
@@ -159,72 +173,78 @@ def follow(table, ways, costs, v, cells):
                 made = d
         if made < 0 or table.load[s, made, lane, column] > 0.0:
             return False
-        ways.made[v, s] = made
-        ways.column[v, s + 1], ways.lane[v, s + 1] = cells[s + 1, 0], cells[s + 1, 1]
+        paths.made[v, s] = made
+        paths.column[v, s + 1], paths.lane[v, s + 1] = cells[s + 1, 0], cells[s + 1, 1]
         s += 1
-    ways.slots[v] = s
-    ways.cost[v] = own_cost(ways, costs, v)
+    paths.slots[v] = s
+    paths.cost[v] = own_cost(paths, costs, v)
     return True
 
 
 @njit(cache=True, nogil=True)
-def stay(table, ways, costs, v):
-    """Lay the way of a vehicle that stays in its cell."""
+def stay(table, paths, costs, v):
+    """Set the path of a vehicle that stays in its cell."""
     s = 0
-    while s < len(table.load) and ways.column[v, s] < table.ended[s]:
-        ways.column[v, s + 1], ways.lane[v, s + 1] = ways.column[v, s], ways.lane[v, s]
-        ways.made[v, s] = 0
+    while s < len(table.load) and paths.column[v, s] < table.ended[s]:
+        paths.column[v, s + 1], paths.lane[v, s + 1] = paths.column[v, s], paths.lane[v, s]
+        paths.made[v, s] = 0
         s += 1
-    ways.slots[v] = s
-    ways.cost[v] = own_cost(ways, costs, v)
+    paths.slots[v] = s
+    paths.cost[v] = own_cost(paths, costs, v)
 
 
 @njit(cache=True, nogil=True)
-def find_victims(table, ways, v, victims):
-    """List those whose moves conflict with a way that is not in the table; return how many."""
-    load, who, made, offsets, first = table.load, table.who, table.made, table.offsets, table.first
+def find_hit(table, paths, v, hit):
+    """List the vehicles in conflict with a path that is not in the table; return how many."""
+    load, vehicle, made, offsets, first = (
+        table.load,
+        table.vehicle,
+        table.made,
+        table.offsets,
+        table.first,
+    )
     _, _, lanes, columns = load.shape
     count = 0
-    for s in range(ways.slots[v]):
-        column, lane, d = ways.column[v, s], ways.lane[v, s], ways.made[v, s]
+    for s in range(paths.slots[v]):
+        column, lane, d = paths.column[v, s], paths.lane[v, s], paths.made[v, s]
         if load[s, d, lane, column] == 0:
             continue
         for k in range(first[d], first[d + 1]):
             c, n = column + offsets[k, 0], lane + offsets[k, 1]
             if 0 <= c < columns and 0 <= n < lanes:
-                u = who[s, n, c]
+                u = vehicle[s, n, c]
                 if u >= 0 and made[s, n, c] == offsets[k, 2]:
                     known = False
                     for i in range(count):
-                        known |= victims[i] == u
+                        known |= hit[i] == u
                     if not known:
-                        victims[count] = u
+                        hit[count] = u
                         count += 1
     return count
 
 
 @njit(cache=True, nogil=True)
-def save(ways, saved, count, v):
-    """Keep a vehicle's way as number `count`."""
-    saved.who[count] = v
-    saved.slots[count] = ways.slots[v]
-    saved.cost[count] = ways.cost[v]
-    saved.column[count] = ways.column[v]
-    saved.lane[count] = ways.lane[v]
-    saved.made[count] = ways.made[v]
+def save(paths, saved, count, v):
+    """Save a vehicle's path as number `count`."""
+    saved.vehicle[count] = v
+    saved.slots[count] = paths.slots[v]
+    saved.cost[count] = paths.cost[v]
+    saved.column[count] = paths.column[v]
+    saved.lane[count] = paths.lane[v]
+    saved.made[count] = paths.made[v]
 
 
 @njit(cache=True, nogil=True)
-def restore(table, ways, saved, begin, count):
-    """Put kept ways back into the table, instead of what is there of the same vehicles."""
+def restore(table, paths, saved, begin, count):
+    """Restore saved paths in the table, replacing the current ones of these vehicles."""
     for i in range(begin, count):
-        if ways.placed[saved.who[i]]:
-            put(table, ways, saved.who[i], -1)
+        if paths.placed[saved.vehicle[i]]:
+            put(table, paths, saved.vehicle[i], -1)
     for i in range(begin, count):
-        v = saved.who[i]
-        ways.slots[v] = saved.slots[i]
-        ways.cost[v] = saved.cost[i]
-        ways.column[v] = saved.column[i]
-        ways.lane[v] = saved.lane[i]
-        ways.made[v] = saved.made[i]
-        put(table, ways, v, 1)
+        v = saved.vehicle[i]
+        paths.slots[v] = saved.slots[i]
+        paths.cost[v] = saved.cost[i]
+        paths.column[v] = saved.column[i]
+        paths.lane[v] = saved.lane[i]
+        paths.made[v] = saved.made[i]
+        put(table, paths, v, 1)

@@ -1,17 +1,17 @@
-"""Planning of a whole stream at once: a complete way for every vehicle, planned anew each slot.
+"""Planning of a whole stream: a complete path for every vehicle, replanned each slot.
 
-The problem is that of the paper's Section 3, without formations: every vehicle on the road is
-planned for, from its cell to the end of the road, in one window of the lattice that moves with it.
-Each vehicle has a way without conflicts at any moment, so the table can be executed as it is; who
-cannot reach its lane stays in the stream, and is tried again with every slot.
+The problem is that of the paper's Section 3, without formations: every vehicle on the road gets a
+path from its cell to the end of the road, in one window of the lattice that moves with it. At any
+moment the paths are without conflicts, so the plan can be executed as it is; a vehicle that cannot
+reach its lane stays in the stream and is tried again in the next slot.
 
-A way is laid by exact dynamic programming over (slot, column, lane) against all others. Where that
-leaves somebody off its lane, *chains of ejections* make room: the vehicle takes its way through
-others at a price, those that it hits are planned anew in turn, and the chain is kept if the sum of
-costs has fallen. In between, neighbours are taken out and put in again in another order (large
-neighbourhood search). Ways are carried over from slot to slot.
+A path is found by exact dynamic programming over (slot, column, lane) against all others. Where a
+vehicle then misses its lane, *ejection chains* make room: the vehicle takes its path through others
+at a penalty, those that it hits are rerouted in turn, and the chain is kept if the sum of costs has
+fallen. In between, neighbours are removed and rerouted in another order (large-neighbourhood
+search). Paths are carried over from slot to slot.
 
-What a move conflicts with is the `ConflictModel` of the other planners.
+Conflicts are those of the `ConflictModel`, as for the other planners.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from itertools import chain
 
 import numpy as np
 
-from laneweave.coordinator.planning.grid import Cell
 from laneweave.coordinator.planning.rolling import search_kernel as kernel
 from laneweave.coordinator.planning.rolling.arrays import Ints, Window, window
 from laneweave.coordinator.planning.rolling.problem import (
+    CellPath,
     StreamCosts,
     StreamPlan,
     StreamRoad,
     StreamVehicle,
-    Way,
 )
+from laneweave.protocol.lattice import Cell
 
 __all__ = [
+    "CellPath",
     "StreamCosts",
     "StreamPlan",
     "StreamPlanner",
     "StreamRoad",
     "StreamVehicle",
-    "Way",
     "warm_up",
 ]
 
@@ -55,10 +55,10 @@ def warm_up() -> None:
 
 
 class StreamPlanner:
-    """Plans a stream slot by slot; a plan depends on nothing but what it is planned from."""
+    """Plans a stream slot by slot; a plan depends only on the arguments of `plan` and the seed."""
 
     def __init__(self, road: StreamRoad, costs: StreamCosts | None = None, seed: int = 0) -> None:
-        """Prepare; `seed` is that of all random choices."""
+        """Prepare; `seed` determines all random choices."""
         self.road = road
         self.costs = costs or StreamCosts()
         self._seed = seed
@@ -70,44 +70,44 @@ class StreamPlanner:
         before: StreamPlan | None = None,
         blocked: Collection[Cell] = (),
     ) -> StreamPlan:
-        """Return ways for all vehicles from the beginning of a slot on.
+        """Return paths for all vehicles from the beginning of a slot on.
 
         Args:
             slot: number of the slot; the lattice begins at 0 with slot 0.
-            vehicles: all that are on the road, each in a cell of its own.
-            before: an earlier plan; ways that still hold are starting points.
-            blocked: cells that nobody may enter; who is in one may leave it.
+            vehicles: all vehicles on the road, each in a different cell.
+            before: an earlier plan; its paths are starting points where they are still valid.
+            blocked: cells that must not be entered; a vehicle in one may leave it.
 
         Raises:
-            ValueError: two vehicles in one cell, or one beside the road.
+            ValueError: two vehicles are in one cell, or one is beside the road.
         """
         began_s = time.monotonic()
         _check(self.road, vehicles)
         end = self.road.length_m - slot * self.road.advance_m
-        ways: dict[str, Way] = {v.vehicle: (v.cell,) for v in vehicles}
+        paths: dict[str, CellPath] = {v.vehicle: (v.cell,) for v in vehicles}
         order = [v for v in vehicles if v.cell[0] * self.road.pitch_m <= end + 1e-6]
         order.sort(key=lambda one: one.cell)
         rounds = 0
         if order:
             arrays = window(self.road, self.costs, slot, order, blocked)
             kept = _kept(slot, order, before, arrays.low)
-            # Mixed, so that the sequences of neighbouring slots have nothing in common.
+            # Mixed, so that the sequences of neighbouring slots are independent.
             rng = np.random.SeedSequence((self._seed, slot & 0xFFFFFFFF)).generate_state(1, "u8")
-            kernel.lay(arrays.table, arrays.ways, arrays.costs, *kept, rng, arrays.scratch)
+            kernel.set_paths(arrays.table, arrays.paths, arrays.costs, *kept, rng, arrays.scratch)
             if len(order) > 1:
                 rounds = kernel.improve(
                     arrays.table,
-                    arrays.ways,
+                    arrays.paths,
                     arrays.costs,
                     self.road.rounds,
-                    self.road.most_ways,
+                    self.road.max_paths,
                     rng,
                     arrays.scratch,
                 )
-            ways |= _ways_of(order, arrays)
-        missed = tuple(v.vehicle for v in vehicles if ways[v.vehicle][-1][1] != v.lane)
+            paths |= _paths_of(order, arrays)
+        missed = tuple(v.vehicle for v in vehicles if paths[v.vehicle][-1][1] != v.lane)
         solve_ms = round(1e3 * (time.monotonic() - began_s), 3)
-        return StreamPlan(slot, ways, missed, rounds, solve_ms)
+        return StreamPlan(slot, paths, missed, rounds, solve_ms)
 
 
 def _check(road: StreamRoad, vehicles: Sequence[StreamVehicle]) -> None:
@@ -122,12 +122,12 @@ def _check(road: StreamRoad, vehicles: Sequence[StreamVehicle]) -> None:
 def _kept(
     slot: int, vehicles: Sequence[StreamVehicle], before: StreamPlan | None, low: int
 ) -> tuple[Ints, Ints]:
-    """Return the cells of all old ways from this slot on, and where those of each vehicle begin."""
-    ways: Mapping[str, Way] = {}
+    """Return the cells of all earlier paths from this slot on, and where those of each begin."""
+    paths: Mapping[str, CellPath] = {}
     age = 0
     if before is not None and before.slot <= slot:
-        ways, age = before.ways, slot - before.slot
-    old = [ways.get(vehicle.vehicle, ())[age:] for vehicle in vehicles]
+        paths, age = before.paths, slot - before.slot
+    old = [paths.get(vehicle.vehicle, ())[age:] for vehicle in vehicles]
     first = np.cumsum([0, *map(len, old)])
     flat = chain.from_iterable(chain.from_iterable(old))
     cells = np.fromiter(flat, dtype=np.int64, count=2 * int(first[-1])).reshape(-1, 2)
@@ -135,10 +135,10 @@ def _kept(
     return cells, first
 
 
-def _ways_of(vehicles: Sequence[StreamVehicle], arrays: Window) -> dict[str, Way]:
-    columns = (arrays.ways.column + arrays.low).tolist()
-    lanes = arrays.ways.lane.tolist()
-    lasts = arrays.ways.slots.tolist()
+def _paths_of(vehicles: Sequence[StreamVehicle], arrays: Window) -> dict[str, CellPath]:
+    columns = (arrays.paths.column + arrays.low).tolist()
+    lanes = arrays.paths.lane.tolist()
+    lasts = arrays.paths.slots.tolist()
     return {
         vehicle.vehicle: tuple(zip(columns[v][: last + 1], lanes[v][: last + 1], strict=True))
         for v, (vehicle, last) in enumerate(zip(vehicles, lasts, strict=True))

@@ -1,4 +1,4 @@
-"""What a stream planner is asked, and what it answers."""
+"""The rolling planning problem and its plan."""
 
 from __future__ import annotations
 
@@ -7,55 +7,55 @@ from collections.abc import Mapping
 from attrs import Attribute, field, frozen
 
 from laneweave.coordinator.planning.conflicts import ConflictModel
-from laneweave.coordinator.planning.grid import Cell, Mode
+from laneweave.protocol.lattice import Cell, Mode
 
-Way = tuple[Cell, ...]
-"""Cells at the beginning of each slot, the current one first, until the road ends."""
+CellPath = tuple[Cell, ...]
+"""Cells at the beginning of each slot, the current one first, up to the end of the road."""
 
 
 def _one_per_cell(_road: object, _field: Attribute[ConflictModel], model: ConflictModel) -> None:
-    if not {"node", "geometric"} & set(model.kinds):
+    if model.vehicles_share_cells:
         raise ValueError(f"conflict kinds {model.kinds} let vehicles share a cell")
 
 
 @frozen
 class StreamRoad:
-    """The road as the lattice sees it, and how the search is bounded."""
+    """The road in terms of the lattice, and the limits of the search."""
 
     lanes: int
     pitch_m: float
     """d_F."""
     advance_m: float
-    """Way of the lattice in a slot: v_F T_F."""
+    """Distance that the lattice travels in a slot: v_F T_F."""
     sorting_m: tuple[float, float]
-    """Moves happen while the whole body is between these positions: S3."""
+    """Segment S3: moves happen while the whole body is between these positions."""
     length_m: float
     """End of the road."""
     body_m: float
-    """Length of a body; the front bumper is what a cell's position says."""
+    """Length of a body; the position of a cell is that of the front bumper."""
     mode: Mode = 1
     model: ConflictModel = field(
         default=ConflictModel(("node", "edge", "special-1", "closing")), validator=_one_per_cell
     )
     rounds: int = 2000
-    """Most rounds of improvement for one slot."""
-    most_ways: int = 50_000
-    """So many ways are looked for in one slot at most, for about 5 us each."""
+    """Maximum number of rounds of improvement per slot."""
+    max_paths: int = 50_000
+    """Maximum number of path searches per slot, of about 5 us each."""
 
 
 @frozen
 class StreamCosts:
-    """What ways cost; whoever ends off its lane costs more than any way."""
+    """Costs of paths; a path that ends off the target lane costs more than any other."""
 
     move: float = 0.3
     off_lane: float = 0.1
-    """For each slot that begins off the lane."""
+    """For each slot that begins off the target lane."""
     backward: float = 2.0
-    """More for a move that loses a column."""
+    """Extra cost of a move that loses a column."""
     forward: float = 0.0
-    """More for a move that gains one; negative: drift ahead of v_F is rewarded."""
+    """Extra cost of a move that gains a column; negative: rewards driving ahead of v_F."""
     missing: float = 60.0
-    """Ending off the lane; up to twice as much near the end of the road."""
+    """Ending off the target lane; up to twice as much near the end of the road."""
 
 
 @frozen
@@ -65,20 +65,20 @@ class StreamVehicle:
     vehicle: str
     cell: Cell
     lane: int
-    """The lane that it needs."""
+    """The target lane."""
     held: bool = False
-    """It stays where it is, whatever is planned."""
+    """Whether it must stay in its cell."""
 
 
 @frozen
 class StreamPlan:
-    """Ways of all vehicles from one slot on."""
+    """Paths of all vehicles from one slot on."""
 
     slot: int
-    ways: Mapping[str, Way]
+    paths: Mapping[str, CellPath]
     missed: tuple[str, ...]
-    """Vehicles whose ways do not end on their lanes."""
+    """Vehicles whose paths do not end on their target lanes."""
     rounds: int = 0
-    """How many rounds of improvement it took."""
+    """Number of rounds of improvement."""
     solve_ms: float = field(default=0.0, eq=False)
-    """Wall-clock time that it took."""
+    """Wall-clock time of planning."""

@@ -1,16 +1,20 @@
-"""Compiled code of `stream`: the search over ways of all vehicles."""
+"""Compiled code of the rolling planner: the search over the paths of all vehicles.
+
+Ejection chains and reorderings improve a plan; see `planner`.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
-from laneweave.coordinator.planning.exact.negotiation_kernel import random_below
-from laneweave.coordinator.planning.rolling.arrays import MOST_EJECTED, PRICE
+from laneweave.coordinator.planning.random_kernel import random_below
 from laneweave.coordinator.planning.rolling.paths_kernel import (
-    NO_WAY,
-    find_victims,
-    find_way,
+    MAX_EJECTED,
+    NO_PATH,
+    PENALTY,
+    find_hit,
+    find_path,
     follow,
     put,
     restore,
@@ -18,158 +22,158 @@ from laneweave.coordinator.planning.rolling.paths_kernel import (
     stay,
 )
 
-_PRICE_GROWTH = 3
-"""Added to the price of a vehicle, at first `PRICE`, each time that a chain hits it."""
-_LEAST_SOFTNESS, _MORE_SOFTNESS = 15.0, 25.0
-"""What it costs in a chain to be in the way of a vehicle: so much, and up to so much more."""
-_HESITATION = 0.9
+_PENALTY_GROWTH = 3
+"""Added to the penalty of a vehicle each time that a chain hits it."""
+_MIN_SOFTNESS, _SOFTNESS_RANGE = 15.0, 25.0
+"""Cost of a conflict in a chain: minimum, and range of a random addition."""
+_MAX_DELAY_COST = 0.9
 _TRIES = 4
-"""Chains for a vehicle that has no way at all."""
+"""Ejection chains for a vehicle without a path."""
 _FIRST_SLACK, _COOLED_AFTER = 16.0, 0.67
-"""By how much the sum of costs may grow at first, and when that is over, in parts of all work."""
+"""Initial increase allowed for the sum of costs, and the share of the work after which it is 0."""
 _REORDER_EVERY = 8
-_MOST_REORDERED = 13
+_MAX_REORDERED = 13
 _IDLE_ROUNDS = 200
-"""Rounds after nobody misses its lane any more."""
+"""Rounds of improvement after all vehicles end on their lanes."""
 _IDLE_SOFTNESS = 3.0
 _ROUNDING = 1e-4
 
 
 @njit(cache=True, nogil=True)
-def lay(table, ways, costs, kept, first, rng, scratch):
-    """Put every vehicle into the table: on its old way where that still holds.
+def set_paths(table, paths, costs, kept, first, rng, scratch):
+    """Add every vehicle to the table, on its earlier path where that is still valid.
 
-    kept: columns and lanes of the old ways, one vehicle after the other; (cells, 2).
+    kept: columns and lanes of the earlier paths, one vehicle after the other; (cells, 2).
     first: where those of each vehicle begin.
     """
-    count = len(ways.cost)
+    count = len(paths.cost)
     for v in range(count):
-        if ways.held[v]:
-            stay(table, ways, costs, v)
-            put(table, ways, v, 1)
+        if paths.held[v]:
+            stay(table, paths, costs, v)
+            put(table, paths, v, 1)
     for v in range(count):
-        if not ways.held[v] and follow(table, ways, costs, v, kept[first[v] : first[v + 1]]):
-            put(table, ways, v, 1)
-    # Foremost first: they have the least time.
+        if not paths.held[v] and follow(table, paths, costs, v, kept[first[v] : first[v + 1]]):
+            put(table, paths, v, 1)
+    # Foremost first: they have the least time left.
     for v in range(count - 1, -1, -1):
-        if ways.placed[v]:
+        if paths.placed[v]:
             continue
-        ways.cost[v] = find_way(table, ways, costs, v, 0.0, NO_WAY, scratch)
-        if ways.cost[v] < NO_WAY:
-            put(table, ways, v, 1)
+        paths.cost[v] = find_path(table, paths, costs, v, 0.0, NO_PATH, scratch)
+        if paths.cost[v] < NO_PATH:
+            put(table, paths, v, 1)
             continue
-        ways.cost[v] = NO_WAY
+        paths.cost[v] = NO_PATH
         for _ in range(_TRIES):
-            if _eject(table, ways, costs, v, _LEAST_SOFTNESS, 0.0, rng, scratch) > 0.0:
+            if _eject(table, paths, costs, v, _MIN_SOFTNESS, 0.0, rng, scratch) > 0.0:
                 break
-        if not ways.placed[v]:
-            _let_stand(table, ways, costs, v, scratch)
+        if not paths.placed[v]:
+            _hold(table, paths, costs, v, scratch)
 
 
 @njit(cache=True, nogil=True)
-def _let_stand(table, ways, costs, start, scratch):
-    """Let a vehicle that has no way stay in its cell, and whoever is in the way of that likewise.
+def _hold(table, paths, costs, start, scratch):
+    """Let a vehicle without a path stay in its cell, and every vehicle in conflict with that, too.
 
-    It always works: if all stay where they are, nobody meets.
+    This always ends without conflicts: vehicles that all stay never meet.
     """
-    queue, victims = scratch.queue, scratch.victims
+    queue, hit = scratch.queue, scratch.hit
     queue[0] = start
     waiting = 1
     while waiting > 0:
         waiting -= 1
         v = queue[waiting]
-        stay(table, ways, costs, v)
-        for i in range(find_victims(table, ways, v, victims)):
-            put(table, ways, victims[i], -1)
-            queue[waiting] = victims[i]
+        stay(table, paths, costs, v)
+        for i in range(find_hit(table, paths, v, hit)):
+            put(table, paths, hit[i], -1)
+            queue[waiting] = hit[i]
             waiting += 1
-        put(table, ways, v, 1)
+        put(table, paths, v, 1)
 
 
 @njit(cache=True, nogil=True)
-def _eject(table, ways, costs, start, softness, slack, rng, scratch):
-    """Give a vehicle a better way, at the price of those that are in it; return what is gained.
+def _eject(table, paths, costs, start, softness, slack, rng, scratch):
+    """Reroute a vehicle through others by an ejection chain; return the decrease of the costs.
 
-    Whoever is hit is planned anew in turn, and may hit others (ejection chains: Glover 1996). Each
-    time the price of who is hit grows. The chain is undone, and nothing gained, if it hits more
-    than `MOST_EJECTED` or the sum of costs does not stay below what it was and `slack`.
+    Vehicles that are hit are rerouted in turn, and may hit others (ejection chains: Glover 1996).
+    Each hit raises the penalty of the vehicle. The chain is undone, and the decrease is 0, if it
+    hits more than `MAX_EJECTED` or the sum of costs grows by `slack` or more.
     """
-    saved, queue, victims, marked = scratch.saved, scratch.queue, scratch.victims, scratch.marked
-    was_placed = ways.placed[start]
+    saved, queue, hit, marked = scratch.saved, scratch.queue, scratch.hit, scratch.marked
+    was_placed = paths.placed[start]
     queue[0] = start
-    waiting, kept, hits, before = 1, 1, 0, ways.cost[start]
-    save(ways, saved, 0, start)
+    waiting, kept, hits, before = 1, 1, 0, paths.cost[start]
+    save(paths, saved, 0, start)
     marked[start] = True
     if was_placed:
-        put(table, ways, start, -1)
-    while waiting > 0 and hits <= MOST_EJECTED:
+        put(table, paths, start, -1)
+    while waiting > 0 and hits <= MAX_EJECTED:
         waiting -= 1
         i = random_below(rng, waiting + 1)
         v, queue[i] = queue[i], queue[waiting]
-        _hesitate(scratch.delay, rng)
-        ways.cost[v] = find_way(table, ways, costs, v, softness, NO_WAY, scratch)
+        _draw_delays(scratch.delay, rng)
+        paths.cost[v] = find_path(table, paths, costs, v, softness, NO_PATH, scratch)
         scratch.delay[:] = 0.0
-        if ways.cost[v] >= NO_WAY:
-            hits = MOST_EJECTED + 1
+        if paths.cost[v] >= NO_PATH:
+            hits = MAX_EJECTED + 1
             break
-        count = find_victims(table, ways, v, victims)
+        count = find_hit(table, paths, v, hit)
         hits += count
-        if hits > MOST_EJECTED:
+        if hits > MAX_EJECTED:
             break
         for i in range(count):
-            u = victims[i]
+            u = hit[i]
             if not marked[u]:
                 marked[u] = True
-                save(ways, saved, kept, u)
+                save(paths, saved, kept, u)
                 kept += 1
-                before += ways.cost[u]
-            put(table, ways, u, -1)
-            ways.price[u] += _PRICE_GROWTH
+                before += paths.cost[u]
+            put(table, paths, u, -1)
+            paths.penalty[u] += _PENALTY_GROWTH
             queue[waiting] = u
             waiting += 1
-        put(table, ways, v, 1)
+        put(table, paths, v, 1)
     after = 0.0
     for k in range(kept):
-        after += ways.cost[saved.who[k]]
-    better = hits <= MOST_EJECTED and after < before + slack
-    _settle(table, ways, kept, better, was_placed, scratch)
+        after += paths.cost[saved.vehicle[k]]
+    better = hits <= MAX_EJECTED and after < before + slack
+    _settle(table, paths, kept, better, was_placed, scratch)
     return before - after if better else 0.0
 
 
 @njit(cache=True, nogil=True)
-def _hesitate(delay, rng):
-    """Draw what moves cost more in each slot, for the next way.
+def _draw_delays(delay, rng):
+    """Draw an extra cost of moves in each slot, for the next path.
 
-    Two that must swap would want the same slot for ever if they did not sometimes hesitate.
+    Without it two vehicles that must swap would compete for the same slot forever.
     """
     for s in range(len(delay)):
-        delay[s] = np.float32(_HESITATION * random_below(rng, 1000) / 1000.0)
+        delay[s] = np.float32(_MAX_DELAY_COST * random_below(rng, 1000) / 1000.0)
 
 
 @njit(cache=True, nogil=True)
-def _settle(table, ways, kept, better, was_placed, scratch):
-    """End a chain that has changed `kept` ways: prices are the least again, or all is undone."""
+def _settle(table, paths, kept, better, was_placed, scratch):
+    """End a chain that has changed `kept` paths: reset the penalties, or undo the chain."""
     saved = scratch.saved
     for k in range(kept):
-        v = saved.who[k]
+        v = saved.vehicle[k]
         scratch.marked[v] = False
-        # The table holds the price that a way was put in with.
-        again = ways.placed[v] and (not better or ways.price[v] != PRICE)
+        # The table holds the penalty with which a path was added.
+        again = paths.placed[v] and (not better or paths.penalty[v] != PENALTY)
         if again:
-            put(table, ways, v, -1)
-        ways.price[v] = PRICE
+            put(table, paths, v, -1)
+        paths.penalty[v] = PENALTY
         if again and better:
-            put(table, ways, v, 1)
+            put(table, paths, v, 1)
     if not better:
-        ways.cost[saved.who[0]] = saved.cost[0]
-        restore(table, ways, saved, 0 if was_placed else 1, kept)
+        paths.cost[saved.vehicle[0]] = saved.cost[0]
+        restore(table, paths, saved, 0 if was_placed else 1, kept)
 
 
 @njit(cache=True, nogil=True)
-def _take_out(table, ways, seed, size, share, rng, scratch):
-    """Take a vehicle and some neighbours out of the table, in a random order; return how many."""
+def _take_out(table, paths, seed, size, share, rng, scratch):
+    """Remove a vehicle and some neighbours from the table, in random order; return how many."""
     saved, chosen = scratch.saved, scratch.chosen
-    count = len(ways.cost)
+    count = len(paths.cost)
     near = 0
     # Those nearest by column: vehicles are in the order of their columns.
     low = high = seed
@@ -182,7 +186,7 @@ def _take_out(table, ways, seed, size, share, rng, scratch):
         else:
             break
         v = low if pick_low else high
-        if not ways.held[v] and random_below(rng, 100) < share:
+        if not paths.held[v] and random_below(rng, 100) < share:
             chosen[near] = v
             near += 1
     chosen[near] = seed
@@ -190,83 +194,83 @@ def _take_out(table, ways, seed, size, share, rng, scratch):
     for i in range(near):
         other = i + random_below(rng, near - i)
         chosen[i], chosen[other] = chosen[other], chosen[i]
-        save(ways, saved, i, chosen[i])
-        put(table, ways, chosen[i], -1)
+        save(paths, saved, i, chosen[i])
+        put(table, paths, chosen[i], -1)
     return near
 
 
 @njit(cache=True, nogil=True)
-def _reorder(table, ways, costs, seed, size, slack, rng, scratch):
-    """Take some neighbours out and put them in anew, in another order; return what is gained.
+def _reorder(table, paths, costs, seed, size, slack, rng, scratch):
+    """Remove some neighbours and reroute them in another order; return the decrease of costs.
 
     (Large neighbourhood search: Shaw 1998.)
     """
     saved, chosen = scratch.saved, scratch.chosen
-    near = _take_out(table, ways, seed, size, 67, rng, scratch)
-    before = least = 0.0
+    near = _take_out(table, paths, seed, size, 67, rng, scratch)
+    before = min_cost = 0.0
     for i in range(near):
         before += saved.cost[i]
-        least += ways.least[chosen[i]]
+        min_cost += paths.min_cost[chosen[i]]
     after = 0.0
     for i in range(near):
         v = chosen[i]
-        least -= ways.least[v]
-        ceiling = before + slack - after - least
-        ways.cost[v] = find_way(table, ways, costs, v, 0.0, ceiling, scratch)
-        after += ways.cost[v]
-        if after + least >= before + slack:
-            restore(table, ways, saved, 0, near)
+        min_cost -= paths.min_cost[v]
+        upper_bound = before + slack - after - min_cost
+        paths.cost[v] = find_path(table, paths, costs, v, 0.0, upper_bound, scratch)
+        after += paths.cost[v]
+        if after + min_cost >= before + slack:
+            restore(table, paths, saved, 0, near)
             return 0.0
-        put(table, ways, v, 1)
+        put(table, paths, v, 1)
     return before - after
 
 
 @njit(cache=True, nogil=True)
-def _list_dear(ways, failing, dear):
-    """List who misses its lane and may reach it, and who has a way that is not the cheapest."""
+def _list_costly(paths, off_lane, costly):
+    """List the vehicles that miss a reachable lane, and those without the cheapest path."""
     missed = more = 0
-    for v in range(len(ways.cost)):
-        if ways.able[v]:
-            if ways.cost[v] >= ways.missing[v]:
-                failing[missed] = v
+    for v in range(len(paths.cost)):
+        if paths.can_arrive[v]:
+            if paths.cost[v] >= paths.missing_cost[v]:
+                off_lane[missed] = v
                 missed += 1
-            elif ways.cost[v] > ways.least[v] + _ROUNDING:
-                dear[more] = v
+            elif paths.cost[v] > paths.min_cost[v] + _ROUNDING:
+                costly[more] = v
                 more += 1
     return missed, more
 
 
 @njit(cache=True, nogil=True)
-def improve(table, ways, costs, rounds, most_ways, rng, scratch):
-    """Improve all ways for some rounds; return how many rounds it took.
+def improve(table, paths, costs, rounds, max_paths, rng, scratch):
+    """Improve all paths for some rounds; return the number of rounds.
 
-    While somebody misses its lane, chains of ejections and new orders take turns; slack cools down
-    from some moves to none. Afterwards a few rounds more look for cheaper ways.
+    While vehicles miss their lanes, ejection chains and reorderings alternate; the slack decreases
+    from several moves to none. Afterwards a few more rounds look for cheaper paths.
     """
-    failing, dear = scratch.failing, scratch.dear
+    off_lane, costly = scratch.off_lane, scratch.costly
     turn = idle = 0
-    scratch.laid[0] = 0
-    while turn < rounds and scratch.laid[0] < most_ways and idle < _IDLE_ROUNDS:
-        missed, more = _list_dear(ways, failing, dear)
+    scratch.searches[0] = 0
+    while turn < rounds and scratch.searches[0] < max_paths and idle < _IDLE_ROUNDS:
+        missed, more = _list_costly(paths, off_lane, costly)
         if missed == 0 and more == 0:
             break
         slack = -_ROUNDING
         if missed > 0:
-            done = max(turn / rounds, scratch.laid[0] / most_ways)
+            done = max(turn / rounds, scratch.searches[0] / max_paths)
             slack = max(slack, _FIRST_SLACK * (1.0 - done / _COOLED_AFTER))
         else:
             idle += 1
         if missed > 0 and turn % _REORDER_EVERY > 0:
-            v = failing[random_below(rng, missed)]
-            softness = _LEAST_SOFTNESS + _MORE_SOFTNESS * random_below(rng, 1000) / 1000.0
-            _eject(table, ways, costs, v, softness, slack, rng, scratch)
+            v = off_lane[random_below(rng, missed)]
+            softness = _MIN_SOFTNESS + _SOFTNESS_RANGE * random_below(rng, 1000) / 1000.0
+            _eject(table, paths, costs, v, softness, slack, rng, scratch)
         elif missed == 0 and turn % 2 > 0:
-            v = dear[random_below(rng, more)]
+            v = costly[random_below(rng, more)]
             softness = _IDLE_SOFTNESS * random_below(rng, 1000) / 1000.0 + 0.2
-            _eject(table, ways, costs, v, softness, slack, rng, scratch)
+            _eject(table, paths, costs, v, softness, slack, rng, scratch)
         else:
-            v = dear[random_below(rng, more)] if more > 0 else failing[random_below(rng, missed)]
-            size = min(2 + random_below(rng, _MOST_REORDERED - 1), len(ways.cost) - 1)
-            _reorder(table, ways, costs, v, size, slack, rng, scratch)
+            v = costly[random_below(rng, more)] if more > 0 else off_lane[random_below(rng, missed)]
+            size = min(2 + random_below(rng, _MAX_REORDERED - 1), len(paths.cost) - 1)
+            _reorder(table, paths, costs, v, size, slack, rng, scratch)
         turn += 1
     return turn

@@ -1,7 +1,7 @@
-"""Checks the ways of a stream, sharing no code with the search.
+"""Check the plan of a stream, without code of the search.
 
-Only the definition of a conflict is shared, because it is what ways are checked against. Meant to
-be called for every plan before it is issued: about a millisecond for 130 vehicles.
+Only the definition of a conflict is shared, because plans are checked against it. Called for every
+plan before it is issued: about a millisecond for 130 vehicles.
 """
 
 from __future__ import annotations
@@ -10,63 +10,63 @@ from collections.abc import Collection, Iterator, Sequence
 from functools import lru_cache
 
 from laneweave.coordinator.planning.conflicts import ConflictModel
-from laneweave.coordinator.planning.grid import Cell, Mode
 from laneweave.coordinator.planning.rolling.problem import (
+    CellPath,
     StreamPlan,
     StreamRoad,
     StreamVehicle,
-    Way,
 )
+from laneweave.protocol.lattice import Cell, Mode, displacements
 
 _ROUNDING_M = 1e-6
 
 
-def problems_of_ways(
+def problems_of_plan(
     road: StreamRoad,
     plan: StreamPlan,
     vehicles: Sequence[StreamVehicle],
     blocked: Collection[Cell] = (),
 ) -> list[str]:
-    """Return what is wrong with a plan for these vehicles; nothing is, if it may be issued."""
+    """Return the errors in a plan for these vehicles; it may be issued if there are none."""
     names = {vehicle.vehicle for vehicle in vehicles}
-    if plan.ways.keys() != names:
-        return [f"ways of {sorted(plan.ways)} for vehicles {sorted(names)}"]
+    if plan.paths.keys() != names:
+        return [f"paths of {sorted(plan.paths)} for vehicles {sorted(names)}"]
     barred = frozenset(blocked)
     problems: list[str] = []
     for vehicle in vehicles:
-        problems += _problems_of_way(road, plan.slot, vehicle, plan.ways[vehicle.vehicle], barred)
+        problems += _problems_of_path(road, plan.slot, vehicle, plan.paths[vehicle.vehicle], barred)
     missed = {
         v.vehicle
         for v in vehicles
-        if plan.ways[v.vehicle][-1:] != () and plan.ways[v.vehicle][-1][1] != v.lane
+        if plan.paths[v.vehicle][-1:] != () and plan.paths[v.vehicle][-1][1] != v.lane
     }
     if set(plan.missed) != missed:
         problems.append(f"says that {sorted(plan.missed)} miss their lanes, not {sorted(missed)}")
     return problems or list(_conflicts(road, plan))
 
 
-def _problems_of_way(
-    road: StreamRoad, slot: int, vehicle: StreamVehicle, way: Way, blocked: frozenset[Cell]
+def _problems_of_path(
+    road: StreamRoad, slot: int, vehicle: StreamVehicle, path: CellPath, blocked: frozenset[Cell]
 ) -> Iterator[str]:
     name = vehicle.vehicle
-    if not way or way[0] != vehicle.cell:
-        yield f"{name} starts at {way[:1]} instead of {vehicle.cell}"
+    if not path or path[0] != vehicle.cell:
+        yield f"{name} starts at {path[:1]} instead of {vehicle.cell}"
         return
-    here = way[0]
-    for s, there in enumerate(way[1:], start=slot):
+    here = path[0]
+    for s, there in enumerate(path[1:], start=slot):
         if there != here:
             yield from _problems_of_move(road, s, name, here, there, blocked)
             if vehicle.held:
                 yield f"{name} is held, but moves in slot {s}"
             here = there
-    ends_m = way[-1][0] * road.pitch_m + (slot + len(way) - 1) * road.advance_m
+    ends_m = path[-1][0] * road.pitch_m + (slot + len(path) - 1) * road.advance_m
     if ends_m <= road.length_m + _ROUNDING_M:
-        yield f"the way of {name} ends at {ends_m} m, on the road"
-    # Before that, it never goes on behind the end of the road.
-    if len(way) > 1:
-        last_m = way[-2][0] * road.pitch_m + (slot + len(way) - 2) * road.advance_m
+        yield f"the path of {name} ends at {ends_m} m, on the road"
+    # Its last slot begins on the road.
+    if len(path) > 1:
+        last_m = path[-2][0] * road.pitch_m + (slot + len(path) - 2) * road.advance_m
         if last_m > road.length_m + _ROUNDING_M:
-            yield f"the way of {name} goes on at {last_m} m, after the road"
+            yield f"the path of {name} goes on at {last_m} m, after the road"
 
 
 def _problems_of_move(
@@ -88,14 +88,14 @@ def _problems_of_move(
 
 
 def _conflicts(road: StreamRoad, plan: StreamPlan) -> Iterator[str]:
-    """Compare each move with what everybody near it does in the same slot."""
-    near = {step: _near(road.mode, road.model, step) for step in _steps(road.mode)}
-    for s in range(max((len(way) for way in plan.ways.values()), default=1) - 1):
+    """Compare each move with those of all nearby vehicles in the same slot."""
+    near = {step: _near(road.mode, road.model, step) for step in displacements(road.mode)}
+    for s in range(max((len(path) for path in plan.paths.values()), default=1) - 1):
         made: dict[Cell, tuple[Cell, str]] = {}
         moving: list[Cell] = []
-        for name, way in plan.ways.items():
-            if s + 1 < len(way):
-                here, there = way[s], way[s + 1]
+        for name, path in plan.paths.items():
+            if s + 1 < len(path):
+                here, there = path[s], path[s + 1]
                 if here in made:
                     yield f"{name} and {made[here][1]} are both in {here} in slot {plan.slot + s}"
                 made[here] = (there[0] - here[0], there[1] - here[1]), name
@@ -110,23 +110,14 @@ def _conflicts(road: StreamRoad, plan: StreamPlan) -> Iterator[str]:
                     yield f"{kind} conflict of {name} and {other[1]} in slot {plan.slot + s}"
 
 
-def _steps(mode: Mode) -> list[Cell]:
-    return [
-        (column, lane)
-        for column in (-1, 0, 1)
-        for lane in (-1, 0, 1)
-        if mode == 2 or not (column and lane)
-    ]
-
-
 @lru_cache(maxsize=256)
 def _near(mode: Mode, model: ConflictModel, step: Cell) -> dict[Cell, dict[Cell, str]]:
-    """Return, for each offset of another vehicle's cell, what it must not do, and why."""
+    """Return the conflicting displacements and their kinds, by offset of the other vehicle."""
     columns, lanes = model.reach
     found: dict[Cell, dict[Cell, str]] = {}
     for column in range(-columns, columns + 1):
         for lane in range(-lanes, lanes + 1):
-            for other in _steps(mode):
+            for other in displacements(mode):
                 b = (column, lane), (column + other[0], lane + other[1])
                 kind = model.kind(((0, 0), step), b)
                 if kind is not None and (column, lane) != (0, 0):

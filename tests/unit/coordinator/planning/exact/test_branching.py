@@ -5,15 +5,18 @@ from attrs import evolve
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from laneweave.coordinator.planning import PlanRequest, PlanResponse, plan, problems_of_response
 from laneweave.coordinator.planning.budget import Budget
 from laneweave.coordinator.planning.exact.branching import Branching
-from laneweave.coordinator.planning.exact.relaxation import ceiling_of
+from laneweave.coordinator.planning.exact.relaxation import upper_bound_of
 from laneweave.coordinator.planning.exact.relaxation_kernel import PER_MOVE
-from laneweave.coordinator.planning.grid import Cell, Grid, Mode
-from laneweave.coordinator.planning.instances import formation_request
+from laneweave.coordinator.planning.facade import plan
+from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.problem import Problem
-from laneweave.coordinator.planning.request import VehicleRequest
+from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
+from laneweave.coordinator.planning.response import PlanResponse
+from laneweave.coordinator.planning.validator import problems_of_response
+from laneweave.launch.bench.request_families import formation_request
+from laneweave.protocol.lattice import Cell, Mode
 from support.planning_oracles import requests
 
 # By the oracle (tests/oracles/milp_oracle.py), in 0.2 to 0.6 s each.
@@ -85,7 +88,7 @@ def mirrored(request: PlanRequest, *, columns: bool) -> PlanRequest:
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10_000), st.integers(2, 8), st.sampled_from((1, 2)))
-def test_the_cost_does_not_depend_on_the_point_of_view(seed: int, size: int, mode: int) -> None:
+def test_mirrored_and_reordered_requests_cost_the_same(seed: int, size: int, mode: int) -> None:
     request = formation_request(seed, vehicles=size, mode=1 if mode == 1 else 2)
     cost = solved(request).cost
     assert solved(mirrored(request, columns=True)).cost == cost
@@ -117,7 +120,7 @@ def test_equal_requests_get_equal_plans() -> None:
     assert (first.paths, first.assignment) == (second.paths, second.assignment)
 
 
-def test_what_cannot_be_solved_is_proven_so() -> None:
+def test_an_infeasible_request_is_proven_infeasible() -> None:
     """Two vehicles in a single lane cannot change places."""
     request = PlanRequest(
         Grid(4, 1),
@@ -139,7 +142,7 @@ def test_what_cannot_be_solved_is_proven_so() -> None:
     ],
     ids=["more vehicles than targets", "no target on the lane", "no target at all"],
 )
-def test_who_has_no_target_cannot_arrive(
+def test_a_vehicle_without_a_target_is_infeasible(
     vehicles: tuple[VehicleRequest, ...], targets: tuple[Cell, ...]
 ) -> None:
     request = PlanRequest(Grid(3, 2), 1, ("geometric",), vehicles, targets)
@@ -147,7 +150,7 @@ def test_who_has_no_target_cannot_arrive(
     assert solved(request).status == by_tree.status == "infeasible"
 
 
-def test_of_many_too_who_has_no_target_cannot_arrive() -> None:
+def test_large_requests_without_enough_targets_are_infeasible() -> None:
     """A path set must not be made of targets that a vehicle may not have."""
     block = [(1 + number // 3, number % 3) for number in range(20)]
     vehicles = (
@@ -165,10 +168,10 @@ def test_rounding_does_not_refute_a_cost() -> None:
     """The value of 24 vehicles that move 180 times each, added up move by move."""
     moved = sum(1.0 + PER_MOVE for _ in range(24 * 180))
     assert moved > 24 * 180 * (1.0 + PER_MOVE)
-    assert moved <= ceiling_of(24 * 180) < 24 * 180 + 1
+    assert moved <= upper_bound_of(24 * 180) < 24 * 180 + 1
 
 
-def test_a_far_target_of_few_vehicles_is_no_obstacle() -> None:
+def test_a_distant_target_is_reached() -> None:
     """Longer ways than to the nearest targets are needed."""
     vehicles = (
         VehicleRequest("a", (0, 0)),
@@ -181,13 +184,23 @@ def test_a_far_target_of_few_vehicles_is_no_obstacle() -> None:
     assert response.cost == plan(request, solver="tappa").cost
 
 
-def test_tables_that_do_not_fit_into_memory_are_not_made() -> None:
+def test_arrays_above_the_memory_limit_are_not_made() -> None:
     vehicles = (VehicleRequest("a", (0, 0)),)
     request = PlanRequest(Grid(1000, 16), 1, ("geometric",), vehicles, ((999, 15),), 20.0)
     assert solved(request).cost == 999 + 15
 
 
-def test_tables_of_too_many_targets_are_not_made() -> None:
+def test_a_limit_on_memory_ends_with_a_feasible_plan() -> None:
+    """Arrays for more steps with multipliers do not fit; a path set was found before."""
+    request = formation_request(0, vehicles=24, deadline_s=60.0)
+    limited = plan(request, solver="branching", max_nodes=60, max_memory_mb=1.5)
+    assert (limited.status, limited.solver, limited.fallback) == ("feasible", "tappa", True)
+    assert problems_of_response(request, limited) == []
+    unlimited = plan(request, solver="branching", max_nodes=60)
+    assert (unlimited.solver, unlimited.fallback) == ("branching", False)
+
+
+def test_arrays_for_too_many_targets_are_not_made() -> None:
     """Each vehicle has a list of its own: 60 teams with 399 targets on 16,000 cells."""
     targets = [(column, lane) for column in range(900, 925) for lane in range(16)]
     vehicles = tuple(
@@ -202,19 +215,19 @@ def test_tables_of_too_many_targets_are_not_made() -> None:
     assert search.gave_up
 
 
-def test_a_wide_road_and_a_long_way_are_no_obstacle() -> None:
+def test_wide_roads_and_long_paths_are_planned() -> None:
     vehicles = tuple(VehicleRequest(f"v{lane}", (0, lane), lane=15 - lane) for lane in (0, 5, 11))
     request = PlanRequest(Grid(4, 16), 2, ("geometric",), vehicles, ((3, 15), (3, 10), (3, 4)))
     response = solved(request)
     assert (response.status, response.cost) == ("optimal", 15 + 5 + 7)
 
 
-def test_what_it_cannot_do_is_left_to_the_other_solver() -> None:
+def test_requests_that_branching_cannot_handle_go_to_tappa() -> None:
     request = evolve(formation_request(1, vehicles=4, mode=2), conflicts=("edge",))
     assert solved(request).status == "optimal"
 
 
-def test_without_time_for_a_proof_the_bound_tells_how_far_it_got() -> None:
+def test_an_unfinished_search_returns_its_bound() -> None:
     request = formation_request(3, vehicles=12)
     response = solved(request, max_nodes=30)
     assert response.status in ("timeout", "feasible")

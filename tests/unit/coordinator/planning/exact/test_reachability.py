@@ -3,15 +3,15 @@
 import pytest
 from hypothesis import given, settings
 
-from laneweave.coordinator.planning import PlanRequest, VehicleRequest, problems_of_paths
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
 from laneweave.coordinator.planning.exact.reachability import Verdict, explore
-from laneweave.coordinator.planning.facade import cells_of, plan
-from laneweave.coordinator.planning.geometry.settings import Geometry
+from laneweave.coordinator.planning.facade import plan
+from laneweave.coordinator.planning.geometry.bodies import BodyGeometry
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.coordinator.planning.problem import Problem
-from laneweave.coordinator.planning.validator import problems_of_response
+from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
+from laneweave.coordinator.planning.validator import problems_of_paths, problems_of_response
 from support.planning_oracles import cheapest_plan, requests
 
 
@@ -30,7 +30,7 @@ def test_verdict_agrees_with_the_joint_search(request: PlanRequest) -> None:
     assert verdict.impossible != solvable
     assert (verdict.solution is not None) == solvable
     if verdict.solution is not None:
-        cells = cells_of(problem, verdict.solution)
+        cells = problem.cells_of(verdict.solution)
         rows = RelativePathMap.padded(["" for _ in cells], cells).rows
         assert problems_of_paths(request, verdict.solution.assignment, rows) == []
 
@@ -48,7 +48,7 @@ PUZZLE = PlanRequest(
 """The eight puzzle with two tiles exchanged, which has no solution."""
 
 
-def test_a_search_that_is_cut_off_shows_nothing() -> None:
+def test_a_truncated_search_has_no_result() -> None:
     _, verdict = _explore(PUZZLE, max_moves=500)
     assert verdict == Verdict(solution=None, impossible=False)
 
@@ -81,9 +81,9 @@ def test_a_crowded_block_is_solved() -> None:
     assert not problems_of_response(request, response)
 
 
-def test_who_may_pass_but_not_wait_beside_is_not_impossible() -> None:
+def test_passing_without_waiting_is_possible() -> None:
     """In wide cells two may pass each other obliquely, but special-4 forbids to pass who waits."""
-    geometry = Geometry(
+    geometry = BodyGeometry(
         length_m=3.5,
         width_m=2.0,
         lane_width_m=8.0,

@@ -3,18 +3,20 @@
 import numpy as np
 import pytest
 
-from laneweave.coordinator.planning import plan
 from laneweave.coordinator.planning.exact.relaxation import Relaxation, stack
 from laneweave.coordinator.planning.exact.relaxation_kernel import PER_MOVE
-from laneweave.coordinator.planning.grid import Mode
-from laneweave.coordinator.planning.instances import formation_request
+from laneweave.coordinator.planning.facade import plan
+from laneweave.launch.bench.request_families import formation_request
+from laneweave.protocol.lattice import Mode
 from unit.coordinator.planning.exact.test_negotiation import arrays_of
 
 CASES: list[tuple[int, int, Mode]] = [(0, 6, 1), (3, 9, 1), (1, 6, 2), (3, 8, 2)]
 
 
 @pytest.mark.parametrize(("seed", "vehicles", "mode"), CASES)
-def test_bounds_rise_up_to_the_least_cost_at_most(seed: int, vehicles: int, mode: Mode) -> None:
+def test_bounds_rise_and_never_exceed_the_minimum_cost(
+    seed: int, vehicles: int, mode: Mode
+) -> None:
     request = formation_request(seed, vehicles=vehicles, mode=mode)
     cost = plan(request).cost
     assert cost is not None
@@ -25,28 +27,28 @@ def test_bounds_rise_up_to_the_least_cost_at_most(seed: int, vehicles: int, mode
         bounds.append(whole.bound)
     assert bounds == sorted(bounds)
     assert bounds[0] < bounds[-1] <= cost * (1.0 + PER_MOVE)
-    assert whole.least_cost <= cost
-    assert whole.least_cost >= 0.9 * cost
+    assert whole.min_cost <= cost
+    assert whole.min_cost >= 0.9 * cost
 
 
 @pytest.mark.parametrize(("seed", "vehicles", "mode"), CASES)
-def test_the_moves_of_a_best_plan_are_never_too_dear(seed: int, vehicles: int, mode: Mode) -> None:
+def test_moves_of_an_optimal_plan_are_never_fixed(seed: int, vehicles: int, mode: Mode) -> None:
     request = formation_request(seed, vehicles=vehicles, mode=mode)
     response = plan(request)
     assert response.cost is not None
-    ways, grouped = arrays_of(request)
-    whole = Relaxation(ways, grouped, 16)
+    arrays, grouped = arrays_of(request)
+    whole = Relaxation(arrays, grouped, 16)
     whole.improve(100)
-    nodes = stack(grouped, whole.prices, ways.valid, 1)
+    nodes = stack(grouped, whole.multipliers, arrays.valid, 1)
     assert whole.put(nodes, response.cost * (1.0 + PER_MOVE) + 1e-9)
     allowed = nodes.allowed[0]
     assert allowed.sum() < 0.5 * whole.allowed.sum()
     for k, path, target in zip(
         grouped.team.tolist(), response.paths, response.assignment, strict=True
     ):
-        cells = [column * ways.lanes + lane for column, lane in path]
+        cells = [column * arrays.lanes + lane for column, lane in path]
         arrival = max([t + 1 for t, cell in enumerate(cells[:-1]) if cell != cells[-1]], default=0)
         for t in range(arrival):
-            (d,) = np.flatnonzero(ways.step == cells[t + 1] - cells[t])
+            (d,) = np.flatnonzero(arrays.step == cells[t + 1] - cells[t])
             assert allowed[k, t, d, cells[t]]
-        assert nodes.first[0, grouped.pair[k, target]] <= arrival
+        assert nodes.earliest[0, grouped.pair[k, target]] <= arrival

@@ -12,30 +12,34 @@ from hypothesis import strategies as st
 
 from laneweave.agents.driving.trajectory import move_profile
 from laneweave.coordinator.planning.conflicts import (
+    MAX_OFFSET,
     PAPER_KINDS,
     ConflictModel,
-    footprint,
+    Move,
+    Pair,
     is_oblique,
 )
 from laneweave.coordinator.planning.geometry import conflict_table as clearances
-from laneweave.coordinator.planning.geometry.bodies import Floats, minimum_jerk_path, outline
+from laneweave.coordinator.planning.geometry.bodies import (
+    BodyGeometry,
+    Floats,
+    minimum_jerk_path,
+    outline,
+)
 from laneweave.coordinator.planning.geometry.conflict_table import (
-    FARTHEST,
-    Pair,
-    close_pairs,
-    least_clearances,
+    conflict_table,
+    min_clearances,
     pairs_closer_than,
 )
-from laneweave.coordinator.planning.geometry.settings import Geometry
-from laneweave.coordinator.planning.grid import Cell, Mode, Move, displacements
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.lattice import Cell, Mode, displacements, footprint
 from laneweave.protocol.scenario.tables import Scenario
 from oracles.moving_bodies import Bodies, least_gap_m
 
-NEAR = range(-FARTHEST, FARTHEST + 1)
+NEAR = range(-MAX_OFFSET, MAX_OFFSET + 1)
 STEPS = displacements(2)
-ANY_DELAY = Geometry()
-HALF_A_SECOND = Geometry(lateness_s=0.5)
+ANY_DELAY = BodyGeometry()
+HALF_A_SECOND = BodyGeometry(lateness_s=0.5)
 
 
 def moves(pair: Pair) -> tuple[Move, Move]:
@@ -52,7 +56,7 @@ def every_pair(mode: Mode = 2) -> list[Pair]:
 
 def footprints_meet(pair: Pair) -> bool:
     a, b = moves(pair)
-    return not footprint(a).isdisjoint(footprint(b))
+    return not footprint(*a).isdisjoint(footprint(*b))
 
 
 @cache
@@ -62,7 +66,7 @@ def actual_paths() -> dict[Cell, Floats]:
 
 
 @st.composite
-def geometries(draw: st.DrawFn) -> Geometry:
+def geometries(draw: st.DrawFn) -> BodyGeometry:
     """Any lengths, times and clearances that fit together, close to what just fits, too."""
     numbers = {
         "length_m": draw(st.floats(3.0, 12.0)),
@@ -81,7 +85,7 @@ def geometries(draw: st.DrawFn) -> Geometry:
     numbers["clearance_across_m"] = (lane_width_m - numbers["width_m"]) * draw(shares)
     lateness_s = draw(st.none() | st.floats(0.0, 1.0))
     try:
-        return Geometry(**numbers, lateness_s=lateness_s)
+        return BodyGeometry(**numbers, lateness_s=lateness_s)
     except BadInputError:
         assume(False)
         raise
@@ -96,52 +100,54 @@ def test_at_any_delay_it_contains_the_kinds_of_the_paper(mode: Mode, kind: str) 
     model = ConflictModel([kind])
     named = {pair for pair in every_pair(mode) if model.kind(*moves(pair)) is not None}
     assert named or (mode == 1 and kind in ("special-2", "special-3", "special-4"))
-    assert named <= close_pairs(ANY_DELAY)
+    assert named <= conflict_table(ANY_DELAY).pairs
 
 
 def test_the_kinds_of_the_paper_overlook_pairs_of_oblique_moves_only() -> None:
     """All others that the table forbids at any delay are conflicts of the paper, too."""
     model = ConflictModel(PAPER_KINDS)
     named = {pair for pair in every_pair() if model.kind(*moves(pair)) is not None}
-    overlooked = close_pairs(ANY_DELAY) & set(every_pair()) - named
+    overlooked = conflict_table(ANY_DELAY).pairs & set(every_pair()) - named
     assert (len(named), len(overlooked)) == (280, 64)
     assert all(is_oblique(move) for pair in overlooked for move in moves(pair))
-    assert ((-1, -2), (-1, -1), (1, 1)) in overlooked & close_pairs(Geometry(lateness_s=0.0))
+    assert ((-1, -2), (-1, -1), (1, 1)) in overlooked & conflict_table(
+        BodyGeometry(lateness_s=0.0)
+    ).pairs
 
 
 def test_at_any_delay_it_is_footprints_but_for_obliques_that_share_a_corner() -> None:
     meeting = {pair for pair in every_pair() if footprints_meet(pair)}
-    allowed = meeting - close_pairs(ANY_DELAY)
+    allowed = meeting - conflict_table(ANY_DELAY).pairs
     assert len(meeting) == 360
     assert len(allowed) == 16
     for pair in allowed:
         a, b = moves(pair)
-        (shared,) = footprint(a) & footprint(b)
+        (shared,) = footprint(*a) & footprint(*b)
         assert shared not in (*a, *b), "a corner of both"
-    assert not {pair for pair in close_pairs(ANY_DELAY) if pair[0] != (0, 0)} - meeting
+    assert not {pair for pair in conflict_table(ANY_DELAY).pairs if pair[0] != (0, 0)} - meeting
 
 
 def test_in_mode_1_it_is_footprints() -> None:
     meeting = {pair for pair in every_pair(1) if footprints_meet(pair)}
-    assert close_pairs(ANY_DELAY) & set(every_pair(1)) == meeting
+    assert conflict_table(ANY_DELAY).pairs & set(every_pair(1)) == meeting
 
 
 # ----------------------------------------------------------------------------------- lateness
 
 
 @pytest.mark.parametrize("along", [-1, 1])
-def test_trains_are_allowed_where_nobody_is_too_late(along: int) -> None:
+def test_trains_are_allowed_with_limited_lateness(along: int) -> None:
     train: Pair = ((1, 0), (along, 0), (along, 0))
-    assert train not in close_pairs(HALF_A_SECOND)
-    assert train in close_pairs(Geometry(lateness_s=0.8))
-    assert train in close_pairs(attrs.evolve(HALF_A_SECOND, clearance_along_m=6.0))
-    assert train in close_pairs(ANY_DELAY)
+    assert train not in conflict_table(HALF_A_SECOND).pairs
+    assert train in conflict_table(BodyGeometry(lateness_s=0.8)).pairs
+    assert train in conflict_table(attrs.evolve(HALF_A_SECOND, clearance_along_m=6.0)).pairs
+    assert train in conflict_table(ANY_DELAY).pairs
 
 
 @pytest.mark.parametrize("lateness_s", [0.0, 0.5])
 @pytest.mark.parametrize("mode", [1, 2])
-def test_nobody_waits_where_another_passes_or_arrives(mode: Mode, lateness_s: float) -> None:
-    table = close_pairs(Geometry(lateness_s=lateness_s))
+def test_waiting_in_a_crossed_cell_is_a_conflict(mode: Mode, lateness_s: float) -> None:
+    table = conflict_table(BodyGeometry(lateness_s=lateness_s)).pairs
     node = ConflictModel(["node", "edge"])
     assert {pair for pair in every_pair(mode) if node.kind(*moves(pair))} <= table
     same_cell = {((0, 0), a, b) for a, b in product(displacements(mode), repeat=2)}
@@ -153,9 +159,9 @@ def test_nobody_waits_where_another_passes_or_arrives(mode: Mode, lateness_s: fl
 
 @settings(max_examples=40, deadline=None)
 @given(geometries())
-def test_disjoint_footprints_are_never_too_close(geometry: Geometry) -> None:
+def test_disjoint_footprints_are_never_too_close(geometry: BodyGeometry) -> None:
     """They are separated by a column or by a lane; so the table never forbids what they allow."""
-    table = close_pairs(geometry)
+    table = conflict_table(geometry).pairs
     for pair in table:
         assert footprints_meet(pair), pair
 
@@ -163,18 +169,18 @@ def test_disjoint_footprints_are_never_too_close(geometry: Geometry) -> None:
 @settings(max_examples=20, deadline=None)
 @given(geometries())
 def test_it_is_the_same_seen_from_the_other_vehicle_or_from_the_other_side(
-    geometry: Geometry,
+    geometry: BodyGeometry,
 ) -> None:
-    table = close_pairs(geometry)
+    table = conflict_table(geometry).pairs
     for (column, lane), a, b in table:
         assert ((-column, -lane), b, a) in table
         assert ((column, -lane), (a[0], -a[1]), (b[0], -b[1])) in table
 
 
-@pytest.mark.parametrize("geometry", [ANY_DELAY, HALF_A_SECOND, Geometry(lateness_s=0.0)])
-def test_backwards_it_forbids_the_same_or_more(geometry: Geometry) -> None:
+@pytest.mark.parametrize("geometry", [ANY_DELAY, HALF_A_SECOND, BodyGeometry(lateness_s=0.0)])
+def test_backwards_it_forbids_the_same_or_more(geometry: BodyGeometry) -> None:
     """Bodies turn more where they fall back while they change lanes."""
-    table = close_pairs(geometry)
+    table = conflict_table(geometry).pairs
     mirrored = {((-c, lane), (-a[0], a[1]), (-b[0], b[1])) for (c, lane), a, b in table}
     assert {pair for pair in mirrored if pair[1][0] <= 0 and pair[2][0] <= 0} <= table
     assert (table == mirrored) == (geometry != HALF_A_SECOND)
@@ -183,7 +189,7 @@ def test_backwards_it_forbids_the_same_or_more(geometry: Geometry) -> None:
 @settings(max_examples=30, deadline=None)
 @given(geometries(), st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.floats(0.0, 0.5))
 def test_more_clearance_or_more_lateness_removes_nothing(
-    geometry: Geometry, along: float, across: float, late_s: float
+    geometry: BodyGeometry, along: float, across: float, late_s: float
 ) -> None:
     late = geometry.lateness_s
     try:
@@ -195,8 +201,11 @@ def test_more_clearance_or_more_lateness_removes_nothing(
         )
     except BadInputError:
         stricter = attrs.evolve(geometry, lateness_s=None)
-    assert close_pairs(geometry) <= close_pairs(stricter)
-    assert close_pairs(geometry) <= close_pairs(attrs.evolve(geometry, lateness_s=None))
+    assert conflict_table(geometry).pairs <= conflict_table(stricter).pairs
+    assert (
+        conflict_table(geometry).pairs
+        <= conflict_table(attrs.evolve(geometry, lateness_s=None)).pairs
+    )
 
 
 # -------------------------------------------------------------------------- against simulation
@@ -204,10 +213,10 @@ def test_more_clearance_or_more_lateness_removes_nothing(
 
 @settings(max_examples=12, deadline=None)
 @given(geometries(), st.integers(0, 10**6))
-def test_it_contains_what_simulated_bodies_do(geometry: Geometry, seed: int) -> None:
+def test_it_contains_what_simulated_bodies_do(geometry: BodyGeometry, seed: int) -> None:
     """And little more: what is forbidden is too close with clearances a little larger."""
     bodies = Bodies(**attrs.asdict(geometry))
-    table = close_pairs(geometry)
+    table = conflict_table(geometry).pairs
     slack_m = 0.1 + 2.0 * 1.875 * geometry.pitch_m / geometry.move_s * geometry.move_s / 100
     for pair in Random(seed).sample(every_pair(), 300):
         if least_gap_m(bodies, *pair) < geometry.clearance_along_m:
@@ -219,50 +228,50 @@ def test_it_contains_what_simulated_bodies_do(geometry: Geometry, seed: int) -> 
 
 @pytest.mark.parametrize("parts", [3, 8, clearances.PARTS])
 @pytest.mark.parametrize("lateness_s", [None, 0.0, 0.3, 0.7])
-def test_it_never_says_more_than_there_is(
+def test_clearances_are_never_overestimated(
     parts: int, lateness_s: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """However coarse it computes; then it says less."""
     monkeypatch.setattr(clearances, "PARTS", parts)
-    geometry, bodies = Geometry(lateness_s=lateness_s), Bodies(lateness_s=lateness_s)
-    found = least_clearances(geometry)
+    geometry, bodies = BodyGeometry(lateness_s=lateness_s), Bodies(lateness_s=lateness_s)
+    found = min_clearances(geometry)
     for (column, lane), a, b in every_pair():
         least_m = found[column + 3, lane + 3, STEPS.index(a), STEPS.index(b)]
         assert least_m <= least_gap_m(bodies, (column, lane), a, b) + 1e-6
 
 
 @pytest.mark.parametrize("lateness_s", [None, 0.0, 0.2, 0.5])
-def test_what_agents_drive_is_not_closer_than_the_default_profile_says(
+def test_driven_motions_are_not_closer_than_the_default_profile(
     lateness_s: float | None,
 ) -> None:
     """They accelerate less and later; the profile errors of the geometry make up for it."""
-    geometry = Geometry(lateness_s=lateness_s)
+    geometry = BodyGeometry(lateness_s=lateness_s)
     exact = attrs.evolve(geometry, profile_error_along_m=0.0, profile_error_across_m=0.0)
-    driven, assumed = least_clearances(exact, actual_paths()), least_clearances(geometry)
+    driven, assumed = min_clearances(exact, actual_paths()), min_clearances(geometry)
     assert (driven >= assumed).all()
-    assert pairs_closer_than(exact, actual_paths()) <= close_pairs(geometry)
+    assert pairs_closer_than(exact, actual_paths()) <= conflict_table(geometry).pairs
 
 
 @pytest.mark.parametrize(
     ("lateness_s", "more", "more_with_errors"),
     [(None, 0, 0), (0.0, 0, 8), (0.2, 0, 0), (0.5, 0, 16)],
 )
-def test_the_table_is_nearly_that_of_what_agents_drive(
+def test_the_table_nearly_equals_that_of_driven_motions(
     lateness_s: float | None, more: int, more_with_errors: int
 ) -> None:
-    geometry = Geometry(lateness_s=lateness_s)
+    geometry = BodyGeometry(lateness_s=lateness_s)
     exact = attrs.evolve(geometry, profile_error_along_m=0.0, profile_error_across_m=0.0)
     driven = pairs_closer_than(exact, actual_paths())
-    assert driven <= close_pairs(exact)
-    assert len(close_pairs(exact) - driven) == more
-    assert len(close_pairs(geometry) - driven) == more_with_errors
+    assert driven <= conflict_table(exact).pairs
+    assert len(conflict_table(exact).pairs - driven) == more
+    assert len(conflict_table(geometry).pairs - driven) == more_with_errors
     of_mode_1 = {step: path for step, path in actual_paths().items() if 0 in step}
     straight = pairs_closer_than(exact, of_mode_1)
     assert straight == {pair for pair in driven if 0 in pair[1] and 0 in pair[2]}
 
 
 def test_profile_errors_cover_the_profiles_of_the_default_scenario() -> None:
-    geometry = Geometry()
+    geometry = BodyGeometry()
     times = np.linspace(0.0, 1.0, 2000)
 
     def edges(paths: dict[Cell, Floats]) -> Floats:
@@ -297,21 +306,26 @@ def test_outlines_hold_between_samples(displacement: Cell) -> None:
     assert (left >= fine[:, 3] - 1e-3).all()
 
 
-def test_moves_that_go_too_far_are_refused() -> None:
+def test_conflicts_beyond_the_maximum_offset_are_refused() -> None:
     paths = {(0, 0): np.zeros((5, 2)), (1, 0): 45.0 * np.linspace(0, 1, 5)[:, None] * [1.0, 0.0]}
     with pytest.raises(ValueError, match="3, 0"):
-        pairs_closer_than(Geometry(), paths)
+        pairs_closer_than(BodyGeometry(), paths)
 
 
-def test_a_model_with_a_geometry_needs_geometric() -> None:
+def test_a_model_with_a_table_needs_geometric() -> None:
     with pytest.raises(ValueError, match="without geometric"):
-        ConflictModel(["node"], Geometry())
+        ConflictModel(["node"], conflict_table(BodyGeometry()))
 
 
-def test_a_model_with_a_geometry_means_its_table() -> None:
-    model = ConflictModel(["geometric"], HALF_A_SECOND)
+def test_a_model_with_a_table_uses_it() -> None:
+    model = ConflictModel(["geometric"], conflict_table(HALF_A_SECOND))
     for pair in every_pair():
-        assert (model.kind(*moves(pair)) == "geometric") == (pair in close_pairs(HALF_A_SECOND))
+        assert (model.kind(*moves(pair)) == "geometric") == (
+            pair in conflict_table(HALF_A_SECOND).pairs
+        )
     train = moves(((1, 0), (1, 0), (1, 0)))
     assert model.kind(*train) is None
-    assert ConflictModel(["special-1", "geometric"], HALF_A_SECOND).kind(*train) == "special-1"
+    assert (
+        ConflictModel(["special-1", "geometric"], conflict_table(HALF_A_SECOND)).kind(*train)
+        == "special-1"
+    )

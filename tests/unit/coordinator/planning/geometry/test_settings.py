@@ -9,16 +9,16 @@ import attrs
 import numpy as np
 import pytest
 
-from laneweave.coordinator.planning import PlanRequest
-from laneweave.coordinator.planning.geometry.settings import Geometry
-from laneweave.coordinator.planning.instances import formation_request
+from laneweave.coordinator.planning.geometry.bodies import BodyGeometry
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.launch.bench.request_families import formation_request
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.tables import Scenario
 from oracles.moving_bodies import Bodies, motion
 
 
 def test_defaults_are_those_of_the_default_scenario() -> None:
-    geometry, scenario = Geometry(), Scenario()
+    geometry, scenario = BodyGeometry(), Scenario()
     assert geometry.length_m == scenario.vehicle.length_m
     assert geometry.width_m == scenario.vehicle.width_m
     assert geometry.lane_width_m == scenario.road.lane_width_m
@@ -30,21 +30,26 @@ def test_defaults_are_those_of_the_default_scenario() -> None:
 
 
 def test_defaults_are_those_of_the_oracle() -> None:
-    assert geometry_of(Bodies()) == Geometry()
+    assert geometry_of(Bodies()) == BodyGeometry()
 
 
-def geometry_of(bodies: Bodies) -> Geometry:
-    return Geometry(**vars(bodies))
+def geometry_from(fields: Mapping[str, object]) -> BodyGeometry | None:
+    document = {**formation_request(0, mode=2).to_dict(), "geometry": fields}
+    return PlanRequest.from_dict(document).geometry
+
+
+def geometry_of(bodies: Bodies) -> BodyGeometry:
+    return BodyGeometry(**vars(bodies))
 
 
 @pytest.mark.parametrize("displacement", [(1, 0), (-1, 1), (0, -1), (0, 0)])
 def test_the_default_profile_is_the_quintic(displacement: tuple[int, int]) -> None:
-    path = Geometry().paths()[displacement]
+    path = BodyGeometry().paths()[displacement]
     places, _ = motion(Bodies(), displacement, np.linspace(0.0, 3.8, len(path)))
     assert np.allclose(path, places, atol=1e-12)
 
 
-NAMES = [attribute.name for attribute in attrs.fields(Geometry)]
+NAMES = [attribute.name for attribute in attrs.fields(BodyGeometry)]
 WRONG: list[tuple[str, object]] = [
     *product(NAMES, ("1", True, [], math.nan, math.inf, -1, -0.001, 10**400, 1000.0)),
     *((name, None) for name in NAMES if name != "lateness_s"),
@@ -59,9 +64,9 @@ WRONG: list[tuple[str, object]] = [
 
 
 @pytest.mark.parametrize(("name", "value"), WRONG)
-def test_what_is_wrong_with_a_field_is_named(name: str, value: object) -> None:
+def test_errors_name_the_field(name: str, value: object) -> None:
     with pytest.raises(BadInputError) as caught:
-        Geometry.from_dict({name: value})
+        geometry_from({name: value})
     assert caught.value.field == f"geometry.{name}"
     assert "allowed: " in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -90,9 +95,9 @@ UNFIT: list[tuple[str, Mapping[str, float]]] = [
 
 
 @pytest.mark.parametrize(("name", "fields"), UNFIT)
-def test_fields_that_do_not_fit_together_are_named(name: str, fields: dict[str, float]) -> None:
+def test_errors_name_inconsistent_fields(name: str, fields: dict[str, float]) -> None:
     with pytest.raises(BadInputError) as caught:
-        Geometry.from_dict(fields)
+        geometry_from(fields)
     assert caught.value.field == f"geometry.{name}"
 
 
@@ -107,8 +112,8 @@ def test_fields_that_do_not_fit_together_are_named(name: str, fields: dict[str, 
         {"clearance_along_m": 0, "clearance_across_m": 0, "lateness_s": 0},
     ],
 )
-def test_what_just_fits_is_accepted(fields: dict[str, float]) -> None:
-    Geometry.from_dict(fields)
+def test_limits_are_accepted(fields: dict[str, float]) -> None:
+    geometry_from(fields)
 
 
 @pytest.mark.parametrize(
@@ -119,13 +124,15 @@ def test_what_just_fits_is_accepted(fields: dict[str, float]) -> None:
         ("lateness_s", {"lateness_s": 3.0}, "lateness_s"),
     ],
 )
-def test_what_is_said_to_be_allowed_is(name: str, fields: dict[str, float], field: str) -> None:
+def test_the_allowed_value_in_an_error_is_accepted(
+    name: str, fields: dict[str, float], field: str
+) -> None:
     with pytest.raises(BadInputError) as caught:
-        Geometry.from_dict(fields)
+        geometry_from(fields)
     most = float(caught.value.allowed.removeprefix("at most ").partition(":")[0].split(",")[0])
-    assert attrs.evolve(Geometry(), **{field: most})
+    assert attrs.evolve(BodyGeometry(), **{field: most})
     with pytest.raises(BadInputError):
-        attrs.evolve(Geometry(), **{name: most + 0.04})
+        attrs.evolve(BodyGeometry(), **{name: most + 0.04})
 
 
 @pytest.mark.parametrize("value", [None, [], 5, "geometry"])
@@ -143,10 +150,10 @@ def test_a_geometry_needs_geometric() -> None:
     assert caught.value.field == "geometry"
     assert "geometric" in caught.value.allowed
     chosen = PlanRequest.from_dict({**document, "geometry": {}, "conflicts": ["geometric"]})
-    assert chosen.geometry == Geometry()
+    assert chosen.geometry == BodyGeometry()
 
 
-def test_wrong_fields_of_a_request_are_named_within_it() -> None:
+def test_errors_in_a_geometry_name_the_request_field() -> None:
     document = formation_request(0, mode=2).to_dict()
     with pytest.raises(BadInputError) as caught:
         PlanRequest.from_dict({**document, "geometry": {"length_m": -1}})
@@ -158,4 +165,4 @@ def test_without_a_geometry_nothing_is_written() -> None:
     assert "geometry" not in document
     written = PlanRequest.from_dict({**document, "geometry": {"lateness_s": 0.5}}).to_dict()
     assert written["geometry"]["lateness_s"] == 0.5
-    assert PlanRequest.from_dict(written).geometry == Geometry(lateness_s=0.5)
+    assert PlanRequest.from_dict(written).geometry == BodyGeometry(lateness_s=0.5)

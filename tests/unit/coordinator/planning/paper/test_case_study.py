@@ -8,20 +8,23 @@ import math
 
 import pytest
 
-from laneweave.coordinator.planning import PlanRequest, VehicleRequest, plan, problems_of_response
-from laneweave.coordinator.planning.assignments import Assignment, assignments
 from laneweave.coordinator.planning.budget import Budget
 from laneweave.coordinator.planning.conflicts import ConflictModel
-from laneweave.coordinator.planning.explanation import entries
-from laneweave.coordinator.planning.facade import cells_of
-from laneweave.coordinator.planning.frd import Weights, cost_matrix
+from laneweave.coordinator.planning.facade import plan
 from laneweave.coordinator.planning.grid import Grid
-from laneweave.coordinator.planning.paper.cbs import ConstraintTree, Node
-from laneweave.coordinator.planning.paper.improvements import Improvements
+from laneweave.coordinator.planning.paper.assignments import (
+    Assignment,
+    Weights,
+    assignments,
+    cost_matrix,
+    preference_matrix,
+)
+from laneweave.coordinator.planning.paper.cbs import ConstraintTree, Improvements, Node
+from laneweave.coordinator.planning.paper.explanation import entries
 from laneweave.coordinator.planning.path_map import RelativePathMap
-from laneweave.coordinator.planning.preference import preference_matrix
-from laneweave.coordinator.planning.problem import Problem
-from laneweave.coordinator.planning.solution import Solution
+from laneweave.coordinator.planning.problem import Problem, Solution
+from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
+from laneweave.coordinator.planning.validator import problems_of_response
 
 CELLS = ((0, 0), (0, 2), (1, 1), (2, 0), (2, 2))
 VEHICLE_GROUPS = (1, 1, 2, 2, 3)
@@ -107,7 +110,7 @@ def test_best_path_sets_of_both_assignments(problem: Problem, switches: Improvem
 
 def test_relative_path_map_of_the_root(problem: Problem) -> None:
     n1 = _nodes(problem)[0]
-    cells = cells_of(problem, Solution(_assignments()[0].targets, n1.paths))
+    cells = problem.cells_of(Solution(_assignments()[0].targets, n1.paths))
     assert str(RelativePathMap.padded(["1", "2", "3", "4", "5"], cells)).splitlines() == [
         "Vehicle ID  step 1  step 2  step 3",
         "1           (0,0)   (0,0)   (0,0)",

@@ -7,13 +7,12 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from laneweave.coordinator.planning import PlanRequest, problems_of_paths
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
-from laneweave.coordinator.planning.facade import cells_of, problem_of
-from laneweave.coordinator.planning.paper.cbs import ConstraintTree, Node
-from laneweave.coordinator.planning.paper.improvements import Improvements
+from laneweave.coordinator.planning.paper.cbs import ConstraintTree, Improvements, Node
 from laneweave.coordinator.planning.path_map import RelativePathMap
-from laneweave.coordinator.planning.solution import Solution
+from laneweave.coordinator.planning.problem import Solution
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.validator import problems_of_paths
 from support.planning_oracles import cheapest_plan, requests
 
 ENOUGH = 600
@@ -26,7 +25,7 @@ def _assignment(request: PlanRequest) -> tuple[int, ...]:
 
 def _tree(request: PlanRequest, switches: Improvements, nodes: int = ENOUGH) -> ConstraintTree:
     budget = Budget(max_nodes=nodes)
-    return ConstraintTree(problem_of(request), _assignment(request), budget, switches, record=True)
+    return ConstraintTree(request.problem(), _assignment(request), budget, switches, record=True)
 
 
 def _search(tree: ConstraintTree, limit: float = math.inf) -> Node | None:
@@ -48,8 +47,8 @@ def test_cost_is_that_of_the_joint_search(request: PlanRequest, switches: Improv
         assert expected is None or tree.lower_bound <= expected
         return
     assert node.cost == expected
-    problem = problem_of(request)
-    cells = cells_of(problem, Solution(_assignment(request), node.paths))
+    problem = request.problem()
+    cells = problem.cells_of(Solution(_assignment(request), node.paths))
     path_map = RelativePathMap.padded(["" for _ in cells], cells)
     assert problems_of_paths(request, _assignment(request), path_map.rows) == []
     assert path_map.cost() == node.cost
@@ -57,7 +56,9 @@ def test_cost_is_that_of_the_joint_search(request: PlanRequest, switches: Improv
 
 @settings(max_examples=40, deadline=None)
 @given(requests(), st.integers(-1, 2))
-def test_a_limit_hides_exactly_what_is_no_better(request: PlanRequest, margin: int) -> None:
+def test_a_limit_excludes_exactly_the_solutions_that_are_not_better(
+    request: PlanRequest, margin: int
+) -> None:
     best = _search(_tree(request, Improvements(), 300))
     assume(best is not None)
     assert best is not None

@@ -5,20 +5,23 @@ import math
 import attrs
 from hypothesis import given, settings
 
-from laneweave.coordinator.planning import PlanRequest, Weights, plan, problems_of_paths
 from laneweave.coordinator.planning.budget import Budget
-from laneweave.coordinator.planning.facade import cells_of, new_tappa, problem_of
-from laneweave.coordinator.planning.instances import traffic_request
-from laneweave.coordinator.planning.paper.improvements import Improvements
+from laneweave.coordinator.planning.facade import plan
+from laneweave.coordinator.planning.paper.assignments import Weights
+from laneweave.coordinator.planning.paper.cbs import Improvements
 from laneweave.coordinator.planning.paper.joint_search import JointSearch
+from laneweave.coordinator.planning.paper.tappa import new_tappa
 from laneweave.coordinator.planning.path_map import RelativePathMap
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.validator import problems_of_paths
+from laneweave.launch.bench.request_families import traffic_request
 from support.planning_oracles import cheapest_plan, requests
 
 
 @settings(max_examples=150, deadline=None)
 @given(requests())
 def test_path_set_is_optimal_and_legal_or_there_is_none(request: PlanRequest) -> None:
-    problem = problem_of(request)
+    problem = request.problem()
     search = JointSearch(problem, request.choices(), Budget())
     expected = cheapest_plan(request)
     bounds = [search.lower_bound]
@@ -34,18 +37,18 @@ def test_path_set_is_optimal_and_legal_or_there_is_none(request: PlanRequest) ->
     assert search.solution is not None
     assert search.solution.cost == search.lower_bound == expected
     rows = RelativePathMap.padded(
-        [vehicle.id for vehicle in request.vehicles], cells_of(problem, search.solution)
+        [vehicle.id for vehicle in request.vehicles], problem.cells_of(search.solution)
     ).rows
     assert problems_of_paths(request, search.solution.assignment, rows) == []
 
 
-def test_a_crowded_formation_is_solved_beside_trees_that_do_not_end() -> None:
+def test_a_crowded_formation_is_solved_while_trees_do_not_end() -> None:
     request = traffic_request(_crowded_seed())
     outcomes = []
     for switches in (Improvements(), attrs.evolve(Improvements(), joint=False)):
         budget = Budget(max_nodes=1_500)
         weights = Weights.for_mode(request.mode)
-        run = new_tappa(problem_of(request), request, weights, budget, switches)
+        run = new_tappa(request.problem(), request, weights, budget, switches)
         run.run()
         outcomes.append((run.finished, run.best_cost))
         assert run.lower_bound <= run.best_cost

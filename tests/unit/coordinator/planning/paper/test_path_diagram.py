@@ -8,9 +8,12 @@ from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.grid import Grid
-from laneweave.coordinator.planning.moves import MoveTable, bits
-from laneweave.coordinator.planning.paper.path_diagram import Bans, Diagram, shortest_paths
-from laneweave.coordinator.planning.paper.sppa import Path, choose_path, conflicting_moves
+from laneweave.coordinator.planning.problem import Bans, Diagram, MoveTable, Path, bits
+from laneweave.coordinator.planning.shortest_paths import (
+    choose_path,
+    conflicting_moves,
+    shortest_paths,
+)
 
 MODEL = ConflictModel(["node", "edge", "special-1"])
 TABLES = [
@@ -117,7 +120,7 @@ def test_choice_has_fewest_conflicts_then_fewest_moves_then_lowest_index(
     assert choose_path(table, diagram, taken) == expected
 
 
-def test_target_that_must_be_left_is_reached_later() -> None:
+def test_a_target_that_must_be_left_is_reached_again_later() -> None:
     table = MoveTable(Grid(3, 1), 1, MODEL)
     middle = table.bit((1, 0))
     diagram = shortest_paths(table, middle, middle, Bans(at={2: 1 << middle}))

@@ -7,19 +7,21 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from laneweave.coordinator.planning.conflicts import KINDS, ConflictModel
-from laneweave.coordinator.planning.grid import Grid, Mode
-from laneweave.coordinator.planning.moves import MoveTable, bits
+from laneweave.coordinator.planning.conflicts import ConflictModel
+from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.paper.constraints import (
     Conflict,
     Constraint,
     bans_for,
     constraints_of,
+    disjoint_constraints,
     is_at_node,
+    rises,
 )
-from laneweave.coordinator.planning.paper.path_diagram import Bans, Diagram, shortest_paths
-from laneweave.coordinator.planning.paper.splits import disjoint_constraints, rises
-from laneweave.coordinator.planning.paper.sppa import Path, choose_path
+from laneweave.coordinator.planning.problem import Bans, Diagram, MoveTable, Path, bits
+from laneweave.coordinator.planning.shortest_paths import choose_path, shortest_paths
+from laneweave.protocol.lattice import Mode
+from laneweave.protocol.scenario.tables import CONFLICT_KINDS
 
 STEPS = 3
 Case = tuple[MoveTable, tuple[Diagram, Diagram], tuple[Path, Path]]
@@ -29,7 +31,7 @@ Case = tuple[MoveTable, tuple[Diagram, Diagram], tuple[Path, Path]]
 def pairs(draw: st.DrawFn) -> Case:
     """Draw two vehicles with different starts and targets, planned on their own."""
     mode: Mode = draw(st.sampled_from([1, 2]))
-    kinds = draw(st.lists(st.sampled_from(KINDS), min_size=1, unique=True))
+    kinds = draw(st.lists(st.sampled_from(CONFLICT_KINDS), min_size=1, unique=True))
     table = MoveTable(draw(st.sampled_from([Grid(3, 2), Grid(4, 1)])), mode, ConflictModel(kinds))
     cells = list(bits(table.cells))
     starts = draw(st.permutations(cells))[:2]
@@ -155,7 +157,7 @@ def _cost_of_child(
 
 @settings(max_examples=60, deadline=None)
 @given(pairs())
-def test_children_cost_as_much_more_as_announced(case: Case) -> None:
+def test_children_cost_more_as_predicted(case: Case) -> None:
     table, diagrams, (p, q) = case
     conflict = _first_conflict(case)
     assume(conflict is not None)

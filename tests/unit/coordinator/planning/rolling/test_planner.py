@@ -20,7 +20,7 @@ from laneweave.coordinator.planning.rolling.planner import (
     StreamRoad,
     StreamVehicle,
 )
-from laneweave.coordinator.planning.rolling.validator import problems_of_ways
+from laneweave.coordinator.planning.rolling.validator import problems_of_plan
 from support import rolling_oracles as oracle
 from support.rolling_oracles import ROAD, SHORT, Stream, streams
 
@@ -37,16 +37,16 @@ def dense(
 
 def driven(plan: StreamPlan, vehicles: list[StreamVehicle]) -> list[StreamVehicle]:
     """Return the vehicles that are on the road in the next slot, where their ways lead."""
-    ways = plan.ways
+    ways = plan.paths
     return [attrs.evolve(v, cell=ways[v.vehicle][1]) for v in vehicles if len(ways[v.vehicle]) > 2]
 
 
 def is_legal(road: StreamRoad, plan: StreamPlan, vehicles: list[StreamVehicle]) -> bool:
     """Look at all pairs in all slots, by the rules that the tests state themselves."""
     starts = {v.vehicle: v.cell for v in vehicles}
-    if {name: way[0] for name, way in plan.ways.items()} != starts:
+    if {name: way[0] for name, way in plan.paths.items()} != starts:
         return False
-    for one, other in combinations(plan.ways.values(), 2):
+    for one, other in combinations(plan.paths.values(), 2):
         pairs = zip(pairwise(one), pairwise(other), strict=False)
         if any(oracle.conflicts(road.model, a, b) for a, b in pairs):
             return False
@@ -58,16 +58,16 @@ def is_legal(road: StreamRoad, plan: StreamPlan, vehicles: list[StreamVehicle]) 
 
 @settings(max_examples=150, deadline=None)
 @given(streams())
-def test_every_stream_gets_complete_ways_without_conflicts(stream: Stream) -> None:
+def test_every_stream_gets_complete_paths_without_conflicts(stream: Stream) -> None:
     road, slot, vehicles, blocked = stream
     planner = StreamPlanner(road)
     plan = planner.plan(slot, vehicles, None, blocked)
-    assert problems_of_ways(road, plan, vehicles, blocked) == []
+    assert problems_of_plan(road, plan, vehicles, blocked) == []
     assert is_legal(road, plan, vehicles)
     # What was planned is driven for a slot, with other cells blocked then.
     later = driven(plan, vehicles)
     again = planner.plan(slot + 1, later, plan, blocked[1:])
-    assert problems_of_ways(road, again, later, blocked[1:]) == []
+    assert problems_of_plan(road, again, later, blocked[1:]) == []
 
 
 @settings(max_examples=60, deadline=None)
@@ -89,10 +89,10 @@ def test_vehicles_need_not_be_where_they_were_planned(stream: Stream) -> None:
     ]
     for skipped in (1, 3):
         later = planner.plan(slot + skipped, moved, plan, blocked)
-        assert problems_of_ways(road, later, moved, blocked) == []
+        assert problems_of_plan(road, later, moved, blocked) == []
 
 
-def test_an_endpoint_without_a_router_is_refused() -> None:
+def test_an_empty_road() -> None:
     assert StreamPlanner(ROAD).plan(3, []) == StreamPlan(3, {}, ())
 
 
@@ -102,19 +102,19 @@ def test_one_vehicle_from_anywhere(column: int) -> None:
     for lane in range(3):
         vehicle = StreamVehicle("v", (column, lane), 0)
         plan = StreamPlanner(ROAD).plan(0, [vehicle])
-        assert problems_of_ways(ROAD, plan, [vehicle]) == []
+        assert problems_of_plan(ROAD, plan, [vehicle]) == []
         slots = (1000 - 15 * column) // 60
         assert plan.missed == (("v",) if lane > max(0, slots) else ())
 
 
-def test_vehicles_that_are_past_the_road_have_no_way_to_go() -> None:
+def test_vehicles_beyond_the_road_have_no_path() -> None:
     vehicles = [StreamVehicle("past", (67, 0), 2), StreamVehicle("last", (66, 0), 0)]
     plan = StreamPlanner(ROAD).plan(0, vehicles)
-    assert plan.ways == {"past": ((67, 0),), "last": ((66, 0), (66, 0))}
+    assert plan.paths == {"past": ((67, 0),), "last": ((66, 0), (66, 0))}
     assert plan.missed == ("past",)
 
 
-def test_two_in_one_cell_and_lanes_that_do_not_exist_are_refused() -> None:
+def test_shared_cells_and_unknown_lanes_are_refused() -> None:
     planner = StreamPlanner(ROAD)
     with pytest.raises(ValueError, match="a and b are both in"):
         planner.plan(0, [StreamVehicle("a", (1, 1), 0), StreamVehicle("b", (1, 1), 0)])
@@ -124,42 +124,42 @@ def test_two_in_one_cell_and_lanes_that_do_not_exist_are_refused() -> None:
         attrs.evolve(ROAD, model=ConflictModel(("edge",)))
 
 
-def test_who_stands_in_a_blocked_cell_may_leave_it_and_nobody_enters() -> None:
+def test_blocked_cells_may_be_left_but_not_entered() -> None:
     blocked = [(30, 0), (30, 1)]
     vehicles = [StreamVehicle("in", (30, 0), 2), StreamVehicle("beside", (30, 2), 0)]
     plan = StreamPlanner(ROAD).plan(0, vehicles, None, blocked)
-    assert problems_of_ways(ROAD, plan, vehicles, blocked) == []
+    assert problems_of_plan(ROAD, plan, vehicles, blocked) == []
     assert plan.missed == ()
-    assert plan.ways["in"][1] in {(29, 0), (31, 0)}
-    assert set(plan.ways["beside"]).isdisjoint(blocked)
+    assert plan.paths["in"][1] in {(29, 0), (31, 0)}
+    assert set(plan.paths["beside"]).isdisjoint(blocked)
 
 
-def test_who_is_held_stays_and_others_go_round() -> None:
+def test_held_vehicles_stay_and_others_drive_around_them() -> None:
     vehicles = [
         StreamVehicle("held", (30, 1), 0, held=True),
         StreamVehicle("a", (30, 0), 2),
         StreamVehicle("b", (30, 2), 0),
     ]
     plan = StreamPlanner(ROAD).plan(0, vehicles)
-    assert set(plan.ways["held"]) == {(30, 1)}
+    assert set(plan.paths["held"]) == {(30, 1)}
     assert plan.missed == ("held",)
 
 
-def test_a_way_that_was_planned_is_given_up_where_somebody_is_held_in_it() -> None:
+def test_a_path_blocked_by_a_held_vehicle_is_replaced() -> None:
     planner = StreamPlanner(ROAD)
     vehicles = [StreamVehicle("a", (30, 0), 2), StreamVehicle("b", (31, 1), 1)]
     before = planner.plan(0, vehicles)
     held = [vehicles[0], StreamVehicle("b", (30, 1), 1, held=True)]
-    assert problems_of_ways(ROAD, before, held) != []
+    assert problems_of_plan(ROAD, before, held) != []
     plan = planner.plan(0, held, before)
-    assert problems_of_ways(ROAD, plan, held) == []
+    assert problems_of_plan(ROAD, plan, held) == []
     assert plan.missed == ()
 
 
 # ------------------------------------------------------------------------- the same each time
 
 
-def test_equal_streams_get_equal_plans_whoever_plans_them() -> None:
+def test_equal_streams_get_equal_plans_from_any_planner() -> None:
     vehicles = dense(Random(1), range(24), 0.8)
     first, second = StreamPlanner(ROAD, seed=5), StreamPlanner(ROAD, seed=5)
     plan = first.plan(0, vehicles)
@@ -173,7 +173,7 @@ def test_equal_streams_get_equal_plans_whoever_plans_them() -> None:
         plan = later
 
 
-def test_ways_stay_while_nothing_changes_unless_others_are_cheaper() -> None:
+def test_paths_change_only_for_cheaper_ones() -> None:
     planner = StreamPlanner(ROAD)
     vehicles = dense(Random(2), range(30), 0.6)
     plan = planner.plan(0, vehicles)
@@ -181,11 +181,11 @@ def test_ways_stay_while_nothing_changes_unless_others_are_cheaper() -> None:
     for slot in range(1, 9):
         vehicles = driven(plan, vehicles)
         later = planner.plan(slot, vehicles, plan)
-        old = StreamPlan(slot, {v.vehicle: plan.ways[v.vehicle][1:] for v in vehicles}, ())
+        old = StreamPlan(slot, {v.vehicle: plan.paths[v.vehicle][1:] for v in vehicles}, ())
         gained = oracle.cost_of_plan(ROAD, old, vehicles) - oracle.cost_of_plan(
             ROAD, later, vehicles
         )
-        if later.ways == old.ways:
+        if later.paths == old.paths:
             kept += 1
         else:
             assert gained > 0
@@ -194,19 +194,19 @@ def test_ways_stay_while_nothing_changes_unless_others_are_cheaper() -> None:
     assert plan.missed == ()
 
 
-def test_a_plan_that_cannot_be_better_is_kept_without_a_round() -> None:
+def test_an_optimal_plan_is_kept_without_a_round() -> None:
     planner = StreamPlanner(ROAD)
     vehicles = [StreamVehicle("a", (0, 0), 1), StreamVehicle("b", (8, 2), 0)]
     plan = planner.plan(0, vehicles)
     again = planner.plan(1, driven(plan, vehicles), plan)
     assert again.rounds == 0
-    assert all(again.ways[name] == way[1:] for name, way in plan.ways.items())
+    assert all(again.paths[name] == way[1:] for name, way in plan.paths.items())
 
 
 # ------------------------------------------------------------------------------ how good it is
 
 
-def test_two_vehicles_never_cost_less_than_the_least_and_mostly_that() -> None:
+def test_two_vehicles_cost_the_minimum_nearly_always() -> None:
     """The least cost: joint search over all cells of both."""
     random = Random(7)
     equal = 0
@@ -221,7 +221,7 @@ def test_two_vehicles_never_cost_less_than_the_least_and_mostly_that() -> None:
 
 
 @pytest.mark.parametrize("share", [0.5, 0.8, 1.0])
-def test_streams_never_cost_less_than_the_least_and_mostly_that(share: float) -> None:
+def test_streams_cost_the_minimum_nearly_always(share: float) -> None:
     """The least cost: a mixed-integer programme."""
     random = Random(3)
     equal = 0
@@ -236,33 +236,33 @@ def test_streams_never_cost_less_than_the_least_and_mostly_that(share: float) ->
     assert equal >= 4
 
 
-def test_chains_of_ejections_solve_what_new_orders_do_not() -> None:
+def test_ejection_chains_solve_streams_that_reorderings_do_not() -> None:
     vehicles = dense(Random(JAM), range(20, 30), 0.85)
     assert StreamPlanner(ROAD).plan(0, vehicles).missed == ()
     order = sorted(vehicles, key=lambda one: one.cell)
     table, ways, costs, scratch = window(ROAD, StreamCosts(), 0, order, ())[1:]
     rng = np.array([1], dtype=np.uint64)
     nothing = np.zeros((0, 2), dtype=np.int64), np.zeros(len(order) + 1, dtype=np.int64)
-    kernel.lay(table, ways, costs, *nothing, rng, scratch)
-    assert (ways.cost >= ways.missing).any()
+    kernel.set_paths(table, ways, costs, *nothing, rng, scratch)
+    assert (ways.cost >= ways.missing_cost).any()
     for turn in range(3000):
         seed, size = turn % len(order), 2 + turn % 12
         kernel._reorder(table, ways, costs, seed, size, 0.0, rng, scratch)
-    assert (ways.cost >= ways.missing).any()
+    assert (ways.cost >= ways.missing_cost).any()
 
 
 @pytest.mark.parametrize("forward", [-0.6, 5.0])
-def test_drift_is_bought_or_avoided(forward: float) -> None:
+def test_drift_follows_its_cost(forward: float) -> None:
     vehicles = dense(Random(4), range(20), 0.3)
     costs = StreamCosts(forward=forward)
     plan = StreamPlanner(ROAD, costs).plan(0, vehicles)
-    assert problems_of_ways(ROAD, plan, vehicles) == []
-    drift = sum(way[-1][0] - way[0][0] for way in plan.ways.values())
+    assert problems_of_plan(ROAD, plan, vehicles) == []
+    drift = sum(way[-1][0] - way[0][0] for way in plan.paths.values())
     assert drift > 3 * len(vehicles) if forward < 0 else drift <= 1
 
 
-def test_a_bound_on_work_is_kept() -> None:
+def test_the_limit_on_path_searches_is_kept() -> None:
     vehicles = dense(Random(5), range(20, 40), 1.0)
     quick = attrs.evolve(ROAD, rounds=3)
     assert StreamPlanner(quick).plan(0, vehicles).rounds == 3
-    assert StreamPlanner(attrs.evolve(ROAD, most_ways=1)).plan(0, vehicles).rounds <= 2
+    assert StreamPlanner(attrs.evolve(ROAD, max_paths=1)).plan(0, vehicles).rounds <= 2

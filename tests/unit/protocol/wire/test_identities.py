@@ -1,4 +1,4 @@
-"""Incarnations rise, and no two processes ever have the same one."""
+"""Names of those who take part; incarnations rise and are different in all processes."""
 
 from __future__ import annotations
 
@@ -9,10 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from laneweave.protocol.wire.identities import Incarnations, above
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.wire.identities import Identity, Incarnations, above, parse_identity
+from laneweave.protocol.wire.topics import Party
+from support.refusals import refusal
 
 STEP = 1 << 22
 NUMBERS = st.integers(0, 1 << 62)
+
+# --- incarnations -----------------------------------------------------------------------------
 
 
 @given(number=NUMBERS, floor=NUMBERS)
@@ -77,3 +82,37 @@ def test_processes_of_the_same_moment_have_different_numbers(
         numbers |= {incarnations() for _ in range(5)}
     assert len(numbers) == 15
     assert {abs(number - clock[0]) < 6 * STEP for number in numbers} == {True}
+
+
+# --- identities -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "text", ["router", "bridge", "coordinator.c1", "vehicle.v0001", "fleet.a.b", "client.-",
+             "observer." + "x" * 55]
+)  # fmt: skip
+def test_an_identity_is_read_back(text: str) -> None:
+    assert parse_identity(text).common_name == text
+
+
+@pytest.mark.parametrize(
+    "text", ["", "router.", "router.x", "bridge.b", "coordinator", "coordinator.", "vehicle.a/b",
+             "Vehicle.a", "tram.a", "vehicle.a b", "vehicle.*", "observer." + "x" * 56, "vehicle.é",
+             "vehicle.a\n", " bridge"]
+)  # fmt: skip
+def test_what_is_no_identity_is_refused(text: str) -> None:
+    assert refusal(parse_identity, text).field == "identity"
+
+
+@given(st.text(max_size=70))
+def test_any_text_is_an_identity_or_refused(text: str) -> None:
+    try:
+        identity = parse_identity(text)
+    except BadInputError:
+        return
+    assert identity.common_name == text
+    assert len(text) <= 64
+
+
+def test_the_parties_are_the_words_of_the_table_of_topics() -> None:
+    assert Identity(Party.VEHICLE, "a").common_name == "vehicle.a"

@@ -1,9 +1,24 @@
-"""Assignments of vehicles to targets in non-decreasing order of cost (paper, section `candi`).
+"""Costs, preferences and assignments in non-decreasing order of cost (paper, section `candi`).
 
-Murty's method: the set of all assignments is split into parts that are described by a prefix of
-fixed pairs and by forbidden targets for the row after it. Taking the best assignment out of its
-part splits the part again. Each new part differs from its parent in one freed vehicle, so its best
-assignment is found by one shortest augmenting path from the parent's dual variables.
+The cost matrix C holds the formation relative distance, FRD (equation `rd`):
+
+    d^r_ij = l^o N^{r,o}_ij + l^s N^{r,s}_ij
+
+N^{r,o} counts the oblique edges of a shortest path, the smaller of the two coordinate differences;
+N^{r,s} counts its straight edges, the rest of the larger one. The paper sets l^s = l^o = 1, which
+is the number of steps in mode 2. In mode 1 an oblique edge takes two steps, hence l^o = 2 there.
+TAPPA stops as soon as the next assignment costs no less than the best path set, which is correct
+only if C is a lower bound on steps; other weights are rejected.
+
+The preference matrix P says which vehicle may be assigned to which target. The paper multiplies
+the costs of forbidden pairs by a large number M. Here P is boolean and forbidden pairs do not exist
+for the assignment, so the result does not depend on a choice of M.
+
+Assignments are enumerated by Murty's method: the set of all assignments is split into parts that
+are described by a prefix of fixed pairs and by forbidden targets for the row after it. Taking the
+best assignment out of its part splits the part again. Each new part differs from its parent in one
+freed vehicle, so its best assignment is found by one shortest augmenting path from the parent's
+dual variables.
 
 Costs are whole numbers. Among assignments of equal cost the lexicographically smallest vector
 comes first: the cost is extended by the vector read as a number with one digit per vehicle, which
@@ -16,13 +31,90 @@ import heapq
 from collections.abc import Iterator, Sequence
 
 import attrs
+import numpy as np
+import numpy.typing as npt
 
 from laneweave.coordinator.planning.budget import Budget
-from laneweave.coordinator.planning.frd import IntMatrix
-from laneweave.coordinator.planning.preference import BoolMatrix
+from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.lattice import Cell, Mode
 
+BoolMatrix = npt.NDArray[np.bool_]
+IntMatrix = npt.NDArray[np.int64]
 Row = dict[int, int]
 """One vehicle's allowed targets and their extended costs."""
+
+
+@attrs.frozen
+class Weights:
+    """The weights l^s and l^o of straight and oblique edges."""
+
+    straight: int
+    oblique: int
+
+    @classmethod
+    def for_mode(cls, mode: Mode) -> Weights:
+        """Return the largest weights for which the distance is a lower bound on steps."""
+        return cls(straight=1, oblique=2 if mode == 1 else 1)
+
+    def checked(self, mode: Mode) -> Weights:
+        """Return the weights.
+
+        Raises:
+            BadInputError: they give no lower bound on steps in this mode.
+        """
+        maximum = Weights.for_mode(mode)
+        for name, value, limit in (
+            ("l_s", self.straight, maximum.straight),
+            ("l_o", self.oblique, maximum.oblique),
+        ):
+            if not 0 <= value <= limit:
+                raise BadInputError(name, value, f"0 to {limit} in mode {mode}, a lower bound")
+        return self
+
+
+def frd(vehicle: Cell, target: Cell, weights: Weights) -> int:
+    """Return the formation relative distance from a vehicle's cell to a target (equation `rd`)."""
+    x = abs(vehicle[0] - target[0])
+    y = abs(vehicle[1] - target[1])
+    return weights.oblique * min(x, y) + weights.straight * (max(x, y) - min(x, y))
+
+
+def cost_matrix(vehicles: Sequence[Cell], targets: Sequence[Cell], weights: Weights) -> IntMatrix:
+    """Return C: row i, column j holds the distance of vehicle i to target j."""
+    rows = [[frd(v, t, weights) for t in targets] for v in vehicles]
+    return np.array(rows, dtype=np.int64).reshape(len(vehicles), len(targets))
+
+
+def preference_matrix(choices: Sequence[frozenset[int]], target_count: int) -> BoolMatrix:
+    """Return P: row i, column j is true if vehicle i may take target j."""
+    allowed = np.zeros((len(choices), target_count), dtype=np.bool_)
+    for i, choice in enumerate(choices):
+        allowed[i, sorted(choice)] = True
+    return allowed
+
+
+def matrices(
+    request: PlanRequest, weights: Weights, choices: list[frozenset[int]], budget: Budget
+) -> tuple[IntMatrix, BoolMatrix]:
+    """Return the cost matrix C and the preference matrix P of a request.
+
+    Blocked cells may make a path longer than the formation relative distance, or impossible. Both
+    only improve the lower bound: C takes the larger number, P drops unreachable targets.
+    """
+    starts = [vehicle.cell for vehicle in request.vehicles]
+    costs = cost_matrix(starts, request.targets, weights)
+    allowed = preference_matrix(choices, len(request.targets))
+    if request.grid.blocked:
+        for i, start in enumerate(starts):
+            budget.check_time()
+            distances = request.grid.distances(start, request.mode, request.targets)
+            for j, target in enumerate(request.targets):
+                if target in distances:
+                    costs[i, j] = max(costs[i, j], distances[target])
+                else:
+                    allowed[i, j] = np.False_
+    return costs, allowed
 
 
 @attrs.frozen
@@ -34,13 +126,13 @@ class Assignment:
 
 
 class _Matching:
-    """A minimum-cost matching with the dual variables that prove it to be one.
+    """A minimum-cost matching with the dual variables that prove its optimality.
 
-    The matrix is made square by idle rows that stand for targets left over, at cost 0.
+    Idle rows of cost 0 make the matrix square; they take the remaining targets.
     """
 
     def __init__(self, rows: list[int], columns: list[int], u: list[int], v: list[int]) -> None:
-        """Take the target of each row, the row of each target, and both potentials."""
+        """Store the target of each row, the row of each target, and both potentials."""
         self.rows = rows
         self.columns = columns
         self.u = u
@@ -109,7 +201,7 @@ def assignments(
 ) -> Iterator[Assignment]:
     """Yield all assignments of allowed pairs, cheapest first, ties in lexicographic order.
 
-    There may be more targets than vehicles. Nothing is computed before it is asked for.
+    There may be more targets than vehicles. Assignments are computed lazily.
     """
     budget = budget or Budget()
     vehicle_count, target_count = costs.shape
@@ -151,16 +243,16 @@ def _extended_costs(costs: IntMatrix, allowed: BoolMatrix, scale: int) -> list[R
 def _best(
     rows: list[Row], vehicle_count: int, target_count: int, budget: Budget
 ) -> _Matching | None:
-    """Return the cheapest matching of all rows, or None if some vehicle cannot be served."""
+    """Return the cheapest matching of all rows, or None if some vehicle has no target left."""
     none = [-1] * target_count
     matching = _Matching(none[:], none[:], [0] * target_count, [0] * target_count)
     for row in range(vehicle_count):
         budget.check_time()
         if not matching.augment(rows, row, 0, frozenset()):
             return None
-    # A target that no vehicle has taken still has potential 0, so an idle row fits it exactly.
-    left_over = (j for j, row in enumerate(matching.columns) if row < 0)
-    for row, j in enumerate(left_over, start=vehicle_count):
+    # An unassigned target still has potential 0, so an idle row at cost 0 is tight.
+    remaining = (j for j, row in enumerate(matching.columns) if row < 0)
+    for row, j in enumerate(remaining, start=vehicle_count):
         matching.rows[row] = j
         matching.columns[j] = row
     return matching

@@ -1,6 +1,7 @@
-"""The run of Algorithms 1 and 2 as data, for people: assignments, constraint trees, why it ended.
+"""A record of Algorithms 1 and 2 for readers: assignments, constraint trees, why the run ended.
 
-The trees are the paper's literal ones while they are small; else those of the improved algorithms.
+The trees are the paper's literal ones while they are small, otherwise those of the improved
+algorithms.
 """
 
 from __future__ import annotations
@@ -13,22 +14,18 @@ from typing import Final, Literal
 import attrs
 
 from laneweave.coordinator.planning.budget import Budget, Clock
-from laneweave.coordinator.planning.facade import cells_of, new_tappa, problem_of
-from laneweave.coordinator.planning.frd import Weights
-from laneweave.coordinator.planning.moves import MoveTable
-from laneweave.coordinator.planning.paper.cbs import ConstraintTree, Node
+from laneweave.coordinator.planning.paper.assignments import Weights
+from laneweave.coordinator.planning.paper.cbs import ConstraintTree, Improvements, Node
 from laneweave.coordinator.planning.paper.constraints import entry
-from laneweave.coordinator.planning.paper.improvements import Improvements
-from laneweave.coordinator.planning.paper.tappa import Attempt, Tappa
+from laneweave.coordinator.planning.paper.tappa import Attempt, Tappa, new_tappa
 from laneweave.coordinator.planning.path_map import RelativePathMap
-from laneweave.coordinator.planning.problem import Problem
+from laneweave.coordinator.planning.problem import MoveTable, Problem, Solution
 from laneweave.coordinator.planning.request import PlanRequest
-from laneweave.coordinator.planning.solution import Solution
 
 MAX_LITERAL_NODES: Final = 150
-"""Nodes taken from literal trees before the improved ones are shown instead."""
+"""Limit on nodes of literal trees; beyond it the improved ones are shown."""
 MAX_NODES: Final = 50_000
-"""The same for improved trees; then the run is shown as far as it came."""
+"""Limit on nodes of improved trees; the run is shown up to there."""
 
 NodeStatus = Literal["expanded", "solution", "open"]
 """open: still in T when the search ended."""
@@ -39,7 +36,7 @@ class ExplainedNode:
     """A node N_i of a constraint tree.
 
     number, parent: i; 0: the root has no parent.
-    constraint: what it adds to the constraints of its parent; empty: the root.
+    constraint: the one that it adds to those of its parent; empty: the root.
     conflicts: its conflict list in the paper's notation.
     path_map: the relative path map of its path set M_i.
     cost: L_i.
@@ -56,7 +53,7 @@ class ExplainedNode:
 
 @attrs.frozen
 class ExplainedAssignment:
-    """What was done for an assignment A_k.
+    """The record of an assignment A_k.
 
     targets: the assignment vector, targets counted from 0.
     cost: C_k.
@@ -117,20 +114,20 @@ def explain(
     if not literal:
         run = _run(request, Improvements(), deadline, MAX_NODES, weights, clock)
     names = [vehicle.id for vehicle in request.vehicles]
-    problem = problem_of(request)
+    problem = request.problem()
     best = math.inf
     found = []
     for attempt in run.attempts or ():
         best = min(best, math.inf if attempt.best_cost is None else attempt.best_cost)
         found.append(_assignment(problem, names, attempt, best))
-    by_tree = best == run.best_cost
+    found_by_tree = best == run.best_cost
     return Explanation(
         literal=literal,
         assignments=tuple(found),
         best_cost=run.best_cost,
         optimal=run.finished,
         joint_bound=run.joint_bound,
-        joint_cost=None if by_tree or run.best is None else run.best.cost,
+        joint_cost=None if found_by_tree or run.best is None else run.best.cost,
         next_cost=run.next_cost,
     )
 
@@ -154,7 +151,7 @@ def _run(
 ) -> Tappa:
     budget = Budget(deadline=deadline, max_nodes=max_nodes, clock=clock)
     weights = (weights or Weights.for_mode(request.mode)).checked(request.mode)
-    problem = problem_of(request)
+    problem = request.problem()
     run = new_tappa(problem, request, weights, budget, improvements, record=True)
     run.run()
     return run
@@ -174,7 +171,7 @@ def _node(
 ) -> ExplainedNode:
     table = problem.table
     constraint = node.constraints[-1] if node.constraints else None
-    cells = cells_of(problem, Solution(tree.assignment, node.paths))
+    cells = problem.cells_of(Solution(tree.assignment, node.paths))
     status: NodeStatus = "expanded" if node.expanded else "open"
     return ExplainedNode(
         number=node.number,

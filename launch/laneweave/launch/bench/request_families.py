@@ -1,4 +1,4 @@
-"""Seeded families of requests for tests and for `laneweave bench planner`.
+"""Seeded families of planning requests, for `laneweave bench planner` and for tests.
 
 Vehicles prefer a random lane, and the targets are parallel: as many on each lane as vehicles prefer
 it. In `block_request` and `formation_request` vehicles start interlaced (on a checkerboard) and the
@@ -16,9 +16,10 @@ from collections.abc import Sequence
 import attrs
 
 from laneweave.coordinator.planning.conflicts import DEFAULT_KINDS
-from laneweave.coordinator.planning.grid import Cell, Grid, Mode
+from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.targets import place
+from laneweave.protocol.lattice import Cell, Mode
 from laneweave.protocol.wire.messages import Name
 
 _SPARE_COLUMNS = (2, 4)
@@ -42,11 +43,11 @@ def block_request(
     conflicts: Sequence[str] | None = None,
     deadline_s: float = 4.0,
 ) -> PlanRequest:
-    """Return a formation in a block that has no spare columns, so with little room to manoeuvre."""
+    """Return a formation in a block without spare columns, so with few empty cells."""
     rng = random.Random(seed)  # noqa: S311
     starts = _checkerboard(vehicles, columns, lanes, first_column=0)
-    wishes = _wishes(rng, vehicles, lanes, most=columns)
-    return _request(Grid(columns, lanes), starts, wishes, mode, conflicts, deadline_s)
+    preferred = _preferred_lanes(rng, vehicles, lanes, most=columns)
+    return _request(Grid(columns, lanes), starts, preferred, mode, conflicts, deadline_s)
 
 
 def formation_request(
@@ -64,8 +65,8 @@ def formation_request(
     occupied = -(-2 * vehicles // lanes)
     columns = behind + occupied + ahead
     starts = _checkerboard(vehicles, columns, lanes, first_column=behind)
-    wishes = _wishes(rng, vehicles, lanes, most=columns)
-    return _request(Grid(columns, lanes), starts, wishes, mode, conflicts, deadline_s)
+    preferred = _preferred_lanes(rng, vehicles, lanes, most=columns)
+    return _request(Grid(columns, lanes), starts, preferred, mode, conflicts, deadline_s)
 
 
 def traffic_request(
@@ -88,13 +89,13 @@ def traffic_request(
         stream.formation()
     columns, entered = stream.formation()
     cells = {Name(f"v{i + 1}"): cell for i, (cell, _) in enumerate(entered)}
-    wishes = {Name(f"v{i + 1}"): lane for i, (_, lane) in enumerate(entered)}
-    targets = place(cells, wishes, columns, _TRAFFIC_LANES)
+    preferred = {Name(f"v{i + 1}"): lane for i, (_, lane) in enumerate(entered)}
+    targets = place(cells, preferred, columns, _TRAFFIC_LANES)
     return PlanRequest(
         Grid(columns, _TRAFFIC_LANES),
         mode,
         tuple(conflicts),
-        tuple(VehicleRequest(name, cells[name], lane=wishes[name]) for name in cells),
+        tuple(VehicleRequest(name, cells[name], lane=preferred[name]) for name in cells),
         targets.cells,
         deadline_s,
     )
@@ -105,7 +106,7 @@ class _Vehicle:
     """A vehicle that arrives on a lane at a time [s] and prefers a lane."""
 
     arrival_s: float
-    wish: int
+    preferred_lane: int
 
 
 class _Arrivals:
@@ -142,22 +143,25 @@ class _Arrivals:
         columns = 0
         while columns < longest and (len(entered) < self._most or columns < shortest):
             room = max(shortest, columns + 1)
-            wishes = [wish for _, _, wish in entered]
+            preferred = [preferred_lane for _, _, preferred_lane in entered]
             entering = []
             for lane, vehicle in self._heads():
                 # A vehicle for whose lane the formation is too short waits.
-                if wishes.count(vehicle.wish) < room:
-                    wishes.append(vehicle.wish)
+                if preferred.count(vehicle.preferred_lane) < room:
+                    preferred.append(vehicle.preferred_lane)
                     entering.append(lane)
             room_left = self._most - len(entered)
             if len(entering) > room_left and columns >= shortest:
                 break
             entered += [
-                (columns, lane, self._waiting[lane].popleft().wish) for lane in entering[:room_left]
+                (columns, lane, self._waiting[lane].popleft().preferred_lane)
+                for lane in entering[:room_left]
             ]
             columns += 1
             self._column += 1
-        return columns, [((columns - 1 - back, lane), wish) for back, lane, wish in entered]
+        return columns, [
+            ((columns - 1 - back, lane), preferred_lane) for back, lane, preferred_lane in entered
+        ]
 
     def _filled(self) -> list[deque[_Vehicle]]:
         """Return the queues, each with at least one vehicle."""
@@ -177,32 +181,32 @@ def _checkerboard(vehicles: int, columns: int, lanes: int, first_column: int) ->
     return board[:vehicles]
 
 
-def _wishes(rng: random.Random, vehicles: int, lanes: int, most: int) -> list[int]:
+def _preferred_lanes(rng: random.Random, vehicles: int, lanes: int, most: int) -> list[int]:
     """Draw preferred lanes until no lane is preferred by more vehicles than it has columns."""
     if vehicles > most * lanes:
         raise ValueError(f"{vehicles} vehicles do not fit on {lanes} lanes of {most} columns")
     while True:
-        wishes = [rng.randrange(lanes) for _ in range(vehicles)]
-        if all(wishes.count(lane) <= most for lane in range(lanes)):
-            return wishes
+        preferred = [rng.randrange(lanes) for _ in range(vehicles)]
+        if all(preferred.count(lane) <= most for lane in range(lanes)):
+            return preferred
 
 
 def _request(
     grid: Grid,
     starts: Sequence[Cell],
-    wishes: Sequence[int],
+    preferred: Sequence[int],
     mode: Mode,
     conflicts: Sequence[str] | None,
     deadline_s: float,
 ) -> PlanRequest:
     targets = []
     for lane in range(grid.lanes):
-        count = wishes.count(lane)
+        count = preferred.count(lane)
         first = (grid.columns - count) // 2
         targets += [(first + k, lane) for k in range(count)]
     vehicles = [
         VehicleRequest(f"v{i + 1}", cell, lane=lane)
-        for i, (cell, lane) in enumerate(zip(starts, wishes, strict=True))
+        for i, (cell, lane) in enumerate(zip(starts, preferred, strict=True))
     ]
     kinds = DEFAULT_KINDS[mode] if conflicts is None else tuple(conflicts)
     return PlanRequest(grid, mode, kinds, tuple(vehicles), tuple(targets), deadline_s)

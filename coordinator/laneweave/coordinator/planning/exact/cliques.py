@@ -1,0 +1,110 @@
+"""Conflict cliques: sets of moves of which one step admits at most one.
+
+Pairs of conflicting moves define the conflicts, but a linear relaxation with pairs only is weak. A
+conflict clique is a clique of the conflict relation: at most one of its moves is made in a step.
+The cliques here are maximal and cover every conflicting pair. With footprints (mode 1 with node,
+edge and special-1; geometric) one pattern is enough: all moves whose footprint contains a cell.
+Tables computed from a geometry, and `closing`, take more patterns.
+
+Conflicts are the same everywhere on the lattice, so a clique is a pattern that is placed on every
+cell, its anchor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+from itertools import product
+
+from laneweave.coordinator.planning.conflicts import ConflictModel, Move, Offset, conflict_offsets
+from laneweave.protocol.lattice import Mode, displacements
+
+Clique = tuple[Offset, ...]
+"""Moves of which one step admits at most one: columns and lanes from the anchor to the from-cell of
+each move, and its displacement."""
+
+
+@lru_cache(maxsize=64)
+def clique_patterns(mode: Mode, model: ConflictModel) -> tuple[Clique, ...]:
+    """Return cliques that cover all pairs of moves that conflict under a model.
+
+    Raises:
+        ValueError: under this model vehicles may share a cell.
+    """
+    if model.vehicles_share_cells:
+        raise ValueError(f"conflicts {model.kinds}: cliques need vehicles that never share a cell")
+    relation = _Relation(mode, model)
+    uncovered = relation.pairs()
+    patterns = []
+    cliques = sorted(relation.maximal_cliques(), key=lambda clique: (-len(clique), clique))
+    for clique in cliques:
+        pairs = {_normal_pair(a, b) for a in clique for b in clique if a < b}
+        if pairs & uncovered:
+            uncovered -= pairs
+            patterns.append(clique)
+    return tuple(patterns)
+
+
+class _Relation:
+    """The conflict relation around the origin; a move is an `Offset` from the anchor (0, 0)."""
+
+    def __init__(self, mode: Mode, model: ConflictModel) -> None:
+        self.steps = displacements(mode)
+        self._mode = mode
+        self._model = model
+        columns, lanes = (range(-reach, reach + 1) for reach in model.reach)
+        self._moves = list(product(columns, lanes, range(len(self.steps))))
+
+    def move(self, member: Offset) -> Move:
+        column, lane, d = member
+        step = self.steps[d]
+        return (column, lane), (column + step[0], lane + step[1])
+
+    def pairs(self) -> set[tuple[Offset, Offset]]:
+        """Return all conflicting pairs, each once for all places on the lattice."""
+        return {
+            _normal_pair((0, 0, d), other)
+            for d, offsets in enumerate(conflict_offsets(self._mode, self._model))
+            for other in offsets
+            if other[:2] != (0, 0)
+        }
+
+    def maximal_cliques(self) -> set[Clique]:
+        """Return the maximal cliques that contain a move from the origin, each once."""
+        found: set[Clique] = set()
+        for d in range(len(self.steps)):
+            origin = (0, 0, d)
+            near = [b for b in self._moves if b != origin and self._exclude(origin, b)]
+            near_of = {a: {b for b in near if b != a and self._exclude(a, b)} for a in near}
+            for clique in _cliques(set(), set(near), set(), near_of):
+                found.add(_normal((origin, *clique)))
+        return found
+
+    def _exclude(self, a: Offset, b: Offset) -> bool:
+        """Return whether two vehicles cannot make both moves; they never share a cell."""
+        return a[:2] == b[:2] or self._model.kind(self.move(a), self.move(b)) is not None
+
+
+def _cliques(
+    chosen: set[Offset], open_: set[Offset], closed: set[Offset], near: dict[Offset, set[Offset]]
+) -> Iterator[Clique]:
+    """Yield maximal cliques (Bron and Kerbosch, Communications of the ACM 16, 1973)."""
+    if not open_ and not closed:
+        yield tuple(chosen)
+        return
+    pivot = max(sorted(open_ | closed), key=lambda member: len(near[member] & open_))
+    for member in sorted(open_ - near[pivot]):
+        yield from _cliques(chosen | {member}, open_ & near[member], closed & near[member], near)
+        open_ = open_ - {member}
+        closed = closed | {member}
+
+
+def _normal(members: Clique) -> Clique:
+    """Return the members with the anchor at the lowest of their from-cells."""
+    column, lane = min((member[0], member[1]) for member in members)
+    return tuple(sorted((c - column, left - lane, d) for c, left, d in members))
+
+
+def _normal_pair(a: Offset, b: Offset) -> tuple[Offset, Offset]:
+    first, second = _normal((a, b))
+    return first, second

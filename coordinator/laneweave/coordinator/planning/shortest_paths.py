@@ -1,0 +1,156 @@
+"""SPPA, the single-vehicle path planning algorithm of the paper.
+
+The paper uses A* in space and time. Here all shortest paths of a vehicle under its constraints are
+computed at once, as sets of moves per step (`Diagram`): forwards, the moves that can be made until
+the vehicle can have arrived for the last time; then backwards, to drop the moves that do not lead
+there. What is left is to choose one of them: the fewest conflicts with the paths of the other
+vehicles, then the fewest moves, then the lowest index.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
+from laneweave.coordinator.planning.problem import (
+    Bans,
+    Diagram,
+    MoveTable,
+    Path,
+    Problem,
+    Solution,
+)
+
+
+def shortest_paths(table: MoveTable, start: int, target: int, bans: Bans) -> Diagram | None:
+    """Return all paths of minimum cost that respect the bans, or None if there is no path."""
+    last_ban = max(*bans.at, *bans.since, bans.earliest, -1)
+    limit = last_ban + table.cell_count + 2 if bans.latest is None else bans.latest
+    arrival = bans.earliest
+    for step, banned in bans.at.items():
+        if banned >> target & 1:
+            arrival = max(arrival, step + 1)
+    for banned in bans.since.values():
+        if banned >> target & 1:
+            return None
+    cells = arriving = 1 << start
+    layers: list[int] = []
+    lasting = 0
+    while len(layers) < arrival or not arriving >> target & 1:
+        step = len(layers)
+        if not cells or step >= limit:
+            return None
+        lasting |= bans.since.get(step, 0)
+        moves = table.starting_in(cells) & ~(bans.at.get(step, 0) | lasting)
+        layers.append(moves)
+        cells = table.ends(moves)
+        # A vehicle that waits at the target arrived earlier, unless a later wait is banned.
+        arriving = cells if not moves >> target & 1 else table.ends(moves & ~(1 << target))
+    if layers:
+        layers[-1] &= ~(1 << target)
+    cells = 1 << target
+    for step in range(len(layers) - 1, -1, -1):
+        layers[step] &= table.leading_to(cells)
+        cells = table.starts(layers[step])
+    return Diagram(tuple(layers), target)
+
+
+def free_paths(problem: Problem, vehicle: int, target: int) -> Diagram | None:
+    """Return the shortest paths of a vehicle to a target (an index) without constraints."""
+    key = vehicle, target
+    if key not in problem.free_paths:
+        problem.free_paths[key] = shortest_paths(
+            problem.table, problem.starts[vehicle], problem.targets[target], Bans()
+        )
+    return problem.free_paths[key]
+
+
+def conflicting_moves(
+    table: MoveTable, others: Sequence[tuple[Path, int]], steps: int
+) -> list[int]:
+    """Return, per step, the moves that conflict with a move of another vehicle.
+
+    Each other vehicle is given as its path and its target, where it waits after arrival.
+    """
+    conflicts = table.conflicts
+    taken = [0] * steps
+    for path, target in others:
+        arrived = len(path)
+        for step in range(steps):
+            taken[step] |= conflicts[path[step] if step < arrived else target]
+    return taken
+
+
+def choose_path(table: MoveTable, diagram: Diagram, taken: Sequence[int]) -> Path:
+    """Return the best path of a diagram, given the moves that conflict with other vehicles."""
+    fan, shifts = table.fan, table.shifts
+    conflict_weight = diagram.cost + 1
+    worth = {diagram.target: 0}
+    choices: list[dict[int, int]] = []
+    for step in range(diagram.cost - 1, -1, -1):
+        layer, bad = diagram.layers[step], taken[step]
+        earlier: dict[int, int] = {}
+        choice: dict[int, int] = {}
+        while layer:
+            low = layer & -layer
+            layer ^= low
+            bit = low.bit_length() - 1
+            d = bit % fan
+            cell = bit - d
+            value = worth[cell + shifts[d]]
+            if d:
+                value += 1
+            if bad & low:
+                value += conflict_weight
+            if cell not in earlier or value < earlier[cell]:
+                earlier[cell] = value
+                choice[cell] = bit
+        worth = earlier
+        choices.append(choice)
+    path: list[int] = []
+    if choices:
+        (cell,) = worth
+        for choice in reversed(choices):
+            path.append(choice[cell])
+            cell = table.landing(choice[cell])
+    return tuple(path)
+
+
+def without_needless_moves(problem: Problem, solution: Solution, budget: Budget) -> Solution:
+    """Return the path set without needless moves.
+
+    Each vehicle in turn takes, among its cheapest paths around all others, the one with the
+    fewest moves. Stops when nothing changes, or when the budget is spent.
+    """
+    while True:
+        before = solution
+        for vehicle in range(len(solution.paths)):
+            try:
+                budget.check_time()
+            except BudgetSpentError:
+                return solution
+            solution = _reroute(problem, solution, vehicle)
+        if solution == before:
+            return solution
+
+
+def _reroute(problem: Problem, solution: Solution, vehicle: int) -> Solution:
+    bans = Bans()
+    for other, path in enumerate(solution.paths):
+        if other != vehicle:
+            _ban_conflicts(problem, bans, path, problem.targets[solution.assignment[other]])
+    target = problem.targets[solution.assignment[vehicle]]
+    diagram = shortest_paths(problem.table, problem.starts[vehicle], target, bans)
+    if diagram is None:
+        return solution
+    path = choose_path(problem.table, diagram, [0] * diagram.cost)
+    paths = (*solution.paths[:vehicle], path, *solution.paths[vehicle + 1 :])
+    return Solution(solution.assignment, paths)
+
+
+def _ban_conflicts(problem: Problem, bans: Bans, path: Path, target: int) -> None:
+    """Ban all moves that conflict with a path or with waiting at its target afterwards."""
+    conflicts = problem.table.conflicts
+    for step, move in enumerate(path):
+        bans.at[step] = bans.at.get(step, 0) | conflicts[move]
+    bans.since[len(path)] = bans.since.get(len(path), 0) | conflicts[target]

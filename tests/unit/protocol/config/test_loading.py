@@ -1,0 +1,186 @@
+"""Scenarios from files, tables and options; one readable line for everything that is wrong."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import attrs
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from laneweave.protocol.config.loading import load_scenario, parse_scenario, to_tables
+from laneweave.protocol.scenario.tables import FormationSettings, Scenario
+from support.refusals import refusal
+
+FOLDER = Path(__file__).parents[4] / "scenarios"
+
+# --- files ------------------------------------------------------------------------------------
+
+
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
+    assert refusal(load_scenario, tmp_path / "none.toml").field == "file"
+    assert refusal(load_scenario, Path("a\0b")).field == "file"
+
+
+def test_a_folder_is_refused(tmp_path: Path) -> None:
+    assert refusal(load_scenario, tmp_path).field == "file"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"seed = ",
+        b"seed 1",
+        b"\xff\xfe",
+        b"seed = 1\nseed = 2",
+        b"[road\nlanes = 3",
+        b"\x00",
+        b"{}",
+        b"seed = " + b"9" * 5000,
+        b"seed = " + b"[" * 5000,
+        b"road.lanes = 3\nroad = 1",
+    ],
+    ids=range(10),
+)
+def test_what_is_no_toml_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "x.toml"
+    path.write_bytes(content)
+    assert refusal(load_scenario, path).field == "file"
+
+
+def test_values_that_toml_allows_are_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "x.toml"
+    for line, field in (
+        ("seed = 0x" + "f" * 5000, "seed"),
+        ("seed = 1979-05-27", "seed"),
+        ("[road]\nlanes = nan", "road.lanes"),
+        ("[demand]\nvolume_veh_per_lane_h = inf", "demand.volume_veh_per_lane_h"),
+        ("[[road]]\nlanes = 3", "road"),
+        ('"a\\nb" = 1', "a\nb"),
+        ('[road]\n"a\\u001b[2J" = 1', "road.a\x1b[2J"),
+    ):
+        path.write_text(line, encoding="utf-8")
+        assert refusal(load_scenario, path).field == field
+
+
+def test_an_empty_file_is_the_default(tmp_path: Path) -> None:
+    path = tmp_path / "x.toml"
+    path.write_text("", encoding="utf-8")
+    assert load_scenario(path) == Scenario()
+
+
+def test_the_folder_is_found_from_anywhere(tmp_path: Path) -> None:
+    path = tmp_path / "d.toml"
+    path.write_text("[security]\nfolder = 'keys'\n")
+    assert load_scenario(path).security.folder == str(tmp_path / "keys")
+    path.write_text("[security]\nfolder = '/etc/keys'\n")
+    assert load_scenario(path).security.folder == "/etc/keys"
+    path.write_text("[security]\n")
+    assert load_scenario(path).security.folder == str(tmp_path / "certs")
+
+
+# --- an earlier name ---------------------------------------------------------------------------
+
+
+def test_paper_stands_for_interlaced_blocks_of_columns_and_slots_of_four_seconds(
+    tmp_path: Path,
+) -> None:
+    meant = FormationSettings(
+        operation="formations", entry="interlaced", close="columns", cycle_s=4.0
+    )
+    assert parse_scenario({"formation": {"operation": "paper"}}).formation == meant
+    assert load_scenario(None, formation__operation="paper").formation == meant
+    path = tmp_path / "x.toml"
+    path.write_text('[formation]\noperation = "paper"\n', encoding="utf-8")
+    assert load_scenario(path).formation == meant
+    # What else is said counts.
+    said = {"operation": "paper", "cycle_s": 6.0, "move_s": 5.0, "entry": "free"}
+    assert parse_scenario({"formation": said}).formation == attrs.evolve(
+        meant, cycle_s=6.0, move_s=5.0, entry="free"
+    )
+    assert (
+        refusal(parse_scenario, {"formation": {"operation": "papers"}}).field
+        == "formation.operation"
+    )
+
+
+def test_a_recording_of_the_paper_s_operation_under_its_earlier_name_is_read() -> None:
+    tables = to_tables(load_scenario(FOLDER / "paper.toml"))
+    earlier = {"operation": "paper", "cycle_s": 4.0, "move_s": 3.8, "block_columns": 4}
+    kept = {
+        name: value
+        for name, value in tables["formation"].items()
+        if name not in ("entry", "close", "max_columns")
+    }
+    recording = tables | {"formation": kept | earlier, "tracking": {"horizon_ticks": 40}}
+    expected = load_scenario(FOLDER / "paper.toml")
+    tracking = attrs.evolve(expected.tracking, horizon_ticks=40)
+    assert parse_scenario(recording) == attrs.evolve(expected, tracking=tracking)
+
+
+# --- round trip and overrides -----------------------------------------------------------------
+
+SCENARIOS = st.builds(
+    lambda lanes, volume, seed, mode, oblique, realm: attrs.evolve(
+        Scenario(),
+        seed=seed,
+        road=attrs.evolve(Scenario().road, lanes=lanes),
+        demand=attrs.evolve(
+            Scenario().demand,
+            volume_veh_per_lane_h=volume,
+            lane_shares=tuple(float(lane + 1) for lane in range(lanes)),
+        ),
+        formation=attrs.evolve(Scenario().formation, mode=mode, weight_oblique=oblique),
+        network=attrs.evolve(Scenario().network, realm=realm),
+    ),
+    st.integers(1, 8),
+    st.floats(1, 3600),
+    st.integers(0, 2**63 - 1),
+    st.sampled_from((1, 2)),
+    st.sampled_from((None, 0, 1)),
+    st.text("abcXYZ019_.-", min_size=1, max_size=64),
+)
+
+
+@settings(max_examples=50, deadline=None)
+@given(SCENARIOS)
+def test_tables_give_the_same_scenario_back(scenario: Scenario) -> None:
+    tables = to_tables(scenario)
+    assert parse_scenario(tables) == scenario
+    assert parse_scenario(json.loads(json.dumps(tables))) == scenario
+
+
+def test_overrides_replace_the_values_of_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "x.toml"
+    path.write_text("seed = 5\n[demand]\nduration_s = 10.0\n", encoding="utf-8")
+    scenario = load_scenario(
+        path, seed=7, demand__volume_veh_per_lane_h=1600, runtime__coordinators=None
+    )
+    assert scenario.seed == 7
+    assert scenario.demand.duration_s == 10.0
+    assert scenario.demand.volume_veh_per_lane_h == 1600.0
+    assert scenario.runtime.coordinators == Scenario().runtime.coordinators
+    assert load_scenario(path, seed=None).seed == 5
+
+
+@pytest.mark.parametrize(
+    ("overrides", "field"),
+    [
+        ({"seed": -1}, "seed"),
+        ({"demand__volume_veh_per_lane_h": math.nan}, "demand.volume_veh_per_lane_h"),
+        ({"demand__speling": 1}, "demand.speling"),
+        ({"speling__x": 1}, "speling"),
+        ({"runtime__coordinators": "3"}, "runtime.coordinators"),
+    ],
+)
+def test_a_wrong_override_is_refused_by_name(overrides: dict[str, object], field: str) -> None:
+    assert refusal(load_scenario, None, **overrides).field == field
+
+
+def test_an_override_of_a_table_that_is_none_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x.toml"
+    path.write_text("demand = 5", encoding="utf-8")
+    assert refusal(load_scenario, path, demand__duration_s=1.0).field == "demand"
