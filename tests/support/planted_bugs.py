@@ -1,8 +1,8 @@
 """Planted bugs: each breaks one rule of the protocol, to show that the tests would notice.
 
-Most replace a guard or an action in one of the two rule books; a few change a row of the table, or
-something outside the books (`plant`). For each there is a story that it spoils; where it says so,
-the story then ends with two vehicles in one cell. docs/SAFETY.md says what else catches it.
+Most replace a guard or an action in a rule book; a few change a row of the table, or something
+outside the books (`plant`). For each there is a story that it spoils; where it says so, the story
+then ends with two vehicles in one cell. docs/SAFETY.md lists what else catches it.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ ROWS_OF_OTHERS = {
     "joining": "which formations are joined: coordinator.formations.roster",
     "charge": "who acts for a vehicle: AgentCore, MotionController",
     "caretaker": "who acts for a vehicle without agent: sim_bridge.caretaker",
-    "estate": "which cells are whose in the rolling operation: MotionController, plans",
-    "handover": "how a leader hands cells over: coordinator.rolling.transfer",
+    "ownership": "which vehicle owns a cell (rolling operation): MotionController, plans",
+    "transfer": "how a leader transfers cells: coordinator.rolling.transfer",
 }
 """Rules that are not, or not only, in the rule books, and where they are."""
 
@@ -145,7 +145,7 @@ BUGS: tuple[PlantedBug, ...] = (
     ),
     # --- V4, V5: news and the start gate
     PlantedBug(
-        "no-gate", "V5", "A vehicle moves as soon as it has the plan, whoever else has it.",
+        "no-gate", "V5", "A vehicle moves as soon as it has the plan itself.",
         "start_gate_guards_a_moving_vehicle", replaced={vehicle.all_are_ready: broken.always},
     ),
     PlantedBug(
@@ -161,7 +161,7 @@ BUGS: tuple[PlantedBug, ...] = (
         },
     ),
     PlantedBug(
-        "ready-while-moving", "V4", "Who has accepted counts as ready, though it still moves.",
+        "ready-while-moving", "V4", "A vehicle that has accepted counts as ready while it moves.",
         "prepare_while_moving", plant=broken.ready_with_plan,
     ),
     PlantedBug(
@@ -199,7 +199,7 @@ BUGS: tuple[PlantedBug, ...] = (
         "dependency", plant=broken.need_one_less,
     ),
     PlantedBug(
-        "corners-forgotten", "V6", "The corner cells of diagonal moves are nobody's.",
+        "corners-forgotten", "V6", "The corner cells of diagonal moves are not occupied.",
         "corner", plant=broken.forget_corners,
     ),
     PlantedBug(
@@ -225,11 +225,11 @@ BUGS: tuple[PlantedBug, ...] = (
         "heartbeat_of_the_dead", collides=False, plant=broken.revive,
     ),
     PlantedBug(
-        "disconnected-candidate-leads", "L1", "Who lost its connection takes all others for dead.",
+        "disconnected-candidate-leads", "L1", "A disconnected candidate takes all others for dead.",
         "own_connection_lost", collides=False, plant=broken.believe_the_void,
     ),
     PlantedBug(
-        "adoption-by-hearsay", "L2", "A plan is adopted though not everybody was heard.",
+        "adoption-by-hearsay", "L2", "A plan is adopted though not all members were heard.",
         "leader_killed_after_half_of_the_plans", collides=False,
         replaced={
             leader.all_are_heard: broken.always,
@@ -247,7 +247,7 @@ BUGS: tuple[PlantedBug, ...] = (
         replaced={leader.one_plan_is_in_force: broken.one_ballot},
     ),
     PlantedBug(
-        "adoption-interrupts", "L2", "Adopted promises are forgotten, so everybody seems new.",
+        "adoption-interrupts", "L2", "Adopted promises are forgotten, so all members seem new.",
         "adoption", collides=False, replaced={leader.adopt: broken.adopt_the_ballot_only},
     ),
     PlantedBug(
@@ -289,7 +289,7 @@ BUGS: tuple[PlantedBug, ...] = (
         replaced={ballot.count_promise: broken.count_entry_cell},
     ),
     PlantedBug(
-        "roster-by-hearsay", "L5", "The roster is whoever was heard.",
+        "roster-by-hearsay", "L5", "The roster is the members that were heard.",
         "roster_by_hearsay", plant=broken.roster_of_heard,
     ),
     PlantedBug(
@@ -311,7 +311,7 @@ BUGS: tuple[PlantedBug, ...] = (
         "planning_fails", collides=False, replaced={ballot.may_try: broken.always},
     ),
     PlantedBug(
-        "promise-taken-for-acceptance", "L6", "Who has promised counts as having the plan.",
+        "promise-taken-for-acceptance", "L6", "A promise counts as an acceptance.",
         "plan_lost_for_one", collides=False, replaced={ballot.is_acceptance: broken.promised_b},
     ),
     PlantedBug(
@@ -328,7 +328,7 @@ BUGS: tuple[PlantedBug, ...] = (
         replaced={ballot.restarted: broken.shows_another_ballot},
     ),
     PlantedBug(
-        "refused-plan-sent-for-ever", "L8", "A plan that nobody accepts is never given up.",
+        "refused-plan-sent-for-ever", "L8", "A plan that no vehicle accepts is never given up.",
         "planner_lets_two_meet", collides=False,
         replaced={leader.time_is_up: broken.time_is_up_unless_issuing},
     ),
@@ -366,7 +366,7 @@ BUGS: tuple[PlantedBug, ...] = (
         "agent_that_is_not_in_charge", collides=False, plant=broken.speak_at_once,
     ),
     PlantedBug(
-        "waking-agent-goes-on", "charge", "An agent that hung goes on as if nobody had taken over.",
+        "waking-agent-goes-on", "charge", "An agent that hung goes on as if still in charge.",
         "agent_that_hung", collides=False, plant=broken.keep_incarnation,
     ),
     PlantedBug(
@@ -379,56 +379,56 @@ BUGS: tuple[PlantedBug, ...] = (
     ),
     # --- the rolling operation
     PlantedBug(
-        "estate-not-checked", "V3", "A plan that takes a cell for the vehicle's is accepted.",
+        "estate-not-checked", "V3", "A plan is accepted that counts a foreign cell as owned.",
         "rolling_false_claim", replaced={vehicle.transfers_only_owned_cells: broken.always},
     ),
     PlantedBug(
-        "possession-not-taken", "V5", "Who opens its gate moves, and takes no possession.",
+        "possession-not-taken", "V5", "A vehicle opens its gate without owning its new cells.",
         "rolling_handover", collides=False, replaced={vehicle.take_ownership: broken.skip},
     ),
     PlantedBug(
-        "moves-off-its-estate", "V5", "Without possession, and the controller obeys all the same.",
+        "moves-off-its-estate", "V5", "The same, and the controller obeys.",
         "rolling_handover", replaced={vehicle.take_ownership: broken.skip}, plant=rolling.obey,
     ),
     PlantedBug(
-        "possession-without-gate", "estate", "A vehicle owns what a plan gives when it accepts.",
+        "possession-without-gate", "ownership", "A vehicle owns what a plan gives when it accepts.",
         "rolling_gate", plant=rolling.possess_at_once,
     ),
     PlantedBug(
-        "deed-after-promise", "estate", "An old deed is drawn up after a higher promise.",
+        "deed-after-promise", "ownership", "An old transfer begins after a higher promise.",
         "rolling_late_command", plant=rolling.draw_up_anything,
     ),
     PlantedBug(
-        "promise-dies-with-process", "estate", "A new process may promise less than the last one.",
+        "promise-dies-with-process", "ownership", "A new process may promise less than the last.",
         "rolling_agent_restarts", collides=False, plant=rolling.forget_promise,
     ),
     PlantedBug(
-        "estate-dies-with-process", "estate", "With the agent the cells are lost.",
+        "estate-dies-with-process", "ownership", "The owned cells are lost with the agent.",
         "rolling_agent_restarts", collides=False, plant=rolling.forget_estate,
     ),
     PlantedBug(
-        "promise-not-noted", "handover", "A promise counts before the controller has noted it.",
+        "promise-not-noted", "transfer", "A promise counts before the controller has noted it.",
         "rolling_promise_not_noted", collides=False, plant=rolling.show_estate_at_once,
     ),
     PlantedBug(
-        "shut-deeds-ignored", "handover", "Whose gate is shut owns what it owned before the deed.",
+        "shut-deeds-ignored", "transfer", "A vehicle with a closed gate owns the cells of before.",
         "rolling_gates_moved_on", plant=rolling.void_shut_deeds,
     ),
     PlantedBug(
-        "common-promise-voids-deeds", "handover", "A newer promise of all makes older deeds void.",
+        "common-promise-voids-deeds", "transfer", "A newer promise of all voids older transfers.",
         "rolling_gates_moved_on", plant=rolling.void_by_common_promise,
     ),
     PlantedBug(
-        "body-left-out", "handover", "Who is under way does without the cell that it comes from.",
+        "body-left-out", "transfer", "A moving vehicle does not need the cell that it leaves.",
         "rolling_under_way", plant=rolling.forget_motion,
     ),
     PlantedBug(
-        "owner-left-out", "handover", "A cell is taken from an owner that is not in the roster.",
+        "owner-left-out", "transfer", "A cell is taken from an owner that is not in the roster.",
         "rolling_owner_left_out", replaced={vehicle.transfers_only_owned_cells: broken.always},
         plant=rolling.check_no_estates,
     ),
     PlantedBug(
-        "cell-kept-by-both", "handover", "Who gives a cell keeps it, too.",
+        "cell-kept-by-both", "transfer", "A vehicle that gives a cell keeps it, too.",
         "rolling_handover", replaced={vehicle.transfers_only_owned_cells: broken.always},
         plant=rolling.keep_what_is_given,
     ),

@@ -13,6 +13,7 @@ from laneweave.coordinator.operation import LogEntry, to_vehicle
 from laneweave.protocol.runtime.node import Compute, Computed, Effect
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.state_machine import RuleBook
+from laneweave.protocol.wire.events import FORMATIONS_JOINED, PLAN_IN_FORCE
 from laneweave.protocol.wire.messages import Ballot, Census, VehicleState
 
 JUST_CLOSED_S = 1.0
@@ -79,7 +80,7 @@ class FormationsOperation:
         leader.on_state(state, now_s)
         if issuing and leader.phase is BallotPhase.IN_FORCE:
             data = {"formation": group[0], "closed_s": leader.formation.closed_s}
-            return [LogEntry("plan-in-force", data)]
+            return [LogEntry(PLAN_IN_FORCE, data)]
         return []
 
     def lead(
@@ -102,7 +103,7 @@ class FormationsOperation:
         formations = closed_formations(census, t_s, self._scenario, self._groups)
         for numbers in with_room(formations, t_s, self._scenario):
             self._groups.join(numbers)
-            yield LogEntry("formations-joined", {"formations": list(numbers), "why": "room"})
+            yield LogEntry(FORMATIONS_JOINED, {"formations": list(numbers), "why": "room"})
             formations = closed_formations(census, t_s, self._scenario, self._groups)
         for number in set(self.leaders) - set(formations):
             del self.leaders[number]
@@ -130,7 +131,7 @@ class FormationsOperation:
         """Issue a plan that was made, or try again later."""
         for outcome in self._planner.finish(computed, t_s, now_s):
             if isinstance(outcome, LogEntry):
-                self._groups_changed |= outcome.kind == "formations-joined"
+                self._groups_changed |= outcome.kind == FORMATIONS_JOINED
             yield outcome
 
     @property

@@ -35,6 +35,17 @@ from laneweave.protocol.lattice import Cell, territory
 from laneweave.protocol.runtime.node import Compute, Computed
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.plans import plan_problems
+from laneweave.protocol.wire.events import (
+    FORMATION_TOO_LATE,
+    FORMATIONS_JOINED,
+    LANE_OUT_OF_REACH,
+    NEIGHBOURS_AWAITED,
+    PLAN_MADE,
+    PLANNING_FAILED,
+    ROOM_AWAITED,
+    STRUCTURE_IMPOSSIBLE,
+    STRUCTURE_TOO_LATE,
+)
 from laneweave.protocol.wire.messages import Ballot, Plan
 
 START_MARGIN_S = 0.5
@@ -147,13 +158,11 @@ class FormationPlanner:
         start_s, end_s = self._start_s(formation, cells, t_s), self._end_s(formation)
         if not formation.sorts and end_s < start_s + scenario.cycles_s[0]:
             leader.on_planning_failed(now_s)
-            yield LogEntry(
-                "structure-too-late", {"formation": numbers[0], "stage": formation.stage}
-            )
+            yield LogEntry(STRUCTURE_TOO_LATE, {"formation": numbers[0], "stage": formation.stage})
             return
         if steps_left(cells, start_s, scenario.cycles_s[0], scenario) == 0:
             leader.give_up(now_s)
-            yield LogEntry("formation-too-late", {"formation": numbers[0]})
+            yield LogEntry(FORMATION_TOO_LATE, {"formation": numbers[0]})
             return
         task = SortingTask(
             numbers,
@@ -226,11 +235,11 @@ class FormationPlanner:
         if isinstance(result, Sorting):
             status = result.response.status if result.response is not None else "optimal"
             if result.short_of_room and self._join_neighbour(leader, t_s):
-                yield LogEntry("formations-joined", {"formations": list(self._groups.of(number))})
+                yield LogEntry(FORMATIONS_JOINED, {"formations": list(self._groups.of(number))})
                 return
             if result.short_of_room and self._room_is_coming(leader.formation.numbers, t_s):
                 leader.on_planning_failed(now_s)
-                yield LogEntry("room-awaited", {"formation": number})
+                yield LogEntry(ROOM_AWAITED, {"formation": number})
                 return
             if result.solved:
                 planned = self._plan(leader, result, t_s)
@@ -244,7 +253,7 @@ class FormationPlanner:
                 error = "; ".join(problems)
         leader.on_planning_failed(now_s)
         data = {"formation": number, "status": status, "error": error}
-        yield LogEntry("planning-failed", data)
+        yield LogEntry(PLANNING_FAILED, data)
 
     def _join_neighbour(self, leader: FormationLeader, t_s: float) -> bool:
         """Join a formation that lacks room with a neighbour; false when none can help.
@@ -345,15 +354,15 @@ def _notes(formation: Formation, sorting: Sorting, pauses: int, plan: Plan) -> I
     number = formation.numbers[0]
     if sorting.impossible:
         data = {"formation": number, "stage": formation.stage, "why": sorting.impossible}
-        yield LogEntry("structure-impossible", data)
+        yield LogEntry(STRUCTURE_IMPOSSIBLE, data)
     if sorting.response is not None:
         timing = {"t0_s": plan.t0_s, "slot_s": plan.slot_s}
-        yield LogEntry("plan-made", _facts(number, sorting.response) | timing)
+        yield LogEntry(PLAN_MADE, _facts(number, sorting.response) | timing)
     if pauses:
-        yield LogEntry("neighbours-awaited", {"formation": number, "slots": pauses})
+        yield LogEntry(NEIGHBOURS_AWAITED, {"formation": number, "slots": pauses})
     if sorting.out_of_reach:
         vehicles = [str(name) for name in sorting.out_of_reach]
-        yield LogEntry("lane-out-of-reach", {"formation": number, "vehicles": vehicles})
+        yield LogEntry(LANE_OUT_OF_REACH, {"formation": number, "vehicles": vehicles})
 
 
 def _facts(number: int, response: PlanResponse) -> dict[str, Any]:

@@ -26,6 +26,13 @@ from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.runtime.node import Compute, Computed, Effect
 from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.wire.events import (
+    HANDOVER_GIVEN_UP,
+    PLAN_IN_FORCE,
+    PLANNING_FAILED,
+    PLANNING_LATE,
+    STREAM_PLANNED,
+)
 from laneweave.protocol.wire.messages import Ballot, Census, Name, Plan, Prepare, VehicleState
 
 SHOWN_S = 0.5
@@ -127,11 +134,11 @@ class RollingOperation:
         transfer.on_state(state, self.observed.states, now_s)
         if transfer.phase is BallotPhase.GIVEN_UP:
             data = {"roster": list(transfer.roster), "why": transfer.why}
-            return [LogEntry("handover-given-up", data)]
+            return [LogEntry(HANDOVER_GIVEN_UP, data)]
         if transfer.phase is BallotPhase.IN_FORCE and self.in_force == 1:
             slot = round(transfer.t0_s / self._slot_s)
             begun_s = transfer.t0_s - self._slot_s
-            return [LogEntry("plan-in-force", {"slot": slot, "closed_s": begun_s + SHOWN_S})]
+            return [LogEntry(PLAN_IN_FORCE, {"slot": slot, "closed_s": begun_s + SHOWN_S})]
         return []
 
     def lead(
@@ -234,16 +241,16 @@ class RollingOperation:
             transfer.give_up("the next slot is planned")
         table = computed.result
         if not isinstance(table, StreamPlan):
-            yield LogEntry("planning-failed", {"slot": slot, "error": computed.error})
+            yield LogEntry(PLANNING_FAILED, {"slot": slot, "error": computed.error})
             return
         self._table = table
         t0_s = slot * self._slot_s
         if t_s > t0_s + LATEST_S:
-            yield LogEntry("planning-late", {"slot": slot})
+            yield LogEntry(PLANNING_LATE, {"slot": slot})
             return
         self.transfers = list(self._make_transfers(table, t0_s, now_s))
         self._transfer_of = {name: each for each in self.transfers for name in each.roster}
-        yield LogEntry("stream-planned", self._facts(table))
+        yield LogEntry(STREAM_PLANNED, self._facts(table))
 
     def _facts(self, table: StreamPlan) -> dict[str, Any]:
         sizes = [len(transfer.roster) for transfer in self.transfers]

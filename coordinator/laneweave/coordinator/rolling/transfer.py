@@ -79,7 +79,7 @@ class CellTransfer(BallotRound):
         for name, promise in self.promises.items():
             owned = owned_cells(promise, dict(states) | self.promises, self.gone)
             if owned is None:
-                return f"nobody can tell what {name} owns"
+                return f"it cannot be told what {name} owns"
             before[name] = owned
         for name, (origin, _) in self.moves.items():
             promise = self.promises[name]

@@ -231,7 +231,7 @@ class PlanningService:
     # --- planning -----------------------------------------------------------------------------
 
     def owns(self, job: int) -> bool:
-        """Tell whether a computation belongs to a request."""
+        """Return whether a computation belongs to a request."""
         return job in self._planning
 
     def _hand_out(self, now_s: float) -> Iterator[Effect]:

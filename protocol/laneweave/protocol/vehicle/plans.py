@@ -92,7 +92,7 @@ def ownership_problems(plan: Plan) -> list[str]:
         if not occupied <= set(cells):
             problems.append(f"{vehicle} does not own {sorted(occupied - set(cells))}")
         if not set(cells) <= owned:
-            problems.append(f"nobody owned {sorted(set(cells) - owned)}")
+            problems.append(f"no member owned {sorted(set(cells) - owned)}")
     return problems
 
 

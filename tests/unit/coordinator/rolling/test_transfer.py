@@ -224,9 +224,9 @@ def test_a_closed_deed_of_an_older_plan_is_resolved_by_the_others() -> None:
 WRONG = {
     "A is not where it was planned from": [evolve(state(A, MID), hold_cell=(1, 0)), state(B, MID)],
     "B does not own": [state(A, MID), evolve(state(B, MID), hold_cell=TARGET)],
-    "nobody owned": [state(A, MID), state(B, MID, estate=((2, 1),))],
+    "no member owned": [state(A, MID), state(B, MID, estate=((2, 1),))],
     "a cell has two owners": [state(A, MID, estate=(*BEFORE[A], (2, 1))), state(B, MID)],
-    "nobody can tell what B owns": [
+    "it cannot be told what B owns": [
         state(C, LOW, Deed(LOW, (), (), (A, B, C))),  # it may open its gate yet
         state(A, MID, Deed(LOW, BEFORE[A], BEFORE[A], (A,))),
         state(B, MID, Deed(LOW, BEFORE[B], (), (A, B, C))),

@@ -82,7 +82,7 @@ UNSOUND = {
     "a cell has two owners after": changed("after", B=(TARGET, (1, 1), (2, 1))),
     "A does not own [(0, 1)]": changed("after", A=(HOME, (1, 0))),
     "B does not own [(2, 1)]": changed("after", B=((1, 1),)),
-    "nobody owned [(9, 9)]": changed("after", B=((1, 1), (2, 1), (9, 9))),
+    "no member owned [(9, 9)]": changed("after", B=((1, 1), (2, 1), (9, 9))),
 }
 
 
