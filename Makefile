@@ -9,7 +9,7 @@ BUDGET ?= 90
 # An idle worker takes over half of another worker's remaining tests.
 PYTEST := $(BIN)/pytest -n 2 --dist worksteal
 
-# Linear algebra stays on one thread: many processes share few cores.
+# One thread for linear algebra: many processes share few cores.
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
@@ -18,7 +18,7 @@ export OPENBLAS_NUM_THREADS := 1
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 19
 
-install: $(STAMP) ## make .venv and install laneweave with everything
+install: $(STAMP) ## create .venv and install laneweave with all extras
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "laneweave needs Python >= 3.11: make PYTHON=python3.11 ...")'
@@ -29,37 +29,37 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -c 'from laneweave.coordinator.planning import warm_up; warm_up()'
 	touch $@
 
-demo: $(STAMP) ## let vehicles sort themselves on the paper's road, one process per vehicle
+demo: $(STAMP) ## run lane sorting on the paper's road, one process per vehicle
 	rm -rf $(RUN)
 	$(BIN)/laneweave run scenarios/demo.toml --out $(RUN)
 
-check: $(STAMP) ## format, lint, types, import contracts
+check: $(STAMP) ## check format, lint, types and import contracts
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-format: $(STAMP) ## rewrite the code in the project's format
+format: $(STAMP) ## format the code
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-test-unit: $(STAMP) ## the inner loop: no processes, under a minute
+test-unit: $(STAMP) ## run the fast tests: no processes, under a minute
 	$(PYTEST) -m 'not full and not slow' tests/unit
 
-test: $(STAMP) ## what CI runs
+test: $(STAMP) ## run the tests that CI runs
 	$(PYTEST) -m 'not full'
 
-test-full: $(STAMP) ## the long programmes too
+test-full: $(STAMP) ## run all tests, including the long ones
 	$(PYTEST)
 
-evaluation: $(STAMP) ## run what docs/EVALUATION.md reports and write its tables (BUDGET=90 minutes on 2 cores)
+evaluation: $(STAMP) ## run the evaluation and write the tables of docs/EVALUATION.md (BUDGET=90 minutes on 2 cores)
 	$(BIN)/python benchmarks/evaluate.py --budget $(BUDGET)
 
-evaluation-faults: $(STAMP) ## the same for "Under faults": apart, since it takes an hour and a half
+evaluation-faults: $(STAMP) ## the same for "Under faults" only; takes an hour and a half more
 	$(BIN)/python benchmarks/evaluate.py --only faults
 
-docs: $(STAMP) ## write the generated parts of the documents
+docs: $(STAMP) ## update the generated parts of the documents
 	$(BIN)/python docs/generate.py
 
-clean: ## remove everything that was made
+clean: ## remove everything that these targets create
 	rm -rf $(VENV) runs build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

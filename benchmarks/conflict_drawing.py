@@ -1,10 +1,10 @@
-"""The conflict table as a picture: what another vehicle may do, wherever it is.
+"""Draw the conflict table: which moves of a second vehicle conflict with a move of the first.
 
-A panel for each kind of move of vehicle A; others follow by symmetry. Around A are the cells from
-which B may start, with an arrow for each of its moves and a dot for waiting, coloured by how late
-one of the two must be to come too close to the other.
+There is one panel for each kind of move of vehicle A; the others follow by symmetry. Around A are
+the cells from which B may start, with an arrow for each of its moves and a dot for waiting. The
+colour shows how late one of the two must be to come too close to the other.
 
-Used by docs/generate.py and geometry.py; no part of the installed package.
+Used by docs/generate.py and geometry.py; not part of the installed package.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from laneweave.launch.drawing.figures import FAINT_INK, INK, new_figure, save
 from laneweave.protocol.lattice import Cell, displacements, footprint
 
 LATENESS_S: Final = 0.5
-"""The margin that is told apart in the picture and in the table of counts."""
+"""Lateness that the picture and the table of counts distinguish."""
 
 PANELS: Final[dict[str, Cell]] = {
     "A waits": (0, 0),
@@ -40,7 +40,7 @@ PANELS: Final[dict[str, Cell]] = {
 
 
 class Verdict(Enum):
-    """When a pair of moves is too close; the value is its colour (Okabe and Ito)."""
+    """Lateness at which a pair of moves is too close; the value is its colour (Okabe and Ito)."""
 
     ON_TIME = "#d55e00"
     LATE = "#e69f00"
@@ -61,13 +61,12 @@ _WIDTH_IN, _ACROSS = 10.0, 2
 _MARGIN_IN, _TITLE_IN, _LEGEND_IN = 0.12, 0.28, 0.5
 _LANE_HEIGHT, _BODY = 0.68, (0.5, 0.22)
 """In lengths of a cell."""
-_ARROW, _DOT, _WAY = (0.14, 0.4), 0.045, 0.56
-"""Where an arrow begins and ends, the size of a dot, and where A's arrow ends, from the middle of
-a cell."""
+_ARROW, _DOT, _PATH = (0.14, 0.4), 0.045, 0.56
+"""Start and end of an arrow, radius of a dot, and end of A's arrow, from the middle of a cell."""
 
 
 def draw_conflicts(out: Path, geometry: BodyGeometry | None = None, dpi: int = 110) -> None:
-    """Write the picture of a geometry's table in mode 2."""
+    """Draw the table of a geometry in mode 2 and write it to a file."""
     save(conflict_figure(geometry or BodyGeometry()), out, dpi)
 
 
@@ -108,7 +107,7 @@ def conflict_figure(geometry: BodyGeometry) -> Figure:
 
 @attrs.frozen
 class Judge:
-    """The tables of one geometry, for three degrees of lateness."""
+    """The conflict tables of one geometry, for three values of lateness."""
 
     on_time: frozenset[Pair]
     late: frozenset[Pair]
@@ -136,7 +135,7 @@ class Judge:
 
 
 def conflict(pair: Pair, *kinds: str) -> bool:
-    """Tell whether two moves are a conflict of one of these kinds, without a geometry."""
+    """Return whether two moves are a conflict of one of these kinds, without a geometry."""
     offset, a, b = pair
     other = offset, (offset[0] + b[0], offset[1] + b[1])
     return ConflictModel(kinds).kind(((0, 0), a), other) is not None
@@ -145,7 +144,7 @@ def conflict(pair: Pair, *kinds: str) -> bool:
 def counts() -> list[tuple[str, int, int]]:
     """Return how many pairs of moves each model forbids in mode 1 and in mode 2.
 
-    Of vehicles in different cells; each pair counts twice, as seen from either vehicle.
+    Only vehicles in different cells count; each pair counts twice, once for either vehicle.
     """
     judge = Judge.of(BodyGeometry())
     near = range(-MAX_OFFSET, MAX_OFFSET + 1)
@@ -213,7 +212,7 @@ def _draw_panel(axes: Axes, a: Cell, judge: Judge) -> None:
     for offset in product(near, near):
         if offset == (0, 0):
             continue
-        # What matters most is drawn last.
+        # The most severe verdict is drawn last, on top.
         verdicts = [(judge.verdict((offset, a, b)), b) for b in displacements(2)]
         order = list(Verdict)
         for verdict, b in sorted(verdicts, key=lambda item: -order.index(item[0])):
@@ -242,7 +241,7 @@ def _draw_move(axes: Axes, cell: Cell, step: Cell, verdict: Verdict) -> None:
 
 
 def _draw_a(axes: Axes, step: Cell) -> None:
-    """Draw A in the middle, the cells of its footprint, and its way."""
+    """Draw A in the middle, the cells of its footprint, and its path."""
     for column, lane in footprint((0, 0), step):
         corner = (column - 0.5, (lane - 0.5) * _LANE_HEIGHT)
         axes.add_patch(
@@ -261,8 +260,8 @@ def _draw_a(axes: Axes, step: Cell) -> None:
     axes.add_patch(body)
     axes.text(0, 0, "A", color="white", size=10, ha="center", va="center_baseline", zorder=7)
     if step != (0, 0):
-        ends = [(0.0, 0.0), (_WAY * step[0], _WAY * step[1] * _LANE_HEIGHT)]
-        way = FancyArrowPatch(*ends, arrowstyle="-|>", mutation_scale=15, shrinkA=0, shrinkB=0)
-        way.set(color=INK, linewidth=2.6, zorder=5)
-        way.set_path_effects([withStroke(linewidth=4.5, foreground="white")])
-        axes.add_patch(way)
+        ends = [(0.0, 0.0), (_PATH * step[0], _PATH * step[1] * _LANE_HEIGHT)]
+        path = FancyArrowPatch(*ends, arrowstyle="-|>", mutation_scale=15, shrinkA=0, shrinkB=0)
+        path.set(color=INK, linewidth=2.6, zorder=5)
+        path.set_path_effects([withStroke(linewidth=4.5, foreground="white")])
+        axes.add_patch(path)

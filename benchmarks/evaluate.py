@@ -1,19 +1,19 @@
-"""All that docs/EVALUATION.md reports: runs it, and brings the document up to date.
+"""Run the evaluation and update docs/EVALUATION.md.
 
     python benchmarks/evaluate.py [--only PART ...] [--seeds A:B] [--budget MINUTES]
                                     [--jobs N] [--duration S] [--sweeps DIR ...] [--out DIR]
 
 zenoh      three points of the sweep over Zenoh with a process per vehicle, and simulated
 speed      real-time factors of three deployments
-length     what a vehicle costs on 1 km and on 10 km of road
-stability  how a disturbance of speed travels: benchmarks/stability.py
-sweep      every method at every volume, seed after seed
+length     cost of a vehicle on 1 km and on 10 km of road
+stability  how a disturbance of speed propagates: benchmarks/stability.py
+sweep      every method at every volume, one seed after the other
 report     docs/evidence/evaluation.json, figures in docs/images, tables in docs/EVALUATION.md
-faults     benchmarks/resilience.py, over an hour; only where it is asked for
+faults     benchmarks/resilience.py, over an hour; only on request
 
-What is finished is kept: the same command goes on where it was. With --budget no seed of the sweep
-is begun that would not be finished in time. The exit status is 1 if a run of formation control has
-broken a promise or a run did not come to its end.
+Finished parts are kept: the same command continues where it stopped. With --budget the sweep starts
+no seed that would not finish in time. The exit status is 1 if a run of formation control violates a
+guarantee or a run does not finish.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ from laneweave.protocol.errors import BadInputError, CommandFailedError
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PARTS = ("zenoh", "speed", "length", "stability", "sweep", "report", "faults")
-"""In the order in which they are run: the sweep takes the time that is left."""
+"""In the order in which they run: the sweep uses the remaining time."""
 APART = ("faults",)
 REPORT_S = 300.0
-"""Kept of the budget for the report."""
+"""Part of the budget reserved for the report."""
 
 
 def parse_parts(names: Sequence[str] | None) -> tuple[str, ...]:
-    """Return the parts to run, in their order; None: all that are not to be asked for.
+    """Return the parts to run, in their order; None: all parts that run without request.
 
     Raises:
-        BadInputError: there is no such part.
+        BadInputError: a part does not exist.
     """
     if names is None:
         return tuple(part for part in PARTS if part not in APART)
@@ -60,7 +60,7 @@ def parse_positive(option: str, text: str, unit: str) -> float:
     """Return a positive number.
 
     Raises:
-        BadInputError: it is none.
+        BadInputError: the text is not a positive number.
     """
     try:
         value = float(text)
@@ -72,7 +72,7 @@ def parse_positive(option: str, text: str, unit: str) -> float:
 
 
 def run_faults(out: Path) -> bool:
-    """Run the fault programme and record what came of it; return whether it came to its end."""
+    """Run the fault experiments and store their results; return whether they finished."""
     folder = out / "faults"
     script = Path(__file__).with_name("resilience.py")
     done = subprocess.run([sys.executable, str(script), "--out", str(folder)], check=False)  # noqa: S603
@@ -82,16 +82,16 @@ def run_faults(out: Path) -> bool:
 
 
 def run_script(script: Path) -> bool:
-    """Run a script of this repository without options; return whether it came to its end."""
+    """Run a script of this repository without options; return whether it succeeded."""
     return subprocess.run([sys.executable, str(script)], check=False).returncode == 0  # noqa: S603
 
 
 def run(arguments: argparse.Namespace) -> bool:
-    """Run what was asked for; return whether everything is as it should be.
+    """Run the requested parts; return whether all of them succeeded.
 
     Raises:
-        BadInputError: an option or a folder is not acceptable.
-        CommandFailedError: files or processes cannot be made.
+        BadInputError: an option or a folder is not valid.
+        CommandFailedError: files or processes cannot be created.
     """
     parts, out = parse_parts(arguments.only), Path(arguments.out)
     end_s = None
@@ -132,9 +132,9 @@ def main() -> int:
     parser.add_argument(
         "--jobs",
         type=int,
-        help="processes at a time, of the sweep and of trials that share; default: all cores",
+        help="parallel processes of the sweep and of trials that share cores; default: all cores",
     )
-    parser.add_argument("--budget", metavar="MINUTES", help="for everything; default: no limit")
+    parser.add_argument("--budget", metavar="MINUTES", help="total time; default: no limit")
     parser.add_argument(
         "--sweeps", nargs="+", type=Path, default=[], metavar="DIR",
         help="report: folders of sweeps instead of OUT/sweep",
@@ -150,7 +150,7 @@ def main() -> int:
         sys.stderr.write(f"{error}\n")
         return 1
     except KeyboardInterrupt:
-        sys.stderr.write("interrupted; the same command goes on\n")
+        sys.stderr.write("interrupted; the same command continues\n")
         return 1
 
 

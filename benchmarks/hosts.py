@@ -1,15 +1,15 @@
-"""What a deployment on several hosts survives: the table of docs/FAULTS.md, "On several hosts".
+"""Faults in a deployment on several hosts: the table of docs/FAULTS.md, "On several hosts".
 
     python benchmarks/hosts.py [--only NAME ...] [--plain] [--short] [--pace P]
                                [--out FOLDER]
 
 Each experiment is one run of the deployment of compose.yaml, as processes on hosts that are network
-namespaces (tests/support/hosts.py): a link is cut, or a service is killed and started again by the
+namespaces (tests/support/hosts.py): a link is cut, or a service is killed and restarted with the
 same command. Roles start before their router. Figures are read from the run's folder and written to
-FOLDER/hosts.json. Experiments that are there already are kept, unless `--only` names them. The exit
-status is 1 if two vehicles touched or a run did not come to its end. It takes the right to make
-network namespaces. `--plain`: without certificates, over TCP. `--short`: vehicles arrive for 20 s
-instead of 90 s.
+FOLDER/hosts.json. Finished experiments are kept, unless `--only` names them. The exit status is 1
+if two vehicles touched or a run did not finish. The script needs permission to create network
+namespaces. `--plain`: without certificates, over TCP. `--short`: vehicles arrive for 20 s instead
+of 90 s.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from support.hosts import Hosts, compose, lasts, open_hosts
 
 LONGEST_S = 600.0
-"""No run takes as long, in wall-clock seconds."""
+"""Upper bound on the duration of a run, in wall-clock seconds."""
 DURATION_S, SHORT_S = 90.0, 20.0
-"""For how long vehicles arrive."""
+"""Duration of the arrivals."""
 BEGIN_S = 40.0
-"""Road time of the fault: vehicles enter, sort themselves, and none has left yet."""
+"""Road time of the fault: vehicles enter and change lanes, and none has left yet."""
 AWAY_S = 3.0
-"""Wall-clock time until a service that was killed is started again."""
+"""Wall-clock time until a killed service is restarted."""
 SERVICES = tuple(name for name, service in compose()["services"].items() if lasts(service))
 
 
@@ -51,7 +51,7 @@ class Experiment:
 
     name: str
     text: str
-    """What happens, for the table."""
+    """Description of the fault, for the table."""
     disturb: Callable[[Hosts], None]
 
 
@@ -71,7 +71,7 @@ def cut(host: str, for_s: float) -> Experiment:
 
 
 def killed(name: str) -> Experiment:
-    """Return an experiment that kills a service and starts it again."""
+    """Return an experiment that kills a service and restarts it."""
 
     def disturb(hosts: Hosts) -> None:
         hosts.kill(name)
@@ -107,7 +107,7 @@ def run(
         experiment.disturb(hosts)
         lasted_s = time.monotonic() - began
         bridge = hosts.finish("bridge", LONGEST_S)
-        # Whoever still runs goes when it is asked to; -9 and the like are processes that died.
+        # Services that still run exit on request; a negative status means that the process died.
         statuses = hosts.stop(*[name for name in hosts.running if name != "router"], "router")
         (*_, last) = hosts.runs
     found = figures(last)
@@ -121,7 +121,7 @@ def run(
 
 
 def figures(folder: Path) -> dict[str, Any]:
-    """Return what a run's folder says about its promises."""
+    """Return the figures of a run's folder."""
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     trips = pq.read_table(folder / "trips.parquet").to_pylist()
     times = [trip["travel_time_s"] for trip in trips if trip["left_s"] is not None]
@@ -144,14 +144,14 @@ def figures(folder: Path) -> dict[str, Any]:
 
 
 def kept_promises(found: dict[str, Any]) -> bool:
-    """Tell whether nobody touched and everybody arrived."""
+    """Return whether no vehicles touched and all vehicles arrived."""
     touched = found["overlaps"] or found["sumo_collisions"]
     complete = found["ending"] == "complete" and found["left"] == found["demanded"] > 0
     return complete and not touched and found["bridge_status"] == 0 and not found["ended_badly"]
 
 
 def main() -> int:
-    """Run what is asked for."""
+    """Run the requested experiments."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     names = [experiment.name for experiment in EXPERIMENTS]
     parser.add_argument("--only", nargs="+", choices=names)
@@ -160,7 +160,7 @@ def main() -> int:
     parser.add_argument("--pace", type=float, default=3.0)
     parser.add_argument("--out", type=Path, default=Path("runs/hosts"))
     arguments = parser.parse_args()
-    # Whatever ends this programme, it ends what it has started.
+    # On SIGTERM, exit normally so that all started processes are stopped.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     base: Path = arguments.out
     base.mkdir(parents=True, exist_ok=True)

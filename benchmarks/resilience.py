@@ -1,11 +1,11 @@
-"""What faults cost: the table of docs/EVALUATION.md, "Under faults".
+"""Cost of faults: the table of docs/EVALUATION.md, "Under faults".
 
     python benchmarks/resilience.py [--only NAME ...] [--out FOLDER]
 
 Each experiment is one `laneweave run` with a faults file: real processes, or for the rolling
-operation all roles over the simulated network, which repeats exactly. Its figures are read from the
-run's folder and written to FOLDER/resilience.json. Experiments that are there already are kept,
-unless `--only` names them. A run's own verdict (overlaps, who did not leave) is among the figures.
+operation all roles over the simulated network, where results repeat exactly. The figures are read
+from the run's folder and written to FOLDER/resilience.json. Finished experiments are kept, unless
+`--only` names them. The run's own verdict (overlaps, vehicles that did not leave) is included.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ SHORT_TICKS = "short-ticks.toml"
 
 
 def demand(volume: int, duration_s: int, operation: str = "formations") -> tuple[str, ...]:
-    """Return the options for vehicles per lane and hour that arrive for some time."""
+    """Return the options for a volume in vehicles/(lane h) and the duration of the arrivals."""
     flow = ("--volume", f"{volume}", "--seed", "1", "--duration", f"{duration_s}")
     return ("--operation", operation, *flow)
 
@@ -68,7 +68,7 @@ EXPERIMENTS = (
     Experiment("blackout-from-start", "blackout-from-start.toml", demand(1600, 200)),
     Experiment("agents-killed", "agents-killed.toml", demand(1600, 300)),
     Experiment("everything", "everything", demand(1600, 200)),
-    # Times are measured on a road that is not full: both cores are to have some room.
+    # Times are measured on a road that is not full, so that both cores have spare capacity.
     Experiment("router-killed", "router-killed-10-times.toml", (*demand(1000, 300), *REAL_TIME)),
     Experiment("leader-killed", "leader-killed-50-times.toml", (*demand(1000, 300), *REAL_TIME)),
     Experiment("leader-stopped", "leader-stopped-30-times.toml", (*demand(600, 560), *REAL_TIME)),
@@ -98,7 +98,7 @@ def run(experiment: Experiment, folder: Path) -> dict[str, Any]:
 
 
 def figures(folder: Path) -> dict[str, Any]:
-    """Return what a run's folder says about its promises."""
+    """Return the figures of a run's folder."""
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     trips = pq.read_table(folder / "trips.parquet").to_pylist()
     kinds: Counter[str] = Counter()
@@ -148,7 +148,7 @@ def _spread(values: list[float]) -> dict[str, float | int]:
 
 
 def main() -> None:
-    """Run what is asked for."""
+    """Run the requested experiments."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     names = [experiment.name for experiment in EXPERIMENTS]
     parser.add_argument("--only", nargs="+", choices=names)

@@ -1,10 +1,11 @@
-"""What security costs: time from put to callback, and how long a router takes to start.
+"""Cost of security: time from put to callback, and start-up time of a router.
 
     .venv/bin/python benchmarks/security.py
 
-A router in a process of its own, a vehicle and a coordinator here: states of 300 B, 500 a second,
-in rounds over TCP, TLS without and TLS with rules, so that other load on the machine meets all
-alike. Then routers with rules for 10, 1000 and 5000 vehicles.
+The router runs in a separate process, a vehicle and a coordinator in this one. The vehicle sends
+500 states of 300 B per second, in alternating rounds over TCP, TLS without rules and TLS with
+rules, so that other load on the machine affects all alike. Then routers with rules for 10, 1000
+and 5000 vehicles are started.
 """
 
 from __future__ import annotations
@@ -55,14 +56,14 @@ def _route(endpoint: str, guard: RouterGuard | None, ready: Connection) -> None:
 
 @contextmanager
 def _router(endpoint: str, guard: RouterGuard | None) -> Iterator[float]:
-    """Run a router; gives the time that it took to start, in seconds."""
+    """Run a router; yield its start-up time in seconds."""
     context = get_context("spawn")
     here, there = context.Pipe()
     process = context.Process(target=_route, args=(endpoint, guard, there))
     began = time.monotonic()
     process.start()
     if not here.poll(START_S):
-        raise TimeoutError("the router does not start")
+        raise TimeoutError("the router did not start")
     try:
         yield time.monotonic() - began
     finally:

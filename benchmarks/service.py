@@ -1,22 +1,22 @@
-"""What the planning service adds to planning: throughput, latency, and the loss of a coordinator.
+"""Overhead of the planning service: throughput, latency, and the loss of a coordinator.
 
     python benchmarks/service.py [--json docs/evidence/service.json]
 
-Real processes: a router, coordinators as `laneweave coordinator` runs them, and clients in a
-process of their own. Requests are formations of 6 to 18 vehicles. Four measurements:
+Real processes: a router, coordinators started with `laneweave coordinator`, and clients in a
+separate process. Requests are formations of 6 to 18 vehicles. Four measurements:
 
-- *alone*: the solver in a process that does nothing else, one request after the other. Its rate is
-  what a worker could do at best.
-- *load*: 200 requests in flight from 20 clients. Each must be answered, and the same request asked
-  once more under its id must get the same plan. Beside the rate, compared with that of the solver
-  alone some minutes before, stands the share of the workers' time that was solving, which does not
-  depend on what else the machine does.
-- *half*: requests come at random, at half the rate that the workers can do. What the service adds
-  to a request is its latency less the solver's time and less the time that it waited for a worker
-  that was busy: a queue forms at half load in front of any single server. Once with the same
-  formations, and once with small ones, of which there are hundreds a second.
-- *loss*: three coordinators with one worker each, one of which is killed again and again. Hit are
-  the requests that were under way at such a moment, or came within the second after it.
+- *alone*: the solver in a process without other work, one request after the other. Its rate is the
+  upper bound for a worker.
+- *load*: 200 requests in flight from 20 clients. Each must be answered, and a repetition of the
+  request with the same id must get the same plan. Reported are the rate, compared with that of the
+  solver alone some minutes before, and the share of the workers' time spent solving, which does not
+  depend on other load on the machine.
+- *half*: requests arrive at random, at half the rate that the workers can process. The overhead of
+  the service is the latency minus the solver's time and minus the time that the request waited for
+  a busy worker: at half load a queue forms before any single server. Measured with the same
+  formations, and with small ones at hundreds of requests per second.
+- *loss*: three coordinators with one worker each, one of which is killed repeatedly. Counted are
+  the requests that were in flight at such a moment, or arrived within the following second.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ LANEWEAVE = str(Path(sys.executable).with_name("laneweave"))
 REQUESTS, CLIENTS = 200, 20
 SIZES = range(6, 19)
 DEADLINE_S = 300.0
-"""Longer than all of it takes: nothing is dropped, and plans do not depend on the load."""
+"""Longer than the whole measurement: no request is dropped, and plans do not depend on the load."""
 SMALL = range(6, 11)
 LOSSES = 10
 LOSS_PAUSE_S = 3.0
@@ -58,7 +58,7 @@ START_S = 60.0
 
 
 def instance(seed: int, sizes: Sequence[int]) -> PlanRequest:
-    """Return a formation; sizes take turns."""
+    """Return a request for one formation; the seed selects its size."""
     request = formation_request(seed, vehicles=sizes[seed % len(sizes)], deadline_s=DEADLINE_S)
     return attrs.evolve(request, id=f"request-{seed}", solver="branching")
 
@@ -73,7 +73,7 @@ class Network:
 
     @property
     def endpoint(self) -> str:
-        """Where the router is."""
+        """Endpoint of the router."""
         return f"unixsock-stream/{self.folder}/router.sock"
 
     def start(self, *arguments: str, name: str) -> None:
@@ -101,7 +101,7 @@ class Network:
 
 @contextlib.contextmanager
 def network(coordinators: int, workers: int) -> Iterator[Network]:
-    """Start a router and coordinators, and wait until they plan."""
+    """Start a router and coordinators, and wait until they answer requests."""
     with tempfile.TemporaryDirectory(prefix="laneweave-") as folder:
         started = Network(Path(folder), workers)
         try:
@@ -112,7 +112,7 @@ def network(coordinators: int, workers: int) -> Iterator[Network]:
                 started.start_coordinator(f"c{number + 1}")
             with PlanClient(started.endpoint) as client:
                 _until(lambda: _answers(client))
-                # Every worker of every coordinator gets ready.
+                # Warm up every worker of every coordinator.
                 for seed in range(60):
                     client.plan(formation_request(seed), START_S)
             time.sleep(3.0)
@@ -125,7 +125,7 @@ def _until(condition: Callable[[], bool]) -> None:
     give_up = time.monotonic() + START_S
     while not condition():
         if time.monotonic() > give_up:
-            raise SystemExit("the network does not come up")
+            raise SystemExit("the network did not start")
         time.sleep(0.1)
 
 
@@ -139,7 +139,7 @@ def _answers(client: PlanClient) -> bool:
 
 @frozen
 class Asked:
-    """One request as its client saw it."""
+    """One request and its response, with the client's timing."""
 
     asked_s: float
     latency_s: float
@@ -147,13 +147,13 @@ class Asked:
 
     @property
     def added_ms(self) -> float:
-        """Latency, less the solver's time and the time that it waited for a busy worker."""
+        """Latency minus the solver's time and the wait for a busy worker."""
         waited_ms = self.response.waited_ms or 0.0
         return 1e3 * self.latency_s - self.response.solve_ms - waited_ms
 
 
 async def ask(client: AsyncPlanClient, request: PlanRequest) -> Asked:
-    """Have a request planned."""
+    """Send a request and return its answer with the latency."""
     begun_s = time.monotonic()
     response = await client.plan(request, timeout_s=2 * DEADLINE_S)
     return Asked(begun_s, time.monotonic() - begun_s, response)
@@ -162,7 +162,7 @@ async def ask(client: AsyncPlanClient, request: PlanRequest) -> Asked:
 async def with_clients(
     endpoint: str, work: Callable[[list[AsyncPlanClient]], Awaitable[Any]], count: int = CLIENTS
 ) -> Any:  # noqa: ANN401
-    """Connect clients, and let them work."""
+    """Connect clients and run `work` with them."""
     async with contextlib.AsyncExitStack() as stack:
         clients = [await stack.enter_async_context(AsyncPlanClient(endpoint)) for _ in range(count)]
         return await work(clients)
@@ -183,13 +183,13 @@ def alone() -> dict[str, Any]:
 
 
 def plan_of(asked: Asked) -> tuple[object, ...]:
-    """Return the plan in an answer; how long it took may differ."""
+    """Return the plan in an answer, without the times."""
     response = asked.response
     return response.status, response.cost, response.assignment, response.paths
 
 
 def load(workers: int, solver_rate_per_s: float) -> dict[str, Any]:
-    """Measure 200 requests in flight from 20 clients, each asked again under its id."""
+    """Measure 200 requests in flight from 20 clients, each repeated with the same id."""
 
     async def work(clients: list[AsyncPlanClient]) -> tuple[list[Asked], list[Asked], float]:
         requests = [instance(seed, SIZES) for seed in range(REQUESTS)]
@@ -222,7 +222,7 @@ def load(workers: int, solver_rate_per_s: float) -> dict[str, Any]:
 
 
 def half(workers: int, sizes: Sequence[int], count: int) -> dict[str, Any]:
-    """Measure what the service adds to requests that come at random, at half load."""
+    """Measure the overhead for requests that arrive at random, at half load."""
     mean_s = statistics.mean(
         checked_plan(instance(seed, sizes)).solve_ms / 1e3 for seed in range(200)
     )
@@ -252,7 +252,7 @@ def half(workers: int, sizes: Sequence[int], count: int) -> dict[str, Any]:
 
 
 def loss() -> dict[str, Any]:
-    """Kill one of three coordinators again and again, under load."""
+    """Kill one of three coordinators repeatedly, under load."""
     rng = random.Random(2)  # noqa: S311
     killed_s: list[float] = []
 
@@ -298,7 +298,7 @@ def loss() -> dict[str, Any]:
 
 
 def quantiles(values: list[float]) -> dict[str, float]:
-    """Return what is worth knowing of a distribution."""
+    """Return the percentiles and the maximum of a distribution."""
     ordered = sorted(values)
     at = {"p50": 0.5, "p95": 0.95, "p99": 0.99}
     return {name: ordered[int(share * (len(ordered) - 1))] for name, share in at.items()} | {
@@ -307,7 +307,7 @@ def quantiles(values: list[float]) -> dict[str, float]:
 
 
 def main() -> None:
-    """Measure all, or some."""
+    """Run all measurements, or the selected one."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--json", type=Path, help="write the figures here")
     parser.add_argument("--only", choices=("load", "half", "loss"))

@@ -1,15 +1,15 @@
-"""What one more agent process costs: `python benchmarks/startup.py [--json] [--agents N]`.
+"""Cost of one more agent process: `python benchmarks/startup.py [--json] [--agents N]`.
 
-A router and agent processes of one vehicle each, started one after the other by the real fork
-server. An agent is ready when its token is up: it has its tracker and its subscriptions then. Some
-ticks follow, in which the vehicles hold their cell. For each process:
+The real fork server starts a router and agent processes of one vehicle each, one after the other.
+An agent is ready when its token appears: by then it has its tracker and its subscriptions. Some
+ticks follow, in which the vehicles hold their cells. For each process:
 
     ready_cpu_ms   CPU time of all its threads, user and system, from the fork to its token
     first_cpu_ms   the same for the answer to its first SENSE
-    own_mb         its own memory (USS) after some ticks: what it does not share with the fork
-                   server or its siblings
+    own_mb         its private memory (USS) after some ticks: not shared with the fork server or
+                   other agents
 
-The CPU time of starting the fork server, which happens once, is given apart.
+The CPU time of starting the fork server, which happens once, is reported separately.
 """
 
 from __future__ import annotations
@@ -52,15 +52,15 @@ TICKS = 20
 def cpu_ms(process_id: int) -> float:
     """Return the CPU time of a process in ms.
 
-    The kernel's clock of the process has ns, the figures in /proc have 10 ms; this is how Linux
-    numbers that clock.
+    The kernel's clock of the process has a resolution of ns, the figures in /proc 10 ms; this
+    expression is Linux's id of that clock.
     """
     return time.clock_gettime((~process_id << 3) | 2) * 1e3
 
 
 @define
 class Fleet:
-    """Agents that have been started."""
+    """Started agent processes and their measurements."""
 
     scenario: Scenario
     processes: dict[Name, ForkServerProcess] = field(factory=dict)
@@ -68,7 +68,7 @@ class Fleet:
     first_ms: dict[Name, float] = field(factory=dict)
 
     def start(self, count: int, folder: str) -> None:
-        """Start a router and agents; wait for each agent, drive some ticks, end nobody."""
+        """Start a router and agents; wait for each agent and drive some ticks."""
         context, network = fork_server(), self.scenario.network
         tables, options = to_tables(self.scenario), {"folder": folder, "temporary": folder}
         router = Name("router")
@@ -128,12 +128,12 @@ def _await_key(inbox: queue.SimpleQueue[Delivery], key: str) -> None:
             news = inbox.get(timeout=1.0)
             if isinstance(news, (TokenUp, Received)) and news.key == key:
                 return
-    raise RuntimeError(f"nothing came on {key}")
+    raise RuntimeError(f"no token or message on {key}")
 
 
 def measured(count: int) -> dict[str, Any]:
-    """Start agents and return what they have cost."""
-    # Each process runs its supervisor's main file, for what that may define: the same one here.
+    """Start agents and return their cost."""
+    # Each process executes the main file of its supervisor: use the one of `laneweave` here, too.
     sys.modules["__main__"].__file__ = str(Path(sys.executable).with_name("laneweave"))
     with tempfile.TemporaryDirectory(prefix="laneweave-") as folder:
         base = Scenario()
@@ -150,7 +150,7 @@ def _figures(fleet: Fleet) -> dict[str, Any]:
     agents = [psutil.Process(fleet.processes[name].pid) for name in fleet.ready_ms]
     server = agents[0].parent()
     if server is None:
-        raise RuntimeError("the fork server is gone")
+        raise RuntimeError("the fork server has ended")
     memory = [agent.memory_full_info() for agent in agents]
     return {
         "agents": len(agents),
@@ -171,7 +171,7 @@ def _median(values: Iterable[float]) -> float:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description="What one more agent process costs.")
+    parser = argparse.ArgumentParser(description="Cost of one more agent process.")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--agents", type=int, default=AGENTS, help="processes")
     options = parser.parse_args()

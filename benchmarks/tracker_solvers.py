@@ -1,8 +1,8 @@
-"""The tracker beside other solvers: `python benchmarks/tracker_solvers.py`.
+"""Compare the tracker with other solvers: `python benchmarks/tracker_solvers.py`.
 
 All solvers get the same recorded problems, the ticks of an episode in order, since most of them
-start from the solution of the tick before. Episodes are those of `laneweave bench tracker`, driven
-with `tracking.always_solve`:
+start from the solution of the previous tick. Episodes are those of `laneweave bench tracker`,
+driven with `tracking.always_solve`:
 
     tracker     the whole call of the tracker
     no-shortcut the same with `tracking.always_solve`: OSQP runs at every tick
@@ -10,8 +10,8 @@ with `tracking.always_solve`:
     daqp        the same program without its states, by a dual active-set method
     lq          the same program without its inequalities, a matrix times a vector: the lower bound
 
-CPU time of one thread; each problem is measured several times and its median counts. Answers are
-compared with the exact first jerk of each program.
+Times are CPU times of one thread; each problem is measured several times, and the median counts.
+Answers are compared with the exact first jerk of each program.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ from laneweave.sim_bridge.recording.recorder import spread
 Array = NDArray[np.float64]
 
 FAMILIES: Final = ("gap-rows", "yielding", "undisturbed")
-"""A gap row presses on the solution; the reference yields, so that none does; no vehicle is near.
-Other ticks are recorded too, since they precede these."""
+"""A gap constraint is active; the reference gives way, so that none is active; no vehicle is near.
+Other ticks are recorded as well, since they precede these."""
 GOALS_MS: Final = {"p50": 0.2, "p99": 1.0, "max": 4.0}
-"""Of the tracker where gap rows press."""
+"""CPU time goals of the tracker where gap constraints are active."""
 _REPEATS = 3
 _ROW_TOLERANCE = 2e-2
-"""A solution that violates a row by more does not count as one."""
+"""Largest constraint violation of a valid solution."""
 _PRESSING_M = 1e-3
 _EXACT = QPSettings(
     eps_abs=1e-7,
@@ -63,7 +63,7 @@ _EXACT = QPSettings(
 
 @frozen(eq=False)
 class Parts:
-    """What the columns and rows of the tracker's programs stand for.
+    """Meaning of the columns and rows of the tracker's programs.
 
     Columns are 6 N states, 2 N jerks and N slacks; the first 6 N rows are the dynamics.
     """
@@ -91,7 +91,7 @@ class Parts:
         return cls(cost, matrix, states, jerks, np.flatnonzero(alone))
 
     def first_jerk(self, problem: Problem, solution: Array) -> Array:
-        """Return the first jerk (2,) from what a solution adds to the reference's jerks."""
+        """Return the first jerk (2,) from a solution relative to the reference's jerks."""
         rows = self.jerk_rows[:2]
         # Jerk limits are symmetric, so the bounds contain the reference's jerk.
         reference = -(problem.lower[rows] + problem.upper[rows]) / 2.0
@@ -100,7 +100,7 @@ class Parts:
 
 @frozen(eq=False)
 class Problem:
-    """One tick: what the tracker was given, its program, and the exact solution."""
+    """One tick: the tracker's inputs, its program, and the exact solution."""
 
     state: State
     window: Window
@@ -112,17 +112,17 @@ class Problem:
     first: Array
     """First jerk (2,) of the exact solution [m/s3]."""
     pressing: bool
-    """Whether a gap row changes the solution: a slack is not zero."""
+    """Whether a gap constraint changes the solution: a slack is not zero."""
 
 
 @frozen(eq=False)
 class Recording:
-    """Episodes of consecutive ticks, and what all their programs share."""
+    """Episodes of consecutive ticks, and the structure shared by their programs."""
 
     parts: Parts
     episodes: list[list[Problem]]
     names: list[str]
-    """Of the episodes' situations."""
+    """Name of the situation of each episode."""
 
     def in_family(self, family: str) -> list[tuple[int, int]]:
         """Return (episode, tick) of the problems of a family."""
@@ -138,7 +138,7 @@ class Recording:
             return name
         if problem.pressing:
             return "gap-rows"
-        # Only a reference that yields does not obey the dynamics.
+        # Only a reference that gives way violates the dynamics.
         return "yielding" if problem.lower[6 : self.parts.states].any() else ""
 
 
@@ -198,13 +198,13 @@ class Answer:
 
 
 class Solver(Protocol):
-    """A way to solve the programs of a recording, one after the other."""
+    """Interface of a solver for the programs of a recording, in order."""
 
     def reset(self) -> None:
         """Begin a new episode."""
 
     def prepare(self, problem: Problem) -> Any:  # noqa: ANN401 - each has its own
-        """Return what `solve` needs; its time counts, and is also reported separately."""
+        """Return the input of `solve`; this time counts, and is also reported separately."""
 
     def solve(self, prepared: Any) -> Answer:  # noqa: ANN401
         """Solve a prepared problem."""
@@ -214,7 +214,7 @@ class TrackerSolver:
     """The whole call of the tracker."""
 
     def __init__(self, make_tracker: Callable[[], Tracker]) -> None:
-        """Take what makes a tracker."""
+        """Store the factory and create the first tracker."""
         self._make = make_tracker
         self._tracker = make_tracker()
 
@@ -245,7 +245,7 @@ class OsqpSolver:
         )
 
     def reset(self) -> None:
-        """Forget the solution of the tick before."""
+        """Discard the solution of the previous tick."""
         self._qp.reset()
 
     def prepare(self, problem: Problem) -> Problem:
@@ -265,7 +265,7 @@ class Condensed:
     """The tracker's program without its states, in unknowns z with the identity as Hessian.
 
     With b the bounds of the dynamics (6 N,) and u the 2 N jerks and N slacks, the states are
-    e = drift b + drive u, and what is left is
+    e = drift b + drive u, and the remaining program is
 
         minimise  1/2 z' z + (linear b)' z   subject to  lower <= rows z + moved b <= upper
         u = back z
@@ -280,7 +280,7 @@ class Condensed:
 
     @classmethod
     def of(cls, parts: Parts) -> Condensed:
-        """Eliminate the states: dense matrices, made once."""
+        """Eliminate the states; the dense matrices are computed once."""
         n = parts.states
         matrix, cost = parts.rows.toarray(), parts.cost.toarray()
         drift = np.linalg.inv(matrix[:n, :n])
@@ -298,23 +298,23 @@ class Condensed:
 
 
 class DaqpSolver:
-    """The condensed program, solved by DAQP, always from no active row.
+    """The condensed program, solved by DAQP, always from an empty active set.
 
-    Updating its workspace instead gave one wrong answer in a hundred (0.8.5), and is not needed:
-    with an identity Hessian nothing has to be factorised.
+    Updating its workspace instead gave one wrong answer in a hundred (0.8.5), and is unnecessary:
+    an identity Hessian needs no factorisation.
     """
 
     def __init__(self, parts: Parts, condensed: Condensed) -> None:
-        """Make the matrices."""
+        """Set up the matrices."""
         self._parts, self._condensed = parts, condensed
         unknowns = len(condensed.back)
         self._hessian = np.eye(unknowns)
         self._kinds = np.zeros(len(condensed.rows), dtype=np.int32)
-        # One product for everything that depends on the dynamics' bounds.
+        # One product for all terms that depend on the dynamics' bounds.
         self._from_bounds = np.concatenate([condensed.linear, -condensed.moved])
 
     def reset(self) -> None:
-        """Nothing is kept between ticks."""
+        """Do nothing: there is no state between ticks."""
 
     def prepare(self, problem: Problem) -> tuple[Problem, Array, Array, Array]:
         """Return the problem and its vectors: linear cost, lower and upper bounds."""
@@ -337,7 +337,7 @@ class DaqpSolver:
 class LqSolver:
     """The optimum without inequalities: a gain from the dynamics' bounds to all jerks.
 
-    The bounds contain the initial error and, where the reference yields, its defect.
+    The bounds contain the initial error and, where the reference gives way, its defect.
     """
 
     def __init__(self, parts: Parts, condensed: Condensed) -> None:
@@ -346,7 +346,7 @@ class LqSolver:
         self._gain = -condensed.back[: parts.jerks] @ condensed.linear
 
     def reset(self) -> None:
-        """Nothing is kept between ticks."""
+        """Do nothing: there is no state between ticks."""
 
     def prepare(self, problem: Problem) -> Problem:
         """Return the problem."""
@@ -377,7 +377,7 @@ def compare(
         scenario: limits, tick and horizon.
         instances: episodes per situation.
         seed: of all episodes.
-        repeats: how often each problem is measured.
+        repeats: number of measurements per problem.
 
     Returns:
         One row per family and solver.
@@ -408,7 +408,7 @@ def solvers(scenario: Scenario, parts: Parts) -> dict[str, Solver]:
 
 @frozen(eq=False)
 class _Measured:
-    """Of all problems, by episode and tick."""
+    """Measurements of all problems, by episode and tick."""
 
     prepare_ms: list[Array]
     solve_ms: list[Array]

@@ -1,12 +1,12 @@
-"""The live page at 90 vehicles: `python benchmarks/watch.py [--json FILE] [--picture PNG]`.
+"""Measure the live page at 90 vehicles: `python benchmarks/watch.py [--json FILE] [--picture PNG]`.
 
-A deployment of its own on this machine: router, three coordinators, two agent processes, bridge in
-real time, `laneweave watch`, and Debian's Chromium. When as many vehicles are on the road the page
-is opened and looked at for some seconds, several times:
+Starts a deployment on this machine: router, three coordinators, two agent processes, bridge in real
+time, `laneweave watch`, and Debian's Chromium. When 90 vehicles are on the road, the page is opened
+and observed for some seconds, several times:
 
     first_paint_ms     first contentful paint, as the browser measures it
     first_frame_ms     the first picture of the road
-    ticks_per_s        of the road: there is no more to show than these
+    ticks_per_s        of the road: the upper bound for the two rates below
     updates_per_s      frames that arrived
     drawn_per_s        frames that were drawn
     server_cpu_share   CPU time of the page's server, of one core
@@ -55,7 +55,7 @@ endpoint = "unixsock-stream/router.sock"
 
 @define
 class Deployment:
-    """The processes of a deployment, in a folder of their own."""
+    """The processes of a deployment, in a separate folder."""
 
     folder: Path
     _processes: list[subprocess.Popen[str]] = field(factory=list)
@@ -72,7 +72,7 @@ class Deployment:
         return process
 
     def end(self) -> None:
-        """End all roles, those that were started last first."""
+        """Stop all roles, in the reverse order of their start."""
         for process in reversed(self._processes):
             process.send_signal(signal.SIGTERM)
         for process in self._processes:
@@ -88,11 +88,15 @@ class Deployment:
 
 
 def wait_until(condition: Any, within_s: float) -> None:  # noqa: ANN401 - any callable
-    """Wait for something to happen."""
+    """Wait until a condition holds.
+
+    Raises:
+        TimeoutError: it did not hold in time.
+    """
     give_up = time.monotonic() + within_s
     while not condition():
         if time.monotonic() > give_up:
-            message = f"not within {within_s:g} s"
+            message = f"the condition did not hold within {within_s:g} s"
             raise TimeoutError(message)
         time.sleep(0.1)
 
@@ -114,7 +118,7 @@ def chromium() -> Iterator[webdriver.Chrome]:
 
 
 def measure(driver: webdriver.Chrome, address: str, server: psutil.Process) -> dict[str, float]:
-    """Open the page and look at it."""
+    """Open the page and observe it for some seconds."""
     driver.get("about:blank")
     driver.get(address)
     wait_until(lambda: driver.execute_script(STATS)["shown"] > 2, START_S)
@@ -135,10 +139,10 @@ def measure(driver: webdriver.Chrome, address: str, server: psutil.Process) -> d
 
 
 def run(vehicles: int, picture: Path | None) -> dict[str, Any]:
-    """Fill a road, look at it, and return what was measured."""
+    """Fill a road, observe the page, and return the measurements."""
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lw-")))
-        # A vehicle needs 67 s for the road's 1000 m: so many are on it at this volume.
+        # A vehicle takes 67 s for the road's 1000 m; this volume gives the requested number.
         volume = 1.06 * vehicles * 3600.0 / (3 * 67.0)
         (folder / "deployment.toml").write_text(DEPLOYMENT.format(volume=round(volume, 1)))
         deployment = Deployment(folder)
@@ -164,7 +168,7 @@ def run(vehicles: int, picture: Path | None) -> dict[str, Any]:
             height = driver.execute_script("return document.body.scrollHeight")
             size = {"width": 1400, "height": height, "deviceScaleFactor": 1, "mobile": False}
             driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-            # In the middle of a slot many are under way.
+            # In the middle of a slot many vehicles are moving.
             wait_until(lambda: 1.7 < driver.execute_script(STATS)["t"] % 4.0 < 2.4, START_S)
             driver.save_screenshot(str(picture))
         return {

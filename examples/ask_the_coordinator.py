@@ -1,7 +1,8 @@
-"""Ask a running coordinator for a plan: three vehicles, each with a lane that it needs.
+"""Ask a running coordinator for a plan: three vehicles, each with a preferred lane.
 
-It runs beside `laneweave router --endpoint tcp/127.0.0.1:7447` and
-`laneweave coordinator --endpoint tcp/127.0.0.1:7447`. Another endpoint may be its argument.
+Start `laneweave router --endpoint tcp/127.0.0.1:7447` and
+`laneweave coordinator --endpoint tcp/127.0.0.1:7447` first. The optional argument is another
+endpoint.
 """
 
 import sys

@@ -1,7 +1,8 @@
-"""Ask a running coordinator for a plan with nothing but `pip install eclipse-zenoh`.
+"""Ask a running coordinator for a plan; the only dependency is `eclipse-zenoh`.
 
-It runs beside `laneweave router --endpoint tcp/127.0.0.1:7447` and
-`laneweave coordinator --endpoint tcp/127.0.0.1:7447`. Another endpoint may be its argument.
+Start `laneweave router --endpoint tcp/127.0.0.1:7447` and
+`laneweave coordinator --endpoint tcp/127.0.0.1:7447` first. The optional argument is another
+endpoint.
 """
 
 import json
