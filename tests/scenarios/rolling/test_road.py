@@ -36,7 +36,7 @@ def first_wrong(rules: RuleBook = VEHICLE_RULES) -> int | None:
 
 @given(st.integers(0, 2**32))
 @settings(max_examples=60, deadline=None)
-def test_no_cell_has_two_owners_and_everybody_owns_where_it_is(seed: int) -> None:
+def test_no_cell_has_two_owners_and_vehicles_own_where_they_are(seed: int) -> None:
     Road(Random(seed)).run(STEPS)
 
 
@@ -48,7 +48,7 @@ def test_much_happens_and_still_no_cell_has_two_owners() -> None:
     assert sum(len(road.opened) for road in roads) > 200
 
 
-def test_a_leader_never_errs_about_what_somebody_owns() -> None:
+def test_a_leader_never_errs_about_what_a_vehicle_owns() -> None:
     """However old what it knows of the others: what it can tell is true, and mostly all of it."""
     told = told_in_part = not_told = 0
     for seed in range(60):

@@ -59,7 +59,7 @@ def run(folder: Path, conditions: Conditions) -> Street:
     return street
 
 
-def test_everybody_gets_to_its_lane(tmp_path: Path) -> None:
+def test_all_vehicles_reach_their_lanes(tmp_path: Path) -> None:
     run(tmp_path, Conditions())
     summary = read_summary(tmp_path)
     assert summary["ending"] == "complete"
@@ -68,7 +68,7 @@ def test_everybody_gets_to_its_lane(tmp_path: Path) -> None:
     assert summary["tracking"]["hold_law_ticks"] == 0
 
 
-def test_on_a_bad_network_nothing_worse_happens_than_that_somebody_is_late(tmp_path: Path) -> None:
+def test_on_a_bad_network_vehicles_are_late_at_worst(tmp_path: Path) -> None:
     run(tmp_path, BAD)
     summary = read_summary(tmp_path)
     assert summary["ending"] == "complete"

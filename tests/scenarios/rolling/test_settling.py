@@ -59,7 +59,7 @@ def test_leads_from_where_it_is_to_rest_in_the_cell(offset_m: float, faster_mps:
 
 @given(st.floats(-22.5, 22.5))
 @settings(max_examples=30, deadline=None)
-def test_no_limit_comes_into_question_and_nobody_overshoots(offset_m: float) -> None:
+def test_no_limit_is_approached_and_no_vehicle_overshoots(offset_m: float) -> None:
     reference = settling(beside(offset_m))
     rows = path(reference)
     assert np.abs(rows[:, 2]).max() < 0.5 * LIMITS.max_accel_mps2

@@ -176,7 +176,7 @@ def test_states_of_vehicles_that_the_census_does_not_list_are_ignored() -> None:
     assert desk.leaders[0].highest == theirs
 
 
-def test_heartbeats_are_periodic_and_say_who_leads() -> None:
+def test_heartbeats_are_periodic_and_name_the_leader() -> None:
     desk = Desk()
     desk.effects.clear()
     for _ in range(20):

@@ -208,7 +208,7 @@ def test_a_newcomer_is_waited_for_but_not_for_ever() -> None:
     assert not election.leading
 
 
-def test_a_newcomer_keeps_those_who_do_not_lead_from_leading() -> None:
+def test_a_newcomer_keeps_other_candidates_from_leading() -> None:
     election = candidate()
     election.on_token_up("a", 1, ELECTION_S - 0.01)
     assert not election.update(ELECTION_S)

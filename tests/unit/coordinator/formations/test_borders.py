@@ -91,7 +91,7 @@ def test_it_pauses_again_while_others_come_back() -> None:
 
 
 @pytest.mark.parametrize("other", [back(0), back(2), back(1, lane=2), back(1, t0_s=T0_S + SLOT_S)])
-def test_nobody_pauses_for_moves_at_other_times_or_on_other_lanes(other: Plan) -> None:
+def test_moves_at_other_times_or_on_other_lanes_cause_no_pause(other: Plan) -> None:
     assert kept_apart(UP, [other], SLACK_S, MAX_STEPS) == UP
 
 

@@ -38,7 +38,7 @@ def test_groups_that_share_a_member_become_one() -> None:
     assert {groups.of(number) for number in range(4)} == {(0, 1, 2, 3)}
 
 
-def test_join_tells_whether_it_was_new() -> None:
+def test_join_returns_whether_it_was_new() -> None:
     groups = Groups()
     for numbers, new in (
         ((), False),

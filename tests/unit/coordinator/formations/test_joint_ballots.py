@@ -147,7 +147,7 @@ def test_an_order_for_a_formation_that_has_been_joined_meanwhile_is_not_worked_o
     assert jobs(effects) == []
 
 
-def test_with_nobody_near_a_formation_is_planned_alone() -> None:
+def test_without_neighbours_a_formation_is_planned_alone() -> None:
     desk = Desk(scenario=JOINING)
     (job,) = jobs(desk.collect_promises(FULL, LANES))
     effects = desk.give(run_job(job))
@@ -171,7 +171,7 @@ def test_formations_are_not_joined_when_together_they_are_too_late() -> None:
     assert plan_of(effects).formations == (0,)
 
 
-def test_nobody_is_joined_who_has_settled() -> None:
+def test_a_formation_that_has_given_up_is_not_joined() -> None:
     """Block 0 is about to leave; behind it there is an overfull lane."""
     desk = Desk(scenario=JOINING)
     (job,) = jobs(behind_of_one(desk, 63.0))
@@ -264,7 +264,7 @@ def test_a_group_is_planned_only_once_its_later_block_has_closed_in_the_census()
     assert desk.leaders[0].formation.roster == (A, B)
 
 
-def test_those_who_are_left_of_a_group_stay_joined() -> None:
+def test_the_remaining_vehicles_of_a_group_stay_joined() -> None:
     desk = Desk()
     desk.lead()
     desk.tell(census({A: (0, 0), B: (-4, 0)}))
@@ -367,7 +367,7 @@ def test_a_vehicle_without_an_agent_keeps_its_cell_and_the_others_drive_around_i
     assert notes(effects, "lane-out-of-reach") == [{"formation": 0, "vehicles": [A]}]
 
 
-def test_when_nobody_can_be_moved_the_plan_has_no_moves() -> None:
+def test_when_no_vehicle_can_be_moved_the_plan_has_no_moves() -> None:
     cells: Cells = {A: (0, 0), B: (-1, 1)}
     desk = Desk()
     desk.lead()

@@ -226,7 +226,7 @@ def test_l3_a_new_ballot_is_above_everything_seen() -> None:
     assert leader.ballot == Ballot(6, Name("me"), 1, 1)
 
 
-def test_prepare_goes_to_those_who_have_not_promised_until_they_have() -> None:
+def test_prepare_goes_to_vehicles_that_have_not_promised() -> None:
     leader, ballot = preparing(A, B)
     sent = dict(leader.outgoing(0.0))
     assert sent == dict.fromkeys((A, B), Prepare(ballot, (0,), (A, B)))
@@ -355,7 +355,7 @@ def test_a_new_ballot_has_not_failed_yet() -> None:
 
 
 @pytest.mark.parametrize("reach", [preparing, issuing, watching])
-def test_results_that_nobody_waits_for_change_nothing(reach: Reach) -> None:
+def test_results_that_are_not_waited_for_change_nothing(reach: Reach) -> None:
     leader, ballot = reach(A, B)
     before = (leader.phase, leader.plan, leader.failures)
     leader.on_planning_failed(3.0)
@@ -377,7 +377,7 @@ def test_restart_during_the_pause_after_failed_planning() -> None:
 # --- L6 ---------------------------------------------------------------------------------------
 
 
-def test_l6_the_plan_goes_to_those_who_have_not_accepted() -> None:
+def test_l6_the_plan_goes_to_vehicles_that_have_not_accepted() -> None:
     leader, ballot = issuing(A, B)
     plan = plan_of(leader)
     assert list(leader.outgoing(0.0)) == [(A, plan), (B, plan)]
@@ -400,7 +400,7 @@ def test_l6_acceptances_count_once_and_of_this_ballot_only() -> None:
     assert phase(leader) is BallotPhase.ISSUING
 
 
-def test_l8_a_plan_that_somebody_refuses_is_given_up() -> None:
+def test_l8_a_plan_that_a_vehicle_refuses_is_given_up() -> None:
     leader, ballot = issuing(A, B)
     hear(leader, state(A, ballot, accepted=True))
     leader.on_time(ISSUE_S - 0.01)
@@ -574,7 +574,7 @@ def astray(**changes: object) -> VehicleState:
     ],
     ids=["astray", "on its way", "on its lane", "out of reach", "another is out of reach"],
 )
-def test_l8_who_ends_on_the_wrong_lane_needs_a_new_plan_unless_that_was_the_plan(
+def test_l8_a_vehicle_on_the_wrong_lane_needs_a_new_plan_unless_planned_so(
     shown: VehicleState, out_of_reach: tuple[Name, ...], then: BallotPhase
 ) -> None:
     leader, ballot = planning(A, B)
@@ -585,7 +585,7 @@ def test_l8_who_ends_on_the_wrong_lane_needs_a_new_plan_unless_that_was_the_plan
     assert phase(leader) is then
 
 
-def test_l8_who_was_out_of_reach_of_an_own_plan_may_be_astray_in_an_adopted_one() -> None:
+def test_l8_out_of_reach_in_an_own_plan_may_be_astray_in_an_adopted_one() -> None:
     leader, ballot = planning(A)
     leader.on_plan(plan_of(leader), 0.0, [A])
     hear(leader, state(A, ballot, accepted=True))
@@ -598,7 +598,7 @@ def test_l8_who_was_out_of_reach_of_an_own_plan_may_be_astray_in_an_adopted_one(
     assert phase(leader) is BallotPhase.PREPARING
 
 
-def test_l8_who_cannot_be_moved_is_not_astray() -> None:
+def test_l8_a_vehicle_that_cannot_be_moved_is_not_astray() -> None:
     """Otherwise a vehicle without an agent would have its formation planned for ever."""
     leader, ballot = preparing(A, B)
     hear(leader, state(A, ballot, attended=False), state(B, ballot))
@@ -625,7 +625,7 @@ def test_l8_an_agent_that_takes_over_from_the_caretaker_leads_to_a_new_ballot() 
 
 
 @pytest.mark.parametrize("reach", [preparing, planning, issuing])
-def test_who_leaves_takes_the_ballot_along(reach: Reach) -> None:
+def test_a_leaving_vehicle_ends_an_unfinished_ballot(reach: Reach) -> None:
     leader, ballot = reach(A, B)
     leader.on_members(formation(A), 1.0)
     assert phase(leader) is BallotPhase.PREPARING
@@ -637,13 +637,13 @@ def test_who_leaves_takes_the_ballot_along(reach: Reach) -> None:
     assert set(leader.hold_cells) == {A}
 
 
-def test_who_leaves_a_plan_in_force_stops_nobody() -> None:
+def test_a_leaving_vehicle_does_not_end_a_plan_in_force() -> None:
     leader, ballot = watching(A, B)
     leader.on_members(formation(A), 1.0)
     assert (leader.phase, leader.ballot) == (BallotPhase.IN_FORCE, ballot)
 
 
-def test_who_leaves_while_observing_is_not_waited_for() -> None:
+def test_a_vehicle_that_leaves_while_observing_is_not_waited_for() -> None:
     leader = control(A, B)
     leader.on_members(formation(A), 0.1)
     hear(leader, state(A, OTHERS, accepted=True))
@@ -651,7 +651,7 @@ def test_who_leaves_while_observing_is_not_waited_for() -> None:
 
 
 @pytest.mark.parametrize("reach", [preparing, planning, issuing, watching])
-def test_what_those_showed_who_left_is_forgotten(reach: Reach) -> None:
+def test_states_of_vehicles_that_left_are_forgotten(reach: Reach) -> None:
     leader, _ = reach(A, B)
     leader.on_members(formation(A), 1.0)
     assert set(leader.states) == {A}
@@ -660,7 +660,7 @@ def test_what_those_showed_who_left_is_forgotten(reach: Reach) -> None:
     assert leader.phase in (BallotPhase.PREPARING, BallotPhase.IN_FORCE)
 
 
-def test_who_joins_a_plan_in_force_leads_to_a_new_ballot_for_all() -> None:
+def test_a_new_member_leads_to_a_new_ballot_for_all() -> None:
     leader, _ = watching(A, B)
     leader.on_members(formation(A, B, C), 1.0)
     assert phase(leader) is BallotPhase.PREPARING

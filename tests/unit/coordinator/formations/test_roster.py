@@ -51,7 +51,7 @@ def joined(*numbers: int) -> Groups:
     return groups
 
 
-def test_a_formation_closes_when_nobody_can_enter_its_block_any_more() -> None:
+def test_a_formation_closes_when_no_vehicle_can_enter_its_block() -> None:
     assert CLOSES_S == 4.5
     assert closed(census(CLOSES_S - 0.1, a=(0, 0))) == {}
     (formation,) = closed(census(CLOSES_S, a=(0, 0))).values()
@@ -75,7 +75,7 @@ def test_members_are_grouped_by_the_block_of_their_entry_and_sorted() -> None:
     assert 1 not in closed(census(8.4, d=(-4, 0)))
 
 
-def test_who_leaves_is_no_member_and_an_empty_formation_is_none() -> None:
+def test_a_vehicle_that_left_is_no_member_and_empty_formations_vanish() -> None:
     assert closed(census(50.0, a=(0, 0), b=(-1, 1)))[0].roster == ("a", "b")
     assert closed(census(60.0, b=(-1, 1)))[0].roster == ("b",)
     assert closed(census(70.0)) == {}
@@ -152,7 +152,7 @@ def test_closing_is_one_and_a_half_columns_after_the_rear_one_of_the_last_block(
     sorting_m=st.floats(0.0, 900.0),
     not_before_s=st.floats(0.0, 1000.0),
 )
-def test_nobody_changes_lanes_before_the_rear_body_is_in_s3(
+def test_no_vehicle_changes_lanes_before_the_rear_body_is_in_s3(
     cells: list[Cell], gap_m: float, sorting_m: float, not_before_s: float
 ) -> None:
     scenario = Scenario(

@@ -108,7 +108,7 @@ def test_blocks_between_joined_formations_are_blocked() -> None:
     assert sorting.moves == {A: (), B: ()}
 
 
-def test_who_has_no_agent_blocks_its_cell_and_is_no_vehicle_of_the_request() -> None:
+def test_a_vehicle_without_agent_blocks_its_cell() -> None:
     order = task({A: (0, 0), B: (-1, 1), C: (-2, 0)}, {A: 1, B: 0, C: 0}, B)
     request = next(plan_requests(order))
     assert request.grid.blocked == {(2, 1)}
@@ -116,7 +116,7 @@ def test_who_has_no_agent_blocks_its_cell_and_is_no_vehicle_of_the_request() -> 
     assert (2, 1) not in request.targets
 
 
-def test_who_gets_no_place_on_its_lane_is_sent_to_its_own_target() -> None:
+def test_a_vehicle_without_a_place_on_its_lane_gets_a_target_of_its_own() -> None:
     cells: dict[Name, Cell] = {A: (0, 0), B: (-1, 0), C: (-2, 0), D: (-3, 0), E: (0, 2)}
     request = next(plan_requests(task(cells, dict.fromkeys(cells, 0))))
     for vehicle in request.vehicles:
@@ -126,7 +126,7 @@ def test_who_gets_no_place_on_its_lane_is_sent_to_its_own_target() -> None:
             assert (vehicle.lane, vehicle.eligible) == (0, None)
 
 
-def test_who_is_dropped_keeps_to_the_lane_that_it_is_on() -> None:
+def test_an_excused_vehicle_keeps_to_its_lane() -> None:
     order = task({A: (0, 0), B: (-1, 1)}, {A: 2, B: 2})
     lanes = [vehicle.lane for vehicle in next(plan_requests(order, A)).vehicles]
     assert lanes == [0, 2]
@@ -152,7 +152,7 @@ def test_waiting_is_no_move() -> None:
     assert {name: cell[1] for name, cell in ends(order, sorting).items()} == {A: 2, B: 0}
 
 
-def test_nobody_to_move_needs_no_planner() -> None:
+def test_without_movable_vehicles_nothing_is_planned() -> None:
     sorting = sort(task({A: (0, 0), B: (-1, 1)}, {A: 1, B: 1}, A, B))
     assert sorting.response is None
     assert sorting.solved
@@ -160,7 +160,7 @@ def test_nobody_to_move_needs_no_planner() -> None:
     assert (sorting.out_of_reach, sorting.short_of_room) == ((A,), False)
 
 
-def test_all_drive_around_who_has_no_agent() -> None:
+def test_all_drive_around_a_vehicle_without_agent() -> None:
     order = task({A: (-1, 1), B: (-1, 2)}, {A: 0, B: 0}, A)
     sorting = sort(order)
     assert sorting.moves[A] == ()
@@ -207,7 +207,7 @@ def test_one_in_a_corner_does_not_keep_the_others_from_their_lanes() -> None:
     assert sorting.short_of_room
 
 
-def test_when_nothing_works_nobody_moves_and_the_answer_says_so() -> None:
+def test_without_any_plan_no_vehicle_moves() -> None:
     """A and B are both walled in: with one of them dropped, the other is still stuck."""
     held: dict[Name, Cell] = {C: (0, 1), D: (-1, 0), E: (-2, 0), F: (-3, 1)}
     order = task(
@@ -303,7 +303,7 @@ def tasks(draw: st.DrawFn) -> SortingTask:
 
 @settings(max_examples=60, deadline=None)
 @given(tasks())
-def test_whatever_is_sorted_stays_inside_and_says_who_misses_its_lane(order: SortingTask) -> None:
+def test_sortings_stay_inside_and_name_vehicles_off_their_lanes(order: SortingTask) -> None:
     sorting = sort(order)
     inside = {cell for number in order.numbers for cell in LATTICE.block_cells(number)}
     assert set(sorting.moves) == set(order.hold_cells)

@@ -89,7 +89,7 @@ def test_each_lane_offers_as_many_cells_as_are_wanted_or_free(
 
 @settings(max_examples=100, deadline=None)
 @given(formations(fitting=True))
-def test_with_room_for_everybody_nobody_has_a_target_of_its_own(
+def test_with_enough_room_no_vehicle_has_a_target_of_its_own(
     drawn: tuple[dict[Name, Cell], dict[Name, int], set[Cell]],
 ) -> None:
     cells, lanes, blocked = drawn
@@ -146,7 +146,7 @@ def test_where_all_are_as_far_away_names_decide() -> None:
     assert set(place(cells, dict.fromkeys(cells, 0), 2, 2).own) == {Name("c")}
 
 
-def test_who_stays_out_gets_the_nearest_cell_that_is_left() -> None:
+def test_a_vehicle_that_stays_out_gets_the_nearest_free_cell() -> None:
     """Not its own one when somebody else needs that; among equals the rearmost."""
     names = [Name(letter) for letter in "abcdef"]
     cells: dict[Name, Cell] = dict(
@@ -171,7 +171,7 @@ def test_a_lane_without_free_cells_offers_none() -> None:
     assert (targets.cells, targets.own) == (((0, 1),), {Name("a"): (0, 1)})
 
 
-def test_nobody_needs_no_targets() -> None:
+def test_without_vehicles_there_are_no_targets() -> None:
     assert place_all({}, {}) == Targets((), {})
 
 

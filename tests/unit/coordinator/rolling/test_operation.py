@@ -181,7 +181,7 @@ def test_a_new_leader_listens_first() -> None:
     assert not desk.calls[0].vehicles[A].held
 
 
-def test_who_leads_again_listens_again_and_leaves_alone_what_was_begun() -> None:
+def test_a_leader_that_is_elected_again_listens_again() -> None:
     desk = bench(A, B)
     desk.ways = {A: ((0, 0), (0, 1))}
     desk.think()
@@ -238,7 +238,7 @@ def test_results_of_others_and_failures_change_nothing() -> None:
 # --- what it plans from -----------------------------------------------------------------------
 
 
-def test_the_planner_sees_everybody_and_what_is_owned() -> None:
+def test_the_planner_gets_all_vehicles_and_owned_cells() -> None:
     desk = bench(A, B)
     desk.think()
     (call,) = desk.calls
@@ -289,14 +289,14 @@ def test_what_has_arrived_in_another_order_counts() -> None:
     assert desk.calls[0].vehicles[A].cell == (1, 0)
 
 
-def test_who_has_just_left_was_there_when_it_looked() -> None:
+def test_a_vehicle_that_has_just_left_is_in_the_snapshot() -> None:
     desk = bench(A, B)
     desk.control.on_census(evolve(census(A), t_s=LOOK_S))
     desk.think()
     assert desk.calls[0].vehicles[B] == StreamVehicle(B, HOMES[B], 1, held=False)
 
 
-def test_whoever_is_not_heard_does_not_keep_others_from_being_planned() -> None:
+def test_an_unheard_vehicle_does_not_keep_others_from_being_planned() -> None:
     """Somebody else may be where it entered by now."""
     for names in ((A, B), (B, A)):
         desk = bench(*names)
@@ -310,7 +310,7 @@ def test_whoever_is_not_heard_does_not_keep_others_from_being_planned() -> None:
     assert len(desk.calls[0].vehicles) == 1
 
 
-def test_who_has_gone_on_since_takes_nobody_along() -> None:
+def test_a_vehicle_that_has_moved_since_is_left_out() -> None:
     desk = bench(A, B)
     desk.ways = {A: ((0, 0), (0, 1)), B: ((2, 1), (2, 2))}
     compute = desk.order()
@@ -347,7 +347,7 @@ def test_a_plan_that_is_not_used_ends_what_was_begun_all_the_same(*, late: bool)
     assert handover.phase is BallotPhase.GIVEN_UP
 
 
-def test_whoever_has_shown_nothing_in_time_is_held() -> None:
+def test_a_vehicle_without_a_state_in_time_is_held() -> None:
     desk = bench(A)
     desk.control.on_census(census(A, C))
     desk.hear(evolve(shown(C), t_s=LOOK_S))
@@ -355,7 +355,7 @@ def test_whoever_has_shown_nothing_in_time_is_held() -> None:
     assert [vehicle.held for vehicle in desk.calls[0].vehicles.values()] == [False, True]
 
 
-def test_whoever_is_late_is_held_and_its_cells_are_blocked() -> None:
+def test_a_late_vehicle_is_held_and_its_cells_are_blocked() -> None:
     """Its gate is open, so its move may begin at any time until it promises something else."""
     desk = bench(A, B)
     late = shown(A, OLD, Deed(OLD, open=True), accepted=True, go=True)
@@ -367,7 +367,7 @@ def test_whoever_is_late_is_held_and_its_cells_are_blocked() -> None:
     assert not {HOMES[A], (1, 1)} & call.blocked
 
 
-def test_whoever_waits_at_a_closed_gate_is_asked_for_something_newer() -> None:
+def test_a_vehicle_at_a_closed_gate_is_asked_for_a_newer_promise() -> None:
     """What it owns either way may be used."""
     desk = bench(A, B)
     deed = Deed(OLD, ESTATES[A], (HOMES[A], (1, 0)), (A, B))
@@ -380,7 +380,7 @@ def test_whoever_waits_at_a_closed_gate_is_asked_for_something_newer() -> None:
     assert (-1, 0) in call.blocked
 
 
-def test_whoever_is_far_from_where_moves_begin_is_not_planned_for() -> None:
+def test_vehicles_far_from_where_moves_begin_are_not_planned_for() -> None:
     road = parse_scenario({"formation": {"operation": "rolling"}, "road": {"s2_m": 2000.0}})
     desk = Bench()
     desk.control = RollingOperation(road, desk.new_ballot, desk.new_job, desk)
@@ -393,7 +393,7 @@ def test_whoever_is_far_from_where_moves_begin_is_not_planned_for() -> None:
     assert set(desk.calls[0].vehicles) == {A}
 
 
-def test_whoever_nobody_drives_is_held_and_its_cells_are_free() -> None:
+def test_a_vehicle_without_agent_is_held_and_its_cells_are_free() -> None:
     desk = bench(A, B)
     desk.hear(shown(B, attended=False))
     desk.think()
@@ -402,7 +402,7 @@ def test_whoever_nobody_drives_is_held_and_its_cells_are_free() -> None:
     assert not set(ESTATES[B]) & call.blocked
 
 
-def test_whoever_was_not_heard_stays_where_it_entered_and_owns_nothing() -> None:
+def test_an_unheard_vehicle_stays_where_it_entered_and_owns_nothing() -> None:
     desk = bench(A)
     desk.control.on_census(census(A, B))
     desk.ways = {A: ((0, 0), (0, 1)), B: ((2, 1), (2, 1))}
@@ -413,14 +413,14 @@ def test_whoever_was_not_heard_stays_where_it_entered_and_owns_nothing() -> None
     assert desk.control.transfers == []  # A would need a cell that is B's
 
 
-def test_cells_of_which_nobody_can_tell_whose_they_are_are_blocked() -> None:
+def test_cells_without_a_certain_owner_are_blocked() -> None:
     desk = bench(A, B)
     desk.hear(shown(B, OLD, Deed(OLD, ESTATES[B], (HOMES[B],), (A, B)), accepted=True))
     desk.think()
     assert set(ESTATES[B]) & desk.calls[0].blocked == set(ESTATES[B]) - {HOMES[B]}
 
 
-def test_a_promise_that_is_not_noted_shows_no_estate() -> None:
+def test_a_promise_that_is_not_noted_shows_no_owned_cells() -> None:
     desk = bench(A, B)
     desk.hear(evolve(shown(B, OLD), estate=(), t_s=BEGUN_S + 0.5))
     desk.think()
@@ -487,7 +487,7 @@ def test_moves_that_share_an_owner_share_a_ballot() -> None:
     assert set(desk.control.transfers[0].moves) == {A, B}
 
 
-def test_whose_promises_would_tell_what_somebody_owns_are_asked_for() -> None:
+def test_vehicles_whose_promises_tell_ownership_are_in_the_roster() -> None:
     """C's gate is closed as far as it knows: B may have opened its own, and D of an older plan."""
     newer = OLD._replace(seq=2)
     desk = bench(A, B, C, D)
@@ -564,7 +564,7 @@ def test_a_ballot_that_fails_is_noted() -> None:
 # --- the census -------------------------------------------------------------------------------
 
 
-def test_whoever_leaves_is_forgotten_and_its_ballot_given_up() -> None:
+def test_a_vehicle_that_leaves_is_forgotten_and_its_ballot_given_up() -> None:
     desk = bench(A, B, C)
     desk.ways = {A: ((0, 0), (0, 1)), C: ((-4, 0), (-5, 0))}
     desk.think()
@@ -575,7 +575,7 @@ def test_whoever_leaves_is_forgotten_and_its_ballot_given_up() -> None:
     assert second.phase is BallotPhase.PREPARING
 
 
-def test_what_is_in_force_stays_so_when_somebody_leaves() -> None:
+def test_a_plan_in_force_stays_so_when_a_vehicle_leaves() -> None:
     desk = bench(A, B)
     desk.ways = {A: ((0, 0), (0, 1))}
     desk.think()

@@ -60,12 +60,14 @@ def test_nothing_can_be_told_while_both_may_open_their_gates() -> None:
         (state(A, 3, (3, 0), deed=Deed(ballot(2), open=True)), {(4, 1)}),  # it will never tell
     ],
 )
-def test_what_one_shows_tells_what_the_other_owns(taker: VehicleState, estate: set[Cell]) -> None:
+def test_the_state_of_one_vehicle_tells_what_the_other_owns(
+    taker: VehicleState, estate: set[Cell]
+) -> None:
     giver = evolve(GIVER, promised=ballot(2), accepted=False)
     assert told(giver, taker) == frozenset(estate)
 
 
-def test_who_has_left_tells_nothing_and_is_not_waited_for() -> None:
+def test_a_vehicle_that_has_left_is_not_waited_for() -> None:
     giver = evolve(GIVER, promised=ballot(2), accepted=False)
     assert told(giver) is None  # it may be there, and was not heard yet
     assert owned_cells(giver, {B: giver}, {A}) == frozenset({(4, 1)})
@@ -115,7 +117,7 @@ def plan_once(planner: Orders, *states: VehicleState) -> RollingOperation:
     return control
 
 
-def test_who_may_know_what_a_member_owns_is_asked_too() -> None:
+def test_vehicles_that_may_know_what_a_member_owns_are_in_the_roster() -> None:
     other = state(C, 1, (5, 1), (5, 0))
     giver = evolve(GIVER, deed=deed(1, ((4, 1), (3, 1), (4, 0)), ((4, 1), (4, 0))))
     giver = evolve(giver, estate=((4, 1), (3, 1), (4, 0)))
@@ -123,7 +125,7 @@ def test_who_may_know_what_a_member_owns_is_asked_too() -> None:
     assert [handover.roster for handover in control.transfers] == [(A, B)]
 
 
-def test_who_waits_at_a_gate_that_never_opens_is_planned_for() -> None:
+def test_a_vehicle_at_a_gate_that_never_opens_is_planned_for() -> None:
     taker = evolve(TAKER, estate=((3, 0), (2, 0)))
     taker = evolve(taker, deed=deed(1, ((3, 0), (2, 0)), ((3, 0), (2, 0), (3, 1))))
     planner = Orders({A: (2, 0)})
@@ -132,7 +134,7 @@ def test_who_waits_at_a_gate_that_never_opens_is_planned_for() -> None:
     assert [set(handover.moves) for handover in control.transfers] == [{A}]
 
 
-def test_who_is_about_to_move_is_left_alone() -> None:
+def test_a_vehicle_that_is_about_to_move_is_held() -> None:
     planner = Orders({})
     plan_once(planner, evolve(TAKER, go=True), GIVER)
     assert planner.held == {A}

@@ -69,7 +69,7 @@ CLOSED = state(A, HIGH, DEED)
 """A has promised more, and its gate was closed then."""
 
 
-def test_without_a_deed_or_with_an_open_one_the_estate_is_what_is_shown() -> None:
+def test_without_a_transfer_or_with_an_open_one_the_state_shows_the_owned_cells() -> None:
     assert owned_cells(state(A, HIGH), {}) == OWNED_BEFORE
     taken = state(A, HIGH, Deed(MID, open=True), estate=AFTER[A])
     assert owned_cells(taken, {}) == OWNED_AFTER
@@ -83,7 +83,7 @@ def test_one_that_knows_the_open_gate_is_enough() -> None:
 
 
 @pytest.mark.parametrize("older", [None, Deed(LOW, open=True)])
-def test_one_that_has_promised_more_without_the_deed_keeps_the_gate_closed(
+def test_a_higher_promise_without_the_transfer_keeps_the_gate_closed(
     older: Deed | None,
 ) -> None:
     assert owned_cells(CLOSED, {C: state(C, BETWEEN, older)}) == OWNED_BEFORE
@@ -100,7 +100,7 @@ def test_one_that_has_promised_more_without_the_deed_keeps_the_gate_closed(
         state(C, MID, DEED),  # it may open its gate yet
     ],
 )  # fmt: skip
-def test_what_may_still_come_tells_nothing(silent: VehicleState) -> None:
+def test_states_that_may_still_change_tell_nothing(silent: VehicleState) -> None:
     others = {B: state(B, HIGH, DEED), C: silent}
     assert owned_cells(CLOSED, others) is None
     assert certain_cells(CLOSED, others) == SURE
@@ -116,7 +116,7 @@ def test_all_have_turned_away_with_closed_gates() -> None:
 
 
 @pytest.mark.parametrize("newer", [None, state(C, HIGH, Deed(BETWEEN, open=True))])
-def test_where_nobody_will_tell_some_cells_are_certain_either_way(
+def test_cells_owned_either_way_are_certain(
     newer: VehicleState | None,
 ) -> None:
     """Somebody opened the gate or did not, and has gone, or taken part in another plan since."""
@@ -135,13 +135,13 @@ def test_where_nobody_will_tell_some_cells_are_certain_either_way(
     assert certain_cells(moving, there, gone) == SURE
 
 
-def test_strangers_and_older_states_of_oneself_tell_nothing() -> None:
+def test_strangers_and_own_older_states_tell_nothing() -> None:
     stranger, others = Name("X"), {B: state(B, MID, DEED), C: state(C, MID, DEED)}
     assert owned_cells(CLOSED, {stranger: state(stranger, HIGH), **others}) is None
     assert owned_cells(CLOSED, {A: state(A, HIGH, Deed(MID, open=True)), **others}) is None
 
 
-def test_whoever_was_alone_in_a_plan_knows() -> None:
+def test_a_single_member_of_a_plan_knows_what_it_owns() -> None:
     alone = deed_of(A, MID, (A,))
     assert owned_cells(state(A, HIGH, alone), {}) == OWNED_BEFORE
     assert owned_cells(state(A, MID, alone), {}) is None
@@ -211,7 +211,7 @@ def test_two_that_move_behind_each_other_need_more_than_one_slot() -> None:
     assert "meet in step 0" in handover.why
 
 
-def test_a_closed_deed_of_an_older_plan_is_resolved_by_the_others() -> None:
+def test_a_closed_transfer_of_an_older_plan_is_resolved_by_the_others() -> None:
     old = Deed(LOW, ((2, 1),), BEFORE[B], (A, B))
     handover = make_handover()
     tell(handover, state(A, MID, Deed(LOW, open=True)), state(B, MID, old, estate=((2, 1),)))
@@ -247,7 +247,7 @@ def test_is_given_up_when_it_cannot_come_about(why: str) -> None:
     assert handover.outgoing(9.0) == []
 
 
-def test_nobody_moves_whom_nobody_drives() -> None:
+def test_a_vehicle_without_agent_is_not_moved() -> None:
     handover = make_handover()
     tell(handover, evolve(state(A, MID), attended=False), state(B, MID))
     assert handover.why == "A is not where it was planned from"
@@ -256,7 +256,7 @@ def test_nobody_moves_whom_nobody_drives() -> None:
     assert handover.phase is BallotPhase.ISSUING  # who only hands cells over need not be driven
 
 
-def test_whoever_restarts_cannot_accept() -> None:
+def test_a_restarted_vehicle_cannot_accept() -> None:
     handover = issued()
     tell(handover, evolve(state(B, MID), incarnation=8))
     assert (handover.phase, handover.why) == (BallotPhase.GIVEN_UP, "B has restarted")

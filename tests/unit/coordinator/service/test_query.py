@@ -95,7 +95,7 @@ def test_a_refusal_is_an_error_of_its_own_kind(
         assert caught.value.field == "mode"
 
 
-def test_a_refusal_without_a_code_is_of_the_kind_that_its_field_tells() -> None:
+def test_a_refusal_without_a_code_is_classified_by_its_field() -> None:
     with pytest.raises(RequestRefusedError, match="wrong"):
         inquiry().after(refusal(field="mode", message="wrong"), START_S)
     with pytest.raises(PlanningFailedError, match="broken"):
@@ -104,7 +104,7 @@ def test_a_refusal_without_a_code_is_of_the_kind_that_its_field_tells() -> None:
         inquiry().after(refusal(message="broken"), START_S)
 
 
-def test_a_message_is_one_line_whoever_wrote_it() -> None:
+def test_a_message_is_always_one_line() -> None:
     with pytest.raises(RequestRefusedError) as caught:
         inquiry().after(refusal(field="a\nb", message="one\r\ntwo\x1b[2J" + 9999 * "x"), START_S)
     assert str(caught.value).startswith("one two [2Jx")
@@ -148,13 +148,13 @@ def given_up_s(error: BaseException) -> float:
     return float(error.__notes__[0].removeprefix("at ")) - START_S
 
 
-def test_where_nobody_answers_for_long_there_is_no_service() -> None:
+def test_without_answers_for_long_there_is_no_service() -> None:
     with pytest.raises(ServiceUnavailableError) as caught:
         after_pauses(inquiry(60.0), [None])
     assert ABSENT_S <= given_up_s(caught.value) <= ABSENT_S + LONGEST_PAUSE_S + 0.01
 
 
-def test_whoever_has_patience_waits_longer_for_a_service() -> None:
+def test_a_patient_client_waits_longer_for_a_service() -> None:
     patient = Inquiry(REQUEST, 60.0, START_S, patience_s=20.0)
     with pytest.raises(ServiceUnavailableError) as caught:
         after_pauses(patient, [None])

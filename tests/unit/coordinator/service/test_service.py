@@ -169,7 +169,7 @@ def test_white_space_before_json_is_fine(desk: Desk) -> None:
     assert desk.orders
 
 
-def test_who_says_json_gets_json(desk: Desk) -> None:
+def test_a_json_request_gets_a_json_answer(desk: Desk) -> None:
     token = desk.ask(msgpack.packb(REQUEST), encoding="application/json")
     assert desk.answer(token)["field"] == "request"
 

@@ -497,7 +497,7 @@ def test_v4_an_open_gate_spreads() -> None:
     assert execution.tick(T0_S) is not None
 
 
-def test_v5_the_gate_needs_everybody() -> None:
+def test_v5_the_gate_needs_all_members() -> None:
     cells: dict[Name, Cell] = {A: (-4, 0), B: (-2, 0), C: (-1, 0)}
     execution = accepted(make_plan(cells=cells))
     assert execution.tick(T0_S) is None

@@ -101,7 +101,7 @@ def test_an_unsound_plan_is_refused(problem: str) -> None:
     assert execution.on_plan(make_plan())
 
 
-def test_without_its_guard_any_estates_are_accepted() -> None:
+def test_without_its_guard_any_transfers_are_accepted() -> None:
     execution = vehicle(
         rules=VEHICLE_RULES.replacing({transfers_only_owned_cells: lambda *_: True})
     )
@@ -118,7 +118,7 @@ def test_a_plan_that_takes_more_for_mine_is_refused() -> None:
     assert execution.on_plan(less)
 
 
-def test_what_a_closed_deed_would_give_me_may_be_mine() -> None:
+def test_cells_of_a_closed_transfer_may_be_owned() -> None:
     """Others may know that its gate is open."""
     plan = changed("before", A=(*BEFORE[A], (7, 0)))(make_plan(HIGH))
     deed = Deed(LOW, BEFORE[A], (*BEFORE[A], (7, 0)), (A, C))
@@ -140,7 +140,7 @@ def test_neither_blocks_nor_joined_formations_matter() -> None:
 # --- promises ---------------------------------------------------------------------------------
 
 
-def test_a_promise_shows_an_estate_only_when_the_controller_has_noted_it() -> None:
+def test_a_promise_shows_owned_cells_only_when_the_controller_has_noted_it() -> None:
     execution = vehicle()
     old = sense(deed=deed_of(A, LOW))
     assert execution.state(old, 0, attended=True).estate == BEFORE[A]
@@ -187,7 +187,7 @@ def test_an_unnoted_plan_is_not_accepted() -> None:
 # --- taking possession ------------------------------------------------------------------------
 
 
-def test_the_deed_says_what_the_plan_says() -> None:
+def test_the_transfer_is_that_of_the_plan() -> None:
     execution = promised()
     assert execution.transfer is None
     execution.on_plan(make_plan())
@@ -231,7 +231,7 @@ def test_does_not_take_possession_while_it_moves() -> None:
     assert execution.transfer == Deed(MID, open=True)
 
 
-def test_without_possession_the_deed_stays_closed() -> None:
+def test_without_its_action_the_transfer_stays_closed() -> None:
     execution = vehicle(rules=VEHICLE_RULES.replacing({take_ownership: lambda *_: None}))
     execution.on_prepare(PREPARE)
     execution.on_plan(make_plan())
@@ -241,7 +241,7 @@ def test_without_possession_the_deed_stays_closed() -> None:
     assert execution.transfer == deed_of(A)
 
 
-def test_where_formations_own_blocks_there_are_no_deeds() -> None:
+def test_where_formations_own_blocks_there_are_no_transfers() -> None:
     execution = evolve(vehicle(), owned=None, joined=(-1, 0))
     execution.on_prepare(Prepare(MID, (-1, 0), (A, B)))
     assert execution.wanted_promised is None
