@@ -104,11 +104,7 @@ def network_of(
 
 def send(network: SimulatedNetwork, name: str, *numbers: int) -> None:
     """Have a node send beats now."""
-    core = network.node(name).core
-    assert isinstance(core, Recorder)
-    before, core.on_event = core.on_event, lambda *_: [beat(number, name) for number in numbers]
-    network.node(name).dispatch(Wakeup(), network.now_s)
-    core.on_event = before
+    perform(network, name, *(beat(number, name) for number in numbers))
 
 
 def perform(network: SimulatedNetwork, name: str, *effects: Effect) -> None:

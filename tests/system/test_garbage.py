@@ -14,25 +14,14 @@ import pytest
 
 from laneweave.protocol.security.access import Access
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
-from laneweave.protocol.wire.codec import MAX_BYTES, VERSION, encode
+from laneweave.protocol.wire.codec import KINDS, MAX_BYTES, VERSION, encode
 from laneweave.protocol.wire.messages import (
-    Announcement,
-    Ballot,
     Census,
-    CensusEntry,
-    ClosedFormation,
-    Command,
     Heartbeat,
     LogEvent,
-    Motion,
     Name,
-    Neighbour,
-    Plan,
-    Prepare,
     Report,
     RoadClock,
-    Sense,
-    VehicleState,
 )
 from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
@@ -56,115 +45,30 @@ from support.harness import (
     plans,
     summary,
 )
+from support.wire_samples import filled, same
 from system.conftest import FinishedRun
 
 KEYS = Keys("default")
 GHOST = Name("ghost")
 HUGE = 2**63 - 1
+NOISE: dict[str, Any] = {
+    "role": "r", "name": "n", "self": 1, "t_s": "soon", "kind": [], "data": {}, "vehicles": HUGE,
+    "status": {}, "formation": "\n\x00",
+}  # fmt: skip
+"""What an event may not say."""
 
 
 def messages(vehicle: Name, *, number: int, real: float) -> dict[type, Any]:
     """Return a well-formed message of each kind, with this number and this real in every place."""
-    cell = (number, number)
-    ballot = Ballot(number, GHOST, number, number)
-    made = (
-        Heartbeat(Name("zz"), number, number, leading=False, formations=number),
-        Prepare(ballot, (number,), (vehicle,)),
-        Plan(
-            ballot,
-            (number,),
-            (vehicle,),
-            {vehicle: number},
-            {vehicle: cell},
-            {vehicle: ((number, cell, (number, 0)),)},
-            real,
-            real,
-            (cell,),
-        ),
-        VehicleState(
-            vehicle,
-            number,
-            number,
-            (number,),
-            ballot,
-            accepted=True,
-            ready=True,
-            completed=number,
-            hold_cell=cell,
-            moving=True,
-            go=True,
-            done=True,
-            overdue=True,
-            attended=True,
-            s_m=real,
-            y_m=real,
-            speed_mps=real,
-            t_s=real,
-        ),
-        Motion(vehicle, number, number, cell, (number, 0), number, number, number),
-        Sense(
-            vehicle,
-            number,
-            real,
-            (real,) * 6,
-            cell,
-            number,
-            cell,
-            number,
-            (Neighbour(number, real, real, real),),
-            (Neighbour(number, real, real, real),),
-            (real, real),
-        ),
-        Command(
-            vehicle,
-            number,
-            number,
-            cell,
-            number,
-            cell,
-            b"\xff\xff\x7f\x7f" * 80,
-            number,
-            (number,) * 3,
-        ),
-        Census(
-            real,
-            (CensusEntry(vehicle, cell, number, real),),
-            (Announcement(vehicle, number, number, real),),
-            (ClosedFormation(number, number, real),),
-            number,
-        ),
-        RoadClock(number, real, number, number, number, number, ended=True),
-        Report(
-            Name("agent"),
-            vehicle,
-            GHOST,
-            number,
-            number,
-            number,
-            number,
-            number,
-            b"\x00\x00\xc0\x7f" * 9,
-        ),
-        LogEvent(
-            Name("agent"),
-            vehicle,
-            real,
-            Name("plan-made"),
-            {
-                "role": "r",
-                "name": "n",
-                "self": 1,
-                "t_s": "soon",
-                "kind": [],
-                "data": {},
-                "solve_ms": real,
-                "vehicles": number,
-                "status": {},
-                "formation": "\n\x00",
-            },
-        ),
-    )
-    return {type(message): message for message in made}
+    leaf = same(name=vehicle, number=number, real=real, raw=b"\xff\xff\x7f\x7f" * 80, data=NOISE)
+    made = {kind: filled(kind, leaf) for kind in KINDS.values()}
+    agent = {"role": Name("agent"), "name": vehicle}
+    special: dict[type, dict[str, Any]] = {
+        Heartbeat: {"coordinator": Name("zz"), "leading": False},
+        Report: {**agent, "process": GHOST, "solve_ms": b"\x00\x00\xc0\x7f" * 9},
+        LogEvent: {**agent, "kind": Name("plan-made"), "data": NOISE | {"solve_ms": real}},
+    }
+    return made | {kind: attrs.evolve(made[kind], **special[kind]) for kind in special}
 
 
 def keys_of(topic: Topic, vehicle: str) -> Iterator[str]:

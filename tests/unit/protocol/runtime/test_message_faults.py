@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 from unittest.mock import Mock
 
 import pytest
-from attrs import define, field
+from attrs import define
 
 from laneweave.protocol.runtime import message_faults as faulty_core
 from laneweave.protocol.runtime.message_faults import FaultyCore, MessageRule, bare
@@ -37,6 +36,7 @@ from laneweave.protocol.wire.topics import (
     Keys,
     Topic,
 )
+from support.node_recorder import Recorder, at_start, beat
 from support.refusals import refusal
 
 
@@ -46,44 +46,14 @@ class Board:
     dropped: int = 0
 
 
-@define
-class Listener:
-    """A core that writes down what reaches it, and says what it is told to say."""
-
-    wakeup_s: float | None = None
-    says: list[Effect] = field(factory=list)
-    heard: list[tuple[Event, float]] = field(factory=list)
-
-    def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
-        self.heard.append((event, now_s))
-        yield from self.says
-
-    @property
-    def numbers(self) -> list[int]:
-        return [event.message for event, _ in self.heard if isinstance(event, Arrived)]
-
-
-def test_metrics_of_the_wrapped_core_are_visible() -> None:
-    @define
-    class Counting(Listener):
-        @property
-        def metrics(self) -> list[RouterMetrics]:
-            return [RouterMetrics(7)]
-
-    core = FaultyCore(Counting(), (), Board(), receiver="vehicle", seed="1")
-    node = Node(core, Mock(), Keys("test"), lambda _: None, Name("1"))
-    assert node.metrics()[1:] == [RouterMetrics(7)]
-    assert list(faulty()[0].metrics) == []
-
-
 def arrived(number: int, topic: Topic = STATE, **parameters: str) -> Arrived:
-    return Arrived(topic, parameters, number)
+    return Arrived(topic, parameters, beat(number).message)
 
 
 def faulty(
     *rules: MessageRule, board: Board | None = None, receiver: str = "vehicle", seed: str = "1"
-) -> tuple[FaultyCore, Listener]:
-    listener = Listener()
+) -> tuple[FaultyCore, Recorder]:
+    listener = Recorder()
     return FaultyCore(listener, rules, board or Board(), receiver=receiver, seed=seed), listener
 
 
@@ -105,6 +75,19 @@ def received(rule: MessageRule, count: int = 2000, seed: str = "1") -> list[int]
     return listener.numbers
 
 
+def test_metrics_of_the_wrapped_core_are_visible() -> None:
+    @define
+    class Counting(Recorder):
+        @property
+        def metrics(self) -> list[RouterMetrics]:
+            return [RouterMetrics(7)]
+
+    core = FaultyCore(Counting(), (), Board(), receiver="vehicle", seed="1")
+    node = Node(core, Mock(), Keys("test"), lambda _: None, Name("1"))
+    assert node.metrics()[1:] == [RouterMetrics(7)]
+    assert list(faulty()[0].metrics) == []
+
+
 def test_without_rules_everything_passes_at_once() -> None:
     board = Board()
     core, listener = faulty(board=board)
@@ -120,24 +103,25 @@ def test_loss_of_one_takes_everything_and_counts_it() -> None:
     core, listener = faulty(MessageRule(loss=1.0), board=board)
     for number in range(10):
         feed(core, arrived(number))
-    assert listener.heard == []
+    assert listener.events == []
     assert board.dropped == 13
 
 
-@pytest.mark.parametrize("loss", [0.1, 0.5, 0.9])
-def test_loss_takes_its_share(loss: float) -> None:
-    passed = received(MessageRule(loss=loss), 5000)
-    assert passed == sorted(set(passed))
-    assert len(passed) / 5000 == pytest.approx(1.0 - loss, abs=0.02)
-
-
-def test_duplication_of_one_doubles_everything() -> None:
-    assert received(MessageRule(duplication=1.0), 3) == [0, 0, 1, 1, 2, 2]
-
-
-def test_duplication_doubles_its_share() -> None:
-    passed = received(MessageRule(duplication=0.25), 5000)
-    assert len(passed) / 5000 == pytest.approx(1.25, abs=0.02)
+@pytest.mark.parametrize(
+    ("rule", "share"),
+    [
+        (MessageRule(loss=0.1), 0.9),
+        (MessageRule(loss=0.5), 0.5),
+        (MessageRule(loss=0.9), 0.1),
+        (MessageRule(duplication=0.25), 1.25),
+        (MessageRule(duplication=1.0), 2.0),
+    ],
+)
+def test_loss_and_duplication_affect_their_share(rule: MessageRule, share: float) -> None:
+    passed = received(rule, 5000)
+    assert passed == sorted(passed)
+    assert len(passed) / 5000 == pytest.approx(share, abs=0.02 if rule.duplication < 1.0 else 0.0)
+    assert max(map(passed.count, range(100))) <= (2 if rule.duplication else 1)
 
 
 def test_duplicates_do_not_depend_on_the_loss() -> None:
@@ -151,13 +135,13 @@ def test_a_delay_keeps_the_order() -> None:
     core, listener = faulty(MessageRule(delay_s=0.5))
     for number in range(5):
         feed(core, arrived(number), 0.1 * number)
-    assert listener.heard == []
+    assert listener.events == []
     assert core.wakeup_s == 0.5
     run_until(core, 0.75)
     assert listener.numbers == [0, 1, 2]
     run_until(core, 10.0)
     assert listener.numbers == [0, 1, 2, 3, 4]
-    times_s = [now_s for _, now_s in listener.heard]
+    times_s = [now_s for now_s, _ in listener.events]
     assert times_s == pytest.approx([0.5, 0.6, 0.7, 0.8, 0.9])
 
 
@@ -169,16 +153,16 @@ def test_jitter_longer_than_the_spacing_reorders() -> None:
     run_until(core, 100.0)
     assert sorted(listener.numbers) == list(range(200))
     assert listener.numbers != list(range(200))
-    for event, now_s in listener.heard:
+    for now_s, event in listener.events:
         assert isinstance(event, Arrived)
-        assert 0.1 <= now_s - 0.1 * event.message <= 1.1 + 1e-9
+        assert 0.1 <= now_s - 0.1 * event.message.term <= 1.1 + 1e-9
 
 
 def test_copies_of_one_message_have_delays_of_their_own() -> None:
     core, listener = faulty(MessageRule(duplication=1.0, jitter_s=1.0))
     feed(core, arrived(7))
     run_until(core, 2.0)
-    (_, first_s), (_, second_s) = listener.heard
+    (first_s, _), (second_s, _) = listener.events
     assert listener.numbers == [7, 7]
     assert first_s != second_s
 
@@ -188,7 +172,7 @@ def test_rules_add_up() -> None:
         MessageRule(duplication=1.0), MessageRule(duplication=1.0), MessageRule(delay_s=1.0)
     )
     feed(core, arrived(1))
-    assert listener.heard == []
+    assert listener.events == []
     run_until(core, 1.0)
     assert listener.numbers == [1, 1, 1, 1]
 
@@ -206,7 +190,7 @@ def test_a_rule_holds_in_its_window_of_road_time() -> None:
 def test_a_rule_from_zero_holds_before_the_road_clock_starts() -> None:
     core, listener = faulty(MessageRule(loss=1.0, from_s=0.0), board=Board())
     feed(core, arrived(1))
-    assert listener.heard == []
+    assert listener.events == []
 
 
 def test_a_rule_is_for_its_topics() -> None:
@@ -231,14 +215,14 @@ def test_a_rule_is_for_its_sender(topic: Topic, parameters: dict[str, str], send
     for named in faulty_core.SENDERS:
         core, listener = faulty(MessageRule(loss=1.0, sender=named))
         feed(core, arrived(1, topic, **parameters))
-        assert (listener.heard == []) is (named == sender)
+        assert (listener.events == []) is (named == sender)
 
 
 def test_a_rule_is_for_its_receiver() -> None:
     for named in faulty_core.SENDERS:
         core, listener = faulty(MessageRule(loss=1.0, receiver=named), receiver="coordinator")
         feed(core, arrived(1))
-        assert (listener.heard == []) is (named == "coordinator")
+        assert (listener.events == []) is (named == "coordinator")
 
 
 def test_equal_seeds_give_equal_fates_and_others_others() -> None:
@@ -269,27 +253,20 @@ def test_what_is_no_message_passes_untouched() -> None:
     ]
     for event in events:
         feed(core, event)
-    assert [event for event, _ in listener.heard] == events
+    assert [event for _, event in listener.events] == events
 
 
-def test_the_core_is_woken_when_it_wants_and_not_for_delayed_messages() -> None:
+@pytest.mark.parametrize(("wanted_s", "woken"), [(3.0, [1.0, 3.0]), (1.0, [1.0])])
+def test_the_core_is_woken_when_it_wants_and_not_for_delayed_messages(
+    wanted_s: float, woken: list[float]
+) -> None:
     core, listener = faulty(MessageRule(delay_s=1.0))
-    listener.wakeup_s = 3.0
+    listener.wakeup_s = wanted_s
     feed(core, arrived(1), 0.0)
-    assert core.wakeup_s == 1.0
-    feed(core, Wakeup(), 1.0)
-    assert listener.heard == [(arrived(1), 1.0)]
-    assert core.wakeup_s == 3.0
-    feed(core, Wakeup(), 3.0)
-    assert listener.heard[1:] == [(Wakeup(), 3.0)]
-
-
-def test_both_are_served_at_one_wakeup() -> None:
-    core, listener = faulty(MessageRule(delay_s=1.0))
-    listener.wakeup_s = 1.0
-    feed(core, arrived(1), 0.0)
-    feed(core, Wakeup(), 1.0)
-    assert [event for event, _ in listener.heard] == [arrived(1), Wakeup()]
+    for due_s in woken:
+        assert core.wakeup_s == due_s
+        feed(core, Wakeup(), due_s)
+    assert listener.events == [(1.0, arrived(1)), (wanted_s, Wakeup())]
 
 
 def test_no_more_are_held_than_fit(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -308,24 +285,25 @@ def test_effects_pass() -> None:
     heartbeat = Heartbeat(Name("c1"), 1, 1, leading=False, formations=0)
     event = LogEvent(Name("agent"), Name("v1"), 0.0, Name("kind"))
     report = Report(Name("agent"), Name("v1"), solves=3)
-    listener.says = [
+    effects: list[Effect] = [
         Send(HEARTBEAT, heartbeat),
         Send(EVENT, event, {"role": "agent"}),
         Send(REPORT, report, {"role": "agent"}),
     ]
-    assert feed(core, Started()) == listener.says
+    listener.on_event = lambda *_: effects
+    assert feed(core, Started()) == effects
 
 
 def test_the_bridge_tells_the_road_time() -> None:
     board = Board()
     core, listener = faulty(board=board, receiver="bridge")
-    listener.says = [Send(CLOCK, RoadClock(125, 12.5, 3, 2, 1, 1, ended=False))]
+    listener.on_event = at_start(Send(CLOCK, RoadClock(125, 12.5, 3, 2, 1, 1, ended=False)))
     feed(core, Started())
     assert board.road_s == 12.5
 
 
 def test_a_bare_core_is_the_core_itself() -> None:
-    core = Listener()
+    core = Recorder()
     assert bare(core) is core
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
+from unittest.mock import Mock, call
 
 import msgpack
 import pytest
@@ -43,6 +43,7 @@ from laneweave.protocol.runtime.transport import (
     Received,
     TokenDown,
     TokenUp,
+    Transport,
 )
 from laneweave.protocol.wire.codec import MAX_BYTES, decode, encode
 from laneweave.protocol.wire.messages import Census, Heartbeat, Name, Report, RoadClock
@@ -58,6 +59,7 @@ from laneweave.protocol.wire.topics import (
     Keys,
     Quality,
 )
+from support.node_recorder import Recorder, at_start
 
 KEYS = Keys("r")
 BEAT = Heartbeat(Name("c1"), 7, 2, leading=True, formations=1)
@@ -65,62 +67,11 @@ BEAT_KEY = "laneweave/r/heartbeat/c1"
 
 
 @define
-class Recorder:
-    """A core that records what happens and answers with prepared effects."""
-
-    effects: list[Effect] = field(factory=list)
-    events: list[tuple[Event, float]] = field(factory=list)
-    wakeup_s: float | None = None
-
-    def handle(self, event: Event, now_s: float) -> Iterable[Effect]:
-        self.events.append((event, now_s))
-        effects, self.effects = self.effects, []
-        return effects
-
-
-@define
-class Calls:
-    """A transport that records its calls."""
-
-    calls: list[tuple[Any, ...]] = field(factory=list)
-
-    def publish(self, key: str, payload: bytes, quality: Quality) -> None:
-        self.calls.append(("publish", key, payload, quality))
-
-    def subscribe(self, key_expression: str) -> None:
-        self.calls.append(("subscribe", key_expression))
-
-    def unsubscribe(self, key_expression: str) -> None:
-        self.calls.append(("unsubscribe", key_expression))
-
-    def announce(self, key: str) -> None:
-        self.calls.append(("announce", key))
-
-    def withdraw(self, key: str) -> None:
-        self.calls.append(("withdraw", key))
-
-    def watch(self, key_expression: str) -> None:
-        self.calls.append(("watch", key_expression))
-
-    def serve(self, key: str) -> None:
-        self.calls.append(("serve", key))
-
-    def answer(self, token: int, payload: bytes, *, ok: bool, encoding: str = "") -> None:
-        self.calls.append(("answer", token, payload, ok, encoding))
-
-    def decline(self, token: int) -> None:
-        self.calls.append(("decline", token))
-
-    def close(self) -> None:
-        self.calls.append(("close",))
-
-
-@define
 class Bench:
     """A node with its recording core and transport."""
 
     core: Recorder = field(factory=Recorder)
-    transport: Calls = field(factory=Calls)
+    transport: Mock = field(factory=lambda: Mock(spec=Transport))
     jobs: list[Compute | Delegate] = field(factory=list)
     node: Node = field(init=False)
 
@@ -128,10 +79,11 @@ class Bench:
     def _make_node(self) -> Node:
         return Node(self.core, self.transport, KEYS, self.jobs.append, Name("n1"))
 
-    def carry_out(self, *effects: Effect) -> list[tuple[Any, ...]]:
-        self.core.effects = list(effects)
+    def carry_out(self, *effects: Effect) -> list[Any]:
+        """Have the node carry out effects; return the calls of its transport."""
+        self.core.on_event = lambda *_: effects
         self.node.dispatch(Wakeup(), 1.0)
-        return self.transport.calls
+        return self.transport.mock_calls
 
 
 @pytest.fixture
@@ -144,7 +96,7 @@ def bench() -> Bench:
 
 def test_a_message_arrives_typed(bench: Bench) -> None:
     bench.node.deliver(Received(BEAT_KEY, encode(BEAT)), 3.5)
-    assert bench.core.events == [(Arrived(HEARTBEAT, {"coordinator": "c1"}, BEAT), 3.5)]
+    assert bench.core.events == [(3.5, Arrived(HEARTBEAT, {"coordinator": "c1"}, BEAT))]
     assert bench.node.rejected == 0
 
 
@@ -166,7 +118,7 @@ def test_a_message_arrives_typed(bench: Bench) -> None:
 )
 def test_deliveries_become_events(bench: Bench, delivery: Delivery, event: Event) -> None:
     bench.node.deliver(delivery, 1.0)
-    assert bench.core.events == [(event, 1.0)]
+    assert bench.core.events == [(1.0, event)]
 
 
 def deep_field(depth: int) -> bytes:
@@ -239,17 +191,17 @@ def test_effects_reach_the_transport(bench: Bench) -> None:
         work,
     )
     assert calls == [
-        ("subscribe", "laneweave/r/state/3/*"),
-        ("subscribe", "laneweave/r/census"),
-        ("unsubscribe", "laneweave/r/state/3/*"),
-        ("announce", "laneweave/r/alive/vehicle/v1"),
-        ("withdraw", "laneweave/r/alive/vehicle/v1"),
-        ("watch", "laneweave/r/alive/vehicle/*"),
-        ("serve", "laneweave/r/service/plan"),
-        ("answer", 5, b"a", True, ""),
-        ("answer", 6, b"e", False, "application/json"),
-        ("decline", 7),
-        ("publish", BEAT_KEY, encode(BEAT), Quality.LATEST),
+        call.subscribe("laneweave/r/state/3/*"),
+        call.subscribe("laneweave/r/census"),
+        call.unsubscribe("laneweave/r/state/3/*"),
+        call.announce("laneweave/r/alive/vehicle/v1"),
+        call.withdraw("laneweave/r/alive/vehicle/v1"),
+        call.watch("laneweave/r/alive/vehicle/*"),
+        call.serve("laneweave/r/service/plan"),
+        call.answer(5, b"a", ok=True, encoding=""),
+        call.answer(6, b"e", ok=False, encoding="application/json"),
+        call.decline(7),
+        call.publish(BEAT_KEY, encode(BEAT), Quality.LATEST),
     ]
     assert bench.jobs == [work]
 
@@ -264,14 +216,14 @@ def test_a_report_gets_the_counters_of_the_node(bench: Bench) -> None:
     calls = bench.carry_out(
         beat, beat, beat, Send(REPORT, report, {"role": "coordinator", "name": "c1"})
     )
-    sent = decode(calls[-1][2], Report)
+    sent = decode(calls[-1].args[1], Report)
     assert sent == evolve(report, process=Name("n1"), published=4, rejected=4)
     assert bench.node.published == 4
 
 
 def test_a_node_tells_what_it_has_counted(bench: Bench) -> None:
     node = bench.node
-    bench.core.effects = [Send(HEARTBEAT, BEAT, {"coordinator": "c1"})]
+    bench.core.on_event = at_start(Send(HEARTBEAT, BEAT, {"coordinator": "c1"}))
     node.dispatch(Started(), 0.0)
     node.deliver(Received(BEAT_KEY, encode(BEAT)), 1.0)
     node.deliver(Received(BEAT_KEY, b"nonsense"), 1.0)
@@ -281,25 +233,25 @@ def test_a_node_tells_what_it_has_counted(bench: Bench) -> None:
 
 
 def test_end_closes_the_transport_and_nothing_is_handled_any_more(bench: Bench) -> None:
-    assert bench.carry_out(End()) == [("close",)]
+    assert bench.carry_out(End()) == [call.close()]
     assert bench.node.ended
     events = list(bench.core.events)
     bench.node.dispatch(Wakeup(), 2.0)
     bench.node.deliver(Received(BEAT_KEY, encode(BEAT)), 2.0)
     bench.node.deliver(LinkDown(), 2.0)
     assert bench.core.events == events
-    assert bench.transport.calls == [("close",)]
+    assert bench.transport.mock_calls == [call.close()]
 
 
 def test_nothing_is_sent_before_the_first_event(bench: Bench) -> None:
-    assert bench.transport.calls == []
+    assert bench.transport.mock_calls == []
     bench.node.dispatch(Started(), 0.0)
-    assert bench.core.events == [(Started(), 0.0)]
+    assert bench.core.events == [(0.0, Started())]
 
 
 def test_census_and_clock_have_no_parameters(bench: Bench) -> None:
     bench.node.deliver(Received("laneweave/r/census", encode(Census(1.0, (), ()))), 1.0)
-    assert bench.core.events == [(Arrived(CENSUS, {}, Census(1.0, (), ())), 1.0)]
+    assert bench.core.events == [(1.0, Arrived(CENSUS, {}, Census(1.0, (), ())))]
     assert CLOCK.parameters == ()
 
 

@@ -24,6 +24,8 @@ from laneweave.protocol.runtime.node import Computed, Delegate
 from laneweave.protocol.runtime.worker_pool import WorkerPool
 from support import worker_jobs as jobs
 
+pytestmark = pytest.mark.slow
+
 WAIT_S = 30.0
 """Nothing here takes a tenth of this; it only guards against hanging."""
 

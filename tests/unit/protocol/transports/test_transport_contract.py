@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Protocol
 from unittest.mock import Mock
 
 import pytest
@@ -58,9 +58,9 @@ REALM = "r"
 KEYS = Keys(REALM)
 LEASE_S = 0.5
 WAIT_S = 10.0
+"""Longest wait for what must come; what comes, comes in milliseconds."""
 ASK_S = 3 * WAIT_S
 """An answer that comes only when the question is given up comes too late for every test."""
-"""Longest wait for what must come; what comes, comes in milliseconds."""
 QUIET_S = 0.15
 """How long to wait for what must not come (Zenoh, wall-clock)."""
 
@@ -113,34 +113,6 @@ class Party:
 Answers = list[Answer | None]
 
 
-class Bed(Protocol):
-    """What a test needs of either network."""
-
-    def join(self, name: str) -> Party:
-        """Add a participant."""
-
-    def join_process(self, name: str) -> None:
-        """Add a participant in its own process that serves and shows the token of its name."""
-
-    def kill(self, name: str) -> None:
-        """Kill such a process, without a word."""
-
-    def ask(self, payload: bytes) -> Answers:
-        """Ask the service; the list gets the answer, or None when there is no service."""
-
-    def break_link(self, *parties: Party) -> None:
-        """Take participants off the network."""
-
-    def mend_link(self, *parties: Party) -> None:
-        """Bring them back."""
-
-    def until(self, condition: Callable[[], object]) -> None:
-        """Let time pass until something holds; fail when it does not in time."""
-
-    def quiet(self) -> None:
-        """Let enough time pass for everything under way to arrive."""
-
-
 # --- the simulated network --------------------------------------------------------------------
 
 
@@ -174,12 +146,13 @@ class Recorder:
 
 @define
 class SimulatedBed:
-    """Virtual time."""
+    """Virtual time; `ZenohBed` has the same methods."""
 
     network: SimulatedNetwork = field(factory=lambda: SimulatedNetwork(seed=1))
     _names: dict[int, str] = field(factory=dict)
 
     def join(self, name: str) -> Party:
+        """Add a participant."""
         core = Recorder()
         node = self.network.add(name, core, REALM)
         party = Party(node._transport, core.got)
@@ -187,31 +160,38 @@ class SimulatedBed:
         return party
 
     def join_process(self, name: str) -> None:
+        """Add a participant in its own process that serves and shows the token of its name."""
         core = Recorder(first=(Serve(SERVICE), Announce(VEHICLE_ALIVE, {"vehicle": name})))
         self.network.add(name, core, REALM)
         self.network.run(self.network.now_s)
 
     def kill(self, name: str) -> None:
+        """Kill such a process with SIGKILL."""
         self.network.kill(name)
 
     def ask(self, payload: bytes) -> Answers:
+        """Ask the service; the list gets the answer, or None when there is no service."""
         answers: Answers = []
         self.network.ask(PLAN_SERVICE, payload, answers.append)
         return answers
 
     def break_link(self, *parties: Party) -> None:
+        """Take participants off the network."""
         for party in parties:
             self.network.disconnect(self._names[id(party)])
 
     def mend_link(self, *parties: Party) -> None:
+        """Bring them back."""
         for party in parties:
             self.network.reconnect(self._names[id(party)])
 
     def until(self, condition: Callable[[], object]) -> None:
+        """Let time pass until something holds; fail when it does not in time."""
         self.network.run(self.network.now_s + WAIT_S, stop=lambda: bool(condition()))
         assert condition()
 
     def quiet(self) -> None:
+        """Let enough time pass for everything under way to arrive."""
         self.network.run(self.network.now_s + 1.0)
 
 
@@ -226,7 +206,6 @@ MEMBER = """
 import sys, time
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.security.access import Access
-from support.refusals import refusal
 transport = ZenohTransport(Access(sys.argv[1], lease_s=float(sys.argv[2])), lambda delivery: None)
 transport.serve(sys.argv[4])
 transport.announce(sys.argv[3])
@@ -285,11 +264,7 @@ class ZenohBed:
     _opened: list[ZenohTransport] = field(factory=list)
     _processes: dict[str, subprocess.Popen[bytes]] = field(factory=dict)
 
-    def join(self, name: str) -> Party:
-        del name
-        return self._join()
-
-    def _join(self) -> Party:
+    def join(self, _: str) -> Party:
         got: list[Delivery] = []
         transport = ZenohTransport(Access(self.router.endpoint, lease_s=LEASE_S), got.append)
         self._opened.append(transport)
@@ -305,19 +280,17 @@ class ZenohBed:
 
     def ask(self, payload: bytes) -> Answers:
         answers: Answers = []
-        client = self._join().transport
+        client = self.join("client").transport
         assert isinstance(client, ZenohTransport)
 
         asked = client.ask(PLAN_SERVICE, payload, ASK_S)
         asked.add_done_callback(lambda done: answers.append(done.result()))
         return answers
 
-    def break_link(self, *parties: Party) -> None:
-        del parties
+    def break_link(self, *_: Party) -> None:
         self.router.kill()
 
-    def mend_link(self, *parties: Party) -> None:
-        del parties
+    def mend_link(self, *_: Party) -> None:
         self.router.start()
 
     def until(self, condition: Callable[[], object]) -> None:
@@ -344,26 +317,28 @@ def router(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Router]:
     assert end_process(router.process) == 0, "the router does not end in good order"
 
 
-@pytest.fixture(params=["simulated", "zenoh"])
+Bed = SimulatedBed | ZenohBed
+both = pytest.fixture(params=["simulated", pytest.param("zenoh", marks=pytest.mark.slow)])
+
+
+@both
 def bed(request: pytest.FixtureRequest) -> Iterator[Bed]:
     if request.param == "simulated":
         yield SimulatedBed()
         return
-    zenoh_bed = ZenohBed(request.getfixturevalue("router"))
-    yield zenoh_bed
-    zenoh_bed.close()
+    with contextlib.closing(ZenohBed(request.getfixturevalue("router"))) as zenoh_bed:
+        yield zenoh_bed
 
 
-@pytest.fixture(params=["simulated", "zenoh"])
+@both
 def breakable_bed(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Bed]:
     if request.param == "simulated":
         yield SimulatedBed()
         return
     router = Router(tmp_path / "s")
     router.start()
-    zenoh_bed = ZenohBed(router)
-    yield zenoh_bed
-    zenoh_bed.close()
+    with contextlib.closing(ZenohBed(router)) as zenoh_bed:
+        yield zenoh_bed
     router.kill()
 
 
@@ -455,17 +430,6 @@ def test_nothing_comes_after_unsubscribe(bed: Bed) -> None:
 # --- tokens -----------------------------------------------------------------------------------
 
 
-def test_a_token_is_seen_to_appear_and_vanish(bed: Bed) -> None:
-    a, b = bed.join("a"), bed.join("b")
-    b.transport.watch(TOKENS)
-    a.transport.announce(token_key("a"))
-    bed.until(lambda: b.tokens() == ["+a"])
-    a.transport.withdraw(token_key("a"))
-    bed.until(lambda: b.tokens() == ["+a", "-a"])
-    a.transport.announce(token_key("a"))
-    bed.until(lambda: b.tokens() == ["+a", "-a", "+a"])
-
-
 def test_a_watcher_begins_with_the_tokens_that_are_there(bed: Bed) -> None:
     a, b = bed.join("a"), bed.join("b")
     a.transport.announce(token_key("a1"))
@@ -526,21 +490,25 @@ def test_news_of_a_token_come_by_turns(bed: Bed) -> None:
     assert {news_of(a, name) for name in names} <= {"+-", "+-+-"}
 
 
-def test_repeated_calls_change_nothing(bed: Bed) -> None:
+def test_a_token_is_seen_to_appear_and_vanish_and_repeated_calls_change_nothing(bed: Bed) -> None:
     a, b = bed.join("a"), bed.join("b")
-    b.transport.watch(TOKENS)
-    b.transport.watch(TOKENS)
-    a.transport.announce(token_key("a"))
-    a.transport.announce(token_key("a"))
+    for _ in range(2):
+        b.transport.watch(TOKENS)
+    for _ in range(2):
+        a.transport.announce(token_key("a"))
     a.transport.withdraw(token_key("unknown"))
     bed.until(b.tokens)
     bed.quiet()
     assert b.tokens() == ["+a"]
-    a.transport.withdraw(token_key("a"))
-    a.transport.withdraw(token_key("a"))
+    for _ in range(2):
+        a.transport.withdraw(token_key("a"))
     bed.until(lambda: len(b.tokens()) == 2)
     bed.quiet()
     assert b.tokens() == ["+a", "-a"]
+    a.transport.announce(token_key("a"))
+    bed.until(lambda: b.tokens() == ["+a", "-a", "+a"])
+    a.transport.close()
+    bed.until(lambda: b.tokens() == ["+a", "-a", "+a", "-a"])
 
 
 def test_a_token_of_two_vanishes_with_the_last(bed: Bed) -> None:
@@ -557,15 +525,6 @@ def test_a_token_of_two_vanishes_with_the_last(bed: Bed) -> None:
     bed.until(lambda: c.tokens() == ["+both", "-both"])
 
 
-def test_closing_takes_the_tokens_back(bed: Bed) -> None:
-    a, b = bed.join("a"), bed.join("b")
-    b.transport.watch(TOKENS)
-    a.transport.announce(token_key("a"))
-    bed.until(lambda: b.tokens() == ["+a"])
-    a.transport.close()
-    bed.until(lambda: b.tokens() == ["+a", "-a"])
-
-
 def test_a_killed_process_loses_its_token(bed: Bed) -> None:
     b = bed.join("b")
     b.transport.watch(TOKENS)
@@ -579,42 +538,53 @@ def test_a_killed_process_loses_its_token(bed: Bed) -> None:
 # --- questions --------------------------------------------------------------------------------
 
 
+def serving(bed: Bed, *names: str) -> list[Party]:
+    """Return participants that serve, which the network knows of."""
+    servers = [bed.join(name) for name in names]
+    for server in servers:
+        server.transport.serve(PLAN_SERVICE)
+        settle(bed, server)
+    return servers
+
+
+def asked(bed: Bed, *servers: Party) -> tuple[Answers, list[int]]:
+    """Ask a question and wait until all servers have it; return its answers and its tokens."""
+    answers = bed.ask(b"?")
+    bed.until(lambda: all(server.questions() for server in servers))
+    return answers, [server.questions()[0].token for server in servers]
+
+
+def payloads(answers: Answers) -> list[bytes | None]:
+    return [None if answer is None else answer.payload for answer in answers]
+
+
 @pytest.mark.parametrize("ok", [True, False])
 def test_a_question_gets_its_answer(bed: Bed, *, ok: bool) -> None:
-    server = bed.join("server")
-    server.transport.serve(PLAN_SERVICE)
+    (server,) = serving(bed, "server")
     server.transport.serve(PLAN_SERVICE)
     settle(bed, server)
-    answers = bed.ask(b"what?")
-    bed.until(server.questions)
-    question = server.questions()[0]
-    assert question.key == PLAN_SERVICE
-    assert question.payload == b"what?"
+    answers, (number,) = asked(bed, server)
+    (question,) = server.questions()
+    assert (question.key, question.payload) == (PLAN_SERVICE, b"?")
     assert answers == []
-    server.transport.answer(question.token, b"that", ok=ok)
-    server.transport.answer(question.token, b"again", ok=True)
+    server.transport.answer(number, b"that", ok=ok)
+    server.transport.answer(number, b"again", ok=True)
     bed.until(lambda: answers)
     bed.quiet()
     assert [given and (given.payload, given.ok) for given in answers] == [(b"that", ok)]
     assert len(server.questions()) == 1
 
 
-def test_questions_have_tokens_of_their_own(bed: Bed) -> None:
-    server = bed.join("server")
-    server.transport.serve(PLAN_SERVICE)
-    settle(bed, server)
+def test_questions_have_tokens_of_their_own_and_unknown_ones_are_ignored(bed: Bed) -> None:
+    (server,) = serving(bed, "server")
+    server.transport.answer(12345, b"x", ok=True)
+    server.transport.answer(-1, b"x", ok=False)
     first, second = bed.ask(b"1"), bed.ask(b"2")
     bed.until(lambda: len(server.questions()) == 2)
     for question in reversed(server.questions()):
         server.transport.answer(question.token, b"to " + question.payload, ok=True)
     bed.until(lambda: first and second)
-    assert [given and given.payload for given in first + second] == [b"to 1", b"to 2"]
-
-
-def test_an_answer_to_an_unknown_question_is_ignored(bed: Bed) -> None:
-    server = bed.join("server")
-    server.transport.answer(12345, b"x", ok=True)
-    server.transport.answer(-1, b"x", ok=False)
+    assert payloads(first + second) == [b"to 1", b"to 2"]
 
 
 def test_a_question_without_a_service_is_not_answered(bed: Bed) -> None:
@@ -623,50 +593,32 @@ def test_a_question_without_a_service_is_not_answered(bed: Bed) -> None:
     assert answers == [None]
 
 
-def test_one_server_that_hangs_does_not_hold_back_the_others(bed: Bed) -> None:
-    servers = [bed.join("hangs"), bed.join("works")]
-    for server in servers:
-        server.transport.serve(PLAN_SERVICE)
-        settle(bed, server)
-    answers = bed.ask(b"?")
-    bed.until(lambda: all(server.questions() for server in servers))
-    servers[1].transport.answer(servers[1].questions()[0].token, b"!", ok=True)
-    bed.until(lambda: answers)  # and the other one has not answered yet
-    assert [given and given.payload for given in answers] == [b"!"]
-    servers[0].transport.answer(servers[0].questions()[0].token, b"late", ok=True)
+def test_a_server_that_hangs_does_not_delay_the_answer_of_another(bed: Bed) -> None:
+    hangs, works = serving(bed, "hangs", "works")
+    answers, (first, second) = asked(bed, hangs, works)
+    works.transport.answer(second, b"!", ok=True)
+    bed.until(lambda: answers)
+    assert payloads(answers) == [b"!"]
+    hangs.transport.answer(first, b"late", ok=True)
     bed.quiet()
-    assert [given and given.payload for given in answers] == [b"!"]
+    assert payloads(answers) == [b"!"]
 
 
-def test_a_question_is_left_to_those_who_answer(bed: Bed) -> None:
-    servers = [bed.join("leaves"), bed.join("answers")]
-    for server in servers:
-        server.transport.serve(PLAN_SERVICE)
-        settle(bed, server)
-    answers = bed.ask(b"?")
-    bed.until(lambda: all(server.questions() for server in servers))
-    servers[0].transport.decline(servers[0].questions()[0].token)
-    servers[0].transport.decline(servers[0].questions()[0].token)
-    servers[0].transport.answer(servers[0].questions()[0].token, b"after all", ok=True)
+@pytest.mark.parametrize("others_answer", [True, False])
+def test_a_declined_question_is_left_to_the_other_servers(bed: Bed, *, others_answer: bool) -> None:
+    declines, other = serving(bed, "declines", "other")
+    answers, (first, second) = asked(bed, declines, other)
+    for number in (first, first, -1):
+        declines.transport.decline(number)
+    declines.transport.answer(first, b"after all", ok=True)
     bed.quiet()
     assert answers == []
-    servers[1].transport.answer(servers[1].questions()[0].token, b"!", ok=True)
+    if others_answer:
+        other.transport.answer(second, b"!", ok=True)
+    else:
+        other.transport.decline(second)
     bed.until(lambda: answers)
-    assert [given and given.payload for given in answers] == [b"!"]
-
-
-def test_a_question_that_all_leave_is_answered_by_nobody(bed: Bed) -> None:
-    servers = [bed.join("a"), bed.join("b")]
-    for server in servers:
-        server.transport.serve(PLAN_SERVICE)
-        settle(bed, server)
-    answers = bed.ask(b"?")
-    bed.until(lambda: all(server.questions() for server in servers))
-    for server in servers:
-        server.transport.decline(server.questions()[0].token)
-        server.transport.decline(-1)
-    bed.until(lambda: answers)
-    assert answers == [None]
+    assert payloads(answers) == [b"!" if others_answer else None]
 
 
 def test_a_question_is_settled_when_its_only_server_is_killed(bed: Bed) -> None:
@@ -742,6 +694,7 @@ def test_without_the_link_everybody_vanishes_and_comes_back(breakable_bed: Bed) 
 # --- what Zenoh alone has ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_after_close_nothing_of_the_closed_session_is_used(router: Router) -> None:
     transport = ZenohTransport(Access(router.endpoint), lambda _: None)
     transport.subscribe(BEATS)
@@ -765,16 +718,14 @@ def test_an_endpoint_that_is_malformed_or_without_a_router_is_refused(endpoint: 
     assert error.field == "network.endpoint"
 
 
+@pytest.mark.slow
 def test_a_service_that_does_not_answer_is_a_timeout(router: Router) -> None:
-    bed = ZenohBed(router)
-    server = bed.join("server")
-    server.transport.serve(PLAN_SERVICE)
-    settle(bed, server)
-    client = bed.join("client").transport
-    assert isinstance(client, ZenohTransport)
-    with pytest.raises(TimeoutError, match="in time"):
-        client.ask(PLAN_SERVICE, b"", 0.2).result(WAIT_S)
-    bed.close()
+    with contextlib.closing(ZenohBed(router)) as bed:
+        serving(bed, "server")
+        client = bed.join("client").transport
+        assert isinstance(client, ZenohTransport)
+        with pytest.raises(TimeoutError, match="in time"):
+            client.ask(PLAN_SERVICE, b"", 0.2).result(WAIT_S)
 
 
 @define
@@ -807,6 +758,7 @@ class Errand:
                 pass
 
 
+@pytest.mark.slow
 def test_a_core_runs_over_zenoh_until_it_ends(router: Router) -> None:
     core = Errand()
     answers: Answers = []

@@ -1,4 +1,4 @@
-"""The trace of a simulated network: equal runs have equal digests, others have not."""
+"""Virtual time: clocks, conditions, actions, and the trace of a run, equal for equal seeds."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from laneweave.protocol.runtime.node import (
     Arrived,
@@ -26,12 +28,80 @@ from laneweave.protocol.runtime.transport import (
     TokenDown,
     TokenUp,
 )
-from laneweave.protocol.transports.simulated.virtual_time import Conditions, Item, TraceDigest
-from support.node_recorder import CALM, STORM, chatter
+from laneweave.protocol.transports.simulated.network import SimulatedNetwork
+from laneweave.protocol.transports.simulated.virtual_time import (
+    Clock,
+    Conditions,
+    Item,
+    TraceDigest,
+)
+from support.node_recorder import CALM, REALM, STORM, Recorder, chatter, network_of
 
-TESTS = Path(__file__).parents[3]
+TESTS = Path(__file__).parents[4]
+
+# --- clocks and conditions --------------------------------------------------------------------
 
 
+@given(
+    st.floats(-1e4, 1e4), st.floats(0.5, 2.0), st.floats(-1e5, 1e5) | st.sampled_from([0.0, 1e-300])
+)
+def test_a_wakeup_is_never_early_and_hardly_late(
+    offset_s: float, rate: float, local_s: float
+) -> None:
+    clock = Clock(offset_s, rate)
+    shown_s = clock.local_s(clock.virtual_s(local_s))
+    assert local_s <= shown_s <= local_s + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("offset_s", "rate"),
+    [(0.0, 0.0), (0.0, -1.0), (float("nan"), 1.0), (float("inf"), 1.0), (0.0, float("nan"))],
+)
+def test_a_clock_that_is_none_is_refused(offset_s: float, rate: float) -> None:
+    network = network_of(a=Recorder())
+    with pytest.raises(ValueError, match="must be"):
+        network.set_clock("a", offset_s, rate)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("loss", 1.1), ("loss", -0.1), ("duplication", 2.0), ("compute_failure", float("nan")),
+     ("delay_s", -1.0), ("jitter_s", float("inf")), ("lease_s", float("nan")),
+     ("compute_s", -0.1), ("compute_jitter_s", -0.1)],
+)  # fmt: skip
+def test_conditions_that_cannot_be_are_refused(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=name):
+        Conditions(**{name: value})
+
+
+# --- time passes ------------------------------------------------------------------------------
+
+
+def test_time_passes_without_events_and_an_action_in_the_past_happens_now() -> None:
+    network = SimulatedNetwork(1)
+    assert not network.step()
+    network.run(5.0)
+    assert network.now_s == 5.0
+    times: list[float] = []
+    network.at(0.0, lambda: times.append(network.now_s))
+    network.run(5.2)
+    assert times == [5.0]
+
+
+def test_a_run_stops_when_it_is_told_to() -> None:
+    core = Recorder()
+    core.wakeup_s = 0.2
+    network = SimulatedNetwork(1, CALM)
+    network.add("a", core, REALM)
+    network.run(5.0, stop=lambda: len(core.of(Wakeup)) == 3)
+    assert len(core.of(Wakeup)) == 3
+    assert network.now_s < 0.3
+
+
+# --- traces -----------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("conditions", [CALM, STORM], ids=["calm", "storm"])
 def test_equal_seeds_give_equal_traces_in_any_process(conditions: Conditions) -> None:
     digest = TraceDigest()
@@ -59,12 +129,16 @@ def test_other_seeds_give_other_traces() -> None:
 
 
 @pytest.mark.parametrize("conditions", [CALM, STORM], ids=["calm", "storm"])
-def test_a_trace_changes_nothing_and_misses_nothing(conditions: Conditions) -> None:
+@pytest.mark.parametrize("seed", [1, 5])
+def test_a_run_is_the_same_with_a_trace_and_with_messages_in_kind(
+    conditions: Conditions, seed: int
+) -> None:
     events: list[tuple[float, str, Item]] = []
-    traced_run = chatter(5, conditions, lambda *event: events.append(event))
-    assert traced_run == chatter(5, conditions)
-    seen, _ = traced_run
-    assert len(events) == sum(len(core) for core in seen)
+    run = chatter(seed, conditions, lambda *event: events.append(event))
+    assert run == chatter(seed, conditions)
+    assert run == chatter(seed, conditions, in_kind=True)
+    seen, _ = run
+    assert len(events) == sum(len(core) for core in seen) > 300
     for name, core in zip(("a", "b"), seen, strict=False):
         mine = [(now_s, item) for now_s, to, item in events if to == name]
         for (now_s, item), (seen_s, event) in zip(mine, core, strict=True):

@@ -1,0 +1,673 @@
+"""The network in virtual time: messages, tokens, the router, faults of nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import pytest
+
+from laneweave.protocol.runtime.node import (
+    Arrived,
+    Compute,
+    Computed,
+    Effect,
+    End,
+    Event,
+    Listen,
+    PeerDown,
+    Serve,
+    Started,
+    Stopping,
+    Unlisten,
+    Wakeup,
+    Watch,
+    Withdraw,
+)
+from laneweave.protocol.runtime.transport import Answer, LinkDown, LinkUp
+from laneweave.protocol.transports.simulated.network import (
+    KILL_SEEN_S,
+    REJOIN_S,
+    Parcel,
+    SimulatedNetwork,
+)
+from laneweave.protocol.transports.simulated.virtual_time import Conditions
+from laneweave.protocol.wire.codec import encode
+from laneweave.protocol.wire.topics import COMMAND, HEARTBEAT, SERVICE, VEHICLE_ALIVE, Keys
+from support.node_recorder import (
+    CALM,
+    REALM,
+    Recorder,
+    at_start,
+    beat,
+    listener,
+    network_of,
+    perform,
+    send,
+    token,
+)
+
+KEY = Keys(REALM).key(HEARTBEAT, coordinator="a")
+BEAT = encode(beat(4).message)
+
+
+# --- messages ---------------------------------------------------------------------------------
+
+
+def test_without_faults_each_message_arrives_once_and_in_order() -> None:
+    receiver = listener()
+    network = network_of(a=Recorder(), b=receiver)
+    send(network, "a", *range(100))
+    network.run(1.0)
+    assert receiver.numbers == list(range(100))
+    assert receiver.times(Arrived) == pytest.approx([0.102] * 100)
+    assert network.dropped == 0
+
+
+@pytest.mark.parametrize("loss", [0.1, 0.5, 0.9])
+def test_messages_are_lost_at_the_given_rate(loss: float) -> None:
+    receivers = {name: listener() for name in ("b", "c")}
+    network = network_of(Conditions(loss=loss), more=receivers, a=Recorder())
+    send(network, "a", *range(2000))
+    network.run(1.0)
+    lost = [2000 - len(core.numbers) for core in receivers.values()]
+    # Four standard deviations.
+    spread = 4 * (2000 * loss * (1 - loss)) ** 0.5
+    assert all(abs(count - 2000 * loss) < spread for count in lost)
+    assert network.dropped == sum(lost)
+    # Each receiver has a fate of its own.
+    assert set(receivers["b"].numbers) != set(receivers["c"].numbers)
+
+
+@pytest.mark.parametrize(("general", "on_key"), [(0.2, 0.6), (0.6, 0.2)])
+def test_the_greater_loss_counts(general: float, on_key: float) -> None:
+    receiver = listener()
+    network = network_of(Conditions(loss=general), a=Recorder(), b=receiver)
+    network.lose(lambda _: on_key)
+    send(network, "a", *range(2000))
+    network.run(1.0)
+    # Four standard deviations.
+    assert abs(len(receiver.numbers) - 800) < 88
+
+
+def test_messages_can_be_lost_by_their_key() -> None:
+    receiver = listener()
+    network = network_of(a=Recorder(), b=Recorder(), c=receiver)
+    network.lose(lambda key: 1.0 if key.endswith("/a") else 0.0)
+    send(network, "a", *range(10))
+    send(network, "b", *range(10, 20))
+    network.run(0.2)
+    assert receiver.numbers == list(range(10, 20))
+    assert network.dropped == 10
+    network.lose(None)
+    send(network, "a", 20)
+    network.run(0.3)
+    assert receiver.numbers[10:] == [20]
+
+
+def test_messages_are_duplicated_at_the_given_rate() -> None:
+    receiver = listener()
+    network = network_of(Conditions(duplication=0.25), a=Recorder(), b=receiver)
+    send(network, "a", *range(2000))
+    network.run(1.0)
+    assert set(receiver.numbers) == set(range(2000))
+    assert abs(len(receiver.numbers) - 2500) < 80
+    assert max(map(receiver.numbers.count, range(50))) == 2
+
+
+def test_messages_overtake_each_other_with_jitter() -> None:
+    receiver = listener()
+    network = network_of(Conditions(jitter_s=0.01), a=Recorder(), b=receiver)
+    send(network, "a", *range(100))
+    network.run(1.0)
+    assert sorted(receiver.numbers) == list(range(100))
+    assert receiver.numbers != sorted(receiver.numbers)
+    assert all(0.102 <= now_s <= 0.112 + 1e-9 for now_s in receiver.times(Arrived))
+
+
+def test_messages_may_take_seconds_and_still_arrive() -> None:
+    receiver = listener()
+    network = network_of(Conditions(jitter_s=5.0), a=Recorder(), b=receiver)
+    send(network, "a", *range(200))
+    network.run(2.6)
+    assert 50 < len(receiver.numbers) < 150
+    network.run(5.2)
+    assert sorted(receiver.numbers) == list(range(200))
+
+
+def test_a_cut_loses_messages_where_it_says_until_it_heals() -> None:
+    receivers = {name: listener() for name in ("b", "c")}
+    network = network_of(more=receivers, a=Recorder())
+    network.cut(lambda sender, receiver: (sender, receiver) == ("a", "b"))
+    send(network, "a", 1)
+    send(network, "c", 2)
+    network.run(0.2)
+    assert receivers["b"].numbers == [2]
+    assert receivers["c"].numbers == [1, 2]
+    assert network.dropped == 1
+    network.cut(None)
+    send(network, "a", 3)
+    network.run(0.3)
+    assert receivers["b"].numbers == [2, 3]
+
+
+@pytest.mark.parametrize("in_kind", [False, True])
+def test_injected_bytes_are_read_or_refused_by_each_receiver(*, in_kind: bool) -> None:
+    network = SimulatedNetwork(1, CALM, in_kind=in_kind)
+    for name in ("a", "b"):
+        network.add(name, listener(), REALM)
+    network.run(0.1)
+    for payload in (b"\xc1", b"\xc1", BEAT):
+        network.inject(KEY, payload)
+    network.run(1.0)
+    for name in ("a", "b"):
+        core = network.node(name).core
+        assert isinstance(core, Recorder)
+        assert core.numbers == [4]
+        assert network.node(name).rejected == 2
+
+
+@pytest.mark.parametrize("in_kind", [False, True])
+def test_a_message_arrives_as_the_same_object_or_an_equal_one(*, in_kind: bool) -> None:
+    network, receiver, sent = SimulatedNetwork(1, CALM, in_kind=in_kind), listener(), beat(7)
+    network.add("b", receiver, REALM)
+    network.add("a", Recorder(at_start(sent)), REALM)
+    network.run(0.2)
+    (arrived,) = receiver.of(Arrived)
+    assert isinstance(arrived, Arrived)
+    assert arrived.message == sent.message
+    assert (arrived.message is sent.message) == in_kind
+    # An object on a key where it does not belong is refused, as its bytes would be.
+    for key in (f"{KEY}/b", Keys(REALM).key(COMMAND, vehicle="a")):
+        network.inject(key, Parcel(sent.message) if in_kind else BEAT)
+    network.run(0.3)
+    assert receiver.of(Arrived) == [arrived]
+
+
+def test_all_who_receive_the_same_bytes_share_one_message() -> None:
+    receivers = {name: listener() for name in ("b", "c")}
+    network = network_of(Conditions(jitter_s=1.0, duplication=1.0), more=receivers, a=Recorder())
+    send(network, "a", 1, 2)
+    network.run(3.0)
+    arrived = [event for core in receivers.values() for event in core.of(Arrived)]
+    assert all(sorted(core.numbers) == [1, 1, 2, 2] for core in receivers.values())
+    assert len({id(event.message) for event in arrived}) == 2  # type: ignore[union-attr]
+
+
+def test_realms_in_one_network_do_not_mix() -> None:
+    network = SimulatedNetwork(1, CALM)
+    ours, theirs = listener(), listener()
+    network.add("a", ours, "r")
+    network.add("b", theirs, "s")
+    network.run(0.1)
+    network.inject("laneweave/r/heartbeat/x", BEAT)
+    network.run(0.2)
+    assert (ours.numbers, theirs.numbers) == ([4], [])
+    network.inject("laneweave/s/heartbeat/x", BEAT)
+    network.run(0.3)
+    assert (ours.numbers, theirs.numbers) == ([4], [4])
+    assert network.node("a").rejected == network.node("b").rejected == 0
+
+
+def test_subscriptions_may_change_between_messages() -> None:
+    receivers = {name: listener() for name in ("b", "c")}
+    network = network_of(more=receivers, a=Recorder())
+    send(network, "a", 1)
+    perform(network, "b", Unlisten(HEARTBEAT))
+    send(network, "a", 2)
+    perform(network, "b", Listen(HEARTBEAT, {"coordinator": "a"}))
+    send(network, "a", 3)
+    send(network, "c", 4)
+    network.run(0.2)
+    assert receivers["b"].numbers == [1, 3]
+    assert receivers["c"].numbers == [1, 2, 3, 4]
+
+
+def test_nothing_is_sent_to_who_has_left() -> None:
+    network = network_of(a=Recorder(), b=listener(), c=listener())
+    send(network, "a", 1)
+    network.kill("b")
+    network.conditions = Conditions(loss=1.0)
+    send(network, "a", 2)
+    assert network.dropped == 1
+
+
+# --- who is there -----------------------------------------------------------------------------
+
+
+def watched(*more: Effect, jitter_s: float = 0.0) -> tuple[SimulatedNetwork, Recorder, Recorder]:
+    """Return a network in which `a` watches and `v` shows a token, and the two cores."""
+    watcher, shown = listener(), Recorder(at_start(token("v"), *more))
+    conditions = Conditions(delay_s=CALM.delay_s, jitter_s=jitter_s)
+    return network_of(conditions, a=watcher, v=shown), watcher, shown
+
+
+@pytest.mark.parametrize("how", ["kill", "stop", "end"])
+def test_a_node_that_has_gone_is_missed_at_once(how: str) -> None:
+    network, watcher, leaver = watched()
+    leaver.on_event = lambda event, _: [beat(9, "v")] if isinstance(event, Stopping) else []
+    if how == "end":
+        perform(network, "v", End())
+    else:
+        getattr(network, how)("v")
+    assert "v" not in network
+    network.run(0.1 + KILL_SEEN_S + 0.002 + 1e-9)
+    assert watcher.tokens == ["+v", "-v"]
+    # Only a node that is asked to stop may still send something.
+    assert len(leaver.of(Stopping)) == (how == "stop")
+    assert watcher.numbers == ([9] if how == "stop" else [])
+
+
+@pytest.mark.parametrize("paused", [False, True])
+def test_a_watcher_that_comes_later_learns_who_is_there(*, paused: bool) -> None:
+    network, _, _ = watched()
+    if paused:
+        network.pause("v")
+    late = Recorder(at_start(Watch(VEHICLE_ALIVE)))
+    network.add("late", late, REALM)
+    network.run(0.3)
+    network.resume("v")
+    network.run(0.4)
+    assert late.tokens == ["+v"]
+
+
+@pytest.mark.parametrize(
+    ("steps", "seen"),
+    [
+        (["resume v", 1.0], "+"),
+        (["pause v", 0.4, "resume v", "pause v", 0.4 + CALM.lease_s - 0.01], "+"),
+        (["pause v", 0.4, "resume v", "pause v", 0.4 + CALM.lease_s + 0.01], "+-"),
+        (["pause v", 1.0, "kill v", 2.0], "+-"),
+        (["disconnect a", "kill v", 1.0, "reconnect a", 2.0], "+-"),
+        (["kill v", 0.1 + KILL_SEEN_S + 0.001, "disconnect a", "reconnect a", 2.0], "+-"),
+    ],
+    ids=["resumed awake", "lease not over", "lease over", "killed in a pause",
+         "died while the link was down", "died as the link broke"],
+)  # fmt: skip
+def test_what_a_watcher_sees_of_a_node(steps: list[str | float], seen: str) -> None:
+    network, watcher, _ = watched()
+    for step in steps:
+        if isinstance(step, str):
+            verb, name = step.split()
+            getattr(network, verb)(name)
+        else:
+            network.run(step)
+    assert watcher.tokens == [f"{sign}v" for sign in seen]
+
+
+def test_a_short_pause_is_not_noticed_and_loses_nothing() -> None:
+    network, watcher, sleeper = watched(Listen(HEARTBEAT))
+    network.pause("v")
+    send(network, "a", 1, 2)
+    network.run(0.3)
+    assert sleeper.numbers == []
+    network.resume("v")
+    assert sleeper.numbers == [1, 2]
+    assert sleeper.times(Arrived) == [0.3, 0.3]
+    network.run(2.0)
+    assert watcher.tokens == ["+v"]
+
+
+def test_a_node_that_is_silent_for_its_lease_is_given_up_and_comes_back_as_a_zombie() -> None:
+    network, watcher, zombie = watched(Listen(HEARTBEAT))
+    zombie.wakeup_s = 0.2
+    network.pause("v")
+    network.run(0.1 + CALM.lease_s - 0.001)
+    assert watcher.tokens == ["+v"]
+    network.run(0.1 + CALM.lease_s + 0.01)
+    assert watcher.tokens == ["+v", "-v"]
+    send(network, "a", 1)
+    network.run(3.0)
+    network.resume("v")
+    assert zombie.numbers == [1]
+    network.run(3.1)
+    assert watcher.tokens == ["+v", "-v", "+v"]
+    assert zombie.times(Wakeup)[0] == 3.0
+
+
+def test_a_paused_node_obeys_stop_when_it_wakes() -> None:
+    network, _, sleeper = watched()
+    network.pause("v")
+    network.stop("v")
+    network.run(0.2)
+    assert "v" in network
+    assert sleeper.of(Stopping) == []
+    network.resume("v")
+    assert "v" not in network
+    assert len(sleeper.of(Stopping)) == 1
+
+
+def test_a_disconnected_node_and_the_others_lose_each_other_and_find_each_other() -> None:
+    start = (Listen(HEARTBEAT), Watch(VEHICLE_ALIVE))
+    cores = {name: Recorder(at_start(*start, token(name))) for name in ("a", "b")}
+    network = network_of(more=cores)
+    assert sorted(cores["a"].tokens) == ["+a", "+b"]
+    network.disconnect("b")
+    network.disconnect("b")
+    send(network, "a", 1)
+    send(network, "b", 2)
+    network.run(0.5)
+    assert cores["a"].tokens[2:] == ["-b"]
+    assert sorted(cores["b"].tokens[2:]) == ["-a", "-b"]
+    assert len(cores["b"].of(LinkDown)) == 1
+    assert cores["a"].of(LinkDown) == []
+    assert cores["a"].numbers == [1]
+    assert cores["b"].numbers == []
+    network.reconnect("b")
+    network.reconnect("b")
+    send(network, "a", 3)
+    network.run(1.0)
+    assert cores["a"].tokens[3:] == ["+b"]
+    assert sorted(cores["b"].tokens[4:]) == ["+a", "+b"]
+    assert len(cores["b"].of(LinkUp)) == 1
+    assert cores["b"].numbers == [3]
+
+
+def test_link_down_may_come_anywhere_among_the_vanished_tokens() -> None:
+    places = set()
+    for seed in range(30):
+        core = listener()
+        network = network_of(
+            seed=seed, a=core, b=Recorder(at_start(token("b"))), c=Recorder(at_start(token("c")))
+        )
+        network.disconnect("a")
+        news = core.of(LinkDown, PeerDown)
+        places.add(next(i for i, event in enumerate(news) if isinstance(event, LinkDown)))
+    assert places == {0, 1, 2}
+
+
+def test_what_is_under_way_is_lost_when_the_link_breaks() -> None:
+    receiver = listener()
+    network = network_of(a=Recorder(), b=receiver)
+    send(network, "a", 1)
+    perform(network, "a", token("a"))
+    network.disconnect("b")
+    network.reconnect("b")
+    network.kill("a")
+    network.run(1.0)
+    assert receiver.numbers == []
+    # The token was shown when `b` came back, and vanished after it.
+    assert receiver.tokens == ["+a", "-a"]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_news_of_a_token_never_overtake_each_other(seed: int) -> None:
+    watcher = listener()
+    network = network_of(Conditions(jitter_s=0.05), seed=seed, a=watcher, v=Recorder())
+    for _ in range(5):
+        perform(network, "v", token("v"), Withdraw(VEHICLE_ALIVE, {"vehicle": "v"}))
+    perform(network, "v", token("v"))
+    network.run(1.0)
+    assert watcher.tokens == ["+v", "-v"] * 5 + ["+v"]
+
+
+def test_a_token_of_two_nodes_vanishes_with_the_last() -> None:
+    watcher = listener()
+    network = network_of(
+        a=watcher, b=Recorder(at_start(token("v"))), c=Recorder(at_start(token("v")))
+    )
+    network.kill("b")
+    network.run(0.5)
+    assert watcher.tokens == ["+v"]
+    network.kill("c")
+    network.run(1.0)
+    assert watcher.tokens == ["+v", "-v"]
+
+
+def test_a_node_started_again_under_its_name_gets_nothing_of_the_old_one() -> None:
+    watcher = listener()
+
+    def order(event: Event, _: float) -> Iterable[Effect]:
+        start = at_start(token("v"), Listen(HEARTBEAT), Compute(1, lambda: "old"))
+        return start(event, 0.0)
+
+    old = Recorder(order)
+    old.wakeup_s = 0.15
+    network = SimulatedNetwork(1, Conditions(jitter_s=0.0, compute_s=0.2))
+    network.add("a", watcher, REALM)
+    network.add("v", old, REALM)
+    network.run(0.1)
+    send(network, "a", 1)
+    network.kill("v")
+    new = Recorder(at_start(token("v"), Listen(HEARTBEAT)))
+    network.add("v", new, REALM)
+    network.run(1.0)
+    assert new.of(Computed, Arrived, Wakeup) == []
+    assert old.of(Computed) == []
+    # The new node shows the token before the old one is missed.
+    assert watcher.tokens[-1] == "+v"
+    network.kill("v")
+    network.run(2.0)
+    assert watcher.tokens[-1] == "-v"
+
+
+def test_faults_of_nodes_that_have_left_are_harmless_and_names_are_unique() -> None:
+    network = network_of(a=Recorder(), v=Recorder())
+    for fault in (network.kill, network.kill, network.stop, network.remove):
+        fault("v")
+    network.run(1.0)
+    assert network.names == ("a",)
+    with pytest.raises(ValueError, match="already"):
+        network.add("a", Recorder(), REALM)
+
+
+@pytest.mark.parametrize("moment", [LinkDown, LinkUp, PeerDown, Arrived, Computed])
+def test_a_node_may_end_at_any_moment(moment: type) -> None:
+    def end(event: Event, _: float) -> Iterable[Effect]:
+        if isinstance(event, moment):
+            return [End(), token("late"), Watch(VEHICLE_ALIVE), Listen(HEARTBEAT), beat(1, "v")]
+        return at_start(token("v"), Listen(HEARTBEAT), Watch(VEHICLE_ALIVE))(event, 0.0)
+
+    core, watcher = Recorder(end), listener()
+    network = network_of(a=watcher, v=core, b=Recorder(at_start(token("b"))))
+    network.disconnect("v")
+    if "v" in network:
+        network.reconnect("v")
+    if "v" in network:
+        network.pause("v")
+        send(network, "a", 1)
+        perform(network, "v", Compute(1, lambda: 1))
+        network.run(0.2)
+        network.resume("v")
+        network.run(0.3)
+    assert "v" not in network
+    network.run(1.0)
+    assert "+late" not in watcher.tokens
+    assert watcher.tokens[-1] == "-v"
+
+
+# --- the router -------------------------------------------------------------------------------
+
+
+def crowd(seed: int = 1) -> tuple[SimulatedNetwork, dict[str, Recorder]]:
+    """Return a network in which everybody shows a token, watches all, and hears all beats."""
+    names = ("a", "b", "c", "d")
+    cores = {
+        name: Recorder(at_start(Listen(HEARTBEAT), Watch(VEHICLE_ALIVE), token(name)))
+        for name in names
+    }
+    network = network_of(seed=seed, more=cores)
+    for core in cores.values():
+        assert sorted(core.tokens) == [f"+{name}" for name in names]
+        core.events.clear()
+    return network, cores
+
+
+def test_without_the_router_everybody_loses_everybody_at_once() -> None:
+    network, cores = crowd()
+    send(network, "a", 1)
+    network.lose_router()
+    network.lose_router()
+    for name, core in cores.items():
+        assert sorted(core.tokens) == ["-a", "-b", "-c", "-d"]
+        assert core.times(PeerDown) == [0.1] * 4
+        assert core.times(LinkDown) == [0.1]
+        send(network, name, 2)
+    network.run(5.0)
+    for core in cores.values():
+        assert core.numbers == []
+        assert core.of(LinkUp) == []
+        assert len(core.tokens) == 4
+
+
+def test_the_nodes_find_the_router_again_one_after_the_other() -> None:
+    network, cores = crowd()
+    network.lose_router()
+    network.run(2.0)
+    network.restore_router()
+    network.restore_router()
+    network.run(2.0 + REJOIN_S[1] + 0.01)
+    times = [core.times(LinkUp) for core in cores.values()]
+    assert all(len(one) == 1 and 2.2 <= one[0] <= 2.9 for one in times)
+    assert len({one[0] for one in times}) == len(cores)
+    for core in cores.values():
+        assert sorted(core.tokens[4:]) == ["+a", "+b", "+c", "+d"]
+    send(network, "a", 3)
+    network.run(4.0)
+    assert [core.numbers for core in cores.values()] == [[3]] * 4
+
+
+def test_nodes_find_the_router_at_times_drawn_from_the_seed() -> None:
+    def join_times(seed: int) -> list[list[float]]:
+        network, cores = crowd(seed)
+        network.lose_router()
+        network.restore_router()
+        network.run(3.0)
+        return [core.times(LinkUp) for core in cores.values()]
+
+    assert join_times(1) == join_times(1)
+    assert join_times(1) != join_times(2)
+
+
+def test_a_router_that_is_lost_again_is_not_found() -> None:
+    network, cores = crowd()
+    network.lose_router()
+    network.restore_router()
+    network.run(0.1 + REJOIN_S[0] - 0.01)
+    network.lose_router()
+    network.run(0.5)
+    network.restore_router()
+    network.run(0.5 + REJOIN_S[0] - 0.01)
+    # The first search has ended with the second loss, though its time has come.
+    assert all(core.of(LinkUp) == [] for core in cores.values())
+    network.run(3.0)
+    assert all(len(core.of(LinkUp)) == 1 for core in cores.values())
+
+
+def test_a_node_that_is_unplugged_stays_so_when_the_router_comes_back() -> None:
+    network, cores = crowd()
+    network.disconnect("a")
+    network.lose_router()
+    network.disconnect("b")
+    network.restore_router()
+    network.run(3.0)
+    for name in ("a", "b"):
+        assert len(cores[name].of(LinkDown)) == 1
+        assert cores[name].of(LinkUp) == []
+    assert sorted(cores["c"].tokens[4:]) == ["+c", "+d"]
+    network.reconnect("a")
+    network.reconnect("b")
+    network.run(4.0)
+    assert all(len(cores[name].of(LinkUp)) == 1 for name in ("a", "b"))
+    assert sorted(cores["c"].tokens[4:]) == ["+a", "+b", "+c", "+d"]
+
+
+def test_nobody_connects_while_the_router_is_lost() -> None:
+    network, cores = crowd()
+    network.disconnect("a")
+    network.lose_router()
+    network.reconnect("a")
+    late = Recorder(at_start(Listen(HEARTBEAT), Watch(VEHICLE_ALIVE), token("late")))
+    network.add("late", late, REALM)
+    network.run(2.0)
+    assert [type(event) for _, event in late.events] == [Started, LinkDown]
+    assert cores["a"].of(LinkUp) == []
+    network.restore_router()
+    network.run(4.0)
+    assert len(cores["a"].of(LinkUp)) == len(late.of(LinkUp)) == 1
+    assert sorted(late.tokens) == ["+a", "+b", "+c", "+d", "+late"]
+    assert "+late" in cores["a"].tokens
+
+
+def test_a_sleeper_looks_for_the_router_when_it_wakes() -> None:
+    network, cores = crowd()
+    network.pause("a")
+    network.run(1.0)
+    network.lose_router()
+    network.run(1.5)
+    network.restore_router()
+    network.run(5.0)
+    assert cores["a"].events == []
+    assert "+a" not in cores["b"].tokens
+    network.resume("a")
+    assert sorted(cores["a"].tokens) == ["-a", "-b", "-c", "-d"]
+    network.run(6.0)
+    assert cores["a"].times(LinkUp) == [pytest.approx(5.55, abs=0.35)]
+    assert "+a" in cores["b"].tokens
+
+
+def test_a_node_may_be_killed_or_end_while_the_router_is_lost() -> None:
+    network, cores = crowd()
+    network.lose_router()
+    network.kill("a")
+    perform(network, "b", End())
+    cores["c"].on_event = lambda event, _: [End()] if isinstance(event, LinkUp) else []
+    network.restore_router()
+    network.run(3.0)
+    assert network.names == ("d",)
+    assert cores["a"].of(LinkUp) == cores["b"].of(LinkUp) == []
+    tokens = cores["d"].tokens[4:]
+    assert "+a" not in tokens
+    assert "+b" not in tokens
+    assert ("+c" in tokens) == ("-c" in tokens)
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("fault", ["disconnect", "kill"])
+def test_a_node_that_goes_while_it_looks_for_the_router_never_finds_it(
+    fault: str, seed: int
+) -> None:
+    network, cores = crowd(seed)
+    network.lose_router()
+    network.restore_router()
+    network.run(0.2)
+    getattr(network, fault)("a")
+    network.run(3.0)
+    assert cores["a"].of(LinkUp) == []
+    for name in ("b", "c", "d"):
+        assert sorted(cores[name].tokens[4:]) == ["+b", "+c", "+d"]
+
+
+def test_a_node_may_end_when_it_loses_the_router() -> None:
+    network, cores = crowd()
+    cores["b"].on_event = lambda event, _: [End()] if isinstance(event, LinkDown) else []
+    network.lose_router()
+    assert network.names == ("a", "c", "d")
+    network.restore_router()
+    network.run(3.0)
+    assert sorted(cores["a"].tokens[4:]) == ["+a", "+c", "+d"]
+
+
+# --- questions --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fault", ["kill", "disconnect", "pause", "stop"])
+def test_a_question_is_settled_when_no_server_can_answer_it(fault: str) -> None:
+    network = SimulatedNetwork(1, Conditions(lease_s=0.5))
+    for name in "ab":
+        network.add(name, Recorder(at_start(Serve(SERVICE))), REALM)
+    network.run(0.1)
+    answers: list[Answer | None] = []
+    network.ask(Keys(REALM).key(SERVICE), b"?", answers.append)
+    network.run(0.2)
+    getattr(network, fault)("a")
+    network.run(1.0)
+    assert answers == []
+    getattr(network, fault)("b")
+    network.run(2.0)
+    assert answers == [None]
+    if fault == "pause":
+        # An answer that comes after the lease is ignored.
+        network.resume("a")
+        network.node("a")._transport.answer(1, b"!", ok=True)
+        network.run(3.0)
+        assert answers == [None]
