@@ -23,7 +23,7 @@ from cattrs.errors import (
 )
 from cattrs.gen import make_dict_structure_fn
 
-from laneweave.protocol.errors import BadInputError, one_line
+from laneweave.protocol.errors import BadInputError
 
 T = TypeVar("T")
 Hook = Callable[[Any, Any], Any]
@@ -189,9 +189,9 @@ def first_problem(error: Exception, path: str = "") -> BadInputError:
             return first_problem(inner, path + _step(inner, bool(path)))
     if isinstance(error, ForbiddenExtraKeysError):
         allowed = sorted(attribute.alias for attribute in attrs.fields(error.cl))
-        key = min(error.extra_fields)
-        name = one_line(key, 80) or repr(key)  # names are user input and must be readable
-        problem = BadInputError(name, "an unknown key", "one of " + ", ".join(allowed))
+        problem = BadInputError(
+            min(error.extra_fields), "an unknown key", "one of " + ", ".join(allowed)
+        )
         return problem.within(path)
     if isinstance(error, BadInputError):
         return error.within(path)

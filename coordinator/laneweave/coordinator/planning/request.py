@@ -19,7 +19,7 @@ from laneweave.coordinator.planning.geometry.conflict_table import conflict_tabl
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.structures import STRUCTURES, shortage, structure_targets
-from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.errors import BadInputError, one_line
 from laneweave.protocol.lattice import Cell, Mode
 from laneweave.protocol.scenario.tables import CONFLICT_KINDS, SOLVERS
 from laneweave.protocol.structuring import structure
@@ -154,7 +154,7 @@ class PlanRequest:
             raise BadInputError("request", data, "an object")
         if data.get("schema") != REQUEST_SCHEMA:
             raise BadInputError("schema", data.get("schema"), repr(REQUEST_SCHEMA))
-        _check_no_null("", data)
+        _check_json("", data)
         if "targets" not in data and "structure" not in data:
             raise BadInputError("targets", None, "a list of cells; or a structure instead")
         if "targets" in data and "structure" in data:
@@ -234,11 +234,18 @@ def _is_given(attribute: attrs.Attribute[Any], value: object) -> bool:
     return value is not None and value != "" and (attribute.name != "targets" or value != ())
 
 
-def _check_no_null(parent: str, value: object) -> None:
-    """Reject null: absent keys have defaults. A geometry may have null for no limit."""
+def _check_json(parent: str, value: object) -> None:
+    """Reject null and unreadable keys; error messages show keys on one line.
+
+    Absent keys have defaults. A geometry may have null for no limit.
+    """
     items: Any = ()
     if isinstance(value, Mapping):
         prefix = f"{parent}." if parent else ""
+        for key, item in value.items():
+            shown = one_line(str(key), 80) or repr(key)
+            if shown != key:
+                raise BadInputError(prefix + shown, item, "only known keys")
         items = ((key, f"{prefix}{key}", item) for key, item in value.items())
     elif isinstance(value, list | tuple):
         items = ((i, f"{parent}[{i}]", item) for i, item in enumerate(value))
@@ -246,7 +253,7 @@ def _check_no_null(parent: str, value: object) -> None:
         if item is None:
             raise BadInputError(field, None, "a value, or no such key")
         if key != "geometry":
-            _check_no_null(field, item)
+            _check_json(field, item)
 
 
 def _check_range(field: str, value: int, low: int, high: int) -> None:
