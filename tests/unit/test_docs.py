@@ -96,7 +96,7 @@ def code(text: str) -> str:
     return text.strip("`")
 
 
-# --- docs/ARCHITECTURE.md: every field of a scenario ---------------------------------------------
+# --- docs/SCENARIO.md: every field of a scenario -------------------------------------------------
 
 UNITS = {
     "veh_per_lane_h": "vehicles/(lane h)",
@@ -180,18 +180,18 @@ def _number(value: float) -> str:
 
 
 def test_table_of_scenario_fields() -> None:
-    part = section(read("ARCHITECTURE.md"), "### All fields")
+    part = section(read("SCENARIO.md"), "## All fields")
     found = rows(part)
     meanings = {code(cells[0]): cells[-1] for cells in found}
     expected = scenario_table(meanings)
     shown = "\n".join(text for text in part.splitlines() if text.startswith("|"))
-    assert shown == expected, f"the table in ARCHITECTURE.md should be\n\n{expected}\n"
+    assert shown == expected, f"the table in SCENARIO.md should be\n\n{expected}\n"
     lacking = [name for name, _ in _scenario_fields() if meanings[name] in ("", "?")]
     assert not lacking, f"fields without a meaning: {lacking}"
 
 
 def test_rows_that_cross_check_fields_name_fields_that_exist() -> None:
-    part = section(read("ARCHITECTURE.md"), "### Rules between fields")
+    part = section(read("SCENARIO.md"), "## Rules between fields")
     known = {name for name, _ in _scenario_fields()}
     named = set(re.findall(r"`([a-z]+\.[a-z_0-9]+)`", part))
     assert named
