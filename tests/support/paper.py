@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from attrs import evolve
+from attrs import evolve, fields
 
-from laneweave.protocol.scenario.tables import FormationSettings, Scenario
+from laneweave.protocol.scenario.tables import FormationSettings, Scenario, Sensing
 from laneweave.protocol.wire.messages import CensusEntry, ClosedFormation
 from laneweave.sim_bridge.road.formation_building import formation_builder
 
@@ -14,18 +14,15 @@ FORMATIONS = FormationSettings(
     operation="formations", entry="interlaced", close="columns", cycle_s=4.0
 )
 PAPER = Scenario(formation=FORMATIONS)
+EXACT = Sensing(**dict.fromkeys((field.name for field in fields(Sensing)), 0.0))
+"""Sensors without errors."""
 
 
 def paper(scenario: Scenario) -> Scenario:
     """Return a scenario in the paper's operation."""
-    formation = evolve(
-        scenario.formation,
-        operation="formations",
-        entry="interlaced",
-        close="columns",
-        cycle_s=4.0,
-    )
-    return evolve(scenario, formation=formation)
+    names = ("operation", "entry", "close", "cycle_s")
+    changes = {name: getattr(FORMATIONS, name) for name in names}
+    return evolve(scenario, formation=evolve(scenario.formation, **changes))
 
 
 def closing_time_s(block: int, scenario: Scenario = PAPER) -> float:

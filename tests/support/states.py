@@ -1,11 +1,20 @@
-"""VEHICLE_STATE messages for tests."""
+"""Messages for tests, and what a core has sent."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterable, Mapping
+from typing import Any, TypeVar
 
-from laneweave.protocol.lattice import Cell
-from laneweave.protocol.wire.messages import Ballot, Name, VehicleState
+import numpy as np
+
+from laneweave.protocol.lattice import Cell, PlannedMove, territory
+from laneweave.protocol.runtime.node import Effect, Send
+from laneweave.protocol.vehicle.motion import cell_state
+from laneweave.protocol.wire.messages import Ballot, Command, Name, Plan, Sense, VehicleState
+from support.paper import PAPER
+
+T = TypeVar("T")
+BALLOT = Ballot(1, Name("c1"), 1, 1)
 
 
 def holding(
@@ -33,3 +42,77 @@ def holding(
         "t_s": 0.0,
     }
     return VehicleState(**(values | more))
+
+
+def make_plan(
+    cells: Mapping[Name, Cell],
+    moves: Mapping[Name, tuple[PlannedMove, ...]] | None = None,
+    **more: object,
+) -> Plan:
+    """Return a plan of vehicles in cells, which hold unless they have moves.
+
+    Args:
+        cells: start cell of each vehicle of the roster.
+        moves: moves of those that move.
+        more: replaces fields; incarnations are 1, and the ballot is `BALLOT`.
+    """
+    all_moves = {name: (moves or {}).get(name, ()) for name in cells}
+    steps = [move for each in all_moves.values() for move in each]
+    values: dict[str, Any] = {
+        "ballot": BALLOT,
+        "formations": (0,),
+        "roster": tuple(cells),
+        "incarnations": dict.fromkeys(cells, 1),
+        "start_cells": dict(cells),
+        "moves": all_moves,
+        "t0_s": 0.0,
+        "slot_s": 4.0,
+        "territory": tuple(sorted(territory(cells.values(), steps))),
+    }
+    return Plan(**(values | more))
+
+
+def sense_in(cell: Cell, tick: int = 0, **more: Any) -> Sense:  # noqa: ANN401 (fields)
+    """Return what a vehicle senses that holds exactly in a cell; `more` replaces fields."""
+    t_s = tick * PAPER.runtime.tick_s
+    formation = PAPER.lattice.block_of(cell[0])
+    values: dict[str, Any] = {
+        "vehicle": Name("me"),
+        "tick": tick,
+        "t_s": t_s,
+        "state": cell_state(PAPER.lattice, cell, t_s),
+        "hold_cell": cell,
+        "motion_end_tick": 0,
+        "motion_origin": cell,
+        "preferred_lane": 0,
+        "ahead": (),
+        "formation": formation,
+        "joined": (formation,),
+    }
+    return Sense(**(values | more))
+
+
+def command(
+    tick: int, *pairs: tuple[float, float], hold_cell: Cell = (0, 1), **more: object
+) -> Command:
+    """Return a command with a jerk for each tick; `more` replaces fields."""
+    values: dict[str, Any] = {
+        "vehicle": Name("me"),
+        "incarnation": 1,
+        "tick": tick,
+        "hold_cell": hold_cell,
+        "motion_end_tick": tick + len(pairs),
+        "motion_origin": (0, 1),
+        "jerks": jerks(*pairs),
+    }
+    return Command(**(values | more))
+
+
+def jerks(*pairs: tuple[float, float], ticks: int = 1) -> bytes:
+    """Return jerks (along, across) as they are sent; `ticks` repeats them."""
+    return np.array(pairs * ticks, dtype="<f4").tobytes()
+
+
+def sent(effects: Iterable[Effect], kind: type[T]) -> list[T]:
+    """Return the messages of a kind."""
+    return [e.message for e in effects if isinstance(e, Send) and isinstance(e.message, kind)]

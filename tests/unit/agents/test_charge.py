@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import pytest
 from attrs import evolve
 
 from laneweave.agents.core import AgentCore
-from laneweave.agents.driving.driver import Drive, SolverStats
-from laneweave.protocol.lattice import Cell, PlannedMove
+from laneweave.launch.fault_search.stand_ins import LightDriver
+from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Effect, Send, Wakeup
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.vehicle.motion import cell_state
 from laneweave.protocol.wire.messages import (
     Ballot,
     Command,
-    Motion,
     Name,
     Prepare,
     Report,
@@ -24,40 +23,29 @@ from laneweave.protocol.wire.messages import (
     VehicleState,
 )
 from laneweave.protocol.wire.topics import PLAN, PREPARE, SENSE, STATE
-from support.agent_rig import BALLOT, HOME, LATTICE, ME, OTHER, TICK_S, Rig, make_plan, sent
-from support.states import holding
+from support.agent_rig import HOME, ME, OTHER, Rig
+from support.states import BALLOT, holding, make_plan, sense_in, sent
+
+OTHER_IS_READY = holding(OTHER, BALLOT, accepted=True, ready=True, done=True, speed_mps=15.0)
+"""The state of the other member, which has accepted the plan."""
 
 
-class Passenger:
-    """A driver that drives nothing and records calls."""
+class Passenger(LightDriver):
+    """A driver that records when it takes over, and is at rest when the test says so."""
 
-    solver_stats = SolverStats()
-
-    def __init__(self, _: Scenario) -> None:
+    def __init__(self, scenario: Scenario) -> None:
         """Begin without calls."""
+        super().__init__(scenario)
         self.taken_over: list[int] = []
-        self.begun: list[PlannedMove] = []
         self.resting = True
 
     def take_over(self, sense: Sense) -> None:
+        super().take_over(sense)
         self.taken_over.append(sense.tick)
-
-    def begin(self, move: PlannedMove, tick: int, ticks: int) -> None:
-        del tick, ticks
-        self.begun.append(move)
 
     def at_rest(self, sense: Sense) -> bool:
         del sense
         return self.resting
-
-    def drive(self, sense: Sense, *, moving: bool) -> Drive:
-        return Drive(sense.tick + 1 if moving else 0, HOME, 0, b"")
-
-    def motion(self, tick: int) -> None:
-        """Publish nothing."""
-
-    def on_motion(self, motion: Motion) -> None:
-        """Ignore motions."""
 
 
 class Seat:
@@ -85,22 +73,10 @@ class Seat:
     def shown(self) -> VehicleState:
         return self.rig.shown[-1]
 
-    def feel(
-        self,
-        attendant: int,
-        *,
-        caretaker: bool = False,
-        joined: tuple[int, ...] = (0,),
-        accepted: Ballot | None = None,
-        cell: Cell = HOME,
-    ) -> list[Effect]:
+    def feel(self, attendant: int, *, cell: Cell = HOME, **more: Any) -> list[Effect]:  # noqa: ANN401
         """Send it the next tick, with a process in charge."""
         self.tick += 1
-        self.last = Sense(
-            ME, self.tick, self.tick * TICK_S, cell_state(LATTICE, cell, self.tick * TICK_S),
-            cell, 0, cell, 0, (), attendant=attendant, caretaker=caretaker, joined=joined,
-            accepted=accepted,
-        )  # fmt: skip
+        self.last = sense_in(cell, self.tick, attendant=attendant, **more)
         return self.rig.hand(SENSE, self.last)
 
     def repeat(self) -> list[Effect]:
@@ -131,7 +107,7 @@ class Seat:
     def plan(self, *formations: int, incarnation: int = 1) -> list[Effect]:
         cells: dict[Name, Cell] = {ME: HOME, OTHER: (0, 0)}
         incarnations = {ME: incarnation, OTHER: 1}
-        plan = make_plan({ME: (), OTHER: ()}, cells, incarnations, formations=formations or (0,))
+        plan = make_plan(cells, incarnations=incarnations, formations=formations or (0,))
         return self.rig.hand(PLAN, plan)
 
 
@@ -151,7 +127,7 @@ def command_of(effects: Iterable[Effect]) -> Command:
 # --- claiming ---------------------------------------------------------------------------------
 
 
-def test_the_first_answer_is_only_a_claim() -> None:
+def test_the_first_answer_is_a_claim_and_states_follow_once_a_sense_grants_it() -> None:
     seat = Seat()
     effects = seat.feel(0)
     assert kinds(effects) == [Command]
@@ -159,30 +135,6 @@ def test_the_first_answer_is_only_a_claim() -> None:
     assert (command.incarnation, command.tick, command.hold_cell) == (1, 1, HOME)
     assert seat.repeat() == effects
     assert not seat.agent.in_charge
-
-
-def test_it_promises_and_accepts_nothing_before_it_is_in_charge() -> None:
-    seat = Seat()
-    other = state_of(OTHER)
-    for effects in (
-        seat.prepare(),  # before it has met its vehicle at all
-        seat.plan(),
-        seat.rig.hand(STATE, other),
-        seat.rig.handle(Wakeup()),
-    ):
-        assert effects == []
-    seat.feel(0)
-    assert seat.prepare() == []
-    assert seat.plan() == []
-    assert seat.rig.hand(STATE, other) == []
-    assert wanted(seat) == ()
-    seat.feel(1)
-    assert (seat.shown.promised, seat.shown.accepted) == (None, False)
-
-
-def test_it_publishes_states_once_a_sense_shows_that_it_is_in_charge() -> None:
-    seat = Seat()
-    seat.feel(0)
     effects = seat.feel(1)
     assert seat.agent.in_charge
     assert kinds(effects) == [Command, VehicleState]
@@ -190,6 +142,21 @@ def test_it_publishes_states_once_a_sense_shows_that_it_is_in_charge() -> None:
     assert kinds(seat.prepare()) == [VehicleState]
     assert seat.shown.promised == BALLOT
     assert kinds(seat.repeat()) == [Command]  # the state is not published again
+
+
+def test_it_promises_and_accepts_nothing_before_it_is_in_charge() -> None:
+    seat = Seat()
+
+    def effects() -> list[Effect]:
+        received = seat.rig.hand(STATE, OTHER_IS_READY)
+        return [*seat.prepare(), *seat.plan(), *received, *seat.rig.handle(Wakeup())]
+
+    assert effects() == []  # before it has met its vehicle at all
+    seat.feel(0)
+    assert effects() == []
+    assert wanted(seat) == ()
+    seat.feel(1)
+    assert (seat.shown.promised, seat.shown.accepted) == (None, False)
 
 
 def test_v1_is_repeated_while_a_claim_is_under_way() -> None:
@@ -232,7 +199,7 @@ def test_superseded_by_another_agent_it_is_silent() -> None:
     higher = BALLOT._replace(seq=2)
     assert seat.prepare(ballot=higher) == []
     assert seat.plan() == []
-    assert seat.rig.hand(STATE, state_of(OTHER)) == []
+    assert seat.rig.hand(STATE, OTHER_IS_READY) == []
 
 
 def test_superseded_by_the_caretaker_it_claims_with_a_new_incarnation_and_no_memory() -> None:
@@ -255,13 +222,14 @@ def test_superseded_by_the_caretaker_it_claims_with_a_new_incarnation_and_no_mem
     assert seat.shown.accepted
 
 
-def test_a_lost_claim_is_repeated_with_the_same_incarnation() -> None:
+def test_a_lost_claim_is_repeated_with_the_same_incarnation_and_without_old_promises() -> None:
     seat = Seat()
     seat.take_charge()
+    seat.prepare(0, 1)
     caretaker = seat.rig.new_incarnation()
     claims = [command_of(seat.feel(caretaker, caretaker=True)) for _ in range(3)]
-    assert [claim.incarnation for claim in claims] == [3, 3, 3]
-    assert [claim.tick for claim in claims] == [3, 4, 5]
+    assert [(claim.incarnation, claim.tick) for claim in claims] == [(3, 3), (3, 4), (3, 5)]
+    assert {claim.joined for claim in claims} == {(0,)}
 
 
 def test_after_another_agent_has_died_it_claims_the_vehicle_from_its_caretaker() -> None:
@@ -394,14 +362,6 @@ def test_joined_formations_outlive_the_agent() -> None:
     assert seat.shown.joined == (0, 3)
 
 
-def test_promises_of_a_lost_charge_are_no_longer_requested() -> None:
-    seat = Seat()
-    seat.take_charge()
-    seat.prepare(0, 1)
-    caretaker = seat.rig.new_incarnation()
-    assert command_of(seat.feel(caretaker, caretaker=True)).joined == (0,)
-
-
 def test_states_matter_only_while_a_plan_waits_for_them() -> None:
     seat = Seat()
     seat.take_charge()
@@ -409,14 +369,9 @@ def test_states_matter_only_while_a_plan_waits_for_them() -> None:
     assert wanted(seat) == ()
     seat.plan()
     assert wanted(seat) == (0,)  # also while it is not noted yet: none is missed
-    seat.rig.hand(STATE, state_of(OTHER))
+    seat.rig.hand(STATE, OTHER_IS_READY)
     seat.note()
     assert wanted(seat) == (0,)
     seat.feel(1)
     assert seat.shown.go
     assert wanted(seat) == ()
-
-
-def state_of(name: Name) -> VehicleState:
-    """Return the state of a member that has accepted the plan and is ready."""
-    return holding(name, BALLOT, accepted=True, ready=True, done=True, speed_mps=15.0)

@@ -18,7 +18,7 @@ from laneweave.protocol.runtime.node import (
 )
 from laneweave.protocol.vehicle.execution import OVERDUE_SLOTS
 from laneweave.protocol.vehicle.motion import ARRIVED_ACROSS_M, ARRIVED_ALONG_M
-from laneweave.protocol.wire.messages import Command, Neighbour, Prepare, Report, VehicleState
+from laneweave.protocol.wire.messages import Command, Name, Neighbour, Prepare, Report, VehicleState
 from laneweave.protocol.wire.topics import (
     COMMAND,
     PLAN,
@@ -28,19 +28,10 @@ from laneweave.protocol.wire.topics import (
     STATE,
     VEHICLE_ALIVE,
 )
-from support.agent_rig import (
-    BALLOT,
-    HOME,
-    ME,
-    MOVE_TICKS,
-    OTHER,
-    SCENARIO,
-    TICK_S,
-    Rig,
-    make_plan,
-    sent,
-    up_and_running,
-)
+from support.agent_rig import HOME, ME, MOVE_TICKS, OTHER, SCENARIO, TICK_S, Rig, up_and_running
+from support.states import BALLOT, holding, make_plan, sent
+
+BOTH: dict[Name, Cell] = {ME: HOME, OTHER: (0, 0)}
 
 # --- coming and going -------------------------------------------------------------------------
 
@@ -60,34 +51,16 @@ def test_starts_with_its_own_topics_and_the_token_last() -> None:
 
 def test_the_state_contains_measurements_and_the_block_of_entry() -> None:
     rig = Rig()
-    rig.formation, rig.joined = 5, (5, 6)
-    rig.claim()
-    sense = rig.sense()
+    sense = attrs.evolve(rig.sense(), formation=5, joined=(5, 6))
+    rig.hand(SENSE, sense)
+    rig.coast(1)
+    sense = attrs.evolve(rig.sense(), formation=5, joined=(5, 6), attendant=1)
     command, state = (each for each in rig.hand(SENSE, sense) if isinstance(each, Send))
     assert (command.topic, command.parameters) == (COMMAND, {"vehicle": ME})
     assert (state.topic, state.parameters) == (STATE, {"formation": 5, "vehicle": ME})
-    assert rig.shown == [
-        VehicleState(
-            vehicle=ME,
-            incarnation=1,
-            formation=5,
-            joined=(5, 6),
-            promised=None,
-            accepted=False,
-            ready=False,
-            completed=0,
-            hold_cell=HOME,
-            moving=False,
-            go=False,
-            done=False,
-            overdue=False,
-            attended=True,
-            s_m=sense.state[0],
-            y_m=sense.state[3],
-            speed_mps=sense.state[1],
-            t_s=sense.t_s,
-        )
-    ]
+    s_m, speed_mps, _, y_m, *_ = sense.state
+    values = {"s_m": s_m, "y_m": y_m, "speed_mps": speed_mps, "t_s": TICK_S}
+    assert rig.shown == [holding(ME, None, HOME, formation=5, joined=(5, 6), **values)]
 
 
 def test_left_reports_once_and_withdraws_its_token_last() -> None:
@@ -160,7 +133,7 @@ def test_a_promise_is_shown_at_once_and_an_acceptance_as_soon_as_it_is_noted() -
     tick = rig.tick
     rig.hand(PREPARE, Prepare(BALLOT, (0,), (ME, OTHER)))
     assert (rig.shown[-1].promised, rig.shown[-1].accepted) == (BALLOT, False)
-    plan = make_plan({ME: (), OTHER: ()}, {ME: HOME, OTHER: (0, 0)}, {ME: 1, OTHER: 1})
+    plan = make_plan(BOTH)
     shown = len(rig.shown)
     asked = rig.hand(PLAN, plan)
     assert len(rig.shown) == shown
@@ -178,7 +151,7 @@ def test_a_promise_is_shown_at_once_and_an_acceptance_as_soon_as_it_is_noted() -
 def test_a_lost_note_is_requested_again_with_each_tick() -> None:
     rig = up_and_running()
     rig.hand(PREPARE, Prepare(BALLOT, (0,), (ME,)))
-    plan = make_plan({ME: ((0, HOME, (-1, 2)),)}, {ME: HOME}, {ME: 1})
+    plan = make_plan({ME: HOME}, {ME: ((0, HOME, (-1, 2)),)})
     rig.hand(PLAN, plan)  # what it asks is lost
     for _ in range(3):
         effects = rig.hand(SENSE, rig.sense())
@@ -197,7 +170,7 @@ def test_a_plan_beyond_its_own_block_is_not_accepted(beyond: Cell) -> None:
     """Plans of other formations run at the same time; only the blocks keep them apart."""
     rig = up_and_running()
     rig.hand(PREPARE, Prepare(BALLOT, (0,), (ME,)))
-    plan = make_plan({ME: ()}, {ME: HOME}, {ME: 1})
+    plan = make_plan({ME: HOME})
     assert rig.hand(PLAN, attrs.evolve(plan, territory=(HOME, beyond))) == []
     rig.confirm(rig.hand(PLAN, plan))
     assert rig.shown[-1].accepted
@@ -212,8 +185,8 @@ def test_a_move_ends_in_its_cell_on_time(target: Cell) -> None:
     rig.accept((0, HOME, target))
     state = rig.run()
     assert (state.moving, state.ready, state.hold_cell, state.completed) == (True, True, target, 0)
-    assert rig.motion_end_tick == rig.tick - 1 + MOVE_TICKS
-    assert rig.motion_origin == HOME
+    assert rig.controller.motion_end_tick == rig.tick - 1 + MOVE_TICKS
+    assert rig.controller.motion_origin == HOME
     state = rig.run(MOVE_TICKS)
     assert (state.moving, state.completed, state.done) == (False, 1, True)
     assert rig.off(target) < 0.12  # what the lag of its actuators leaves
@@ -238,15 +211,10 @@ def test_two_moves_in_their_slots() -> None:
 
 def test_v7_only_when_the_body_is_there() -> None:
     """A vehicle ahead keeps it back: time is over, but the move is not."""
-    rig = up_and_running()
-    rig.accept((0, HOME, (0, 1)))
-    rig.run(10)
-    for _ in range(60):  # a vehicle stays 4 m ahead of its current position
-        rig.ahead = (Neighbour(1, 4.0, SCENARIO.formation.speed_mps),)
-        state = rig.run()
-    assert rig.off((0, 1)) > ARRIVED_ALONG_M
+    rig = kept_back()
+    state = rig.shown[-1]
     assert (state.moving, state.completed) == (True, 0)
-    assert rig.motion_end_tick == rig.tick
+    assert rig.controller.motion_end_tick == rig.tick
     rig.ahead = ()
     while rig.run().moving:
         assert rig.tick < 400
@@ -254,13 +222,21 @@ def test_v7_only_when_the_body_is_there() -> None:
     assert rig.shown[-1].completed == 1
 
 
+def kept_back() -> Rig:
+    """Return a vehicle whose move ahead is late because of a vehicle 4 m ahead."""
+    rig = up_and_running()
+    rig.accept((0, HOME, (0, 1)))
+    rig.run(10)
+    rig.ahead = (Neighbour(1, 4.0, SCENARIO.formation.speed_mps),)
+    rig.run(60)
+    assert rig.off((0, 1)) > ARRIVED_ALONG_M
+    return rig
+
+
 def test_overdue_is_shown() -> None:
     rig = up_and_running()
     rig.hand(PREPARE, Prepare(BALLOT, (0,), (ME, OTHER)))
-    plan = make_plan(
-        {ME: ((0, HOME, (-1, 2)),), OTHER: ()}, {ME: HOME, OTHER: (0, 0)}, {ME: 1, OTHER: 1}
-    )
-    rig.confirm(rig.hand(PLAN, plan))
+    rig.confirm(rig.hand(PLAN, make_plan(BOTH, {ME: ((0, HOME, (-1, 2)),)})))
     patience = round(OVERDUE_SLOTS * SCENARIO.cycles_s[0] / TICK_S)
     assert not rig.run(patience - rig.tick).overdue
     assert rig.run().overdue
@@ -283,7 +259,7 @@ def test_restart_takes_the_motion_over(silent_ticks: int) -> None:
     assert (state.incarnation, state.promised, state.hold_cell) == (2, None, (0, 2))
     assert state.moving == under_way
     if under_way:
-        assert rig.motion_origin == HOME
+        assert rig.controller.motion_origin == HOME
     state = rig.run(MOVE_TICKS)
     assert (state.moving, state.completed) == (False, 0)
     assert rig.off((0, 2)) < 0.1
@@ -307,21 +283,13 @@ def test_restart_while_moving_is_not_ready_before_the_motion_ends() -> None:
 
 def test_restart_of_a_vehicle_that_is_late_still_counts_as_moving() -> None:
     """The time of its motion is over, but the body still occupies the cell that it leaves."""
-    rig = up_and_running()
-    rig.accept((0, HOME, (0, 1)))
-    rig.run(10)
-    for _ in range(60):
-        rig.ahead = (Neighbour(1, 4.0, SCENARIO.formation.speed_mps),)
-        rig.run()
+    rig = kept_back()
     rig.restart()
     rig.claim()
     state = rig.run()
     assert rig.off((0, 1)) > ARRIVED_ALONG_M
     assert state.moving
-    rig.hand(PREPARE, Prepare(BALLOT._replace(seq=2), (0,), (ME,)))
-    plan = make_plan({ME: ()}, {ME: (0, 1)}, {ME: 2}, BALLOT._replace(seq=2))
-    rig.confirm(rig.hand(PLAN, plan))
-    assert rig.shown[-1].accepted
+    rig.accept(ballot=BALLOT._replace(seq=2))
     assert not rig.shown[-1].ready
     rig.ahead = ()
     while rig.run().moving:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import pytest
 from attrs import evolve
@@ -20,7 +21,6 @@ from laneweave.protocol.runtime.node import (
     Listen,
     PeerDown,
     PeerUp,
-    Send,
     Started,
     Stopping,
     Unlisten,
@@ -29,18 +29,14 @@ from laneweave.protocol.runtime.node import (
     Withdraw,
 )
 from laneweave.protocol.scenario.deployment import Shard
-from laneweave.protocol.vehicle.motion import cell_state
 from laneweave.protocol.wire.messages import (
     Announcement,
-    Ballot,
     Census,
     CensusEntry,
     Command,
     Name,
-    Plan,
     Prepare,
     Report,
-    Sense,
     VehicleState,
 )
 from laneweave.protocol.wire.topics import (
@@ -55,16 +51,18 @@ from laneweave.protocol.wire.topics import (
     Topic,
 )
 from support.paper import PAPER
+from support.states import BALLOT, make_plan, sense_in, sent
 
-SCENARIO = PAPER
 A, B, C = Name("A"), Name("B"), Name("C")
-BALLOT = Ballot(1, Name("c1"), 1, 1)
 FRONT: Cell = (0, 0)
 """In formation 0; the next block begins at column -4."""
+SIDE: Cell = (-1, 1)
+"""Likewise."""
+STATES_OF_0 = STATE, {"formation": 0}
 
 
 def make_host(*vehicles: Name, shard: Shard | None = None) -> AgentHost:
-    return AgentHost(lambda name: AgentCore(name, lambda: 1, SCENARIO), vehicles, shard)
+    return AgentHost(lambda name: AgentCore(name, lambda: 1, PAPER), vehicles, shard)
 
 
 def give(host: AgentHost, event: Event, now_s: float = 0.0) -> list[Effect]:
@@ -75,40 +73,22 @@ def hand(host: AgentHost, topic: Topic, vehicle: Name, message: object) -> list[
     return give(host, Arrived(topic, {"vehicle": vehicle}, message))
 
 
-def sense(
+def feel(
+    host: AgentHost,
     vehicle: Name,
-    cell: Cell,
+    cell: Cell = FRONT,
     tick: int = 1,
-    *,
-    attendant: int = 1,
-    joined: tuple[int, ...] | None = None,
-    accepted: Ballot | None = None,
-    left: bool = False,
-) -> Sense:
-    """Return what a vehicle senses whose agent is in charge, unless another attendant is given."""
-    t_s = tick * SCENARIO.runtime.tick_s
-    state = cell_state(SCENARIO.lattice, cell, t_s)
-    formation = SCENARIO.lattice.block_of(cell[0])
-    return Sense(
-        vehicle, tick, t_s, state, cell, 0, cell, 0, (), formation=formation, attendant=attendant,
-        joined=(formation,) if joined is None else joined, accepted=accepted, left=left,
-    )  # fmt: skip
+    **more: Any,  # noqa: ANN401 (fields)
+) -> list[Effect]:
+    """Send a vehicle its SENSE; its agent is in charge, unless another attendant is given."""
+    felt = sense_in(cell, tick, vehicle=vehicle, **({"attendant": 1} | more))
+    return hand(host, SENSE, vehicle, felt)
 
 
-def senders(effects: Iterable[Effect], kind: type[Command] | type[VehicleState]) -> list[str]:
-    return [
-        effect.message.vehicle
-        for effect in effects
-        if isinstance(effect, Send) and isinstance(effect.message, kind)
-    ]
-
-
-def shown_by(effects: Iterable[Effect]) -> list[VehicleState]:
-    return [
-        effect.message
-        for effect in effects
-        if isinstance(effect, Send) and isinstance(effect.message, VehicleState)
-    ]
+def show(host: AgentHost, state: VehicleState) -> list[Effect]:
+    """Bring the host a state of a vehicle, as the network does."""
+    key = {"formation": str(state.formation), "vehicle": state.vehicle}
+    return give(host, Arrived(STATE, key, state))
 
 
 def census(*on_road: Name, announced: Iterable[Name] = ()) -> Census:
@@ -126,14 +106,10 @@ def accept(
     effects: list[Effect] = []
     for name in cells:
         effects += hand(host, PREPARE, name, Prepare(BALLOT, formations, tuple(cells)))
-    plan = Plan(
-        BALLOT, formations, tuple(cells), dict.fromkeys(cells, 1), cells, dict.fromkeys(cells, ()),
-        0.0, 4.0, tuple(cells.values()),
-    )  # fmt: skip
+    plan = make_plan(cells, formations=formations)
     for name, cell in cells.items():
         effects += hand(host, PLAN, name, plan)
-        noted = sense(name, cell, joined=formations, accepted=BALLOT)
-        effects += hand(host, SENSE, name, noted)
+        effects += feel(host, name, cell, joined=formations, accepted=BALLOT)
     return effects
 
 
@@ -141,95 +117,69 @@ def test_events_go_to_the_vehicle_that_they_concern() -> None:
     host = make_host(A, B)
     started = give(host, Started())
     assert [e.parameters["vehicle"] for e in started if isinstance(e, Announce)] == [A, B]
-    effects = hand(host, SENSE, B, sense(B, (-1, 1)))
-    assert senders(effects, Command) == senders(effects, VehicleState) == [B]
-    hand(host, SENSE, A, sense(A, FRONT))
+    effects = feel(host, B, SIDE)
+    assert [each.vehicle for each in sent(effects, Command)] == [B]
+    assert [each.vehicle for each in sent(effects, VehicleState)] == [B]
+    feel(host, A)
     effects = hand(host, PREPARE, A, Prepare(BALLOT, (0,), (A, B)))
-    assert [(s.vehicle, s.promised) for s in shown_by(effects)] == [(A, BALLOT)]
-    assert hand(host, SENSE, C, sense(C, FRONT)) == []
+    assert [(s.vehicle, s.promised) for s in sent(effects, VehicleState)] == [(A, BALLOT)]
+    assert feel(host, C) == []
 
 
-def test_states_go_to_the_members_of_the_formation() -> None:
+@pytest.mark.parametrize("formation", [0, 1])
+def test_states_go_to_the_members_of_their_formation(formation: int) -> None:
     host = make_host(A, B, C)
-    cells: dict[Name, Cell] = {A: FRONT, B: (-1, 1)}
-    for name, cell in (*cells.items(), (C, (-4, 0))):
-        hand(host, SENSE, name, sense(name, cell))
-    *_, last = shown_by(accept(host, cells))
+    for name, cell in ((A, FRONT), (B, SIDE), (C, (-4, 0))):
+        feel(host, name, cell)
+    *_, last = sent(accept(host, {A: FRONT, B: SIDE}), VehicleState)
     assert (last.vehicle, last.ready) == (B, True)
-    give(host, Arrived(STATE, {"formation": "0", "vehicle": B}, last))
-    (state,) = shown_by(hand(host, SENSE, A, sense(A, FRONT, 2)))
-    assert state.go  # A has heard B
-    (state,) = shown_by(hand(host, SENSE, B, sense(B, (-1, 1), 2)))
+    show(host, evolve(last, formation=formation))
+    (state,) = sent(feel(host, A, FRONT, 2), VehicleState)
+    assert state.go is (formation == 0)  # A has heard B
+    (state,) = sent(feel(host, B, SIDE, 2), VehicleState)
     assert not state.go  # B has not heard A
 
 
-def test_states_of_other_formations_are_not_handed_on() -> None:
+@pytest.mark.parametrize(("rear", "formations"), [(SIDE, (0,)), ((-4, 0), (0, 1))])
+def test_host_subscribes_to_all_formations_of_a_plan_while_an_agent_waits(
+    rear: Cell, formations: tuple[int, ...]
+) -> None:
     host = make_host(A, B)
-    cells: dict[Name, Cell] = {A: FRONT, B: (-1, 1)}
+    cells: dict[Name, Cell] = {A: FRONT, B: rear}
     for name, cell in cells.items():
-        hand(host, SENSE, name, sense(name, cell))
-    *_, last = shown_by(accept(host, cells))
-    elsewhere = evolve(last, formation=1)
-    give(host, Arrived(STATE, {"formation": "1", "vehicle": B}, elsewhere))
-    (state,) = shown_by(hand(host, SENSE, A, sense(A, FRONT, 2)))
-    assert not state.go
-
-
-def test_host_subscribes_to_a_formation_only_while_an_agent_waits() -> None:
-    host = make_host(A, B)
-    cells: dict[Name, Cell] = {A: FRONT, B: (-1, 1)}
-    for name, cell in cells.items():
-        assert Listen(STATE, {"formation": 0}) not in hand(host, SENSE, name, sense(name, cell))
-    effects = accept(host, cells)
-    assert effects.count(Listen(STATE, {"formation": 0})) == 1
-    first, second = (s for s in shown_by(effects) if s.accepted)
-    key = {"formation": "0", "vehicle": first.vehicle}
-    give(host, Arrived(STATE, key, first))
-    assert give(host, Arrived(STATE, {**key, "vehicle": second.vehicle}, second)) == []
-    hand(host, SENSE, A, sense(A, FRONT, 2))
-    assert Unlisten(STATE, {"formation": 0}) in hand(host, SENSE, B, sense(B, (-1, 1), 2))
-
-
-def test_host_subscribes_to_all_formations_of_a_joint_plan_while_an_agent_waits() -> None:
-    host = make_host(A, B)
-    cells: dict[Name, Cell] = {A: FRONT, B: (-4, 0)}
-    for name, cell in cells.items():
-        hand(host, SENSE, name, sense(name, cell, joined=(0, 1)))
-    effects = accept(host, cells, (0, 1))
-    topics = [effect for effect in effects if isinstance(effect, Listen)]
-    assert topics == [Listen(STATE, {"formation": 0}), Listen(STATE, {"formation": 1})]
-    first, second = (state for state in shown_by(effects) if state.accepted)
-    assert (first.formation, second.formation) == (0, 1)
-    give(host, Arrived(STATE, {"formation": "0", "vehicle": A}, first))
-    give(host, Arrived(STATE, {"formation": "1", "vehicle": B}, second))
-    (state,) = shown_by(hand(host, SENSE, A, sense(A, FRONT, 2, joined=(0, 1))))
+        assert Listen(*STATES_OF_0) not in feel(host, name, cell, joined=formations)
+    effects = accept(host, cells, formations)
+    assert [effect for effect in effects if isinstance(effect, Listen)] == [
+        Listen(STATE, {"formation": each}) for each in formations
+    ]
+    first, second = (state for state in sent(effects, VehicleState) if state.accepted)
+    assert (first.formation, second.formation) == (0, formations[-1])
+    assert show(host, first) == show(host, second) == []
+    (state,) = sent(feel(host, A, FRONT, 2, joined=formations), VehicleState)
     assert state.go
-    effects = hand(host, SENSE, B, sense(B, (-4, 0), 2, joined=(0, 1)))
+    effects = feel(host, B, rear, 2, joined=formations)
     assert [effect for effect in effects if isinstance(effect, Unlisten)] == [
-        Unlisten(STATE, {"formation": 0}),
-        Unlisten(STATE, {"formation": 1}),
+        Unlisten(STATE, {"formation": each}) for each in formations
     ]
 
 
 def test_an_agent_that_lost_charge_waits_for_no_states() -> None:
     host = make_host(A)
-    hand(host, SENSE, A, sense(A, FRONT))
-    assert Listen(STATE, {"formation": 0}) in accept(host, {A: FRONT, B: (-1, 1)})
-    effects = hand(host, SENSE, A, sense(A, FRONT, 2, attendant=9))
+    feel(host, A)
+    assert Listen(*STATES_OF_0) in accept(host, {A: FRONT, B: SIDE})
+    effects = feel(host, A, FRONT, 2, attendant=9)
     assert [e for e in effects if getattr(e, "topic", None) is not MOTION] == [
-        Unlisten(STATE, {"formation": 0})
+        Unlisten(*STATES_OF_0)
     ]
 
 
 def test_ends_when_the_last_vehicle_has_left() -> None:
     host = make_host(A, B)
     for name in (A, B):
-        hand(host, SENSE, name, sense(name, FRONT))
-    effects = hand(host, SENSE, A, sense(A, FRONT, 2, left=True))
-    assert End() not in effects
-    assert hand(host, SENSE, A, sense(A, FRONT, 3)) == []
-    effects = hand(host, SENSE, B, sense(B, FRONT, 2, left=True))
-    assert effects.count(End()) == 1
+        feel(host, name)
+    assert End() not in feel(host, A, FRONT, 2, left=True)
+    assert feel(host, A, FRONT, 3) == []
+    assert feel(host, B, FRONT, 2, left=True).count(End()) == 1
 
 
 def test_what_agents_have_counted_stays_when_they_end() -> None:
@@ -239,10 +189,10 @@ def test_what_agents_have_counted_stays_when_they_end() -> None:
         vehicles=2, vehicles_in_charge=0, solves_total=0, unusable_total=0
     )
     for name in (A, B):
-        hand(host, SENSE, name, sense(name, FRONT))
+        feel(host, name)
     (driving,) = host.metrics
     assert driving == evolve(before, vehicles_in_charge=2, solves_total=2)
-    hand(host, SENSE, A, sense(A, FRONT, 2, left=True))
+    feel(host, A, FRONT, 2, left=True)
     (after,) = host.metrics
     assert after == evolve(driving, vehicles=1, vehicles_in_charge=1)
 
@@ -250,15 +200,18 @@ def test_what_agents_have_counted_stays_when_they_end() -> None:
 def test_nothing_follows_the_end() -> None:
     """Not even the end of a subscription: the node has left the network by then."""
     host = make_host(A)
-    hand(host, SENSE, A, sense(A, FRONT))
-    accept(host, {A: FRONT, B: (-1, 1)})  # A waits for B's state
-    effects = hand(host, SENSE, A, sense(A, FRONT, 2, left=True))
-    assert effects[-2:] == [Unlisten(STATE, {"formation": 0}), End()]
+    feel(host, A)
+    accept(host, {A: FRONT, B: SIDE})  # A waits for B's state
+    effects = feel(host, A, FRONT, 2, left=True)
+    assert effects[-2:] == [Unlisten(*STATES_OF_0), End()]
 
 
-def test_ends_when_no_bridge_comes() -> None:
+@pytest.mark.parametrize("strangers", [[], ["ghost"]])
+def test_ends_when_no_bridge_comes(strangers: list[str]) -> None:
     host = make_host(A)
     give(host, Started(), 10.0)
+    for stranger in strangers:
+        give(host, PeerUp(BRIDGE_ALIVE, {"incarnation": stranger}), 11.0)
     assert host.wakeup_s == 10.0 + ALONE_S
     assert give(host, Wakeup(), 10.0 + ALONE_S) == [End()]
 
@@ -303,13 +256,6 @@ def test_what_is_no_newer_bridge_changes_nothing(other: str) -> None:
     assert give(shard, census_of(A)) == []  # it has the vehicle still
 
 
-def test_a_stranger_is_not_the_bridge_that_an_agent_waits_for() -> None:
-    host = make_host(A)
-    give(host, Started(), 10.0)
-    give(host, PeerUp(BRIDGE_ALIVE, {"incarnation": "ghost"}), 11.0)
-    assert give(host, Wakeup(), 10.0 + ALONE_S) == [End()]
-
-
 def test_a_shard_lets_go_of_vehicles_that_the_census_lacks() -> None:
     host = make_host(shard=Shard(0, 1))
     give(host, census_of(A, B))
@@ -334,12 +280,8 @@ def test_a_shard_accepts_the_census_of_its_own_bridge(other: int) -> None:
 
 
 def test_stopping_reports_for_every_vehicle() -> None:
-    reports = [
-        effect.message.name
-        for effect in give(make_host(A, B), Stopping())
-        if isinstance(effect, Send) and isinstance(effect.message, Report)
-    ]
-    assert reports == [A, B]
+    reports = sent(give(make_host(A, B), Stopping()), Report)
+    assert [report.name for report in reports] == [A, B]
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
@@ -369,8 +311,8 @@ def test_a_shard_takes_announced_vehicles_and_those_on_the_road_once() -> None:
 def test_a_shard_continues_without_vehicles_and_takes_none_twice() -> None:
     host = make_host(shard=Shard(0, 1))
     give(host, Arrived(CENSUS, {}, census(A)))
-    hand(host, SENSE, A, sense(A, FRONT))
-    assert End() not in hand(host, SENSE, A, sense(A, FRONT, 2, left=True))
+    feel(host, A)
+    assert End() not in feel(host, A, FRONT, 2, left=True)
     assert give(host, Arrived(CENSUS, {}, census(A))) == []
     assert give(host, Wakeup(), 1e6) == []
 

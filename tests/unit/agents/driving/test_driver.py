@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import attrs
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from laneweave.agents.driving.program import NO_GAPS, Gaps
 from laneweave.agents.driving.reference import Window
 from laneweave.agents.driving.tracker import Tracker, TrackResult
 from laneweave.protocol.lattice import Cell, PlannedMove
-from laneweave.protocol.scenario.tables import Scenario, Sensing
+from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import (
     ARRIVED_ACROSS_M,
     ARRIVED_ALONG_M,
@@ -26,8 +28,10 @@ from laneweave.protocol.wire.messages import Neighbour, Report, Sense
 from laneweave.protocol.wire.topics import SENSE
 from laneweave.sim_bridge.bodies.motion_controller import Rung
 from laneweave.sim_bridge.bodies.plant import Plant
-from support.agent_rig import HOME, LATTICE, ME, MOVE_TICKS, SCENARIO, TICK_S, sent, up_and_running
+from support.agent_rig import HOME, LATTICE, ME, MOVE_TICKS, SCENARIO, TICK_S, up_and_running
 from support.driving import Road
+from support.paper import EXACT
+from support.states import sense_in, sent
 
 N = SCENARIO.horizon_ticks
 MOVE: PlannedMove = (0, HOME, (-1, 2))
@@ -60,20 +64,12 @@ def sense(
     tick: int = 10,
     cell: Cell = HOME,
     *,
-    end_tick: int = 0,
-    origin: Cell | None = None,
-    ticks: int = 0,
     off: tuple[float, float] = (0.0, 0.0),
-    ahead: tuple[Neighbour, ...] = (),
-    behind: tuple[Neighbour, ...] = (),
+    **more: Any,  # noqa: ANN401 (fields)
 ) -> Sense:
     """Return what a vehicle senses that is `off` metres from its cell, along and across."""
-    t_s = tick * TICK_S
-    s, v, a, y, v_y, a_y = cell_state(LATTICE, cell, t_s)
-    state = (s + off[0], v, a, y + off[1], v_y, a_y)
-    return Sense(
-        ME, tick, t_s, state, cell, end_tick, origin or cell, 0, ahead, behind, motion_ticks=ticks
-    )
+    s, v, a, y, v_y, a_y = cell_state(LATTICE, cell, tick * TICK_S)
+    return sense_in(cell, tick, **{"state": (s + off[0], v, a, y + off[1], v_y, a_y), **more})
 
 
 def driver() -> TrackingDriver:
@@ -92,6 +88,16 @@ def with_probe(made: TrackingDriver, scenario: Scenario = SCENARIO) -> Probe:
 def probed() -> tuple[TrackingDriver, Probe]:
     made = driver()
     return made, with_probe(made)
+
+
+def follow(made: TrackingDriver, scenario: Scenario, ticks: int) -> tuple[Drive, dict[str, Any]]:
+    """Let a driver begin its move at tick 10 and drive a body; return how far both have come."""
+    plant = Plant(sense().state, scenario.vehicle, TICK_S)
+    for tick in range(10, 10 + ticks):
+        felt = sense(tick, state=plant.state, setpoint=plant.setpoint)
+        drive = made.drive(felt, moving=True)
+        plant.step(*jerks(drive)[0].tolist())
+    return drive, {"state": plant.state, "setpoint": plant.setpoint}
 
 
 def jerks(drive: Drive) -> NDArray[np.float64]:
@@ -125,72 +131,43 @@ def test_a_move_ends_after_its_time_and_its_horizon_ends_in_the_target() -> None
     assert end == pytest.approx(cell_state(LATTICE, MOVE[2], (10 + N) * TICK_S), abs=0.02)
 
 
-def test_a_motion_under_way_is_taken_over_where_it_is() -> None:
-    made = driver()
-    made.begin(MOVE, 10, MOVE_TICKS)
-    plant = Plant(sense().state, SCENARIO.vehicle, TICK_S)
-    for tick in range(10, 25):
-        felt = attrs.evolve(sense(tick), state=plant.state, setpoint=plant.setpoint)
-        drive = made.drive(felt, moving=True)
-        plant.step(*jerks(drive)[0].tolist())
-    felt = attrs.evolve(
-        sense(
-            25,
-            MOVE[2],
-            end_tick=drive.motion_end_tick,
-            origin=drive.motion_origin,
-            ticks=drive.motion_ticks,
-        ),
-        state=plant.state,
-        setpoint=plant.setpoint,
-    )
-    heir = TrackingDriver(SCENARIO)
+@pytest.mark.parametrize(
+    ("scenario", "ticks"), [(SCENARIO, MOVE_TICKS), (Scenario(), 44), (Scenario(), 68)]
+)
+def test_a_motion_under_way_is_taken_over_where_it_is(scenario: Scenario, ticks: int) -> None:
+    """A new process knows no plan: the motion controller has kept how long the move takes."""
+    made = TrackingDriver(scenario)
+    made.take_over(sense())
+    made.begin(MOVE, 10, ticks)
+    drive, body = follow(made, scenario, 20)
+    motion: dict[str, Any] = {
+        "motion_end_tick": 10 + ticks,
+        "motion_origin": HOME,
+        "motion_ticks": ticks,
+    }
+    assert {name: getattr(drive, name) for name in motion} == motion
+    felt = sense(30, MOVE[2], **motion, **body)
+    heir = TrackingDriver(scenario)
     heir.take_over(felt)
     assert not heir.at_rest(felt)
     theirs, mine = made.drive(felt, moving=True), heir.drive(felt, moving=True)
-    assert (mine.motion_end_tick, mine.motion_origin) == (10 + MOVE_TICKS, HOME)
-    assert mine.motion_ticks == MOVE_TICKS
+    assert {name: getattr(mine, name) for name in motion} == motion
     assert jerks(mine) == pytest.approx(jerks(theirs), abs=1e-3)
+    assert heir.motion(10 + 2 * REPEAT_TICKS) == Course(HOME, MOVE[2], 10, ticks)
 
 
 @pytest.mark.parametrize("end_tick", [0, 9, 10])
 def test_a_motion_whose_time_is_over_is_taken_over_as_a_hold(end_tick: int) -> None:
     made = TrackingDriver(SCENARIO)
-    made.take_over(sense(end_tick=end_tick, origin=(-2, 1), ticks=MOVE_TICKS))
+    made.take_over(sense(motion_end_tick=end_tick, motion_origin=(-2, 1), motion_ticks=MOVE_TICKS))
     assert made.at_rest(sense())
     assert made.drive(sense(), moving=False).motion_origin == HOME
-
-
-@pytest.mark.parametrize("ticks", [44, 68])
-def test_a_long_move_is_taken_over_with_the_time_that_it_takes(ticks: int) -> None:
-    """A new process knows no plan: the motion controller has kept how long the move takes."""
-    scenario = Scenario()
-    made = TrackingDriver(scenario)
-    made.take_over(sense())
-    made.begin(MOVE, 10, ticks)
-    plant = Plant(sense().state, scenario.vehicle, TICK_S)
-    for tick in range(10, 30):
-        felt = attrs.evolve(sense(tick), state=plant.state, setpoint=plant.setpoint)
-        drive = made.drive(felt, moving=True)
-        plant.step(*jerks(drive)[0].tolist())
-    assert (drive.motion_end_tick, drive.motion_ticks) == (10 + ticks, ticks)
-    felt = attrs.evolve(
-        sense(30, MOVE[2], end_tick=10 + ticks, origin=HOME, ticks=ticks),
-        state=plant.state,
-        setpoint=plant.setpoint,
-    )
-    heir = TrackingDriver(scenario)
-    heir.take_over(felt)
-    theirs, mine = made.drive(felt, moving=True), heir.drive(felt, moving=True)
-    assert (mine.motion_end_tick, mine.motion_ticks) == (10 + ticks, ticks)
-    assert jerks(mine) == pytest.approx(jerks(theirs), abs=1e-3)
-    assert heir.motion(10 + 2 * REPEAT_TICKS) == Course(HOME, MOVE[2], 10, ticks)
 
 
 @pytest.mark.parametrize("ticks", [0, MOVE_TICKS - 1, 2**63 - 1, -1])
 def test_a_move_of_an_impossible_duration_is_taken_over_as_a_hold(ticks: int) -> None:
     heir = TrackingDriver(SCENARIO)
-    heir.take_over(sense(25, MOVE[2], end_tick=48, origin=HOME, ticks=ticks))
+    heir.take_over(sense(25, MOVE[2], motion_end_tick=48, motion_origin=HOME, motion_ticks=ticks))
     drive = heir.drive(sense(25, MOVE[2]), moving=False)
     assert (drive.motion_origin, drive.motion_ticks) == (MOVE[2], 0)
 
@@ -210,18 +187,13 @@ def test_a_move_of_an_impossible_duration_is_taken_over_as_a_hold(ticks: int) ->
         (10 + MOVE_TICKS, (0.0, ARRIVED_ACROSS_M + 0.01), False),
     ],
 )
-def test_a_motion_ends_when_its_time_is_over_and_the_body_is_there(
+def test_a_motion_ends_when_its_time_is_over_and_the_body_is_in_the_target(
     tick: int, off: tuple[float, float], rests: bool
 ) -> None:
     made = driver()
     made.begin(MOVE, 10, MOVE_TICKS)
     assert made.at_rest(sense(tick, MOVE[2], off=off)) is rests
-
-
-def test_at_rest_is_meant_for_the_target_and_not_for_where_it_came_from() -> None:
-    made = driver()
-    made.begin(MOVE, 10, MOVE_TICKS)
-    assert not made.at_rest(sense(10 + MOVE_TICKS, HOME))
+    assert not made.at_rest(sense(tick, HOME))  # the cell that it came from
 
 
 def test_a_late_motion_has_an_end_in_the_future() -> None:
@@ -241,8 +213,7 @@ def test_the_commanded_state_is_tracked_and_not_the_bodys() -> None:
     """What the set-point is about to do needs no correction."""
     made, probe = probed()
     s, v, a, y, v_y, a_y = sense().state
-    felt = attrs.evolve(sense(), state=(s, v + 0.4, a - 0.5, y, v_y, a_y), setpoint=(0.7, 0.2))
-    made.drive(felt, moving=False)
+    made.drive(sense(state=(s, v + 0.4, a - 0.5, y, v_y, a_y), setpoint=(0.7, 0.2)), moving=False)
     lag_s = SCENARIO.vehicle.actuator_lag_s
     expected = (s + lag_s * 0.4, v + 0.4 - lag_s * 0.5, 0.7, y, v_y, 0.2)
     assert probe.state == pytest.approx(expected)
@@ -311,8 +282,7 @@ def test_a_usable_answer_ends_the_silence() -> None:
 
 def test_meanwhile_the_body_goes_on_with_the_last_good_trajectory_and_then_holds() -> None:
     """With exact sensors the body moves as if nothing had failed."""
-    exact = Sensing(**dict.fromkeys((field.name for field in attrs.fields(Sensing)), 0.0))
-    scenario = attrs.evolve(SCENARIO, sensing=exact)
+    scenario = attrs.evolve(SCENARIO, sensing=EXACT)
     broken_at = 25
     roads = [Road(scenario, {ME: HOME}) for _ in range(2)]
     for road in roads:

@@ -19,17 +19,13 @@ from laneweave.protocol.runtime.node import Arrived, Effect, Listen, Send, Unlis
 from laneweave.protocol.vehicle.motion import cell_state
 from laneweave.protocol.wire.messages import Motion, Name, Neighbour, Sense
 from laneweave.protocol.wire.topics import MOTION, SENSE
-from support.agent_rig import HOME, ME, MOVE_TICKS, SCENARIO, TICK_S, Rig, sent, up_and_running
+from support.agent_rig import HOME, ME, MOVE_TICKS, OTHER, SCENARIO, TICK_S, Rig, up_and_running
 from support.driving import Road, road_scenario
+from support.states import sense_in, sent
 
 Array = NDArray[np.float64]
 
-OTHER = Name("other")
-N, LENGTH_M, LEAST_M = (
-    SCENARIO.horizon_ticks,
-    SCENARIO.vehicle.length_m,
-    SCENARIO.tracking.min_gap_m,
-)
+LENGTH_M, LEAST_M = SCENARIO.vehicle.length_m, SCENARIO.tracking.min_gap_m
 KNOWN = round(SENSED_S / TICK_S)
 """Ticks for which local sensing is extrapolated."""
 BEGIN = 10
@@ -42,16 +38,7 @@ BACK: tuple[Cell, Cell] = ((1, 1), (0, 1))
 
 def published(rig: Rig, ticks: int) -> list[Motion]:
     """Run and return the motions that were sent."""
-    found: list[Motion] = []
-    for _ in range(ticks):
-        effects = rig.hand(SENSE, rig.sense())
-        found += sent(effects, Motion)
-        (command,) = [
-            e.message for e in effects if isinstance(e, Send) and e.topic.name == "command"
-        ]
-        rig.take(command)
-        rig.coast(1)
-    return found
+    return [motion for _ in range(ticks) for motion in sent(rig.answer(), Motion)]
 
 
 def test_a_motion_is_published_when_it_begins_and_every_ten_ticks() -> None:
@@ -68,7 +55,6 @@ def test_a_motion_is_published_when_it_begins_and_every_ten_ticks() -> None:
 
 def test_the_motion_goes_out_after_command_and_state_on_a_key_of_its_own() -> None:
     rig = up_and_running()
-    rig.formation, rig.joined = 0, (0,)
     rig.accept((0, HOME, (-1, 2)))
     effects = [e for e in rig.hand(SENSE, rig.sense()) if isinstance(e, Send)]
     assert [effect.topic.name for effect in effects] == ["command", "state", "motion"]
@@ -129,12 +115,7 @@ def put(
     host: AgentHost, vehicle: Name, stretch: int, tick: int = 1, *, charge: int = 1
 ) -> list[Effect]:
     """Let a vehicle sense that it is in a stretch, and which process is in charge."""
-    cell = (-stretch * STRETCH_COLUMNS, 0)
-    t_s = tick * TICK_S
-    felt = Sense(
-        vehicle, tick, t_s, cell_state(SCENARIO.lattice, cell, t_s), cell, 0, cell, 0, (),
-        formation=SCENARIO.lattice.block_of(cell[0]), attendant=charge,
-    )  # fmt: skip
+    felt = sense_in((-stretch * STRETCH_COLUMNS, 0), tick, vehicle=vehicle, attendant=charge)
     return list(host.handle(Arrived(SENSE, {"vehicle": vehicle}, felt), 0.0))
 
 
@@ -221,9 +202,8 @@ def gaps(
     lane: int = HOME[1],
 ) -> Gaps:
     """Return what others leave a vehicle in the home cell."""
-    state = cell_state(SCENARIO.lattice, HOME, tick * TICK_S)
-    felt = Sense(ME, tick, tick * TICK_S, state, HOME, 0, HOME, 0, ahead, behind)
-    return around.gaps(felt, state, lane)
+    felt = sense_in(HOME, tick, ahead=ahead, behind=behind)
+    return around.gaps(felt, felt.state, lane)
 
 
 def hearing(*motions: Motion) -> Surroundings:

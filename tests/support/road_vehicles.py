@@ -1,0 +1,49 @@
+"""Vehicles on the road: body and motion controller, without an agent."""
+
+from __future__ import annotations
+
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.vehicle.motion import State, cell_state
+from laneweave.sim_bridge.bodies.motion_controller import MotionController
+from laneweave.sim_bridge.bodies.plant import Plant
+from laneweave.sim_bridge.road.demand import Arrival
+from laneweave.sim_bridge.road.entry import Admission
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from support.paper import PAPER
+
+
+def controller_in(
+    cell: Cell, scenario: Scenario = PAPER, *, state: State | None = None, attendant: int = 0
+) -> MotionController:
+    """Return the motion controller of a vehicle in a cell.
+
+    Args:
+        cell: where it holds.
+        scenario: its limits and its lattice.
+        state: of its body; None: at rest in the cell.
+        attendant: incarnation of the process in charge; 0: none.
+    """
+    start = cell_state(scenario.lattice, cell, 0.0) if state is None else state
+    plant = Plant(start, scenario.vehicle, scenario.runtime.tick_s)
+    controller = MotionController(plant, scenario, cell)
+    if attendant:
+        controller.put_in_charge(attendant)
+    return controller
+
+
+def vehicle_in(
+    cell: Cell,
+    name: str = "A",
+    scenario: Scenario = PAPER,
+    *,
+    preferred_lane: int = 0,
+    controller: MotionController | None = None,
+) -> RoadVehicle:
+    """Return a vehicle with exact sensors that entered a cell at road time 0."""
+    admission = Admission(Arrival(name, cell[1], preferred_lane, 0.0), cell, 0.0)
+    vehicle = RoadVehicle.entering(admission, 0.0, scenario)
+    vehicle.sensors = None
+    if controller is not None:
+        vehicle.controller = controller
+    return vehicle
