@@ -156,7 +156,7 @@ def _checked_road_drawer(out: Path, scenario: Scenario, mode: int) -> _Drawer:
     try:
         from laneweave.launch.drawing import plan as plan_drawing
         from laneweave.launch.drawing import plan_on_road as road_drawing
-        from laneweave.launch.drawing.plan_driving import scenario_in_mode
+        from laneweave.launch.drawing.plan_on_road import scenario_in_mode
     except ModuleNotFoundError as error:
         allowed = f"only with laneweave[agent] and laneweave[sim] ({error.name} is not installed)"
         raise BadInputError("--draw-road", str(out), allowed) from error

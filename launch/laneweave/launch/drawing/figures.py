@@ -6,10 +6,12 @@ matplotlib is imported when the first picture is drawn, so that the command line
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.text import Text
 
 DPI = 150
 INK, FAINT_INK = "#30343a", "#6a7078"
@@ -29,3 +31,16 @@ def save(figure: Figure, out: Path, dpi: float) -> None:
     """Write a picture."""
     out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(out, dpi=dpi)
+
+
+def write(
+    axes: Axes,
+    point: tuple[float, float],
+    text: str,
+    size_pt: float,
+    **style: Any,  # noqa: ANN401 (properties of a text)
+) -> Text:
+    """Write a text; a dollar sign in it does not start a formula."""
+    found = axes.text(*point, text, size=size_pt, color=INK, va="center", parse_math=False)
+    found.set(**style)
+    return found

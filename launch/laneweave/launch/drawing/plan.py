@@ -19,10 +19,9 @@ from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Rectangle
 from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
 
-from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
-from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK, new_figure, save
+from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK, new_figure, save, write
 from laneweave.protocol.errors import BadInputError
 
 Place = tuple[float, float]
@@ -46,8 +45,8 @@ _CELL, _BORDER, _BLOCKED = "#f1f2f4", "#d3d6db", "#a3a9b1"
 _LANE_HEIGHT, _BODY_LENGTH, _BODY_WIDTH, _OUTLINE = 0.8, 0.68, 0.46, 0.9
 """In lengths of a cell; the outline is a share of the cell."""
 _MAX_ACROSS, _MAX_WIDTH_IN, _MIN_WIDTH_IN = 4, 12.0, 5.6
-_CELL_RANGE_IN = (0.34, 0.62)
-_LEFT_IN, _ABOVE_IN, _BELOW_IN, _TITLE_IN, _NOTE_IN = 0.32, 0.26, 0.24, 0.4, 0.24
+_MIN_CELL_IN, _MAX_CELL_IN = 0.34, 0.62
+_LEFT_IN, _BETWEEN_IN, _TITLE_IN = 0.32, 0.5, 0.64
 _MAX_PIXELS, _MAX_FRAME_PIXELS, _MAX_SIDE_PIXELS = 3e7, 8e5, 3e4
 _MAX_LABEL_LENGTH = 6
 _NOTE = "front to the right, left lane on top; outlines are targets in the colours of their teams"
@@ -80,8 +79,7 @@ def check_drawing(out: Path, option: str = "--draw") -> None:
 
 def draw_plan(request: PlanRequest, response: PlanResponse, out: Path) -> None:
     """Write a figure or an animation, depending on the suffix of `out`."""
-    write = write_gif if out.suffix.lower() == ".gif" else write_png
-    write(request, response, out)
+    (write_gif if out.suffix.lower() == ".gif" else write_png)(request, response, out)
 
 
 def write_png(request: PlanRequest, response: PlanResponse, out: Path, dpi: int = DPI) -> None:
@@ -92,11 +90,11 @@ def write_png(request: PlanRequest, response: PlanResponse, out: Path, dpi: int 
 
 def write_gif(request: PlanRequest, response: PlanResponse, out: Path, dpi: int = 100) -> None:
     """Write an animation of the plan in an endless loop."""
-    layout = _Layout.of(request.grid, 1)
-    figure = layout.new_figure(response)
-    axes = layout.new_panel(figure, 0)
-    _draw_lattice(axes, request)
-    vehicles = _Vehicles.draw(axes, request, layout)
+    figure, (axes,), cell_in = _new_panels(request, response, 1)
+    vehicles = _Vehicles.draw(axes, request, cell_in)
+    _name_time(axes, 0)
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")  # the panel keeps its place
     writer = PillowWriter(fps=FRAMES_PER_S)
     with writer.saving(figure, str(out), _limited_dpi(figure, dpi, _MAX_FRAME_PIXELS)):
         for time in _frame_times(_steps(response)):
@@ -110,15 +108,12 @@ def plan_figure(request: PlanRequest, response: PlanResponse) -> Figure:
 
     Without a plan there is one panel with the start cells.
     """
-    times = range(min(_steps(response) + 1, MAX_PANELS))
-    layout = _Layout.of(request.grid, len(times))
-    figure = layout.new_figure(response)
-    for time in times:
-        axes = layout.new_panel(figure, time)
+    count = min(_steps(response) + 1, MAX_PANELS)
+    figure, panels, cell_in = _new_panels(request, response, count)
+    for time, axes in enumerate(panels):
         _name_time(axes, time)
-        _draw_lattice(axes, request)
         places = _places(request, response, time)
-        _Vehicles.draw(axes, request, layout).move(places)
+        _Vehicles.draw(axes, request, cell_in).move(places)
         _draw_moves(axes, places, _places(request, response, time + 1))
     return figure
 
@@ -129,69 +124,30 @@ def team_colours(request: PlanRequest) -> dict[frozenset[int], str]:
     return {choice: _colour(number) for number, choice in enumerate(teams)}
 
 
-@attrs.frozen
-class _Layout:
-    """Layout of the panels, which fill rows from the left."""
-
-    grid: Grid
-    across: int
-    rows: int
-    cell_in: float
-
-    @classmethod
-    def of(cls, grid: Grid, panels: int) -> _Layout:
-        min_in, max_in = _CELL_RANGE_IN
-        fitting = int(_MAX_WIDTH_IN / (grid.columns * min_in + _LEFT_IN))
-        rows = math.ceil(panels / max(1, min(_MAX_ACROSS, fitting)))
-        across = math.ceil(panels / rows)
-        room_in = (_MAX_WIDTH_IN / across - _LEFT_IN) / grid.columns
-        return cls(grid, across, rows, max(min_in, min(max_in, room_in)))
-
-    @property
-    def panel_in(self) -> tuple[float, float]:
-        """Return width and height of the cells of one panel."""
-        height_in = self.grid.lanes * _LANE_HEIGHT * self.cell_in
-        return self.grid.columns * self.cell_in, height_in
-
-    @property
-    def pitch_in(self) -> tuple[float, float]:
-        """Return the distances between panels."""
-        return self.panel_in[0] + _LEFT_IN, self.panel_in[1] + _ABOVE_IN + _BELOW_IN
-
-    @property
-    def size_in(self) -> tuple[float, float]:
-        """Return width and height of the figure."""
-        width_in = max(_MIN_WIDTH_IN, self.across * self.pitch_in[0] + _LEFT_IN)
-        return width_in, self.rows * self.pitch_in[1] + _TITLE_IN + _NOTE_IN
-
-    def new_figure(self, response: PlanResponse) -> Figure:
-        """Return a figure with a title and a note."""
-        width_in, height_in = self.size_in
-        figure = new_figure(width_in, height_in)
-        figure.set_layout_engine("none")
-        title_y, note_y = 1 - 0.16 / height_in, 0.1 / height_in
-        figure.suptitle(_title(response), y=title_y, va="top", fontsize=11, color=INK)
-        figure.text(0.5, note_y, _NOTE, ha="center", va="bottom", fontsize=7, color=FAINT_INK)
-        return figure
-
-    def new_panel(self, figure: Figure, number: int) -> Axes:
-        """Return empty axes whose unit is the length of a cell."""
-        row, place = divmod(number, self.across)
-        (width_in, height_in), (panel_in, tall_in) = self.size_in, self.panel_in
-        margin_in = (width_in - self.across * self.pitch_in[0] + _LEFT_IN) / 2
-        left_in = margin_in + place * self.pitch_in[0]
-        bottom_in = height_in - _TITLE_IN - (row + 1) * self.pitch_in[1] + _BELOW_IN
-        box_in = (left_in / width_in, bottom_in / height_in)
-        axes = figure.add_axes((*box_in, panel_in / width_in, tall_in / height_in))
-        axes.set_xlim(-0.5, self.grid.columns - 0.5)
-        axes.set_ylim(-0.5 * _LANE_HEIGHT, (self.grid.lanes - 0.5) * _LANE_HEIGHT)
-        return axes
-
-    def font_size(self, labels: Sequence[str]) -> float:
-        """Return the font size in points with which all labels fit into a vehicle."""
-        cell_pt = 72 * self.cell_in
-        longest = max(len(label) for label in labels)
-        return min(11.0, 0.3 * cell_pt, _BODY_LENGTH * cell_pt / (0.75 * longest))
+def _new_panels(
+    request: PlanRequest, response: PlanResponse, count: int
+) -> tuple[Figure, list[Axes], float]:
+    """Return a figure with a title, `count` lattices without vehicles, and a cell's length [in]."""
+    grid = request.grid
+    fitting = int(_MAX_WIDTH_IN / (grid.columns * _MIN_CELL_IN + _LEFT_IN))
+    rows = math.ceil(count / max(1, min(_MAX_ACROSS, fitting)))
+    across = math.ceil(count / rows)
+    room_in = (_MAX_WIDTH_IN / across - _LEFT_IN) / grid.columns
+    cell_in = max(_MIN_CELL_IN, min(_MAX_CELL_IN, room_in))
+    width_in = max(_MIN_WIDTH_IN, across * (grid.columns * cell_in + _LEFT_IN))
+    panel_in = grid.lanes * _LANE_HEIGHT * cell_in + _BETWEEN_IN
+    figure = new_figure(width_in, rows * panel_in + _TITLE_IN)
+    figure.suptitle(_title(response), fontsize=11, color=INK)
+    figure.supxlabel(_NOTE, fontsize=7, color=FAINT_INK)
+    panels = list(figure.subplots(rows, across, squeeze=False).flat)
+    for axes in panels[count:]:
+        axes.remove()
+    for axes in panels[:count]:
+        axes.set_xlim(-0.5, grid.columns - 0.5)
+        axes.set_ylim(-0.5 * _LANE_HEIGHT, (grid.lanes - 0.5) * _LANE_HEIGHT)
+        axes.set_aspect("equal")
+        _draw_lattice(axes, request)
+    return figure, panels[:count], cell_in
 
 
 @attrs.frozen
@@ -202,18 +158,22 @@ class _Vehicles:
     labels: list[Text]
 
     @classmethod
-    def draw(cls, axes: Axes, request: PlanRequest, layout: _Layout) -> _Vehicles:
-        """Draw the vehicles on their start cells."""
+    def draw(cls, axes: Axes, request: PlanRequest, cell_in: float) -> _Vehicles:
+        """Draw the vehicles on their start cells, with names that fit into them."""
         names = [short_name(vehicle.id) for vehicle in request.vehicles]
-        size_pt, colours = layout.font_size(names), team_colours(request)
+        cell_pt, longest = 72 * cell_in, max(map(len, names))
+        size_pt = min(11.0, 0.3 * cell_pt, _BODY_LENGTH * cell_pt / (0.75 * longest))
+        colours = team_colours(request)
+        style = f"round,pad=0,rounding_size={0.3 * _BODY_WIDTH}"
         drawn = cls([], [])
         for vehicle, name, choice in zip(request.vehicles, names, request.choices(), strict=True):
-            body = _body(colours[choice])
-            body.set_label(vehicle.id)
+            body = FancyBboxPatch((0, 0), _BODY_LENGTH, _BODY_WIDTH, boxstyle=style, zorder=3)
+            body.set(fc=colours[choice], ec=INK, lw=0.6, label=vehicle.id)
             axes.add_patch(body)
             drawn.bodies.append(body)
-            ink = _ink_on(colours[choice])
-            drawn.labels.append(_text(axes, name, size_pt, ink))
+            label = write(axes, (0, 0), name, size_pt, color=_ink_on(colours[choice]), zorder=5)
+            label.set(ha="center", va="center_baseline")
+            drawn.labels.append(label)
         drawn.move([vehicle.cell for vehicle in request.vehicles])
         return drawn
 
@@ -282,23 +242,19 @@ def _draw_lattice(axes: Axes, request: PlanRequest) -> None:
     axes.vlines(columns, *axes.get_ylim(), colors=_BORDER, linewidth=0.6, zorder=1)
     lanes = [(lane - 0.5) * _LANE_HEIGHT for lane in range(1, grid.lanes)]
     axes.hlines(lanes, *axes.get_xlim(), colors=_BORDER, linewidth=0.6, zorder=1)
-    _number_cells(axes, grid)
+    every = math.ceil(grid.columns / 20)
+    axes.set_xticks(range(0, grid.columns, every), labels=map(str, range(0, grid.columns, every)))
+    axes.set_yticks(
+        [lane * _LANE_HEIGHT for lane in range(grid.lanes)], labels=map(str, range(grid.lanes))
+    )
+    axes.tick_params(length=0, pad=2, labelsize=6, labelcolor=FAINT_INK)
+    axes.spines[:].set(color=_BLOCKED, linewidth=0.8)
     for cell in sorted(grid.blocked):
         blocked = _rectangle(cell, 1.0, facecolor="#e1e3e7", edgecolor=_BLOCKED, hatch="////")
         axes.add_patch(blocked).set(label="blocked", linewidth=0.0, zorder=1.5)
     colours = team_colours(request)
     for number, target in enumerate(request.targets):
         _draw_target(axes, target, [colours[team] for team in colours if number in team])
-
-
-def _number_cells(axes: Axes, grid: Grid) -> None:
-    every = math.ceil(grid.columns / 20)
-    axes.set_xticks(range(0, grid.columns, every), labels=map(str, range(0, grid.columns, every)))
-    lanes = range(grid.lanes)
-    axes.set_yticks([lane * _LANE_HEIGHT for lane in lanes], labels=map(str, lanes))
-    axes.tick_params(length=0, pad=2, labelsize=6, labelcolor=FAINT_INK)
-    for spine in axes.spines.values():
-        spine.set(color=_BLOCKED, linewidth=0.8)
 
 
 def _draw_target(axes: Axes, cell: Place, colours: Sequence[str]) -> None:
@@ -336,28 +292,6 @@ def _rectangle(
     width, height = share, share * _LANE_HEIGHT
     corner = (x - width / 2, y - height / 2)
     return Rectangle(corner, width, height, facecolor=facecolor, edgecolor=edgecolor, hatch=hatch)
-
-
-def _body(colour: str) -> FancyBboxPatch:
-    style = f"round,pad=0,rounding_size={0.3 * _BODY_WIDTH}"
-    return FancyBboxPatch(
-        (0, 0), _BODY_LENGTH, _BODY_WIDTH, boxstyle=style, fc=colour, ec=INK, lw=0.6, zorder=3
-    )
-
-
-def _text(axes: Axes, text: str, size_pt: float, ink: str) -> Text:
-    # Names may contain dollar signs, which must not start formulas.
-    return axes.text(
-        0,
-        0,
-        text,
-        size=size_pt,
-        color=ink,
-        ha="center",
-        va="center_baseline",
-        parse_math=False,
-        zorder=5,
-    )
 
 
 def short_name(name: str) -> str:

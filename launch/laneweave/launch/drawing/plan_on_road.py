@@ -1,8 +1,13 @@
-"""Figures of a plan as vehicles drive it on the road: at successive instants, and over time.
+"""A plan on the road as the vehicles' own controllers drive it, and figures of it.
 
-The upper panels show the road in the geodetic coordinate system after each step, with the path of
-each vehicle since the start; the lower ones the vehicles' positions over time, along the road
-relative to the moving formation, and across it. An animation shows the road alone.
+Step k begins at k T_F. Each vehicle follows its path as an agent drives it: the reference of
+`agents.driving`, its tracker, and the simulated body (`sim_bridge.bodies.plant`). All hold their
+start cells at time 0. There is no noise, no other traffic and no gap control: what is driven is the
+plan, with everything that its conflict kinds allow.
+
+The upper panels of a figure show the road in the geodetic coordinate system after each step, with
+the path of each vehicle since the start; the lower ones the vehicles' positions over time, along
+the road relative to the moving formation, and across it. An animation shows the road alone.
 
 This module needs matplotlib and OSQP; import it only to draw.
 """
@@ -24,13 +29,18 @@ from matplotlib.patheffects import withStroke
 from matplotlib.text import Annotation
 from numpy.typing import NDArray
 
+from laneweave.agents.driving.reference import Reference
+from laneweave.agents.driving.tracker import Tracker
+from laneweave.agents.driving.trajectory import check_moves
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK, new_figure, save
 from laneweave.launch.drawing.plan import short_name, team_colours
-from laneweave.launch.drawing.plan_driving import Drive, drive_plan
+from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import corners, pose_of
+from laneweave.protocol.vehicle.motion import cell_state, commanded_state
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, corners, pose_of
+from laneweave.sim_bridge.bodies.plant import Plant
 
 MAX_INSTANTS: Final = 8
 """Plans with more steps are drawn at only this number of instants."""
@@ -43,6 +53,90 @@ _WIDTH_IN, _LANE_IN, _ROAD_GAP_IN, _TIMES_IN = 11.0, 0.24, 0.24, 2.3
 _MARGIN_M = 10.0
 _NOTE = "front to the right, left lane on top, lanes drawn wider than they are"
 _ROAD, _MARKING = "#e3e5e8", "#ffffff"
+
+
+@attrs.frozen(eq=False)
+class Drive:
+    """Motions of all vehicles from the start until a plan has ended.
+
+    states: (vehicles, ticks + 1, 6): s [m], v [m/s], a [m/s2], y [m], v_y [m/s], a_y [m/s2] on the
+        road; s is the front bumper, 0 where the rear column is at time 0; y is the body's centre,
+        from the right road edge.
+    slot_ticks: ticks of a step.
+    overlaps: pairs of vehicles whose bodies overlapped.
+    min_gap_m: shortest gap of two bodies in line; infinite: no two were in line.
+    """
+
+    scenario: Scenario
+    states: NDArray[np.float64]
+    slot_ticks: int
+    overlaps: tuple[tuple[str, str], ...]
+    min_gap_m: float
+
+    @property
+    def ticks(self) -> int:
+        """Ticks that it lasts."""
+        return int(self.states.shape[1]) - 1
+
+    @property
+    def steps(self) -> int:
+        """Steps of the plan."""
+        return self.ticks // self.slot_ticks
+
+    def time_s(self, tick: int) -> float:
+        """Return the time at a tick."""
+        return tick * self.scenario.runtime.tick_s
+
+
+def scenario_in_mode(scenario: Scenario, mode: int) -> Scenario:
+    """Return the scenario in a relative motion mode.
+
+    Raises:
+        BadInputError: a move of this mode cannot be driven within the vehicles' limits.
+    """
+    scenario = attrs.evolve(scenario, formation=attrs.evolve(scenario.formation, mode=mode))
+    check_moves(scenario)
+    return scenario
+
+
+def drive_plan(scenario: Scenario, names: Sequence[str], paths: Sequence[Sequence[Cell]]) -> Drive:
+    """Drive a plan.
+
+    Args:
+        scenario: v_F, d_F, T_F, lane width, vehicles and tracking; see `scenario_in_mode`.
+        names: of the vehicles.
+        paths: cells of each vehicle at all time points; one time point: all hold.
+    """
+    slot_ticks = round(scenario.cycles_s[0] / scenario.runtime.tick_s)
+    ticks = slot_ticks * (len(paths[0]) - 1)
+    states = np.array([_drive_vehicle(scenario, path, slot_ticks, ticks) for path in paths])
+    overlaps: set[tuple[str, str]] = set()
+    min_gap_m = np.inf
+    size_m = scenario.vehicle.length_m, scenario.vehicle.width_m
+    for now in states.swapaxes(0, 1):
+        poses = {name: pose_of(state) for name, state in zip(names, now.tolist(), strict=True)}
+        bodies = Bodies(poses, *size_m)
+        overlaps.update(bodies.overlapping_pairs())
+        min_gap_m = min(min_gap_m, bodies.min_gaps().gap_m)
+    return Drive(scenario, states, slot_ticks, tuple(sorted(overlaps)), float(min_gap_m))
+
+
+def _drive_vehicle(
+    scenario: Scenario, path: Sequence[Cell], slot_ticks: int, ticks: int
+) -> NDArray[np.float64]:
+    """Return the states of one vehicle, (ticks + 1, 6)."""
+    reference, tracker = Reference.hold(scenario, path[0]), Tracker(scenario)
+    start = cell_state(scenario.lattice, path[0], 0.0)
+    plant = Plant(start, scenario.vehicle, scenario.runtime.tick_s)
+    states, speed_mps = [start], scenario.formation.speed_mps
+    for tick in range(ticks):
+        step, since = divmod(tick, slot_ticks)
+        if since == 0 and path[step] != path[step + 1]:
+            reference = Reference.move(scenario, path[step], path[step + 1], tick)
+        state = commanded_state(plant.state, plant.setpoint, scenario.vehicle, speed_mps)
+        jerk_s, jerk_y = tracker.solve(state, reference.window(tick)).jerk[0].tolist()
+        states.append(plant.step(jerk_s, jerk_y))
+    return np.array(states)
 
 
 def draw_road(request: PlanRequest, response: PlanResponse, scenario: Scenario, out: Path) -> None:
@@ -91,8 +185,7 @@ class _Picture:
 
 def road_figure(picture: _Picture) -> Figure:
     """Return the road at successive instants, and positions over time below."""
-    drive = picture.drive
-    steps = drive.ticks // drive.slot_ticks
+    drive, steps = picture.drive, picture.drive.steps
     count = min(steps, MAX_INSTANTS - 1) + 1
     instants = [round(number * steps / max(1, count - 1)) for number in range(count)]
     road_in = picture.lanes * _LANE_IN
@@ -102,17 +195,20 @@ def road_figure(picture: _Picture) -> Figure:
     roads, times = figure.subfigures(2, 1, squeeze=False, height_ratios=heights_in)[:, 0]
     panels = list(roads.subplots(count, sharex=True, squeeze=False)[:, 0])
     for axes, step in zip(panels, instants, strict=True):
+        _draw_empty_road(axes, picture, named=axes is panels[-1])
         _draw_instant(axes, picture, step * drive.slot_ticks)
-    _name_road(panels[-1])
     along, across = times.subplots(1, 2)
-    _draw_along(along, picture)
-    _draw_across(across, picture)
+    moved_m = drive.scenario.formation.speed_mps * drive.time_s(1) * np.arange(drive.ticks + 1)
+    _draw_over_time(along, picture, drive.states[:, :, 0] - moved_m, "s $-$ v$_F$ t (m)")
+    _draw_over_time(across, picture, drive.states[:, :, 3], "lateral position y (m)")
+    for lane in range(picture.lanes + 1):
+        border_m = lane * drive.scenario.road.lane_width_m
+        across.axhline(border_m, color=FAINT_INK, linewidth=0.5, dashes=(5, 5))
     return figure
 
 
 def _draw_instant(axes: Axes, picture: _Picture, tick: int) -> None:
-    """Draw the road at a tick, with the path of each vehicle since the start."""
-    _draw_empty_road(axes, picture)
+    """Draw the vehicles at a tick, with the path of each one since the start."""
     _name_time(axes, picture.drive.time_s(tick))
     for number, colour in enumerate(picture.colours):
         along_m, _, _, across_m, _, _ = picture.drive.states[number, : tick + 1].T
@@ -120,7 +216,8 @@ def _draw_instant(axes: Axes, picture: _Picture, tick: int) -> None:
         _Body.draw(axes, picture, number).move(picture.drive, number, tick)
 
 
-def _draw_empty_road(axes: Axes, picture: _Picture) -> None:
+def _draw_empty_road(axes: Axes, picture: _Picture, *, named: bool) -> None:
+    """Draw the lanes, and if `named` what the axis shows."""
     width_m = picture.drive.scenario.road.lane_width_m
     axes.set_xlim(*picture.extent_m)
     axes.set_ylim(-0.3, picture.lanes * width_m + 0.3)
@@ -128,14 +225,10 @@ def _draw_empty_road(axes: Axes, picture: _Picture) -> None:
     for lane in range(1, picture.lanes):
         axes.axhline(lane * width_m, color=_MARKING, linewidth=1.4, dashes=(5, 5), zorder=1)
     axes.set_yticks([])
-    axes.tick_params(length=2, labelsize=7, labelcolor=FAINT_INK, bottom=False, labelbottom=False)
-    for spine in axes.spines.values():
-        spine.set_visible(False)
-
-
-def _name_road(axes: Axes) -> None:
-    axes.set_xlabel(f"position on the road s (m); {_NOTE}", fontsize=8, color=INK)
-    axes.tick_params(labelbottom=True, bottom=True)
+    axes.tick_params(length=2, labelsize=7, labelcolor=FAINT_INK, bottom=named, labelbottom=named)
+    axes.spines[:].set_visible(False)
+    if named:
+        axes.set_xlabel(f"position on the road s (m); {_NOTE}", fontsize=8, color=INK)
 
 
 def _name_time(axes: Axes, time_s: float) -> None:
@@ -173,41 +266,19 @@ class _Body:
         self.label.xy = (state[0], state[3])
 
 
-def _draw_along(axes: Axes, picture: _Picture) -> None:
-    """Draw positions along the road, relative to the moving formation."""
+def _draw_over_time(
+    axes: Axes, picture: _Picture, values: NDArray[np.float64], meaning: str
+) -> None:
+    """Draw values (vehicles, ticks + 1) over time, with names where each line begins and ends."""
     drive = picture.drive
-    times_s = _times_s(axes, picture)
-    moved_m = drive.scenario.formation.speed_mps * times_s
-    _draw_lines(axes, picture, times_s, drive.states[:, :, 0] - moved_m)
-    axes.set_ylabel("s $-$ v$_F$ t (m)", fontsize=8, color=INK)
-
-
-def _draw_across(axes: Axes, picture: _Picture) -> None:
-    """Draw positions across the road, with the borders of the lanes."""
-    width_m = picture.drive.scenario.road.lane_width_m
-    _draw_lines(axes, picture, _times_s(axes, picture), picture.drive.states[:, :, 3])
-    for lane in range(picture.lanes + 1):
-        axes.axhline(lane * width_m, color=FAINT_INK, linewidth=0.5, dashes=(5, 5))
-    axes.set_ylabel("lateral position y (m)", fontsize=8, color=INK)
-
-
-def _times_s(axes: Axes, picture: _Picture) -> NDArray[np.float64]:
-    """Prepare an axis of time with a line for each step; return the times of all ticks."""
-    drive = picture.drive
-    steps = drive.ticks // drive.slot_ticks
-    every = math.ceil(max(1, steps) / 10)
-    axes.set_xticks([drive.time_s(step * drive.slot_ticks) for step in range(0, steps + 1, every)])
+    times_s = drive.scenario.runtime.tick_s * np.arange(drive.ticks + 1)
+    ticks = range(0, drive.ticks + 1, drive.slot_ticks * math.ceil(max(1, drive.steps) / 10))
+    axes.set_xticks([drive.time_s(tick) for tick in ticks])
     axes.grid(axis="x", color=_ROAD, linewidth=0.8)
     axes.set_xlabel("time (s), a line for each step", fontsize=8, color=INK)
+    axes.set_ylabel(meaning, fontsize=8, color=INK)
     axes.tick_params(length=2, labelsize=7, labelcolor=FAINT_INK)
     axes.spines[["top", "right"]].set_visible(False)
-    return drive.scenario.runtime.tick_s * np.arange(drive.ticks + 1, dtype=np.float64)
-
-
-def _draw_lines(
-    axes: Axes, picture: _Picture, times_s: NDArray[np.float64], values: NDArray[np.float64]
-) -> None:
-    """Draw a line for each vehicle, with its name where it begins and where it ends."""
     for line, colour in zip(values, picture.colours, strict=True):
         axes.plot(times_s, line, color=colour, linewidth=1.6)
     axes.set_xlim(-0.02 * times_s[-1], 1.02 * times_s[-1] or 1.0)
@@ -266,8 +337,7 @@ def _write_gif(picture: _Picture, out: Path) -> None:
     figure = new_figure(_WIDTH_IN, 0.8 + 1.6 * picture.lanes * _LANE_IN)
     figure.suptitle(picture.title, fontsize=9, color=INK)
     axes = figure.subplots()
-    _draw_empty_road(axes, picture)
-    _name_road(axes)
+    _draw_empty_road(axes, picture, named=True)
     bodies = [_Body.draw(axes, picture, number) for number in range(len(picture.labels))]
     every = max(1, math.ceil(drive.ticks / MAX_FRAMES))
     ticks = [*range(0, drive.ticks, every), drive.ticks]

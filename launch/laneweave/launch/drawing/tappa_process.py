@@ -8,21 +8,18 @@ matplotlib.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-import attrs
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch
 
 from laneweave.coordinator.planning.paper.explanation import (
     ExplainedAssignment,
     ExplainedNode,
     Explanation,
 )
-from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK, new_figure, save
+from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK, new_figure, save, write
 from laneweave.launch.drawing.tappa_text import number, trees_shown, vector
 
 MAX_ASSIGNMENTS: Final = 6
@@ -30,11 +27,22 @@ MAX_LAYERS, MAX_ACROSS, MAX_ENTRIES = 3, 5, 4
 MAX_MAPS: Final = 3
 
 _WIDTH_IN, _MARGIN_IN, _TITLE_IN, _CHAIN_IN, _HEADING_IN = 12.0, 0.25, 0.55, 1.75, 0.4
-_BOX_IN, _LAYER_GAP_IN, _LINE_IN, _PAD_IN = 2.15, 0.45, 0.165, 0.09
+_LAYER_GAP_IN, _LINE_IN, _PAD_IN = 0.45, 0.165, 0.09
 _RADIUS_IN = 0.34
+_SPACING: Final = 1.5
+"""Line spacing of a text whose lines are `_LINE_IN` high."""
 _COLOURS: Final = {"expanded": "#f1f2f4", "solution": "#cdebd9", "open": "#fbf3dc"}
 _ASSIGNMENT, _PATHS, _BEST = "#f3c9c4", "#d9d2ec", "#8b74c9"
 _SMALL, _NORMAL = 7.5, 9.0
+_ARROW: Final[dict[str, Any]] = {
+    "arrowstyle": "-|>",
+    "color": FAINT_INK,
+    "shrinkA": 0,
+    "shrinkB": 1,
+}
+
+Layer = tuple[list[ExplainedNode], int]
+"""Nodes of one depth of a tree, and how many are left out."""
 
 
 def draw_explanation(explanation: Explanation, out: Path) -> None:
@@ -43,7 +51,7 @@ def draw_explanation(explanation: Explanation, out: Path) -> None:
 
 
 def explanation_figure(explanation: Explanation) -> Figure:
-    """Return the figure; its axes are in inches."""
+    """Return the figure; its axes are in inches, from the upper left corner."""
     best = _best(explanation.assignments)
     layers = [] if best is None else _layers(best[1].nodes)
     maps = [] if best is None else _chosen_maps(best[1].nodes, layers)
@@ -56,15 +64,16 @@ def explanation_figure(explanation: Explanation) -> Figure:
     axes.set_axis_off()
     axes.set_xlim(0, _WIDTH_IN)
     axes.set_ylim(height_in, 0)
-    _write(axes, _MARGIN_IN, 0.25, f"Ended: {explanation.why_it_ended}", size=11)
+    write(axes, (_MARGIN_IN, 0.25), f"Ended: {explanation.why_it_ended}", 11)
     _draw_chain(axes, explanation, best, _TITLE_IN)
     if best is None:
         return figure
     top_in = _TITLE_IN + _CHAIN_IN
     k, assignment = best
-    _write(axes, _MARGIN_IN, top_in, f"Constraint tree of A_{k}, {len(assignment.nodes)} nodes")
+    heading = f"Constraint tree of A_{k}, {len(assignment.nodes)} nodes"
+    write(axes, (_MARGIN_IN, top_in), heading, _NORMAL)
     shown = f"{trees_shown(explanation)}; green: solution, yellow: still in T at the end"
-    _write(axes, _MARGIN_IN, top_in + 0.18, shown, size=_SMALL, colour=FAINT_INK)
+    write(axes, (_MARGIN_IN, top_in + 0.18), shown, _SMALL, color=FAINT_INK)
     _draw_tree(axes, assignment, layers, top_in + _HEADING_IN)
     _draw_maps(axes, maps, top_in + tree_in + 1.5 * _HEADING_IN)
     return figure
@@ -86,65 +95,52 @@ def _draw_chain(
 ) -> None:
     """Draw a circle for each assignment, and below it a rectangle for its path set."""
     shown = explanation.assignments[:MAX_ASSIGNMENTS]
-    left_out = len(explanation.assignments) - len(shown)
-    pitch_in = min(2.6, (_WIDTH_IN - 1.6) / max(1, len(shown) + 1))
-    centres = [0.9 + pitch_in * i for i in range(len(shown) + 1)]
+    pitch_in = min(2.6, (_WIDTH_IN - 1.6) / (len(shown) + 1))
     y = top_in + _RADIUS_IN + 0.1
-    for left, right in pairwise(centres):
-        _arrow(axes, (left + _RADIUS_IN, y), (right - _RADIUS_IN, y))
-    for k, (x, one) in enumerate(zip(centres, shown, strict=False), start=1):
-        axes.add_patch(Circle((x, y), _RADIUS_IN, facecolor=_ASSIGNMENT, edgecolor=INK))
-        _write(axes, x, y - 0.08, f"A_{k}", centred=True)
-        _write(axes, x, y + 0.12, f"C_{k} = {one.cost}", size=_SMALL, centred=True)
-        _arrow(axes, (x, y + _RADIUS_IN), (x, y + _RADIUS_IN + 0.3))
-        is_best = best is not None and best[0] == k and one.best_cost is not None
-        cost = number(one.best_cost)
-        label = f"P_{k}: C'_{k} = {cost}" if one.best_cost is not None else "none below C'*"
-        box = (x - 0.62, y + _RADIUS_IN + 0.3)
-        _box(axes, box, 1.24, 0.3, _PATHS, edge=_BEST if is_best else INK, bold=is_best)
-        _write(axes, x, box[1] + 0.16, label, size=_SMALL, centred=True)
-        _write(
-            axes, x, box[1] + 0.45, vector(one.targets), size=6.5, colour=FAINT_INK, centred=True
-        )
-    last = centres[-1]
-    axes.add_patch(Circle((last, y), _RADIUS_IN, facecolor="white", edgecolor=INK, linestyle="--"))
-    k = len(explanation.assignments) + 1
+    for k, one in enumerate(shown, start=1):
+        x = 0.9 + pitch_in * (k - 1)
+        _draw_circle(axes, (x, y), f"A_{k}\nC_{k} = {one.cost}", mfc=_ASSIGNMENT)
+        axes.annotate("", (x + pitch_in - _RADIUS_IN, y), (x + _RADIUS_IN, y), arrowprops=_ARROW)
+        below = y + _RADIUS_IN
+        axes.annotate("", (x, below + 0.3), (x, below), arrowprops=_ARROW)
+        found = one.best_cost is not None
+        label = f"P_{k}: C'_{k} = {number(one.best_cost)}" if found else "none below C'*"
+        is_best = found and best is not None and best[0] == k
+        box = _box(_PATHS, edge=_BEST if is_best else INK, bold=is_best)
+        write(axes, (x, below + 0.4), label, _SMALL, ha="center", bbox=box)
+        write(axes, (x, below + 0.75), vector(one.targets), 6.5, color=FAINT_INK, ha="center")
+    k, left_out = len(explanation.assignments) + 1, len(explanation.assignments) - len(shown)
     if left_out:
-        _write(axes, last, y, f"{left_out} more", size=_SMALL, centred=True)
+        text = f"{left_out} more"
     elif explanation.next_cost is None:
-        _write(axes, last, y, "end", size=_SMALL, centred=True)
+        text = "end"
     else:
-        _write(axes, last, y - 0.08, f"A_{k}", centred=True)
-        _write(
-            axes, last, y + 0.12, f"C_{k} = {explanation.next_cost:g}", size=_SMALL, centred=True
-        )
+        text = f"A_{k}\nC_{k} = {explanation.next_cost:g}"
+    _draw_circle(axes, (0.9 + pitch_in * len(shown), y), text, mfc="white")
 
 
-@attrs.frozen
-class _Layer:
-    """Nodes of one depth, and how many are left out."""
-
-    nodes: tuple[ExplainedNode, ...]
-    left_out: int
+def _draw_circle(axes: Axes, centre: tuple[float, float], text: str, mfc: str) -> None:
+    axes.plot(*centre, "o", ms=2 * 72 * _RADIUS_IN, mfc=mfc, mec=INK, clip_on=False)
+    write(axes, centre, text, _SMALL, ha="center", linespacing=_SPACING)
 
 
-def _layers(nodes: Sequence[ExplainedNode]) -> list[_Layer]:
+def _layers(nodes: Sequence[ExplainedNode]) -> list[Layer]:
     """Return the first layers of a tree; solutions and their ancestors are not left out."""
     parents = {node.number: node.parent for node in nodes}
-    wanted = next((node.number for node in nodes if node.status == "solution"), 0)
-    on_the_way = set()
-    while wanted:
-        on_the_way.add(wanted)
-        wanted = parents[wanted]
-    layers: list[_Layer] = []
+    ancestor = next((node.number for node in nodes if node.status == "solution"), 0)
+    kept = set()
+    while ancestor:
+        kept.add(ancestor)
+        ancestor = parents[ancestor]
+    layers: list[Layer] = []
     above = {0}
     while len(layers) < MAX_LAYERS:
         layer = [node for node in nodes if node.parent in above]
         if not layer:
             break
-        ranked = sorted(layer, key=lambda node: (node.number not in on_the_way, node.number))
+        ranked = sorted(layer, key=lambda node: (node.number not in kept, node.number))
         shown = sorted(ranked[:MAX_ACROSS], key=lambda node: (node.parent, node.number))
-        layers.append(_Layer(tuple(shown), len(layer) - len(shown)))
+        layers.append((shown, len(layer) - len(shown)))
         above = {node.number for node in shown}
     return layers
 
@@ -152,13 +148,10 @@ def _layers(nodes: Sequence[ExplainedNode]) -> list[_Layer]:
 def _node_lines(node: ExplainedNode) -> list[str]:
     lines = [f"N_{node.number}    L_{node.number} = {node.cost}"]
     lines.append(f"constraint {_short(node.constraint)}" if node.constraint else "no constraints")
-    if not node.conflicts:
-        lines.append("no conflicts")
-    else:
-        lines.append("conflicts")
-        lines += map(_short, node.conflicts[:MAX_ENTRIES])
-        if len(node.conflicts) > MAX_ENTRIES:
-            lines.append(f"and {len(node.conflicts) - MAX_ENTRIES} more")
+    lines.append("conflicts" if node.conflicts else "no conflicts")
+    lines += map(_short, node.conflicts[:MAX_ENTRIES])
+    if len(node.conflicts) > MAX_ENTRIES:
+        lines.append(f"and {len(node.conflicts) - MAX_ENTRIES} more")
     return lines
 
 
@@ -167,45 +160,43 @@ def _short(entry: str) -> str:
     return entry if len(entry) <= 30 else entry[:14] + "…" + entry[-14:]
 
 
-def _layer_height_in(layer: _Layer) -> float:
-    return max(len(_node_lines(node)) for node in layer.nodes) * _LINE_IN + 2 * _PAD_IN
+def _height_in(node: ExplainedNode) -> float:
+    return len(_node_lines(node)) * _LINE_IN + 2 * _PAD_IN
+
+
+def _layer_height_in(layer: Layer) -> float:
+    return max(map(_height_in, layer[0]))
 
 
 def _draw_tree(
-    axes: Axes, assignment: ExplainedAssignment, layers: Sequence[_Layer], top_in: float
+    axes: Axes, assignment: ExplainedAssignment, layers: Sequence[Layer], top_in: float
 ) -> None:
     bottoms: dict[int, tuple[float, float]] = {}
-    for layer in layers:
-        height_in = _layer_height_in(layer)
-        pitch_in = (_WIDTH_IN - 2 * _MARGIN_IN) / max(len(layer.nodes), 1)
-        for i, node in enumerate(layer.nodes):
+    right_in, drawn = _WIDTH_IN - _MARGIN_IN, 0
+    for nodes, left_out in layers:
+        pitch_in = (_WIDTH_IN - 2 * _MARGIN_IN) / len(nodes)
+        for i, node in enumerate(nodes):
             x = _MARGIN_IN + (i + 0.5) * pitch_in
-            lines = _node_lines(node)
-            own_in = len(lines) * _LINE_IN + 2 * _PAD_IN
-            solved = node.status == "solution"
-            corner = (x - _BOX_IN / 2, top_in)
-            _box(axes, corner, _BOX_IN, own_in, _COLOURS[node.status], bold=solved)
-            for row, line in enumerate(lines):
-                y = top_in + _PAD_IN + (row + 0.5) * _LINE_IN
-                _write(axes, corner[0] + _PAD_IN, y, line, size=_NORMAL if row == 0 else _SMALL)
+            text = "\n".join(_node_lines(node))
+            box = _box(_COLOURS[node.status], bold=node.status == "solution")
+            node_text = write(axes, (x, top_in + _PAD_IN), text, _SMALL, bbox=box)
+            node_text.set(ha="center", va="top", linespacing=_SPACING, multialignment="left")
             if node.parent in bottoms:
-                _arrow(axes, bottoms[node.parent], (x, top_in))
-            bottoms[node.number] = (x, top_in + own_in)
-        if layer.left_out:
-            text = f"… and {layer.left_out} more children"
-            x = _WIDTH_IN - _MARGIN_IN
-            _write(axes, x, top_in - 0.12, text, size=_SMALL, colour=FAINT_INK, right=True)
-        top_in += height_in + _LAYER_GAP_IN
-    deeper = len(assignment.nodes) - sum(len(layer.nodes) + layer.left_out for layer in layers)
-    if deeper:
-        text = f"{deeper} more nodes are not drawn"
-        y = top_in - 0.25
-        _write(axes, _WIDTH_IN - _MARGIN_IN, y, text, size=_SMALL, colour=FAINT_INK, right=True)
+                axes.annotate("", (x, top_in), bottoms[node.parent], arrowprops=_ARROW)
+            bottoms[node.number] = (x, top_in + _height_in(node))
+        if left_out:
+            text = f"… and {left_out} more children"
+            write(axes, (right_in, top_in - 0.12), text, _SMALL, color=FAINT_INK, ha="right")
+        drawn += len(nodes) + left_out
+        top_in += _layer_height_in((nodes, left_out)) + _LAYER_GAP_IN
+    if len(assignment.nodes) > drawn:
+        text = f"{len(assignment.nodes) - drawn} more nodes are not drawn"
+        write(axes, (right_in, top_in - 0.25), text, _SMALL, color=FAINT_INK, ha="right")
 
 
-def _chosen_maps(nodes: Sequence[ExplainedNode], layers: Sequence[_Layer]) -> list[ExplainedNode]:
+def _chosen_maps(nodes: Sequence[ExplainedNode], layers: Sequence[Layer]) -> list[ExplainedNode]:
     """Return the root, the solution, and one more node that is drawn."""
-    drawn = [node for layer in layers for node in layer.nodes]
+    drawn = [node for layer, _ in layers for node in layer]
     solutions = [node for node in nodes if node.status == "solution"]
     others = [node for node in drawn[1:] if node not in solutions]
     return [*drawn[:1], *(one for one in solutions if one not in drawn[:1]), *others][:MAX_MAPS]
@@ -216,63 +207,16 @@ def _map_lines(node: ExplainedNode) -> list[str]:
 
 
 def _draw_maps(axes: Axes, nodes: Sequence[ExplainedNode], top_in: float) -> None:
-    """Draw relative path maps side by side, as many columns of them as there is room for."""
+    """Draw relative path maps side by side, in a size that fits."""
     pitch_in = (_WIDTH_IN - 2 * _MARGIN_IN) / max(1, len(nodes))
     for i, node in enumerate(nodes):
         left = _MARGIN_IN + i * pitch_in
-        _write(axes, left, top_in, f"Relative path map of N_{node.number}")
+        write(axes, (left, top_in), f"Relative path map of N_{node.number}", _NORMAL)
         lines = _map_lines(node)
-        widest = max(map(len, lines))
-        size = min(7.5, 72 * (pitch_in - 0.3) / (0.62 * widest))
-        for row, line in enumerate(lines, start=1):
-            y = top_in + 0.06 + row * _LINE_IN
-            axes.text(
-                left,
-                y,
-                line,
-                size=size,
-                family="monospace",
-                va="center",
-                color=INK,
-                parse_math=False,
-            )
+        size_pt = min(_SMALL, 72 * (pitch_in - 0.3) / (0.62 * max(map(len, lines))))
+        table = write(axes, (left, top_in + 0.14), "\n".join(lines), size_pt, va="top")
+        table.set(family="monospace", linespacing=_SPACING)
 
 
-def _box(
-    axes: Axes,
-    corner: tuple[float, float],
-    width: float,
-    height: float,
-    colour: str,
-    *,
-    edge: str = INK,
-    bold: bool = False,
-) -> None:
-    style = "round,pad=0,rounding_size=0.06"
-    axes.add_patch(
-        FancyBboxPatch(
-            corner, width, height, boxstyle=style, fc=colour, ec=edge, lw=2.0 if bold else 0.8
-        )
-    )
-
-
-def _arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float]) -> None:
-    arrow = FancyArrowPatch(start, end, arrowstyle="-|>", mutation_scale=9, shrinkA=0, shrinkB=1)
-    arrow.set(color=FAINT_INK, linewidth=0.9)
-    axes.add_patch(arrow)
-
-
-def _write(
-    axes: Axes,
-    x: float,
-    y: float,
-    text: str,
-    *,
-    size: float = _NORMAL,
-    colour: str = INK,
-    centred: bool = False,
-    right: bool = False,
-) -> None:
-    where = "center" if centred else "right" if right else "left"
-    # Names may contain dollar signs, which must not start formulas.
-    axes.text(x, y, text, size=size, color=colour, ha=where, va="center", parse_math=False)
+def _box(colour: str, *, edge: str = INK, bold: bool = False) -> dict[str, Any]:
+    return {"boxstyle": "round,pad=0.4", "fc": colour, "ec": edge, "lw": 2.0 if bold else 0.8}

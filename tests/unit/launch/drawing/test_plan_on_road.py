@@ -20,8 +20,14 @@ from laneweave.launch.cli import main as cli
 from laneweave.launch.cli import plan_answers
 from laneweave.launch.drawing import figures as drawing
 from laneweave.launch.drawing import plan_on_road as road_drawing
-from laneweave.launch.drawing.plan_driving import Drive, drive_plan
-from laneweave.launch.drawing.plan_on_road import MAX_INSTANTS, _Picture, draw_road, road_figure
+from laneweave.launch.drawing.plan_on_road import (
+    MAX_INSTANTS,
+    Drive,
+    _Picture,
+    draw_road,
+    drive_plan,
+    road_figure,
+)
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.tables import Scenario
