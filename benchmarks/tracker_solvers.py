@@ -38,7 +38,7 @@ from laneweave.launch.bench.tracker import SITUATIONS, drive
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import State
-from laneweave.sim_bridge.recording.recorder import spread
+from laneweave.sim_bridge.recording.trips import spread
 
 Array = NDArray[np.float64]
 

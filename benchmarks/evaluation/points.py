@@ -15,7 +15,7 @@ from laneweave.launch.recordings.runs import Run
 from laneweave.launch.recordings.trajectories import Tracks, read_tracks
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.sim_bridge.recording.recorder import WARM_UP_S
+from laneweave.sim_bridge.recording.trips import WARM_UP_S
 
 SLOW_BIN_M: Final = 50.0
 SLOW_SHARE: Final = 0.5

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 
-from laneweave.launch.recordings.runs import SCENARIO_KEY
+from laneweave.sim_bridge.recording.trips import SCENARIO_KEY
 
 NEWER_FIELDS = ("entry", "close", "max_columns")
 """Fields of `formation` that earlier versions did not have."""

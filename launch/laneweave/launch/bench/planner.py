@@ -26,7 +26,7 @@ from laneweave.launch.bench.request_families import (
 )
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Mode
-from laneweave.sim_bridge.recording.recorder import spread
+from laneweave.sim_bridge.recording.trips import spread
 
 
 @attrs.frozen

@@ -24,7 +24,7 @@ from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.local_run import LocalRun
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.sim_bridge.recording.recorder import spread
+from laneweave.sim_bridge.recording.trips import spread
 
 ROLES = ("router", "coordinator", "bridge", "agent")
 LOOK_EVERY_S = 0.3

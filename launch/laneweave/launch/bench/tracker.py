@@ -24,7 +24,7 @@ from laneweave.agents.driving.surroundings import SENSED_S
 from laneweave.agents.driving.tracker import Tracker, TrackResult
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import State, integrate
-from laneweave.sim_bridge.recording.recorder import spread
+from laneweave.sim_bridge.recording.trips import spread
 
 Array = NDArray[np.float64]
 

@@ -16,9 +16,8 @@ from laneweave.protocol.config.loading import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.summary import RunSummary, read_summary
+from laneweave.sim_bridge.recording.trips import SCENARIO_KEY
 
-SCENARIO_KEY = b"laneweave.scenario"
-"""Metadata of a run's Parquet files."""
 SWEEP_FILE, POINT_FILE = "sweep.json", "point.json"
 """They mark the folder of a sweep, and of a point in it."""
 POINT_SCHEMA = "laneweave.sweep.point/1"

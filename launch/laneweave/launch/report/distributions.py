@@ -1,6 +1,6 @@
 """Distributions over a run: spacing and headway, deceleration and comfort; counts and figures.
 
-Counted are the times of steady traffic: from the end of the warm-up (`recorder.py: WARM_UP_S`) to
+Counted are the times of steady traffic: from the end of the warm-up (`trips.py: WARM_UP_S`) to
 the end of the demand; the whole run where that is too short.
 """
 
@@ -25,7 +25,7 @@ from laneweave.launch.report.style import (
     volume_title,
 )
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.sim_bridge.recording.recorder import WARM_UP_S
+from laneweave.sim_bridge.recording.trips import WARM_UP_S
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

@@ -1,7 +1,17 @@
-"""The record of a run: the recorder's files, and reports of all roles, in `summary.json`."""
+"""The record of a run: its files, and the figures of all roles in `summary.json`.
+
+    trajectories.parquet   one row per vehicle and tick, written in row groups as the run goes on
+    trips.parquet          one row per demanded vehicle, written at the end
+    ticks.parquet          one row per tick, written at the end
+    events.jsonl           one JSON object per line, flushed line by line
+
+The first two contain the scenario as JSON in their metadata (key `SCENARIO_KEY`), so that figures
+can be drawn from them alone.
+"""
 
 from __future__ import annotations
 
+import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -16,7 +26,19 @@ from attrs import define, field
 from numpy.typing import NDArray
 
 from laneweave.protocol.scenario.tables import SOLVERS, Scenario, solver_of_event
-from laneweave.protocol.summary import RunSummary, write_summary
+from laneweave.protocol.summary import (
+    SCHEMA,
+    DurationMs,
+    LeaderChanges,
+    Messages,
+    Planning,
+    PlanningMs,
+    RunSummary,
+    RuntimeFigures,
+    Tracking,
+    VehicleCounts,
+    write_summary,
+)
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.events import (
     AGENT_TOOK_OVER,
@@ -33,7 +55,15 @@ from laneweave.protocol.wire.events import (
 from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, LogEvent, Name, Report
 from laneweave.sim_bridge.bodies.motion_controller import Rung
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
-from laneweave.sim_bridge.recording.recorder import Recorder, spread
+from laneweave.sim_bridge.recording.trajectories import Sample, Trajectories
+from laneweave.sim_bridge.recording.trips import (
+    Trip,
+    metadata_of,
+    spread,
+    throughput,
+    travel_time,
+    trips_table,
+)
 from laneweave.sim_bridge.road.demand import Arrival
 
 
@@ -96,40 +126,47 @@ class RunRecord:
     def __init__(
         self, folder: Path, scenario: Scenario, method: str, stopwatch: Callable[[], float]
     ) -> None:
-        """Open a run's folder; see `Recorder` for its files."""
+        """Open the files of a run in its folder, which is created if it is missing."""
+        folder.mkdir(parents=True, exist_ok=True)
         self._folder = folder
         self._scenario = scenario
         self._method = method
         self._stopwatch = stopwatch
         self._began = stopwatch()
-        self._recorder = Recorder(folder, scenario)
+        self._metadata = metadata_of(scenario)
+        self._events = (folder / "events.jsonl").open("w", encoding="utf-8", buffering=1)
+        self._trajectories = Trajectories(
+            folder / "trajectories.parquet", self._metadata, scenario.vehicle.min_accel_mps2
+        )
+        self._trips: dict[Name, Trip] = {}
         self._leadership = _Leadership()
         self._reports: dict[tuple[Name, Name], Report] = {}
         self._plans: list[dict[str, Any]] = []
         self._plans_by_solver = Counter(dict.fromkeys(SOLVERS, 0))
         self._ticks: list[tuple[float, int, float]] = []
-        self._rung_ticks = dict.fromkeys(Rung, 0)
-        self._missed_ticks = 0
+        """(road time, vehicles on the road, duration in ms) of each tick."""
+        self._rung_ticks: Counter[Rung] = Counter()
         self._caretaker_takeovers = 0
         self._agent_takeovers = 0
-        self._left_off_lane = 0
         self._left_unattended = 0
         self._closed = False
+        self.missed_ticks = 0
+        """Answers that had not arrived by their tick's deadline."""
 
     # --- the road -----------------------------------------------------------------
 
-    def note(self, t_s: float, kind: str, **data: object) -> None:
+    def note(self, t_s: float, kind: str, /, **data: object) -> None:
         """Write an event of the bridge."""
-        if not self._closed:
-            self._recorder.event(t_s, kind, role="bridge", **data)
+        self._write_event(t_s, kind, {"role": "bridge"} | data)
 
     def on_demanded(self, arrival: Arrival) -> None:
         """Record a vehicle that wants to enter."""
-        self._recorder.demanded(arrival)
+        self._trips[Name(arrival.vehicle)] = Trip(arrival)
 
     def on_entered(self, vehicle: RecordedVehicle) -> None:
         """Record a vehicle that has entered the road."""
-        self._recorder.entered(vehicle.name, vehicle.entered_s, vehicle.formation)
+        trip = self._trips[Name(vehicle.name)]
+        trip.entered_s, trip.formation = vehicle.entered_s, vehicle.formation
         self.note(
             vehicle.entered_s,
             ENTERED,
@@ -143,7 +180,7 @@ class RunRecord:
         """Record a closed formation."""
         number, columns = closed.first_block, closed.columns(self._scenario.lattice)
         for vehicle in members:
-            self._recorder.assign(vehicle, number)
+            self._trips[vehicle].formation = number
         self.note(
             closed.closed_s,
             FORMATION_CLOSED,
@@ -161,40 +198,25 @@ class RunRecord:
         beyond_m = s_m - self._scenario.road.length_m
         left_s = t_s - beyond_m / v_mps if v_mps > 0 else t_s
         lane = int(y_m // self._scenario.road.lane_width_m)
-        self._recorder.left(vehicle.name, left_s, lane)
-        self._count_rungs(vehicle)
-        preferred_lane = vehicle.arrival.preferred_lane
-        self.note(
-            left_s,
-            LEFT,
-            vehicle=vehicle.name,
-            lane=lane,
-            on_preferred_lane=lane == preferred_lane,
-        )
+        trip = self._trips[Name(vehicle.name)]
+        trip.left_s, trip.final_lane = left_s, lane
+        self._rung_ticks.update(vehicle.rung_ticks)
         self._left_unattended += not attended
-        if lane != preferred_lane:
-            self._left_off_lane += 1
-            self.note(
-                left_s,
-                LEFT_OFF_LANE,
-                vehicle=vehicle.name,
-                lane=lane,
-                preferred_lane=preferred_lane,
-                attended=attended,
-            )
+        preferred_lane = vehicle.arrival.preferred_lane
+        on_preferred_lane = lane == preferred_lane
+        where = {"vehicle": vehicle.name, "lane": lane}
+        self.note(left_s, LEFT, **where, on_preferred_lane=on_preferred_lane)
+        if not on_preferred_lane:
+            lanes = {**where, "preferred_lane": preferred_lane}
+            self.note(left_s, LEFT_OFF_LANE, **lanes, attended=attended)
 
     def on_still_on_road(self, vehicle: RecordedVehicle) -> None:
         """Record a vehicle that is on the road at the end of the run."""
-        self._count_rungs(vehicle)
-
-    @property
-    def missed_ticks(self) -> int:
-        """Answers that had not come by their tick's deadline."""
-        return self._missed_ticks
+        self._rung_ticks.update(vehicle.rung_ticks)
 
     def on_missed(self, agents: int) -> None:
         """Record the number of agents that have not answered a tick by its deadline."""
-        self._missed_ticks += agents
+        self.missed_ticks += agents
 
     def on_caretaker_took_over(self, t_s: float, vehicle: Name, reason: str) -> None:
         """Record that a caretaker has taken charge, and why: see `Absence`."""
@@ -219,8 +241,8 @@ class RunRecord:
         overlaps = list(overlaps)
         for pair in overlaps:
             self.note(t_s, OVERLAP, vehicles=pair)
-        self._recorder.safety(overlaps, collisions, gaps)
-        self._recorder.tick(t_s, [_sample(vehicle) for vehicle in vehicles])
+        self._trajectories.distances(overlaps, collisions, gaps)
+        self._trajectories.tick(t_s, [_sample(vehicle) for vehicle in vehicles])
 
     def on_tick(self, t_s: float, on_road: int, duration_s: float) -> None:
         """Record the duration of a tick."""
@@ -230,11 +252,9 @@ class RunRecord:
 
     def on_event(self, event: LogEvent) -> None:
         """Record an event of another role."""
-        if self._closed:
-            return
         # Role and name of the message replace those in its data.
         data = event.data | {"role": event.role, "name": event.name}
-        self._recorder.event(event.t_s, event.kind, **data)
+        self._write_event(event.t_s, event.kind, data)
         if event.kind in PLAN_EVENTS:
             self._plans.append(event.data)
             solver = solver_of_event(event.kind, event.data)
@@ -270,81 +290,115 @@ class RunRecord:
             return
         self.note(t_s, RUN_ENDED, ending=ending.value)
         self._closed = True
-        self._recorder.close()
+        trips = trips_table(self._trips.values(), self._metadata)
+        try:
+            self._trajectories.close()
+        finally:
+            self._events.close()
+            pq.write_table(trips, self._folder / "trips.parquet", compression="zstd")
         self._write_ticks()
-        summary = self._recorder.summarise(self._method, t_s) | {"ending": ending.value}
-        summary["vehicles"] |= {
-            "left_off_lane": self._left_off_lane,
-            "left_unattended": self._left_unattended,
-        }
-        write_summary(self._folder, RunSummary.from_json(summary | self._rest(t_s)))
+        write_summary(self._folder, self._summary(trips, t_s, ending))
+
+    def _write_event(self, t_s: float, kind: str, data: Mapping[str, object]) -> None:
+        """Write a line to `events.jsonl` immediately, unless the record is closed.
+
+        Values unknown to JSON are written as text; keys `t_s` and `kind` in the data are ignored.
+        """
+        if not self._closed:
+            own: dict[str, object] = {"t_s": t_s, "kind": kind}
+            self._events.write(json.dumps({**own, **data, **own}, default=str) + "\n")
 
     def _write_ticks(self) -> None:
         """Write ticks.parquet: how long each tick took, with how many vehicles on the road."""
-        times, counts, durations = zip(*self._ticks, strict=True) if self._ticks else ((), (), ())
+        types = {"t_s": pa.float64(), "on_road": pa.int32(), "tick_ms": pa.float32()}
+        columns = zip(*self._ticks, strict=True) if self._ticks else ((), (), ())
         table = pa.table(
             {
-                "t_s": pa.array(times, pa.float64()),
-                "on_road": pa.array(counts, pa.int32()),
-                "tick_ms": pa.array(durations, pa.float32()),
+                name: pa.array(values, kind)
+                for (name, kind), values in zip(types.items(), columns, strict=True)
             }
         )
         pq.write_table(table, self._folder / "ticks.parquet", compression="zstd")
 
-    def _count_rungs(self, vehicle: RecordedVehicle) -> None:
-        for rung, ticks in vehicle.rung_ticks.items():
-            self._rung_ticks[rung] += ticks
-
-    def _rest(self, t_s: float) -> dict[str, Any]:
-        wall_s, ticks = self._stopwatch() - self._began, self._rung_ticks
+    def _summary(self, trips: pa.Table, t_s: float, ending: Ending) -> RunSummary:
+        scenario, wall_s = self._scenario, self._stopwatch() - self._began
+        left = trips.num_rows - trips["left_s"].null_count
+        on_preferred_lane = trips["on_preferred_lane"].to_pylist().count(True)
         reports = self._reports.values()
-        solve_ms = _milliseconds(report.solve_ms for report in reports)
+        return RunSummary(
+            schema=SCHEMA,
+            method=self._method,
+            seed=scenario.seed,
+            volume_veh_per_lane_h=scenario.demand.volume_veh_per_lane_h,
+            lanes=scenario.road.lanes,
+            road_m=scenario.road.length_m,
+            simulated_s=round(t_s, 6),
+            vehicles=VehicleCounts(
+                demanded=trips.num_rows,
+                entered=trips.num_rows - trips["entered_s"].null_count,
+                left=left,
+                on_preferred_lane=on_preferred_lane,
+                peak=self._trajectories.peak,
+                left_off_lane=left - on_preferred_lane,
+                left_unattended=self._left_unattended,
+            ),
+            travel_time_s=travel_time(trips),
+            throughput_veh_per_lane_h=throughput(trips, scenario.road.lanes),
+            safety=self._trajectories.safety(),
+            ending=ending.value,
+            planning=self._planning(),
+            tracking=self._tracking(),
+            runtime=RuntimeFigures(
+                real_time_factor=round(t_s / wall_s, 3) if wall_s > 0 else 0.0,
+                wall_s=round(wall_s, 3),
+                processes=None,
+                vehicles_per_process=scenario.runtime.vehicles_per_process,
+                tick_ms=DurationMs(**spread(np.array([tick[2] for tick in self._ticks]), 50, 99)),
+            ),
+            messages=Messages(
+                published=_per_process(reports, "published"),
+                dropped_by_faults=0,
+                rejected=_per_process(reports, "rejected"),
+            ),
+            failover=LeaderChanges(
+                leader_changes=self._leadership.changes,
+                recovery_s=self._leadership.recovery_s,
+            ),
+        )
+
+    def _planning(self) -> Planning:
+        plans = self._plans
+        solve_ms = np.array([_number(plan.get("solve_ms")) for plan in plans])
+        sizes = (int(_number(plan.get("vehicles"))) for plan in plans)
+        return Planning(
+            plans=len(plans),
+            optimal=sum(plan.get("status") == "optimal" for plan in plans),
+            largest_formation=max(sizes, default=0),
+            by_solver=dict(self._plans_by_solver),
+            fallbacks=sum(plan.get("fallback") is True for plan in plans),
+            solve_ms=PlanningMs(**spread(solve_ms, 50, 95, largest=True)),
+        )
+
+    def _tracking(self) -> Tracking:
+        reports, ticks = self._reports.values(), self._rung_ticks
         solves = sum(report.solves for report in reports)
         osqp_solves = sum(report.osqp_solves for report in reports)
-        plan_ms = np.array([_number(plan.get("solve_ms")) for plan in self._plans])
-        return {
-            "planning": {
-                "plans": len(self._plans),
-                "optimal": sum(plan.get("status") == "optimal" for plan in self._plans),
-                "largest_formation": max(
-                    (int(_number(plan.get("vehicles"))) for plan in self._plans), default=0
-                ),
-                "by_solver": dict(self._plans_by_solver),
-                "fallbacks": sum(plan.get("fallback") is True for plan in self._plans),
-                "solve_ms": spread(plan_ms, 50, 95, largest=True),
-            },
-            "tracking": {
-                "solves": solves,
-                "osqp_solves": osqp_solves,
-                "unconstrained_steps": solves - osqp_solves,
-                "unusable": sum(report.unusable for report in reports),
-                "hold_law_ticks": ticks[Rung.HOLD] + ticks[Rung.GIVE_WAY],
-                "emergency_ticks": ticks[Rung.EMERGENCY],
-                "missed_ticks": self._missed_ticks,
-                "caretaker_takeovers": self._caretaker_takeovers,
-                "agent_takeovers": self._agent_takeovers,
-                "solve_ms": spread(solve_ms, 50, 99),
-            },
-            "runtime": {
-                "real_time_factor": round(t_s / wall_s, 3) if wall_s > 0 else 0.0,
-                "wall_s": round(wall_s, 3),
-                "processes": None,
-                "vehicles_per_process": self._scenario.runtime.vehicles_per_process,
-                "tick_ms": spread(np.array([tick[2] for tick in self._ticks]), 50, 99),
-            },
-            "messages": {
-                "published": _per_process(reports, "published"),
-                "dropped_by_faults": 0,
-                "rejected": _per_process(reports, "rejected"),
-            },
-            "failover": {
-                "leader_changes": self._leadership.changes,
-                "recovery_s": self._leadership.recovery_s,
-            },
-        }
+        solve_ms = _milliseconds(report.solve_ms for report in reports)
+        return Tracking(
+            solves=solves,
+            osqp_solves=osqp_solves,
+            unconstrained_steps=solves - osqp_solves,
+            unusable=sum(report.unusable for report in reports),
+            hold_law_ticks=ticks[Rung.HOLD] + ticks[Rung.GIVE_WAY],
+            emergency_ticks=ticks[Rung.EMERGENCY],
+            missed_ticks=self.missed_ticks,
+            caretaker_takeovers=self._caretaker_takeovers,
+            agent_takeovers=self._agent_takeovers,
+            solve_ms=DurationMs(**spread(solve_ms, 50, 99)),
+        )
 
 
-def _sample(vehicle: RecordedVehicle) -> tuple[str, float, float, float, float, int | None, int]:
+def _sample(vehicle: RecordedVehicle) -> Sample:
     s_m, v_mps, a_mps2, y_m, _, _ = vehicle.state
     column, lane = vehicle.cell
     return (vehicle.name, s_m, y_m, v_mps, a_mps2, column, lane)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
+import pyarrow.parquet as pq
 import pytest
 
 from laneweave.launch.drawing.colours import lane_colours
@@ -14,32 +16,39 @@ from laneweave.launch.recordings.runs import Comparison, Run, scenario_of
 from laneweave.launch.report.figures import draw_speeds, draw_travel_times
 from laneweave.launch.report.snapshots import road_snapshots
 from laneweave.protocol.config.loading import parse_scenario
-from laneweave.sim_bridge.recording.recorder import Recorder
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.sim_bridge.recording.trajectories import Sample, Trajectories
+from laneweave.sim_bridge.recording.trips import Trip, metadata_of, trips_table
 from laneweave.sim_bridge.road.demand import Arrival
 
 
 def make_run(folder: Path, lanes: int = 3, vehicles: int = 12, *, lattice: bool = True) -> Path:
     """Record vehicles that drive straight on, one per second, from 55 s on."""
     scenario = parse_scenario({"road": {"lanes": lanes}})
-    with closing(Recorder(folder, scenario)) as recorder:
-        for number in range(vehicles):
-            lane = number % lanes
-            recorder.demanded(Arrival(f"v{number}", lane, lane, 55.0 + number))
-            recorder.entered(f"v{number}", 55.5 + number, number // 6 if lattice else None)
-        for tick in range(1300):
-            t_s = 0.1 * tick
-            samples = []
-            for number in range(vehicles):
-                s_m = 15.0 * (t_s - 55.5 - number)
-                if 0.0 <= s_m < 1000.0:
-                    y_m = (number % lanes + 0.5) * 3.5
-                    samples.append(
-                        (f"v{number}", s_m, y_m, 15.0, 0.0, -number if lattice else None, 0)
-                    )
-            recorder.tick(t_s, samples)
-        for number in range(vehicles):
-            recorder.left(f"v{number}", 55.5 + number + 1000 / 15, number % lanes)
+    trips = []
+    for number in range(vehicles):
+        arrival = Arrival(f"v{number}", number % lanes, number % lanes, 55.0 + number)
+        entered_s, formation = 55.5 + number, number // 6 if lattice else None
+        trips.append(Trip(arrival, entered_s, entered_s + 1000 / 15, formation, arrival.lane))
+    record(folder, scenario, trips)
     return folder
+
+
+def record(folder: Path, scenario: Scenario, trips: Sequence[Trip]) -> None:
+    """Write the files of a run whose vehicles drive at 15 m/s on the lanes of their arrival."""
+    metadata = metadata_of(scenario)
+    folder.mkdir(exist_ok=True)
+    pq.write_table(trips_table(trips, metadata), folder / "trips.parquet")
+    with closing(Trajectories(folder / "trajectories.parquet", metadata, -9.0)) as trajectories:
+        for tick in range(1300):
+            samples: list[Sample] = []
+            for number, trip in enumerate(trips):
+                s_m = 15.0 * (0.1 * tick - (trip.entered_s or 0.0))
+                if 0.0 <= s_m < 1000.0:
+                    y_m, column = (trip.arrival.lane + 0.5) * 3.5, -number
+                    in_column = column if trip.formation is not None else None
+                    samples.append((f"v{number}", s_m, y_m, 15.0, 0.0, in_column, 0))
+            trajectories.tick(0.1 * tick, samples)
 
 
 def is_picture(path: Path) -> bool:
@@ -67,7 +76,7 @@ def test_pictures_of_any_number_of_lanes(tmp_path: Path, lanes: int) -> None:
 
 
 def test_pictures_of_an_empty_run(tmp_path: Path) -> None:
-    Recorder(tmp_path, parse_scenario({})).close()
+    record(tmp_path, parse_scenario({}), ())
     draw_all(tmp_path)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,11 +11,13 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
+from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.wire.messages import Heartbeat, LogEvent, Name, Report
 from laneweave.sim_bridge.bodies.motion_controller import Rung
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
+from laneweave.sim_bridge.recording.trips import SCENARIO_KEY
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
@@ -247,10 +250,36 @@ def test_ticks_are_timed(record: RunRecord, watch: Watch, tmp_path: Path) -> Non
     assert [row["on_road"] for row in rows] == [0, 1, 2, 3]
 
 
-def test_a_run_in_which_nothing_happened_has_a_summary(record: RunRecord, tmp_path: Path) -> None:
+def test_an_empty_run_has_all_files_and_an_agreed_summary(
+    record: RunRecord, tmp_path: Path
+) -> None:
     record.close(0.0, Ending.INTERRUPTED)
     found = read_summary(tmp_path)
     assert found["runtime"]["real_time_factor"] == 0.0
     assert found["tracking"]["solve_ms"] == {"p50": None, "p99": None}
     assert found["planning"]["largest_formation"] == 0
+    assert list(found)[:11] == [
+        *("schema", "method", "seed", "volume_veh_per_lane_h", "lanes", "road_m", "simulated_s"),
+        *("vehicles", "travel_time_s", "throughput_veh_per_lane_h", "safety"),
+    ]
+    assert list(found["safety"]) == [
+        *("overlaps", "sumo_collisions", "min_gap_m", "min_headway_s", "emergency_brakes"),
+        *("max_accel_mps2", "min_accel_mps2", "max_jerk_mps3"),
+    ]
+    assert found["schema"] == "laneweave.summary/1"
     assert pq.read_table(tmp_path / "ticks.parquet").num_rows == 0
+    for name in ("trajectories.parquet", "trips.parquet"):
+        metadata = pq.read_schema(tmp_path / name).metadata or {}
+        assert parse_scenario(json.loads(metadata[SCENARIO_KEY])) == SCENARIO
+        assert pq.read_table(tmp_path / name).num_rows == 0
+
+
+def test_events_are_written_at_once_and_begin_with_the_time(
+    record: RunRecord, tmp_path: Path
+) -> None:
+    record.note(1.5, "agent-missing", vehicle="v1", path=tmp_path)
+    (line,) = (tmp_path / "events.jsonl").read_text().splitlines()
+    assert list(json.loads(line)) == ["t_s", "kind", "role", "vehicle", "path"]
+    record.note(2.0, "odd", t_s=99, kind="other", more=[1, 2])
+    (odd,) = read_events(tmp_path, "odd")
+    assert odd == {"t_s": 2.0, "kind": "odd", "role": "bridge", "more": [1, 2]}

@@ -1,0 +1,134 @@
+"""Trajectories: a row for each vehicle and tick in `trajectories.parquet`, and their extremes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from laneweave.protocol.summary import Safety
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
+from laneweave.sim_bridge.recording.trips import Metadata, finite
+
+ROWS_PER_GROUP = 100_000
+"""Rows that are buffered before they are written."""
+EMERGENCY_SHARE = 0.9
+"""Braking harder than this share of the limit counts as an emergency brake."""
+
+_COLUMNS: list[pa.Field[Any]] = [
+    pa.field("t_s", pa.float64(), nullable=False),
+    pa.field("vehicle", pa.string(), nullable=False),
+    pa.field("s_m", pa.float32(), nullable=False),
+    pa.field("y_m", pa.float32(), nullable=False),
+    pa.field("speed_mps", pa.float32(), nullable=False),
+    pa.field("accel_mps2", pa.float32(), nullable=False),
+    pa.field("column", pa.int32()),
+    pa.field("lane", pa.int8(), nullable=False),
+]
+
+Sample = tuple[str, float, float, float, float, int | None, int]
+"""(vehicle, s m, y m, speed m/s, acceleration m/s2, column or None off the lattice, lane).
+
+s is the front bumper, y the body's centre from the right road edge; column and lane are the cell.
+"""
+
+
+class Trajectories:
+    """Writes the rows in groups as the run goes on, and measures the extremes over them."""
+
+    def __init__(self, path: Path, metadata: Metadata, min_accel_mps2: float) -> None:
+        """Open the file; `min_accel_mps2` is the limit of braking."""
+        self.peak = 0
+        """Highest number of vehicles in a tick."""
+        self._schema = pa.schema(_COLUMNS, metadata)
+        self._writer = pq.ParquetWriter(
+            path,
+            self._schema,
+            compression="zstd",
+            use_dictionary=["t_s", "vehicle", "column", "lane"],  # type: ignore[arg-type]
+            use_byte_stream_split=["s_m", "y_m", "speed_mps", "accel_mps2"],
+        )
+        self._times: list[float] = []
+        self._rows: list[Sample] = []
+        """Buffered rows; `_times` has the time of each."""
+        self._brake_mps2 = EMERGENCY_SHARE * min_accel_mps2
+        self._last_s, self._last_accels = -math.inf, dict[str, float]()
+        """Time of the last tick, and the acceleration of each vehicle in it."""
+        self._overlaps: set[tuple[str, str]] = set()
+        self._collisions: set[tuple[str, str]] = set()
+        self._min_gap_m = self._min_headway_s = math.inf
+        self._emergency_brakes = 0
+        self._min_accel_mps2, self._max_accel_mps2 = math.inf, -math.inf
+        self._max_jerk_mps3 = -math.inf
+
+    def tick(self, t_s: float, rows: list[Sample]) -> None:
+        """Record all vehicles on the road at a road time, once per tick."""
+        brake_mps2, last_accels, dt_s = self._brake_mps2, self._last_accels, t_s - self._last_s
+        accels = {row[0]: row[4] for row in rows}
+        for vehicle, accel in accels.items():
+            last = last_accels.get(vehicle)
+            if last is not None and dt_s > 0.0:
+                self._max_jerk_mps3 = max(self._max_jerk_mps3, abs(accel - last) / dt_s)
+            if accel < brake_mps2 and (last is None or last >= brake_mps2):
+                self._emergency_brakes += 1
+        self._last_s, self._last_accels = t_s, accels
+        self._min_accel_mps2 = min(self._min_accel_mps2, *accels.values(), math.inf)
+        self._max_accel_mps2 = max(self._max_accel_mps2, *accels.values(), -math.inf)
+        self._times += [t_s] * len(rows)
+        self._rows += rows
+        self.peak = max(self.peak, len(rows))
+        if len(self._rows) >= ROWS_PER_GROUP:
+            self._write_rows()
+
+    def distances(
+        self,
+        overlaps: Iterable[tuple[str, str]],
+        collisions: Iterable[tuple[str, str]],
+        gaps: MinGaps,
+    ) -> None:
+        """Record how close the vehicles are in one tick.
+
+        Args:
+            overlaps: pairs of `Bodies.overlapping_pairs`.
+            collisions: pairs that SUMO reports.
+            gaps: result of `Bodies.min_gaps`.
+        """
+        self._overlaps.update(overlaps)
+        self._collisions.update(collisions)
+        self._min_gap_m = min(self._min_gap_m, gaps.gap_m)
+        self._min_headway_s = min(self._min_headway_s, gaps.headway_s)
+
+    def safety(self) -> Safety:
+        """Return the counts and extremes so far."""
+        return Safety(
+            overlaps=len(self._overlaps),
+            sumo_collisions=len(self._collisions),
+            min_gap_m=finite(self._min_gap_m),
+            min_headway_s=finite(self._min_headway_s),
+            emergency_brakes=self._emergency_brakes,
+            max_accel_mps2=finite(self._max_accel_mps2),
+            min_accel_mps2=finite(self._min_accel_mps2),
+            max_jerk_mps3=finite(self._max_jerk_mps3),
+        )
+
+    def close(self) -> None:
+        """Write the buffered rows, and close the file."""
+        try:
+            self._write_rows()
+        finally:
+            self._writer.close()
+
+    def _write_rows(self) -> None:
+        """Write the buffered rows as one row group."""
+        if not self._rows:
+            return
+        columns = [self._times, *zip(*self._rows, strict=True)]
+        self._times, self._rows = [], []
+        arrays = [
+            pa.array(column, field.type) for column, field in zip(columns, _COLUMNS, strict=True)
+        ]
+        self._writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=self._schema))

@@ -1,0 +1,123 @@
+"""Trips: a row for each demanded vehicle in `trips.parquet`, and the figures over all of them."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from attrs import define
+from numpy.typing import NDArray
+
+from laneweave.protocol.config.loading import to_tables
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.summary import TravelTime
+from laneweave.sim_bridge.road.demand import Arrival
+
+Metadata = dict[bytes | str, bytes | str]
+SCENARIO_KEY = b"laneweave.scenario"
+"""Key of the scenario in the metadata of a run's Parquet files."""
+WARM_UP_S = 60.0
+"""Vehicles that enter before this road time are not counted: the road is emptier for them."""
+
+_COLUMNS: list[pa.Field[Any]] = [
+    pa.field("vehicle", pa.string(), nullable=False),
+    pa.field("arrival_lane", pa.int8(), nullable=False),
+    pa.field("preferred_lane", pa.int8(), nullable=False),
+    pa.field("final_lane", pa.int8()),
+    pa.field("on_preferred_lane", pa.bool_()),
+    pa.field("demanded_s", pa.float64(), nullable=False),
+    pa.field("entered_s", pa.float64()),
+    pa.field("left_s", pa.float64()),
+    pa.field("travel_time_s", pa.float64()),
+    pa.field("entry_delay_s", pa.float64()),
+    pa.field("formation", pa.int32()),
+    pa.field("counted", pa.bool_(), nullable=False),
+]
+
+
+@define
+class Trip:
+    """The trip of one vehicle."""
+
+    arrival: Arrival
+    entered_s: float | None = None
+    left_s: float | None = None
+    formation: int | None = None
+    final_lane: int | None = None
+
+    def row(self, last_arrival_s: float) -> dict[str, Any]:
+        """Return its row; its travel time includes the time for which it waited to enter."""
+        demanded_s, entered_s, left_s = self.arrival.t_s, self.entered_s, self.left_s
+        entered_in_time = entered_s is not None and WARM_UP_S <= entered_s <= last_arrival_s
+        left = self.final_lane is not None
+        return {
+            "vehicle": self.arrival.vehicle,
+            "arrival_lane": self.arrival.lane,
+            "preferred_lane": self.arrival.preferred_lane,
+            "final_lane": self.final_lane,
+            "on_preferred_lane": self.final_lane == self.arrival.preferred_lane if left else None,
+            "demanded_s": demanded_s,
+            "entered_s": entered_s,
+            "left_s": left_s,
+            "travel_time_s": None if left_s is None else left_s - demanded_s,
+            "entry_delay_s": None if entered_s is None else entered_s - demanded_s,
+            "formation": self.formation,
+            "counted": left_s is not None and entered_in_time,
+        }
+
+
+def metadata_of(scenario: Scenario) -> Metadata:
+    """Return the metadata of a run's Parquet files."""
+    return {SCENARIO_KEY: json.dumps(to_tables(scenario)).encode()}
+
+
+def trips_table(trips: Iterable[Trip], metadata: Metadata) -> pa.Table:
+    """Return the table of all trips."""
+    listed = list(trips)
+    last_s = max((trip.arrival.t_s for trip in listed), default=-math.inf)
+    rows = [trip.row(last_s) for trip in listed]
+    return pa.Table.from_pylist(rows, schema=pa.schema(_COLUMNS, metadata))
+
+
+def travel_time(trips: pa.Table) -> TravelTime:
+    """Return the figures of the counted vehicles' travel times."""
+    times_s = trips.filter(pc.field("counted"))["travel_time_s"].to_numpy()
+    mean_s = finite(float(np.mean(times_s))) if len(times_s) else None
+    return TravelTime(mean=mean_s, **spread(times_s, 50, 95, largest=True))
+
+
+def throughput(trips: pa.Table, lanes: int) -> float | None:
+    """Return the vehicles per lane and hour that pass the end of the road; None if undefined.
+
+    It is the rate between the first and the last counted vehicle that leave.
+    """
+    counted_s = trips.filter(pc.field("counted"))["left_s"].to_numpy()
+    if not len(counted_s) or counted_s.max() <= counted_s.min():
+        return None
+    left_s = trips["left_s"].drop_null().to_numpy()
+    passed = int(np.sum((counted_s.min() < left_s) & (left_s <= counted_s.max())))
+    return finite(3600.0 * passed / float(np.ptp(counted_s)) / lanes)
+
+
+def finite(value: float) -> float | None:
+    """Return a number for JSON, rounded to a thousandth; None for infinities and NaN."""
+    return round(value, 3) if math.isfinite(value) else None
+
+
+def spread(
+    values: NDArray[Any], *percentiles: int, largest: bool = False
+) -> dict[str, float | None]:
+    """Return percentiles by name, `max` too if it is wanted; None where there are no values."""
+    ranks = {f"p{percentile}": percentile for percentile in percentiles}
+    if largest:
+        ranks["max"] = 100
+    with np.errstate(all="ignore"):
+        return {
+            name: finite(float(np.percentile(values, rank))) if len(values) else None
+            for name, rank in ranks.items()
+        }

@@ -1,0 +1,158 @@
+"""Trips and trajectories come back from their files; figures count the right vehicles."""
+
+from __future__ import annotations
+
+import math
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from attrs import astuple
+
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.summary import Safety, TravelTime
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
+from laneweave.sim_bridge.recording import trajectories as trajectories_module
+from laneweave.sim_bridge.recording.trajectories import Sample, Trajectories
+from laneweave.sim_bridge.recording.trips import (
+    Trip,
+    metadata_of,
+    throughput,
+    travel_time,
+    trips_table,
+)
+from laneweave.sim_bridge.road.demand import Arrival
+
+METADATA = metadata_of(Scenario())
+
+
+def trip(
+    number: int,
+    demanded_s: float,
+    entered_s: float | None = None,
+    left_s: float | None = None,
+    lanes: tuple[int, int, int] = (0, 1, 1),
+) -> Trip:
+    """Return one vehicle's trip; lanes: arrival, preferred, final."""
+    arrival = Arrival(f"v{number:04d}", lanes[0], lanes[1], demanded_s)
+    formation = None if entered_s is None else number // 6
+    return Trip(arrival, entered_s, left_s, formation, None if left_s is None else lanes[2])
+
+
+def table(*trips: Trip) -> pa.Table:
+    return trips_table(trips, METADATA)
+
+
+@pytest.fixture
+def trajectories(tmp_path: Path) -> Trajectories:
+    return Trajectories(tmp_path / "trajectories.parquet", METADATA, -10.0)
+
+
+def test_trajectories_come_back(
+    trajectories: Trajectories, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(0)
+    expected = []
+    monkeypatch.setattr(trajectories_module, "ROWS_PER_GROUP", 25)
+    with closing(trajectories):
+        for tick in range(40):
+            samples: list[Sample] = []
+            for n in range(tick % 5):
+                s_m, y_m, speed, accel = map(float, rng.uniform(0, 10, 4))
+                samples.append((f"v{n}", s_m, y_m, speed, accel, -n if n else None, n % 3))
+            trajectories.tick(0.1 * tick, samples)
+            expected += [(0.1 * tick, *sample) for sample in samples]
+    file = pq.ParquetFile(tmp_path / "trajectories.parquet")
+    assert file.num_row_groups > 2
+    found = file.read()
+    names = ["t_s", "vehicle", "s_m", "y_m", "speed_mps", "accel_mps2", "column", "lane"]
+    assert found.column_names == names
+    rows = list(zip(*(found[name].to_pylist() for name in names), strict=True))
+    for row, wanted in zip(rows, expected, strict=True):
+        assert row[:2] == wanted[:2]
+        assert row[2:6] == pytest.approx(wanted[2:6], rel=1e-6)
+        assert row[6:] == wanted[6:]
+
+
+def test_trips_have_every_state() -> None:
+    rows = table(
+        trip(1, 1.0, 3.0, 70.0),
+        trip(2, 62.0, 64.5, 131.5, lanes=(2, 0, 1)),
+        trip(3, 70.0, 71.0),
+        trip(4, 80.0),
+    ).to_pylist()
+    assert rows[1] == {
+        "vehicle": "v0002",
+        "arrival_lane": 2,
+        "preferred_lane": 0,
+        "final_lane": 1,
+        "on_preferred_lane": False,
+        "demanded_s": 62.0,
+        "entered_s": 64.5,
+        "left_s": 131.5,
+        "travel_time_s": 69.5,
+        "entry_delay_s": 2.5,
+        "formation": 0,
+        "counted": True,
+    }
+    assert [row["counted"] for row in rows] == [False, True, False, False]
+    assert [row["on_preferred_lane"] for row in rows] == [True, False, None, None]
+    assert [row["left_s"] for row in rows] == [70.0, 131.5, None, None]
+    assert [row["entered_s"] for row in rows] == [3.0, 64.5, 71.0, None]
+
+
+def test_only_vehicles_between_warm_up_and_last_arrival_count() -> None:
+    found = table(
+        trip(1, 58.0, 59.9, 900.0),  # enters during the warm-up
+        *(trip(n, 10.0 * n + 39.0, 10.0 * n + 40.0, 11.0 * n + 100.0) for n in range(2, 12)),
+        trip(12, 150.0, 150.5, 800.0),  # enters after the last arrival
+        trip(13, 149.0, 149.5),  # still on the road
+    )
+    times_s = [61.0 + number for number in range(2, 12)]
+    expected = [np.mean(times_s), np.median(times_s), np.percentile(times_s, 95), 72.0]
+    assert astuple(travel_time(found)) == pytest.approx(tuple(expected))
+    # Ten counted vehicles leave at 122, 133, ... 221 s: one in 11 s, over three lanes.
+    assert throughput(found, 3) == pytest.approx(3600 / 11 / 3, abs=1e-3)
+
+
+@pytest.mark.parametrize("trips", [(), (trip(1, 1.0, 2.0, 70.0),)], ids=["empty", "short"])
+def test_a_run_without_counted_vehicles_has_no_figures(trips: tuple[Trip, ...]) -> None:
+    assert travel_time(table(*trips)) == TravelTime(mean=None, p50=None, p95=None, max=None)
+    assert throughput(table(*trips), 3) is None
+
+
+def test_safety_is_the_worst_of_the_run(trajectories: Trajectories) -> None:
+    assert trajectories.safety() == Safety(
+        overlaps=0,
+        sumo_collisions=0,
+        min_gap_m=None,
+        min_headway_s=None,
+        emergency_brakes=0,
+        max_accel_mps2=None,
+        min_accel_mps2=None,
+        max_jerk_mps3=None,
+    )
+    trajectories.distances([("a", "b")], [], MinGaps(4.0, 1.2))
+    trajectories.distances([("a", "b"), ("a", "c")], [("a", "b")], MinGaps(3.25, 1.5))
+    trajectories.distances([], [], MinGaps(math.inf, math.inf))
+    safety = trajectories.safety()
+    assert (safety.overlaps, safety.sumo_collisions) == (2, 1)
+    assert (safety.min_gap_m, safety.min_headway_s) == (3.25, 1.2)
+    trajectories.close()
+
+
+def test_emergency_brakes_are_counted_by_episode(trajectories: Trajectories) -> None:
+    accels = {"a": [0.0, -9.5, -10.0, -8.0, -9.1, 0.0], "b": [0.0, 1.0, 1.5, 1.5, -8.9, -9.0]}
+    for tick in range(6):
+        rows: list[Sample] = [(v, 0.0, 1.0, 15.0, accels[v][tick], None, 0) for v in accels]
+        trajectories.tick(0.1 * tick, rows)
+    safety = trajectories.safety()
+    assert trajectories.peak == 2
+    assert safety.emergency_brakes == 2
+    assert safety.min_accel_mps2 == -10.0
+    assert safety.max_accel_mps2 == 1.5
+    assert safety.max_jerk_mps3 == pytest.approx(104.0)
+    trajectories.close()
