@@ -1,8 +1,9 @@
-"""A run's trajectories as arrays, vehicle by vehicle."""
+"""A run's trajectories as arrays, vehicle by vehicle; and its trips."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.compute as pc
@@ -14,6 +15,7 @@ from laneweave.protocol.errors import BadInputError
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 
 OFF_LATTICE = np.iinfo(np.int64).min
 """Column of a vehicle off the lattice."""
@@ -41,9 +43,31 @@ class Tracks:
         """Number of each row's vehicle."""
         return np.repeat(np.arange(len(self.names)), np.diff(self.starts))
 
+    @property
+    def changed(self) -> Bools:
+        """Whether each row is the first one of its vehicle in another cell."""
+        changed = np.zeros(len(self.t_s), dtype=np.bool_)
+        changed[1:] = (np.diff(self.column) != 0) | (np.diff(self.lane) != 0)
+        changed[self.starts[:-1]] = False
+        return changed
+
     def rows(self, number: int) -> slice:
         """Return the rows of a vehicle."""
         return slice(int(self.starts[number]), int(self.starts[number + 1]))
+
+    def sampled(self, number: int, name: str, times_s: Floats) -> Floats:
+        """Return a column of a vehicle, interpolated at some times."""
+        rows = self.rows(number)
+        return np.asarray(np.interp(times_s, self.t_s[rows], getattr(self, name)[rows]))
+
+
+def read_trips(folder: Path) -> dict[str, dict[str, Any]]:
+    """Return a run's trips, by vehicle.
+
+    Raises:
+        OSError, ValueError: they cannot be read.
+    """
+    return {trip["vehicle"]: trip for trip in pq.read_table(folder / "trips.parquet").to_pylist()}
 
 
 def read_tracks(folder: Path) -> Tracks:
@@ -64,19 +88,16 @@ def read_tracks(folder: Path) -> Tracks:
     t_s = table["t_s"].to_numpy().astype(np.float64)
     order = np.lexsort((t_s, vehicle))
     counts = np.bincount(vehicle, minlength=len(names))
-
-    def floats(name: str) -> Floats:
-        return np.asarray(table[name].to_numpy()[order], dtype=np.float64)
-
+    values = {
+        name: table[name].to_numpy()[order].astype(np.float64)
+        for name in ("s_m", "y_m", "speed_mps", "accel_mps2")
+    }
     column = pc.fill_null(pc.cast(table["column"], "int64"), int(OFF_LATTICE)).to_numpy()
     return Tracks(
         names=tuple(names),
         starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         t_s=t_s[order],
-        s_m=floats("s_m"),
-        y_m=floats("y_m"),
-        speed_mps=floats("speed_mps"),
-        accel_mps2=floats("accel_mps2"),
+        **values,
         column=column[order].astype(np.int64),
         lane=table["lane"].to_numpy()[order].astype(np.int64),
     )

@@ -13,20 +13,19 @@ import math
 from typing import Any, Final
 
 import numpy as np
-import pyarrow.parquet as pq
 from attrs import frozen
 
 from laneweave.launch.drawing.colours import road_scene
 from laneweave.launch.observe.column_owners import Formations, recorded_formations
 from laneweave.launch.recordings.runs import Run
-from laneweave.launch.recordings.trajectories import Floats, Tracks
+from laneweave.launch.recordings.trajectories import Floats, Tracks, read_trips
 
 FORMAT: Final = "laneweave.animation/1"
 KINDS: Final = {"s_m": "<u2", "y_m": "<u2", "speed_mps": "u1"}
 """The columns and their data types."""
 STEPS_S: Final = (0.2, 0.5, 1.0)
 MAX_SAMPLES: Final = 600_000
-"""4 MB of text. A longer run is sampled more coarsely, or ends earlier."""
+"""They take 4 MB of text. A longer run is sampled more coarsely, or ends earlier."""
 
 
 def animation_data(run: Run, tracks: Tracks, title: str) -> dict[str, Any]:
@@ -39,7 +38,7 @@ def animation_data(run: Run, tracks: Tracks, title: str) -> dict[str, Any]:
     """
     scenario, road = run.scenario, run.scenario.road
     formations = Formations(())
-    if not scenario.formation.rolling:  # the stream has none
+    if not scenario.formation.rolling:  # the rolling operation has none
         formations = recorded_formations(run.folder, scenario.lattice)
     samples = _sample(run, tracks, formations)
     units = {
@@ -76,20 +75,15 @@ class _Samples:
 
 def _sample(run: Run, tracks: Tracks, formations: Formations) -> _Samples:
     """Sample all vehicles on a common grid of times."""
-    trips = pq.read_table(
-        run.folder / "trips.parquet", columns=["vehicle", "preferred_lane", "formation"]
-    ).to_pylist()
-    trip_of = {trip["vehicle"]: trip for trip in trips}
-    known = formations.by_number
+    trips, known = read_trips(run.folder), formations.by_number
     driven_s = len(tracks.t_s) * run.scenario.runtime.tick_s
     step_s = next((step for step in STEPS_S if driven_s / step <= MAX_SAMPLES), STEPS_S[-1])
     end_s = float(tracks.t_s.max(initial=0.0))
     vehicles: list[dict[str, Any]] = []
     columns: dict[str, list[Floats]] = {name: [] for name in KINDS}
     samples = 0
-    for number in np.argsort(tracks.t_s[tracks.starts[:-1]], kind="stable"):
-        rows = tracks.rows(int(number))
-        t_s = tracks.t_s[rows]
+    for number in np.argsort(tracks.t_s[tracks.starts[:-1]], kind="stable").tolist():
+        t_s = tracks.t_s[tracks.rows(number)]
         first = math.ceil(t_s[0] / step_s - 1e-6)
         count = math.floor(t_s[-1] / step_s + 1e-6) - first + 1
         if count < 1:
@@ -101,11 +95,11 @@ def _sample(run: Run, tracks: Tracks, formations: Formations) -> _Samples:
         samples += count
         times_s = step_s * (first + np.arange(count))
         for name, parts in columns.items():
-            parts.append(np.interp(times_s, t_s, getattr(tracks, name)[rows]))
-        trip = trip_of.get(tracks.names[int(number)], {})
+            parts.append(tracks.sampled(number, name, times_s))
+        trip = trips.get(tracks.names[number], {})
         vehicles.append(
             {
-                "name": tracks.names[int(number)],
+                "name": tracks.names[number],
                 "lane": int(trip.get("preferred_lane") or 0),
                 "formation": trip["formation"] if trip.get("formation") in known else None,
                 "first": first,

@@ -1,4 +1,4 @@
-"""Makes the report of one run, or of many side by side: pictures and a page.
+"""The report of one run, or of many side by side: pictures and a page.
 
 The report of one run is a comparison of one.
 """
@@ -6,6 +6,7 @@ The report of one run is a comparison of one.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 from attrs import define, field
@@ -60,13 +61,19 @@ class _Report:
     dpi: int
     sections: list[Section] = field(factory=list)
 
+    def draw(
+        self, name: str, draw: Callable[[Path, int], None], caption: str, alt: str
+    ) -> list[Picture]:
+        """Draw a picture."""
+        path = self.figures / name
+        draw(path, self.dpi)
+        return [Picture(path, self.dpi, caption, alt)]
+
     def add(
         self, title: str, name: str, draw: Callable[[Path, int], None], caption: str, alt: str
     ) -> None:
         """Draw a picture, and add a section with it."""
-        path = self.figures / name
-        draw(path, self.dpi)
-        self.sections.append(Section(title, pictures=[Picture(path, self.dpi, caption, alt)]))
+        self.sections.append(Section(title, pictures=self.draw(name, draw, caption, alt)))
 
 
 def report_run(run: Run, *, formation: int | None = None, dpi: int = DPI) -> Path:
@@ -112,11 +119,11 @@ def report_comparison(
 def _sections(
     comparison: Comparison, report: _Report, names: Mapping[str, str], formation: int | None
 ) -> list[Section]:
-    """Return all sections; `names` has the pictures that are called otherwise."""
+    """Return all sections; `names` maps names of pictures to those in the folder of a run."""
     several = not names
     busiest = [run for run in map(comparison.busiest, comparison.labels) if run is not None]
     shown = [(run, read_tracks(run.folder)) for run in busiest]
-    # First of all, because it may refuse the formation.
+    # First, because it raises an error for an unknown formation.
     maps = (
         driven_map(run, tracks, formation)
         for run, tracks in shown
@@ -127,7 +134,7 @@ def _sections(
     report.add(
         "Travel time",
         names.get("travel_times.png", "travel_times.png"),
-        lambda path, dpi: figures.draw_travel_times(comparison, path, dpi),
+        partial(figures.draw_travel_times, comparison),
         TRAVEL_CAPTION,
         "Box plots of travel times by method and traffic volume",
     )
@@ -135,7 +142,7 @@ def _sections(
         report.add(
             "Throughput and lanes",
             "flows.png",
-            lambda path, dpi: figures.draw_flows(comparison, path, dpi),
+            partial(figures.draw_flows, comparison),
             FLOW_CAPTION,
             "Throughput and share on the preferred lane against traffic volume",
         )
@@ -143,11 +150,11 @@ def _sections(
         report.add(
             "Speed over space and time",
             names.get("speeds.png", "speeds.png"),
-            lambda path, dpi: figures.draw_speeds(comparison, path, dpi),
+            partial(figures.draw_speeds, comparison),
             SPEED_CAPTION,
             "Heat maps of mean speed over time and position, one for each method and volume",
         )
-        pictures = [_snapshots(report, run, names) for run in busiest]
+        pictures = [one for run in busiest for one in _snapshots(report, run, names)]
         report.sections.append(Section("Snapshots", pictures=pictures))
         _add_path_map(report, driven)
         _add_distributions(report, comparison, busiest[0])
@@ -156,18 +163,18 @@ def _sections(
     return report.sections
 
 
-def _snapshots(report: _Report, run: Run, names: Mapping[str, str]) -> Picture:
+def _snapshots(report: _Report, run: Run, names: Mapping[str, str]) -> list[Picture]:
     name = f"road-{run.label}.png"
-    path = report.figures / names.get(name, name)
     # A comparison shows the same stretch of all methods: the paper's, where the road has it.
     fits = name not in names and run.scenario.road.length_m >= PAPER_STRETCH_M[1]
-    road_snapshots(run.folder, path, stretch_m=PAPER_STRETCH_M if fits else None, dpi=report.dpi)
-    caption = (
+    stretch_m = PAPER_STRETCH_M if fits else None
+    return report.draw(
+        names.get(name, name),
+        lambda path, dpi: road_snapshots(run.folder, path, stretch_m=stretch_m, dpi=dpi),
         f"{_title(run)}. Four instants, the shortest T_F apart. Colours are the lanes that "
-        "vehicles prefer; the faster, the lighter."
+        "vehicles prefer; the faster, the lighter.",
+        f"Four strips of road with vehicles coloured by preferred lane, {run.label}",
     )
-    alt = f"Four strips of road with vehicles coloured by preferred lane, {run.label}"
-    return Picture(path, report.dpi, caption, alt)
 
 
 def _add_path_map(report: _Report, driven: DrivenMap | None) -> None:
@@ -176,8 +183,8 @@ def _add_path_map(report: _Report, driven: DrivenMap | None) -> None:
     report.add(
         "Relative path map",
         "path_map.png",
-        lambda path, dpi: draw_path_map(driven, path, dpi),
-        f"The cells (column, lane) of {driven.whose} at the ends of slots, as driven. "
+        partial(draw_path_map, driven),
+        f"The cells (column, lane) of {driven.vehicles} at the ends of slots, as driven. "
         "The box before a name has the colour of the preferred lane; cells have the colour of "
         "their lane, strong where that is the preferred one; bold: moved in the slot before.",
         f"Table of the cells of {driven.name} by vehicle and slot",
@@ -195,14 +202,14 @@ def _add_distributions(report: _Report, comparison: Comparison, example: Run) ->
     report.add(
         "Spacings and time headways",
         "spacing.png",
-        lambda path, dpi: distributions.draw_spacings(counted, example.scenario, path, dpi),
+        partial(distributions.draw_spacings, counted, example.scenario),
         SPACING_CAPTION,
         "Cumulative distributions of spacing and time headway",
     )
     report.add(
         "Deceleration and comfort",
         "comfort.png",
-        lambda path, dpi: distributions.draw_comfort(counted, example.scenario, path, dpi),
+        partial(distributions.draw_comfort, counted, example.scenario),
         COMFORT_CAPTION,
         "Shares of driving time above each deceleration, jerk and lateral acceleration",
     )

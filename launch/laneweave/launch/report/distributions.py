@@ -8,19 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 from attrs import field, frozen
-from numpy.typing import NDArray
 
-from laneweave.launch.drawing.figures import INK, new_figure, save
-from laneweave.launch.recordings.trajectories import Floats, Tracks
+from laneweave.launch.recordings.trajectories import Bools, Floats, Tracks
 from laneweave.launch.report.style import (
+    REFERENCE,
     label_colours,
     legend_above,
     note,
-    plain,
+    picture,
     spread_evenly,
     volume_title,
 )
@@ -28,10 +27,7 @@ from laneweave.protocol.scenario.tables import Scenario
 from laneweave.sim_bridge.recording.trips import WARM_UP_S
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
-
-Bools = NDArray[np.bool_]
 
 SAMPLE_S: Final = 1.0
 """Period at which spacings are sampled; they change slowly."""
@@ -167,67 +163,52 @@ def _draw(
 ) -> None:
     labels = list(dict.fromkeys(label for label, _ in counted))
     volumes = spread_evenly(sorted({volume for _, volume in counted}))
-    colours = label_colours(labels)
-    if len(volumes) == 1:
-        # Quantities side by side: a single column of panels would be too tall.
-        figure = new_figure(3.2 * len(quantities), 3.0)
-        panels = figure.subplots(1, len(quantities), squeeze=False).T
-    else:
-        figure = new_figure(1.0 + 2.1 * len(volumes), 0.6 + 1.95 * len(quantities))
-        panels = figure.subplots(
-            len(quantities), len(volumes), sharex="row", sharey="row", squeeze=False
-        )
-    for row, quantity in enumerate(quantities):
-        for column, volume in enumerate(volumes):
-            axes = panels[row, column]
+    colours, single = label_colours(labels), len(volumes) == 1
+    # With one volume, quantities are side by side: a single column of panels would be too tall.
+    size_in = (3.2 * len(quantities), 3.0)
+    if not single:
+        size_in = (1.0 + 2.1 * len(volumes), 0.6 + 1.95 * len(quantities))
+    with picture(*size_in, out, dpi) as figure:
+        shared: Literal["none", "row"] = "none" if single else "row"
+        rows, columns = (1, len(quantities)) if single else (len(quantities), len(volumes))
+        panels = figure.subplots(rows, columns, sharex=shared, sharey=shared, squeeze=False)
+        keys = [(quantity, volume) for quantity in quantities for volume in volumes]
+        for axes, (quantity, volume) in zip(panels.flat, keys, strict=True):
             for label in labels:
                 if (label, volume) in counted:
                     _draw_one(axes, counted[label, volume], quantity, label, colours[label])
             if not axes.lines:
                 note(axes, "no trajectories")
-            _draw_limits(axes, quantity, scenario)
-            plain(axes)
-            axes.set_xlabel(f"{quantity.name} ({quantity.unit})", fontsize=8.5, color=INK)
-            if column == 0 or len(volumes) == 1:
-                axes.set_ylabel(_axis_label(quantity), fontsize=8.5, color=INK)
-            if row == 0 and len(volumes) > 1:
-                axes.set_title(volume_title(volume), fontsize=9, color=INK)
-    if len(labels) > 1:
-        handles: dict[str, Artist] = {}
-        for axes in panels.flat:
-            drawn, names = axes.get_legend_handles_labels()
-            handles |= dict(zip(names, drawn, strict=True))
-        legend_above(figure, [handles[label] for label in labels], labels)
-    save(figure, out, dpi)
+            axes.axvline(_set_value(quantity, scenario), zorder=1, **REFERENCE)
+            axes.set_xlabel(f"{quantity.name} ({quantity.unit})")
+            if volume == volumes[0]:
+                share = "time with more" if quantity.exceedance else "vehicles with less"
+                axes.set_ylabel(f"share of {share}")
+            if quantity is quantities[0] and not single:
+                axes.set_title(volume_title(volume))
+        if len(labels) > 1:
+            legend_above(figure)
 
 
 def _draw_one(axes: Axes, counts: Counts, quantity: Quantity, label: str, colour: str) -> None:
+    style: dict[str, Any] = {"color": colour, "linewidth": 1.4, "label": label}
     if quantity.exceedance:
-        edges, shares = quantity.edges[:-1], counts.exceedance(quantity)
-        seen = shares > 0.0
-        axes.plot(edges[seen], shares[seen], color=colour, linewidth=1.4, label=label)
+        shares = counts.exceedance(quantity)
+        axes.plot(quantity.edges[:-1][shares > 0.0], shares[shares > 0.0], **style)
         axes.set_yscale("log")
-        axes.set_ylim(MIN_SHARE, 1.3)
-        axes.set_xlim(0.0, quantity.edges[-1])
-        return
-    axes.plot(quantity.edges[1:-1], counts.cumulative(quantity), color=colour, label=label)
-    axes.lines[-1].set_linewidth(1.4)
-    axes.set_xlim(0.0, quantity.edges[-2])
-    axes.set_ylim(0.0, 1.03)
+        axes.set(ylim=(MIN_SHARE, 1.3), xlim=(0.0, quantity.edges[-1]))
+    else:
+        axes.plot(quantity.edges[1:-1], counts.cumulative(quantity), **style)
+        axes.set(ylim=(0.0, 1.03), xlim=(0.0, quantity.edges[-2]))
 
 
-def _draw_limits(axes: Axes, quantity: Quantity, scenario: Scenario) -> None:
-    """Draw the upper limit of a quantity, or the formation's set value."""
+def _set_value(quantity: Quantity, scenario: Scenario) -> float:
+    """Return the upper limit of a quantity, or the formation's set value."""
     vehicle, formation = scenario.vehicle, scenario.formation
-    place = {
+    return {
         SPACING.name: formation.gap_m,
         HEADWAY.name: formation.gap_m / formation.speed_mps,
         DECELERATION.name: -vehicle.min_accel_mps2,
         JERK.name: vehicle.max_jerk_mps3,
         LATERAL.name: vehicle.max_lateral_accel_mps2,
     }[quantity.name]
-    axes.axvline(place, color="#8a9099", linewidth=1.0, linestyle="--", zorder=1)
-
-
-def _axis_label(quantity: Quantity) -> str:
-    return "share of time with more" if quantity.exceedance else "share of vehicles with less"

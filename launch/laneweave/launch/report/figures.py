@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,22 +12,23 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from attrs import frozen
 
-from laneweave.launch.drawing.figures import FAINT_INK, INK, new_figure, save
-from laneweave.launch.recordings.runs import Comparison, Run, scenario_of
-from laneweave.launch.recordings.trajectories import Floats
+from laneweave.launch.drawing.figures import INK
+from laneweave.launch.recordings.runs import Comparison, Run
+from laneweave.launch.recordings.trajectories import Floats, read_tracks
 from laneweave.launch.report.style import (
+    NOTE,
+    REFERENCE,
     label_colours,
     legend_above,
     note,
-    plain,
+    picture,
     spread_evenly,
     volume_title,
 )
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.summary import RunSummary
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
 
 JAMMED = 1.25
 """A box belongs to a jam if its upper quartile exceeds the lowest median by this factor."""
@@ -34,6 +36,8 @@ MARGIN = 0.04
 """Part of the scale that is free below the shortest travel time."""
 LOWER_SHARE = 0.66
 """Part of the height below the break, for the methods that do not jam."""
+BIN_M, BIN_S = 20.0, 5.0
+"""Size of the bins of mean speeds."""
 
 
 def draw_travel_times(comparison: Comparison, out: Path, dpi: int) -> None:
@@ -41,51 +45,50 @@ def draw_travel_times(comparison: Comparison, out: Path, dpi: int) -> None:
 
     Where a method jams, the axis is broken: jams are much longer than other differences.
     """
-    from matplotlib.patches import Patch  # noqa: PLC0415 - lazily
-
     labels, volumes = comparison.labels, comparison.volumes
-    colours = label_colours(labels)
     times = {
         label: [_travel_times(comparison.at(label, volume)) for volume in volumes]
         for label in labels
     }
-    figure = new_figure(max(5.6, 1.6 + 0.3 * len(volumes) * (len(labels) + 0.8)), 4.4)
     break_s = _break(one for found in times.values() for one in found)
-    if break_s is None:
-        lower = figure.subplots()
-        panels = [lower]
-    else:
-        shares = (1.0 - LOWER_SHARE, LOWER_SHARE)
-        upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=shares)
-        panels = [upper, lower]
-    for axes in panels:
-        _draw_boxes(axes, times, colours)
-        plain(axes, grid="y")
-    _draw_free_flow(lower, comparison)
-    if break_s is not None:
-        _break_axis(upper, lower, break_s)
-    for number, label in enumerate(labels):
-        places = _places(number, labels, volumes)
-        for place, volume, one in zip(places, volumes, times[label], strict=True):
-            if comparison.at(label, volume) and not len(one):
-                lower.text(
-                    place,
-                    0.03,
-                    "no vehicle",
-                    transform=lower.get_xaxis_transform(),
-                    rotation=90,
-                    ha="center",
-                    va="bottom",
-                    fontsize=7,
-                    color=FAINT_INK,
-                )
-    lower.set_xticks(range(len(volumes)), labels=[f"{volume:g}" for volume in volumes])
-    lower.set_xlim(-0.6, len(volumes) - 0.4)
-    lower.set_xlabel("traffic volume (veh/(lane·h))")
-    lower.set_ylabel("travel time (s)")
-    handles = [Patch(facecolor=colours[one] + "55", edgecolor=colours[one]) for one in labels]
-    legend_above(figure, handles, labels)
-    save(figure, out, dpi)
+    width_in = max(5.6, 1.6 + 0.3 * len(volumes) * (len(labels) + 0.8))
+    with picture(width_in, 4.4, out, dpi) as figure:
+        shares = [1.0] if break_s is None else [1.0 - LOWER_SHARE, LOWER_SHARE]
+        panels = figure.subplots(len(shares), 1, sharex=True, height_ratios=shares, squeeze=False)
+        upper, lower = panels[0, 0], panels[-1, 0]
+        for axes in panels.flat:
+            _draw_boxes(axes, times)
+            axes.grid(visible=False, axis="x")
+        for t_s in sorted({_free_flow_s(run) for run in comparison.runs}):
+            lower.axhline(t_s, zorder=0, **REFERENCE)
+            lower.annotate(
+                f"free flow\n{t_s:.1f} s",
+                (1.0, t_s),
+                xycoords=("axes fraction", "data"),
+                xytext=(4, 0),
+                textcoords="offset points",
+                va="center",
+                annotation_clip=False,
+                **NOTE,
+            )
+        if break_s is not None:
+            _break_axis(upper, lower, break_s)
+        for label, places in zip(labels, _places(len(labels), len(volumes)), strict=True):
+            for place, volume, found in zip(places, volumes, times[label], strict=True):
+                if comparison.at(label, volume) and not len(found):
+                    where = lower.get_xaxis_transform()
+                    style: dict[str, Any] = {
+                        "transform": where,
+                        "rotation": 90,
+                        "ha": "center",
+                        "va": "bottom",
+                    }
+                    lower.text(place, 0.03, "no vehicle", **style, **NOTE)
+        lower.set_xticks(range(len(volumes)), labels=[f"{volume:g}" for volume in volumes])
+        lower.set_xlim(-0.6, len(volumes) - 0.4)
+        lower.set_xlabel("traffic volume (veh/(lane·h))")
+        lower.set_ylabel("travel time (s)")
+        legend_above(figure)
 
 
 def _break(times_s: Iterable[Floats]) -> float | None:
@@ -106,154 +109,105 @@ def _break_axis(upper: Axes, lower: Axes, break_s: float) -> None:
     upper.spines["bottom"].set_visible(False)
     upper.tick_params(axis="x", bottom=False, labelbottom=False)
     upper.set_ylabel("jams (s)")
-    for axes, y in ((upper, 0.0), (lower, 1.0)):
-        axes.plot(
-            [0.0],
-            [y],
-            transform=axes.transAxes,
-            color=INK,
-            clip_on=False,
-            marker=[(-1.0, -0.5), (1.0, 0.5)],
-            markersize=9,
-            linestyle="none",
-        )
+    slash: dict[str, Any] = {"marker": [(-1.0, -0.5), (1.0, 0.5)], "markersize": 9, "color": INK}
+    upper.plot([0.0], [0.0], transform=upper.transAxes, clip_on=False, **slash)
+    lower.plot([0.0], [1.0], transform=lower.transAxes, clip_on=False, **slash)
 
 
-def _places(number: int, labels: Sequence[str], volumes: Sequence[float]) -> Floats:
-    """Return the places of a label's boxes along the axis."""
-    width = 0.8 / len(labels)
-    shift = (number - 0.5 * (len(labels) - 1)) * width
-    return np.arange(len(volumes), dtype=np.float64) + shift
+def _places(labels: int, volumes: int, width: float = 0.8) -> Floats:
+    """Return places along the axis, shape (labels, volumes): the labels of a volume side by side.
+
+    `width` is that of all labels at a volume; volumes are 1 apart.
+    """
+    shifts = (np.arange(labels) - 0.5 * (labels - 1)) * width / max(1, labels)
+    return np.asarray(np.arange(volumes) + shifts[:, None])
 
 
-def _draw_boxes(
-    axes: Axes, times_s: Mapping[str, Sequence[Floats]], colours: Mapping[str, str]
-) -> None:
+def _draw_boxes(axes: Axes, times_s: Mapping[str, Sequence[Floats]]) -> None:
     """Draw the boxes of each label, one for each volume, and a line through their means."""
-    labels = list(times_s)
-    width = 0.8 / len(labels)
-    for number, (label, times) in enumerate(times_s.items()):
-        places = _places(number, labels, range(len(times)))
+    volumes = len(next(iter(times_s.values())))
+    all_places, colours = _places(len(times_s), volumes), label_colours(times_s)
+    for places, (label, times) in zip(all_places, times_s.items(), strict=True):
+        colour = colours[label]
         axes.boxplot(
             times,
             positions=places,
-            widths=0.72 * width,
+            widths=0.72 * 0.8 / len(times_s),
             manage_ticks=False,
             patch_artist=True,
-            boxprops={"facecolor": colours[label] + "55", "edgecolor": colours[label]},
+            label=label,
+            boxprops={"facecolor": colour + "55", "edgecolor": colour},
             medianprops={"color": INK, "linewidth": 1.2},
-            whiskerprops={"color": colours[label]},
-            capprops={"color": colours[label]},
-            flierprops={"marker": ".", "markersize": 2.5, "markeredgecolor": colours[label]},
+            whiskerprops={"color": colour},
+            capprops={"color": colour},
+            flierprops={"marker": ".", "markersize": 2.5, "markeredgecolor": colour},
         )
         means = [float(np.mean(one)) if len(one) else np.nan for one in times]
-        axes.plot(
-            places, means, color=colours[label], marker="o", markersize=3.5, linewidth=1.3, zorder=3
-        )
+        axes.plot(places, means, "o-", color=colour, markersize=3.5, linewidth=1.3, zorder=3)
 
 
-def _draw_free_flow(axes: Axes, comparison: Comparison) -> None:
-    times_s = {
-        run.scenario.road.length_m / run.scenario.formation.speed_mps for run in comparison.runs
-    }
-    for t_s in sorted(times_s):
-        axes.axhline(t_s, color="#8a9099", linewidth=1.0, linestyle="--", zorder=0)
-        axes.annotate(
-            f"free flow\n{t_s:.1f} s",
-            (1.0, t_s),
-            xycoords=("axes fraction", "data"),
-            xytext=(4, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=7.5,
-            color=FAINT_INK,
-            annotation_clip=False,
-        )
+def _free_flow_s(run: Run) -> float:
+    return run.scenario.road.length_m / run.scenario.formation.speed_mps
 
 
-def _travel_times(runs: tuple[Run, ...]) -> Floats:
+def _travel_times(runs: Iterable[Run]) -> Floats:
     """Return the travel times in s of the counted vehicles."""
     found = [np.empty(0)]
     for run in runs:
         table = pq.read_table(run.folder / "trips.parquet", columns=["travel_time_s", "counted"])
-        counted = table.filter(pc.field("counted"))["travel_time_s"].drop_null()
-        found.append(counted.to_numpy().astype(np.float64))
+        found.append(table.filter(pc.field("counted"))["travel_time_s"].drop_null().to_numpy())
     return np.concatenate(found)
 
 
 def draw_flows(comparison: Comparison, out: Path, dpi: int) -> None:
     """Draw throughput and the share on the preferred lane against the demand."""
-    figure = new_figure(9.2, 3.7)
-    left, right = figure.subplots(1, 2)
     volumes = np.array(comparison.volumes)
-    margin = 0.06 * (float(np.ptp(volumes)) or 400.0)
-    span = np.array([volumes[0] - margin, volumes[-1] + margin])
-    left.plot(span, span, color="#8a9099", linewidth=1.0, linestyle="--", zorder=0)
-    left.annotate(
-        "dashed: throughput = demand",
-        (0.97, 0.04),
-        xycoords="axes fraction",
-        ha="right",
-        fontsize=7.5,
-        color=FAINT_INK,
-    )
-    left.set_ylabel("throughput (veh/(lane·h))")
-    _draw_seeds(left, comparison, _throughput)
-    right.set_ylabel("left on the preferred lane (%)")
-    _draw_seeds(right, comparison, _preferred_percent)
-    low = right.get_ylim()[0]
-    right.set_ylim(min(low, 95.0), 100.0 + 0.04 * (100.0 - min(low, 95.0)))
-    for axes in (left, right):
-        axes.set_xlabel("traffic volume (veh/(lane·h))")
-        axes.set_xlim(*span)
-        axes.set_xticks(volumes if len(volumes) <= 8 else volumes[:: 1 + len(volumes) // 8])
-        plain(axes)
-    handles, labels = right.get_legend_handles_labels()
-    if handles:
-        legend_above(figure, handles, labels)
-    save(figure, out, dpi)
+    range_veh_per_lane_h = float(np.ptp(volumes)) or 400.0
+    span = volumes[[0, -1]] + np.array([-0.06, 0.06]) * range_veh_per_lane_h
+    with picture(9.2, 3.7, out, dpi) as figure:
+        left, right = figure.subplots(1, 2)
+        left.plot(span, span, zorder=0, **REFERENCE)
+        text = "dashed: throughput = demand"
+        left.annotate(text, (0.97, 0.04), xycoords="axes fraction", ha="right", **NOTE)
+        left.set_ylabel("throughput (veh/(lane·h))")
+        right.set_ylabel("left on the preferred lane (%)")
+        for axes, figure_name in (
+            (left, "throughput_veh_per_lane_h"),
+            (right, "preferred_percent"),
+        ):
+            _draw_seeds(axes, comparison, attrgetter(figure_name), 0.012 * range_veh_per_lane_h)
+            axes.set_xlabel("traffic volume (veh/(lane·h))")
+            axes.set_xlim(*span)
+            axes.set_xticks(volumes if len(volumes) <= 8 else volumes[:: 1 + len(volumes) // 8])
+        low = min(right.get_ylim()[0], 95.0)
+        right.set_ylim(low, 100.0 + 0.04 * (100.0 - low))
+        legend_above(figure)
 
 
-def _draw_seeds(axes: Axes, comparison: Comparison, value: Callable[[Run], float | None]) -> None:
-    """Draw each run as a dot, and the mean over seeds with its standard deviation as a line."""
-    colours = label_colours(comparison.labels)
-    shown = False
-    volumes = np.array(comparison.volumes)
-    apart = 0.012 * (float(np.ptp(volumes)) or 400.0)
-    for number, label in enumerate(comparison.labels):
-        # Side by side, where several labels have the same value.
-        places = volumes + (number - 0.5 * (len(comparison.labels) - 1)) * apart
+def _draw_seeds(
+    axes: Axes, comparison: Comparison, value: Callable[[RunSummary], float | None], apart: float
+) -> None:
+    """Draw each run as a dot, and the mean over seeds with its standard deviation as a line.
+
+    Dots and lines of labels are a little apart, since several labels may have the same value.
+    """
+    colours, labels, nothing = label_colours(comparison.labels), comparison.labels, True
+    for number, label in enumerate(labels):
+        shift = (number - 0.5 * (len(labels) - 1)) * apart
         means, spreads = [], []
-        for place, volume in zip(places, comparison.volumes, strict=True):
-            found = [value(run) for run in comparison.at(label, volume)]
-            values = np.array([one for one in found if one is not None])
-            means.append(values.mean() if len(values) else np.nan)
-            spreads.append(values.std(ddof=1) if len(values) > 1 else 0.0)
-            axes.plot(
-                [place] * len(values), values, ".", color=colours[label], markersize=4, alpha=0.45
-            )
-            shown = shown or len(values) > 0
-        axes.errorbar(
-            places,
-            means,
-            yerr=spreads,
-            color=colours[label],
-            label=label,
-            marker="o",
-            markersize=4.5,
-            linewidth=1.5,
-            capsize=3,
-        )
-    if not shown:
+        for volume in comparison.volumes:
+            summaries = [run.summary for run in comparison.at(label, volume) if run.summary]
+            found = [one for one in map(value, summaries) if one is not None]
+            nothing &= not found
+            means.append(float(np.mean(found)) if found else np.nan)
+            spreads.append(float(np.std(found, ddof=1)) if len(found) > 1 else 0.0)
+            place = [volume + shift] * len(found)
+            axes.plot(place, found, ".", color=colours[label], markersize=4, alpha=0.45)
+        places = np.array(comparison.volumes) + shift
+        style: dict[str, Any] = {"marker": "o", "markersize": 4.5, "linewidth": 1.5, "capsize": 3}
+        axes.errorbar(places, means, spreads, color=colours[label], label=label, **style)
+    if nothing:
         note(axes, "runs too short to count vehicles")
-
-
-def _throughput(run: Run) -> float | None:
-    return run.summary.throughput_veh_per_lane_h if run.summary else None
-
-
-def _preferred_percent(run: Run) -> float | None:
-    return run.summary.preferred_percent if run.summary else None
 
 
 def draw_speeds(comparison: Comparison, out: Path, dpi: int) -> None:
@@ -262,28 +216,24 @@ def draw_speeds(comparison: Comparison, out: Path, dpi: int) -> None:
     shown = {
         (label, volume): comparison.shown(label, volume) for label in labels for volume in volumes
     }
-    maps = {key: mean_speeds(run.folder) for key, run in shown.items() if run is not None}
-    last_s = max(one.edges_s[-1] for one in maps.values())
-    last_m = max(one.edges_m[-1] for one in maps.values())
-    top_mps = max(speed_ceiling_mps(run.scenario, maps[key]) for key, run in shown.items() if run)
-    figure = new_figure(1.5 + 2.05 * max(2, len(volumes)), 0.75 + 1.75 * len(labels))
-    panels = figure.subplots(len(labels), len(volumes), sharex=True, sharey=True, squeeze=False)
-    mesh = None
-    for row, label in enumerate(labels):
-        for column, volume in enumerate(volumes):
-            axes, run = panels[row, column], shown[label, volume]
-            axes.set_xlim(0.0, last_s)
-            axes.set_ylim(0.0, last_m)
+    maps = {key: mean_speeds(run) for key, run in shown.items() if run is not None}
+    fastest_mps = [float(one.speed_mps.max()) for one in maps.values() if one.speed_mps.count()]
+    set_mps = [1.2 * run.scenario.formation.speed_mps for run in shown.values() if run is not None]
+    width_in, height_in = 1.5 + 2.05 * max(2, len(volumes)), 0.75 + 1.75 * len(labels)
+    with picture(width_in, height_in, out, dpi) as figure:
+        panels = figure.subplots(len(labels), len(volumes), sharex=True, sharey=True, squeeze=False)
+        for axes, ((label, volume), run) in zip(panels.flat, shown.items(), strict=True):
+            axes.grid(visible=False)
+            axes.spines[:].set_visible(True)
             axes.set_facecolor("#f2f3f5")
-            axes.tick_params(colors=INK, labelsize=7.5, length=2.5)
-            if row == 0:
-                axes.set_title(volume_title(volume), fontsize=9, color=INK)
-            if column == 0:
-                axes.set_ylabel(label, fontsize=9, color=INK, fontweight="bold")
+            if label == labels[0]:
+                axes.set_title(volume_title(volume))
+            if volume == volumes[0]:
+                axes.set_ylabel(label, fontweight="bold")
             if run is None:
                 note(axes, "no trajectories")
                 continue
-            one = maps[label, volume]
+            one, top_mps = maps[label, volume], max(fastest_mps + set_mps)
             mesh = axes.pcolormesh(
                 one.edges_s,
                 one.edges_m,
@@ -295,13 +245,12 @@ def draw_speeds(comparison: Comparison, out: Path, dpi: int) -> None:
             )
             start_m = run.scenario.road.sorting_start_m
             axes.axhline(start_m, color="white", linewidth=0.7, linestyle="--")
-    figure.supxlabel("time (s)", fontsize=9, color=INK)
-    figure.supylabel("position on the road (m)", fontsize=9, color=INK)
-    if mesh is not None:
+        axes.set_xlim(0.0, max(one.edges_s[-1] for one in maps.values()))
+        axes.set_ylim(0.0, max(one.edges_m[-1] for one in maps.values()))
+        figure.supxlabel("time (s)", fontsize=9)
+        figure.supylabel("position on the road (m)", fontsize=9)
         bar = figure.colorbar(mesh, ax=panels, pad=0.012, aspect=22 * len(labels), fraction=0.03)
-        bar.set_label("mean speed (m/s)", fontsize=9, color=INK)
-        bar.ax.tick_params(labelsize=7.5)
-    save(figure, out, dpi)
+        bar.set_label("mean speed (m/s)")
 
 
 @frozen
@@ -316,28 +265,12 @@ class MeanSpeeds:
     """Shape (bins along the road, bins in time); masked where no vehicle was."""
 
 
-def mean_speeds(folder: Path, *, bin_m: float = 20.0, bin_s: float = 5.0) -> MeanSpeeds:
-    """Return the mean speed over road and time.
-
-    Args:
-        folder: a run's folder.
-        bin_m: length of a bin along the road.
-        bin_s: length of a bin in time.
-    """
-    path = folder / "trajectories.parquet"
-    length_m = scenario_of(path).road.length_m
-    table = pq.read_table(path, columns=["t_s", "s_m", "speed_mps"])
-    t_s, s_m, speed = (table[name].to_numpy().astype(np.float64) for name in table.column_names)
-    end_s = float(t_s.max(initial=0.0))
-    edges_s = np.arange(0.0, end_s + bin_s, bin_s) if end_s > 0.0 else np.array([0.0, bin_s])
-    edges_m = np.linspace(0.0, length_m, max(1, round(length_m / bin_m)) + 1)
-    count, _, _ = np.histogram2d(s_m, t_s, bins=[edges_m, edges_s])
-    total, _, _ = np.histogram2d(s_m, t_s, bins=[edges_m, edges_s], weights=speed)
-    mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
-    return MeanSpeeds(edges_m, edges_s, np.ma.masked_invalid(mean))
-
-
-def speed_ceiling_mps(scenario: Scenario, speeds: MeanSpeeds) -> float:
-    """Return the upper end of a colour scale for speeds."""
-    found = float(speeds.speed_mps.max()) if speeds.speed_mps.count() else 0.0
-    return max(1.2 * scenario.formation.speed_mps, found)
+def mean_speeds(run: Run) -> MeanSpeeds:
+    """Return the mean speed over road and time."""
+    tracks, length_m = read_tracks(run.folder), run.scenario.road.length_m
+    edges_s = np.arange(0.0, max(float(tracks.t_s.max(initial=0.0)), BIN_S / 2) + BIN_S, BIN_S)
+    edges_m = np.linspace(0.0, length_m, max(1, round(length_m / BIN_M)) + 1)
+    bins = [edges_m, edges_s]
+    count, _, _ = np.histogram2d(tracks.s_m, tracks.t_s, bins)
+    total, _, _ = np.histogram2d(tracks.s_m, tracks.t_s, bins, weights=tracks.speed_mps)
+    return MeanSpeeds(edges_m, edges_s, np.ma.masked_array(total, count == 0) / count)

@@ -1,15 +1,12 @@
-"""Snapshots of the road: where everybody is at some instants, drawn from a run's Parquet files."""
+"""Snapshots of the road: all vehicles at some instants, drawn from a run's Parquet files."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-import attrs
 import numpy as np
-import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
 from laneweave.launch.drawing.colours import (
     SHADE_STRENGTH,
@@ -17,47 +14,24 @@ from laneweave.launch.drawing.colours import (
     lane_colours,
     lane_names,
 )
-from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK, new_figure, save
+from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK
 from laneweave.launch.observe.column_owners import Formations, recorded_formations
 from laneweave.launch.recordings.runs import scenario_of
+from laneweave.launch.recordings.trajectories import Floats, Tracks, read_tracks, read_trips
+from laneweave.launch.report.style import picture
 from laneweave.protocol.scenario.tables import Scenario
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Floats = NDArray[np.float64]
-
 _ASPHALT, _PAINT = "#eeeff1", "#ffffff"
 _OWNED = ("#e2e4e8", "#d5d8dd")
-"""Columns of formations, by turns."""
+"""Alternating colours of the columns of formations."""
 _ACROSS_SCALE = 1.8
-"""Roads are drawn this much wider than they are, or their lanes would be threads."""
+"""Scale across the road over the scale along it: to scale, lanes would be too thin."""
 _HEADROOM_M = 4.5
-"""Room above the road for the numbers of formations."""
-
-
-@attrs.frozen
-class _Track:
-    """One vehicle's trajectory; all arrays have shape (ticks,)."""
-
-    t_s: Floats
-    s_m: Floats
-    y_m: Floats
-    speed_mps: Floats
-
-    def at(self, t_s: float) -> tuple[float, float, float, float] | None:
-        """Return (s m, y m, heading rad, speed m/s) at a time, None if it is not on the road."""
-        if not self.t_s[0] - 1e-6 <= t_s <= self.t_s[-1] + 1e-6:
-            return None
-        s_m, y_m, speed_mps = (
-            float(np.interp(t_s, self.t_s, values))
-            for values in (self.s_m, self.y_m, self.speed_mps)
-        )
-        if len(self.t_s) < 2:
-            return s_m, y_m, 0.0, speed_mps
-        slope = np.interp(t_s, self.t_s, np.gradient(self.y_m, self.t_s))
-        return s_m, y_m, float(np.arctan2(slope, max(speed_mps, 0.1))), speed_mps
+"""Space above the road for the numbers of formations."""
 
 
 def road_snapshots(
@@ -76,10 +50,10 @@ def road_snapshots(
 
     Args:
         folder: a run's folder.
-        out: the picture to write; its suffix says the format.
-        times: road times in s; none: the four instants, the shortest T_F apart, at which most
+        out: the picture to write; its suffix defines the format.
+        times: road times in s; empty: the four instants, the shortest T_F apart, at which most
             vehicles are between two lanes.
-        stretch_m: the stretch of road from and to; none: 20 m before lane sorting begins and the
+        stretch_m: (from m, to m); None: from 20 m before lane sorting begins to
             300 m behind that point.
         dpi: resolution in dots per inch.
     """
@@ -88,35 +62,40 @@ def road_snapshots(
     if stretch_m is None:
         start_m = max(0.0, road.sorting_start_m - 20.0)
         stretch_m = (start_m, min(road.length_m, start_m + 320.0))
-    tracks = _tracks(folder)
+    tracks = read_tracks(folder)
     if not times:
         times = _instants(tracks, scenario, stretch_m)
-    trips = pq.read_table(folder / "trips.parquet", columns=["vehicle", "preferred_lane"])
-    preferred = {trip["vehicle"]: int(trip["preferred_lane"]) for trip in trips.to_pylist()}
+    trips = read_trips(folder)
     formations = Formations(())
-    if not scenario.formation.rolling:  # the stream has none
+    if not scenario.formation.rolling:  # the rolling operation has none
         formations = recorded_formations(folder, scenario.lattice)
-    width_in = 9.6
-    strip_in = (
-        _ACROSS_SCALE
-        * (width_in - 0.9)
-        * (road.lanes * road.lane_width_m + _HEADROOM_M)
-        / (stretch_m[1] - stretch_m[0])
-    )
-    figure = new_figure(width_in, 0.9 + len(times) * (strip_in + 0.06))
-    strips = figure.subplots(len(times), 1, sharex=True, squeeze=False)[:, 0]
-    for axes, t_s in zip(strips, times, strict=True):
-        _draw_road(axes, scenario, stretch_m)
-        _draw_formations(axes, scenario, stretch_m, formations, t_s)
-        axes.set_ylabel(f"{t_s:g} s", rotation=0, ha="right", va="center", color=INK)
-        for vehicle, track in tracks.items():
-            pose = track.at(t_s)
-            if pose is not None and stretch_m[0] <= pose[0] <= stretch_m[1] + 10.0:
-                _draw_vehicle(axes, pose, preferred.get(vehicle, 0), scenario)
-    strips[-1].tick_params(axis="x", bottom=True, labelbottom=True)
-    strips[-1].set_xlabel("position on the road (m)")
-    _draw_legend(figure, scenario)
-    save(figure, out, dpi)
+    width_in, road_m = 9.6, road.lanes * road.lane_width_m + _HEADROOM_M
+    strip_in = _ACROSS_SCALE * (width_in - 0.9) * road_m / (stretch_m[1] - stretch_m[0])
+    with picture(width_in, 0.9 + len(times) * (strip_in + 0.06), out, dpi) as figure:
+        strips = figure.subplots(len(times), 1, sharex=True, squeeze=False)[:, 0]
+        for axes, t_s in zip(strips, times, strict=True):
+            _draw_road(axes, scenario, stretch_m)
+            _draw_formations(axes, scenario, stretch_m, formations, t_s)
+            axes.set_ylabel(f"{t_s:g} s", rotation=0, ha="right", va="center", fontsize=10)
+            for number, name in enumerate(tracks.names):
+                pose = _pose(tracks, number, t_s)
+                if pose is not None and stretch_m[0] <= pose[0] <= stretch_m[1] + 10.0:
+                    preferred = trips[name]["preferred_lane"] if name in trips else 0
+                    _draw_vehicle(axes, pose, preferred, scenario)
+        strips[-1].tick_params(axis="x", bottom=True, labelbottom=True)
+        strips[-1].set_xlabel("position on the road (m)")
+        _draw_legend(figure, scenario)
+
+
+def _pose(tracks: Tracks, number: int, t_s: float) -> tuple[float, float, float, float] | None:
+    """Return (s m, y m, heading rad, speed m/s) of a vehicle; None: it is not on the road."""
+    times_s, y_m = tracks.t_s[tracks.rows(number)], tracks.y_m[tracks.rows(number)]
+    if not times_s[0] - 1e-6 <= t_s <= times_s[-1] + 1e-6:
+        return None
+    at = np.array([t_s])
+    place = [float(tracks.sampled(number, name, at)[0]) for name in ("s_m", "y_m", "speed_mps")]
+    lateral_mps = np.interp(t_s, times_s, np.gradient(y_m, times_s)) if len(y_m) > 1 else 0.0
+    return place[0], place[1], float(np.arctan2(lateral_mps, max(place[2], 0.1))), place[2]
 
 
 def _draw_road(axes: Axes, scenario: Scenario, stretch_m: tuple[float, float]) -> None:
@@ -140,8 +119,8 @@ def _draw_road(axes: Axes, scenario: Scenario, stretch_m: tuple[float, float]) -
         axes.plot(*place, color=INK, linewidth=1.0, linestyle=":", zorder=2)
     axes.set_yticks([])
     axes.tick_params(axis="x", bottom=False, labelbottom=False)
-    for spine in axes.spines.values():
-        spine.set_visible(False)
+    axes.spines[:].set_visible(False)
+    axes.grid(visible=False)
 
 
 def _draw_formations(
@@ -177,7 +156,7 @@ def _draw_formations(
 def _draw_vehicle(
     axes: Axes, pose: tuple[float, float, float, float], preferred: int, scenario: Scenario
 ) -> None:
-    """Draw a vehicle's body and a pale windscreen that shows where its front is."""
+    """Draw a vehicle's body, and a pale windscreen at its front."""
     from matplotlib.patches import Polygon  # noqa: PLC0415 - lazily, see above
 
     s_m, y_m, heading, speed_mps = pose
@@ -199,30 +178,21 @@ def _draw_vehicle(
 
 
 def _draw_legend(figure: Figure, scenario: Scenario) -> None:
-    """Say what the colours mean, above the strips."""
+    """Draw a legend of the colours above the strips."""
     from matplotlib.patches import Patch  # noqa: PLC0415 - lazily, see above
 
     speed_mps = scenario.formation.speed_mps
     colours = lane_colours(scenario.road.lanes)
     names = lane_names(scenario.road.lanes)
-    handles = [
-        Patch(facecolor=colours[lane], edgecolor=INK, linewidth=0.5, label=f"prefers {names[lane]}")
-        for lane in reversed(range(scenario.road.lanes))
+    entries: list[tuple[Any, str]] = [
+        (colours[lane], f"prefers {names[lane]}") for lane in reversed(range(len(colours)))
     ]
-    for sign, word in ((-1, "slower"), (1, "faster")):
-        handles.append(
-            Patch(
-                facecolor=_shade("#8a8f96", sign * SPEED_SPAN_MPS),
-                edgecolor=INK,
-                linewidth=0.5,
-                label=f"{word} than {speed_mps:g} m/s",
-            )
-        )
+    for over_mps, word in ((-SPEED_SPAN_MPS, "slower"), (SPEED_SPAN_MPS, "faster")):
+        entries.append((_shade("#8a8f96", over_mps), f"{word} than {speed_mps:g} m/s"))
     figure.legend(
-        handles=handles,
+        handles=[Patch(fc=colour, ec=INK, lw=0.5, label=label) for colour, label in entries],
         loc="outside upper center",
-        ncols=len(handles),
-        frameon=False,
+        ncols=len(entries),
         fontsize=8,
         handlelength=1.6,
         columnspacing=1.6,
@@ -240,39 +210,15 @@ def _shade(colour: str, over_mps: float) -> tuple[float, float, float]:
     return (mixed[0], mixed[1], mixed[2])
 
 
-def _tracks(folder: Path) -> dict[str, _Track]:
-    """Return the trajectory of each vehicle."""
-    columns = ["t_s", "s_m", "y_m", "speed_mps"]
-    table = pq.read_table(
-        folder / "trajectories.parquet",
-        columns=[*columns, "vehicle"],
-        read_dictionary=["vehicle"],
-    )
-    names = np.asarray(table["vehicle"].to_pylist(), dtype=object).astype(str)
-    values = {name: table[name].to_numpy().astype(np.float64) for name in columns}
-    order = np.lexsort((values["t_s"], names))
-    vehicles, starts = np.unique(names[order], return_index=True)
-    parts = np.split(order, starts[1:]) if len(vehicles) else []
-    return {
-        str(vehicle): _Track(**{name: values[name][part] for name in columns})
-        for vehicle, part in zip(vehicles, parts, strict=True)
-    }
-
-
-def _instants(
-    tracks: Mapping[str, _Track], scenario: Scenario, stretch_m: tuple[float, float]
-) -> list[float]:
+def _instants(tracks: Tracks, scenario: Scenario, stretch_m: tuple[float, float]) -> list[float]:
     """Return four times, the shortest T_F apart, at which most vehicles are between two lanes.
 
     There are fewer if the recording ends earlier. A vehicle counts by its distance from the nearest
     lane centre, and a little for being on the stretch.
     """
-    if not tracks:
+    t_s, s_m, y_m = tracks.t_s, tracks.s_m, tracks.y_m
+    if not len(t_s):
         return [0.0]
-    t_s, s_m, y_m = (
-        np.concatenate([getattr(track, name) for track in tracks.values()])
-        for name in ("t_s", "s_m", "y_m")
-    )
     tick_s, width_m = scenario.runtime.tick_s, scenario.road.lane_width_m
     off_centre = np.abs(y_m / width_m - np.floor(y_m / width_m) - 0.5)
     inside = (s_m >= stretch_m[0]) & (s_m <= stretch_m[1])

@@ -1,15 +1,16 @@
-"""The style of a report's figures: colours of labels, axes, legends."""
+"""The style of a report's figures: colours of labels, axes, legends, panels."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Final
+import contextlib
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
-from laneweave.launch.drawing.figures import FAINT_INK, INK
+from laneweave.launch.drawing.figures import FAINT_INK, INK, new_figure, save
 from laneweave.launch.methods import METHODS
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -26,9 +27,44 @@ _PALETTE: Final = (
     "#808890",
     "#a8a13a",
 )
-GRID: Final = "#e4e6e9"
+_STYLE: Final[Any] = {
+    "axes.axisbelow": True,
+    "axes.edgecolor": "#b6bbc2",
+    "axes.grid": True,
+    "axes.labelcolor": INK,
+    "axes.labelsize": 9,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlesize": 9,
+    "grid.color": "#e4e6e9",
+    "grid.linewidth": 0.7,
+    "legend.fontsize": 8.5,
+    "legend.frameon": False,
+    "text.color": INK,
+    "xtick.color": INK,
+    "xtick.labelsize": 8,
+    "xtick.major.size": 3,
+    "ytick.color": INK,
+    "ytick.labelsize": 8,
+    "ytick.major.size": 3,
+}
+REFERENCE: Final[dict[str, Any]] = {"color": "#8a9099", "linewidth": 1.0, "linestyle": "--"}
+"""The style of lines for limits and set values."""
+NOTE: Final[dict[str, Any]] = {"fontsize": 7.5, "color": FAINT_INK}
+"""The style of small texts."""
 MAX_COLUMNS: Final = 6
 """Volumes that fit side by side."""
+
+
+@contextlib.contextmanager
+def picture(width_in: float, height_in: float, out: Path, dpi: float) -> Iterator[Figure]:
+    """Yield an empty figure in the style of reports, and write it to a file at the end."""
+    import matplotlib as mpl  # noqa: PLC0415 - lazily
+
+    with mpl.rc_context(_STYLE):
+        figure = new_figure(width_in, height_in)
+        yield figure
+        save(figure, out, dpi)
 
 
 def label_colours(labels: Iterable[str]) -> dict[str, str]:
@@ -56,39 +92,18 @@ def volume_title(volume_veh_per_lane_h: float) -> str:
     return f"{volume_veh_per_lane_h:g} veh/(lane·h)"
 
 
-def plain(axes: Axes, *, grid: str = "both") -> None:
-    """Give axes a light grid, and hide the upper and right spines."""
-    axes.grid(axis="y" if grid == "y" else "both", color=GRID, linewidth=0.7)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color("#b6bbc2")
-    axes.tick_params(colors=INK, labelsize=8, length=3)
-    axes.xaxis.label.set_color(INK)
-    axes.yaxis.label.set_color(INK)
-
-
-def legend_above(figure: Figure, handles: Sequence[Artist], labels: Sequence[str]) -> None:
-    """Put one legend above all panels."""
-    figure.legend(
-        handles,
-        labels,
-        loc="outside upper center",
-        ncols=min(6, len(labels)),
-        frameon=False,
-        fontsize=8.5,
-        labelcolor=INK,
-    )
+def legend_above(figure: Figure) -> None:
+    """Put one legend for all panels above them."""
+    entries: dict[str, Any] = {}
+    for axes in figure.axes:
+        handles, labels = axes.get_legend_handles_labels()
+        entries = dict(zip(labels, handles, strict=True)) | entries
+    if entries:
+        figure.legend(
+            entries.values(), entries, loc="outside upper center", ncols=min(6, len(entries))
+        )
 
 
 def note(axes: Axes, text: str) -> None:
     """Write the reason into the middle of empty axes."""
-    axes.text(
-        0.5,
-        0.5,
-        text,
-        transform=axes.transAxes,
-        ha="center",
-        va="center",
-        fontsize=8,
-        color=FAINT_INK,
-    )
+    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", **NOTE)

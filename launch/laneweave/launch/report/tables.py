@@ -12,13 +12,14 @@ from laneweave.launch.recordings.runs import Comparison, Run
 from laneweave.launch.report.summary_table import summary_rows
 
 _Column = tuple[str, str, str, int]
-"""Heading, column of the results, its aggregation over seeds, digits."""
+"""Heading, column of the results, its aggregation over seeds (empty: a text), digits."""
 
-_TRAFFIC: Final = (
-    ("travel time mean (s)", "travel_time_s_mean", 2),
-    ("p95 (s)", "travel_time_s_p95", 2),
-    ("throughput (veh/(lane·h))", "throughput_veh_per_lane_h", 0),
-    ("on the preferred lane (%)", PREFERRED, 2),
+_TRAFFIC: Final[tuple[_Column, ...]] = (
+    ("runs", "runs", "", 0),
+    ("travel time mean (s)", "travel_time_s_mean", "mean", 2),
+    ("p95 (s)", "travel_time_s_p95", "mean", 2),
+    ("throughput (veh/(lane·h))", "throughput_veh_per_lane_h", "mean", 0),
+    ("on the preferred lane (%)", PREFERRED, "mean", 2),
 )
 _SAFETY: Final[tuple[_Column, ...]] = (
     ("smallest gap (m)", "safety_min_gap_m", "min", 2),
@@ -28,6 +29,7 @@ _SAFETY: Final[tuple[_Column, ...]] = (
     ("real-time factor", "runtime_real_time_factor", "min", 1),
 )
 _PLANNING: Final[tuple[_Column, ...]] = (
+    ("solvers", "solvers", "", 0),
     ("largest formation", "planning_largest_formation", "max", 0),
     ("plans", "planning_plans", "sum", 0),
     ("fallbacks", "planning_fallbacks", "sum", 0),
@@ -55,12 +57,18 @@ def tables_of(comparison: Comparison) -> list[Table]:
     if len(comparison.runs) == 1 and not comparison.failed:
         return [run_table(comparison.runs[0])]
     results = results_table(comparison.runs)
-    extremes = [(column, function) for _, column, function, _ in (*_SAFETY, *_PLANNING)]
-    solvers = [name for name in results.column_names if name.startswith(_BY_SOLVER)]
-    extremes += [(name, "sum") for name in solvers]
-    extremes += [(column, function) for _, column, _ in _TRAFFIC for function in ("mean", "stddev")]
-    rows = over_seeds(results, extremes)
-    return [traffic_table(rows), safety_table(rows), planning_table(rows), failed_table(comparison)]
+    columns = (*_TRAFFIC, *_SAFETY, *_PLANNING)
+    wanted = [(column, function) for _, column, function, _ in columns if function]
+    wanted += [(column, "stddev") for column, function in wanted if function == "mean"]
+    wanted += [(name, "sum") for name in results.column_names if name.startswith(_BY_SOLVER)]
+    rows = [row | {"solvers": _solvers(row)} for row in over_seeds(results, wanted)]
+    planned = [row for row in rows if row["planning_plans_sum"]]
+    return [
+        _table(rows, _TRAFFIC, "Means over the seeds, ± their standard deviation."),
+        _table(rows, _SAFETY, "Extremes or sums over the seeds, not means."),
+        _table(planned, _PLANNING, "Planning: sums over the seeds; sizes and times are maxima."),
+        failed_table(comparison),
+    ]
 
 
 def run_table(run: Run) -> Table:
@@ -68,39 +76,6 @@ def run_table(run: Run) -> Table:
     rows = summary_rows(run.summary) if run.summary else []
     caption = "Results of the run; summary.json has all figures."
     return Table(("", "value"), [("method", run.label), *rows], caption, 2)
-
-
-def traffic_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Return travel times, throughput and shares: means over seeds with standard deviations."""
-    cells = [
-        [*_key(row), str(row["runs"]), *(_mean(row, column, n) for _, column, n in _TRAFFIC)]
-        for row in rows
-    ]
-    headings = ("label", "veh/(lane·h)", "runs", *(name for name, *_ in _TRAFFIC))
-    return Table(headings, cells, "Means over the seeds, ± their standard deviation.")
-
-
-def safety_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Return the extremes over all seeds."""
-    cells = [[*_key(row), *_cells(row, _SAFETY)] for row in rows]
-    headings = ("label", "veh/(lane·h)", *(name for name, *_ in _SAFETY))
-    return Table(headings, cells, "Extremes or sums over the seeds, not means.")
-
-
-def planning_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Return planning times and solvers of the rows that have plans."""
-    cells = []
-    for row in rows:
-        if row["planning_plans_sum"]:
-            solvers = {
-                name.removeprefix(_BY_SOLVER).removesuffix("_sum"): plans
-                for name, plans in row.items()
-                if name.startswith(_BY_SOLVER) and plans
-            }
-            named = ", ".join(f"{name} {plans}" for name, plans in sorted(solvers.items()))
-            cells.append([*_key(row), named or "-", *_cells(row, _PLANNING)])
-    headings = ("label", "veh/(lane·h)", "solvers", *(name for name, *_ in _PLANNING))
-    return Table(headings, cells, "Planning: sums over the seeds; sizes and times are maxima.")
 
 
 def failed_table(comparison: Comparison) -> Table:
@@ -113,19 +88,33 @@ def failed_table(comparison: Comparison) -> Table:
     return Table(("label", "veh/(lane·h)", "seed", "reason"), rows, caption, 4)
 
 
-def _key(row: Mapping[str, Any]) -> list[str]:
-    return [row[KEYS[0]], f"{row[KEYS[1]]:g}"]
+def _table(rows: Sequence[Mapping[str, Any]], columns: Sequence[_Column], caption: str) -> Table:
+    """Return a table with a row for each label and volume."""
+    cells = [
+        [row[KEYS[0]], f"{row[KEYS[1]]:g}", *(_cell(row, column) for column in columns)]
+        for row in rows
+    ]
+    return Table(("label", "veh/(lane·h)", *(name for name, *_ in columns)), cells, caption)
 
 
-def _cells(row: Mapping[str, Any], columns: Sequence[_Column]) -> list[str]:
-    values = ((row[f"{column}_{function}"], digits) for _, column, function, digits in columns)
-    return ["-" if value is None else f"{value:.{digits}f}" for value, digits in values]
-
-
-def _mean(row: Mapping[str, Any], column: str, digits: int) -> str:
-    """Return `mean ± standard deviation` of the seeds that have the figure."""
-    mean, deviation = row[f"{column}_mean"], row[f"{column}_stddev"]
-    if mean is None:
+def _cell(row: Mapping[str, Any], wanted: _Column) -> str:
+    """Return a text or a figure; a mean with its standard deviation where there is one."""
+    _, column, function, digits = wanted
+    if not function:
+        return str(row[column])
+    value = row[f"{column}_{function}"]
+    deviation = row[f"{column}_stddev"] if function == "mean" else None
+    if value is None:
         return "-"
-    text = f"{mean:.{digits}f}"
+    text = f"{value:.{digits}f}"
     return text if deviation is None else f"{text} ± {deviation:.{digits}f}"
+
+
+def _solvers(row: Mapping[str, Any]) -> str:
+    """Return the number of plans of each solver."""
+    plans = {
+        name.removeprefix(_BY_SOLVER).removesuffix("_sum"): count
+        for name, count in row.items()
+        if name.startswith(_BY_SOLVER) and count
+    }
+    return ", ".join(f"{name} {count}" for name, count in sorted(plans.items())) or "-"
