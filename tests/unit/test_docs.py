@@ -46,15 +46,16 @@ LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 HEADING = re.compile(r"^#+ +(.+)$", re.MULTILINE)
 
 
-def markdown_files() -> list[Path]:
-    found = list(ROOT.glob("*.md"))
+def project_files(pattern: str) -> list[Path]:
+    """Return the files below the project's own folders."""
+    found: list[Path] = []
     for folder in ROOT.iterdir():
         if folder.is_dir() and folder.name[0] != "." and folder.name not in NOT_OURS:
-            found += folder.rglob("*.md")
-    return sorted(found)
+            found += folder.rglob(pattern)
+    return found
 
 
-MARKDOWN = markdown_files()
+MARKDOWN = sorted([*ROOT.glob("*.md"), *project_files("*.md")])
 IDS = [str(path.relative_to(ROOT)) for path in MARKDOWN]
 each_document = pytest.mark.parametrize("path", MARKDOWN, ids=IDS)
 
@@ -201,7 +202,7 @@ def test_rows_that_cross_check_fields_name_fields_that_exist() -> None:
 def test_endings_of_runs() -> None:
     (meaning,) = (
         cells[1]
-        for cells in rows(section(read("ARCHITECTURE.md"), "## The end of a run"))
+        for cells in rows(section(read("RUNS.md"), "## The end of a run"))
         if code(cells[0]) == "ending"
     )
     assert set(re.findall(r"`(\w+)`:", meaning)) == {ending.value for ending in Ending}
@@ -234,15 +235,19 @@ def test_generated_parts_are_up_to_date() -> None:
 
 
 def test_places_in_the_code_exist() -> None:
-    """Rule tables name `module.py: Class.method` or `module.py: function`."""
-    sources: dict[str, str] = {}
-    for path in ROOT.glob("*/laneweave/**/*.py"):
-        sources[path.name] = sources.get(path.name, "") + path.read_text(encoding="utf-8")
-    places = re.findall(r"`(\w+\.py): ([\w.]+)`", read("PROTOCOL.md") + read("SAFETY.md"))
+    """Documents name `module.py: Class.method`, `module.py: function` or `folder/module.py`."""
+    sources = {
+        path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8")
+        for path in project_files("*.py")
+    }
+    documents = "".join(path.read_text(encoding="utf-8") for path in DOCS.glob("*.md"))
+    places = re.findall(r"`((?:\w+/)*\w+\.py)(?:: ([\w.]+))?`", documents)
     assert places
     for module, name in places:
+        text = "".join(text for path, text in sources.items() if f"/{path}".endswith(f"/{module}"))
+        assert text, f"there is no {module}"
         last = name.rpartition(".")[2]
-        assert re.search(rf"\b(def|class) {last}\b|^{last}\b", sources[module], re.MULTILINE), (
+        assert re.search(rf"\b(def|class) {last}\b|^{last}\b", text, re.MULTILINE) or not name, (
             f"{module} has no {name}"
         )
 
