@@ -9,10 +9,12 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import signal
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
 import uuid
 from collections.abc import Callable, Iterator
@@ -187,6 +189,19 @@ class Lab:
         """Endpoint of the router of the run that is under way."""
         (socket,) = self.sockets.glob("laneweave-*/router.sock")
         return f"unixsock-stream/{socket}"
+
+
+@contextlib.contextmanager
+def laboratory(folder: Path, loaded: Loaded | None = None) -> Iterator[Lab]:
+    """Give processes a place; a process that is left at the end is an error."""
+    sockets = Path(tempfile.mkdtemp(prefix="lw-"))
+    lab = Lab(folder, sockets, loaded=loaded)
+    try:
+        yield lab
+    finally:
+        left = lab.kill_rest()
+        shutil.rmtree(sockets, ignore_errors=True)
+    assert not left
 
 
 def interrupt(process: subprocess.Popen[str], number: signal.Signals) -> None:

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
-import shutil
-import socket
-import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import zenoh
@@ -26,52 +23,25 @@ from laneweave.protocol.security.access import (
 )
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.topics import Keys, Quality, Topic
-from support.harness import ROAD, Lab
+from support.deployments import REALM, deployment
+from support.harness import Lab
 
-KEYS = Keys("test")
+KEYS = Keys(REALM)
+SECURITY = """
+[security]
+mode = "mtls"
+fleets = { agents-1 = "0/2", agents-2 = "1/2" }
+clients = ["plan", "other"]
+"""
 QUIET_S = 0.1
 """How long to wait for what must not come; what comes, comes in milliseconds."""
 COME_S = 20.0
 """Longest wait for what must come."""
 
 
-def free_port() -> int:
-    """Return a port that was free a moment ago."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port: int = server.getsockname()[1]
-        return port
-
-
-def deployment(lab: Lab, port: int) -> Path:
+def secured_deployment(lab: Lab, port: int) -> Path:
     """Write a secured deployment's configuration."""
-    text = f"""{ROAD}
-[demand]
-volume_veh_per_lane_h = 1300.0
-duration_s = 14.0
-
-[network]
-realm = "test"
-endpoint = "tls/127.0.0.1:{port}"
-
-[security]
-mode = "mtls"
-fleets = {{ agents-1 = "0/2", agents-2 = "1/2" }}
-clients = ["plan", "other"]
-"""
-    return lab.path("deployment.toml", text)
-
-
-@contextlib.contextmanager
-def laboratory(folder: Path) -> Iterator[Lab]:
-    """Give processes a place, for longer than one test."""
-    sockets = Path(tempfile.mkdtemp(prefix="lw-"))
-    lab = Lab(folder, sockets)
-    try:
-        yield lab
-    finally:
-        left = lab.kill_rest()
-        shutil.rmtree(sockets, ignore_errors=True)
-    assert not left
+    return deployment(lab, f"tls/127.0.0.1:{port}", SECURITY)
 
 
 @define

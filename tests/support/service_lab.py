@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import queue
-import socket
 import subprocess
 import threading
 import time
@@ -24,28 +23,21 @@ from laneweave.protocol.runtime.transport import Delivery, TokenDown, TokenUp
 from laneweave.protocol.security.access import Access
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.topics import COORDINATOR_ALIVE, Keys
+from support.deployments import free_tcp
 from support.harness import END_S, Ended, Lab
 
 REALM = "default"
 LEASE_S = 1.0
 
 
-def free_tcp() -> str:
-    """Return an endpoint on a port that was free a moment ago."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return f"tcp/127.0.0.1:{server.getsockname()[1]}"
-
-
-def request(name: str = "", vehicles: int = 3, **changes: object) -> dict[str, Any]:
+def request(name: str = "", **changes: object) -> dict[str, Any]:
     """Return a request that is planned within milliseconds."""
     named = {"id": name} if name else {}
     return {
         "schema": "laneweave.plan.request/1",
         **named,
         "grid": {"columns": 6, "lanes": 3},
-        "vehicles": [
-            {"id": f"v{i}", "cell": [i // 3, i % 3], "lane": (i + 1) % 3} for i in range(vehicles)
-        ],
+        "vehicles": [{"id": f"v{i}", "cell": [0, i], "lane": (i + 1) % 3} for i in range(3)],
         "targets": [[column, lane] for column in range(2, 6) for lane in range(3)],
         "deadline_s": 20.0,
         **changes,
@@ -54,16 +46,15 @@ def request(name: str = "", vehicles: int = 3, **changes: object) -> dict[str, A
 
 def slow_request(name: str, deadline_s: float) -> dict[str, Any]:
     """Return a request that takes as long as it may."""
-    return {
-        "schema": "laneweave.plan.request/1",
-        "id": name,
-        "grid": {"columns": 12, "lanes": 4},
-        "vehicles": [
+    return request(
+        name,
+        grid={"columns": 12, "lanes": 4},
+        vehicles=[
             {"id": f"v{i}", "cell": [i // 4 * 2, i % 4], "lane": 3 - i % 4} for i in range(20)
         ],
-        "targets": [[column, lane] for column in range(12) for lane in range(4)],
-        "deadline_s": deadline_s,
-    }
+        targets=[[column, lane] for column in range(12) for lane in range(4)],
+        deadline_s=deadline_s,
+    )
 
 
 @define
@@ -200,6 +191,7 @@ class Load:
     plan: Callable[..., Any]
     threads: int = 0
     make: Callable[[], dict[str, Any]] = request
+    asked: int = 0
     over: threading.Event = field(factory=threading.Event)
     failures: list[Exception] = field(factory=list)
     outcomes: list[str] = field(factory=list)
@@ -223,9 +215,16 @@ class Load:
             thread.join(END_S)
             assert not thread.is_alive()
 
+    def wait_answers(self, more: int) -> None:
+        """Wait until so many more requests have been answered, or one has failed."""
+        enough, give_up = len(self.outcomes) + more, time.monotonic() + END_S
+        while len(self.outcomes) < enough and not self.failures:
+            assert time.monotonic() < give_up, f"{len(self.outcomes)} of {enough} answers"
+            time.sleep(0.02)
+
     def _ask_in_turn(self) -> None:
         while not self.over.is_set():
-            made, asked_s = PlanRequest.from_dict(self.make()), time.monotonic()
+            made, asked_s = self._make()
             try:
                 self._note(asked_s, self.plan(made, END_S))
             except (PlanError, TimeoutError) as error:
@@ -234,11 +233,16 @@ class Load:
     async def ask_in_turn(self) -> None:
         """Ask as a task."""
         while not self.over.is_set():
-            made, asked_s = PlanRequest.from_dict(self.make()), time.monotonic()
+            made, asked_s = self._make()
             try:
                 self._note(asked_s, await self.plan(made, END_S))
             except (PlanError, TimeoutError) as error:
                 self._fail(error)
+
+    def _make(self) -> tuple[PlanRequest, float]:
+        made, asked_s = PlanRequest.from_dict(self.make()), time.monotonic()
+        self.asked += 1
+        return made, asked_s
 
     def _note(self, asked_s: float, response: PlanResponse) -> None:
         self.outcomes.append(response.status)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
 import pytest
 
-from support.harness import DEMAND, ROAD, Lab
+from support.harness import DEMAND, ROAD, Lab, laboratory
 from support.loaded import Loaded
 from support.sharing import made_once
 
@@ -26,14 +24,8 @@ def loaded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Loaded]:
 @pytest.fixture
 def lab(tmp_path: Path, loaded: Loaded) -> Iterator[Lab]:
     """Processes of this test; whatever is left of them at its end is an error."""
-    sockets = Path(tempfile.mkdtemp(prefix="lw-"))
-    laboratory = Lab(tmp_path, sockets, loaded=loaded)
-    try:
-        yield laboratory
-    finally:
-        left = laboratory.kill_rest()
-        shutil.rmtree(sockets, ignore_errors=True)
-    assert not left
+    with laboratory(tmp_path, loaded) as laboratory_of_test:
+        yield laboratory_of_test
 
 
 @pytest.fixture

@@ -37,9 +37,8 @@ def the_line(ended: Ended) -> str:
     """Return the one line of a command that must have been refused."""
     assert ended.status == 2, ended
     assert ended.out == ""
-    lines = ended.err.splitlines()
-    assert len(lines) == 1, ended.err
-    return lines[0]
+    (line,) = ended.complaints
+    return line
 
 
 @pytest.mark.parametrize(

@@ -10,25 +10,27 @@ from pathlib import Path
 
 import pytest
 
-from support.harness import END_S, Lab
-from system.test_deployment import REQUEST, _ask, deployment, free_tcp, start_router, stop
+from support.deployments import REALM, ask, deployment, free_tcp, start_router, stop
+from support.harness import END_S, Ended, Lab
+from support.service_lab import request
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-MOST_LINES = 40
+MAX_LINES = 40
 
 
 @pytest.mark.parametrize("example", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
 def test_an_example_is_short(example: Path) -> None:
-    assert len(example.read_text(encoding="utf-8").splitlines()) < MOST_LINES
+    assert len(example.read_text(encoding="utf-8").splitlines()) < MAX_LINES
 
 
 def test_examples_ask_a_coordinator(lab: Lab) -> None:
     endpoint = free_tcp()
     config = deployment(lab, endpoint)
-    config.write_text(config.read_text(encoding="utf-8").replace('"test"', '"default"'), "utf-8")
+    text = config.read_text(encoding="utf-8")
+    config.write_text(text.replace(f'"{REALM}"', '"default"'), encoding="utf-8")
     router = start_router(lab, config)
     coordinator = lab.start("coordinator", "--config", config)
-    lab.wait_until(lambda: _ask(lab, config, REQUEST, "--realm", "default").status == 0, END_S)
+    lab.wait_until(lambda: ask(lab, config, request()).status == 0, END_S)
 
     assert _run("ask_the_coordinator", endpoint).startswith("optimal: cost ")
     assert _run("only_zenoh_and_json", endpoint).startswith("optimal cost 7\n")
@@ -45,17 +47,16 @@ def _run(example: str, endpoint: str) -> str:
         check=False,
         env=dict(os.environ) | {"PYTHONWARNINGS": "error"},
     )
-    assert (done.returncode, done.stderr) == (0, "")
-    return done.stdout
+    ended = Ended(done.returncode, done.stdout, done.stderr)
+    assert (ended.status, ended.complaints) == (0, []), ended
+    return ended.out
 
 
 def test_a_plan_waits_for_router_and_coordinator(lab: Lab) -> None:
     endpoint = free_tcp()
     config = deployment(lab, endpoint)
-    path = lab.path("request.json", json.dumps(REQUEST))
-    asked = lab.start(
-        "plan", path, "--connect", endpoint, "--realm", "test", "--wait", f"{END_S:g}"
-    )
+    path = lab.path("request.json", json.dumps(request()))
+    asked = lab.start("plan", path, "--connect", endpoint, "--realm", REALM, "--wait", f"{END_S:g}")
     router = start_router(lab, config)
     coordinator = lab.start("coordinator", "--config", config)
 

@@ -11,11 +11,13 @@ import pytest
 from support.harness import (
     DEMAND,
     END_S,
+    RUN_S,
     SHORT_ROAD,
     Lab,
     check_safe_and_complete,
     events,
     final_lanes,
+    log_lines,
     plans,
     summary,
 )
@@ -81,6 +83,47 @@ def test_nothing_arrives_from_the_start(lab: Lab) -> None:
     # Cells are safe without a word; nobody was told where to go.
     assert found["planning"]["plans"] == 0
     assert found["messages"]["dropped_by_faults"] > 0
+
+
+def test_a_leader_that_is_killed_is_replaced(
+    finished_run: FinishedRun, lab: Lab, road: Path
+) -> None:
+    killed_at_s = 13.0
+    faults = lab.path("faults.toml", f"[[kill]]\nat_s = {killed_at_s}\n")
+    folder = lab.folder / "out"
+
+    # Slow enough that an election takes a second or two of road time, not ten.
+    found = run_with(lab, road, faults, "--pace", "5")
+
+    assert final_lanes(folder) == final_lanes(finished_run("simulated"))
+    leaders = {event["coordinator"] for event in events(folder, "leader")}
+    assert len(leaders) > 1
+    (recovery_s,) = found["failover"]["recovery_s"]
+    assert 0 < recovery_s < RUN_S
+    assert found["failover"]["leader_changes"] >= 1
+    # It was killed while plans were made.
+    made = plans(folder)
+    planned_s = [event["t_s"] for event in made]
+    assert min(planned_s) < killed_at_s < max(planned_s)
+    # Both leaders planned as the paper does, for formations, and every vehicle got its path.
+    makers = {event["name"] for event in made}
+    assert 1 < len(makers) <= len(leaders)
+    assert makers <= leaders
+    assert {event["kind"] for event in made} == {"plan-made"}
+    assert {(event["solver"], event["status"]) for event in made} == {("tappa", "optimal")}
+    assert sum(event["vehicles"] for event in made) >= found["vehicles"]["entered"]
+    assert found["planning"]["by_solver"]["tappa"] == len(made)
+    assert [line for line in log_lines(folder) if line["level"] == "error"] == []
+
+
+def test_a_coordinator_that_does_not_lead_is_killed_without_effect(
+    finished_run: FinishedRun, lab: Lab, road: Path
+) -> None:
+    faults = lab.path("faults.toml", '[[kill]]\ntarget = "c3"\nat_s = 13\n')
+
+    run_with(lab, road, faults, "--vehicles-per-process", "8")
+
+    assert final_lanes(lab.folder / "out") == final_lanes(finished_run("simulated"))
 
 
 def test_agents_are_killed_and_started_again(lab: Lab, short: Path) -> None:

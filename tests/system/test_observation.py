@@ -14,8 +14,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from laneweave.launch.cli.status_command import listen
 from laneweave.launch.observe.status import BRIDGE, COORDINATOR, RoleHealth, Status
 from laneweave.protocol.config.loading import load_scenario
+from support.deployments import deployment, free_tcp, ping, start_router, stop
 from support.harness import END_S, Ended, Lab
-from system.test_deployment import deployment, free_tcp, start_router, stop
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "DEPLOYMENT.md"
 LOOK_S = "0.6"
@@ -54,13 +54,13 @@ def names(found: dict[str, float]) -> set[str]:
 
 
 def test_status_of_a_deployment(lab: Lab) -> None:
-    config = deployment(lab, free_tcp())
-    # Longer than anybody looks at it; and c1 is to lead until it is killed, however busy this is.
+    # Longer than the test takes; and c1 leads until it is killed, even on a busy machine.
+    config = deployment(lab, free_tcp(), "election_s = 1.5\n")
     text = config.read_text("utf-8").replace("duration_s = 14.0", "duration_s = 900.0")
-    config.write_text(f"{text}election_s = 1.5\n", encoding="utf-8")
+    config.write_text(text, encoding="utf-8")
     nobody = status(lab, config)
     assert (nobody.status, nobody.out) == (2, "")
-    assert nobody.err.startswith("network.endpoint: got ")
+    assert nobody.complaints[0].startswith("network.endpoint: got ")
 
     router = start_router(lab, config)
     assert seen(config).problem == "there is no leader: no coordinator is there"
@@ -74,18 +74,21 @@ def test_status_of_a_deployment(lab: Lab) -> None:
     assert (ended.status, ended.out) == (1, "")
     assert ended.complaints == ["not healthy: coordinator c3 is not there"]
 
-    lab.wait_until(lambda: seen(config).vehicles.attended > 5, END_S)
+    def flows(found: Status) -> bool:
+        """Tell whether the road advances, with messages of some vehicles, few of them lost."""
+        rates, losses = found.messages_per_s, (found.loss.clock, found.loss.state)
+        return (
+            found.vehicles.agents >= found.vehicles.attended > 5
+            and found.road is not None
+            and found.road.advanced_s > 0.0
+            and rates.get("state", 0.0) > rates.get("clock", 0.0) > 0.0
+            and all(loss is not None and loss < 0.5 for loss in losses)
+        )
+
+    lab.wait_until(lambda: flows(seen(config)), END_S)
     found = seen(config)
-    assert (found.healthy, found.leader, found.claims) == (True, "c1", ("c1",))
+    assert (found.leader, found.claims) == ("c1", ("c1",))
     assert {one.coordinator for one in found.candidates} == {"c1", "c2"}
-    assert found.road is not None
-    assert found.road.advanced_s > 0.0
-    assert found.vehicles.agents >= found.vehicles.attended > 5
-    assert found.messages_per_s["state"] > found.messages_per_s["clock"] > 1.0
-    assert found.loss.clock is not None
-    assert found.loss.clock < 0.5
-    assert found.loss.state is not None
-    assert found.loss.state < 0.5
     assert seen(config, RoleHealth(BRIDGE)).healthy
     table = status(lab, config)
     assert (table.status, table.complaints) == (0, []), table
@@ -115,7 +118,7 @@ def test_metrics_of_a_coordinator(lab: Lab) -> None:
     config = deployment(lab, free_tcp())
     address, router_address = (free_tcp().removeprefix("tcp/") for _ in range(2))
     router = lab.start("router", "--config", config, "--metrics", router_address)
-    lab.wait_until(lambda: lab.finish(lab.start("ping", "--config", config)).status == 0, END_S)
+    lab.wait_until(lambda: ping(lab, config).status == 0, END_S)
     coordinator = lab.start(
         "coordinator", "--config", config, "--metrics", address, LANEWEAVE_LOG="json"
     )
@@ -137,8 +140,8 @@ def test_metrics_of_a_coordinator(lab: Lab) -> None:
 
     taken = lab.finish(lab.start("agent", "--config", config, "--metrics", address), END_S)
     assert (taken.status, taken.out) == (2, "")
-    assert taken.err.startswith("observation.metrics: got ")
-    assert len(taken.err.splitlines()) == 1
+    (line,) = taken.complaints
+    assert line.startswith("observation.metrics: got ")
 
     host, port = address.split(":")
     with socket.create_connection((host, int(port))) as open_end:

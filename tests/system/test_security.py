@@ -41,7 +41,8 @@ from laneweave.protocol.wire.topics import (
     VEHICLE_ALIVE,
     Topic,
 )
-from support.harness import END_S, RUN_S, Ended, Lab, check_safe_and_complete, trips
+from support.deployments import ask, free_port, start_router, stop
+from support.harness import END_S, RUN_S, Lab, check_safe_and_complete, laboratory, trips
 from support.secured import (
     KEYS,
     QUIET_S,
@@ -49,10 +50,8 @@ from support.secured import (
     Network,
     answer_to,
     connects,
-    deployment,
-    free_port,
-    laboratory,
     opens,
+    secured_deployment,
     shown_by,
     until,
     until_heard,
@@ -72,7 +71,7 @@ def secured(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Sc
     """Run one router for the whole module; give its folder of certificates, and the scenario."""
     folder = tmp_path_factory.mktemp("secured")
     with laboratory(folder) as lab:
-        config = deployment(lab, free_port())
+        config = secured_deployment(lab, free_port())
         init = ("certs", "init", "certs", "--config", config)
         vehicles = ("--vehicle", A, "--vehicle", B, "--vehicle", "stranger")
         assert lab.run(*init, *vehicles, "--client", "stranger").status == 0
@@ -320,42 +319,34 @@ def test_nobody_else_passes_for_the_router(network: Network, name: str) -> None:
 def test_a_role_says_in_one_line_what_is_wrong_with_its_certificate(
     network: Network, lab: Lab
 ) -> None:
-    config = deployment(lab, int(network.scenario.network.endpoint.rpartition(":")[2]))
+    config = secured_deployment(lab, int(network.scenario.network.endpoint.rpartition(":")[2]))
     ours, theirs = network.folder, lab.folder / "theirs"
     name = "observer.ping"
     issue(make_authority(theirs), theirs, parse_identity(name), days=30.0)
+
+    def shown(authority: Path, certificate: Path) -> dict[str, str]:
+        return {
+            "LANEWEAVE_CA_FILE": str(authority / "ca.pem"),
+            "LANEWEAVE_CERTIFICATE_FILE": str(certificate / f"{name}.pem"),
+            "LANEWEAVE_PRIVATE_KEY_FILE": str(certificate / f"{name}.key"),
+        }
+
     cases: tuple[tuple[dict[str, str], str], ...] = (
         ({}, "certificate authority"),
         ({"LANEWEAVE_CA_FILE": str(ours / "ca.pem")}, "certificate"),
-        (
-            {
-                "LANEWEAVE_CA_FILE": str(ours / "ca.pem"),
-                "LANEWEAVE_CERTIFICATE_FILE": str(theirs / f"{name}.pem"),
-                "LANEWEAVE_PRIVATE_KEY_FILE": str(theirs / f"{name}.key"),
-            },
-            "certificate",
-        ),
-        # All is well among these, but the router is another authority's.
-        (
-            {
-                "LANEWEAVE_CA_FILE": str(theirs / "ca.pem"),
-                "LANEWEAVE_CERTIFICATE_FILE": str(theirs / f"{name}.pem"),
-                "LANEWEAVE_PRIVATE_KEY_FILE": str(theirs / f"{name}.key"),
-            },
-            "network.endpoint",
-        ),
+        (shown(ours, theirs), "certificate"),
+        # These fit together, but the router's certificate is of another authority.
+        (shown(theirs, theirs), "network.endpoint"),
     )
     for environment, field in cases:
         ended = lab.run("ping", "--config", config, within_s=END_S, **environment)
         assert (ended.status, ended.out) == (2, ""), ended
-        assert len(ended.err.splitlines()) == 1
-        assert ended.err.startswith(f"{field}: "), ended.err
+        (line,) = ended.complaints
+        assert line.startswith(f"{field}: ")
     # The key may come as text.
-    good = {
-        "LANEWEAVE_CA_FILE": str(ours / "ca.pem"),
-        "LANEWEAVE_CERTIFICATE_FILE": str(ours / f"{name}.pem"),
-        "LANEWEAVE_PRIVATE_KEY": (ours / f"{name}.key").read_text(encoding="ascii"),
-    }
+    good = shown(ours, ours)
+    key = Path(good.pop("LANEWEAVE_PRIVATE_KEY_FILE"))
+    good["LANEWEAVE_PRIVATE_KEY"] = key.read_text(encoding="ascii")
     ended = lab.run("ping", "--config", config, within_s=END_S, **good)
     assert (ended.status, ended.out, ended.complaints) == (0, "", []), ended
 
@@ -364,11 +355,10 @@ def test_a_role_says_in_one_line_what_is_wrong_with_its_certificate(
 
 
 def test_a_secured_deployment_runs_to_its_end(lab: Lab) -> None:
-    config = deployment(lab, free_port())
+    config = secured_deployment(lab, free_port())
     assert lab.run("certs", "init", "certs", "--config", config).status == 0
     network = Network(lab.folder / "certs", load_scenario(config))
-    router = lab.start("router", "--config", config)
-    lab.wait_until(lambda: opens(network.access("observer.ping")), END_S)
+    router = start_router(lab, config)
     roles = [
         lab.start("coordinator", "--config", config, "--name", "c1"),
         lab.start("coordinator", "--config", config, "--name", "c2"),
@@ -379,23 +369,19 @@ def test_a_secured_deployment_runs_to_its_end(lab: Lab) -> None:
         observer = network.join("observer.status")
         observer.transport.subscribe(KEYS.all_of(HEARTBEAT))
         lab.wait_until(lambda: len({key for key, _ in observer.received()}) == 2, END_S)
-        request = Path(__file__).parents[2] / "docs/examples/case-study.json"
-
-        def ask() -> Ended:
-            return lab.finish(lab.start("plan", request, "--config", config), RUN_S)
-
-        # Planning has to be got ready first, which may take longer than the request's deadline.
-        lab.wait_until(lambda: ask().status == 0)
-        assert json.loads(ask().out)["cost"] == 7
+        example = Path(__file__).parents[2] / "docs/examples/case-study.json"
+        request = json.loads(example.read_text(encoding="utf-8"))
+        # Planning is prepared first, which may take longer than the request's deadline.
+        lab.wait_until(lambda: ask(lab, config, request).status == 0)
+        assert json.loads(ask(lab, config, request | {"deadline_s": 60.0}).out)["cost"] == 7
         looked = lab.finish(lab.start("status", "--config", config, "--json"), END_S)
         assert (looked.status, looked.complaints) == (0, []), looked
         assert json.loads(looked.out)["leader"] == "c1"
         bridge = lab.start("bridge", "--config", config, "--pace", "20", "--out", "out")
         ended = lab.finish(bridge, RUN_S)
     assert (ended.status, ended.complaints) == (0, []), ended
-    for process in (*roles, router):
-        process.send_signal(signal.SIGTERM)
-        assert lab.finish(process, END_S).status == 0
+    stop(lab, *roles)
+    stop(lab, router)
     check_safe_and_complete(lab.folder / "out")
     for vehicle, trip in trips(lab.folder / "out").items():
         assert trip["final_lane"] == trip["preferred_lane"], vehicle
