@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from attrs import evolve
 
-from laneweave.protocol.lattice import Cell, PlannedMove, territory
+from laneweave.protocol.lattice import Cell
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.vehicle.execution import PlanExecution
 from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
 from laneweave.protocol.wire.messages import Ballot, Deed, Name, Plan, Sense, VehicleState
 from support.rolling_road import LATTICE
+from support.states import make_plan as plan_of
 
 A, B, C = Name("A"), Name("B"), Name("C")
 LOW, MID, HIGH = (Ballot(term, Name("c1"), 10, 1) for term in (1, 2, 3))
@@ -23,18 +24,13 @@ INCARNATION = 7
 
 
 def make_plan(ballot: Ballot = MID) -> Plan:
-    cells: dict[Name, Cell] = {A: HOME, B: (2, 1)}
-    moves: dict[Name, tuple[PlannedMove, ...]] = {A: ((0, HOME, TARGET),), B: ()}
-    return Plan(
+    return plan_of(
+        {A: HOME, B: (2, 1)},
+        {A: ((0, HOME, TARGET),)},
         ballot=ballot,
-        formations=(0,),
-        roster=(A, B),
-        incarnations=dict.fromkeys(cells, INCARNATION),
-        start_cells=cells,
-        moves=moves,
+        incarnations={A: INCARNATION, B: INCARNATION},
         t0_s=T0_S,
         slot_s=SLOT_S,
-        territory=tuple(sorted(territory(cells.values(), moves[A]))),
         before=BEFORE,
         after=AFTER,
     )

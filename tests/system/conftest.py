@@ -9,22 +9,13 @@ from pathlib import Path
 import pytest
 
 from support.harness import DEMAND, ROAD, Lab, laboratory
-from support.loaded import Loaded
 from support.sharing import made_once
 
 
-@pytest.fixture(scope="session")
-def loaded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Loaded]:
-    """What runs commands without loading the package each time."""
-    process = Loaded(tmp_path_factory.mktemp("loaded"))
-    yield process
-    process.close()
-
-
 @pytest.fixture
-def lab(tmp_path: Path, loaded: Loaded) -> Iterator[Lab]:
+def lab(tmp_path: Path) -> Iterator[Lab]:
     """Processes of this test; whatever is left of them at its end is an error."""
-    with laboratory(tmp_path, loaded) as laboratory_of_test:
+    with laboratory(tmp_path) as laboratory_of_test:
         yield laboratory_of_test
 
 

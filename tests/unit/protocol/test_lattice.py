@@ -27,14 +27,6 @@ MOVES = st.builds(
 )
 
 
-@given(LATTICES, COLUMNS)
-def test_a_column_is_in_the_range_of_its_block_only(lattice: Lattice, column: int) -> None:
-    block = lattice.block_of(column)
-    assert column in lattice.block_range(block)
-    assert column not in lattice.block_range(block - 1)
-    assert column not in lattice.block_range(block + 1)
-
-
 @given(LATTICES, st.integers(-500, 500))
 def test_blocks_partition_the_columns(lattice: Lattice, block: int) -> None:
     columns = lattice.block_range(block)
@@ -92,11 +84,6 @@ def test_a_footprint_is_the_same_both_ways(cell: Cell, by: tuple[int, int]) -> N
     assert cells == footprint(target, cell)
     assert {cell, target} <= cells
     assert len(cells) == {0: 1, 1: 2, 2: 4}[abs(by[0]) + abs(by[1])]
-
-
-@given(CELLS)
-def test_a_hold_occupies_its_cell(cell: Cell) -> None:
-    assert footprint(cell, cell) == {cell}
 
 
 @given(st.lists(CELLS, max_size=8), st.lists(MOVES, max_size=8))

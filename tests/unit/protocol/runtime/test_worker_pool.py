@@ -156,17 +156,14 @@ def test_workers_work_at_the_same_time(two: Bench, tmp_path: Path) -> None:
 # --- workers that die or hang -----------------------------------------------------------------
 
 
-def test_an_idle_worker_that_is_killed_is_replaced(one: Bench) -> None:
+@pytest.mark.parametrize("with_a_job", [True, False])
+def test_an_idle_worker_that_is_killed_is_replaced(one: Bench, *, with_a_job: bool) -> None:
     before = one.process_id()
     os.kill(before, signal.SIGKILL)
+    if not with_a_job:
+        wait_until(lambda: one.pool.process_ids not in ([before], []))
     assert one.process_id() not in (before, os.getpid())
-
-
-def test_a_worker_that_is_killed_is_replaced_without_a_job(one: Bench) -> None:
-    before = one.process_id()
-    os.kill(before, signal.SIGKILL)
-    wait_until(lambda: one.pool.process_ids not in ([before], []))
-    assert one.process_id() == one.pool.process_ids[0] != before
+    assert one.pool.process_ids == [one.process_id()]
 
 
 def test_the_job_of_a_worker_that_is_killed_is_done_by_another(two: Bench, tmp_path: Path) -> None:

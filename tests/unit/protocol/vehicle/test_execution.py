@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 from attrs import evolve
 
-from laneweave.protocol.lattice import Cell, Lattice, PlannedMove, territory
+from laneweave.protocol.lattice import Cell, Lattice, PlannedMove
 from laneweave.protocol.state_machine import Function
 from laneweave.protocol.vehicle.execution import LISTEN_S, PlanExecution
 from laneweave.protocol.vehicle.execution_rules import (
@@ -19,6 +19,8 @@ from laneweave.protocol.vehicle.execution_rules import (
 )
 from laneweave.protocol.wire.messages import Ballot, Name, Plan, Prepare, Sense, VehicleState
 from support.rule_recorder import RuleRecorder
+from support.states import holding
+from support.states import make_plan as plan_of
 
 A, B, C = Name("A"), Name("B"), Name("C")
 LOW = Ballot(1, Name("c1"), 10, 1)
@@ -53,49 +55,20 @@ def make_plan(
     formations: tuple[int, ...] = (0,),
 ) -> Plan:
     cells = cells or AT
-    moves = dict.fromkeys(cells, ()) | (moves or {A: ((0, (-4, 0), (-4, 1)),)})
-    return Plan(
+    return plan_of(
+        cells,
+        moves or {A: ((0, (-4, 0), (-4, 1)),)},
         ballot=ballot,
         formations=formations,
-        roster=tuple(cells),
         incarnations=dict.fromkeys(cells, 7),
-        start_cells=cells,
-        moves=moves,
         t0_s=T0_S,
         slot_s=SLOT_S,
-        territory=tuple(territory(cells.values(), [m for each in moves.values() for m in each])),
     )
 
 
-def shown(
-    name: Name = B,
-    ballot: Ballot | None = MID,
-    completed: int = 0,
-    *,
-    accepted: bool = True,
-    ready: bool = True,
-    go: bool = False,
-) -> VehicleState:
-    return VehicleState(
-        vehicle=name,
-        incarnation=7,
-        formation=0,
-        joined=(0,),
-        promised=ballot,
-        accepted=accepted,
-        ready=ready,
-        completed=completed,
-        hold_cell=(-4, 0),
-        moving=False,
-        go=go,
-        done=False,
-        overdue=False,
-        attended=True,
-        s_m=0.0,
-        y_m=0.0,
-        speed_mps=0.0,
-        t_s=0.0,
-    )
+def shown(name: Name = B, ballot: Ballot | None = MID, **more: object) -> VehicleState:
+    """Return the state of a vehicle that has accepted a plan and is ready."""
+    return holding(name, ballot, (-4, 0), **({"accepted": True, "ready": True} | more))
 
 
 def taken(plan: Plan | None = None, name: Name = A) -> PlanExecution:
@@ -128,10 +101,6 @@ def going(plan: Plan | None = None, name: Name = A) -> PlanExecution:
     execution.on_state(shown(other, go=True))
     assert execution.go
     return execution
-
-
-def gate(execution: PlanExecution) -> bool:
-    return execution.go
 
 
 # --- V1 ---------------------------------------------------------------------------------------
@@ -230,7 +199,7 @@ def test_v2_while_moving_the_motion_ends_but_counts_for_no_plan() -> None:
     assert not execution.ready  # it still occupies the footprint of the old move
     execution.on_state(shown(ballot=HIGH))
     assert execution.tick(T0_S) is None
-    assert not gate(execution)
+    assert not execution.go
 
     execution.end_motion()
     assert execution.completed == 0
@@ -267,32 +236,27 @@ def test_what_was_joined_stays_joined_whatever_comes_late() -> None:
 # --- V3 ---------------------------------------------------------------------------------------
 
 
-def test_v3_accepts_the_plan_of_the_promised_ballot_once() -> None:
-    execution = accepted()
+@pytest.mark.parametrize(
+    ("reach", "phase"), [(accepted, ExecutionPhase.GATED), (going, ExecutionPhase.GOING)]
+)
+def test_v3_accepts_the_plan_of_the_promised_ballot_once(
+    reach: Callable[[], PlanExecution], phase: ExecutionPhase
+) -> None:
+    execution = reach()
     plan = execution.plan
-    assert (execution.ready, execution.phase) == (True, ExecutionPhase.GATED)
-    assert not execution.on_plan(make_plan())
-    assert not execution.on_plan(make_plan(moves={A: ((0, (-4, 0), (-5, 0)),)}))  # a second one
-    assert execution.plan is plan
+    assert (execution.ready, execution.phase) == (True, phase)
+    for second in (make_plan(), make_plan(moves={A: ((0, (-4, 0), (-5, 0)),)})):
+        assert not execution.on_plan(second)
+        assert (execution.plan, execution.phase) == (plan, phase)
 
 
-def test_v3_with_the_gate_open_no_plan_is_accepted() -> None:
-    execution = going()
-    plan = execution.plan
-    assert not execution.on_plan(make_plan(moves={A: ((0, (-4, 0), (-5, 0)),)}))
-    assert (execution.plan, execution.phase) == (plan, ExecutionPhase.GOING)
-
-
-def test_v3_needs_a_promise() -> None:
-    assert not vehicle().on_plan(make_plan())
-
-
-@pytest.mark.parametrize("ballot", [LOW, HIGH])
-def test_v3_ignores_plans_of_other_ballots(ballot: Ballot) -> None:
+@pytest.mark.parametrize("promised", [None, LOW, HIGH])
+def test_v3_ignores_plans_of_ballots_that_it_has_not_promised(promised: Ballot | None) -> None:
     execution = vehicle()
-    execution.on_prepare(prepare(MID))
-    assert not execution.on_plan(make_plan(ballot))
-    assert (execution.plan, execution.promised) == (None, MID)
+    if promised is not None:
+        execution.on_prepare(prepare(promised))
+    assert not execution.on_plan(make_plan(MID))
+    assert (execution.plan, execution.promised) == (None, promised)
 
 
 @pytest.mark.parametrize(
@@ -491,9 +455,9 @@ def test_v4_late_states_take_nothing_back(reach: Callable[[], PlanExecution]) ->
 def test_v4_an_open_gate_spreads() -> None:
     execution = accepted()
     execution.on_state(shown(ready=False, go=True))
-    assert gate(execution)
+    assert execution.go
     execution.on_state(shown(go=False))
-    assert gate(execution)
+    assert execution.go
     assert execution.tick(T0_S) is not None
 
 
@@ -505,17 +469,17 @@ def test_v5_the_gate_needs_all_members() -> None:
     assert execution.tick(T0_S) is None
     execution.on_state(shown(C, ready=False))
     assert execution.tick(T0_S) is None
-    assert not gate(execution)
+    assert not execution.go
     execution.on_state(shown(C))
     assert execution.tick(T0_S) == (0, (-4, 0), (-4, 1))
-    assert gate(execution)
+    assert execution.go
 
 
 def test_v5_alone_in_the_roster() -> None:
     execution = accepted(make_plan(cells={A: (-4, 0)}))
-    assert not gate(execution)
+    assert not execution.go
     assert execution.tick(T0_S) is not None
-    assert gate(execution)
+    assert execution.go
 
 
 def test_v5_opens_for_others_before_the_own_time_and_without_own_moves() -> None:
@@ -537,13 +501,9 @@ def test_v6_not_before_its_time() -> None:
     assert (execution.hold_cell, execution.moving) == ((-4, 1), True)
 
 
-def test_v6_late_is_not_too_late() -> None:
-    execution = going()
-    assert execution.tick(T0_S + 100.0) == (0, (-4, 0), (-4, 1))
-
-
-def test_v6_time_without_the_gate_is_not_enough() -> None:
+def test_v6_a_late_move_needs_the_open_gate_and_nothing_else() -> None:
     assert accepted().tick(T0_S + 100.0) is None
+    assert going().tick(T0_S + 100.0) == (0, (-4, 0), (-4, 1))
 
 
 def test_v6_dependencies() -> None:
@@ -641,26 +601,10 @@ def test_the_state_says_what_the_vehicle_knows_and_senses(*, attended: bool) -> 
     )
     execution = going()
     assert execution.tick(T0_S) is not None
-    expected = VehicleState(
-        vehicle=A,
-        incarnation=7,
-        formation=3,
-        joined=(0,),
-        promised=MID,
-        accepted=True,
-        ready=True,
-        completed=0,
-        hold_cell=(-4, 1),
-        moving=True,
-        go=True,
-        done=False,
-        overdue=False,
-        attended=attended,
-        s_m=7.0,
-        y_m=2.0,
-        speed_mps=14.0,
-        t_s=100.1,
-    )
+    expected = holding(
+        A, MID, (-4, 1), incarnation=7, formation=3, accepted=True, ready=True, moving=True,
+        go=True, attended=attended, s_m=7.0, y_m=2.0, speed_mps=14.0, t_s=100.1,
+    )  # fmt: skip
     assert execution.state(sense, 3, attended=attended) == expected
     execution.end_motion()
     assert execution.state(sense, 3, attended=attended) == evolve(

@@ -180,19 +180,31 @@ def test_an_int_is_taken_where_a_number_is_meant() -> None:
 # --- the envelope -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("version", [0, 2, -1, "1", None, True, 1.0, [1], {}, b"1", 2**64 - 1])
-def test_another_version_is_refused(version: object) -> None:
+BEAT = envelope(SAMPLES[Heartbeat])[2]
+VERSIONS: list[object] = [0, 2, -1, "1", None, True, 1.0, [1], {}, b"1", 2**64 - 1]
+NO_KINDS: list[object] = [
+    "Hearbeat", "heartbeat", "", "object", "Ballot", "Neighbour", 1, None, [], {}, b"Plan"
+]  # fmt: skip
+WRONG_ENVELOPES: list[tuple[object, str]] = [
+    *(([version, "Heartbeat", BEAT], "version") for version in VERSIONS),
+    *(([VERSION, kind, BEAT], "kind") for kind in NO_KINDS),
+    *(
+        ([VERSION, "RoadClock", body], "RoadClock")
+        for body in (None, 1, "x", [], [["tick", 1]], b"", True)
+    ),
+    *(
+        (whole, "message")
+        for whole in (None, 1, "Plan", {}, [], [1], [1, "Plan"], [1, "Plan", {}, {}],
+                      {"0": 1, "1": "Plan"})
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("whole", "field"), WRONG_ENVELOPES)
+def test_a_wrong_envelope_is_refused_by_its_part(whole: object, field: str) -> None:
     assert VERSION == 1
-    _, kind, body = envelope(SAMPLES[Heartbeat])
-    assert refusal(decode, pack(version, kind, body)).field == "version"
-
-
-@pytest.mark.parametrize(
-    "kind", ["Hearbeat", "heartbeat", "", "object", "Ballot", "Neighbour", 1, None, [], {}, b"Plan"]
-)
-def test_an_unknown_kind_is_refused(kind: object) -> None:
-    version, _, body = envelope(SAMPLES[Heartbeat])
-    assert refusal(decode, pack(version, kind, body)).field == "kind"
+    packed: bytes = msgpack.packb(whole)
+    assert refusal(decode, packed).field == field
 
 
 def test_another_kind_than_the_expected_is_refused() -> None:
@@ -202,20 +214,6 @@ def test_another_kind_than_the_expected_is_refused() -> None:
                 error = refusal(decode, encode(sample), expected)
                 assert error.field == "kind"
                 assert expected.__name__ in str(error)
-
-
-@pytest.mark.parametrize("body", [None, 1, "x", [], [["tick", 1]], b"", True])
-def test_fields_that_are_no_map_are_refused(body: object) -> None:
-    assert refusal(decode, pack(1, "RoadClock", body)).field == "RoadClock"
-
-
-@pytest.mark.parametrize(
-    "envelope_",
-    [None, 1, "Plan", {}, [], [1], [1, "Plan"], [1, "Plan", {}, {}], {"0": 1, "1": "Plan"}],
-)
-def test_what_is_no_envelope_is_refused(envelope_: object) -> None:
-    packed: bytes = msgpack.packb(envelope_)
-    assert refusal(decode, packed).field == "message"
 
 
 def test_an_oversize_payload_is_refused_before_it_is_read() -> None:
