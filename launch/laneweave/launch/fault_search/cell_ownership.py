@@ -40,12 +40,10 @@ class CellOwnership:
     """Checks the ownership of all cells of a run."""
 
     def __init__(self, report: Report) -> None:
-        """Start without vehicles; `report` receives the violations."""
+        """Start without vehicles; `report` receives each violation once."""
         self._report = report
+        self._reported: set[tuple[str, str, str]] = set()
         self._holdings: dict[str, Holding] = {}
-        self._owner: dict[Cell, str] = {}
-        self._owned: dict[str, Cells] = {}
-        """Owned cells of each vehicle; the inverse of `_owner`."""
         self._opened: set[Ballot] = set()
         """Ballots under which a vehicle has taken possession."""
         self._bodies: dict[str, Cells] = {}
@@ -68,27 +66,20 @@ class CellOwnership:
             transfer: its newest transfer.
             body: cells that its body occupies from now on; None: unchanged.
         """
-        known = self._holdings.get(vehicle)
         holding = Holding(frozenset(cells), transfer)
         if body is not None:
             self._bodies[vehicle] = body
-        elif known == holding:
+        elif self._holdings.get(vehicle) == holding:
             return
         self._holdings[vehicle] = holding
-        changed = [vehicle]
-        if transfer is not None and transfer.open and transfer.ballot not in self._opened:
+        if transfer is not None and transfer.open:
             self._opened.add(transfer.ballot)
-            changed += [
-                name
-                for name, other in self._holdings.items()
-                if name != vehicle and other.transfer and other.transfer.ballot == transfer.ballot
-            ]
-        self._update_owners(t_s, changed)
+        self._check(t_s)
 
     def occupy(self, t_s: float, vehicle: str, cells: Cells) -> None:
         """Update the cells that a body occupies."""
         self._bodies[vehicle] = cells
-        self._check_body(t_s, vehicle)
+        self._check(t_s)
 
     def move(self, t_s: float, vehicle: str, ballot: Ballot) -> None:
         """Check the start of a motion under a ballot."""
@@ -99,31 +90,21 @@ class CellOwnership:
         """Remove a vehicle that has left the road, and free its cells."""
         self._holdings.pop(vehicle, None)
         self._bodies.pop(vehicle, None)
-        self._free(vehicle)
 
-    def _free(self, vehicle: str) -> None:
-        for cell in self._owned.pop(vehicle, frozenset()):
-            if self._owner.get(cell) == vehicle:
-                del self._owner[cell]
-
-    def _update_owners(self, t_s: float, vehicles: list[str]) -> None:
-        for vehicle in vehicles:
-            self._free(vehicle)
-        for vehicle in vehicles:
-            owned = self._holdings[vehicle].owned(self._opened)
-            self._owned[vehicle] = owned
-            for cell in sorted(owned):
-                other = self._owner.setdefault(cell, vehicle)
+    def _check(self, t_s: float) -> None:
+        owners: dict[Cell, str] = {}
+        for vehicle, holding in self._holdings.items():
+            owned = holding.owned(self._opened)
+            for cell in owned:
+                other = owners.setdefault(cell, vehicle)
                 if other != vehicle:
-                    self._report("owner", t_s, [vehicle, other], f"both own {cell}")
-            self._check_body(t_s, vehicle)
+                    self._report_once("owner", t_s, [vehicle, other], f"both own {cell}")
+            foreign = self._bodies.get(vehicle, frozenset()) - (holding.cells & owned)
+            if foreign:
+                text = f"its body is in {sorted(foreign)}, which it does not own"
+                self._report_once("trespass", t_s, [vehicle], text)
 
-    def _check_body(self, t_s: float, vehicle: str) -> None:
-        body = self._bodies.get(vehicle)
-        holding = self._holdings.get(vehicle)
-        if body is None or holding is None:
-            return
-        foreign = body - (holding.cells & self._owned[vehicle])
-        if foreign:
-            text = f"its body is in {sorted(foreign)}, which it does not own"
-            self._report("trespass", t_s, [vehicle], text)
+    def _report_once(self, kind: str, t_s: float, vehicles: list[str], text: str) -> None:
+        if (kind, vehicles[0], text) not in self._reported:
+            self._reported.add((kind, vehicles[0], text))
+            self._report(kind, t_s, vehicles, text)

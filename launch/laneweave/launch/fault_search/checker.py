@@ -19,8 +19,7 @@ machines inside the processes and shares no code with them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator
 
 from attrs import define, frozen
 
@@ -46,18 +45,6 @@ class Violation:
     def __str__(self) -> str:
         """Return one readable line."""
         return f"{self.t_s:8.3f} s  {self.kind}: {', '.join(self.vehicles)}: {self.text}"
-
-
-@define
-class _Published:
-    """The newest state that one process has published of one vehicle."""
-
-    promised: Ballot | None = None
-    accepted: bool = False
-    completed: int = 0
-    go: bool = False
-    joined: frozenset[int] = frozenset()
-    hold_cell: Cell | None = None
 
 
 @define
@@ -97,8 +84,8 @@ class Checker:
         self._moving: dict[str, tuple[float, Cell, Ballot | None]] = {}
         """End time, target cell and ballot of the motion of each moving body."""
         self._checked_s = 0.0
-        self._published: dict[str, dict[int, _Published]] = {}
-        """Newest states of each vehicle, by the incarnation of the process."""
+        self._states: dict[str, dict[int, VehicleState]] = {}
+        """Newest published state of each vehicle, by the incarnation of the process."""
         self._begun: dict[tuple[str, int, Cell], Ballot | None] = {}
         """Ballot under which (vehicle, process, cell) has been published as a move."""
         self._done: dict[tuple[Ballot, str], int] = {}
@@ -106,11 +93,6 @@ class Checker:
         self._runs: dict[Ballot, _Run] = {}
         self._charge: dict[str, tuple[int, frozenset[int]]] = {}
         """Newest attendant and joined formations of each motion controller."""
-        self._listeners: dict[type, Callable[[float, Any], None]] = {
-            VehicleState: self._on_state,
-            Plan: self._on_plan,
-            Sense: self._on_sense,
-        }
 
     # --- the road -----------------------------------------------------------------------------
 
@@ -244,9 +226,13 @@ class Checker:
 
     def sent(self, t_s: float, message: object) -> None:
         """Check a message when it is sent."""
-        listener = self._listeners.get(type(message))
-        if listener is not None:
-            listener(t_s, message)
+        match message:
+            case VehicleState():
+                self._on_state(t_s, message)
+            case Plan():
+                self._on_plan(t_s, message)
+            case Sense():
+                self._on_sense(t_s, message)
 
     def _on_plan(self, t_s: float, plan: Plan) -> None:
         known = self.plans.setdefault(plan.ballot, plan)
@@ -265,27 +251,25 @@ class Checker:
             self._charge[sense.vehicle] = sense.attendant, frozenset(sense.joined)
 
     def _on_state(self, t_s: float, state: VehicleState) -> None:
-        processes = self._published.setdefault(state.vehicle, {})
-        published = processes.get(state.incarnation)
-        if published is None:
-            published = processes[state.incarnation] = _Published()
+        states = self._states.setdefault(state.vehicle, {})
+        before = states.get(state.incarnation)
+        states[state.incarnation] = state
+        if before is None:
             # A new process inherits the joined formations of earlier ones.
-            inherited = [
-                one.joined for number, one in processes.items() if number < state.incarnation
-            ]
-            published.joined = frozenset().union(*inherited)
-        for text in _revoked(published, state):
+            earlier = [one for number, one in states.items() if number < state.incarnation]
+            joined = {number for one in earlier for number in one.joined}
+        else:
+            joined = set(before.joined)
+        texts = []
+        if not joined.issubset(state.joined):
+            texts.append(f"it has joined {state.joined} after {sorted(joined)}")
+        if before is not None:
+            texts += _revoked(before, state)
+            if state.moving and before.hold_cell != state.hold_cell:
+                key = (state.vehicle, state.incarnation, state.hold_cell)
+                self._begun[key] = state.promised if state.accepted else None
+        for text in texts:
             self._report("monotone", t_s, [state.vehicle], text)
-        if state.moving and published.hold_cell not in (None, state.hold_cell):
-            key = (state.vehicle, state.incarnation, state.hold_cell)
-            self._begun[key] = state.promised if state.accepted else None
-        if state.promised != published.promised:
-            published.completed, published.go = 0, False
-        published.promised, published.accepted = state.promised, state.accepted
-        published.completed, published.go = state.completed, state.go
-        published.hold_cell = state.hold_cell
-        if len(published.joined) != len(state.joined):
-            published.joined = frozenset(state.joined)
 
     def _log(self, t_s: float, event: str) -> None:
         if self._note is not None:
@@ -296,24 +280,19 @@ class Checker:
             self.violations.append(Violation(kind, t_s, tuple(vehicles), text))
 
 
-def _revoked(published: _Published, state: VehicleState) -> list[str]:
-    """Return the contradictions between a new state and the one published before."""
-    texts = []
-    if not published.joined.issubset(state.joined):
-        texts.append(f"it has joined {state.joined} after {sorted(published.joined)}")
-    if published.promised is None:
-        return texts
-    if state.promised is None or state.promised < published.promised:
-        return [*texts, f"it promises {short(state.promised)} after {short(published.promised)}"]
-    if state.promised > published.promised:
-        return texts
-    if published.accepted and not state.accepted:
-        texts.append(f"it has not accepted {short(state.promised)} any more")
-    if state.completed < published.completed:
-        texts.append(f"it has completed {state.completed} moves after {published.completed}")
-    if published.go and not state.go:
-        texts.append(f"its gate for {short(state.promised)} closes again")
-    return texts
+def _revoked(before: VehicleState, state: VehicleState) -> Iterator[str]:
+    """Yield what of its previous state a process has revoked."""
+    if before.promised is None:
+        return
+    if state.promised is None or state.promised < before.promised:
+        yield f"it promises {short(state.promised)} after {short(before.promised)}"
+    elif state.promised == before.promised:
+        if before.accepted and not state.accepted:
+            yield f"it has not accepted {short(state.promised)} any more"
+        if state.completed < before.completed:
+            yield f"it has completed {state.completed} moves after {before.completed}"
+        if before.go and not state.go:
+            yield f"its gate for {short(state.promised)} closes again"
 
 
 def short(ballot: Ballot | None) -> str:

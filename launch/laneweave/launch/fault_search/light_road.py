@@ -9,11 +9,11 @@ publishes.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from typing import Protocol
 
 import attrs
 from attrs import frozen
 
+from laneweave.launch.fault_search.checker import Checker
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import (
@@ -34,7 +34,6 @@ from laneweave.protocol.wire.messages import (
     CensusEntry,
     ClosedFormation,
     Command,
-    Deed,
     Name,
     Plan,
     Prepare,
@@ -88,27 +87,6 @@ class Grant:
     t_s: float
     owner: Name
     cell: Cell
-
-
-class RoadObserver(Protocol):
-    """Receives the events on the road; the checker is one."""
-
-    def own(self, t_s: float, vehicle: str, owned: tuple[Cell, ...], transfer: Deed | None) -> None:
-        """Record what a motion controller shows as owned."""
-
-    def enter(self, t_s: float, vehicle: str, cell: Cell) -> None:
-        """Record that a vehicle enters."""
-
-    def leave(self, t_s: float, vehicle: str) -> None:
-        """Record that a vehicle leaves."""
-
-    def begin(
-        self, t_s: float, vehicle: str, incarnation: int, move: tuple[Cell, Cell], lasts_s: float
-    ) -> None:
-        """Record that a body begins to move."""
-
-    def advance(self, t_s: float) -> None:
-        """Advance the time."""
 
 
 class LightBody(Plant):
@@ -205,7 +183,7 @@ class LightRoad:
         scenario: Scenario,
         visits: Iterable[Visit],
         preferred_lanes: dict[Name, int],
-        observer: RoadObserver,
+        checker: Checker,
         new_incarnation: Callable[[], int],
         move_lasts_s: Callable[[], float],
         lost: Callable[[], bool],
@@ -218,7 +196,7 @@ class LightRoad:
             scenario: lattice and timing.
             visits: the vehicles and their times.
             preferred_lanes: preferred lane of each vehicle when it enters.
-            observer: receives the events on the road.
+            checker: observes the events on the road.
             new_incarnation: returns incarnations for caretakers.
             move_lasts_s: draws the duration of the next motion.
             lost: draws whether the next SENSE or COMMAND is lost, in addition to network loss.
@@ -239,7 +217,7 @@ class LightRoad:
         self._closed: list[ClosedFormation] = []
         self._closed_to = NONE_CLOSED
         self._preferred_lanes = preferred_lanes
-        self._observer = observer
+        self._checker = checker
         self._move_lasts_s = move_lasts_s
         self._lost = lost
         self._attendance = Attendance(scenario, new_incarnation)
@@ -295,7 +273,7 @@ class LightRoad:
         if controller.hold_cell != held:
             lasts_s = self._move_lasts_s()
             move = (held, controller.hold_cell)
-            self._observer.begin(now_s, command.vehicle, command.incarnation, move, lasts_s)
+            self._checker.begin(now_s, command.vehicle, command.incarnation, move, lasts_s)
             vehicle.body.go(controller.hold_cell, now_s, lasts_s)
 
     # --- the tick -----------------------------------------------------------------------------
@@ -303,7 +281,7 @@ class LightRoad:
     def _on_tick(self, now_s: float) -> Iterator[Effect]:
         self.tick += 1
         t_s = self.tick * self._tick_s
-        self._observer.advance(now_s)
+        self._checker.advance(now_s)
         self._let_enter(now_s)
         self._close_formations(t_s)
         self._grant_cells(now_s)
@@ -327,7 +305,7 @@ class LightRoad:
             visit = self._visits.pop(0)
             lane = self._preferred_lanes[visit.vehicle]
             self.vehicles[visit.vehicle] = LightVehicle(visit, lane, self._scenario)
-            self._observer.enter(now_s, visit.vehicle, visit.cell)
+            self._checker.enter(now_s, visit.vehicle, visit.cell)
             self._report_ownership(visit.vehicle, now_s)
             self._census_due_tick = 0
 
@@ -351,7 +329,7 @@ class LightRoad:
 
     def _report_ownership(self, name: Name, now_s: float) -> None:
         controller = self.vehicles[name].controller
-        self._observer.own(now_s, name, controller.owned, controller.transfer)
+        self._checker.own(now_s, name, controller.owned, controller.transfer)
 
     def _let_leave(self, now_s: float) -> Iterator[Effect]:
         length_m = self._scenario.road.length_m
@@ -363,7 +341,7 @@ class LightRoad:
         for name in leaving:
             self._departures.add(self.vehicles.pop(name))
             yield from self._attendance.forget(name)
-            self._observer.leave(now_s, name)
+            self._checker.leave(now_s, name)
             self._census_due_tick = 0
         yield from self._departures.notify(self.tick, self._attendance.answers.up)
 

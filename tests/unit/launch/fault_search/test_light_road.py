@@ -7,6 +7,8 @@ from itertools import count, pairwise
 
 import pytest
 
+from laneweave.launch.fault_search.bodies import Geometry
+from laneweave.launch.fault_search.checker import Checker
 from laneweave.launch.fault_search.light_road import LightRoad, Visit
 from laneweave.launch.fault_search.setup import make_scenario
 from laneweave.protocol.lattice import Cell
@@ -16,7 +18,6 @@ from laneweave.protocol.wire.messages import (
     Ballot,
     Census,
     Command,
-    Deed,
     Name,
     Prepare,
     Sense,
@@ -29,43 +30,19 @@ A = Name("a")
 OWN = {"vehicle": "a"}
 
 
-class Log:
-    """A watcher that notes everything."""
-
-    def __init__(self) -> None:
-        """Begin with nothing."""
-        self.lines: list[tuple[object, ...]] = []
-
-    def enter(self, t_s: float, vehicle: str, cell: Cell) -> None:
-        self.lines.append(("enter", round(t_s, 3), vehicle, cell))
-
-    def own(self, t_s: float, vehicle: str, estate: tuple[Cell, ...], deed: Deed | None) -> None:
-        pass
-
-    def leave(self, t_s: float, vehicle: str) -> None:
-        self.lines.append(("leave", round(t_s, 3), vehicle))
-
-    def begin(
-        self, t_s: float, vehicle: str, incarnation: int, way: tuple[Cell, Cell], lasts_s: float
-    ) -> None:
-        self.lines.append(("begin", round(t_s, 3), vehicle, incarnation, way, lasts_s))
-
-    def advance(self, t_s: float) -> None:
-        pass
-
-
 class Bench:
     """A road with one vehicle, driven by hand."""
 
     def __init__(self, **visit: float | None) -> None:
         """Open the road."""
-        self.log = Log()
+        self.log: list[tuple[float, str]] = []
+        checker = Checker(Geometry(15.0, 3.5, 5.0, 1.8), lambda *event: self.log.append(event))
         given = {"enters_s": 0.0, "leaves_s": None} | visit
         self.road = LightRoad(
             SCENARIO,
             [Visit(A, (4, 1), **given)],  # type: ignore[arg-type]
             {A: 2},
-            self.log,
+            checker,
             count(100).__next__,
             lambda: 0.8,
             lambda: self.loses,
@@ -109,9 +86,9 @@ def bench() -> Bench:
 def test_the_process_in_charge_moves_the_body(bench: Bench) -> None:
     bench.tick()
     bench.command(7, (4, 2))
-    assert bench.log.lines == [
-        ("enter", 0.0, "a", (4, 1)),
-        ("begin", 0.1, "a", 7, ((4, 1), (4, 2)), 0.8),
+    assert bench.log == [
+        (0.0, "*** a enters in (4, 1)"),
+        (0.1, "*** a moves from (4, 1) to (4, 2) in 0.80 s"),
     ]
     lateral = [bench.sense().state[3] for _ in range(9)]
     assert lateral[3] == pytest.approx(1.5 * 3.5 + 3.5 * 0.5)
@@ -122,23 +99,23 @@ def test_a_lost_command_changes_nothing(bench: Bench) -> None:
     bench.tick()
     bench.loses = True
     bench.command(7, (4, 2))
-    assert len(bench.log.lines) == 1
+    assert len(bench.log) == 1
 
 
 def test_a_late_command_counts_unless_a_newer_one_was_there(bench: Bench) -> None:
     for _ in range(3):
         bench.tick()
     bench.command(7, (4, 2), tick=2)
-    assert len(bench.log.lines) == 2
+    assert len(bench.log) == 2
     bench.command(7, (4, 1), tick=1)
-    assert len(bench.log.lines) == 2
+    assert len(bench.log) == 2
     assert bench.road.refused == 1
 
 
 def test_an_earlier_process_is_refused(bench: Bench) -> None:
     bench.tick()
     bench.command(6, (4, 2))
-    assert len(bench.log.lines) == 1
+    assert len(bench.log) == 1
     assert bench.road.refused == 1
 
 
@@ -184,7 +161,7 @@ def test_a_leaving_vehicle_is_notified_and_in_no_census(bench: Bench) -> None:
     census = [message for message in sent[3] if isinstance(message, Census)]
     assert [len(each.on_road) for each in census] == [0]
     assert [message.left for message in sent[3] if isinstance(message, Sense)] == [True]
-    assert bench.log.lines[-1] == ("leave", 0.3, "a")
+    assert bench.log[-1][1] == "*** a leaves the road"
     bench.agent(up=False)
     bench.tick()
     assert not [message for message in bench.tick() if isinstance(message, Sense)]
