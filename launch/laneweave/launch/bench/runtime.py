@@ -10,7 +10,7 @@ import os
 import platform
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -125,7 +125,7 @@ def machine() -> dict[str, Any]:
     }
 
 
-def runtime_table(rows: list[dict[str, Any]]) -> Table:
+def runtime_table(rows: Sequence[dict[str, Any]]) -> Table:
     """Return the results of `bench_runtime` as a table."""
     table = Table("vehicles", "per process", "real-time factor", "tick p50 / p99 ms")
     for role in ROLES:

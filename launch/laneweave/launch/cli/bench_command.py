@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import json
+import re
 from enum import StrEnum
 from typing import Annotated
 
 import typer
+from rich.console import Console
 
 from laneweave.launch.cli.options import SOLVER_NAMES
+from laneweave.protocol.config.loading import load_scenario
+from laneweave.protocol.errors import BadInputError
 
 
 class Benchmark(StrEnum):
@@ -55,12 +60,40 @@ def bench(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Measure this machine: roads of 30, 60 and 90 vehicles, plans for 6 to 36, or tracking."""
-    from laneweave.launch.bench import measurements
+    from laneweave.coordinator.planning.request import checked_solver
+    from laneweave.launch.bench.planner import FAMILIES, bench_planner, planner_table
+    from laneweave.launch.bench.runtime import bench_runtime, machine, runtime_table
+    from laneweave.launch.bench.tracker import bench_tracker, tracker_table
 
     if what is Benchmark.planner:
-        report = measurements.measure_planner(vehicles, families, instances, seed, deadline, solver)
+        checked_solver(solver, "--solver")
+        sizes, chosen = _parse_sizes(vehicles, "6,9,12,18,24,36"), families.split(",")
+        if not set(chosen) <= set(FAMILIES):
+            allowed = f"some of {', '.join(FAMILIES)}, with commas between"
+            raise BadInputError("--families", families, allowed)
+        found = bench_planner(
+            sizes, chosen, instances=instances, seed=seed, deadline_s=deadline, solver=solver
+        )
+        rows, make_table = list(found), planner_table
     elif what is Benchmark.tracker:
-        report = measurements.measure_tracker(instances, seed)
+        rows = bench_tracker(load_scenario(None), instances=instances, seed=seed)
+        make_table = tracker_table
     else:
-        report = measurements.measure_runtime(vehicles, seconds, per_process, seed)
-    report.show(as_json=as_json)
+        sizes = _parse_sizes(vehicles, "30,60,90")
+        rows = [
+            bench_runtime(size, seconds=seconds, per_process=per_process, seed=seed)
+            for size in sizes
+        ]
+        make_table = runtime_table
+    if as_json:
+        result = {"benchmark": what.value, "machine": machine(), "results": rows}
+        typer.echo(json.dumps(result, indent=2))
+    else:
+        Console().print(make_table(rows))
+
+
+def _parse_sizes(text: str | None, default: str) -> list[int]:
+    sizes = (default if text is None else text).split(",")
+    if not all(re.fullmatch(r"[1-9][0-9]?|1[0-9][0-9]|200", size) for size in sizes):
+        raise BadInputError("--vehicles", text, "numbers from 1 to 200 with commas between")
+    return [int(size) for size in sizes]

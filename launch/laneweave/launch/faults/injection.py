@@ -7,11 +7,11 @@ it starts; a local run may instead make partitions with network namespaces.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import Any, Protocol
 
 import structlog
-from attrs import define, field, frozen
+from attrs import define, field
 
 from laneweave.launch.faults.failover import Failover
 from laneweave.launch.faults.network_namespaces import GroupNetwork, NamespacesUnavailableError
@@ -59,17 +59,6 @@ class RoleControl(Protocol):
         """Start a killed role again with an empty memory."""
 
 
-@frozen
-class _Recovery:
-    """A resume or restart that is due later."""
-
-    role: str
-    due_s: float
-    """Node clock."""
-    resumes: bool
-    """Resume the role; otherwise restart it."""
-
-
 @define
 class FaultInjection:
     """The faults of one run."""
@@ -90,7 +79,8 @@ class FaultInjection:
     """Number of starts of each role."""
     _waiting: list[FaultEvent] = field(factory=list)
     """Due events without a target so far."""
-    _recoveries: list[_Recovery] = field(factory=list)
+    _recoveries: list[tuple[float, str, Callable[[str], None]]] = field(factory=list)
+    """Resumes and restarts that are due later: time on the node clock, role, and what to do."""
     _targets: dict[str, set[str]] = field(factory=dict)
     """Targets of each fault; a fault hits each agent only once."""
     _paused: set[str] = field(factory=set)
@@ -105,7 +95,7 @@ class FaultInjection:
     @property
     def wakeup_s(self) -> float | None:
         """Latest time of the next call of `step`, on the clock of `now_s`; None: no limit."""
-        return min((recovery.due_s for recovery in self._recoveries), default=None)
+        return min((due_s for due_s, _, _ in self._recoveries), default=None)
 
     def message_rules(self) -> tuple[MessageRule, ...]:
         """Return the rules for messages, including those that make partitions."""
@@ -172,14 +162,11 @@ class FaultInjection:
     # --- kills and pauses ---------------------------------------------------------------------
 
     def _recover(self, now_s: float) -> None:
-        due = [recovery for recovery in self._recoveries if recovery.due_s <= now_s]
-        self._recoveries = [recovery for recovery in self._recoveries if recovery.due_s > now_s]
-        for recovery in due:
-            if recovery.resumes:
-                self._paused.discard(recovery.role)
-                self.roles.resume(recovery.role)
-            else:
-                self.roles.restart(recovery.role)
+        due = [recovery for recovery in self._recoveries if recovery[0] <= now_s]
+        self._recoveries = [recovery for recovery in self._recoveries if recovery[0] > now_s]
+        for _, role, recover in due:
+            self._paused.discard(role)
+            recover(role)
 
     def _choose(self, event: FaultEvent, view: RoadView) -> str | None:
         running = [name for name in self.roles.running if name not in self._paused]
@@ -213,12 +200,12 @@ class FaultInjection:
         if event.for_s is not None:
             self.roles.pause(name)
             self._paused.add(name)
-            self._recoveries.append(_Recovery(name, now_s + event.for_s, resumes=True))
+            self._recoveries.append((now_s + event.for_s, name, self.roles.resume))
         else:
             self.roles.kill(name)
             if event.restart_after_s is not None:
                 restart_s = now_s + event.restart_after_s
-                self._recoveries.append(_Recovery(name, restart_s, resumes=False))
+                self._recoveries.append((restart_s, name, self.roles.restart))
         if name == view.leader:
             self.failover.on_leader_fault(view, now_s, event.for_s)
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -34,6 +33,7 @@ from laneweave.protocol.config.loading import to_tables
 from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.runtime.message_faults import SENDER_OF_ROLE
+from laneweave.protocol.runtime.processes import stop_signals
 from laneweave.protocol.scenario.deployment import Security
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.security.rights import access_of
@@ -114,7 +114,7 @@ class LocalRun:
         self.folder.mkdir(parents=True, exist_ok=True)
         with (
             tempfile.TemporaryDirectory(prefix="laneweave-") as temporary,
-            self._signals(),
+            stop_signals(self._request_stop),
             RunProgress(self.scenario, show=self.show_progress) as progress,
         ):
             network = attrs.evolve(
@@ -173,7 +173,7 @@ class LocalRun:
             while not self._stop and self._check_processes():
                 observer.wait(POLL_S)
                 view, now = observer.view, time.monotonic()
-                progress.update(view)
+                progress.show(view)
                 for group in self._agents_to_start(observer):
                     processes.start("agent", f"agent-{group[0]}", vehicles=group)
                 road_s = view.t_s
@@ -238,19 +238,8 @@ class LocalRun:
                 self._started_groups.add(index)
                 yield [name for name, group in self._group_of.items() if group == index]
 
-    @contextlib.contextmanager
-    def _signals(self) -> Iterator[None]:
-        """Turn SIGINT and SIGTERM into an orderly end."""
-
-        def stop(_number: int, _frame: object) -> None:
-            self._stop = True
-
-        before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+    def _request_stop(self) -> None:
+        self._stop = True
 
 
 def fault_injection(

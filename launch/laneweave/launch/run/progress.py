@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import time
-from types import TracebackType
-from typing import Self
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
@@ -13,14 +11,12 @@ from laneweave.launch.observe.road_view import RoadView
 from laneweave.protocol.scenario.tables import Scenario
 
 
-class RunProgress:
+class RunProgress(Progress):
     """Progress bar with simulated time, vehicles on the road, leader and real-time factor."""
 
     def __init__(self, scenario: Scenario, *, show: bool) -> None:
         """Create a bar up to the time at which the last vehicle can leave; hidden if not `show`."""
-        free_flow_s = scenario.road.length_m / scenario.formation.speed_mps
-        self._total_s = scenario.demand.duration_s + free_flow_s
-        self._bar = Progress(
+        super().__init__(
             TextColumn("{task.fields[now]}"),
             BarColumn(bar_width=None),
             TextColumn("{task.fields[road]}"),
@@ -31,26 +27,14 @@ class RunProgress:
             disable=not show,
             transient=True,
         )
-        self._task: TaskID = self._bar.add_task(
+        free_flow_s = scenario.road.length_m / scenario.formation.speed_mps
+        self._total_s = scenario.demand.duration_s + free_flow_s
+        self._task: TaskID = self.add_task(
             "run", total=self._total_s, now="starting", road="", leader="no leader", rate=""
         )
         self._began: tuple[float, float] | None = None
 
-    def __enter__(self) -> Self:
-        """Start the display."""
-        self._bar.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Remove the bar."""
-        self._bar.stop()
-
-    def update(self, view: RoadView) -> None:
+    def show(self, view: RoadView) -> None:
         """Show the current state of the run."""
         clock = view.clock
         if clock is None:
@@ -59,7 +43,7 @@ class RunProgress:
         if self._began is None:
             self._began = (now, clock.t_s)
         wall_s, road_s = now - self._began[0], clock.t_s - self._began[1]
-        self._bar.update(
+        self.update(
             self._task,
             completed=min(clock.t_s, self._total_s),
             now=f"{clock.t_s:6.1f} s",

@@ -47,7 +47,7 @@ class ReferenceRun:
                 while road.ending is None:
                     road.advance()
                     if road.tick % PROGRESS_EVERY_TICKS == 0:
-                        progress.update(RoadView(clock=road.clock))
+                        progress.show(RoadView(clock=road.clock))
             finally:
                 record.close(road.t_s, road.ending or Ending.INTERRUPTED)
         return complete_summary(self.folder, problems=(), processes=1)

@@ -190,7 +190,7 @@ class SimulatedRun:
                 return
             if bridge.tick >= shown + PROGRESS_EVERY_TICKS:
                 shown = bridge.tick
-                progress.update(self._view)
+                progress.show(self._view)
 
     def _inject(self, injection: FaultInjection, now_s: float) -> None:
         """Apply faults if the road time has advanced or a role is to resume or restart."""

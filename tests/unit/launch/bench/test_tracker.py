@@ -7,8 +7,8 @@ import json
 import pytest
 
 from laneweave.agents.driving.tracker import Tracker
-from laneweave.launch.bench.measurements import measure_tracker
 from laneweave.launch.bench.tracker import SITUATIONS, bench_tracker, drive, tracker_table
+from laneweave.launch.cli import main as cli
 from laneweave.protocol.scenario.tables import Scenario
 
 SCENARIO = Scenario()
@@ -34,7 +34,7 @@ def test_episodes_repeat() -> None:
 
 
 def test_json_has_a_result_for_each_situation(capsys: pytest.CaptureFixture[str]) -> None:
-    measure_tracker(1, 3).show(as_json=True)
+    assert cli._status(["bench", "tracker", "--instances", "1", "--seed", "3", "--json"]) == 0
     shown = json.loads(capsys.readouterr().out)
     assert shown["benchmark"] == "tracker"
     assert len(shown["results"]) == len(SITUATIONS)

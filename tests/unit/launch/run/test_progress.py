@@ -21,7 +21,7 @@ VIEWS = (
 def test_any_view_can_be_shown(capsys: pytest.CaptureFixture[str], show: bool) -> None:
     with RunProgress(Scenario(), show=show) as progress:
         for view in VIEWS:
-            progress.update(view)
+            progress.show(view)
     captured = capsys.readouterr()
     assert captured.out == ""
     if not show:
