@@ -13,6 +13,7 @@ import json
 import re
 import sys
 from collections.abc import Iterator
+from enum import Enum
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -44,8 +45,8 @@ from laneweave.protocol.runtime.metrics import (
     metrics_of,
 )
 from laneweave.protocol.security.rights import rights_table
-from laneweave.protocol.state_machine import markdown_table, mermaid_diagram
-from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES, ExecutionPhase
+from laneweave.protocol.state_machine import Function, RuleBook
+from laneweave.protocol.vehicle.execution import VEHICLE_RULES, ExecutionPhase
 from laneweave.protocol.wire import events, messages
 from laneweave.protocol.wire.topics import TOPICS
 from laneweave.sim_bridge.metrics import BridgeMetrics
@@ -89,8 +90,43 @@ SNAPSHOTS: dict[type[MetricsSnapshot], str] = {
 """What offers numbers, and whose they are."""
 
 
-def _diagram(text: str) -> str:
-    return f"```mermaid\n{text}\n```"
+def _meaning(function: Function) -> str:
+    """Return what a guard or an action means: the first line of its docstring."""
+    text = inspect.getdoc(function) or function.__name__
+    return text.splitlines()[0].rstrip(".")
+
+
+def _rule_table(book: RuleBook) -> str:
+    """Return the table of a book."""
+    lines = ["| rule | event | in phase | guard | action | then |", "|---|---|---|---|---|---|"]
+    for row in book.table:
+        every = set(row.sources) == set(type(row.sources[0]))
+        phases = "any" if every else ", ".join(str(phase.value) for phase in row.sources)
+        guards = "; ".join(map(_meaning, row.guards))
+        actions = "; ".join(map(_meaning, row.actions)) or "nothing"
+        target = row.target.value if row.target is not None else ""
+        lines.append(f"| {row.rule} | {row.event} | {phases} | {guards} | {actions} | {target} |")
+    return "\n".join(lines)
+
+
+def _phase_diagram(book: RuleBook, start: Enum) -> str:
+    """Return the diagram of the phases of a book."""
+    lines = ["stateDiagram-v2", f"  [*] --> {_node(start)}"]
+    arrows: dict[tuple[Enum, Enum], list[str]] = {}
+    for row in book.table:
+        for source in row.sources:
+            if row.target is not None and row.target is not source:
+                labels = arrows.setdefault((source, row.target), [])
+                label = f"{row.rule} {row.event}"
+                if label not in labels:
+                    labels.append(label)
+    for (source, target), labels in arrows.items():
+        lines.append(f"  {_node(source)} --> {_node(target)}: {', '.join(labels)}")
+    return "```mermaid\n" + "\n".join(lines) + "\n```"
+
+
+def _node(phase: Enum) -> str:
+    return str(phase.value).replace(" ", "_").replace("-", "_")
 
 
 def _topics() -> str:
@@ -430,12 +466,12 @@ def parts() -> dict[str, str]:
         "topics": _topics(),
         "messages": _messages(),
         "events": _events(),
-        "vehicle rules": markdown_table(VEHICLE_RULES),
-        "vehicle phases": _diagram(mermaid_diagram(VEHICLE_RULES, ExecutionPhase.FREE)),
-        "leader rules": markdown_table(LEADER_RULES),
-        "leader phases": _diagram(mermaid_diagram(LEADER_RULES, BallotPhase.OBSERVING)),
-        "transfer rules": markdown_table(TRANSFER_RULES),
-        "transfer phases": _diagram(mermaid_diagram(TRANSFER_RULES, BallotPhase.PREPARING)),
+        "vehicle rules": _rule_table(VEHICLE_RULES),
+        "vehicle phases": _phase_diagram(VEHICLE_RULES, ExecutionPhase.FREE),
+        "leader rules": _rule_table(LEADER_RULES),
+        "leader phases": _phase_diagram(LEADER_RULES, BallotPhase.OBSERVING),
+        "transfer rules": _rule_table(TRANSFER_RULES),
+        "transfer phases": _phase_diagram(TRANSFER_RULES, BallotPhase.PREPARING),
         "planted bugs": _planted_bugs(),
         "profiles": _profiles(),
         "resilience": _resilience(),

@@ -20,9 +20,8 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Effect
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.state_machine import Transition
-from laneweave.protocol.vehicle import execution_rules
-from laneweave.protocol.vehicle.execution import PlanExecution
-from laneweave.protocol.vehicle.execution_rules import PLAN, ExecutionPhase
+from laneweave.protocol.vehicle import execution
+from laneweave.protocol.vehicle.execution import PLAN, ExecutionPhase, PlanExecution
 from laneweave.protocol.vehicle.plans import Needs, dependencies
 from laneweave.protocol.wire.messages import (
     Ballot,
@@ -144,11 +143,11 @@ def one_less(plan: Plan, vehicle: Name) -> tuple[Needs, ...]:
 
 
 def need_one_less(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(execution_rules, "dependencies", one_less)
+    patch.setattr(execution, "dependencies", one_less)
 
 
 def forget_corners(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(execution_rules, "dependencies", without_corners)
+    patch.setattr(execution, "dependencies", without_corners)
 
 
 def without_corners(plan: Plan, vehicle: Name) -> tuple[Needs, ...]:

@@ -16,9 +16,10 @@ from laneweave.coordinator.ballots import ballot_round as ballot
 from laneweave.coordinator.formations import leader
 from laneweave.coordinator.rolling import transfer
 from laneweave.protocol.state_machine import Function, RuleBook, Transition
-from laneweave.protocol.vehicle import execution_rules as vehicle
+from laneweave.protocol.vehicle import execution as vehicle
 from support import broken_cell_ownership as rolling
 from support import broken_rules as broken
+from support.rule_books import replacing
 
 ROWS_OF_OTHERS = {
     "L1": "election: coordinator.election",
@@ -72,7 +73,7 @@ class PlantedBug:
 
     def _broken(self, book: RuleBook) -> RuleBook:
         used = book.functions
-        return book.replacing({rule: bug for rule, bug in self.replaced.items() if rule in used})
+        return replacing(book, {rule: bug for rule, bug in self.replaced.items() if rule in used})
 
 
 BUGS: tuple[PlantedBug, ...] = (

@@ -18,8 +18,7 @@ from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.scenario.tables import FormationSettings, Scenario
 from laneweave.protocol.state_machine import RuleBook
-from laneweave.protocol.vehicle.execution import PlanExecution
-from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
+from laneweave.protocol.vehicle.execution import VEHICLE_RULES, PlanExecution
 from laneweave.protocol.vehicle.motion import cell_state
 from laneweave.protocol.wire.messages import (
     Ballot,

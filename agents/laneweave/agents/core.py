@@ -38,8 +38,7 @@ from laneweave.protocol.runtime.node import (
 )
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.state_machine import RuleBook
-from laneweave.protocol.vehicle.execution import PlanExecution
-from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
+from laneweave.protocol.vehicle.execution import VEHICLE_RULES, PlanExecution
 from laneweave.protocol.wire.identities import above
 from laneweave.protocol.wire.messages import (
     Command,

@@ -8,12 +8,11 @@ function's docstring is its meaning there.
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from enum import Enum
 from typing import Any
 
-from attrs import evolve, frozen
+from attrs import frozen
 
 Function = Callable[..., Any]
 """A guard or an action, of (machine, message)."""
@@ -68,59 +67,3 @@ class RuleBook:
                     machine.phase = row.target
                 return row
         return None
-
-    def replacing(self, others: Mapping[Function, Function]) -> RuleBook:
-        """Return a book in which other functions stand for some: for tests that plant a bug.
-
-        Raises:
-            ValueError: a function to be replaced is not in the table.
-        """
-        for function in others.keys() - self.functions:
-            raise ValueError(f"no rule uses {function.__name__}")
-
-        def replaced(functions: tuple[Function, ...]) -> tuple[Function, ...]:
-            return tuple(others.get(function, function) for function in functions)
-
-        return RuleBook(
-            evolve(row, guards=replaced(row.guards), actions=replaced(row.actions))
-            for row in self.table
-        )
-
-
-def meaning(function: Function) -> str:
-    """Return what a guard or an action means: the first line of its docstring."""
-    text = inspect.getdoc(function) or function.__name__
-    return text.splitlines()[0].rstrip(".")
-
-
-def markdown_table(book: RuleBook) -> str:
-    """Return the table of a book for docs/PROTOCOL.md."""
-    lines = ["| rule | event | in phase | guard | action | then |", "|---|---|---|---|---|---|"]
-    for row in book.table:
-        every = set(row.sources) == set(type(row.sources[0]))
-        phases = "any" if every else ", ".join(str(phase.value) for phase in row.sources)
-        guards = "; ".join(map(meaning, row.guards))
-        actions = "; ".join(map(meaning, row.actions)) or "nothing"
-        target = row.target.value if row.target is not None else ""
-        lines.append(f"| {row.rule} | {row.event} | {phases} | {guards} | {actions} | {target} |")
-    return "\n".join(lines)
-
-
-def mermaid_diagram(book: RuleBook, start: Enum) -> str:
-    """Return the diagram of the phases of a book for docs/PROTOCOL.md."""
-    lines = ["stateDiagram-v2", f"  [*] --> {_node(start)}"]
-    arrows: dict[tuple[Enum, Enum], list[str]] = {}
-    for row in book.table:
-        for source in row.sources:
-            if row.target is not None and row.target is not source:
-                labels = arrows.setdefault((source, row.target), [])
-                label = f"{row.rule} {row.event}"
-                if label not in labels:
-                    labels.append(label)
-    for (source, target), labels in arrows.items():
-        lines.append(f"  {_node(source)} --> {_node(target)}: {', '.join(labels)}")
-    return "\n".join(lines)
-
-
-def _node(phase: Enum) -> str:
-    return str(phase.value).replace(" ", "_").replace("-", "_")

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from laneweave.coordinator.rolling import ownership, transfer
 from laneweave.coordinator.rolling.ownership import _Sign, owned_cells
 from laneweave.protocol.state_machine import Function, RuleBook
-from laneweave.protocol.vehicle.execution_rules import (
+from laneweave.protocol.vehicle.execution import (
     VEHICLE_RULES,
     all_are_ready,
     take_ownership,
@@ -19,6 +19,7 @@ from laneweave.protocol.vehicle.execution_rules import (
 from laneweave.protocol.wire.messages import Ballot, Deed, VehicleState
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
 from support.rolling_road import Road, WrongError
+from support.rule_books import replacing
 
 STEPS = 600
 SEEDS = range(300)
@@ -122,4 +123,4 @@ def test_a_planted_bug_is_found(plant: object, monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.parametrize("rule", [all_are_ready, take_ownership], ids=lambda rule: rule.__name__)
 def test_a_broken_rule_is_found(rule: Function) -> None:
-    assert first_wrong(VEHICLE_RULES.replacing({rule: lambda *_: True})) is not None
+    assert first_wrong(replacing(VEHICLE_RULES, {rule: lambda *_: True})) is not None

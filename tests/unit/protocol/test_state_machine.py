@@ -1,4 +1,4 @@
-"""Machines from one table: which row is taken, what a book refuses, and the tables it prints."""
+"""State machines from a table: which row is taken, and what a book with planted bugs refuses."""
 
 from __future__ import annotations
 
@@ -10,11 +10,8 @@ from attrs import define, field
 from laneweave.protocol.state_machine import (
     RuleBook,
     Transition,
-    markdown_table,
-    meaning,
-    mermaid_diagram,
 )
-from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES, ExecutionPhase
+from support.rule_books import replacing
 
 
 class Lamp(Enum):
@@ -35,10 +32,7 @@ class Machine:
 
 
 def is_powered(machine: Machine, _: object) -> bool:
-    """There is current.
-
-    A second paragraph is for the reader of the code.
-    """
+    """There is current."""
     return machine.powered
 
 
@@ -121,7 +115,7 @@ def test_actions_see_the_phase_before_and_guards_stop_at_the_first_that_fails() 
     def look(machine: Machine, _: object) -> None:
         seen.append(machine.phase)
 
-    book = BOOK.replacing({is_rough: never, click: look})
+    book = replacing(BOOK, {is_rough: never, click: look})
     book.take(Machine(powered=False), "switch", None)
     assert seen == [Lamp.OFF]
     RuleBook([Transition("X", "go", (Lamp.OFF,), (), (look,), Lamp.ON)]).take(Machine(), "go", None)
@@ -132,7 +126,7 @@ def test_actions_see_the_phase_before_and_guards_stop_at_the_first_that_fails() 
 
 
 def test_a_function_is_replaced_in_a_copy_only() -> None:
-    book = BOOK.replacing({is_powered: lambda machine, message: True})  # noqa: ARG005
+    book = replacing(BOOK, {is_powered: lambda machine, message: True})  # noqa: ARG005
     machine = Machine(powered=False)
     taken = book.take(machine, "switch", "softly")
     assert taken is book.table[1]
@@ -144,77 +138,10 @@ def test_a_function_is_replaced_in_a_copy_only() -> None:
 
 
 def test_a_function_is_replaced_in_all_of_its_rows() -> None:
-    book = BOOK.replacing({click: unused})
+    book = replacing(BOOK, {click: unused})
     assert book.functions == {is_powered, is_rough, glow, unused}
 
 
 def test_a_function_that_no_rule_uses_cannot_be_replaced() -> None:
     with pytest.raises(ValueError, match="no rule uses unused"):
-        BOOK.replacing({unused: click})
-
-
-# --- printed tables ---------------------------------------------------------------------------
-
-
-def test_words_are_the_first_line_without_a_full_stop() -> None:
-    def silent() -> None:
-        pass
-
-    assert meaning(is_powered) == "There is current"
-    assert meaning(glow) == "Glow"
-    assert meaning(silent) == "silent"
-
-
-def test_the_markdown_table_has_a_line_for_each_row_in_order() -> None:
-    assert markdown_table(BOOK).splitlines() == [
-        "| rule | event | in phase | guard | action | then |",
-        "|---|---|---|---|---|---|",
-        "| S1 | switch | off, on | There is current; The switch is hit hard | Click | broken |",
-        "| S2 | switch | off | There is current | Click; Glow | on |",
-        "| S3 | switch | on |  | nothing | off |",
-        "| S4 | switch | any |  | Click |  |",
-        "| S5 | replace | broken, off |  | nothing | off |",
-    ]
-
-
-def test_the_diagram_has_an_arrow_for_each_change_of_phase() -> None:
-    assert mermaid_diagram(BOOK, Lamp.OFF).splitlines() == [
-        "stateDiagram-v2",
-        "  [*] --> off",
-        "  off --> broken: S1 switch",
-        "  on --> broken: S1 switch",
-        "  off --> on: S2 switch",
-        "  on --> off: S3 switch",
-        "  broken --> off: S5 replace",
-    ]
-
-
-def test_the_diagram_writes_phases_as_single_words() -> None:
-    class Odd(Enum):
-        TWO_WORDS = "backing off"
-        HYPHEN = "half-done"
-
-    book = RuleBook([Transition("O", "go", (Odd.TWO_WORDS,), (), (), Odd.HYPHEN)])
-    assert "  backing_off --> half_done: O go" in mermaid_diagram(book, Odd.HYPHEN).splitlines()
-
-
-def test_rows_with_the_same_arrow_share_it_and_are_named_once() -> None:
-    rows = [
-        Transition("T1", "push", (Lamp.OFF,), (), (), Lamp.ON),
-        Transition("T1", "push", (Lamp.OFF,), (), (), Lamp.ON),
-        Transition("T2", "pull", (Lamp.OFF,), (), (), Lamp.ON),
-    ]
-    assert mermaid_diagram(RuleBook(rows), Lamp.ON).splitlines()[1:] == [
-        "  [*] --> on",
-        "  off --> on: T1 push, T2 pull",
-    ]
-
-
-def test_the_vehicles_rules_print_with_every_rule_and_phase() -> None:
-    lines = markdown_table(VEHICLE_RULES).splitlines()[2:]
-    assert len(lines) == len(VEHICLE_RULES.table)
-    assert {line.split("|")[1].strip() for line in lines} == {f"V{n}" for n in range(2, 8)}
-    assert all(line.count("|") == 7 for line in lines)
-    diagram = mermaid_diagram(VEHICLE_RULES, ExecutionPhase.FREE)
-    for stage in ExecutionPhase:
-        assert stage.value in diagram
+        replacing(BOOK, {unused: click})

@@ -20,7 +20,7 @@ from attrs import evolve
 from laneweave.coordinator.formations.roster import on_tick, start_time_s
 from laneweave.coordinator.planning.conflicts import ConflictModel, Move
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.vehicle.execution_rules import TIME_TOLERANCE_S
+from laneweave.protocol.vehicle.execution import TIME_TOLERANCE_S
 from laneweave.protocol.wire.messages import Plan
 
 RESERVE_S = 3.0

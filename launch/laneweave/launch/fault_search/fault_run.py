@@ -35,7 +35,7 @@ from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
 from laneweave.protocol.transports.simulated.virtual_time import TraceDigest
-from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
+from laneweave.protocol.vehicle.execution import VEHICLE_RULES
 from laneweave.protocol.wire.codec import encode
 from laneweave.protocol.wire.messages import Command, Name, Plan, Prepare, Sense, VehicleState
 from laneweave.protocol.wire.topics import Keys

@@ -21,7 +21,7 @@ from laneweave.coordinator.formations.leader import (
 from laneweave.coordinator.formations.roster import Formation
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import Ballot, CensusEntry, Name, Plan, Prepare, VehicleState
-from support.rule_recorder import RuleRecorder
+from support.rule_books import RuleRecorder, replacing
 
 A, B, C = Name("A"), Name("B"), Name("C")
 OTHERS = Ballot(1, Name("other"), 1, 1)
@@ -754,7 +754,7 @@ def test_a_vehicle_that_restarts_while_its_ballot_is_outbid_is_asked_again() -> 
 
 
 def test_a_bug_is_planted_in_one_leader_and_in_no_other() -> None:
-    book = LEADER_RULES.replacing({all_have_promised: lambda me, _: bool(me.promises)})
+    book = replacing(LEADER_RULES, {all_have_promised: lambda me, _: bool(me.promises)})
     for rules, ordered in ((book, True), (LEADER_RULES, False)):
         leader = FormationLeader(formation(A, B), Ballots(), RNG, resend_s=RESEND_S, rules=rules)
         leader.begin(0.0, observe=False)

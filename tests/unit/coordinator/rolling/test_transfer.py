@@ -26,7 +26,7 @@ from support.rolling_samples import (
     make_plan,
     state,
 )
-from support.rule_recorder import RuleRecorder
+from support.rule_books import RuleRecorder
 
 RESEND_S = 0.2
 OWNED_BEFORE, OWNED_AFTER = frozenset(BEFORE[A]), frozenset(AFTER[A])

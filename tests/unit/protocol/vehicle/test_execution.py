@@ -9,16 +9,17 @@ from attrs import evolve
 
 from laneweave.protocol.lattice import Cell, Lattice, PlannedMove
 from laneweave.protocol.state_machine import Function
-from laneweave.protocol.vehicle.execution import LISTEN_S, PlanExecution
-from laneweave.protocol.vehicle.execution_rules import (
+from laneweave.protocol.vehicle.execution import (
+    LISTEN_S,
     VEHICLE_RULES,
     ExecutionPhase,
+    PlanExecution,
     has_joined,
     is_promised_ballot,
     starts_in_my_cell,
 )
 from laneweave.protocol.wire.messages import Ballot, Name, Plan, Prepare, Sense, VehicleState
-from support.rule_recorder import RuleRecorder
+from support.rule_books import RuleRecorder, replacing
 from support.states import holding
 from support.states import make_plan as plan_of
 
@@ -659,7 +660,7 @@ def always(*_: object) -> bool:
     ],
 )
 def test_a_bug_is_planted_in_one_execution_and_in_no_other(rule: Function, spoiled: Plan) -> None:
-    sound, buggy = vehicle(), evolve(vehicle(), rules=VEHICLE_RULES.replacing({rule: always}))
+    sound, buggy = vehicle(), evolve(vehicle(), rules=replacing(VEHICLE_RULES, {rule: always}))
     for execution in (sound, buggy):
         execution.on_prepare(prepare(MID))
     assert buggy.on_plan(spoiled)

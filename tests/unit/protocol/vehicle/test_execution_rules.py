@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 from attrs import evolve
 
-from laneweave.protocol.vehicle.execution import PlanExecution
-from laneweave.protocol.vehicle.execution_rules import (
+from laneweave.protocol.vehicle.execution import (
     VEHICLE_RULES,
     ExecutionPhase,
+    PlanExecution,
     take_ownership,
     transfers_only_owned_cells,
 )
@@ -35,6 +35,7 @@ from support.rolling_samples import (
     state,
     vehicle,
 )
+from support.rule_books import replacing
 
 PREPARE = Prepare(MID, (), (A, B))
 
@@ -103,7 +104,7 @@ def test_an_unsound_plan_is_refused(problem: str) -> None:
 
 def test_without_its_guard_any_transfers_are_accepted() -> None:
     execution = vehicle(
-        rules=VEHICLE_RULES.replacing({transfers_only_owned_cells: lambda *_: True})
+        rules=replacing(VEHICLE_RULES, {transfers_only_owned_cells: lambda *_: True})
     )
     execution.on_prepare(PREPARE)
     assert execution.on_plan(changed("before", A=(HOME, (7, 7)))(make_plan()))
@@ -232,7 +233,7 @@ def test_does_not_take_possession_while_it_moves() -> None:
 
 
 def test_without_its_action_the_transfer_stays_closed() -> None:
-    execution = vehicle(rules=VEHICLE_RULES.replacing({take_ownership: lambda *_: None}))
+    execution = vehicle(rules=replacing(VEHICLE_RULES, {take_ownership: lambda *_: None}))
     execution.on_prepare(PREPARE)
     execution.on_plan(make_plan())
     execution.on_noted(MID)
