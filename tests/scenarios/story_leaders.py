@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 
 from attrs import define, field
 
+from laneweave.coordinator.ballots.ballot_round import FAILED, PROMISED, TIME
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.formations.leader import FormationLeader
 from laneweave.coordinator.formations.operation import FormationsOperation
@@ -78,7 +79,7 @@ class Leader:
 
     def wake(self, mail: Mail, now_s: float) -> Iterator[str]:
         """Let timers run; list what is sent."""
-        yield from self._watched(lambda: self.control.on_time(now_s))
+        yield from self._watched(lambda: self.control.take(TIME, now_s))
         for vehicle, message in self.control.outgoing(now_s):
             yield post(mail, message, vehicle)
 
@@ -92,22 +93,22 @@ class Leader:
     def plan(self, text: str, now_s: float) -> Iterator[str]:
         """Issue a plan that the story gives."""
         control = self.control
-        if not control.take_planning_order(now_s) or control.ballot is None:
+        if not control.take(PROMISED, now_s) or control.ballot is None:
             yield f"{self.name} cannot plan"
             return
         plan = written_plan(text, control, control.ballot)
         yield from self._watched(lambda: control.on_plan(plan, now_s))
 
     def fail(self, now_s: float) -> Iterator[str]:
-        if not self.control.take_planning_order(now_s):
+        if not self.control.take(PROMISED, now_s):
             yield f"{self.name} cannot plan"
             return
-        yield from self._watched(lambda: self.control.on_planning_failed(now_s))
+        yield from self._watched(lambda: self.control.take(FAILED, now_s))
 
     def about(self) -> str:
         return about(self.name, self.control)
 
-    def _watched(self, action: Callable[[], None]) -> Iterator[str]:
+    def _watched(self, action: Callable[[], object]) -> Iterator[str]:
         before = self.about()
         action()
         if self.about() != before:

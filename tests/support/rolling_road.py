@@ -12,7 +12,7 @@ from random import Random
 
 from attrs import define, field, frozen
 
-from laneweave.coordinator.rolling.observed import is_older
+from laneweave.coordinator.ballots.ballot_round import is_older
 from laneweave.coordinator.rolling.ownership import owned_cells
 from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.lattice import Cell, footprint

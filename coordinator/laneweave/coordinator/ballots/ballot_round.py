@@ -5,15 +5,10 @@ they will hold, and issues that one plan under the ballot. Nothing here is neede
 that a ballot is never used twice and that a plan is made only from the promises of the *whole*
 roster; vehicles check the rest.
 
-The operations differ in three points. Each is a parameter of `ballot_rules`, which returns the rows
-of the transition table that both share:
-
-- outbid: back off and try again (formations), or give up until the next slot (rolling);
-- a vehicle restarted: prepare a new ballot, or give up;
-- planning failed: keep the ballot and try again, or give up.
-
-How the plan is made is up to the operation, between the events `PROMISED` and `PLANNED`: by the
-planner, beside the core (formations), or at once from the promises (rolling).
+Each operation has a table of its own, with the rows of `PLAN_RULES` in both. They differ where a
+ballot is outbid, a vehicle has restarted, or planning has failed: formations try again, the rolling
+operation gives up until the next slot. Between the events `PROMISED` and `PLANNED` the plan is
+made: by the planner, beside the core (formations), or at once from the promises (rolling).
 """
 
 from __future__ import annotations
@@ -21,10 +16,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from enum import Enum
 
-from attrs import define, field, frozen
+from attrs import define, field
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.state_machine import Function, RuleBook, Transition
+from laneweave.protocol.state_machine import RuleBook, Transition
 from laneweave.protocol.wire.messages import Ballot, Name, Plan, Prepare, VehicleState
 
 ISSUE_S = 30.0
@@ -98,6 +93,11 @@ class BallotRound:
     def incarnations(self) -> dict[Name, int]:
         """Incarnation of the process of each vehicle that promised."""
         return {name: self.promises[name].incarnation for name in self.roster}
+
+    def take(self, event: str, now_s: float, message: object = None) -> bool:
+        """Take an event of the rule table; return whether a row of it fits."""
+        self.now_s = now_s
+        return self.rules.take(self, event, message) is not None
 
     def outgoing(self, now_s: float) -> Iterable[tuple[Name, Prepare | Plan]]:
         """Return what has to be sent (again) now, and to which vehicle."""
@@ -196,67 +196,46 @@ def count_acceptance(me: BallotRound, state: VehicleState) -> None:
     me.back_offs = 0
 
 
-# --- the table --------------------------------------------------------------------------------
+# --- the rows that both operations share ------------------------------------------------------
+
+_PREPARING, _PLANNING, _ISSUING = UNFINISHED
+
+PLAN_RULES = (
+    Transition(
+        "L5", PROMISED, (_PREPARING,), (all_have_promised, may_try), (order_plan,), _PLANNING
+    ),
+    Transition("L5", PLANNED, (_PLANNING,), (), (issue,), _ISSUING),
+    Transition(
+        "L6",
+        STATE,
+        (_ISSUING,),
+        (is_acceptance, is_the_last),
+        (count_acceptance,),
+        BallotPhase.IN_FORCE,
+    ),
+    Transition("L6", STATE, (_ISSUING,), (is_acceptance,), (count_acceptance,)),
+)
+"""From the promises of all to a plan in force (L5, L6)."""
 
 
-@frozen
-class Reaction:
-    """What a leader does where a ballot cannot go on."""
+def is_older(state: VehicleState, other: VehicleState) -> bool:
+    """Return whether a state of a vehicle was sent before another one of it.
 
-    sources: tuple[BallotPhase, ...]
-    """Phases in which it reacts at all."""
-    actions: tuple[Function, ...]
-    target: BallotPhase
-    guards: tuple[Function, ...] = ()
-    """Beside those of the shared row."""
-
-
-def ballot_rules(
-    *,
-    outbid: Reaction,
-    restart: Reaction,
-    failure: Reaction,
-    promise_guards: tuple[Function, ...] = (),
-) -> tuple[Transition, ...]:
-    """Return the rows that both operations share.
-
-    Args:
-        outbid: reaction to a vehicle that promised a higher ballot.
-        restart: reaction to a vehicle whose process is not the one that promised.
-        failure: reaction to failed planning.
-        promise_guards: what a state must show beside the promise to be counted.
+    Between two ticks it shows states with equal times; it never promises less or takes back an
+    acceptance, so a late state cannot pass for a newer one.
     """
-    preparing, planning, issuing = UNFINISHED
+    if state.incarnation == other.incarnation and state.t_s != other.t_s:
+        return state.t_s < other.t_s
+    return _age(state) < _age(other)
+
+
+def _age(state: VehicleState) -> tuple[object, ...]:
+    transfer = state.deed
     return (
-        Transition(
-            "L7",
-            STATE,
-            outbid.sources,
-            (shows_higher_promise, *outbid.guards),
-            outbid.actions,
-            outbid.target,
-        ),
-        Transition(
-            "L8",
-            STATE,
-            restart.sources,
-            (*restart.guards, restarted),
-            restart.actions,
-            restart.target,
-        ),
-        Transition("L4", STATE, (preparing,), (is_promise, *promise_guards), (count_promise,)),
-        Transition(
-            "L5", PROMISED, (preparing,), (all_have_promised, may_try), (order_plan,), planning
-        ),
-        Transition("L5", PLANNED, (planning,), (), (issue,), issuing),
-        Transition("L5", FAILED, failure.sources, failure.guards, failure.actions, failure.target),
-        Transition(
-            "L6",
-            STATE,
-            (issuing,),
-            (is_acceptance, is_the_last),
-            (count_acceptance,),
-            BallotPhase.IN_FORCE,
-        ),
-        Transition("L6", STATE, (issuing,), (is_acceptance,), (count_acceptance,)),
+        state.incarnation,
+        state.t_s,
+        state.promised or (),
+        bool(state.estate),
+        state.accepted,
+        (transfer.ballot, transfer.open) if transfer is not None else (),
     )

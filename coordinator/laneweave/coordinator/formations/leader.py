@@ -15,17 +15,20 @@ from attrs import define, field
 from laneweave.coordinator.ballots.ballot_round import (
     FAILED,
     MEMBERS,
+    PLAN_RULES,
     PLANNED,
-    PROMISED,
     STATE,
     TIME,
     TOO_LATE,
     UNFINISHED,
     BallotPhase,
     BallotRound,
-    Reaction,
-    ballot_rules,
+    count_promise,
     had_promised,
+    is_older,
+    is_promise,
+    restarted,
+    shows_higher_promise,
 )
 from laneweave.coordinator.formations.roster import Formation
 from laneweave.protocol.state_machine import RuleBook, Transition
@@ -82,7 +85,7 @@ class FormationLeader(BallotRound):
         self.phase = BallotPhase.OBSERVING
         if not observe:
             self.until_s = now_s
-            self.on_time(now_s)
+            self.take(TIME, now_s)
 
     def on_members(self, formation: Formation, now_s: float) -> None:
         """Take the formation as a newer census shows it (L8).
@@ -91,62 +94,30 @@ class FormationLeader(BallotRound):
         """
         if formation == self.formation:
             return
-        self.now_s = now_s
         for vehicle in set(self.formation.roster) - set(formation.roster):
             self.states.pop(vehicle, None)
-        self.rules.take(self, MEMBERS, formation)
+        self.take(MEMBERS, now_s, formation)
         self.formation = formation
 
     def on_state(self, state: VehicleState, now_s: float) -> None:
         """Take the state of a member (L2, L4, L6, L7, L8)."""
-        self.now_s = now_s
         if self._is_news(state):
             self.states[state.vehicle] = state
             if state.promised is not None:
                 self.highest = max(self.highest or state.promised, state.promised)
-            self.rules.take(self, STATE, state)
-
-    def on_time(self, now_s: float) -> None:
-        """Let timers run out."""
-        self.now_s = now_s
-        self.rules.take(self, TIME, None)
-
-    def take_planning_order(self, now_s: float) -> bool:
-        """Return true, once, when the whole roster has promised and planning should begin (L5)."""
-        self.now_s = now_s
-        return self.rules.take(self, PROMISED, None) is not None
+            self.take(STATE, now_s, state)
 
     def on_plan(self, plan: Plan, now_s: float, out_of_reach: Iterable[Name] = ()) -> None:
         """Issue the plan under the ballot that was promised (L5)."""
-        self.now_s = now_s
         self.out_of_reach = frozenset(out_of_reach)
-        self.rules.take(self, PLANNED, plan)
-
-    def on_planning_failed(self, now_s: float) -> None:
-        """Keep the ballot and try again later (L5)."""
-        self.now_s = now_s
-        self.rules.take(self, FAILED, None)
-
-    def give_up(self, now_s: float) -> None:
-        """Plan no more: no step fits in before the end of the road."""
-        self.now_s = now_s
-        self.rules.take(self, TOO_LATE, None)
+        self.take(PLANNED, now_s, plan)
 
     def _is_news(self, state: VehicleState) -> bool:
         """Return whether a state is from a member and not older than its newest one."""
         known = self.states.get(state.vehicle)
         return state.vehicle in self.formation.roster and (
-            known is None or _age(state) >= _age(known)
+            known is None or not is_older(state, known)
         )
-
-
-def _age(state: VehicleState) -> tuple[object, ...]:
-    """Return what orders the states of one vehicle, older ones first.
-
-    Between two ticks it shows states with equal times; it never promises less or takes back an
-    acceptance, so a late state cannot pass for a newer one.
-    """
-    return (state.incarnation, state.t_s, state.promised or (), state.accepted)
 
 
 # --- guards and actions -----------------------------------------------------------------------
@@ -265,12 +236,18 @@ LEADER_RULES: RuleBook = RuleBook(
         ),
         Transition("L3", STATE, _OBSERVING, (all_are_heard,), *_PREPARE),
         Transition("L3", TIME, _OBSERVING, (time_is_up,), *_PREPARE),
-        *ballot_rules(
-            outbid=Reaction((*UNFINISHED, *_IN_FORCE), (back_off,), BallotPhase.BACKING_OFF),
-            restart=Reaction((*_PLANNING, *_ISSUING, *_IN_FORCE), *_PREPARE),
-            failure=Reaction(_PLANNING, (keep_ballot,), BallotPhase.PREPARING),
-            promise_guards=(has_joined,),
+        Transition(
+            "L7",
+            STATE,
+            (*UNFINISHED, *_IN_FORCE),
+            (shows_higher_promise,),
+            (back_off,),
+            BallotPhase.BACKING_OFF,
         ),
+        Transition("L8", STATE, (*_PLANNING, *_ISSUING, *_IN_FORCE), (restarted,), *_PREPARE),
+        Transition("L4", STATE, _PREPARING, (is_promise, has_joined), (count_promise,)),
+        *PLAN_RULES,
+        Transition("L5", FAILED, _PLANNING, (), (keep_ballot,), BallotPhase.PREPARING),
         Transition(
             "L7",
             TIME,

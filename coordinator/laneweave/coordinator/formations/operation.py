@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Iterator
 
-from laneweave.coordinator.ballots.ballot_round import BallotPhase
+from laneweave.coordinator.ballots.ballot_round import PROMISED, TIME, BallotPhase
 from laneweave.coordinator.formations.leader import LEADER_RULES, FormationLeader
 from laneweave.coordinator.formations.planner import FormationPlanner
 from laneweave.coordinator.formations.roster import Formation, Groups, closed_formations, with_room
@@ -93,8 +93,8 @@ class FormationsOperation:
         for leader in self.leaders.values():
             if leader.wakeup_s is None or leader.wakeup_s > now_s:
                 continue
-            leader.on_time(now_s)
-            if leader.take_planning_order(now_s):
+            leader.take(TIME, now_s)
+            if leader.take(PROMISED, now_s):
                 yield from self._planner.order(leader, t_s, now_s)
             for vehicle, message in leader.outgoing(now_s):
                 yield to_vehicle(vehicle, message)

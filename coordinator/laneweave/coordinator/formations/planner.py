@@ -13,7 +13,7 @@ from typing import Any
 
 from attrs import define, field
 
-from laneweave.coordinator.ballots.ballot_round import BallotPhase
+from laneweave.coordinator.ballots.ballot_round import FAILED, TOO_LATE, BallotPhase
 from laneweave.coordinator.formations.leader import FormationLeader
 from laneweave.coordinator.formations.pacing import comfortable_steps, paced, steps_of
 from laneweave.coordinator.formations.roster import (
@@ -157,11 +157,11 @@ class FormationPlanner:
         cells = cells or self._block_cells(numbers)
         start_s, end_s = self._start_s(formation, cells, t_s), self._end_s(formation)
         if not formation.sorts and end_s < start_s + scenario.cycles_s[0]:
-            leader.on_planning_failed(now_s)
+            leader.take(FAILED, now_s)
             yield LogEntry(STRUCTURE_TOO_LATE, {"formation": numbers[0], "stage": formation.stage})
             return
         if steps_left(cells, start_s, scenario.cycles_s[0], scenario) == 0:
-            leader.give_up(now_s)
+            leader.take(TOO_LATE, now_s)
             yield LogEntry(FORMATION_TOO_LATE, {"formation": numbers[0]})
             return
         task = SortingTask(
@@ -238,7 +238,7 @@ class FormationPlanner:
                 yield LogEntry(FORMATIONS_JOINED, {"formations": list(self._groups.of(number))})
                 return
             if result.short_of_room and self._room_is_coming(leader.formation.numbers, t_s):
-                leader.on_planning_failed(now_s)
+                leader.take(FAILED, now_s)
                 yield LogEntry(ROOM_AWAITED, {"formation": number})
                 return
             if result.solved:
@@ -251,7 +251,7 @@ class FormationPlanner:
                     yield from _notes(leader.formation, result, pauses, plan)
                     return
                 error = "; ".join(problems)
-        leader.on_planning_failed(now_s)
+        leader.take(FAILED, now_s)
         data = {"formation": number, "status": status, "error": error}
         yield LogEntry(PLANNING_FAILED, data)
 

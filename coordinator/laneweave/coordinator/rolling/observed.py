@@ -12,6 +12,7 @@ from typing import TypeVar
 
 from attrs import frozen
 
+from laneweave.coordinator.ballots.ballot_round import is_older
 from laneweave.protocol.wire.messages import Census, Name, VehicleState
 
 _News = TypeVar("_News", Census, VehicleState)
@@ -109,25 +110,6 @@ class ObservedRoad:
         before = self._before.get(state.vehicle)
         if before is None or is_older(before, state):
             self._before[state.vehicle] = state
-
-
-def is_older(state: VehicleState, other: VehicleState) -> bool:
-    """Return whether a state of a vehicle was sent before another one of it."""
-    if state.incarnation == other.incarnation and state.t_s != other.t_s:
-        return state.t_s < other.t_s
-    return _age(state) < _age(other)
-
-
-def _age(state: VehicleState) -> tuple[object, ...]:
-    transfer = state.deed
-    return (
-        state.incarnation,
-        state.t_s,
-        state.promised or (),
-        bool(state.estate),
-        state.accepted,
-        (transfer.ballot, transfer.open) if transfer is not None else (),
-    )
 
 
 def _at(t_s: float, newest: _News | None, before: _News | None) -> _News | None:

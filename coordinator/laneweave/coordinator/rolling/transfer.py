@@ -15,6 +15,7 @@ from attrs import define, field
 from laneweave.coordinator.ballots.ballot_round import (
     FAILED,
     MEMBERS,
+    PLAN_RULES,
     PLANNED,
     PROMISED,
     STATE,
@@ -22,9 +23,11 @@ from laneweave.coordinator.ballots.ballot_round import (
     UNFINISHED,
     BallotPhase,
     BallotRound,
-    Reaction,
-    ballot_rules,
+    count_promise,
     had_promised,
+    is_promise,
+    restarted,
+    shows_higher_promise,
 )
 from laneweave.coordinator.rolling.ownership import States, owned_cells
 from laneweave.protocol.lattice import Cell, PlannedMove, footprint, territory
@@ -59,11 +62,10 @@ class CellTransfer(BallotRound):
 
     def on_state(self, state: VehicleState, states: States, now_s: float) -> None:
         """Take a newer state of a member; `states` has the newest one of every vehicle."""
-        self.now_s = now_s
-        self.rules.take(self, STATE, state)
-        if self.rules.take(self, PROMISED, None) is not None:
+        self.take(STATE, now_s, state)
+        if self.take(PROMISED, now_s):
             plan = self._make_plan(states)
-            self.rules.take(self, PLANNED if isinstance(plan, Plan) else FAILED, plan)
+            self.take(PLANNED if isinstance(plan, Plan) else FAILED, now_s, plan)
 
     def on_left(self, vehicle: Name) -> None:
         """Give up: a member has left the road."""
@@ -134,18 +136,17 @@ def note_reason(me: CellTransfer, why: str) -> None:
 
 
 _PREPARING, _PLANNING, _ISSUING = UNFINISHED
-_WAITING = (_PREPARING, _ISSUING)
+_WAITING, _GIVEN_UP = (_PREPARING, _ISSUING), BallotPhase.GIVEN_UP
 
 TRANSFER_RULES: RuleBook = RuleBook(
     (
-        *ballot_rules(
-            outbid=Reaction(_WAITING, (note_outbid,), BallotPhase.GIVEN_UP),
-            restart=Reaction(_WAITING, (note_restart,), BallotPhase.GIVEN_UP, (had_promised,)),
-            failure=Reaction((_PLANNING,), (note_reason,), BallotPhase.GIVEN_UP),
-            promise_guards=(shows_owned_cells,),
-        ),
-        Transition("L8", MEMBERS, _WAITING, (), (note_reason,), BallotPhase.GIVEN_UP),
-        Transition("L8", TOO_LATE, _WAITING, (), (note_reason,), BallotPhase.GIVEN_UP),
+        Transition("L7", STATE, _WAITING, (shows_higher_promise,), (note_outbid,), _GIVEN_UP),
+        Transition("L8", STATE, _WAITING, (had_promised, restarted), (note_restart,), _GIVEN_UP),
+        Transition("L4", STATE, (_PREPARING,), (is_promise, shows_owned_cells), (count_promise,)),
+        *PLAN_RULES,
+        Transition("L5", FAILED, (_PLANNING,), (), (note_reason,), _GIVEN_UP),
+        Transition("L8", MEMBERS, _WAITING, (), (note_reason,), _GIVEN_UP),
+        Transition("L8", TOO_LATE, _WAITING, (), (note_reason,), _GIVEN_UP),
     )
 )
 """Rules L4 to L8 of cell transfers."""

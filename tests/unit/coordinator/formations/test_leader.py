@@ -8,7 +8,15 @@ from collections.abc import Callable, Iterable
 import pytest
 from attrs import evolve
 
-from laneweave.coordinator.ballots.ballot_round import ISSUE_S, BallotPhase, all_have_promised
+from laneweave.coordinator.ballots.ballot_round import (
+    FAILED,
+    ISSUE_S,
+    PROMISED,
+    TIME,
+    TOO_LATE,
+    BallotPhase,
+    all_have_promised,
+)
 from laneweave.coordinator.formations.leader import (
     BACK_OFF_S,
     LEADER_RULES,
@@ -113,7 +121,7 @@ def preparing(*names: Name) -> tuple[FormationLeader, Ballot]:
 def planning(*names: Name) -> tuple[FormationLeader, Ballot]:
     leader, ballot = preparing(*names)
     hear(leader, *(state(name, ballot) for name in names))
-    assert leader.take_planning_order(0.0)
+    assert leader.take(PROMISED, 0.0)
     return leader, ballot
 
 
@@ -146,9 +154,9 @@ def test_l2_adopts_a_plan_that_all_have_accepted_and_sends_nothing() -> None:
     leader = control(A, B)
     hear(leader, state(A, OTHERS, accepted=True), state(B, OTHERS, accepted=True))
     assert (leader.phase, leader.ballot, leader.plan) == (BallotPhase.IN_FORCE, OTHERS, None)
-    leader.on_time(100.0)
+    leader.take(TIME, 100.0)
     assert list(leader.outgoing(100.0)) == []
-    assert not leader.take_planning_order(100.0)
+    assert not leader.take(PROMISED, 100.0)
     assert leader.wakeup_s is None
 
 
@@ -175,10 +183,10 @@ def test_l2_mixed_states_lead_to_a_new_ballot(last: VehicleState) -> None:
 def test_l2_waits_for_the_states_of_the_roster_but_not_for_ever() -> None:
     leader = control(A, B)
     hear(leader, state(A, OTHERS, accepted=True))
-    leader.on_time(OBSERVE_S - 0.01)
+    leader.take(TIME, OBSERVE_S - 0.01)
     assert phase(leader) is BallotPhase.OBSERVING
     assert leader.wakeup_s == OBSERVE_S
-    leader.on_time(OBSERVE_S)
+    leader.take(TIME, OBSERVE_S)
     assert phase(leader) is BallotPhase.PREPARING
 
 
@@ -211,9 +219,9 @@ def test_without_observing_it_prepares_at_once_whatever_it_would_hear() -> None:
 def test_begin_observes_from_its_own_time_on() -> None:
     leader = FormationLeader(formation(A), Ballots(), RNG, resend_s=RESEND_S)
     leader.begin(100.0)
-    leader.on_time(100.0 + OBSERVE_S - 0.01)
+    leader.take(TIME, 100.0 + OBSERVE_S - 0.01)
     assert phase(leader) is BallotPhase.OBSERVING
-    leader.on_time(100.0 + OBSERVE_S)
+    leader.take(TIME, 100.0 + OBSERVE_S)
     assert phase(leader) is BallotPhase.PREPARING
 
 
@@ -240,16 +248,16 @@ def test_l4_only_this_ballot_is_a_promise_and_not_once_accepted() -> None:
     leader, ballot = preparing(A)
     for each in (state(A), state(A, ballot._replace(seq=0)), state(A, ballot, accepted=True)):
         hear(leader, each)
-        assert not leader.take_planning_order(0.0)
+        assert not leader.take(PROMISED, 0.0)
 
 
 def test_a_promise_that_was_forgotten_is_void() -> None:
     leader, ballot = preparing(A, B)
     hear(leader, state(A, ballot), state(A, incarnation=2), state(B, ballot))
-    assert not leader.take_planning_order(0.0)
+    assert not leader.take(PROMISED, 0.0)
     assert to(leader.outgoing(0.0)) == [A]
     hear(leader, state(A, ballot, incarnation=2, cell=(3, 1)))
-    assert leader.take_planning_order(0.0)
+    assert leader.take(PROMISED, 0.0)
     assert leader.incarnations == {A: 2, B: 1}
     assert leader.hold_cells == {A: (3, 1), B: (0, 0)}
 
@@ -267,7 +275,7 @@ def test_a_promise_that_was_forgotten_is_void() -> None:
 def test_a_late_state_takes_no_promise_back(newer: VehicleState, older: VehicleState) -> None:
     leader, _ = preparing(A)
     hear(leader, newer, older)
-    assert leader.take_planning_order(0.0)
+    assert leader.take(PROMISED, 0.0)
 
 
 # --- joint ballots ----------------------------------------------------------------------------
@@ -291,16 +299,16 @@ def test_a_promise_counts_once_the_vehicle_has_joined_exactly_the_formations(
     assert leader.ballot is not None
     hear(leader, state(A, leader.ballot, joined=joined, t_s=1.0))
     assert leader.promises == {}
-    assert not leader.take_planning_order(0.0)
+    assert not leader.take(PROMISED, 0.0)
     assert to(leader.outgoing(0.0)) == [A]
     hear(leader, state(A, leader.ballot, joined=(0, 1), t_s=1.1))
-    assert leader.take_planning_order(0.0)
+    assert leader.take(PROMISED, 0.0)
 
 
 def test_a_promise_is_void_once_the_vehicle_shows_more_formations() -> None:
     leader, ballot = preparing(A, B)
     hear(leader, state(A, ballot), state(A, ballot, joined=(0, 1), t_s=1.0), state(B, ballot))
-    assert not leader.take_planning_order(0.0)
+    assert not leader.take(PROMISED, 0.0)
 
 
 # --- L5 ---------------------------------------------------------------------------------------
@@ -309,10 +317,10 @@ def test_a_promise_is_void_once_the_vehicle_shows_more_formations() -> None:
 def test_l5_needs_the_whole_roster_and_orders_once() -> None:
     leader, ballot = preparing(A, B, C)
     hear(leader, state(A, ballot), state(B, ballot))
-    assert not leader.take_planning_order(0.0)
+    assert not leader.take(PROMISED, 0.0)
     hear(leader, state(C, ballot))
-    assert leader.take_planning_order(0.0)
-    assert not leader.take_planning_order(0.0)
+    assert leader.take(PROMISED, 0.0)
+    assert not leader.take(PROMISED, 0.0)
     assert (leader.phase, leader.wakeup_s) == (BallotPhase.PLANNING, None)
     assert list(leader.outgoing(9.0)) == []
 
@@ -321,13 +329,13 @@ def test_l5_failed_planning_keeps_the_ballot_and_tries_again_later_and_later() -
     leader, ballot = planning(A)
     now_s = 0.0
     for pause_s in (RETRY_S, 2 * RETRY_S, 4 * RETRY_S):
-        leader.on_planning_failed(now_s)
+        leader.take(FAILED, now_s)
         assert leader.wakeup_s == now_s + pause_s
-        assert not leader.take_planning_order(now_s + pause_s - 0.01)
+        assert not leader.take(PROMISED, now_s + pause_s - 0.01)
         now_s += pause_s
-        leader.on_time(now_s)
+        leader.take(TIME, now_s)
         assert list(leader.outgoing(now_s)) == []
-        assert leader.take_planning_order(now_s)
+        assert leader.take(PROMISED, now_s)
         assert leader.ballot == ballot
     leader.on_plan(plan_of(leader), now_s)
     assert leader.failures == 0
@@ -337,41 +345,41 @@ def test_l5_the_pauses_after_failed_planning_do_not_grow_for_ever() -> None:
     leader, _ = planning(A)
     now_s, pauses = 0.0, []
     for _ in range(8):
-        leader.on_planning_failed(now_s)
+        leader.take(FAILED, now_s)
         pauses.append((leader.wakeup_s or 0.0) - now_s)
         now_s += pauses[-1]
-        assert leader.take_planning_order(now_s)
+        assert leader.take(PROMISED, now_s)
     assert pauses == [1.0, 2.0, 4.0, 8.0, 8.0, 8.0, 8.0, 8.0]
     assert max(pauses) == LONGEST_RETRY_S
 
 
 def test_a_new_ballot_has_not_failed_yet() -> None:
     leader, _ = planning(A)
-    leader.on_planning_failed(0.0)
+    leader.take(FAILED, 0.0)
     leader.on_members(formation(A, lane=2), 0.1)
     assert leader.ballot is not None
     hear(leader, state(A, leader.ballot, t_s=1.0), now_s=0.1)
-    assert leader.take_planning_order(0.1)
+    assert leader.take(PROMISED, 0.1)
 
 
 @pytest.mark.parametrize("reach", [preparing, issuing, watching])
 def test_results_that_are_not_waited_for_change_nothing(reach: Reach) -> None:
     leader, ballot = reach(A, B)
     before = (leader.phase, leader.plan, leader.failures)
-    leader.on_planning_failed(3.0)
-    leader.give_up(3.0)
+    leader.take(FAILED, 3.0)
+    leader.take(TOO_LATE, 3.0)
     assert (leader.phase, leader.plan, leader.failures) == before
     assert leader.ballot == ballot
 
 
 def test_restart_during_the_pause_after_failed_planning() -> None:
     leader, ballot = planning(A)
-    leader.on_planning_failed(0.0)
+    leader.take(FAILED, 0.0)
     hear(leader, state(A, incarnation=2))
-    assert not leader.take_planning_order(RETRY_S)
+    assert not leader.take(PROMISED, RETRY_S)
     assert to(leader.outgoing(RETRY_S)) == [A]
     hear(leader, state(A, ballot, incarnation=2))
-    assert leader.take_planning_order(RETRY_S + RESEND_S)
+    assert leader.take(PROMISED, RETRY_S + RESEND_S)
 
 
 # --- L6 ---------------------------------------------------------------------------------------
@@ -403,10 +411,10 @@ def test_l6_acceptances_count_once_and_of_this_ballot_only() -> None:
 def test_l8_a_plan_that_a_vehicle_refuses_is_given_up() -> None:
     leader, ballot = issuing(A, B)
     hear(leader, state(A, ballot, accepted=True))
-    leader.on_time(ISSUE_S - 0.01)
+    leader.take(TIME, ISSUE_S - 0.01)
     assert phase(leader) is BallotPhase.ISSUING
     assert to(leader.outgoing(ISSUE_S - 0.01)) == [B]
-    leader.on_time(ISSUE_S)
+    leader.take(TIME, ISSUE_S)
     assert phase(leader) is BallotPhase.PREPARING
     assert leader.ballot is not None
     assert leader.ballot > ballot
@@ -427,8 +435,8 @@ def test_l7_outbid_backs_off_then_looks_and_takes_a_higher_term(
     pause_s = (leader.wakeup_s or 0.0) - 5.0
     assert BACK_OFF_S[0] <= pause_s <= BACK_OFF_S[1]
     assert list(leader.outgoing(9.0)) == []
-    assert not leader.take_planning_order(9.0)
-    leader.on_time(5.0 + pause_s)
+    assert not leader.take(PROMISED, 9.0)
+    leader.take(TIME, 5.0 + pause_s)
     assert phase(leader) is BallotPhase.OBSERVING
     hear(leader, state(A, higher, t_s=2.0), state(B, ballot, t_s=2.0), now_s=6.0)
     assert phase(leader) is BallotPhase.PREPARING
@@ -440,7 +448,7 @@ def test_l7_adopts_the_others_plan_if_it_is_in_force_after_the_pause() -> None:
     leader, _ = issuing(A, B)
     higher = Ballot(2, Name("z"), 1, 1)
     hear(leader, state(A, higher, t_s=1.0))
-    leader.on_time(1.0)
+    leader.take(TIME, 1.0)
     for name in (A, B):
         hear(leader, state(name, higher, accepted=True, incarnation=2, t_s=2.0))
     assert (leader.phase, leader.ballot) == (BallotPhase.IN_FORCE, higher)
@@ -464,9 +472,9 @@ def outbid(leader: FormationLeader, now_s: float) -> tuple[float, Ballot]:
     hear(leader, state(A, higher, t_s=now_s), now_s=now_s)
     assert phase(leader) is BallotPhase.BACKING_OFF
     pause_s = (leader.wakeup_s or 0.0) - now_s
-    leader.on_time(now_s + pause_s - 1e-6)
+    leader.take(TIME, now_s + pause_s - 1e-6)
     assert phase(leader) is BallotPhase.BACKING_OFF
-    leader.on_time(now_s + pause_s)
+    leader.take(TIME, now_s + pause_s)
     hear(leader, state(A, higher, t_s=now_s), state(B, t_s=now_s), now_s=now_s + pause_s)
     assert phase(leader) is BallotPhase.PREPARING
     assert leader.ballot > higher
@@ -475,7 +483,7 @@ def outbid(leader: FormationLeader, now_s: float) -> tuple[float, Ballot]:
 
 def promise_and_plan(leader: FormationLeader, ballot: Ballot, now_s: float) -> None:
     hear(leader, state(A, ballot, t_s=now_s), state(B, ballot, t_s=now_s), now_s=now_s)
-    assert leader.take_planning_order(now_s)
+    assert leader.take(PROMISED, now_s)
     leader.on_plan(plan_of(leader), now_s)
 
 
@@ -504,7 +512,7 @@ def test_l7_after_a_success_the_pauses_are_short_again(success: str) -> None:
     else:
         theirs = ballot._replace(term=ballot.term + 1)
         hear(leader, state(A, theirs, accepted=True, t_s=80.0), now_s=80.0)
-        leader.on_time(100.0)
+        leader.take(TIME, 100.0)
         for name in (A, B):
             hear(leader, state(name, theirs, accepted=True, t_s=101.0), now_s=101.0)
         assert (phase(leader), leader.ballot) == (BallotPhase.IN_FORCE, theirs)
@@ -591,7 +599,7 @@ def test_l8_out_of_reach_in_an_own_plan_may_be_astray_in_an_adopted_one() -> Non
     hear(leader, state(A, ballot, accepted=True))
     higher = ballot._replace(term=9)
     hear(leader, state(A, higher, t_s=1.0))
-    leader.on_time(1.0)
+    leader.take(TIME, 1.0)
     hear(leader, state(A, higher, accepted=True, t_s=2.0), now_s=1.0)
     assert phase(leader) is BallotPhase.IN_FORCE
     hear(leader, astray(promised=higher, t_s=3.0))
@@ -602,7 +610,7 @@ def test_l8_a_vehicle_that_cannot_be_moved_is_not_astray() -> None:
     """Otherwise a vehicle without an agent would have its formation planned for ever."""
     leader, ballot = preparing(A, B)
     hear(leader, state(A, ballot, attended=False), state(B, ballot))
-    assert leader.take_planning_order(0.0)
+    assert leader.take(PROMISED, 0.0)
     assert leader.unattended == {A}
     leader.on_plan(plan_of(leader), 0.0)
     hear(leader, *(state(name, ballot, accepted=True, attended=name is B) for name in (A, B)))
@@ -613,7 +621,7 @@ def test_l8_a_vehicle_that_cannot_be_moved_is_not_astray() -> None:
 def test_l8_an_agent_that_takes_over_from_the_caretaker_leads_to_a_new_ballot() -> None:
     leader, ballot = preparing(A)
     hear(leader, state(A, ballot, attended=False))
-    assert leader.take_planning_order(0.0)
+    assert leader.take(PROMISED, 0.0)
     leader.on_plan(plan_of(leader), 0.0)
     hear(leader, state(A, ballot, accepted=True, attended=False))
     assert phase(leader) is BallotPhase.IN_FORCE
@@ -633,7 +641,7 @@ def test_a_leaving_vehicle_ends_an_unfinished_ballot(reach: Reach) -> None:
     assert leader.ballot > ballot
     assert list(leader.outgoing(1.0)) == [(A, Prepare(leader.ballot, (0,), (A,)))]
     hear(leader, state(B, leader.ballot), state(A, leader.ballot))
-    assert leader.take_planning_order(1.0)
+    assert leader.take(PROMISED, 1.0)
     assert set(leader.hold_cells) == {A}
 
 
@@ -669,9 +677,9 @@ def test_a_new_member_leads_to_a_new_ballot_for_all() -> None:
 
 def test_settled_is_the_end() -> None:
     leader, ballot = planning(A)
-    leader.give_up(0.0)
+    leader.take(TOO_LATE, 0.0)
     hear(leader, state(A, ballot, incarnation=2, overdue=True))
-    leader.on_time(1e6)
+    leader.take(TIME, 1e6)
     leader.on_members(formation(A, lane=2), 1e6)
     assert (leader.phase, leader.wakeup_s) == (BallotPhase.GIVEN_UP, None)
     assert list(leader.outgoing(1e6)) == []
@@ -693,7 +701,7 @@ def test_a_history_takes_every_row_of_the_table() -> None:
     def promise_and_plan() -> None:
         for name in (A, B):
             show(name, leader.ballot, incarnation=2)
-        assert leader.take_planning_order(leader.now_s)
+        assert leader.take(PROMISED, leader.now_s)
 
     def issue() -> None:
         promise_and_plan()
@@ -709,15 +717,15 @@ def test_a_history_takes_every_row_of_the_table() -> None:
         show(name, OTHERS, accepted=True)  # adopted
     show(A, OTHERS, incarnation=2)  # restarted
     show(A, OTHERS._replace(term=50), incarnation=2)  # outbid
-    leader.on_time(10.0)  # the pause is over
-    leader.on_time(10.0 + OBSERVE_S)  # nobody says anything
+    leader.take(TIME, 10.0)  # the pause is over
+    leader.take(TIME, 10.0 + OBSERVE_S)  # nobody says anything
     show(A, leader.ballot, incarnation=2)
     show(A, None, incarnation=3)  # void
     leader.begin(20.0)
     for name in (A, B):
         show(name, None, incarnation=2)  # all are heard, and nothing is in force
     promise_and_plan()
-    leader.on_planning_failed(20.0)
+    leader.take(FAILED, 20.0)
     leader.now_s = 20.0 + RETRY_S
     watch()
     show(A, leader.ballot, incarnation=2, accepted=True, overdue=True)  # stalls
@@ -726,10 +734,10 @@ def test_a_history_takes_every_row_of_the_table() -> None:
     watch()
     leader.on_members(formation(A, B, lane=2), leader.now_s)  # new targets
     issue()
-    leader.on_time(leader.now_s + ISSUE_S)  # somebody refuses
+    leader.take(TIME, leader.now_s + ISSUE_S)  # somebody refuses
     leader.on_members(formation(A, B, lane=1), leader.now_s)  # new targets, unfinished
     promise_and_plan()
-    leader.give_up(leader.now_s)
+    leader.take(TOO_LATE, leader.now_s)
     names = {f"{row.rule} {row.event} {row.guards}" for row in LEADER_RULES.table}
     taken = {
         f"{row.rule} {row.event} {row.guards}"
@@ -745,7 +753,7 @@ def test_a_vehicle_that_restarts_while_its_ballot_is_outbid_is_asked_again() -> 
     assert phase(leader) is BallotPhase.BACKING_OFF  # outbid comes first
     hear(leader, state(A, incarnation=3, t_s=2.0))
     assert phase(leader) is BallotPhase.BACKING_OFF
-    leader.on_time(leader.until_s)
+    leader.take(TIME, leader.until_s)
     hear(leader, state(A, incarnation=3, t_s=3.0), state(B, ballot, accepted=True, t_s=3.0))
     assert phase(leader) is BallotPhase.PREPARING
     assert leader.ballot is not None
@@ -759,7 +767,7 @@ def test_a_bug_is_planted_in_one_leader_and_in_no_other() -> None:
         leader = FormationLeader(formation(A, B), Ballots(), RNG, resend_s=RESEND_S, rules=rules)
         leader.begin(0.0, observe=False)
         hear(leader, state(A, leader.ballot))
-        assert leader.take_planning_order(0.0) is ordered
+        assert leader.take(PROMISED, 0.0) is ordered
 
 
 # --- ballots ----------------------------------------------------------------------------------
@@ -782,13 +790,13 @@ def test_under_random_states_ballots_only_rise_and_plans_need_all_promises(seed:
             overdue=rng.random() < 0.1,
         )
         leader.on_state(each, now_s)
-        leader.on_time(now_s)
-        if leader.take_planning_order(now_s):
+        leader.take(TIME, now_s)
+        if leader.take(PROMISED, now_s):
             assert set(leader.hold_cells) == {A, B}
             if rng.random() < 0.7:
                 leader.on_plan(plan_of(leader), now_s)
             else:
-                leader.on_planning_failed(now_s)
+                leader.take(FAILED, now_s)
         for _, message in leader.outgoing(now_s):
             assert message.ballot == leader.ballot
             if message.ballot != ballots[-1]:
