@@ -9,14 +9,13 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from attrs import define, field, fields
+from attrs import asdict, define, field
 
 from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.protocol.config.loading import parse_scenario
-from laneweave.protocol.lattice import Cell, PlannedMove, territory
+from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import (
     Arrived,
     Core,
@@ -26,27 +25,27 @@ from laneweave.protocol.runtime.node import (
     Node,
     PeerDown,
     PeerUp,
-    Send,
     Started,
     Wakeup,
 )
 from laneweave.protocol.scenario.deployment import Shard
-from laneweave.protocol.scenario.tables import Scenario, Sensing
+from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.codec import encode
-from laneweave.protocol.wire.messages import Ballot, Command, Name, Plan, Prepare, Report, Sense
+from laneweave.protocol.wire.messages import Command, Name, Prepare, Report, Sense
 from laneweave.protocol.wire.topics import COMMAND, PLAN, PREPARE, REPORT, VEHICLE_ALIVE, Keys
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose, pose_of
 from laneweave.sim_bridge.core import BRIDGE, BridgeCore, TickPhase
 from laneweave.sim_bridge.recording.run_record import RunRecord
 from laneweave.sim_bridge.road.demand import Arrival
+from support.paper import EXACT
+from support.states import jerks, make_plan, sent
 
 ROAD = {"lanes": 2, "s1_m": 20.0, "s2_m": 20.0, "s3_m": 160.0}
 """As short as the checks allow: a vehicle takes 14 s."""
-EXACT = {field.name: 0.0 for field in fields(Sensing)}
-"""Sensors without errors."""
+A, B = Name("A"), Name("B")
 REALM = "bench"
 KEYS = Keys(REALM)
 FOR_EVER_S = 1e6
@@ -55,11 +54,15 @@ FOR_EVER_S = 1e6
 def make_scenario(**tables: dict[str, Any]) -> Scenario:
     """Return the paper's operation on a short road with exact sensors, but for some tables."""
     formation = {"operation": "paper", **tables.pop("formation", {})}
-    return parse_scenario({"road": ROAD, "sensing": EXACT, "formation": formation} | tables)
+    return parse_scenario({"road": ROAD, "sensing": asdict(EXACT), "formation": formation} | tables)
 
 
 def arrival(vehicle: str, t_s: float, lane: int = 0, preferred_lane: int = 0) -> Arrival:
     return Arrival(vehicle, lane, preferred_lane, t_s)
+
+
+TWO = (arrival(A, 0.5, lane=1), arrival(B, 0.6, lane=0))
+"""A enters at 1 s, B at 2 s: when the first free cells pass that are in the structure."""
 
 
 class PlainWorld:
@@ -129,6 +132,11 @@ def read_events(folder: Path, kind: str) -> list[dict[str, Any]]:
     return [event for event in map(json.loads, lines) if event["kind"] == kind]
 
 
+def deadlines_until_silent(scenario: Scenario) -> int:
+    """Return how many deadlines an agent misses before it is silent."""
+    return round(scenario.runtime.agent_silent_s / scenario.runtime.tick_deadline_s)
+
+
 # --- by hand ----------------------------------------------------------------------------------
 
 
@@ -196,6 +204,20 @@ class Desk:
         }
         return Command(**(known | changes))
 
+    def known(self, vehicle: str) -> tuple[object, ...]:
+        """Return all that a motion controller knows."""
+        controller = self.core.vehicles[Name(vehicle)].controller
+        return (
+            controller.command_tick,
+            controller.attendant,
+            controller.joined,
+            controller.accepted,
+            controller.hold_cell,
+            controller.motion_origin,
+            controller.motion_end_tick,
+            controller._jerks.tobytes(),
+        )
+
     def report(self, role: str, name: str, **counters: Any) -> list[Effect]:  # noqa: ANN401
         message = Report(Name(role), Name(name), **counters)
         return self.give(Arrived(REPORT, {"role": role, "name": name}, message))
@@ -234,19 +256,6 @@ class Desk:
                 self.core.phase is TickPhase.ANSWERS and set(vehicles) <= set(self.core.vehicles)
             )
         )
-
-
-def jerks(*pairs: tuple[float, float], ticks: int = 1) -> bytes:
-    return np.array(pairs * ticks, dtype="<f4").tobytes()
-
-
-def sent(effects: Iterable[Effect], kind: type) -> list[Any]:
-    """Return the messages of a kind."""
-    return [
-        effect.message
-        for effect in effects
-        if isinstance(effect, Send) and isinstance(effect.message, kind)
-    ]
 
 
 def asked(effects: Iterable[Effect]) -> list[str]:
@@ -370,21 +379,16 @@ class Street:
         """Give a vehicle a plan of its own, as a leader does: one move."""
         name, agent = Name(vehicle), self.agents[Name(vehicle)]
         start = self.bridge.vehicles[name].controller.hold_cell
-        ballot = Ballot(1, Name("c9"), 1, 1)
-        block = self.scenario.lattice.block_of(start[0])
-        move: PlannedMove = (0, start, target)
-        plan = Plan(
-            ballot=ballot,
-            formations=(block,),
-            roster=(name,),
+        formations = (self.scenario.lattice.block_of(start[0]),)
+        plan = make_plan(
+            {name: start},
+            {name: ((0, start, target),)},
+            formations=formations,
             incarnations={name: agent._incarnation},
-            start_cells={name: start},
-            moves={name: (move,)},
             t0_s=t0_s,
             slot_s=self.scenario.cycles_s[0],
-            territory=tuple(sorted(territory([start], [move]))),
         )
-        prepare = Prepare(ballot, (block,), (name,))
+        prepare = Prepare(plan.ballot, formations, (name,))
         for topic, message in ((PREPARE, prepare), (PLAN, plan)):
             self.network.inject(KEYS.key(topic, vehicle=vehicle), encode(message))
             self.network.run(self.network.now_s + 0.02)  # nothing overtakes it

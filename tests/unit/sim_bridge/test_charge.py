@@ -11,42 +11,31 @@ from attrs import evolve
 from laneweave.protocol.runtime.node import Arrived, Effect, Listen, Send, Stopping, Unlisten
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.wire.identities import above
-from laneweave.protocol.wire.messages import Ballot, Name, Plan, Prepare, Sense, VehicleState
+from laneweave.protocol.wire.messages import Name, Plan, Prepare, Sense, VehicleState
 from laneweave.protocol.wire.topics import COMMAND, PLAN, PREPARE, STATE
 from laneweave.sim_bridge.core import TickPhase
 from laneweave.sim_bridge.road.answers import LATE_SHARE
 from support.bridge_bench import (
+    TWO,
+    A,
+    B,
     Desk,
     arrival,
-    jerks,
+    deadlines_until_silent,
     make_scenario,
     read_events,
     read_summary,
-    sent,
 )
+from support.states import BALLOT, jerks, make_plan, sent
 
 SCENARIO = make_scenario()
-TICK_S = SCENARIO.runtime.tick_s
-SILENT_S = SCENARIO.runtime.agent_silent_s
-MISSES = round(SILENT_S / SCENARIO.runtime.tick_deadline_s)
-"""Deadlines that an agent misses before it is silent."""
-A, B = Name("A"), Name("B")
-TWO = (arrival(A, 0.5, lane=1), arrival(B, 0.6, lane=0))
+TICK_S, SILENT_S = SCENARIO.runtime.tick_s, SCENARIO.runtime.agent_silent_s
+MISSES = deadlines_until_silent(SCENARIO)
 OF_B = {"vehicle": B}
 CARE_OF_B: list[Effect] = [Listen(PREPARE, OF_B), Listen(PLAN, OF_B)]
 CARE_OF_B_ENDS: list[Effect] = [Unlisten(PREPARE, OF_B), Unlisten(PLAN, OF_B)]
 AGENT = 17
 """Incarnation of B's agent."""
-
-
-@pytest.fixture
-def desk(tmp_path: Path) -> Desk:
-    """Two vehicles have just entered, and both agents have been asked."""
-    desk = Desk(SCENARIO, tmp_path, TWO)
-    desk.start(A, B)
-    desk.drive_to_entry(A, B)
-    desk.effects.clear()
-    return desk
 
 
 @pytest.fixture
@@ -91,20 +80,6 @@ def listening(effects: Iterable[Effect]) -> list[Effect]:
     return [effect for effect in effects if isinstance(effect, (Listen, Unlisten))]
 
 
-def known(desk: Desk, vehicle: Name) -> tuple[object, ...]:
-    """Return all that a motion controller knows."""
-    controller = desk.core.vehicles[vehicle].controller
-    return (
-        controller.command_tick,
-        controller.attendant,
-        controller.joined,
-        controller.accepted,
-        controller.hold_cell,
-        controller.motion_end_tick,
-        controller._jerks.tobytes(),
-    )
-
-
 # --- agents -----------------------------------------------------------------------------------
 
 
@@ -128,12 +103,12 @@ def test_what_the_controller_has_joined_is_confirmed(attended: Desk) -> None:
 
 def test_an_agent_that_restarts_takes_charge_and_its_zombie_does_not(attended: Desk) -> None:
     attended.answer(B, incarnation=AGENT + 1)
-    before = known(attended, B)
+    before = attended.known(B)
     attended.answer(B, incarnation=AGENT, jerks=jerks((9.0, 0.0)))
-    assert known(attended, B) == before
+    assert attended.known(B) == before
     next_tick(attended, A)
     attended.answer(B, incarnation=AGENT, jerks=jerks((9.0, 0.0)))
-    assert known(attended, B) == before
+    assert attended.known(B) == before
     assert attended.core._answers.awaited == {A, B}  # it is not the zombie's answer that counts
     (event,) = read_events(attended.folder, "agent-took-over")
     assert (event["vehicle"], event["previous"]) == (B, "agent")
@@ -149,19 +124,7 @@ def test_the_answers_of_a_zombie_are_no_sign_of_life(attended: Desk) -> None:
     assert sensed(attended, B).caretaker
 
 
-def test_a_claim_that_fails_is_tried_again_with_the_next_tick(desk: Desk) -> None:
-    desk.answer(B, incarnation=AGENT)
-    desk.answer(B, incarnation=AGENT + 1)
-    next_tick(desk, A)
-    assert sensed(desk, B).attendant == AGENT
-    desk.answer(B, incarnation=AGENT + 1)
-    next_tick(desk, A)
-    assert sensed(desk, B).attendant == AGENT + 1
-
-
 # --- what is noted within a tick --------------------------------------------------------------
-
-BALLOT = Ballot(1, Name("c1"), 7, 1)
 
 
 def test_what_is_new_to_the_controller_is_confirmed_at_once(attended: Desk) -> None:
@@ -180,26 +143,13 @@ def test_it_is_confirmed_at_once_whatever_the_tick_and_then_not_played(attended:
     attended.answer(B, incarnation=AGENT)
     attended.answer(A)
     assert attended.core.phase is TickPhase.PACE  # the next tick is not due yet
-    before = known(attended, B)
+    before = attended.known(B)
     for tick, ballot in ((-1, BALLOT), (0, BALLOT._replace(seq=2))):
         late = {"incarnation": AGENT, "tick": attended.core.tick + tick, "accepted": ballot}
         effects = attended.answer(B, **late, hold_cell=(-1, 1), jerks=jerks((9.0, 0.0)))
         assert sense_of(effects, B, attended.core.tick).accepted == ballot
         attended.core.vehicles[B].controller.accepted = None
-        assert known(attended, B) == before
-
-
-def test_nothing_is_noted_for_an_agent_that_has_been_replaced(attended: Desk) -> None:
-    """Its successor may be in an older plan already."""
-    attended.answer(B, incarnation=AGENT, accepted=BALLOT)
-    attended.drive_to(attended.core.tick + 1)
-    attended.answer(B, incarnation=AGENT + 1)
-    assert attended.core.vehicles[B].controller.accepted is None
-    before = known(attended, B)
-    assert attended.answer(B, incarnation=AGENT, accepted=BALLOT._replace(seq=2)) == []
-    assert known(attended, B) == before
-    next_tick(attended, A)
-    assert (sensed(attended, B).attendant, sensed(attended, B).accepted) == (AGENT + 1, None)
+        assert attended.known(B) == before
 
 
 def test_a_caretaker_inherits_no_acceptance(attended: Desk) -> None:
@@ -213,15 +163,20 @@ def test_a_caretaker_inherits_no_acceptance(attended: Desk) -> None:
 # --- caretakers take charge -------------------------------------------------------------------
 
 
+def check_cared_for(desk: Desk, reason: str) -> None:
+    """Check that B's caretaker has taken charge in this tick."""
+    assert sensed(desk, B).caretaker
+    assert listening(desk.effects)[-2:] == CARE_OF_B
+    (event,) = read_events(desk.folder, "caretaker-took-over")
+    assert (event["vehicle"], event["reason"]) == (B, reason)
+
+
 def test_the_caretaker_takes_charge_when_the_agent_is_gone(attended: Desk) -> None:
     attended.down(B)
-    effects = next_tick(attended, A)
+    next_tick(attended, A)
+    check_cared_for(attended, "absent")
     attendant = sensed(attended, B).attendant
-    assert sensed(attended, B).caretaker
     assert attendant > AGENT
-    assert listening(effects) == CARE_OF_B
-    (event,) = read_events(attended.folder, "caretaker-took-over")
-    assert (event["vehicle"], event["reason"]) == (B, "absent")
     for _ in range(5):  # once
         assert listening(next_tick(attended, A)) == []
         assert sensed(attended, B).attendant == attendant
@@ -231,11 +186,8 @@ def test_the_caretaker_takes_charge_when_the_agent_is_silent(attended: Desk) -> 
     for _ in range(MISSES - 1):
         next_tick(attended, A)
         assert not sensed(attended, B).caretaker
-    effects = next_tick(attended, A)
-    assert sensed(attended, B).caretaker
-    assert listening(effects) == CARE_OF_B
-    (event,) = read_events(attended.folder, "caretaker-took-over")
-    assert (event["vehicle"], event["reason"]) == (B, "silent")
+    next_tick(attended, A)
+    check_cared_for(attended, "silent")
 
 
 def late_answer(desk: Desk) -> None:
@@ -253,10 +205,8 @@ def test_the_caretaker_takes_charge_when_no_answer_comes_in_time(attended: Desk)
         if sensed(attended, B).caretaker:
             break
     assert tick > 2
-    assert sensed(attended, B).caretaker
+    check_cared_for(attended, "late")
     assert attended.core._answers.silent == set()
-    (event,) = read_events(attended.folder, "caretaker-took-over")
-    assert (event["vehicle"], event["reason"]) == (B, "late")
     for _ in range(3):  # as long as it is late it stays so
         late_answer(attended)
         next_tick(attended, A)
@@ -264,13 +214,14 @@ def test_the_caretaker_takes_charge_when_no_answer_comes_in_time(attended: Desk)
     check_takes_back(attended)
 
 
-def test_an_agent_that_claims_its_vehicle_is_present_without_a_token(
-    tmp_path: Path,
-) -> None:
+def test_an_agent_that_claims_its_vehicle_is_present_without_a_token(tmp_path: Path) -> None:
     desk = Desk(SCENARIO, tmp_path, TWO)
+    desk.core._attendance._new_incarnation = lambda: 10**9
     desk.start(A)
     desk.drive_to_entry(A, B)
+    check_cared_for(desk, "absent")  # its agent never came
     care = sensed(desk, B).attendant
+    assert care == 10**9  # as for any process
     assert desk.answer(B, incarnation=care + 1) == CARE_OF_B_ENDS
     assert B in desk.core._answers.up
     for _ in range(3):
@@ -283,16 +234,6 @@ def test_a_refused_claim_is_no_presence(desk: Desk) -> None:
     desk.down(B)
     desk.answer(B, incarnation=AGENT, hold_cell=(-1, 1))  # a move is no claim
     assert B not in desk.core._answers.up
-
-
-def test_the_caretaker_takes_charge_when_the_agent_never_came(tmp_path: Path) -> None:
-    desk = Desk(SCENARIO, tmp_path, TWO)
-    desk.start(A)
-    desk.drive_to_entry(A, B)
-    assert sensed(desk, B).caretaker
-    assert listening(desk.effects)[-2:] == CARE_OF_B
-    (event,) = read_events(tmp_path, "caretaker-took-over")
-    assert (event["vehicle"], event["reason"]) == (B, "absent")
 
 
 def test_an_agent_that_is_back_at_once_needs_no_caretaker(attended: Desk) -> None:
@@ -309,14 +250,6 @@ def test_caretakers_have_greater_incarnations_than_all_before(desk: Desk) -> Non
     next_tick(desk, A)
     # Not just the next number: another process that steps above the agent may take that.
     assert sensed(desk, B).attendant == above(5, 10**18) > 10**18
-
-
-def test_caretakers_take_incarnations_as_processes_do(tmp_path: Path) -> None:
-    desk = Desk(SCENARIO, tmp_path, TWO)
-    desk.core._attendance._new_incarnation = lambda: 10**9
-    desk.start(A)
-    desk.drive_to_entry(A, B)
-    assert sensed(desk, B).attendant == 10**9
 
 
 def test_there_are_no_caretakers_while_the_bridge_is_off_the_network(attended: Desk) -> None:
@@ -340,19 +273,9 @@ def test_there_are_no_caretakers_while_the_bridge_is_off_the_network(attended: D
 def ballot_for(desk: Desk) -> tuple[Prepare, Plan]:
     """Return a ballot for B alone, which only holds."""
     sense = desk.core.vehicles[B].sense(0, caretaker=True)
-    ballot = Ballot(1, Name("c1"), 7, 1)
-    prepare = Prepare(ballot, (sense.formation,), (B,))
-    plan = Plan(
-        ballot=ballot,
-        formations=prepare.formations,
-        roster=(B,),
-        incarnations={B: sense.attendant},
-        start_cells={B: sense.hold_cell},
-        moves={B: ()},
-        t0_s=0.0,
-        slot_s=4.0,
-        territory=(sense.hold_cell,),
-    )
+    prepare = Prepare(BALLOT, (sense.formation,), (B,))
+    incarnations = {B: sense.attendant}
+    plan = make_plan({B: sense.hold_cell}, formations=prepare.formations, incarnations=incarnations)
     return prepare, plan
 
 
@@ -372,17 +295,6 @@ def test_a_caretaker_promises_and_accepts_at_once(cared_for: Desk) -> None:
     assert (state.promised, state.accepted) == (prepare.ballot, False)
     (state,) = sent(cared_for.give(Arrived(PLAN, OF_B, plan)), VehicleState)
     assert (state.promised, state.accepted) == (prepare.ballot, True)
-
-
-def test_a_caretaker_accepts_no_plan_that_moves_its_vehicle(cared_for: Desk) -> None:
-    prepare, plan = ballot_for(cared_for)
-    column, lane = cell = plan.start_cells[B]
-    target = (column, 1 - lane)
-    moving = evolve(plan, moves={B: ((0, cell, target),)}, territory=(cell, target))
-    cared_for.give(Arrived(PREPARE, OF_B, prepare))
-    assert cared_for.give(Arrived(PLAN, OF_B, moving)) == []
-    (state,) = sent(next_tick(cared_for, A), VehicleState)
-    assert not state.accepted
 
 
 def test_the_bridge_publishes_no_state_of_a_vehicle_with_an_agent(attended: Desk) -> None:
@@ -413,9 +325,9 @@ def test_an_agent_that_was_silent_takes_its_vehicle_back(attended: Desk) -> None
 
 def check_takes_back(desk: Desk) -> None:
     care = sensed(desk, B).attendant
-    before = known(desk, B)
+    before = desk.known(B)
     assert desk.answer(B, incarnation=AGENT) == []  # it does not know yet
-    assert known(desk, B) == before
+    assert desk.known(B) == before
     assert desk.answer(B, incarnation=care + 1) == CARE_OF_B_ENDS
     next_tick(desk, A)
     sense = sensed(desk, B)
@@ -430,9 +342,9 @@ def check_takes_back(desk: Desk) -> None:
 def test_an_agent_cannot_move_its_vehicle_with_the_claim(cared_for: Desk) -> None:
     cared_for.up(B)
     next_tick(cared_for, A)
-    before = known(cared_for, B)
+    before = cared_for.known(B)
     assert cared_for.answer(B, hold_cell=(-1, 1)) == []
-    assert known(cared_for, B) == before
+    assert cared_for.known(B) == before
     assert cared_for.core._answers.awaited == {A, B}
 
 

@@ -34,49 +34,25 @@ from laneweave.sim_bridge.bodies.overlaps_and_gaps import pose_of
 from laneweave.sim_bridge.core import WIND_UP_S, TickPhase
 from laneweave.sim_bridge.road.attendance import LEFT_REPEATS
 from support.bridge_bench import (
+    TWO,
+    A,
+    B,
     Desk,
     arrival,
     asked,
+    deadlines_until_silent,
     ended,
-    jerks,
     make_scenario,
     read_events,
     read_summary,
-    sent,
 )
+from support.states import jerks, sent
 
 SCENARIO = make_scenario()
 TICK_S, RESEND_S = SCENARIO.runtime.tick_s, SCENARIO.runtime.tick_resend_s
 DEADLINE_S, SILENT_S = SCENARIO.runtime.tick_deadline_s, SCENARIO.runtime.agent_silent_s
 PATIENCE_S, LITTLE_PATIENCE_S = SCENARIO.runtime.agent_start_s, SCENARIO.network.resend_s
-MISSES = round(SILENT_S / DEADLINE_S)
-"""Deadlines that an agent misses before it is silent."""
-A, B = Name("A"), Name("B")
-TWO = (arrival(A, 0.5, lane=1), arrival(B, 0.6, lane=0))
-"""A enters at 1 s, B at 2 s: when the first free cells pass that are in the structure."""
-
-
-@pytest.fixture
-def desk(tmp_path: Path) -> Desk:
-    """Two vehicles have just entered, and both agents have been asked."""
-    desk = Desk(SCENARIO, tmp_path, TWO)
-    desk.start(A, B)
-    desk.drive_to_entry(A, B)
-    desk.effects.clear()
-    return desk
-
-
-def record_of(desk: Desk, vehicle: Name) -> tuple[object, ...]:
-    """Return all that a motion controller knows."""
-    controller = desk.core.vehicles[vehicle].controller
-    return (
-        controller.command_tick,
-        controller.attendant,
-        controller.hold_cell,
-        controller.motion_origin,
-        controller.motion_end_tick,
-        controller._jerks.tobytes(),
-    )
+MISSES = deadlines_until_silent(SCENARIO)
 
 
 # --- the beginning ----------------------------------------------------------------------------
@@ -156,30 +132,30 @@ def test_ticks_keep_the_pace_and_do_not_make_up_for_lost_time(desk: Desk) -> Non
     assert desk.now_s == pytest.approx(late_s + TICK_S)  # only one
 
 
-def test_every_vehicle_senses_the_one_ahead(tmp_path: Path) -> None:
-    desk = Desk(SCENARIO, tmp_path, [arrival(A, 0.1), arrival(B, 2.1)])
+def one_behind_the_other(folder: Path, scenario: Scenario) -> tuple[Desk, dict[Name, Sense]]:
+    """Let B enter behind A; return what both sense then."""
+    desk = Desk(scenario, folder, [arrival(A, 0.1), arrival(B, 2.1)])
     desk.start(A, B)
     desk.drive_to_entry(B)
     desk.answer(A)
     desk.answer(B)
-    senses = {sense.vehicle: sense for sense in sent(desk.wake(), Sense)}
+    return desk, {sense.vehicle: sense for sense in sent(desk.wake(), Sense)}
+
+
+def test_every_vehicle_senses_the_one_ahead(tmp_path: Path) -> None:
+    _, senses = one_behind_the_other(tmp_path, SCENARIO)
     assert senses[A].ahead == ()
     ((lane, gap_m, speed_mps),) = [(n.lane, n.gap_m, n.speed_mps) for n in senses[B].ahead]
     assert (lane, speed_mps) == (0, 15.0)
     assert gap_m == pytest.approx(30.0 - SCENARIO.vehicle.length_m)
-    assert [(n.lane, n.gap_m) for n in senses[A].behind] == [(0, pytest.approx(gap_m))]
+    (behind,) = senses[A].behind
+    assert behind.lane == 0
+    assert behind.gap_m == pytest.approx(gap_m)
     assert senses[B].behind == ()
 
 
-def test_measurement_errors_are_the_same_in_repeated_senses(
-    tmp_path: Path,
-) -> None:
-    desk = Desk(make_scenario(sensing={}), tmp_path, [arrival(A, 0.1), arrival(B, 2.1)])
-    desk.start(A, B)
-    desk.drive_to_entry(B)
-    desk.answer(A)
-    desk.answer(B)
-    senses = {sense.vehicle: sense for sense in sent(desk.wake(), Sense)}
+def test_measurement_errors_are_the_same_in_repeated_senses(tmp_path: Path) -> None:
+    desk, senses = one_behind_the_other(tmp_path, make_scenario(sensing={}))
     for name, sense in senses.items():
         true = desk.core.vehicles[name].state
         assert sense.state != true
@@ -198,6 +174,8 @@ def test_measurement_errors_are_the_same_in_repeated_senses(
 def test_only_agents_that_have_not_answered_are_asked_again(desk: Desk) -> None:
     began_s, tick = desk.now_s, desk.core.tick
     desk.answer(A)
+    desk.now_s += 0.99 * RESEND_S
+    assert desk.give(Wakeup()) == []  # too early
     for times in (1, 2, 3):
         assert desk.core.wakeup_s == pytest.approx(began_s + times * RESEND_S)
         effects = desk.wake()
@@ -206,24 +184,6 @@ def test_only_agents_that_have_not_answered_are_asked_again(desk: Desk) -> None:
         assert sent(effects, Sense)[0].tick == tick
     desk.answer(B)
     assert desk.core.tick == tick + 1
-
-
-def test_no_agent_is_asked_again_too_early(desk: Desk) -> None:
-    desk.now_s += 0.99 * RESEND_S
-    assert desk.give(Wakeup()) == []
-
-
-def test_at_the_deadline_the_road_goes_on_and_the_next_tick_waits_for_all(desk: Desk) -> None:
-    for _ in range(MISSES - 1):
-        began_s, tick = desk.now_s, desk.core.tick
-        assert desk.core._answers.awaited == {A, B}
-        desk.answer(A)
-        while desk.core.tick == tick:
-            desk.wake()
-        assert desk.now_s == pytest.approx(began_s + DEADLINE_S)
-        desk.drive_to(desk.core.tick)
-    assert read_events(desk.folder, "agent-silent") == []
-    assert B not in desk.core._attendance
 
 
 def test_a_vehicle_without_an_answer_continues_its_trajectory(desk: Desk) -> None:
@@ -240,11 +200,20 @@ def test_a_vehicle_without_an_answer_continues_its_trajectory(desk: Desk) -> Non
     assert controller.rung is Rung.PLAY
 
 
-def test_an_agent_without_answers_becomes_silent_and_is_not_awaited(desk: Desk) -> None:
-    began_s, tick = desk.now_s, desk.core.tick
-    desk.drive_to_silence(B)
-    assert desk.now_s == pytest.approx(began_s + SILENT_S)
-    assert desk.core.tick == tick + MISSES
+def test_an_agent_without_answers_is_awaited_to_each_deadline_until_it_is_silent(
+    desk: Desk,
+) -> None:
+    for _ in range(MISSES):
+        assert read_events(desk.folder, "agent-silent") == []
+        assert B not in desk.core._attendance
+        assert desk.core._answers.awaited == {A, B}
+        began_s, tick = desk.now_s, desk.core.tick
+        desk.answer(A)
+        while desk.core.tick == tick:
+            desk.wake()
+        assert desk.now_s == pytest.approx(began_s + DEADLINE_S)
+        desk.drive_to(desk.core.tick)
+    assert desk.core._answers.silent == {B}
     (event,) = read_events(desk.folder, "agent-silent")
     assert (event["vehicle"], event["t_s"]) == (B, pytest.approx(desk.core.t_s))
     # All agents are still asked, but the tick does not wait for the silent one.
@@ -262,21 +231,32 @@ def test_a_late_answer_ends_the_silence_and_does_nothing_else(desk: Desk) -> Non
     late = desk.command(B, jerks=jerks((5.0, 5.0), ticks=40))
     desk.drive_to_silence(B)
     desk.drive_to(desk.core.tick + 3)
-    known = record_of(desk, B)
+    known = desk.known(B)
     assert desk.give(Arrived(COMMAND, {"vehicle": B}, late)) == []
-    assert record_of(desk, B) == known
+    assert desk.known(B) == known
     assert B in desk.core._attendance  # until it claims its vehicle
     desk.answer(A)  # this tick had not asked it to be waited for
     desk.wake()
     assert desk.core._answers.awaited == {A, B}
 
 
-@pytest.mark.parametrize("apart", [-5, -1, 1, 5, 2**62])
-def test_an_answer_to_another_tick_changes_nothing(desk: Desk, apart: int) -> None:
-    known, tick = record_of(desk, A), desk.core.tick
+@pytest.mark.parametrize(
+    ("apart", "changes"),
+    [
+        *[(apart, {}) for apart in (-5, -1, 1, 5, 2**62)],
+        (0, {"jerks": b"123"}),
+        (0, {"jerks": jerks((float("nan"), 0.0))}),
+        (0, {"hold_cell": (0, 7)}),
+    ],
+)
+def test_an_answer_to_another_tick_or_that_makes_no_sense_changes_nothing(
+    desk: Desk, apart: int, changes: dict[str, object]
+) -> None:
+    known, tick = desk.known(A), desk.core.tick
     moving = {"hold_cell": (-1, 0), "motion_end_tick": tick + 9, "motion_origin": (-1, 0)}
-    desk.answer(A, tick=tick + apart, jerks=jerks((9.0, 9.0), ticks=9), **moving)
-    assert record_of(desk, A) == known
+    answer = {"tick": tick + apart, "jerks": jerks((9.0, 9.0), ticks=9), **moving}
+    desk.answer(A, **(answer | changes))
+    assert desk.known(A) == known
     assert desk.core._answers.awaited == {A, B}
 
 
@@ -284,34 +264,20 @@ def test_an_answer_between_two_ticks_changes_nothing(desk: Desk) -> None:
     desk.answer(A)
     desk.answer(B)
     assert desk.core.phase is TickPhase.PACE
-    known = record_of(desk, A)
+    known = desk.known(A)
     early = desk.command(A, hold_cell=(-1, 0), jerks=jerks((9.0, 9.0), ticks=9))
     assert early.tick == desk.core.tick  # no agent has been asked about it yet
     desk.give(Arrived(COMMAND, {"vehicle": A}, early))
-    assert record_of(desk, A) == known
+    assert desk.known(A) == known
     desk.wake()
     assert desk.core._answers.awaited == {A, B}
 
 
 def test_the_first_answer_to_a_tick_counts(desk: Desk) -> None:
     desk.answer(A)
-    known = record_of(desk, A)
+    known = desk.known(A)
     desk.answer(A, jerks=jerks((9.0, 0.0)))
-    assert record_of(desk, A) == known
-
-
-def test_an_answer_that_makes_no_sense_is_none(desk: Desk) -> None:
-    known = record_of(desk, A)
-    for name, nonsense in (
-        ("jerks", b"123"),
-        ("jerks", jerks((float("nan"), 0.0))),
-        ("hold_cell", (0, 7)),
-    ):
-        desk.answer(A, **{name: nonsense})
-        assert record_of(desk, A) == known
-        assert desk.core._answers.awaited == {A, B}
-    desk.answer(A)
-    assert desk.core._answers.awaited == {B}
+    assert desk.known(A) == known
 
 
 def test_answers_for_unknown_vehicles_are_ignored(desk: Desk) -> None:
@@ -492,12 +458,14 @@ def test_reports_about_vehicles_of_an_earlier_run_do_not_count(tmp_path: Path) -
     assert read_summary(tmp_path)["tracking"]["solves"] == 3
 
 
-def test_winding_up_has_a_deadline(tmp_path: Path) -> None:
+@pytest.mark.parametrize("stopped", [False, True])
+def test_winding_up_has_a_deadline_and_may_be_stopped(tmp_path: Path, *, stopped: bool) -> None:
     desk = wound_up(tmp_path)
     desk.report("agent", A)
     began_s = desk.now_s
-    assert ended(desk.wake())
-    assert desk.now_s == began_s + WIND_UP_S
+    desk.give(Stopping()) if stopped else desk.wake()
+    assert desk.core.phase is TickPhase.ENDED
+    assert desk.now_s == (began_s if stopped else began_s + WIND_UP_S)
     assert read_summary(tmp_path)["ending"] == "complete"
 
 
@@ -522,12 +490,6 @@ def test_a_run_that_is_stopped_was_interrupted(desk: Desk) -> None:
     (event,) = read_events(desk.folder, "run-ended")
     assert event["ending"] == "interrupted"
     assert desk.give(Wakeup()) == []
-
-
-def test_a_run_that_is_stopped_while_it_winds_up_is_complete_all_the_same(tmp_path: Path) -> None:
-    desk = wound_up(tmp_path)
-    desk.give(Stopping())
-    assert read_summary(tmp_path)["ending"] == "complete"
 
 
 def test_a_run_ends_at_the_limit(tmp_path: Path) -> None:
@@ -560,17 +522,10 @@ def test_nothing_is_left_over_at_the_end(tmp_path: Path) -> None:
     core = desk.core
     assert core.phase is TickPhase.ENDED
     for left_over in (
-        core._attendance._caretakers,
-        core._answers._unheard,
-        core._answers._unheard_s,
-        *(
-            core.vehicles,
-            core._departures.repeats,
-            core._answers.silent,
-            core._answers.awaited,
-            core._at_entrance,
-        ),
-        *(core._answers.up, core._unreported, desk.world.at),
+        *(core.vehicles, core._departures.repeats, core._attendance._caretakers),
+        *(core._answers._unheard, core._answers._unheard_s),
+        *(core._answers.silent, core._answers.awaited, core._answers.up),
+        *(core._at_entrance, core._unreported, desk.world.at),
     ):
         assert not left_over
 

@@ -9,12 +9,15 @@ import json
 from pathlib import Path
 from typing import Any
 
+from attrs import asdict
+
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.sim_bridge.core import TickPhase
 from laneweave.sim_bridge.road.demand import Arrival
-from support.bridge_bench import EXACT, Street, arrival, read_summary
+from support.bridge_bench import Street, arrival, read_summary
+from support.paper import EXACT
 
 LOOK_S = 0.5
 """How long before a change the cells are looked at."""
@@ -54,7 +57,7 @@ def test_a_formation_takes_on_one_structure_after_the_other(tmp_path: Path) -> N
     scenario = parse_scenario(
         {
             "road": {"lanes": 3, "s1_m": 50.0, "s2_m": 950.0, "s3_m": 400.0},
-            "sensing": EXACT,
+            "sensing": asdict(EXACT),
             "formation": {
                 "structures": [
                     {"from_m": 200.0, "structure": "interlaced"},
@@ -82,7 +85,7 @@ def joining(join: str) -> Scenario:
     return parse_scenario(
         {
             "road": {"lanes": 3, "s1_m": 50.0, "s2_m": 450.0, "s3_m": 500.0},
-            "sensing": EXACT,
+            "sensing": asdict(EXACT),
             "formation": {
                 "max_columns": 3,
                 "max_joined": 2,
