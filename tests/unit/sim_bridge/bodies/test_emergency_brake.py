@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import attrs
-import numpy as np
 import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
@@ -11,11 +10,14 @@ from hypothesis import strategies as st
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.braking import EmergencyBrake, last_tick_m
 from laneweave.protocol.vehicle.motion import Jerk, commanded_state, limited_jerk
-from laneweave.protocol.wire.messages import Command, Name, Neighbour
+from laneweave.protocol.wire.messages import Name, Neighbour
 from laneweave.sim_bridge.bodies.motion_controller import MotionController, Rung
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Around
 from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.bodies.sensors import Sensors
+from support.paper import EXACT
+from support.road_vehicles import controller_in
+from support.states import command
 
 SCENARIO = Scenario()
 LIMITS, TICK_S = SCENARIO.vehicle, SCENARIO.runtime.tick_s
@@ -118,13 +120,12 @@ def drive_behind(
     scenario: Scenario, number: int, gap_m: float, *, braking_tick: int
 ) -> tuple[float, MotionController]:
     """Let a vehicle speed up behind one that holds and then brakes; return the smallest gap."""
-    own, other = plant_at(0.0, 15.0), plant_at(LIMITS.length_m + gap_m, 15.0)
-    controller = MotionController(own, scenario, (0, 0))
+    controller = controller_in((0, 0), scenario, state=(0.0, 15.0, 0.0, 1.75, 0.0, 0.0))
+    own, other = controller.plant, plant_at(LIMITS.length_m + gap_m, 15.0)
     sensors = Sensors(scenario, Name(f"v{number}"))
     least_m = gap_m
     for tick in range(braking_tick + 60):
-        jerks = np.array([(15.0, 0.0)], dtype="<f4").tobytes()
-        controller.take(Command(Name("v"), 1, tick, (0, 0), tick + 1, (0, 0), jerks))
+        controller.take(command(tick, (15.0, 0.0), hold_cell=(0, 0), motion_origin=(0, 0)))
         around = sensors.measure_neighbours(([attrs.astuple(seen(own, other))], []))
         controller.perceive(sensors.measure(own.state), around)
         controller.step(tick)
@@ -138,11 +139,10 @@ def drive_behind(
 
 @pytest.mark.parametrize("jerk", [-40.0, -1000.0, -3e38])
 def test_commanding_more_than_the_body_can_brake_does_not_count_as_braking(jerk: float) -> None:
-    own, wall = plant_at(0.0, 15.0), plant_at(24.0, 0.0)
-    controller = MotionController(own, SCENARIO, (0, 0))
+    controller = controller_in((0, 0), SCENARIO, state=(0.0, 15.0, 0.0, 1.75, 0.0, 0.0))
+    own, wall = controller.plant, plant_at(24.0, 0.0)
     for tick in range(40):
-        jerks = np.array([(jerk, 0.0)], dtype="<f4").tobytes()
-        controller.take(Command(Name("v"), 1, tick, (0, 0), tick + 1, (0, 0), jerks))
+        controller.take(command(tick, (jerk, 0.0), hold_cell=(0, 0), motion_origin=(0, 0)))
         controller.perceive(own.state, Around((seen(own, wall),), ()))
         controller.step(tick)
         assert seen(own, wall).gap_m > MARGIN_M - 0.1
@@ -159,7 +159,6 @@ def test_errors_of_measurement_do_not_make_it_too_late(number: int) -> None:
 
 def test_it_is_not_more_careful_than_it_has_to_be() -> None:
     """With exact sensors a vehicle stops little more than its margin behind the one ahead."""
-    exact = {field.name: 0.0 for field in attrs.fields(type(SCENARIO.sensing))}
-    scenario = attrs.evolve(SCENARIO, sensing=type(SCENARIO.sensing)(**exact))
+    scenario = attrs.evolve(SCENARIO, sensing=EXACT)
     least_m, _ = drive_behind(scenario, 0, 12.0, braking_tick=12)
     assert MARGIN_M - 3.0 * WITHIN_A_TICK_M <= least_m <= MARGIN_M + 1.5

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 
-import numpy as np
 import pytest
 from attrs import evolve
 
@@ -13,8 +12,9 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.vehicle.motion import Jerk, cell_state
 from laneweave.protocol.wire.messages import Ballot, Command, Name
 from laneweave.sim_bridge.bodies.motion_controller import MAX_COLUMN, MotionController, Rung
-from laneweave.sim_bridge.bodies.plant import Plant
+from support import states
 from support.paper import PAPER
+from support.road_vehicles import controller_in
 
 SCENARIO = PAPER
 LATTICE, TICK_S = SCENARIO.lattice, SCENARIO.runtime.tick_s
@@ -25,17 +25,13 @@ AGENT = 5
 
 @pytest.fixture
 def controller() -> MotionController:
-    plant = Plant(cell_state(LATTICE, HOME, 0.0), SCENARIO.vehicle, TICK_S)
-    controller = MotionController(plant, SCENARIO, HOME)
-    controller.put_in_charge(AGENT)
-    return controller
+    return controller_in(HOME, attendant=AGENT)
 
 
 def command(
     tick: int, *pairs: tuple[float, float], hold_cell: Cell = HOME, incarnation: int = AGENT
 ) -> Command:
-    played = np.array(pairs, dtype="<f4").tobytes()
-    return Command(Name("v"), incarnation, tick, hold_cell, tick + len(pairs), HOME, played)
+    return states.command(tick, *pairs, hold_cell=hold_cell, incarnation=incarnation)
 
 
 def driven(controller: MotionController) -> dict[Rung, int]:
@@ -89,26 +85,20 @@ def test_the_newest_command_counts(controller: MotionController) -> None:
     assert (controller.motion_origin, controller.motion_end_tick) == (HOME, 7)
 
 
-def test_a_command_without_jerks_leaves_the_motion_under_way_as_it_is(
+def test_a_command_without_jerks_leaves_the_motion_as_it_is_unless_it_names_another_cell(
     controller: MotionController,
 ) -> None:
-    controller.take(command(5, (1.0, 0.0), (2.0, 0.0), hold_cell=(1, 1)))
+    controller.take(command(5, *[(1.0, 0.0)] * 3, hold_cell=(1, 1)))
     controller.step(5)
     assert controller.take(command(6, hold_cell=(1, 1)))
-    assert (controller.command_tick, controller.motion_end_tick) == (6, 7)
+    assert (controller.command_tick, controller.motion_end_tick) == (6, 8)
     controller.step(6)
-    assert controller.plant.setpoint[0] == pytest.approx(3.0 * TICK_S)
+    assert controller.plant.setpoint[0] == pytest.approx(2.0 * TICK_S)
     assert driven(controller) == {Rung.PLAY: 2}
-
-
-def test_a_command_without_jerks_that_names_another_cell_goes_there_by_the_hold_law(
-    controller: MotionController,
-) -> None:
-    controller.take(command(5, (1.0, 0.0), (2.0, 0.0)))
-    assert controller.take(command(6, hold_cell=(1, 1)))
-    controller.step(6)
-    assert controller.hold_cell == (1, 1)
-    assert driven(controller) == {Rung.HOLD: 1}
+    assert controller.take(command(7, hold_cell=(2, 1)))  # by the hold law
+    controller.step(7)
+    assert controller.hold_cell == (2, 1)
+    assert driven(controller) == {Rung.PLAY: 2, Rung.HOLD: 1}
 
 
 # --- the process in charge --------------------------------------------------------------------
@@ -128,8 +118,7 @@ def known(controller: MotionController) -> tuple[object, ...]:
 
 
 def test_a_new_vehicle_has_no_process_in_charge() -> None:
-    plant = Plant(cell_state(LATTICE, HOME, 0.0), SCENARIO.vehicle, TICK_S)
-    controller = MotionController(plant, SCENARIO, (-9, 1))
+    controller = controller_in((-9, 1))
     assert (controller.attendant, controller.joined) == (0, (LATTICE.block_of(-9),))
     assert controller.accepted is None
 
@@ -155,7 +144,7 @@ def test_a_newer_process_takes_charge_with_its_command(controller: MotionControl
 
 def test_a_claim_cannot_move_the_vehicle(controller: MotionController) -> None:
     """It could not act for the vehicle before, so no plan can allow its move."""
-    controller.take(command(3, (1.0, 0.0)))
+    controller.take(evolve(command(3, (1.0, 0.0)), accepted=LOW))
     before = known(controller)
     assert not controller.take(command(4, (2.0, 0.0), hold_cell=(1, 1), incarnation=AGENT + 1))
     assert known(controller) == before
@@ -209,13 +198,6 @@ def asking(
     return evolve(command(tick, incarnation=incarnation), accepted=accepted, joined=joined)
 
 
-def test_an_acceptance_is_noted_with_a_command(controller: MotionController) -> None:
-    assert controller.take(asking(LOW))
-    assert controller.accepted == LOW
-    controller.take(asking(None, tick=4))
-    assert controller.accepted == LOW
-
-
 def test_requests_of_the_process_in_charge_are_noted_whatever_the_tick(
     controller: MotionController,
 ) -> None:
@@ -229,10 +211,11 @@ def test_requests_of_the_process_in_charge_are_noted_whatever_the_tick(
     assert known(controller)[3:] == before[3:]  # it is not played
 
 
-def test_the_newest_acceptance_counts(controller: MotionController) -> None:
-    assert controller.note(asking(HIGH))
-    for older in (LOW, None):
-        assert not controller.note(asking(older))
+@pytest.mark.parametrize("with_command", [False, True])
+def test_the_newest_acceptance_counts(controller: MotionController, *, with_command: bool) -> None:
+    for tick, (ballot, noted) in enumerate(((HIGH, True), (LOW, False), (None, False)), start=3):
+        request = asking(ballot, tick=tick)
+        assert controller.take(request) if with_command else controller.note(request) is noted
         assert controller.accepted == HIGH
 
 
@@ -266,13 +249,6 @@ def test_an_acceptance_is_forgotten_when_another_takes_charge(
     assert not controller.note(asking(HIGH, tick=4))  # its time is over
     assert controller.accepted is None
     assert controller.note(asking(LOW, tick=4, incarnation=AGENT + 1))
-
-
-def test_a_claim_that_is_refused_makes_nothing_forgotten(controller: MotionController) -> None:
-    controller.take(asking(LOW))
-    claim = command(4, hold_cell=(1, 1), incarnation=AGENT + 1)
-    assert not controller.take(claim)
-    assert controller.accepted == LOW
 
 
 # --- what it refuses --------------------------------------------------------------------------

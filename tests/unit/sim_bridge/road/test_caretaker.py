@@ -4,24 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-import numpy as np
 import pytest
 from attrs import evolve
 
-from laneweave.protocol.lattice import Cell, PlannedMove, territory
-from laneweave.protocol.wire.messages import Ballot, Command, Name, Plan, Prepare, VehicleState
+from laneweave.protocol.lattice import Cell, PlannedMove
+from laneweave.protocol.wire.messages import Ballot, Name, Plan, Prepare, VehicleState
 from laneweave.sim_bridge.road.attendance import Caretaker
-from laneweave.sim_bridge.road.demand import Arrival
-from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from support.paper import PAPER
+from support.road_vehicles import vehicle_in
+from support.states import command, holding, make_plan
 
-SCENARIO = PAPER
 A, B = Name("A"), Name("B")
 HOME: Cell = (-2, 0)
 NEXT: Cell = (-1, 0)
 OTHER: Cell = (0, 2)
-FORMATION = SCENARIO.lattice.block_of(HOME[0])
+FORMATION = PAPER.lattice.block_of(HOME[0])
 AGENT, CARETAKER = 5, 8
 """Incarnations."""
 FIRST, SECOND = Ballot(1, Name("c1"), 7, 1), Ballot(1, Name("c1"), 7, 2)
@@ -30,8 +28,7 @@ FIRST, SECOND = Ballot(1, Name("c1"), 7, 1), Ballot(1, Name("c1"), 7, 2)
 @pytest.fixture
 def vehicle() -> RoadVehicle:
     """A vehicle that an agent was in charge of; road time is 0."""
-    admission = Admission(Arrival("A", 0, 1, 0.0), HOME, 0.0)
-    vehicle = RoadVehicle.entering(admission, 0.0, SCENARIO)
+    vehicle = vehicle_in(HOME)
     vehicle.controller.put_in_charge(AGENT)
     return vehicle
 
@@ -39,12 +36,6 @@ def vehicle() -> RoadVehicle:
 @pytest.fixture
 def caretaker(vehicle: RoadVehicle) -> Caretaker:
     return Caretaker(vehicle, CARETAKER, 0)
-
-
-def begin_move(vehicle: RoadVehicle, ticks: int = 38) -> None:
-    """Begin a move as an agent does; by the hold law, which takes longer."""
-    jerks = np.zeros((1, 2), dtype="<f4").tobytes()
-    vehicle.controller.take(Command(A, AGENT, 0, NEXT, ticks, HOME, jerks))
 
 
 def drive(vehicle: RoadVehicle, ticks: Iterable[int]) -> None:
@@ -60,20 +51,9 @@ def plan(
     ballot: Ballot = FIRST, *, own_moves: tuple[PlannedMove, ...] = (), start: Cell = HOME
 ) -> Plan:
     moves: dict[Name, tuple[PlannedMove, ...]] = {A: own_moves, B: ((0, OTHER, (-1, 2)),)}
-    starts = {A: start, B: OTHER}
-    return Plan(
-        ballot=ballot,
-        formations=(FORMATION,),
-        roster=(A, B),
-        incarnations={A: CARETAKER, B: 3},
-        start_cells=starts,
-        moves=moves,
-        t0_s=1.0,
-        slot_s=4.0,
-        territory=tuple(
-            sorted(territory(starts.values(), [m for one in moves.values() for m in one]))
-        ),
-    )
+    incarnations = {A: CARETAKER, B: 3}
+    fields = {"ballot": ballot, "formations": (FORMATION,), "incarnations": incarnations}
+    return make_plan({A: start, B: OTHER}, moves, t0_s=1.0, **fields)
 
 
 def answer_of(caretaker: Caretaker, message: Prepare | Plan, tick: int = 0) -> VehicleState:
@@ -84,26 +64,10 @@ def answer_of(caretaker: Caretaker, message: Prepare | Plan, tick: int = 0) -> V
 
 def test_shows_what_the_vehicle_does(caretaker: Caretaker, vehicle: RoadVehicle) -> None:
     drive(vehicle, range(10))
-    assert caretaker.state(10) == VehicleState(
-        vehicle=A,
-        incarnation=CARETAKER,
-        formation=FORMATION,
-        joined=(FORMATION,),
-        promised=None,
-        accepted=False,
-        ready=False,
-        completed=0,
-        hold_cell=HOME,
-        moving=False,
-        go=False,
-        done=False,
-        overdue=False,
-        attended=False,
-        s_m=vehicle.state[0],
-        y_m=vehicle.state[3],
-        speed_mps=vehicle.state[1],
-        t_s=1.0,
-    )
+    s_m, speed_mps, _, y_m, *_ = vehicle.state
+    state = holding(A, None, HOME, incarnation=CARETAKER, attended=False)
+    assert state.formation == FORMATION
+    assert caretaker.state(10) == evolve(state, s_m=s_m, y_m=y_m, speed_mps=speed_mps, t_s=1.0)
 
 
 def test_takes_charge_with_an_incarnation_above_all_earlier_ones(vehicle: RoadVehicle) -> None:
@@ -113,36 +77,24 @@ def test_takes_charge_with_an_incarnation_above_all_earlier_ones(vehicle: RoadVe
     assert vehicle.controller.attendant == AGENT + 1
 
 
-def test_promises_the_highest_ballot(caretaker: Caretaker) -> None:
-    assert answer_of(caretaker, prepare(SECOND)).promised == SECOND
-    assert answer_of(caretaker, prepare(SECOND)).promised == SECOND
-    assert answer_of(caretaker, prepare(FIRST)).promised == SECOND
-
-
-def test_promises_nothing_that_is_not_for_its_vehicle(caretaker: Caretaker) -> None:
+def test_promises_the_highest_ballot_for_its_vehicle(caretaker: Caretaker) -> None:
     assert caretaker.on_message(evolve(prepare(), roster=(B,)), 0) is None
     assert caretaker.state(0).promised is None
+    for ballot in (SECOND, SECOND, FIRST):
+        assert answer_of(caretaker, prepare(ballot)).promised == SECOND
 
 
-def test_accepts_a_plan_in_which_its_vehicle_holds(caretaker: Caretaker) -> None:
-    answer_of(caretaker, prepare())
-    state = answer_of(caretaker, plan())
-    assert (state.accepted, state.ready, state.done, state.go) == (True, True, True, False)
-    assert caretaker.on_message(plan(), 0) is None
-    assert caretaker.state(1).accepted
-
-
-def test_what_it_accepts_is_noted_as_that_of_an_agent_is(
+def test_accepts_a_plan_in_which_its_vehicle_holds_and_the_controller_notes_it(
     caretaker: Caretaker, vehicle: RoadVehicle
 ) -> None:
-    answer_of(caretaker, prepare())
-    caretaker.on_message(plan(own_moves=((1, HOME, NEXT),)), 0)
-    assert vehicle.controller.accepted is None
-    answer_of(caretaker, plan())
-    assert vehicle.controller.accepted == FIRST
-    answer_of(caretaker, prepare(SECOND))
-    answer_of(caretaker, plan(SECOND))
-    assert vehicle.controller.accepted == SECOND
+    for ballot in (FIRST, SECOND):
+        state = answer_of(caretaker, prepare(ballot))
+        assert (state.promised, state.accepted) == (ballot, False)  # it ends the plan before
+        state = answer_of(caretaker, plan(ballot))
+        assert (state.accepted, state.ready, state.done, state.go) == (True, True, True, False)
+        assert vehicle.controller.accepted == ballot
+        assert caretaker.on_message(plan(ballot), 0) is None
+        assert caretaker.state(1).accepted
 
 
 def test_what_the_agent_before_it_accepted_is_not_its_own(vehicle: RoadVehicle) -> None:
@@ -167,18 +119,12 @@ def test_what_the_agent_before_it_accepted_is_not_its_own(vehicle: RoadVehicle) 
     ],
     ids=["it moves", "ballot", "cell", "incarnation", "not joined", "territory", "not in it"],
 )
-def test_accepts_no_other_plan(caretaker: Caretaker, refused: Plan) -> None:
+def test_accepts_no_other_plan(caretaker: Caretaker, vehicle: RoadVehicle, refused: Plan) -> None:
     answer_of(caretaker, prepare())
     assert caretaker.on_message(refused, 0) is None
     assert not caretaker.state(0).accepted
+    assert vehicle.controller.accepted is None
     assert answer_of(caretaker, plan()).accepted  # the right one may still come
-
-
-def test_a_new_ballot_ends_the_plan(caretaker: Caretaker) -> None:
-    answer_of(caretaker, prepare())
-    answer_of(caretaker, plan())
-    state = answer_of(caretaker, prepare(SECOND))
-    assert (state.promised, state.accepted) == (SECOND, False)
 
 
 def test_joins_formations_for_the_vehicle(caretaker: Caretaker, vehicle: RoadVehicle) -> None:
@@ -198,17 +144,17 @@ def test_never_moves_whatever_it_has_promised_and_accepted(
     for tick in range(200):
         drive(vehicle, (tick,))
         state = caretaker.state(tick + 1)
-        assert (state.hold_cell, state.moving, state.go, state.overdue) == (
-            HOME,
-            False,
-            False,
-            False,
-        )
+        assert state.hold_cell == HOME
+        assert not any((state.moving, state.go, state.overdue))
     assert vehicle.controller.hold_cell == HOME
 
 
 def test_the_move_of_the_agent_before_it_counts_until_its_end(vehicle: RoadVehicle) -> None:
-    begin_move(vehicle)
+    # By the hold law, which takes longer than the 38 ticks of the command.
+    move = command(
+        0, (0.0, 0.0), hold_cell=NEXT, incarnation=AGENT, motion_end_tick=38, motion_origin=HOME
+    )
+    assert vehicle.controller.take(move)
     drive(vehicle, range(5))
     caretaker = Caretaker(vehicle, CARETAKER, 5)
     state = answer_of(caretaker, prepare(), 5)
@@ -225,7 +171,7 @@ def test_the_move_of_the_agent_before_it_counts_until_its_end(vehicle: RoadVehic
             ends.append(tick + 1)
     assert 38 <= ends[-1] < 120
     assert ends == list(range(6, ends[-1] + 1))  # once
-    assert vehicle.state[0] == pytest.approx(SCENARIO.lattice.cell_s_m(NEXT[0], 15.0), abs=0.1)
+    assert vehicle.state[0] == pytest.approx(PAPER.lattice.cell_s_m(NEXT[0], 15.0), abs=0.1)
 
 
 def test_a_body_that_gives_way_does_not_count_as_moving(

@@ -8,11 +8,13 @@ import pytest
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.vehicle.motion import State, cell_state, commanded_state, hold_law
-from laneweave.protocol.wire.messages import Command, Name, Neighbour
-from laneweave.sim_bridge.bodies.motion_controller import RELEASE_M, MotionController, Rung
+from laneweave.protocol.wire.messages import Neighbour
+from laneweave.sim_bridge.bodies.motion_controller import RELEASE_M, Rung
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import NONE_AROUND, Around
 from laneweave.sim_bridge.bodies.plant import Plant
 from support.paper import PAPER
+from support.road_vehicles import controller_in
+from support.states import command
 
 SCENARIO = PAPER
 LIMITS, LATTICE, TICK_S = SCENARIO.vehicle, SCENARIO.lattice, SCENARIO.runtime.tick_s
@@ -25,8 +27,8 @@ class Track:
 
     def __init__(self, state: State | None = None) -> None:
         """Put it into its cell, alone."""
-        self.plant = Plant(state or cell_state(LATTICE, HOME, 0.0), LIMITS, TICK_S)
-        self.controller = MotionController(self.plant, SCENARIO, HOME)
+        self.controller = controller_in(HOME, state=state)
+        self.plant = self.controller.plant
         self.tick = 0
         self.rear_m, self.speed_mps, self.lane = np.inf, V_F, HOME[1]
         self.min_accel_mps2 = 0.0
@@ -39,12 +41,7 @@ class Track:
         return float(self.rear_m - self.plant.state[0])
 
     def command(self, *pairs: tuple[float, float], hold_cell: Cell = HOME) -> None:
-        jerks = np.array(pairs, dtype="<f4").tobytes()
-        end_tick = self.tick + len(pairs)
-        taken = self.controller.take(
-            Command(Name("v"), 1, self.tick, hold_cell, end_tick, HOME, jerks)
-        )
-        assert taken
+        assert self.controller.take(command(self.tick, *pairs, hold_cell=hold_cell))
 
     def step(self) -> Rung:
         around = NONE_AROUND
@@ -82,12 +79,6 @@ def test_it_plays_a_command_as_long_as_it_could_still_brake(
     assert track.plant.state[1] == V_F
 
 
-def test_a_trajectory_that_ran_out_is_followed_by_a_hold(track: Track) -> None:
-    track.command((2.0, 0.0), (2.0, 0.0), (-1.0, 0.5))
-    assert track.run(6) == [Rung.PLAY] * 3 + [Rung.HOLD] * 3
-    assert track.controller.rung_ticks[Rung.PLAY] == track.controller.rung_ticks[Rung.HOLD] == 3
-
-
 def test_holding_is_the_hold_law_for_the_commanded_state(track: Track) -> None:
     track.command((6.0, 4.0), (6.0, 4.0))
     track.run(2)
@@ -101,11 +92,12 @@ def test_holding_is_the_hold_law_for_the_commanded_state(track: Track) -> None:
     assert plant.state == expected.state
 
 
-@pytest.mark.parametrize("speed_mps", [0.0, 7.0])
-def test_a_holding_vehicle_gives_way_comfortably_and_keeps_its_distance(
-    track: Track, speed_mps: float
+@pytest.mark.parametrize(("speed_mps", "lane"), [(0.0, 1), (7.0, 1), (0.0, 2)])
+def test_a_holding_vehicle_gives_way_comfortably_on_its_target_lane(
+    track: Track, speed_mps: float, lane: int
 ) -> None:
-    track.put_ahead(40.0, speed_mps)
+    track.command(hold_cell=(0, lane))
+    track.put_ahead(40.0, speed_mps, lane)
     gaps = [track.gap_m for _ in range(300) if track.step()]
     assert min(gaps) > SCENARIO.tracking.min_gap_m - 0.1
     assert track.plant.state[1] == pytest.approx(speed_mps, abs=0.1)
@@ -120,14 +112,6 @@ def test_vehicles_on_other_lanes_are_not_in_its_way(track: Track) -> None:
         track.put_ahead(40.0, 0.0, lane)
         assert set(track.run(60)) == {Rung.HOLD}
         assert track.gap_m < -20.0
-
-
-def test_a_vehicle_on_the_target_lane_is_in_its_way(track: Track) -> None:
-    track.command(hold_cell=(0, 2))
-    track.put_ahead(40.0, 0.0, lane=2)
-    gaps = [track.gap_m for _ in range(200) if track.step()]
-    assert min(gaps) > SCENARIO.tracking.min_gap_m - 0.1
-    assert track.controller.rung_ticks[Rung.EMERGENCY] == 0
 
 
 # --- emergencies ----------------------------------------------------------------------------------
@@ -146,15 +130,16 @@ def test_an_emergency_overrides_the_command(track: Track) -> None:
     assert track.gap_m > 0.2
 
 
-def test_an_emergency_ends_in_a_hold_and_an_interrupted_trajectory_is_not_taken_up_again(
-    track: Track,
-) -> None:
-    track.command(*[(0.0, 0.0)] * 40)
+def test_an_emergency_ends_in_a_hold_and_only_a_fresh_command_leads_back_up(track: Track) -> None:
+    track.command(*[(0.0, 0.0)] * 60)
     track.put_ahead(9.0, 8.0)
-    rungs = track.run(2)
-    assert rungs[-1] is Rung.EMERGENCY
+    assert track.run(2)[-1] is Rung.EMERGENCY
     track.rear_m = np.inf
     assert track.run(30) == [Rung.HOLD] * 30  # the trajectory would have gone on all the time
+    track.command(hold_cell=HOME)  # it has nothing to play
+    assert track.step() is Rung.HOLD
+    track.command(*[(1.0, 0.0)] * 3)
+    assert track.run(4) == [Rung.PLAY] * 3 + [Rung.HOLD]
 
 
 def test_after_an_emergency_it_gives_way_behind_a_slow_vehicle(track: Track) -> None:
@@ -169,18 +154,6 @@ def test_after_an_emergency_it_gives_way_behind_a_slow_vehicle(track: Track) -> 
     assert order[-1] is Rung.GIVE_WAY
     assert track.plant.state[1] == pytest.approx(6.0, abs=0.3)
     assert track.gap_m > 1.0
-
-
-def test_only_a_fresh_command_leads_back_up(track: Track) -> None:
-    track.command(*[(0.0, 0.0)] * 40)
-    track.put_ahead(9.0, 8.0)
-    track.run(2)
-    track.rear_m = np.inf
-    assert track.step() is Rung.HOLD
-    track.command(hold_cell=HOME)  # it has nothing to play
-    assert track.step() is Rung.HOLD
-    track.command(*[(1.0, 0.0)] * 3)
-    assert track.run(4) == [Rung.PLAY] * 3 + [Rung.HOLD]
 
 
 def test_a_fresh_command_does_not_end_an_emergency(track: Track) -> None:
@@ -248,7 +221,7 @@ def test_it_steers_on_while_it_brakes(track: Track) -> None:
 # --- what it measures -----------------------------------------------------------------------------
 
 
-def test_it_drives_by_what_its_sensors_measure() -> None:
+def test_it_drives_by_what_its_sensors_measure_in_this_tick() -> None:
     track = Track()
     s, *rest = track.plant.state
     track.controller.perceive((s - 2.0, *rest), NONE_AROUND)  # type: ignore[arg-type]
@@ -256,11 +229,4 @@ def test_it_drives_by_what_its_sensors_measure() -> None:
     assert track.controller.moving(0)
     track.controller.step(0)
     assert track.plant.setpoint[0] > 0.1
-
-
-def test_a_measurement_is_of_one_tick_only() -> None:
-    track = Track()
-    s, *rest = track.plant.state
-    track.controller.perceive((s - 2.0, *rest), NONE_AROUND)  # type: ignore[arg-type]
-    track.controller.step(0)
     assert track.controller.measured == track.plant.state
