@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from attrs import frozen
 
-from laneweave.protocol.lattice import Cell
+from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.runtime.node import Send
 from laneweave.protocol.scenario.tables import FormationSettings, Scenario
 from laneweave.protocol.wire.messages import (
@@ -21,7 +21,7 @@ from laneweave.protocol.wire.messages import (
     VehicleState,
 )
 from laneweave.protocol.wire.topics import CENSUS, CLOCK, HEARTBEAT, PLAN, STATE
-from support.states import holding
+from support.states import holding, make_plan
 
 BALLOT = Ballot(3, Name("c1"), 17, 5)
 ROLLING = Scenario(formation=FormationSettings(operation="rolling"))
@@ -106,18 +106,9 @@ class Convoy:
 
     def plan(self, tick: int) -> Plan:
         """Return a plan in which every tenth vehicle moves a column ahead."""
-        movers = {name: self.cell(number) for number, name in enumerate(self.names)}
-        return Plan(
-            ballot=BALLOT,
-            formations=(0,),
-            roster=tuple(self.names),
-            incarnations=dict.fromkeys(self.names, 1),
-            start_cells=movers,
-            moves={
-                name: ((0, cell, (cell[0] + 1, cell[1])),)
-                for name, cell in list(movers.items())[::10]
-            },
-            t0_s=tick * self.scenario.runtime.tick_s,
-            slot_s=4.0,
-            territory=(),
-        )
+        cells = {name: self.cell(number) for number, name in enumerate(self.names)}
+        moves: dict[Name, tuple[PlannedMove, ...]] = {
+            name: ((0, cell, (cell[0] + 1, cell[1])),) for name, cell in list(cells.items())[::10]
+        }
+        t0_s = tick * self.scenario.runtime.tick_s
+        return make_plan(cells, moves, ballot=BALLOT, t0_s=t0_s, territory=())

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from math import inf
+from typing import Any
 
 import numpy as np
 from attrs import define, field, frozen
@@ -23,10 +24,9 @@ from laneweave.protocol.wire.messages import Command, Motion, Name
 from laneweave.sim_bridge.bodies.motion_controller import Rung
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, Pose, pose_of
 from laneweave.sim_bridge.bodies.plant import Plant
-from laneweave.sim_bridge.road.demand import Arrival
-from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from support.paper import paper
+from support.road_vehicles import vehicle_in
 
 Array = NDArray[np.float64]
 
@@ -86,8 +86,7 @@ class Road:
         """Vehicles that brake past the jerk limit, or have not recovered from that."""
         self.driven: dict[Name, Driven] = {}
         for name, cell in cells.items():
-            admission = Admission(Arrival(name, cell[1], cell[1], 0.0), cell, 0.0)
-            vehicle = RoadVehicle.entering(admission, 0.0, scenario)
+            vehicle = vehicle_in(cell, name, scenario, exact=False)
             self.driven[vehicle.name] = Driven(vehicle, TrackingDriver(scenario), cell)
         self.vehicles = {name: one.vehicle for name, one in self.driven.items()}
         self._show()
@@ -206,9 +205,14 @@ class LimitUse:
     violations: int
     """Vehicle ticks with an excess."""
 
-    def __add__(self, other: LimitUse) -> LimitUse:
-        """Return the use of both."""
-        return LimitUse(max(self.excess, other.excess), self.violations + other.violations)
+
+def limit_figures(uses: Sequence[Mapping[str, LimitUse]]) -> dict[str, dict[str, Any]]:
+    """Return violations and the largest excess (None: nothing counted) of several runs by limit."""
+    excess = {name: max(use[name].excess for use in uses) for name in uses[0]}
+    return {
+        "violations": {name: sum(use[name].violations for use in uses) for name in uses[0]},
+        "excess": {name: most if most > -inf else None for name, most in excess.items()},
+    }
 
 
 def limit_use(

@@ -12,7 +12,7 @@ diagonally from two cells. Sometimes a third vehicle holds one cell behind the s
 from __future__ import annotations
 
 from collections.abc import Iterable
-from math import inf, isfinite
+from math import isfinite
 from random import Random
 from typing import Any
 
@@ -22,7 +22,7 @@ from attrs import frozen
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.wire.messages import Name
-from support.driving import LimitUse, Road, limit_use, road_scenario
+from support.driving import LimitUse, Road, limit_figures, limit_use, road_scenario
 
 KINDS = ("holding", "closing", "lane-entry")
 STANDING_MPS = 0.1
@@ -177,9 +177,6 @@ def summary(outcomes: Iterable[EmergencyResult]) -> dict[str, Any]:
     impacts = [one for one in outcomes if one.impact]
     gaps = [one.least_gap_m for one in outcomes if isfinite(one.least_gap_m)]
     closest = min(outcomes, key=lambda one: one.least_gap_m)
-    limits = outcomes[0].limits
-    for one in outcomes[1:]:
-        limits = {name: use + one.limits[name] for name, use in limits.items()}
     return {
         "situations": len(outcomes),
         "impacts": len(impacts),
@@ -195,8 +192,7 @@ def summary(outcomes: Iterable[EmergencyResult]) -> dict[str, Any]:
         "never_in_line": len(outcomes) - len(gaps),
         "standing": sum(one.standing for one in outcomes),
         "braked_situations": sum(one.braked > 0 for one in outcomes),
-        "violations": {name: use.violations for name, use in limits.items()},
-        "excess": {name: use.excess if use.excess > -inf else None for name, use in limits.items()},
+        **limit_figures([one.limits for one in outcomes]),
     }
 
 

@@ -37,13 +37,14 @@ def vehicle_in(
     name: str = "A",
     scenario: Scenario = PAPER,
     *,
-    preferred_lane: int = 0,
+    exact: bool = True,
     controller: MotionController | None = None,
 ) -> RoadVehicle:
-    """Return a vehicle with exact sensors that entered a cell at road time 0."""
-    admission = Admission(Arrival(name, cell[1], preferred_lane, 0.0), cell, 0.0)
+    """Return a vehicle that entered a cell at road time 0, by default with exact sensors."""
+    admission = Admission(Arrival(name, cell[1], cell[1], 0.0), cell, 0.0)
     vehicle = RoadVehicle.entering(admission, 0.0, scenario)
-    vehicle.sensors = None
+    if exact:
+        vehicle.sensors = None
     if controller is not None:
         vehicle.controller = controller
     return vehicle

@@ -19,7 +19,6 @@ from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.scenario.tables import FormationSettings, Scenario
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.vehicle.execution import VEHICLE_RULES, PlanExecution
-from laneweave.protocol.vehicle.motion import cell_state
 from laneweave.protocol.wire.messages import (
     Ballot,
     Command,
@@ -30,7 +29,7 @@ from laneweave.protocol.wire.messages import (
     VehicleState,
 )
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
-from laneweave.sim_bridge.bodies.plant import Plant
+from support.road_vehicles import controller_in
 
 ROLLING = Scenario(formation=FormationSettings(operation="rolling"))
 LATTICE, TICK_S = ROLLING.lattice, ROLLING.runtime.tick_s
@@ -51,8 +50,7 @@ ESTATES: dict[str, tuple[Cell, ...]] = {
 def controller_of(cells: Iterable[Cell]) -> MotionController:
     """Return the controller of a vehicle that owns cells and holds in the first one."""
     first, *others = cells
-    plant = Plant(cell_state(LATTICE, first, 0.0), ROLLING.vehicle, TICK_S)
-    controller = MotionController(plant, ROLLING, first)
+    controller = controller_in(first, ROLLING)
     for cell in (first, *others):
         controller.assign_cell(cell)
     return controller

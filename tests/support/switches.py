@@ -20,8 +20,16 @@ from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.plans import plan_problems
-from laneweave.protocol.wire.messages import Ballot, Name, Plan
-from support.driving import LimitUse, Road, lattice_errors_m, limit_use, road_scenario
+from laneweave.protocol.wire.messages import Name
+from support.driving import (
+    LimitUse,
+    Road,
+    lattice_errors_m,
+    limit_figures,
+    limit_use,
+    road_scenario,
+)
+from support.states import make_plan
 
 WITHIN_ALONG_M = 0.2
 WITHIN_ACROSS_M = 0.1
@@ -136,24 +144,13 @@ def _request(rng: Random, scenario: Scenario, names: tuple[Name, ...], grid: Gri
 def _legal(switch: Switch) -> Switch:
     """Return a switch that vehicles would accept as a PLAN."""
     by_step = [switch.begins(step) for step in range(switch.steps)]
-    problems = plan_problems(
-        Plan(
-            ballot=Ballot(1, Name("c1"), 1, 1),
-            formations=(0,),
-            roster=switch.names,
-            incarnations=dict.fromkeys(switch.names, 1),
-            start_cells={name: path[0] for name, path in _paths(switch)},
-            moves={name: tuple(b[name] for b in by_step if name in b) for name in switch.names},
-            t0_s=_LEAD_S,
-            slot_s=switch.scenario.cycles_s[0],
-            territory=tuple(
-                (column, lane)
-                for column in range(COLUMNS[1])
-                for lane in range(switch.scenario.road.lanes)
-            ),
-        )
+    plan = make_plan(
+        {name: path[0] for name, path in _paths(switch)},
+        {name: tuple(b[name] for b in by_step if name in b) for name in switch.names},
+        t0_s=_LEAD_S,
+        slot_s=switch.scenario.cycles_s[0],
     )
-    if problems:
+    if problems := plan_problems(plan):
         raise RuntimeError("an illegal plan: " + "; ".join(problems))
     return switch
 
@@ -218,9 +215,6 @@ def summary(results: Iterable[SwitchResult]) -> dict[str, Any]:
     # A switch from a formation into itself has no points.
     errors = np.array([error for one in results for error in one.errors_m]).reshape(-1, 2)
     within = (errors[:, 0] <= WITHIN_ALONG_M) & (errors[:, 1] <= WITHIN_ACROSS_M)
-    limits = results[0].limits
-    for one in results[1:]:
-        limits = {name: use + one.limits[name] for name, use in limits.items()}
     worst = max(results, key=lambda one: max((max(e) for e in one.errors_m), default=0.0))
     closest = min(results, key=lambda one: one.least_gap_m)
     return {
@@ -238,8 +232,7 @@ def summary(results: Iterable[SwitchResult]) -> dict[str, Any]:
         "least_gap_m": closest.least_gap_m,
         "closest_switch": closest.index,
         "overlaps": sum(one.overlaps for one in results),
-        "violations": {name: use.violations for name, use in limits.items()},
-        "excess": {name: use.excess for name, use in limits.items()},
+        **limit_figures([one.limits for one in results]),
         "braked": sum(one.braked for one in results),
         "late": sum(one.late for one in results),
         "unusable": sum(one.unusable for one in results),

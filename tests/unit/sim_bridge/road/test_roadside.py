@@ -109,17 +109,17 @@ def test_every_vehicle_is_announced_before_entering_and_never_too_many_at_once(
     assert watch.most_announced == per_lane * lattice.lanes
 
 
-@pytest.mark.parametrize("announce_s", [0.0, 2.0])
-def test_long_ticks_change_nothing(announce_s: float) -> None:
-    data = LONG_TICKS | {"runtime": {"tick_s": 1.0, "announce_s": announce_s}}
+@pytest.mark.parametrize(
+    "data",
+    [
+        *(AWKWARD | {"seed": seed} for seed in range(3)),
+        *(LONG_TICKS | {"runtime": {"tick_s": 1.0, "announce_s": at_s}} for at_s in (0.0, 2.0)),
+    ],
+)
+def test_demand_is_counted_before_the_entry_however_awkward_or_long_the_ticks(
+    data: dict[str, Any],
+) -> None:
     watch = Watch(structure(data, Scenario))
-    watch.run()
-    assert len(watch.entered) > 300
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_demand_is_counted_before_the_entry_however_awkward_the_ticks(seed: int) -> None:
-    watch = Watch(parse_scenario(AWKWARD | {"seed": seed}))
     watch.run()
     assert len(watch.entered) > 300
 

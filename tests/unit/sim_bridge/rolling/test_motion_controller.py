@@ -9,18 +9,21 @@ from attrs import evolve
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import Ballot, Command, Deed, Name, Prepare
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
 from laneweave.sim_bridge.road.attendance import Caretaker
-from laneweave.sim_bridge.road.demand import Arrival
-from laneweave.sim_bridge.road.entry import Admission
-from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from support.road_vehicles import controller_in, vehicle_in
 from support.rolling_road import controller_of
 from support.rolling_samples import AFTER, BEFORE, HIGH, HOME, LOW, MID, A, B, deed_of, make_plan
 
 AGENT = 7
+
+
+@pytest.fixture
+def controller() -> MotionController:
+    """The controller of A, whose agent is in charge."""
+    return make_controller()
 
 
 def make_controller() -> MotionController:
@@ -54,13 +57,8 @@ def kept(controller: MotionController) -> tuple[object, ...]:
     return controller.promised, controller.accepted, deed, frozenset(controller.owned)
 
 
-def test_an_estate_is_what_the_roadside_gave() -> None:
-    controller = make_controller()
+def test_orders_one_after_the_other(controller: MotionController) -> None:
     assert kept(controller) == (None, None, None, frozenset(BEFORE[A]))
-
-
-def test_orders_one_after_the_other() -> None:
-    controller = make_controller()
     assert controller.note(PROMISE)
     assert not controller.note(PROMISE)
     assert controller.note(ACCEPTANCE)
@@ -71,23 +69,14 @@ def test_orders_one_after_the_other() -> None:
     assert kept(controller) == (MID, MID, OPEN, frozenset(AFTER[A]))
 
 
-def test_a_deed_of_less_than_was_promised_is_not_drawn_up() -> None:
-    controller = make_controller()
-    controller.note(order(HIGH))
-    controller.note(ACCEPTANCE)
-    assert kept(controller) == (HIGH, None, None, frozenset(BEFORE[A]))
-
-
-def test_without_its_deed_a_plan_is_not_accepted() -> None:
-    controller = make_controller()
+def test_without_its_deed_a_plan_is_not_accepted(controller: MotionController) -> None:
     controller.note(order(MID, None, MID))
     assert controller.accepted is None
     controller.note(order(MID, deed_of(A, LOW), MID))
     assert (controller.accepted, controller.transfer) == (None, None)
 
 
-def test_only_the_newest_deed_can_be_opened() -> None:
-    controller = make_controller()
+def test_only_the_newest_deed_can_be_opened(controller: MotionController) -> None:
     controller.note(ACCEPTANCE)
     newer = Deed(HIGH, BEFORE[A], BEFORE[A], (A,))
     controller.note(order(HIGH, newer, HIGH))
@@ -96,17 +85,21 @@ def test_only_the_newest_deed_can_be_opened() -> None:
     assert set(controller.owned) == set(BEFORE[A])
 
 
-def test_a_promise_binds_the_next_process() -> None:
-    controller = make_controller()
+@pytest.mark.parametrize("process", [AGENT, AGENT + 1])
+def test_a_promise_binds_this_process_and_the_next(
+    controller: MotionController, process: int
+) -> None:
+    """No deed of less than was promised is drawn up."""
     controller.note(order(HIGH))
-    controller.put_in_charge(AGENT + 1)
-    assert (controller.promised, controller.accepted) == (HIGH, None)
-    controller.note(evolve(ACCEPTANCE, incarnation=AGENT + 1))
-    assert (controller.promised, controller.transfer) == (HIGH, None)
+    if process != AGENT:
+        controller.put_in_charge(process)
+    controller.note(evolve(ACCEPTANCE, incarnation=process))
+    assert kept(controller) == (HIGH, None, None, frozenset(BEFORE[A]))
 
 
-def test_a_deed_outlives_the_process_and_its_acceptance_does_not() -> None:
-    controller = make_controller()
+def test_a_deed_outlives_the_process_and_its_acceptance_does_not(
+    controller: MotionController,
+) -> None:
     controller.note(ACCEPTANCE)
     controller.put_in_charge(AGENT + 1)
     assert kept(controller) == (MID, None, deed_of(A), frozenset(BEFORE[A]))
@@ -115,10 +108,7 @@ def test_a_deed_outlives_the_process_and_its_acceptance_does_not() -> None:
 
 
 def test_where_formations_own_blocks_acceptance_needs_no_deed() -> None:
-    admission = Admission(Arrival("A", 0, 0, 0.0), HOME, 0.0)
-    paper = parse_scenario({"formation": {"operation": "paper"}})
-    controller = RoadVehicle.entering(admission, 0.0, paper).controller
-    controller.put_in_charge(AGENT)
+    controller = controller_in(HOME, attendant=AGENT)
     controller.note(order(accepted=MID))
     assert (controller.accepted, controller.owned) == (MID, ())
 
@@ -211,15 +201,15 @@ GIVEN: Cell = (-1, 0)
 
 
 @pytest.mark.parametrize("when", range(4))
-def test_a_cell_that_comes_at_any_time_is_kept(when: int) -> None:
-    """The plan was made before anybody knew of it."""
-    controller = make_controller()
-    for step, each in enumerate((PROMISE, ACCEPTANCE, POSSESSION)):
+def test_a_cell_that_comes_at_any_time_is_kept(controller: MotionController, when: int) -> None:
+    """The plan was made before the cell was assigned; a closed deed has it on both sides."""
+    for step, each in enumerate((PROMISE, ACCEPTANCE, POSSESSION, POSSESSION)):
         if when == step:
             controller.assign_cell(GIVEN)
+            if (deed := controller.transfer) is not None and not deed.open:
+                assert GIVEN in deed.before
+                assert GIVEN in deed.after
         controller.note(each)
-    if when == 3:
-        controller.assign_cell(GIVEN)
     assert set(controller.owned) == {*AFTER[A], GIVEN}
 
 
@@ -239,29 +229,12 @@ def test_a_cell_that_a_plan_knew_is_not_kept_by_force(when: int, *, opened: bool
     assert GIVEN not in controller.owned
 
 
-def test_a_closed_deed_shows_the_cell_on_both_sides() -> None:
-    controller = make_controller()
-    controller.note(ACCEPTANCE)
-    controller.assign_cell(GIVEN)
-    deed = controller.transfer
-    assert deed is not None
-    assert GIVEN in deed.before
-    assert GIVEN in deed.after
-
-
 # --- the caretaker ----------------------------------------------------------------------------
-
-
-def make_caretaker(controller: MotionController) -> Caretaker:
-    admission = Admission(Arrival("A", 0, 0, 0.0), HOME, 0.0)
-    return Caretaker(RoadVehicle(A, admission, controller), AGENT + 1, 0)
 
 
 def test_the_caretaker_hands_cells_over_and_moves_nothing() -> None:
     controller = controller_of(BEFORE[B][::-1])
-    admission = Admission(Arrival("B", 1, 0, 0.0), (2, 1), 0.0)
-    vehicle = RoadVehicle(B, admission, controller)
-    caretaker = Caretaker(vehicle, AGENT, 0)
+    caretaker = Caretaker(vehicle_in((2, 1), B, controller=controller), AGENT, 0)
     plan = make_plan()
     state = caretaker.on_message(Prepare(MID, (), (A, B)), 0)
     assert state is not None
@@ -273,9 +246,7 @@ def test_the_caretaker_hands_cells_over_and_moves_nothing() -> None:
     assert controller.accepted == MID
 
 
-def test_the_caretaker_is_bound_by_what_the_agent_promised() -> None:
-    controller = make_controller()
+def test_the_caretaker_is_bound_by_what_the_agent_promised(controller: MotionController) -> None:
     controller.note(order(HIGH))
-    caretaker = make_caretaker(controller)
-    shown = caretaker.state(0)
+    shown = Caretaker(vehicle_in(HOME, A, controller=controller), AGENT + 1, 0).state(0)
     assert (shown.promised, shown.estate) == (HIGH, tuple(sorted(BEFORE[A])))

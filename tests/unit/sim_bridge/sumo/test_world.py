@@ -34,6 +34,12 @@ def cruising(s_m: float, y_m: float, v_y_mps: float = 0.0) -> State:
     return (s_m, 15.0, 0.0, y_m, v_y_mps, 0.0)
 
 
+def add(world: SumoWorld, states: dict[str, State]) -> None:
+    for vehicle, state in states.items():
+        world.add(vehicle, state)
+    world.step()
+
+
 def assert_exact(world: SumoWorld, states: dict[str, State]) -> None:
     shown = world.positions()
     assert set(shown) == set(states)
@@ -44,9 +50,7 @@ def assert_exact(world: SumoWorld, states: dict[str, State]) -> None:
 def test_the_whole_road_and_every_lateral_position_are_exact(world: SumoWorld) -> None:
     borders = [0.9, 1.75, 3.5, 3.5 - 1e-9, 3.5 + 1e-9, 5.25, 7.0, 8.75, 9.6]
     states = {f"v{n}": cruising(0.0, y) for n, y in enumerate(borders)}
-    for vehicle, state in states.items():
-        world.add(vehicle, state)
-    world.step()
+    add(world, states)
     assert_exact(world, states)
     for s_m in [*np.arange(0.0, 1000.0, 7.3), 999.999, 1000.0, 1002.5, 1030.0]:
         for n, (vehicle, (_, _, _, y_m, _, _)) in enumerate(list(states.items())):
@@ -97,36 +101,26 @@ def test_a_vehicle_that_is_not_placed_stays(world: SumoWorld) -> None:
         assert world.positions()["v1"] == pytest.approx((100.0, 1.75, 0.0, 15.0), abs=1e-6)
 
 
-def test_a_vehicle_is_shown_from_the_step_after_its_addition(world: SumoWorld) -> None:
-    assert world.positions() == {}
-    world.add("v1", cruising(0.7, 1.75))
-    assert world.positions() == {}
-    world.step()
-    assert list(world.positions()) == ["v1"]
-
-
-def test_a_name_can_be_used_again(world: SumoWorld) -> None:
-    for s_m in (10.0, 20.0):
+def test_a_vehicle_is_shown_from_the_step_after_its_addition_to_its_removal(
+    world: SumoWorld,
+) -> None:
+    for s_m in (10.0, 20.0):  # a name can be used again
         world.add("v1", cruising(s_m, 1.75))
+        assert world.positions() == {}
         world.step()
         assert world.positions()["v1"][0] == pytest.approx(s_m)
         world.remove("v1")
         assert world.positions() == {}
         world.step()
-
-
-def test_addition_and_removal_within_one_tick(world: SumoWorld) -> None:
     world.add("v1", cruising(10.0, 1.75))
-    world.remove("v1")
+    world.remove("v1")  # within one tick
     world.step()
     assert world.positions() == {}
 
 
 def test_sumo_reports_a_collision_and_leaves_the_vehicles_where_they_are(world: SumoWorld) -> None:
     states = {"b": cruising(100.0, 1.75), "a": cruising(103.0, 1.75), "c": cruising(120.0, 1.75)}
-    for vehicle, state in states.items():
-        world.add(vehicle, state)
-    world.step()
+    add(world, states)
     for _ in range(3):
         states = {v: (s + 1.5, *rest) for v, (s, *rest) in states.items()}  # type: ignore[misc]
         for vehicle, state in states.items():
@@ -169,9 +163,7 @@ def test_odd_roads_are_exact(tmp_path: Path) -> None:
         states = {
             f"v{lane}": cruising(160.0 * lane + 0.123, (lane + 0.5) * 3.1, 0.3) for lane in range(5)
         }
-        for vehicle, state in states.items():
-            world.add(vehicle, state)
-        world.step()
+        add(world, states)
         assert_exact(world, states)
 
 
