@@ -166,6 +166,7 @@ INERT = [
     ("formation.max_nodes", 'operation = "rolling"\nmax_nodes = 10'),
     ("formation.block_columns", 'operation = "rolling"\nclose = "columns"\nblock_columns = 4'),
     ("formation.block_columns", "block_columns = 4"),
+    ("formation.join", 'join = "room"'),
     ("formation.max_columns", 'close = "columns"\nmax_columns = 7'),
     ("formation.max_columns", 'operation = "paper"\nmax_columns = 7'),
 ]
