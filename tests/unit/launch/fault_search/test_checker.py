@@ -2,36 +2,27 @@
 
 from __future__ import annotations
 
-import attrs
+from itertools import pairwise
+
 import pytest
 
 from laneweave.launch.fault_search.bodies import Geometry
-from laneweave.launch.fault_search.checker import MAX_VIOLATIONS, Checker, Violation
-from laneweave.protocol.lattice import Cell, PlannedMove
-from laneweave.protocol.wire.messages import Ballot, Name, Plan, Sense, VehicleState
-from support.states import holding
+from laneweave.launch.fault_search.checker import MAX_VIOLATIONS, Checker
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.wire.messages import Ballot, Name, Sense, VehicleState
+from support.states import holding, make_plan
 
 GEOMETRY = Geometry(pitch_m=15.0, lane_width_m=3.5, length_m=5.0, width_m=1.8)
 A, B, C = Name("a"), Name("b"), Name("c")
 MOVE_S = 0.8
 
+Paths = dict[Name, tuple[Cell, ...]]
+Motion = tuple[float, Name, int, Cell]
+"""Time, vehicle, number of the plan, target."""
+
 
 def ballot(seq: int) -> Ballot:
     return Ballot(1, Name("c1"), 1, seq)
-
-
-def plan(seq: int, moves: dict[Name, tuple[PlannedMove, ...]]) -> Plan:
-    return Plan(
-        ballot=ballot(seq),
-        formations=(0,),
-        roster=tuple(moves),
-        incarnations=dict.fromkeys(moves, 1),
-        start_cells={},
-        moves=moves,
-        t0_s=0.0,
-        slot_s=1.0,
-        territory=(),
-    )
 
 
 def state(vehicle: Name, seq: int | None, hold_cell: Cell = (0, 0), **more: object) -> VehicleState:
@@ -45,21 +36,30 @@ def sense(attendant: int, joined: tuple[int, ...] = (0,)) -> Sense:
 
 
 class Scene:
-    """A road with vehicles whose agents do as plans say."""
+    """A road with vehicles whose agents execute plans."""
 
-    def __init__(self, **cells: Cell) -> None:
-        """Put vehicles in cells."""
+    def __init__(self, *plans: Paths) -> None:
+        """Put vehicles in the first cells of their paths, and send the plans."""
         self.checker = Checker(GEOMETRY)
-        self.cells = {Name(name): cell for name, cell in cells.items()}
+        self.cells: dict[Name, Cell] = {}
+        for paths in plans:
+            self.cells = {name: path[0] for name, path in paths.items()} | self.cells
         for name, cell in self.cells.items():
             self.checker.enter(0.0, name, cell)
             self.checker.sent(0.0, state(name, None, cell))
+        for seq, paths in enumerate(plans, start=1):
+            self.issue(seq, paths)
 
-    def issue(self, t_s: float, seq: int, **moves: tuple[PlannedMove, ...]) -> None:
-        self.checker.sent(t_s, plan(seq, {Name(name): each for name, each in moves.items()}))
+    def issue(self, seq: int, paths: Paths) -> None:
+        moves = {
+            name: tuple((step, *move) for step, move in enumerate(pairwise(path)))
+            for name, path in paths.items()
+        }
+        cells = {name: path[0] for name, path in paths.items()}
+        self.checker.sent(0.0, make_plan(cells, moves, ballot=ballot(seq)))
 
     def move(self, t_s: float, name: Name, seq: int, target: Cell, lasts_s: float = MOVE_S) -> None:
-        """Let an agent say that it moves under a ballot, and let the body do so."""
+        """Let an agent publish that it moves under a ballot, and move the body."""
         self.checker.sent(t_s, state(name, seq, target, accepted=True, moving=True, go=True))
         self.checker.begin(t_s, name, 1, (self.cells[name], target), lasts_s)
         self.cells[name] = target
@@ -69,48 +69,99 @@ class Scene:
         return [violation.kind for violation in self.checker.violations]
 
 
-def test_a_plan_that_is_executed_in_order_is_fine() -> None:
-    scene = Scene(a=(0, 0), b=(1, 0))
-    scene.issue(0.0, 1, a=((1, (0, 0), (1, 0)),), b=((0, (1, 0), (1, 1)),))
-    scene.move(1.0, B, 1, (1, 1))
-    scene.move(1.9, A, 1, (1, 0))
+FOLLOWING: Paths = {A: ((0, 0), (1, 0)), B: ((1, 0), (1, 1))}
+THERE_AND_BACK: Paths = {A: ((0, 0), (1, 0), (0, 0), (0, 1))}
+SHARED: tuple[Paths, Paths] = (
+    {A: ((0, 0), (0, 1), (0, 0)), B: ((4, 0), (4, 1))},
+    {B: ((4, 1), (4, 0)), C: ((8, 0), (8, 1))},
+)
+"""A and B share the first plan, B and C the second one."""
+
+
+@pytest.mark.parametrize(
+    ("plans", "motions", "kinds"),
+    [
+        pytest.param([FOLLOWING], [(1.0, B, 1, (1, 1)), (1.9, A, 1, (1, 0))], [], id="in order"),
+        pytest.param(
+            [FOLLOWING],
+            [(1.0, B, 1, (1, 1)), (1.5, A, 1, (1, 0))],
+            ["cell"],
+            id="a cell that is still occupied",
+        ),
+        pytest.param(
+            [{A: ((0, 0), (1, 0)), B: ((1, 0),)}],
+            [(1.0, A, 1, (1, 0))],
+            ["cell"],
+            id="a cell in which a vehicle holds",
+        ),
+        pytest.param(
+            [{A: ((0, 0), (1, 1)), B: ((1, 0),)}],
+            [(1.0, A, 1, (1, 1))],
+            ["cell"],
+            id="the corner of an oblique motion",
+        ),
+        pytest.param(
+            [THERE_AND_BACK], [(1.0, A, 1, (0, 1))], ["motion"], id="another lane than planned"
+        ),
+        pytest.param(
+            [THERE_AND_BACK], [(1.0, A, 1, (-1, 0))], ["motion"], id="another column than planned"
+        ),
+        pytest.param(
+            [THERE_AND_BACK],
+            [(1.0, A, 1, (1, 0)), (2.0, A, 1, (0, 0)), (3.0, A, 1, (1, 0))],
+            ["motion"],
+            id="a motion out of order",
+        ),
+        pytest.param(
+            [{A: ((0, 0), (1, 0), (1, 1))}],
+            [(1.0, A, 1, (1, 0)), (1.4, A, 1, (1, 1))],
+            ["motion"],
+            id="a motion before the last one has ended",
+        ),
+        pytest.param(
+            SHARED,
+            [(1.0, A, 1, (0, 1)), (1.0, B, 1, (4, 1)), (1.9, C, 2, (8, 1)), (3.0, B, 2, (4, 0))],
+            [],
+            id="plans one after the other",
+        ),
+        pytest.param(
+            SHARED,
+            [(1.0, A, 1, (0, 1)), (1.5, C, 2, (8, 1))],
+            ["interleaved"],
+            id="a plan that begins during a motion of another one",
+        ),
+        pytest.param(
+            SHARED,
+            [(1.0, A, 1, (0, 1)), (2.0, C, 2, (8, 1)), (3.0, A, 1, (0, 0))],
+            ["interleaved"],
+            id="a plan that continues after another one has begun",
+        ),
+        pytest.param(
+            [{A: ((0, 0), (0, 1), (0, 0))}, {B: ((4, 0), (4, 1))}],
+            [(1.0, A, 1, (0, 1)), (1.5, B, 2, (4, 1)), (2.0, A, 1, (0, 0))],
+            [],
+            id="plans without a common vehicle at the same time",
+        ),
+    ],
+)
+def test_motions(plans: list[Paths], motions: list[Motion], kinds: list[str]) -> None:
+    scene = Scene(*plans)
+    for motion in motions:
+        scene.move(*motion)
     scene.checker.advance(5.0)
-    assert scene.checker.violations == []
-    assert scene.checker.motions == 2
+    assert [kind for kind in scene.kinds if kind != "overlap"] == kinds
+    assert kinds or "overlap" not in scene.kinds
+    assert scene.checker.motions == len(motions)
 
 
-def test_a_cell_that_is_still_occupied_is_seen() -> None:
-    scene = Scene(a=(0, 0), b=(1, 0))
-    scene.issue(0.0, 1, a=((1, (0, 0), (1, 0)),), b=((0, (1, 0), (1, 1)),))
-    scene.move(1.0, B, 1, (1, 1))
-    scene.move(1.5, A, 1, (1, 0))
-    assert scene.kinds == ["cell"]
-    assert set(scene.checker.violations[0].vehicles) == {A, B}
-
-
-def test_a_cell_that_another_vehicle_holds_is_seen() -> None:
-    scene = Scene(a=(0, 0), b=(1, 0))
-    scene.issue(0.0, 1, a=((0, (0, 0), (1, 0)),), b=())
-    scene.move(1.0, A, 1, (1, 0))
-    assert scene.kinds == ["cell"]
-
-
-def test_the_corners_of_an_oblique_motion_are_occupied() -> None:
-    scene = Scene(a=(0, 0), b=(1, 0))
-    scene.issue(0.0, 1, a=((0, (0, 0), (1, 1)),), b=())
-    scene.move(1.0, A, 1, (1, 1))
-    assert scene.kinds == ["cell"]
-
-
-def test_an_entry_into_an_occupied_cell_is_seen() -> None:
-    scene = Scene(a=(0, 0))
+def test_an_entry_into_an_occupied_cell_is_reported() -> None:
+    scene = Scene({A: ((0, 0),)})
     scene.checker.enter(1.0, B, (0, 0))
     assert scene.kinds == ["cell"]
 
 
-def test_bodies_that_overlap_are_seen_at_the_time_at_which_they_touch() -> None:
-    scene = Scene(a=(0, 0), b=(1, 0))
-    scene.issue(0.0, 1, a=((0, (0, 0), (1, 0)),), b=())
+def test_an_overlap_is_reported_with_the_time_of_contact() -> None:
+    scene = Scene({A: ((0, 0), (1, 0)), B: ((1, 0),)})
     scene.move(1.0, A, 1, (1, 0), lasts_s=1.5)
     scene.checker.advance(1.5)
     assert "overlap" not in scene.kinds
@@ -120,103 +171,33 @@ def test_bodies_that_overlap_are_seen_at_the_time_at_which_they_touch() -> None:
     assert overlap.t_s == pytest.approx(2.0)  # 10 m of net gap at 10 m/s
 
 
-def test_a_vehicle_that_has_left_blocks_no_cell() -> None:
-    scene = Scene(a=(0, 0), b=(1, 0))
-    scene.issue(0.0, 1, a=((0, (0, 0), (1, 0)),), b=())
+def test_a_vehicle_that_has_left_frees_its_cell() -> None:
+    scene = Scene({A: ((0, 0), (1, 0)), B: ((1, 0),)})
     scene.checker.leave(0.5, B)
     scene.move(1.0, A, 1, (1, 0))
     scene.checker.advance(3.0)
     assert scene.kinds == []
 
 
-def test_a_motion_without_a_plan_is_seen() -> None:
-    scene = Scene(a=(0, 0))
+def test_a_motion_without_a_plan_is_reported() -> None:
+    scene = Scene()
+    scene.checker.enter(0.0, A, (0, 0))
     scene.checker.begin(1.0, A, 1, ((0, 0), (1, 0)), MOVE_S)
     assert scene.kinds == ["motion"]
 
 
-def test_a_motion_of_a_process_that_said_nothing_of_it_is_seen() -> None:
-    scene = Scene(a=(0, 0))
-    scene.issue(0.0, 1, a=((0, (0, 0), (1, 0)),))
+def test_a_motion_that_its_process_has_not_published_is_reported() -> None:
+    scene = Scene({A: ((0, 0), (1, 0))})
     scene.checker.sent(1.0, state(A, 1, (1, 0), accepted=True, moving=True))
     scene.checker.begin(1.0, A, 2, ((0, 0), (1, 0)), MOVE_S)
     assert scene.kinds == ["motion"]
 
 
-@pytest.mark.parametrize("target", [(0, 1), (-1, 0)])
-def test_a_motion_that_is_not_in_the_plan_is_seen(target: Cell) -> None:
-    scene = Scene(a=(0, 0))
-    scene.issue(0.0, 1, a=((0, (0, 0), (1, 0)),))
-    scene.move(1.0, A, 1, target)
-    assert scene.kinds == ["motion"]
-
-
-def test_a_motion_out_of_turn_is_seen() -> None:
-    scene = Scene(a=(0, 0))
-    scene.issue(0.0, 1, a=((0, (0, 0), (1, 0)), (1, (1, 0), (0, 0)), (2, (0, 0), (0, 1))))
-    scene.move(1.0, A, 1, (1, 0))
-    scene.move(2.0, A, 1, (0, 0))
-    scene.move(3.0, A, 1, (1, 0))
-    assert scene.kinds == ["motion"]
-
-
-def test_a_motion_that_turns_off_is_seen() -> None:
-    scene = Scene(a=(0, 0))
-    scene.issue(0.0, 1, a=((0, (0, 0), (1, 0)), (1, (1, 0), (1, 1))))
-    scene.move(1.0, A, 1, (1, 0))
-    scene.move(1.4, A, 1, (1, 1))
-    assert scene.kinds == ["motion"]
-
-
-def _two_plans(scene: Scene) -> None:
-    """A and B share the first plan, B and C the second one."""
-    scene.issue(0.0, 1, a=((0, (0, 0), (0, 1)), (1, (0, 1), (0, 0))), b=((0, (4, 0), (4, 1)),))
-    scene.issue(0.0, 2, b=((0, (4, 1), (4, 0)),), c=((0, (8, 0), (8, 1)),))
-
-
-def test_plans_one_after_the_other_are_fine() -> None:
-    scene = Scene(a=(0, 0), b=(4, 0), c=(8, 0))
-    _two_plans(scene)
-    scene.move(1.0, A, 1, (0, 1))
-    scene.move(1.0, B, 1, (4, 1))
-    scene.move(1.9, C, 2, (8, 1))
-    scene.move(3.0, B, 2, (4, 0))
+def test_a_second_plan_under_one_ballot_is_reported() -> None:
+    scene = Scene({A: ((0, 0), (0, 1))})
+    scene.issue(1, {A: ((0, 0), (0, 1))})
     assert scene.kinds == []
-
-
-def test_a_plan_that_begins_during_a_motion_of_another_one_is_seen() -> None:
-    scene = Scene(a=(0, 0), b=(4, 0), c=(8, 0))
-    _two_plans(scene)
-    scene.move(1.0, A, 1, (0, 1))
-    scene.move(1.5, C, 2, (8, 1))
-    assert scene.kinds == ["interleaved"]
-
-
-def test_a_plan_that_goes_on_after_another_one_has_begun_is_seen() -> None:
-    scene = Scene(a=(0, 0), b=(4, 0), c=(8, 0))
-    _two_plans(scene)
-    scene.move(1.0, A, 1, (0, 1))
-    scene.move(2.0, C, 2, (8, 1))
-    scene.move(3.0, A, 1, (0, 0))
-    assert scene.kinds == ["interleaved"]
-
-
-def test_plans_without_a_common_vehicle_may_run_at_once() -> None:
-    scene = Scene(a=(0, 0), b=(4, 0))
-    scene.issue(0.0, 1, a=((0, (0, 0), (0, 1)), (1, (0, 1), (0, 0))))
-    scene.issue(0.0, 2, b=((0, (4, 0), (4, 1)),))
-    scene.move(1.0, A, 1, (0, 1))
-    scene.move(1.5, B, 2, (4, 1))
-    scene.move(2.0, A, 1, (0, 0))
-    assert scene.kinds == []
-
-
-def test_a_second_plan_under_one_ballot_is_seen() -> None:
-    scene = Scene(a=(0, 0))
-    scene.issue(0.0, 1, a=((0, (0, 0), (0, 1)),))
-    scene.issue(0.2, 1, a=((0, (0, 0), (0, 1)),))
-    assert scene.kinds == []
-    scene.issue(0.4, 1, a=((0, (0, 0), (1, 0)),))
+    scene.issue(1, {A: ((0, 0), (1, 0))})
     assert scene.kinds == ["two-plans"]
 
 
@@ -234,7 +215,7 @@ def test_a_second_plan_under_one_ballot_is_seen() -> None:
         (sense(5, (0, 1)), sense(6, (0,))),
     ],
 )
-def test_what_is_taken_back_is_seen(before: object, after: object) -> None:
+def test_a_revocation_is_reported(before: object, after: object) -> None:
     checker = Checker(GEOMETRY)
     checker.sent(0.0, before)
     assert checker.violations == []
@@ -269,8 +250,3 @@ def test_violations_are_limited() -> None:
     for _ in range(2 * MAX_VIOLATIONS):
         checker.stuck(1.0, A, "")
     assert len(checker.violations) == MAX_VIOLATIONS
-
-
-def test_a_violation_is_data() -> None:
-    violation = Violation("cell", 1.0, (A, B), "both occupy [(0, 0)]")
-    assert attrs.asdict(violation)["vehicles"] == (A, B)
