@@ -66,31 +66,35 @@ def test_a_body_at_rest_is_done() -> None:
     assert body((3, 3)).done_s == 0.0
 
 
-def test_head_on_bodies_meet_where_their_bumpers_touch() -> None:
-    # 30 m apart at a closing speed of 30 m/s: 25 m remain to the other one's bumper.
-    at_s = overlap_between(body((0, 0), (1, 0)), body((2, 0), (1, 0)), 0.0, 1.0)
-    assert at_s == pytest.approx(25.0 / 30.0)
+HEAD_ON = body((0, 0), (1, 0)), body((2, 0), (1, 0))
 
 
-def test_bodies_on_different_lanes_pass() -> None:
-    assert overlap_between(body((0, 0), (1, 0)), body((1, 1), (0, 1)), 0.0, 1.0) is None
-
-
-def test_bodies_that_change_places_meet_in_between() -> None:
-    at_s = overlap_between(body((0, 0), (0, 1)), body((0, 1), (0, 0)), 0.0, 1.0)
-    assert at_s == pytest.approx((3.5 - 1.8) / 7.0)
-
-
-def test_an_overlap_after_a_motion_has_ended_is_seen() -> None:
-    # One stands at the end of its way from 1 s on; the other arrives there later.
-    at_s = overlap_between(body((0, 0), (1, 0)), body((3, 0), (1, 0), lasts_s=3.0), 0.0, 3.0)
-    assert at_s == pytest.approx(2.5)
-
-
-def test_the_time_looked_at_is_kept_to() -> None:
-    one, other = body((0, 0), (1, 0)), body((2, 0), (1, 0))
-    assert overlap_between(one, other, 0.0, 0.8) is None
-    assert overlap_between(one, other, 0.9, 1.0) == pytest.approx(0.9)
+@pytest.mark.parametrize(
+    ("pair", "from_s", "to_s", "at_s"),
+    [
+        # 30 m apart at a closing speed of 30 m/s: 25 m remain between the bumpers.
+        pytest.param(HEAD_ON, 0.0, 1.0, 25.0 / 30.0, id="head-on"),
+        pytest.param(HEAD_ON, 0.0, 0.8, None, id="after the interval"),
+        pytest.param(HEAD_ON, 0.9, 1.0, 0.9, id="before the interval"),
+        pytest.param(
+            (body((0, 0), (1, 0)), body((1, 1), (0, 1))), 0.0, 1.0, None, id="on different lanes"
+        ),
+        pytest.param(
+            (body((0, 0), (0, 1)), body((0, 1), (0, 0))),
+            *(0.0, 1.0, (3.5 - 1.8) / 7.0),
+            id="exchange of cells",
+        ),
+        # One rests at the end of its motion from 1 s on; the other arrives there later.
+        pytest.param(
+            (body((0, 0), (1, 0)), body((3, 0), (1, 0), lasts_s=3.0)), 0.0, 3.0, 2.5, id="at rest"
+        ),
+    ],
+)
+def test_first_time_of_an_overlap(
+    pair: tuple[Body, Body], from_s: float, to_s: float, at_s: float | None
+) -> None:
+    expected = None if at_s is None else pytest.approx(at_s)
+    assert overlap_between(*pair, from_s, to_s) == expected
 
 
 def test_exact_against_small_steps() -> None:

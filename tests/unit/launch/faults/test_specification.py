@@ -202,14 +202,16 @@ def test_a_preset_loads_for_any_run(name: str) -> None:
     assert load_faults(name, ("c1",), ())
 
 
-@pytest.mark.parametrize(("name", "loss"), [("lossy10", 0.1), ("lossy50", 0.5)])
-def test_lossy_presets_take_every_message_of_the_whole_run(name: str, loss: float) -> None:
-    assert load_faults(name, COORDINATORS) == FaultSpec(messages=(MessageRule(loss=loss),))
-
-
-def test_blackout_begins_after_a_minute() -> None:
-    expected = FaultSpec(messages=(MessageRule(loss=1.0, from_s=60.0),))
-    assert load_faults("blackout", COORDINATORS) == expected
+@pytest.mark.parametrize(
+    ("name", "rule"),
+    [
+        ("lossy10", MessageRule(loss=0.1)),
+        ("lossy50", MessageRule(loss=0.5)),
+        ("blackout", MessageRule(loss=1.0, from_s=60.0)),
+    ],
+)
+def test_presets_of_message_loss(name: str, rule: MessageRule) -> None:
+    assert load_faults(name, COORDINATORS) == FaultSpec(messages=(rule,))
 
 
 def test_an_unknown_name_gives_one_line_with_the_presets() -> None:
