@@ -7,6 +7,8 @@ import pytest
 
 from support.disturbances import BRAKING_S, Case, respond
 
+pytestmark = pytest.mark.slow
+
 NOISE_MPS = 0.2
 """More than errors of sensors and tracking make of a speed."""
 

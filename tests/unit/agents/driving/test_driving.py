@@ -22,6 +22,7 @@ SWITCHES = 12
 """In each mode."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [1, 2])
 def test_formation_switches_reach_all_goals(mode: int) -> None:
     numbers = range(mode - 1, 2 * SWITCHES, 2)

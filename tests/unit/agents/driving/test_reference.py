@@ -49,7 +49,7 @@ def check_limits(trajectory: Trajectory, scenario: Scenario = SCENARIO) -> None:
 
 
 @pytest.mark.parametrize(("dx", "dy"), MOVES)
-def test_moves_keep_all_limits_and_end_at_rest_in_the_next_cell(dx: int, dy: int) -> None:
+def test_moves_keep_all_limits_and_go_straight_to_rest_in_the_next_cell(dx: int, dy: int) -> None:
     profile = move_profile(SCENARIO, dx, dy)
     assert profile.states.shape == (39, 6)
     assert profile.jerks.shape == (38, 2)
@@ -59,13 +59,8 @@ def test_moves_keep_all_limits_and_end_at_rest_in_the_next_cell(dx: int, dy: int
     )
     check_limits(profile)
     check_exact(profile.states, profile.jerks)
-
-
-@pytest.mark.parametrize(("dx", "dy"), MOVES)
-def test_moves_do_not_overshoot(dx: int, dy: int) -> None:
-    states = move_profile(SCENARIO, dx, dy).states
-    for column, length in ((0, 15.0 * dx), (3, 3.5 * dy)):
-        way = states[:, column] * np.sign(length)
+    for column, length in ((0, 15.0 * dx), (3, 3.5 * dy)):  # no overshoot
+        way = profile.states[:, column] * np.sign(length)
         assert way.min() >= -1e-3
         assert way.max() <= abs(length) + 1e-3
 
@@ -75,12 +70,9 @@ def test_a_quintic_would_break_the_limit_that_moves_keep() -> None:
     assert SCENARIO.vehicle.max_accel_mps2 < 10.0 / 3.0**0.5 * 15.0 / 3.8**2
 
 
-def test_move_is_planned_once_per_process() -> None:
+def test_move_to_a_neighbouring_cell_is_planned_once_per_process() -> None:
     assert move_profile(SCENARIO, 1, -1) is move_profile(Scenario(), 1, -1)
     assert not move_profile(SCENARIO, 1, -1).states.flags.writeable
-
-
-def test_move_beyond_the_neighbouring_cell_is_refused() -> None:
     with pytest.raises(ValueError, match="neighbouring"):
         move_profile(SCENARIO, 2, 0)
 
@@ -163,6 +155,8 @@ def test_reference_of_a_hold() -> None:
         expected = cell_state(SCENARIO.lattice, (4, 2), (k - 7) * TICK_S)
         np.testing.assert_allclose(window.states[k], expected, atol=1e-9)
     assert not window.jerks.any()
+    window.states[:] = -1.0
+    assert reference.window(-7).states[0, 1] == SCENARIO.formation.speed_mps  # nothing is shared
 
 
 def test_reference_follows_any_trajectory() -> None:
@@ -172,12 +166,6 @@ def test_reference_follows_any_trajectory() -> None:
         check_exact(window.states, window.jerks)
     end = reference.window(75).states[0] - cell_state(SCENARIO.lattice, (0, 0), 75 * TICK_S)
     np.testing.assert_allclose(end, [20.0, 0.0, 0.0, 3.5, 0.0, 0.0], atol=1e-6)
-
-
-def test_windows_do_not_share_states() -> None:
-    reference = Reference.hold(SCENARIO, (0, 0))
-    reference.window(3).states[:] = -1.0
-    assert reference.window(3).states[0, 1] == SCENARIO.formation.speed_mps
 
 
 def test_window_is_cheap() -> None:

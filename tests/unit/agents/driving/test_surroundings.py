@@ -78,13 +78,10 @@ def test_it_minds_the_lanes_that_it_touches_and_the_one_that_it_enters(
     assert off(gaps.earliest)[0] == pytest.approx(LEAST_M - gap_m)
 
 
-def test_without_neighbours_there_are_no_gaps() -> None:
+def test_without_neighbours_ahead_or_behind_there_are_no_gaps_there() -> None:
     assert gaps_of(sense()) is NO_GAPS
     beside = (Neighbour(0, 1.0, V_F), Neighbour(2, 1.0, V_F))
     assert gaps_of(sense(beside, beside)) is NO_GAPS
-
-
-def test_vehicles_ahead_and_behind_are_distinguished() -> None:
     near = (Neighbour(1, 4.0, V_F),)
     assert gaps_of(sense(near)).earliest is None
     assert gaps_of(sense((), near)).latest is None

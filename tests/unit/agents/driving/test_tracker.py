@@ -9,6 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from attrs import evolve
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -20,6 +21,7 @@ from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import Jerk, State, cell_state, integrate, limited_jerk
 
 SCENARIO = Scenario()
+ALWAYS = evolve(SCENARIO, tracking=evolve(SCENARIO.tracking, always_solve=True))
 LIMITS = SCENARIO.vehicle
 LATTICE = SCENARIO.lattice
 TICK_S = SCENARIO.runtime.tick_s
@@ -300,16 +302,20 @@ def test_a_distant_vehicle_changes_nothing(distance: float) -> None:
     np.testing.assert_allclose(result.jerk, expected.jerk, atol=0.05)
 
 
-def test_gap_rows_leave_nothing_behind() -> None:
-    reference = Reference.hold(SCENARIO, (0, 1))
-    tracker = Tracker(SCENARIO)
-    state = cell_state(LATTICE, (0, 1), 0.0)
-    pressed = tracker.solve(state, reference.window(0), behind_of(np.full(N + 1, state[0] + 6.0)))
+@pytest.mark.parametrize("side", ["ahead", "behind"])
+@pytest.mark.parametrize("scenario", [SCENARIO, ALWAYS])
+def test_gap_rows_leave_nothing_behind(scenario: Scenario, side: str) -> None:
+    window, state = Reference.hold(SCENARIO, (0, 1)).window(0), cell_state(LATTICE, (0, 1), 0.0)
+    tracker = Tracker(scenario)
+    if side == "ahead":
+        pressed = tracker.solve(state, window, behind_of(np.full(N + 1, state[0] + 6.0)))
+        assert pressed.jerk[0, 0] < -1.0
+    else:
+        pressed = tracker.solve(state, window, Gaps(earliest=window.states[:, 0] + 0.9))
+        assert pressed.jerk[0, 0] > 0.2
     assert pressed.usable
-    assert pressed.jerk[0, 0] < -1.0
-    result = pressed
     for _ in range(20):
-        result = tracker.solve(state, reference.window(0))
+        result = tracker.solve(state, window)
     np.testing.assert_allclose(result.jerk, 0.0, atol=0.05)
 
 
@@ -365,26 +371,13 @@ def test_bad_numbers_raise_and_leave_nothing_behind(part: str, number: float) ->
 
 
 def test_bad_shapes_raise() -> None:
-    state, window, gaps = good_input()
-    assert gaps.earliest is not None
-    assert gaps.latest is not None
-    tracker = Tracker(SCENARIO)
-    with pytest.raises(ValueError, match="window"):
-        tracker.solve(state, Window(window.states[:-1], window.jerks))
-    with pytest.raises(ValueError, match="window"):
-        tracker.solve(state, Window(window.states, window.jerks[:-1]))
-    with pytest.raises(ValueError, match="latest"):
-        tracker.solve(state, window, Gaps(latest=gaps.latest[:-1]))
-    with pytest.raises(ValueError, match="earliest"):
-        tracker.solve(state, window, Gaps(earliest=gaps.earliest[:-1]))
-
-
-def test_a_plan_that_is_played_without_looking_ends_in_the_cell() -> None:
-    """The motion controller does so when nothing better comes."""
-    reference = Reference.move(SCENARIO, (0, 1), (1, 1), 0)
-    state = cell_state(LATTICE, (0, 1), 0.0)
-    plan = Tracker(SCENARIO).solve(state, reference.window(0)).jerk
-    assert plan.shape == (N, 2)
-    for along, across in plan[:38].tolist():
-        state = integrate(state, (along, across), TICK_S)
-    assert np.abs(error(state, (1, 1), 38)).max() < 0.01
+    state, window, _ = good_input()
+    short = np.full(N, 500.0)
+    for name, bad_window, bad_gaps in (
+        ("window", Window(window.states[:-1], window.jerks), Gaps()),
+        ("window", Window(window.states, window.jerks[:-1]), Gaps()),
+        ("latest", window, Gaps(latest=short)),
+        ("earliest", window, Gaps(earliest=-short)),
+    ):
+        with pytest.raises(ValueError, match=name):
+            Tracker(SCENARIO).solve(state, bad_window, bad_gaps)

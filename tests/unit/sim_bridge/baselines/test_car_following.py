@@ -19,17 +19,13 @@ def moved(s_m: float, speed_mps: float, wanted_mps: float) -> tuple[float, float
     return s_m + 0.5 * (speed_mps + new_mps) * TICK_S, new_mps
 
 
-def test_the_gap_is_the_one_of_the_paper() -> None:
-    following = Following(PAPER)
-    assert following.gap_m(15.0) == pytest.approx(5.0 + 15.0 * 0.66)
+def test_the_gap_is_the_one_of_the_paper_and_the_net_gap_has_a_body_more() -> None:
+    paper, net = Following(PAPER), Following(rule_scenario(gap="net"))
+    assert paper.gap_m(15.0) == pytest.approx(5.0 + 15.0 * 0.66)
     # Front to front d_0 is no more than a body: bumpers must not touch.
-    assert following.gap_m(0.0) == pytest.approx(5.0 + 1.0)
-
-
-def test_the_net_gap_has_a_body_more() -> None:
-    following = Following(rule_scenario(gap="net"))
-    assert following.gap_m(15.0) == pytest.approx(5.0 + 5.0 + 15.0 * 0.66)
-    assert following.gap_m(0.0) == pytest.approx(5.0 + 5.0)
+    assert paper.gap_m(0.0) == pytest.approx(5.0 + 1.0)
+    assert net.gap_m(15.0) == pytest.approx(5.0 + 5.0 + 15.0 * 0.66)
+    assert net.gap_m(0.0) == pytest.approx(5.0 + 5.0)
 
 
 def test_a_vehicle_at_its_gap_keeps_its_speed() -> None:

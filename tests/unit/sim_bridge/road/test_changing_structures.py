@@ -9,6 +9,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import pytest
 from attrs import asdict
 
 from laneweave.protocol.config.loading import parse_scenario
@@ -19,16 +20,24 @@ from laneweave.sim_bridge.road.demand import Arrival
 from support.bridge_bench import Street, arrival, read_summary
 from support.paper import EXACT
 
+pytestmark = pytest.mark.slow
+
 LOOK_S = 0.5
 """How long before a change the cells are looked at."""
 
 
-def drive(scenario: Scenario, folder: Path, arrivals: tuple[Arrival, ...]) -> list[dict[str, Any]]:
-    """Drive a demand to its end; return the events, each with the cells of all vehicles then."""
+Cells = dict[float, dict[str, Cell]]
+"""The cells of all vehicles by road time [s]."""
+
+
+def drive(
+    scenario: Scenario, folder: Path, arrivals: tuple[Arrival, ...]
+) -> tuple[list[dict[str, Any]], Cells]:
+    """Drive a demand to its end; return the events and the cells of all vehicles."""
     street = Street(scenario, folder, arrivals)
     street.start_coordinators(2)
     street.start_shard()
-    cells: dict[float, dict[str, Cell]] = {}
+    cells: Cells = {}
 
     def ended() -> bool:
         bridge = street.bridge
@@ -39,14 +48,13 @@ def drive(scenario: Scenario, folder: Path, arrivals: tuple[Arrival, ...]) -> li
     summary = read_summary(folder)
     assert summary["safety"]["overlaps"] == 0
     assert summary["vehicles"]["on_preferred_lane"] == summary["vehicles"]["demanded"]
-    (folder / "cells.json").write_text(json.dumps([[t_s, each] for t_s, each in cells.items()]))
-    return [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
+    lines = (folder / "events.jsonl").read_text().splitlines()
+    return [json.loads(line) for line in lines], cells
 
 
-def cells_at(folder: Path, t_s: float) -> dict[str, tuple[int, int]]:
-    looks = json.loads((folder / "cells.json").read_text())
-    _, cells = min(looks, key=lambda look: abs(look[0] - t_s))
-    return {name: (column, lane) for name, (column, lane) in cells.items()}
+def before(cells: Cells, plan: dict[str, Any]) -> dict[str, Cell]:
+    """Return the cells shortly before a plan begins."""
+    return cells[min(cells, key=lambda t_s: abs(t_s - (plan["t0_s"] - LOOK_S)))]
 
 
 def of_kind(events: list[dict[str, Any]], kind: str) -> list[dict[str, Any]]:
@@ -67,14 +75,14 @@ def test_a_formation_takes_on_one_structure_after_the_other(tmp_path: Path) -> N
         }
     )
     arrivals = tuple(arrival(f"v{n}", 1.0 + 0.8 * n, n % 3, (n + 1) % 3) for n in range(6))
-    events = drive(scenario, tmp_path, arrivals)
+    events, cells = drive(scenario, tmp_path, arrivals)
     plans = of_kind(events, "plan-made")
     assert [plan["vehicles"] for plan in plans] == [6, 6, 6]
     assert {plan["solver"] for plan in plans} == {"tappa"}
 
-    interlaced = cells_at(tmp_path, plans[1]["t0_s"] - LOOK_S)
+    interlaced = before(cells, plans[1])
     assert len({(column + lane) % 2 for column, lane in interlaced.values()}) == 1
-    parallel = cells_at(tmp_path, plans[2]["t0_s"] - LOOK_S)
+    parallel = before(cells, plans[2])
     assert {lane for _, lane in parallel.values()} == {0, 1}
     for wanted in (0, 1):
         columns = sorted(column for column, lane in parallel.values() if lane == wanted)
@@ -108,13 +116,13 @@ LATECOMER = (
 
 def test_a_vehicle_joins_a_formation_that_has_room(tmp_path: Path) -> None:
     scenario = joining("room")
-    events = drive(scenario, tmp_path, LATECOMER)
+    events, cells = drive(scenario, tmp_path, LATECOMER)
     assert [len(event["vehicles"]) for event in of_kind(events, "formation-closed")] == [4, 1]
     (joined,) = of_kind(events, "formations-joined")
     assert joined["why"] == "room"
     sorting = of_kind(events, "plan-made")[-1]
     assert sorting["vehicles"] == 5
-    together = cells_at(tmp_path, sorting["t0_s"] - LOOK_S)
+    together = before(cells, sorting)
     assert len(together) == 5
     assert len({(column + lane) % 2 for column, lane in together.values()}) == 1
     columns = [column for column, _ in together.values()]
@@ -122,6 +130,6 @@ def test_a_vehicle_joins_a_formation_that_has_room(tmp_path: Path) -> None:
 
 
 def test_without_need_formations_stay_apart_unless_they_may_join(tmp_path: Path) -> None:
-    events = drive(joining("needed"), tmp_path, LATECOMER)
+    events, _ = drive(joining("needed"), tmp_path, LATECOMER)
     assert of_kind(events, "formations-joined") == []
     assert {plan["vehicles"] for plan in of_kind(events, "plan-made")} == {4, 1}

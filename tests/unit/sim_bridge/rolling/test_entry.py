@@ -164,6 +164,7 @@ class Entrance:
         return owners
 
 
+@pytest.mark.slow
 @given(streams(), st.sampled_from([0.1, 0.3, 1.0, 2.5]))
 @settings(max_examples=60, deadline=None)
 def test_every_cell_near_behind_a_vehicle_of_the_lane_is_its(
@@ -184,6 +185,7 @@ def test_every_cell_near_behind_a_vehicle_of_the_lane_is_its(
                 assert owners[each, lane] == name
 
 
+@pytest.mark.slow
 @given(streams(), st.sampled_from([0.1, 1.0]))
 @settings(max_examples=60, deadline=None)
 def test_every_cell_near_a_vehicle_has_an_owner(stream: list[Arrival], tick_s: float) -> None:
