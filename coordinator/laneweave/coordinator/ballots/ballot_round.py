@@ -18,7 +18,7 @@ from enum import Enum
 
 from attrs import define, field
 
-from laneweave.protocol.lattice import Cell
+from laneweave.protocol.lattice import Cell, PlannedMove, territory
 from laneweave.protocol.state_machine import RuleBook, Transition
 from laneweave.protocol.wire.messages import Ballot, Name, Plan, Prepare, VehicleState
 
@@ -93,6 +93,28 @@ class BallotRound:
     def incarnations(self) -> dict[Name, int]:
         """Incarnation of the process of each vehicle that promised."""
         return {name: self.promises[name].incarnation for name in self.roster}
+
+    def make_plan(
+        self,
+        formations: tuple[int, ...],
+        moves: dict[Name, tuple[PlannedMove, ...]],
+        t0_s: float,
+        slot_s: float,
+    ) -> Plan:
+        """Return the plan of these moves from the cells that were promised."""
+        assert self.ballot is not None  # noqa: S101 (set before planning begins)
+        cells, every_move = self.hold_cells, [move for each in moves.values() for move in each]
+        return Plan(
+            ballot=self.ballot,
+            formations=formations,
+            roster=tuple(cells),
+            incarnations=self.incarnations,
+            start_cells=cells,
+            moves=moves,
+            t0_s=t0_s,
+            slot_s=slot_s,
+            territory=tuple(sorted(territory(cells.values(), every_move))),
+        )
 
     def take(self, event: str, now_s: float, message: object = None) -> bool:
         """Take an event of the rule table; return whether a row of it fits."""

@@ -52,7 +52,6 @@ class FormationsOperation:
         self._rules = rules
         self._groups = Groups()
         self._planner = FormationPlanner(scenario, self._groups, self.leaders, new_job)
-        self._groups_changed = False
 
     def forget(self) -> None:
         """Forget all formations, and which of them are joined."""
@@ -66,12 +65,12 @@ class FormationsOperation:
 
     def on_clock(self, t_s: float, now_s: float) -> None:
         """Measure the pace of the road."""
-        self._planner.on_clock(t_s, now_s)
+        self._planner.pace.on_clock(t_s, now_s)
 
     def on_state(self, state: VehicleState, now_s: float) -> list[LogEntry]:
         """Pass the state on to the leader of its formation."""
         # Formations that a vehicle has joined stay joined, under any leader.
-        self._groups_changed |= self._groups.join((state.formation, *state.joined))
+        self._groups.join((state.formation, *state.joined))
         group = self._groups.of(state.formation)
         leader = self.leaders.get(group[0])
         if leader is None or leader.formation.numbers != group:
@@ -87,9 +86,9 @@ class FormationsOperation:
         self, census: Census, t_s: float, now_s: float, *, changed: bool
     ) -> Iterator[Effect | LogEntry]:
         """Update members, let timers run out, order plans, send messages."""
-        if changed or self._groups_changed:
-            self._groups_changed = False
+        if changed or self._groups.changed:
             yield from self._update_members(census, t_s, now_s)
+            self._groups.changed = False
         for leader in self.leaders.values():
             if leader.wakeup_s is None or leader.wakeup_s > now_s:
                 continue
@@ -129,10 +128,7 @@ class FormationsOperation:
 
     def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterator[Compute | LogEntry]:
         """Issue a plan that was made, or try again later."""
-        for outcome in self._planner.finish(computed, t_s, now_s):
-            if isinstance(outcome, LogEntry):
-                self._groups_changed |= outcome.kind == FORMATIONS_JOINED
-            yield outcome
+        return self._planner.finish(computed, t_s, now_s)
 
     @property
     def wakeups(self) -> list[float]:

@@ -31,7 +31,7 @@ from laneweave.coordinator.formations.sorting import Sorting, SortingTask, sort_
 from laneweave.coordinator.operation import LogEntry
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.response import PlanResponse
-from laneweave.protocol.lattice import Cell, territory
+from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Compute, Computed
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.plans import plan_problems
@@ -60,6 +60,11 @@ MAX_DOUBLINGS = 4
 """The bound on search nodes doubles with each failed planning, this often."""
 PACE_WINDOW_S = 2.0
 """Measurement window of the road's pace (node clock)."""
+LOGGED = (
+    *("status", "cost", "lower_bound", "steps", "solve_ms"),
+    *("assignments_tried", "nodes_expanded", "solver", "fallback"),
+)
+"""Fields of a response that are logged with its plan."""
 MIN_PACE = 0.1
 """Lowest pace, so that deadlines stay finite while the road stands still."""
 
@@ -115,7 +120,8 @@ class FormationPlanner:
         """Orders that have not begun, oldest first: for each formation its ballot and the work."""
         self._under_way: tuple[int, int, Ballot] | None = None
         """Number, formation and ballot of the computation under way."""
-        self._pace = RoadPace()
+        self.pace = RoadPace()
+        """From which deadlines follow."""
         formation = scenario.formation
         oblique = formation.weight_oblique
         self._weights = Weights(
@@ -126,16 +132,12 @@ class FormationPlanner:
         """Drop all orders that have not begun."""
         self._waiting.clear()
 
-    def on_clock(self, t_s: float, now_s: float) -> None:
-        """Measure the pace of the road, from which deadlines follow."""
-        self._pace.on_clock(t_s, now_s)
-
     def _deadline_s(self, start_s: float, t_s: float) -> float:
         """Return the deadline: that of the scenario, or the time until the first move."""
         given_s = self._scenario.formation.planning_deadline_s
         if given_s is not None:
             return given_s
-        until_start_s = (start_s - t_s) / self._pace.pace
+        until_start_s = (start_s - t_s) / self.pace.pace
         return min(max(until_start_s, SHORTEST_DEADLINE_S), LONGEST_DEADLINE_S)
 
     def order(
@@ -298,20 +300,9 @@ class FormationPlanner:
         return closes_s - ROOM_S < t_s <= closes_s + START_MARGIN_S
 
     def _plan(self, leader: FormationLeader, sorting: Sorting, t_s: float) -> Plan:
-        hold_cells, numbers, ballot = leader.hold_cells, leader.formation.numbers, leader.ballot
-        assert ballot is not None  # noqa: S101 (set before planning begins)
-        all_moves = [move for each in sorting.moves.values() for move in each]
-        return Plan(
-            ballot=ballot,
-            formations=numbers,
-            roster=tuple(hold_cells),
-            incarnations=leader.incarnations,
-            start_cells=hold_cells,
-            moves=sorting.moves,
-            t0_s=self._start_s(leader.formation, hold_cells.values(), t_s),
-            slot_s=self._scenario.cycles_s[0],
-            territory=tuple(sorted(territory(hold_cells.values(), all_moves))),
-        )
+        t0_s = self._start_s(leader.formation, leader.hold_cells.values(), t_s)
+        slot_s = self._scenario.cycles_s[0]
+        return leader.make_plan(leader.formation.numbers, sorting.moves, t0_s, slot_s)
 
     def _paced(self, plan: Plan, leader: FormationLeader, t_s: float) -> Plan:
         """Choose the slots of a plan; it begins when its vehicles have settled in their cells."""
@@ -366,16 +357,5 @@ def _notes(formation: Formation, sorting: Sorting, pauses: int, plan: Plan) -> I
 
 
 def _facts(number: int, response: PlanResponse) -> dict[str, Any]:
-    return {
-        "formation": number,
-        "vehicles": len(response.paths),
-        "status": response.status,
-        "cost": response.cost,
-        "lower_bound": response.lower_bound,
-        "steps": response.steps,
-        "solve_ms": response.solve_ms,
-        "assignments_tried": response.assignments_tried,
-        "nodes_expanded": response.nodes_expanded,
-        "solver": response.solver,
-        "fallback": response.fallback,
-    }
+    facts = {name: getattr(response, name) for name in LOGGED}
+    return {"formation": number, "vehicles": len(response.paths), **facts}

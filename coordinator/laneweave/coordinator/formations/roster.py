@@ -61,6 +61,8 @@ class Formation:
 class Groups:
     """Which blocks plan together, as far as one leader knows; groups only grow."""
 
+    changed: bool = False
+    """Set when blocks are joined; the reader resets it."""
     _group: dict[int, Numbers] = field(factory=dict)
 
     def of(self, number: int) -> Numbers:
@@ -72,8 +74,8 @@ class Groups:
         union = tuple(sorted({other for number in numbers for other in self.of(number)}))
         if not union or self.of(union[0]) == union:
             return False
-        for number in union:
-            self._group[number] = union
+        self._group |= dict.fromkeys(union, union)
+        self.changed = True
         return True
 
     def forget(self) -> None:

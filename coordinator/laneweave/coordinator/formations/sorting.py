@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from functools import partial
 from itertools import islice
 from typing import Any
 
@@ -84,18 +85,15 @@ class SortingTask:
         deserted blocks.
         """
         first, lattice = self.columns.start, self.scenario.lattice
-        usable, held_cells = {*self.numbers} - {*self.deserted}, set(self.hold_cells.values())
-        foreign = [
-            (column - first, lane)
+        usable = {*self.numbers} - {*self.deserted}
+        foreign = {
+            (column, lane)
             for column in self.columns
             if lattice.block_of(column) not in usable
             for lane in range(lattice.lanes)
-            if (column, lane) not in held_cells
-        ]
-        held = [
-            (self.hold_cells[name][0] - first, self.hold_cells[name][1]) for name in self.unattended
-        ]
-        return tuple(sorted({*foreign, *held}))
+        } - {*self.hold_cells.values()}
+        cells = foreign | {self.hold_cells[name] for name in self.unattended}
+        return tuple(sorted((column - first, lane) for column, lane in cells))
 
 
 @frozen
@@ -187,9 +185,10 @@ def sort_lanes(
     """
     if not task.movers:
         return _sorting(task, None)
-    if task.structure is not None:
-        return _form(task, task.structure, max_nodes, weights)
     memory_mb = task.scenario.service.worker_memory_mb
+    plan = partial(checked_plan, max_nodes=max_nodes, max_memory_mb=memory_mb, weights=weights)
+    if task.structure is not None:
+        return _form(task, task.structure, plan)
     ends_s = clock() + task.deadline_s
     for excused in (None, *task.movers):
         best: PlanResponse | None = None
@@ -197,10 +196,7 @@ def sort_lanes(
             left_s = ends_s - clock()
             if best is not None and left_s <= MIN_DEADLINE_S:
                 break
-            hurried = evolve(request, deadline_s=max(left_s, MIN_DEADLINE_S))
-            response = checked_plan(
-                hurried, max_nodes=max_nodes, max_memory_mb=memory_mb, weights=weights
-            )
+            response = plan(evolve(request, deadline_s=max(left_s, MIN_DEADLINE_S)))
             if best is None or _steps(response) < _steps(best):
                 best = response
             if _steps(best) <= task.steps or not response.paths:
@@ -216,7 +212,7 @@ def _steps(response: PlanResponse) -> float:
 
 
 def _form(
-    task: SortingTask, structure: DrivingStructure, max_nodes: int, weights: Weights
+    task: SortingTask, structure: DrivingStructure, plan: Callable[[PlanRequest], PlanResponse]
 ) -> Sorting:
     """Plan the paths into a structure; all members stay where they are if it has too few cells."""
     members = [{"id": name, "cell": list(cell)} for name, cell in task.movers.items()]
@@ -227,11 +223,7 @@ def _form(
         if error.field != "structure":
             raise
         return evolve(_sorting(task, None), impossible=error.allowed)
-    memory_mb = task.scenario.service.worker_memory_mb
-    return _sorting(
-        task,
-        checked_plan(request, max_nodes=max_nodes, max_memory_mb=memory_mb, weights=weights),
-    )
+    return _sorting(task, plan(request))
 
 
 def _sorting(task: SortingTask, response: PlanResponse | None) -> Sorting:

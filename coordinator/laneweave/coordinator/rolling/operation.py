@@ -14,8 +14,6 @@ from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import Any
 
-from attrs import frozen
-
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.operation import LogEntry, to_vehicle
 from laneweave.coordinator.planning.rolling.planner import StreamPlan, StreamVehicle
@@ -50,16 +48,6 @@ AHEAD_M = 600.0
 all vehicles that can come near each other there are known in time."""
 BESIDE = 10
 """Columns ahead of the foremost vehicle and behind the rearmost one that may be planned with."""
-
-
-@frozen
-class _Request:
-    """Input of a planning."""
-
-    slot: int
-    vehicles: tuple[StreamVehicle, ...]
-    blocked: frozenset[Cell]
-    before: StreamPlan | None
 
 
 class RollingOperation:
@@ -181,14 +169,16 @@ class RollingOperation:
             return
         if max(self._since[0], t_s - 1.5 * self._scenario.runtime.tick_s) > look_s:
             look_s = t_s  # too late for that time: take the newest states
-        request = self._request(slot + 1, look_s)
+        vehicles, blocked = self._observed_at(look_s, slot + 1)
         self._newest_slot = slot + 1
         job = self._new_job()
         self._ordered = (job, slot + 1)
-        yield Compute(job, partial(_plan, self._planner, request))
+        yield Compute(job, partial(self._planner.plan, slot + 1, vehicles, self._table, blocked))
 
-    def _request(self, slot: int, look_s: float) -> _Request:
-        """Return the input of a planning: what was the case at a road time."""
+    def _observed_at(
+        self, look_s: float, slot: int
+    ) -> tuple[tuple[StreamVehicle, ...], frozenset[Cell]]:
+        """Return the vehicles to plan for from a slot on, and the cells that they cannot use."""
         vehicles: dict[Cell, StreamVehicle] = {}
         owned, taken = set[Cell](), set[Cell]()
         # States received while this coordinator led before do not tell where vehicles are now.
@@ -217,13 +207,13 @@ class RollingOperation:
             heard = StreamVehicle(entry.vehicle, state.hold_cell, entry.preferred_lane, held)
             vehicles.setdefault(state.hold_cell, heard)
         columns = [column for column, _ in vehicles] or [0]
-        blocked = {
+        blocked = frozenset(
             (column, lane)
             for column in range(min(columns) - BESIDE, max(columns) + BESIDE + 1)
             for lane in range(self._scenario.road.lanes)
             if (column, lane) not in owned or (column, lane) in taken
-        }
-        return _Request(slot, tuple(vehicles.values()), frozenset(blocked), self._table)
+        )
+        return tuple(vehicles.values()), blocked
 
     def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterator[LogEntry]:
         """Take a plan, and begin ballots for its first moves.
@@ -317,10 +307,6 @@ class RollingOperation:
     def in_force(self) -> int:
         """Number of ballots of this slot that are in force."""
         return sum(transfer.phase is BallotPhase.IN_FORCE for transfer in self.transfers)
-
-
-def _plan(planner: Planner, request: _Request) -> StreamPlan:
-    return planner.plan(request.slot, request.vehicles, request.before, request.blocked)
 
 
 def _clusters(groups: Iterable[set[Name]]) -> list[set[Name]]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from attrs import define, field
+from attrs import define, evolve, field
 
 from laneweave.coordinator.ballots.ballot_round import (
     FAILED,
@@ -30,7 +30,7 @@ from laneweave.coordinator.ballots.ballot_round import (
     shows_higher_promise,
 )
 from laneweave.coordinator.rolling.ownership import States, owned_cells
-from laneweave.protocol.lattice import Cell, PlannedMove, footprint, territory
+from laneweave.protocol.lattice import Cell, PlannedMove, footprint
 from laneweave.protocol.state_machine import RuleBook, Transition
 from laneweave.protocol.vehicle.plans import ownership_problems, plan_problems
 from laneweave.protocol.wire.messages import Ballot, Name, Plan, VehicleState
@@ -96,17 +96,9 @@ class CellTransfer(BallotRound):
         after = {name: (cells - given) | needed.get(name, set()) for name, cells in before.items()}
         moves: dict[Name, tuple[PlannedMove, ...]] = dict.fromkeys(self.roster, ())
         moves |= {name: ((0, *move),) for name, move in self.moves.items()}
-        every_move = [move for each in moves.values() for move in each]
-        return Plan(
-            ballot=self.ballot,
-            formations=tuple(sorted({promise.formation for promise in self.promises.values()})),
-            roster=self.roster,
-            incarnations=self.incarnations,
-            start_cells=self.hold_cells,
-            moves=moves,
-            t0_s=self.t0_s,
-            slot_s=self.slot_s,
-            territory=tuple(sorted(territory(self.hold_cells.values(), every_move))),
+        formations = tuple(sorted({promise.formation for promise in self.promises.values()}))
+        return evolve(
+            self.make_plan(formations, moves, self.t0_s, self.slot_s),
             before={name: tuple(sorted(before[name])) for name in self.roster},
             after={name: tuple(sorted(after[name])) for name in self.roster},
         )

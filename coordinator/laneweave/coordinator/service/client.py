@@ -25,19 +25,18 @@ from types import TracebackType
 from typing import Self
 
 import attrs
+from attrs import define, field
 
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
-from laneweave.coordinator.service.query import (
-    ABSENT_S,
-    AskAgain,
-    DeadlinePassedError,
-    Inquiry,
-    PlanError,
-    PlanningFailedError,
-    RequestRefusedError,
-    ServiceOverloadedError,
-    ServiceUnavailableError,
+from laneweave.coordinator.service.format import (
+    INVALID,
+    JSON,
+    LATE,
+    OVERLOADED,
+    Format,
+    Refusal,
+    format_of,
 )
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.errors import BadInputError
@@ -48,21 +47,130 @@ from laneweave.protocol.transports.zenoh.transport import connect_patiently
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.topics import SERVICE, Keys, Party
 
-__all__ = [
-    "AsyncPlanClient",
-    "DeadlinePassedError",
-    "PlanClient",
-    "PlanError",
-    "PlanningFailedError",
-    "RequestRefusedError",
-    "ServiceOverloadedError",
-    "ServiceUnavailableError",
-    "client_access",
-]
-
 DEFAULT_TIMEOUT_S = 10.0
 LONGEST_ATTEMPT_S = 86_400.0
 """Zenoh does not accept arbitrarily long timeouts."""
+
+
+FIRST_PAUSE_S = 0.02
+LONGEST_PAUSE_S = 0.5
+ABSENT_S = 3.0
+"""A coordinator that is killed is given up at once, one that hangs after `network.lease_s`, and a
+new router is found in less than a second."""
+
+
+class PlanError(Exception):
+    """A request was not planned; the message says why, in one line."""
+
+
+class RequestRefusedError(PlanError):
+    """The request is not valid."""
+
+    def __init__(self, message: str, field_name: str) -> None:
+        """Store the line and the field that it is about."""
+        super().__init__(message)
+        self.field = field_name
+
+
+class ServiceUnavailableError(PlanError):
+    """No answer: no coordinator can be reached on this network."""
+
+
+class ServiceOverloadedError(PlanError):
+    """The coordinators were overloaded at every attempt."""
+
+
+class DeadlinePassedError(PlanError):
+    """The request's deadline passed before a worker was free."""
+
+
+class PlanningFailedError(PlanError):
+    """The service made an error."""
+
+
+@define
+class PendingRequest:
+    """One plan request over all attempts: what to do after each one; pure, without a clock.
+
+    A request may be sent repeatedly: coordinators recognise it by its id, and planning it twice
+    does no harm. It is sent again if there is no answer (its coordinator was killed or is cut off,
+    and the others do not know yet), or if its coordinator is overloaded.
+    """
+
+    request: PlanRequest
+    timeout_s: float
+    begun_s: float
+    form: Format = JSON
+    patience_s: float = ABSENT_S
+    """Without any answer for so long there is no service [s]."""
+    _pause_s: float = FIRST_PAUSE_S
+    _absent_since_s: float | None = field(default=None)
+
+    @property
+    def payload(self) -> bytes:
+        """Bytes of the request; the same each time, so the same coordinator is assigned to it."""
+        return self.form.write(self.request.to_dict())
+
+    def left_s(self, now_s: float) -> float:
+        """Return the time left [s]."""
+        return self.begun_s + self.timeout_s - now_s
+
+    def after(self, answer: Answer | None, now_s: float) -> PlanResponse | float:
+        """Return the plan, or the pause [s] after which the request should be sent again.
+
+        Args:
+            answer: to the newest attempt; None: there was none.
+            now_s: on the clock of `begun_s`.
+
+        Raises:
+            PlanError: there will be no plan.
+        """
+        if answer is None:
+            return self._after_silence(now_s)
+        self._absent_since_s = None
+        if answer.ok:
+            return self._read(answer)
+        refusal = self._refusal(answer)
+        if refusal.code == OVERLOADED:
+            return self._pause(now_s, ServiceOverloadedError(refusal.message))
+        if refusal.code == INVALID:
+            raise RequestRefusedError(refusal.message, refusal.field)
+        if refusal.code == LATE:
+            raise DeadlinePassedError(refusal.message)
+        raise PlanningFailedError(refusal.message)
+
+    def _after_silence(self, now_s: float) -> float:
+        since_s = now_s if self._absent_since_s is None else self._absent_since_s
+        self._absent_since_s = since_s
+        absent = ServiceUnavailableError("no coordinator answers on this network and realm")
+        if now_s >= since_s + self.patience_s:
+            raise absent
+        return self._pause(now_s, absent)
+
+    def _pause(self, now_s: float, otherwise: PlanError) -> float:
+        """Try again after a growing pause, unless no time is left for it."""
+        pause_s, self._pause_s = self._pause_s, min(2 * self._pause_s, LONGEST_PAUSE_S)
+        if self.left_s(now_s) <= pause_s:
+            raise otherwise
+        return pause_s
+
+    @staticmethod
+    def _read(answer: Answer) -> PlanResponse:
+        try:
+            return PlanResponse.from_dict(_parse(answer))
+        except BadInputError as error:
+            raise PlanningFailedError(f"the answer is no plan: {error}") from error
+
+    @staticmethod
+    def _refusal(answer: Answer) -> Refusal:
+        try:
+            return Refusal.from_dict(_parse(answer))
+        except BadInputError as error:
+            raise PlanningFailedError(f"the answer is no error reply: {error}") from error
+
+
+def _parse(answer: Answer) -> dict[str, object]:
+    return format_of(answer.payload, answer.encoding).read(answer.payload)
 
 
 def client_access(config: Path, name: str = "plan", endpoint: str | None = None) -> Access:
@@ -101,17 +209,17 @@ class _Connection:
         self._transport = connect_patiently(access, lambda _: None)
         self._closed = False
 
-    def _begin(self, request: PlanRequest, timeout_s: float) -> Inquiry:
+    def _begin(self, request: PlanRequest, timeout_s: float) -> PendingRequest:
         if not request.id:
             request = attrs.evolve(request, id=uuid.uuid4().hex)
-        return Inquiry(request, timeout_s, time.monotonic(), patience_s=self._patience_s)
+        return PendingRequest(request, timeout_s, time.monotonic(), patience_s=self._patience_s)
 
-    def _ask(self, inquiry: Inquiry) -> Future[Answer | None]:
+    def _ask(self, pending: PendingRequest) -> Future[Answer | None]:
         if self._closed:
             raise ServiceUnavailableError("this client is closed")
-        left_s = min(max(0.0, inquiry.left_s(time.monotonic())), LONGEST_ATTEMPT_S)
-        encoding = inquiry.form.encoding
-        return self._transport.ask(self._key, inquiry.payload, left_s, encoding)
+        left_s = min(max(0.0, pending.left_s(time.monotonic())), LONGEST_ATTEMPT_S)
+        encoding = pending.form.encoding
+        return self._transport.ask(self._key, pending.payload, left_s, encoding)
 
     def _close(self) -> None:
         self._closed = True
@@ -136,13 +244,13 @@ class PlanClient(_Connection):
             PlanningFailedError: the service made an error.
             TimeoutError: no answer within `timeout_s`.
         """
-        inquiry = self._begin(request, timeout_s)
+        pending = self._begin(request, timeout_s)
         while True:
-            answer = self._ask(inquiry).result()
-            outcome = inquiry.after(answer, time.monotonic())
-            if not isinstance(outcome, AskAgain):
+            answer = self._ask(pending).result()
+            outcome = pending.after(answer, time.monotonic())
+            if isinstance(outcome, PlanResponse):
                 return outcome
-            time.sleep(outcome.pause_s)
+            time.sleep(outcome)
 
     def close(self) -> None:
         """Leave the network; calls that wait for a plan raise `ServiceUnavailableError`."""
@@ -169,13 +277,13 @@ class AsyncPlanClient(_Connection):
         self, request: PlanRequest, timeout_s: float = DEFAULT_TIMEOUT_S
     ) -> PlanResponse:
         """Send a request and return the plan; as `PlanClient.plan`."""
-        inquiry = self._begin(request, timeout_s)
+        pending = self._begin(request, timeout_s)
         while True:
-            answer = await asyncio.wrap_future(self._ask(inquiry))
-            outcome = inquiry.after(answer, time.monotonic())
-            if not isinstance(outcome, AskAgain):
+            answer = await asyncio.wrap_future(self._ask(pending))
+            outcome = pending.after(answer, time.monotonic())
+            if isinstance(outcome, PlanResponse):
                 return outcome
-            await asyncio.sleep(outcome.pause_s)
+            await asyncio.sleep(outcome)
 
     async def close(self) -> None:
         """Leave the network; calls that wait for a plan raise `ServiceUnavailableError`."""

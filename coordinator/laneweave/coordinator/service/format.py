@@ -14,9 +14,6 @@ from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.protocol.errors import BadInputError, one_line
 from laneweave.protocol.runtime.node import Reply
 
-JSON_TYPE: Final = "application/json"
-MSGPACK_TYPE: Final = "application/msgpack"
-
 INVALID: Final = "invalid"
 """The request is not acceptable; sending it again will not help."""
 OVERLOADED: Final = "overloaded"
@@ -46,10 +43,8 @@ class Refusal:
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Refusal:
         """Read an error reply; without a code: `INVALID` if it names a field, else `FAILED`."""
-        field, message = (
-            one_line(str(data.get("field", ""))),
-            one_line(str(data.get("message", ""))),
-        )
+        field = one_line(str(data.get("field", "")))
+        message = one_line(str(data.get("message", "")))
         return cls(str(data.get("code", INVALID if field else FAILED)), message, field)
 
 
@@ -79,21 +74,12 @@ class Format:
 
     def reply(self, token: int, answer: PlanResponse | Refusal) -> Reply:
         """Return the effect that answers a question."""
-        if isinstance(answer, Refusal):
-            return self.refuse(token, answer)
-        return Reply(token, self.write(answer.to_dict()), encoding=self.encoding)
-
-    def refuse(self, token: int, refusal: Refusal) -> Reply:
-        """Return the effect that refuses a question."""
-        return Reply(token, self.write(refusal.to_dict()), ok=False, encoding=self.encoding)
+        ok = isinstance(answer, PlanResponse)
+        return Reply(token, self.write(answer.to_dict()), ok=ok, encoding=self.encoding)
 
 
-JSON: Final = Format(
-    JSON_TYPE,
-    lambda data: json.dumps(data).encode(),
-    json.loads,
-)
-MSGPACK: Final = Format(MSGPACK_TYPE, msgpack.packb, msgpack.unpackb)
+JSON: Final = Format("application/json", lambda data: json.dumps(data).encode(), json.loads)
+MSGPACK: Final = Format("application/msgpack", msgpack.packb, msgpack.unpackb)
 
 
 def format_of(payload: bytes, encoding: str) -> Format:

@@ -181,7 +181,7 @@ class PlanningService:
             entry, kept = self._known(request)
         except BadInputError as error:
             self._count("invalid_total")
-            yield form.refuse(token, Refusal(INVALID, str(error), error.field))
+            yield form.reply(token, Refusal(INVALID, str(error), error.field))
             return
         if entry is not None:
             self._count("repeated_total")
@@ -193,7 +193,7 @@ class PlanningService:
             return
         if len(self._waiting) + len(self._planning) >= self._settings.queue_limit:
             self._count("overloaded_total")
-            yield form.refuse(token, self._overloaded())
+            yield form.reply(token, self._overloaded())
             return
         entry = _Entry(request, now_s, job, [(token, form)])
         if request.id:

@@ -15,13 +15,13 @@ from laneweave.coordinator.planning.paper.explanation import explain
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.service.client import (
+    ABSENT_S,
     PlanClient,
     PlanError,
     RequestRefusedError,
     ServiceUnavailableError,
     client_access,
 )
-from laneweave.coordinator.service.query import ABSENT_S
 from laneweave.launch.drawing.tappa_text import explanation_text
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
 from laneweave.protocol.scenario.tables import Scenario

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import combinations
 
-from laneweave.protocol.lattice import Cell, footprint
+from laneweave.protocol.lattice import Cell, footprint, territory
 from laneweave.protocol.wire.messages import Name, Plan
 
 Needs = dict[Name, int]
@@ -23,21 +23,18 @@ def dependencies(plan: Plan, vehicle: Name) -> tuple[Needs, ...]:
     A move in step s needs of vehicle A: 1 + the index of A's last move in a step before s whose
     footprint meets the move's; vehicles with no such move are left out.
     """
+
+    def needs(step: int, cells: frozenset[Cell]) -> Needs:
+        return {
+            other: index + 1
+            for other, moves in plan.moves.items()
+            for index, (other_step, origin, target) in enumerate(moves)
+            if other != vehicle and other_step < step and cells & footprint(origin, target)
+        }
+
     return tuple(
-        _needs(plan, vehicle, step, footprint(origin, target))
-        for step, origin, target in plan.moves[vehicle]
+        needs(step, footprint(origin, target)) for step, origin, target in plan.moves[vehicle]
     )
-
-
-def _needs(plan: Plan, vehicle: Name, step: int, cells: frozenset[Cell]) -> Needs:
-    needs: Needs = {}
-    for other, moves in plan.moves.items():
-        if other == vehicle:
-            continue
-        for index, (other_step, origin, target) in enumerate(moves):
-            if other_step < step and cells & footprint(origin, target):
-                needs[other] = index + 1
-    return needs
 
 
 def plan_problems(plan: Plan) -> list[str]:
@@ -57,11 +54,8 @@ def plan_problems(plan: Plan) -> list[str]:
     if problems:
         return problems
     problems += _step_problems(plan)
-    occupied = set(plan.start_cells.values())
-    for moves in plan.moves.values():
-        for _, origin, target in moves:
-            occupied |= footprint(origin, target)
-    missing = occupied - set(plan.territory)
+    every_move = [move for moves in plan.moves.values() for move in moves]
+    missing = territory(plan.start_cells.values(), every_move) - set(plan.territory)
     if missing:
         problems.append(f"territory lacks cells {sorted(missing)}")
     return problems
@@ -86,9 +80,7 @@ def ownership_problems(plan: Plan) -> list[str]:
             problems.append(f"a cell has two owners {name}")
     owned = {cell for each in plan.before.values() for cell in each}
     for vehicle, cells in plan.after.items():
-        occupied = {plan.start_cells[vehicle]}
-        for _, origin, target in plan.moves[vehicle]:
-            occupied |= footprint(origin, target)
+        occupied = territory([plan.start_cells[vehicle]], plan.moves[vehicle])
         if not occupied <= set(cells):
             problems.append(f"{vehicle} does not own {sorted(occupied - set(cells))}")
         if not set(cells) <= owned:
