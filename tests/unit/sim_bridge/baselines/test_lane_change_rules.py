@@ -43,18 +43,13 @@ def test_one_lane_at_a_time_towards_the_preferred_one() -> None:
 # --- rule 2 -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("distance_m", [-NEEDED_M + 0.1, -1.0, 0.0, 1.0, NEEDED_M - 0.1])
-def test_a_small_gap_is_not_accepted(distance_m: float) -> None:
-    one = vehicle("a", 500.0, 0, 1)
-    sort(one, vehicle("b", 500.0 + distance_m, 1))
-    assert one.lane == 0
-
-
-@pytest.mark.parametrize("distance_m", [-NEEDED_M - 0.1, NEEDED_M + 0.1])
-def test_a_gap_that_is_large_enough_is_accepted(distance_m: float) -> None:
-    one = vehicle("a", 500.0, 0, 1)
-    assert sort(one, vehicle("b", 500.0 + distance_m, 1)) == set()
-    assert one.lane == 1
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("distance_m", [0.0, 1.0, NEEDED_M - 0.1, NEEDED_M + 0.1])
+def test_a_gap_is_accepted_if_it_is_large_enough(distance_m: float, side: int) -> None:
+    one, accepted = vehicle("a", 500.0, 0, 1), distance_m > NEEDED_M
+    slowing = sort(one, vehicle("b", 500.0 + side * distance_m, 1))
+    assert one.lane == int(accepted)
+    assert not (accepted and slowing)
 
 
 def test_the_speed_of_the_follower_counts() -> None:

@@ -114,30 +114,22 @@ def test_a_vehicle_takes_the_first_interlaced_cell_that_it_can_reach() -> None:
     assert found["behind"].t_s - found["behind"].arrival.t_s == pytest.approx(1.9)
 
 
-def test_a_block_takes_no_more_than_can_reach_their_lane() -> None:
-    # Five vehicles want lane 1, which has four cells in a block.
-    meter = interlaced_meter(lattice())
-    for number in range(2):
+@pytest.mark.parametrize(
+    ("block_columns", "most", "rows", "preferred_lane", "by_block"),
+    [(4, 6, 2, 1, [4, 2]), (8, 5, 4, None, [5, 5, 2]), (4, 12, 4, None, [6, 6])],
+    ids=["four cells of a lane", "largest formation", "interlaced cells of the paper's block"],
+)
+def test_a_block_takes_no_more_than_it_has_room_for(
+    block_columns: int, most: int, rows: int, preferred_lane: int | None, by_block: list[int]
+) -> None:
+    grid = lattice(block_columns=block_columns)
+    meter = interlaced_meter(grid, most)
+    for number in range(rows):
         for lane in range(3):
-            meter.demand(Arrival(f"{number}-{lane}", lane, 1, 0.0))
-    columns = [admission.cell[0] for admission in meter.admit(30.0)]
-    assert [lattice().block_of(column) for column in columns] == [0, 0, 0, 0, 1, 1]
-
-
-def test_a_block_takes_no_more_than_the_largest_formation() -> None:
-    meter = interlaced_meter(lattice(block_columns=8), 5)
-    for number in range(4):
-        for lane in range(3):
-            meter.demand(Arrival(f"{number}-{lane}", lane, lane, 0.0))
-    admissions = meter.admit(100.0)
-    blocks = Counter(lattice(block_columns=8).block_of(a.cell[0]) for a in admissions)
-    assert list(blocks.values()) == [5, 5, 2]
-
-
-def test_the_paper_s_blocks_hold_six() -> None:
-    grid = lattice()
-    for block in range(4):
-        assert sum(grid.interlaced(cell) for cell in grid.block_cells(block)) == 6
+            preferred = lane if preferred_lane is None else preferred_lane
+            meter.demand(Arrival(f"{number}-{lane}", lane, preferred, 0.0))
+    blocks = Counter(grid.block_of(entry.cell[0]) for entry in meter.admit(100.0))
+    assert list(blocks.values()) == by_block
 
 
 def test_a_late_demand_takes_no_column_that_has_passed() -> None:

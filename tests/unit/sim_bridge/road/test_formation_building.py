@@ -141,26 +141,22 @@ def cases(draw: st.DrawFn) -> Case:
     return Case(lanes, vehicles, columns, spread_s, interlaced, stream)
 
 
-@given(cases())
+@pytest.mark.parametrize("grows", [True, False], ids=["growing", "blocks of columns"])
+@given(case=cases())
 @settings(max_examples=150, deadline=None)
-def test_every_vehicle_is_in_one_formation_that_has_room_for_all_of_its_wishes(case: Case) -> None:
-    grid = lattice(case.lanes)
-    builder = GrowingFormations(grid, case.most_vehicles, case.most_columns, case.spread_s)
+def test_every_vehicle_is_in_one_formation_that_has_room_for_all_of_its_wishes(
+    case: Case, *, grows: bool
+) -> None:
+    grid = lattice(case.lanes, 1 if grows else BLOCK_COLUMNS)
+    builder: FormationBuilder = (
+        GrowingFormations(grid, case.most_vehicles, case.most_columns, case.spread_s)
+        if grows
+        else ColumnBlocks(grid, case.most_vehicles, case.spread_s)
+    )
     entrance = Entrance(grid, builder, case.spread_s, case.interlaced)
     entrance.run(list(case.stream))
     assert {each.arrival for each in entrance.admissions} == set(case.stream)
-    check(entrance, case.most_vehicles, case.most_columns)
-
-
-@given(cases())
-@settings(max_examples=75, deadline=None)
-def test_blocks_of_columns_likewise(case: Case) -> None:
-    grid = lattice(case.lanes, BLOCK_COLUMNS)
-    builder = ColumnBlocks(grid, case.most_vehicles, case.spread_s)
-    entrance = Entrance(grid, builder, case.spread_s, case.interlaced)
-    entrance.run(list(case.stream))
-    assert {each.arrival for each in entrance.admissions} == set(case.stream)
-    check(entrance, case.most_vehicles, 10)
+    check(entrance, case.most_vehicles, case.most_columns if grows else 10)
 
 
 @pytest.mark.parametrize("bug", ["column-given-twice", "closed-too-early", "columns-forgotten"])
@@ -173,8 +169,7 @@ def test_the_check_notices_a_roadside_that_is_wrong(bug: str) -> None:
     ]
     with pytest.raises(AssertionError):
         run_and_check(entrance, stream)
-    right = Entrance(lattice(), growing(), SPREAD_S)
-    run_and_check(right, stream)
+    run_and_check(Entrance(lattice(), growing(), SPREAD_S), stream)
 
 
 def run_and_check(entrance: Entrance, stream: list[Arrival]) -> None:
@@ -288,19 +283,15 @@ def test_a_vehicle_behind_the_maximum_length_begins_another_formation() -> None:
     assert columns(builder, 100.0) == [(-26, -32)]
 
 
-def test_columns_between_two_formations_belong_to_none() -> None:
+def test_columns_without_vehicles_belong_to_no_formation() -> None:
     builder = growing()
+    assert columns(builder, 100.0) == []
+    assert builder.closed_to == -1
     take(builder, (-20, 1, 0))
     columns(builder, 100.0)
     take(builder, (-50, 1, 0))
     assert columns(builder, 100.0) == [(-49, -55)]
     assert builder.closed_to == 55
-
-
-def test_without_vehicles_nothing_is_closed() -> None:
-    builder = growing()
-    assert columns(builder, 1000.0) == []
-    assert builder.closed_to == -1
 
 
 def test_on_one_lane_a_formation_needs_no_free_column() -> None:
