@@ -132,8 +132,8 @@ def check_story(path: Path, player: Player | None = None) -> None:
         except StoryError as error:
             raise type(error)(f"{path.name}:{line.number}: {error}") from error
         if happened != line.expected:
-            told = "".join(f"\n  => {each}" for each in happened) or "\n  nothing"
-            raise StoryError(f"{path.name}:{line.number}: {line.command}{told}")
+            happened_lines = "".join(f"\n  => {each}" for each in happened) or "\n  nothing"
+            raise StoryError(f"{path.name}:{line.number}: {line.command}{happened_lines}")
 
 
 def ends_in_collision(path: Path, player: Player) -> bool:

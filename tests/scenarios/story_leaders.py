@@ -296,4 +296,4 @@ def _moves_of(plan: Plan) -> str:
         for name, moves in sorted(plan.moves.items())
         for step, _, target in moves
     ]
-    return " ".join(moves) or "nobody moves"
+    return " ".join(moves) or "no vehicle moves"

@@ -17,7 +17,7 @@ from laneweave.protocol.wire.messages import Heartbeat, Plan, VehicleState
 from laneweave.protocol.wire.topics import COORDINATOR_ALIVE
 from scenarios.story_leaders import Candidate, Leader, Mail, formation_of
 from scenarios.story_road import TICK_S, Agent, CaretakerProcess, Process, Vehicle
-from scenarios.story_text import CollisionError, StoryError, cell_of, shown, told, written
+from scenarios.story_text import CollisionError, StoryError, cell_of, shown, state_text, written
 
 Lines = Iterator[str]
 
@@ -75,7 +75,7 @@ class Player:
         """Carry a command out and tell what happened.
 
         Raises:
-            StoryError: the command is not known, or names nobody.
+            StoryError: the command is unknown, or names an unknown process or vehicle.
             CollisionError: two vehicles occupy one cell.
         """
         for pattern, action in self._grammar:
@@ -239,7 +239,7 @@ class Player:
         for process in self.processes.values():
             if process.vehicle.name == vehicle and process.incarnation == attendant:
                 return process
-        raise StoryError(f"nobody is in charge of {vehicle}")
+        raise StoryError(f"no process is in charge of {vehicle}")
 
     # --- mail and states ----------------------------------------------------------------------
 
@@ -247,7 +247,7 @@ class Player:
         process = self.processes[name]
         message = self._mail.get((kind, ballot, process.vehicle.name))
         if message is None:
-            yield "nobody has sent it"
+            yield "it was never sent"
             return
         before, promised = process.shown, _promised(process)
         process.get(message, self.tick)
@@ -359,7 +359,7 @@ class Player:
             yield from self.candidates[name].about()
         else:
             state = self.processes[name].shown
-            yield told(name, state) if state is not None else f"{name} has shown nothing"
+            yield state_text(name, state) if state is not None else f"{name} has shown nothing"
 
 
 @frozen

@@ -114,7 +114,7 @@ class Vehicle:
         t_s: float,
         scenario: Scenario = SCENARIO,
     ) -> Vehicle:
-        """Return a vehicle that nobody is in charge of yet."""
+        """Return a vehicle that no process is in charge of yet."""
         arrival = Arrival(Name(name), cell[1], preferred_lane, t_s)
         road = RoadVehicle.entering(Admission(arrival, cell, t_s), t_s, scenario)
         return cls(road, cell, scenario=scenario)

@@ -1,12 +1,12 @@
-"""Stories of the rolling operation: vehicles own cells, and short ballots hand them over.
+"""Stories of the rolling operation: vehicles own cells, and short ballots transfer them.
 
 | command | what it does |
 |---|---|
 | `vehicle A at 3,0 wants 1, owns 4,0 2,0` | it owns these cells beside its own |
 | `vehicle A at 3,0 from 2,0 wants 1, owns 2,0` | it is still on its way into its cell |
 | `stream L1 term 1` | a leader that has just taken over |
-| `L1 hands over A>3,1 with B` | a new ballot: A moves to 3,1; the roster is A and B |
-| `L1 hands over A>3,1 claiming 3,1` | the same of a faulty leader: A owns 3,1, it says |
+| `L1 transfers A>3,1 with B` | a new ballot: A moves to 3,1; the roster is A and B |
+| `L1 transfers A>3,1 claiming 3,1` | the same of a faulty leader that claims that A owns 3,1 |
 | `L1 collects promises` | in short: all get the PREPARE, and are heard |
 | `L1 brings its plan to A B` | in short: they get the PLAN |
 | `A B hear each other` | in short |
@@ -44,18 +44,18 @@ class StreamLeader:
     name: str
     term: int
     states: dict[Name, VehicleState] = field(factory=dict)
-    handover: CellTransfer | None = None
+    transfer: CellTransfer | None = None
     claims: tuple[Cell, ...] = ()
-    """Cells that it takes for the mover's, whoever owns them."""
+    """Cells that it wrongly takes as owned by the mover."""
     ballots: int = 0
     gone: frozenset[Name] = frozenset()
-    """Who has left the road."""
+    """Vehicles that have left the road."""
 
     def begin(self, mover: Name, target: Cell, others: tuple[Name, ...], now_s: float) -> None:
         """Begin a ballot over a mover and others."""
         self.ballots += 1
         roster = tuple(sorted({mover, *others}))
-        self.handover = CellTransfer(
+        self.transfer = CellTransfer(
             ballot=Ballot(self.term, Name(self.name), 1, self.ballots),
             roster=roster,
             moves={mover: (self.states[mover].hold_cell, target)},
@@ -67,28 +67,28 @@ class StreamLeader:
         )
 
     def send(self, mail: Mail, now_s: float) -> Lines:
-        if self.handover is not None:
-            for vehicle, message in self.handover.outgoing(now_s):
+        if self.transfer is not None:
+            for vehicle, message in self.transfer.outgoing(now_s):
                 yield post(mail, message, vehicle)
 
     def hear(self, state: VehicleState, now_s: float) -> Lines:
-        handover = self.handover
-        if self.claims and handover is not None and state.vehicle in handover.moves:
+        transfer = self.transfer
+        if self.claims and transfer is not None and state.vehicle in transfer.moves:
             state = evolve(state, estate=tuple(sorted({*state.estate, *self.claims})))
         self.states[state.vehicle] = state
-        if handover is None:
+        if transfer is None:
             return
-        before = handover.phase
-        handover.on_state(state, self.states, now_s)
-        if handover.phase is not before:
+        before = transfer.phase
+        transfer.on_state(state, self.states, now_s)
+        if transfer.phase is not before:
             yield self.about()
 
     def about(self) -> str:
-        handover = self.handover
-        if handover is None:
+        transfer = self.transfer
+        if transfer is None:
             return f"{self.name} has no ballot"
-        why = f": {handover.why}" if handover.phase is BallotPhase.GIVEN_UP else ""
-        return f"{self.name} {handover.phase.value} {written(handover.ballot)}{why}"
+        why = f": {transfer.why}" if transfer.phase is BallotPhase.GIVEN_UP else ""
+        return f"{self.name} {transfer.phase.value} {written(transfer.ballot)}{why}"
 
 
 class RollingPlayer(Player):
@@ -104,7 +104,7 @@ class RollingPlayer(Player):
         mine: tuple[tuple[str, Callable[..., Lines | None]], ...] = (
             (r"vehicle (\w+) at (\S+)(?: from (\S+))? wants (\d+)(?:, owns (.+))?", self._enter),
             (r"stream (\w+) term (\d+)", self._stream),
-            (r"(\w+) hands over (\w+)>(\S+)(?: with ([\w ]+))?(?: claiming (.+))?", self._hands),
+            (r"(\w+) transfers (\w+)>(\S+)(?: with ([\w ]+))?(?: claiming (.+))?", self._transfer),
             (r"(\w+) brings its plan to (.+)", self._issues),
             (r"([\w ]+) hear each other", self._hear_each_other),
             (r"(\w+) gets (PREPARE|PLAN) (\S+) late", self._gets_late),
@@ -173,7 +173,7 @@ class RollingPlayer(Player):
         del leader.states[Name(vehicle)]
         leader.gone |= {Name(vehicle)}
 
-    def _hands(
+    def _transfer(
         self, name: str, mover: str, target: str, others: str | None, claimed: str | None
     ) -> None:
         leader = self.streams[name]
@@ -190,26 +190,26 @@ class RollingPlayer(Player):
             yield from super()._sends(name)
 
     def _collects(self, name: str) -> Lines:
-        leader, handover = self.streams[name], self._handover_of(name)
+        leader, transfer = self.streams[name], self._transfer_of(name)
         list(leader.send(self._mail, self.t_s))
         told: list[str] = []
-        for vehicle in handover.roster:
-            self._deliver_to(vehicle, "PREPARE", handover)
+        for vehicle in transfer.roster:
+            self._deliver_to(vehicle, "PREPARE", transfer)
             told += leader.hear(self._shown_by(vehicle), self.t_s)
-        yield f"{' '.join(sorted(handover.promises)) or 'none'} promise {written(handover.ballot)}"
+        yield f"{' '.join(sorted(transfer.promises)) or 'none'} promise {written(transfer.ballot)}"
         yield from told
 
     def _issues(self, name: str, vehicles: str) -> Lines:
-        leader, handover = self.streams[name], self._handover_of(name)
+        leader, transfer = self.streams[name], self._transfer_of(name)
         list(leader.send(self._mail, self.t_s))
         for vehicle in vehicles.split():
-            self._deliver_to(vehicle, "PLAN", handover)
+            self._deliver_to(vehicle, "PLAN", transfer)
             state = self._shown_by(vehicle)
-            accepts = state.accepted and state.promised == handover.ballot
+            accepts = state.accepted and state.promised == transfer.ballot
             yield f"{vehicle} accepts" if accepts else f"{vehicle} does not accept"
 
-    def _deliver_to(self, vehicle: str, kind: str, handover: CellTransfer) -> None:
-        message = self._mail.get((kind, written(handover.ballot), vehicle))
+    def _deliver_to(self, vehicle: str, kind: str, transfer: CellTransfer) -> None:
+        message = self._mail.get((kind, written(transfer.ballot), vehicle))
         if message is not None:
             self._in_charge_of(vehicle).get(message, self.tick)
 
@@ -228,11 +228,11 @@ class RollingPlayer(Player):
     def _show(self, name: str) -> Lines:
         yield from [self.streams[name].about()] if name in self.streams else super()._show(name)
 
-    def _handover_of(self, name: str) -> CellTransfer:
-        handover = self.streams[name].handover
-        if handover is None:
+    def _transfer_of(self, name: str) -> CellTransfer:
+        transfer = self.streams[name].transfer
+        if transfer is None:
             raise StoryError(f"{name} has no ballot")
-        return handover
+        return transfer
 
     def _shown_by(self, name: str) -> VehicleState:
         """Return what a process shows, or whoever is in charge of a vehicle of this name."""

@@ -1,4 +1,4 @@
-"""How a story writes things, and what can be wrong with one."""
+"""The notation of stories, and the errors that a story can end with."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from laneweave.protocol.wire.messages import Ballot, VehicleState
 
 
 class StoryError(AssertionError):
-    """A story went otherwise, or cannot be read."""
+    """A story does not go as written, or cannot be parsed."""
 
 
 class CollisionError(StoryError):
@@ -30,8 +30,8 @@ def written(ballot: Ballot) -> str:
     return "/".join(str(part) for part in ballot)
 
 
-def told(name: str, state: VehicleState) -> str:
-    """Tell what a state says."""
+def state_text(name: str, state: VehicleState) -> str:
+    """Write the state of a vehicle."""
     parts = [f"{name} {'moves to' if state.moving else 'holds'} {shown(state.hold_cell)}"]
     if state.promised is not None:
         has = "accepted" if state.accepted else "promised"
@@ -52,5 +52,6 @@ def told(name: str, state: VehicleState) -> str:
     if state.estate:
         parts.append(f"owns {' '.join(map(shown, state.estate))}")
     if state.deed is not None:
-        parts.append(f"deed {written(state.deed.ballot)} {'open' if state.deed.open else 'shut'}")
+        gate = "open" if state.deed.open else "closed"
+        parts.append(f"transfer {written(state.deed.ballot)} {gate}")
     return ", ".join(parts)

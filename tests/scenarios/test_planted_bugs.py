@@ -11,14 +11,14 @@ from laneweave.coordinator.rolling.transfer import TRANSFER_RULES
 from laneweave.protocol.vehicle.execution import VEHICLE_RULES
 from scenarios.stories import check_story, ends_in_collision, player_of
 from scenarios.story_text import StoryError
-from support.planted_bugs import BUGS, NOT_A_SAFETY_MATTER, ROWS_OF_OTHERS, PlantedBug, unchanged
+from support.planted_bugs import BUGS, NOT_A_SAFETY_MATTER, ROWS_OF_OTHERS, Bug, unchanged
 
 HERE = Path(__file__).parent
 BOOKS = (VEHICLE_RULES, LEADER_RULES, TRANSFER_RULES)
 
 
 @pytest.mark.parametrize("bug", BUGS, ids=lambda bug: bug.name)
-def test_planted_bug_spoils_its_story(bug: PlantedBug, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_planted_bug_spoils_its_story(bug: Bug, monkeypatch: pytest.MonkeyPatch) -> None:
     path = HERE / f"{bug.story}.txt"
     bug.plant(monkeypatch)
     with pytest.raises(StoryError):

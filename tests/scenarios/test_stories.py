@@ -52,7 +52,7 @@ def test_readme_lists_all_stories() -> None:
         ("A ticks", "there is no 'A'"),
         ("vehicle A at 0,0 wants 1\nvehicle B at 0,0 wants 1", "both occupy"),
         ("vehicle A at 0,0 wants 1\nA ticks\n=> A moves 0,0 > 0,1", "A holds 0,0"),
-        ("vehicle A at 0,0 wants 1\nA gets PLAN 1/L1/1/1", "nobody has sent"),
+        ("vehicle A at 0,0 wants 1\nA gets PLAN 1/L1/1/1", "was never sent"),
         ("clock 2.0\nclock 1.0", "it is 2 s already"),
         ("vehicle A at 0,0 wants 1\nleader L1 term 1 leads A\nL1 hears A", "L1 preparing"),
     ],

@@ -23,7 +23,7 @@ if __name__ == "__main__":  # run as a program: as `pythonpath` in pyproject.tom
 from laneweave.launch.fault_search.fault_run import FaultRun
 from laneweave.launch.fault_search.profiles import PROFILES
 from laneweave.launch.fault_search.search import quiet_logs
-from support.planted_bugs import BUGS, PlantedBug
+from support.planted_bugs import BUGS, Bug
 
 SEEDS = 500
 SEARCHED = ("mixed", "joint", "rolling")
@@ -41,9 +41,7 @@ class Catch:
     """What was violated."""
 
 
-def first_catch(
-    bug: PlantedBug, seeds: Iterable[int], profiles: Sequence[str] = SEARCHED
-) -> Catch | None:
+def first_catch(bug: Bug, seeds: Iterable[int], profiles: Sequence[str] = SEARCHED) -> Catch | None:
     """Run seeds with a planted bug until a run is not as it must be.
 
     Raises:
@@ -55,7 +53,7 @@ def first_catch(
     return catch
 
 
-def _first_failure(bug: PlantedBug, seeds: Iterable[int], profiles: Sequence[str]) -> Catch | None:
+def _first_failure(bug: Bug, seeds: Iterable[int], profiles: Sequence[str]) -> Catch | None:
     with pytest.MonkeyPatch.context() as patch:
         bug.plant(patch)
         for profile in profiles:
@@ -73,7 +71,7 @@ def _search(name: str, count: int, profiles: Sequence[str]) -> Catch | None:
     return first_catch(bug_named(name), range(count), profiles)
 
 
-def bug_named(name: str) -> PlantedBug:
+def bug_named(name: str) -> Bug:
     """Return a planted bug."""
     return next(bug for bug in BUGS if bug.name == name)
 

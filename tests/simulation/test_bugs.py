@@ -17,8 +17,8 @@ SOON = {
     "second-plan-under-one-ballot": ("mixed", "two-plans"),
     "promise-keeps-plan": ("mixed", "motion"),
     "joined-not-learned": ("mixed", "stuck"),
-    "possession-not-taken": ("rolling", "gate"),
-    "possession-without-gate": ("rolling", "owner"),
+    "ownership-not-taken": ("rolling", "gate"),
+    "ownership-without-gate": ("rolling", "owner"),
 }
 """Bugs that a few seeds of a profile show, and as what; each kind of violation but `overlap`."""
 FOUND = (
@@ -28,7 +28,7 @@ FOUND = (
     "promise-keeps-heard",
     "joining-not-asked",
     "no-promise-check",
-    "zombie-plan-accepted",
+    "lower-ballot-plan-accepted",
     "plan-taken-twice",
     "no-gate",
     "gate-minus-one",
@@ -47,13 +47,13 @@ FOUND = (
     "second-plan-under-one-ballot",
     "joined-not-learned",
     "part-of-blocks-planned",
-    "possession-not-taken",
-    "moves-off-its-estate",
-    "possession-without-gate",
-    "deed-after-promise",
-    "estate-dies-with-process",
-    "shut-deeds-ignored",
-    "common-promise-voids-deeds",
+    "ownership-not-taken",
+    "moves-outside-owned-cells",
+    "ownership-without-gate",
+    "transfer-after-promise",
+    "ownership-lost-with-process",
+    "closed-transfers-ignored",
+    "common-promise-cancels-transfers",
     "cell-kept-by-both",
 )
 """Bugs that the search has been seen to find, each with a run that passes without the bug."""

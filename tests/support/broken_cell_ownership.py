@@ -32,7 +32,7 @@ def obey(patch: Patch) -> None:
     patch.setattr(MotionController, "take", mutant)
 
 
-def possess_at_once(patch: Patch) -> None:
+def own_at_once(patch: Patch) -> None:
     begin_transfer = MotionController.begin_transfer
 
     def mutant(self: MotionController, deed: Deed) -> None:
@@ -42,7 +42,7 @@ def possess_at_once(patch: Patch) -> None:
     patch.setattr(MotionController, "begin_transfer", mutant)
 
 
-def draw_up_anything(patch: Patch) -> None:
+def note_any_transfer(patch: Patch) -> None:
     def mutant(self: MotionController, deed: Deed) -> None:
         if deed != self.transfer:
             self.transfer, self.owned = deed, deed.before
@@ -60,7 +60,7 @@ def forget_promise(patch: Patch) -> None:
     patch.setattr(MotionController, "put_in_charge", mutant)
 
 
-def forget_estate(patch: Patch) -> None:
+def forget_owned_cells(patch: Patch) -> None:
     put_in_charge = MotionController.put_in_charge
 
     def mutant(self: MotionController, incarnation: int) -> None:
@@ -72,7 +72,7 @@ def forget_estate(patch: Patch) -> None:
     patch.setattr(MotionController, "put_in_charge", mutant)
 
 
-def show_estate_at_once(patch: Patch) -> None:
+def show_owned_cells_at_once(patch: Patch) -> None:
     state = PlanExecution.state
 
     def mutant(
@@ -84,7 +84,7 @@ def show_estate_at_once(patch: Patch) -> None:
     patch.setattr(PlanExecution, "state", mutant)
 
 
-def void_shut_deeds(patch: Patch) -> None:
+def cancel_closed_transfers(patch: Patch) -> None:
     def mutant(state: VehicleState, states: States, gone: Collection[Name]) -> frozenset[Cell]:
         del states, gone
         return frozenset(state.estate)
@@ -92,7 +92,7 @@ def void_shut_deeds(patch: Patch) -> None:
     patch.setattr(transfer, "owned_cells", mutant)
 
 
-def void_by_common_promise(patch: Patch) -> None:
+def cancel_on_common_promise(patch: Patch) -> None:
     owned_cells = ownership.owned_cells
 
     def mutant(
@@ -119,7 +119,7 @@ def forget_motion(patch: Patch) -> None:
     patch.setattr(transfer, "owned_cells", mutant)
 
 
-def check_no_estates(patch: Patch) -> None:
+def skip_ownership_checks(patch: Patch) -> None:
     patch.setattr(transfer, "ownership_problems", _no_problems)
     patch.setattr(vehicle_rules, "ownership_problems", _no_problems)
 
@@ -135,7 +135,7 @@ def keep_what_is_given(patch: Patch) -> None:
         return evolve(plan, after=after)
 
     patch.setattr(CellTransfer, "_plan", mutant)
-    check_no_estates(patch)
+    skip_ownership_checks(patch)
 
 
 def _no_problems(plan: Plan) -> list[str]:

@@ -40,7 +40,7 @@ from laneweave.sim_bridge.road.formation_building import ColumnBlocks
 
 LEASE_S = 2.0
 FAR_BEHIND = 2**31
-"""A block that nobody ever reaches."""
+"""A block beyond those of any run."""
 EARLY_S = 4.0
 """About as long as a block of columns takes to enter."""
 
@@ -109,7 +109,7 @@ def accepted_mine_or_newer(me: PlanExecution, state: VehicleState) -> bool:
     )
 
 
-def hear_whoever(me: PlanExecution, state: VehicleState) -> None:
+def hear_any_state(me: PlanExecution, state: VehicleState) -> None:
     me.heard[state.vehicle] = max(me.heard.get(state.vehicle, -1), state.completed)
 
 
@@ -181,9 +181,9 @@ def roster_of_heard(patch: pytest.MonkeyPatch) -> None:
 
 def roster_of_majority(patch: pytest.MonkeyPatch) -> None:
     def mutant(me: FormationLeader) -> tuple[Name, ...]:
-        everybody = me.formation.roster
-        promised = tuple(name for name in everybody if name in me.promises)
-        return promised if 2 * len(promised) > len(everybody) else everybody
+        members = me.formation.roster
+        promised = tuple(name for name in members if name in me.promises)
+        return promised if 2 * len(promised) > len(members) else members
 
     patch.setattr(FormationLeader, "roster", property(mutant))
 
@@ -195,7 +195,7 @@ def roster_of_promised(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(FormationLeader, "roster", property(mutant))
 
 
-def anybody_has_promised(me: FormationLeader, _: object) -> bool:
+def any_has_promised(me: FormationLeader, _: object) -> bool:
     return bool(me.promises)
 
 
@@ -276,7 +276,7 @@ def revive(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Election, "on_heartbeat", mutant)
 
 
-def believe_the_void(patch: pytest.MonkeyPatch) -> None:
+def ignore_link_loss(patch: pytest.MonkeyPatch) -> None:
     def mutant(self: Election, *, up: bool, now_s: float) -> None:
         del self, up, now_s
 
@@ -327,7 +327,7 @@ def join_nothing(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Groups, "join", mutant)
 
 
-def play_everything(patch: pytest.MonkeyPatch) -> None:
+def play_any_command(patch: pytest.MonkeyPatch) -> None:
     take = MotionController.take
 
     def mutant(self: MotionController, command: Command) -> bool:
@@ -336,7 +336,7 @@ def play_everything(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(MotionController, "take", mutant)
 
 
-def speak_at_once(patch: pytest.MonkeyPatch) -> None:
+def always_in_charge(patch: pytest.MonkeyPatch) -> None:
     def mutant(self: AgentCore) -> bool:
         return self.execution is not None and not self.ended
 

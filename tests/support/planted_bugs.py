@@ -39,7 +39,7 @@ def unchanged(_: pytest.MonkeyPatch) -> None:
 
 
 @frozen(eq=False)
-class PlantedBug:
+class Bug:
     """One broken rule."""
 
     name: str
@@ -54,7 +54,7 @@ class PlantedBug:
     owners of one, or with a body in a cell that is not its own); otherwise nothing worse than
     disorder, or a vehicle that waits for ever."""
     replaced: Mapping[Function, Function] = field(factory=dict)
-    """Guards and actions of a vehicle or a leader, and what stands for them."""
+    """Guards and actions of a vehicle or a leader, and their replacements."""
     vehicle_row: Callable[[Transition], Transition] | None = None
     """Changes rows of a vehicle's table."""
     plant: Callable[[pytest.MonkeyPatch], None] = unchanged
@@ -76,363 +76,205 @@ class PlantedBug:
         return replacing(book, {rule: bug for rule, bug in self.replaced.items() if rule in used})
 
 
-BUGS: tuple[PlantedBug, ...] = (
+BUGS: tuple[Bug, ...] = (
     # --- V2: promises
-    PlantedBug(
-        "lower-ballot-promised", "V2", "A lower ballot than the promised one is promised, too.",
-        "late_duplicate_plan", collides=False, replaced={vehicle.is_above_promise: broken.always},
-    ),
-    PlantedBug(
-        "promise-keeps-count", "V2", "A promise does not begin the count of moves anew.",
-        "count_begins_anew", replaced={vehicle.drop_plan: broken.keep_count},
-    ),
-    PlantedBug(
-        "promise-keeps-plan", "V2", "A promise does not end the part in the old plan.",
-        "prepare_while_moving", replaced={vehicle.drop_plan: broken.skip},
-    ),
-    PlantedBug(
-        "promise-keeps-heard", "V2", "What was heard of the old plan counts in the new one.",
-        "heard_begins_anew", replaced={vehicle.forget_heard: broken.skip},
-    ),
-    PlantedBug(
-        "joining-not-asked", "V2", "A promise does not ask the controller to join formations.",
-        "joint_ballot", collides=False, replaced={vehicle.promise: broken.promise_without_joining},
-    ),
+    Bug("lower-ballot-promised", "V2", "A lower ballot than the promised one is promised, too.",
+        "late_duplicate_plan", collides=False, replaced={vehicle.is_above_promise: broken.always}),
+    Bug("promise-keeps-count", "V2", "A promise does not begin the count of moves anew.",
+        "promise_resets_the_count", replaced={vehicle.drop_plan: broken.keep_count}),
+    Bug("promise-keeps-plan", "V2", "A promise does not end the part in the old plan.",
+        "prepare_while_moving", replaced={vehicle.drop_plan: broken.skip}),
+    Bug("promise-keeps-heard", "V2", "What was heard of the old plan counts in the new one.",
+        "promise_discards_what_was_heard", replaced={vehicle.forget_heard: broken.skip}),
+    Bug("joining-not-asked", "V2", "A promise does not ask the controller to join formations.",
+        "joint_ballot", collides=False, replaced={vehicle.promise: broken.promise_without_joining}),
     # --- V3: acceptance
-    PlantedBug(
-        "no-promise-check", "V3", "Any plan that names the vehicle is accepted at any time.",
-        "plan_of_a_zombie", collides=False,
+    Bug("no-promise-check", "V3", "Any plan that names the vehicle is accepted at any time.",
+        "plan_of_a_resumed_leader", collides=False,
         replaced={vehicle.is_promised_ballot: broken.always, vehicle.accept: broken.accept_anew},
-        vehicle_row=broken.plan_in_any_phase,
-    ),
-    PlantedBug(
-        "acceptance-not-noted", "V3", "A plan is accepted without the motion controller's word.",
-        "zombie_takes_a_newer_plan",
-        replaced={vehicle.is_noted: broken.always}, plant=broken.note_by_itself,
-    ),
-    PlantedBug(
-        "zombie-plan-accepted", "V3", "A plan of a lower ballot than the promised one is accepted.",
-        "plan_of_a_lower_ballot", replaced={vehicle.is_promised_ballot: broken.always},
-    ),
-    PlantedBug(
-        "plan-taken-twice", "V3", "A repeated PLAN begins the plan anew.",
+        vehicle_row=broken.plan_in_any_phase),
+    Bug("acceptance-not-noted", "V3", "A plan is accepted before the motion controller notes it.",
+        "replaced_agent_takes_a_newer_plan",
+        replaced={vehicle.is_noted: broken.always}, plant=broken.note_by_itself),
+    Bug("lower-ballot-plan-accepted", "V3", "A plan of a lower ballot than promised is accepted.",
+        "plan_of_a_lower_ballot", replaced={vehicle.is_promised_ballot: broken.always}),
+    Bug("plan-taken-twice", "V3", "A repeated PLAN begins the plan anew.",
         "plan_repeated", replaced={vehicle.accept: broken.accept_anew},
-        vehicle_row=broken.plan_in_any_phase,
-    ),
-    PlantedBug(
-        "incarnation-not-checked", "V3", "A plan for an earlier process is accepted.",
-        "plan_for_an_earlier_process", replaced={vehicle.names_my_incarnation: broken.always},
-    ),
-    PlantedBug(
-        "start-cell-not-checked", "V3", "A plan that begins in another cell is accepted.",
-        "planner_mistakes_a_cell", replaced={vehicle.starts_in_my_cell: broken.always},
-    ),
-    PlantedBug(
-        "plan-not-checked", "V3", "A plan in which two vehicles meet is accepted.",
-        "planner_lets_two_meet", replaced={vehicle.is_executable: broken.always},
-    ),
-    PlantedBug(
-        "territory-not-checked", "V3", "A plan beyond the blocks of its formations is accepted.",
-        "planner_leaves_its_block", replaced={vehicle.keeps_to_its_blocks: broken.always},
-    ),
-    PlantedBug(
-        "joined-not-checked", "V3", "A plan for formations that were not joined is accepted.",
-        "planner_claims_another_block", replaced={vehicle.has_joined: broken.always},
-    ),
-    PlantedBug(
-        "part-of-blocks-accepted", "V3", "A plan for some of the joined blocks is accepted.",
+        vehicle_row=broken.plan_in_any_phase),
+    Bug("incarnation-not-checked", "V3", "A plan for an earlier process is accepted.",
+        "plan_for_an_earlier_process", replaced={vehicle.names_my_incarnation: broken.always}),
+    Bug("start-cell-not-checked", "V3", "A plan that begins in another cell is accepted.",
+        "planner_has_a_wrong_cell", replaced={vehicle.starts_in_my_cell: broken.always}),
+    Bug("plan-not-checked", "V3", "A plan in which two vehicles meet is accepted.",
+        "planner_lets_two_meet", replaced={vehicle.is_executable: broken.always}),
+    Bug("territory-not-checked", "V3", "A plan beyond the blocks of its formations is accepted.",
+        "planner_leaves_its_block", replaced={vehicle.keeps_to_its_blocks: broken.always}),
+    Bug("joined-not-checked", "V3", "A plan for formations that were not joined is accepted.",
+        "planner_claims_another_block", replaced={vehicle.has_joined: broken.always}),
+    Bug("part-of-blocks-accepted", "V3", "A plan for some of the joined blocks is accepted.",
         "planner_leaves_a_block_out",
-        replaced={vehicle.has_joined: broken.plans_for_some_of_its_blocks},
-    ),
+        replaced={vehicle.has_joined: broken.plans_for_some_of_its_blocks}),
     # --- V4, V5: news and the start gate
-    PlantedBug(
-        "no-gate", "V5", "A vehicle moves as soon as it has the plan itself.",
-        "start_gate_guards_a_moving_vehicle", replaced={vehicle.all_are_ready: broken.always},
-    ),
-    PlantedBug(
-        "gate-minus-one", "V5", "The gate opens when all other members but one are ready.",
-        "gate_minus_one", replaced={vehicle.all_are_ready: broken.all_but_one_are_ready},
-    ),
-    PlantedBug(
-        "gate-on-promise", "V4", "The promises of all others open the gate.",
+    Bug("no-gate", "V5", "A vehicle moves as soon as it has the plan itself.",
+        "start_gate_guards_a_moving_vehicle", replaced={vehicle.all_are_ready: broken.always}),
+    Bug("gate-minus-one", "V5", "The gate opens when all other members but one are ready.",
+        "gate_minus_one", replaced={vehicle.all_are_ready: broken.all_but_one_are_ready}),
+    Bug("gate-on-promise", "V4", "The promises of all others open the gate.",
         "gate_on_promise",
         replaced={
             vehicle.is_of_my_plan: broken.promised_my_ballot,
-            vehicle.hear: broken.hear_whoever,
-        },
-    ),
-    PlantedBug(
-        "ready-while-moving", "V4", "A vehicle that has accepted counts as ready while it moves.",
-        "prepare_while_moving", plant=broken.ready_with_plan,
-    ),
-    PlantedBug(
-        "one-acceptance-opens-the-gate", "V4", "Any other member's acceptance opens the gate.",
-        "gate_minus_one", replaced={vehicle.shows_open_gate: broken.always},
-    ),
-    PlantedBug(
-        "go-of-another-ballot", "V4", "An open gate in another ballot opens this one.",
-        "gate_is_open_for_all", replaced={vehicle.is_of_my_plan: broken.accepted_mine_or_goes},
-    ),
-    PlantedBug(
-        "release-on-any-ballot", "V4", "Moves completed in any plan count for this one.",
-        "newer_ballot_releases_nothing", replaced={vehicle.is_of_my_plan: broken.accepted_anything},
-    ),
-    PlantedBug(
-        "release-on-a-newer-ballot", "V4", "Moves completed in a newer plan count for this one.",
+            vehicle.hear: broken.hear_any_state,
+        }),
+    Bug("ready-while-moving", "V4", "A vehicle that has accepted counts as ready while it moves.",
+        "prepare_while_moving", plant=broken.ready_with_plan),
+    Bug("one-acceptance-opens-the-gate", "V4", "Any other member's acceptance opens the gate.",
+        "gate_minus_one", replaced={vehicle.shows_open_gate: broken.always}),
+    Bug("go-of-another-ballot", "V4", "An open gate in another ballot opens this one.",
+        "gate_is_open_for_all", replaced={vehicle.is_of_my_plan: broken.accepted_mine_or_goes}),
+    Bug("release-on-any-ballot", "V4", "Moves completed in any plan count for this one.",
         "newer_ballot_releases_nothing",
-        replaced={vehicle.is_of_my_plan: broken.accepted_mine_or_newer},
-    ),
-    PlantedBug(
-        "move-under-way-counts", "V4", "A move that has begun counts as completed.",
-        "dependency", replaced={vehicle.hear: broken.hear_moves_under_way},
-    ),
+        replaced={vehicle.is_of_my_plan: broken.accepted_anything}),
+    Bug("release-on-a-newer-ballot", "V4", "Moves completed in a newer plan count for this one.",
+        "newer_ballot_releases_nothing",
+        replaced={vehicle.is_of_my_plan: broken.accepted_mine_or_newer}),
+    Bug("move-under-way-counts", "V4", "A move that has begun counts as completed.",
+        "dependency", replaced={vehicle.hear: broken.hear_moves_under_way}),
     # --- V6, V7: moves
-    PlantedBug(
-        "timetable", "V6", "The clock alone releases moves.",
-        "dependency", replaced={vehicle.is_released: broken.always},
-    ),
-    PlantedBug(
-        "lease", "V6", "A move is released when it has been due for long: `it must have stopped`.",
-        "lease", replaced={vehicle.is_released: broken.is_released_after_a_while},
-    ),
-    PlantedBug(
-        "need-minus-one", "V6", "A move waits for one completed move less than it needs.",
-        "dependency", plant=broken.need_one_less,
-    ),
-    PlantedBug(
-        "corners-forgotten", "V6", "The corner cells of diagonal moves are not occupied.",
-        "corner", plant=broken.forget_corners,
-    ),
-    PlantedBug(
-        "start-while-moving", "V6", "A move begins before the one under way has ended.",
-        "one_motion_at_a_time", replaced={vehicle.is_holding: broken.always},
-    ),
-    PlantedBug(
-        "no-pacing", "V6", "Moves begin before their time.",
-        "paced_by_the_clock", collides=False, replaced={vehicle.is_time: broken.always},
-    ),
-    PlantedBug(
-        "counted-at-the-start", "V7", "A move is counted when it begins.",
+    Bug("timetable", "V6", "The clock alone releases moves.",
+        "dependency", replaced={vehicle.is_released: broken.always}),
+    Bug("lease", "V6", "A move is released when it has been due for a long time.",
+        "lease", replaced={vehicle.is_released: broken.is_released_after_a_while}),
+    Bug("need-minus-one", "V6", "A move waits for one completed move less than it needs.",
+        "dependency", plant=broken.need_one_less),
+    Bug("corners-forgotten", "V6", "The corner cells of diagonal moves are not occupied.",
+        "corner", plant=broken.forget_corners),
+    Bug("start-while-moving", "V6", "A move begins before the one under way has ended.",
+        "one_motion_at_a_time", replaced={vehicle.is_holding: broken.always}),
+    Bug("no-pacing", "V6", "Moves begin before their time.",
+        "paced_by_the_clock", collides=False, replaced={vehicle.is_time: broken.always}),
+    Bug("counted-at-the-start", "V7", "A move is counted when it begins.",
         "dependency",
-        replaced={vehicle.start_move: broken.start_and_count, vehicle.count_move: broken.skip},
-    ),
-    PlantedBug(
-        "old-motion-counts", "V7", "A motion of an older plan is counted in the new one.",
-        "motion_of_an_old_plan", replaced={vehicle.moved_in_plan: broken.always},
-    ),
+        replaced={vehicle.start_move: broken.start_and_count, vehicle.count_move: broken.skip}),
+    Bug("old-motion-counts", "V7", "A motion of an older plan is counted in the new one.",
+        "motion_of_an_old_plan", replaced={vehicle.moved_in_plan: broken.always}),
     # --- a leader
-    PlantedBug(
-        "heartbeat-revives-the-dead", "L1", "A heartbeat in flight revives a dead candidate.",
-        "heartbeat_of_the_dead", collides=False, plant=broken.revive,
-    ),
-    PlantedBug(
-        "disconnected-candidate-leads", "L1", "A disconnected candidate takes all others for dead.",
-        "own_connection_lost", collides=False, plant=broken.believe_the_void,
-    ),
-    PlantedBug(
-        "adoption-by-hearsay", "L2", "A plan is adopted though not all members were heard.",
+    Bug("heartbeat-revives-dead-candidate", "L1", "A heartbeat in flight revives a dead candidate.",
+        "late_heartbeat_of_a_dead_candidate", collides=False, plant=broken.revive),
+    Bug("disconnected-candidate-leads", "L1", "A disconnected candidate takes all others for dead.",
+        "own_connection_lost", collides=False, plant=broken.ignore_link_loss),
+    Bug("adoption-without-all-members", "L2", "A plan is adopted before all members were heard.",
         "leader_killed_after_half_of_the_plans", collides=False,
         replaced={
             leader.all_are_heard: broken.always,
             leader.one_plan_is_in_force: broken.heard_have_accepted,
-        },
-    ),
-    PlantedBug(
-        "mixed-ballots-adopted", "L2", "A plan is adopted though some accepted another one.",
+        }),
+    Bug("mixed-ballots-adopted", "L2", "A plan is adopted though some accepted another one.",
         "mixed_ballots", collides=False,
-        replaced={leader.one_plan_is_in_force: broken.all_have_accepted},
-    ),
-    PlantedBug(
-        "overdue-plan-adopted", "L2", "A plan that stalls is adopted.",
+        replaced={leader.one_plan_is_in_force: broken.all_have_accepted}),
+    Bug("overdue-plan-adopted", "L2", "A plan that stalls is adopted.",
         "overdue_is_not_adopted", collides=False,
-        replaced={leader.one_plan_is_in_force: broken.one_ballot},
-    ),
-    PlantedBug(
-        "adoption-interrupts", "L2", "Adopted promises are forgotten, so all members seem new.",
-        "adoption", collides=False, replaced={leader.adopt: broken.adopt_the_ballot_only},
-    ),
-    PlantedBug(
-        "ballot-reused-after-restart", "L3", "Ballots do not tell processes of one name apart.",
-        "leader_restarts", plant=broken.forget_incarnation,
-    ),
-    PlantedBug(
-        "second-plan-under-one-ballot", "L3", "The roster is asked again under the same ballot.",
-        "one_plan_per_ballot", replaced={leader.prepare: broken.prepare_the_same},
-    ),
-    PlantedBug(
-        "old-states-are-news", "L4", "A late state of an earlier process counts as a promise.",
-        "late_promise_of_an_earlier_process", collides=False, plant=broken.take_old_states,
-    ),
-    PlantedBug(
-        "promise-of-any-ballot", "L4", "A promise of another ballot is counted for this one.",
-        "leader_restarts", collides=False, replaced={ballot.is_promise: broken.promised_something},
-    ),
-    PlantedBug(
-        "joined-ignored", "L4", "A promise counts whatever its vehicle has joined.",
-        "joint_ballot_needs_all", collides=False, replaced={leader.has_joined: broken.always},
-    ),
-    PlantedBug(
-        "part-of-blocks-planned", "L4", "Leaders plan for some of the joined blocks; all accept.",
+        replaced={leader.one_plan_is_in_force: broken.one_ballot}),
+    Bug("adoption-interrupts", "L2", "Adopted promises are forgotten, so all members seem new.",
+        "adoption", collides=False, replaced={leader.adopt: broken.adopt_the_ballot_only}),
+    Bug("ballot-reused-after-restart", "L3", "Ballots do not tell processes of one name apart.",
+        "leader_restarts", plant=broken.forget_incarnation),
+    Bug("second-plan-under-one-ballot", "L3", "The roster is asked again under the same ballot.",
+        "one_plan_per_ballot", replaced={leader.prepare: broken.prepare_the_same}),
+    Bug("old-states-are-news", "L4", "A late state of an earlier process counts as a promise.",
+        "late_promise_of_an_earlier_process", collides=False, plant=broken.take_old_states),
+    Bug("promise-of-any-ballot", "L4", "A promise of another ballot is counted for this one.",
+        "leader_restarts", collides=False, replaced={ballot.is_promise: broken.promised_something}),
+    Bug("joined-ignored", "L4", "A promise counts whatever its vehicle has joined.",
+        "joint_ballot_needs_all", collides=False, replaced={leader.has_joined: broken.always}),
+    Bug("part-of-blocks-planned", "L4", "Leaders plan for some of the joined blocks; all accept.",
         "joint_ballot_needs_all",
         replaced={
             leader.has_joined: broken.always,
             vehicle.has_joined: broken.plans_for_some_of_its_blocks,
         },
-        plant=broken.join_nothing,
-    ),
-    PlantedBug(
-        "void-promise-counted", "L4", "The promise of a process that has gone is kept.",
-        "promise_forgotten", collides=False, replaced={leader.void_promise: broken.skip},
-    ),
-    PlantedBug(
-        "promise-without-cell", "L4", "The leader plans from other cells than were promised.",
+        plant=broken.join_nothing),
+    Bug("void-promise-counted", "L4", "The promise of a process that has gone is kept.",
+        "promise_forgotten", collides=False, replaced={leader.void_promise: broken.skip}),
+    Bug("promise-without-cell", "L4", "The leader plans from other cells than were promised.",
         "late_duplicate_plan", collides=False,
-        replaced={ballot.count_promise: broken.count_entry_cell},
-    ),
-    PlantedBug(
-        "roster-by-hearsay", "L5", "The roster is the members that were heard.",
-        "roster_by_hearsay", plant=broken.roster_of_heard,
-    ),
-    PlantedBug(
-        "early-exclusion", "L5", "The promises of a majority are enough.",
-        "silent_vehicle", plant=broken.roster_of_majority,
-    ),
-    PlantedBug(
-        "promises-not-awaited", "L5", "The first promises are enough to plan for them.",
+        replaced={ballot.count_promise: broken.count_entry_cell}),
+    Bug("roster-of-heard-members", "L5", "The roster is the members that were heard.",
+        "member_not_heard", plant=broken.roster_of_heard),
+    Bug("early-exclusion", "L5", "The promises of a majority are enough.",
+        "silent_vehicle", plant=broken.roster_of_majority),
+    Bug("promises-not-awaited", "L5", "The first promises are enough to plan for them.",
         "silent_vehicle",
-        replaced={ballot.all_have_promised: broken.anybody_has_promised},
-        plant=broken.roster_of_promised,
-    ),
-    PlantedBug(
-        "prepared-again-after-failure", "L5", "After failed planning a new ballot is prepared.",
-        "planning_fails", collides=False, replaced={leader.keep_ballot: broken.prepare_anew},
-    ),
-    PlantedBug(
-        "failed-planning-repeated-at-once", "L5", "Failed planning is repeated without a pause.",
-        "planning_fails", collides=False, replaced={ballot.may_try: broken.always},
-    ),
-    PlantedBug(
-        "promise-taken-for-acceptance", "L6", "A promise counts as an acceptance.",
-        "plan_lost_for_one", collides=False, replaced={ballot.is_acceptance: broken.promised_b},
-    ),
-    PlantedBug(
-        "one-acceptance-is-enough", "L6", "The leader rests when the first vehicle has the plan.",
-        "plan_lost_for_one", collides=False, replaced={ballot.is_the_last: broken.always},
-    ),
-    PlantedBug(
-        "outbid-not-noticed", "L7", "A leader that was outbid goes on.",
-        "two_leaders", collides=False, replaced={ballot.shows_higher_promise: broken.never},
-    ),
-    PlantedBug(
-        "restart-not-noticed", "L8", "A vehicle whose process changed counts as if it had not.",
+        replaced={ballot.all_have_promised: broken.any_has_promised},
+        plant=broken.roster_of_promised),
+    Bug("prepared-again-after-failure", "L5", "After failed planning a new ballot is prepared.",
+        "planning_fails", collides=False, replaced={leader.keep_ballot: broken.prepare_anew}),
+    Bug("failed-planning-repeated-at-once", "L5", "Failed planning is repeated without a pause.",
+        "planning_fails", collides=False, replaced={ballot.may_try: broken.always}),
+    Bug("promise-taken-for-acceptance", "L6", "A promise counts as an acceptance.",
+        "plan_lost_for_one", collides=False, replaced={ballot.is_acceptance: broken.promised_b}),
+    Bug("one-acceptance-is-enough", "L6", "The leader rests when the first vehicle has the plan.",
+        "plan_lost_for_one", collides=False, replaced={ballot.is_the_last: broken.always}),
+    Bug("outbid-not-noticed", "L7", "A leader that was outbid goes on.",
+        "two_leaders", collides=False, replaced={ballot.shows_higher_promise: broken.never}),
+    Bug("restart-not-noticed", "L8", "A vehicle whose process changed counts as if it had not.",
         "restart_hidden_by_a_duplicate", collides=False,
-        replaced={ballot.restarted: broken.shows_another_ballot},
-    ),
-    PlantedBug(
-        "refused-plan-sent-for-ever", "L8", "A plan that no vehicle accepts is never given up.",
+        replaced={ballot.restarted: broken.shows_another_ballot}),
+    Bug("refused-plan-sent-for-ever", "L8", "A plan that no vehicle accepts is never given up.",
         "planner_lets_two_meet", collides=False,
-        replaced={leader.time_is_up: broken.time_is_up_unless_issuing},
-    ),
-    PlantedBug(
-        "stall-not-noticed", "L8", "A plan that stalls is watched for ever.",
-        "adopted_plan_stalls", collides=False, replaced={leader.stalls: broken.never},
-    ),
-    PlantedBug(
-        "wrong-lane-not-noticed", "L8", "A vehicle that an old plan left on a wrong lane stays.",
-        "adopted_for_other_targets", collides=False, replaced={leader.is_astray: broken.never},
-    ),
-    PlantedBug(
-        "new-targets-not-noticed", "L8", "New members or wishes change nothing.",
-        "new_member", collides=False, replaced={leader.has_new_targets: broken.never},
-    ),
+        replaced={leader.time_is_up: broken.time_is_up_unless_issuing}),
+    Bug("stall-not-noticed", "L8", "A plan that stalls is watched for ever.",
+        "adopted_plan_stalls", collides=False, replaced={leader.stalls: broken.never}),
+    Bug("wrong-lane-not-noticed", "L8", "A vehicle that an old plan left on a wrong lane stays.",
+        "adopted_for_other_targets", collides=False, replaced={leader.is_astray: broken.never}),
+    Bug("new-targets-not-noticed", "L8", "New members or wishes change nothing.",
+        "new_member", collides=False, replaced={leader.has_new_targets: broken.never}),
     # --- outside the books
-    PlantedBug(
-        "planned-before-closed", "census", "A formation is planned while vehicles may still enter.",
-        "formation_closes", plant=broken.close_at_once,
-    ),
-    PlantedBug(
-        "closed-before-all-entered", "census", "A formation closes while vehicles may still enter.",
-        "formation_closes", plant=broken.close_early,
-    ),
-    PlantedBug(
-        "joined-not-learned", "joining", "A leader does not learn which formations are joined.",
-        "joint_ballot_is_learned", collides=False, plant=broken.join_nothing,
-    ),
-    PlantedBug(
-        "superseded-command-played", "charge", "The controller plays the commands of any process.",
-        "superseded_agent", plant=broken.play_everything,
-    ),
-    PlantedBug(
-        "speaks-before-in-charge", "charge", "An agent promises before it is in charge.",
-        "agent_that_is_not_in_charge", collides=False, plant=broken.speak_at_once,
-    ),
-    PlantedBug(
-        "waking-agent-goes-on", "charge", "An agent that hung goes on as if still in charge.",
-        "agent_that_hung", collides=False, plant=broken.keep_incarnation,
-    ),
-    PlantedBug(
-        "caretaker-accepts-moves", "caretaker", "The caretaker accepts moves that it never makes.",
-        "caretaker_never_moves", collides=False, plant=broken.accept_moves,
-    ),
-    PlantedBug(
-        "caretaker-forgets-motion", "caretaker", "A vehicle under way counts as being there.",
-        "caretaker_of_a_moving_vehicle", plant=broken.never_moving,
-    ),
+    Bug("planned-before-closed", "census", "A formation is planned while vehicles may still enter.",
+        "formation_closes", plant=broken.close_at_once),
+    Bug("closed-before-all-entered", "census", "A formation closes while vehicles may still enter.",
+        "formation_closes", plant=broken.close_early),
+    Bug("joined-not-learned", "joining", "A leader does not learn which formations are joined.",
+        "joint_ballot_is_learned", collides=False, plant=broken.join_nothing),
+    Bug("superseded-command-played", "charge", "The controller plays the commands of any process.",
+        "superseded_agent", plant=broken.play_any_command),
+    Bug("promises-before-in-charge", "charge", "An agent promises before it is in charge.",
+        "agent_that_is_not_in_charge", collides=False, plant=broken.always_in_charge),
+    Bug("resumed-agent-continues", "charge", "An agent that hung goes on as if still in charge.",
+        "agent_that_hung", collides=False, plant=broken.keep_incarnation),
+    Bug("caretaker-accepts-moves", "caretaker", "The caretaker accepts moves that it never makes.",
+        "caretaker_never_moves", collides=False, plant=broken.accept_moves),
+    Bug("caretaker-forgets-motion", "caretaker", "A vehicle under way counts as being there.",
+        "caretaker_of_a_moving_vehicle", plant=broken.never_moving),
     # --- the rolling operation
-    PlantedBug(
-        "estate-not-checked", "V3", "A plan is accepted that counts a foreign cell as owned.",
-        "rolling_false_claim", replaced={vehicle.transfers_only_owned_cells: broken.always},
-    ),
-    PlantedBug(
-        "possession-not-taken", "V5", "A vehicle opens its gate without owning its new cells.",
-        "rolling_handover", collides=False, replaced={vehicle.take_ownership: broken.skip},
-    ),
-    PlantedBug(
-        "moves-off-its-estate", "V5", "The same, and the controller obeys.",
-        "rolling_handover", replaced={vehicle.take_ownership: broken.skip}, plant=rolling.obey,
-    ),
-    PlantedBug(
-        "possession-without-gate", "ownership", "A vehicle owns what a plan gives when it accepts.",
-        "rolling_gate", plant=rolling.possess_at_once,
-    ),
-    PlantedBug(
-        "deed-after-promise", "ownership", "An old transfer begins after a higher promise.",
-        "rolling_late_command", plant=rolling.draw_up_anything,
-    ),
-    PlantedBug(
-        "promise-dies-with-process", "ownership", "A new process may promise less than the last.",
-        "rolling_agent_restarts", collides=False, plant=rolling.forget_promise,
-    ),
-    PlantedBug(
-        "estate-dies-with-process", "ownership", "The owned cells are lost with the agent.",
-        "rolling_agent_restarts", collides=False, plant=rolling.forget_estate,
-    ),
-    PlantedBug(
-        "promise-not-noted", "transfer", "A promise counts before the controller has noted it.",
-        "rolling_promise_not_noted", collides=False, plant=rolling.show_estate_at_once,
-    ),
-    PlantedBug(
-        "shut-deeds-ignored", "transfer", "A vehicle with a closed gate owns the cells of before.",
-        "rolling_gates_moved_on", plant=rolling.void_shut_deeds,
-    ),
-    PlantedBug(
-        "common-promise-voids-deeds", "transfer", "A newer promise of all voids older transfers.",
-        "rolling_gates_moved_on", plant=rolling.void_by_common_promise,
-    ),
-    PlantedBug(
-        "body-left-out", "transfer", "A moving vehicle does not need the cell that it leaves.",
-        "rolling_under_way", plant=rolling.forget_motion,
-    ),
-    PlantedBug(
-        "owner-left-out", "transfer", "A cell is taken from an owner that is not in the roster.",
+    Bug("ownership-not-checked", "V3", "A plan is accepted that counts a foreign cell as owned.",
+        "rolling_false_claim", replaced={vehicle.transfers_only_owned_cells: broken.always}),
+    Bug("ownership-not-taken", "V5", "A vehicle opens its gate without owning its new cells.",
+        "rolling_cell_transfer", collides=False, replaced={vehicle.take_ownership: broken.skip}),
+    Bug("moves-outside-owned-cells", "V5", "The same, and the controller obeys.",
+        "rolling_cell_transfer",
+        replaced={vehicle.take_ownership: broken.skip}, plant=rolling.obey),
+    Bug("ownership-without-gate", "ownership", "A vehicle owns what a plan gives when it accepts.",
+        "rolling_gate", plant=rolling.own_at_once),
+    Bug("transfer-after-promise", "ownership", "An old transfer begins after a higher promise.",
+        "rolling_late_command", plant=rolling.note_any_transfer),
+    Bug("promise-lost-with-process", "ownership", "A new process may promise less than the last.",
+        "rolling_agent_restarts", collides=False, plant=rolling.forget_promise),
+    Bug("ownership-lost-with-process", "ownership", "The owned cells are lost with the agent.",
+        "rolling_agent_restarts", collides=False, plant=rolling.forget_owned_cells),
+    Bug("promise-not-noted", "transfer", "A promise counts before the controller has noted it.",
+        "rolling_promise_not_noted", collides=False, plant=rolling.show_owned_cells_at_once),
+    Bug("closed-transfers-ignored", "transfer", "A vehicle with a closed gate owns its old cells.",
+        "rolling_cell_passed_on", plant=rolling.cancel_closed_transfers),
+    Bug("common-promise-cancels-transfers", "transfer", "A newer promise of all cancels transfers.",
+        "rolling_cell_passed_on", plant=rolling.cancel_on_common_promise),
+    Bug("body-left-out", "transfer", "A moving vehicle does not need the cell that it leaves.",
+        "rolling_under_way", plant=rolling.forget_motion),
+    Bug("owner-left-out", "transfer", "A cell is taken from an owner that is not in the roster.",
         "rolling_owner_left_out", replaced={vehicle.transfers_only_owned_cells: broken.always},
-        plant=rolling.check_no_estates,
-    ),
-    PlantedBug(
-        "cell-kept-by-both", "transfer", "A vehicle that gives a cell keeps it, too.",
-        "rolling_handover", replaced={vehicle.transfers_only_owned_cells: broken.always},
-        plant=rolling.keep_what_is_given,
-    ),
+        plant=rolling.skip_ownership_checks),
+    Bug("cell-kept-by-both", "transfer", "A vehicle that gives a cell keeps it, too.",
+        "rolling_cell_transfer", replaced={vehicle.transfers_only_owned_cells: broken.always},
+        plant=rolling.keep_what_is_given),
 )  # fmt: skip
 
 NOT_A_SAFETY_MATTER: Mapping[Function, str] = {
