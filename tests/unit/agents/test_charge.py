@@ -171,14 +171,14 @@ def test_v1_is_repeated_while_a_claim_is_under_way() -> None:
     assert seat.shown.hold_cell == cells[3]
 
 
-def test_a_vehicle_that_moves_when_it_takes_charge_counts_as_moving() -> None:
+def test_a_motion_and_joined_formations_are_taken_over_with_the_charge() -> None:
     seat = Seat()
-    seat.feel(0)
     seat.driver.resting = False
-    seat.feel(1)
-    assert seat.shown.moving
+    for attendant in (0, 1):
+        assert command_of(seat.feel(attendant, joined=(0, 3))).joined == (0, 3)
+    assert (seat.shown.moving, seat.shown.joined) == (True, (0, 3))
     seat.driver.resting = True
-    seat.feel(1)
+    seat.feel(1, joined=(0, 3))
     assert (seat.shown.moving, seat.shown.completed) == (False, 0)
 
 
@@ -314,11 +314,10 @@ def test_a_note_for_another_process_is_no_acceptance(attendant: int) -> None:
 def test_an_acceptance_of_the_previous_process_does_not_count() -> None:
     seat = Seat()
     seat.feel(0)
-    seat.feel(1, accepted=BALLOT)
-    assert (seat.shown.promised, seat.shown.accepted) == (None, False)
-    seat.prepare()
-    seat.feel(1, accepted=BALLOT)
-    assert (seat.shown.promised, seat.shown.accepted) == (BALLOT, False)
+    for promised in (None, BALLOT):
+        seat.feel(1, accepted=BALLOT)
+        assert (seat.shown.promised, seat.shown.accepted) == (promised, False)
+        seat.prepare()
 
 
 def test_a_higher_promise_cancels_a_requested_note() -> None:
@@ -352,14 +351,6 @@ def test_a_joint_plan_is_accepted_once_the_controller_has_confirmed_its_formatio
     seat.note(joined=(0, 1))
     assert (seat.shown.joined, seat.shown.accepted) == ((0, 1), True)
     assert wanted(seat) == (0, 1)
-
-
-def test_joined_formations_outlive_the_agent() -> None:
-    seat = Seat()
-    for _ in range(2):
-        command = command_of(seat.feel(1, joined=(0, 3)))
-        assert command.joined == (0, 3)
-    assert seat.shown.joined == (0, 3)
 
 
 def test_states_matter_only_while_a_plan_waits_for_them() -> None:

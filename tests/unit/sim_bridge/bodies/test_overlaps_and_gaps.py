@@ -150,6 +150,9 @@ def test_a_negative_gap_means_an_overlap(road: dict[str, Pose]) -> None:
 
 
 def test_gap_and_headway_of_a_simple_queue() -> None:
+    assert bodies({}).min_gaps() == MinGaps(math.inf, math.inf)
+    beside = {"a": (10.0, 1.75, 0.0, 15.0), "b": (10.0, 5.25, 0.0, 15.0)}
+    assert bodies(beside).min_gaps() == MinGaps(math.inf, math.inf)
     road = {
         "first": (100.0, 1.75, 0.0, 10.0),
         "second": (85.0, 1.75, 0.0, 15.0),
@@ -157,12 +160,6 @@ def test_gap_and_headway_of_a_simple_queue() -> None:
         "other lane": (84.0, 5.25, 0.0, 15.0),
     }
     assert bodies(road).min_gaps() == MinGaps(4.0, 1.0)
-
-
-def test_without_vehicles_in_line_the_gap_is_infinite() -> None:
-    road = {"a": (10.0, 1.75, 0.0, 15.0), "b": (10.0, 5.25, 0.0, 15.0)}
-    assert bodies(road).min_gaps() == MinGaps(math.inf, math.inf)
-    assert bodies({}).min_gaps() == MinGaps(math.inf, math.inf)
 
 
 def sense(road: dict[str, Pose], accels_mps2: dict[str, float] | None = None) -> dict[str, Around]:
