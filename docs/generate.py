@@ -1,8 +1,8 @@
-"""Writes the parts of the documents that follow from the code: `python docs/generate.py`.
+"""Write the generated parts of the documents: `python docs/generate.py`.
 
-In a document a generated part stands between `<!-- begin NAME -->` and `<!-- end NAME -->`; a test
-compares it with what this script would write. The pictures of the conflict table and of how
-the case study is solved are drawn, too.
+A generated part stands between `<!-- begin NAME -->` and `<!-- end NAME -->`; a test compares it
+with the output of this script. The script also draws the pictures of the conflict table and of the
+solution of the case study.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-if __name__ == "__main__":  # run as a program: as `pythonpath` in pyproject.toml
+if __name__ == "__main__":  # same paths as `pythonpath` in pyproject.toml
     sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
@@ -54,28 +54,27 @@ from support.planted_bugs import BUGS
 
 DOCS = Path(__file__).resolve().parent
 FOUND = DOCS / "evidence" / "planted-bugs-found.json"
-"""What the random search found, as `tests/simulation/search_bugs.py` prints it."""
+"""Output of `tests/simulation/search_bugs.py`."""
 MEASURED = DOCS / "evidence" / "resilience.json"
-"""What `benchmarks/resilience.py` wrote."""
+"""Output of `benchmarks/resilience.py`."""
 PLANNED = DOCS / "evidence" / "planner.json"
-"""What `laneweave bench planner --json` printed."""
-
+"""Output of `laneweave bench planner --json`."""
 SWITCHES = DOCS / "evidence" / "planner-switches.json"
-"""What `benchmarks/planner_switches.py` wrote."""
+"""Output of `benchmarks/planner_switches.py`."""
 GEOMETRY = DOCS / "evidence" / "geometry.json"
-"""What `benchmarks/geometry.py` wrote."""
+"""Output of `benchmarks/geometry.py`."""
 CLOSING = DOCS / "evidence" / "closing.json"
-"""What `benchmarks/closing.py` wrote."""
+"""Output of `benchmarks/closing.py`."""
 STREAM = DOCS / "evidence" / "stream.json"
-"""What `benchmarks/stream.py` wrote."""
+"""Output of `benchmarks/stream.py`."""
 HOSTS = DOCS / "evidence" / "hosts.json"
-"""What `benchmarks/hosts.py` wrote."""
+"""Output of `benchmarks/hosts.py`."""
 SERVICE = DOCS / "evidence" / "service.json"
-"""What `benchmarks/service.py` wrote."""
+"""Output of `benchmarks/service.py`."""
 EVALUATED = DOCS / "evidence" / "evaluation.json"
-"""What `benchmarks/evaluate.py` wrote."""
+"""Output of `benchmarks/evaluate.py`."""
 STABILITY = DOCS / "evidence" / "stability.json"
-"""What `benchmarks/stability.py` wrote."""
+"""Output of `benchmarks/stability.py`."""
 CONFLICTS = DOCS / "images" / "conflict-table.png"
 CASE = DOCS / "examples" / "case-study.json"
 SOLVING = DOCS / "images" / "solving-process.png"
@@ -87,7 +86,7 @@ SNAPSHOTS: dict[type[MetricsSnapshot], str] = {
     BridgeMetrics: "bridge",
     RouterMetrics: "router",
 }
-"""What offers numbers, and whose they are."""
+"""Classes of metrics, each with the role that serves them."""
 
 
 def _meaning(function: Function) -> str:
@@ -130,7 +129,7 @@ def _node(phase: Enum) -> str:
 
 
 def _topics() -> str:
-    """Return the table of topics."""
+    """Return the table of topics, keys and readers."""
     lines = [
         "| Topic | Key | Message | Sender | Quality | Readers | Remark |",
         "|---|---|---|---|---|---|---|",
@@ -147,7 +146,7 @@ def _topics() -> str:
 
 
 def _messages() -> str:
-    """Return a section for each class of the messages: its docstring, and a table of its fields."""
+    """Return a section for each message class: its docstring and a table of its fields."""
     sections = []
     for node in _syntax(messages).body:
         if isinstance(node, ast.ClassDef):
@@ -196,14 +195,14 @@ def _planted_bugs() -> str:
 
 
 def _profiles() -> str:
-    """Return the table of what `laneweave simulate --profile` takes."""
+    """Return the table of the profiles of `laneweave simulate`."""
     lines = ["| `--profile` | what goes wrong |", "|---|---|"]
     lines += [f"| `{profile.name}` | {profile.text} |" for profile in PROFILES.values()]
     return "\n".join(lines)
 
 
 def _resilience() -> str:
-    """Return the table of what faults cost."""
+    """Return the table of the cost of faults, by `benchmarks/resilience.py`."""
     measured = json.loads(MEASURED.read_text(encoding="utf-8"))
     lines = [
         "| experiment | left | on their lane | overlaps | least gap | travel time | more |",
@@ -224,7 +223,7 @@ def _resilience() -> str:
 
 
 def _more(name: str, run: dict[str, Any]) -> Iterator[str]:
-    """Yield what is worth saying of one experiment."""
+    """Yield the remarks on one experiment."""
     if run["dropped"]:
         yield f"{run['dropped']:,} messages lost"
     taken_over = run["events"].get("caretaker-took-over", 0)
@@ -244,7 +243,7 @@ def _more(name: str, run: dict[str, Any]) -> Iterator[str]:
 
 
 def _planner() -> str:
-    """Return the table of what `laneweave bench planner` measured."""
+    """Return the table of the results of `laneweave bench planner`."""
     lines = [
         "| conflicts | vehicles | proven in 4 s | CPU ms p50 / p95 | gap p50 / max | by 0.1 s |",
         "|---|---|---|---|---|---|",
@@ -261,7 +260,7 @@ def _planner() -> str:
 
 
 def _switches() -> str:
-    """Return the table of what improvements of TAPPA are worth."""
+    """Return the table of the effect of TAPPA's improvements."""
     lines = [
         "| family | improvements | proven in 4 s | CPU ms p50 / p95 / max |",
         "|---|---|---|---|",
@@ -274,14 +273,14 @@ def _switches() -> str:
 
 
 def _conflicts() -> str:
-    """Return the table of how many pairs of moves are forbidden."""
+    """Return the table of the number of forbidden pairs of moves."""
     lines = ["| conflicts | pairs in mode 1 | pairs in mode 2 |", "|---|---|---|"]
     lines += [f"| {name} | {one} | {two} |" for name, one, two in counts()]
     return "\n".join(lines)
 
 
 def _distances() -> str:
-    """Return the table of how near bodies come that may move, by `benchmarks/geometry.py`."""
+    """Return the table of minimum distances in permitted moves, by `benchmarks/geometry.py`."""
     table = json.loads(GEOMETRY.read_text(encoding="utf-8"))["nearest_m"]
     late = list(table[0])[1:]
     columns = " | ".join(f"one up to {name} late" if name != "0 s" else "on time" for name in late)
@@ -293,7 +292,7 @@ def _distances() -> str:
 
 
 def _geometry() -> str:
-    """Return the table of what tables cost and save, as `benchmarks/geometry.py` measured."""
+    """Return the table of cost and benefit of conflict tables, by `benchmarks/geometry.py`."""
     lines = [
         "| vehicles | `geometric` | steps of all | cheaper | proven | CPU ms p50 / p95 |",
         "|---|---|---|---|---|---|",
@@ -308,7 +307,7 @@ def _geometry() -> str:
 
 
 def _closing() -> str:
-    """Return the table of what it costs not to close up, as `benchmarks/closing.py` measured."""
+    """Return the table of the cost of `closing` conflicts, by `benchmarks/closing.py`."""
     lines = [
         "| conflicts | vehicles | closes up | steps | dearer | more | CPU ms p50 | mean | factor |",
         "|---|---|---|---|---|---|---|---|---|",
@@ -327,7 +326,7 @@ def _closing() -> str:
 
 
 def _stream() -> str:
-    """Return the table of how well the stream planner sorts, by `benchmarks/stream.py`."""
+    """Return the table of results of the stream planner, by `benchmarks/stream.py`."""
     lines = [
         (
             "| variant | veh/(lane h) | off their lanes | travel time mean / p95 | columns gained "
@@ -348,7 +347,7 @@ def _stream() -> str:
 
 
 def _metrics() -> str:
-    """Return all numbers that processes offer, as Prometheus knows them."""
+    """Return the table of all metrics with their Prometheus names."""
     lines = [
         "| metric | kind | of | meaning |",
         "|---|---|---|---|",
@@ -363,7 +362,7 @@ def _metrics() -> str:
 
 
 def _hosts() -> str:
-    """Return the table of what a deployment on several hosts survives."""
+    """Return the table of faults in a deployment on several hosts, by `benchmarks/hosts.py`."""
     measured = json.loads(HOSTS.read_text(encoding="utf-8"))
     calm_s = measured["undisturbed"]["travel_time_s"]
     lines = [
@@ -386,7 +385,7 @@ def _hosts() -> str:
 
 
 def _service() -> str:
-    """Return the tables of what `benchmarks/service.py` measured."""
+    """Return the tables of the planning service, by `benchmarks/service.py`."""
     measured = json.loads(SERVICE.read_text(encoding="utf-8"))
     return "\n\n".join(
         "\n".join(table)
@@ -410,7 +409,7 @@ def _service_load(runs: list[dict[str, Any]]) -> Iterator[str]:
 
 
 def _stability() -> str:
-    """Return the table of how a disturbance of speed travels, by `benchmarks/stability.py`."""
+    """Return the table of how a speed disturbance propagates, by `benchmarks/stability.py`."""
     headings = (
         "", "speed lost, messages lost", "disturbed one", "1st behind", "2nd behind", "last",
         "amplification", "any behind", "the last", "braked", "least gap",
@@ -461,7 +460,7 @@ def _workers(run: dict[str, Any]) -> str:
 
 @cache
 def parts() -> dict[str, str]:
-    """Return each generated part by its name."""
+    """Return the generated parts by name."""
     return {
         "topics": _topics(),
         "messages": _messages(),
@@ -492,7 +491,7 @@ def parts() -> dict[str, str]:
 
 
 def rewritten(text: str) -> str:
-    """Return a document's text with its generated parts as they should be."""
+    """Return a document's text with up-to-date generated parts."""
     known = parts()
 
     def replace(match: re.Match[str]) -> str:

@@ -69,7 +69,7 @@ def fences(text: str, *languages: str) -> list[str]:
 
 
 def section(text: str, heading: str) -> str:
-    """Return what follows a heading, up to the next heading of the same or a higher level."""
+    """Return the text below a heading, up to the next heading of the same or a higher level."""
     level = len(heading) - len(heading.lstrip("#"))
     begin = re.search(rf"^{re.escape(heading)}$", text, re.MULTILINE)
     assert begin is not None, f"no heading {heading!r}"
@@ -146,7 +146,7 @@ def _unit(name: str) -> str:
 
 def _allowed(attribute: attrs.Attribute[Any]) -> str:
     if attribute.validator is None:
-        # Parsing any scenario resolves the annotations from text to types, with their modules.
+        # Parsing a scenario resolves the annotations from text to types, with their modules.
         kind = attribute.type.__name__ if attribute.type in (str, bool) else str(attribute.type)
         kinds = {
             "str": "text",
@@ -156,7 +156,7 @@ def _allowed(attribute: attrs.Attribute[Any]) -> str:
             "tuple[DrivingStructure, ...]": "list of tables",
         }
         return kinds[re.sub(r"[a-z]+\.", "", kind)]
-    # Of a field that may be unset, the rule for what is set.
+    # For an optional field: the rule for its values.
     rule = getattr(attribute.validator, "validator", attribute.validator)
     found = inspect.getclosurevars(rule).nonlocals
     if "choices" in found:
@@ -186,12 +186,12 @@ def test_table_of_scenario_fields() -> None:
     meanings = {code(cells[0]): cells[-1] for cells in found}
     expected = scenario_table(meanings)
     shown = "\n".join(text for text in part.splitlines() if text.startswith("|"))
-    assert shown == expected, f"the table in SCENARIO.md should be\n\n{expected}\n"
-    lacking = [name for name, _ in _scenario_fields() if meanings[name] in ("", "?")]
-    assert not lacking, f"fields without a meaning: {lacking}"
+    assert shown == expected, f"expected table in SCENARIO.md:\n\n{expected}\n"
+    missing = [name for name, _ in _scenario_fields() if meanings[name] in ("", "?")]
+    assert not missing, f"fields without a meaning: {missing}"
 
 
-def test_rows_that_cross_check_fields_name_fields_that_exist() -> None:
+def test_rules_between_fields_name_existing_fields() -> None:
     part = section(read("SCENARIO.md"), "## Rules between fields")
     known = {name for name, _ in _scenario_fields()}
     named = set(re.findall(r"`([a-z]+\.[a-z_0-9]+)`", part))
@@ -211,7 +211,7 @@ def test_endings_of_runs() -> None:
 # --- docs/PROTOCOL.md: keys and messages ---------------------------------------------------------
 
 
-def test_messages_say_what_happens_when_they_are_not_as_expected() -> None:
+def test_docstrings_of_messages_state_what_loss_delay_and_duplication_cause() -> None:
     for kind in KINDS.values():
         text = inspect.getdoc(kind) or ""
         assert "Missing" in text, kind.__name__
@@ -220,7 +220,7 @@ def test_messages_say_what_happens_when_they_are_not_as_expected() -> None:
 
 
 def test_generated_parts_are_up_to_date() -> None:
-    """What follows from the code is as `python docs/generate.py` writes it."""
+    """Generated parts equal the output of `python docs/generate.py`."""
     specification = importlib.util.spec_from_file_location("generate", DOCS / "generate.py")
     assert specification is not None
     assert specification.loader is not None
@@ -252,13 +252,13 @@ def test_places_in_the_code_exist() -> None:
         )
 
 
-# --- docs/SAFETY.md: the least gap ---------------------------------------------------------------
+# --- docs/SAFETY.md: the minimum gap -------------------------------------------------------------
 
 
-def test_least_gap_of_mode_1() -> None:
-    """Vehicles with disjoint footprints, one up to 2 s late, from the profiles in use."""
-    least_m = min(_gaps_of_pairs(Scenario(), late_ticks=(0, 10, 20)))
-    assert f"**{least_m:.2f} m**" in read("SAFETY.md")
+def test_minimum_gap_of_mode_1() -> None:
+    """Vehicles with disjoint footprints, one up to 2 s late, on the trajectories in use."""
+    min_m = min(_gaps_of_pairs(Scenario(), late_ticks=(0, 10, 20)))
+    assert f"**{min_m:.2f} m**" in read("SAFETY.md")
 
 
 def _gaps_of_pairs(scenario: Scenario, late_ticks: Sequence[int]) -> Iterator[float]:
@@ -278,7 +278,7 @@ def _gaps_of_pairs(scenario: Scenario, late_ticks: Sequence[int]) -> Iterator[fl
 
 @lru_cache(maxsize=1024)
 def _motion(scenario: Scenario, cell: Cell, step: Cell, late: int) -> NDArray[np.float64]:
-    """Return states (60, 6) of a move that begins late, relative to the lattice."""
+    """Return states (60, 6) of a move that begins `late` ticks late, relative to the lattice."""
     states = move_profile(scenario, *step).states
     at = np.clip(np.arange(60) - late, 0, len(states) - 1)
     moved: NDArray[np.float64] = states[at] + np.array(cell_state(scenario.lattice, cell, 0.0))
@@ -306,8 +306,8 @@ def test_fields_of_a_status() -> None:
     assert f"`{SCHEMA}`" in text
 
 
-def test_all_numbers_are_documented() -> None:
-    """Every class that says what it is about has its rows in the table of metrics."""
+def test_all_metrics_are_documented() -> None:
+    """Every snapshot class (class variable `ABOUT`) has rows in the table of metrics."""
     shown = [code(cells[0]) for cells in rows(section(read("DEPLOYMENT.md"), "### Metrics"))]
     subjects = [
         subject
@@ -319,7 +319,7 @@ def test_all_numbers_are_documented() -> None:
         assert any(name.startswith(f"laneweave_{subject}_") for name in shown), subject
 
 
-def test_logs_are_set_as_documented() -> None:
+def test_log_options_are_as_documented() -> None:
     program: Any = typer.main.get_command(app)
     for option, variable, *_ in rows(section(read("DEPLOYMENT.md"), "### Logs")):
         for role in ("router", "coordinator", "agent", "bridge"):
@@ -387,7 +387,7 @@ def test_commands_exist(path: Path) -> None:
         options = {word.partition("=")[0] for word in words if word.startswith("--")}
         assert options <= known | {"--help"}, command
         if len(words) > 1 and not re.search(r"[\[\]|>&]|\.\.\.|--help", command):
-            # A whole command: the parser takes it, with placeholders as file names.
+            # A complete command: the parser accepts it, with placeholders as file names.
             subcommand.make_context(words[0], words[1:])
 
 
@@ -421,7 +421,7 @@ def test_scenario_files_load(path: Path) -> None:
 
 
 @each_document
-def test_json_in_documents_is_a_request_or_an_answer(path: Path) -> None:
+def test_requests_in_documents_are_valid(path: Path) -> None:
     for body in fences(path.read_text(encoding="utf-8"), "json"):
         data = json.loads(body)
         if data.get("schema") == "laneweave.plan.request/1":
@@ -433,7 +433,7 @@ def test_example_requests_are_valid(path: Path) -> None:
     PlanRequest.from_dict(json.loads(path.read_text(encoding="utf-8")))
 
 
-def test_the_answer_to_the_case_study_is_the_one_shown(capsys: pytest.CaptureFixture[str]) -> None:
+def test_answer_to_the_case_study_is_as_shown(capsys: pytest.CaptureFixture[str]) -> None:
     answer_request(DOCS / "examples/case-study.json", None, None, "tappa", as_table=True)
     assert capsys.readouterr().out in fences(read("PLANNING.md"), "text")
 

@@ -1,4 +1,4 @@
-"""The house rules that no other tool checks."""
+"""Rules of the repository that no other tool checks: namespace, pinned versions, base install."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def _normal(name: str) -> str:
 
 
 @pytest.mark.parametrize("root", ROOTS)
-def test_the_namespace_has_no_init(root: str) -> None:
-    # One __init__.py here would hide the other four portions of the namespace.
+def test_namespace_has_no_init(root: str) -> None:
+    # An __init__.py here would hide the other four portions of the namespace.
     assert not (ROOT / root / "laneweave" / "__init__.py").exists()
     assert (ROOT / root / "laneweave" / root / "__init__.py").exists()
     assert (ROOT / root / "laneweave" / root / "py.typed").exists()
@@ -41,7 +41,7 @@ def test_every_dependency_is_pinned_by_name_and_version_only() -> None:
     assert names - set(pinned()) == set()
 
 
-def test_constraints_hold_names_and_versions_only() -> None:
+def test_constraints_are_names_and_versions_only() -> None:
     for line in (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines():
         assert re.fullmatch(r"[A-Za-z0-9._-]+==[0-9][A-Za-z0-9.]*", line), line
 
@@ -70,42 +70,42 @@ def run_base_install(*arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_a_base_install_plans() -> None:
+def test_base_install_plans() -> None:
     done = run_base_install("plan", "docs/examples/case-study.json", "--format", "table")
     assert (done.returncode, done.stderr) == (0, "")
     assert "cost 7" in done.stdout
 
 
-def test_a_base_install_says_what_a_run_needs() -> None:
+def test_base_install_names_the_extra_for_runs() -> None:
     done = run_base_install("run", "--duration", "5")
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert "not installed" in done.stderr
 
 
-def test_a_base_install_says_what_metrics_need() -> None:
+def test_base_install_names_the_extra_for_metrics() -> None:
     done = run_base_install("router", "--endpoint", "tcp/127.0.0.1:1", "--metrics", "127.0.0.1:1")
     assert (done.returncode, done.stdout) == (2, "")
-    (said,) = done.stderr.splitlines()
-    assert said.startswith("prometheus_client: not installed")
-    assert said.endswith("install laneweave[metrics]")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("prometheus_client: not installed")
+    assert line.endswith("install laneweave[metrics]")
 
 
-def test_a_base_install_says_what_a_drawing_needs() -> None:
+def test_base_install_names_the_extra_for_drawings() -> None:
     done = run_base_install("plan", "docs/examples/case-study.json", "--draw", "plan.png")
     assert (done.returncode, done.stdout) == (2, "")
     assert "not installed" in done.stderr
 
 
-def test_a_base_install_says_what_a_drawing_of_the_road_needs() -> None:
+def test_base_install_names_the_extras_for_drawings_of_the_road() -> None:
     done = run_base_install("plan", "docs/examples/case-study.json", "--draw-road", "road.png")
     assert (done.returncode, done.stdout) == (2, "")
-    (said,) = done.stderr.splitlines()
-    assert said.startswith("--draw-road: got 'road.png'")
-    assert "laneweave[agent] and laneweave[sim]" in said
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("--draw-road: got 'road.png'")
+    assert "laneweave[agent] and laneweave[sim]" in line
 
 
-def test_a_base_install_says_what_certificates_need(tmp_path: Path) -> None:
+def test_base_install_names_the_extra_for_certificates(tmp_path: Path) -> None:
     done = run_base_install("certs", "init", str(tmp_path / "certs"))
     assert (done.returncode, done.stdout) == (2, "")
     assert len(done.stderr.splitlines()) == 1
@@ -113,13 +113,13 @@ def test_a_base_install_says_what_certificates_need(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_base_install_checks_a_configuration() -> None:
+def test_base_install_checks_a_configuration() -> None:
     done = run_base_install("config", "check", "scenarios/compose.toml")
     assert done.returncode == 0
     assert "tls/router:7447" in done.stdout
 
 
-def test_a_base_install_says_what_the_live_page_needs() -> None:
+def test_base_install_names_the_extra_for_the_live_page() -> None:
     done = run_base_install("watch", "--endpoint", "tcp/127.0.0.1:1")
     assert (done.returncode, done.stdout) == (2, "")
     assert len(done.stderr.splitlines()) == 1
