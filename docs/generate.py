@@ -27,7 +27,7 @@ if __name__ == "__main__":  # same paths as `pythonpath` in pyproject.toml
 from conflict_drawing import counts, draw_conflicts
 from evaluation.evidence import read_evidence
 from evaluation.tables import document_parts
-from laneweave.agents.metrics import AgentMetrics
+from laneweave.agents.host import AgentMetrics
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.formations.leader import LEADER_RULES
 from laneweave.coordinator.metrics import CoordinatorMetrics
@@ -49,7 +49,7 @@ from laneweave.protocol.state_machine import Function, RuleBook
 from laneweave.protocol.vehicle.execution import VEHICLE_RULES, ExecutionPhase
 from laneweave.protocol.wire import events, messages
 from laneweave.protocol.wire.topics import TOPICS
-from laneweave.sim_bridge.metrics import BridgeMetrics
+from laneweave.sim_bridge.core import BridgeMetrics
 from support.planted_bugs import BUGS
 
 DOCS = Path(__file__).resolve().parent

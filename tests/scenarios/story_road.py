@@ -239,7 +239,7 @@ class CaretakerProcess:
 
     def give_way(self) -> None:
         """An agent has taken charge."""
-        list(self._attendance.forget(self.vehicle.name))
+        list(self._attendance._end_caretaker(self.vehicle.name))
 
     def sense(self, tick: int) -> None:
         self.tick = tick

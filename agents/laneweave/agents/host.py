@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from typing import ClassVar
+
+from attrs import frozen
 
 from laneweave.agents.core import AgentCore
-from laneweave.agents.metrics import AgentMetrics
-from laneweave.protocol.runtime.metrics import MetricsSnapshot
+from laneweave.protocol.runtime.metrics import MetricsSnapshot, metric
 from laneweave.protocol.runtime.node import (
     Arrived,
     Effect,
@@ -34,6 +36,18 @@ from laneweave.protocol.wire.topics import (
 
 ALONE_S = 60.0
 """Agents of named vehicles end when there was no bridge for this long (node clock)."""
+
+
+@frozen
+class AgentMetrics:
+    """Counters of the vehicles of one process."""
+
+    ABOUT: ClassVar[str] = "agent"
+
+    vehicles: int = metric("Vehicles that this process drives or waits for")
+    vehicles_in_charge: int = metric("Vehicles on the road of which this process is in charge")
+    solves_total: int = metric("Trajectories that were tracked, one for each tick")
+    unusable_total: int = metric("Solutions of the tracker that could not be used")
 
 
 class AgentHost:

@@ -12,11 +12,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping
 from enum import Enum
+from typing import ClassVar
 
 import structlog
+from attrs import frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.runtime.metrics import MetricsSnapshot
+from laneweave.protocol.runtime.metrics import MetricsSnapshot, metric
 from laneweave.protocol.runtime.node import (
     Announce,
     Arrived,
@@ -24,7 +26,6 @@ from laneweave.protocol.runtime.node import (
     End,
     Event,
     Listen,
-    PeerDown,
     PeerUp,
     Send,
     Started,
@@ -52,9 +53,8 @@ from laneweave.protocol.wire.topics import (
     SENSE,
     VEHICLE_ALIVE,
 )
-from laneweave.sim_bridge.metrics import BridgeMetrics
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
-from laneweave.sim_bridge.road.attendance import Attendance, Departures, notify_left
+from laneweave.sim_bridge.road.attendance import Attendance, notify_left
 from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from laneweave.sim_bridge.world import World, show_bodies
@@ -64,6 +64,24 @@ log = structlog.get_logger(__name__)
 BRIDGE = Name("bridge")
 WIND_UP_S = 2.0
 """How long the bridge waits for final reports at the end of a run."""
+
+
+@frozen
+class BridgeMetrics:
+    """Counters of the road."""
+
+    ABOUT: ClassVar[str] = "bridge"
+
+    road_seconds: float = metric("Road time")
+    ticks_total: int = metric("Ticks of the road that are over")
+    missed_answers_total: int = metric(
+        "Answers of agents that had not come when their tick's deadline passed"
+    )
+    vehicles_demanded_total: int = metric("Vehicles that have arrived at the road")
+    vehicles_entered_total: int = metric("Vehicles that have entered the road")
+    vehicles_left_total: int = metric("Vehicles that have left the road at its end")
+    vehicles_on_road: int = metric("Vehicles on the road")
+    vehicles_unattended: int = metric("Vehicles on the road of which a caretaker is in charge")
 
 
 class TickPhase(Enum):
@@ -117,7 +135,6 @@ class BridgeCore:
         self._attendance = Attendance(scenario, new_incarnation)
         self._answers = self._attendance.answers
         self._at_entrance: list[RoadVehicle] = []
-        self._departures = Departures()
         self._unreported: set[str] = {BRIDGE}
         """Processes whose final report is awaited."""
         self._patience_s = scenario.runtime.agent_start_s
@@ -177,31 +194,26 @@ class BridgeCore:
         self._attendance.on_network(event, now_s)
         match event:
             case Started():
-                yield from self._start(now_s)
+                for subscribed in (COMMAND, EVENT, REPORT, HEARTBEAT):
+                    yield Listen(subscribed)
+                yield Watch(VEHICLE_ALIVE)
+                yield Announce(BRIDGE_ALIVE, {"incarnation": self._incarnation})
+                self._open_tick(now_s)
             case Arrived(_, parameters, message):
                 yield from self._on_message(message, parameters, now_s)
             case PeerUp(topic, parameters) if topic is VEHICLE_ALIVE:
-                self._on_agent_up(Name(parameters["vehicle"]))
-            case PeerDown(topic, parameters) if topic is VEHICLE_ALIVE:
-                if self._attendance.link_up:
-                    self._departures.forget(Name(parameters["vehicle"]))
+                self._patience_s = self.scenario.runtime.agent_start_s
+                if parameters["vehicle"] in self.vehicles:
+                    self._unreported.add(parameters["vehicle"])
             case Wakeup() if self.phase is TickPhase.ANSWERS:
-                yield from self._send_again(now_s)
+                for name in self._answers.ask_again(now_s):
+                    yield self._sense_of(self.vehicles[name])
             case Stopping():
                 # Stopped while it waits for final reports: the run itself has ended.
                 winding_up = self.phase is TickPhase.WIND_UP
                 self._finish(self._ending if winding_up else Ending.INTERRUPTED)
             case _:
                 pass
-
-    def _start(self, now_s: float) -> Iterator[Effect]:
-        yield Listen(COMMAND)
-        yield Listen(EVENT)
-        yield Listen(REPORT)
-        yield Listen(HEARTBEAT)
-        yield Watch(VEHICLE_ALIVE)
-        yield Announce(BRIDGE_ALIVE, {"incarnation": self._incarnation})
-        self._open_tick(now_s)
 
     def _on_message(
         self, message: object, parameters: Mapping[str, str], now_s: float
@@ -252,19 +264,16 @@ class BridgeCore:
             self._unreported.discard(report.name)
         self._record.on_report(report)
 
-    def _on_agent_up(self, vehicle: Name) -> None:
-        self._patience_s = self.scenario.runtime.agent_start_s
-        if vehicle in self.vehicles:
-            self._unreported.add(vehicle)
-
     # --- the tick -----------------------------------------------------------------------------
 
     def _proceed(self, now_s: float) -> Iterator[Effect]:
         """Proceed through the phases until one has to wait, for one tick at most."""
         if self.phase is TickPhase.PACE and now_s >= self._until_s:
             self._open_tick(now_s)
-        if self.phase is TickPhase.AGENTS and self._entrance_clear(now_s):
-            yield from self._begin_tick(now_s)
+        if self.phase is TickPhase.AGENTS:
+            missing = any(each.name not in self._answers.up for each in self._at_entrance)
+            if not missing or now_s >= self._until_s:
+                yield from self._begin_tick(now_s)
         if self.phase is TickPhase.ANSWERS and self._answers.complete(now_s):
             yield from self._end_tick(now_s)
         if self.phase is TickPhase.WIND_UP and (now_s >= self._until_s or not self._unreported):
@@ -284,11 +293,6 @@ class BridgeCore:
         self.phase = TickPhase.AGENTS
         self._until_s = now_s + self._patience_s
 
-    def _entrance_clear(self, now_s: float) -> bool:
-        return now_s >= self._until_s or all(
-            vehicle.name in self._answers.up for vehicle in self._at_entrance
-        )
-
     def _begin_tick(self, now_s: float) -> Iterator[Effect]:
         self._enter()
         self._close_formations()
@@ -298,7 +302,7 @@ class BridgeCore:
         for vehicle in self.vehicles.values():
             yield self._sense_of(vehicle)
         yield from self._attendance.states(self.tick)
-        yield from self._departures.notify(self.tick, self._answers.up)
+        yield from self._attendance.notify_departed(self.tick)
         self._attendance.ask(self.vehicles, now_s)
         self.phase = TickPhase.ANSWERS
 
@@ -330,10 +334,6 @@ class BridgeCore:
         for vehicle, absence in self._attendance.unattended(self.vehicles, now_s):
             self._record.on_caretaker_took_over(self.t_s, vehicle.name, absence)
             yield from self._attendance.take_charge(vehicle, self.tick)
-
-    def _send_again(self, now_s: float) -> Iterator[Effect]:
-        for name in self._answers.ask_again(now_s):
-            yield self._sense_of(self.vehicles[name])
 
     def _sense_of(self, vehicle: RoadVehicle) -> Effect:
         caretaker = vehicle.name in self._attendance
@@ -368,8 +368,7 @@ class BridgeCore:
                 self._world.remove(name)
                 self._roadside.count_left()
                 self._record.on_left(vehicle, self.t_s, attended=name not in self._attendance)
-                self._departures.add(vehicle)
-                yield from self._attendance.forget(name)
+                yield from self._attendance.leave(vehicle)
 
     def _over(self) -> bool:
         if not self.vehicles and self._roadside.exhausted(self.t_s):
@@ -384,16 +383,12 @@ class BridgeCore:
     def _wind_up(self, now_s: float) -> Iterator[Effect]:
         on_road = self.vehicles.values()
         yield from self._roadside.publish(self.tick, self.t_s, on_road, ended=True)
-        yield from self._departures.notify(self.tick, self._answers.up)
+        yield from self._attendance.notify_departed(self.tick)
         for vehicle in self.vehicles.values():
             yield notify_left(vehicle, self.tick)
         # Last, so that it counts everything, and through the network like the others: the node adds
         # its own counters.
-        yield Send(
-            REPORT,
-            Report(role=Name("bridge"), name=BRIDGE),
-            {"role": "bridge", "name": BRIDGE},
-        )
+        yield Send(REPORT, Report(role=BRIDGE, name=BRIDGE), {"role": BRIDGE, "name": BRIDGE})
         self.phase = TickPhase.WIND_UP
         self._until_s = now_s + WIND_UP_S
 

@@ -9,8 +9,7 @@ import pytest
 from attrs import evolve
 
 from laneweave.agents.core import AgentCore
-from laneweave.agents.host import ALONE_S, AgentHost
-from laneweave.agents.metrics import AgentMetrics
+from laneweave.agents.host import ALONE_S, AgentHost, AgentMetrics
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import (
     Announce,

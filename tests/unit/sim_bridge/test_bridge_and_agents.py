@@ -244,7 +244,7 @@ def check_all_gone(street: Street) -> None:
     """Check that nothing is kept of vehicles that are no more."""
     bridge = street.bridge
     # The last one's token may vanish after its report, with which the run is over.
-    assert set(bridge._departures.repeats) <= bridge._answers.up <= {MANY[-1].vehicle}
+    assert set(bridge._attendance.departed) <= bridge._answers.up <= {MANY[-1].vehicle}
     assert not bridge._unreported
     for node in street.nodes:
         assert not getattr(node.core, "_agents", None)
@@ -265,7 +265,7 @@ def test_a_whole_run_counts_every_message_once_and_keeps_little_of_vehicles_that
 
     def look() -> bool:
         nonlocal most
-        most = max(most, len(bridge._departures.repeats))
+        most = max(most, len(bridge._attendance.departed))
         if bridge.phase is TickPhase.WIND_UP and not ended_s:
             ended_s.append(street.network.now_s)
         return bridge.phase is TickPhase.ENDED

@@ -395,7 +395,7 @@ def test_departures_are_notified_until_the_agent_is_gone(tmp_path: Path) -> None
     desk.effects.clear()
     desk.drive_to(desk.core.tick + 2)
     assert not any(sense.left for sense in sent(desk.effects, Sense))
-    assert len(desk.core._departures.repeats) == 0
+    assert len(desk.core._attendance.departed) == 0
 
 
 def test_departures_are_notified_a_limited_number_of_times(tmp_path: Path) -> None:
@@ -405,7 +405,7 @@ def test_departures_are_notified_a_limited_number_of_times(tmp_path: Path) -> No
     notified = [sense.vehicle for sense in sent(desk.effects, Sense) if sense.left]
     assert notified.count(A) == LEFT_REPEATS
     assert notified.count(B) == 1  # it was the last one
-    assert A not in desk.core._departures.repeats
+    assert A not in desk.core._attendance.departed
 
 
 # --- the end ----------------------------------------------------------------------------------
@@ -520,7 +520,7 @@ def test_nothing_is_left_over_at_the_end(tmp_path: Path) -> None:
     core = desk.core
     assert core.phase is TickPhase.ENDED
     for left_over in (
-        *(core.vehicles, core._departures.repeats, core._attendance._caretakers),
+        *(core.vehicles, core._attendance.departed, core._attendance._caretakers),
         *(core._answers._unheard, core._answers._unheard_s),
         *(core._answers.silent, core._answers.awaited, core._answers.up),
         *(core._at_entrance, core._unreported, desk.world.at),

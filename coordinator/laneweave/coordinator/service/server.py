@@ -51,31 +51,24 @@ class ServiceMetrics:
 
     ABOUT: ClassVar[str] = "service"
 
-    taken_total: int = field(default=0, metadata=metric("Requests that fell to this coordinator"))
-    left_total: int = field(
-        default=0, metadata=metric("Requests that were left to other coordinators")
+    taken_total: int = metric("Requests that fell to this coordinator", default=0)
+    left_total: int = metric("Requests that were left to other coordinators", default=0)
+    answered_total: int = metric("Requests that were planned and answered", default=0)
+    repeated_total: int = metric(
+        "Requests that were answered with another one's answer, by their id", default=0
     )
-    answered_total: int = field(
-        default=0, metadata=metric("Requests that were planned and answered")
+    invalid_total: int = metric("Requests refused: not valid", default=0)
+    overloaded_total: int = metric("Requests refused: too many in hand", default=0)
+    late_total: int = metric(
+        "Requests dropped: the deadline passed before a worker was free", default=0
     )
-    repeated_total: int = field(
-        default=0,
-        metadata=metric("Requests that were answered with another one's answer, by their id"),
+    failed_total: int = metric("Requests whose planning failed", default=0)
+    planning_seconds_total: float = metric("Solvers' time", default=0.0)
+    service_seconds_total: float = metric(
+        "Time from requests' arrivals to their answers, without the solvers' time", default=0.0
     )
-    invalid_total: int = field(default=0, metadata=metric("Requests refused: not valid"))
-    overloaded_total: int = field(default=0, metadata=metric("Requests refused: too many in hand"))
-    late_total: int = field(
-        default=0,
-        metadata=metric("Requests dropped: the deadline passed before a worker was free"),
-    )
-    failed_total: int = field(default=0, metadata=metric("Requests whose planning failed"))
-    planning_seconds_total: float = field(default=0.0, metadata=metric("Solvers' time"))
-    service_seconds_total: float = field(
-        default=0.0,
-        metadata=metric("Time from requests' arrivals to their answers, without the solvers' time"),
-    )
-    waiting: int = field(default=0, metadata=metric("Requests that wait for a worker"))
-    planning: int = field(default=0, metadata=metric("Requests that workers have"))
+    waiting: int = metric("Requests that wait for a worker", default=0)
+    planning: int = metric("Requests that workers have", default=0)
 
 
 @define(eq=False)

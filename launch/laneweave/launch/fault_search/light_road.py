@@ -50,7 +50,7 @@ from laneweave.protocol.wire.topics import (
 )
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
 from laneweave.sim_bridge.bodies.plant import Plant
-from laneweave.sim_bridge.road.attendance import Absence, Attendance, Departures
+from laneweave.sim_bridge.road.attendance import Absence, Attendance
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.roadside import CENSUS_EVERY_TICKS
@@ -221,7 +221,6 @@ class LightRoad:
         self._move_lasts_s = move_lasts_s
         self._lost = lost
         self._attendance = Attendance(scenario, new_incarnation)
-        self._departures = Departures()
         self._census_due_tick = 0
 
     @property
@@ -339,11 +338,10 @@ class LightRoad:
             if each.leaves_by(now_s) or each.body.state[0] > length_m
         ]
         for name in leaving:
-            self._departures.add(self.vehicles.pop(name))
-            yield from self._attendance.forget(name)
+            yield from self._attendance.leave(self.vehicles.pop(name))
             self._checker.leave(now_s, name)
             self._census_due_tick = 0
-        yield from self._departures.notify(self.tick, self._attendance.answers.up)
+        yield from self._attendance.notify_departed(self.tick)
 
     def _attend(self, now_s: float) -> Iterator[Effect]:
         """Let caretakers take charge of vehicles with absent or silent agents."""

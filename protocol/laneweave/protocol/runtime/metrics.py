@@ -1,8 +1,8 @@
 """Metrics of a process: what it counts, described once, readable from other threads.
 
 A *snapshot* is a frozen attrs class with a class variable `ABOUT` and one field per metric: an int,
-a float, a bool, or a mapping of text to number. Field names end with the unit, in base units, and
-with `_total` if the value only ever grows; their metadata, made by `metric`, describes them.
+a float, a bool, or a mapping of text to number, described by `metric`. Field names end with the
+unit, in base units, and with `_total` if the value only ever grows.
 
 A reader never touches the counters of another thread: it puts a `SnapshotRequest` among the events
 of the process, and the thread that counts answers it (`snapshot_source`).
@@ -100,14 +100,15 @@ class Metric:
             yield (), float(value)
 
 
-def metric(meaning: str, *, label: str = "") -> dict[str, Any]:
-    """Return the metadata of a metric's field.
+def metric(meaning: str, *, label: str = "", default: object = attrs.NOTHING) -> Any:  # noqa: ANN401
+    """Return the attrs field of a metric.
 
     Args:
         meaning: what the number is, in one sentence without the full stop.
         label: of a mapping: what its keys are.
+        default: of the field; without one it is mandatory.
     """
-    return {"meaning": meaning, "label": label}
+    return attrs.field(default=default, metadata={"meaning": meaning, "label": label})
 
 
 def metrics_of(kind: type[MetricsSnapshot]) -> tuple[Metric, ...]:
@@ -129,19 +130,15 @@ class NodeMetrics:
 
     ABOUT: ClassVar[str] = "node"
 
-    published_total: int = attrs.field(metadata=metric("Messages that this process has published"))
-    received_total: Mapping[str, int] = attrs.field(
-        metadata=metric("Well-formed messages that have arrived", label="topic")
+    published_total: int = metric("Messages that this process has published")
+    received_total: Mapping[str, int] = metric(
+        "Well-formed messages that have arrived", label="topic"
     )
-    rejected_total: int = attrs.field(
-        metadata=metric("Messages that have arrived and were not well formed")
+    rejected_total: int = metric("Messages that have arrived and were not well formed")
+    events_total: int = metric(
+        "Events that the core has handled: messages, tokens, timers, results"
     )
-    events_total: int = attrs.field(
-        metadata=metric("Events that the core has handled: messages, tokens, timers, results")
-    )
-    handling_seconds_total: float = attrs.field(
-        metadata=metric("Time that this process has spent on handling events")
-    )
+    handling_seconds_total: float = metric("Time that this process has spent on handling events")
 
 
 @frozen
@@ -150,4 +147,4 @@ class RouterMetrics:
 
     ABOUT: ClassVar[str] = "router"
 
-    sessions: int = attrs.field(metadata=metric("Processes that are connected"))
+    sessions: int = metric("Processes that are connected")

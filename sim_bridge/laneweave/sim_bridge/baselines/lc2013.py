@@ -46,7 +46,10 @@ class Lc2013Traffic:
         came = [self._entered(name, t_s, entrance) for name in sorted(entered)]
         for vehicle in self._vehicles.values():
             self._look(vehicle)
-        self._release()
+        for vehicle in list(self._kept_on_lane):
+            if vehicle.s_m >= self._road.sorting_start_m:
+                self._kept_on_lane.remove(vehicle)
+                self._sumo.allow_lane_changes(vehicle.name, allowed=True)
         return came
 
     def poses(self) -> dict[str, Pose]:
@@ -65,8 +68,9 @@ class Lc2013Traffic:
 
     def _offer(self, t_s: float, entrance: Entrance) -> None:
         """Offer SUMO the next vehicle of each lane once; SUMO inserts it when there is room."""
-        for arrival in entrance.firsts():
-            if arrival.vehicle not in self._offered:
+        for lane in range(self._road.lanes):
+            arrival = entrance.first(lane)
+            if arrival is not None and arrival.vehicle not in self._offered:
                 s_m = entrance.furthest_m(arrival, t_s)
                 self._sumo.offer(arrival.vehicle, arrival.lane, arrival.preferred_lane, s_m)
                 if not self._everywhere:
@@ -95,14 +99,6 @@ class Lc2013Traffic:
         vehicle.accel_mps2 = (speed_mps - vehicle.speed_mps) / self._tick_s
         vehicle.s_m, vehicle.y_m, vehicle.speed_mps = s_m, y_m, speed_mps
         vehicle.lane = int(y_m // self._road.lane_width_m)
-
-    def _release(self) -> None:
-        """Allow lane changes of vehicles that have reached S3."""
-        for vehicle in [
-            each for each in self._kept_on_lane if each.s_m >= self._road.sorting_start_m
-        ]:
-            self._kept_on_lane.remove(vehicle)
-            self._sumo.allow_lane_changes(vehicle.name, allowed=True)
 
 
 def check_lc2013(scenario: Scenario) -> None:

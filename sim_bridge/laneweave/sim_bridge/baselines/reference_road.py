@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Protocol
 
 from attrs import define
@@ -57,14 +57,7 @@ class ReferenceVehicle:
     @property
     def state(self) -> State:
         """(s m, v m/s, a m/s2, y m, v_y m/s, a_y m/s2)."""
-        return (
-            self.s_m,
-            self.speed_mps,
-            self.accel_mps2,
-            self.y_m,
-            self.lateral_speed_mps,
-            0.0,
-        )
+        return self.s_m, self.speed_mps, self.accel_mps2, self.y_m, self.lateral_speed_mps, 0.0
 
     @property
     def cell(self) -> tuple[None, int]:
@@ -97,12 +90,6 @@ class Entrance:
     def first(self, lane: int) -> Arrival | None:
         """Return the next vehicle of a lane."""
         return self._queues[lane][0] if self._queues[lane] else None
-
-    def firsts(self) -> Iterator[Arrival]:
-        """Yield the next vehicle of each lane."""
-        for queue in self._queues:
-            if queue:
-                yield queue[0]
 
     def furthest_m(self, arrival: Arrival, t_s: float) -> float:
         """Return how far beyond s = 0 a vehicle can be at the tick at which it enters.

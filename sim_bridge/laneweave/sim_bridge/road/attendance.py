@@ -8,10 +8,8 @@ learn that their vehicles have left.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from enum import StrEnum
-
-from attrs import define, field
 
 from laneweave.protocol.runtime.node import Effect, Event, Listen, PeerDown, PeerUp, Send, Unlisten
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
@@ -126,6 +124,8 @@ class Attendance:
         self._lease_s = scenario.network.lease_s
         self._new_incarnation = new_incarnation
         self._caretakers: dict[Name, Caretaker] = {}
+        self.departed: dict[Name, tuple[RoadVehicle, int]] = {}
+        """Vehicles that have left the road, and how often their agents are still notified."""
         self._absence_counts_s = -math.inf
         """From this time on a missing token means that the agent is absent."""
 
@@ -194,10 +194,20 @@ class Attendance:
             yield from self._end_caretaker(vehicle.name)
         return True
 
-    def forget(self, vehicle: Name) -> Iterator[Effect]:
-        """Forget a vehicle that left the road."""
-        self.answers.forget(vehicle)
-        yield from self._end_caretaker(vehicle)
+    def leave(self, vehicle: RoadVehicle) -> Iterator[Effect]:
+        """Take a vehicle off the road, and notify its agent from now on."""
+        self.answers.forget(vehicle.name)
+        self.departed[vehicle.name] = (vehicle, LEFT_REPEATS)
+        yield from self._end_caretaker(vehicle.name)
+
+    def notify_departed(self, tick: int) -> Iterator[Effect]:
+        """Notify the agents of departed vehicles that are up once more."""
+        for name, (vehicle, repeats) in list(self.departed.items()):
+            if name not in self.answers.up or repeats == 0:
+                del self.departed[name]
+                continue
+            self.departed[name] = (vehicle, repeats - 1)
+            yield notify_left(vehicle, tick)
 
     # --- caretakers ---------------------------------------------------------------------------
 
@@ -247,31 +257,6 @@ class Attendance:
 
 def _state_effect(state: VehicleState) -> Effect:
     return Send(STATE, state, {"formation": state.formation, "vehicle": state.vehicle})
-
-
-@define
-class Departures:
-    """Vehicles that have left the road and whose agents must be notified."""
-
-    repeats: dict[Name, tuple[RoadVehicle, int]] = field(factory=dict)
-    """Vehicle and remaining notifications, by name."""
-
-    def add(self, vehicle: RoadVehicle) -> None:
-        """Add a vehicle that left the road."""
-        self.repeats[vehicle.name] = (vehicle, LEFT_REPEATS)
-
-    def forget(self, vehicle: Name) -> None:
-        """Stop notifying an agent, because its token has vanished."""
-        self.repeats.pop(vehicle, None)
-
-    def notify(self, tick: int, up: Collection[Name]) -> Iterator[Effect]:
-        """Notify the agents that are up once more."""
-        for name, (vehicle, repeats) in list(self.repeats.items()):
-            if name not in up or repeats == 0:
-                del self.repeats[name]
-                continue
-            self.repeats[name] = (vehicle, repeats - 1)
-            yield notify_left(vehicle, tick)
 
 
 def notify_left(vehicle: RoadVehicle, tick: int) -> Effect:

@@ -20,36 +20,12 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from typing import Protocol
 
 from attrs import define, field
 
 from laneweave.protocol.lattice import Cell, Lattice
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.wire.messages import ClosedFormation
-
-
-class FormationBuilder(Protocol):
-    """Assigns entering vehicles to formations, in order of time."""
-
-    first_open_column: float
-    """The foremost column that can still be entered; infinite: any."""
-
-    @property
-    def closed_to(self) -> int:
-        """All blocks up to this number are closed; -1: none."""
-
-    def takes(self, cell: Cell, preferred_lane: int, t_s: float) -> bool:
-        """Take a vehicle into the formation of its cell; False: it needs a cell further back.
-
-        Args:
-            cell: where it would enter.
-            preferred_lane: its preferred lane.
-            t_s: road time at which it would enter.
-        """
-
-    def closed(self, t_s: float) -> list[ClosedFormation]:
-        """Return the formations that have been closed since the last call, up to a road time."""
 
 
 @define
@@ -61,6 +37,7 @@ class ColumnBlocks:
     spread_s: float
     """Maximum time between a vehicle and its cell at the start of the road."""
     first_open_column: float = math.inf
+    """The foremost column that can still be entered; infinite: any."""
     _taken: Counter[int] = field(factory=Counter)
     _preferring: Counter[tuple[int, int]] = field(factory=Counter)
     """Vehicles by (block, preferred lane)."""
@@ -68,7 +45,7 @@ class ColumnBlocks:
     """The next block to be closed."""
 
     def takes(self, cell: Cell, preferred_lane: int, t_s: float) -> bool:
-        """Take a vehicle into the formation of its cell; see `FormationBuilder`."""
+        """Take a vehicle that would enter in a cell; False: it needs a cell further back."""
         del t_s
         block = self.lattice.block_of(cell[0])
         if (
@@ -81,7 +58,7 @@ class ColumnBlocks:
         return True
 
     def closed(self, t_s: float) -> list[ClosedFormation]:
-        """Return the blocks whose last column has passed; see `FormationBuilder`."""
+        """Return the formations closed since the last call: their last column has passed."""
         closed = []
         while (closed_s := self._closing_s(self._next)) <= t_s:
             if self._taken[self._next]:
@@ -109,6 +86,7 @@ class GrowingFormations:
     spread_s: float
     """Maximum time between a vehicle and its cell at the start of the road."""
     first_open_column: float = 0
+    """The foremost column that can still be entered."""
     _front: int | None = None
     """Foremost column of the open formation; None: there is none."""
     _rear: int = 0
@@ -124,7 +102,7 @@ class GrowingFormations:
         return self._length_for(self.max_vehicles)
 
     def takes(self, cell: Cell, preferred_lane: int, t_s: float) -> bool:
-        """Take a vehicle into the formation of its cell; see `FormationBuilder`."""
+        """Take a vehicle that would enter in a cell; False: it needs a cell further back."""
         column = cell[0]
         if self._front is not None and column <= self._front - self.max_columns:
             self._close(self._front - self.max_columns + 1, t_s)
@@ -133,7 +111,10 @@ class GrowingFormations:
         if column > self.first_open_column:
             return False
         if self._front is None:
-            self._front = int(min(self.first_open_column, column + self._columns_ahead))
+            # Columns ahead of the one just entered can still be entered, this many:
+            spread_m = self.spread_s * self.lattice.speed_mps
+            ahead = math.floor(2.0 * spread_m / self.lattice.pitch_m + 1e-6)
+            self._front = int(min(self.first_open_column, column + ahead))
             self._rear = column
         self._rear = min(self._rear, column)
         self._taken += 1
@@ -148,7 +129,7 @@ class GrowingFormations:
         return self.lattice.block_of(int(self.first_open_column)) - 1
 
     def closed(self, t_s: float) -> list[ClosedFormation]:
-        """Return the formations that have been closed; see `FormationBuilder`."""
+        """Return the formations that have been closed since the last call."""
         if self._front is not None:
             rear = self._front - self.max_columns + 1
             closed_s = self.lattice.passing_time_s(rear) + self.spread_s
@@ -173,16 +154,14 @@ class GrowingFormations:
         self._front, self._taken = None, 0
         self._preferring.clear()
 
-    @property
-    def _columns_ahead(self) -> int:
-        """Columns ahead of the one just entered that can still be entered."""
-        spread_m = self.spread_s * self.lattice.speed_mps
-        return math.floor(2.0 * spread_m / self.lattice.pitch_m + 1e-6)
-
     def _length_for(self, vehicles: int) -> int:
         """Return the columns that hold some vehicles and one free column's worth of cells."""
         lanes = self.lattice.lanes
         return math.ceil((vehicles + lanes) / lanes) if lanes > 1 else vehicles
+
+
+FormationBuilder = ColumnBlocks | GrowingFormations
+"""Assigns entering vehicles to formations, in order of time."""
 
 
 def formation_builder(scenario: Scenario) -> FormationBuilder | None:

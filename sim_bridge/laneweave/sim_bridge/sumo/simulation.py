@@ -9,12 +9,14 @@ from __future__ import annotations
 import ctypes
 import math
 import os
-from collections.abc import Callable, Iterable
-from types import TracebackType
+from collections.abc import Iterable
+from pathlib import Path
 from typing import Any, Self
 
 from laneweave.protocol.errors import CommandFailedError
+from laneweave.protocol.scenario.tables import Scenario
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
+from laneweave.sim_bridge.sumo.network import write_network
 
 DEBIAN_PACKAGES = {
     "libX11.so.6": "libx11-6",
@@ -37,13 +39,13 @@ class SumoSession:
 
     _open: SumoSession | None = None
 
-    def __init__(self, options: Callable[[], tuple[str, ...]], body_length_m: float) -> None:
-        """Load libsumo and start SUMO.
+    def __init__(self, scenario: Scenario, folder: Path, *, exits: bool = False) -> None:
+        """Load libsumo, write a road's network into a folder and start SUMO on it.
 
         Args:
-            options: writes SUMO's input files and returns its argument list; called after libsumo
-                has been loaded.
-            body_length_m: length of every vehicle.
+            scenario: road, vehicles and tick.
+            folder: folder for SUMO's input files.
+            exits: whether SUMO drives; see `write_network`.
 
         Raises:
             SumoUnavailableError: libsumo cannot be loaded.
@@ -52,8 +54,8 @@ class SumoSession:
         if SumoSession._open is not None:
             raise RuntimeError("libsumo holds one simulation per process, and one is open")
         self._sumo: Any = _load_libsumo()
-        self._sumo.start([*options()])
-        self._half_body_m = 0.5 * body_length_m
+        self._sumo.start([*write_network(scenario, folder, exits=exits)])
+        self._half_body_m = 0.5 * scenario.vehicle.length_m
         SumoSession._open = self
 
     @property
@@ -61,19 +63,9 @@ class SumoSession:
         """The vehicle functions of libsumo."""
         return self._sumo.vehicle
 
-    @property
-    def is_open(self) -> bool:
-        """Whether SUMO is running."""
-        return SumoSession._open is self
-
     def step(self) -> None:
         """Advance SUMO by one tick."""
         self._sumo.simulationStep()
-
-    def departed(self) -> tuple[str, ...]:
-        """Return the vehicles that SUMO has inserted in the last step."""
-        departed: tuple[str, ...] = self._sumo.simulation.getDepartedIDList()
-        return departed
 
     def collisions(self) -> list[tuple[str, str]]:
         """Return the pairs that SUMO reports as colliding in the last step, sorted, each once.
@@ -109,12 +101,7 @@ class SumoSession:
         """Return this session."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """Close this session."""
         self.close()
 

@@ -17,12 +17,7 @@ from pathlib import Path
 
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
-from laneweave.sim_bridge.sumo.network import (
-    VEHICLE_TYPE,
-    exit_route,
-    margin_m,
-    write_network_with_exits,
-)
+from laneweave.sim_bridge.sumo.network import VEHICLE_TYPE, exit_route, margin_m
 from laneweave.sim_bridge.sumo.simulation import SumoSession
 
 _NO_LANE_CHANGES = 0
@@ -34,19 +29,8 @@ class SumoTraffic(SumoSession):
     """One road with vehicles that SUMO drives. Close it, or use it as a context manager."""
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
-        """Write the network into a folder and start SUMO on it.
-
-        Args:
-            scenario: road, vehicles, tick, and the table `lc2013`.
-            folder: folder for SUMO's input files.
-
-        Raises:
-            SumoUnavailableError: libsumo cannot be loaded.
-            RuntimeError: another simulation is open in this process.
-        """
-        super().__init__(
-            lambda: write_network_with_exits(scenario, folder), scenario.vehicle.length_m
-        )
+        """Start SUMO on an empty road; see `SumoSession`."""
+        super().__init__(scenario, folder, exits=True)
         self._margin_m = margin_m(scenario)
         self._speed_mps = scenario.formation.speed_mps
         self._on_road: dict[str, None] = {}
@@ -78,7 +62,7 @@ class SumoTraffic(SumoSession):
     def advance(self) -> tuple[str, ...]:
         """Advance by one tick and return the vehicles that have entered the road."""
         self.step()
-        entered = self.departed()
+        entered: tuple[str, ...] = self._sumo.simulation.getDepartedIDList()
         self._on_road.update(dict.fromkeys(entered))
         return entered
 
@@ -90,8 +74,3 @@ class SumoTraffic(SumoSession):
         """Take a vehicle off the road."""
         del self._on_road[vehicle]
         self.vehicle.remove(vehicle)
-
-    def close(self) -> None:
-        """End SUMO; a second call does nothing."""
-        self._on_road.clear()
-        super().close()

@@ -20,7 +20,7 @@ from pathlib import Path
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose, pose_of
-from laneweave.sim_bridge.sumo.network import EDGE, ROUTE, VEHICLE_TYPE, margin_m, write_network
+from laneweave.sim_bridge.sumo.network import EDGE, ROUTE, VEHICLE_TYPE, margin_m
 from laneweave.sim_bridge.sumo.simulation import SumoSession
 
 
@@ -28,17 +28,8 @@ class SumoWorld(SumoSession):
     """One road with vehicles in SUMO. Close it, or use it as a context manager."""
 
     def __init__(self, scenario: Scenario, folder: Path) -> None:
-        """Write the network into a folder and start SUMO on it.
-
-        Args:
-            scenario: road, vehicle size and tick.
-            folder: folder for SUMO's input files.
-
-        Raises:
-            SumoUnavailableError: libsumo cannot be loaded.
-            RuntimeError: another world is open in this process.
-        """
-        super().__init__(lambda: write_network(scenario, folder), scenario.vehicle.length_m)
+        """Start SUMO on an empty road; see `SumoSession`."""
+        super().__init__(scenario, folder)
         margin = margin_m(scenario)
         self._range_m = (-margin, scenario.road.length_m + margin)
         """Positions at which SUMO can show vehicles."""
@@ -51,16 +42,12 @@ class SumoWorld(SumoSession):
     def add(self, vehicle: str, state: State) -> None:
         """Put a new vehicle on the road; SUMO shows it from the next step on.
 
-        Args:
-            vehicle: its name.
-            state: (s, v, a, y, v_y, a_y) in m and s.
-
         Raises:
             ValueError: it is on the road already, or `state` is not on the edge.
         """
         if vehicle in self._states:
             raise ValueError(f"{vehicle} is on the road already")
-        self._check(vehicle, state)
+        self._check(vehicle, state)  # before SUMO knows the vehicle
         api = self.vehicle
         api.add(vehicle, ROUTE, typeID=VEHICLE_TYPE, depart="now", departPos="0", departSpeed="0")
         api.setSpeedMode(vehicle, 0)
@@ -70,10 +57,6 @@ class SumoWorld(SumoSession):
 
     def place(self, vehicle: str, state: State) -> None:
         """Set the state of a vehicle at the end of the next step.
-
-        Args:
-            vehicle: a vehicle that was added.
-            state: (s, v, a, y, v_y, a_y) in m and s.
 
         Raises:
             ValueError: the vehicle is not on the road, or `state` is not on the edge.
@@ -121,13 +104,6 @@ class SumoWorld(SumoSession):
         self._placed.discard(vehicle)
         self._shown = [other for other in self._shown if other != vehicle]
         self.vehicle.remove(vehicle)
-
-    def close(self) -> None:
-        """End SUMO; a second call does nothing."""
-        if self.is_open:
-            self._states.clear()
-            self._shown.clear()
-            super().close()
 
     def _check(self, vehicle: str, state: State) -> None:
         """Reject a state that SUMO would map to another place."""

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from typing import ClassVar
 
 import pytest
-from attrs import field, frozen
+from attrs import Factory, frozen
 from prometheus_client.parser import text_string_to_metric_families
 
 from laneweave.launch.observe.metrics_server import families, shown_metrics
@@ -24,9 +24,9 @@ class Counted:
 
     ABOUT: ClassVar[str] = "test"
 
-    apples_total: int = field(default=3, metadata=metric("Apples eaten"))
-    pears_total: Mapping[str, int] = field(
-        factory=lambda: {"green": 1, "red": 2}, metadata=metric("Pears eaten", label="colour")
+    apples_total: int = metric("Apples eaten", default=3)
+    pears_total: Mapping[str, int] = metric(
+        "Pears eaten", label="colour", default=Factory(lambda: {"green": 1, "red": 2})
     )
     ripe: bool = True
     age_seconds: float = 1.5

@@ -13,7 +13,7 @@ from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.tables import Scenario
 from laneweave.sim_bridge.baselines.lc2013 import check_lc2013
-from laneweave.sim_bridge.sumo.network import write_network_with_exits
+from laneweave.sim_bridge.sumo.network import write_network
 from laneweave.sim_bridge.sumo.traffic import SumoTraffic
 from laneweave.sim_bridge.sumo.world import SumoWorld
 
@@ -22,7 +22,7 @@ def written(
     folder: Path, **tables: dict[str, Any]
 ) -> tuple[tuple[str, ...], ET.Element, ET.Element]:
     """Return SUMO's options, the network and the routes."""
-    options = write_network_with_exits(parse_scenario(tables), folder)
+    options = write_network(parse_scenario(tables), folder, exits=True)
     network, routes = (
         ET.parse(folder / name).getroot()  # noqa: S314 (our own)
         for name in ("road.net.xml", "road.rou.xml")
