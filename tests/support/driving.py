@@ -165,10 +165,7 @@ class Road:
             course = one.driver.motion(self.tick)
             if course is None:
                 continue
-            motion = Motion(
-                name, 1, stretch_of(course.origin[0]), course.origin, course.target,
-                course.begin_tick, course.ticks, self.tick,
-            )  # fmt: skip
+            motion = Motion(name, 1, stretch_of(course[0][0]), *course, self.tick)
             for other, listener in self.driven.items():
                 if other != name:
                     listener.driver.on_motion(motion)

@@ -22,7 +22,7 @@ from collections.abc import Callable
 
 from attrs import evolve
 
-from laneweave.agents.driving.driver import Course, Driver, SolverStats, TrackingDriver
+from laneweave.agents.driving.driver import Driver, SolverStats, TrackingDriver
 from laneweave.protocol.lattice import PlannedMove, stretch_of
 from laneweave.protocol.runtime.node import (
     Announce,
@@ -212,8 +212,10 @@ class AgentCore:
     def _act(self, sense: Sense, *, in_charge: bool) -> list[Effect]:
         execution = self.execution
         assert execution is not None  # noqa: S101 (there was a SENSE)
-        self.wanted_motions = _stretches_near(execution.hold_cell[0]) if in_charge else ()
+        self.wanted_motions = ()
         if in_charge:
+            stretch = stretch_of(execution.hold_cell[0])
+            self.wanted_motions = stretch - 1, stretch, stretch + 1
             execution.on_joined(sense.joined)
             execution.on_noted(sense.accepted)
             execution.on_owned(sense)
@@ -238,7 +240,9 @@ class AgentCore:
             effects.append(self._state())
             course = self._driver.motion(sense.tick)
             if course is not None:
-                effects.append(self._motion(course, sense.tick))
+                stretch = stretch_of(course[0][0])
+                motion = Motion(self.vehicle, self._incarnation, stretch, *course, sense.tick)
+                effects.append(Send(MOTION, motion, {"stretch": stretch, **self._own}))
         return effects
 
     def _on_confirmation(self, sense: Sense) -> list[Effect]:
@@ -312,19 +316,6 @@ class AgentCore:
         state = execution.state(sense, self._formation or 0, attended=True)
         return Send(STATE, state, self._state_parameters)
 
-    def _motion(self, course: Course, tick: int) -> Effect:
-        motion = Motion(
-            vehicle=self.vehicle,
-            incarnation=self._incarnation,
-            stretch=stretch_of(course.origin[0]),
-            origin=course.origin,
-            target=course.target,
-            begin_tick=course.begin_tick,
-            ticks=course.ticks,
-            tick=tick,
-        )
-        return Send(MOTION, motion, {"stretch": motion.stretch, "vehicle": self.vehicle})
-
     def leave(self) -> list[Effect]:
         """End, because the vehicle has left the road."""
         if self.ended:
@@ -347,8 +338,3 @@ class AgentCore:
             solve_ms=stats.solve_ms,
         )
         return Send(REPORT, report, {"role": "agent", "name": self.vehicle})
-
-
-def _stretches_near(column: int) -> tuple[int, int, int]:
-    stretch = stretch_of(column)
-    return stretch - 1, stretch, stretch + 1

@@ -102,7 +102,10 @@ class AgentHost:
     def handle(self, event: Event, now_s: float) -> list[Effect]:
         """Take an event; see `Core`."""
         if isinstance(event, Arrived) and isinstance(event.message, Motion):
-            self._on_motion(event.message)  # changes no subscription
+            motion = event.message  # changes no subscription
+            for name, agent in self._agents.items():
+                if name != motion.vehicle and motion.stretch in agent.wanted_motions:
+                    agent.on_motion(motion)
             return []
         hosted = bool(self._agents)
         if isinstance(event, Arrived):
@@ -150,11 +153,6 @@ class AgentHost:
             return effects
         name = event.parameters.get("vehicle")
         return self._dispatch(event, Name(name), now_s) if name in self._agents else []
-
-    def _on_motion(self, motion: Motion) -> None:
-        for name, agent in self._agents.items():
-            if name != motion.vehicle and motion.stretch in agent.wanted_motions:
-                agent.on_motion(motion)
 
     def _dispatch_to_all(self, event: Event, now_s: float) -> list[Effect]:
         effects: list[Effect] = []

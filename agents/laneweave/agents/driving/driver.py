@@ -24,6 +24,8 @@ from laneweave.protocol.vehicle.motion import at_rest_in_cell, cell_state, comma
 from laneweave.protocol.wire.messages import Motion, Sense
 
 _FLOAT32 = np.dtype("<f4")
+Course = tuple[Cell, Cell, int, int]
+"""(origin, target, first tick, ticks) of a motion, as published to other vehicles."""
 
 
 @define  # made at each tick: frozen ones take three times as long
@@ -38,16 +40,6 @@ class Drive:
     jerks: bytes
     """Little-endian float32 pairs (along, across) in m/s3, one for each tick of the horizon; empty
     when there is nothing better than what is being executed."""
-
-
-@frozen
-class Course:
-    """A motion as published to other vehicles."""
-
-    origin: Cell
-    target: Cell
-    begin_tick: int
-    ticks: int
 
 
 @frozen
@@ -110,7 +102,7 @@ class TrackingDriver:
     @property
     def solver_stats(self) -> SolverStats:
         """Counters and durations of tracking so far."""
-        solve_ms = np.array(self._solve_ms, dtype="<f4").tobytes()
+        solve_ms = np.array(self._solve_ms, dtype=_FLOAT32).tobytes()
         return SolverStats(len(self._solve_ms), self._unusable, self._osqp_solves, solve_ms)
 
     def take_over(self, sense: Sense) -> None:
@@ -118,21 +110,13 @@ class TrackingDriver:
         scenario = self._scenario
         self._goal = sense.hold_cell
         if sense.motion_origin == sense.hold_cell and sense.motion_end_tick > sense.tick + 3:
-            state = commanded_state(
-                sense.state, sense.setpoint, scenario.vehicle, self._lattice.speed_mps
-            )
+            state = commanded_state(sense.state, sense.setpoint, self._vehicle, self._speed_mps)
             self._reference = Reference.settling(
                 scenario, sense.hold_cell, state, sense.tick, sense.motion_end_tick
             )
         elif sense.motion_end_tick > sense.tick and sense.motion_ticks in self._durations:
-            self._ticks = sense.motion_ticks
-            self._reference = Reference.move(
-                scenario,
-                sense.motion_origin,
-                sense.hold_cell,
-                sense.motion_end_tick - self._ticks,
-                self._ticks,
-            )
+            begin_tick = sense.motion_end_tick - sense.motion_ticks
+            self.begin((0, sense.motion_origin, sense.hold_cell), begin_tick, sense.motion_ticks)
         else:
             self._reference = Reference.hold(scenario, sense.hold_cell)
 
@@ -179,7 +163,7 @@ class TrackingDriver:
             return None
         if tick >= reference.end_tick or (tick - reference.start_tick) % REPEAT_TICKS:
             return None
-        return Course(reference.origin, self._goal, reference.start_tick, self._ticks)
+        return reference.origin, self._goal, reference.start_tick, self._ticks
 
     def on_motion(self, motion: Motion) -> None:
         """Take the announced motion of another vehicle."""

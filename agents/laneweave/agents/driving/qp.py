@@ -1,9 +1,9 @@
 """Quadratic programs: the only module that imports OSQP; it checks every answer.
 
-    minimise    1/2 x' P x + q' x
+    minimise    1/2 x' P x
     subject to  lower <= A x <= upper
 
-P and A are set up once; the vectors change between solutions. This module makes up for checks that
+P and A are set up once; the bounds change between solutions. This module makes up for checks that
 OSQP 1.1 leaves to its caller: it accepts vectors of the wrong length, prints a message and uses old
 data when lower > upper, keeps a NaN in its warm start, and returns a finite x for an infeasible
 problem.
@@ -85,7 +85,7 @@ class QPResult:
 
 
 class QuadraticProgram:
-    """One quadratic program, set up once and solved repeatedly with changing vectors.
+    """One quadratic program, set up once and solved repeatedly with changing bounds.
 
     Use one object per thread. Equal sequences of calls give bit-identical results.
     """
@@ -96,7 +96,6 @@ class QuadraticProgram:
         rows: Any,  # noqa: ANN401
         lower: Vector,
         upper: Vector,
-        linear: Vector | None = None,
         settings: QPSettings | None = None,
         scale: QPScale | None = None,
     ) -> None:
@@ -107,7 +106,6 @@ class QuadraticProgram:
             rows: A, sparse (m, n).
             lower: lower bounds (m,); -inf for none.
             upper: upper bounds (m,); +inf for none.
-            linear: q (n,); None for zero.
             settings: None for the defaults.
             scale: units in which OSQP receives the program; None: those of the caller.
 
@@ -118,7 +116,6 @@ class QuadraticProgram:
         m, n = rows.shape
         if cost.shape != (n, n):
             raise ValueError(f"cost has shape {cost.shape}, rows have {n} columns")
-        self._n = n
         self._settings = settings or QPSettings()
         self._scale = _checked_scale(scale or QPScale(np.ones(m), np.ones(n)), m, n)
         by_rows, by_unknowns = (sparse.diags(by) for by in (self._scale.rows, self._scale.unknowns))
@@ -133,7 +130,6 @@ class QuadraticProgram:
         self._above, self._below = np.zeros(m), np.zeros(m)
         self._zero_x, self._zero_y = np.zeros(n), np.zeros(m)
         self._check_bounds(lower, upper)
-        first = np.zeros(n) if linear is None else self._checked_linear(linear)
         # OSQP reads the upper triangle, sorted by row within each column.
         triangle = cost_csc.copy()
         columns = np.repeat(np.arange(n), np.diff(triangle.indptr))
@@ -143,7 +139,7 @@ class QuadraticProgram:
         rows_csc.sort_indices()
         self._solver = ext_builtin.OSQPSolver(
             ext_builtin.CSC(triangle),
-            first,
+            self._zero_x,
             ext_builtin.CSC(rows_csc),
             self._lower,
             self._upper,
@@ -152,16 +148,15 @@ class QuadraticProgram:
             _osqp_settings(self._settings),
         )
 
-    def update(self, lower: Vector, upper: Vector, linear: Vector | None = None) -> None:
-        """Replace the bounds (m,) and, unless None, the linear cost (n,).
+    def update(self, lower: Vector, upper: Vector) -> None:
+        """Replace the bounds (m,).
 
         Raises:
-            ValueError: a shape is wrong, a number is NaN, the linear cost is not finite, a lower
-                bound is +inf, an upper bound -inf, or lower > upper. The program is unchanged.
+            ValueError: a shape is wrong, a number is NaN, a lower bound is +inf, an upper bound
+                -inf, or lower > upper. The program is unchanged.
         """
-        checked = None if linear is None else self._checked_linear(linear)
         self._check_bounds(lower, upper)
-        if self._solver.update_data_vec(q=checked, l=self._lower, u=self._upper):
+        if self._solver.update_data_vec(q=None, l=self._lower, u=self._upper):
             raise ValueError("OSQP refused the vectors")
 
     def solve(self) -> QPResult:
@@ -199,13 +194,6 @@ class QuadraticProgram:
         self._above /= self._scale.rows
         # A NaN anywhere propagates and fails every comparison.
         return max(float(self._above.max()), 0.0) if self._above.size else 0.0
-
-    def _checked_linear(self, linear: Vector) -> Vector:
-        if linear.shape != (self._n,):
-            raise ValueError(f"linear has shape {linear.shape}, expected {(self._n,)}")
-        if not np.isfinite(linear).all():
-            raise ValueError("linear cost is not finite")
-        return linear * self._scale.unknowns
 
     def _check_bounds(self, lower: Vector, upper: Vector) -> None:
         """Copy checked bounds, clipped to OSQP's infinity, or raise and change nothing."""

@@ -39,6 +39,8 @@ class Window:
     """(N, 2): j_s, j_y [m/s3]."""
     bounds: ErrorBounds | None = None
     """Admissible errors beside it, from the next tick on; None: not computed."""
+    defect: Array | None = None
+    """c (N, 3) by which it violates the dynamics along the road; None: it obeys them."""
 
 
 class Reference:
@@ -98,14 +100,7 @@ class Reference:
         start_tick: int,
         ticks: int | None = None,
     ) -> Reference:
-        """Return the reference of one move.
-
-        Args:
-            scenario: lattice, tick and horizon.
-            origin: cell where it begins.
-            target: a neighbouring cell.
-            start_tick: tick at which it begins.
-            ticks: duration; see `move_profile`.
+        """Return the reference of one move to a neighbouring cell; see `move_profile`.
 
         Raises:
             InfeasibleTrajectoryError: the move cannot be driven within the limits.
@@ -118,14 +113,9 @@ class Reference:
     def settling(
         cls, scenario: Scenario, cell: Cell, state: State, tick: int, end_tick: int
     ) -> Reference:
-        """Return the reference that ends at rest in a cell; see `settling_trajectory`.
+        """Return the reference from a commanded state at `tick` to rest in a cell at `end_tick`.
 
-        Args:
-            scenario: lattice and tick.
-            cell: where it ends.
-            state: commanded state at `tick`.
-            tick: tick at which it begins.
-            end_tick: tick at which it ends, at least three ticks later.
+        It takes at least three ticks; see `settling_trajectory`.
         """
         goal = cell_state(scenario.lattice, cell, tick * scenario.runtime.tick_s)
         trajectory = settling_trajectory(scenario, np.array(state) - goal, end_tick - tick)

@@ -57,29 +57,11 @@ class TrackResult:
     """Largest violation of a row by the solver's answer, before limits were applied."""
 
 
-@define(eq=False)
-class _Target:
-    """The path that is tracked in this tick."""
-
-    states: Array
-    """(N + 1, 6)."""
-    jerks: Array
-    """(N, 2)."""
-    defect: Array | None
-    """c (N, 3) of the axis along the road; None for zero."""
-    bounds: ErrorBounds | None = None
-    """Admissible errors beside it; None: not computed."""
-
-
 class Tracker:
     """Tracks references. One object per vehicle."""
 
     def __init__(self, scenario: Scenario) -> None:
-        """Prepare the program.
-
-        Args:
-            scenario: horizon, tick, limits; `tracking.always_solve` turns the fast path off.
-        """
+        """Prepare the program; `tracking.always_solve` turns the fast path off."""
         n = self._n = scenario.horizon_ticks
         self._tick_s = scenario.runtime.tick_s
         self._axis = axis_matrices(self._tick_s)
@@ -104,31 +86,22 @@ class Tracker:
             )
 
     def solve(self, state: State, window: Window, gaps: Gaps = NO_GAPS) -> TrackResult:
-        """Return the jerks that bring the vehicle to its reference.
-
-        Args:
-            state: commanded state (s, v, a, y, v_y, a_y) now.
-            window: the reference from now on, N + 1 states and N jerks.
-            gaps: positions that other vehicles leave free.
+        """Return the jerks that bring a vehicle from its commanded state to its reference.
 
         Raises:
             ValueError: a shape is wrong, a number is NaN or the state not finite.
         """
         start = time.thread_time()
-        states, jerks = window.states, window.jerks
-        if (states.shape, jerks.shape) != self._shapes:
-            raise ValueError(
-                f"window has shapes {states.shape}, {jerks.shape}, not {self._n} ticks"
-            )
+        shapes = window.states.shape, window.jerks.shape
+        if shapes != self._shapes:
+            raise ValueError(f"window has shapes {shapes}, not {self._n} ticks")
         # A finite sum implies finite numbers, which is the usual case.
         if not math.isfinite(sum(state)) and not all(map(math.isfinite, state)):
             raise ValueError(f"state is not finite: {state}")
         if gaps is not NO_GAPS:
             gaps.check(self._n)
         program = self.program
-        target = self._yielding(state, states, jerks, gaps.latest)
-        if target.states is states:
-            target.bounds = window.bounds
+        target = self._yielding(state, window, gaps.latest)
         iterations = 0
         error = _error(state, target)
         usable = _is_near(error)
@@ -142,7 +115,7 @@ class Tracker:
             result = program.solve()
             usable, iterations = result.usable, result.iterations
         if not usable:
-            target = self._yielding(state, *self._path_back(state, states), gaps.latest)
+            target = self._yielding(state, self._path_back(state, window.states), gaps.latest)
             error = _error(state, target)
             program.write_bounds(error, target.states, target.jerks, target.defect, gaps)
             program.admit_zero()
@@ -159,14 +132,7 @@ class Tracker:
         """Return the jerks that keep a vehicle in its cell when no other vehicle is near.
 
         They equal those of `solve` and take a fraction of its time: this close to the cell no row
-        can bind.
-
-        Args:
-            state: commanded state now.
-            goal: state of a vehicle at rest in the cell, now.
-
-        Returns:
-            None: the vehicle is not this close.
+        can bind. None: the commanded state is not this close to `goal`, rest in the cell.
         """
         if self._regulator is None:
             return None
@@ -195,7 +161,7 @@ class Tracker:
         jerk = self._regulator.inputs.dot((s, v, a, y, v_y, a_y)).reshape(-1, 2)
         return TrackResult(jerk, True, 0, (time.thread_time() - start) * 1e3, 0.0)
 
-    def _regulated(self, error: State, target: _Target, gaps: Gaps) -> Array | None:
+    def _regulated(self, error: State, target: Window, gaps: Gaps) -> Array | None:
         """Return the jerks (N, 2) of the unconstrained solution if it keeps all rows."""
         if self._regulator is None or target.defect is not None:
             return None
@@ -218,25 +184,25 @@ class Tracker:
         answer: Array = target.jerks + free_jerk
         return answer
 
-    def _yielding(self, state: State, states: Array, jerks: Array, latest: Array | None) -> _Target:
+    def _yielding(self, state: State, window: Window, latest: Array | None) -> Window:
         """Return the reference as it is, or a yielding path if it violates a gap."""
-        if latest is None or not (states[:, 0] > latest).any():
-            return _Target(states, jerks, None)
-        states, jerks = states.copy(), jerks.copy()
+        if latest is None or not (window.states[:, 0] > latest).any():
+            return window
+        states, jerks = window.states.copy(), window.jerks.copy()
         yield_behind(state, states, jerks, latest, self._tick_s, self._limits)
         transition, effect = self._axis
         along = states[:, :3]
         defect = along[:-1] @ transition.T + jerks[:, :1] * effect[:, 0] - along[1:]
-        return _Target(states, jerks, defect)
+        return Window(states, jerks, None, defect)
 
-    def _path_back(self, state: State, states: Array) -> tuple[Array, Array]:
-        """Return the hold law's path from a state to a reference: states (N + 1, 6), jerks."""
+    def _path_back(self, state: State, states: Array) -> Window:
+        """Return the hold law's path from a state to the states of a reference."""
         path, inputs = [state], []
         for row in states[:-1].tolist():
             jerk = hold_law(path[-1], tuple(row), self._limits, self._tick_s)
             path.append(integrate(path[-1], jerk, self._tick_s))
             inputs.append(jerk)
-        return np.array(path), np.array(inputs)
+        return Window(np.array(path), np.array(inputs))
 
     def _limited(self, state: State, jerk: Array) -> Array:
         """Return jerks (N, 2) that keep the limits exactly, as far as the state allows."""
@@ -271,7 +237,7 @@ class Tracker:
         )
 
 
-def _error(state: State, target: _Target) -> State:
+def _error(state: State, target: Window) -> State:
     s, v, a, y, v_y, a_y = target.states[0].tolist()
     return (
         state[0] - s,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from laneweave.agents.driving.driver import Course, Drive, SolverStats, TrackingDriver
+from laneweave.agents.driving.driver import Drive, SolverStats, TrackingDriver
 from laneweave.agents.driving.motions import REPEAT_TICKS
 from laneweave.agents.driving.program import NO_GAPS, Gaps
 from laneweave.agents.driving.reference import Window
@@ -153,7 +153,7 @@ def test_a_motion_under_way_is_taken_over_where_it_is(scenario: Scenario, ticks:
     theirs, mine = made.drive(felt, moving=True), heir.drive(felt, moving=True)
     assert {name: getattr(mine, name) for name in motion} == motion
     assert jerks(mine) == pytest.approx(jerks(theirs), abs=1e-3)
-    assert heir.motion(10 + 2 * REPEAT_TICKS) == Course(HOME, MOVE[2], 10, ticks)
+    assert heir.motion(10 + 2 * REPEAT_TICKS) == (HOME, MOVE[2], 10, ticks)
 
 
 @pytest.mark.parametrize("end_tick", [0, 9, 10])
