@@ -81,13 +81,14 @@ def strict_converter(*, detailed: bool) -> Converter:
         lambda kind: _origin(kind) is tuple, lambda kind: _tuple_hook(kind, converter)
     )
     converter.register_structure_hook_factory(
-        lambda kind: _origin(kind) in (dict, abc.Mapping), lambda kind: _dict_hook(kind, converter)
+        lambda kind: _origin(kind) in (dict, abc.Mapping),
+        lambda kind: _dict_hook(kind, converter),
     )
     converter.register_structure_hook_factory(attrs.has, lambda kind: _class_hook(kind, converter))
     return converter
 
 
-def _origin(kind: Any) -> object:  # noqa: ANN401 (whatever annotates a field)
+def _origin(kind: Any) -> object:  # noqa: ANN401 (any annotation)
     return get_origin(kind)
 
 
@@ -124,7 +125,7 @@ def _tuple_hook(kind: Any, converter: Converter) -> Hook:  # noqa: ANN401 (a gen
 
     if converter.detailed_validation:
         return detailed
-    # States, cells and lists are all of one kind, and most of what a vehicle hears.
+    # Lists of one kind (states, cells) are most of what a vehicle receives.
     return fast_alike if all(part is first_part for _, part in hooks) else fast_mixed
 
 
@@ -163,7 +164,7 @@ def _class_hook(kind: type, converter: Converter) -> Hook:
                 raise BadInputError("", key, "text as the key of each field")
         return fields_hook(value, kind)
 
-    # The fast one refuses the same, it only cannot say why.
+    # The fast hook rejects the same values, but its errors name no field.
     return detailed if converter.detailed_validation else fields_hook
 
 

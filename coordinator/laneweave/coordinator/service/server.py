@@ -253,7 +253,7 @@ class PlanningService:
     ) -> PlanResponse | Refusal:
         if isinstance(result, PlanResponse):
             return result
-        if error.endswith(TOO_LATE):
+        if error == TOO_LATE:
             return self._late(entry, now_s)
         self._count("failed_total")
         return Refusal(FAILED, f"planning failed: {error}", "")

@@ -55,7 +55,7 @@ def router(
         run_router(
             network.listens_at,
             network.lease_s,
-            told_by="network.listen" if network.listen else "network.endpoint",
+            field="network.listen" if network.listen else "network.endpoint",
             guard=guard,
             observe=observe,
         )

@@ -53,19 +53,21 @@ class Arrived:
 
 
 @frozen
-class PeerUp:
-    """A peer's liveliness token appeared."""
+class _OnTopic:
+    """A topic, and parameters of its keys; those that are not given match anything."""
 
     topic: Topic
-    parameters: Mapping[str, str]
+    parameters: Mapping[str, Any] = field(factory=dict)
 
 
 @frozen
-class PeerDown:
-    """A peer's liveliness token vanished."""
+class PeerUp(_OnTopic):
+    """A peer's liveliness token appeared."""
 
-    topic: Topic
-    parameters: Mapping[str, str]
+
+@frozen
+class PeerDown(_OnTopic):
+    """A peer's liveliness token vanished."""
 
 
 @frozen
@@ -112,43 +114,28 @@ class Send:
 
 
 @frozen
-class Listen:
-    """Subscribe to a topic; parameters that are not given match anything."""
-
-    topic: Topic
-    parameters: dict[str, Any] = field(factory=dict)
+class Listen(_OnTopic):
+    """Subscribe to a topic."""
 
 
 @frozen
-class Unlisten:
+class Unlisten(_OnTopic):
     """Undo `Listen`."""
 
-    topic: Topic
-    parameters: dict[str, Any] = field(factory=dict)
-
 
 @frozen
-class Announce:
+class Announce(_OnTopic):
     """Show a liveliness token."""
 
-    topic: Topic
-    parameters: dict[str, Any] = field(factory=dict)
-
 
 @frozen
-class Withdraw:
+class Withdraw(_OnTopic):
     """Withdraw a liveliness token."""
 
-    topic: Topic
-    parameters: dict[str, Any] = field(factory=dict)
-
 
 @frozen
-class Watch:
+class Watch(_OnTopic):
     """Receive `PeerUp` and `PeerDown` for matching tokens."""
-
-    topic: Topic
-    parameters: dict[str, Any] = field(factory=dict)
 
 
 @frozen
@@ -357,24 +344,18 @@ class Node:
             case End():
                 self.ended = True
                 transport.close()
-            case _:
-                self._declare(effect)
-
-    def _declare(self, effect: Effect) -> None:
-        transport = self._transport
-        match effect:
-            case Listen(topic, parameters):
-                transport.subscribe(self._keys.all_of(topic, **parameters))
-            case Unlisten(topic, parameters):
-                transport.unsubscribe(self._keys.all_of(topic, **parameters))
+            case Serve(topic):
+                transport.serve(self._keys.key(topic))
             case Announce(topic, parameters):
                 transport.announce(self._keys.key(topic, **parameters))
             case Withdraw(topic, parameters):
                 transport.withdraw(self._keys.key(topic, **parameters))
+            case Listen(topic, parameters):
+                transport.subscribe(self._keys.all_of(topic, **parameters))
+            case Unlisten(topic, parameters):
+                transport.unsubscribe(self._keys.all_of(topic, **parameters))
             case Watch(topic, parameters):
                 transport.watch(self._keys.all_of(topic, **parameters))
-            case Serve(topic):
-                transport.serve(self._keys.key(topic))
 
 
 def read_message(
@@ -412,21 +393,17 @@ def run_job(job: Compute) -> Computed:
         return Computed(job.job, job.work())
     except Exception as error:
         log.exception("computation failed", job=job.job)
-        return Computed(job.job, None, f"{type(error).__name__}: {error}")
+        return Computed(job.job, None, described(error))
 
 
 def run_delegated(job: Delegate, now_s: Callable[[], float]) -> Computed:
-    """Run a delegated computation in this process, on the clock `now_s`."""
-    return run_job(Compute(job.job, partial(in_time, job.work, job.deadline_s, now_s)))
-
-
-def in_time(work: Callable[[float], Any], deadline_s: float, now_s: Callable[[], float]) -> object:
-    """Return the result of `work`, called with the time left.
-
-    Raises:
-        TimeoutError: no time is left.
-    """
-    left_s = deadline_s - now_s()
+    """Run a delegated computation in this process, on the clock `now_s`, if time is left."""
+    left_s = job.deadline_s - now_s()
     if left_s <= 0:
-        raise TimeoutError(TOO_LATE)
-    return work(left_s)
+        return Computed(job.job, None, TOO_LATE)
+    return run_job(Compute(job.job, partial(job.work, left_s)))
+
+
+def described(error: Exception) -> str:
+    """Return an exception as the `error` of a `Computed`."""
+    return f"{type(error).__name__}: {error}"

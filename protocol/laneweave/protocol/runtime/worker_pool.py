@@ -18,11 +18,10 @@ import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
-from typing import Any
 
 import structlog
 
-from laneweave.protocol.runtime.node import Computed, Delegate, in_time
+from laneweave.protocol.runtime.node import Computed, Delegate, described, run_delegated
 from laneweave.protocol.runtime.processes import die_with_parent
 
 log = structlog.get_logger(__name__)
@@ -131,7 +130,7 @@ class _Worker:
                 # The thread must go on, or a share of the requests would wait forever.
                 log.exception("a worker is given up", job=job.job)
                 self._forget()
-                result = Computed(job.job, None, _described(error))
+                result = Computed(job.job, None, described(error))
             if not self._ending.is_set():
                 done(result)
                 if self._connection is None:
@@ -183,7 +182,7 @@ class _Worker:
         """Return the result of a job; None if the process died."""
         left_s = max(0.0, job.deadline_s - time.monotonic())
         try:
-            connection.send((job.work, job.deadline_s))
+            connection.send(job)
             # A new process warms up first; its pipe has room for a job.
             if connection.poll(left_s + OVERDUE_S):
                 result, error = connection.recv()
@@ -193,7 +192,7 @@ class _Worker:
         except Exception as error:
             # It cannot be pickled. The pipe carries whole messages, so nothing of it is left there.
             log.exception("a job or its result cannot be handed over", job=job.job)
-            return Computed(job.job, None, _described(error))
+            return Computed(job.job, None, described(error))
         self._forget()
         log.warning("a worker was stopped: it went on too long", job=job.job)
         return Computed(job.job, None, "the worker was stopped: it went on too long")
@@ -231,25 +230,11 @@ def _do_next(connection: Connection) -> None:
         EOFError, OSError: the other end is closed.
     """
     try:
-        work, deadline_s = connection.recv()
-        connection.send(_result(work, deadline_s))
+        # All processes of a machine share the clock of `time.monotonic`.
+        computed = run_delegated(connection.recv(), time.monotonic)
+        connection.send((computed.result, computed.error))
     except (EOFError, OSError):
         raise
     except Exception as error:  # it cannot be pickled
         log.exception("a job or its result cannot be handed over")
-        connection.send((None, _described(error)))
-
-
-def _result(work: Callable[[float], Any], deadline_s: float) -> tuple[Any, str]:
-    # All processes of a machine share the clock of `time.monotonic`.
-    try:
-        return in_time(work, deadline_s, time.monotonic), ""
-    except TimeoutError as error:
-        return None, str(error)
-    except Exception as error:
-        log.exception("computation failed")
-        return None, _described(error)
-
-
-def _described(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}"
+        connection.send((None, described(error)))

@@ -18,7 +18,7 @@ from laneweave.protocol.validators import host_port, key_part, key_parts, one_of
 
 FleetMembers = str | tuple[str, ...]
 """A shard `I/N` of the vehicles that are announced, or vehicles by name."""
-MOST_SHARDS = 10_000
+MAX_SHARDS = 10_000
 
 
 @frozen
@@ -45,8 +45,8 @@ def parse_shard(text: str, name: str) -> Shard:
     """
     index, _, count = text.partition("/")
     digits = index.isdecimal() and count.isdecimal() and len(text) < 20
-    if not digits or not int(index) < int(count) <= MOST_SHARDS:
-        raise BadInputError(name, text, f"I/N with 0 <= I < N <= {MOST_SHARDS}")
+    if not digits or not int(index) < int(count) <= MAX_SHARDS:
+        raise BadInputError(name, text, f"I/N with 0 <= I < N <= {MAX_SHARDS}")
     return Shard(int(index), int(count))
 
 

@@ -234,23 +234,20 @@ def access_control(scenario: Scenario) -> dict[str, Any]:
 def size_limits(scenario: Scenario) -> list[dict[str, Any]]:
     """Return the maximum message sizes as Zenoh's `low_pass_filter`."""
     keys = Keys(scenario.network.realm)
-    questions = [keys.all_of(topic) for topic in TOPICS if topic.exchange is Exchange.QUESTIONS]
-    messages = [keys.all_of(topic) for topic in TOPICS if topic.exchange is Exchange.MESSAGES]
     request_bytes = REQUEST_MARGIN * scenario.service.max_request_bytes
     return [
-        _size_limit("requests", "query", questions, request_bytes),
-        _size_limit("messages", "put", messages, MAX_BYTES),
+        {
+            "id": name,
+            "flows": [str(Flow.IN)],
+            "messages": [message],
+            "key_exprs": [keys.all_of(topic) for topic in TOPICS if topic.exchange is exchange],
+            "size_limit": max_bytes,
+        }
+        for name, message, exchange, max_bytes in (
+            ("requests", "query", Exchange.QUESTIONS, request_bytes),
+            ("messages", "put", Exchange.MESSAGES, MAX_BYTES),
+        )
     ]
-
-
-def _size_limit(name: str, message: str, keys: list[str], max_bytes: int) -> dict[str, Any]:
-    return {
-        "id": name,
-        "flows": [str(Flow.IN)],
-        "messages": [message],
-        "key_exprs": keys,
-        "size_limit": max_bytes,
-    }
 
 
 # --- documentation --------------------------------------------------------------------------------

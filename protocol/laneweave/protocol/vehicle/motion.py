@@ -54,7 +54,7 @@ _CATCH_UP_SHARE = 0.25
 """Largest speed towards the cell along the road, as a share of the cell's speed."""
 
 _PLENTY = 0.3
-"""More than the 1/4 of `_least_accel`, by far more than rounding."""
+"""More than the 1/4 of `_min_accel`, by far more than rounding."""
 
 _OPEN_GAIN = 0.6
 """Speed at which a gap that is too small is opened, per metre that it lacks [1/s]."""
@@ -164,13 +164,13 @@ def limited_accel(v: float, a: float, jerk: float, limits: Vehicle, tick_s: floa
     step = j_max * tick_s
     a_next = a + tick_s * (jerk if -j_max <= jerk <= j_max else _clamp(jerk, -j_max, j_max))
     # Mostly there is room in plenty, which is quicker to see than how much acceleration it leaves:
-    # see `_least_accel`.
+    # see `_min_accel`.
     share, x = (2.0 * v / tick_s + a) / step, -a_next / step
     if share < (x + 1.0) * x + _PLENTY:
-        a_next = max(a_next, _least_accel(share, step))
+        a_next = max(a_next, _min_accel(share, step))
     share, x = (2.0 * (limits.max_speed_mps - v) / tick_s - a) / step, a_next / step
     if share < (x + 1.0) * x + _PLENTY:
-        a_next = min(a_next, -_least_accel(share, step))
+        a_next = min(a_next, -_min_accel(share, step))
     low, high = limits.min_accel_mps2, limits.max_accel_mps2
     return a_next if low <= a_next <= high else _clamp(a_next, low, high)
 
@@ -203,10 +203,10 @@ def _limited_lateral_accel(
     speed, rate, rate_next = ratio * v, ratio * a, ratio * a_next
     share, x = (2.0 * (speed + v_y) / tick_s + (rate + a_y)) / step, -(rate_next + ay_next) / step
     if share < (x + 1.0) * x + _PLENTY:
-        ay_next = max(ay_next, _least_accel(share, step) - rate_next)
+        ay_next = max(ay_next, _min_accel(share, step) - rate_next)
     share, x = (2.0 * (speed - v_y) / tick_s + (rate - a_y)) / step, (ay_next - rate_next) / step
     if share < (x + 1.0) * x + _PLENTY:
-        ay_next = min(ay_next, rate_next - _least_accel(share, step))
+        ay_next = min(ay_next, rate_next - _min_accel(share, step))
     return ay_next if -a_max <= ay_next <= a_max else _clamp(ay_next, -a_max, a_max)
 
 
@@ -298,7 +298,7 @@ def _clamp(value: float, low: float, high: float) -> float:
     return 0.0 if math.isnan(value) else min(max(value, low), high)
 
 
-def _least_accel(share: float, step: float) -> float:
+def _min_accel(share: float, step: float) -> float:
     """Return the least rate after this tick from which a room can be kept >= 0.
 
     The room is a speed above its lower bound [m/s] and the rate its derivative [m/s2]. Raising the

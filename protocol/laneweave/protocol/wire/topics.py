@@ -170,23 +170,7 @@ SERVICE = Topic(
     remark="a query",
 )  # fmt: skip
 
-TOPICS = (
-    CLOCK,
-    CENSUS,
-    SENSE,
-    COMMAND,
-    STATE,
-    MOTION,
-    PREPARE,
-    PLAN,
-    HEARTBEAT,
-    REPORT,
-    EVENT,
-    COORDINATOR_ALIVE,
-    VEHICLE_ALIVE,
-    BRIDGE_ALIVE,
-    SERVICE,
-)
+TOPICS = tuple(each for each in tuple(globals().values()) if isinstance(each, Topic))
 
 
 @frozen

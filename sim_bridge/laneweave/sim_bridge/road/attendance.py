@@ -147,7 +147,9 @@ class Attendance:
                 self.answers.agent_up(Name(parameters["vehicle"]))
             case PeerDown(topic, parameters) if topic is VEHICLE_ALIVE:
                 if self.link_up:
-                    self.answers.agent_down(Name(parameters["vehicle"]))
+                    name = Name(parameters["vehicle"])
+                    self.answers.agent_down(name)
+                    self.departed.pop(name, None)
             case LinkUp():
                 self.link_up = True
                 # Other processes reconnect at about the same time.

@@ -68,7 +68,7 @@ class Member:
         self.news_s = 0.0
         """Arrival time of the newest token event: these do not overtake each other."""
         self.seen: dict[str, None] = {}
-        """Tokens that it was last told are there."""
+        """Tokens that its node knows to be there."""
         self._simulation = simulation
         self._backlog: list[Item] = []
         self._alarm = 0
@@ -89,11 +89,7 @@ class Member:
         """Deliver what was sent during this connection."""
         if not self.connected or self.connection != connection:
             return
-        if (
-            isinstance(delivery, Received)
-            or not isinstance(delivery, (TokenUp, TokenDown))
-            or learn(self.seen, delivery)
-        ):
+        if not isinstance(delivery, (TokenUp, TokenDown)) or learn(self.seen, delivery):
             self.hand_over(delivery)
 
     def hand_over(self, item: Item) -> None:
@@ -206,15 +202,23 @@ class Tokens:
         self._simulation = simulation
         self._members = members
 
-    def appeared(self, owner: Member, key: str) -> None:
-        """Report a token that its owner has just shown."""
-        if owner.visible and not self._shown(key, owner):
-            self._publish(TokenUp(key))
-
-    def vanished(self, owner: Member, key: str) -> None:
-        """Report a token that its owner has just withdrawn."""
-        if owner.visible and not self._shown(key, owner):
-            self._publish(TokenDown(key))
+    def report(
+        self,
+        kind: type[TokenUp | TokenDown],
+        owner: Member,
+        keys: Iterable[str],
+        but: Member | None = None,
+    ) -> None:
+        """Report tokens that a visible member has just shown or withdrawn, to all but one."""
+        if not owner.visible:
+            return
+        for key in keys:
+            if not self._shown(key, owner):
+                news = kind(key)
+                for member in self._members.values():
+                    watches = member is not but and member.connected
+                    if watches and matches_any(member.watched, key):
+                        self._send(member, news)
 
     def introduce(self, watcher: Member, expressions: Iterable[str]) -> None:
         """Report the tokens that are there to one watcher."""
@@ -228,31 +232,12 @@ class Tokens:
         for key in dict.fromkeys(keys):
             self._send(watcher, TokenUp(key))
 
-    def show_all(self, owner: Member, but: Member | None = None) -> None:
-        """Report the tokens of a member that has become visible, to all but one."""
-        if owner.visible:
-            for key in owner.tokens:
-                if not self._shown(key, owner):
-                    self._publish(TokenUp(key), but)
-
-    def hide_all(self, owner: Member) -> None:
-        """Report to all but the owner that the tokens of a visible member are gone."""
-        if owner.visible:
-            for key in owner.tokens:
-                if not self._shown(key, owner):
-                    self._publish(TokenDown(key), owner)
-
     def _shown(self, key: str, owner: Member) -> bool:
         """Return whether another member shows a token on this key."""
         return any(
             member is not owner and member.visible and key in member.tokens
             for member in self._members.values()
         )
-
-    def _publish(self, news: TokenUp | TokenDown, but: Member | None = None) -> None:
-        for member in self._members.values():
-            if member is not but and member.connected and matches_any(member.watched, news.key):
-                self._send(member, news)
 
     def _send(self, watcher: Member, news: TokenUp | TokenDown) -> None:
         simulation = self._simulation

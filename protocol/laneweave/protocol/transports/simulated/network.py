@@ -39,6 +39,7 @@ from laneweave.protocol.runtime.transport import (
     Question,
     Received,
     TokenDown,
+    TokenUp,
 )
 from laneweave.protocol.transports.simulated.member import Member, Tokens
 from laneweave.protocol.transports.simulated.virtual_time import Clock, Conditions, Simulation
@@ -95,44 +96,37 @@ class _Question:
     """Tokens of all servers that may still answer; shared among them."""
 
 
-class SimulatedTransport:
-    """One node's view of the simulated network: the peer of `ZenohTransport`."""
+class _Transport:
+    """One node's view of the simulated network: the peer of `ZenohTransport`; see `Transport`."""
 
     def __init__(self, network: SimulatedNetwork, member: Member) -> None:
-        """Attach a member to a network."""
         self._network = network
         self._member = member
 
     def publish(self, key: str, payload: bytes, quality: Quality) -> None:
-        """Send to all subscribers; each copy is lost or delayed on its own."""
         del quality
         if not self._member.closed:
             self._network.carry(self._member.name, key, payload)
 
     def subscribe(self, key_expression: str) -> None:
-        """Subscribe."""
         self._member.subscriptions[key_expression] = None
         self._network.reroute(self._member, key_expression)
 
     def unsubscribe(self, key_expression: str) -> None:
-        """Undo `subscribe`."""
         self._member.subscriptions.pop(key_expression, None)
         self._network.reroute(self._member, key_expression)
 
     def announce(self, key: str) -> None:
-        """Show a token."""
         if key not in self._member.tokens and not self._member.closed:
             self._member.tokens[key] = None
-            self._network.tokens.appeared(self._member, key)
+            self._network.tokens.report(TokenUp, self._member, (key,))
 
     def withdraw(self, key: str) -> None:
-        """Withdraw a token."""
         if key in self._member.tokens and not self._member.closed:
             del self._member.tokens[key]
-            self._network.tokens.vanished(self._member, key)
+            self._network.tokens.report(TokenDown, self._member, (key,))
 
     def watch(self, key_expression: str) -> None:
-        """Watch tokens, beginning with those that are there."""
         member = self._member
         if key_expression not in member.watched and not member.closed:
             member.watched[key_expression] = None
@@ -140,19 +134,15 @@ class SimulatedTransport:
                 self._network.tokens.introduce(member, (key_expression,))
 
     def serve(self, key: str) -> None:
-        """Answer questions on a key."""
         self._member.served.add(key)
 
     def answer(self, token: int, payload: bytes, *, ok: bool, encoding: str = "") -> None:
-        """Answer a question once."""
         self._network.take_answer(self._member, token, Answer(payload, ok, encoding))
 
     def decline(self, token: int) -> None:
-        """Leave a question to the other servers."""
         self._network.take_answer(self._member, token, None)
 
     def close(self) -> None:
-        """Leave the network."""
         if not self._member.closed:
             self._network.remove(self._member.name)
 
@@ -196,7 +186,7 @@ class SimulatedNetwork(Simulation):
         if name in self._members:
             raise ValueError(f"node {name} is already in the network")
         member = Member(self, name, next(self._member_count))
-        member.transport = SimulatedTransport(self, member)
+        member.transport = _Transport(self, member)
         member.clock = self._clocks.get(name)
         member.node = Node(
             core,
@@ -255,7 +245,7 @@ class SimulatedNetwork(Simulation):
             return
         if member.lapsed:
             member.lapsed = False
-            self.tokens.show_all(member)
+            self.tokens.report(TokenUp, member, member.tokens)
         member.wake()
         self._rejoin_later(member)
 
@@ -420,19 +410,23 @@ class SimulatedNetwork(Simulation):
         for expression in member.subscriptions:
             self.reroute(member, expression)
         if member.visible:
-            self.at(self.now_s + seen_after_s, self.tokens.hide_all, member)
+            self.at(self.now_s + seen_after_s, self._hide, member)
         self.at(self.now_s + seen_after_s, self._abandon_questions, member)
+
+    def _hide(self, member: Member) -> None:
+        """Report to all others that the tokens of a member are gone."""
+        self.tokens.report(TokenDown, member, member.tokens, but=member)
 
     def _lapse(self, member: Member, pause: int) -> None:
         if member.paused and member.pauses == pause and not member.closed:
-            self.tokens.hide_all(member)
+            self._hide(member)
             member.lapsed = True
             self._abandon_questions(member)
 
     def _break_links(self, members: Iterable[Member]) -> None:
         broken = [member for member in members if member.connected]
         for member in broken:
-            self.tokens.hide_all(member)
+            self._hide(member)
             member.connected = False
             member.connection += 1
             self._abandon_questions(member)
@@ -447,7 +441,7 @@ class SimulatedNetwork(Simulation):
         if member.connected:
             return
         member.connected = True
-        self.tokens.show_all(member, but=member)
+        self.tokens.report(TokenUp, member, member.tokens, but=member)
         self.tokens.introduce(member, member.watched)
         member.hand_over(LinkUp())
 

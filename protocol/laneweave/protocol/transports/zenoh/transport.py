@@ -46,23 +46,13 @@ log = structlog.get_logger(__name__)
 # Express would send each sample in a packet of its own; with DROP it loses most of a synchronised
 # burst, so it is off everywhere.
 _QUALITY: dict[Quality, dict[str, Any]] = {
-    Quality.LATEST: {
-        "congestion_control": zenoh.CongestionControl.DROP,
-        "priority": zenoh.Priority.DATA,
-        "express": False,
-    },
-    Quality.ASSURED: {
-        "congestion_control": zenoh.CongestionControl.BLOCK,
-        "priority": zenoh.Priority.DATA,
-        "express": False,
-    },
-    Quality.LOCKSTEP: {
-        "congestion_control": zenoh.CongestionControl.BLOCK,
-        "priority": zenoh.Priority.REAL_TIME,
-        "express": False,
-    },
+    quality: {"congestion_control": congestion, "priority": priority, "express": False}
+    for quality, congestion, priority in (
+        (Quality.LATEST, zenoh.CongestionControl.DROP, zenoh.Priority.DATA),
+        (Quality.ASSURED, zenoh.CongestionControl.BLOCK, zenoh.Priority.DATA),
+        (Quality.LOCKSTEP, zenoh.CongestionControl.BLOCK, zenoh.Priority.REAL_TIME),
+    )
 }
-
 
 MAX_QUESTIONS = 4096
 """Maximum number of open questions; more are declined."""
@@ -114,30 +104,30 @@ class ZenohTransport:
         """Connect to a router.
 
         Args:
-            access: where the router is, and as whom to get there.
+            access: endpoint, identity and credentials of this process.
             deliver: called from Zenoh's threads with each delivery; must return at once.
 
         Raises:
-            BadInputError: the endpoint is malformed or nobody answers there, or the credentials
-                are not in order.
+            BadInputError: the endpoint is malformed, no router answers there, or the credentials
+                are not valid.
         """
         endpoint = check_endpoint(access.endpoint)
-        whose = ""
+        authority = ""
         if access.credentials is not None:
             check_credentials(access.credentials, access.identity)
-            whose = f", of the authority that vouches for {access.identity}"
+            authority = f" with a certificate of the authority that signed {access.identity}'s"
         try:
             self._session = _open(client_settings(access), CLIENT_RUNTIME)
         except zenoh.ZError as error:
             raise BadInputError(
-                "network.endpoint", endpoint, f"the endpoint of a running router{whose}"
+                "network.endpoint", endpoint, f"the endpoint of a running router{authority}"
             ) from error
         self._deliver = deliver
         self._subscriptions: dict[str, Any] = {}
         self._tokens: dict[str, Any] = {}
         self._watched: dict[str, Any] = {}
         self._seen: dict[str, None] = {}
-        """Keys of the tokens that were last delivered as being there."""
+        """Keys of the tokens that the node knows to be there."""
         self._seen_lock = threading.Lock()
         self._served: dict[str, Any] = {}
         self._questions: dict[int, zenoh.Query] = {}
@@ -285,18 +275,18 @@ class ZenohTransport:
 def connect(
     access: Access, deliver: Deliver, stopped: Callable[[float], object]
 ) -> ZenohTransport | None:
-    """Connect to a router, however late it comes: for `connect_timeout_s`.
+    """Connect to a router; retry for `connect_timeout_s`.
 
     Args:
-        access: where the router is, and as whom to get there.
+        access: see `ZenohTransport`.
         deliver: see `ZenohTransport`.
-        stopped: waits for so many seconds and tells whether the process was asked to end.
+        stopped: waits for some seconds and returns whether the process was asked to end.
 
     Returns:
         The session; None: the process was asked to end meanwhile.
 
     Raises:
-        BadInputError: the endpoint is malformed, or nobody has answered there in time.
+        BadInputError: the endpoint is malformed, or no router has answered there in time.
     """
     check_endpoint(access.endpoint)
     give_up_s = time.monotonic() + access.connect_timeout_s
@@ -329,7 +319,7 @@ def run_router(
     listen: Sequence[str],
     lease_s: float,
     ready: Callable[[], None] | None = None,
-    told_by: str = "network.endpoint",
+    field: str = "network.endpoint",
     guard: RouterGuard | None = None,
     observe: Observe = unobserved,
 ) -> None:
@@ -337,16 +327,16 @@ def run_router(
 
     Args:
         listen: endpoints where it listens. A socket file that a killed router left is replaced.
-        lease_s: after this time of silence the others give the router up.
+        lease_s: clients consider the router lost after this time of silence.
         ready: called when it listens.
-        told_by: name of the field with the endpoints, for errors.
+        field: name of the field with the endpoints, for errors.
         guard: rights and credentials; None: all clients may do everything.
         observe: registers the metrics source, once it listens.
 
     Raises:
-        BadInputError: it cannot listen at an endpoint, or its credentials are not in order.
+        BadInputError: it cannot listen at an endpoint, or its credentials are not valid.
     """
-    endpoints = [check_endpoint(endpoint, told_by) for endpoint in listen]
+    endpoints = [check_endpoint(endpoint, field) for endpoint in listen]
     if guard is not None:
         check_credentials(guard.credentials, str(Party.ROUTER), guard.host)
     stop: queue.SimpleQueue[bool] = queue.SimpleQueue()
@@ -355,7 +345,7 @@ def run_router(
             session = _open(router_settings(endpoints, lease_s, guard), ROUTER_RUNTIME)
         except zenoh.ZError as error:
             raise BadInputError(
-                told_by, ", ".join(endpoints), "endpoints that are free to listen at"
+                field, ", ".join(endpoints), "endpoints that are free to listen at"
             ) from error
         try:
             observe(lambda: [RouterMetrics(len(session.info.transports()))])
@@ -381,12 +371,12 @@ def _answer_of(reply: zenoh.Reply) -> Answer | Exception:
     return Answer(text, False, "" if error is None else str(error.encoding))
 
 
-def _settle(first: Future[Answer | None], outcome: Answer | Exception | None) -> None:
-    """Give a future its first outcome."""
+def _settle(first: Future[Answer | None], answer: Answer | Exception | None) -> None:
+    """Complete a future unless it is complete."""
     if first.done():
         return
     with contextlib.suppress(InvalidStateError):
-        if isinstance(outcome, Exception):
-            first.set_exception(outcome)
+        if isinstance(answer, Exception):
+            first.set_exception(answer)
         else:
-            first.set_result(outcome)
+            first.set_result(answer)
