@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from operator import attrgetter, ge, gt, le, lt
 from typing import Any
 
 from laneweave.protocol.config.participants import identities_of, max_vehicles
@@ -22,6 +23,9 @@ MAX_TICKS = 200
 MAX_SECURED_VEHICLES = 5000
 """Maximum number of vehicles for which a router has rules."""
 
+_RELATIONS = {"at least": ge, "at most": le, "more than": gt, "less than": lt}
+_Comparison = tuple[str, str, float, str]
+"""(field, relation, limit, what the limit is)."""
 
 ROLLING_ONLY = ("sort_in_s2", "reward_drift")
 """Fields of `formation` that only the rolling operation reads."""
@@ -48,41 +52,32 @@ def check_scenario(scenario: Scenario) -> None:
     Raises:
         BadInputError: the first field that violates a rule.
     """
-    _check_lanes(scenario)
-    _check_motion(scenario)
-    _check_conflicts(scenario)
-    _check_structures(scenario)
-    _check_timing(scenario)
-    _check_braking(scenario)
-    _check_settling(scenario)
-    _check_security(scenario)
+    for check in (
+        _check_lanes,
+        _check_motion,
+        _check_structures,
+        _check_timing,
+        _check_braking,
+        _check_settling,
+        _check_security,
+    ):
+        check(scenario)
 
 
 def check_effects(data: Mapping[str, Any], scenario: Scenario) -> None:
-    """Check that each value of a file has an effect with the file's other values.
-
-    Args:
-        data: tables of the file.
-        scenario: the scenario that they define.
+    """Check that each value of a file's tables has an effect in the scenario that they define.
 
     Raises:
         BadInputError: the first field without an effect.
     """
     formation, given = scenario.formation, data.get("formation", {})
+    by_vehicles = formation.closes_by_vehicles
     for fields, has_effect, allowed in (
         (ROLLING_ONLY, formation.rolling, 'none, unless formation.operation is "rolling"'),
         (FORMATIONS_ONLY, not formation.rolling, 'none where formation.operation is "rolling"'),
-        (
-            ("max_columns",),
-            formation.closes_by_vehicles,
-            'none, unless formation.close is "vehicles"',
-        ),
+        (("max_columns",), by_vehicles, 'none, unless formation.close is "vehicles"'),
         (("join",), formation.max_joined > 1, "none, unless formation.max_joined is above 1"),
-        (
-            ("block_columns",),
-            not formation.closes_by_vehicles,
-            'none, unless formation.close is "columns"',
-        ),
+        (("block_columns",), not by_vehicles, 'none, unless formation.close is "columns"'),
     ):
         for name in fields:
             _require(name not in given or has_effect, f"formation.{name}", given.get(name), allowed)
@@ -91,6 +86,15 @@ def check_effects(data: Mapping[str, Any], scenario: Scenario) -> None:
 def _require(ok: bool, name: str, value: object, allowed: str) -> None:
     if not ok:
         raise BadInputError(name, value, allowed)
+
+
+def _compare(scenario: Scenario, comparisons: Iterable[_Comparison]) -> None:
+    """Check that fields have the stated relations to their limits."""
+    for name, relation, limit, meaning in comparisons:
+        value = attrgetter(name)(scenario)
+        _require(
+            _RELATIONS[relation](value, limit), name, value, f"{relation} {limit:g}: {meaning}"
+        )
 
 
 def _check_lanes(scenario: Scenario) -> None:
@@ -108,13 +112,9 @@ def _check_lanes(scenario: Scenario) -> None:
         list(shares),
         "numbers >= 0, not all 0, with a finite sum",
     )
-    _require(
-        road.lane_width_m >= vehicle.width_m + MIN_SIDE_GAP_M,
-        "road.lane_width_m",
-        road.lane_width_m,
-        f"at least {vehicle.width_m + MIN_SIDE_GAP_M:g}: vehicle.width_m = {vehicle.width_m:g} and "
-        f"{MIN_SIDE_GAP_M:g} between bodies side by side",
-    )
+    width_m = vehicle.width_m + MIN_SIDE_GAP_M
+    what = f"vehicle.width_m and {MIN_SIDE_GAP_M:g} between bodies side by side"
+    _compare(scenario, [("road.lane_width_m", "at least", width_m, what)])
     _require(
         3600.0 / demand.volume_veh_per_lane_h >= demand.min_headway_s,
         "demand.volume_veh_per_lane_h",
@@ -124,32 +124,17 @@ def _check_lanes(scenario: Scenario) -> None:
 
 
 def _check_motion(scenario: Scenario) -> None:
-    formation, vehicle, road = scenario.formation, scenario.vehicle, scenario.road
-    min_gap_m = scenario.tracking.min_gap_m
-    shortest_m = vehicle.length_m + max(min_gap_m, MIN_GAP_M)
-    _require(
-        formation.gap_m >= shortest_m,
-        "formation.gap_m",
-        formation.gap_m,
-        f"at least {shortest_m:g}: vehicle.length_m = {vehicle.length_m:g} and between two "
-        f"bumpers tracking.min_gap_m = {min_gap_m:g}, at least {MIN_GAP_M:g}",
-    )
+    formation, vehicle = scenario.formation, scenario.vehicle
+    gap_m = max(scenario.tracking.min_gap_m, MIN_GAP_M)
+    what = f"vehicle.length_m, and tracking.min_gap_m between bumpers, at least {MIN_GAP_M:g}"
+    _compare(scenario, [("formation.gap_m", "at least", vehicle.length_m + gap_m, what)])
     cycle_s, move_s = formation.cycle_s, formation.move_s
     if move_s is not None:
-        _require(
-            cycle_s is not None and move_s <= cycle_s,
-            "formation.move_s",
-            move_s,
-            "none without formation.cycle_s"
-            if cycle_s is None
-            else f"at most formation.cycle_s = {cycle_s:g}",
-        )
-    _require(
-        formation.speed_mps < vehicle.max_speed_mps,
-        "formation.speed_mps",
-        formation.speed_mps,
-        f"below vehicle.max_speed_mps = {vehicle.max_speed_mps:g}",
-    )
+        allowed = "none without" if cycle_s is None else f"at most {cycle_s:g},"
+        ok = cycle_s is not None and move_s <= cycle_s
+        _require(ok, "formation.move_s", move_s, f"{allowed} formation.cycle_s")
+    max_mps = vehicle.max_speed_mps
+    _compare(scenario, [("formation.speed_mps", "less than", max_mps, "vehicle.max_speed_mps")])
     _require(
         (formation.weight_oblique or 0) <= formation.oblique_steps,
         "formation.weight_oblique",
@@ -158,11 +143,13 @@ def _check_motion(scenario: Scenario) -> None:
     )
     block_m = (formation.greatest_length - 1) * formation.gap_m
     needed_m = block_m + vehicle.length_m + formation.speed_mps * scenario.cycles_s[0]
+    _compare(scenario, [("road.s3_m", "at least", needed_m, "a whole formation and one step")])
     _require(
-        road.s3_m >= needed_m,
-        "road.s3_m",
-        road.s3_m,
-        f"at least {needed_m:g}: a whole formation and one step fit in",
+        formation.executable,
+        "formation.conflicts",
+        sorted(formation.conflict_kinds),
+        "geometric, or in mode 1 node, edge and special-1: moves of one step must have disjoint "
+        "footprints to be executed without a timetable",
     )
 
 
@@ -187,45 +174,25 @@ def _check_structures(scenario: Scenario) -> None:
         )
 
 
-def _check_conflicts(scenario: Scenario) -> None:
-    formation = scenario.formation
-    _require(
-        formation.executable,
-        "formation.conflicts",
-        sorted(formation.conflict_kinds),
-        "geometric, or in mode 1 node, edge and special-1: moves of one step must have disjoint "
-        "footprints to be executed without a timetable",
-    )
-
-
 def _check_timing(scenario: Scenario) -> None:
     network, runtime, formation = scenario.network, scenario.runtime, scenario.formation
-    _require(
-        network.election_s > 2 * network.heartbeat_s,
-        "network.election_s",
-        network.election_s,
-        f"more than twice network.heartbeat_s = {network.heartbeat_s:g}",
-    )
-    _require(
-        network.lease_s > network.heartbeat_s,
-        "network.lease_s",
-        network.lease_s,
-        f"more than network.heartbeat_s = {network.heartbeat_s:g}",
-    )
     shortest_s, longest_s = scenario.cycles_s
+    longest_move_s = longest_s - formation.slack_s
+    heartbeat_s, silent_s = network.heartbeat_s, runtime.agent_silent_s
+    _compare(
+        scenario,
+        [
+            ("network.election_s", "more than", 2 * heartbeat_s, "twice network.heartbeat_s"),
+            ("network.lease_s", "more than", heartbeat_s, "network.heartbeat_s"),
+        ],
+    )
     for name, value in (
         ("cycle_s", shortest_s),
         ("cycle_s", longest_s),
         ("move_s", shortest_s - formation.slack_s),
     ):
-        ticks = value / runtime.tick_s
-        _require(
-            ticks >= 2 and abs(ticks - round(ticks)) < 1e-6,
-            f"formation.{name}",
-            value,
-            f"a multiple of runtime.tick_s = {runtime.tick_s:g}, at least twice it",
-        )
-    longest_move_s = longest_s - formation.slack_s
+        allowed = f"a multiple of runtime.tick_s = {runtime.tick_s:g}, at least twice it"
+        _require(_in_ticks(scenario, value, 2), f"formation.{name}", value, allowed)
     _require(
         scenario.horizon_ticks * runtime.tick_s >= longest_move_s - 1e-6,
         "tracking.horizon_ticks",
@@ -238,37 +205,30 @@ def _check_timing(scenario: Scenario) -> None:
         runtime.tick_s,
         f"long enough for the longest T_F, {longest_s:g} s, to have at most {MAX_TICKS} ticks",
     )
-    _require(
-        runtime.tick_resend_s < runtime.tick_deadline_s,
-        "runtime.tick_resend_s",
-        runtime.tick_resend_s,
-        f"less than runtime.tick_deadline_s = {runtime.tick_deadline_s:g}",
+    what = "runtime.agent_silent_s, so that a lost session is noticed before its agent is silent"
+    deadline_s = runtime.tick_deadline_s
+    _compare(
+        scenario,
+        [
+            ("runtime.tick_resend_s", "less than", deadline_s, "runtime.tick_deadline_s"),
+            ("runtime.tick_deadline_s", "at most", silent_s, "runtime.agent_silent_s"),
+            ("network.lease_s", "at most", silent_s, what),
+        ],
     )
-    _require(
-        runtime.tick_deadline_s <= runtime.agent_silent_s,
-        "runtime.tick_deadline_s",
-        runtime.tick_deadline_s,
-        f"at most runtime.agent_silent_s = {runtime.agent_silent_s:g}",
-    )
-    _require(
-        network.lease_s <= runtime.agent_silent_s,
-        "network.lease_s",
-        network.lease_s,
-        f"at most runtime.agent_silent_s = {runtime.agent_silent_s:g}: a session that is lost is "
-        "noticed before its agent counts as silent",
-    )
+
+
+def _in_ticks(scenario: Scenario, time_s: float, min_ticks: int) -> bool:
+    """Return whether a time is a whole number of ticks, and not too few."""
+    ticks = time_s / scenario.runtime.tick_s
+    return ticks >= min_ticks - 1e-6 and abs(ticks - round(ticks)) < 1e-6
 
 
 def _check_braking(scenario: Scenario) -> None:
-    reaction_s, tick_s = scenario.braking.reaction_s, scenario.runtime.tick_s
-    ticks = reaction_s / tick_s
-    _require(
-        ticks >= 1 - 1e-6 and abs(ticks - round(ticks)) < 1e-6,
-        "braking.reaction_s",
-        reaction_s,
-        f"a multiple of runtime.tick_s = {tick_s:g}, at least once it: a vehicle looks once in a "
-        "tick",
+    reaction_s = scenario.braking.reaction_s
+    allowed = (
+        f"a multiple of runtime.tick_s = {scenario.runtime.tick_s:g}: sensors measure each tick"
     )
+    _require(_in_ticks(scenario, reaction_s, 1), "braking.reaction_s", reaction_s, allowed)
     gap_m, min_m = scenario.formation.gap_m, min_pitch_m(scenario)
     _require(
         gap_m >= min_m,
