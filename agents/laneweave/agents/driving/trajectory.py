@@ -40,7 +40,8 @@ from laneweave.protocol.scenario.tables import Scenario, Vehicle
 from laneweave.protocol.vehicle.braking import (
     ERROR_SIGMAS,
     last_tick_m,
-    lead_way_m,
+    lead_lag_s,
+    lead_path_m,
     own_braking_mps2,
     spare_error_m,
 )
@@ -109,7 +110,8 @@ class Envelope:
         errors_m = ERROR_SIGMAS * spare_error_m(scenario, (1.0 + _CLOSING_SPEEDUP) * speed_mps)
         brake_mps2, tick_s = own_braking_mps2(scenario), scenario.runtime.tick_s
         kept_m = braking.margin_m + errors_m + _TRACKING_ERROR_M + last_tick_m(brake_mps2, tick_s)
-        max_m = gap_m + lead_way_m(scenario, speed_mps) - kept_m - lost_s * speed_mps
+        lead_m = lead_path_m(speed_mps, 0.0, braking.lead_brake_mps2, lead_lag_s(scenario))
+        max_m = gap_m + lead_m - kept_m - lost_s * speed_mps
         return cls(ticks, brake_mps2, max_m)
 
 

@@ -1,8 +1,8 @@
-"""Are a process's certificate, key and authority in order? Asked before it uses them.
+"""Checks of a process's certificate, key and authority before it uses them.
 
-The answer comes from a TLS handshake of the process with itself, in memory: what OpenSSL accepts
-there, and Zenoh's library beyond, is what the others are going to accept. So it takes nothing but
-the standard library, and what is wrong is one line instead of a connection that does not come up.
+The check is a TLS handshake of the process with itself, in memory, by the standard library: what
+OpenSSL accepts here, its peers accept as well. A fault is reported in one line instead of as a
+connection that cannot be established.
 """
 
 from __future__ import annotations
@@ -27,32 +27,26 @@ from laneweave.protocol.wire.topics import Party
 log = structlog.get_logger(__name__)
 
 SOON_S = 7 * 86400.0
-"""Certificates that end so soon are warned of."""
+"""Certificates that expire within this time cause a warning."""
 _EXPIRED, _NOT_YET = 10, 9
-"""OpenSSL's numbers for a certificate out of its time."""
+"""OpenSSL's codes for a certificate outside its validity period."""
 
 
 @frozen
 class Findings:
-    """What was found about credentials that are in order."""
+    """Properties of valid credentials."""
 
     valid_until_s: float
-    """Unix time at which the certificate ends."""
+    """Unix time at which the certificate expires."""
     warnings: tuple[str, ...]
     """One line each."""
 
 
 def check_credentials(credentials: Credentials, identity: str, host: str = "") -> Findings:
-    """Check credentials as far as can be done without the network, and log the warnings.
-
-    Args:
-        credentials: of this process.
-        identity: whom they must be of.
-        host: under which clients look for this process; a router's certificate must be valid for
-            it. Empty, or for any other identity: not looked at.
+    """Check credentials as far as possible without the network, and log the warnings.
 
     Raises:
-        BadInputError: names the file, and what is wrong with it.
+        BadInputError: see `examine`.
     """
     found = examine(credentials, identity, host)
     for warning in found.warnings:
@@ -62,15 +56,21 @@ def check_credentials(credentials: Credentials, identity: str, host: str = "") -
 
 @cache
 def _warn(identity: str, warning: str) -> None:
-    """Log a warning once, however often somebody tries to connect."""
+    """Log a warning once, however often the process tries to connect."""
     log.warning("certificate", identity=identity, warning=warning)
 
 
 def examine(credentials: Credentials, identity: str, host: str = "") -> Findings:
-    """Check as `check_credentials` does, without a log.
+    """Check credentials as far as possible without the network.
+
+    Args:
+        credentials: those of a process.
+        identity: common name that the certificate must have.
+        host: host at which clients reach a router, for which its certificate must be valid; empty:
+            not checked. Ignored for other identities.
 
     Raises:
-        BadInputError: names the file, and what is wrong with it.
+        BadInputError: names the file and what is wrong with it.
     """
     is_router = identity == Party.ROUTER
     _check_readable("certificate authority", credentials.ca)
@@ -89,7 +89,7 @@ def examine(credentials: Credentials, identity: str, host: str = "") -> Findings
             "certificate authority", credentials.ca, "a certificate in PEM"
         ) from error
     if not is_router:
-        # Whoever judges is the server of the handshake, and has to show something.
+        # The judging side is the server of this handshake and needs a certificate, too.
         _load_own(judging, credentials)
         showing.check_hostname = False
         showing.verify_mode = ssl.CERT_NONE
@@ -99,7 +99,7 @@ def examine(credentials: Credentials, identity: str, host: str = "") -> Findings
         raise BadInputError(
             "certificate",
             credentials.certificate,
-            f"a certificate of {identity}, this one is of {', '.join(names) or 'nobody'}",
+            f"a certificate of {identity}; this one is of {', '.join(names) or 'no name'}",
         )
     until_s = float(ssl.cert_time_to_seconds(shown["notAfter"]))
     return Findings(until_s, tuple(_warnings(credentials, until_s)))
@@ -110,16 +110,16 @@ def _check_readable(name: str, path: str) -> None:
         text = Path(path).read_bytes()
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
-        raise BadInputError(name, path, f"a file that can be read ({reason})") from error
+        raise BadInputError(name, path, f"a readable file ({reason})") from error
     if b"-----BEGIN " not in text:
         raise BadInputError(name, path, "a file in PEM")
 
 
 def _load_own(context: ssl.SSLContext, credentials: Credentials) -> None:
-    """Have a context show the process's certificate."""
+    """Load the process's certificate and key into a context."""
     with _key_file(credentials) as key:
         try:
-            # An encrypted key is refused, not asked for at the terminal.
+            # Refuse an encrypted key instead of asking for a password at the terminal.
             context.load_cert_chain(credentials.certificate, key, password=lambda: "")
         except ssl.SSLError as error:
             if error.reason == "KEY_VALUES_MISMATCH":
@@ -133,7 +133,7 @@ def _load_own(context: ssl.SSLContext, credentials: Credentials) -> None:
 
 @contextlib.contextmanager
 def _key_file(credentials: Credentials) -> Iterator[str]:
-    """Give the private key as a file, which is none on a disk if it came as text."""
+    """Yield a path of the private key; one that came as text stays in memory."""
     if not credentials.private_key_pem:
         yield credentials.private_key
         return
@@ -148,10 +148,10 @@ def _key_file(credentials: Credentials) -> Iterator[str]:
 def _handshake(
     showing: ssl.SSLContext, judging: ssl.SSLContext, credentials: Credentials, host: str
 ) -> dict[str, Any]:
-    """Let one side show its certificate to the other; return what that one saw.
+    """Shake hands between two contexts; return the certificate that the judging side received.
 
     Raises:
-        BadInputError: it refused what it saw.
+        BadInputError: it refused the certificate.
     """
     there, back = ssl.MemoryBIO(), ssl.MemoryBIO()
     router_shows = judging.protocol == ssl.PROTOCOL_TLS_CLIENT
@@ -164,7 +164,7 @@ def _handshake(
     shower = showing.wrap_bio(back, there, server_side=router_shows)
     waiting = [judge, shower]
     try:
-        # Each side needs to be heard three times at most.
+        # Each side takes at most three turns.
         for _ in range(4):
             for side in tuple(waiting):
                 with contextlib.suppress(ssl.SSLWantReadError):
@@ -174,7 +174,7 @@ def _handshake(
         raise _refusal(error, credentials, host) from error
     except ssl.SSLError as error:
         raise BadInputError(
-            "certificate", credentials.certificate, f"one that TLS takes ({error.reason})"
+            "certificate", credentials.certificate, f"one that TLS accepts ({error.reason})"
         ) from error
     shown: dict[str, Any] = judge.getpeercert() or {}
     return shown
@@ -185,9 +185,9 @@ def _refusal(
 ) -> BadInputError:
     code, words = error.verify_code, error.verify_message
     if code == _EXPIRED:
-        allowed = "one that is still valid, this one, or its authority's, has expired"
+        allowed = "one that is still valid; this one, or its authority's, has expired"
     elif code == _NOT_YET:
-        allowed = "one that is valid already, this one, or its authority's, is not yet"
+        allowed = "one that is already valid; this one, or its authority's, is not yet"
     elif "match" in words:
         allowed = f"one that is valid for {host}, where clients look for the router"
     else:
@@ -202,4 +202,4 @@ def _warnings(credentials: Credentials, until_s: float) -> Iterator[str]:
     if not credentials.private_key_pem:
         mode = Path(credentials.private_key).stat().st_mode
         if mode & (stat.S_IRWXG | stat.S_IRWXO):
-            yield f"{credentials.private_key} may be read by others: chmod 600"
+            yield f"{credentials.private_key} is readable by other users: chmod 600"

@@ -1,23 +1,22 @@
-"""Motion of one vehicle: exact integration, limits, and the law that brings it to rest in a cell.
+"""Motion of one vehicle: exact integration, limits, and the control law that holds a cell.
 
 State and input of the road model, both axes triple integrators (front bumper s along the road,
 body centre y across it):
 
     state z = (s, v, a, y, v_y, a_y)        input u = (j_s, j_y), constant during a tick
 
-**The commanded state.** A body does not follow its set-point of acceleration u at once, but as a
-first-order lag does: lag da/dt = u - a. Let c = s + lag v. Then dc/dt = v + lag a and
-d2c/dt2 = u: the point c moves as if there were no lag, and the body follows it as a low-pass
-filter does, lag ds/dt = c - s. So whoever steers the *commanded state* (c, dc/dt, u) has
-compensated the lag exactly, and since a low-pass filter averages, the body keeps every limit on
-speed, acceleration and jerk, and every distance between two bodies of equal lag, that the commanded
-states keep. All laws here, the tracker and the references are about commanded states. They
-are counted from where they are at rest in the lattice (lag v_F is left out of c), so that a
-vehicle that holds has equal true and commanded states.
+**The commanded state.** The acceleration of a body follows its set-point u with a first-order lag:
+lag da/dt = u - a. Let c = s + lag v. Then dc/dt = v + lag a and d2c/dt2 = u: the point c moves
+without lag, and the body follows it like a low-pass filter, lag ds/dt = c - s. Controlling the
+*commanded state* (c, dc/dt, u) therefore compensates the lag exactly. Since a low-pass filter
+averages, the body keeps every limit on speed, acceleration and jerk that the commanded state keeps,
+and two bodies of equal lag keep the distances of their commanded states. All control laws here, the
+tracker and the references use commanded states. The constant lag v_F is left out of c, so a vehicle
+that holds has equal true and commanded states.
 
-Everything here is a pure function of plain floats. The agent plans with it, the vehicle's own
-motion controller runs on it when the agent's commands run out, and the plant integrates with it,
-so the three agree to the last bit.
+Everything here is a pure function of floats. The agent plans with it, the motion controller drives
+with it when the agent's commands end, and the plant integrates with it, so the three agree to the
+last bit.
 """
 
 from __future__ import annotations
@@ -54,22 +53,16 @@ _CATCH_UP_SHARE = 0.25
 """Largest speed towards the cell along the road, as a share of the cell's speed."""
 
 _PLENTY = 0.3
-"""More than the 1/4 of `_min_accel`, by far more than rounding."""
+"""Exceeds the 1/4 of `_min_accel` by far more than rounding errors."""
 
 _OPEN_GAIN = 0.6
-"""Speed at which a gap that is too small is opened, per metre that it lacks [1/s]."""
+"""Speed at which a gap that is too small is opened, per missing metre [1/s]."""
 _SETTLE_TICKS = 2.0
-"""Ticks after which the speed is to be the safe one."""
+"""Ticks within which the safe speed is reached."""
 
 
 def integrate(state: State, jerk: Jerk, tick_s: float) -> State:
-    """Return the state after one tick of constant jerk: the exact solution, no approximation.
-
-    Args:
-        state: (s, v, a, y, v_y, a_y) in m and s.
-        jerk: (j_s, j_y) [m/s3].
-        tick_s: length of the tick [s].
-    """
+    """Return the state after one tick of constant jerk: the exact solution."""
     s, v, a, y, v_y, a_y = state
     j_s, j_y = jerk
     half = tick_s * tick_s / 2.0
@@ -87,12 +80,12 @@ def integrate(state: State, jerk: Jerk, tick_s: float) -> State:
 def commanded_state(
     state: State, setpoint: tuple[float, float], limits: Vehicle, speed_mps: float
 ) -> State:
-    """Return the state that a body pursues through its actuators; see the module.
+    """Return the commanded state of a body; see the module.
 
     Args:
-        state: of the body, (s, v, a, y, v_y, a_y) in m and s.
-        setpoint: accelerations that its actuators were told, along and across [m/s2].
-        limits: the vehicle; its lags count.
+        state: state of the body.
+        setpoint: accelerations commanded to its actuators, along and across [m/s2].
+        limits: the vehicle, for its lags.
         speed_mps: v_F, the speed of the lattice.
     """
     s, v, a, y, v_y, a_y = state
@@ -114,14 +107,7 @@ def cell_state(lattice: Lattice, cell: Cell, t_s: float) -> State:
 
 
 def at_rest_in_cell(state: State, lattice: Lattice, cell: Cell, t_s: float) -> bool:
-    """Tell whether a motion that led to `cell` has ended: the body is close to the target point.
-
-    Args:
-        state: of the body at road time `t_s` [s].
-        lattice: where the cell lies.
-        cell: (column, lane) of the target.
-        t_s: road time [s].
-    """
+    """Return whether a motion to `cell` has ended: the body is close to the target at `t_s`."""
     goal = cell_state(lattice, cell, t_s)
     return (
         abs(state[0] - goal[0]) <= ARRIVED_ALONG_M and abs(state[3] - goal[3]) <= ARRIVED_ACROSS_M
@@ -132,17 +118,11 @@ def limited_jerk(state: State, jerk: Jerk, limits: Vehicle, tick_s: float) -> Je
     """Return the jerk nearest to `jerk` that keeps the vehicle within its limits.
 
     After the tick the accelerations are within their limits, the speed within [0, max_speed_mps]
-    and |v_y| <= max_slip_ratio v, and all of them can be kept ever after: the speed looks ahead,
-    so braking ends early enough for the acceleration to return to zero before the vehicle would
-    roll backwards. From a state that was reached within the limits this needs no more than the
-    jerk limits. From any other (an emergency brake that was released late) the jerk limit gives
-    way to the speed, and the speed to the acceleration limit.
-
-    Args:
-        state: (s, v, a, y, v_y, a_y) in m and s, finite.
-        jerk: wanted (j_s, j_y) [m/s3]; NaN counts as zero.
-        limits: the vehicle's limits.
-        tick_s: length of the tick [s].
+    and |v_y| <= max_slip_ratio v, and later ticks can keep all of these: braking ends early enough
+    for the acceleration to return to zero before the vehicle would roll backwards. From a state
+    that was reached within the limits the jerk limits suffice. From any other (after an emergency
+    brake) the speed limits take precedence over the jerk limits, and the acceleration limits over
+    the speed limits. The state must be finite; a jerk that is NaN counts as zero.
     """
     _, v, a, _, v_y, a_y = state
     a_next = limited_accel(v, a, jerk[0], limits, tick_s)
@@ -153,18 +133,12 @@ def limited_jerk(state: State, jerk: Jerk, limits: Vehicle, tick_s: float) -> Je
 def limited_accel(v: float, a: float, jerk: float, limits: Vehicle, tick_s: float) -> float:
     """Return the acceleration along the road after a tick of the jerk that `limited_jerk` allows.
 
-    Args:
-        v: speed along the road [m/s].
-        a: acceleration along the road [m/s2].
-        jerk: wanted j_s [m/s3]; NaN counts as zero.
-        limits: the vehicle's limits.
-        tick_s: length of the tick [s].
+    `v`, `a` and `jerk` are along the road in m and s; a jerk that is NaN counts as zero.
     """
     j_max = limits.max_jerk_mps3
     step = j_max * tick_s
     a_next = a + tick_s * (jerk if -j_max <= jerk <= j_max else _clamp(jerk, -j_max, j_max))
-    # Mostly there is room in plenty, which is quicker to see than how much acceleration it leaves:
-    # see `_min_accel`.
+    # Usually the room is ample, which is a cheaper test than the bound itself: see `_min_accel`.
     share, x = (2.0 * v / tick_s + a) / step, -a_next / step
     if share < (x + 1.0) * x + _PLENTY:
         a_next = max(a_next, _min_accel(share, step))
@@ -187,19 +161,16 @@ def _limited_lateral_accel(
     Args:
         motion: (v, a, v_y, a_y) in m and s.
         a_next: acceleration along the road after the tick [m/s2].
-        jerk: wanted j_y [m/s3]; NaN counts as zero.
+        jerk: requested j_y [m/s3]; NaN counts as zero.
         limits: the vehicle's limits.
         tick_s: length of the tick [s].
     """
     v, a, v_y, a_y = motion
-    j_max, ratio, a_max = (
-        limits.max_lateral_jerk_mps3,
-        limits.max_slip_ratio,
-        limits.max_lateral_accel_mps2,
-    )
+    j_max, ratio = limits.max_lateral_jerk_mps3, limits.max_slip_ratio
+    a_max = limits.max_lateral_accel_mps2
     step = j_max * tick_s
     ay_next = a_y + tick_s * (jerk if -j_max <= jerk <= j_max else _clamp(jerk, -j_max, j_max))
-    # Room to either side of the slip limit is a speed too: ratio v -+ v_y >= 0.
+    # The distance to either side of the slip limit is a speed, too: ratio v -+ v_y >= 0.
     speed, rate, rate_next = ratio * v, ratio * a, ratio * a_next
     share, x = (2.0 * (speed + v_y) / tick_s + (rate + a_y)) / step, -(rate_next + ay_next) / step
     if share < (x + 1.0) * x + _PLENTY:
@@ -213,14 +184,14 @@ def _limited_lateral_accel(
 def hold_law(state: State, reference: State, limits: Vehicle, tick_s: float) -> Jerk:
     """Return the jerk that brings the vehicle to rest in a cell: a saturated linear feedback.
 
-    Position error asks for a speed, speed error for an acceleration, acceleration error for a
-    jerk; each is saturated before it is passed on. It looks neither ahead nor behind; `keep_gap`
-    does.
+    The position error determines a speed, the speed error an acceleration, the acceleration error
+    a jerk; each is saturated before it is used. Other vehicles are ignored: see `keep_gap`. The
+    result keeps the limits as `limited_jerk` does.
 
     Args:
-        state: (s, v, a, y, v_y, a_y) in m and s, finite.
-        reference: the cell now, `cell_state(lattice, cell, t_s)`.
-        limits: the vehicle's limits; the result respects them as `limited_jerk` does.
+        state: finite state.
+        reference: state of the cell now, `cell_state(lattice, cell, t_s)`.
+        limits: the vehicle's limits.
         tick_s: length of the tick [s].
     """
     s, v, a, y, v_y, a_y = state
@@ -249,34 +220,35 @@ def keep_gap(
     min_gap_m: float,
     tick_s: float,
 ) -> Jerk:
-    """Return `jerk`, or one that brakes more where that is needed to stay behind somebody.
+    """Return `jerk`, or one that brakes harder where that is needed to stay behind a vehicle.
 
     The safe speed after Gipps ("A behavioural car-following model for computer simulation",
-    Transportation Research B 15, 1981): should the other one brake with b to standstill, this one,
+    Transportation Research B 15, 1981): if the vehicle ahead brakes with b to standstill, this one,
     which brakes with b after the time T, comes to rest `min_gap_m` behind it,
 
         v T + v^2 / (2 b)  <=  gap - min_gap + v_other^2 / (2 b).
 
-    b is the braking that the hold law asks for, too, so a row of vehicles that all drive by these
-    laws is safe as a whole. T is the time in which limited jerk builds b up; the time and the speed
-    that a vehicle gains until it has ended speeding up count, too.
+    b is also the maximum braking of the hold law, so a row of vehicles that all drive by these laws
+    is safe as a whole. T is the time in which limited jerk builds b up; the time until the vehicle
+    stops accelerating, and the speed that it gains until then, are added.
 
-    Two exceptions. Who is at least `min_gap_m` behind may always be as fast as the other one: a row
-    at equal speed stays as it is, however tight, but closer than v T it relies on `min_gap_m` when
-    the first one brakes. And who is closer than `min_gap_m` falls back. Time is discrete: with
-    ticks of 0.1 s up to 0.1 m of the gap may lack, with ticks of 0.4 s up to 2 m (measured).
+    Two exceptions. A vehicle at least `min_gap_m` behind may always be as fast as the one ahead: a
+    row at equal speed stays as it is, however tight, but below v T it relies on `min_gap_m` when
+    the first one brakes. And a vehicle closer than `min_gap_m` falls back. Time is discrete: with
+    ticks of 0.1 s up to 0.1 m of the gap may be missing, with ticks of 0.4 s up to 2 m (measured).
+    The result keeps the limits as `limited_jerk` does.
 
     Args:
-        state: (s, v, a, y, v_y, a_y) in m and s, finite.
-        jerk: wanted (j_s, j_y) [m/s3].
+        state: finite state.
+        jerk: requested jerk.
         ahead: (net gap [m], speed [m/s]) of each vehicle to stay behind.
-        limits: the vehicle's limits; the result respects them as `limited_jerk` does.
-        min_gap_m: net gap to keep [m].
+        limits: the vehicle's limits.
+        min_gap_m: net gap to keep.
         tick_s: length of the tick [s].
     """
     _, v, a, _, _, _ = state
     brake = -_BRAKE_SHARE * limits.min_accel_mps2
-    # Who is speeding up goes on to do so until the jerk limit has brought that to an end.
+    # A vehicle that accelerates continues to do so until limited jerk has ended it.
     fade_s = max(a, 0.0) / limits.max_jerk_mps3
     gained_v = max(a, 0.0) * (0.5 * fade_s + tick_s)
     delay_s = brake / (2.0 * limits.max_jerk_mps3) + 2.0 * tick_s + fade_s
@@ -299,21 +271,21 @@ def _clamp(value: float, low: float, high: float) -> float:
 
 
 def _min_accel(share: float, step: float) -> float:
-    """Return the least rate after this tick from which a room can be kept >= 0.
+    """Return the minimum rate after this tick with which a speed can stay above its lower bound.
 
-    The room is a speed above its lower bound [m/s] and the rate its derivative [m/s2]. Raising the
-    rate to zero from -x jerk tick_s, whole ticks at full jerk and a last part tick, costs
-    jerk tick_s^2 / 2 times the linear interpolation of m^2 at x, and this tick costs the mean of
-    both rates. The bound is where both together use up the room:
+    The room is the speed above that bound [m/s] and the rate its derivative [m/s2]. Raising the
+    rate to zero from -x jerk tick_s, by whole ticks at full jerk and a partial one, uses
+    jerk tick_s^2 / 2 times the linear interpolation of m^2 at x, and this tick uses the mean of
+    both rates. At the bound both together use all of the room:
 
         x + interp(m^2)(x) = 2 (room + rate tick_s / 2) / (jerk tick_s^2)
 
-    The interpolation is above x^2 by 1/4 at most: where the right side is more than x + x^2 + 1/4,
-    a rate of -x jerk tick_s is above the bound.
+    The interpolation exceeds x^2 by at most 1/4: where the right side is above x + x^2 + 1/4, a
+    rate of -x jerk tick_s is above the bound.
 
     Args:
         share: the right side.
-        step: jerk tick_s, the most that the rate changes in a tick [m/s2].
+        step: jerk tick_s, the maximum change of the rate in a tick [m/s2].
     """
     if share <= 0.0:
         return -share * step

@@ -17,7 +17,8 @@ from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.braking import (
     ERROR_SIGMAS,
     EmergencyBrake,
-    lead_way_m,
+    lead_lag_s,
+    lead_path_m,
     min_pitch_m,
     spare_error_m,
     stopping_distance_m,
@@ -32,6 +33,11 @@ V_F = SCENARIO.formation.speed_mps
 CELL_GAP_M = SCENARIO.formation.gap_m - LIMITS.length_m
 BRAKE = EmergencyBrake(SCENARIO)
 NO_JERK: Jerk = (0.0, 0.0)
+
+
+def lead_m(speed_mps: float, accel_mps2: float = 0.0) -> float:
+    brake_mps2, lag_s = ASSUMED.lead_brake_mps2, lead_lag_s(SCENARIO)
+    return lead_path_m(speed_mps, accel_mps2, brake_mps2, lag_s)
 
 
 def body(v_mps: float, a_mps2: float = 0.0) -> State:
@@ -79,7 +85,7 @@ def test_a_body_that_brakes_goes_as_far_as_integration_says(
 def test_with_the_assumptions_of_a_scenario_it_is_a_tenth_of_a_metre_off_at_most(
     v_mps: float, accel_mps2: float
 ) -> None:
-    way_m = lead_way_m(SCENARIO, v_mps, accel_mps2)
+    way_m = lead_m(v_mps, accel_mps2)
     true_m = integrated_way_m(v_mps, accel_mps2, ASSUMED.lead_brake_mps2, ASSUMED.lead_lag_s)
     assert true_m - 0.105 <= way_m <= true_m + 1e-3
     if v_mps >= 5.0:
@@ -87,11 +93,11 @@ def test_with_the_assumptions_of_a_scenario_it_is_a_tenth_of_a_metre_off_at_most
 
 
 def test_who_is_ahead_may_stop_speeding_up_at_once_and_brakes_hard_for_good() -> None:
-    assert lead_way_m(SCENARIO, 15.0, 4.0) == lead_way_m(SCENARIO, 15.0)
-    assert lead_way_m(SCENARIO, 15.0, -2.0) < lead_way_m(SCENARIO, 15.0)
-    hardest = lead_way_m(SCENARIO, 15.0, -ASSUMED.lead_brake_mps2)
-    assert lead_way_m(SCENARIO, 15.0, -99.0) == hardest == pytest.approx(15.0**2 / 20.0)
-    assert lead_way_m(SCENARIO, -1.0) == lead_way_m(SCENARIO, 0.0) == 0.0
+    assert lead_m(15.0, 4.0) == lead_m(15.0)
+    assert lead_m(15.0, -2.0) < lead_m(15.0)
+    hardest = lead_m(15.0, -ASSUMED.lead_brake_mps2)
+    assert lead_m(15.0, -99.0) == hardest == pytest.approx(15.0**2 / 20.0)
+    assert lead_m(-1.0) == lead_m(0.0) == 0.0
 
 
 # --- what is to spare -----------------------------------------------------------------------------
