@@ -113,7 +113,7 @@ def test_what_ends_soon_or_lies_open_is_warned_of(folder: Path, tmp_path: Path) 
     (tmp_path / f"{NAME}.key").chmod(0o640)
     first, second = examine(credentials(tmp_path), NAME).warnings
     assert "expires in 3.0 days" in first
-    assert "may be read by others" in second
+    assert "is readable by other users" in second
     # A role that waits for its router asks again and again.
     with structlog.testing.capture_logs() as logged:
         for _ in range(3):
