@@ -12,7 +12,7 @@ import inspect
 import json
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from enum import Enum
 from functools import cache
 from pathlib import Path
@@ -44,11 +44,12 @@ from laneweave.protocol.runtime.metrics import (
     RouterMetrics,
     metrics_of,
 )
-from laneweave.protocol.security.rights import rights_table
+from laneweave.protocol.security.rights import READING, SENDING, Flow, rights_on
 from laneweave.protocol.state_machine import Function, RuleBook
 from laneweave.protocol.vehicle.execution import VEHICLE_RULES, ExecutionPhase
 from laneweave.protocol.wire import events, messages
-from laneweave.protocol.wire.topics import TOPICS
+from laneweave.protocol.wire.identities import Identity
+from laneweave.protocol.wire.topics import TOPICS, Exchange, Party, Topic
 from laneweave.sim_bridge.core import BridgeMetrics
 from support.planted_bugs import BUGS
 
@@ -87,6 +88,52 @@ SNAPSHOTS: dict[type[MetricsSnapshot], str] = {
     RouterMetrics: "router",
 }
 """Classes of metrics, each with the role that serves them."""
+
+
+_VERBS = {
+    Exchange.MESSAGES: ("sends", "reads"),
+    Exchange.TOKENS: ("shows", "watches"),
+    Exchange.QUESTIONS: ("asks", "serves"),
+}
+_PARTIES = (
+    Party.BRIDGE,
+    Party.COORDINATOR,
+    Party.VEHICLE,
+    Party.FLEET,
+    Party.CLIENT,
+    Party.OBSERVER,
+)
+
+
+def rights_table() -> str:
+    """Return the table of rights for DEPLOYMENT.md."""
+    lines = ["| certificate | may |", "|---|---|"]
+    for party in _PARTIES:
+        identity = Identity(party, "" if party is Party.BRIDGE else "NAME")
+        does = "<br>".join(_rights_of(identity))
+        lines.append(f"| `{identity.common_name}` | {does} |")
+    return "\n".join(lines)
+
+
+def _rights_of(identity: Identity) -> Iterator[str]:
+    if identity.party is Party.FLEET:
+        yield "all that a vehicle may, for each of its vehicles"
+    for exchange, verbs in _VERBS.items():
+        topics = [topic for topic in TOPICS if topic.exchange is exchange]
+        for verb, rights in zip(verbs, (SENDING[exchange], READING[exchange]), strict=True):
+            keys = dict.fromkeys(_keys_of(topics, identity, rights[0]))
+            if keys:
+                yield f"{verb} " + ", ".join(f"`{key}`" for key in keys)
+
+
+def _keys_of(
+    topics: Iterable[Topic], identity: Identity, wanted: tuple[Flow, str]
+) -> Iterator[str]:
+    for topic in topics:
+        for right, parameters in rights_on(topic, identity.party, identity.name):
+            if right == wanted:
+                shown = dict.fromkeys(topic.parameters, "*") | parameters
+                yield topic.pattern.format_map(shown)
 
 
 def _meaning(function: Function) -> str:

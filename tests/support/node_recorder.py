@@ -152,6 +152,5 @@ def chatter(
     network.at(1.0, network.lose_router)
     network.at(1.1, network.restore_router)
     network.at(2.2, network.kill, "c")
-    network.at(2.3, network.lose, lambda key: 0.5 if key.endswith("b") else 0.0)
     network.run(2.6)
     return [core.events for core in cores.values()], (network.dropped, network.delivered)

@@ -8,7 +8,7 @@ from a process and what goes out to it, so each right has a flow, seen from the 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -92,7 +92,7 @@ def rules_of(identity: Identity, scenario: Scenario) -> tuple[Rule, ...]:
     keys = Keys(scenario.network.realm)
     for party, name in _represented(identity, scenario):
         for topic in TOPICS:
-            for right, parameters in _rights(topic, party, name):
+            for right, parameters in rights_on(topic, party, name):
                 allowed.setdefault(right, {})[keys.all_of(topic, **parameters)] = None
     return tuple(Rule(flow, message, tuple(found)) for (flow, message), found in allowed.items())
 
@@ -106,7 +106,7 @@ def _represented(identity: Identity, scenario: Scenario) -> Iterator[tuple[Party
             yield Party.VEHICLE, vehicle
 
 
-def _rights(
+def rights_on(
     topic: Topic, party: Party, name: str
 ) -> Iterator[tuple[tuple[Flow, str], dict[str, str]]]:
     """Yield the rights that a topic grants, each with the parameters that its keys must have."""
@@ -248,42 +248,3 @@ def size_limits(scenario: Scenario) -> list[dict[str, Any]]:
             ("messages", "put", Exchange.MESSAGES, MAX_BYTES),
         )
     ]
-
-
-# --- documentation --------------------------------------------------------------------------------
-
-_VERBS = {
-    Exchange.MESSAGES: ("sends", "reads"),
-    Exchange.TOKENS: ("shows", "watches"),
-    Exchange.QUESTIONS: ("asks", "serves"),
-}
-_TABLE = (Party.BRIDGE, Party.COORDINATOR, Party.VEHICLE, Party.FLEET, Party.CLIENT, Party.OBSERVER)
-
-
-def rights_table() -> str:
-    """Return the Markdown table of rights for docs/DEPLOYMENT.md."""
-    lines = ["| certificate | may |", "|---|---|"]
-    for party in _TABLE:
-        identity = Identity(party, "" if party is Party.BRIDGE else "NAME")
-        does = "<br>".join(_described(identity))
-        lines.append(f"| `{identity.common_name}` | {does} |")
-    return "\n".join(lines)
-
-
-def _described(identity: Identity) -> Iterator[str]:
-    if identity.party is Party.FLEET:
-        yield "all that a vehicle may, for each of its vehicles"
-    for exchange, verbs in _VERBS.items():
-        topics = [topic for topic in TOPICS if topic.exchange is exchange]
-        for verb, rights in zip(verbs, (SENDING[exchange], READING[exchange]), strict=True):
-            keys = dict.fromkeys(_keys(topics, identity, rights[0]))
-            if keys:
-                yield f"{verb} " + ", ".join(f"`{key}`" for key in keys)
-
-
-def _keys(topics: Iterable[Topic], identity: Identity, wanted: tuple[Flow, str]) -> Iterator[str]:
-    for topic in topics:
-        for right, parameters in _rights(topic, identity.party, identity.name):
-            if right == wanted:
-                shown = dict.fromkeys(topic.parameters, "*") | parameters
-                yield topic.pattern.format_map(shown)

@@ -17,7 +17,6 @@ from laneweave.protocol.security.rights import (
     access_control,
     access_of,
     guard_of,
-    rights_table,
     rules_of,
     size_limits,
 )
@@ -210,13 +209,6 @@ def test_an_open_network_has_no_guard() -> None:
     guard = guard_of(everywhere, {})
     assert guard is not None
     assert guard.host == ""
-
-
-def test_the_table_for_people_names_all_who_take_part() -> None:
-    table = rights_table()
-    for party in set(Party) - {Party.ROUTER}:
-        assert f"| `{party}" in table
-    assert "serves `service/plan`" in table
 
 
 # --- access ---------------------------------------------------------------------------------------

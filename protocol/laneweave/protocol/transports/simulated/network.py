@@ -164,7 +164,6 @@ class SimulatedNetwork(Simulation):
         self._beside: dict[str, list[str]] = {}
         """Keys of the routes, by all but their last part."""
         self._cut: Callable[[str, str], bool] | None = None
-        self._loss_on: Callable[[str], float] | None = None
         self._router_up = True
         self._outages = 0
         self._questions: dict[int, _Question] = {}
@@ -268,10 +267,6 @@ class SimulatedNetwork(Simulation):
         """Partition: messages from a to b are lost if `blocked(a, b)`; None ends it."""
         self._cut = blocked
 
-    def lose(self, loss_on: Callable[[str], float] | None) -> None:
-        """Lose messages with probability max(`loss_on(key)`, `Conditions.loss`); None ends it."""
-        self._loss_on = loss_on
-
     def disconnect(self, name: str) -> None:
         """Disconnect a node: it and the others see each other's tokens vanish at once.
 
@@ -317,8 +312,6 @@ class SimulatedNetwork(Simulation):
             return
         conditions, cut, draw = self.conditions, self._cut, self.random.random
         duplication, loss = conditions.duplication, conditions.loss
-        if self._loss_on is not None:
-            loss = max(loss, self._loss_on(key))
         route = self._routes.get(key)
         message = Received(key, payload)
         for receiver in self._route(key) if route is None else route:

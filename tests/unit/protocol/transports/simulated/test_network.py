@@ -78,32 +78,6 @@ def test_messages_are_lost_at_the_given_rate(loss: float) -> None:
     assert set(receivers["b"].numbers) != set(receivers["c"].numbers)
 
 
-@pytest.mark.parametrize(("general", "on_key"), [(0.2, 0.6), (0.6, 0.2)])
-def test_the_greater_loss_counts(general: float, on_key: float) -> None:
-    receiver = listener()
-    network = network_of(Conditions(loss=general), a=Recorder(), b=receiver)
-    network.lose(lambda _: on_key)
-    send(network, "a", *range(2000))
-    network.run(1.0)
-    # Four standard deviations.
-    assert abs(len(receiver.numbers) - 800) < 88
-
-
-def test_messages_can_be_lost_by_their_key() -> None:
-    receiver = listener()
-    network = network_of(a=Recorder(), b=Recorder(), c=receiver)
-    network.lose(lambda key: 1.0 if key.endswith("/a") else 0.0)
-    send(network, "a", *range(10))
-    send(network, "b", *range(10, 20))
-    network.run(0.2)
-    assert receiver.numbers == list(range(10, 20))
-    assert network.dropped == 10
-    network.lose(None)
-    send(network, "a", 20)
-    network.run(0.3)
-    assert receiver.numbers[10:] == [20]
-
-
 def test_messages_are_duplicated_at_the_given_rate() -> None:
     receiver = listener()
     network = network_of(Conditions(duplication=0.25), a=Recorder(), b=receiver)
