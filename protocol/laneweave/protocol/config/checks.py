@@ -141,7 +141,7 @@ def _check_motion(scenario: Scenario) -> None:
         formation.weight_oblique,
         "at most 1 in mode 2 (an oblique edge is one step), at most 2 in mode 1",
     )
-    block_m = (formation.greatest_length - 1) * formation.gap_m
+    block_m = (formation.max_length - 1) * formation.gap_m
     needed_m = block_m + vehicle.length_m + formation.speed_mps * scenario.cycles_s[0]
     _compare(scenario, [("road.s3_m", "at least", needed_m, "a whole formation and one step")])
     _require(

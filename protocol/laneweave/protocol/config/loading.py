@@ -47,7 +47,7 @@ def load_scenario(path: Path | None, **overrides: object) -> Scenario:
 
 
 def _resolve_folder(data: dict[str, Any], path: Path) -> None:
-    """Make the folder of certificates one that does not depend on where a role is started."""
+    """Make the folder of certificates independent of the working directory."""
     security = data.get("security")
     if isinstance(security, dict):
         folder = security.get("folder", Security().folder)
@@ -74,7 +74,7 @@ def parse_scenario(data: Mapping[str, Any]) -> Scenario:
     """Build a scenario from nested tables and cross-check it.
 
     Raises:
-        BadInputError: a field is unknown, of the wrong type, out of range, or does not fit others.
+        BadInputError: a field is unknown, of the wrong type or range, or contradicts others.
     """
     scenario = structure(_with_current_names(data), Scenario)
     check_scenario(scenario)
@@ -82,7 +82,7 @@ def parse_scenario(data: Mapping[str, Any]) -> Scenario:
 
 
 def _with_current_names(data: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the tables with `operation = "paper"`, an earlier name, in today's terms."""
+    """Return the tables with the earlier value `operation = "paper"` replaced by its meaning."""
     formation = data.get("formation") if isinstance(data, Mapping) else None
     if not isinstance(formation, Mapping) or formation.get("operation") != "paper":
         return data

@@ -106,10 +106,10 @@ class Transport(Protocol):
     def watch(self, key_expression: str) -> None:
         """Deliver tokens that appear or vanish, beginning with those that are there.
 
-        This node's own are among them. News of one key come by turns, first that it is there: what
-        is known already is not delivered again. A token of its own that it shows only for a moment
-        may come and go twice, for the network tells of it too, later. Several nodes may show a
-        token on one key: it has vanished when the last of them has taken it back.
+        This node's own tokens are included. For each key, appearances and disappearances alternate,
+        beginning with an appearance; repeated reports are not delivered. A token of its own that it
+        shows only briefly may appear and vanish twice, because the network reports it, too, later.
+        Several nodes may show a token on one key: it vanishes when the last of them withdraws it.
         """
 
     def serve(self, key: str) -> None:

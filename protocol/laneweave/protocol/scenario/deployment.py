@@ -1,4 +1,4 @@
-"""The tables of a configuration that tell how roles are deployed: network, security, service.
+"""Configuration tables about the deployment of roles: network, security, service.
 
 They are part of the one TOML file that every role reads (`tables.py`); a file that holds only
 these is what docs/DEPLOYMENT.md calls a DEPLOYMENT.toml.
@@ -23,25 +23,21 @@ MAX_SHARDS = 10_000
 
 @frozen
 class Shard:
-    """Which of the announced vehicles a process takes: those whose name falls to `index`."""
+    """Share of the announced vehicles that a process takes, by a hash of their names."""
 
     index: int
     count: int
 
     def takes(self, vehicle: str) -> bool:
-        """Tell whether a vehicle belongs to this shard, alike in every process."""
+        """Return whether a vehicle belongs to this shard; equal in all processes."""
         return zlib.crc32(vehicle.encode()) % self.count == self.index
 
 
 def parse_shard(text: str, name: str) -> Shard:
-    """Return the shard `I/N`.
-
-    Args:
-        text: what somebody wrote.
-        name: of the field or option, for the error.
+    """Return the shard `I/N`; `name` is the field or option, for the error.
 
     Raises:
-        BadInputError: it is no shard.
+        BadInputError: the text is not a shard.
     """
     index, _, count = text.partition("/")
     digits = index.isdecimal() and count.isdecimal() and len(text) < 20
@@ -52,7 +48,7 @@ def parse_shard(text: str, name: str) -> Shard:
 
 @frozen
 class Network:
-    """How roles find each other and when they give each other up; wall-clock seconds."""
+    """How roles connect, and when they consider each other lost; wall-clock seconds."""
 
     realm: str = field(default="default", validator=key_part)
     """First part of every key: deployments with different realms do not see each other."""
@@ -61,10 +57,9 @@ class Network:
     listen: tuple[str, ...] = ()
     """Where the router listens; empty: at `endpoint`."""
     lease_s: float = field(default=1.0, validator=within(0.1, 60.0))
-    """A silent session is given up after this time (Zenoh's transport lease)."""
+    """A silent session is closed after this time (Zenoh's transport lease)."""
     connect_timeout_s: float = field(default=0.0, validator=within(0.0, 86_400.0))
-    """How long a role tries to connect before it gives up: whoever starts the roles need not start
-    the router first. 0: once."""
+    """How long a role tries to connect, so that the router may start later; 0: one attempt."""
     heartbeat_s: float = field(default=0.1, validator=within(0.01, 10.0))
     election_s: float = field(default=0.7, validator=within(0.05, 60.0))
     """A candidate leads when it has been the best-ranked one for this long. A process that dies is
@@ -90,20 +85,20 @@ def _fleets(_: object, attribute: attrs.Attribute[Any], value: Mapping[str, Flee
 
 @frozen
 class Security:
-    """Who may do what on the network; off on one host, one switch for deployments."""
+    """Access control of the network; off by default, for runs on one host."""
 
     mode: str = field(default="off", validator=one_of("off", "mtls"))
-    """`mtls`: every process shows a certificate, and the router lets it do what its name allows."""
+    """`mtls`: every process has a certificate, and the router grants rights by its name."""
     folder: str = "certs"
-    """Where the certificates are, as `laneweave certs init` makes them; relative to the file."""
+    """Folder of the certificates that `laneweave certs init` makes; relative to the file."""
     fleets: Mapping[str, FleetMembers] = field(factory=dict, validator=_fleets, hash=False)
     """Agent processes that drive several vehicles: a shard `I/N`, or the vehicles' names."""
     vehicles: tuple[str, ...] = field(default=(), validator=key_parts)
     """Vehicles that may have a process of their own; empty: all that may arrive in the demand."""
     clients: tuple[str, ...] = field(default=("plan",), validator=key_parts)
-    """Who may ask the planning service."""
+    """Processes that may query the planning service."""
     observers: tuple[str, ...] = field(default=("ping", "status", "watch"), validator=key_parts)
-    """Who may look on."""
+    """Processes that may only read."""
 
 
 @frozen
@@ -116,20 +111,20 @@ class Service:
     """Limit on the arrays of branch and bound in each of them. A plan that reaches it is completed
     by the other solver; without a proof its status is `feasible`."""
     queue_limit: int = field(default=256, validator=within(1, 100_000))
-    """Requests in hand, those that are being planned among them; more are refused."""
+    """Maximum number of requests that wait or are being planned; more are refused."""
     max_request_bytes: int = field(default=262_144, validator=within(1024, 1 << 20))
     """A longer request is refused."""
     max_deadline_s: float = field(default=600.0, validator=within(0.001, 3600.0))
-    """A longer deadline is refused: nobody may have a worker for ever."""
+    """A request with a longer deadline is refused."""
     cache_entries: int = field(default=1024, validator=within(0, 1_000_000))
-    """Answers that are kept for requests that are asked again by their id."""
+    """Number of answers kept for requests that are repeated with the same id."""
     cache_s: float = field(default=60.0, validator=within(0.0, 86_400.0))
-    """For how long."""
+    """Time for which answers are kept."""
 
 
 @frozen
 class Observation:
-    """How a deployment is looked at."""
+    """Observation of a deployment."""
 
     metrics: str = field(default="", validator=host_port)
-    """HOST:PORT at which a role shows its metrics in the Prometheus text format; empty: not."""
+    """HOST:PORT at which a role serves its metrics in the Prometheus text format; empty: none."""

@@ -31,19 +31,19 @@ COMFORT_MPS2 = 3.0
 """Accelerations up to this are comfortable, along and across."""
 ROLLING_CYCLE_S = 6.0
 COMFORTABLE_VOLUME_VEH_PER_LANE_H = 2000.0
-"""T_F of the rolling operation up to this volume, where it is comfortable. Denser traffic needs
-more steps on the same road: at 2400 one vehicle of a hundred misses its lane with 6 s, none of a
-thousand with 4 s (`benchmarks/stream.py`)."""
+"""Up to this volume T_F of the rolling operation is `ROLLING_CYCLE_S`, which is comfortable. Denser
+traffic needs more steps on the same road: at 2400 one vehicle in a hundred misses its lane with
+6 s, none in a thousand with 4 s (`benchmarks/stream.py`)."""
 CYCLE_STEP_S = 0.2
-"""Few values of T_F are in use, so that trajectories of moves are planned once."""
+"""Step between values of T_F: few values mean few trajectories to plan."""
 SLACK_S = 0.2
 """Part of T_F in which nothing moves, unless `formation.move_s` says otherwise."""
 
 PAPERS_FORMATIONS: Mapping[str, object] = MappingProxyType(
     {"entry": "interlaced", "close": "columns", "cycle_s": 4.0}
 )
-"""Fields of the table `formation` that make it the paper's: what `operation = "paper"` stands for
-where a file, a recording or an option says so."""
+"""Values of the table `formation` that `operation = "paper"` stands for in files, recordings and
+options."""
 
 SOLVERS: Final = ("tappa", "branching")
 """`tappa`: the paper's algorithm. `branching`: branch and bound, for large formations."""
@@ -105,7 +105,7 @@ class Demand:
     duration_s: float = field(default=300.0, validator=within(0, 86_400, open_low=True))
     min_headway_s: float = field(default=1.0, validator=within(0.0, 60.0))
     lane_shares: tuple[float, ...] = ()
-    """Share of vehicles that prefer each lane; empty: all lanes alike."""
+    """Share of vehicles that prefer each lane; empty: equal shares."""
 
 
 @frozen
@@ -113,24 +113,24 @@ class DrivingStructure:
     """A geometric structure in which formations drive before they sort (paper, Section 2.2)."""
 
     from_m: float = field(validator=within(0.0, 60_000.0))
-    """Position from which on they change to it, when their rear has passed it."""
+    """Formations change to it when their rear has passed this position."""
     structure: str = field(validator=one_of("parallel", "interlaced"))
     lanes: tuple[int, ...] = ()
-    """Lanes that it uses; empty: all of the road."""
+    """Lanes that it uses; empty: all lanes."""
 
 
 @frozen
 class FormationSettings:
-    """Formation control parameters d_F, T_F, v_F and the planner's choices."""
+    """Formation control parameters d_F, T_F, v_F and settings of the planner."""
 
     operation: str = field(default="formations", validator=one_of("formations", "rolling"))
     """`formations`: closed formations, each sorted by one plan (the paper's operation).
-    `rolling`: no formations; the whole stream is planned anew in each slot."""
+    `rolling`: no formations; the whole stream is replanned in each slot."""
     entry: str = field(default="free", validator=one_of("free", "interlaced"))
     """Formations: the cells that vehicles may enter, all or those of the interlaced structure."""
     close: str = field(default="vehicles", validator=one_of("vehicles", "columns"))
-    """Formations: a formation ends at `max_vehicles` vehicles, or at `max_columns` columns; or
-    every formation has `block_columns` columns, as the paper's."""
+    """Formations: `vehicles`: a formation ends at `max_vehicles` vehicles or `max_columns` columns;
+    `columns`: each formation has `block_columns` columns, as in the paper."""
     gap_m: float = field(default=15.0, validator=within(1.0, 200.0))
     """d_F, the column pitch."""
     cycle_s: float | None = field(default=None, validator=optional(within(0.5, 60.0)))
@@ -146,16 +146,16 @@ class FormationSettings:
     sort_in_s2: bool = False
     """Rolling operation: lanes are changed in S2, too, as soon as vehicles have settled."""
     reward_drift: bool = False
-    """Rolling operation: moving ahead of v_F counts as a gain where it costs nobody else."""
+    """Rolling operation: moving ahead of v_F counts as a gain where it costs no other vehicle."""
     block_columns: int = field(default=4, validator=within(1, 24))
     """Columns of a formation where `close` is `columns`; the interlaced structure uses half of
     its cells."""
     max_columns: int = field(default=7, validator=within(1, 24))
-    """Greatest length of a formation where `close` is `vehicles`."""
+    """Maximum length of a formation where `close` is `vehicles`."""
     max_vehicles: int = field(default=6, validator=within(1, 36))
-    """Largest formation (the paper: six)."""
+    """Maximum size of a formation (paper: six)."""
     max_joined: int = field(default=1, validator=within(1, 4))
-    """Most neighbouring formations that one ballot may join."""
+    """Maximum number of neighbouring formations that one ballot may join."""
     join: str = field(default="needed", validator=one_of("needed", "room"))
     """When neighbouring formations join: `needed`: when one alone lacks room for sorting; `room`:
     also when the vehicles of both fit into one formation, `max_vehicles`."""
@@ -171,14 +171,14 @@ class FormationSettings:
     weight_oblique: int | None = field(default=None, validator=one_of(None, 0, 1, 2))
     """l_o of the formation relative distance; none: the number of steps of an oblique edge."""
     solver: str = field(default=DEFAULT_SOLVER, validator=one_of(*SOLVERS))
-    """What plans formations, and requests to the planning service that name no solver."""
+    """Solver of formations, and of requests to the planning service that name none."""
     planning_deadline_s: float | None = field(
         default=None, validator=optional(within(0.01, 3600.0))
     )
     """Upper bound on planning time; none: the time until the first move could begin, 1 to 15 s. On
     most machines `max_nodes` is reached first."""
     max_nodes: int = field(default=20_000, validator=within(1, 100_000_000))
-    """Bound on search nodes per plan: keeps equal seeds equal whatever the machine's speed."""
+    """Maximum number of search nodes per plan: results do not depend on the machine's speed."""
 
     @property
     def rolling(self) -> bool:
@@ -201,8 +201,8 @@ class FormationSettings:
         return 1 if self.closes_by_vehicles else self.block_columns
 
     @property
-    def greatest_length(self) -> int:
-        """Most columns of a formation."""
+    def max_length(self) -> int:
+        """Maximum number of columns of a formation."""
         return self.max_columns if self.closes_by_vehicles else self.block_columns
 
     @property
@@ -219,7 +219,7 @@ class FormationSettings:
 
     @property
     def bound_veh_per_lane_h(self) -> float:
-        """Most vehicles that may enter a lane in an hour: one for each cell that may be entered.
+        """Maximum number of vehicles per lane and hour: one for each cell that may be entered.
 
         V_u = 3600 v_F / (2 d_F) with interlaced entry (paper, Section 5.2.3), twice as many
         where every cell may be entered.
@@ -228,11 +228,11 @@ class FormationSettings:
 
     @property
     def entry_spread_s(self) -> float:
-        """Most time between a vehicle and its cell as they pass the start of the road.
+        """Maximum time between a vehicle and its cell as they pass the start of the road.
 
-        Half of what lies between two cells, so that a vehicle waits only when it is too close
-        behind another one. Formations: half as much again, so that vehicles catch up with cells
-        that stayed empty, and queues end sooner.
+        Half of the time between two cells, so that a vehicle waits only if it is too close behind
+        another one. In formations half as much again: vehicles catch up with cells that stayed
+        empty, and queues end sooner.
         """
         return (0.5 if self.rolling else 0.75) * self.entry_spacing_s
 
@@ -276,7 +276,7 @@ class Vehicle:
 
 @frozen
 class Sensing:
-    """How well a vehicle knows itself and those around it: standard deviations, each tick anew."""
+    """Standard deviations of measurement errors, which are drawn anew at each tick."""
 
     position_noise_m: float = field(default=0.05, validator=within(0.0, 5.0))
     lateral_noise_m: float = field(default=0.02, validator=within(0.0, 1.0))
@@ -292,7 +292,7 @@ class Sensing:
 
 @frozen
 class Braking:
-    """What the emergency brake of every vehicle assumes of whoever is ahead, and of itself.
+    """Assumptions of the emergency brake about the vehicle ahead and its own vehicle.
 
     Its own braking is `vehicle.min_accel_mps2`, through `vehicle.actuator_lag_s`.
     """
@@ -300,12 +300,12 @@ class Braking:
     lead_brake_mps2: float = field(default=10.0, validator=within(0.1, 30.0))
     """Hardest braking of the vehicle ahead."""
     lead_lag_s: float = field(default=0.2, validator=within(0.0, 2.0))
-    """Its brakes build up no faster than a first-order lag of this time constant does."""
+    """Minimum time constant of the first-order lag of its brakes."""
     reaction_s: float = field(default=0.1, validator=within(0.01, 5.0))
-    """From a look of the sensors to the set-point that follows from the next one: whole ticks, one
-    and what sensors and brakes need beside it (in this plant nothing)."""
+    """Time from a measurement to the set-point that follows from the next one: one tick, and whole
+    ticks for delays of sensors and brakes (none in this plant)."""
     margin_m: float = field(default=0.3, validator=within(0.0, 10.0))
-    """Net gap that is left when both stand still; errors of measurement come out of it."""
+    """Net gap left when both stand still; measurement errors reduce it."""
 
 
 @frozen
@@ -315,7 +315,7 @@ class Tracking:
     horizon_ticks: int | None = field(default=None, validator=optional(within(10, 200)))
     """Ticks that the tracker looks ahead; None: the longest T_F."""
     min_gap_m: float = field(default=3.0, validator=within(0.0, 100.0))
-    """Net gap to the vehicle ahead that the tracker gives up its reference for."""
+    """The tracker leaves its reference to keep this net gap to the vehicle ahead."""
     always_solve: bool = False
     """Solve the quadratic program with OSQP in every tick, also where its solution without the
     inequalities is known to satisfy them all."""
@@ -330,17 +330,17 @@ class RuleSettings:
     headway_s: float = field(default=0.66, validator=within(0.0, 10.0))
     """tau of the same."""
     stop_distance_m: float = field(default=150.0, validator=within(1.0, 20_000.0))
-    """d_stop: who gives way so near to the end stops; the paper's table calls it d_end."""
+    """d_stop: a vehicle that yields this near to the end stops; d_end in the paper's table."""
     gap: str = field(default="front-to-front", validator=one_of("front-to-front", "net"))
     """What d_R is measured between: front bumpers, or bumper to bumper."""
     yielding: str = field(default="unsorted", validator=one_of("unsorted", "all"))
-    """Who slows down for a vehicle of higher priority."""
+    """Vehicles that slow down for one of higher priority."""
     slow_down_mps2: float = field(default=3.0, validator=within(0.1, 20.0))
-    """Braking of those who give way; vehicles ahead are braked for as hard as it takes."""
+    """Braking of a vehicle that yields; behind another vehicle it brakes as hard as needed."""
     lane_change_s: float = field(default=0.0, validator=within(0.0, 20.0))
     """Time that a lane change takes; 0: none."""
     min_gap_m: float = field(default=1.0, validator=within(0.1, 50.0))
-    """Least net gap: d_R alone, front to front, would let bumpers touch."""
+    """Minimum net gap: d_R alone, front to front, would let bumpers touch."""
 
 
 @frozen
@@ -350,7 +350,7 @@ class Lc2013Settings:
     headway_s: float = field(default=0.66, validator=within(0.0, 10.0, open_low=True))
     """tau of the car following, from bumper to bumper."""
     min_gap_m: float = field(default=0.0, validator=within(0.0, 50.0))
-    """Net gap of those who stand."""
+    """Net gap at standstill."""
     lane_change_s: float = field(default=0.0, validator=within(0.0, 20.0))
     """Time that a lane change takes; 0: none."""
     lane_changes: str = field(default="sorting", validator=one_of("sorting", "everywhere"))
@@ -363,28 +363,29 @@ class Runtime:
 
     tick_s: float = field(default=0.1, validator=within(0.01, 1.0))
     tick_resend_s: float = field(default=0.05, validator=within(0.005, 10.0))
-    """A tick is sent again after this time to those who have not answered (wall-clock seconds)."""
+    """Interval at which a tick is resent to agents that have not answered (wall-clock seconds)."""
     tick_deadline_s: float = field(default=0.3, validator=within(0.02, 60.0))
-    """Then the road goes on; who has not answered plays what it has (wall-clock seconds)."""
+    """A tick proceeds after this time; vehicles without an answer continue their trajectories
+    (wall-clock seconds)."""
     agent_silent_s: float = field(default=3.0, validator=within(0.1, 600.0))
-    """An agent that is asked for this long without any answer is not waited for any more, and its
-    vehicle's caretaker takes charge (wall-clock seconds)."""
+    """After this time without an answer ticks no longer wait for an agent, and its vehicle's
+    caretaker takes charge (wall-clock seconds)."""
     agent_start_s: float = field(default=15.0, validator=within(0.1, 120.0))
-    """How long the entrance waits for a vehicle's agent to come up (wall-clock seconds)."""
+    """Maximum wait at the entrance for a vehicle's agent (wall-clock seconds)."""
     announce_s: float = field(default=6.0, validator=within(0.0, 600.0))
     """Arrivals are announced this long ahead, so that their agents are up in time (road s)."""
     max_pace: float = field(default=10.0, validator=within(0.01, 1000.0))
-    """Most road seconds per second: network and planning take wall-clock time, and must stay short
-    against the lead that a plan has before its start."""
+    """Maximum road seconds per second: the wall-clock time of network and planning must stay short
+    compared with the time between a plan and its start."""
     coordinators: int = field(default=3, validator=within(1, 9))
     vehicles_per_process: int = field(default=1, validator=within(1, 1000))
     max_road_s: float = field(default=100_000.0, validator=within(1.0, 1e6))
-    """A run that has not ended by this road time is ended and counted as failed."""
+    """A run that exceeds this road time is ended and counts as failed."""
 
 
 @frozen
 class Scenario:
-    """Everything a role needs to know."""
+    """Complete configuration, read by all roles."""
 
     schema: str = field(default=SCHEMA, validator=one_of(SCHEMA))
     seed: int = field(default=1, validator=within(0, 2**63 - 1))
@@ -441,8 +442,8 @@ class Scenario:
         none, the longest.
         """
         formation = self.formation
-        least_s = math.sqrt(10.0 / math.sqrt(3.0) * formation.gap_m / COMFORT_MPS2)
-        comfortable = [slot_s for slot_s in self.slots_s if slot_s >= least_s + formation.slack_s]
+        min_s = math.sqrt(10.0 / math.sqrt(3.0) * formation.gap_m / COMFORT_MPS2)
+        comfortable = [slot_s for slot_s in self.slots_s if slot_s >= min_s + formation.slack_s]
         return min(comfortable, default=self.slots_s[-1])
 
     @property
@@ -467,7 +468,7 @@ class Scenario:
 
     @property
     def moves_from_m(self) -> float:
-        """Position from which on bodies may move from cell to cell: S3, or S2 if that is used."""
+        """Position from which bodies may move from cell to cell: S3, or S2 if that is used."""
         start_m, formation = self.road.sorting_start_m, self.formation
         if not (formation.rolling and formation.sort_in_s2):
             return start_m
