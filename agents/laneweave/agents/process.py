@@ -52,14 +52,14 @@ def run_agents(
 
     Args:
         scenario: what all vehicles know.
-        access: how this process gets onto the network.
+        access: endpoint, realm and identity of this process.
         vehicles: names of its vehicles; empty: all of the shard, as they are announced.
         shard: see `AgentHost`.
         wrap: wraps the core, to inject faults.
         observe: registers the metrics source.
 
     Raises:
-        BadInputError: there is no answer at the endpoint.
+        BadInputError: no router answers at the endpoint.
     """
     incarnations = Incarnations()
     host = AgentHost(

@@ -28,7 +28,7 @@ def run_bridge(
     """Run the simulated world until all vehicles have left, or until SIGINT or SIGTERM.
 
     Args:
-        scenario: road, demand, vehicles, endpoint.
+        scenario: complete configuration.
         folder: the run's folder.
         method: name of the control method, for the summary.
         pace: maximum road seconds per second; None: the scenario's.
@@ -36,7 +36,7 @@ def run_bridge(
         observe: registers the metrics source.
 
     Raises:
-        BadInputError: there is no answer at the scenario's endpoint.
+        BadInputError: no router answers at the scenario's endpoint.
         SumoUnavailableError: libsumo cannot be loaded.
     """
     record = RunRecord(folder, scenario, method, time.perf_counter)

@@ -42,14 +42,9 @@ def show_bodies(
     record: RunRecord,
     t_s: float,
 ) -> None:
-    """Show all bodies, record their poses, and update every vehicle's sensors.
+    """Show all bodies after a tick, record their poses, and update every vehicle's sensors.
 
-    Args:
-        world: advanced by one tick.
-        vehicles: all vehicles on the road, already moved by one tick.
-        scenario: size of vehicles and lanes.
-        record: takes overlaps, collisions, gaps and samples.
-        t_s: road time after the tick.
+    The vehicles have already moved by one tick; `t_s` is the road time after it.
     """
     states = {name: vehicle.state for name, vehicle in vehicles.items()}
     for name, state in states.items():

@@ -144,19 +144,17 @@ class FaultyCore:
 
     def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
         """Handle an event; see `Core`."""
-        for effect in self._on_event(event, now_s):
+        match event:
+            case Arrived():
+                effects: Iterable[Effect] = self._on_arrived(event, now_s)
+            case Wakeup():
+                effects = self._on_wakeup(event, now_s)
+            case _:
+                effects = self.core.handle(event, now_s)
+        for effect in effects:
             if isinstance(effect, Send) and isinstance(effect.message, RoadClock):
                 self._board.road_s = effect.message.t_s
             yield effect
-
-    def _on_event(self, event: Event, now_s: float) -> Iterator[Effect]:
-        match event:
-            case Arrived():
-                yield from self._on_arrived(event, now_s)
-            case Wakeup():
-                yield from self._on_wakeup(event, now_s)
-            case _:
-                yield from self.core.handle(event, now_s)
 
     def _on_arrived(self, arrived: Arrived, now_s: float) -> Iterator[Effect]:
         delays_s = self._fate(arrived)

@@ -135,11 +135,7 @@ class ReferenceRoad:
     ) -> None:
         """Set the road up before the first tick.
 
-        Args:
-            scenario: road, demand, vehicles.
-            traffic: an empty road.
-            record: receives the measurements.
-            stopwatch: measures the duration of ticks [s]; has no other effect.
+        `stopwatch` measures the duration of ticks [s]; it has no other effect.
         """
         self.tick = 0
         self._scenario = scenario

@@ -23,12 +23,7 @@ class RuleTraffic:
     """The vehicles on the road, moved by the rules; see `Traffic`."""
 
     def __init__(self, scenario: Scenario, world: World) -> None:
-        """Begin with an empty road.
-
-        Args:
-            scenario: road, vehicles, tick, and the table `rule`.
-            world: an empty world, which shows the vehicles.
-        """
+        """Begin with an empty road, shown in an empty world."""
         self._world = world
         self._rules = Rules(scenario)
         self._lanes = Lanes(scenario.road.lanes)

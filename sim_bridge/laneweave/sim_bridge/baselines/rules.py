@@ -49,11 +49,7 @@ class Following:
         self._tick_s = scenario.runtime.tick_s
 
     def gap_m(self, speed_mps: float) -> float:
-        """Return the required gap d_R = d_0 + v tau, front to front.
-
-        Args:
-            speed_mps: v, of the follower.
-        """
+        """Return the required gap d_R = d_0 + v tau, front to front, of a follower at speed v."""
         return max(self._standstill_m + self._headway_s * speed_mps, self._min_distance_m)
 
     def suits(self, s_m: float, speed_mps: float, ahead_s_m: float, ahead_speed_mps: float) -> bool:
@@ -80,11 +76,8 @@ class Following:
           as hard as they can from then on. This is Krauss' condition for a follower that reacts
           within the tick.
 
-        Args:
-            s_m: follower, at the beginning of the tick.
-            speed_mps: its speed then.
-            ahead_s_m: vehicle ahead, at the end of the tick.
-            ahead_speed_mps: its speed then.
+        Position and speed of the follower are those at the beginning of the tick, those of the
+        vehicle ahead those at its end.
         """
         half_s, braking = 0.5 * self._tick_s, self._braking_mps2
         room_m = ahead_s_m - s_m - speed_mps * half_s

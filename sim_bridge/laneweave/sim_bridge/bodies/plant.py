@@ -21,13 +21,7 @@ class Plant:
     """One vehicle's body: its state, and the set-points of its actuators."""
 
     def __init__(self, state: State, limits: Vehicle, tick_s: float) -> None:
-        """Start at a state, with set-points that equal its accelerations.
-
-        Args:
-            state: (s, v, a, y, v_y, a_y) in m and s.
-            limits: the vehicle's limits and lags.
-            tick_s: length of a tick [s].
-        """
+        """Start at a state, with set-points that equal its accelerations."""
         self._state = state
         self._setpoint = (state[2], state[5])
         self._limits = limits
@@ -49,27 +43,15 @@ class Plant:
         return self._setpoint
 
     def step(self, jerk_s: float, jerk_y: float) -> State:
-        """Move on by one tick.
-
-        Args:
-            jerk_s: requested longitudinal jerk [m/s3]; limited by `limited_jerk`, NaN is 0.
-            jerk_y: requested lateral jerk [m/s3]; limited likewise.
-
-        Returns:
-            The new state.
-        """
+        """Move by one tick with jerks that `limited_jerk` limits; return the new state."""
         commanded = commanded_state(self._state, self._setpoint, self._limits, 0.0)
         self._move(commanded, limited_jerk(commanded, (jerk_s, jerk_y), self._limits, self._tick_s))
         return self._state
 
     def brake(self, jerk_y: float) -> State:
-        """Brake as hard as the vehicle can for one tick, beyond the limit on jerk.
+        """Brake as hard as the vehicle can for one tick, beyond the limit on longitudinal jerk.
 
-        Args:
-            jerk_y: requested lateral jerk [m/s3]; limited by `limited_jerk`.
-
-        Returns:
-            The new state.
+        The requested lateral jerk is limited by `limited_jerk`. Returns the new state.
         """
         s, v, _, y, v_y, a_y = commanded_state(self._state, self._setpoint, self._limits, 0.0)
         # The commanded state stops first, and the body comes to rest behind it.
@@ -86,22 +68,11 @@ class Plant:
         from_s, from_v, from_a, from_y, from_vy, from_ay = commanded
         to_s, to_v, to_a, to_y, to_vy, to_ay = integrate(commanded, jerk, self._tick_s)
         s, v, a, y, v_y, a_y = self._state
-        next_s, next_v, a = _follow(
-            (s, v, a),
-            (from_s, from_v, from_a),
-            (to_s, to_v, to_a),
-            jerk[0],
-            self._lag_s,
-            self._decay,
-        )
-        y, v_y, a_y = _follow(
-            (y, v_y, a_y),
-            (from_y, from_vy, from_ay),
-            (to_y, to_vy, to_ay),
-            jerk[1],
-            self._lag_y_s,
-            self._decay_y,
-        )
+        along, across = (from_s, from_v, from_a), (from_y, from_vy, from_ay)
+        to_along, to_across = (to_s, to_v, to_a), (to_y, to_vy, to_ay)
+        lag_s, lag_y_s = self._lag_s, self._lag_y_s
+        next_s, next_v, a = _follow((s, v, a), along, to_along, jerk[0], lag_s, self._decay)
+        y, v_y, a_y = _follow((y, v_y, a_y), across, to_across, jerk[1], lag_y_s, self._decay_y)
         # Brakes do not push a body backwards: not when released just before standstill, nor by
         # rounding.
         next_s, next_v = max(next_s, s), max(next_v, 0.0)

@@ -49,12 +49,7 @@ class Caretaker:
     """
 
     def __init__(self, vehicle: RoadVehicle, incarnation: int, tick: int) -> None:
-        """Take charge of a vehicle, whatever its motion.
-
-        Args:
-            vehicle: the vehicle.
-            incarnation: greater than that of every process that was in charge before.
-            tick: number of the tick that begins.
+        """Take charge of a vehicle at the tick that begins, whatever its motion.
 
         Raises:
             ValueError: the incarnation is not greater than that of the process in charge.
@@ -112,12 +107,7 @@ class Attendance:
     """
 
     def __init__(self, scenario: Scenario, new_incarnation: Callable[[], int]) -> None:
-        """Begin without agents and without caretakers.
-
-        Args:
-            scenario: timeouts.
-            new_incarnation: returns a number that no process has used before.
-        """
+        """Begin without agents and caretakers; the callable returns unused incarnations."""
         self.answers = Answers(scenario.runtime)
         self.link_up = True
         """Whether the bridge is connected to the network."""

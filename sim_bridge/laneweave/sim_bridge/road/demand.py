@@ -16,7 +16,7 @@ from itertools import accumulate
 
 import numpy as np
 from attrs import frozen
-from numpy.random import Generator, SeedSequence, default_rng
+from numpy.random import SeedSequence, default_rng
 
 from laneweave.protocol.config.participants import vehicle_name
 from laneweave.protocol.scenario.tables import Scenario
@@ -39,14 +39,7 @@ class Arrival:
 
 
 def arrivals(scenario: Scenario) -> tuple[Arrival, ...]:
-    """Draw the arrivals of a scenario from its seed.
-
-    Args:
-        scenario: road, demand and seed.
-
-    Returns:
-        All arrivals in [0, demand.duration_s], by time, then lane.
-    """
+    """Draw all arrivals in [0, demand.duration_s] from a scenario's seed, by time, then lane."""
     drawn = sorted(
         (t_s, lane, preferred)
         for lane in range(scenario.road.lanes)
@@ -62,8 +55,10 @@ def _arrivals_on(lane: int, scenario: Scenario) -> list[tuple[float, int]]:
     """Return (time in s, preferred lane) of each arrival on one lane."""
     demand = scenario.demand
     mean_excess_s = max(0.0, 3600.0 / demand.volume_veh_per_lane_h - demand.min_headway_s)
-    headways = _generator(scenario.seed, _HEADWAYS, lane)
-    preferences = _generator(scenario.seed, _PREFERENCES, lane)
+    headways, preferences = (
+        default_rng(SeedSequence(scenario.seed, spawn_key=(purpose, lane)))
+        for purpose in (_HEADWAYS, _PREFERENCES)
+    )
     # The last bound is exactly one despite rounding: every draw in [0, 1) finds a lane.
     bounds = np.array([*accumulate(scenario.lane_shares)][:-1])
     result: list[tuple[float, int]] = []
@@ -74,8 +69,3 @@ def _arrivals_on(lane: int, scenario: Scenario) -> list[tuple[float, int]]:
             return result
         preferred = int(np.searchsorted(bounds, preferences.random(), side="right"))
         result.append((float(t_s), preferred))
-
-
-def _generator(seed: int, purpose: int, lane: int) -> Generator:
-    """Return the random generator of one purpose on one lane."""
-    return default_rng(SeedSequence(seed, spawn_key=(purpose, lane)))

@@ -96,13 +96,9 @@ class EntryMeter:
         insort(self._queues[arrival.lane], arrival, key=lambda other: other.t_s)
 
     def admit(self, until_s: float) -> list[Admission]:
-        """Decide on all entries since the last call, up to a road time.
+        """Return the vehicles that have entered since the last call, by time, then lane.
 
-        Args:
-            until_s: road time, usually now; a vehicle demanded later enters later.
-
-        Returns:
-            The vehicles that enter, by time, then lane.
+        `until_s` is usually the current road time; a vehicle demanded later enters later.
         """
         admissions = []
         while True:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from itertools import chain
+from itertools import chain, takewhile
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Effect, Send
@@ -169,12 +169,6 @@ class Roadside:
         """Publish the clock, and the census on every change, every 10 ticks, and at the end.
 
         The closing of a formation is a change, too: its roster is final then.
-
-        Args:
-            tick: number of the tick that begins.
-            t_s: its road time.
-            on_road: all vehicles on the road.
-            ended: whether it is the last tick.
         """
         yield Send(CLOCK, self.clock(tick, t_s, len(on_road), ended=ended))
         due = ended or tick >= self._census_sent_tick + CENSUS_EVERY_TICKS
@@ -237,7 +231,10 @@ class Roadside:
         """Return the vehicles that may enter within the announced time."""
         room = [self._announced_per_lane] * self._lanes
         coming = []
-        for arrival in chain(self._meter.waiting, self._upcoming(t_s)):
+        until_s = t_s + self._announce_s
+        later = map(self._arrivals.__getitem__, range(self._queued, len(self._arrivals)))
+        upcoming = takewhile(lambda one: one.t_s <= until_s, later)
+        for arrival in chain(self._meter.waiting, upcoming):
             if room[arrival.lane] > 0:
                 room[arrival.lane] -= 1
                 coming.append(arrival)
@@ -250,9 +247,3 @@ class Roadside:
             )
             for arrival in sorted(coming, key=lambda arrival: (arrival.t_s, arrival.vehicle))
         )
-
-    def _upcoming(self, t_s: float) -> Iterator[Arrival]:
-        for index in range(self._queued, len(self._arrivals)):
-            if self._arrivals[index].t_s > t_s + self._announce_s:
-                return
-            yield self._arrivals[index]

@@ -93,25 +93,13 @@ class RoadVehicle:
         return self.controller.rung_ticks
 
     def perceive(self, around: ExactNeighbours) -> None:
-        """Measure its own state and its neighbours.
-
-        Args:
-            around: neighbours as exact sensors would see them.
-        """
-        sensors = self.sensors
-        if sensors is not None:
-            self.controller.perceive(
-                sensors.measure(self.state), sensors.measure_neighbours(around)
-            )
+        """Measure its own state and its neighbours, given as exact sensors would see them."""
+        if self.sensors is not None:
+            measured = self.sensors.measure(self.state)
+            self.controller.perceive(measured, self.sensors.measure_neighbours(around))
 
     def sense(self, tick: int, *, caretaker: bool, left: bool = False) -> Sense:
-        """Return its SENSE: measurements and the state of its motion controller.
-
-        Args:
-            tick: number of the tick that begins.
-            caretaker: whether its caretaker is in charge.
-            left: whether it has left the road.
-        """
+        """Return its SENSE at the tick that begins: measurements and state of its controller."""
         controller = self.controller
         around = controller.around
         return Sense(
