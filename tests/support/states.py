@@ -18,7 +18,7 @@ BALLOT = Ballot(1, Name("c1"), 1, 1)
 
 
 def holding(
-    vehicle: Name, promised: Ballot | None, hold_cell: Cell = (0, 0), **more: object
+    vehicle: Name, promised: Ballot | None = None, hold_cell: Cell = (0, 0), **more: object
 ) -> VehicleState:
     """Return the state of a vehicle of formation 0; `more` replaces or adds fields."""
     values: dict[str, Any] = {

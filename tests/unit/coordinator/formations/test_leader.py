@@ -27,9 +27,10 @@ from laneweave.coordinator.formations.leader import (
     FormationLeader,
 )
 from laneweave.coordinator.formations.roster import Formation
-from laneweave.protocol.lattice import Cell
+from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.wire.messages import Ballot, CensusEntry, Name, Plan, Prepare, VehicleState
 from support.rule_books import RuleRecorder, replacing
+from support.states import holding as state
 
 A, B, C = Name("A"), Name("B"), Name("C")
 OTHERS = Ballot(1, Name("other"), 1, 1)
@@ -56,45 +57,32 @@ class Ballots:
         return Ballot(self.term, Name("me"), 1, self.given)
 
 
-def control(*names: Name, numbers: tuple[int, ...] = (0,)) -> FormationLeader:
-    made = FormationLeader(formation(*names, numbers=numbers), Ballots(), RNG, resend_s=RESEND_S)
-    made.begin(0.0)
-    return made
+def control(
+    *names: Name,
+    numbers: tuple[int, ...] = (0,),
+    begin_s: float = 0.0,
+    observe: bool = True,
+    rules: RuleBook = LEADER_RULES,
+) -> FormationLeader:
+    """Return a leader that has just begun."""
+    members = formation(*names, numbers=numbers)
+    leader = FormationLeader(members, Ballots(), RNG, resend_s=RESEND_S, rules=rules)
+    leader.begin(begin_s, observe=observe)
+    return leader
 
 
-def state(
-    name: Name,
-    promised: Ballot | None = None,
-    *,
-    accepted: bool = False,
-    incarnation: int = 1,
-    t_s: float = 0.0,
-    cell: Cell = (0, 0),
-    done: bool = False,
-    overdue: bool = False,
-    attended: bool = True,
-    joined: tuple[int, ...] = (0,),
-) -> VehicleState:
-    return VehicleState(
-        vehicle=name,
-        incarnation=incarnation,
-        formation=0,
-        joined=joined,
-        promised=promised,
-        accepted=accepted,
-        ready=accepted,
-        completed=0,
-        hold_cell=cell,
-        moving=False,
-        go=False,
-        done=done,
-        overdue=overdue,
-        attended=attended,
-        s_m=0.0,
-        y_m=0.0,
-        speed_mps=0.0,
-        t_s=t_s,
-    )
+def adopted(*names: Name, incarnation: int = 1, lane: int = 0) -> FormationLeader:
+    """Return a leader that has adopted the plan of another one."""
+    leader, shown = control(*names), {"accepted": True, "incarnation": incarnation}
+    hear(leader, *(state(name, OTHERS, (0, lane), **shown) for name in names))
+    assert (leader.phase, leader.ballot, leader.plan) == (BallotPhase.IN_FORCE, OTHERS, None)
+    return leader
+
+
+def prepares_anew(leader: FormationLeader, above: Ballot) -> bool:
+    """Return whether a leader prepares a ballot above another one."""
+    assert leader.ballot is not None
+    return phase(leader) is BallotPhase.PREPARING and leader.ballot > above
 
 
 def phase(leader: FormationLeader) -> BallotPhase:
@@ -126,12 +114,7 @@ def planning(*names: Name) -> tuple[FormationLeader, Ballot]:
 
 
 def plan_of(leader: FormationLeader) -> Plan:
-    assert leader.ballot is not None
-    cells = leader.hold_cells
-    return Plan(
-        leader.ballot, leader.formation.numbers, tuple(cells), leader.incarnations, cells,
-        dict.fromkeys(cells, ()), 0.0, 4.0, (),
-    )  # fmt: skip
+    return leader.make_plan(leader.formation.numbers, dict.fromkeys(leader.roster, ()), 0.0, 4.0)
 
 
 def issuing(*names: Name) -> tuple[FormationLeader, Ballot]:
@@ -151,9 +134,8 @@ def watching(*names: Name) -> tuple[FormationLeader, Ballot]:
 
 
 def test_l2_adopts_a_plan_that_all_have_accepted_and_sends_nothing() -> None:
-    leader = control(A, B)
-    hear(leader, state(A, OTHERS, accepted=True), state(B, OTHERS, accepted=True))
-    assert (leader.phase, leader.ballot, leader.plan) == (BallotPhase.IN_FORCE, OTHERS, None)
+    leader = adopted(A, B, incarnation=7)
+    assert leader.incarnations == {A: 7, B: 7}  # it is watched by its promises
     leader.take(TIME, 100.0)
     assert list(leader.outgoing(100.0)) == []
     assert not leader.take(PROMISED, 100.0)
@@ -175,22 +157,21 @@ def test_l2_mixed_states_lead_to_a_new_ballot(last: VehicleState) -> None:
     hear(leader, state(A, OTHERS, accepted=True))
     assert phase(leader) is BallotPhase.OBSERVING
     hear(leader, last)
-    assert phase(leader) is BallotPhase.PREPARING
-    assert leader.ballot is not None
-    assert leader.ballot > OTHERS
+    assert prepares_anew(leader, OTHERS)
 
 
-def test_l2_waits_for_the_states_of_the_roster_but_not_for_ever() -> None:
-    leader = control(A, B)
-    hear(leader, state(A, OTHERS, accepted=True))
-    leader.take(TIME, OBSERVE_S - 0.01)
+@pytest.mark.parametrize("begin_s", [0.0, 100.0])
+def test_l2_waits_for_the_states_of_the_roster_for_a_limited_time(begin_s: float) -> None:
+    leader = control(A, B, begin_s=begin_s)
+    hear(leader, state(A, OTHERS, accepted=True), now_s=begin_s)
+    leader.take(TIME, begin_s + OBSERVE_S - 0.01)
     assert phase(leader) is BallotPhase.OBSERVING
-    assert leader.wakeup_s == OBSERVE_S
-    leader.take(TIME, OBSERVE_S)
+    assert leader.wakeup_s == begin_s + OBSERVE_S
+    leader.take(TIME, begin_s + OBSERVE_S)
     assert phase(leader) is BallotPhase.PREPARING
 
 
-def test_strangers_say_nothing() -> None:
+def test_states_of_other_vehicles_are_ignored() -> None:
     leader = control(A)
     hear(leader, state(C, OTHERS._replace(term=9)))
     assert phase(leader) is BallotPhase.OBSERVING
@@ -198,31 +179,15 @@ def test_strangers_say_nothing() -> None:
     assert leader.ballot == Ballot(1, Name("me"), 1, 1)
 
 
-def test_l2_an_adopted_plan_is_watched_by_its_promises() -> None:
-    leader = control(A, B)
-    hear(leader, state(A, OTHERS, accepted=True), state(B, OTHERS, accepted=True, incarnation=7))
-    assert leader.incarnations == {A: 1, B: 7}
-
-
-def test_without_observing_it_prepares_at_once_whatever_it_would_hear() -> None:
+def test_without_observing_it_prepares_at_once() -> None:
     """A formation that has closed under this leader has no plan that could be adopted."""
-    leader = FormationLeader(formation(A, B), Ballots(), RNG, resend_s=RESEND_S)
-    leader.begin(5.0, observe=False)
+    leader = control(A, B, begin_s=5.0, observe=False)
     assert (leader.phase, leader.wakeup_s) == (BallotPhase.PREPARING, 5.0)
     assert to(leader.outgoing(5.0)) == [A, B]
     hear(leader, state(A, OTHERS._replace(term=0)), now_s=5.0)
     assert phase(leader) is BallotPhase.PREPARING  # a lower ballot is overruled
     hear(leader, state(B, OTHERS._replace(term=3)), now_s=5.0)
     assert phase(leader) is BallotPhase.BACKING_OFF
-
-
-def test_begin_observes_from_its_own_time_on() -> None:
-    leader = FormationLeader(formation(A), Ballots(), RNG, resend_s=RESEND_S)
-    leader.begin(100.0)
-    leader.take(TIME, 100.0 + OBSERVE_S - 0.01)
-    assert phase(leader) is BallotPhase.OBSERVING
-    leader.take(TIME, 100.0 + OBSERVE_S)
-    assert phase(leader) is BallotPhase.PREPARING
 
 
 # --- L3 and L4 --------------------------------------------------------------------------------
@@ -256,7 +221,7 @@ def test_a_promise_that_was_forgotten_is_void() -> None:
     hear(leader, state(A, ballot), state(A, incarnation=2), state(B, ballot))
     assert not leader.take(PROMISED, 0.0)
     assert to(leader.outgoing(0.0)) == [A]
-    hear(leader, state(A, ballot, incarnation=2, cell=(3, 1)))
+    hear(leader, state(A, ballot, incarnation=2, hold_cell=(3, 1)))
     assert leader.take(PROMISED, 0.0)
     assert leader.incarnations == {A: 2, B: 1}
     assert leader.hold_cells == {A: (3, 1), B: (0, 0)}
@@ -282,8 +247,7 @@ def test_a_late_state_takes_no_promise_back(newer: VehicleState, older: VehicleS
 
 
 def test_prepare_of_a_joint_ballot_names_all_formations() -> None:
-    leader = FormationLeader(formation(A, B, numbers=(3, 4)), Ballots(), RNG, resend_s=RESEND_S)
-    leader.begin(0.0, observe=False)
+    leader = control(A, B, numbers=(3, 4), observe=False)
     assert leader.ballot is not None
     expected = Prepare(leader.ballot, (3, 4), (A, B))
     assert dict(leader.outgoing(0.0)) == {A: expected, B: expected}
@@ -325,10 +289,10 @@ def test_l5_needs_the_whole_roster_and_orders_once() -> None:
     assert list(leader.outgoing(9.0)) == []
 
 
-def test_l5_failed_planning_keeps_the_ballot_and_tries_again_later_and_later() -> None:
+def test_l5_failed_planning_keeps_the_ballot_and_retries_after_growing_pauses() -> None:
     leader, ballot = planning(A)
     now_s = 0.0
-    for pause_s in (RETRY_S, 2 * RETRY_S, 4 * RETRY_S):
+    for pause_s in (1.0, 2.0, 4.0, *4 * [LONGEST_RETRY_S]):
         leader.take(FAILED, now_s)
         assert leader.wakeup_s == now_s + pause_s
         assert not leader.take(PROMISED, now_s + pause_s - 0.01)
@@ -339,18 +303,6 @@ def test_l5_failed_planning_keeps_the_ballot_and_tries_again_later_and_later() -
         assert leader.ballot == ballot
     leader.on_plan(plan_of(leader), now_s)
     assert leader.failures == 0
-
-
-def test_l5_the_pauses_after_failed_planning_do_not_grow_for_ever() -> None:
-    leader, _ = planning(A)
-    now_s, pauses = 0.0, []
-    for _ in range(8):
-        leader.take(FAILED, now_s)
-        pauses.append((leader.wakeup_s or 0.0) - now_s)
-        now_s += pauses[-1]
-        assert leader.take(PROMISED, now_s)
-    assert pauses == [1.0, 2.0, 4.0, 8.0, 8.0, 8.0, 8.0, 8.0]
-    assert max(pauses) == LONGEST_RETRY_S
 
 
 def test_a_new_ballot_has_not_failed_yet() -> None:
@@ -415,9 +367,7 @@ def test_l8_a_plan_that_a_vehicle_refuses_is_given_up() -> None:
     assert phase(leader) is BallotPhase.ISSUING
     assert to(leader.outgoing(ISSUE_S - 0.01)) == [B]
     leader.take(TIME, ISSUE_S)
-    assert phase(leader) is BallotPhase.PREPARING
-    assert leader.ballot is not None
-    assert leader.ballot > ballot
+    assert prepares_anew(leader, ballot)
     assert to(leader.outgoing(ISSUE_S)) == [A, B]
 
 
@@ -527,24 +477,21 @@ def test_l7_after_a_success_the_pauses_are_short_again(success: str) -> None:
 def test_l8_a_restarted_agent_leads_to_a_new_ballot(reach: Reach) -> None:
     leader, ballot = reach(A, B)
     hear(leader, state(A, incarnation=2))
-    assert phase(leader) is BallotPhase.PREPARING
-    assert leader.ballot is not None
-    assert leader.ballot > ballot
+    assert prepares_anew(leader, ballot)
 
 
 @pytest.mark.parametrize("promised", [None, OTHERS])
 def test_l8_a_restarted_agent_in_an_adopted_plan(promised: Ballot | None) -> None:
     """A duplicate of the old PREPARE may make it promise the adopted ballot once more."""
-    leader = control(A, B)
-    hear(leader, state(A, OTHERS, accepted=True), state(B, OTHERS, accepted=True))
+    leader = adopted(A, B)
     hear(leader, state(A, promised, incarnation=2))
-    assert phase(leader) is BallotPhase.PREPARING
+    assert prepares_anew(leader, OTHERS)
 
 
 def test_l8_overdue_leads_to_a_new_ballot() -> None:
     leader, ballot = watching(A, B)
     hear(leader, state(A, ballot, accepted=True, overdue=True))
-    assert phase(leader) is BallotPhase.PREPARING
+    assert prepares_anew(leader, ballot)
 
 
 def test_l8_new_targets_lead_to_a_new_ballot() -> None:
@@ -555,20 +502,19 @@ def test_l8_new_targets_lead_to_a_new_ballot() -> None:
     assert phase(leader) is BallotPhase.PREPARING
 
 
-def test_l8_an_adopted_plan_that_ended_on_the_wrong_lane_was_for_other_targets() -> None:
-    leader = control(A)
-    hear(leader, state(A, OTHERS, accepted=True, cell=(0, 2)))
-    assert phase(leader) is BallotPhase.IN_FORCE
-    hear(leader, state(A, OTHERS, accepted=True, cell=(0, 1), done=True, t_s=1.0))
-    assert phase(leader) is BallotPhase.IN_FORCE
-    hear(leader, state(A, OTHERS, accepted=True, cell=(0, 2), done=True, t_s=2.0))
-    assert phase(leader) is BallotPhase.PREPARING
-
-
 def astray(**changes: object) -> VehicleState:
     """Return what a member shows that is done on lane 2 and prefers lane 1."""
-    done = state(A, Ballot(1, Name("me"), 1, 1), accepted=True, cell=(0, 2), done=True, t_s=1.0)
+    ballot = Ballot(1, Name("me"), 1, 1)
+    done = state(A, ballot, (0, 2), accepted=True, done=True, t_s=1.0)
     return evolve(done, **changes)  # type: ignore[arg-type]
+
+
+def test_l8_an_adopted_plan_that_ended_on_the_wrong_lane_was_for_other_targets() -> None:
+    leader = adopted(A, lane=2)
+    hear(leader, astray(promised=OTHERS, hold_cell=(0, 1)))
+    assert phase(leader) is BallotPhase.IN_FORCE
+    hear(leader, astray(promised=OTHERS, t_s=2.0))
+    assert prepares_anew(leader, OTHERS)
 
 
 @pytest.mark.parametrize(
@@ -606,8 +552,8 @@ def test_l8_out_of_reach_in_an_own_plan_may_be_astray_in_an_adopted_one() -> Non
     assert phase(leader) is BallotPhase.PREPARING
 
 
-def test_l8_a_vehicle_that_cannot_be_moved_is_not_astray() -> None:
-    """Otherwise a vehicle without an agent would have its formation planned for ever."""
+def test_l8_a_vehicle_without_agent_is_not_astray_until_an_agent_takes_over() -> None:
+    """Otherwise its formation would be planned again and again."""
     leader, ballot = preparing(A, B)
     hear(leader, state(A, ballot, attended=False), state(B, ballot))
     assert leader.take(PROMISED, 0.0)
@@ -616,17 +562,8 @@ def test_l8_a_vehicle_that_cannot_be_moved_is_not_astray() -> None:
     hear(leader, *(state(name, ballot, accepted=True, attended=name is B) for name in (A, B)))
     hear(leader, astray(attended=False))
     assert phase(leader) is BallotPhase.IN_FORCE
-
-
-def test_l8_an_agent_that_takes_over_from_the_caretaker_leads_to_a_new_ballot() -> None:
-    leader, ballot = preparing(A)
-    hear(leader, state(A, ballot, attended=False))
-    assert leader.take(PROMISED, 0.0)
-    leader.on_plan(plan_of(leader), 0.0)
-    hear(leader, state(A, ballot, accepted=True, attended=False))
-    assert phase(leader) is BallotPhase.IN_FORCE
     hear(leader, state(A, incarnation=2))
-    assert phase(leader) is BallotPhase.PREPARING
+    assert prepares_anew(leader, ballot)
 
 
 # --- the roster -------------------------------------------------------------------------------
@@ -636,9 +573,8 @@ def test_l8_an_agent_that_takes_over_from_the_caretaker_leads_to_a_new_ballot() 
 def test_a_leaving_vehicle_ends_an_unfinished_ballot(reach: Reach) -> None:
     leader, ballot = reach(A, B)
     leader.on_members(formation(A), 1.0)
-    assert phase(leader) is BallotPhase.PREPARING
+    assert prepares_anew(leader, ballot)
     assert leader.ballot is not None
-    assert leader.ballot > ballot
     assert list(leader.outgoing(1.0)) == [(A, Prepare(leader.ballot, (0,), (A,)))]
     hear(leader, state(B, leader.ballot), state(A, leader.ballot))
     assert leader.take(PROMISED, 1.0)
@@ -675,7 +611,7 @@ def test_a_new_member_leads_to_a_new_ballot_for_all() -> None:
     assert to(leader.outgoing(1.0)) == [A, B, C]
 
 
-def test_settled_is_the_end() -> None:
+def test_a_formation_that_was_given_up_stays_so() -> None:
     leader, ballot = planning(A)
     leader.take(TOO_LATE, 0.0)
     hear(leader, state(A, ballot, incarnation=2, overdue=True))
@@ -691,7 +627,7 @@ def test_settled_is_the_end() -> None:
 def test_a_history_takes_every_row_of_the_table() -> None:
     """No row is hidden behind an earlier one."""
     book = RuleRecorder(LEADER_RULES)
-    leader = FormationLeader(formation(A, B), Ballots(), RNG, resend_s=RESEND_S, rules=book)
+    leader = control(A, B, rules=book)
     clock = iter(range(1, 1000))
 
     def show(name: Name, promised: Ballot | None, **changes: object) -> None:
@@ -718,7 +654,7 @@ def test_a_history_takes_every_row_of_the_table() -> None:
     show(A, OTHERS, incarnation=2)  # restarted
     show(A, OTHERS._replace(term=50), incarnation=2)  # outbid
     leader.take(TIME, 10.0)  # the pause is over
-    leader.take(TIME, 10.0 + OBSERVE_S)  # nobody says anything
+    leader.take(TIME, 10.0 + OBSERVE_S)  # no states arrive
     show(A, leader.ballot, incarnation=2)
     show(A, None, incarnation=3)  # void
     leader.begin(20.0)
@@ -734,7 +670,7 @@ def test_a_history_takes_every_row_of_the_table() -> None:
     watch()
     leader.on_members(formation(A, B, lane=2), leader.now_s)  # new targets
     issue()
-    leader.take(TIME, leader.now_s + ISSUE_S)  # somebody refuses
+    leader.take(TIME, leader.now_s + ISSUE_S)  # a vehicle refuses
     leader.on_members(formation(A, B, lane=1), leader.now_s)  # new targets, unfinished
     promise_and_plan()
     leader.take(TOO_LATE, leader.now_s)
@@ -755,17 +691,14 @@ def test_a_vehicle_that_restarts_while_its_ballot_is_outbid_is_asked_again() -> 
     assert phase(leader) is BallotPhase.BACKING_OFF
     leader.take(TIME, leader.until_s)
     hear(leader, state(A, incarnation=3, t_s=3.0), state(B, ballot, accepted=True, t_s=3.0))
-    assert phase(leader) is BallotPhase.PREPARING
-    assert leader.ballot is not None
-    assert leader.ballot > higher
+    assert prepares_anew(leader, higher)
     assert leader.promises == {}
 
 
 def test_a_bug_is_planted_in_one_leader_and_in_no_other() -> None:
     book = replacing(LEADER_RULES, {all_have_promised: lambda me, _: bool(me.promises)})
     for rules, ordered in ((book, True), (LEADER_RULES, False)):
-        leader = FormationLeader(formation(A, B), Ballots(), RNG, resend_s=RESEND_S, rules=rules)
-        leader.begin(0.0, observe=False)
+        leader = control(A, B, observe=False, rules=rules)
         hear(leader, state(A, leader.ballot))
         assert leader.take(PROMISED, 0.0) is ordered
 

@@ -1,4 +1,4 @@
-"""The stream is planned once in each slot, from what is known for certain, and put into force."""
+"""The rolling operation: when it plans, what it plans from, and which ballots it begins."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from laneweave.coordinator.rolling.operation import (
     _clusters,
 )
 from laneweave.coordinator.rolling.planner import CheckedPlanner, stream_planner, stream_road
+from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Compute, Computed
@@ -54,7 +55,8 @@ def shown(
     **changes: Any,  # noqa: ANN401 (fields)
 ) -> State:
     plain = state(name, promised, deed, estate=ESTATES[name], t_s=BEGUN_S + 0.4)
-    return evolve(plain, hold_cell=HOMES[name], done=True, **changes)
+    values: dict[str, Any] = {"hold_cell": HOMES[name], "done": True} | changes
+    return evolve(plain, **values)
 
 
 def census(*names: Name) -> Census:
@@ -64,7 +66,7 @@ def census(*names: Name) -> Census:
 
 @define
 class Call:
-    """What the planner was asked."""
+    """Input of a planning."""
 
     slot: int
     vehicles: dict[str, StreamVehicle]
@@ -74,7 +76,7 @@ class Call:
 
 @define
 class Bench:
-    """A stream control with a planner that answers what the test says."""
+    """A rolling operation with a planner that returns the paths of the test."""
 
     ways: dict[str, tuple[Cell, ...]] = field(factory=dict)
     calls: list[Call] = field(factory=list)
@@ -84,7 +86,7 @@ class Bench:
     control: RollingOperation = field(init=False)
 
     def __attrs_post_init__(self) -> None:
-        """Be the planner."""
+        """Pass itself as the planner."""
         self.control = RollingOperation(ROLLING, self.new_ballot, self.new_job, self)
 
     def new_ballot(self, above: Ballot | None) -> Ballot:
@@ -125,10 +127,21 @@ class Bench:
         computed = Computed(compute.job, compute.work())
         return list(self.control.finish(computed, t_s, 50.0))
 
+    def call(self, t_s: float = LOOK_S) -> Call:
+        """Plan at a road time; return what the planner was asked."""
+        self.think(t_s)
+        return self.calls[-1]
 
-def bench(*names: Name) -> Bench:
-    """Return a bench that has heard of vehicles for long enough."""
-    made = Bench()
+    @property
+    def transfer(self) -> CellTransfer:
+        """The only ballot."""
+        (transfer,) = self.control.transfers
+        return transfer
+
+
+def bench(*names: Name, ways: dict[str, tuple[Cell, ...]] | None = None) -> Bench:
+    """Return a bench that has observed vehicles for long enough."""
+    made = Bench(ways or {})
     made.control.on_census(census(*names))
     assert made.order(BEGUN_S - 2.0) is None
     made.hear(*(shown(name) for name in names))
@@ -182,8 +195,7 @@ def test_a_new_leader_listens_first() -> None:
 
 
 def test_a_leader_that_is_elected_again_listens_again() -> None:
-    desk = bench(A, B)
-    desk.ways = {A: ((0, 0), (0, 1))}
+    desk = bench(A, B, ways={A: ((0, 0), (0, 1))})
     desk.think()
     desk.control.take_over()
     assert (desk.control.transfers, desk.control.wakeups) == ([], [])
@@ -202,24 +214,16 @@ def test_a_leader_that_is_elected_again_listens_again() -> None:
     }
 
 
-def test_a_plan_that_comes_late_is_dropped() -> None:
-    desk = bench(A)
-    desk.ways = {A: ((0, 0), (1, 0))}
-    begins_s = (SLOT + 1) * SLOT_S
+@pytest.mark.parametrize(
+    ("late_s", "kind", "ballots"), [(0.1, "planning-late", 0), (-0.1, "stream-planned", 1)]
+)
+def test_a_plan_that_comes_late_is_dropped(late_s: float, kind: str, ballots: int) -> None:
+    desk = bench(A, ways={A: ((0, 0), (1, 0))})
     compute = desk.order()
     assert compute is not None
-    assert [note.kind for note in desk.finish(compute, begins_s + LATEST_S + 0.1)] == [
-        "planning-late"
-    ]
-    assert desk.control.transfers == []
-    desk = bench(A)
-    desk.ways = {A: ((0, 0), (1, 0))}
-    compute = desk.order()
-    assert compute is not None
-    assert [note.kind for note in desk.finish(compute, begins_s + LATEST_S - 0.1)] == [
-        "stream-planned"
-    ]
-    assert len(desk.control.transfers) == 1
+    entries = desk.finish(compute, (SLOT + 1) * SLOT_S + LATEST_S + late_s)
+    assert [entry.kind for entry in entries] == [kind]
+    assert len(desk.control.transfers) == ballots
 
 
 def test_results_of_others_and_failures_change_nothing() -> None:
@@ -240,8 +244,7 @@ def test_results_of_others_and_failures_change_nothing() -> None:
 
 def test_the_planner_gets_all_vehicles_and_owned_cells() -> None:
     desk = bench(A, B)
-    desk.think()
-    (call,) = desk.calls
+    call = desk.call()
     assert call.vehicles == {
         name: StreamVehicle(name, HOMES[name], 1, held=False) for name in (A, B)
     }
@@ -264,14 +267,13 @@ def test_it_plans_from_where_vehicles_will_hold() -> None:
     assert not desk.calls[0].vehicles[A].held
 
 
-def test_what_is_shown_later_does_not_count() -> None:
+def test_later_states_do_not_count() -> None:
     """Whether it has arrived by then depends on how fast messages are."""
     desk = bench(A, B)
     desk.hear(evolve(shown(A, OLD), hold_cell=(1, 0), t_s=LOOK_S))
     desk.hear(evolve(shown(C), t_s=LOOK_S))
     desk.control.on_census(evolve(census(B, D), t_s=LOOK_S))
-    desk.think()
-    (call,) = desk.calls
+    call = desk.call()
     assert call.vehicles == {
         name: StreamVehicle(name, HOMES[name], 1, held=False) for name in (A, B)
     }
@@ -279,7 +281,7 @@ def test_what_is_shown_later_does_not_count() -> None:
     assert set(desk.calls[1].vehicles) == {B, D}
 
 
-def test_what_has_arrived_in_another_order_counts() -> None:
+def test_states_may_arrive_in_any_order() -> None:
     desk = bench(A)
     desk.hear(evolve(shown(A), hold_cell=(2, 0), t_s=LOOK_S))
     desk.hear(evolve(shown(A), hold_cell=(1, 0), t_s=BEGUN_S + SHOWN_S))
@@ -297,7 +299,7 @@ def test_a_vehicle_that_has_just_left_is_in_the_snapshot() -> None:
 
 
 def test_an_unheard_vehicle_does_not_keep_others_from_being_planned() -> None:
-    """Somebody else may be where it entered by now."""
+    """Another vehicle may be where it entered by now."""
     for names in ((A, B), (B, A)):
         desk = bench(*names)
         desk.control.on_census(census(*names, C))
@@ -311,40 +313,40 @@ def test_an_unheard_vehicle_does_not_keep_others_from_being_planned() -> None:
 
 
 def test_a_vehicle_that_has_moved_since_is_left_out() -> None:
-    desk = bench(A, B)
-    desk.ways = {A: ((0, 0), (0, 1)), B: ((2, 1), (2, 2))}
+    desk = bench(A, B, ways={A: ((0, 0), (0, 1)), B: ((2, 1), (2, 2))})
     compute = desk.order()
     assert compute is not None
     desk.hear(evolve(shown(A, OLD, moving=True), hold_cell=(1, 0), t_s=LOOK_S))
     desk.hear(evolve(shown(B), estate=(*ESTATES[B], (2, 2)), t_s=LOOK_S))
     desk.finish(compute, LOOK_S)
-    assert [set(handover.moves) for handover in desk.control.transfers] == [{B}]
+    assert [set(transfer.moves) for transfer in desk.control.transfers] == [{B}]
 
 
-def test_what_has_not_come_about_is_given_up_when_its_slot_has_begun() -> None:
-    desk = bench(A)
-    desk.ways = {A: ((0, 0), (1, 0))}
+def test_a_ballot_that_is_not_in_force_is_given_up_when_its_slot_has_begun() -> None:
+    desk = bench(A, ways={A: ((0, 0), (1, 0))})
     desk.think()
-    (handover,) = desk.control.transfers
-    desk.order(handover.t0_s + LATEST_S)
-    assert handover.wakeup_s is not None
-    desk.order(handover.t0_s + LATEST_S + 0.1)
-    assert handover.phase is BallotPhase.GIVEN_UP
+    transfer = desk.transfer
+    desk.order(transfer.t0_s + LATEST_S)
+    assert transfer.wakeup_s is not None
+    desk.order(transfer.t0_s + LATEST_S + 0.1)
+    assert transfer.phase is BallotPhase.GIVEN_UP
 
 
-@pytest.mark.parametrize("late", [True, False])
-def test_a_plan_that_is_not_used_ends_what_was_begun_all_the_same(*, late: bool) -> None:
-    desk = bench(A)
-    desk.ways = {A: ((0, 0), (1, 0))}
+@pytest.mark.parametrize("result", ["in time", "late", "failed"])
+def test_the_result_of_the_next_planning_ends_older_ballots(result: str) -> None:
+    desk = bench(A, ways={A: ((0, 0), (1, 0))})
     desk.think()
-    (handover,) = desk.control.transfers
+    old = desk.transfer
     compute = desk.order(LOOK_S + SLOT_S)
     assert compute is not None
-    if late:
-        desk.finish(compute, (SLOT + 2) * SLOT_S + LATEST_S + 0.1)
-    else:
+    if result == "failed":
         list(desk.control.finish(Computed(compute.job, None, "out of memory"), LOOK_S, 0.0))
-    assert handover.phase is BallotPhase.GIVEN_UP
+    else:
+        late_s = 0.1 if result == "late" else -0.1
+        desk.finish(compute, (SLOT + 2) * SLOT_S + LATEST_S + late_s)
+    assert old.phase is BallotPhase.GIVEN_UP
+    if result == "in time":
+        assert desk.transfer.ballot > old.ballot
 
 
 def test_a_vehicle_without_a_state_in_time_is_held() -> None:
@@ -355,29 +357,44 @@ def test_a_vehicle_without_a_state_in_time_is_held() -> None:
     assert [vehicle.held for vehicle in desk.calls[0].vehicles.values()] == [False, True]
 
 
-def test_a_late_vehicle_is_held_and_its_cells_are_blocked() -> None:
-    """Its gate is open, so its move may begin at any time until it promises something else."""
-    desk = bench(A, B)
-    late = shown(A, OLD, Deed(OLD, open=True), accepted=True, go=True)
-    desk.hear(evolve(late, done=False, estate=(*ESTATES[A], (5, 1)), t_s=BEGUN_S + 0.5))
-    desk.think()
-    (call,) = desk.calls
-    assert call.vehicles[A].held
-    assert {(1, 0), (-1, 0), (5, 1)} <= call.blocked
-    assert not {HOMES[A], (1, 1)} & call.blocked
+CLOSED = Deed(OLD, ESTATES[A], (HOMES[A], (1, 0)), (A, B))
 
 
-def test_a_vehicle_at_a_closed_gate_is_asked_for_a_newer_promise() -> None:
-    """What it owns either way may be used."""
+@pytest.mark.parametrize(
+    ("observed", "held", "blocked", "usable"),
+    [
+        (  # its gate is open: its move may begin at any time until it promises another ballot
+            shown(A, OLD, Deed(OLD, open=True), accepted=True, go=True, done=False),
+            True,
+            {(1, 0), (-1, 0)},
+            {HOMES[A]},
+        ),
+        (  # its gate is closed: what it owns either way may be used
+            shown(A, OLD, CLOSED, accepted=True, done=False),
+            False,
+            {(-1, 0)},
+            {HOMES[A], (1, 0)},
+        ),
+        (shown(A, attended=False), True, set(), {*ESTATES[A]}),
+        (  # what it owns cannot be told
+            shown(A, OLD, Deed(OLD, ESTATES[A], (HOMES[A],), (A, B)), accepted=True),
+            False,
+            {*ESTATES[A]} - {HOMES[A]},
+            {HOMES[A]},
+        ),
+        (shown(A, OLD, estate=()), False, {*ESTATES[A]}, set()),
+    ],
+    ids=["late", "closed gate", "without agent", "no certain owner", "promise not noted"],
+)
+def test_which_vehicles_are_held_and_which_cells_are_blocked(
+    observed: State, held: bool, blocked: set[Cell], usable: set[Cell]
+) -> None:
     desk = bench(A, B)
-    deed = Deed(OLD, ESTATES[A], (HOMES[A], (1, 0)), (A, B))
-    waits = shown(A, OLD, deed, accepted=True)
-    desk.hear(evolve(waits, done=False, t_s=BEGUN_S + 0.5))
-    desk.think()
-    (call,) = desk.calls
-    assert not call.vehicles[A].held
-    assert (1, 0) not in call.blocked
-    assert (-1, 0) in call.blocked
+    desk.hear(evolve(observed, t_s=BEGUN_S + 0.5))
+    call = desk.call()
+    assert [vehicle.held for vehicle in call.vehicles.values()] == [held, False]
+    assert blocked <= call.blocked
+    assert not usable & call.blocked
 
 
 def test_vehicles_far_from_where_moves_begin_are_not_planned_for() -> None:
@@ -393,38 +410,14 @@ def test_vehicles_far_from_where_moves_begin_are_not_planned_for() -> None:
     assert set(desk.calls[0].vehicles) == {A}
 
 
-def test_a_vehicle_without_agent_is_held_and_its_cells_are_free() -> None:
-    desk = bench(A, B)
-    desk.hear(shown(B, attended=False))
-    desk.think()
-    (call,) = desk.calls
-    assert [vehicle.held for vehicle in call.vehicles.values()] == [False, True]
-    assert not set(ESTATES[B]) & call.blocked
-
-
 def test_an_unheard_vehicle_stays_where_it_entered_and_owns_nothing() -> None:
     desk = bench(A)
     desk.control.on_census(census(A, B))
     desk.ways = {A: ((0, 0), (0, 1)), B: ((2, 1), (2, 1))}
-    desk.think()
-    (call,) = desk.calls
+    call = desk.call()
     assert call.vehicles[B] == StreamVehicle(B, HOMES[B], 1, held=True)
     assert set(ESTATES[B]) <= call.blocked
     assert desk.control.transfers == []  # A would need a cell that is B's
-
-
-def test_cells_without_a_certain_owner_are_blocked() -> None:
-    desk = bench(A, B)
-    desk.hear(shown(B, OLD, Deed(OLD, ESTATES[B], (HOMES[B],), (A, B)), accepted=True))
-    desk.think()
-    assert set(ESTATES[B]) & desk.calls[0].blocked == set(ESTATES[B]) - {HOMES[B]}
-
-
-def test_a_promise_that_is_not_noted_shows_no_owned_cells() -> None:
-    desk = bench(A, B)
-    desk.hear(evolve(shown(B, OLD), estate=(), t_s=BEGUN_S + 0.5))
-    desk.think()
-    assert set(ESTATES[B]) <= desk.calls[0].blocked
 
 
 # --- states -----------------------------------------------------------------------------------
@@ -463,13 +456,12 @@ def test_ballots_are_above_all_that_was_promised() -> None:
 
 
 def test_one_ballot_for_the_mover_and_the_owners_of_its_cells() -> None:
-    desk = bench(A, B, C)
-    desk.ways = {A: ((0, 0), (0, 1)), B: ((2, 1), (2, 1)), C: ((-4, 0),)}
+    desk = bench(A, B, C, ways={A: ((0, 0), (0, 1)), B: ((2, 1), (2, 1)), C: ((-4, 0),)})
     (note,) = desk.think()
-    (handover,) = desk.control.transfers
-    assert handover.roster == (A, B)
-    assert handover.moves == {A: ((0, 0), (0, 1))}
-    assert (handover.t0_s, handover.slot_s) == ((SLOT + 1) * SLOT_S, SLOT_S)
+    (transfer,) = desk.control.transfers
+    assert transfer.roster == (A, B)
+    assert transfer.moves == {A: ((0, 0), (0, 1))}
+    assert (transfer.t0_s, transfer.slot_s) == ((SLOT + 1) * SLOT_S, SLOT_S)
     expected = {"slot": SLOT + 1, "moves": 1, "ballots": 1, "largest": 2, "vehicles": 3}
     assert expected.items() <= note.data.items()
 
@@ -483,7 +475,7 @@ def test_moves_that_share_an_owner_share_a_ballot() -> None:
         D: ((-8, 2), (-8, 2)),
     }
     desk.think()
-    assert [handover.roster for handover in desk.control.transfers] == [(A, B), (C,)]
+    assert [transfer.roster for transfer in desk.control.transfers] == [(A, B), (C,)]
     assert set(desk.control.transfers[0].moves) == {A, B}
 
 
@@ -498,14 +490,13 @@ def test_vehicles_whose_promises_tell_ownership_are_in_the_roster() -> None:
     )
     desk.ways = {C: ((-4, 0), (-5, 0))}
     desk.think()
-    assert [handover.roster for handover in desk.control.transfers] == [(B, C)]
-    desk = bench(A, B, C, D)
-    desk.ways = {C: ((-4, 0), (-5, 0))}
+    assert [transfer.roster for transfer in desk.control.transfers] == [(B, C)]
+    desk = bench(A, B, C, D, ways={C: ((-4, 0), (-5, 0))})
     desk.think()
-    assert [handover.roster for handover in desk.control.transfers] == [(C,)]
+    assert [transfer.roster for transfer in desk.control.transfers] == [(C,)]
 
 
-def test_clusters_are_what_hangs_together() -> None:
+def test_groups_that_share_a_vehicle_are_one_cluster() -> None:
     groups = [{A, B}, {C}, {D}, {B, C}]
     assert sorted(map(sorted, _clusters(groups))) == [[A, B, C], [D]]
     assert _clusters([]) == []
@@ -523,8 +514,7 @@ def run_ballot(desk: Bench) -> Plan:
 
 
 def test_from_the_plan_to_a_ballot_in_force() -> None:
-    desk = bench(A, B)
-    desk.ways = {A: ((0, 0), (0, 1))}
+    desk = bench(A, B, ways={A: ((0, 0), (0, 1))})
     desk.think()
     assert desk.control.wakeups == [50.0]
     plan = run_ballot(desk)
@@ -541,20 +531,8 @@ def test_from_the_plan_to_a_ballot_in_force() -> None:
     assert desk.control.wakeups == []
 
 
-def test_what_has_not_come_about_is_given_up_with_the_next_plan() -> None:
-    desk = bench(A, B)
-    desk.ways = {A: ((0, 0), (0, 1))}
-    desk.think()
-    (old,) = desk.control.transfers
-    desk.think(LOOK_S + SLOT_S)
-    assert old.phase is BallotPhase.GIVEN_UP
-    assert old not in desk.control.transfers
-    assert desk.control.transfers[0].ballot > old.ballot
-
-
 def test_a_ballot_that_fails_is_noted() -> None:
-    desk = bench(A, B)
-    desk.ways = {A: ((0, 0), (0, 1))}
+    desk = bench(A, B, ways={A: ((0, 0), (0, 1))})
     desk.think()
     (note,) = desk.hear(evolve(shown(B, Ballot(9, Name("c2"), 1, 1)), t_s=BEGUN_S + 1.0))
     assert (note.kind, note.data) == ("handover-given-up", {"roster": [A, B], "why": "outbid"})
@@ -565,8 +543,7 @@ def test_a_ballot_that_fails_is_noted() -> None:
 
 
 def test_a_vehicle_that_leaves_is_forgotten_and_its_ballot_given_up() -> None:
-    desk = bench(A, B, C)
-    desk.ways = {A: ((0, 0), (0, 1)), C: ((-4, 0), (-5, 0))}
+    desk = bench(A, B, C, ways={A: ((0, 0), (0, 1)), C: ((-4, 0), (-5, 0))})
     desk.think()
     first, second = desk.control.transfers
     desk.control.on_census(census(A, C))
@@ -576,19 +553,17 @@ def test_a_vehicle_that_leaves_is_forgotten_and_its_ballot_given_up() -> None:
 
 
 def test_a_plan_in_force_stays_so_when_a_vehicle_leaves() -> None:
-    desk = bench(A, B)
-    desk.ways = {A: ((0, 0), (0, 1))}
+    desk = bench(A, B, ways={A: ((0, 0), (0, 1))})
     desk.think()
-    (handover,) = desk.control.transfers
-    handover.phase = BallotPhase.IN_FORCE
+    transfer = desk.transfer
+    transfer.phase = BallotPhase.IN_FORCE
     desk.control.on_census(census(A))
-    assert handover.phase is BallotPhase.IN_FORCE
+    assert transfer.phase is BallotPhase.IN_FORCE
 
 
-def test_another_road_begins_with_nothing() -> None:
+def test_a_new_road_starts_without_memory() -> None:
     """Its clock begins at 0."""
-    desk = bench(A, B)
-    desk.ways = {A: ((0, 0), (0, 1))}
+    desk = bench(A, B, ways={A: ((0, 0), (0, 1))})
     desk.think()
     desk.control.forget()
     assert (desk.control.observed.states, desk.control.transfers, desk.control.wakeups) == (
@@ -607,7 +582,7 @@ def test_another_road_begins_with_nothing() -> None:
     assert call.vehicles == {A: StreamVehicle(A, HOMES[A], 1, held=True)}  # not heard
 
 
-def test_nothing_is_kept_of_those_that_have_left() -> None:
+def test_vehicles_that_have_left_are_forgotten() -> None:
     desk = bench(A, B, C)
     desk.hear(*(evolve(shown(name), t_s=BEGUN_S + 0.5) for name in (A, B, C)))
     desk.control.on_census(evolve(census(B), t_s=BEGUN_S + 0.5))
@@ -620,8 +595,8 @@ def test_nothing_is_kept_of_those_that_have_left() -> None:
 # --- the real planner -------------------------------------------------------------------------
 
 
-def test_the_real_planner_takes_what_it_is_given() -> None:
-    """Also somebody who was not heard, whose own cell is blocked."""
+def test_the_real_planner_accepts_its_input() -> None:
+    """Also a vehicle that was not heard, whose own cell is blocked."""
     new_ballot = Ballot(7, Name("c1"), 1, 1)
     control = RollingOperation(ROLLING, lambda _: new_ballot, lambda: 1, stream_planner(ROLLING))
     control.on_census(census(A, B, C))
@@ -639,8 +614,8 @@ def test_the_real_planner_takes_what_it_is_given() -> None:
     assert note.kind == "stream-planned"
 
 
-def test_a_wrong_plan_is_no_plan() -> None:
-    """The planner is not trusted: a way that ends on the road is not issued."""
+def test_a_wrong_plan_is_not_issued() -> None:
+    """The planner is not trusted: a path that ends on the road is not issued."""
     bench = Bench(ways={A: (HOMES[A], HOMES[A])})
     planner = CheckedPlanner(stream_road(ROLLING), bench)
     bench.control = RollingOperation(ROLLING, bench.new_ballot, bench.new_job, planner)

@@ -1,4 +1,4 @@
-"""One ballot: who promised, what everybody owns, the plan, and when it is given up."""
+"""One cell transfer: promises, ownership, the plan, and when it is given up."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ BETWEEN = Ballot(2, Name("c1"), 10, 2)
 """Above MID, below HIGH."""
 
 
-def make_handover(moves: dict[Name, tuple[Cell, Cell]] | None = None) -> CellTransfer:
+def make_transfer(moves: dict[Name, tuple[Cell, Cell]] | None = None) -> CellTransfer:
     return CellTransfer(
         ballot=MID,
         roster=(A, B),
@@ -47,22 +47,22 @@ def make_handover(moves: dict[Name, tuple[Cell, Cell]] | None = None) -> CellTra
     )
 
 
-def tell(handover: CellTransfer, *states: VehicleState) -> None:
+def hear(transfer: CellTransfer, *states: VehicleState) -> None:
     known: dict[Name, VehicleState] = {}
     for each in states:
         known[each.vehicle] = each
-        if each.vehicle in handover.roster:
-            handover.on_state(each, known, 0.0)
+        if each.vehicle in transfer.roster:
+            transfer.on_state(each, known, 0.0)
 
 
 def issued() -> CellTransfer:
-    handover = make_handover()
-    tell(handover, state(A, MID), state(B, MID))
-    assert handover.phase is BallotPhase.ISSUING
-    return handover
+    transfer = make_transfer()
+    hear(transfer, state(A, MID), state(B, MID))
+    assert transfer.phase is BallotPhase.ISSUING
+    return transfer
 
 
-# --- what somebody owns -----------------------------------------------------------------------
+# --- what a vehicle owns -----------------------------------------------------------------------
 
 DEED = deed_of(A, MID, (A, B, C))
 CLOSED = state(A, HIGH, DEED)
@@ -107,7 +107,7 @@ def test_states_that_may_still_change_tell_nothing(silent: VehicleState) -> None
     assert partners(CLOSED, others) == {B, C}
 
 
-def test_all_have_turned_away_with_closed_gates() -> None:
+def test_when_all_have_promised_more_with_closed_gates_the_old_cells_are_owned() -> None:
     others = {B: state(B, BETWEEN, DEED), C: state(C, HIGH, DEED)}
     assert owned_cells(CLOSED, others) == certain_cells(CLOSED, others) == OWNED_BEFORE
     assert partners(CLOSED, others) == frozenset()
@@ -119,7 +119,7 @@ def test_all_have_turned_away_with_closed_gates() -> None:
 def test_cells_owned_either_way_are_certain(
     newer: VehicleState | None,
 ) -> None:
-    """Somebody opened the gate or did not, and has gone, or taken part in another plan since."""
+    """A member may have opened the gate; it has left, or has had another plan since."""
     there = {} if newer is None else {C: newer}
     gone = {C} if newer is None else set[Name]()
     assert owned_cells(CLOSED, {B: state(B, HIGH, DEED), **there}, gone) == SURE
@@ -135,7 +135,7 @@ def test_cells_owned_either_way_are_certain(
     assert certain_cells(moving, there, gone) == SURE
 
 
-def test_strangers_and_own_older_states_tell_nothing() -> None:
+def test_states_of_other_vehicles_and_own_older_ones_are_ignored() -> None:
     stranger, others = Name("X"), {B: state(B, MID, DEED), C: state(C, MID, DEED)}
     assert owned_cells(CLOSED, {stranger: state(stranger, HIGH), **others}) is None
     assert owned_cells(CLOSED, {A: state(A, HIGH, Deed(MID, open=True)), **others}) is None
@@ -151,15 +151,15 @@ def test_a_single_member_of_a_plan_knows_what_it_owns() -> None:
 
 
 def test_prepares_until_all_have_promised() -> None:
-    handover = make_handover()
-    assert handover.outgoing(0.9) == []
-    assert handover.wakeup_s == 1.0
+    transfer = make_transfer()
+    assert transfer.outgoing(0.9) == []
+    assert transfer.wakeup_s == 1.0
     expected = Prepare(MID, (), (A, B))
-    assert handover.outgoing(1.0) == [(A, expected), (B, expected)]
-    assert handover.outgoing(1.1) == []
-    assert handover.wakeup_s == 1.0 + RESEND_S
-    tell(handover, state(A, MID))
-    assert handover.outgoing(1.2) == [(B, expected)]
+    assert transfer.outgoing(1.0) == [(A, expected), (B, expected)]
+    assert transfer.outgoing(1.1) == []
+    assert transfer.wakeup_s == 1.0 + RESEND_S
+    hear(transfer, state(A, MID))
+    assert transfer.outgoing(1.2) == [(B, expected)]
 
 
 @pytest.mark.parametrize(
@@ -168,55 +168,55 @@ def test_prepares_until_all_have_promised() -> None:
     ids=["of an older ballot", "none", "not noted", "accepted already"],
 )
 def test_what_is_no_promise_does_not_count(no_promise: VehicleState) -> None:
-    handover = make_handover()
-    tell(handover, state(A, MID), no_promise)
-    assert (handover.phase, set(handover.promises)) == (BallotPhase.PREPARING, {A})
+    transfer = make_transfer()
+    hear(transfer, state(A, MID), no_promise)
+    assert (transfer.phase, set(transfer.promises)) == (BallotPhase.PREPARING, {A})
 
 
 def test_the_plan_is_made_from_the_promises() -> None:
-    handover = issued()
-    plan = handover.plan
+    transfer = issued()
+    plan = transfer.plan
     assert plan == evolve(
         make_plan(), formations=plan.formations if plan else (), incarnations={A: 7, B: 7}
     )
     assert plan is not None
     assert plan_problems(plan) == ownership_problems(plan) == []
-    assert handover.outgoing(1.0) == [(A, plan), (B, plan)]
-    assert handover.outgoing(1.1) == []
-    tell(handover, state(B, MID, accepted=True))
-    assert handover.outgoing(1.2) == [(A, plan)]
-    tell(handover, state(A, MID, accepted=True))
-    assert handover.phase is BallotPhase.IN_FORCE
-    assert handover.wakeup_s is None
-    assert handover.outgoing(9.0) == []
+    assert transfer.outgoing(1.0) == [(A, plan), (B, plan)]
+    assert transfer.outgoing(1.1) == []
+    hear(transfer, state(B, MID, accepted=True))
+    assert transfer.outgoing(1.2) == [(A, plan)]
+    hear(transfer, state(A, MID, accepted=True))
+    assert transfer.phase is BallotPhase.IN_FORCE
+    assert transfer.wakeup_s is None
+    assert transfer.outgoing(9.0) == []
 
 
 def test_the_newest_promise_counts() -> None:
-    """What the roadside gives between two states is known."""
-    handover = make_handover()
-    tell(handover, state(A, MID), state(A, MID, estate=(*BEFORE[A], (5, 0))), state(B, MID))
-    assert handover.plan is not None
-    assert handover.plan.before[A] == (*BEFORE[A], (5, 0))
-    assert handover.plan.after[A] == (*AFTER[A], (5, 0))
+    """It includes cells that the roadside assigned between two states."""
+    transfer = make_transfer()
+    hear(transfer, state(A, MID), state(A, MID, estate=(*BEFORE[A], (5, 0))), state(B, MID))
+    assert transfer.plan is not None
+    assert transfer.plan.before[A] == (*BEFORE[A], (5, 0))
+    assert transfer.plan.after[A] == (*AFTER[A], (5, 0))
 
 
-def test_two_that_move_behind_each_other_need_more_than_one_slot() -> None:
-    """A cell that somebody leaves in this slot is its own in it."""
-    handover = make_handover({A: (HOME, TARGET), B: ((2, 1), (1, 1))})
-    tell(handover, state(A, MID), state(B, MID))
-    assert handover.phase is BallotPhase.ISSUING
-    handover = make_handover({A: (HOME, (1, 1)), B: ((2, 1), (1, 1))})
-    tell(handover, state(A, MID), state(B, MID))
-    assert handover.phase is BallotPhase.GIVEN_UP
-    assert "meet in step 0" in handover.why
+def test_a_cell_that_is_left_in_a_slot_cannot_be_entered_in_it() -> None:
+    """A cell that a vehicle leaves in this slot is still its own in the slot."""
+    transfer = make_transfer({A: (HOME, TARGET), B: ((2, 1), (1, 1))})
+    hear(transfer, state(A, MID), state(B, MID))
+    assert transfer.phase is BallotPhase.ISSUING
+    transfer = make_transfer({A: (HOME, (1, 1)), B: ((2, 1), (1, 1))})
+    hear(transfer, state(A, MID), state(B, MID))
+    assert transfer.phase is BallotPhase.GIVEN_UP
+    assert "meet in step 0" in transfer.why
 
 
 def test_a_closed_transfer_of_an_older_plan_is_resolved_by_the_others() -> None:
     old = Deed(LOW, ((2, 1),), BEFORE[B], (A, B))
-    handover = make_handover()
-    tell(handover, state(A, MID, Deed(LOW, open=True)), state(B, MID, old, estate=((2, 1),)))
-    assert isinstance(handover.plan, Plan)
-    assert handover.plan.before == BEFORE
+    transfer = make_transfer()
+    hear(transfer, state(A, MID, Deed(LOW, open=True)), state(B, MID, old, estate=((2, 1),)))
+    assert isinstance(transfer.plan, Plan)
+    assert transfer.plan.before == BEFORE
 
 
 # --- giving up --------------------------------------------------------------------------------
@@ -237,46 +237,46 @@ WRONG = {
 
 
 @pytest.mark.parametrize("why", WRONG)
-def test_is_given_up_when_it_cannot_come_about(why: str) -> None:
-    handover = make_handover()
-    tell(handover, *WRONG[why])
-    assert handover.phase is BallotPhase.GIVEN_UP
-    assert why in handover.why
-    assert handover.plan is None
-    assert handover.wakeup_s is None
-    assert handover.outgoing(9.0) == []
+def test_is_given_up_when_it_cannot_succeed(why: str) -> None:
+    transfer = make_transfer()
+    hear(transfer, *WRONG[why])
+    assert transfer.phase is BallotPhase.GIVEN_UP
+    assert why in transfer.why
+    assert transfer.plan is None
+    assert transfer.wakeup_s is None
+    assert transfer.outgoing(9.0) == []
 
 
 def test_a_vehicle_without_agent_is_not_moved() -> None:
-    handover = make_handover()
-    tell(handover, evolve(state(A, MID), attended=False), state(B, MID))
-    assert handover.why == "A is not where it was planned from"
-    handover = make_handover()
-    tell(handover, state(A, MID), evolve(state(B, MID), attended=False))
-    assert handover.phase is BallotPhase.ISSUING  # who only hands cells over need not be driven
+    transfer = make_transfer()
+    hear(transfer, evolve(state(A, MID), attended=False), state(B, MID))
+    assert transfer.why == "A is not where it was planned from"
+    transfer = make_transfer()
+    hear(transfer, state(A, MID), evolve(state(B, MID), attended=False))
+    assert (
+        transfer.phase is BallotPhase.ISSUING
+    )  # a vehicle that only gives cells need not be driven
 
 
-def test_a_restarted_vehicle_cannot_accept() -> None:
-    handover = issued()
-    tell(handover, evolve(state(B, MID), incarnation=8))
-    assert (handover.phase, handover.why) == (BallotPhase.GIVEN_UP, "B has restarted")
-
-
-def test_outbid_while_the_plan_is_sent() -> None:
-    handover = issued()
-    tell(handover, state(B, HIGH))
-    assert handover.why == "outbid"
+@pytest.mark.parametrize(
+    ("shown", "why"),
+    [(evolve(state(B, MID), incarnation=8), "B has restarted"), (state(B, HIGH), "outbid")],
+)
+def test_is_given_up_while_the_plan_is_sent(shown: VehicleState, why: str) -> None:
+    transfer = issued()
+    hear(transfer, shown)
+    assert (transfer.phase, transfer.why) == (BallotPhase.GIVEN_UP, why)
 
 
 def test_what_is_in_force_or_given_up_stays_so() -> None:
-    handover = issued()
-    tell(handover, state(A, MID, accepted=True), state(B, MID, accepted=True))
-    tell(handover, state(A, HIGH))
-    assert handover.phase is BallotPhase.IN_FORCE
-    handover = make_handover()
-    handover.give_up("no reason")
-    tell(handover, state(A, MID), state(B, MID))
-    assert (handover.phase, handover.why) == (BallotPhase.GIVEN_UP, "no reason")
+    transfer = issued()
+    hear(transfer, state(A, MID, accepted=True), state(B, MID, accepted=True))
+    hear(transfer, state(A, HIGH))
+    assert transfer.phase is BallotPhase.IN_FORCE
+    transfer = make_transfer()
+    transfer.give_up("no reason")
+    hear(transfer, state(A, MID), state(B, MID))
+    assert (transfer.phase, transfer.why) == (BallotPhase.GIVEN_UP, "no reason")
 
 
 # --- the table as a whole ---------------------------------------------------------------------
@@ -287,8 +287,8 @@ def test_histories_take_every_row_of_the_table() -> None:
     book = RuleRecorder(TRANSFER_RULES)
 
     def begun(*states: VehicleState) -> CellTransfer:
-        transfer = evolve(make_handover(), rules=book)
-        tell(transfer, *states)
+        transfer = evolve(make_transfer(), rules=book)
+        hear(transfer, *states)
         return transfer
 
     promised = state(A, MID), state(B, MID)
@@ -303,8 +303,8 @@ def test_histories_take_every_row_of_the_table() -> None:
 
 def test_a_vehicle_that_restarts_while_the_ballot_is_outbid_does_not_revive_it() -> None:
     transfer = issued()
-    tell(transfer, evolve(state(A, HIGH), incarnation=9))
+    hear(transfer, evolve(state(A, HIGH), incarnation=9))
     assert (transfer.phase, transfer.why) == (BallotPhase.GIVEN_UP, "outbid")
-    tell(transfer, evolve(state(A, MID), incarnation=9), evolve(state(A, MID), incarnation=10))
+    hear(transfer, evolve(state(A, MID), incarnation=9), evolve(state(A, MID), incarnation=10))
     assert (transfer.phase, transfer.why) == (BallotPhase.GIVEN_UP, "outbid")
     assert list(transfer.outgoing(1e6)) == []
