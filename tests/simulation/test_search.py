@@ -1,7 +1,7 @@
 """Random search: whatever happens to network and processes, no rule of the checker is broken.
 
-Each seed draws roads, vehicles, wishes and faults (`laneweave.launch.fault_search`). A failure is
-replayed by the command that is printed with it. The whole programme is
+Each seed draws roads, vehicles, preferred lanes and faults (`laneweave.launch.fault_search`). The
+command printed with a failure replays it. The whole programme is
 
     laneweave simulate --seeds 0:20000
 """
@@ -43,8 +43,8 @@ def outcomes(profile: str, seeds: range, *, digest: bool = False) -> Iterator[Se
     """Run seeds, in each of which no rule must be broken."""
     for seed in seeds:
         outcome = FaultRun(seed, PROFILES[profile], digest=digest).run()
-        told = "\n".join(map(str, outcome.violations))
-        assert not told, f"{told}\n{replay_command(seed, PROFILES[profile])}"
+        violations = "\n".join(map(str, outcome.violations))
+        assert not violations, f"{violations}\n{replay_command(seed, PROFILES[profile])}"
         yield outcome
 
 
@@ -112,8 +112,8 @@ def test_every_kind_of_fault_happens() -> None:
 def test_without_faults_the_last_plan_is_not_late(seed: int) -> None:
     outcome = FaultRun(seed, PROFILES["calm"]).run()
     assert not outcome.violations
-    # The last wishes come at most so long before the end of the phase; then one census, the margin
-    # of a plan, and the steps: of the plan under way one, of the last one at most eight.
+    # The last preferences change at most 1 s before the end of the phase; then follow one census,
+    # the margin of a plan, and the steps: one of the current plan, at most eight of the last one.
     assert outcome.totals.longest_healing_s < 1.0 + 0.5 + 9 * SLOT_S
     assert outcome.totals.dropped == 0
 

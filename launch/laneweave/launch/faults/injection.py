@@ -196,7 +196,7 @@ class FaultInjection:
         self, event: FaultEvent, name: str, road_s: float, now_s: float, view: RoadView
     ) -> None:
         self._targets.setdefault(event.fault_name, set()).add(name)
-        self._record(road_s, event.fault_name, event.verb, name)
+        self._record(road_s, event.fault_name, event.fault.verb, name)
         if event.for_s is not None:
             self.roles.pause(name)
             self._paused.add(name)

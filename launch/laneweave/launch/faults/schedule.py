@@ -40,11 +40,6 @@ class FaultEvent:
     restart_after_s: float | None = None
     """Wall-clock seconds between a kill and the restart; None: no restart."""
 
-    @property
-    def verb(self) -> str:
-        """The effect on the target: `killed` or `paused`."""
-        return _verb(self.fault)
-
 
 class FaultSchedule:
     """All fault events of a run in the order of their times; some faults repeat without end."""
@@ -73,7 +68,7 @@ class FaultSchedule:
         `applied` has the names of the faults of which at least one event has found a target.
         """
         lines = [
-            f"the run ended before {fault.target} was {_verb(fault)} at {fault.from_s:g} s"
+            f"the run ended before {fault.target} was {fault.verb} at {fault.from_s:g} s"
             for name, fault in self._specification.role_faults()
             if name not in applied
         ]
@@ -87,10 +82,6 @@ class FaultSchedule:
             if window.from_s > self._reached_s
         ]
         return lines
-
-
-def _verb(fault: RoleFault) -> str:
-    return "paused" if isinstance(fault, Pause) else "killed"
 
 
 def _events(seed: int, name: str, fault: RoleFault) -> Iterator[FaultEvent]:

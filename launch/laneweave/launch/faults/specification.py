@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterator
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import attrs
 from attrs import field, frozen
@@ -58,6 +58,9 @@ class RoleFault:
         BadInputError: a value is not allowed, or values contradict each other.
     """
 
+    verb: ClassVar[str]
+    """The effect on the target."""
+
     target: str = LEADER
     """`leader`, `router`, `coordinator` (any), `agent` (any on the road), or the name of a
     coordinator or a vehicle."""
@@ -97,6 +100,8 @@ class RoleFault:
 class Kill(RoleFault):
     """Kill roles with SIGKILL, and optionally restart them with an empty memory."""
 
+    verb = "killed"
+
     restart_after_s: float | None = field(default=None, validator=optional(within(0.0, 600.0)))
     """Wall-clock seconds; None: the role is not restarted."""
     restart_share: float = field(default=1.0, validator=within(0.0, 1.0))
@@ -112,6 +117,8 @@ class Kill(RoleFault):
 @frozen(kw_only=True)
 class Pause(RoleFault):
     """Stop roles with SIGSTOP and resume them later with SIGCONT, with outdated knowledge."""
+
+    verb = "paused"
 
     for_s: NumberOrRange = field(validator=_duration)
     """Wall-clock seconds, or a range from which they are drawn for each pause."""

@@ -25,7 +25,7 @@ def test_every_family_and_size_gets_a_row() -> None:
     assert planner_table(rows).row_count == len(rows)
 
 
-def test_what_does_not_fit_into_a_block_is_told() -> None:
+def test_too_many_vehicles_for_a_block_are_refused() -> None:
     with pytest.raises(BadInputError, match="13 vehicles do not fit"):
         FAMILIES["block"].request(0, 13, 4.0)
 

@@ -44,8 +44,11 @@ def test_the_option_goes_before_the_file_and_the_file_before_the_default(
 
 def test_an_unknown_solver_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli._status(["plan", request_file(tmp_path), "--solver", "magic"]) == 2
-    told = capsys.readouterr()
-    assert (told.out, told.err) == ("", "solver: got 'magic'; allowed: one of tappa, branching\n")
+    captured = capsys.readouterr()
+    assert (captured.out, captured.err) == (
+        "",
+        "solver: got 'magic'; allowed: one of tappa, branching\n",
+    )
 
 
 def test_the_table_names_the_solver(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -195,10 +195,10 @@ def test_bad_places_are_refused_before_planning(
     (tmp_path / "file").touch()
     monkeypatch.setattr(plan_answers, "checked_plan", None)
     assert cli._status(["plan", str(CASE_STUDY), "--draw", str(tmp_path / name)]) == 2
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert told.err.startswith("--draw: got ")
-    assert allowed in told.err
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("--draw: got ")
+    assert allowed in captured.err
 
 
 def test_the_check_leaves_nothing_behind(tmp_path: Path) -> None:
@@ -239,10 +239,10 @@ def test_a_failed_drawing_is_reported(
     monkeypatch.setattr(plan_answers, "checked_plan", lambda *_, **__: PLAN)
     monkeypatch.setattr(plan_drawing, "draw_plan", full)
     assert cli._status(["plan", str(CASE_STUDY), "--draw", str(tmp_path / "plan.png")]) == 1
-    told = capsys.readouterr()
-    assert json.loads(told.out)["cost"] == 7
-    assert "not drawn" in told.err
-    assert len(told.err.splitlines()) == 1
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["cost"] == 7
+    assert "not drawn" in captured.err
+    assert len(captured.err.splitlines()) == 1
 
 
 def test_without_draw_nothing_is_drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -205,6 +205,6 @@ def test_what_cannot_be_drawn_is_refused_in_one_line(
     (tmp_path / "fast.toml").write_text("[formation]\nmove_s = 1.0", encoding="utf-8")
     monkeypatch.setattr(plan_answers, "checked_plan", None)
     assert cli._status(["plan", str(CASE_STUDY), *options]) == 2
-    told = capsys.readouterr()
-    assert (told.out, len(told.err.splitlines())) == ("", 1)
-    assert told.err.startswith(line)
+    captured = capsys.readouterr()
+    assert (captured.out, len(captured.err.splitlines())) == ("", 1)
+    assert captured.err.startswith(line)

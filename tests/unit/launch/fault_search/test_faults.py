@@ -59,11 +59,11 @@ def test_old_messages_are_delivered_once_more(world: FaultRun) -> None:
 
 @pytest.mark.parametrize("kind", ["leader-kill", "coordinator-kill", "agent-kill"])
 def test_killed_processes_are_started_again(world: FaultRun, kind: str) -> None:
-    everybody = set(world.network.names)
+    all_nodes = set(world.network.names)
     harm(world, kind)
-    assert len(everybody - set(world.network.names)) == 1
+    assert len(all_nodes - set(world.network.names)) == 1
     world.faults.heal()
-    assert set(world.network.names) == everybody
+    assert set(world.network.names) == all_nodes
 
 
 def test_the_leader_is_the_coordinator_that_leads(world: FaultRun) -> None:

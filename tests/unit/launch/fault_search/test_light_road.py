@@ -116,7 +116,7 @@ def test_a_late_command_counts_unless_a_newer_one_was_there(bench: Bench) -> Non
 
 
 def test_a_vehicle_without_agent_gets_a_caretaker_that_gives_way(bench: Bench) -> None:
-    for _ in range(10):  # so long an agent may take to come
+    for _ in range(10):  # time that an agent may take to connect
         bench.tick()
     bench.agent(up=False)
     sent = bench.tick()

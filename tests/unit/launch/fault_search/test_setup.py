@@ -37,9 +37,9 @@ def columns_of(setup: Setup, formation: ClosedFormation) -> int:
     return len(formation.columns(setup.scenario.lattice))
 
 
-def asks_for_too_much(setup: Setup, wishes: dict[Name, int]) -> bool:
+def asks_for_too_much(setup: Setup, preferences: dict[Name, int]) -> bool:
     """Tell whether more vehicles of a formation want a lane than that has cells."""
-    lanes = Counter((formation_of(setup, each), wishes[each.vehicle]) for each in setup.visits)
+    lanes = Counter((formation_of(setup, each), preferences[each.vehicle]) for each in setup.visits)
     return any(count > columns_of(setup, formation) for (formation, _), count in lanes.items())
 
 
@@ -83,11 +83,11 @@ def test_in_every_formation_a_vehicle_stays(name: str) -> None:
 @EVERY
 def test_the_last_preferences_can_be_satisfied(name: str) -> None:
     for setup, rng in draw(name):
-        wishes = setup.preferences(rng, last=True)
-        if asks_for_too_much(setup, wishes):
+        preferences = setup.preferences(rng, last=True)
+        if asks_for_too_much(setup, preferences):
             assert setup.scenario.formation.max_joined > 1
             assert setup.adjoin
-            together = Counter(wishes.values())
+            together = Counter(preferences.values())
             assert max(together.values()) <= sum(columns_of(setup, one) for one in setup.formations)
 
 
