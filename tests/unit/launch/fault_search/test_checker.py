@@ -113,6 +113,12 @@ SHARED: tuple[Paths, Paths] = (
             id="a motion out of order",
         ),
         pytest.param(
+            [{A: ((0, 0), (1, 0))}],
+            [(1.0, A, 1, (1, 0)), (2.0, A, 1, (1, 1))],
+            ["motion"],
+            id="a motion after the end of the plan",
+        ),
+        pytest.param(
             [{A: ((0, 0), (1, 0), (1, 1))}],
             [(1.0, A, 1, (1, 0)), (1.4, A, 1, (1, 1))],
             ["motion"],
