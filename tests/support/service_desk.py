@@ -1,8 +1,9 @@
-"""A coordinator on a bench: what it is told, what it answers, and who is on its road."""
+"""A coordinator under test: its inputs, its effects, and the vehicles on its road."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
+from typing import Any
 
 from attrs import evolve
 
@@ -20,7 +21,7 @@ from laneweave.protocol.wire.messages import (
     Name,
     VehicleState,
 )
-from laneweave.protocol.wire.topics import CENSUS
+from laneweave.protocol.wire.topics import CENSUS, STATE
 from support.paper import PAPER, closed_blocks
 from support.states import holding
 
@@ -33,7 +34,7 @@ Cells = dict[Name, Cell]
 
 
 class Desk:
-    """A coordinator and what it has been told."""
+    """A coordinator under test, its clock and its effects."""
 
     def __init__(
         self, name: str = "c1", incarnation: int = 1, scenario: Scenario = SCENARIO
@@ -83,9 +84,19 @@ class Desk:
         """Lead a formation up to the order of its plan."""
         self.lead()
         self.tell(census(cells, lanes))
-        for name, cell in cells.items():
-            self.tell(state(name, cell))
+        self.observe(cells)
         return self.promise(cells)
+
+    def observe(self, cells: Cells, t_s: float = 0.0) -> list[Effect]:
+        """Let all vehicles show that they hold their cells and have promised nothing."""
+        return self.give(*(Arrived(STATE, {}, state(*item, t_s=t_s)) for item in cells.items()))
+
+    def accept(self, cells: Cells, t_s: float = 2.0, **more: Any) -> list[Effect]:  # noqa: ANN401
+        """Let all vehicles accept the plan of formation 0, or of its group."""
+        effects: list[Effect] = []
+        for name, cell in cells.items():
+            effects += self.tell(state(name, cell, self.ballot, accepted=True, t_s=t_s, **more))
+        return effects
 
     def promise(
         self, cells: Cells, joined: tuple[int, ...] = (0,), unattended: Collection[Name] = ()
@@ -96,6 +107,19 @@ class Desk:
             shown = state(name, cell, self.ballot, t_s=1.0, joined=joined)
             effects += self.tell(evolve(shown, attended=name not in unattended))
         return effects
+
+
+def leading(
+    cells: Cells,
+    lanes: dict[Name, int] | None = None,
+    t_s: float = T_S,
+    scenario: Scenario = SCENARIO,
+) -> Desk:
+    """Return a coordinator that leads and has received a census."""
+    desk = Desk(scenario=scenario)
+    desk.lead()
+    desk.tell(census(cells, lanes, t_s))
+    return desk
 
 
 def census(cells: Cells, lanes: dict[Name, int] | None = None, t_s: float = T_S) -> Census:

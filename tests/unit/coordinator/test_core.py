@@ -73,12 +73,13 @@ from support.service_desk import (
     F,
     census,
     jobs,
+    leading,
     logged,
     messages,
     state,
 )
 
-# --- being there ------------------------------------------------------------------------------
+# --- starting, bridges, election --------------------------------------------------------------
 
 
 def test_start() -> None:
@@ -108,7 +109,7 @@ def test_a_new_bridge_has_a_new_road() -> None:
 
 
 @pytest.mark.parametrize("other", ["7", "6", "ghost", "-1"])
-def test_what_is_no_newer_bridge_changes_nothing(other: str) -> None:
+def test_tokens_of_no_newer_bridge_change_nothing(other: str) -> None:
     """The same one after a loss of the link, one of an earlier run, or a stranger's token."""
     desk = Desk()
     desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}))
@@ -119,25 +120,25 @@ def test_what_is_no_newer_bridge_changes_nothing(other: str) -> None:
     assert desk.core.t_s == T_S
 
 
-def news_of(bridge: int, cells: Cells, t_s: float) -> tuple[Census, RoadClock]:
+def of_bridge(bridge: int, cells: Cells, t_s: float) -> tuple[Census, RoadClock]:
     clock = RoadClock(round(10 * t_s), t_s, 1, 1, 1, 0, ended=False, bridge=bridge)
     return evolve(census(cells, t_s=t_s), bridge=bridge), clock
 
 
 def road(desk: Desk) -> tuple[list[Name], float]:
-    """Return whom a coordinator knows on the road, and the road time."""
+    """Return the vehicles that a coordinator knows on the road, and the road time."""
     assert desk.core.census is not None
     return [entry.vehicle for entry in desk.core.census.on_road], desk.core.t_s
 
 
 @pytest.mark.parametrize("index", [0, 1], ids=["census", "clock"])
-def test_news_of_an_earlier_road_are_ignored(index: int) -> None:
+def test_messages_of_an_earlier_bridge_are_ignored(index: int) -> None:
     """They come late, and their road time is ahead of the new one's."""
     desk = Desk()
     desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}))
-    for message in news_of(7, {A: (0, 0)}, T_S):
+    for message in of_bridge(7, {A: (0, 0)}, T_S):
         desk.tell(message)
-    desk.tell(news_of(6, {B: (0, 0)}, 9 * T_S)[index])
+    desk.tell(of_bridge(6, {B: (0, 0)}, 9 * T_S)[index])
     assert road(desk) == ([A], T_S)
 
 
@@ -146,22 +147,20 @@ def test_a_newer_bridge_is_met_by_its_news_before_its_token_is_seen() -> None:
         desk = Desk()
         desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}))
         desk.collect_promises({A: (0, 0)}, {A: 1})
-        newer = news_of(8, {B: (0, 0)}, 1.0)
+        newer = of_bridge(8, {B: (0, 0)}, 1.0)
         desk.tell(newer[index])
         assert (desk.leaders, desk.core.t_s) == ({}, 1.0)
         desk.tell(newer[1 - index])
         assert road(desk) == ([B], 1.0)
         desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "8"}))  # nothing new
         assert road(desk) == ([B], 1.0)
-        desk.tell(news_of(7, {A: (0, 0)}, 9 * T_S)[index])
+        desk.tell(of_bridge(7, {A: (0, 0)}, 9 * T_S)[index])
         assert road(desk) == ([B], 1.0)
 
 
 def test_states_of_vehicles_that_the_census_does_not_list_are_ignored() -> None:
     """Or not in this formation: what they have joined is of another road."""
-    desk = Desk()
-    desk.lead()
-    desk.tell(census({A: (0, 0), B: (-5, 0)}))
+    desk = leading({A: (0, 0), B: (-5, 0)})
     theirs = Ballot(4, Name("c9"), 3, 2)
     for stranger in (
         state(C, (0, 0), theirs, joined=(0, 1)),
@@ -228,9 +227,7 @@ def test_stopping_reports_and_does_nothing_else() -> None:
 
 
 def test_an_older_census_is_ignored() -> None:
-    desk = Desk()
-    desk.lead()
-    desk.tell(census({A: (0, 0), B: (-1, 1)}))
+    desk = leading({A: (0, 0), B: (-1, 1)})
     desk.tell(census({A: (0, 0)}, t_s=T_S - 0.1))
     assert list(desk.leaders[0].formation.roster) == [A, B]
     desk.tell(census({B: (-1, 1)}, t_s=T_S + 0.1))
@@ -238,9 +235,7 @@ def test_an_older_census_is_ignored() -> None:
 
 
 def test_a_formation_that_is_not_closed_is_not_touched() -> None:
-    desk = Desk()
-    desk.lead()
-    desk.tell(census({A: (0, 0)}, t_s=4.4))
+    desk = leading({A: (0, 0)}, t_s=4.4)
     desk.tell(RoadClock(99, 9.9, 1, 1, 1, 0, ended=False))
     assert desk.leaders == {}  # the census is too old to be complete
     desk.tell(census({A: (0, 0)}, t_s=4.6))
@@ -248,9 +243,7 @@ def test_a_formation_that_is_not_closed_is_not_touched() -> None:
 
 
 def test_a_formation_that_has_left_is_forgotten() -> None:
-    desk = Desk()
-    desk.lead()
-    desk.tell(census({A: (0, 0)}))
+    desk = leading({A: (0, 0)})
     desk.tell(census({}, t_s=T_S + 1.0))
     assert desk.leaders == {}
 
@@ -292,9 +285,7 @@ def test_prepare_promise_plan_acceptance() -> None:
 
 
 def test_adoption_sends_nothing() -> None:
-    desk = Desk()
-    desk.lead()
-    desk.tell(census({A: (0, 0), B: (-1, 1)}, {B: 1}))
+    desk = leading({A: (0, 0), B: (-1, 1)}, {B: 1})
     theirs = Ballot(4, Name("c0"), 3, 2)
     for name, cell in ((A, (0, 0)), (B, (-1, 1))):
         desk.tell(state(name, cell, theirs, accepted=True))
@@ -337,8 +328,7 @@ def lead_two_formations(desk: Desk) -> tuple[Compute, list[Effect]]:
     """Return the order of the first formation, and the effects of the second one's promise."""
     desk.lead()
     desk.tell(census(APART, {A: 1, B: 1}))
-    for name, cell in APART.items():
-        desk.tell(state(name, cell))
+    desk.observe(APART)
     (first,) = jobs(promise(desk, A))
     return first, promise(desk, B)
 
@@ -362,8 +352,7 @@ def test_one_formation_is_planned_after_the_other() -> None:
     assert desk.leaders[1].phase is BallotPhase.ISSUING
 
 
-def test_an_order_that_is_replaced_before_its_turn_comes_is_not_worked_on() -> None:
-    """A hard one that is worked on for nothing would keep the new one waiting."""
+def test_a_replaced_order_is_not_computed() -> None:
     desk = Desk()
     first, _ = lead_two_formations(desk)
     desk.tell(census(APART, {A: 1, B: 2}, t_s=T_S + 1.0))
@@ -374,7 +363,7 @@ def test_an_order_that_is_replaced_before_its_turn_comes_is_not_worked_on() -> N
     assert jobs(desk.wait(0.1)) == []
 
 
-def test_an_order_whose_leader_has_been_outbid_is_not_worked_on() -> None:
+def test_an_order_of_an_outbid_leader_is_not_computed() -> None:
     desk = Desk()
     first, _ = lead_two_formations(desk)
     desk.tell(state(B, APART[B], desk.ballot._replace(term=9), t_s=2.0))
@@ -442,10 +431,8 @@ def test_failed_planning_is_logged_and_tried_again_under_the_same_ballot(spoil: 
 
 @pytest.mark.parametrize("cell", [(-4, 0), (77, 0), (0, 5), (-1, 1)])
 def test_cells_that_cannot_be_planned_from_do_not_stop_the_coordinator(cell: Cell) -> None:
-    """Outside the block, or the cell of another: a promise may come from anybody."""
-    desk = Desk()
-    desk.lead()
-    desk.tell(census({A: (0, 0), B: (-1, 1)}))
+    """Outside the block, or the cell of another vehicle."""
+    desk = leading({A: (0, 0), B: (-1, 1)})
     desk.tell(state(A))
     desk.tell(state(B))
     desk.tell(evolve(state(A, promised=desk.ballot, t_s=1.0), hold_cell=cell))
@@ -454,9 +441,7 @@ def test_cells_that_cannot_be_planned_from_do_not_stop_the_coordinator(cell: Cel
 
 
 def test_too_late_for_any_step_settles() -> None:
-    desk = Desk()
-    desk.lead()
-    desk.tell(census({A: (0, 0)}, t_s=66.0))
+    desk = leading({A: (0, 0)}, t_s=66.0)
     desk.tell(state(A))
     effects = desk.tell(state(A, (0, 0), desk.ballot, t_s=1.0))
     assert jobs(effects) == []
@@ -466,7 +451,7 @@ def test_too_late_for_any_step_settles() -> None:
 
 
 def test_failed_planning_searches_further_each_time() -> None:
-    """The bound on nodes doubles, so that what is hard is solved in the end."""
+    """The bound on nodes doubles, so hard tasks are solved eventually."""
     few = evolve(SCENARIO, formation=evolve(SCENARIO.formation, solver="branching", max_nodes=1))
     desk = Desk(scenario=few)
     cells: Cells = {A: (0, 0), B: (-1, 1), C: (-2, 0), D: (-3, 1), E: (0, 2), F: (-2, 2)}
@@ -572,7 +557,7 @@ def test_ballots_never_repeat() -> None:
     ids=["equal term of a worse name", "later process of its own", "lower", "higher term"],
 )
 def test_a_new_ballot_is_above_what_vehicles_show(shown: Ballot) -> None:
-    """With an equal term the name alone could make it the lower one, for ever."""
+    """With an equal term the name alone could make it the lower one."""
     desk = Desk()
     desk.lead()
     assert desk.core.election.term == 1

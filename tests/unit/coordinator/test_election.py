@@ -1,4 +1,4 @@
-"""Rule L1: who leads, and what a candidate concludes from heartbeats, tokens and its own link."""
+"""Rule L1: when a candidate leads, given heartbeats, tokens and its own link."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def beat(name: str, incarnation: int = 1, term: int = 0, *, leading: bool = Fals
 
 
 @pytest.mark.parametrize("heard_s", [0.1, 0.3, 1.1, 7.7, 1e6 + 0.3])
-def test_it_can_decide_exactly_when_it_asks_to_be_woken(heard_s: float) -> None:
+def test_it_can_decide_exactly_at_its_wakeup(heard_s: float) -> None:
     """Rounding must not make a candidate sleep on until the next heartbeat."""
     election = candidate()
     election.on_heartbeat(beat("a"), heard_s)
@@ -44,7 +44,7 @@ def test_a_better_ranked_candidate_keeps_it_from_leading() -> None:
     assert election.update(0.3 + ELECTION_S)
 
 
-def test_a_worse_ranked_candidate_does_not() -> None:
+def test_a_worse_ranked_candidate_does_not_keep_it_from_leading() -> None:
     election = candidate()
     election.on_heartbeat(beat("c"), 0.3)
     assert election.next_change_s(0.3) == math.inf
@@ -108,7 +108,7 @@ def test_late_tokens_of_an_old_process_do_not_replace_the_new_one() -> None:
     assert election.update(ELECTION_S)
 
 
-def test_a_zombie_that_comes_back_counts_again() -> None:
+def test_a_stopped_process_that_resumes_counts_again() -> None:
     election = candidate()
     election.on_heartbeat(beat("a"), 0.1)
     election.on_token_down("a", 1)  # stopped for longer than its lease
@@ -123,7 +123,7 @@ def test_a_zombie_that_comes_back_counts_again() -> None:
     assert not election.update(2.3 + ELECTION_S - 0.01)
 
 
-def test_losing_the_own_link_concludes_nothing_about_others() -> None:
+def test_losing_the_own_link_changes_nothing_known_of_others() -> None:
     election = candidate()
     election.on_heartbeat(beat("a"), 0.5)
     election.on_link(up=False, now_s=0.6)
@@ -160,17 +160,17 @@ def test_terms_only_rise() -> None:
     assert (election.leading, election.term) == (True, 51)
 
 
-def test_a_leader_that_slept_does_not_go_on_below_the_term_of_the_one_in_between() -> None:
+def test_a_leader_that_was_paused_takes_a_term_above_those_used_meanwhile() -> None:
     election = candidate("a")
     election.update(ELECTION_S)
-    election.on_heartbeat(beat("b", term=2), 9.0)  # it led while this one slept
+    election.on_heartbeat(beat("b", term=2), 9.0)  # it led while this one was paused
     assert not election.update(9.0)
     assert (election.leading, election.term) == (True, 3)
     election.on_heartbeat(beat("b", term=3), 9.1)  # it has seen the new term by now
     assert election.term == 3
 
 
-def test_the_own_heartbeat_says_nothing_about_terms() -> None:
+def test_the_own_heartbeat_does_not_change_the_term() -> None:
     """Of an earlier process of the same name, or its own that comes back: no race with itself."""
     election = candidate("a")
     election.update(ELECTION_S)
@@ -178,7 +178,7 @@ def test_the_own_heartbeat_says_nothing_about_terms() -> None:
     assert election.term == 1
 
 
-def test_two_leaders_that_hear_each_other_do_not_outbid_each_other_for_ever() -> None:
+def test_two_leaders_that_hear_each_other_stop_outbidding() -> None:
     first, second = candidate("a"), candidate("b")
     for election in (first, second):
         election.update(ELECTION_S)
@@ -193,8 +193,8 @@ def test_two_leaders_that_hear_each_other_do_not_outbid_each_other_for_ever() ->
     assert (first.term, second.term) == (10, 10)
 
 
-def test_a_newcomer_is_waited_for_but_not_for_ever() -> None:
-    """Somebody leads all the time while a better-ranked candidate is too young to lead."""
+def test_a_leader_waits_for_a_newcomer_for_a_limited_time() -> None:
+    """There is always a leader while a better-ranked candidate is too young to lead."""
     election = candidate()
     election.update(ELECTION_S)
     patience_s = 1.0 + NEWCOMER_SHARE * ELECTION_S

@@ -14,7 +14,7 @@ from laneweave.protocol.scenario.tables import Scenario
 from laneweave.protocol.vehicle.plans import plan_problems
 from laneweave.protocol.wire.messages import Ballot, LogEvent, Name, Plan
 from support.service_desk import SCENARIO as DESK_SCENARIO
-from support.service_desk import A, B, C, Cells, D, Desk, E, F, census, jobs, messages, state
+from support.service_desk import A, B, C, Cells, D, Desk, E, F, jobs, leading, messages, state
 
 SCENARIO = evolve(DESK_SCENARIO, formation=evolve(DESK_SCENARIO.formation, solver="branching"))
 """Of the plans with equal cost, those of branching close up across the border."""
@@ -53,7 +53,7 @@ def closing_pairs(one: Plan, other: Plan) -> list[tuple[PlannedMove, PlannedMove
     ]
 
 
-# --- pauses ---------------------------------------------------------------------------------------
+# --- pauses -----------------------------------------------------------------------------------
 
 UP = plan_of(
     ((0, (-6, 1), (-5, 1)), (1, (-5, 1), (-4, 1)), (2, (-4, 1), (-4, 0))),
@@ -113,7 +113,7 @@ def test_without_moves_there_is_nothing_to_keep_apart() -> None:
     assert kept_apart(nobody, [UP], SLACK_S, MAX_STEPS) == nobody
 
 
-# --- the leader -----------------------------------------------------------------------------------
+# --- the leader -------------------------------------------------------------------------------
 
 G, H, J, K, L = (Name(letter) for letter in "GHJKL")
 AHEAD: Cells = {A: (-1, 1), B: (-3, 1), C: (0, 2), D: (0, 0), E: (-2, 2), F: (-2, 0)}
@@ -125,11 +125,8 @@ LANES = {A: 1, B: 0, C: 0, D: 2, E: 0, F: 1, G: 1, H: 0, J: 2, K: 1, L: 1}
 
 def two_formations(scenario: Scenario = SCENARIO, first: int = 0) -> tuple[Desk, Compute]:
     """Collect the promises of both blocks, of one block first; return the order for that one."""
-    desk = Desk(scenario=scenario)
-    desk.lead()
-    desk.tell(census(AHEAD | BEHIND, LANES))
-    for name, cell in (AHEAD | BEHIND).items():
-        desk.tell(state(name, cell))
+    desk = leading(AHEAD | BEHIND, LANES, scenario=scenario)
+    desk.observe(AHEAD | BEHIND)
     effects: list[Effect] = []
     for number in (first, 1 - first):
         ballot = desk.leaders[number].ballot

@@ -1,4 +1,4 @@
-"""Joint ballots, members without agents, and who is observed: the coordinator's core end to end."""
+"""Joint ballots, members without agents, and observing: the coordinator's core end to end."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ from support.service_desk import (
     F,
     census,
     jobs,
+    leading,
     logged,
     messages,
     state,
@@ -59,11 +60,8 @@ def notes(effects: list[Effect], kind: str) -> list[dict[str, object]]:
 
 def overfull(scenario: Scenario) -> tuple[Desk, Compute]:
     """Lead up to the order for the overfull block; block 1 is behind it and has been prepared."""
-    desk = Desk(scenario=scenario)
-    desk.lead()
-    desk.tell(census(FULL | NEXT, LANES))
-    for name, cell in (FULL | NEXT).items():
-        desk.tell(state(name, cell))
+    desk = leading(FULL | NEXT, LANES, scenario=scenario)
+    desk.observe(FULL | NEXT)
     (job,) = jobs(desk.promise(FULL))
     return desk, job
 
@@ -73,8 +71,7 @@ def behind_of_one(desk: Desk, t_s: float) -> list[Effect]:
     cells: Cells = {F: (0, 0)} | BEHIND
     desk.lead()
     desk.tell(census(cells, dict.fromkeys(cells, 1), t_s=t_s))
-    for name, cell in cells.items():
-        desk.tell(state(name, cell))
+    desk.observe(cells)
     ahead = jobs(desk.promise({F: (0, 0)}))
     ballot, effects = desk.leaders[1].ballot, list[Effect]()
     for name, cell in BEHIND.items():
@@ -106,28 +103,27 @@ def test_an_overfull_lane_is_sorted_by_a_joint_ballot_of_two_formations() -> Non
     assert notes(effects, "formations-joined") == [{"formations": [0, 1]}]
     assert messages(effects, Plan) == []
     assert {number: each.formation.numbers for number, each in desk.leaders.items()} == {0: (0, 1)}
-    everybody = FULL | NEXT
+    members = FULL | NEXT
     prepares = []
-    for name, cell in everybody.items():
+    for name, cell in members.items():
         prepares += messages(desk.tell(state(name, cell, t_s=0.5)), Prepare)
-    assert [send.parameters["vehicle"] for send in prepares] == list(everybody)
-    assert {send.message for send in prepares} == {Prepare(desk.ballot, (0, 1), tuple(everybody))}
+    assert [send.parameters["vehicle"] for send in prepares] == list(members)
+    assert {send.message for send in prepares} == {Prepare(desk.ballot, (0, 1), tuple(members))}
     assert separate is not None
     assert desk.ballot > separate
 
     # Promised, but not yet known to be remembered by the motion controllers.
-    assert jobs(desk.promise(everybody)) == []
-    (job,) = jobs(desk.promise(everybody, joined=(0, 1)))
+    assert jobs(desk.promise(members)) == []
+    (job,) = jobs(desk.promise(members, joined=(0, 1)))
     effects = desk.give(run_job(job))
     plan = plan_of(effects)
     assert plan_problems(plan) == []
-    assert (plan.ballot, plan.formations, plan.roster) == (desk.ballot, (0, 1), tuple(everybody))
+    assert (plan.ballot, plan.formations, plan.roster) == (desk.ballot, (0, 1), tuple(members))
     assert set(plan.territory) <= LATTICE.block_cells(0) | LATTICE.block_cells(1)
     for name, moves in plan.moves.items():
-        assert (moves[-1][2] if moves else everybody[name])[1] == LANES[name]
+        assert (moves[-1][2] if moves else members[name])[1] == LANES[name]
     assert notes(effects, "lane-out-of-reach") == []
-    for name, cell in everybody.items():
-        desk.tell(state(name, cell, desk.ballot, accepted=True, t_s=2.0, joined=(0, 1)))
+    desk.accept(members, joined=(0, 1))
     assert desk.leaders[0].phase is BallotPhase.IN_FORCE
 
 
@@ -183,10 +179,10 @@ def test_a_formation_that_has_given_up_is_not_joined() -> None:
 def test_no_more_formations_are_joined_than_the_scenario_allows() -> None:
     desk, job = overfull(JOINING)
     desk.give(run_job(job))
-    everybody = FULL | NEXT
+    members = FULL | NEXT
     third: Cells = {Name("third"): (-9, 1)}
     crowd = LANES | dict.fromkeys(NEXT, 1) | {Name("third"): 1}
-    cells: Cells = everybody | {Name(f"x{index}"): (-7 + index, 2) for index in range(4)}
+    cells: Cells = members | {Name(f"x{index}"): (-7 + index, 2) for index in range(4)}
     lanes = dict.fromkeys(cells, 1) | crowd
     desk.tell(census(cells | third, lanes, t_s=T_S + 1.0))
     for name, cell in cells.items():
@@ -201,15 +197,13 @@ def test_no_more_formations_are_joined_than_the_scenario_allows() -> None:
 
 
 def test_a_group_is_learned_from_a_state_of_any_member() -> None:
-    desk = Desk()
-    desk.lead()
-    desk.tell(census(FULL | NEXT, LANES))
+    desk = leading(FULL | NEXT, LANES)
     assert sorted(desk.leaders) == [0, 1]
     desk.tell(state(F, NEXT[F], joined=(0, 1)))
     assert sorted(desk.leaders) == [0]
     control = desk.leaders[0]
     assert (control.formation.numbers, control.formation.roster) == ((0, 1), (*FULL, F))
-    desk.tell(state(F, NEXT[F], joined=(1,), t_s=9.0))  # nobody takes that back
+    desk.tell(state(F, NEXT[F], joined=(1,), t_s=9.0))  # joined formations never part
     assert desk.leaders[0] is control
 
 
@@ -235,10 +229,8 @@ def test_an_acceptance_that_shows_more_formations_puts_no_plan_in_force() -> Non
 
 
 def test_groups_that_overlap_become_one() -> None:
-    desk = Desk()
-    desk.lead()
     cells: Cells = {A: (0, 0), B: (-5, 1), C: (-9, 1)}
-    desk.tell(census(cells))
+    desk = leading(cells)
     assert sorted(desk.leaders) == [0, 1, 2]
     desk.tell(state(A, cells[A], joined=(0, 1)))
     desk.tell(evolve(state(C, cells[C]), formation=2, joined=(1, 2)))
@@ -248,7 +240,7 @@ def test_groups_that_overlap_become_one() -> None:
 
 
 def test_a_group_is_planned_only_once_its_later_block_has_closed_in_the_census() -> None:
-    """Until then somebody may enter whom no ballot would know of."""
+    """Until then a vehicle may enter that no ballot names."""
     desk = Desk()
     desk.lead()
     cells: Cells = {A: (0, 0), B: (-4, 0)}
@@ -265,9 +257,7 @@ def test_a_group_is_planned_only_once_its_later_block_has_closed_in_the_census()
 
 
 def test_the_remaining_vehicles_of_a_group_stay_joined() -> None:
-    desk = Desk()
-    desk.lead()
-    desk.tell(census({A: (0, 0), B: (-4, 0)}))
+    desk = leading({A: (0, 0), B: (-4, 0)})
     desk.tell(state(A, joined=(0, 1)))
     desk.tell(census({B: (-4, 0)}, t_s=T_S + 1.0))
     control = desk.leaders[0]
@@ -286,14 +276,14 @@ def test_another_road_has_other_groups() -> None:
     assert sorted(desk.leaders) == [0, 1]
 
 
-# --- who is observed first --------------------------------------------------------------------
+# --- which formations are observed first ------------------------------------------------------
 
 
 def just_closed(number: int = 0) -> float:
     return closing_time_s(number) + 0.1
 
 
-def test_a_formation_that_closes_before_the_leaders_eyes_is_prepared_at_once() -> None:
+def test_a_formation_that_this_leader_saw_close_is_prepared_at_once() -> None:
     desk = Desk()
     desk.lead()
     desk.watch(ELECTION_S + 0.1)
@@ -322,7 +312,7 @@ def test_a_leader_that_has_just_begun_observes_every_formation() -> None:
 
 
 def test_a_leader_that_was_paused_observes_every_formation() -> None:
-    """Another one may have led, and planned, while it slept."""
+    """Another one may have led and planned meanwhile."""
     desk = Desk()
     desk.lead()
     desk.watch(2 * ELECTION_S)
@@ -352,11 +342,8 @@ def test_a_plan_in_force_is_logged_with_the_time_at_which_its_formation_had_clos
 def test_a_vehicle_without_an_agent_keeps_its_cell_and_the_others_drive_around_it() -> None:
     """A holds in the middle lane, between B and the lane that B wants."""
     cells: Cells = {A: (-1, 1), B: (-1, 2)}
-    desk = Desk()
-    desk.lead()
-    desk.tell(census(cells, {A: 0, B: 0}))
-    for name, cell in cells.items():
-        desk.tell(state(name, cell))
+    desk = leading(cells, {A: 0, B: 0})
+    desk.observe(cells)
     (job,) = jobs(desk.promise(cells, unattended=[A]))
     effects = desk.give(run_job(job))
     plan = plan_of(effects)
@@ -369,11 +356,8 @@ def test_a_vehicle_without_an_agent_keeps_its_cell_and_the_others_drive_around_i
 
 def test_when_no_vehicle_can_be_moved_the_plan_has_no_moves() -> None:
     cells: Cells = {A: (0, 0), B: (-1, 1)}
-    desk = Desk()
-    desk.lead()
-    desk.tell(census(cells, {A: 0, B: 2}))
-    for name, cell in cells.items():
-        desk.tell(state(name, cell))
+    desk = leading(cells, {A: 0, B: 2})
+    desk.observe(cells)
     (job,) = jobs(desk.promise(cells, unattended=[A, B]))
     effects = desk.give(run_job(job))
     assert plan_of(effects).moves == {A: (), B: ()}
@@ -382,16 +366,13 @@ def test_when_no_vehicle_can_be_moved_the_plan_has_no_moves() -> None:
         shown = state(name, cell, desk.ballot, accepted=True, t_s=2.0)
         desk.tell(evolve(shown, attended=False, done=True))
     desk.watch(3.0)
-    assert desk.leaders[0].phase is BallotPhase.IN_FORCE  # and it is not planned again for ever
+    assert desk.leaders[0].phase is BallotPhase.IN_FORCE  # and it is not planned again
 
 
-def test_a_lane_that_only_those_without_agents_miss_is_no_reason_to_join() -> None:
-    desk = Desk(scenario=JOINING)
-    desk.lead()
+def test_a_lane_that_only_vehicles_without_agents_miss_joins_no_formations() -> None:
     cells: Cells = {A: (0, 0), B: (-1, 1)} | NEXT
-    desk.tell(census(cells, {A: 2, B: 0, F: 0}))
-    for name, cell in cells.items():
-        desk.tell(state(name, cell))
+    desk = leading(cells, {A: 2, B: 0, F: 0}, scenario=JOINING)
+    desk.observe(cells)
     mine = {name: cells[name] for name in (A, B)}
     (job,) = jobs(desk.promise(mine, unattended=[A]))
     effects = desk.give(run_job(job))

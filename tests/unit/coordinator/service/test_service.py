@@ -49,7 +49,7 @@ SETTINGS = Service(queue_limit=8, max_request_bytes=4096, cache_entries=4, cache
 
 @define
 class Desk:
-    """A service with one worker, its clock, and what it has said so far."""
+    """A service with one worker, its clock, and its replies so far."""
 
     service: PlanningService = field(factory=lambda: PlanningService("c1", SETTINGS, workers=1))
     now_s: float = 100.0
@@ -59,7 +59,7 @@ class Desk:
     _tokens: int = 0
 
     def ask(self, data: object, *, encoding: str = "", others: tuple[str, ...] = ()) -> int:
-        """Ask something; returns the token."""
+        """Ask something; return the token."""
         payload = data if isinstance(data, bytes) else json.dumps(data).encode()
         self._tokens += 1
         job = 1000 + self._tokens
@@ -302,7 +302,7 @@ def test_what_was_handed_out_ahead_is_dropped_at_its_deadline(desk: Desk) -> Non
     assert desk.answer(ahead)["code"] == LATE
     assert busy not in desk.replies
     assert desk.service.wakeup_s is None
-    # Asked again, it is another request; what the worker says of the first one is nobody's.
+    # Asked again, it is another request; the result of the first one is dropped.
     again = desk.ask(named("ahead", deadline_s=5.0))
     for _ in range(3):
         desk.work()
@@ -320,21 +320,16 @@ def test_what_is_being_planned_is_not_dropped_at_its_deadline(desk: Desk) -> Non
     assert desk.answer(token)["status"] == "optimal"
 
 
-def test_a_worker_that_hangs_has_failed_and_is_not_called_late(desk: Desk) -> None:
+@pytest.mark.parametrize("error", ["the worker was stopped: it went on too long", "it died"])
+def test_a_failed_computation_is_an_error_reply_and_is_not_called_late(
+    desk: Desk, error: str
+) -> None:
     token = desk.ask(REQUEST | {"deadline_s": 5.0})
     desk.wait(10.1)
-    desk.end(Computed(desk.orders.pop().job, None, "the worker was stopped: it went on too long"))
-    refusal = desk.answer(token)
-    assert refusal["code"] == FAILED
-    assert "went on too long" in refusal["message"]
-
-
-def test_a_failed_computation_is_an_error_reply(desk: Desk) -> None:
-    token = desk.ask(REQUEST)
-    desk.end(Computed(desk.orders.pop().job, None, "the worker died"))
+    desk.end(Computed(desk.orders.pop().job, None, error))
     refusal = desk.answer(token)
     assert (refusal["code"], refusal["field"]) == (FAILED, "")
-    assert "the worker died" in refusal["message"]
+    assert error in refusal["message"]
 
 
 # --- limits -----------------------------------------------------------------------------------
@@ -480,12 +475,12 @@ def owners(payload: bytes, names: tuple[str, ...]) -> list[str]:
 
 
 @given(st.binary(), st.sets(st.sampled_from(NAMES), min_size=1))
-def test_a_request_falls_to_exactly_one(payload: bytes, names: set[str]) -> None:
+def test_each_request_is_assigned_to_one_coordinator(payload: bytes, names: set[str]) -> None:
     assert len(owners(payload, tuple(names))) == 1
 
 
 @given(st.binary(), st.sampled_from(NAMES))
-def test_when_one_dies_only_its_requests_move(payload: bytes, dead: str) -> None:
+def test_when_one_dies_only_its_requests_are_assigned_anew(payload: bytes, dead: str) -> None:
     (before,) = owners(payload, NAMES)
     (after,) = owners(payload, tuple(name for name in NAMES if name != dead))
     assert after == before or before == dead
@@ -500,28 +495,28 @@ def test_the_load_is_shared_evenly() -> None:
     assert all(abs(count - 1000) < 170 for count in counts.values())
 
 
-def test_what_falls_to_another_is_left_to_it(desk: Desk) -> None:
+def test_requests_of_another_coordinator_are_declined(desk: Desk) -> None:
     tokens = [desk.ask(named(str(n)), others=("c2",)) for n in range(40)]
-    numbers = desk.service.metrics
+    metrics = desk.service.metrics
     assert desk.left
-    assert numbers.left_total == len(desk.left)
-    assert numbers.taken_total == len(tokens) - len(desk.left) > 0
+    assert metrics.left_total == len(desk.left)
+    assert metrics.taken_total == len(tokens) - len(desk.left) > 0
     assert not set(desk.left) & set(desk.replies)
 
 
-# --- numbers ----------------------------------------------------------------------------------
+# --- metrics ----------------------------------------------------------------------------------
 
 
-def test_the_numbers_tell_what_was_done(desk: Desk) -> None:
+def test_metrics_count_what_was_done(desk: Desk) -> None:
     assert desk.service.metrics == ServiceMetrics()
     desk.ask(named("r"))
     desk.ask(named("r"))
     desk.ask({})
     desk.wait(2.0)
     desk.work()
-    numbers = desk.service.metrics
-    assert (numbers.taken_total, numbers.answered_total) == (3, 1)
-    assert (numbers.repeated_total, numbers.invalid_total) == (1, 1)
-    assert numbers.planning_seconds_total > 0
-    assert numbers.planning_seconds_total + numbers.service_seconds_total == pytest.approx(2.0)
-    assert (numbers.waiting, numbers.planning) == (0, 0)
+    metrics = desk.service.metrics
+    assert (metrics.taken_total, metrics.answered_total) == (3, 1)
+    assert (metrics.repeated_total, metrics.invalid_total) == (1, 1)
+    assert metrics.planning_seconds_total > 0
+    assert metrics.planning_seconds_total + metrics.service_seconds_total == pytest.approx(2.0)
+    assert (metrics.waiting, metrics.planning) == (0, 0)

@@ -1,4 +1,4 @@
-"""A vehicle that owns cells: what it promises, which plans it accepts, when it takes possession."""
+"""A vehicle that owns cells: its promises, the plans that it accepts, when it takes ownership."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ from typing import Any
 import pytest
 from attrs import evolve
 
+from laneweave.protocol.lattice import PlannedMove
 from laneweave.protocol.vehicle.execution import (
-    VEHICLE_RULES,
     ExecutionPhase,
     PlanExecution,
-    take_ownership,
-    transfers_only_owned_cells,
 )
 from laneweave.protocol.vehicle.plans import ownership_problems, plan_problems
 from laneweave.protocol.wire.messages import Deed, Plan, Prepare
@@ -35,7 +33,6 @@ from support.rolling_samples import (
     state,
     vehicle,
 )
-from support.rule_books import replacing
 
 PREPARE = Prepare(MID, (), (A, B))
 
@@ -102,19 +99,11 @@ def test_an_unsound_plan_is_refused(problem: str) -> None:
     assert execution.on_plan(make_plan())
 
 
-def test_without_its_guard_any_transfers_are_accepted() -> None:
-    execution = vehicle(
-        rules=replacing(VEHICLE_RULES, {transfers_only_owned_cells: lambda *_: True})
-    )
-    execution.on_prepare(PREPARE)
-    assert execution.on_plan(changed("before", A=(HOME, (7, 7)))(make_plan()))
-
-
-def test_a_plan_that_takes_more_for_mine_is_refused() -> None:
+def test_a_plan_that_claims_more_cells_than_the_vehicle_owns_is_refused() -> None:
     plan = make_plan()
     execution = promised()
     assert not execution.on_plan(changed("before", A=(*BEFORE[A], (7, 0)))(plan))
-    # Less does no harm: what nobody knows of is nobody's from then on.
+    # Fewer cells do no harm: the others then have no owner.
     less = evolve(plan, before=BEFORE | {A: (HOME,)}, after=AFTER | {A: (HOME, TARGET)})
     assert execution.on_plan(less)
 
@@ -185,7 +174,7 @@ def test_an_unnoted_plan_is_not_accepted() -> None:
     assert not execution.go
 
 
-# --- taking possession ------------------------------------------------------------------------
+# --- taking ownership -------------------------------------------------------------------------
 
 
 def test_the_transfer_is_that_of_the_plan() -> None:
@@ -195,31 +184,29 @@ def test_the_transfer_is_that_of_the_plan() -> None:
     assert execution.transfer == Deed(MID, BEFORE[A], AFTER[A], (A, B))
 
 
-def test_takes_possession_when_all_are_ready() -> None:
+@pytest.mark.parametrize(
+    ("shown", "t_s", "owns", "move"),
+    [
+        ({"ready": False}, T0_S, False, None),
+        ({}, T0_S, True, (0, HOME, TARGET)),
+        ({}, T0_S - 1.0, True, None),
+        ({"ready": False, "go": True}, T0_S - 1.0, True, None),
+    ],
+    ids=["not all are ready", "all are ready", "before the moves are due", "another has go"],
+)
+def test_takes_ownership_with_the_open_gate(
+    shown: dict[str, Any], t_s: float, owns: bool, move: PlannedMove | None
+) -> None:
     execution = accepted()
     assert execution.tick(T0_S) is None
     assert execution.transfer == deed_of(A)
-    execution.on_state(state(B, MID, accepted=True))
-    assert execution.transfer == deed_of(A)
-    assert execution.tick(T0_S) == (0, HOME, TARGET)
-    assert execution.transfer == Deed(MID, open=True)
+    execution.on_state(evolve(state(B, MID, accepted=True), **shown))
+    assert execution.tick(t_s) == move
+    assert execution.transfer == (Deed(MID, open=True) if owns else deed_of(A))
+    assert execution.go is owns
 
 
-def test_takes_possession_before_the_moves_are_due() -> None:
-    execution = accepted()
-    execution.on_state(state(B, MID, accepted=True))
-    assert execution.tick(T0_S - 1.0) is None
-    assert execution.transfer == Deed(MID, open=True)
-
-
-def test_takes_possession_when_another_has() -> None:
-    execution = accepted()
-    execution.on_state(evolve(state(B, MID, accepted=True), ready=False, go=True))
-    assert execution.transfer == Deed(MID, open=True)
-    assert execution.go
-
-
-def test_does_not_take_possession_while_it_moves() -> None:
+def test_does_not_take_ownership_while_it_moves() -> None:
     execution = promised()
     execution.moving = True
     execution.on_plan(make_plan())
@@ -230,16 +217,6 @@ def test_does_not_take_possession_while_it_moves() -> None:
     execution.end_motion()
     execution.tick(T0_S)
     assert execution.transfer == Deed(MID, open=True)
-
-
-def test_without_its_action_the_transfer_stays_closed() -> None:
-    execution = vehicle(rules=replacing(VEHICLE_RULES, {take_ownership: lambda *_: None}))
-    execution.on_prepare(PREPARE)
-    execution.on_plan(make_plan())
-    execution.on_noted(MID)
-    execution.on_state(state(B, MID, accepted=True))
-    assert execution.tick(T0_S) is not None
-    assert execution.transfer == deed_of(A)
 
 
 def test_where_formations_own_blocks_there_are_no_transfers() -> None:
