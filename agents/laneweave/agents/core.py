@@ -272,7 +272,7 @@ class AgentCore:
         return [Send(COMMAND, self._command, self._own)] if self._command != command else []
 
     def _forget_road(self) -> None:
-        """Forget the vehicle of an earlier bridge, as a process that starts anew (V1)."""
+        """Forget the vehicle of an earlier bridge, as a process that has just started (V1)."""
         self._incarnation = self._new_incarnation()
         self._sense = self._command = self._move = self.execution = None
         self.wanted_motions, self.wanted_states = (), ()

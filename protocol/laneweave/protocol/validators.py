@@ -1,4 +1,4 @@
-"""What a configured value may be: names, numbers, endpoints, and validators for attrs fields.
+"""Validators of configured values (names, numbers, endpoints), for attrs fields and elsewhere.
 
 Every check raises `BadInputError` with the field, the value and the allowed range.
 """

@@ -292,7 +292,7 @@ def _both(limit: float) -> tuple[float, float]:
 
 
 def settling_trajectory(scenario: Scenario, start: Array, ticks: int) -> Trajectory:
-    """Return the trajectory with the least sum of squared jerks from a state to rest at the origin.
+    """Return the trajectory of minimum squared jerk from a state to rest at the origin.
 
     Limits are ignored: a vehicle that enters has so long for one and a half columns that it never
     comes near them.

@@ -128,7 +128,7 @@ class _Worker:
                 result = self._do(job)
             except Exception as error:
                 # The thread must go on, or a share of the requests would wait forever.
-                log.exception("a worker is given up", job=job.job)
+                log.exception("a worker is replaced after an error", job=job.job)
                 self._forget()
                 result = Computed(job.job, None, described(error))
             if not self._ending.is_set():

@@ -438,7 +438,7 @@ class Scenario:
     def comfortable_cycle_s(self) -> float:
         """Shortest T_F that plans may have in which no move needs more than `COMFORT_MPS2` [s].
 
-        A move of least jerk by d in T needs an acceleration of 10 / sqrt(3) d / T^2. If there is
+        A minimum-jerk move by d in T needs an acceleration of 10 / sqrt(3) d / T^2. If there is
         none, the longest.
         """
         formation = self.formation

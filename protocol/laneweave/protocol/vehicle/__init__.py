@@ -1,4 +1,4 @@
-"""What a vehicle and everybody who plans for it must agree on: motion, braking, plan execution.
+"""Rules that vehicles and planners share: motion, braking, plan execution.
 
 Entry points: `execution.PlanExecution` (the vehicle's side of the execution protocol, rules V1 to
 V7), `motion` (integration and limits), `braking` (the emergency brake). Pure functions and state

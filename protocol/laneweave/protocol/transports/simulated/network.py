@@ -204,7 +204,7 @@ class SimulatedNetwork(Simulation):
         return member.node
 
     def __contains__(self, name: str) -> bool:
-        """Tell whether a node is in the network."""
+        """Return whether a node is in the network."""
         return name in self._members
 
     @property
