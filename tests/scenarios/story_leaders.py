@@ -171,14 +171,14 @@ class Candidate:
         yield from self.handle(run_job(self.jobs.pop(0)), mail, now_s)
 
     def handle(self, event: Event, mail: Mail, now_s: float) -> Iterator[str]:
-        """Hand an event to the core and tell what it did."""
+        """Pass an event to the core; yield its effects."""
         before = self.about()
         effects = self.core.handle(event, now_s)
-        told = [line for effect in effects if (line := self._effect(effect, mail))]
-        # Logged first, then what it is about, then what it sends.
-        yield from (line for line in told if not line.startswith(("PREPARE", "PLAN")))
+        lines = [line for effect in effects if (line := self._effect(effect, mail))]
+        # Log entries first, then changed leaders, then messages.
+        yield from (line for line in lines if not line.startswith(("PREPARE", "PLAN")))
         yield from (line for line in self.about() if line not in before)
-        yield from (line for line in told if line.startswith(("PREPARE", "PLAN")))
+        yield from (line for line in lines if line.startswith(("PREPARE", "PLAN")))
 
     def about(self) -> list[str]:
         lines = []
@@ -191,7 +191,7 @@ class Candidate:
         return lines
 
     def rank(self) -> str:
-        """Tell whether it leads."""
+        """Write whether it leads."""
         election = self.core.election
         return f"{self.name} {'leads' if election.leading else 'waits'}, term {election.term}"
 
@@ -278,14 +278,14 @@ def written_plan(text: str, control: FormationLeader, ballot: Ballot) -> Plan:
 
 
 def post(mail: Mail, message: Prepare | Plan, vehicle: str) -> str:
-    """Put a message into the mail and tell so."""
+    """Put a message into the mail; return the line that says so."""
     kind = "PLAN" if isinstance(message, Plan) else "PREPARE"
     mail[kind, written(message.ballot), vehicle] = message
     return f"{kind} {written(message.ballot)} to {vehicle}"
 
 
 def about(name: str, control: FormationLeader) -> str:
-    """Tell what a leader is about."""
+    """Write the phase and the ballot of a leader."""
     ballot = f" {written(control.ballot)}" if control.ballot is not None else ""
     return f"{name} {control.phase.value}{ballot}"
 

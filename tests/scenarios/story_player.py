@@ -68,11 +68,11 @@ class Player:
 
     @property
     def t_s(self) -> float:
-        """Road time, and everybody's clock."""
+        """Road time, which all clocks show."""
         return self.tick * TICK_S
 
     def play(self, command: str) -> Lines:
-        """Carry a command out and tell what happened.
+        """Execute a command; yield what happened.
 
         Raises:
             StoryError: the command is unknown, or names an unknown process or vehicle.
@@ -97,7 +97,7 @@ class Player:
                     raise CollisionError(f"{command}: {name} and {owner[cell]} both occupy {cell}")
                 owner[cell] = name
 
-    # --- who there is -------------------------------------------------------------------------
+    # --- vehicles and processes ---------------------------------------------------------------
 
     def _vehicle(self, name: str, cell: str, lane: str) -> None:
         self.vehicles[name] = Vehicle.entering(name, cell_of(cell), int(lane), self.t_s)
@@ -112,7 +112,7 @@ class Player:
     def _put_in_charge(self, name: str, vehicle: Vehicle) -> None:
         agent = Agent(name, vehicle, self._vehicle_rules)
         self.processes[name] = agent
-        # With the first tick it claims the vehicle, with the second one it senses that it has it.
+        # In the first tick it claims the vehicle, in the second one it senses that it has it.
         for _ in range(2):
             list(self._ticks(name))
         if not agent.in_charge:
@@ -252,8 +252,8 @@ class Player:
         before, promised = process.shown, _promised(process)
         process.get(message, self.tick)
         if isinstance(message, Plan):
-            heeded = process.shown is not before
-            yield f"{name} accepts" if heeded else f"{name} ignores it"
+            accepted = process.shown is not before
+            yield f"{name} accepts" if accepted else f"{name} ignores it"
         else:
             yield f"{name} promises" if _promised(process) != promised else f"{name} ignores it"
 
@@ -349,7 +349,7 @@ class Player:
     def _body_arrives(self, name: str) -> None:
         self.vehicles[name].at = self.vehicles[name].road.controller.hold_cell
 
-    # --- looking at things --------------------------------------------------------------------
+    # --- inspection ---------------------------------------------------------------------------
 
     def _show(self, name: str) -> Lines:
         if name in self.leaders:
@@ -364,7 +364,7 @@ class Player:
 
 @frozen
 class _Snapshot:
-    """What a vehicle was about before a tick."""
+    """State of a vehicle before a tick."""
 
     execution: PlanExecution | None
     hold_cell: Cell

@@ -12,8 +12,9 @@ from itertools import count
 from attrs import define, evolve, field
 
 from laneweave.agents.core import AgentCore
-from laneweave.agents.driving.driver import Drive, SolverStats
-from laneweave.protocol.lattice import Cell, Lattice, PlannedMove
+from laneweave.agents.driving.driver import Drive
+from laneweave.launch.fault_search.stand_ins import LightDriver
+from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Arrived, Effect, Send, Started
 from laneweave.protocol.scenario.deployment import Network
 from laneweave.protocol.scenario.tables import FormationSettings, Road, Runtime, Scenario
@@ -22,7 +23,6 @@ from laneweave.protocol.vehicle.execution import PlanExecution
 from laneweave.protocol.vehicle.motion import at_rest_in_cell, cell_state
 from laneweave.protocol.wire.messages import (
     Command,
-    Motion,
     Name,
     Plan,
     Prepare,
@@ -59,38 +59,14 @@ ROLLING = evolve(SCENARIO, formation=evolve(SCENARIO.formation, operation="rolli
 """The same with vehicles that own cells."""
 
 
-class StoryDriver:
-    """Drives without dynamics: a motion is over when the story has brought the body there."""
-
-    solver_stats = SolverStats()
-
-    def __init__(self, scenario: Scenario) -> None:
-        """Make a driver that knows nothing of its vehicle yet."""
-        self._lattice: Lattice = scenario.lattice
-        self._origin: Cell = (0, 0)
-        self._goal: Cell = (0, 0)
-        self._ticks = 0
-
-    def take_over(self, sense: Sense) -> None:
-        self._origin, self._goal = sense.motion_origin, sense.hold_cell
-        self._ticks = sense.motion_ticks
-
-    def begin(self, move: PlannedMove, tick: int, ticks: int) -> None:
-        del tick
-        self._ticks = ticks
-        _, self._origin, self._goal = move
+class StoryDriver(LightDriver):
+    """Driver without dynamics: a motion ends when the story has brought the body to its target."""
 
     def at_rest(self, sense: Sense) -> bool:
         return at_rest_in_cell(sense.state, self._lattice, self._goal, sense.t_s)
 
     def drive(self, sense: Sense, *, moving: bool) -> Drive:
         return Drive(sense.tick + 1 if moving else 0, self._origin, self._ticks, b"")
-
-    def motion(self, tick: int) -> None:
-        """Tell others nothing: there are no trajectories."""
-
-    def on_motion(self, motion: Motion) -> None:
-        """Ignore others' motions."""
 
 
 @define(eq=False)
@@ -142,13 +118,13 @@ class Vehicle:
         }
 
     def sense(self, tick: int) -> Sense:
-        """Return what the vehicle shows to whoever acts for it."""
+        """Return what the process in charge of the vehicle senses."""
         controller = self.road.controller
         self.place_body(tick)
         return self.road.sense(tick, caretaker=controller.attendant in self.caretakers)
 
     def place_body(self, tick: int) -> None:
-        """Put the body where the story has it: the lattice goes on moving."""
+        """Put the body where the story has it: the lattice keeps moving."""
         state = cell_state(SCENARIO.lattice, self.at, tick * TICK_S)
         self.road.controller.plant = Plant(state, SCENARIO.vehicle, TICK_S)
 
@@ -157,7 +133,7 @@ class Agent:
     """An agent process of a vehicle."""
 
     def __init__(self, name: str, vehicle: Vehicle, rules: RuleBook) -> None:
-        """Start a process; it has not met the vehicle yet."""
+        """Start a process that has received nothing yet."""
         self.name = name
         self.vehicle = vehicle
         self.shown: VehicleState | None = None
@@ -175,7 +151,7 @@ class Agent:
 
     @property
     def incarnation(self) -> int | None:
-        """The one that it acts under; None before it has met its vehicle."""
+        """Its own; None before the first SENSE."""
         return self.execution.incarnation if self.execution is not None else None
 
     @property
@@ -251,7 +227,7 @@ class CaretakerProcess:
         self._note(self._attendance.on_message(self.vehicle.name, message, tick))
 
     def hear(self, state: VehicleState) -> None:
-        """It never moves, so nothing that others show matters to it."""
+        """Ignore states of others: a caretaker never moves its vehicle."""
 
     def _note(self, effects: Iterable[Effect]) -> None:
         for effect in effects:

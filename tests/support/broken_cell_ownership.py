@@ -1,4 +1,4 @@
-"""What planted bugs of the rolling operation put in the place of rules; see `planted_bugs`."""
+"""Broken methods for the bugs of the rolling operation in `planted_bugs`."""
 
 from __future__ import annotations
 
@@ -85,11 +85,7 @@ def show_owned_cells_at_once(patch: Patch) -> None:
 
 
 def cancel_closed_transfers(patch: Patch) -> None:
-    def mutant(state: VehicleState, states: States, gone: Collection[Name]) -> frozenset[Cell]:
-        del states, gone
-        return frozenset(state.estate)
-
-    patch.setattr(transfer, "owned_cells", mutant)
+    patch.setattr(transfer, "owned_cells", lambda state, *_: frozenset(state.estate))
 
 
 def cancel_on_common_promise(patch: Patch) -> None:
@@ -120,8 +116,8 @@ def forget_motion(patch: Patch) -> None:
 
 
 def skip_ownership_checks(patch: Patch) -> None:
-    patch.setattr(transfer, "ownership_problems", _no_problems)
-    patch.setattr(vehicle_rules, "ownership_problems", _no_problems)
+    for module in (transfer, vehicle_rules):
+        patch.setattr(module, "ownership_problems", lambda plan: [])  # noqa: ARG005
 
 
 def keep_what_is_given(patch: Patch) -> None:
@@ -136,8 +132,3 @@ def keep_what_is_given(patch: Patch) -> None:
 
     patch.setattr(CellTransfer, "_plan", mutant)
     skip_ownership_checks(patch)
-
-
-def _no_problems(plan: Plan) -> list[str]:
-    del plan
-    return []

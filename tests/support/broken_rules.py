@@ -1,8 +1,8 @@
-"""What planted bugs put in the place of rules; `planted_bugs` says what is broken by it."""
+"""Broken guards, actions and methods for the bugs in `planted_bugs`."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import pytest
@@ -55,7 +55,7 @@ def never(*_: object) -> bool:
     return False
 
 
-def skip(*_: object) -> None:
+def skip(*_: object, **__: object) -> None:
     """Do not act."""
 
 
@@ -172,27 +172,27 @@ def start_and_count(me: PlanExecution, _: object) -> None:
 # --- a leader ---------------------------------------------------------------------------------
 
 
-def roster_of_heard(patch: pytest.MonkeyPatch) -> None:
-    def mutant(me: FormationLeader) -> tuple[Name, ...]:
-        return tuple(name for name in me.formation.roster if name in me.states)
+def replace_roster(
+    patch: pytest.MonkeyPatch, roster: Callable[[FormationLeader], Iterable[Name]]
+) -> None:
+    patch.setattr(FormationLeader, "roster", property(lambda me: tuple(roster(me))))
 
-    patch.setattr(FormationLeader, "roster", property(mutant))
+
+def roster_of_heard(patch: pytest.MonkeyPatch) -> None:
+    replace_roster(patch, lambda me: (name for name in me.formation.roster if name in me.states))
 
 
 def roster_of_majority(patch: pytest.MonkeyPatch) -> None:
-    def mutant(me: FormationLeader) -> tuple[Name, ...]:
+    def mutant(me: FormationLeader) -> Iterable[Name]:
         members = me.formation.roster
-        promised = tuple(name for name in members if name in me.promises)
+        promised = [name for name in members if name in me.promises]
         return promised if 2 * len(promised) > len(members) else members
 
-    patch.setattr(FormationLeader, "roster", property(mutant))
+    replace_roster(patch, mutant)
 
 
 def roster_of_promised(patch: pytest.MonkeyPatch) -> None:
-    def mutant(me: FormationLeader) -> tuple[Name, ...]:
-        return tuple(me.promises) or me.formation.roster
-
-    patch.setattr(FormationLeader, "roster", property(mutant))
+    replace_roster(patch, lambda me: me.promises or me.formation.roster)
 
 
 def any_has_promised(me: FormationLeader, _: object) -> bool:
@@ -200,10 +200,9 @@ def any_has_promised(me: FormationLeader, _: object) -> bool:
 
 
 def take_old_states(patch: pytest.MonkeyPatch) -> None:
-    def mutant(me: FormationLeader, state: VehicleState) -> bool:
-        return state.vehicle in me.formation.roster
-
-    patch.setattr(FormationLeader, "_is_news", mutant)
+    patch.setattr(
+        FormationLeader, "_is_news", lambda me, state: state.vehicle in me.formation.roster
+    )
 
 
 def heard_have_accepted(me: FormationLeader, _: object) -> bool:
@@ -227,7 +226,7 @@ def prepare_the_same(me: FormationLeader, _: object) -> None:
     if me.ballot is None:
         me.ballot = me.new_ballot(me.highest)
     else:
-        # Who has restarted is asked again; the others have promised this ballot.
+        # Vehicles that restarted are asked again; the others have promised this ballot.
         known = {name: each.incarnation for name, each in me.promises.items()}
         me.promises = {
             name: promise
@@ -277,10 +276,7 @@ def revive(patch: pytest.MonkeyPatch) -> None:
 
 
 def ignore_link_loss(patch: pytest.MonkeyPatch) -> None:
-    def mutant(self: Election, *, up: bool, now_s: float) -> None:
-        del self, up, now_s
-
-    patch.setattr(Election, "on_link", mutant)
+    patch.setattr(Election, "on_link", skip)
 
 
 def forget_incarnation(patch: pytest.MonkeyPatch) -> None:
@@ -320,11 +316,7 @@ def close_early(patch: pytest.MonkeyPatch) -> None:
 
 
 def join_nothing(patch: pytest.MonkeyPatch) -> None:
-    def mutant(self: Groups, numbers: Iterable[int]) -> bool:
-        del self, numbers
-        return False
-
-    patch.setattr(Groups, "join", mutant)
+    patch.setattr(Groups, "join", never)
 
 
 def play_any_command(patch: pytest.MonkeyPatch) -> None:
@@ -358,7 +350,7 @@ def keep_incarnation(patch: pytest.MonkeyPatch) -> None:
     sense = AgentCore._on_sense
 
     def mutant(self: AgentCore, message: Any) -> Any:  # noqa: ANN401
-        # As if the caretaker had never been: what was promised before still counts.
+        # As if there had been no caretaker: earlier promises still count.
         return sense(self, evolve(message, attendant=self._incarnation))
 
     patch.setattr(AgentCore, "_on_sense", mutant)
@@ -376,8 +368,4 @@ def accept_moves(patch: pytest.MonkeyPatch) -> None:
 
 
 def never_moving(patch: pytest.MonkeyPatch) -> None:
-    def mutant(self: MotionController, tick: int) -> bool:
-        del self, tick
-        return False
-
-    patch.setattr(MotionController, "moving", mutant)
+    patch.setattr(MotionController, "moving", never)

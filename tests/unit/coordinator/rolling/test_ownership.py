@@ -1,4 +1,4 @@
-"""Deeds whose gate is shut: what can be told, who must be asked, and that nobody waits for ever."""
+"""Closed transfers: which cells are certain, which promises are needed, and which vehicles move."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ TAKER = state(A, 1, (3, 0), deed=TAKES, accepted=True, ready=True)
 GIVER = state(B, 1, (4, 1), (3, 1), deed=GIVES, accepted=True, ready=True, done=True)
 
 
-def told(giver: VehicleState, *others: VehicleState) -> frozenset[Cell] | None:
+def owned(giver: VehicleState, *others: VehicleState) -> frozenset[Cell] | None:
     return owned_cells(giver, {other.vehicle: other for other in (giver, *others)})
 
 
-def test_nothing_can_be_told_while_both_may_open_their_gates() -> None:
-    assert told(GIVER, TAKER) is None
+def test_ownership_is_unknown_while_both_may_open_their_gates() -> None:
+    assert owned(GIVER, TAKER) is None
     assert certain_cells(GIVER, {A: TAKER, B: GIVER}) == {(4, 1)}
     assert partners(GIVER, {A: TAKER, B: GIVER}) == {A, B}
 
@@ -55,32 +55,35 @@ def test_nothing_can_be_told_while_both_may_open_their_gates() -> None:
     ("taker", "estate"),
     [
         (state(A, 1, (3, 0), (3, 1), deed=Deed(ballot(1), open=True)), {(4, 1)}),
-        (state(A, 2, (3, 0)), {(4, 1), (3, 1)}),  # it has never had the deed
+        (state(A, 2, (3, 0)), {(4, 1), (3, 1)}),  # it has never had the transfer
         (evolve(TAKER, promised=ballot(2), accepted=False), {(4, 1), (3, 1)}),
-        (state(A, 3, (3, 0), deed=Deed(ballot(2), open=True)), {(4, 1)}),  # it will never tell
+        (
+            state(A, 3, (3, 0), deed=Deed(ballot(2), open=True)),
+            {(4, 1)},
+        ),  # it shows a newer one
     ],
 )
 def test_the_state_of_one_vehicle_tells_what_the_other_owns(
     taker: VehicleState, estate: set[Cell]
 ) -> None:
     giver = evolve(GIVER, promised=ballot(2), accepted=False)
-    assert told(giver, taker) == frozenset(estate)
+    assert owned(giver, taker) == frozenset(estate)
 
 
 def test_a_vehicle_that_has_left_is_not_waited_for() -> None:
     giver = evolve(GIVER, promised=ballot(2), accepted=False)
-    assert told(giver) is None  # it may be there, and was not heard yet
+    assert owned(giver) is None  # it may be there, and was not heard yet
     assert owned_cells(giver, {B: giver}, {A}) == frozenset({(4, 1)})
     assert partners(giver, {B: giver}) == {B}
 
 
-def test_a_body_under_way_may_need_what_it_gives() -> None:
+def test_a_moving_vehicle_may_need_the_cells_that_it_gives() -> None:
     giver = evolve(GIVER, promised=ballot(2), accepted=False, moving=True)
-    assert told(giver) is None
+    assert owned(giver) is None
 
 
 class Orders:
-    """A planner that moves whom it is told to, and notes who is held."""
+    """A planner with given moves that records which vehicles are held."""
 
     def __init__(self, moves: dict[Name, Cell]) -> None:
         """Plan these moves in each slot."""
@@ -104,7 +107,7 @@ class Orders:
 
 
 def plan_once(planner: Orders, *states: VehicleState) -> RollingOperation:
-    """Let a leader hear states and plan one slot."""
+    """Let a leader receive states and plan one slot."""
     numbers = count(10)
     control = RollingOperation(SCENARIO, lambda _: ballot(next(numbers)), lambda: 1, planner)
     entries = tuple(CensusEntry(each.vehicle, each.hold_cell, 0, 0.0) for each in states)
@@ -122,7 +125,7 @@ def test_vehicles_that_may_know_what_a_member_owns_are_in_the_roster() -> None:
     giver = evolve(GIVER, deed=deed(1, ((4, 1), (3, 1), (4, 0)), ((4, 1), (4, 0))))
     giver = evolve(giver, estate=((4, 1), (3, 1), (4, 0)))
     control = plan_once(Orders({B: (4, 0)}), TAKER, giver, other)
-    assert [handover.roster for handover in control.transfers] == [(A, B)]
+    assert [transfer.roster for transfer in control.transfers] == [(A, B)]
 
 
 def test_a_vehicle_at_a_gate_that_never_opens_is_planned_for() -> None:
@@ -131,7 +134,7 @@ def test_a_vehicle_at_a_gate_that_never_opens_is_planned_for() -> None:
     planner = Orders({A: (2, 0)})
     control = plan_once(planner, taker, GIVER)
     assert not planner.held
-    assert [set(handover.moves) for handover in control.transfers] == [{A}]
+    assert [set(transfer.moves) for transfer in control.transfers] == [{A}]
 
 
 def test_a_vehicle_that_is_about_to_move_is_held() -> None:
