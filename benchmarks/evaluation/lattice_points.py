@@ -1,14 +1,14 @@
-"""How far apart vehicles are at the lattice's fixed time points, from a run's trajectories.
+"""Distances between vehicles at the lattice's fixed time points, from a run's trajectories.
 
-At the end of each slot vehicles that moved in it are at rest in a cell, and two vehicles of a lane
-are d_F or more apart, front to front. Between those points they may be nearer, by design: one falls
-back into a cell while another leaves it.
+At the end of each slot the vehicles that moved in it are at rest in a cell, and two vehicles of a
+lane are at least d_F apart, front to front. Between those points they may be closer, by design: one
+falls back into a cell while another leaves it.
 
-Each plan has its own slots. Looked at are the ticks before a vehicle begins a move, and one tick of
-each shortest T_F; and of the vehicles those that are at rest then: on the road for
-`formation.settle_s` or longer, and either about to begin a move or in the same cell for at least
-the longest time of a move. Lanes and distances are those of the bodies, not of the cells that they
-should be in, so that a body in the wrong place is seen.
+Each plan has its own slots. The ticks examined are those before a vehicle begins a move, and one
+tick of each shortest T_F. Of the vehicles, those are examined that are at rest: on the road for at
+least `formation.settle_s`, and either about to begin a move or in the same cell for at least the
+longest time of a move. Lanes and distances are those of the bodies, not of the cells that they
+should be in, so that a body in the wrong place is found.
 """
 
 from __future__ import annotations
@@ -17,40 +17,37 @@ from typing import Final
 
 import numpy as np
 from attrs import frozen
-from numpy.typing import NDArray
 
-from laneweave.launch.recordings.trajectories import OFF_LATTICE, Floats, Ints, Tracks
+from laneweave.launch.recordings.trajectories import OFF_LATTICE, Bools, Floats, Ints, Tracks
 from laneweave.protocol.scenario.tables import Scenario
 
-Bools = NDArray[np.bool_]
-
 TOLERANCE_M: Final = 0.3
-"""Two bodies may be nearer than d_F by so much: each is tracked to within 0.1 m at lattice points
+"""Two bodies may be closer than d_F by this much: each is tracked to within 0.1 m at lattice points
 with sensors that err by 0.05 m (standard deviation), and both may err towards each other."""
 
 
 @frozen
 class LatticeSpacing:
-    """What was found at the lattice points of one run or of several."""
+    """Distances at the lattice points of a run."""
 
     least_m: float | None
-    """Least distance from front bumper to front bumper; None: never two on a lane."""
+    """Smallest distance from front bumper to front bumper; None: never two on a lane."""
     pairs: int
-    """How many distances were looked at."""
+    """Number of distances examined."""
     worst_off_m: float | None
     """Greatest distance of a settled vehicle from its cell along the road."""
 
     def keeps(self, pitch_m: float) -> bool:
-        """Tell whether no distance is below the pitch d_F, but for the tolerance."""
+        """Tell whether no distance is below the pitch d_F, apart from the tolerance."""
         return self.least_m is None or self.least_m >= pitch_m - TOLERANCE_M
 
 
 def lattice_spacing(tracks: Tracks, scenario: Scenario) -> LatticeSpacing:
-    """Return how far apart settled vehicles are at the ends of slots.
+    """Return the distances between settled vehicles at the ends of slots.
 
     Args:
         tracks: the run's trajectories.
-        scenario: what was run.
+        scenario: of the run.
     """
     lattice = scenario.lattice
     ticks = np.rint(tracks.t_s / scenario.runtime.tick_s).astype(np.int64)
@@ -72,11 +69,8 @@ def lattice_spacing(tracks: Tracks, scenario: Scenario) -> LatticeSpacing:
 def _settled(tracks: Tracks, ticks: Ints, scenario: Scenario) -> Bools:
     """Return whether each row is a lattice point of a vehicle at rest in a cell."""
     formation, tick_s = scenario.formation, scenario.runtime.tick_s
-    first = np.zeros(len(ticks), dtype=np.bool_)
-    first[tracks.starts[:-1][np.diff(tracks.starts) > 0]] = True
-    changed = np.zeros(len(ticks), dtype=np.bool_)
-    changed[1:] = (np.diff(tracks.column) != 0) | (np.diff(tracks.lane) != 0)
-    changed &= ~first
+    first, changed = np.zeros(len(ticks), dtype=np.bool_), tracks.changed
+    first[tracks.starts[:-1]] = True
     about_to_move = np.append(changed[1:], False)[: len(ticks)]
     shortest_s, longest_s = scenario.cycles_s
     period = round(shortest_s / tick_s)
@@ -92,7 +86,7 @@ def _settled(tracks: Tracks, ticks: Ints, scenario: Scenario) -> Bools:
 
 
 def _slot_phase(changes: Ints, period: int) -> int:
-    """Return at which tick of a period slots end: where most cells change in the tick after.
+    """Return the tick of a period at which slots end: most cells change in the tick after it.
 
     A vehicle shows its next cell in the first tick of its move.
     """

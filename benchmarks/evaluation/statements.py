@@ -1,6 +1,6 @@
-"""What the paper says about its results (Section 5.2), beside what was measured here.
+"""The paper's statements about its results (Section 5.2), beside what was measured here.
 
-Verdicts are computed, by rules that stand with each statement, so that they follow the data.
+Each statement has a rule that computes its verdict from the data.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ OWN: Final = "paper-6"
 CLOSED: Final = ("formations", OWN, "paper-12")
 """Closed formations: the default ones, and the paper's."""
 ALIKE_S: Final = 1.0
-"""Methods are alike where their mean travel times differ by no more."""
+"""Methods are alike if their mean travel times differ by at most this."""
 STABLE: Final = 1.05
 """Travel times are stable if they grow by no more than this factor from 1000 to 1600."""
 CONGESTED: Final = 1.25
-"""A method is congested where its mean travel time is so many times that of free flow."""
+"""A method is congested if its mean travel time exceeds this multiple of free flow."""
 UNDISTURBED: Final = 0.9
 """Speeds are undisturbed if no stretch of road is below this share of v_F on average."""
 CARRIED: Final = 0.97
@@ -42,7 +42,7 @@ FAILS, DEPENDS, OTHERWISE = "**does not hold**", "depends on the reading", ""
 
 @frozen
 class Statement:
-    """One of them."""
+    """A statement of the paper, and its verdict."""
 
     text: str
     measured: str
@@ -112,7 +112,7 @@ class _Judge:
         return Statement(text, "; ".join(parts), _all(kept))
 
     def _congested_from(self, label: str) -> tuple[float | None, float | None]:
-        """Return the least congested volume, and the greatest below it that was looked at."""
+        """Return the lowest congested volume, and the highest measured one below it."""
         setting = self.evidence.setting
         times = {
             row.volume_veh_per_lane_h: row.travel_s
@@ -127,7 +127,7 @@ class _Judge:
         return first, max(below, default=None)
 
     def _rows(self, *labels: str) -> tuple[list[PointRow], list[bool | None]]:
-        """Return all points of labels, and None for each one that is planned and missing."""
+        """Return all points of labels, and None for each planned point that is missing."""
         rows = [
             self._row(label, volume)
             for label in labels
@@ -269,7 +269,7 @@ class _Judge:
 
 
 def _onset(first: float | None, below: float | None) -> str:
-    """Return from which volume on a method is congested, as far as was looked."""
+    """Return the volume from which on a method is congested, as far as it was measured."""
     if first is None:
         return MISSING if below is None else f"not up to {below:g}"
     return f"at {first:g}" + ("" if below is None else f", not yet at {below:g}")
@@ -281,7 +281,7 @@ def _series(texts: Sequence[str], known: Sequence[float]) -> str:
 
 
 def _all(kept: Sequence[bool | None]) -> str:
-    """Return a verdict that asks for all; None stands for what is missing."""
+    """Return the verdict of a statement that holds if all findings agree; None: missing."""
     known = [one for one in kept if one is not None]
     if not known:
         return ""
@@ -289,7 +289,7 @@ def _all(kept: Sequence[bool | None]) -> str:
 
 
 def _some(kept: Sequence[bool | None]) -> str:
-    """Return a verdict where readings of the rules may differ."""
+    """Return the verdict of a statement that may hold for some readings of the rules only."""
     known = [one for one in kept if one is not None]
     return _so_far(DEPENDS, kept) if any(known) and not all(known) else _all(kept)
 

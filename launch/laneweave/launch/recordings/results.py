@@ -79,17 +79,22 @@ def over_seeds(table: pa.Table, wanted: Iterable[tuple[str, str]]) -> list[dict[
     return [{"runs": row.pop("seed_count"), **row} for row in rows]
 
 
-def _figures(summary: RunSummary) -> dict[str, float | int | None]:
-    return flat_numbers(summary.to_json()) | {PREFERRED: summary.preferred_percent}
-
-
-def flat_numbers(tables: Mapping[str, Any], parent: str = "") -> dict[str, float | int | None]:
-    """Return all numbers of nested tables by their path, joined with `_`; null stays null."""
-    flat: dict[str, float | int | None] = {}
+def flatten(tables: Mapping[str, Any], separator: str) -> dict[str, Any]:
+    """Return all values of nested tables by their path."""
+    flat: dict[str, Any] = {}
     for key, value in tables.items():
-        name = f"{parent}{key}"
         if isinstance(value, Mapping):
-            flat |= flat_numbers(value, f"{name}_")
-        elif value is None or (isinstance(value, (int, float)) and not isinstance(value, bool)):
-            flat[name] = value
+            inner = flatten(value, separator)
+            flat |= {f"{key}{separator}{name}": one for name, one in inner.items()}
+        else:
+            flat[key] = value
     return flat
+
+
+def _figures(summary: RunSummary) -> dict[str, float | int | None]:
+    """Return all numbers of a summary; null stays null."""
+    return {
+        name: value
+        for name, value in flatten(summary.to_json(), "_").items()
+        if value is None or (isinstance(value, (int, float)) and not isinstance(value, bool))
+    } | {PREFERRED: summary.preferred_percent}

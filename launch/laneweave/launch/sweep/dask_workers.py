@@ -1,8 +1,8 @@
 """The points of a sweep as tasks of an existing Dask cluster.
 
 Workers need laneweave, but no shared disk: the task returns a point's files, and the client writes
-them. Each task starts a process, as on this machine, since a worker may run several tasks in one
-process and SUMO may crash.
+them. Each task starts a process, as a local sweep does: a worker may run several tasks in one
+process, and SUMO may crash.
 """
 
 from __future__ import annotations
@@ -13,32 +13,27 @@ import uuid
 from collections.abc import Generator, Sequence
 from pathlib import Path
 
-from attrs import frozen
+from attrs import evolve
 from distributed import Client, Event, Future, as_completed, connect
 
-from laneweave.launch.sweep.execution import Ended, Job, run_in_process
+from laneweave.launch.sweep.execution import LOG_FILE, Ended, kept_files, run_in_process
+from laneweave.launch.sweep.points import Point
 from laneweave.protocol.errors import BadInputError
 
 CONNECT_S = 10.0
-RETURNED = ("summary.json", "trips.parquet", "events.jsonl", "log.txt")
 
 
-@frozen
-class Returned:
-    """The result of a task."""
-
-    problems: tuple[str, ...]
-    wall_s: float
-    files: dict[str, bytes]
+Returned = tuple[Ended, dict[str, bytes]]
+"""The result of a task: the point as it ended on its worker, and its files."""
 
 
 def run_on_dask(
-    jobs: Sequence[Job], unfinished: Path, address: str
+    points: Sequence[Point], unfinished: Path, address: str
 ) -> Generator[Ended, None, None]:
-    """Run all jobs on a cluster, and yield each at its end; closing the generator ends them.
+    """Run all points on a cluster, and yield each at its end; closing the generator ends them.
 
     Args:
-        jobs: the points.
+        points: the points.
         unfinished: folder on this machine in which the points' folders are created.
         address: of the cluster's scheduler.
 
@@ -56,8 +51,10 @@ def run_on_dask(
         stop = Event(sweep, client=client)
         try:
             futures = {
-                client.submit(run_as_task, job, sweep, key=f"{job.name}-{sweep}", pure=False): job
-                for job in jobs
+                client.submit(
+                    run_as_task, point, sweep, key=f"{point.name}-{sweep}", pure=False
+                ): point
+                for point in points
             }
             for future in as_completed(futures, loop=client.loop):
                 yield _received(future, futures[future], unfinished)
@@ -66,15 +63,13 @@ def run_on_dask(
             stop.set()
 
 
-def run_as_task(job: Job, sweep: str) -> Returned:
+def run_as_task(point: Point, sweep: str) -> Returned:
     """Run a point on a worker (the task)."""
     stop = Event(sweep)
     with tempfile.TemporaryDirectory(prefix="laneweave-point-") as temporary:
-        ended = run_in_process(job, Path(temporary) / job.name, stop.is_set)
-        names = [*RETURNED, *(["trajectories.parquet"] if job.keep_trajectories else [])]
-        paths = [ended.folder / name for name in names]
-        files = {path.name: path.read_bytes() for path in paths if path.is_file()}
-    return Returned(ended.problems, ended.wall_s, files)
+        ended = run_in_process(point, Path(temporary) / point.name, stop.is_set)
+        paths = (ended.folder / name for name in (*kept_files(point), LOG_FILE))
+        return ended, {path.name: path.read_bytes() for path in paths if path.is_file()}
 
 
 async def _greet(address: str) -> None:
@@ -82,18 +77,18 @@ async def _greet(address: str) -> None:
     await comm.close()
 
 
-def _received(future: Future[Returned], job: Job, unfinished: Path) -> Ended:
+def _received(future: Future[Returned], point: Point, unfinished: Path) -> Ended:
     """Write the files that a task returned; a failed task is a failed run."""
-    folder = unfinished / job.name
+    folder = unfinished / point.name
     folder.mkdir(parents=True)
     if future.status != "finished":
         error = future.exception() if future.status == "error" else None
         reason = f"{type(error).__name__}: {error}" if error is not None else str(future.status)
         future.release()
-        return Ended(job.name, folder, (f"its task failed: {' '.join(reason.split())}",), 0.0)
-    returned = future.result()
+        return Ended(point, folder, (f"its task failed: {' '.join(reason.split())}",), 0.0)
+    ended, files = future.result()
     # Lets the cluster drop the result.
     future.release()
-    for name, content in returned.files.items():
+    for name, content in files.items():
         (folder / name).write_bytes(content)
-    return Ended(job.name, folder, returned.problems, returned.wall_s)
+    return evolve(ended, folder=folder)

@@ -16,11 +16,14 @@ import time
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
-from typing import Any
 
-from attrs import asdict, frozen
+from attrs import frozen
 
+from laneweave.launch.recordings.runs import TRAJECTORIES
 from laneweave.launch.run.roles import THREAD_LIMITS
+from laneweave.launch.sweep.points import Point
+from laneweave.protocol.config.loading import to_tables
+from laneweave.protocol.summary import SUMMARY_FILE
 
 JOB_FILE, RESULT_FILE, LOG_FILE = "job.json", "result.json", "log.txt"
 POINT_PROCESS = "laneweave.launch.sweep.point_process"
@@ -31,47 +34,43 @@ END_S = 10.0
 
 
 @frozen
-class Job:
-    """The order for a process."""
-
-    name: str
-    method: str
-    tables: dict[str, Any]
-    """The scenario, as of `to_tables`."""
-    keep_trajectories: bool
-
-
-@frozen
 class Ended:
     """A point that was run; its files are in `folder`."""
 
-    name: str
+    point: Point
     folder: Path
     problems: tuple[str, ...]
     """Why it failed; empty: it did not."""
     wall_s: float
 
 
+def kept_files(point: Point) -> tuple[str, ...]:
+    """Return the names of the files of a point that are kept; if it fails, `LOG_FILE` is, too."""
+    kept = (SUMMARY_FILE, "trips.parquet", "events.jsonl")
+    return (*kept, TRAJECTORIES) if point.keep_trajectories else kept
+
+
 class StoppedError(Exception):
     """The sweep was stopped before this run was finished."""
 
 
-def run_in_process(job: Job, folder: Path, stopped: Callable[[], bool]) -> Ended:
+def run_in_process(point: Point, folder: Path, stopped: Callable[[], bool]) -> Ended:
     """Run a point in a new process and return its result.
 
     Args:
-        job: the point.
+        point: the point.
         folder: where its files go; it is created.
-        stopped: whether the sweep was stopped meanwhile.
+        stopped: returns whether the sweep was stopped.
 
     Raises:
-        StoppedError: it was, and the process has ended.
+        StoppedError: the sweep was stopped, and the process has ended.
         OSError: files or processes cannot be created.
     """
     if stopped():
-        raise StoppedError(job.name)
+        raise StoppedError(point.name)
     folder.mkdir(parents=True)
-    (folder / JOB_FILE).write_text(json.dumps(asdict(job)), encoding="utf-8")
+    job = {"method": point.method, "tables": to_tables(point.scenario)}
+    (folder / JOB_FILE).write_text(json.dumps(job), encoding="utf-8")
     began_s = time.monotonic()
     with (folder / LOG_FILE).open("wb") as log:
         process = subprocess.Popen(  # noqa: S603 - this package, with arguments of its own
@@ -83,18 +82,18 @@ def run_in_process(job: Job, folder: Path, stopped: Callable[[], bool]) -> Ended
             # Ctrl-C would reach the whole group; the sweep ends its processes itself.
             process_group=0,
         )
-    follow(process, job.name, stopped)
+    follow(process, point.name, stopped)
     wall_s = time.monotonic() - began_s
-    return Ended(job.name, folder, _problems(folder, process.returncode), wall_s)
+    return Ended(point, folder, _problems(folder, process.returncode), wall_s)
 
 
 def run_locally(
-    jobs: Sequence[Job], unfinished: Path, workers: int
+    points: Sequence[Point], unfinished: Path, workers: int
 ) -> Generator[Ended, None, None]:
-    """Run all jobs on this machine, and yield each at its end; closing the generator ends them.
+    """Run all points on this machine, and yield each at its end; closing the generator ends them.
 
     Args:
-        jobs: the points.
+        points: the points.
         unfinished: folder in which the points' folders are created.
         workers: number of processes at a time.
 
@@ -102,10 +101,11 @@ def run_locally(
         OSError: files or processes cannot be created.
     """
     stop = threading.Event()
-    pool = ThreadPoolExecutor(min(workers, max(1, len(jobs))), "point")
+    pool = ThreadPoolExecutor(min(workers, max(1, len(points))), "point")
     try:
         futures = [
-            pool.submit(run_in_process, job, unfinished / job.name, stop.is_set) for job in jobs
+            pool.submit(run_in_process, point, unfinished / point.name, stop.is_set)
+            for point in points
         ]
         for future in as_completed(futures):
             yield future.result()
@@ -120,10 +120,10 @@ def follow(process: subprocess.Popen[bytes], name: str, stopped: Callable[[], bo
     Args:
         process: the process.
         name: of its run.
-        stopped: whether the result is no longer wanted.
+        stopped: returns whether the result is no longer wanted.
 
     Raises:
-        StoppedError: it is not, and the process was ended.
+        StoppedError: it is no longer wanted, and the process was ended.
     """
     try:
         while process.poll() is None:

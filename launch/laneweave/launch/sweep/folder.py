@@ -18,30 +18,27 @@ from __future__ import annotations
 import fcntl
 import json
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 from laneweave.launch.methods import METHODS, affects
-from laneweave.launch.recordings.results import write_results
+from laneweave.launch.recordings.results import flatten, write_results
 from laneweave.launch.recordings.runs import (
     SWEEP_FILE,
-    TRAJECTORIES,
     Run,
     sweep_runs,
     write_point,
 )
-from laneweave.launch.sweep.execution import LOG_FILE, Ended
+from laneweave.launch.sweep.execution import LOG_FILE, Ended, kept_files
 from laneweave.launch.sweep.points import Point
 from laneweave.protocol.config.loading import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.summary import SUMMARY_FILE, read_summary
+from laneweave.protocol.summary import read_summary
 
 RESULTS_FILE = "results.parquet"
 SCHEMA = {"schema": "laneweave.sweep/1"}
-_ALWAYS_KEPT = (SUMMARY_FILE, "trips.parquet", "events.jsonl")
 
 
 class SweepFolder:
@@ -76,12 +73,7 @@ class SweepFolder:
         """Return this folder."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Remove unfinished points, and release the folder."""
         shutil.rmtree(self.unfinished, ignore_errors=True)
         self._mark.close()
@@ -97,13 +89,13 @@ class SweepFolder:
         return self._runs
 
     def check_settings(self, base: Scenario) -> None:
-        """Check that the recorded points were run with the same settings, as far as they matter.
+        """Check that the recorded points were run with the same settings.
 
         Args:
             base: the scenario of this sweep; its volume and seed are ignored.
 
         Raises:
-            BadInputError: they were not.
+            BadInputError: a setting that affects their method was different.
         """
         for name, run in self._runs.items():
             labelled = METHODS.get(run.label)
@@ -112,8 +104,8 @@ class SweepFolder:
             tables = to_tables(base)
             tables["seed"] = run.scenario.seed
             tables["demand"]["volume_veh_per_lane_h"] = run.volume_veh_per_lane_h
-            expected = _flat(to_tables(labelled.settings(parse_scenario(tables))))
-            recorded = _flat(to_tables(run.scenario))
+            expected = flatten(to_tables(labelled.settings(parse_scenario(tables))), ".")
+            recorded = flatten(to_tables(run.scenario), ".")
             where = f"as recorded in {self.out / name}; a sweep with other settings needs a new one"
             for field in dict.fromkeys([*recorded, *expected]):
                 value, own = recorded.get(field), expected.get(field)
@@ -131,12 +123,13 @@ class SweepFolder:
             and (not point.keep_trajectories or run.has_trajectories)
         )
 
-    def take(self, point: Point, ended: Ended) -> Run:
+    def take(self, ended: Ended) -> Run:
         """Move a point that was run into the folder, and update the table of results.
 
         Raises:
             CommandFailedError: it cannot be written.
         """
+        point = ended.point
         run = Run(
             folder=self.out / point.name,
             label=point.label,
@@ -146,13 +139,13 @@ class SweepFolder:
             reason="; ".join(ended.problems),
             wall_s=round(ended.wall_s, 3),
         )
-        kept = {*_ALWAYS_KEPT}
-        if point.keep_trajectories:
-            kept.add(TRAJECTORIES)
-        if ended.problems:
-            kept.add(LOG_FILE)
+        kept = (*kept_files(point), LOG_FILE) if ended.problems else kept_files(point)
         try:
-            _keep_only(ended.folder, kept)
+            for path in ended.folder.iterdir():
+                if path.is_dir():
+                    shutil.rmtree(path)
+                elif path.name not in kept:
+                    path.unlink()
             write_point(run, ended.folder)
             if run.folder.exists():
                 shutil.rmtree(run.folder)
@@ -167,24 +160,3 @@ class SweepFolder:
         """Write the table of all points that were run."""
         runs = sorted(self._runs.values(), key=lambda run: run.order)
         write_results(runs, self.out / RESULTS_FILE)
-
-
-def _flat(tables: Mapping[str, Any], parent: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in tables.items():
-        if isinstance(value, Mapping):
-            flat |= _flat(value, f"{parent}{key}.")
-        else:
-            flat[f"{parent}{key}"] = value
-    return flat
-
-
-def _keep_only(folder: Path, names: Iterable[str]) -> None:
-    kept = set(names)
-    for path in folder.iterdir():
-        if path.name in kept:
-            continue
-        if path.is_dir():
-            shutil.rmtree(path)
-        else:
-            path.unlink()

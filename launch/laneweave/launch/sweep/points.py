@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 from attrs import evolve, frozen
 
@@ -30,14 +30,9 @@ class Point:
         return self.scenario.demand.volume_veh_per_lane_h
 
     @property
-    def seed(self) -> int:
-        """The seed of everything random."""
-        return self.scenario.seed
-
-    @property
     def name(self) -> str:
         """Name of the point's folder."""
-        return f"{self.label}-{volume_text(self.volume_veh_per_lane_h)}-{self.seed}"
+        return f"{self.label}-{volume_text(self.volume_veh_per_lane_h)}-{self.scenario.seed}"
 
 
 def volume_text(volume_veh_per_lane_h: float) -> str:
@@ -82,34 +77,26 @@ def plan_points(
     count = len(labels) * len(volumes) * len(seeds)
     if count > MAX_POINTS:
         raise BadInputError("--seeds", len(seeds), f"at most {MAX_POINTS} runs, not {count}")
-    return tuple(_points(base, labels, volumes, seeds, keep))
-
-
-def _points(
-    base: Scenario,
-    labels: Sequence[str],
-    volumes: Sequence[float],
-    seeds: Sequence[int],
-    keep: KeepTrajectories,
-) -> Iterator[Point]:
-    settings: dict[tuple[str, float], Scenario] = {}
+    settings: list[tuple[str, Scenario]] = []
     for label in labels:
         for volume in volumes:
             try:
-                settings[label, volume] = _with_volume(METHODS[label].settings(base), volume)
-                check_moves(settings[label, volume])
+                scenario = _with_volume(METHODS[label].settings(base), volume)
+                check_moves(scenario)
             except BadInputError as error:
-                raise BadInputError(
-                    f"{error.field} ({label})", error.value, error.allowed
-                ) from error
+                field = f"{error.field} ({label})"
+                raise BadInputError(field, error.value, error.allowed) from error
+            settings.append((label, scenario))
     kept = {
         KeepTrajectories.none: (),
         KeepTrajectories.first_seed: seeds[:1],
         KeepTrajectories.all: seeds,
     }[keep]
-    for seed in seeds:
-        for (label, _), scenario in settings.items():
-            yield Point(label, METHODS[label].method, evolve(scenario, seed=seed), seed in kept)
+    return tuple(
+        Point(label, METHODS[label].method, evolve(scenario, seed=seed), seed in kept)
+        for seed in seeds
+        for label, scenario in settings
+    )
 
 
 def _with_volume(scenario: Scenario, volume_veh_per_lane_h: float) -> Scenario:

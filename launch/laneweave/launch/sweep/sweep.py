@@ -14,14 +14,13 @@ from rich.table import Table
 
 from laneweave.launch.recordings.results import PREFERRED, over_seeds, results_table
 from laneweave.launch.recordings.runs import Run
-from laneweave.launch.sweep.execution import Ended, Job
+from laneweave.launch.sweep.execution import Ended
 from laneweave.launch.sweep.folder import SweepFolder
 from laneweave.launch.sweep.points import Point, volume_text
-from laneweave.protocol.config.loading import to_tables
 from laneweave.protocol.errors import CommandFailedError
 
-Runner = Callable[[Sequence[Job], Path], Generator[Ended, None, None]]
-"""Runs jobs in a folder and yields each at its end; closing the generator ends all of them."""
+Runner = Callable[[Sequence[Point], Path], Generator[Ended, None, None]]
+"""Runs points in a folder and yields each at its end; closing the generator ends all of them."""
 
 
 def conduct(points: Sequence[Point], folder: SweepFolder, run: Runner, *, show: bool) -> int:
@@ -30,25 +29,21 @@ def conduct(points: Sequence[Point], folder: SweepFolder, run: Runner, *, show: 
     Args:
         points: the sweep.
         folder: where the points are recorded.
-        run: runs the jobs.
+        run: runs points.
         show: whether to show progress on stderr.
 
     Raises:
         CommandFailedError: files or processes cannot be made.
     """
-    waiting = {point.name: point for point in points if not folder.is_finished(point)}
-    jobs = [
-        Job(point.name, point.method, to_tables(point.scenario), point.keep_trajectories)
-        for point in waiting.values()
-    ]
+    waiting = [point for point in points if not folder.is_finished(point)]
     folder.write_results()
     try:
         with (
-            _Progress(len(points), len(points) - len(jobs), show=show) as progress,
-            closing(run(jobs, folder.unfinished)) as ends,
+            _Progress(len(points), len(points) - len(waiting), show=show) as progress,
+            closing(run(waiting, folder.unfinished)) as ends,
         ):
             for ended in ends:
-                progress.count(ended.name, folder.take(waiting[ended.name], ended))
+                progress.count(folder.take(ended))
     except OSError as error:
         raise CommandFailedError(f"the sweep cannot go on: {error}") from error
     return sum(bool(folder.runs[point.name].reason) for point in points)
@@ -75,13 +70,13 @@ class _Progress(Progress):
         if show and finished:
             console.print(f"{finished} of {total} runs were finished before", highlight=False)
 
-    def count(self, name: str, run: Run) -> None:
+    def count(self, run: Run) -> None:
         """Count a point that has ended."""
         self._failed += bool(run.reason)
         self.update(self._task, advance=1, failed=self._failed)
         if self._show:
             reason = f": {escape(run.reason)}" if run.reason else ""
-            line = f"{escape(name)}: {run.status} in {run.wall_s:.1f} s{reason}"
+            line = f"{escape(run.folder.name)}: {run.status} in {run.wall_s:.1f} s{reason}"
             self.console.print(line, highlight=False, soft_wrap=True)
 
 
@@ -96,21 +91,18 @@ def print_results(points: Sequence[Point], folder: SweepFolder, console: Console
     table.add_column("label")
     for heading in ("veh/(lane h)", "done", "failed", "travel time", "throughput", "on lane"):
         table.add_column(heading, justify="right")
-    for key, count in Counter((run.label, run.volume_veh_per_lane_h) for run in runs).items():
-        row = means.get(key, {"runs": 0})
-        table.add_row(
-            key[0],
-            volume_text(key[1]),
-            str(row["runs"]),
-            str(count - row["runs"]),
-            *(
-                "-" if row.get(f"{column}_mean") is None else f"{row[f'{column}_mean']:.2f}{unit}"
-                for column, unit in zip(columns, (" s", "", " %"), strict=True)
-            ),
-        )
+    for (label, volume), count in Counter(
+        (run.label, run.volume_veh_per_lane_h) for run in runs
+    ).items():
+        row = means.get((label, volume), {"runs": 0})
+        figures = [
+            "-" if row.get(f"{column}_mean") is None else f"{row[f'{column}_mean']:.2f}{unit}"
+            for column, unit in zip(columns, (" s", "", " %"), strict=True)
+        ]
+        counts = (str(row["runs"]), str(count - row["runs"]))
+        table.add_row(label, volume_text(volume), *counts, *figures)
     console.print(table)
-    for point in points:
-        run = folder.runs[point.name]
+    for run in runs:
         if run.reason:
-            line = f"FAILED: {point.name}: {run.reason}"
+            line = f"FAILED: {run.folder.name}: {run.reason}"
             console.print(line, style="bold red", highlight=False, markup=False, soft_wrap=True)

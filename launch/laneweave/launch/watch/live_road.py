@@ -170,11 +170,8 @@ class LiveRoad:
     def _rows(self, t_s: float, formations: Formations) -> Iterator[Row]:
         census, states = self.view.census, self.view.states
         listed = {entry.vehicle: entry for entry in census.on_road} if census is not None else {}
-        for name, entry in listed.items():
-            yield self._row(name, t_s, entry, states.get(name), formations)
-        for name, state in states.items():
-            if name not in listed:
-                yield self._row(name, t_s, None, state, formations)
+        for name in {**listed, **states}:
+            yield self._row(name, t_s, listed.get(name), states.get(name), formations)
 
     def _row(
         self,

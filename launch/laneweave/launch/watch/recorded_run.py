@@ -1,7 +1,7 @@
 """A recorded run as frames, made on request.
 
-The files of a run do not contain owned cells, plans beyond a vehicle's current cell or move, or
-lost messages; so neither do these frames. The scene has the summary's message counts.
+The files of a run contain no owned cells, no plans beyond a vehicle's current cell or move, and no
+lost messages, so the frames do not either. The scene has the summary's message counts.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 from attrs import frozen
 from numpy.typing import NDArray
 
 from laneweave.launch.observe.column_owners import JOINED, Formations, recorded_formations
 from laneweave.launch.recordings.runs import Run, single_run
-from laneweave.launch.recordings.trajectories import OFF_LATTICE, Tracks, read_tracks
+from laneweave.launch.recordings.trajectories import OFF_LATTICE, Tracks, read_tracks, read_trips
 from laneweave.launch.watch.frames import MOVING, EventFeed, Row, compact, plan_row, scene_of
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
+from laneweave.protocol.wire.events import ENTERED, LEADER, LEFT
 
 STEP_S = 0.2
 """Road time between two frames; the page interpolates."""
@@ -56,7 +56,7 @@ class Recording:
         run = single_run(folder)
         try:
             self._tracks = read_tracks(folder)
-            self._trips = _trips(folder)
+            self._trips = read_trips(folder)
             self._moments = list(_moments(folder))
             formations = recorded_formations(folder, run.scenario.lattice)
         except (OSError, ValueError, KeyError, TypeError) as error:
@@ -75,8 +75,8 @@ class Recording:
         demands_s = [float(trip["demanded_s"]) for trip in self._trips.values()]
         self._demands_s = np.sort(np.array(demands_s, dtype=np.float64))
         self._times_s = [moment.t_s for moment in self._moments]
-        title = f"{run.label}, {run.volume_veh_per_lane_h:g} vehicles/(lane h), seed "
-        title += f"{run.scenario.seed}"
+        volume = f"{run.volume_veh_per_lane_h:g} vehicles/(lane h)"
+        title = f"{run.label}, {volume}, seed {run.scenario.seed}"
         self.scene = scene_of(run.scenario, "recorded", title, self._step_s) | {
             "losses": _losses(run),
             "rolling": rolling,
@@ -92,6 +92,7 @@ class Recording:
         t_s = number * self._step_s
         moment = self._moments[max(0, bisect_right(self._times_s, t_s + 1e-6) - 1)]
         rows = list(self._vehicles(number, t_s))
+        demanded = int(np.searchsorted(self._demands_s, t_s, side="right"))
         present = {row.formation for row in rows}
         shown = Formations(one for one in self._formations.values() if one.number in present)
         return {
@@ -101,12 +102,12 @@ class Recording:
             "w": None,
             "status": "recorded",
             "since": None,
-            "leader": list(moment.leader) if moment.leader is not None else None,
+            "leader": moment.leader,
             "candidates": [],
-            "counts": [self._demanded(t_s), moment.entered, len(rows), moment.left],
+            "counts": [demanded, moment.entered, len(rows), moment.left],
             "loss": None,
             "plan": moment.plan,
-            "news": list(moment.news),
+            "news": moment.news,
             "formations": [[one.number, one.rear, one.front] for one in shown.listed],
             "joined": shown.joined(moment.joined, self._run.scenario.lattice),
             "vehicles": [row.compact() for row in rows],
@@ -140,9 +141,6 @@ class Recording:
                 flags=MOVING * moving,
             )
 
-    def _demanded(self, t_s: float) -> int:
-        return int(np.searchsorted(self._demands_s, t_s, side="right"))
-
 
 def _frames_of(
     tracks: Tracks, tick_s: float, stride: int
@@ -156,41 +154,29 @@ def _frames_of(
     return numbers[order], pairs[order]
 
 
-def _trips(folder: Path) -> dict[str, dict[str, Any]]:
-    columns = ["vehicle", "preferred_lane", "formation", "demanded_s"]
-    table = pq.read_table(folder / "trips.parquet", columns=columns)
-    return {str(trip["vehicle"]): trip for trip in table.to_pylist()}
-
-
 def _moments(folder: Path) -> Iterator[_Moment]:
     """Yield the state after each event in order of time, beginning with an empty one."""
-    yield _Moment(float("-inf"))
     events = []
     for line in (folder / "events.jsonl").read_text(encoding="utf-8").splitlines():
         event = json.loads(line)
         events.append((float(event.pop("t_s")), str(event.pop("kind")), event))
-    leader: tuple[str, int] | None = None
-    plan: list[Any] | None = None
-    feed, entered, left = EventFeed(), 0, 0
-    joined: tuple[tuple[int, ...], ...] = ()
+    moment, feed = _Moment(float("-inf")), EventFeed()
+    yield moment
     for t_s, kind, data in sorted(events, key=lambda event: event[0]):
         role = data.pop("role", "")
-        process = str(data.pop("name", role))
-        if kind == "leader":
-            leader = (str(data.get("coordinator")), int(data.get("term", 0)))
-        plan = plan_row(t_s, kind, data) or plan
-        entered += kind == "entered"
-        left += kind == "left"
+        feed.add(t_s, str(data.pop("name", role)), kind, data)
+        leader, joined = moment.leader, moment.joined
+        if kind == LEADER:
+            leader = str(data.get("coordinator")), int(data.get("term", 0))
         if kind == JOINED and role == "coordinator":
             joined = (*joined, tuple(map(int, data["formations"])))
-        feed.add(t_s, process, kind, data)
-        yield _Moment(t_s, leader, plan, tuple(feed.rows), entered, left, joined)
+        plan = plan_row(t_s, kind, data) or moment.plan
+        entered, left = moment.entered + (kind == ENTERED), moment.left + (kind == LEFT)
+        moment = _Moment(t_s, leader, plan, tuple(feed.rows), entered, left, joined)
+        yield moment
 
 
 def _losses(run: Run) -> dict[str, int]:
     """Return the summary's counts of messages published, and dropped by injected faults."""
-    messages = run.summary.messages if run.summary else None
-    return {
-        "published": messages.published if messages else 0,
-        "dropped_by_faults": messages.dropped_by_faults if messages else 0,
-    }
+    names = ("published", "dropped_by_faults")
+    return {name: getattr(run.summary.messages, name) if run.summary else 0 for name in names}
