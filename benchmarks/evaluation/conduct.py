@@ -37,7 +37,7 @@ PICTURES = "evaluation-*.png"
 
 
 def say(text: str) -> None:
-    """Write a line about how far it is."""
+    """Write a line of progress to stderr."""
     sys.stderr.write(f"{time.strftime('%H:%M:%S')} {text}\n")
     sys.stderr.flush()
 
@@ -52,8 +52,8 @@ class Rounds:
     jobs: int
     """Processes at a time."""
     end_s: float | None
-    """No round is begun that would last beyond this time (`time.monotonic`); None: no such time.
-    The first one is always run."""
+    """No round is begun that would last beyond this time (`time.monotonic`); None: no limit. The
+    first one is always run."""
 
     def run(self, out: Path) -> bool:
         """Run the rounds that are not finished; return whether formation control kept its promises.
@@ -84,13 +84,13 @@ class Rounds:
 
 
 def run_trials(part: str, out: Path, root: Path, jobs: int) -> bool:
-    """Run the trials of a part; return whether all came to their end.
+    """Run the trials of a part; return whether all succeeded.
 
     Args:
         part: `zenoh`, `speed` or `length`.
         out: the evaluation's folder.
         root: of the repository.
-        jobs: how many may run at a time, of those that share the machine.
+        jobs: number that may run at a time, of those that share the machine.
     """
     stop = threading.Event()
 
@@ -117,7 +117,7 @@ def run_trials(part: str, out: Path, root: Path, jobs: int) -> bool:
 
 
 def collect(out: Path, sweeps: Iterable[Path], images: Path) -> Evidence:
-    """Return what the runs that are there say, and draw their figures.
+    """Return the evidence of the existing runs, and draw their figures.
 
     Args:
         out: the evaluation's folder.
@@ -125,7 +125,7 @@ def collect(out: Path, sweeps: Iterable[Path], images: Path) -> Evidence:
         images: where the figures go; earlier ones that were not drawn again are removed.
 
     Raises:
-        BadInputError: a folder is not that of a sweep, or they do not go together.
+        BadInputError: a folder is not that of a sweep, or they cannot be compared.
         OSError, ValueError, KeyError: a run's files cannot be read.
     """
     folders = list(sweeps) or [path for path in (out / SWEEP_FOLDER,) if is_sweep(path)]
@@ -154,7 +154,7 @@ def collect(out: Path, sweeps: Iterable[Path], images: Path) -> Evidence:
 def refresh(out: Path, sweeps: Iterable[Path], docs: Path) -> None:
     """Bring docs/evidence/evaluation.json and the figures up to date.
 
-    What has no runs in the folders stays as it was recorded.
+    Parts without runs in the folders keep the recorded values.
 
     Args:
         out: the evaluation's folder.

@@ -1,4 +1,4 @@
-"""docs/evidence/evaluation.json: all that the document's tables are made from."""
+"""docs/evidence/evaluation.json: the data of all tables of the document."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SCHEMA: Final = "laneweave.evaluation/1"
 
 @frozen
 class Setting:
-    """What all points of the sweep share."""
+    """The settings of all points of the sweep."""
 
     duration_s: float
     """Vehicles arrive for this long."""
@@ -48,7 +48,7 @@ class Picture:
 
 @frozen
 class Evidence:
-    """What was measured; what is missing is empty."""
+    """All measurements; missing ones are empty."""
 
     schema: str = SCHEMA
     setting: Setting | None = None
@@ -64,7 +64,7 @@ class Evidence:
         return {(row.label, row.volume_veh_per_lane_h): row for row in self.points}
 
     def renewed(self, new: Evidence) -> Evidence:
-        """Return this with every part replaced that is there anew.
+        """Return a copy in which the parts of newer evidence replace the earlier ones.
 
         Points, their setting and their pictures are one part: they come from the same runs.
         """
@@ -80,7 +80,7 @@ class Evidence:
 
 
 def setting_of(runs: Sequence[Run]) -> Setting:
-    """Return what some runs share; the first one of formation control speaks for all.
+    """Return what some runs share; those of the first run of formation control.
 
     The reference methods do not read all of it.
     """
@@ -98,10 +98,10 @@ def setting_of(runs: Sequence[Run]) -> Setting:
 
 
 def read_evidence(path: Path) -> Evidence:
-    """Return what is recorded; nothing, if there is no file.
+    """Return the recorded evidence; empty if there is no file.
 
     Raises:
-        BadInputError: the file holds something else.
+        BadInputError: the file has other contents.
         ValueError: it is not JSON.
     """
     if not path.is_file():
@@ -110,6 +110,6 @@ def read_evidence(path: Path) -> Evidence:
 
 
 def write_evidence(evidence: Evidence, path: Path) -> None:
-    """Write it whole or not at all."""
+    """Write the evidence atomically."""
     text = json.dumps(asdict(evidence), indent=1)
     write_atomically(path, text + "\n")

@@ -127,7 +127,7 @@ def _runtime(evidence: Evidence) -> Iterator[tuple[str, str, str, str]]:
 
 
 def _one(what: str, asked: str, measured: str, kept: Sequence[bool]) -> tuple[str, str, str, str]:
-    """Return a row; without anything that was looked at, one that says so."""
+    """Return a row; without measurements, a row that says so."""
     if not kept:
         return what, asked, MISSING, ""
     return what, asked, measured, _verdict(all(kept))

@@ -6,14 +6,14 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 MISSING: Final = "missing"
-"""Stands where a measurement is planned and not there."""
+"""Text for a measurement that is planned and missing."""
 NOT_RUN: Final = "-"
-"""Stands where none is planned."""
+"""Text for a measurement that is not planned."""
 HOLDS, MISSED = "holds", "**missed**"
 
 
 def markdown(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table; without rows it has one that says so."""
+    """Return a table; without rows, one row that says so."""
     listed = list(rows) or [[MISSING, *[""] * (len(headings) - 1)]]
     lines = [" | ".join(cells) for cells in (headings, *listed)]
     rule = "|" + "---|" * len(headings)

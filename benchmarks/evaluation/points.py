@@ -25,32 +25,32 @@ LIMIT_ERROR: Final = 0.001
 STREAM_PLANNED: Final = "stream-planned"
 """Event of a plan of the rolling operation."""
 SOLVER: Final = {PLANNED: "branching", STREAM_PLANNED: "stream"}
-"""What has planned, by the kind of event, where the event does not say it."""
+"""The solver of a kind of event, where the event does not name it."""
 Key = tuple[str, float]
 """(label, volume in vehicles/(lane h))."""
 
 
 @frozen
 class Traced:
-    """What trajectories say, of one run or of several."""
+    """Figures from the trajectories of one run or of several."""
 
     runs: int
     lattice_least_m: float | None
-    """Least spacing at lattice points; None: no lattice, or never two on a lane."""
+    """Smallest spacing at lattice points; None: no lattice, or never two on a lane."""
     lattice_pairs: int
     lattice_worst_off_m: float | None
     """Greatest distance from the own cell there."""
     lattice_kept: bool
-    """Whether no spacing there is below the pitch, but for the tolerance."""
+    """Whether no spacing there is below the pitch, apart from the tolerance."""
     slow_m: tuple[float, float] | None
     """Congested stretch of road, from and to: mean speed below half of v_F; None: nowhere."""
     slowest_mps: float | None
-    """Least mean speed of a bin of the road; None: nobody drove."""
+    """Lowest mean speed of a bin of the road; None: no vehicle drove."""
 
 
 @frozen
 class PlanningTimes:
-    """How long a solver has taken, over the plans of all seeds."""
+    """Planning times of a solver, over the plans of all seeds."""
 
     solver: str
     plans: int
@@ -61,7 +61,7 @@ class PlanningTimes:
 
 @frozen
 class PointRow:
-    """A label at a volume, over all seeds that came to their end; None: it cannot be told."""
+    """A label at a volume, over all seeds whose runs are complete; None: not known."""
 
     label: str
     volume_veh_per_lane_h: float
@@ -94,7 +94,7 @@ class PointRow:
     planning_p95_ms: float | None
     """Worst over the seeds."""
     traced: Traced | None
-    """What the trajectories say; None: none were kept."""
+    """Figures from trajectories; None: none were kept."""
     plans: int = 0
     """Over all seeds, as the next ones."""
     fallbacks: int = 0
@@ -111,7 +111,7 @@ def point_rows(runs: Iterable[Run]) -> list[PointRow]:
     """Return the rows of all labels and volumes, in the order of labels.
 
     Raises:
-        BadInputError: runs cannot stand side by side: other roads or demands, or one twice.
+        BadInputError: runs cannot be compared: other roads or demands, or one twice.
         OSError, ValueError, KeyError: a run's files cannot be read.
     """
     listed = sorted(runs, key=lambda run: run.order)
@@ -123,7 +123,7 @@ def point_rows(runs: Iterable[Run]) -> list[PointRow]:
 
 
 def check_comparable(runs: Sequence[Run]) -> None:
-    """Check that runs have the same road and demand, but for volume and seed, each run once.
+    """Check that runs have the same road and demand, except volume and seed, each run once.
 
     Raises:
         BadInputError: they do not.
@@ -185,7 +185,7 @@ def _row(key: Key, runs: Sequence[Run]) -> PointRow:
 
 
 def planning_times(runs: Iterable[Run]) -> tuple[PlanningTimes, ...]:
-    """Return how long each solver has taken in some runs, by their events.
+    """Return the planning times of each solver in some runs, by their events.
 
     Raises:
         OSError, ValueError, TypeError: events cannot be read.
@@ -213,9 +213,9 @@ def within_limits(low: float | None, high: float | None, scenario: Scenario) -> 
     """Tell whether accelerations are within the limits of the vehicles.
 
     Args:
-        low: hardest braking in m/s2; None: nobody drove.
+        low: hardest braking in m/s2; None: no vehicle drove.
         high: greatest acceleration in m/s2.
-        scenario: what was run.
+        scenario: of the run.
     """
     vehicle = scenario.vehicle
     return (low is None or low >= vehicle.min_accel_mps2 - LIMIT_ERROR) and (
@@ -224,7 +224,7 @@ def within_limits(low: float | None, high: float | None, scenario: Scenario) -> 
 
 
 def _traced(runs: Sequence[Run]) -> Traced | None:
-    """Return what the trajectories of some runs say together."""
+    """Return the figures of the trajectories of some runs together."""
     found = [trace(read_tracks(run.folder), run.scenario) for run in runs]
     if not found:
         return None
@@ -244,11 +244,11 @@ def _traced(runs: Sequence[Run]) -> Traced | None:
 
 
 def trace(tracks: Tracks, scenario: Scenario) -> Traced:
-    """Return what the trajectories of one run say.
+    """Return the figures of the trajectories of one run.
 
     Args:
         tracks: its trajectories.
-        scenario: what was run.
+        scenario: of the run.
     """
     spacing = lattice_spacing(tracks, scenario)
     slow_m, slowest_mps = slow_stretch(tracks, scenario)

@@ -39,7 +39,7 @@ _ROUNDING_S = 1e-6
 
 @frozen
 class Agreement:
-    """How far two runs agree."""
+    """How well two runs agree."""
 
     vehicles: int
     """That left the road in both."""
@@ -76,7 +76,7 @@ def agreement(
     Args:
         one: trips of a run.
         other: trips of another run of the same demand.
-        tick_s: travel times may differ by so much.
+        tick_s: travel times may differ by this much.
     """
     first, second = ({trip["vehicle"]: trip for trip in trips} for trips in (one, other))
     gone = [
@@ -105,11 +105,11 @@ class Trial:
     ending: str = "complete"
     """As in summary.json; a run with another one has failed."""
     shares: bool = False
-    """It needs one core only, its times do not count, and others like it may run beside it."""
+    """It needs one core, its times are not evaluated, and similar ones may run beside it."""
 
     @property
     def command(self) -> str:
-        """What a person would type, but for the folder."""
+        """The command line, without the folder."""
         return shlex.join(("laneweave", "run", *self.options))
 
 
@@ -142,14 +142,14 @@ class FactorRow:
 
 @frozen
 class CostRow:
-    """What a vehicle costs on a road."""
+    """Computing time of a vehicle on a road."""
 
     trial: str
     command: str
     road_m: float
     vehicles_peak: int
     cost_ms: float
-    """Time per vehicle and tick, everything included."""
+    """Wall-clock time of the run per vehicle and tick."""
 
 
 def _demand(volume: int, duration_s: int, *more: str) -> tuple[str, ...]:
@@ -169,23 +169,23 @@ TRIALS: Final = (
     Trial("speed", "zenoh", _demand(1600, 300)),
     Trial("speed", "zenoh-50", _demand(1600, 300, "--vehicles-per-process", "50")),
     Trial("speed", "simulated", _demand(1600, 300, *SIMULATED)),
-    # Ended when the road has been full for a while: nobody has to wait until it is empty again.
+    # Ended when the road has been full for a while; the time until it is empty is not needed.
     Trial("length", "long", ("benchmarks/long-road.toml", *SIMULATED), ending="limit"),
     Trial("length", "short", _demand(1800, 600, "--operation", "rolling", *SIMULATED)),
 )
 
 
 def run_trial(trial: Trial, out: Path, root: Path, stopped: Callable[[], bool]) -> None:
-    """Run a trial unless it is there already, whole and with the same options.
+    """Run a trial unless it has been run with the same options.
 
     Args:
         trial: the run.
         out: the evaluation's folder.
         root: where the names of scenario files begin.
-        stopped: whether the evaluation has been ended meanwhile.
+        stopped: returns whether the evaluation was ended.
 
     Raises:
-        CommandFailedError: the run did not come to its end, or took too long and was ended.
+        CommandFailedError: the run failed, or took too long and was ended.
         StoppedError: the evaluation was ended, and the run with it.
     """
     folder = out.resolve() / trial.part / trial.name
@@ -221,7 +221,7 @@ def run_trial(trial: Trial, out: Path, root: Path, stopped: Callable[[], bool]) 
 
 
 def is_finished(trial: Trial, out: Path) -> bool:
-    """Tell whether a trial is there."""
+    """Tell whether a trial has been run with the same options."""
     path = out / trial.part / trial.name / COMMAND_FILE
     try:
         return tuple(json.loads(path.read_text(encoding="utf-8"))) == trial.options

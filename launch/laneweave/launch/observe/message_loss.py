@@ -121,10 +121,10 @@ class LossMeter:
         Before the first census the vehicles that it lists count, as far as they were on the road.
         """
         before = [census for census in self._censuses if census.t_s <= t_s + TOLERANCE_S]
-        return (before[-1:] or list(self._censuses)[:1] or [_NOBODY])[0].on_road
+        return (before[-1:] or list(self._censuses)[:1] or [_EMPTY_CENSUS])[0].on_road
 
     def _tick(self, t_s: float) -> int:
         return round(t_s / self._tick_s) if self._tick_s else 0
 
 
-_NOBODY = Census(0.0, (), ())
+_EMPTY_CENSUS = Census(0.0, (), ())

@@ -1,4 +1,4 @@
-"""What an observer knows of a deployment: its newest road, its coordinators, and its processes.
+"""The observed state of a deployment: its newest road, its coordinators, and its processes.
 
 Every bridge process numbers itself (its incarnation). A clock or census of a newer bridge begins a
 new road; those of an older one are ignored.
@@ -72,7 +72,7 @@ def claims_of(coordinators: Sequence[Coordinator]) -> list[Coordinator]:
 
 @define
 class RoadView:
-    """What messages and liveliness tokens have told so far."""
+    """What is known from messages and liveliness tokens."""
 
     clock: RoadClock | None = None
     """The newest one."""

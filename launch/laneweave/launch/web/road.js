@@ -1,14 +1,14 @@
 "use strict";
-// How a road is drawn on a canvas, in reports and on the live page. Lengths in m, speeds in m/s.
+// Draws a road on a canvas, in reports and on the live page. Lengths in m, speeds in m/s.
 //
 // A scene has `road` {length_m, lanes, lane_width_m, sorting_start_m}, `body_m` [length, width],
 // `lattice` {speed_mps, pitch_m}, `shade` {span_mps, strength}, and `colours`, one for each lane. A body has `name`, `lane` (its colour; -1: none), `s`, `y`, `v`, `slope`, and may be
 // `faint`: drawn as an outline only.
 
 const laneweaveRoad = (() => {
-  const ACROSS = 1.8; // roads are drawn this much wider than they are
+  const ACROSS = 1.8; // scale across the road over the scale along it
   const ABOVE_PX = 13; // for names of vehicles on the left lane
-  const GAP_PX = 30; // between two stretches, for the numbers of metres
+  const GAP_PX = 30; // between two stretches, for the scale in metres
   const NAMED_FROM = 6; // pixels for each metre
   const UNKNOWN = "#8a8f96";
   const LIGHT = {
@@ -28,7 +28,7 @@ const laneweaveRoad = (() => {
     glass: "rgba(255,255,255,.75)",
   };
 
-  /** A colour, darker below the lattice's speed and lighter above it. */
+  /** Return a colour, darker below the lattice's speed and lighter above it. */
   function shade(colour, over, span, strength) {
     const share = Math.max(-1, Math.min(1, over / span));
     const end = share > 0 ? 255 : 0;
@@ -40,20 +40,20 @@ const laneweaveRoad = (() => {
     return `rgb(${mixed.join(",")})`;
   }
 
-  /** Stretches [from, to] of a whole road that are shown below each other. */
+  /** Return stretches [from, to] of a whole road, to be shown below each other. */
   function wholeRoad(length) {
     const count = Math.max(1, Math.min(6, Math.round(length / 250)));
     return Array.from({ length: count }, (_, i) => [(length * i) / count, (length * (i + 1)) / count]);
   }
 
-  /** A stretch of a road around a place, which may be near an end or beyond it. */
+  /** Return a stretch of a road around a place, which may be near an end or beyond it. */
   function windowAround(length, centre, size) {
     const half = Math.min(size, length) / 2;
     const middle = Math.max(half, Math.min(length - half, centre));
     return [middle - half, middle + half];
   }
 
-  /** Rear and front of some columns at a time, half of the gap around them included. */
+  /** Return rear and front of some columns at a time, with half of the gap around them. */
   function columnsAt(scene, rear, front, t) {
     const { pitch_m: pitch, speed_mps: speed } = scene.lattice;
     const margin = (pitch - scene.body_m[0]) / 2;
@@ -104,27 +104,27 @@ const laneweaveRoad = (() => {
       });
     }
 
-    /** Where a stretch begins on the canvas. */
+    /** Return where a stretch begins on the canvas. */
     top(number) {
       return ABOVE_PX + number * (this.roadPx + GAP_PX);
     }
 
-    /** Place on the canvas of a place along the road. */
+    /** Return the place on the canvas of a place along the road. */
     x(s) {
       return (s - this.from) * this.scale;
     }
 
-    /** Place below the left edge of the road. */
+    /** Return the place below the left edge of the road. */
     y(place) {
       return this.roadPx - place * this.scale * ACROSS;
     }
 
-    /** Whether some of [rear, front] is on the stretch that is being drawn. */
+    /** Return whether part of [rear, front] is on the stretch that is being drawn. */
     shows(rear, front) {
       return front >= this.from && rear <= this.to;
     }
 
-    /** What is at a place of the canvas: {s, y} in m, null between two stretches. */
+    /** Return the position on the road of a place of the canvas, {s, y} in m; null: between two stretches. */
     placeAt(canvasX, canvasY) {
       if (!this.strips) return null;
       for (let number = 0; number < this.strips.length; number += 1) {
@@ -161,7 +161,7 @@ const laneweaveRoad = (() => {
       pen.fillRect(0, 0, width, roadPx);
       pen.strokeStyle = theme.paint;
       pen.lineWidth = 2;
-      // Dashes belong to the road: they move with it.
+      // Dashes are fixed to the road, so they move with it.
       pen.setLineDash([6 * scale, 6 * scale]);
       pen.lineDashOffset = from * scale;
       for (let lane = 1; lane < road.lanes; lane += 1) {
@@ -194,7 +194,7 @@ const laneweaveRoad = (() => {
       }
     }
 
-    /** A vehicle's colour at a speed. */
+    /** Return a vehicle's colour at a speed. */
     colour(lane, speed) {
       const { colours, shade: how, lattice } = this.scene;
       const own = lane < 0 ? UNKNOWN : colours[lane % colours.length];

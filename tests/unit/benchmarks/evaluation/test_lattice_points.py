@@ -94,7 +94,7 @@ def test_slots_may_end_at_any_tick() -> None:
     assert found.worst_off_m == pytest.approx(0.0)
 
 
-def test_who_has_just_entered_does_not_count() -> None:
+def test_vehicles_that_have_just_entered_do_not_count() -> None:
     late = evolve(SCENARIO, formation=evolve(SCENARIO.formation, settle_s=39.0))
     found = lattice_spacing(parked((0, 0, 0.0), (1, 0, -9.0)), late)
     assert found.pairs == 1

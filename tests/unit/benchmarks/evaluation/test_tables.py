@@ -140,7 +140,9 @@ def test_goals() -> None:
     ("on_lane", "share_percent", "met"),
     [(4000, 100.0, True), (3999, 100.0, False), (3998, 99.95, True), (3997, 99.95, False)],
 )
-def test_shares_are_of_all_who_came(on_lane: int, share_percent: float, *, met: bool) -> None:
+def test_shares_are_of_all_demanded_vehicles(
+    on_lane: int, share_percent: float, *, met: bool
+) -> None:
     row = evolve(point("rolling", 2200.0, 67.5), on_preferred_lane=on_lane)
     goal = Goal("rolling", 2200.0, 67.5, share_percent)
     assert meets(row, goal) is met

@@ -61,7 +61,7 @@ def test_numbers_become_metrics() -> None:
     ]  # fmt: skip
 
 
-def test_numbers_are_asked_for_when_somebody_looks() -> None:
+def test_metrics_are_read_at_each_request() -> None:
     address, eaten = free_address(), 0
 
     def source() -> Iterable[MetricsSnapshot]:
@@ -99,7 +99,7 @@ def test_a_process_that_hangs_tells_nothing() -> None:
             scrape(address)
 
 
-def test_whoever_asks_for_nothing_does_not_keep_it_from_ending() -> None:
+def test_an_idle_client_does_not_delay_the_end() -> None:
     address = free_address()
     host, port = address.split(":")
     with shown_metrics(address), socket.create_connection((host, int(port))) as open_end:
@@ -116,7 +116,7 @@ def test_it_listens_nowhere_else() -> None:
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "192.0.2.1"])
-def test_where_nobody_can_listen(host: str) -> None:
+def test_unusable_addresses_are_refused(host: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"{host}:{taken.getsockname()[1]}"
         with pytest.raises(BadInputError, match=r"observation.metrics: got .*a free port"):

@@ -114,7 +114,7 @@ def in_node(expression: str, data: dict[str, Any]) -> Any:  # noqa: ANN401 - any
 
 
 @needs_node
-def test_the_player_shows_everybody_where_they_were(run: Run, tracks: Tracks) -> None:
+def test_the_player_shows_the_recorded_positions(run: Run, tracks: Tracks) -> None:
     data = animation_data(run, tracks, "")
     times_s = [0.0, 7.3, 21.05, 33.33, data["end_s"], data["end_s"] + 5.0]
     expression = (

@@ -1,4 +1,4 @@
-"""What is counted in trajectories, and formations' path maps as they were driven."""
+"""Counts over trajectories, and formations' path maps as they were driven."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def tracks(*vehicles: Sequence[ArrayLike]) -> Tracks:
 
 
 def centres(counts: Counts, quantity: Quantity) -> list[float]:
-    """Return the middles of the bins that something was counted in."""
+    """Return the middles of the bins that are not empty."""
     middles = 0.5 * (quantity.edges[1:] + quantity.edges[:-1])
     return [round(float(one), 3) for one in middles[counts.of[quantity.name] > 0]]
 
@@ -104,7 +104,7 @@ def test_counts_add_up() -> None:
     np.testing.assert_array_equal(both.exceedance(DECELERATION), one.exceedance(DECELERATION))
 
 
-def test_path_maps_are_what_was_driven(swept: Path) -> None:
+def test_path_maps_are_those_of_the_driven_plans(swept: Path) -> None:
     run = single_run(swept / "formation-1600-1")
     driven_tracks = read_tracks(run.folder)
     trips = {row["vehicle"]: row for row in pq.read_table(run.folder / "trips.parquet").to_pylist()}
@@ -224,7 +224,7 @@ def test_the_path_map_of_an_older_recording(swept: Path, tmp_path: Path) -> None
     assert shown.slot_s == 4.0
 
 
-def test_colours_of_labels_stay_whatever_is_beside_them() -> None:
+def test_a_label_has_the_same_colour_beside_any_others() -> None:
     alone = label_colours(["paper-12"])["paper-12"]
     several = label_colours(["formation", "paper-12", "mine", "yours"])
     assert several["paper-12"] == alone

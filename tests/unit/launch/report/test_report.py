@@ -1,4 +1,4 @@
-"""Reports of real runs: what is written, and that the page needs nothing else."""
+"""Reports of real runs: files, tables, and a page that needs no other file."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ RUN_FIGURES = {
 
 
 class Reader(HTMLParser):
-    """Collects what is on a page."""
+    """Collects the contents of a page."""
 
     def __init__(self, page: Path) -> None:
         """Read a page."""
@@ -66,7 +66,7 @@ class Reader(HTMLParser):
 
 
 def check_page(page: Path, pictures: int) -> Reader:
-    """Check that a page needs no other file, and return what is on it."""
+    """Check that a page needs no other file, and return its contents."""
     reader = Reader(page)
     for tag, attributes in reader.elements:
         assert "src" not in attributes or tag == "img"

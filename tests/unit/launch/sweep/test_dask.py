@@ -13,7 +13,7 @@ distributed = pytest.importorskip(
 )
 
 
-def test_a_cluster_comes_to_the_same(tmp_path: Path) -> None:
+def test_a_cluster_has_the_same_results(tmp_path: Path) -> None:
     scenario = short_road(tmp_path)
     lists = ("--volumes", "1200,1600", "--seeds", "3:4")
     with distributed.LocalCluster(

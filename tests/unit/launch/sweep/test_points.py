@@ -1,4 +1,4 @@
-"""Which points a sweep has, and which input is refused."""
+"""The points of a sweep, and refused input."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_labels_bring_their_settings(label: str, columns: int, vehicles: int) ->
     assert METHODS["formation"].settings(base) == base
 
 
-def test_formations_are_the_default_ones_whatever_the_scenario_says() -> None:
+def test_the_label_formations_has_the_default_settings_in_any_scenario() -> None:
     default, paper = load_scenario(None), load_scenario(ROOT / "scenarios" / "paper.toml")
     found = METHODS["formations"].settings(paper)
     assert found.cycles_s == default.cycles_s == (4.0, 7.0)
@@ -92,20 +92,16 @@ def test_bad_volumes(text: str) -> None:
         parse_volumes(text, Scenario())
 
 
-def test_a_volume_that_does_not_fit_the_scenario() -> None:
-    base = load_scenario(None, demand__min_headway_s=3.0)
+def test_volumes_and_labels_that_do_not_fit_the_scenario() -> None:
     with pytest.raises(BadInputError, match="--volumes: got '1600'"):
-        parse_volumes("1000,1600", base)
-
-
-def test_a_label_that_does_not_fit_the_scenario() -> None:
+        parse_volumes("1000,1600", load_scenario(None, demand__min_headway_s=3.0))
     base = load_scenario(None, road__s3_m=160.0)
     with pytest.raises(BadInputError, match=r"road.s3_m \(paper-12\): got 160.0"):
         plan_points(base, ["paper-12"], [1000.0], range(1), KeepTrajectories.none)
 
 
 @pytest.mark.parametrize("base", [Scenario(), load_scenario(None, formation__operation="rolling")])
-def test_the_paper_s_formations_are_the_paper_s_whatever_the_scenario_is(base: Scenario) -> None:
+def test_the_labels_of_the_paper_have_its_settings_in_any_scenario(base: Scenario) -> None:
     (point,) = plan_points(base, ["paper-6"], [1000.0], range(1), KeepTrajectories.none)
     formation = point.scenario.formation
     assert (formation.operation, formation.cycle_s) == ("formations", 4.0)

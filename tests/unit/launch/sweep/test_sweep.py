@@ -1,4 +1,4 @@
-"""Sweeps with real runs: what they leave, how they go on, what a failed run is."""
+"""Sweeps with real runs: their files, continuation, and failed runs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def whole(scenario: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder of a sweep that nobody disturbed, with two processes."""
+    """Return the folder of an undisturbed sweep with two processes."""
     out = tmp_path_factory.mktemp("whole") / "sweep"
     done = sweep(scenario, out, *LISTS, "--jobs", 2)
     assert done.returncode == 0, done.stderr
@@ -33,7 +33,7 @@ def whole(scenario: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_what_a_sweep_leaves(whole: Path) -> None:
+def test_the_files_of_a_sweep(whole: Path) -> None:
     rows = pq.read_table(whole / "results.parquet").to_pylist()
     assert [(row["label"], row["volume_veh_per_lane_h"], row["seed"]) for row in rows] == [
         ("formation", 1200.0, 1),
@@ -59,9 +59,7 @@ def test_what_a_sweep_leaves(whole: Path) -> None:
     }
 
 
-def test_a_sweep_that_is_ended_goes_on_where_it_was(
-    whole: Path, scenario: Path, tmp_path: Path
-) -> None:
+def test_an_interrupted_sweep_is_continued(whole: Path, scenario: Path, tmp_path: Path) -> None:
     out = tmp_path / "sweep"
     process = subprocess.Popen(
         command(scenario, out, *LISTS, "--jobs", 1),
@@ -139,7 +137,7 @@ def test_other_settings_are_refused(whole: Path, scenario: Path) -> None:
     assert line.startswith("demand.duration_s: got 7.0; allowed: 8.0, as recorded in ")
 
 
-def test_settings_that_a_method_does_not_read_may_be_others(whole: Path, tmp_path: Path) -> None:
+def test_settings_that_do_not_affect_a_method_may_differ(whole: Path, tmp_path: Path) -> None:
     scenario = short_road(tmp_path)
     scenario.write_text(scenario.read_text() + '\n[rule]\ngap = "net"\n')
     done = sweep(scenario, whole, *LISTS)
@@ -163,7 +161,7 @@ def test_settings_that_a_method_does_not_read_may_be_others(whole: Path, tmp_pat
         ("seed", "lc2013", True),
     ],
 )
-def test_what_affects(field: str, method: str, matters: bool) -> None:
+def test_which_settings_affect_a_method(field: str, method: str, matters: bool) -> None:
     assert affects(field, method) is matters
 
 

@@ -22,7 +22,7 @@ BEGIN = "const store = new laneweaveFrames.FrameStore();"
 
 
 def in_node(program: str, data: object = None) -> Any:  # noqa: ANN401 - any JSON
-    """Return what a program returns; `data` is there, and the page's scripts are."""
+    """Return the result of a program, which can use `data` and the page's scripts."""
     scripts = [road_script(), *(text_of(PAGE, f"templates/{name}.js") for name in PARTS)]
     whole = "\n".join(scripts) + (
         "\nconst data = JSON.parse(require('fs').readFileSync(0));"
@@ -68,7 +68,7 @@ def test_frames_that_are_pushed_are_kept_and_bounded() -> None:
     assert found == [100, 3099, 3000, 3099, 3098, None, 100]
 
 
-def test_what_is_missing_is_asked_for_once() -> None:
+def test_missing_frames_are_requested_once() -> None:
     messages = [scene("recorded", 0, 500), reel(0, 500, 0, 49), reel(0, 500, 60, 70)]
     found = in_node(
         f"{BEGIN} store.take(data[0]);"
@@ -95,7 +95,7 @@ def row(name: str, s_m: float, y_m: float, flags: int = 1) -> list[Any]:
     return [name, s_m, y_m, 15.0, 1, -1, [-3, 1], 0, flags, [-4, 1, -5, 1]]
 
 
-def test_between_two_frames_vehicles_are_on_their_way() -> None:
+def test_vehicles_are_interpolated_between_frames() -> None:
     one = json.loads(frame(1, 10.0, vehicles=[row("a", 100.0, 5.0), row("gone", 999.0, 5.0)]))
     two = json.loads(frame(2, 10.2, vehicles=[row("a", 103.0, 5.3), row("new", 0.0, 5.0)]))
     between = "return laneweaveFrames.between(data[0], data[1], 0.5);"
@@ -105,8 +105,8 @@ def test_between_two_frames_vehicles_are_on_their_way() -> None:
     body = shown["bodies"][0]
     assert (body["s"], body["y"], body["slope"]) == pytest.approx((101.5, 5.15, 0.25 / 3.0))
     assert (body["hold"], body["target"], body["owned"]) == ([-3, 1], None, [[-4, 1], [-5, 1]])
-    # Who drives straight on is drawn so, whatever the errors of measurement; another run is
-    # another road; nobody jumps.
+    # Measurement errors do not rotate a vehicle that drives straight on. Positions are not
+    # interpolated over jumps, and not between runs.
     two["vehicles"][0][8] = 0
     assert in_node(between, [one, two])["bodies"][0]["slope"] == 0
     two["vehicles"][0][1] = 500.0

@@ -1,4 +1,4 @@
-"""A recorded run as frames: everybody is where the files say that they were."""
+"""A recorded run as frames: vehicles are at the positions in its files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def frames(recording: Recording) -> list[dict[str, Any]]:
     return [json.loads(text) for text in recording.frames(0, recording.last)]
 
 
-def test_everybody_is_where_they_were(recorded: Path) -> None:
+def test_vehicles_are_at_their_recorded_positions(recorded: Path) -> None:
     recording, tracks = Recording(recorded), read_tracks(recorded)
     shown = frames(recording)
     assert [frame["n"] for frame in shown] == list(range(recording.last + 1))
@@ -88,7 +88,7 @@ def test_an_older_recording_has_formations_of_equal_length(recorded: Path, tmp_p
     shown = frames(Recording(folder))
     assert {one[2] - one[1] for frame in shown for one in frame["formations"]} == {3}
     assert all(one[2] == -4 * one[0] for frame in shown for one in frame["formations"])
-    # When a block was closed is not known: its vehicles are shown in it from the beginning.
+    # The time at which a block was closed is not known: it contains its vehicles from the start.
     assert all(row[5] >= 0 for frame in shown for row in frame["vehicles"])
 
 
@@ -106,14 +106,14 @@ def test_formations_that_plan_together(recorded: Path, tmp_path: Path) -> None:
     assert recording.frame(100)["joined"] == [[first[0], second[0]]]
 
 
-def test_nothing_before_and_after(recorded: Path) -> None:
+def test_there_are_no_frames_before_and_after(recorded: Path) -> None:
     recording = Recording(recorded)
     assert recording.frames(recording.last + 1, recording.last + 9) == []
     assert len(recording.frames(recording.last - 1, recording.last + 9)) == 2
 
 
 @pytest.mark.parametrize("lost", ["trajectories.parquet", "summary.json", "trips.parquet"])
-def test_what_is_no_run_is_refused(recorded: Path, tmp_path: Path, lost: str) -> None:
+def test_an_incomplete_run_is_refused(recorded: Path, tmp_path: Path, lost: str) -> None:
     folder = tmp_path / "run"
     shutil.copytree(recorded, folder)
     (folder / lost).unlink()

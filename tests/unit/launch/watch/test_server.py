@@ -1,4 +1,4 @@
-"""The web server as browsers meet it: a real one, over real sockets."""
+"""The web server, over real sockets."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Site:
         await server.serve(sockets=[self._listener])
 
     def offer(self, frame: str) -> None:
-        """Offer a frame to everybody, from another thread than the server's."""
+        """Offer a frame to all browsers, from another thread than the server's."""
         wait_until(lambda: self._loop is not None)
         assert self._loop is not None
         self._loop.call_soon_threadsafe(self.audience.offer, frame)
@@ -112,14 +112,14 @@ def shared_site() -> Iterator[Site]:
 
 @pytest.fixture
 def site(shared_site: Site) -> Site:
-    """Return a server that all is healthy with, and that nobody looks at."""
+    """Return a healthy server without browsers."""
     shared_site.healthy = True
     wait_until(lambda: not shared_site.audience.browsers)
     return shared_site
 
 
 @pytest.mark.parametrize("path", ["/", "/road.js", "/frames.js", "/layers.js", "/watch.js"])
-def test_the_page_needs_nobody_else(site: Site, path: str) -> None:
+def test_the_page_needs_no_other_server(site: Site, path: str) -> None:
     status, kind, text = site.get(path)
     assert status == 200
     assert kind.startswith("text/html" if path == "/" else "text/javascript")
@@ -127,7 +127,7 @@ def test_the_page_needs_nobody_else(site: Site, path: str) -> None:
     assert not addresses
 
 
-def test_the_health_check_says_whether_all_is_well(site: Site) -> None:
+def test_the_health_check(site: Site) -> None:
     status, kind, text = site.get("/healthz")
     assert (status, kind) == (200, "application/json")
     assert json.loads(text) == {"ok": True, "more": 1, "browsers": 0}
@@ -136,16 +136,11 @@ def test_the_health_check_says_whether_all_is_well(site: Site) -> None:
     assert (status, json.loads(text)["ok"]) == (503, False)
 
 
-def test_a_browser_gets_the_scene_and_then_frames(site: Site) -> None:
+def test_a_browser_gets_the_scene_and_new_frames_and_those_that_it_requests(site: Site) -> None:
     with site.browser() as browser:
         assert receive(browser)["scene"]["last"] == 4
         site.offer('{"n":5}')
         assert receive(browser) == {"n": 5}
-
-
-def test_a_browser_asks_for_frames(site: Site) -> None:
-    with site.browser() as browser:
-        receive(browser)
         browser.send('{"want":[1,3]}')
         answer = receive(browser)
         assert (answer["reel"], answer["frames"]) == ([1, 3], [{"n": 1}, {"n": 2}, {"n": 3}])
@@ -155,7 +150,7 @@ def test_several_browsers_come_and_go(site: Site) -> None:
     with site.browser() as one, site.browser() as other:
         receive(one), receive(other)
         wait_until(lambda: len(site.audience.browsers) == 2)
-        # One vanishes without a word.
+        # One disconnects without closing the websocket.
         one.socket.shutdown(socket.SHUT_RDWR)
         wait_until(lambda: len(site.audience.browsers) == 1)
         site.offer('{"n":5}')
@@ -163,7 +158,7 @@ def test_several_browsers_come_and_go(site: Site) -> None:
     wait_until(lambda: not site.audience.browsers)
 
 
-def test_a_slow_browser_gets_fewer_frames_and_holds_nobody_up(site: Site) -> None:
+def test_a_slow_browser_gets_fewer_frames_and_delays_no_other(site: Site) -> None:
     with contextlib.closing(deaf_socket(site)), site.browser(max_size=None) as fast:
         receive(fast)
         wait_until(lambda: len(site.audience.browsers) == 2)
@@ -172,7 +167,7 @@ def test_a_slow_browser_gets_fewer_frames_and_holds_nobody_up(site: Site) -> Non
             # The fast one reads every frame, the slow one none.
             assert receive(fast)["n"] == number
         assert max(browser.skipped for browser in site.audience.browsers) > 20
-    # It is gone at last, whatever is still under way to it.
+    # It is disconnected at last, with frames still unsent.
     wait_until(lambda: not site.audience.browsers)
 
 
@@ -208,7 +203,7 @@ def deaf_socket(site: Site) -> socket.socket:
         b"\x00",
     ],
 )
-def test_whoever_talks_nonsense_is_shown_out(site: Site, message: str | bytes) -> None:
+def test_malformed_requests_close_the_connection(site: Site, message: str | bytes) -> None:
     assert request_of(None if isinstance(message, bytes) else message) is None
     with site.browser() as browser:
         receive(browser)
@@ -220,16 +215,14 @@ def test_whoever_talks_nonsense_is_shown_out(site: Site, message: str | bytes) -
     assert site.get("/healthz")[0] == 200
 
 
-def test_pages_of_others_are_not_served(site: Site) -> None:
+def test_pages_of_other_servers_are_refused(site: Site) -> None:
     with pytest.raises(InvalidStatus), site.browser(origin="http://elsewhere.example"):
         pass
     with site.browser(origin=f"http://{site.host}") as browser:
         assert "scene" in receive(browser)
 
 
-def test_there_is_an_end_to_the_number_of_browsers(
-    site: Site, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_number_of_browsers_is_limited(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("laneweave.launch.watch.server.MAX_BROWSERS", 1)
     with site.browser() as first, site.browser() as second:
         receive(first)
@@ -237,7 +230,7 @@ def test_there_is_an_end_to_the_number_of_browsers(
             receive(second)
 
 
-def test_an_end_does_not_wait_for_browsers() -> None:
+def test_the_end_does_not_wait_for_browsers() -> None:
     with contextlib.ExitStack() as stack:
         with Site(live_source()).running() as site:
             browser = stack.enter_context(site.browser())
@@ -270,12 +263,12 @@ def test_nothing_queues_for_a_browser() -> None:
 @pytest.mark.parametrize(
     "listen", ["", "8080", "localhost", ":8080", "127.0.0.1:", "127.0.0.1:x", "127.0.0.1:65536"]
 )
-def test_addresses_that_are_none(listen: str) -> None:
+def test_malformed_addresses_are_refused(listen: str) -> None:
     with pytest.raises(BadInputError, match="--listen"):
         open_socket(listen)
 
 
-def test_an_address_that_is_taken_or_not_ours() -> None:
+def test_unusable_addresses_are_refused() -> None:
     with contextlib.closing(open_socket("127.0.0.1:0")) as taken:
         port = taken.getsockname()[1]
         for listen in (f"127.0.0.1:{port}", "192.0.2.1:8080", "no.such.host.invalid:80"):
