@@ -9,12 +9,13 @@ import numpy as np
 from attrs import frozen
 
 from evaluation.lattice_points import lattice_spacing
-from laneweave.launch.observe.column_owners import PLANNED, read_events
+from laneweave.launch.observe.column_owners import read_events
 from laneweave.launch.recordings.results import results_table
 from laneweave.launch.recordings.runs import Run
 from laneweave.launch.recordings.trajectories import Tracks, read_tracks
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.wire.events import PLAN_MADE, STREAM_PLANNED
 from laneweave.sim_bridge.recording.trips import WARM_UP_S
 
 SLOW_BIN_M: Final = 50.0
@@ -22,9 +23,7 @@ SLOW_SHARE: Final = 0.5
 """Where traffic is slower than this share of v_F on average, it is congested."""
 LIMIT_ERROR: Final = 0.001
 """Summaries are rounded to this."""
-STREAM_PLANNED: Final = "stream-planned"
-"""Event of a plan of the rolling operation."""
-SOLVER: Final = {PLANNED: "branching", STREAM_PLANNED: "stream"}
+SOLVER: Final = {PLAN_MADE: "branching", STREAM_PLANNED: "stream"}
 """The solver of a kind of event, where the event does not name it."""
 Key = tuple[str, float]
 """(label, volume in vehicles/(lane h))."""

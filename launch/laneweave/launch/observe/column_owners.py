@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from bisect import bisect_left
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,11 +12,9 @@ import pyarrow.parquet as pq
 from attrs import field, frozen
 
 from laneweave.protocol.lattice import Lattice
-from laneweave.protocol.wire.events import FORMATION_CLOSED, FORMATIONS_JOINED, PLAN_MADE
+from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.wire.events import FORMATION_CLOSED
 from laneweave.protocol.wire.messages import ClosedFormation
-
-CLOSED, JOINED, PLANNED = FORMATION_CLOSED, FORMATIONS_JOINED, PLAN_MADE
-"""Events of a run that are about formations."""
 
 
 @frozen
@@ -46,13 +43,8 @@ def _rearmost_first(found: Iterable[FormationColumns]) -> tuple[FormationColumns
 class Formations:
     """Formations without common columns."""
 
-    listed: tuple[FormationColumns, ...] = field(converter=_rearmost_first)
+    listed: tuple[FormationColumns, ...] = field(converter=_rearmost_first, default=())
     """The rearmost first."""
-    _fronts: list[int] = field(init=False)
-
-    @_fronts.default
-    def _sorted_fronts(self) -> list[int]:
-        return [one.front for one in self.listed]
 
     @classmethod
     def of_census(cls, closed: Iterable[ClosedFormation], lattice: Lattice) -> Formations:
@@ -66,10 +58,7 @@ class Formations:
 
     def at(self, column: int) -> FormationColumns | None:
         """Return the formation of a column; None: it belongs to none of these."""
-        place = bisect_left(self._fronts, column)
-        if place == len(self.listed) or self.listed[place].rear > column:
-            return None
-        return self.listed[place]
+        return next((one for one in self.listed if one.rear <= column <= one.front), None)
 
     def joined(self, groups: Iterable[Collection[int]], lattice: Lattice) -> list[list[int]]:
         """Return groups of at least two formations that plan together, by their numbers.
@@ -104,6 +93,13 @@ def read_events(folder: Path, *kinds: str) -> Iterator[Mapping[str, Any]]:
             yield event
 
 
+def closed_formations(folder: Path, scenario: Scenario) -> Formations:
+    """Return the formations of a recorded run; none in the rolling operation."""
+    if scenario.formation.rolling:
+        return Formations()
+    return recorded_formations(folder, scenario.lattice)
+
+
 def recorded_formations(folder: Path, lattice: Lattice) -> Formations:
     """Return the formations of a recorded run that had vehicles.
 
@@ -114,7 +110,7 @@ def recorded_formations(folder: Path, lattice: Lattice) -> Formations:
         OSError, ValueError, KeyError, TypeError: a file of the run cannot be read.
     """
     found: dict[int, FormationColumns] = {}
-    for event in read_events(folder, CLOSED):
+    for event in read_events(folder, FORMATION_CLOSED):
         if event.get("role") == "bridge":
             rear, front = event["columns"]
             number = int(event["formation"])

@@ -16,7 +16,7 @@ import numpy as np
 from attrs import frozen
 
 from laneweave.launch.drawing.colours import road_scene
-from laneweave.launch.observe.column_owners import Formations, recorded_formations
+from laneweave.launch.observe.column_owners import Formations, closed_formations
 from laneweave.launch.recordings.runs import Run
 from laneweave.launch.recordings.trajectories import Floats, Tracks, read_trips
 
@@ -37,9 +37,7 @@ def animation_data(run: Run, tracks: Tracks, title: str) -> dict[str, Any]:
         title: of the run on the page.
     """
     scenario, road = run.scenario, run.scenario.road
-    formations = Formations(())
-    if not scenario.formation.rolling:  # the rolling operation has none
-        formations = recorded_formations(run.folder, scenario.lattice)
+    formations = closed_formations(run.folder, scenario)
     samples = _sample(run, tracks, formations)
     units = {
         "s_m": max(0.02, float(tracks.s_m.max(initial=0.0)) / 65_000),

@@ -19,8 +19,6 @@ from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.launch.drawing.colours import lane_colours
 from laneweave.launch.drawing.figures import INK
 from laneweave.launch.observe.column_owners import (
-    JOINED,
-    PLANNED,
     FormationColumns,
     read_events,
     recorded_formations,
@@ -29,6 +27,7 @@ from laneweave.launch.recordings.runs import Run
 from laneweave.launch.recordings.trajectories import OFF_LATTICE, Tracks, read_trips
 from laneweave.launch.report.style import NOTE, picture
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.wire.events import FORMATIONS_JOINED, PLAN_MADE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -155,12 +154,12 @@ def _driven_slots(
     tick_s, slot_s = run.scenario.runtime.tick_s, run.scenario.cycles_s[0]
     last_s = max(changes_s, default=math.inf) + 0.5 * tick_s
     together, found = {formation}, None
-    for event in read_events(run.folder, JOINED, PLANNED):
+    for event in read_events(run.folder, FORMATIONS_JOINED, PLAN_MADE):
         if event.get("role") != "coordinator":
             continue
-        if event["kind"] == JOINED and formation in event["formations"]:
+        if event["kind"] == FORMATIONS_JOINED and formation in event["formations"]:
             together.update(event["formations"])
-        if event["kind"] == PLANNED and event["formation"] in together and "t0_s" in event:
+        if event["kind"] == PLAN_MADE and event["formation"] in together and "t0_s" in event:
             slots = float(event["t0_s"]), float(event["slot_s"])
             found = slots if slots[0] <= last_s and slots[1] > 0.0 else found
     if found is not None:

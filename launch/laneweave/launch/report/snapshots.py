@@ -15,7 +15,7 @@ from laneweave.launch.drawing.colours import (
     lane_names,
 )
 from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK
-from laneweave.launch.observe.column_owners import Formations, recorded_formations
+from laneweave.launch.observe.column_owners import Formations, closed_formations
 from laneweave.launch.recordings.runs import scenario_of
 from laneweave.launch.recordings.trajectories import Floats, Tracks, read_tracks, read_trips
 from laneweave.launch.report.style import picture
@@ -66,9 +66,7 @@ def road_snapshots(
     if not times:
         times = _instants(tracks, scenario, stretch_m)
     trips = read_trips(folder)
-    formations = Formations(())
-    if not scenario.formation.rolling:  # the rolling operation has none
-        formations = recorded_formations(folder, scenario.lattice)
+    formations = closed_formations(folder, scenario)
     width_in, road_m = 9.6, road.lanes * road.lane_width_m + _HEADROOM_M
     strip_in = _ACROSS_SCALE * (width_in - 0.9) * road_m / (stretch_m[1] - stretch_m[0])
     with picture(width_in, 0.9 + len(times) * (strip_in + 0.06), out, dpi) as figure:

@@ -164,7 +164,7 @@ class LiveRoad:
         """Return the closed formations on the road; none in the rolling operation."""
         census = self.view.census
         if census is None or self.scenario.formation.rolling:
-            return Formations(())
+            return Formations()
         return Formations.of_census(census.formations, self.scenario.lattice)
 
     def _rows(self, t_s: float, formations: Formations) -> Iterator[Row]:

@@ -16,13 +16,13 @@ import numpy as np
 from attrs import frozen
 from numpy.typing import NDArray
 
-from laneweave.launch.observe.column_owners import JOINED, Formations, recorded_formations
+from laneweave.launch.observe.column_owners import Formations, closed_formations
 from laneweave.launch.recordings.runs import Run, single_run
 from laneweave.launch.recordings.trajectories import OFF_LATTICE, Tracks, read_tracks, read_trips
 from laneweave.launch.watch.frames import MOVING, EventFeed, Row, compact, plan_row, scene_of
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.wire.events import ENTERED, LEADER, LEFT
+from laneweave.protocol.wire.events import ENTERED, FORMATIONS_JOINED, LEADER, LEFT
 
 STEP_S = 0.2
 """Road time between two frames; the page interpolates."""
@@ -58,13 +58,13 @@ class Recording:
             self._tracks = read_tracks(folder)
             self._trips = read_trips(folder)
             self._moments = list(_moments(folder))
-            formations = recorded_formations(folder, run.scenario.lattice)
+            formations = closed_formations(folder, run.scenario)
         except (OSError, ValueError, KeyError, TypeError) as error:
             allowed = f"the folder of a finished run ({error})"
             raise BadInputError("DIR", str(folder), allowed) from error
         self._run = run
         rolling = run.scenario.formation.rolling or run.label != "formation"
-        self._formations = (Formations(()) if rolling else formations).by_number
+        self._formations = {} if rolling else formations.by_number
         tick_s = run.scenario.runtime.tick_s
         stride = max(1, round(STEP_S / tick_s))
         self._step_s = stride * tick_s
@@ -168,7 +168,7 @@ def _moments(folder: Path) -> Iterator[_Moment]:
         leader, joined = moment.leader, moment.joined
         if kind == LEADER:
             leader = str(data.get("coordinator")), int(data.get("term", 0))
-        if kind == JOINED and role == "coordinator":
+        if kind == FORMATIONS_JOINED and role == "coordinator":
             joined = (*joined, tuple(map(int, data["formations"])))
         plan = plan_row(t_s, kind, data) or moment.plan
         entered, left = moment.entered + (kind == ENTERED), moment.left + (kind == LEFT)
