@@ -1,4 +1,4 @@
-"""What a run leaves behind of what roles report, and how it ended."""
+"""The files of a run: reports of the roles, its vehicles, its ending."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def test_the_newest_report_of_a_sender_counts(record: RunRecord, tmp_path: Path)
 
 
 @pytest.mark.parametrize("nonsense", [b"123", floats(float("nan"), float("inf"), -1.0), b""])
-def test_durations_that_are_none_are_left_out(
+def test_malformed_durations_are_ignored(
     record: RunRecord, tmp_path: Path, nonsense: bytes
 ) -> None:
     record.on_report(Report(Name("agent"), Name("A"), solve_ms=nonsense))
@@ -182,7 +182,7 @@ def test_recovery_is_the_time_without_a_heartbeat_of_a_leader(
 # --- the world --------------------------------------------------------------------------------
 
 
-def test_a_trip_is_written_down(record: RunRecord, tmp_path: Path) -> None:
+def test_a_trip_is_recorded(record: RunRecord, tmp_path: Path) -> None:
     traveller = vehicle()
     record.on_demanded(traveller.admission.arrival)
     record.on_entered(traveller)
@@ -203,6 +203,7 @@ def test_a_trip_is_written_down(record: RunRecord, tmp_path: Path) -> None:
     assert (entered["t_s"], entered["lane"], entered["preferred_lane"]) == (2.0, 0, 1)
     summary = read_summary(tmp_path)
     assert (summary["vehicles"]["entered"], summary["vehicles"]["left"]) == (2, 1)
+    assert summary["vehicles"]["left_off_lane"] == 0
     assert summary["tracking"]["hold_law_ticks"] == 7
     assert summary["tracking"]["emergency_ticks"] == 5
 
@@ -212,11 +213,15 @@ def test_a_vehicle_that_stands_at_the_end_has_left(record: RunRecord, tmp_path: 
     record.on_demanded(traveller.admission.arrival)
     record.on_entered(traveller)
     traveller.controller.plant._state = (SCENARIO.road.length_m, 0.0, 0.0, 1.75, 0.0, 0.0)
-    record.on_left(traveller, 70.0, attended=True)
+    record.on_left(traveller, 70.0, attended=False)
     assert read_events(tmp_path, "left")[0]["t_s"] == 70.0
+    assert read_events(tmp_path, "left-off-lane")[0]["attended"] is False
+    record.close(70.0, Ending.LIMIT)
+    vehicles = read_summary(tmp_path)["vehicles"]
+    assert (vehicles["left_off_lane"], vehicles["left_unattended"]) == (1, 1)
 
 
-def test_what_was_shown_is_recorded(record: RunRecord, tmp_path: Path) -> None:
+def test_positions_and_overlaps_are_recorded(record: RunRecord, tmp_path: Path) -> None:
     pair = ("v0001", "v0002")
     for tick in range(3):
         record.on_shown(
