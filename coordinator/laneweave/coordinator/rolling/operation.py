@@ -173,7 +173,7 @@ class RollingOperation:
         self._newest_slot = slot + 1
         job = self._new_job()
         self._ordered = (job, slot + 1)
-        yield Compute(job, partial(self._planner.plan, slot + 1, vehicles, self._table, blocked))
+        yield Compute(job, partial(self._planner, slot + 1, vehicles, self._table, blocked))
 
     def _observed_at(
         self, look_s: float, slot: int

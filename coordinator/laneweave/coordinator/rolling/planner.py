@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from typing import Protocol
+from collections.abc import Callable, Collection, Sequence
 
 from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.rolling.planner import (
@@ -21,49 +20,37 @@ REWARD = -0.5
 """Cost of a column gained if drift is rewarded; a move costs 0.3."""
 
 
-class Planner(Protocol):
-    """Plans all vehicles on the road; `StreamPlanner` except in fault searches and tests."""
+Planner = Callable[[int, Sequence[StreamVehicle], StreamPlan | None, Collection[Cell]], StreamPlan]
+"""Returns paths for all vehicles from the beginning of a slot on, given the slot, the vehicles, the
+plan before, and blocked cells; `StreamPlanner.plan` except in fault searches and tests."""
+
+
+def checked(road: StreamRoad, planner: Planner) -> Planner:
+    """Return a planner that raises `ValueError` for plans that break a rule.
+
+    A check takes half a millisecond.
+    """
 
     def plan(
-        self,
         slot: int,
         vehicles: Sequence[StreamVehicle],
-        before: StreamPlan | None = None,
-        blocked: Collection[Cell] = (),
+        before: StreamPlan | None,
+        blocked: Collection[Cell],
     ) -> StreamPlan:
-        """Return paths for all vehicles from the beginning of a slot on."""
-
-
-class CheckedPlanner:
-    """Refuses plans that break a rule; a check takes half a millisecond."""
-
-    def __init__(self, road: StreamRoad, planner: Planner) -> None:
-        """Check what a planner plans for a road."""
-        self._road, self._planner = road, planner
-
-    def plan(
-        self,
-        slot: int,
-        vehicles: Sequence[StreamVehicle],
-        before: StreamPlan | None = None,
-        blocked: Collection[Cell] = (),
-    ) -> StreamPlan:
-        """Return paths for all vehicles from the beginning of a slot on.
-
-        Raises:
-            ValueError: the vehicles contradict each other, or the plan is wrong.
-        """
-        table = self._planner.plan(slot, vehicles, before, blocked)
-        problems = problems_of_plan(self._road, table, vehicles, blocked)
+        table = planner(slot, vehicles, before, blocked)
+        problems = problems_of_plan(road, table, vehicles, blocked)
         if problems:
             raise ValueError(f"the plan of slot {slot} is wrong: {'; '.join(problems)}")
         return table
+
+    return plan
 
 
 def stream_planner(scenario: Scenario) -> Planner:
     """Return the planner of a scenario's road."""
     road = stream_road(scenario)
-    return CheckedPlanner(road, StreamPlanner(road, _costs(scenario), scenario.seed))
+    costs = StreamCosts(forward=REWARD if scenario.formation.reward_drift else 0.0)
+    return checked(road, StreamPlanner(road, costs, scenario.seed).plan)
 
 
 def stream_road(scenario: Scenario) -> StreamRoad:
@@ -80,7 +67,3 @@ def stream_road(scenario: Scenario) -> StreamRoad:
         mode=mode,
         model=ConflictModel(formation.conflict_kinds),
     )
-
-
-def _costs(scenario: Scenario) -> StreamCosts:
-    return StreamCosts(forward=REWARD if scenario.formation.reward_drift else 0.0)

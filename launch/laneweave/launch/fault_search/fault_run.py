@@ -118,28 +118,6 @@ class _ListenedCore:
         return effects
 
 
-class _ListenedPlanner:
-    """A rolling planner that passes the vehicles that it moves or holds to a listener."""
-
-    def __init__(self, planner: Planner, listener: Callable[[Sequence[str]], None]) -> None:
-        self._planner = planner
-        self._listener = listener
-
-    def plan(
-        self,
-        slot: int,
-        vehicles: Sequence[StreamVehicle],
-        before: StreamPlan | None = None,
-        blocked: Collection[Cell] = (),
-    ) -> StreamPlan:
-        plan = self._planner.plan(slot, vehicles, before, blocked)
-        held = [vehicle.vehicle for vehicle in vehicles if vehicle.held]
-        paths = plan.paths.items()
-        moved = [name for name, path in paths if len(path) > 1 and path[0] != path[1]]
-        self._listener([*held, *moved])
-        return plan
-
-
 class FaultRun:
     """One run; call `run` once."""
 
@@ -279,12 +257,25 @@ class FaultRun:
         self.network.add(name, _ListenedCore(core, name, self._on_message), scenario.network.realm)
 
     def _make_planner(self, scenario: Scenario) -> Planner:
-        planner = stream_planner(scenario) if self.setup.thorough else LightPlanner(scenario)
-        return _ListenedPlanner(planner, self._on_planned)
+        """Return a planner that records the vehicles that it moves or holds after the healing."""
+        planner = stream_planner(scenario) if self.setup.thorough else LightPlanner(scenario).plan
 
-    def _on_planned(self, vehicles: Sequence[str]) -> None:
-        if self.faults.healed:
-            self._proposed.update(vehicles)
+        def plan(
+            slot: int,
+            vehicles: Sequence[StreamVehicle],
+            before: StreamPlan | None,
+            blocked: Collection[Cell],
+        ) -> StreamPlan:
+            table = planner(slot, vehicles, before, blocked)
+            if self.faults.healed:
+                paths = table.paths.items()
+                self._proposed.update(vehicle.vehicle for vehicle in vehicles if vehicle.held)
+                self._proposed.update(
+                    name for name, path in paths if len(path) > 1 and path[0] != path[1]
+                )
+            return table
+
+        return plan
 
     def old_payload(self, rng: random.Random) -> tuple[str, bytes] | None:
         """Return key and payload of a message sent some time ago."""

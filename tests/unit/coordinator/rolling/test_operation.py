@@ -22,7 +22,7 @@ from laneweave.coordinator.rolling.operation import (
     RollingOperation,
     _clusters,
 )
-from laneweave.coordinator.rolling.planner import CheckedPlanner, stream_planner, stream_road
+from laneweave.coordinator.rolling.planner import checked, stream_planner, stream_road
 from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.lattice import Cell
@@ -86,8 +86,8 @@ class Bench:
     control: RollingOperation = field(init=False)
 
     def __attrs_post_init__(self) -> None:
-        """Pass itself as the planner."""
-        self.control = RollingOperation(ROLLING, self.new_ballot, self.new_job, self)
+        """Make the operation, with this object's planner."""
+        self.control = RollingOperation(ROLLING, self.new_ballot, self.new_job, self.plan)
 
     def new_ballot(self, above: Ballot | None) -> Ballot:
         self.asked_above.append(above)
@@ -400,7 +400,7 @@ def test_which_vehicles_are_held_and_which_cells_are_blocked(
 def test_vehicles_far_from_where_moves_begin_are_not_planned_for() -> None:
     road = parse_scenario({"formation": {"operation": "rolling"}, "road": {"s2_m": 2000.0}})
     desk = Bench()
-    desk.control = RollingOperation(road, desk.new_ballot, desk.new_job, desk)
+    desk.control = RollingOperation(road, desk.new_ballot, desk.new_job, desk.plan)
     far_s = (road.moves_from_m - AHEAD_M) / 15.0
     slot = math.ceil(far_s / SLOT_S)
     desk.control.on_census(census(A, D))  # D is 120 m behind A
@@ -617,7 +617,7 @@ def test_the_real_planner_accepts_its_input() -> None:
 def test_a_wrong_plan_is_not_issued() -> None:
     """The planner is not trusted: a path that ends on the road is not issued."""
     bench = Bench(ways={A: (HOMES[A], HOMES[A])})
-    planner = CheckedPlanner(stream_road(ROLLING), bench)
+    planner = checked(stream_road(ROLLING), bench.plan)
     bench.control = RollingOperation(ROLLING, bench.new_ballot, bench.new_job, planner)
     bench.control.on_census(census(A))
     bench.hear(shown(A))

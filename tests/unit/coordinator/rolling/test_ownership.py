@@ -109,7 +109,7 @@ class Orders:
 def plan_once(planner: Orders, *states: VehicleState) -> RollingOperation:
     """Let a leader receive states and plan one slot."""
     numbers = count(10)
-    control = RollingOperation(SCENARIO, lambda _: ballot(next(numbers)), lambda: 1, planner)
+    control = RollingOperation(SCENARIO, lambda _: ballot(next(numbers)), lambda: 1, planner.plan)
     entries = tuple(CensusEntry(each.vehicle, each.hold_cell, 0, 0.0) for each in states)
     control.on_census(Census(0.0, entries, ()))
     for each in states:
