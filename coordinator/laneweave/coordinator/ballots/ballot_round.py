@@ -221,6 +221,7 @@ def count_acceptance(me: BallotRound, state: VehicleState) -> None:
 # --- the rows that both operations share ------------------------------------------------------
 
 _PREPARING, _PLANNING, _ISSUING = UNFINISHED
+_IN_FORCE = BallotPhase.IN_FORCE
 
 PLAN_RULES = (
     Transition(
@@ -228,12 +229,7 @@ PLAN_RULES = (
     ),
     Transition("L5", PLANNED, (_PLANNING,), (), (issue,), _ISSUING),
     Transition(
-        "L6",
-        STATE,
-        (_ISSUING,),
-        (is_acceptance, is_the_last),
-        (count_acceptance,),
-        BallotPhase.IN_FORCE,
+        "L6", STATE, (_ISSUING,), (is_acceptance, is_the_last), (count_acceptance,), _IN_FORCE
     ),
     Transition("L6", STATE, (_ISSUING,), (is_acceptance,), (count_acceptance,)),
 )

@@ -220,41 +220,25 @@ def has_new_targets(me: FormationLeader, formation: Formation) -> bool:
     )
 
 
-_OBSERVING, _IN_FORCE = (BallotPhase.OBSERVING,), (BallotPhase.IN_FORCE,)
-_PREPARING, _PLANNING, _ISSUING = ((phase,) for phase in UNFINISHED)
+_OBSERVING, _PREPARING, _PLANNING, _ISSUING, _IN_FORCE, _BACKING_OFF, _ = (
+    (phase,) for phase in BallotPhase
+)
+_ADOPT = (adopt,), BallotPhase.IN_FORCE
+_BACK_OFF = (back_off,), BallotPhase.BACKING_OFF
 _PREPARE = (prepare,), BallotPhase.PREPARING
 
 LEADER_RULES: RuleBook = RuleBook(
     (
-        Transition(
-            "L2",
-            STATE,
-            _OBSERVING,
-            (all_are_heard, one_plan_is_in_force),
-            (adopt,),
-            BallotPhase.IN_FORCE,
-        ),
+        Transition("L2", STATE, _OBSERVING, (all_are_heard, one_plan_is_in_force), *_ADOPT),
         Transition("L3", STATE, _OBSERVING, (all_are_heard,), *_PREPARE),
         Transition("L3", TIME, _OBSERVING, (time_is_up,), *_PREPARE),
-        Transition(
-            "L7",
-            STATE,
-            (*UNFINISHED, *_IN_FORCE),
-            (shows_higher_promise,),
-            (back_off,),
-            BallotPhase.BACKING_OFF,
-        ),
+        Transition("L7", STATE, (*UNFINISHED, *_IN_FORCE), (shows_higher_promise,), *_BACK_OFF),
         Transition("L8", STATE, (*_PLANNING, *_ISSUING, *_IN_FORCE), (restarted,), *_PREPARE),
         Transition("L4", STATE, _PREPARING, (is_promise, has_joined), (count_promise,)),
         *PLAN_RULES,
         Transition("L5", FAILED, _PLANNING, (), (keep_ballot,), BallotPhase.PREPARING),
         Transition(
-            "L7",
-            TIME,
-            (BallotPhase.BACKING_OFF,),
-            (time_is_up,),
-            (observe_members,),
-            BallotPhase.OBSERVING,
+            "L7", TIME, _BACKING_OFF, (time_is_up,), (observe_members,), BallotPhase.OBSERVING
         ),
         Transition("L4", STATE, _PREPARING, (had_promised,), (void_promise,)),
         Transition("L5", TOO_LATE, _PLANNING, (), (), BallotPhase.GIVEN_UP),

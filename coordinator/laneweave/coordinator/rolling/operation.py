@@ -86,11 +86,9 @@ class RollingOperation:
 
     def forget(self) -> None:
         """Forget everything: there is another road."""
+        self.take_over()
         self.observed.forget()
-        self.transfers.clear()
-        self._transfer_of.clear()
-        self._table = self._ordered = self._since = None
-        self._newest_slot = -1
+        self._table, self._newest_slot = None, -1
 
     def take_over(self) -> None:
         """Begin anew: listen for a while before anything is planned.

@@ -447,7 +447,7 @@ def rest(me: PlanExecution, _: object) -> None:
 
 
 _ANY = tuple(ExecutionPhase)
-_WITH_PLAN = (ExecutionPhase.TAKEN, ExecutionPhase.GATED, ExecutionPhase.GOING)
+_, _PROMISED, _TAKEN, _GATED, _GOING = _ANY
 
 VEHICLE_RULES: RuleBook = RuleBook(
     (
@@ -457,13 +457,13 @@ VEHICLE_RULES: RuleBook = RuleBook(
             _ANY,
             (is_in_roster, is_above_promise),
             (promise, drop_plan, forget_heard, show),
-            ExecutionPhase.PROMISED,
+            _PROMISED,
         ),
         Transition("V2", PREPARE, _ANY, (is_in_roster,), (show,)),
         Transition(
             "V3",
             PLAN,
-            (ExecutionPhase.PROMISED,),
+            (_PROMISED,),
             (
                 is_promised_ballot,
                 names_my_incarnation,
@@ -474,34 +474,16 @@ VEHICLE_RULES: RuleBook = RuleBook(
                 transfers_only_owned_cells,
             ),
             (accept,),
-            ExecutionPhase.TAKEN,
+            _TAKEN,
         ),
+        Transition("V3", NOTED, (_TAKEN,), (is_noted,), (show,), _GATED),
         Transition(
-            "V3", NOTED, (ExecutionPhase.TAKEN,), (is_noted,), (show,), ExecutionPhase.GATED
+            "V4", STATE, (_GATED,), (is_of_my_plan, shows_open_gate), (hear, take_ownership), _GOING
         ),
+        Transition("V4", STATE, (_TAKEN, _GATED, _GOING), (is_of_my_plan,), (hear,)),
+        Transition("V5", GATE, (_GATED,), (is_holding, all_are_ready), (take_ownership,), _GOING),
         Transition(
-            "V4",
-            STATE,
-            (ExecutionPhase.GATED,),
-            (is_of_my_plan, shows_open_gate),
-            (hear, take_ownership),
-            ExecutionPhase.GOING,
-        ),
-        Transition("V4", STATE, _WITH_PLAN, (is_of_my_plan,), (hear,)),
-        Transition(
-            "V5",
-            GATE,
-            (ExecutionPhase.GATED,),
-            (is_holding, all_are_ready),
-            (take_ownership,),
-            ExecutionPhase.GOING,
-        ),
-        Transition(
-            "V6",
-            TICK,
-            (ExecutionPhase.GOING,),
-            (is_holding, has_next_move, is_time, is_released),
-            (start_move,),
+            "V6", TICK, (_GOING,), (is_holding, has_next_move, is_time, is_released), (start_move,)
         ),
         Transition("V7", REST, _ANY, (is_moving, moved_in_plan), (count_move, rest)),
         Transition("V7", REST, _ANY, (is_moving,), (rest,)),
