@@ -25,7 +25,7 @@ from conflict_drawing import conflict
 from laneweave.agents.driving.trajectory import move_profile
 from laneweave.coordinator.planning.conflicts import PAPER_KINDS, ConflictModel, Pair
 from laneweave.coordinator.planning.exact.cliques import clique_patterns
-from laneweave.coordinator.planning.facade import checked_plan, warm_up
+from laneweave.coordinator.planning.facade import plan, warm_up
 from laneweave.coordinator.planning.geometry.bodies import BodyGeometry
 from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
 from laneweave.coordinator.planning.request import PlanRequest
@@ -62,7 +62,7 @@ def measured(vehicles: int) -> Iterator[dict[str, Any]]:
             request = formation_request(seed, vehicles=vehicles, mode=2, deadline_s=DEADLINE_S)
             request = attrs.evolve(request, geometry=geometry)
             began = time.thread_time()
-            response = checked_plan(request, solver="branching")
+            response = plan(request, solver="branching")
             times_ms.append((time.thread_time() - began) * 1e3)
             proven += response.status == "optimal"
             costs.append(_cost(request, response.cost))

@@ -22,7 +22,7 @@ from laneweave.coordinator.planning.budget import Budget
 from laneweave.coordinator.planning.facade import MAX_NODES, plan, warm_up
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.paper.cbs import Improvements
-from laneweave.coordinator.planning.paper.tappa import new_tappa
+from laneweave.coordinator.planning.paper.tappa import Tappa
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.launch.bench.request_families import TRAFFIC_KINDS, block_request, traffic_request
 
@@ -56,7 +56,7 @@ def planned(request: PlanRequest, improvements: Improvements) -> tuple[float, in
     began = time.thread_time()
     budget = Budget(deadline=began + DEADLINE_S, max_nodes=MAX_NODES, clock=time.thread_time)
     weights = Weights.for_mode(request.mode)
-    run = new_tappa(request.problem(), request, weights, budget, improvements)
+    run = Tappa(request, request.problem(), weights, budget, improvements)
     run.run()
     took_ms = 1e3 * (time.thread_time() - began)
     return took_ms, run.best.cost if run.finished and run.best is not None else None

@@ -6,6 +6,7 @@ is a predicate over two moves made by two different vehicles in the same step.
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import combinations, pairwise
 from typing import Any
 
@@ -225,7 +226,12 @@ class Problem:
         return distance
 
     def conflict(self, a: Move, b: Move) -> bool:
-        return bool(conflict_kinds(a, b, self.conflicts, self.bodies))
+        return _exclude(a, b, self.conflicts, self.bodies)
+
+
+@lru_cache(maxsize=200_000)
+def _exclude(a: Move, b: Move, kinds: tuple[str, ...], bodies: Bodies | None) -> bool:
+    return bool(conflict_kinds(a, b, kinds, bodies))
 
 
 def _cell(pair: Iterable[int]) -> Cell:

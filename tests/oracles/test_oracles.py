@@ -17,6 +17,9 @@ from oracles.instances import (
 from oracles.path_rules import KINDS, Move, Problem, check_paths, conflict_kinds
 
 DIAGONAL: Move = ((0, 0), (1, 1))
+FOOTPRINT_KINDS = KINDS[: KINDS.index("geometric") + 1]
+"""The kinds of the paper and `geometric`, which contains them."""
+CLOSING_KINDS = (*FOOTPRINT_KINDS, "closing")
 
 # The case study of the paper, cells from 0: cost 7 with node and edge conflicts in mode 2.
 CASE_STUDY: dict[str, Any] = {
@@ -44,6 +47,7 @@ CASE_STUDY: dict[str, Any] = {
         # one moves to where the other stays; two move to one cell
         (((0, 0), (1, 0)), ((1, 0), (1, 0)), "node geometric"),
         (((0, 0), (1, 0)), ((2, 0), (1, 0)), "node geometric"),
+        (((0, 0), (1, 0)), ((1, 1), (1, 0)), "node geometric"),
         # swap, straight and oblique
         (((0, 0), (1, 0)), ((1, 0), (0, 0)), "edge special-1 geometric"),
         (DIAGONAL, ((1, 1), (0, 0)), "edge special-1 geometric"),
@@ -62,6 +66,9 @@ CASE_STUDY: dict[str, Any] = {
         (DIAGONAL, ((1, 1), (1, 0)), "special-1 special-3 geometric"),
         (DIAGONAL, ((0, 1), (0, 0)), "special-1 special-3 geometric"),
         (DIAGONAL, ((1, 0), (1, 1)), "node special-3 geometric"),
+        # out of one cell
+        (DIAGONAL, ((0, 0), (1, 0)), "special-2 geometric"),
+        (DIAGONAL, ((0, 0), (0, 1)), "special-3 geometric"),
         # three cells, but not those of one square
         (DIAGONAL, ((1, 1), (2, 1)), "special-1 geometric"),
         (DIAGONAL, ((1, 1), (1, 2)), "special-1 geometric"),
@@ -77,6 +84,7 @@ CASE_STUDY: dict[str, Any] = {
         # side by side, and apart
         (((0, 0), (1, 0)), ((0, 1), (1, 1)), ""),
         (DIAGONAL, ((0, 2), (1, 2)), ""),
+        (DIAGONAL, ((1, 2), (2, 2)), ""),
         (DIAGONAL, ((0, -1), (1, 0)), "geometric"),
         (DIAGONAL, ((0, 2), (1, 3)), ""),
         (((0, 0), (0, 0)), ((1, 0), (2, 0)), ""),
@@ -84,9 +92,9 @@ CASE_STUDY: dict[str, Any] = {
 )
 def test_two_moves(a: Move, b: Move, kinds: str) -> None:
     for first, second in ((a, b), (b, a)):
-        assert conflict_kinds(first, second) == kinds.split()
+        assert conflict_kinds(first, second, FOOTPRINT_KINDS) == kinds.split()
         for turn in (_turned, _mirrored):
-            swapped = conflict_kinds(turn(first), turn(second))
+            swapped = conflict_kinds(turn(first), turn(second), FOOTPRINT_KINDS)
             exchange = {"special-2": "special-3", "special-3": "special-2"}
             expected = [exchange.get(k, k) for k in kinds.split()] if turn is _turned else None
             assert swapped == (expected or kinds.split())
@@ -111,9 +119,13 @@ def _mirrored(move: Move) -> Move:
         (DIAGONAL, ((3, 1), (2, 0)), True),
         (DIAGONAL, ((3, 2), (2, 1)), True),
         (DIAGONAL, ((3, 0), (2, -1)), True),
+        (DIAGONAL, ((3, 1), (2, 2)), True),
+        (((0, 1), (1, 0)), ((3, 1), (2, 1)), True),
+        (((0, 0), (1, 0)), ((3, 0), (2, 1)), True),
         # no lane of both
         (((0, 0), (1, 0)), ((3, 1), (2, 1)), False),
         (DIAGONAL, ((3, 2), (2, 2)), False),
+        (((0, 0), (1, -1)), ((3, 1), (2, 2)), False),
         # three become one, two become one or stay two
         (((0, 0), (1, 0)), ((4, 0), (3, 0)), False),
         (((0, 0), (1, 0)), ((3, 0), (3, 0)), False),
@@ -126,7 +138,7 @@ def _mirrored(move: Move) -> Move:
 def test_two_that_close_up(a: Move, b: Move, closing: bool) -> None:
     for turn in (lambda move: move, _mirrored):
         for first, second in ((a, b), (b, a)):
-            found = conflict_kinds(turn(first), turn(second))
+            found = conflict_kinds(turn(first), turn(second), CLOSING_KINDS)
             assert found == ["closing"] * closing
 
 
@@ -152,9 +164,8 @@ def test_geometric_contains_all_kinds_of_the_paper() -> None:
     around = [(c, lane) for c in range(-1, 3) for lane in range(-1, 3)]
     moves = [(u, v) for u in around for v in around if max(abs(u[0] - v[0]), abs(u[1] - v[1])) < 2]
     for a, b in combinations(moves, 2):
-        kinds = conflict_kinds(a, b)
-        others = [kind for kind in kinds if kind not in ("geometric", "closing")]
-        assert not others or "geometric" in kinds
+        kinds = conflict_kinds(a, b, FOOTPRINT_KINDS)
+        assert not kinds or "geometric" in kinds
 
 
 def test_faults_in_a_response_are_found() -> None:

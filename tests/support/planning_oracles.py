@@ -4,17 +4,26 @@ from __future__ import annotations
 
 import heapq
 import itertools
-from collections.abc import Iterator, Sequence
+import json
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import lru_cache
+from random import Random
+from typing import Any
 
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.conflicts import ConflictModel, Move
+from laneweave.coordinator.planning.facade import plan
 from laneweave.coordinator.planning.geometry.bodies import BodyGeometry
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.protocol.lattice import Cell, Mode
-from laneweave.protocol.scenario.tables import CONFLICT_KINDS
+from laneweave.protocol.scenario.tables import CONFLICT_KINDS, SOLVERS
+from oracles.moving_bodies import Bodies, drive
+from oracles.path_rules import check_paths
+
+DEADLINE_S = 60.0
+"""Comparisons are about costs, not about times."""
 
 
 def moves_from(cell: Cell, grid: Grid, mode: Mode) -> list[Move]:
@@ -82,6 +91,45 @@ def cheapest_plan(request: PlanRequest, fixed: Sequence[int] | None = None) -> i
                 best[key] = entry[0]
                 heapq.heappush(heap, entry)
     return None
+
+
+def faults(request: dict[str, Any], cost: int | None, solver: str) -> list[str]:
+    """Return what is wrong with the answer of one solver, if the minimum cost is this.
+
+    The paths are checked by independent rules; with a geometry, also by driving them with delays.
+    """
+    asked = PlanRequest.from_dict({**request, "deadline_s": DEADLINE_S})
+    response = plan(asked, solver=solver, fallback=False).to_dict()
+    claims = [response[key] for key in ("status", "cost", "lower_bound")]
+    expected = ["infeasible" if cost is None else "optimal", cost, cost]
+    if claims != expected:
+        return [f"answers {claims}, the oracle {expected}"]
+    if cost is None:
+        return []
+    found = check_paths(request, response)
+    if "geometry" in request:
+        random = Random(json.dumps(request))
+        min_m = min(drive(request, response, random) for _ in range(3))
+        if min_m < Bodies(**request["geometry"]).clearance_along_m:
+            found.append(f"only {min_m:.2f} m apart")
+    return found
+
+
+def assert_agreement(
+    requests: Iterable[dict[str, Any]],
+    oracle: Callable[[dict[str, Any]], int | None],
+    solvers: Sequence[str] = SOLVERS,
+) -> None:
+    """Assert that solvers plan at the cost that an oracle proves, with legal paths."""
+    wrong = []
+    for request in requests:
+        cost = oracle(request)
+        wrong += [
+            f"{solver}: {fault}: {json.dumps(request)}"
+            for solver in solvers
+            for fault in faults(request, cost, solver)
+        ]
+    assert not wrong, "\n".join(wrong)
 
 
 GEOMETRIES = (None, BodyGeometry(), BodyGeometry(lateness_s=0.0), BodyGeometry(lateness_s=0.5))

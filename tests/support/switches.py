@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from attrs import frozen
 
-from laneweave.coordinator.planning.facade import checked_plan
+from laneweave.coordinator.planning.facade import plan
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.protocol.lattice import Cell, PlannedMove
@@ -111,7 +111,7 @@ def random_switch(
         scenario = road_scenario(seed, mode, lanes)
         # Noise is drawn from seed and name.
         names = tuple(Name(f"s{index}v{i}") for i in range(rng.randint(*vehicles)))
-        response = checked_plan(
+        response = plan(
             _request(rng, scenario, names, Grid(rng.randint(*columns), lanes)),
             max_nodes=_MAX_NODES,
         )

@@ -20,7 +20,7 @@ from attrs import evolve, frozen
 
 from laneweave.coordinator.formations.roster import Numbers
 from laneweave.coordinator.planning.budget import Clock
-from laneweave.coordinator.planning.facade import checked_plan
+from laneweave.coordinator.planning.facade import plan
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
@@ -186,9 +186,9 @@ def sort_lanes(
     if not task.movers:
         return _sorting(task, None)
     memory_mb = task.scenario.service.worker_memory_mb
-    plan = partial(checked_plan, max_nodes=max_nodes, max_memory_mb=memory_mb, weights=weights)
+    make_plan = partial(plan, max_nodes=max_nodes, max_memory_mb=memory_mb, weights=weights)
     if task.structure is not None:
-        return _form(task, task.structure, plan)
+        return _form(task, task.structure, make_plan)
     ends_s = clock() + task.deadline_s
     for excused in (None, *task.movers):
         best: PlanResponse | None = None
@@ -196,7 +196,7 @@ def sort_lanes(
             left_s = ends_s - clock()
             if best is not None and left_s <= MIN_DEADLINE_S:
                 break
-            response = plan(evolve(request, deadline_s=max(left_s, MIN_DEADLINE_S)))
+            response = make_plan(evolve(request, deadline_s=max(left_s, MIN_DEADLINE_S)))
             if best is None or _steps(response) < _steps(best):
                 best = response
             if _steps(best) <= task.steps or not response.paths:
@@ -212,7 +212,7 @@ def _steps(response: PlanResponse) -> float:
 
 
 def _form(
-    task: SortingTask, structure: DrivingStructure, plan: Callable[[PlanRequest], PlanResponse]
+    task: SortingTask, structure: DrivingStructure, make_plan: Callable[[PlanRequest], PlanResponse]
 ) -> Sorting:
     """Plan the paths into a structure; all members stay where they are if it has too few cells."""
     members = [{"id": name, "cell": list(cell)} for name, cell in task.movers.items()]
@@ -223,7 +223,7 @@ def _form(
         if error.field != "structure":
             raise
         return evolve(_sorting(task, None), impossible=error.allowed)
-    return _sorting(task, plan(request))
+    return _sorting(task, make_plan(request))
 
 
 def _sorting(task: SortingTask, response: PlanResponse | None) -> Sorting:

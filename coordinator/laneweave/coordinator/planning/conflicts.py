@@ -93,18 +93,6 @@ def _triangle(a: Move, b: Move) -> bool:
     return is_oblique(a) and not corners(a).isdisjoint(b)
 
 
-def _special_2(a: Move, b: Move) -> bool:
-    return is_longitudinal(b) and _triangle(a, b)
-
-
-def _special_3(a: Move, b: Move) -> bool:
-    return is_lateral(b) and _triangle(a, b)
-
-
-def _special_4(a: Move, b: Move) -> bool:
-    return is_wait(b) and _triangle(a, b)
-
-
 def _geometric(a: Move, b: Move) -> bool:
     return not footprint(*a).isdisjoint(footprint(*b))
 
@@ -123,9 +111,9 @@ _PREDICATES: Final[dict[str, Callable[[Move, Move], bool]]] = {
     "node": _node,
     "edge": _edge,
     "special-1": _special_1,
-    "special-2": _special_2,
-    "special-3": _special_3,
-    "special-4": _special_4,
+    "special-2": lambda a, b: is_longitudinal(b) and _triangle(a, b),
+    "special-3": lambda a, b: is_lateral(b) and _triangle(a, b),
+    "special-4": lambda a, b: is_wait(b) and _triangle(a, b),
     "geometric": _geometric,
     "closing": _closing,
 }

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Final, Protocol
+from typing import Final
 
 import attrs
 
@@ -17,9 +17,9 @@ from laneweave.coordinator.planning.budget import (
     Clock,
 )
 from laneweave.coordinator.planning.paper.assignments import Weights
-from laneweave.coordinator.planning.paper.tappa import new_tappa
+from laneweave.coordinator.planning.paper.tappa import Tappa
 from laneweave.coordinator.planning.path_map import RelativePathMap
-from laneweave.coordinator.planning.problem import Problem, Solution
+from laneweave.coordinator.planning.problem import Problem, Search
 from laneweave.coordinator.planning.request import PlanRequest, checked_solver
 from laneweave.coordinator.planning.response import PlanResponse, Status
 from laneweave.coordinator.planning.shortest_paths import without_needless_moves
@@ -36,40 +36,13 @@ MAX_NODES: Final = 500_000
 """Bounds the memory of TAPPA's trees to about 1 GB; it takes minutes to get there."""
 
 
-class Search(Protocol):
-    """A search for the best path set, by any solver."""
-
-    lower_bound: float
-    """No path set costs less; infinite: there is none."""
-    finished: bool
-    """The search is complete: `best` is optimal, or nothing exists."""
-    gave_up: bool
-    """This solver cannot decide the problem within its memory; another one may."""
-    tried: int
-    """Number of assignments examined one by one."""
-    has_fewest_moves: bool
-    """It is proven that no path set of the same cost as `best` has fewer moves."""
-
-    @property
-    def best(self) -> Solution | None:
-        """The cheapest path set so far."""
-
-    def run(self) -> None:
-        """Search until the optimum is proven or the budget is spent."""
-
-
 @attrs.frozen
 class _Result:
     """The result of a solver, without the memory of its search."""
 
     solver: str
     nodes: int
-    best: Solution | None = None
-    lower_bound: float = 0
-    finished: bool = False
-    gave_up: bool = False
-    has_fewest_moves: bool = False
-    tried: int = 0
+    found: Search
 
 
 def plan(
@@ -82,7 +55,7 @@ def plan(
     fallback: bool = True,
     clock: Clock = time.monotonic,
 ) -> PlanResponse:
-    """Plan one request.
+    """Plan one request; the plan is checked by code that shares nothing with the searches.
 
     Equal requests get equal plans unless the deadline passes first.
 
@@ -97,10 +70,12 @@ def plan(
             path sets is returned; False: TAPPA may spend everything. A solver that cannot handle
             the request at all is always replaced by the other one.
         clock: returns the time in s.
+
+    Raises:
+        RuntimeError: the plan is wrong, which is an error in the planner.
     """
     started = clock()
-    structured = request.structure is not None
-    request = request.settled()
+    asked_request, request = request, request.settled()
     asked = checked_solver(solver or request.solver or DEFAULT_SOLVER)
     weights = (weights or Weights.for_mode(request.mode)).checked(request.mode)
     nodes = MAX_NODES if max_nodes is None else min(max_nodes, MAX_NODES)
@@ -122,10 +97,15 @@ def plan(
             clock=clock,
         )
         results.append(_solve(name, problem, request, weights, budget))
-        if results[-1].finished or not (results[-1].gave_up or shares):
+        if results[-1].found.finished or not (results[-1].found.gave_up or shares):
             break
     response = _response(request, problem, asked, results, started, clock)
-    return attrs.evolve(response, targets=request.targets) if structured else response
+    if asked_request.structure is not None:
+        response = attrs.evolve(response, targets=request.targets)
+    problems = problems_of_response(asked_request, response)
+    if problems:
+        raise RuntimeError("the planner made a wrong plan: " + "; ".join(problems))
+    return response
 
 
 def _order(asked: str, problem: Problem, *, fallback: bool) -> tuple[str, ...]:
@@ -141,32 +121,18 @@ def _solve(
     solver: str, problem: Problem, request: PlanRequest, weights: Weights, budget: Budget
 ) -> _Result:
     """Run one solver until it has finished, gives up or has spent its budget."""
-    search: Search | None = None
+    found = Search()
     with suppress(BudgetSpentError):
-        search = _search(solver, problem, request, weights, budget)
+        search: Search
+        if solver == "branching":
+            from laneweave.coordinator.planning.exact.branching import Branching  # noqa: PLC0415
+
+            search = Branching(problem, request.choices(), budget)
+        else:
+            search = Tappa(request, problem, weights, budget)
         search.run()
-    if search is None:
-        return _Result(solver, budget.nodes)
-    return _Result(
-        solver,
-        budget.nodes,
-        search.best,
-        search.lower_bound,
-        search.finished,
-        search.gave_up,
-        search.has_fewest_moves,
-        search.tried,
-    )
-
-
-def _search(
-    solver: str, problem: Problem, request: PlanRequest, weights: Weights, budget: Budget
-) -> Search:
-    if solver == "branching":
-        from laneweave.coordinator.planning.exact.branching import Branching  # noqa: PLC0415
-
-        return Branching(problem, request.choices(), budget)
-    return new_tappa(problem, request, weights, budget)
+        found = Search(**attrs.asdict(search, recurse=False))
+    return _Result(solver, budget.nodes, found)
 
 
 def _response(
@@ -178,16 +144,17 @@ def _response(
     clock: Clock,
 ) -> PlanResponse:
     """Combine the results of the solvers: the cheapest path set and the highest lower bound."""
-    found = [result.best for result in reversed(results) if result.best is not None]
+    searches = [result.found for result in results]
+    found = [search.best for search in reversed(searches) if search.best is not None]
     best = min(found, key=lambda solution: solution.cost, default=None)
-    if best is not None and not any(result.has_fewest_moves for result in results):
+    if best is not None and not any(search.has_fewest_moves for search in searches):
         budget = Budget(deadline=started + request.deadline_s, clock=clock)
         best = without_needless_moves(problem, best, budget)
     cells = [] if best is None else problem.cells_of(best)
     path_map = RelativePathMap.padded([v.id for v in request.vehicles][: len(cells)], cells)
-    bound = max(result.lower_bound for result in results)
+    bound = max(search.lower_bound for search in searches)
     cost = None if best is None else best.cost
-    finished = any(result.finished for result in results) or cost == bound
+    finished = any(search.finished for search in searches) or cost == bound
     last = results[-1].solver
     return PlanResponse(
         status=_status(found=best is not None, finished=finished),
@@ -197,7 +164,7 @@ def _response(
         assignment=() if best is None else best.assignment,
         paths=path_map.rows,
         solve_ms=round(1e3 * (clock() - started), 3),
-        assignments_tried=sum(result.tried for result in results),
+        assignments_tried=sum(search.tried for search in searches),
         nodes_expanded=sum(result.nodes for result in results),
         solver=last,
         fallback=last != asked,
@@ -208,34 +175,6 @@ def _status(*, found: bool, finished: bool) -> Status:
     if found:
         return "optimal" if finished else "feasible"
     return "infeasible" if finished else "timeout"
-
-
-def checked_plan(
-    request: PlanRequest,
-    *,
-    max_nodes: int | None = None,
-    max_memory_mb: float = DEFAULT_MEMORY_MB,
-    weights: Weights | None = None,
-    solver: str | None = None,
-    fallback: bool = True,
-) -> PlanResponse:
-    """Plan one request and check the response against it; see `plan`.
-
-    Raises:
-        RuntimeError: the response is wrong, which is an error in the planner.
-    """
-    response = plan(
-        request,
-        max_nodes=max_nodes,
-        max_memory_mb=max_memory_mb,
-        weights=weights,
-        solver=solver,
-        fallback=fallback,
-    )
-    problems = problems_of_response(request, response)
-    if problems:
-        raise RuntimeError("the planner made a wrong plan: " + "; ".join(problems))
-    return response
 
 
 def warm_up() -> None:

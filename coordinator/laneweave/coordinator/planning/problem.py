@@ -119,6 +119,17 @@ class MoveTable:
             cells |= part << shift if shift >= 0 else part >> -shift
         return cells
 
+    def distances(self, cells: int) -> dict[int, int]:
+        """Return the minimum number of steps between each cell and the nearest of some cells."""
+        found: dict[int, int] = {}
+        reached, steps = cells, 0
+        while cells:
+            found.update(dict.fromkeys(bits(cells), steps))
+            cells = self.ends(self.starting_in(cells)) & ~reached
+            reached |= cells
+            steps += 1
+        return found
+
     def common_conflicts(self, moves: int) -> int:
         """Return the moves that conflict with every one of the given moves."""
         common = self.valid
@@ -207,6 +218,30 @@ class Solution:
     def cost(self) -> int:
         """Return the cost of the path set."""
         return sum(len(path) for path in self.paths)
+
+
+@attrs.define(eq=False)
+class Search:
+    """A search for the best path set: what all solvers have in common.
+
+    best: the cheapest path set so far.
+    lower_bound: no path set costs less; infinite: there is none.
+    finished: the search is complete: `best` is optimal, or nothing exists.
+    gave_up: this solver cannot decide the problem within its memory; another one may.
+    tried: number of assignments examined one by one.
+    has_fewest_moves: it is proven that no path set of the same cost as `best` has fewer moves.
+    """
+
+    best: Solution | None = None
+    lower_bound: float = 0
+    finished: bool = False
+    gave_up: bool = False
+    tried: int = 0
+    has_fewest_moves: bool = False
+
+    def run(self) -> None:
+        """Search until the optimum is proven or the budget is spent."""
+        raise NotImplementedError
 
 
 class Problem:

@@ -94,7 +94,7 @@ def ranked_runs(
         equal ones, and the index in `free` of its first cell.
     """
     runs = np.lib.stride_tricks.sliding_window_view(np.asarray(free), len(columns))
-    share = _off_front(runs, width) if ahead else _off_middle(runs, width)
+    share = (width - 1 - runs.mean(axis=1)) / (10 * width) if ahead else _off_middle(runs, width)
     totals = np.abs(runs - np.sort(columns)).sum(axis=1) + share
     return [(float(totals[first]), int(first)) for first in np.argsort(totals, kind="stable")]
 
@@ -187,8 +187,3 @@ def _fill(
 def _off_middle(columns: NDArray[np.int64], width: int) -> NDArray[np.float64]:
     """Return a tie-breaker below 0.06: the smaller, the nearer to the middle."""
     return np.asarray(np.abs(columns.mean(axis=-1) - (width - 1) / 2) / (10 * width))
-
-
-def _off_front(columns: NDArray[np.int64], width: int) -> NDArray[np.float64]:
-    """Return a tie-breaker below 0.1: the smaller, the nearer to the front."""
-    return np.asarray((width - 1 - columns.mean(axis=-1)) / (10 * width))

@@ -27,19 +27,6 @@ class Targets:
     """Targets of those that cannot get their lanes: the nearest cell that is left."""
 
 
-def place(
-    cells: Mapping[Name, Cell],
-    preferred_lanes: Mapping[Name, int],
-    columns: int,
-    lanes: int,
-    blocked: Collection[Cell] = (),
-    *,
-    ahead: bool = False,
-) -> Targets:
-    """Place the targets of vehicles where their paths are shortest; see `placements`."""
-    return next(placements(cells, preferred_lanes, columns, lanes, blocked, ahead=ahead))
-
-
 def placements(
     cells: Mapping[Name, Cell],
     preferred_lanes: Mapping[Name, int],
@@ -105,16 +92,15 @@ def _ranked_targets(
     lane: int,
     cells: Sequence[Cell],
     columns: int,
-    free: Sequence[int] | None,
+    free: Sequence[int],
     *,
     ahead: bool,
 ) -> list[tuple[float, list[Cell]]]:
     """Return all runs of neighbouring cells on a lane, each with its rank, the best one first."""
-    free = range(columns) if free is None else free
-    count = min(len(cells), len(free))
+    count = len(cells)
     if count == 0:
         return [(0.0, [])]
-    runs = ranked_runs([column for column, _ in cells][:count], free, columns, ahead=ahead)
+    runs = ranked_runs([column for column, _ in cells], free, columns, ahead=ahead)
     return [
         (rank, [(column, lane) for column in free[first : first + count]]) for rank, first in runs
     ]

@@ -1,7 +1,7 @@
 """Check a plan against its request, without code of the search.
 
-Only the definition of a conflict is shared, because plans are checked against it. `checked_plan`
-calls this before a coordinator issues a plan.
+Only the definition of a conflict is shared, because plans are checked against it. `facade.plan`
+calls this for every plan.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from typing import ClassVar
 import attrs
 from attrs import define, field, frozen
 
-from laneweave.coordinator.planning.facade import checked_plan
+from laneweave.coordinator.planning.facade import plan
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.service.format import (
@@ -316,12 +316,12 @@ def _digest(request: PlanRequest) -> bytes:
 def plan_in_time(
     request: PlanRequest, solver: str, memory_mb: float, left_s: float
 ) -> PlanResponse:
-    """Plan a request in the time that is left of its deadline; see `checked_plan`.
+    """Plan a request in the time that is left of its deadline; see `plan`.
 
     `solver` plans where the request names none.
     """
     left_s = min(left_s, request.deadline_s)
     hurried = attrs.evolve(request, deadline_s=left_s)
-    response = checked_plan(hurried, solver=request.solver or solver, max_memory_mb=memory_mb)
+    response = plan(hurried, solver=request.solver or solver, max_memory_mb=memory_mb)
     waited_ms = round(1e3 * (request.deadline_s - left_s), 3)
     return attrs.evolve(response, waited_ms=waited_ms)

@@ -3,7 +3,7 @@
 Vehicles prefer a random lane, and the targets are parallel: as many on each lane as vehicles prefer
 it. In `block_request` and `formation_request` vehicles start interlaced (on a checkerboard) and the
 targets are in the middle columns; in `traffic_request` vehicles start where traffic puts them, and
-`targets.place` chooses as it does for a formation on the road.
+`targets.placements` chooses as it does for a formation on the road.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import attrs
 from laneweave.coordinator.planning.conflicts import DEFAULT_KINDS
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
-from laneweave.coordinator.planning.targets import place
+from laneweave.coordinator.planning.targets import placements
 from laneweave.protocol.lattice import Cell, Mode
 from laneweave.protocol.wire.messages import Name
 
@@ -90,7 +90,7 @@ def traffic_request(
     columns, entered = stream.formation()
     cells = {Name(f"v{i + 1}"): cell for i, (cell, _) in enumerate(entered)}
     preferred = {Name(f"v{i + 1}"): lane for i, (_, lane) in enumerate(entered)}
-    targets = place(cells, preferred, columns, _TRAFFIC_LANES)
+    targets = next(placements(cells, preferred, columns, _TRAFFIC_LANES))
     return PlanRequest(
         Grid(columns, _TRAFFIC_LANES),
         mode,

@@ -10,7 +10,7 @@ from typing import Any
 
 import attrs
 
-from laneweave.coordinator.planning.facade import checked_plan
+from laneweave.coordinator.planning.facade import plan
 from laneweave.coordinator.planning.paper.explanation import explain
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
@@ -93,7 +93,7 @@ def answer_request(
         drawers.append(_checked_drawer(drawing))
     if road_drawing is not None:
         drawers.append(_checked_road_drawer(road_drawing, scenario or Scenario(), request.mode))
-    response = checked_plan(request) if access is None else _ask(access, request, wait_s)
+    response = plan(request) if access is None else _ask(access, request, wait_s)
     if as_table:
         sys.stdout.write(_table(request, response))
     else:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from laneweave.coordinator.formations import sorting as sorting_module
 from laneweave.coordinator.formations.roster import Numbers
 from laneweave.coordinator.formations.sorting import Sorting, SortingTask, plan_requests, sort_lanes
-from laneweave.coordinator.planning.facade import checked_plan
+from laneweave.coordinator.planning.facade import plan
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
@@ -198,7 +198,7 @@ def walled_in() -> SortingTask:
 def test_one_in_a_corner_does_not_keep_the_others_from_their_lanes() -> None:
     order = walled_in()
     whole = next(plan_requests(order))
-    assert checked_plan(whole, max_nodes=NODES, weights=WEIGHTS).status == "infeasible"
+    assert plan(whole, max_nodes=NODES, weights=WEIGHTS).status == "infeasible"
     sorting = sort(order)
     assert sorting.solved
     assert sorting.moves[A] == ()
@@ -254,9 +254,9 @@ def test_a_structure_that_cannot_be_reached_is_planned_once(
 
     def count(request: PlanRequest, **limits: Any) -> PlanResponse:  # noqa: ANN401
         asked.append(request)
-        return checked_plan(request, **limits)
+        return plan(request, **limits)
 
-    monkeypatch.setattr(sorting_module, "checked_plan", count)
+    monkeypatch.setattr(sorting_module, "plan", count)
     held: dict[Name, Cell] = {C: (0, 1), D: (-1, 0), E: (-2, 0), F: (-3, 1)}
     order = task({A: (0, 0), B: (-3, 0)} | held, dict.fromkeys([A, B, *held], 0), *held)
     lane_2 = DrivingStructure(from_m=200.0, structure="parallel", lanes=(2,))
@@ -271,9 +271,9 @@ def test_all_placements_share_one_deadline(monkeypatch: pytest.MonkeyPatch) -> N
     def slow_plan(request: PlanRequest, **limits: Any) -> PlanResponse:  # noqa: ANN401
         asked.append(request.deadline_s)
         now_s[0] += 2.0
-        return checked_plan(request, **limits)
+        return plan(request, **limits)
 
-    monkeypatch.setattr(sorting_module, "checked_plan", slow_plan)
+    monkeypatch.setattr(sorting_module, "plan", slow_plan)
     cells = {A: (0, 0), B: (-1, 1), C: (-2, 0), D: (-3, 1), E: (0, 2), F: (-2, 2)}
     order = task(cells, {A: 2, B: 2, C: 1, D: 0, E: 0, F: 1}, numbers=(0, 1))
     hurried = evolve(order, deadline_s=5.0, steps=0)

@@ -1,6 +1,5 @@
 """The planner must answer with exactly the cost that the oracle proves, and with legal paths."""
 
-import json
 from collections import Counter
 from collections.abc import Callable, Iterator
 from itertools import product
@@ -17,7 +16,6 @@ from laneweave.launch.bench.request_families import (
     traffic_request,
 )
 from laneweave.protocol.lattice import Mode
-from laneweave.protocol.scenario.tables import SOLVERS
 from oracles import joint_search, milp_oracle
 from oracles.instances import (
     CLOSING,
@@ -31,6 +29,7 @@ from oracles.instances import (
 )
 from oracles.path_rules import check_paths
 from oracles.proven import Oracle, by_oracle
+from support.planning_oracles import assert_agreement
 
 INSTANCES = 200
 MORE_INSTANCES = 1_600
@@ -38,54 +37,25 @@ FORMATION_INSTANCES = 100
 LARGE_INSTANCES = 100
 CLOSING_INSTANCES = 60
 LARGE_DEADLINE_S = 4.0
-DEADLINE_S = 60.0
-"""Of the others: this is about costs, not about times."""
 CHUNK = 10
 
 
-def _plan(request: dict[str, Any], solver: str = "tappa") -> dict[str, Any]:
-    """Return the answer of one solver, without the other one to fall back on."""
-    asked = PlanRequest.from_dict({"deadline_s": DEADLINE_S, **request})
-    response: dict[str, Any] = plan(asked, solver=solver, fallback=False).to_dict()
-    return response
-
-
-def _faults(request: dict[str, Any], cost: int | None, solver: str) -> list[str]:
-    """Return what is wrong with the answer, if the least cost is this; None: there is no plan."""
-    response = _plan(request, solver)
-    if cost is None:
-        found = response["status"]
-        return [] if found == "infeasible" else [f"{found}, but there is no solution"]
-    claims = {key: response[key] for key in ("status", "cost", "lower_bound")}
-    expected = {"status": "optimal", "cost": cost, "lower_bound": cost}
-    if claims != expected:
-        return [f"answers {claims}, the oracle {expected}"]
-    return check_paths(request, response)
+def chunks(instances: int, first: int = 0) -> pytest.MarkDecorator:
+    """Run a test with `CHUNK` seeds at a time."""
+    every = range(first, first + instances, CHUNK)
+    return pytest.mark.parametrize("seeds", [range(k, k + CHUNK) for k in every], ids=str)
 
 
 @by_oracle
-@pytest.mark.parametrize("first", range(0, INSTANCES, CHUNK))
-def test_planner_agrees_with_the_oracle(first: int, oracle: Oracle) -> None:
-    _agree_on_random(first, oracle)
+@chunks(INSTANCES)
+def test_planner_agrees_with_the_oracle(seeds: range, oracle: Oracle) -> None:
+    assert_agreement(map(random_request, seeds), oracle)
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("first", range(INSTANCES, INSTANCES + MORE_INSTANCES, CHUNK))
-def test_planner_agrees_with_the_oracle_on_many_more(first: int) -> None:
-    _agree_on_random(first, milp_oracle.optimal_cost)
-
-
-def _agree_on_random(first: int, oracle: Oracle) -> None:
-    wrong = []
-    for seed in range(first, first + CHUNK):
-        request = random_request(seed)
-        cost = oracle(request)
-        wrong += [
-            f"seed {seed}, {solver}: {fault}: {json.dumps(request)}"
-            for solver in SOLVERS
-            for fault in _faults(request, cost, solver)
-        ]
-    assert not wrong, "\n".join(wrong)
+@chunks(MORE_INSTANCES, first=INSTANCES)
+def test_planner_agrees_with_the_oracle_on_many_more(seeds: range) -> None:
+    assert_agreement(map(random_request, seeds), milp_oracle.optimal_cost)
 
 
 FORMATIONS: tuple[tuple[Mode, tuple[str, ...]], ...] = (
@@ -102,45 +72,29 @@ def _formation(seed: int) -> dict[str, Any]:
 
 
 @by_oracle
-@pytest.mark.parametrize("first", range(0, FORMATION_INSTANCES, CHUNK))
+@chunks(FORMATION_INSTANCES)
 def test_planner_agrees_with_the_oracle_on_formations_beyond_six(
-    first: int, oracle: Oracle
+    seeds: range, oracle: Oracle
 ) -> None:
-    wrong = []
-    for seed in range(first, first + CHUNK):
-        request = _formation(seed)
-        cost = oracle(request)
-        assert cost is not None
-        wrong += [f"seed {seed}: {fault}" for fault in _faults(request, cost, "branching")]
-    assert not wrong, "\n".join(wrong)
+    assert_agreement(map(_formation, seeds), oracle, ["branching"])
 
 
 def _interlaced(seed: int) -> PlanRequest:
     return block_request(seed, vehicles=2 + seed % 5, conflicts=TRAFFIC_KINDS)
 
 
-SIX: dict[str, Callable[[int], PlanRequest]] = {"interlaced": _interlaced, "free": traffic_request}
-"""Formations of at most six vehicles, as roads have them."""
-
-
 @pytest.mark.full
-@pytest.mark.parametrize("first", range(0, INSTANCES, CHUNK))
-@pytest.mark.parametrize("family", SIX)
-def test_planner_agrees_with_the_oracle_on_formations_of_six(family: str, first: int) -> None:
-    wrong = []
-    for seed in range(first, first + CHUNK):
-        request = SIX[family](seed).to_dict()
-        cost = milp_oracle.optimal_cost(request)
-        wrong += [
-            f"seed {seed}, {solver}: {fault}"
-            for solver in SOLVERS
-            for fault in _faults({**request, "deadline_s": DEADLINE_S}, cost, solver)
-        ]
-    assert not wrong, "\n".join(wrong)
+@chunks(INSTANCES)
+@pytest.mark.parametrize("family", [_interlaced, traffic_request])
+def test_planner_agrees_with_the_oracle_on_formations_of_six(
+    family: Callable[[int], PlanRequest], seeds: range
+) -> None:
+    """Formations of at most six vehicles, as roads have them."""
+    assert_agreement((family(seed).to_dict() for seed in seeds), milp_oracle.optimal_cost)
 
 
 def _closing(seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return a request in which nobody may close up, and the same in which everybody may."""
+    """Return a request in which vehicles may not close up, and the same in which they may."""
     mode, conflicts = CLOSING[seed // 2 % len(CLOSING)]
     make = meeting_request if seed % 2 else random_request
     request = make(seed, (mode, conflicts))
@@ -148,20 +102,11 @@ def _closing(seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 @by_oracle
-@pytest.mark.parametrize("first", range(0, CLOSING_INSTANCES, CHUNK))
-def test_planner_agrees_with_the_oracle_with_closing(first: int, oracle: Oracle) -> None:
-    wrong, dearer = [], 0
-    for seed in range(first, first + CHUNK):
-        request, free = _closing(seed)
-        cost = oracle(request)
-        dearer += cost != oracle(free)
-        wrong += [
-            f"seed {seed}, {solver}: {fault}: {json.dumps(request)}"
-            for solver in SOLVERS
-            for fault in _faults(request, cost, solver)
-        ]
-    assert not wrong, "\n".join(wrong)
-    assert dearer, "than where two may close up"
+@chunks(CLOSING_INSTANCES)
+def test_planner_agrees_with_the_oracle_with_closing(seeds: range, oracle: Oracle) -> None:
+    pairs = [_closing(seed) for seed in seeds]
+    assert_agreement([request for request, _ in pairs], oracle)
+    assert any(oracle(request) != oracle(free) for request, free in pairs), "closing costs nothing"
 
 
 def compared() -> Iterator[dict[str, Any]]:
@@ -177,7 +122,7 @@ def compared() -> Iterator[dict[str, Any]]:
 def test_proofs_on_large_requests_agree_with_the_oracle(seed: int) -> None:
     """Three to five lanes, all conflicts, blocked cells, lists of targets, more than are needed."""
     request = {**large_request(seed), "deadline_s": LARGE_DEADLINE_S}
-    response = _plan(request, "branching")
+    response = plan(PlanRequest.from_dict(request), solver="branching", fallback=False).to_dict()
     assert not check_paths(request, response)
     try:
         cost = milp_oracle.optimal_cost(request)
@@ -209,20 +154,17 @@ CROWDED = list(product(range(8), ((3, 2, 2), (4, 1, 2), (3, 2, 3))))
 def test_planner_agrees_with_joint_search_on_crowded_grids(code: int) -> None:
     """Many of these have no solution, which the planner must prove."""
     mode, conflicts = EVERY_VARIANT[code]
-    wrong = []
-    for seed, (columns, lanes, count) in CROWDED:
-        request = small_request(
-            1000 * code + seed,
-            columns=columns,
-            lanes=lanes,
-            count=count,
-            mode=mode,
-            conflicts=conflicts,
-        )
-        cost = joint_search.optimal_cost(request)
-        for solver in SOLVERS:
-            wrong += [
-                f"seed {seed}, {solver}: {fault}: {json.dumps(request)}"
-                for fault in _faults(request, cost, solver)
-            ]
-    assert not wrong, "\n".join(wrong)
+    assert_agreement(
+        (
+            small_request(
+                1000 * code + seed,
+                columns=columns,
+                lanes=lanes,
+                count=count,
+                mode=mode,
+                conflicts=conflicts,
+            )
+            for seed, (columns, lanes, count) in CROWDED
+        ),
+        joint_search.optimal_cost,
+    )

@@ -4,6 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from laneweave.coordinator.planning.conflicts import ConflictModel
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.paper.assignments import (
     Weights,
@@ -11,6 +12,7 @@ from laneweave.coordinator.planning.paper.assignments import (
     frd,
     preference_matrix,
 )
+from laneweave.coordinator.planning.problem import MoveTable
 from laneweave.coordinator.planning.request import VehicleRequest
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, Mode
@@ -30,7 +32,9 @@ def test_the_equation_of_the_paper() -> None:
 def test_default_weights_give_the_number_of_steps_on_a_free_grid(
     a: Cell, b: Cell, mode: Mode
 ) -> None:
-    assert frd(a, b, Weights.for_mode(mode)) == Grid(5, 3).distances(a, mode, [b])[b]
+    table = MoveTable(Grid(5, 3), mode, ConflictModel(["node"]))
+    steps = table.distances(1 << table.bit(a))
+    assert frd(a, b, Weights.for_mode(mode)) == steps[table.bit(b)]
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from laneweave.coordinator.planning.conflicts import ConflictModel, Move
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.problem import MoveTable, bits
-from laneweave.protocol.lattice import Mode
+from laneweave.protocol.lattice import Cell, Mode, displacements
 from laneweave.protocol.scenario.tables import CONFLICT_KINDS
 
 GRIDS = [
@@ -31,7 +31,8 @@ def _moves(table: MoveTable) -> set[Move]:
         (cell, to)
         for cell in product(range(table.grid.columns), range(table.grid.lanes))
         if table.grid.is_free(cell)
-        for to in table.grid.neighbours(cell, table.mode)
+        for step in displacements(table.mode)
+        if table.grid.is_free(to := (cell[0] + step[0], cell[1] + step[1]))
     }
 
 
@@ -83,3 +84,17 @@ def test_moves_that_conflict_with_all() -> None:
     into_the_middle = {((0, 0), (1, 0)), ((1, 0), (1, 0)), ((2, 0), (1, 0))}
     assert {table.move(bit) for bit in bits(table.common_conflicts(both))} == into_the_middle
     assert table.common_conflicts(0) == table.valid
+
+
+@pytest.mark.parametrize("mode", [1, 2])
+def test_distances_lead_around_blocked_cells(mode: Mode) -> None:
+    table = MoveTable(Grid(4, 3, [(1, 1), (2, 0), (3, 1), (2, 2)]), mode, MODELS[0])
+
+    def distance(start: Cell, end: Cell) -> int | None:
+        return table.distances(1 << table.bit(start)).get(table.bit(end))
+
+    assert distance((0, 0), (2, 1)) == (None if mode == 1 else 2)
+    assert distance((0, 0), (1, 2)) == 3 - (mode - 1)
+    assert distance((0, 0), (0, 0)) == 0
+    both = table.distances(1 << table.bit((0, 0)) | 1 << table.bit((0, 2)))
+    assert {table.cell(bit): steps for bit, steps in both.items()}[1, 2] == 1

@@ -1,6 +1,5 @@
 """Plans whose conflicts are computed from geometry: exact, and far enough apart when driven."""
 
-import json
 from collections.abc import Iterator
 from functools import cache
 from itertools import product
@@ -16,10 +15,9 @@ from laneweave.coordinator.planning import request as request_module
 from laneweave.coordinator.planning.budget import Budget
 from laneweave.coordinator.planning.conflicts import ConflictTable
 from laneweave.coordinator.planning.exact.reachability import explore
-from laneweave.coordinator.planning.facade import checked_plan, plan
+from laneweave.coordinator.planning.facade import plan
 from laneweave.coordinator.planning.geometry.bodies import BodyGeometry
 from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
-from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.validator import problems_of_paths
 from laneweave.launch.bench.request_families import formation_request
@@ -31,6 +29,8 @@ from oracles.instances import random_request, small_request
 from oracles.moving_bodies import Bodies, Profile, drive, least_gap_of_plan_m
 from oracles.path_rules import check_paths
 from oracles.proven import Oracle, by_oracle
+from support.planning_oracles import assert_agreement
+from unit.coordinator.planning.test_against_milp import chunks
 
 ON_TIME = {"lateness_s": 0.0}
 LATE = {"lateness_s": 0.5}
@@ -58,24 +58,6 @@ TIGHT = {
 KINDS = (["geometric"], ["geometric"], ["node", "geometric"], ["special-1", "geometric"])
 
 INSTANCES = 60
-CHUNK = 10
-
-
-def faults(request: dict[str, Any], cost: int | None, solver: str, seed: int) -> list[str]:
-    """What is wrong with a plan, by what it claims, by its paths, and by driving it."""
-    asked = PlanRequest.from_dict({"deadline_s": 60.0, **request})
-    response = checked_plan(asked, solver=solver, fallback=False).to_dict()
-    claims = response["status"], response["cost"]
-    if claims != ("infeasible" if cost is None else "optimal", cost):
-        return [f"answers {claims}, the oracle {cost}"]
-    if cost is None:
-        return []
-    found = check_paths(request, response)
-    rng = Random(seed)
-    least_m = min(drive(request, response, rng) for _ in range(3))
-    if least_m < Bodies(**request["geometry"]).clearance_along_m:
-        found.append(f"only {least_m:.2f} m apart")
-    return found
 
 
 def _request(seed: int) -> dict[str, Any]:
@@ -90,50 +72,30 @@ def compared() -> Iterator[dict[str, Any]]:
 
 
 @by_oracle
-@pytest.mark.parametrize("first", range(0, INSTANCES, CHUNK))
-def test_planner_agrees_with_the_oracle(first: int, oracle: Oracle) -> None:
+@chunks(INSTANCES)
+def test_planner_agrees_with_the_oracle(seeds: range, oracle: Oracle) -> None:
     """The oracle computes conflicts by simulating bodies."""
-    wrong = []
-    for seed in range(first, first + CHUNK):
-        request = _request(seed)
-        cost = oracle(request)
-        wrong += [
-            f"seed {seed}, {solver}: {fault}: {json.dumps(request)}"
-            for solver in SOLVERS
-            for fault in faults(request, cost, solver, seed)
-        ]
-    assert not wrong, "\n".join(wrong)
+    assert_agreement(map(_request, seeds), oracle)
 
 
 CROWDED = ((3, 2, 2), (4, 1, 2), (3, 2, 3), (2, 2, 3), (2, 2, 4))
-MODES: tuple[Mode, ...] = (1, 2)
 
 
 @pytest.mark.parametrize("geometry", [*GEOMETRIES, TIGHT], ids=str)
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", [1, 2])
 def test_planner_agrees_with_joint_search_on_crowded_grids(
     geometry: dict[str, float], mode: Mode
 ) -> None:
-    wrong = []
-    for seed, (columns, lanes, count) in product(range(5), CROWDED):
-        request = {
-            **small_request(
-                seed,
-                columns=columns,
-                lanes=lanes,
-                count=count,
-                mode=mode,
-                conflicts=["geometric"],
-            ),
-            "geometry": geometry,
-        }
-        cost = joint_search.optimal_cost(request)
-        wrong += [
-            f"seed {seed}, {solver}: {fault}: {json.dumps(request)}"
-            for solver in SOLVERS
-            for fault in faults(request, cost, solver, seed)
-        ]
-    assert not wrong, "\n".join(wrong)
+    assert_agreement(
+        (
+            small_request(
+                seed, columns=columns, lanes=lanes, count=count, mode=mode, conflicts=["geometric"]
+            )
+            | {"geometry": geometry}
+            for seed, (columns, lanes, count) in product(range(5), CROWDED)
+        ),
+        joint_search.optimal_cost,
+    )
 
 
 # ------------------------------------------------------------------------------------- trains
@@ -157,7 +119,7 @@ def test_a_train_starts_together_with_limited_lateness(
 ) -> None:
     more = {} if geometry is None else {"geometry": geometry}
     for solver in SOLVERS:
-        response = checked_plan(PlanRequest.from_dict({**TRAIN, **more}), solver=solver)
+        response = plan(PlanRequest.from_dict({**TRAIN, **more}), solver=solver)
         assert (response.status, response.cost) == ("optimal", cost)
 
 
@@ -209,9 +171,7 @@ def test_a_ring_can_only_turn_as_a_whole(geometry: dict[str, float], cost: int |
     }
     assert joint_search.optimal_cost(document) == cost
     request = PlanRequest.from_dict(document)
-    cells = [vehicle.cell for vehicle in request.vehicles]
-    problem = Problem(request.grid, request.mode, request.conflict_model, cells, request.targets)
-    verdict = explore(problem, request.choices(), Budget(), 10**6)
+    verdict = explore(request.problem(), request.choices(), Budget(), 10**6)
     assert verdict.impossible == (cost is None)
     assert (verdict.solution is None) == (cost is None)
     assert plan(request).cost == cost
@@ -239,7 +199,7 @@ def test_formations_keep_the_clearance_when_agents_drive_them(lateness_s: float)
     for seed in range(6):
         document = formation_request(seed, vehicles=8, mode=2).to_dict()
         document["geometry"] = {"lateness_s": lateness_s}
-        response = checked_plan(PlanRequest.from_dict(document), max_nodes=300)
+        response = plan(PlanRequest.from_dict(document), max_nodes=300)
         paths = [list(path) for path in response.paths]
         bodies = Bodies(lateness_s=lateness_s)
         for number in range(4):

@@ -7,7 +7,7 @@ import math
 import attrs
 import pytest
 
-from laneweave.coordinator.planning.facade import TAPPA_SHARE, checked_plan, plan
+from laneweave.coordinator.planning.facade import TAPPA_SHARE, plan
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.launch.bench.request_families import block_request, formation_request
@@ -68,10 +68,10 @@ def test_responses_without_a_solver_are_read() -> None:
 
 
 def test_branching_continues_when_tappa_has_spent_its_nodes() -> None:
-    alone = checked_plan(HARD, max_nodes=NODES, solver="tappa", fallback=False)
+    alone = plan(HARD, max_nodes=NODES, solver="tappa", fallback=False)
     assert (alone.status, alone.solver, alone.fallback) == ("timeout", "tappa", False)
-    response = checked_plan(HARD, max_nodes=NODES)
-    best = checked_plan(HARD, solver="branching")
+    response = plan(HARD, max_nodes=NODES)
+    best = plan(HARD, solver="branching")
     assert (response.solver, response.fallback) == ("branching", True)
     assert (response.status, response.cost) == ("optimal", best.cost)
     assert TAPPA_SHARE * NODES < response.nodes_expanded <= NODES

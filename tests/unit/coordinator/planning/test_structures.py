@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
-from laneweave.coordinator.planning.facade import checked_plan
+from laneweave.coordinator.planning.facade import plan
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
@@ -169,7 +169,7 @@ def test_vehicles_with_a_lane_get_it_and_the_others_fill_the_rest() -> None:
     for vehicle in vehicles[:4]:
         vehicle["lane"] = 0
     request = PlanRequest.from_dict(LANE_DROP | {"vehicles": vehicles})
-    response = checked_plan(request)
+    response = plan(request)
     lanes = [path[-1][1] for path in response.paths]
     assert lanes[:4] == [0] * 4
     assert lanes.count(1) == 2
@@ -180,7 +180,7 @@ def test_vehicles_with_a_lane_get_it_and_the_others_fill_the_rest() -> None:
 
 def test_the_response_holds_the_targets_of_the_structure() -> None:
     request = PlanRequest.from_dict(LANE_DROP)
-    response = checked_plan(request)
+    response = plan(request)
     assert response.status == "optimal"
     assert response.targets is not None
     ends = [response.targets[target] for target in response.assignment]
@@ -189,14 +189,14 @@ def test_the_response_holds_the_targets_of_the_structure() -> None:
     assert PlanRequest.from_dict(request.to_dict()) == request
     by_hand = request.with_targets(response.targets)
     assert by_hand.to_dict()["targets"] == [list(target) for target in response.targets]
-    assert attrs.evolve(checked_plan(by_hand), targets=response.targets, solve_ms=0.0) == (
+    assert attrs.evolve(plan(by_hand), targets=response.targets, solve_ms=0.0) == (
         attrs.evolve(response, solve_ms=0.0)
     )
 
 
 def test_targets_of_another_structure_are_detected() -> None:
     request = PlanRequest.from_dict(LANE_DROP | {"structure": "interlaced"})
-    response = checked_plan(request)
+    response = plan(request)
     assert response.targets is not None
     wrong = [
         (*response.targets[:-1], (0, 2)),
@@ -218,7 +218,7 @@ def test_a_formation_changes_its_structure_twice_in_a_row() -> None:
     cells = []
     for structure, lanes in (("parallel", [0, 1]), ("interlaced", [0, 1, 2])):
         request = LANE_DROP | {"vehicles": vehicles, "structure": structure, "lanes": lanes}
-        response = checked_plan(PlanRequest.from_dict(request))
+        response = plan(PlanRequest.from_dict(request))
         assert response.status == "optimal"
         cells.append({path[-1] for path in response.paths})
         for vehicle, path in zip(vehicles, response.paths, strict=True):

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from itertools import permutations
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from laneweave.coordinator.planning.targets import Targets, place
+from laneweave.coordinator.planning.targets import Targets, placements
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import Name
 
@@ -43,7 +42,7 @@ def way(cell: Cell, target: Cell) -> int:
 def place_all(
     cells: dict[Name, Cell], lanes: dict[Name, int], blocked: set[Cell] | None = None
 ) -> Targets:
-    return place(cells, lanes, COLUMNS, LANES, blocked or set())
+    return next(placements(cells, lanes, COLUMNS, LANES, blocked or set()))
 
 
 def parallel_targets(
@@ -53,7 +52,7 @@ def parallel_targets(
     open_columns = range(columns) if free is None else free
     blocked = {(column, lane) for column in range(columns) if column not in open_columns}
     held = {Name(f"v{index}"): cell for index, cell in enumerate(cells)}
-    targets = place(held, dict.fromkeys(held, lane), columns, LANES, blocked)
+    targets = next(placements(held, dict.fromkeys(held, lane), columns, LANES, blocked))
     return [cell for cell in targets.cells if cell not in targets.own.values()]
 
 
@@ -143,7 +142,7 @@ def test_on_an_overfull_lane_those_furthest_away_stay_out() -> None:
 
 def test_where_all_are_as_far_away_names_decide() -> None:
     cells: dict[Name, Cell] = {Name(letter): (0, 0) for letter in "cab"}
-    assert set(place(cells, dict.fromkeys(cells, 0), 2, 2).own) == {Name("c")}
+    assert set(next(placements(cells, dict.fromkeys(cells, 0), 2, 2)).own) == {Name("c")}
 
 
 def test_a_vehicle_that_stays_out_gets_the_nearest_free_cell() -> None:
@@ -176,39 +175,6 @@ def test_without_vehicles_there_are_no_targets() -> None:
 
 
 # --- one lane ---------------------------------------------------------------------------------
-
-
-@given(
-    cells=st.lists(st.tuples(st.integers(0, 7), st.integers(0, 2)), max_size=8, unique=True),
-    lane=st.integers(0, 2),
-)
-def test_targets_of_a_lane_are_contiguous_and_inside(cells: list[Cell], lane: int) -> None:
-    targets = parallel_targets(lane, cells, 8)
-    columns = [target[0] for target in targets]
-    assert len(targets) == len(cells)
-    assert {target[1] for target in targets} <= {lane}
-    assert columns == list(range(columns[0], columns[0] + len(columns))) if columns else True
-    assert all(0 <= column < 8 for column in columns)
-
-
-@given(
-    cells=st.lists(st.tuples(st.integers(0, 3), st.integers(0, 2)), max_size=4, unique=True),
-    lane=st.integers(0, 2),
-)
-def test_targets_of_a_lane_are_where_the_ways_are_short(cells: list[Cell], lane: int) -> None:
-    assert parallel_targets(lane, cells, COLUMNS) == shortest_row(lane, cells)
-
-
-@pytest.mark.parametrize(
-    ("lane", "cells", "targets"),
-    [
-        (1, [(2, 1), (3, 1)], [(2, 1), (3, 1)]),
-        (1, [(6, 0), (7, 2)], [(6, 1), (7, 1)]),
-        (0, [], []),
-    ],
-)
-def test_examples_of_short_ways(lane: int, cells: list[Cell], targets: list[Cell]) -> None:
-    assert parallel_targets(lane, cells, 8) == targets
 
 
 @given(

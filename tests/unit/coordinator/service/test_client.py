@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from laneweave.coordinator.planning.facade import checked_plan
+from laneweave.coordinator.planning.facade import plan
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.service.client import (
@@ -46,7 +46,7 @@ REQUEST = PlanRequest.from_dict(
         "targets": [[1, 1], [2, 0]],
     }
 )
-PLAN = checked_plan(REQUEST)
+PLAN = plan(REQUEST)
 START_S = 100.0
 FORMATS = pytest.mark.parametrize("form", [JSON, MSGPACK], ids=["JSON", "MessagePack"])
 

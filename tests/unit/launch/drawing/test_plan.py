@@ -193,7 +193,7 @@ def test_bad_places_are_refused_before_planning(
 ) -> None:
     (tmp_path / "folder.png").mkdir()
     (tmp_path / "file").touch()
-    monkeypatch.setattr(plan_answers, "checked_plan", None)
+    monkeypatch.setattr(plan_answers, "plan", None)
     assert cli._status(["plan", str(CASE_STUDY), "--draw", str(tmp_path / name)]) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -221,7 +221,7 @@ def test_the_answer_is_printed_and_drawn(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(plan_answers, "checked_plan", lambda *_, **__: PLAN)
+    monkeypatch.setattr(plan_answers, "plan", lambda *_, **__: PLAN)
     monkeypatch.setattr(plan_answers, "_ask", lambda *_: PLAN)
     arguments = ["plan", str(CASE_STUDY), "--draw", str(tmp_path / "plan.png")]
     arguments += [] if endpoint is None else ["--connect", endpoint]
@@ -236,7 +236,7 @@ def test_a_failed_drawing_is_reported(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(plan_answers, "checked_plan", lambda *_, **__: PLAN)
+    monkeypatch.setattr(plan_answers, "plan", lambda *_, **__: PLAN)
     monkeypatch.setattr(plan_drawing, "draw_plan", full)
     assert cli._status(["plan", str(CASE_STUDY), "--draw", str(tmp_path / "plan.png")]) == 1
     captured = capsys.readouterr()
@@ -246,7 +246,7 @@ def test_a_failed_drawing_is_reported(
 
 
 def test_without_draw_nothing_is_drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(plan_answers, "checked_plan", lambda *_, **__: PLAN)
+    monkeypatch.setattr(plan_answers, "plan", lambda *_, **__: PLAN)
     monkeypatch.setattr(plan_drawing, "draw_plan", None)
     monkeypatch.chdir(tmp_path)
     answer_request(CASE_STUDY, None, None, "tappa", as_table=True)

@@ -13,7 +13,7 @@ from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 from PIL import Image
 
-from laneweave.coordinator.planning.facade import checked_plan
+from laneweave.coordinator.planning.facade import plan
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.launch.cli import main as cli
@@ -37,7 +37,7 @@ EXAMPLES = Path(__file__).resolve().parents[4] / "docs" / "examples"
 CASE_STUDY = EXAMPLES / "case-study.json"
 REQUEST = PlanRequest.from_dict(json.loads(CASE_STUDY.read_text(encoding="utf-8")))
 NAMES = [vehicle.id for vehicle in REQUEST.vehicles]
-PLAN = checked_plan(REQUEST)
+PLAN = plan(REQUEST)
 NO_PLAN = PlanResponse("infeasible", None, None, None, (), (), 1.0, 1, 1)
 SCENARIO = Scenario()
 
@@ -85,8 +85,7 @@ def test_what_the_conflict_kinds_allow_is_shown(driven: Drive) -> None:
     """With node and edge conflicts alone, vehicles 2 and 3 pass through each other's corners."""
     assert driven.overlaps == (("2", "3"),)
     careful = attrs.evolve(REQUEST, conflicts=("geometric",))
-    plan = checked_plan(careful)
-    apart = drive_plan(SCENARIO, NAMES, plan.paths)
+    apart = drive_plan(SCENARIO, NAMES, plan(careful).paths)
     assert apart.overlaps == ()
     assert apart.min_gap_m > 0
 
@@ -126,7 +125,7 @@ def test_of_a_long_plan_some_instants_are_drawn() -> None:
             "targets": [[19, 0]],
         }
     )
-    figure = road_figure(_Picture.of(request, checked_plan(request), SCENARIO))
+    figure = road_figure(_Picture.of(request, plan(request), SCENARIO))
     *roads, _, _ = figure.axes
     assert len(roads) == MAX_INSTANTS
     assert (roads[0].get_ylabel(), roads[-1].get_ylabel()) == ("0.0 s", "76.0 s")
@@ -203,7 +202,7 @@ def test_what_cannot_be_drawn_is_refused_in_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "fast.toml").write_text("[formation]\nmove_s = 1.0", encoding="utf-8")
-    monkeypatch.setattr(plan_answers, "checked_plan", None)
+    monkeypatch.setattr(plan_answers, "plan", None)
     assert cli._status(["plan", str(CASE_STUDY), *options]) == 2
     captured = capsys.readouterr()
     assert (captured.out, len(captured.err.splitlines())) == ("", 1)

@@ -41,7 +41,6 @@ from laneweave.coordinator.planning.exact.reachability import explore
 from laneweave.coordinator.planning.exact.relaxation import (
     Relaxation,
     Stack,
-    stack,
     upper_bound_of,
 )
 from laneweave.coordinator.planning.exact.relaxation_kernel import (
@@ -54,7 +53,7 @@ from laneweave.coordinator.planning.exact.relaxation_kernel import (
     UNREACHABLE,
 )
 from laneweave.coordinator.planning.grid import Grid
-from laneweave.coordinator.planning.problem import Problem, Solution
+from laneweave.coordinator.planning.problem import Problem, Search, Solution
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.shortest_paths import without_needless_moves
 
@@ -88,29 +87,17 @@ def warm_up() -> None:
     # Two vehicles that change places: an instance that needs branching.
     vehicles = (VehicleRequest("a", (0, 0), lane=1), VehicleRequest("b", (0, 1), lane=0))
     request = PlanRequest(Grid(2, 2), 1, ("geometric",), vehicles, ((0, 0), (0, 1)))
-    search_ = Branching(request.problem(), request.choices(), Budget())
-    search_.run()
-    search_.negotiate(search_.relaxation(_SPARE_STEPS), _WARM_UP_WORK)
+    branching = Branching(request.problem(), request.choices(), Budget())
+    branching.run()
+    branching.negotiate(branching.relaxation(_SPARE_STEPS), _WARM_UP_WORK)
 
 
-class Branching:
-    """The state of the search; implements `facade.Search`.
-
-    best: the cheapest path set so far.
-    lower_bound: no path set costs less; infinite: there is none.
-    finished: the search is complete; `best` is optimal, or nothing exists.
-    has_fewest_moves: it is also proven that no path set of this cost has fewer moves.
-    """
+class Branching(Search):
+    """The state of the search; `gave_up`: stuck (`branching_kernel.STUCK`), or out of memory."""
 
     def __init__(self, problem: Problem, choices: Sequence[frozenset[int]], budget: Budget) -> None:
         """Prepare the search."""
-        self.lower_bound: float = 0
-        self.finished = False
-        self.tried = 0
-        self.has_fewest_moves = False
-        self.gave_up = False
-        """The search is stuck (`branching_kernel.STUCK`) or reached its memory limit."""
-        self.best: Solution | None = None
+        super().__init__()
         self._negotiation: Negotiation | None = None
         self._problem = problem
         self._choices = choices
@@ -158,7 +145,7 @@ class Branching:
                 break
             if number == _BATCH and len(self._choices) >= _MANY_VEHICLES:
                 self.negotiate(whole, _FIRST_WORK, stop_at_first=True)
-        nodes = self._stack(whole, _FIRST_STACK)
+        nodes = whole.stack(_FIRST_STACK)
         while not self.finished and not self.gave_up:
             if math.isinf(self.lower_bound):
                 self.finished = True
@@ -202,9 +189,6 @@ class Branching:
     def relaxation(self, steps: int) -> Relaxation:
         """Return the relaxed problem with multipliers of 0."""
         return Relaxation(self._arrays, self._teams, steps)
-
-    def _stack(self, whole: Relaxation, size: int) -> Stack:
-        return stack(self._teams, whole.multipliers, self._arrays.valid, size)
 
     def _longest_path(self) -> int:
         """Return the steps of the longest path when targets are assigned at minimum cost."""
@@ -259,7 +243,7 @@ class Branching:
             self.gave_up = True
             return nodes
         whole.lengthen(more)
-        return self._stack(whole, len(nodes.step_size))
+        return whole.stack(len(nodes.step_size))
 
     def _break_ties(self, whole: Relaxation, nodes: Stack) -> Stack:
         """Search for a solution of the same cost as the best one with fewer moves."""

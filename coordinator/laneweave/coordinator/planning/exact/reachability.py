@@ -56,7 +56,7 @@ def explore(
 
     start, order = _sorted_by_team([problem.starts[v] for v in vehicles], team)
     vehicles = [vehicles[i] for i in order]
-    away = [_steps_away(problem.table, goal) for goal in goals]
+    away = [problem.table.distances(sum(1 << cell for cell in goal)) for goal in goals]
     found: dict[State, _Step | None] = {start: None}
     frontier = [(0, 0, start)]
     made = 0
@@ -78,19 +78,6 @@ def explore(
                 left = sum(steps.get(cell, 0) for steps, cell in zip(away, following, strict=True))
                 heapq.heappush(frontier, (left, len(found), following))
     return Verdict(impossible=True)
-
-
-def _steps_away(table: MoveTable, goals: frozenset[int]) -> dict[int, int]:
-    """Return the minimum number of steps from each cell to one of the goals."""
-    steps: dict[int, int] = {}
-    reached = cells = sum(1 << goal for goal in goals)
-    count = 0
-    while cells:
-        steps.update(dict.fromkeys(bits(cells), count))
-        count += 1
-        cells = table.starts(table.leading_to(cells)) & ~reached
-        reached |= cells
-    return steps
 
 
 def _can_be_made_one_after_another(table: MoveTable) -> bool:

@@ -129,17 +129,6 @@ def scratch(arrays: MoveArrays, teams: Teams, steps: int) -> Scratch:
     )
 
 
-def stack(teams: Teams, multipliers: Floats, valid: Bools, size: int) -> Stack:
-    """Return an empty stack."""
-    groups, pairs = len(teams.pair), len(teams.pair_cell)
-    return Stack(
-        allowed=np.zeros((size, groups, len(multipliers), *valid.shape), dtype=np.bool_),
-        earliest=np.zeros((size, pairs), dtype=np.int64),
-        multipliers=np.zeros((size, *multipliers.shape)),
-        step_size=np.ones(size),
-    )
-
-
 def upper_bound_of(cost: int) -> float:
     """Return an upper bound on the value of solutions of a cost, for any number of moves.
 
@@ -152,7 +141,6 @@ class Relaxation:
     """The relaxed problem at its best multipliers so far.
 
     multipliers: (T, R); T is the number of steps in which cliques have multipliers.
-    bound: lower bound on every solution; `UNREACHABLE`: there is none.
     """
 
     def __init__(self, arrays: MoveArrays, teams: Teams, steps: int) -> None:
@@ -171,15 +159,13 @@ class Relaxation:
         self.allowed[:] = self.arrays.valid
         self.earliest = np.zeros(len(self.teams.pair_cell), dtype=np.int64)
         # Forbid moves from cells that no vehicle can reach in time.
-        self._list()
+        self._begin()
         self._fix(self.allowed, self.earliest, self.multipliers, UNREACHABLE)
         self._begin()
 
-    def _list(self) -> None:
-        self._span = list_moves(self.arrays, self.allowed, self.scratch)[1]
-
     def _begin(self) -> None:
-        self._list()
+        """List the allowed moves and reset the subgradient method."""
+        self._span = list_moves(self.arrays, self.allowed, self.scratch)[1]
         start_over(self.multipliers, self._span, self.scratch, self.state)
 
     def _fix(
@@ -198,16 +184,21 @@ class Relaxation:
         return float(bound)
 
     @property
-    def bound(self) -> float:
-        """Lower bound on every solution; `UNREACHABLE`: there is none."""
-        return float(self.state[BOUND])
-
-    @property
     def min_cost(self) -> float:
-        """The bound as a number of steps; infinite: there is no solution."""
-        if self.bound >= UNREACHABLE:
+        """Lower bound on every solution, as a number of steps; infinite: there is none."""
+        bound = float(self.state[BOUND])
+        if bound >= UNREACHABLE:
             return math.inf
-        return math.ceil(self.bound / (1.0 + PER_MOVE) - _TOLERANCE)
+        return math.ceil(bound / (1.0 + PER_MOVE) - _TOLERANCE)
+
+    def stack(self, size: int) -> Stack:
+        """Return an empty stack for nodes of this problem."""
+        return Stack(
+            allowed=np.zeros((size, *self.allowed.shape), dtype=np.bool_),
+            earliest=np.zeros((size, *self.earliest.shape), dtype=np.int64),
+            multipliers=np.zeros((size, *self.multipliers.shape)),
+            step_size=np.ones(size),
+        )
 
     def improve(self, iterations: int) -> None:
         """Run some iterations of the subgradient method."""

@@ -35,6 +35,7 @@ import numpy as np
 import numpy.typing as npt
 
 from laneweave.coordinator.planning.budget import Budget
+from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, Mode
@@ -95,7 +96,7 @@ def preference_matrix(choices: Sequence[frozenset[int]], target_count: int) -> B
 
 
 def matrices(
-    request: PlanRequest, weights: Weights, choices: list[frozenset[int]], budget: Budget
+    request: PlanRequest, problem: Problem, weights: Weights, budget: Budget
 ) -> tuple[IntMatrix, BoolMatrix]:
     """Return the cost matrix C and the preference matrix P of a request.
 
@@ -104,12 +105,12 @@ def matrices(
     """
     starts = [vehicle.cell for vehicle in request.vehicles]
     costs = cost_matrix(starts, request.targets, weights)
-    allowed = preference_matrix(choices, len(request.targets))
+    allowed = preference_matrix(request.choices(), len(request.targets))
     if request.grid.blocked:
-        for i, start in enumerate(starts):
+        for i, start in enumerate(problem.starts):
             budget.check_time()
-            distances = request.grid.distances(start, request.mode, request.targets)
-            for j, target in enumerate(request.targets):
+            distances = problem.table.distances(1 << start)
+            for j, target in enumerate(problem.targets):
                 if target in distances:
                     costs[i, j] = max(costs[i, j], distances[target])
                 else:
@@ -125,18 +126,21 @@ class Assignment:
     cost: int
 
 
+@attrs.define(eq=False)
 class _Matching:
     """A minimum-cost matching with the dual variables that prove its optimality.
 
     Idle rows of cost 0 make the matrix square; they take the remaining targets.
+
+    rows: target of each row.
+    columns: row of each target.
+    u, v: potentials of rows and targets.
     """
 
-    def __init__(self, rows: list[int], columns: list[int], u: list[int], v: list[int]) -> None:
-        """Store the target of each row, the row of each target, and both potentials."""
-        self.rows = rows
-        self.columns = columns
-        self.u = u
-        self.v = v
+    rows: list[int]
+    columns: list[int]
+    u: list[int]
+    v: list[int]
 
     def copy(self) -> _Matching:
         """Return an independent copy."""

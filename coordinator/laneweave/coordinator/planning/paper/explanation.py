@@ -17,7 +17,7 @@ from laneweave.coordinator.planning.budget import Budget, Clock
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.paper.cbs import ConstraintTree, Improvements, Node
 from laneweave.coordinator.planning.paper.constraints import entry
-from laneweave.coordinator.planning.paper.tappa import Attempt, Tappa, new_tappa
+from laneweave.coordinator.planning.paper.tappa import Attempt, Tappa
 from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.coordinator.planning.problem import MoveTable, Problem, Solution
 from laneweave.coordinator.planning.request import PlanRequest
@@ -152,7 +152,7 @@ def _run(
     budget = Budget(deadline=deadline, max_nodes=max_nodes, clock=clock)
     weights = (weights or Weights.for_mode(request.mode)).checked(request.mode)
     problem = request.problem()
-    run = new_tappa(problem, request, weights, budget, improvements, record=True)
+    run = Tappa(request, problem, weights, budget, improvements, record=True)
     run.run()
     return run
 

@@ -66,9 +66,8 @@ class JointSearch:
         self._start = tuple(problem.starts[v] for v in self._vehicles)
         self._start_labels = tuple(labels[v] for v in self._vehicles)
         self._distance = [
-            _distances(
-                problem,
-                [s for s, label in zip(problem.starts, labels, strict=True) if label == own],
+            problem.table.distances(
+                sum(1 << s for s, label in zip(problem.starts, labels, strict=True) if label == own)
             )
             for own in range(1, 2 * len(teams), 2)
         ]
@@ -222,17 +221,3 @@ def _picker(places: tuple[int, ...]) -> Callable[[Labels], Labels]:
     if len(places) == 1:
         return lambda labels: (labels[places[0]],)
     return itemgetter(*places)
-
-
-def _distances(problem: Problem, starts: Sequence[int]) -> dict[int, int]:
-    """Return the minimum number of steps to each cell from the nearest start."""
-    table = problem.table
-    found: dict[int, int] = {}
-    reached = cells = sum({1 << start for start in starts})
-    steps = 0
-    while cells:
-        found.update(dict.fromkeys(bits(cells), steps))
-        cells = table.ends(table.starting_in(cells)) & ~reached
-        reached |= cells
-        steps += 1
-    return found

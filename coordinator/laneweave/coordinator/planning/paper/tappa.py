@@ -12,7 +12,6 @@ only for path sets that cost less than C'*; and a search over the cells of all v
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
 
 import attrs
 
@@ -25,7 +24,7 @@ from laneweave.coordinator.planning.paper.assignments import (
 )
 from laneweave.coordinator.planning.paper.cbs import ConstraintTree, Improvements
 from laneweave.coordinator.planning.paper.joint_search import JointSearch
-from laneweave.coordinator.planning.problem import Problem, Solution
+from laneweave.coordinator.planning.problem import Problem, Search, Solution
 from laneweave.coordinator.planning.request import PlanRequest
 
 _JOINT_AFTER = 32
@@ -50,13 +49,10 @@ class Attempt:
     best_cost: int | None
 
 
-class Tappa:
+class Tappa(Search):
     """The state of Algorithm 1.
 
     best: the best path set P* so far; its cost is C'*.
-    lower_bound: no path set costs less.
-    finished: the search is complete; `best` is optimal, or nothing exists.
-    gave_up, has_fewest_moves: always false.
     tried: k, the number of assignments to which CBSA was applied.
     attempts: what CBSA did for each of them, if that is recorded.
     next_cost: C_{k+1}, if it was the last cost examined.
@@ -64,9 +60,9 @@ class Tappa:
 
     def __init__(
         self,
+        request: PlanRequest,
         problem: Problem,
-        assignments_: Iterator[Assignment],
-        choices: Sequence[frozenset[int]],
+        weights: Weights,
         budget: Budget,
         improvements: Improvements | None = None,
         *,
@@ -75,25 +71,24 @@ class Tappa:
         """Prepare the search.
 
         Args:
-            problem: vehicles and targets.
-            assignments_: the assignments in order of cost.
-            choices: eligible targets of each vehicle.
+            request: what to plan.
+            problem: the same as the searches see it.
+            weights: of the formation relative distance.
             budget: deadline and limit on nodes.
             improvements: what is added to the paper's algorithms; None: everything.
             record: whether to keep all constraint trees.
         """
-        self.best: Solution | None = None
-        self.lower_bound: float = 0
-        self.finished = False
-        self.gave_up = self.has_fewest_moves = False
-        self.tried = 0
+        super().__init__()
         self.attempts: list[Attempt] | None = [] if record else None
         self.next_cost: float | None = None
         self._problem = problem
-        self._assignments = assignments_
+        costs, allowed = matrices(request, problem, weights, budget)
+        self._assignments = assignments(costs, allowed, budget)
         self._budget = budget
         self._improvements = improvements or Improvements()
-        self._joint = JointSearch(problem, choices, budget) if self._improvements.joint else None
+        self._joint = (
+            JointSearch(problem, request.choices(), budget) if self._improvements.joint else None
+        )
 
     @property
     def best_cost(self) -> float:
@@ -156,19 +151,3 @@ class Tappa:
         if self.best_cost <= self.joint_bound:
             return -math.inf
         return self.best_cost if self._improvements.cutoff else math.inf
-
-
-def new_tappa(
-    problem: Problem,
-    request: PlanRequest,
-    weights: Weights,
-    budget: Budget,
-    improvements: Improvements | None = None,
-    *,
-    record: bool = False,
-) -> Tappa:
-    """Return Algorithm 1 for a request, ready to run; see `Tappa`."""
-    choices = request.choices()
-    costs, allowed = matrices(request, weights, choices, budget)
-    in_order = assignments(costs, allowed, budget)
-    return Tappa(problem, in_order, choices, budget, improvements, record=record)

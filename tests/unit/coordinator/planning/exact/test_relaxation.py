@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from laneweave.coordinator.planning.exact.relaxation import Relaxation, stack
-from laneweave.coordinator.planning.exact.relaxation_kernel import PER_MOVE
+from laneweave.coordinator.planning.exact.relaxation import Relaxation
+from laneweave.coordinator.planning.exact.relaxation_kernel import BOUND, PER_MOVE
 from laneweave.coordinator.planning.facade import plan
 from laneweave.launch.bench.request_families import formation_request
 from laneweave.protocol.lattice import Mode
@@ -24,7 +24,7 @@ def test_bounds_rise_and_never_exceed_the_minimum_cost(
     bounds = []
     for _ in range(30):
         whole.improve(10)
-        bounds.append(whole.bound)
+        bounds.append(float(whole.state[BOUND]))
     assert bounds == sorted(bounds)
     assert bounds[0] < bounds[-1] <= cost * (1.0 + PER_MOVE)
     assert whole.min_cost <= cost
@@ -39,7 +39,7 @@ def test_moves_of_an_optimal_plan_are_never_fixed(seed: int, vehicles: int, mode
     arrays, grouped = arrays_of(request)
     whole = Relaxation(arrays, grouped, 16)
     whole.improve(100)
-    nodes = stack(grouped, whole.multipliers, arrays.valid, 1)
+    nodes = whole.stack(1)
     assert whole.put(nodes, response.cost * (1.0 + PER_MOVE) + 1e-9)
     allowed = nodes.allowed[0]
     assert allowed.sum() < 0.5 * whole.allowed.sum()

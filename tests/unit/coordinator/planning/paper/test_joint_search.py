@@ -10,7 +10,7 @@ from laneweave.coordinator.planning.facade import plan
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.paper.cbs import Improvements
 from laneweave.coordinator.planning.paper.joint_search import JointSearch
-from laneweave.coordinator.planning.paper.tappa import new_tappa
+from laneweave.coordinator.planning.paper.tappa import Tappa
 from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.validator import problems_of_paths
@@ -48,7 +48,7 @@ def test_a_crowded_formation_is_solved_while_trees_do_not_end() -> None:
     for switches in (Improvements(), attrs.evolve(Improvements(), joint=False)):
         budget = Budget(max_nodes=1_500)
         weights = Weights.for_mode(request.mode)
-        run = new_tappa(request.problem(), request, weights, budget, switches)
+        run = Tappa(request, request.problem(), weights, budget, switches)
         run.run()
         outcomes.append((run.finished, run.best_cost))
         assert run.lower_bound <= run.best_cost
