@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import subprocess
 import sys
@@ -124,3 +125,16 @@ def test_base_install_names_the_extra_for_the_live_page() -> None:
     assert (done.returncode, done.stdout) == (2, "")
     assert len(done.stderr.splitlines()) == 1
     assert "laneweave[watch]" in done.stderr
+
+
+def test_makefile_and_containerfile_import_what_exists() -> None:
+    imports = [
+        (module, name)
+        for file in ("Makefile", "Containerfile")
+        for module, name in re.findall(
+            r"from (laneweave[\w.]*) import (\w+)", (ROOT / file).read_text(encoding="utf-8")
+        )
+    ]
+    assert imports
+    for module, name in imports:
+        assert hasattr(importlib.import_module(module), name), f"{module} has no {name}"
