@@ -26,7 +26,7 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt hatchling editables
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-build-isolation -c constraints.txt -e '.[dev]'
 	find coordinator -name '*.nb[ci]' -delete
-	$(BIN)/python -c 'from laneweave.coordinator.planning.facade import warm_up; warm_up()'
+	$(BIN)/python -c 'from laneweave.coordinator.planning.solve import warm_up; warm_up()'
 	touch $@
 
 demo: $(STAMP) ## run lane sorting on the paper's road, one process per vehicle

@@ -30,14 +30,14 @@ from attrs import define, field
 from laneweave.agents.core import AgentCore
 from laneweave.agents.driving.driver import Drive, TrackingDriver
 from laneweave.agents.host import AgentHost
-from laneweave.coordinator.formations.planner import LONGEST_DEADLINE_S
+from laneweave.coordinator.formations.planning_orders import LONGEST_DEADLINE_S
 from laneweave.coordinator.formations.roster import start_time_s, steps_left
 from laneweave.coordinator.formations.sorting import SortingTask, sort_lanes
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.protocol.lattice import territory
 from laneweave.protocol.runtime.node import Node, Started, read_message
 from laneweave.protocol.runtime.transport import Received
-from laneweave.protocol.scenario.tables import FormationSettings, Scenario
+from laneweave.protocol.scenario.fields import FormationSettings, Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.codec import decode, encode
 from laneweave.protocol.wire.messages import Ballot, Command, Name, Plan, Prepare, Sense
@@ -47,7 +47,7 @@ from laneweave.sim_bridge.recording.run_record import RunRecord
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
-from laneweave.sim_bridge.world import show_bodies
+from laneweave.sim_bridge.world_interface import show_bodies
 
 FORMATIONS = 3
 VEHICLES = 6

@@ -17,9 +17,9 @@ from typing import Any
 import attrs
 import numpy as np
 
-from laneweave.coordinator.planning.conflicts import ConflictModel
+from laneweave.coordinator.planning.conflict_model import ConflictModel
 from laneweave.coordinator.planning.exact.arrays import move_arrays
-from laneweave.coordinator.planning.facade import plan, warm_up
+from laneweave.coordinator.planning.solve import plan, warm_up
 from laneweave.launch.bench.planner import FAMILIES
 from laneweave.protocol.lattice import Cell
 

@@ -22,9 +22,14 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch, Rectangle
 from matplotlib.patheffects import withStroke
 
-from laneweave.coordinator.planning.conflicts import MAX_OFFSET, PAPER_KINDS, ConflictModel, Pair
-from laneweave.coordinator.planning.geometry.bodies import BodyGeometry
+from laneweave.coordinator.planning.conflict_model import (
+    MAX_OFFSET,
+    PAPER_KINDS,
+    ConflictModel,
+    Pair,
+)
 from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
+from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
 from laneweave.launch.drawing.figures import FAINT_INK, INK, new_figure, save
 from laneweave.protocol.lattice import Cell, displacements, footprint
 

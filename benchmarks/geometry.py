@@ -23,15 +23,15 @@ from numpy.typing import NDArray
 
 from conflict_drawing import conflict
 from laneweave.agents.driving.trajectory import move_profile
-from laneweave.coordinator.planning.conflicts import PAPER_KINDS, ConflictModel, Pair
+from laneweave.coordinator.planning.conflict_model import PAPER_KINDS, ConflictModel, Pair
 from laneweave.coordinator.planning.exact.cliques import clique_patterns
-from laneweave.coordinator.planning.facade import plan, warm_up
-from laneweave.coordinator.planning.geometry.bodies import BodyGeometry
 from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
+from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
 from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.solve import plan, warm_up
 from laneweave.launch.bench.request_families import formation_request
 from laneweave.protocol.lattice import displacements
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import cell_state
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, pose_of
 

@@ -19,11 +19,11 @@ import attrs
 import numpy as np
 
 from laneweave.coordinator.planning.budget import Budget
-from laneweave.coordinator.planning.facade import MAX_NODES, plan, warm_up
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.paper.cbs import Improvements
 from laneweave.coordinator.planning.paper.tappa import Tappa
 from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.solve import MAX_NODES, plan, warm_up
 from laneweave.launch.bench.request_families import TRAFFIC_KINDS, block_request, traffic_request
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "evidence" / "planner-switches.json"

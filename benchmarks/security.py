@@ -26,9 +26,9 @@ import attrs
 from laneweave.launch.deploy.certificate_authority import issue, make_authority
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.runtime.transport import Delivery, Received
-from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.security.access import Access, RouterGuard
-from laneweave.protocol.security.rights import access_of, guard_of
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.security.access_control import access_of, guard_of
+from laneweave.protocol.security.connection import Access, RouterGuard
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport, run_router
 from laneweave.protocol.wire.identities import parse_identity
 from laneweave.protocol.wire.topics import STATE, Keys, Quality

@@ -39,9 +39,9 @@ from typing import Any
 import attrs
 from attrs import define, field, frozen
 
-from laneweave.coordinator.planning.facade import plan, warm_up
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
+from laneweave.coordinator.planning.solve import plan, warm_up
 from laneweave.coordinator.service.client import AsyncPlanClient, PlanClient, PlanError
 from laneweave.launch.bench.request_families import formation_request
 

@@ -34,8 +34,8 @@ from laneweave.launch.run.roles import fork_server, start_role
 from laneweave.protocol.config.loading import to_tables
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.transport import Delivery, Received, TokenUp
-from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.security.access import Access
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.codec import encode
 from laneweave.protocol.wire.messages import Name, Sense

@@ -19,21 +19,21 @@ import attrs
 import numpy as np
 from attrs import field, frozen
 
-from laneweave.coordinator.planning.conflicts import ConflictModel
-from laneweave.coordinator.planning.facade import warm_up
-from laneweave.coordinator.planning.geometry.bodies import BodyGeometry
+from laneweave.coordinator.planning.conflict_model import ConflictModel
 from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
-from laneweave.coordinator.planning.rolling.planner import (
+from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
+from laneweave.coordinator.planning.rolling.path_search import (
     StreamCosts,
     StreamPlan,
     StreamPlanner,
     StreamRoad,
     StreamVehicle,
 )
-from laneweave.coordinator.planning.rolling.validator import problems_of_plan
-from laneweave.coordinator.rolling.planner import REWARD, stream_road
+from laneweave.coordinator.planning.rolling.rolling_validator import problems_of_plan
+from laneweave.coordinator.planning.solve import warm_up
+from laneweave.coordinator.rolling.checked_planner import REWARD, stream_road
 from laneweave.protocol.config.loading import load_scenario
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.road.demand import arrivals
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "evidence" / "stream.json"

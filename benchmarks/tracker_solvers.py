@@ -29,14 +29,14 @@ from attrs import evolve, frozen
 from numpy.typing import NDArray
 from scipy import sparse
 
-from laneweave.agents.driving.program import SETTINGS, Gaps, program_scale
-from laneweave.agents.driving.qp import QPSettings, QuadraticProgram
+from laneweave.agents.driving.qp_solver import QPSettings, QuadraticProgram
 from laneweave.agents.driving.reference import Window
 from laneweave.agents.driving.tracker import Tracker
+from laneweave.agents.driving.tracking_problem import SETTINGS, Gaps, program_scale
 from laneweave.launch.bench.runtime import machine
 from laneweave.launch.bench.tracker import SITUATIONS, drive
 from laneweave.protocol.config.loading import load_scenario
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.sim_bridge.recording.trips import spread
 

@@ -44,9 +44,9 @@ from laneweave.protocol.runtime.metrics import (
     RouterMetrics,
     metrics_of,
 )
-from laneweave.protocol.security.rights import READING, SENDING, Flow, rights_on
+from laneweave.protocol.security.access_control import READING, SENDING, Flow, rights_on
 from laneweave.protocol.state_machine import Function, RuleBook
-from laneweave.protocol.vehicle.execution import VEHICLE_RULES, ExecutionPhase
+from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES, ExecutionPhase
 from laneweave.protocol.wire import events, messages
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.topics import TOPICS, Exchange, Party, Topic

@@ -19,7 +19,7 @@ import numpy as np
 from attrs import frozen
 
 from laneweave.launch.recordings.trajectories import OFF_LATTICE, Bools, Floats, Ints, Tracks
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 
 TOLERANCE_M: Final = 0.3
 """Two bodies may be closer than d_F by this much: each is tracked to within 0.1 m at lattice points

@@ -10,11 +10,11 @@ from attrs import frozen
 
 from evaluation.lattice_points import lattice_spacing
 from laneweave.launch.observe.column_owners import read_events
-from laneweave.launch.recordings.results import results_table
+from laneweave.launch.recordings.results_over_seeds import results_table
 from laneweave.launch.recordings.runs import Run
 from laneweave.launch.recordings.trajectories import Tracks, read_tracks
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.events import PLAN_MADE, STREAM_PLANNED
 from laneweave.sim_bridge.recording.trips import WARM_UP_S
 

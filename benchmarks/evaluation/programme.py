@@ -6,9 +6,9 @@ from typing import Final
 
 from attrs import frozen
 
-from laneweave.launch.methods import KeepTrajectories
+from laneweave.launch.run_methods import KeepTrajectories
 from laneweave.launch.sweep.points import Point, plan_points
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 
 SEEDS: Final = range(1, 6)
 DURATION_S: Final = 600.0

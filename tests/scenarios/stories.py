@@ -72,7 +72,7 @@ from attrs import frozen
 
 from laneweave.coordinator.formations.leader import LEADER_RULES
 from laneweave.protocol.state_machine import RuleBook
-from laneweave.protocol.vehicle.execution import VEHICLE_RULES
+from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES
 from scenarios.story_player import Player
 from scenarios.story_rolling import RollingPlayer, is_rolling
 from scenarios.story_text import CollisionError, StoryError

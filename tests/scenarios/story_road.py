@@ -16,11 +16,11 @@ from laneweave.agents.driving.driver import Drive
 from laneweave.launch.fault_search.stand_ins import LightDriver
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Arrived, Effect, Send, Started
-from laneweave.protocol.scenario.deployment import Network
-from laneweave.protocol.scenario.tables import FormationSettings, Road, Runtime, Scenario
+from laneweave.protocol.scenario.deployment_fields import Network
+from laneweave.protocol.scenario.fields import FormationSettings, Road, Runtime, Scenario
 from laneweave.protocol.state_machine import RuleBook
-from laneweave.protocol.vehicle.execution import PlanExecution
 from laneweave.protocol.vehicle.motion import at_rest_in_cell, cell_state
+from laneweave.protocol.vehicle.plan_execution import PlanExecution
 from laneweave.protocol.wire.messages import (
     Command,
     Name,

@@ -8,7 +8,7 @@ import pytest
 
 from laneweave.coordinator.formations.leader import LEADER_RULES
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES
-from laneweave.protocol.vehicle.execution import VEHICLE_RULES
+from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES
 from scenarios.stories import check_story, ends_in_collision, player_of
 from scenarios.story_text import StoryError
 from support.planted_bugs import BUGS, NOT_A_SAFETY_MATTER, ROWS_OF_OTHERS, Bug, unchanged

@@ -11,7 +11,7 @@ from laneweave.agents.core import AgentCore
 from laneweave.agents.driving.driver import Driver, TrackingDriver
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.runtime.node import Arrived, Effect, Event
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.wire.messages import (
     Ballot,

@@ -28,8 +28,8 @@ from laneweave.protocol.runtime.node import (
     Started,
     Wakeup,
 )
-from laneweave.protocol.scenario.deployment import Shard
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.deployment_fields import Shard
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.vehicle.motion import State

@@ -11,8 +11,8 @@ from laneweave.coordinator.rolling import ownership, transfer
 from laneweave.coordinator.rolling.ownership import States
 from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.vehicle import execution as vehicle_rules
-from laneweave.protocol.vehicle.execution import PlanExecution
+from laneweave.protocol.vehicle import plan_execution as vehicle_rules
+from laneweave.protocol.vehicle.plan_execution import PlanExecution
 from laneweave.protocol.wire.messages import Command, Deed, Name, Plan, Sense, VehicleState
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
 

@@ -18,10 +18,10 @@ from laneweave.coordinator.formations.roster import Formation, Groups
 from laneweave.launch.fault_search.light_road import LightRoad
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Effect
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.state_machine import Transition
-from laneweave.protocol.vehicle import execution
-from laneweave.protocol.vehicle.execution import PLAN, ExecutionPhase, PlanExecution
+from laneweave.protocol.vehicle import plan_execution as execution
+from laneweave.protocol.vehicle.plan_execution import PLAN, ExecutionPhase, PlanExecution
 from laneweave.protocol.vehicle.plans import Needs, dependencies
 from laneweave.protocol.wire.messages import (
     Ballot,

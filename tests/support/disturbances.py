@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from laneweave.agents.driving.reference import Reference
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.tables import Scenario, Vehicle
+from laneweave.protocol.scenario.fields import Scenario, Vehicle
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.wire.messages import Name

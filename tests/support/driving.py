@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from laneweave.agents.driving.driver import TrackingDriver
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.lattice import Cell, PlannedMove, stretch_of
-from laneweave.protocol.scenario.tables import Scenario, Vehicle
+from laneweave.protocol.scenario.fields import Scenario, Vehicle
 from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.wire.messages import Command, Motion, Name
 from laneweave.sim_bridge.bodies.motion_controller import Rung

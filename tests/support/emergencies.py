@@ -20,7 +20,7 @@ import numpy as np
 from attrs import frozen
 
 from laneweave.protocol.lattice import Cell, PlannedMove
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import Name
 from support.driving import LimitUse, Road, limit_figures, limit_use, road_scenario
 

@@ -16,7 +16,7 @@ from attrs import frozen
 
 from laneweave.coordinator.service.format import CODES, FAILED, OVERLOADED
 from laneweave.protocol.runtime.transport import Answer
-from laneweave.protocol.security.access import Access
+from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.topics import SERVICE, Keys
 

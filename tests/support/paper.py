@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from attrs import evolve, fields
 
-from laneweave.protocol.scenario.tables import FormationSettings, Scenario, Sensing
+from laneweave.protocol.scenario.fields import FormationSettings, Scenario, Sensing
 from laneweave.protocol.wire.messages import CensusEntry, ClosedFormation
 from laneweave.sim_bridge.road.formation_building import formation_builder
 

@@ -12,13 +12,13 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-from laneweave.coordinator.planning.conflicts import ConflictModel, Move
-from laneweave.coordinator.planning.facade import plan
-from laneweave.coordinator.planning.geometry.bodies import BodyGeometry
+from laneweave.coordinator.planning.conflict_model import ConflictModel, Move
+from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
+from laneweave.coordinator.planning.solve import plan
 from laneweave.protocol.lattice import Cell, Mode
-from laneweave.protocol.scenario.tables import CONFLICT_KINDS, SOLVERS
+from laneweave.protocol.scenario.fields import CONFLICT_KINDS, SOLVERS
 from oracles.moving_bodies import Bodies, drive
 from oracles.path_rules import check_paths
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
 from laneweave.sim_bridge.bodies.plant import Plant

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_array
 
-from laneweave.coordinator.planning.conflicts import ConflictModel, Move
-from laneweave.coordinator.planning.geometry.bodies import BodyGeometry
+from laneweave.coordinator.planning.conflict_model import ConflictModel, Move
 from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
-from laneweave.coordinator.planning.rolling.planner import (
+from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
+from laneweave.coordinator.planning.rolling.path_search import (
     CellPath,
     StreamCosts,
     StreamPlan,

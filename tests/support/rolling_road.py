@@ -16,9 +16,9 @@ from laneweave.coordinator.ballots.ballot_round import is_older
 from laneweave.coordinator.rolling.ownership import owned_cells
 from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.lattice import Cell, footprint
-from laneweave.protocol.scenario.tables import FormationSettings, Scenario
+from laneweave.protocol.scenario.fields import FormationSettings, Scenario
 from laneweave.protocol.state_machine import RuleBook
-from laneweave.protocol.vehicle.execution import VEHICLE_RULES, PlanExecution
+from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES, PlanExecution
 from laneweave.protocol.wire.messages import (
     Ballot,
     Command,

@@ -6,7 +6,7 @@ from attrs import evolve
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.state_machine import RuleBook
-from laneweave.protocol.vehicle.execution import VEHICLE_RULES, PlanExecution
+from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES, PlanExecution
 from laneweave.protocol.wire.messages import Ballot, Deed, Name, Plan, Sense, VehicleState
 from support.rolling_road import LATTICE
 from support.states import make_plan as plan_of

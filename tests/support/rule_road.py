@@ -9,7 +9,7 @@ from typing import Any
 from attrs import define, field
 
 from laneweave.protocol.config.loading import parse_scenario
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle
 from laneweave.sim_bridge.baselines.rule_based import RuleTraffic
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies

@@ -13,8 +13,8 @@ from attrs import define, field
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.transport import Delivery, Question, Received, TokenUp
-from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.security.access import (
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.security.connection import (
     Access,
     Credentials,
     ca_path,

@@ -12,7 +12,7 @@ from laneweave.coordinator.formations.leader import FormationLeader
 from laneweave.coordinator.formations.operation import FormationsOperation
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Arrived, Compute, Effect, Send, Started, Wakeup
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import (
     Ballot,
     Census,

@@ -20,7 +20,7 @@ from laneweave.coordinator.service.client import PlanClient, PlanError
 from laneweave.coordinator.service.format import JSON
 from laneweave.coordinator.service.rendezvous import falls_to
 from laneweave.protocol.runtime.transport import Delivery, TokenDown, TokenUp
-from laneweave.protocol.security.access import Access
+from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.topics import COORDINATOR_ALIVE, Keys
 from support.deployments import free_tcp

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from attrs import frozen
 
-from laneweave.coordinator.planning.facade import plan
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
+from laneweave.coordinator.planning.solve import plan
 from laneweave.protocol.lattice import Cell, PlannedMove
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.plans import plan_problems
 from laneweave.protocol.wire.messages import Name
 from support.driving import (

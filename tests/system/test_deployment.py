@@ -11,7 +11,7 @@ import subprocess
 import pytest
 
 from laneweave.protocol.runtime.transport import Delivery, TokenUp
-from laneweave.protocol.security.access import Access
+from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.topics import BRIDGE_ALIVE, Keys
 from support.deployments import REALM, ask, deployment, free_tcp, ping, start_router, stop

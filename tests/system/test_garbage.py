@@ -12,7 +12,7 @@ import attrs
 import msgpack
 import pytest
 
-from laneweave.protocol.security.access import Access
+from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.codec import KINDS, MAX_BYTES, VERSION, encode
 from laneweave.protocol.wire.messages import (

@@ -18,9 +18,9 @@ import zenoh
 
 from laneweave.launch.deploy.certificate_authority import issue, load_authority, make_authority
 from laneweave.protocol.config.loading import load_scenario
-from laneweave.protocol.scenario.deployment import Shard
-from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.security.rights import REQUEST_MARGIN
+from laneweave.protocol.scenario.deployment_fields import Shard
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.security.access_control import REQUEST_MARGIN
 from laneweave.protocol.wire.codec import MAX_BYTES
 from laneweave.protocol.wire.identities import parse_identity
 from laneweave.protocol.wire.topics import (

@@ -22,7 +22,7 @@ from websockets.sync.client import connect
 
 from laneweave.launch.observe.column_owners import read_events
 from laneweave.launch.recordings.trajectories import read_tracks
-from laneweave.protocol.security.access import Access
+from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.codec import encode
 from laneweave.protocol.wire.topics import Keys

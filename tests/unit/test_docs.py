@@ -28,9 +28,9 @@ from laneweave.launch.cli.plan_answers import answer_request
 from laneweave.launch.faults.specification import load_faults
 from laneweave.launch.observe.status import SCHEMA, Status
 from laneweave.protocol.config.loading import load_scenario, parse_scenario
+from laneweave.protocol.field_validators import HOST_PORT_RULE, NAME_RULE
 from laneweave.protocol.lattice import Cell, footprint
-from laneweave.protocol.scenario.tables import CONFLICT_KINDS, Scenario
-from laneweave.protocol.validators import HOST_PORT_RULE, NAME_RULE
+from laneweave.protocol.scenario.fields import CONFLICT_KINDS, Scenario
 from laneweave.protocol.vehicle.motion import cell_state
 from laneweave.protocol.wire.codec import KINDS
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, pose_of

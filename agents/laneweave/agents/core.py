@@ -36,9 +36,9 @@ from laneweave.protocol.runtime.node import (
     Unlisten,
     Withdraw,
 )
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.state_machine import RuleBook
-from laneweave.protocol.vehicle.execution import VEHICLE_RULES, PlanExecution
+from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES, PlanExecution
 from laneweave.protocol.wire.identities import above
 from laneweave.protocol.wire.messages import (
     Command,

@@ -23,7 +23,7 @@ from laneweave.protocol.runtime.node import (
     Wakeup,
     Watch,
 )
-from laneweave.protocol.scenario.deployment import Shard
+from laneweave.protocol.scenario.deployment_fields import Shard
 from laneweave.protocol.wire.messages import Census, Motion, Name, VehicleState
 from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,

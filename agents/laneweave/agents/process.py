@@ -10,9 +10,9 @@ from laneweave.agents.driving.driver import TrackingDriver
 from laneweave.agents.host import AgentHost
 from laneweave.protocol.runtime.message_faults import Wrap, bare
 from laneweave.protocol.runtime.metrics import Observe, unobserved
-from laneweave.protocol.scenario.deployment import Shard
-from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.security.access import Access
+from laneweave.protocol.scenario.deployment_fields import Shard
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.runner import run_core
 from laneweave.protocol.vehicle.motion import cell_state
 from laneweave.protocol.wire.identities import Incarnations

@@ -12,8 +12,8 @@ from laneweave.coordinator.formations.leader import LEADER_RULES
 from laneweave.coordinator.formations.operation import FormationsOperation
 from laneweave.coordinator.metrics import CoordinatorMetrics
 from laneweave.coordinator.operation import LogEntry, Operation
+from laneweave.coordinator.rolling.checked_planner import Planner, stream_planner
 from laneweave.coordinator.rolling.operation import RollingOperation
-from laneweave.coordinator.rolling.planner import Planner, stream_planner
 from laneweave.coordinator.service.server import PlanningService
 from laneweave.protocol.runtime.metrics import MetricsSnapshot
 from laneweave.protocol.runtime.node import (
@@ -34,7 +34,7 @@ from laneweave.protocol.runtime.node import (
     Watch,
 )
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.wire.events import LEADER_ELECTED, LEADER_STEPPED_DOWN
 from laneweave.protocol.wire.messages import (

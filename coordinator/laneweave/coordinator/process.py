@@ -11,12 +11,12 @@ from collections.abc import Iterator
 import structlog
 
 from laneweave.coordinator.core import CoordinatorCore
-from laneweave.coordinator.planning.facade import warm_up
+from laneweave.coordinator.planning.solve import warm_up
 from laneweave.protocol.runtime.message_faults import Wrap, bare
 from laneweave.protocol.runtime.metrics import Observe, unobserved
 from laneweave.protocol.runtime.worker_pool import WorkerPool
-from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.security.rights import access_of
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.security.access_control import access_of
 from laneweave.protocol.transports.zenoh.runner import run_core
 from laneweave.protocol.wire.identities import Incarnations
 from laneweave.protocol.wire.messages import Name

@@ -33,7 +33,7 @@ from laneweave.protocol.runtime.node import (
     Wakeup,
     Watch,
 )
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.events import AGENT_MISSING, AGENT_SILENT
 from laneweave.protocol.wire.messages import (
     Command,
@@ -57,7 +57,7 @@ from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
 from laneweave.sim_bridge.road.attendance import Attendance, notify_left
 from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
-from laneweave.sim_bridge.world import World, show_bodies
+from laneweave.sim_bridge.world_interface import World, show_bodies
 
 log = structlog.get_logger(__name__)
 

@@ -8,13 +8,13 @@ from pathlib import Path
 
 from laneweave.protocol.runtime.message_faults import Wrap, bare
 from laneweave.protocol.runtime.metrics import Observe, unobserved
-from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.security.rights import access_of
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.security.access_control import access_of
 from laneweave.protocol.transports.zenoh.runner import run_core
 from laneweave.protocol.wire.identities import Incarnations
 from laneweave.sim_bridge.core import BridgeCore
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
-from laneweave.sim_bridge.sumo.world import SumoWorld
+from laneweave.sim_bridge.sumo.sumo_world import SumoWorld
 
 
 def run_bridge(

@@ -11,11 +11,7 @@ from hypothesis import strategies as st
 from laneweave.coordinator.rolling import ownership
 from laneweave.coordinator.rolling.ownership import _Sign, owned_cells
 from laneweave.protocol.state_machine import Function, RuleBook
-from laneweave.protocol.vehicle.execution import (
-    VEHICLE_RULES,
-    all_are_ready,
-    take_ownership,
-)
+from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES, all_are_ready, take_ownership
 from laneweave.protocol.wire.messages import Ballot, Deed, VehicleState
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
 from support.broken_cell_ownership import cancel_closed_transfers, forget_promise

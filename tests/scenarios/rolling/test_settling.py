@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from laneweave.agents.driving.driver import TrackingDriver
 from laneweave.agents.driving.reference import Reference
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State, cell_state, integrate
 from laneweave.protocol.wire.messages import Name, Sense
 from laneweave.sim_bridge.bodies.plant import Plant

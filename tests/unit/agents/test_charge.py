@@ -12,7 +12,7 @@ from laneweave.agents.core import AgentCore
 from laneweave.launch.fault_search.stand_ins import LightDriver
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Effect, Send, Wakeup
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import (
     Ballot,
     Command,

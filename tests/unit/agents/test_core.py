@@ -16,8 +16,8 @@ from laneweave.protocol.runtime.node import (
     Unlisten,
     Withdraw,
 )
-from laneweave.protocol.vehicle.execution import OVERDUE_SLOTS
 from laneweave.protocol.vehicle.motion import ARRIVED_ACROSS_M, ARRIVED_ALONG_M
+from laneweave.protocol.vehicle.plan_execution import OVERDUE_SLOTS
 from laneweave.protocol.wire.messages import Command, Name, Neighbour, Prepare, Report, VehicleState
 from laneweave.protocol.wire.topics import (
     COMMAND,

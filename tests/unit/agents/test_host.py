@@ -27,7 +27,7 @@ from laneweave.protocol.runtime.node import (
     Watch,
     Withdraw,
 )
-from laneweave.protocol.scenario.deployment import Shard
+from laneweave.protocol.scenario.deployment_fields import Shard
 from laneweave.protocol.wire.messages import (
     Announcement,
     Census,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from laneweave.agents.driving.tracker import Tracker
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from tracker_solvers import (
     FAMILIES,
     Condensed,

@@ -14,7 +14,7 @@ from laneweave.protocol.wire.identities import above
 from laneweave.protocol.wire.messages import Name, Plan, Prepare, Sense, VehicleState
 from laneweave.protocol.wire.topics import COMMAND, PLAN, PREPARE, STATE
 from laneweave.sim_bridge.core import TickPhase
-from laneweave.sim_bridge.road.answers import LATE_SHARE
+from laneweave.sim_bridge.road.tick_answers import LATE_SHARE
 from support.bridge_bench import (
     TWO,
     A,

@@ -19,7 +19,7 @@ from laneweave.protocol.runtime.node import (
     Watch,
 )
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import Census, Name, Report, RoadClock, Sense
 from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,

@@ -14,12 +14,12 @@ import numpy as np
 from attrs import define, frozen
 
 from laneweave.agents.driving.motions import REPEAT_TICKS
-from laneweave.agents.driving.program import NO_GAPS
 from laneweave.agents.driving.reference import Reference
 from laneweave.agents.driving.surroundings import Surroundings
 from laneweave.agents.driving.tracker import Tracker
+from laneweave.agents.driving.tracking_problem import NO_GAPS
 from laneweave.protocol.lattice import Cell, PlannedMove
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import at_rest_in_cell, cell_state, commanded_state
 from laneweave.protocol.wire.messages import Motion, Sense
 

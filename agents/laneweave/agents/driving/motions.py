@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from laneweave.agents.driving.trajectory import move_profile
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import Motion, Name
 
 Array = NDArray[np.float64]

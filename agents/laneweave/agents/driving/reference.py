@@ -10,10 +10,10 @@ import numpy as np
 from attrs import define
 from numpy.typing import NDArray
 
-from laneweave.agents.driving.program import ErrorBounds
+from laneweave.agents.driving.tracking_problem import ErrorBounds
 from laneweave.agents.driving.trajectory import Trajectory, move_profile, settling_trajectory
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.tables import Scenario, Vehicle
+from laneweave.protocol.scenario.fields import Scenario, Vehicle
 from laneweave.protocol.vehicle.motion import State, cell_state, integrate, limited_jerk
 
 Array = NDArray[np.float64]

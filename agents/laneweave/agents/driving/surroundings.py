@@ -18,8 +18,8 @@ from attrs import frozen
 from numpy.typing import NDArray
 
 from laneweave.agents.driving.motions import Motions
-from laneweave.agents.driving.program import NO_GAPS, Gaps
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.agents.driving.tracking_problem import NO_GAPS, Gaps
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import Motion, Neighbour, Sense
 

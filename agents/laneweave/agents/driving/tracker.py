@@ -25,10 +25,10 @@ import numpy as np
 from attrs import define
 from numpy.typing import NDArray
 
-from laneweave.agents.driving.program import NO_GAPS, ErrorBounds, Gaps, TrackingProgram
 from laneweave.agents.driving.reference import Window, yield_behind
 from laneweave.agents.driving.regulator import axis_matrices, shared_regulator
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.agents.driving.tracking_problem import NO_GAPS, ErrorBounds, Gaps, TrackingProgram
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State, hold_law, integrate, limited_jerk
 
 Array = NDArray[np.float64]

@@ -33,11 +33,11 @@ from attrs import frozen
 from numpy.typing import NDArray
 from scipy import sparse
 
-from laneweave.agents.driving.qp import MAX_ITERATIONS, QPSettings, QuadraticProgram
+from laneweave.agents.driving.qp_solver import MAX_ITERATIONS, QPSettings, QuadraticProgram
 from laneweave.agents.driving.regulator import axis_matrices
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.tables import Scenario, Vehicle
-from laneweave.protocol.vehicle.braking import (
+from laneweave.protocol.scenario.fields import Scenario, Vehicle
+from laneweave.protocol.vehicle.emergency_brake import (
     ERROR_SIGMAS,
     last_tick_m,
     lead_lag_s,

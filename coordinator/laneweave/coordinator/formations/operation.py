@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterator
 
 from laneweave.coordinator.ballots.ballot_round import PROMISED, TIME, BallotPhase
 from laneweave.coordinator.formations.leader import LEADER_RULES, FormationLeader
-from laneweave.coordinator.formations.planner import FormationPlanner
+from laneweave.coordinator.formations.planning_orders import FormationPlanner
 from laneweave.coordinator.formations.roster import Formation, Groups, closed_formations, with_room
 from laneweave.coordinator.operation import LogEntry, to_vehicle
 from laneweave.protocol.runtime.node import Compute, Computed, Effect
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.wire.events import FORMATIONS_JOINED, PLAN_IN_FORCE
 from laneweave.protocol.wire.messages import Ballot, Census, VehicleState

@@ -18,9 +18,9 @@ from collections.abc import Iterable, Sequence
 from attrs import evolve
 
 from laneweave.coordinator.formations.roster import on_tick, start_time_s
-from laneweave.coordinator.planning.conflicts import ConflictModel, Move
-from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.vehicle.execution import TIME_TOLERANCE_S
+from laneweave.coordinator.planning.conflict_model import ConflictModel, Move
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.vehicle.plan_execution import TIME_TOLERANCE_S
 from laneweave.protocol.wire.messages import Plan
 
 RESERVE_S = 3.0

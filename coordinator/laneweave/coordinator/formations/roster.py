@@ -21,7 +21,7 @@ from itertools import pairwise
 from attrs import define, field, frozen
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import Census, CensusEntry, Name
 
 STAGE_LEAD_S = 5.0

@@ -20,14 +20,14 @@ from attrs import evolve, frozen
 
 from laneweave.coordinator.formations.roster import Numbers
 from laneweave.coordinator.planning.budget import Clock
-from laneweave.coordinator.planning.facade import plan
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
+from laneweave.coordinator.planning.solve import plan
 from laneweave.coordinator.planning.targets import placements
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, PlannedMove
-from laneweave.protocol.scenario.tables import DrivingStructure, Scenario
+from laneweave.protocol.scenario.fields import DrivingStructure, Scenario
 from laneweave.protocol.wire.messages import Name
 
 MAX_PLACEMENTS = 6

@@ -11,7 +11,7 @@ from itertools import combinations
 
 import attrs
 
-from laneweave.coordinator.planning.conflicts import ConflictModel, Move
+from laneweave.coordinator.planning.conflict_model import ConflictModel, Move
 from laneweave.protocol.lattice import Cell
 
 

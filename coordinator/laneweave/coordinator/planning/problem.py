@@ -17,7 +17,7 @@ from typing import Final
 
 import attrs
 
-from laneweave.coordinator.planning.conflicts import ConflictModel, Move, conflict_offsets
+from laneweave.coordinator.planning.conflict_model import ConflictModel, Move, conflict_offsets
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.protocol.lattice import Cell, Mode, displacements
 

@@ -13,16 +13,20 @@ from typing import Any, Final
 
 import attrs
 
-from laneweave.coordinator.planning.conflicts import DEFAULT_KINDS, ConflictModel
-from laneweave.coordinator.planning.geometry.bodies import BodyGeometry
+from laneweave.coordinator.planning.conflict_model import DEFAULT_KINDS, ConflictModel
+from laneweave.coordinator.planning.formation_structures import (
+    STRUCTURES,
+    shortage,
+    structure_targets,
+)
 from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
+from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.problem import Problem
-from laneweave.coordinator.planning.structures import STRUCTURES, shortage, structure_targets
 from laneweave.protocol.errors import BadInputError, one_line
 from laneweave.protocol.lattice import Cell, Mode
-from laneweave.protocol.scenario.tables import CONFLICT_KINDS, SOLVERS
-from laneweave.protocol.structuring import structure
+from laneweave.protocol.parsing import structure
+from laneweave.protocol.scenario.fields import CONFLICT_KINDS, SOLVERS
 
 REQUEST_SCHEMA: Final = "laneweave.plan.request/1"
 DEFAULT_DEADLINE_S: Final = 4.0

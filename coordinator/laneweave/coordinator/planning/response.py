@@ -11,9 +11,9 @@ from attrs.validators import optional
 from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.coordinator.planning.request import PlanRequest, as_json
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.field_validators import within
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.structuring import structure
-from laneweave.protocol.validators import within
+from laneweave.protocol.parsing import structure
 
 RESPONSE_SCHEMA: Final = "laneweave.plan.response/1"
 

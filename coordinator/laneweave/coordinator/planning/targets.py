@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 
 from attrs import frozen
 
-from laneweave.coordinator.planning.structures import ranked_runs
+from laneweave.coordinator.planning.formation_structures import ranked_runs
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import Name
 

@@ -16,14 +16,14 @@ from typing import Any
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.operation import LogEntry, to_vehicle
-from laneweave.coordinator.planning.rolling.planner import StreamPlan, StreamVehicle
+from laneweave.coordinator.planning.rolling.path_search import StreamPlan, StreamVehicle
+from laneweave.coordinator.rolling.checked_planner import Planner
 from laneweave.coordinator.rolling.observed import ObservedRoad
 from laneweave.coordinator.rolling.ownership import certain_cells, partners
-from laneweave.coordinator.rolling.planner import Planner
 from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.runtime.node import Compute, Computed, Effect
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.events import (
     HANDOVER_GIVEN_UP,
     PLAN_IN_FORCE,

@@ -41,8 +41,8 @@ from laneweave.coordinator.service.format import (
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.transport import Answer
-from laneweave.protocol.security.access import Access
-from laneweave.protocol.security.rights import access_of
+from laneweave.protocol.security.access_control import access_of
+from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import connect_patiently
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.topics import SERVICE, Keys, Party

@@ -18,9 +18,9 @@ from typing import ClassVar
 import attrs
 from attrs import define, field, frozen
 
-from laneweave.coordinator.planning.facade import plan
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
+from laneweave.coordinator.planning.solve import plan
 from laneweave.coordinator.service.format import (
     FAILED,
     INVALID,
@@ -36,8 +36,8 @@ from laneweave.coordinator.service.rendezvous import falls_to
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.metrics import metric
 from laneweave.protocol.runtime.node import TOO_LATE, Decline, Delegate, Effect, Reply
-from laneweave.protocol.scenario.deployment import Service
-from laneweave.protocol.scenario.tables import DEFAULT_SOLVER
+from laneweave.protocol.scenario.deployment_fields import Service
+from laneweave.protocol.scenario.fields import DEFAULT_SOLVER
 
 HANDED_OUT_AHEAD = 1
 """Jobs queued for each worker beside its current one, so that it never waits for the next."""

@@ -15,9 +15,9 @@ import attrs
 import numpy as np
 from rich.table import Table
 
-from laneweave.coordinator.planning.facade import plan, warm_up
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
+from laneweave.coordinator.planning.solve import plan, warm_up
 from laneweave.launch.bench.request_families import (
     TRAFFIC_KINDS,
     block_request,

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from rich import box
 from rich.table import Table
 
-from laneweave.agents.driving.program import NO_GAPS, Gaps
 from laneweave.agents.driving.reference import Reference, Window
 from laneweave.agents.driving.surroundings import SENSED_S
 from laneweave.agents.driving.tracker import Tracker, TrackResult
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.agents.driving.tracking_problem import NO_GAPS, Gaps
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State, integrate
 from laneweave.sim_bridge.recording.trips import spread
 

@@ -11,8 +11,8 @@ import typer
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.validators import host_of
+from laneweave.protocol.field_validators import host_of
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.identities import Identity, parse_identity
 from laneweave.protocol.wire.topics import Party
 
@@ -59,7 +59,7 @@ def init(
         load_authority,
         make_authority,
     )
-    from laneweave.protocol.security.access import ca_path, certificate_path
+    from laneweave.protocol.security.connection import ca_path, certificate_path
 
     _check_days(days)
     if folder == Path():

@@ -13,7 +13,7 @@ import typer
 from laneweave.launch.run.logs import LogFormat, LogLevel
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.tables import SOLVERS, Scenario
+from laneweave.protocol.scenario.fields import SOLVERS, Scenario
 
 MAX_SEEDS = 10_000_000
 MAX_JOBS = 256

@@ -10,10 +10,10 @@ from typing import Any
 
 import attrs
 
-from laneweave.coordinator.planning.facade import plan
 from laneweave.coordinator.planning.paper.explanation import explain
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
+from laneweave.coordinator.planning.solve import plan
 from laneweave.coordinator.service.client import (
     ABSENT_S,
     PlanClient,
@@ -24,8 +24,8 @@ from laneweave.coordinator.service.client import (
 )
 from laneweave.launch.drawing.tappa_text import explanation_text
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
-from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.security.access import Access
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.security.connection import Access
 
 MAX_WAIT_S = 3600.0
 ANSWER_MARGIN_S = 8.0

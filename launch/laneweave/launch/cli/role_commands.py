@@ -27,13 +27,13 @@ from laneweave.launch.cli.options import (
     load_deployment,
     refuse_inert,
 )
-from laneweave.launch.methods import FORMATION
 from laneweave.launch.run.logs import LogFormat, LogLevel, log_role
 from laneweave.launch.run.run_folder import draw_report, new_folder
+from laneweave.launch.run_methods import FORMATION
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.metrics import Observe, unobserved
-from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.security.rights import access_of
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.security.access_control import access_of
 
 log = structlog.get_logger(__name__)
 
@@ -46,7 +46,7 @@ def router(
     log_level: Level = None,
 ) -> None:
     """Run the Zenoh router of a deployment."""
-    from laneweave.protocol.security.rights import guard_of
+    from laneweave.protocol.security.access_control import guard_of
     from laneweave.protocol.transports.zenoh.transport import run_router
 
     settings = load_deployment(config, endpoint, observation__metrics=metrics)
@@ -82,7 +82,7 @@ def coordinator(
 ) -> None:
     """Run a coordinator, which also answers plan requests."""
     from laneweave.coordinator.process import run_coordinator
-    from laneweave.protocol.validators import NAME_PATTERN, NAME_RULE
+    from laneweave.protocol.field_validators import NAME_PATTERN, NAME_RULE
 
     if not NAME_PATTERN.fullmatch(name):
         raise BadInputError("--name", name, NAME_RULE)

@@ -19,10 +19,10 @@ from laneweave.launch.cli.options import (
     refuse_inert,
     shows_progress,
 )
-from laneweave.launch.methods import FORMATION, LC2013, RULE
 from laneweave.launch.run.run_folder import draw_report, new_folder
+from laneweave.launch.run_methods import FORMATION, LC2013, RULE
 from laneweave.protocol.config.loading import load_scenario
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 
 if TYPE_CHECKING:
     from laneweave.launch.run.outcome import Outcome

@@ -29,10 +29,10 @@ from laneweave.launch.observe.status import (
     status_of,
 )
 from laneweave.protocol.errors import BadInputError, CommandFailedError
-from laneweave.protocol.scenario.deployment import parse_shard
-from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.security.rights import access_of
-from laneweave.protocol.validators import NAME_PATTERN, NAME_RULE
+from laneweave.protocol.field_validators import NAME_PATTERN, NAME_RULE
+from laneweave.protocol.scenario.deployment_fields import parse_shard
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.security.access_control import access_of
 from laneweave.protocol.wire.topics import Keys
 
 WAIT_S = 0.1

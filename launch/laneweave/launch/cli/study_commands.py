@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 
 from laneweave.launch.cli.options import check_jobs, parse_seeds
-from laneweave.launch.methods import METHODS, KeepTrajectories
+from laneweave.launch.run_methods import METHODS, KeepTrajectories
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 
@@ -59,7 +59,7 @@ def sweep(
     no_progress: Annotated[bool, typer.Option("--no-progress", help="Show no progress.")] = False,
 ) -> None:
     """Run methods x volumes x seeds in parallel, in virtual time; finished runs are kept."""
-    from laneweave.launch.methods import parse_methods
+    from laneweave.launch.run_methods import parse_methods
     from laneweave.launch.sweep.execution import run_locally
     from laneweave.launch.sweep.folder import SweepFolder
     from laneweave.launch.sweep.points import parse_volumes, plan_points

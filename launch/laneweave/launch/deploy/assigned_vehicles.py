@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from attrs import frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.deployment import FleetMembers, Security, Shard, parse_shard
-from laneweave.protocol.validators import NAME_PATTERN, NAME_RULE
+from laneweave.protocol.field_validators import NAME_PATTERN, NAME_RULE
+from laneweave.protocol.scenario.deployment_fields import FleetMembers, Security, Shard, parse_shard
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.topics import Party
 

@@ -20,7 +20,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.security.access import ca_path, certificate_path, key_path
+from laneweave.protocol.security.connection import ca_path, certificate_path, key_path
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.topics import Party
 

@@ -11,10 +11,15 @@ from attrs import define, field
 
 from laneweave.protocol.config.participants import demanded_vehicles, identities_of, members_of
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.field_validators import check_endpoint, host_of
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.security.access_control import (
+    EVERYWHERE,
+    KNOWN_RULE,
+    credentials_of,
+    rules_of,
+)
 from laneweave.protocol.security.certificates import examine
-from laneweave.protocol.security.rights import EVERYWHERE, KNOWN_RULE, credentials_of, rules_of
-from laneweave.protocol.validators import check_endpoint, host_of
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.topics import Party
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 
 _THREE_LANES = ("#2f6fc4", "#3f9b4f", "#cf3f3a")
 """Right to left: blue, green, red, the paper's colours."""

@@ -37,7 +37,7 @@ from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK, new_figure, save
 from laneweave.launch.drawing.plan import short_name, team_colours
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import cell_state, commanded_state
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, corners, pose_of
 from laneweave.sim_bridge.bodies.plant import Plant

@@ -23,8 +23,8 @@ from collections.abc import Callable, Iterable, Iterator
 
 from attrs import define, frozen
 
-from laneweave.launch.fault_search.bodies import Body, Geometry, overlap_between
 from laneweave.launch.fault_search.cell_ownership import CellOwnership
+from laneweave.launch.fault_search.checker_geometry import Body, Geometry, overlap_between
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import Ballot, Deed, Name, Plan, Sense, VehicleState
 

@@ -19,10 +19,10 @@ from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.formations.leader import LEADER_RULES
-from laneweave.coordinator.planning.rolling.planner import StreamPlan, StreamVehicle
-from laneweave.coordinator.rolling.planner import Planner, stream_planner
-from laneweave.launch.fault_search.bodies import Geometry
+from laneweave.coordinator.planning.rolling.path_search import StreamPlan, StreamVehicle
+from laneweave.coordinator.rolling.checked_planner import Planner, stream_planner
 from laneweave.launch.fault_search.checker import Checker, Violation
+from laneweave.launch.fault_search.checker_geometry import Geometry
 from laneweave.launch.fault_search.faults import CLOCK_DRIFT, CLOCK_OFFSET_S, ROAD, RandomFaults
 from laneweave.launch.fault_search.light_road import LightRoad
 from laneweave.launch.fault_search.profiles import Profile
@@ -31,11 +31,11 @@ from laneweave.launch.fault_search.stand_ins import LightDriver, LightPlanner
 from laneweave.launch.fault_search.story import Story
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Core, Effect, Event, Send
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
 from laneweave.protocol.transports.simulated.virtual_time import TraceDigest
-from laneweave.protocol.vehicle.execution import VEHICLE_RULES
+from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES
 from laneweave.protocol.wire.codec import encode
 from laneweave.protocol.wire.messages import Command, Name, Plan, Prepare, Sense, VehicleState
 from laneweave.protocol.wire.topics import Keys

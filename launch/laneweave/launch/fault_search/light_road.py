@@ -27,7 +27,7 @@ from laneweave.protocol.runtime.node import (
     Wakeup,
     Watch,
 )
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import (
     Census,

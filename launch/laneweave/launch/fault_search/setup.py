@@ -16,8 +16,8 @@ from laneweave.launch.fault_search.faults import CLOCK_DRIFT, CLOCK_OFFSET_S, LE
 from laneweave.launch.fault_search.light_road import Grant, Visit
 from laneweave.launch.fault_search.profiles import Profile
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.deployment import Network
-from laneweave.protocol.scenario.tables import FormationSettings, Road, Runtime, Scenario
+from laneweave.protocol.scenario.deployment_fields import Network
+from laneweave.protocol.scenario.fields import FormationSettings, Road, Runtime, Scenario
 from laneweave.protocol.wire.messages import ClosedFormation, Name
 
 TICK_S = 0.1

@@ -9,10 +9,10 @@ import random
 from collections.abc import Collection, Sequence
 
 from laneweave.agents.driving.driver import Drive, SolverStats
-from laneweave.coordinator.planning.rolling.planner import CellPath, StreamPlan, StreamVehicle
-from laneweave.coordinator.rolling.planner import stream_road
+from laneweave.coordinator.planning.rolling.path_search import CellPath, StreamPlan, StreamVehicle
+from laneweave.coordinator.rolling.checked_planner import stream_road
 from laneweave.protocol.lattice import Cell, PlannedMove, displacements, footprint
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import at_rest_in_cell
 from laneweave.protocol.wire.messages import Motion, Sense
 

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 from attrs import field, frozen
 
 from laneweave.protocol.lattice import Lattice
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.events import FORMATION_CLOSED
 from laneweave.protocol.wire.messages import ClosedFormation
 

@@ -16,8 +16,8 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.field_validators import host_and_port
 from laneweave.protocol.runtime.metrics import MetricsSnapshot, Observe, Source, metrics_of
-from laneweave.protocol.validators import host_and_port
 
 log = structlog.get_logger(__name__)
 

@@ -11,10 +11,10 @@ from typing import Any
 import pyarrow.parquet as pq
 from attrs import evolve, frozen
 
-from laneweave.launch.methods import rank
+from laneweave.launch.run_methods import rank
 from laneweave.protocol.config.loading import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import RunSummary, read_summary
 from laneweave.sim_bridge.recording.trips import SCENARIO_KEY
 

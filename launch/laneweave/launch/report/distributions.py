@@ -23,7 +23,7 @@ from laneweave.launch.report.style import (
     spread_evenly,
     volume_title,
 )
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.recording.trips import WARM_UP_S
 
 if TYPE_CHECKING:

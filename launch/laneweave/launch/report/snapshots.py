@@ -19,7 +19,7 @@ from laneweave.launch.observe.column_owners import Formations, closed_formations
 from laneweave.launch.recordings.runs import scenario_of
 from laneweave.launch.recordings.trajectories import Floats, Tracks, read_tracks, read_trips
 from laneweave.launch.report.style import picture
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

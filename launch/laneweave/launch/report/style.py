@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from laneweave.launch.drawing.figures import FAINT_INK, INK, new_figure, save
-from laneweave.launch.methods import METHODS
+from laneweave.launch.run_methods import METHODS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

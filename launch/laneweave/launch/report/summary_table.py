@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 from collections import Counter
 
-from laneweave.protocol.scenario.tables import COMFORT_MPS2
+from laneweave.protocol.scenario.fields import COMFORT_MPS2
 from laneweave.protocol.summary import Planning, RunSummary, Safety
 
 MAX_LISTED = 5

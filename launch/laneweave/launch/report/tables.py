@@ -7,7 +7,12 @@ from typing import Any, Final
 
 from attrs import frozen
 
-from laneweave.launch.recordings.results import KEYS, PREFERRED, over_seeds, results_table
+from laneweave.launch.recordings.results_over_seeds import (
+    KEYS,
+    PREFERRED,
+    over_seeds,
+    results_table,
+)
 from laneweave.launch.recordings.runs import Comparison, Run
 from laneweave.launch.report.summary_table import summary_rows
 

@@ -17,10 +17,10 @@ from typing import Any
 import attrs
 from attrs import define, field
 
-from laneweave.coordinator.planning.facade import warm_up
-from laneweave.launch.faults.board import MessageFaults, SharedBoard
+from laneweave.coordinator.planning.solve import warm_up
 from laneweave.launch.faults.injection import FaultInjection
 from laneweave.launch.faults.network_namespaces import HUB, open_network
+from laneweave.launch.faults.shared_counters import MessageFaults, SharedBoard
 from laneweave.launch.faults.specification import SENDER_OF_GROUP, FaultSpec
 from laneweave.launch.observe.observer import Observer
 from laneweave.launch.observe.road_view import RoadView
@@ -34,9 +34,9 @@ from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.runtime.message_faults import SENDER_OF_ROLE
 from laneweave.protocol.runtime.processes import stop_signals
-from laneweave.protocol.scenario.deployment import Security
-from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.security.rights import access_of
+from laneweave.protocol.scenario.deployment_fields import Security
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.security.access_control import access_of
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.topics import Keys
 from laneweave.sim_bridge.road.demand import arrivals

@@ -10,17 +10,17 @@ from pathlib import Path
 
 from attrs import define
 
-from laneweave.launch.methods import RULE
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.outcome import Outcome, complete_summary
 from laneweave.launch.run.progress import RunProgress
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.launch.run_methods import RULE
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.baselines.lc2013 import Lc2013Traffic, check_lc2013
 from laneweave.sim_bridge.baselines.reference_road import ReferenceRoad, Traffic
 from laneweave.sim_bridge.baselines.rule_based import RuleTraffic, check_rule
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
+from laneweave.sim_bridge.sumo.sumo_world import SumoWorld
 from laneweave.sim_bridge.sumo.traffic import SumoTraffic
-from laneweave.sim_bridge.sumo.world import SumoWorld
 
 PROGRESS_EVERY_TICKS = 50
 

@@ -30,7 +30,7 @@ from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.runtime.message_faults import Wrap, bare
 from laneweave.protocol.runtime.processes import die_with_parent
-from laneweave.protocol.security.rights import access_of
+from laneweave.protocol.security.access_control import access_of
 
 log = structlog.get_logger(__name__)
 

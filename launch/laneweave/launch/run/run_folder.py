@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from laneweave.protocol.errors import BadInputError, CommandFailedError
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 
 LOG = "log.jsonl"
 

@@ -14,8 +14,8 @@ from attrs import define, field
 from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost
 from laneweave.coordinator.core import CoordinatorCore
-from laneweave.launch.faults.board import LocalBoard
 from laneweave.launch.faults.injection import FaultInjection
+from laneweave.launch.faults.shared_counters import LocalBoard
 from laneweave.launch.faults.specification import ROUTER, FaultSpec
 from laneweave.launch.observe.observer import TOPICS
 from laneweave.launch.observe.road_view import RoadView
@@ -24,13 +24,13 @@ from laneweave.launch.run.progress import RunProgress
 from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.runtime.message_faults import FaultyCore
 from laneweave.protocol.runtime.node import Arrived, Core, Effect, Event, Listen, Started
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.core import BridgeCore, TickPhase
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
-from laneweave.sim_bridge.sumo.world import SumoWorld
+from laneweave.sim_bridge.sumo.sumo_world import SumoWorld
 
 STALL_S = 600.0
 """A run fails if its road clock stands still for this much virtual time."""

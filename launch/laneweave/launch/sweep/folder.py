@@ -22,19 +22,19 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Self
 
-from laneweave.launch.methods import METHODS, affects
-from laneweave.launch.recordings.results import flatten, write_results
+from laneweave.launch.recordings.results_over_seeds import flatten, write_results
 from laneweave.launch.recordings.runs import (
     SWEEP_FILE,
     Run,
     sweep_runs,
     write_point,
 )
+from laneweave.launch.run_methods import METHODS, affects
 from laneweave.launch.sweep.execution import LOG_FILE, Ended, kept_files
 from laneweave.launch.sweep.points import Point
 from laneweave.protocol.config.loading import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError, CommandFailedError
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import read_summary
 
 RESULTS_FILE = "results.parquet"

@@ -8,11 +8,11 @@ import signal
 import sys
 from pathlib import Path
 
-from laneweave.launch.methods import FORMATION
 from laneweave.launch.run.logs import log_to_terminal
 from laneweave.launch.run.reference_run import ReferenceRun
 from laneweave.launch.run.roles import collect_rarely
 from laneweave.launch.run.simulated_run import SimulatedRun
+from laneweave.launch.run_methods import FORMATION
 from laneweave.launch.sweep.execution import JOB_FILE, RESULT_FILE
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.files import write_atomically

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from attrs import evolve, frozen
 
 from laneweave.agents.driving.trajectory import check_moves
-from laneweave.launch.methods import METHODS, KeepTrajectories
+from laneweave.launch.run_methods import METHODS, KeepTrajectories
 from laneweave.protocol.config.loading import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 
 MAX_POINTS = 100_000
 

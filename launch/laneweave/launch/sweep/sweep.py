@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from laneweave.launch.recordings.results import PREFERRED, over_seeds, results_table
+from laneweave.launch.recordings.results_over_seeds import PREFERRED, over_seeds, results_table
 from laneweave.launch.recordings.runs import Run
 from laneweave.launch.sweep.execution import Ended
 from laneweave.launch.sweep.folder import SweepFolder

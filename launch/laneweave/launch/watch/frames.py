@@ -58,7 +58,7 @@ from attrs import define, field, frozen
 
 from laneweave.launch.drawing.colours import lane_names, road_scene
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.tables import Scenario, solver_of_event
+from laneweave.protocol.scenario.fields import Scenario, solver_of_event
 from laneweave.protocol.wire.events import (
     ENTERED,
     FORMATION_CLOSED,

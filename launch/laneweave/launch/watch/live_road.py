@@ -23,7 +23,7 @@ from laneweave.launch.watch.frames import (
     plan_row,
 )
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import (
     Ballot,
     CensusEntry,

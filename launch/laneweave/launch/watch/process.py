@@ -27,8 +27,8 @@ from laneweave.launch.watch.server import Audience, Health, make_app
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.node import Arrived
 from laneweave.protocol.runtime.transport import Delivery
-from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.security.rights import access_of
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.security.access_control import access_of
 from laneweave.protocol.transports.zenoh.transport import connect_patiently
 from laneweave.protocol.wire.topics import Keys
 

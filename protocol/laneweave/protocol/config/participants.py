@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 
-from laneweave.protocol.scenario.deployment import FleetMembers, parse_shard
-from laneweave.protocol.scenario.tables import Demand, Scenario
+from laneweave.protocol.scenario.deployment_fields import FleetMembers, parse_shard
+from laneweave.protocol.scenario.fields import Demand, Scenario
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.topics import Party
 

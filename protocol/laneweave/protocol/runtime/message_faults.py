@@ -19,6 +19,7 @@ import attrs
 from attrs import field, frozen
 
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.field_validators import one_of, within
 from laneweave.protocol.runtime.metrics import MetricsSnapshot
 from laneweave.protocol.runtime.node import (
     Arrived,
@@ -29,7 +30,6 @@ from laneweave.protocol.runtime.node import (
     Wakeup,
     core_metrics,
 )
-from laneweave.protocol.validators import one_of, within
 from laneweave.protocol.wire.messages import RoadClock
 from laneweave.protocol.wire.topics import TOPICS
 

@@ -21,7 +21,7 @@ import structlog
 from attrs import frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.security.access import Credentials
+from laneweave.protocol.security.connection import Credentials
 from laneweave.protocol.wire.topics import Party
 
 log = structlog.get_logger(__name__)

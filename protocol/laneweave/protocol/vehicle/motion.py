@@ -25,7 +25,7 @@ import math
 from collections.abc import Iterable
 
 from laneweave.protocol.lattice import Cell, Lattice
-from laneweave.protocol.scenario.tables import Vehicle
+from laneweave.protocol.scenario.fields import Vehicle
 
 State = tuple[float, float, float, float, float, float]
 """(s [m], v [m/s], a [m/s2], y [m], v_y [m/s], a_y [m/s2])."""

@@ -16,7 +16,7 @@ import time
 from attrs import frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.validators import NAME_PATTERN
+from laneweave.protocol.field_validators import NAME_PATTERN
 from laneweave.protocol.wire.topics import Party
 
 MAX_COMMON_NAME = 64

@@ -17,7 +17,7 @@ from types import MappingProxyType
 from attrs import frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.validators import NAME_PATTERN, NAME_RULE
+from laneweave.protocol.field_validators import NAME_PATTERN, NAME_RULE
 from laneweave.protocol.wire import messages
 
 PREFIX = "laneweave"

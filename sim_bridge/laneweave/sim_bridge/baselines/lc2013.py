@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Collection
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 from laneweave.sim_bridge.sumo.traffic import SumoTraffic

@@ -9,7 +9,7 @@ from typing import Protocol
 
 from attrs import define
 
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import RoadClock
 from laneweave.sim_bridge.bodies.motion_controller import Rung

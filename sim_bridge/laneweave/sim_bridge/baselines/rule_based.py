@@ -10,11 +10,11 @@ import math
 from collections.abc import Collection, Iterable
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.baselines.reference_road import Entrance, ReferenceVehicle
 from laneweave.sim_bridge.baselines.rules import Lanes, Rules, priority
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
-from laneweave.sim_bridge.world import World
+from laneweave.sim_bridge.world_interface import World
 
 _ROUNDING_M = 1e-9
 

@@ -29,8 +29,8 @@ from attrs import define, evolve, field
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, Lattice
-from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.vehicle.braking import EmergencyBrake
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.vehicle.emergency_brake import EmergencyBrake
 from laneweave.protocol.vehicle.motion import (
     Jerk,
     State,

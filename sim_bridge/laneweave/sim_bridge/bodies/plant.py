@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 
-from laneweave.protocol.scenario.tables import Vehicle
+from laneweave.protocol.scenario.fields import Vehicle
 from laneweave.protocol.vehicle.motion import Jerk, State, commanded_state, integrate, limited_jerk
 
 Axis = tuple[float, float, float]

@@ -10,7 +10,7 @@ import zlib
 
 import numpy as np
 
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import Name, Neighbour
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Around, ExactNeighbours

@@ -25,7 +25,7 @@ import pyarrow.parquet as pq
 from attrs import define, field
 from numpy.typing import NDArray
 
-from laneweave.protocol.scenario.tables import SOLVERS, Scenario, solver_of_event
+from laneweave.protocol.scenario.fields import SOLVERS, Scenario, solver_of_event
 from laneweave.protocol.summary import (
     SCHEMA,
     DurationMs,

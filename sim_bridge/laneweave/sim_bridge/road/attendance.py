@@ -13,12 +13,12 @@ from enum import StrEnum
 
 from laneweave.protocol.runtime.node import Effect, Event, Listen, PeerDown, PeerUp, Send, Unlisten
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
-from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.vehicle.execution import PlanExecution
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.vehicle.plan_execution import PlanExecution
 from laneweave.protocol.wire.identities import above
 from laneweave.protocol.wire.messages import Command, Name, Plan, Prepare, VehicleState
 from laneweave.protocol.wire.topics import PLAN, PREPARE, SENSE, STATE, VEHICLE_ALIVE
-from laneweave.sim_bridge.road.answers import Answers
+from laneweave.sim_bridge.road.tick_answers import Answers
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 LEFT_REPEATS = 20

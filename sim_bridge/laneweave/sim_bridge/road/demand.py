@@ -19,7 +19,7 @@ from attrs import frozen
 from numpy.random import SeedSequence, default_rng
 
 from laneweave.protocol.config.participants import vehicle_name
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 
 _HEADWAYS, _PREFERENCES = 0, 1
 

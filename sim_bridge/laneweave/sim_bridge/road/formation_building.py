@@ -24,7 +24,7 @@ from collections import Counter
 from attrs import define, field
 
 from laneweave.protocol.lattice import Cell, Lattice
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import ClosedFormation
 
 

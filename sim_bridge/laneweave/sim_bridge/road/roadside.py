@@ -11,7 +11,7 @@ from itertools import chain, takewhile
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Effect, Send
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import (
     Announcement,
     Census,

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from attrs import define
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.wire.messages import ClosedFormation, Name, Sense
 from laneweave.sim_bridge.bodies.motion_controller import MotionController, Rung

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from laneweave.protocol.errors import CommandFailedError
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 from laneweave.sim_bridge.sumo.network import write_network
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 from laneweave.sim_bridge.sumo.network import VEHICLE_TYPE, exit_route, margin_m
 from laneweave.sim_bridge.sumo.simulation import SumoSession

@@ -13,8 +13,8 @@ from laneweave.agents.driving.trajectory import (
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.vehicle.braking import ERROR_SIGMAS, EmergencyBrake, spare_error_m
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.vehicle.emergency_brake import ERROR_SIGMAS, EmergencyBrake, spare_error_m
 from laneweave.protocol.vehicle.motion import Jerk, cell_state
 from laneweave.protocol.wire.messages import Neighbour
 from laneweave.sim_bridge.bodies.plant import Plant

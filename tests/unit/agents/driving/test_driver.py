@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from laneweave.agents.driving.driver import Drive, SolverStats, TrackingDriver
 from laneweave.agents.driving.motions import REPEAT_TICKS
-from laneweave.agents.driving.program import NO_GAPS, Gaps
 from laneweave.agents.driving.reference import Window
 from laneweave.agents.driving.tracker import Tracker, TrackResult
+from laneweave.agents.driving.tracking_problem import NO_GAPS, Gaps
 from laneweave.protocol.lattice import Cell, PlannedMove
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import (
     ARRIVED_ACROSS_M,
     ARRIVED_ALONG_M,

@@ -12,8 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import linalg
 
-from laneweave.agents.driving import program as program_module
-from laneweave.agents.driving.program import Gaps
+from laneweave.agents.driving import tracking_problem as program_module
 from laneweave.agents.driving.reference import Reference, Window
 from laneweave.agents.driving.regulator import (
     JERK_WEIGHT,
@@ -22,7 +21,8 @@ from laneweave.agents.driving.regulator import (
     axis_matrices,
 )
 from laneweave.agents.driving.tracker import Tracker, TrackResult
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.agents.driving.tracking_problem import Gaps
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State, cell_state, integrate
 
 SCENARIO = Scenario()

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from laneweave.agents.driving.reference import Reference
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import (
     Jerk,
     State,

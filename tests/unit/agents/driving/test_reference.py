@@ -17,7 +17,7 @@ from laneweave.agents.driving.trajectory import (
     plan_trajectory,
 )
 from laneweave.protocol.config.loading import parse_scenario
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State, cell_state, integrate
 
 SCENARIO = Scenario()

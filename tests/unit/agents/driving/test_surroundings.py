@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from attrs import evolve
 
-from laneweave.agents.driving.program import NO_GAPS, Gaps
 from laneweave.agents.driving.surroundings import SENSED_S, Surroundings
+from laneweave.agents.driving.tracking_problem import NO_GAPS, Gaps
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State, cell_state, commanded_state
 from laneweave.protocol.wire.messages import Name, Neighbour, Sense
 from laneweave.sim_bridge.bodies.plant import Plant

@@ -13,11 +13,11 @@ from attrs import evolve
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from laneweave.agents.driving.program import Gaps
 from laneweave.agents.driving.reference import Reference, Window
 from laneweave.agents.driving.tracker import Tracker, TrackResult
+from laneweave.agents.driving.tracking_problem import Gaps
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import Jerk, State, cell_state, integrate, limited_jerk
 
 SCENARIO = Scenario()

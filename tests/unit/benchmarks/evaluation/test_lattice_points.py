@@ -10,7 +10,7 @@ from evaluation.lattice_points import TOLERANCE_M, lattice_spacing
 from evaluation.points import slow_stretch, within_limits
 from laneweave.launch.recordings.trajectories import OFF_LATTICE, Tracks
 from laneweave.protocol.config.loading import load_scenario
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 
 SCENARIO = load_scenario(None)
 LATTICE = SCENARIO.lattice

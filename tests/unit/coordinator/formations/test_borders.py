@@ -7,10 +7,10 @@ from attrs import evolve
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.formations.pacing import kept_apart, steps_of
-from laneweave.coordinator.planning.conflicts import ConflictModel
+from laneweave.coordinator.planning.conflict_model import ConflictModel
 from laneweave.protocol.lattice import PlannedMove
 from laneweave.protocol.runtime.node import Compute, Effect, run_job
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.plans import plan_problems
 from laneweave.protocol.wire.messages import Ballot, LogEvent, Name, Plan
 from support.service_desk import SCENARIO as DESK_SCENARIO

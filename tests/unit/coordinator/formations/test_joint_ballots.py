@@ -7,7 +7,7 @@ from attrs import evolve
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.formations.operation import JUST_CLOSED_S
 from laneweave.protocol.runtime.node import Compute, Effect, PeerUp, run_job
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.plans import plan_problems
 from laneweave.protocol.wire.messages import Ballot, LogEvent, Name, Plan, Prepare, RoadClock
 from laneweave.protocol.wire.topics import BRIDGE_ALIVE

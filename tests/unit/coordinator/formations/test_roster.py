@@ -18,7 +18,7 @@ from laneweave.coordinator.formations.roster import (
     time_left_s,
 )
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.tables import Road, Scenario
+from laneweave.protocol.scenario.fields import Road, Scenario
 from laneweave.protocol.wire.messages import Census, CensusEntry, ClosedFormation, Name
 from support.paper import FORMATIONS, PAPER, closed_blocks, closing_time_s
 

@@ -9,7 +9,7 @@ from laneweave.coordinator.formations import pacing
 from laneweave.coordinator.formations.pacing import MIN_RESERVE_S, RESERVE_S, kept_apart, steps_of
 from laneweave.coordinator.formations.roster import start_time_s, time_left_s
 from laneweave.protocol.lattice import Cell, PlannedMove
-from laneweave.protocol.scenario.tables import FormationSettings, Scenario
+from laneweave.protocol.scenario.fields import FormationSettings, Scenario
 from laneweave.protocol.wire.messages import Ballot, Name, Plan
 
 SCENARIO = Scenario()

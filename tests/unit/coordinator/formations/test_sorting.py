@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from laneweave.coordinator.formations import sorting as sorting_module
 from laneweave.coordinator.formations.roster import Numbers
 from laneweave.coordinator.formations.sorting import Sorting, SortingTask, plan_requests, sort_lanes
-from laneweave.coordinator.planning.facade import plan
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
+from laneweave.coordinator.planning.solve import plan
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, footprint
-from laneweave.protocol.scenario.tables import DrivingStructure, Scenario
+from laneweave.protocol.scenario.fields import DrivingStructure, Scenario
 from laneweave.protocol.wire.messages import Name
 from support.paper import FORMATIONS, PAPER
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from laneweave.coordinator.planning.facade import plan
 from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.bench.request_families import (
     TRAFFIC_KINDS,
     block_request,

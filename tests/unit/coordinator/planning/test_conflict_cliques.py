@@ -5,12 +5,12 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from laneweave.coordinator.planning.conflicts import ConflictModel, Move
+from laneweave.coordinator.planning.conflict_model import ConflictModel, Move
 from laneweave.coordinator.planning.exact.arrays import move_arrays
 from laneweave.coordinator.planning.exact.cliques import Clique, clique_patterns
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.protocol.lattice import Mode, displacements
-from laneweave.protocol.scenario.tables import CONFLICT_KINDS
+from laneweave.protocol.scenario.fields import CONFLICT_KINDS
 from oracles.instances import EVERY_VARIANT
 
 MODELS: list[tuple[Mode, tuple[str, ...]]] = [

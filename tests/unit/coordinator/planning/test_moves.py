@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from laneweave.coordinator.planning.conflicts import ConflictModel, Move
+from laneweave.coordinator.planning.conflict_model import ConflictModel, Move
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.problem import MoveTable, bits
 from laneweave.protocol.lattice import Cell, Mode, displacements
-from laneweave.protocol.scenario.tables import CONFLICT_KINDS
+from laneweave.protocol.scenario.fields import CONFLICT_KINDS
 
 GRIDS = [
     Grid(4, 3, []),

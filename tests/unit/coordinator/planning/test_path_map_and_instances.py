@@ -2,9 +2,9 @@
 
 import pytest
 
-from laneweave.coordinator.planning.conflicts import ConflictModel
-from laneweave.coordinator.planning.facade import plan
+from laneweave.coordinator.planning.conflict_model import ConflictModel
 from laneweave.coordinator.planning.path_map import FoundConflict, RelativePathMap, final_arrival
+from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.bench.request_families import (
     block_request,
     formation_request,

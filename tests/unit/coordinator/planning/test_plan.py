@@ -14,17 +14,17 @@ from hypothesis import strategies as st
 
 import laneweave.coordinator
 import laneweave.protocol
-from laneweave.coordinator.planning.facade import plan
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.path_map import RelativePathMap, final_arrival
+from laneweave.coordinator.planning.plan_validator import problems_of_response
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanResponse
-from laneweave.coordinator.planning.validator import problems_of_response
+from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.bench.request_families import block_request, formation_request
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, Mode
-from laneweave.protocol.scenario.tables import CONFLICT_KINDS
+from laneweave.protocol.scenario.fields import CONFLICT_KINDS
 from support.planning_oracles import cheapest_plan, requests
 
 
@@ -249,7 +249,7 @@ def _without_time(response: PlanResponse) -> PlanResponse:
 
 
 SCRIPT = """
-from laneweave.coordinator.planning.facade import plan
+from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.bench.request_families import block_request
 for seed in range(6):
     for mode in (1, 2):

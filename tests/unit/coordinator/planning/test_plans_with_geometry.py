@@ -13,17 +13,17 @@ import pytest
 from laneweave.agents.driving.trajectory import move_profile
 from laneweave.coordinator.planning import request as request_module
 from laneweave.coordinator.planning.budget import Budget
-from laneweave.coordinator.planning.conflicts import ConflictTable
+from laneweave.coordinator.planning.conflict_model import ConflictTable
 from laneweave.coordinator.planning.exact.reachability import explore
-from laneweave.coordinator.planning.facade import plan
-from laneweave.coordinator.planning.geometry.bodies import BodyGeometry
 from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
+from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
+from laneweave.coordinator.planning.plan_validator import problems_of_paths
 from laneweave.coordinator.planning.request import PlanRequest
-from laneweave.coordinator.planning.validator import problems_of_paths
+from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.bench.request_families import formation_request
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Mode, displacements
-from laneweave.protocol.scenario.tables import SOLVERS, Scenario
+from laneweave.protocol.scenario.fields import SOLVERS, Scenario
 from oracles import joint_search
 from oracles.instances import random_request, small_request
 from oracles.moving_bodies import Bodies, Profile, drive, least_gap_of_plan_m

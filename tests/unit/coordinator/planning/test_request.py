@@ -9,10 +9,10 @@ import attrs
 import pytest
 from hypothesis import given, settings
 
-from laneweave.coordinator.planning.facade import plan
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanResponse
+from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.bench.request_families import block_request
 from laneweave.protocol.errors import BadInputError
 from support.planning_oracles import requests

@@ -7,12 +7,12 @@ import math
 import attrs
 import pytest
 
-from laneweave.coordinator.planning.facade import TAPPA_SHARE, plan
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
+from laneweave.coordinator.planning.solve import TAPPA_SHARE, plan
 from laneweave.launch.bench.request_families import block_request, formation_request
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.tables import SOLVERS
+from laneweave.protocol.scenario.fields import SOLVERS
 
 EASY = block_request(1, vehicles=3, deadline_s=3600.0)
 HARD = block_request(25, conflicts=("node", "edge", "special-1", "closing"), deadline_s=3600.0)

@@ -12,7 +12,8 @@ from attrs import define, evolve, field
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.operation import LogEntry
-from laneweave.coordinator.planning.rolling.planner import StreamPlan, StreamVehicle
+from laneweave.coordinator.planning.rolling.path_search import StreamPlan, StreamVehicle
+from laneweave.coordinator.rolling.checked_planner import checked, stream_planner, stream_road
 from laneweave.coordinator.rolling.operation import (
     AHEAD_M,
     BESIDE,
@@ -22,7 +23,6 @@ from laneweave.coordinator.rolling.operation import (
     RollingOperation,
     _clusters,
 )
-from laneweave.coordinator.rolling.planner import checked, stream_planner, stream_road
 from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.lattice import Cell

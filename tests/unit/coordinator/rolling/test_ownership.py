@@ -8,12 +8,12 @@ from itertools import count
 import pytest
 from attrs import evolve
 
-from laneweave.coordinator.planning.rolling.planner import StreamPlan, StreamVehicle
+from laneweave.coordinator.planning.rolling.path_search import StreamPlan, StreamVehicle
 from laneweave.coordinator.rolling.operation import RollingOperation
 from laneweave.coordinator.rolling.ownership import certain_cells, owned_cells, partners
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Computed
-from laneweave.protocol.scenario.tables import FormationSettings, Road, Scenario
+from laneweave.protocol.scenario.fields import FormationSettings, Road, Scenario
 from laneweave.protocol.wire.messages import Ballot, Census, CensusEntry, Deed, Name, VehicleState
 from support.states import holding
 

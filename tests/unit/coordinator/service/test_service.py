@@ -25,7 +25,7 @@ from laneweave.protocol.runtime.node import (
     Reply,
     run_delegated,
 )
-from laneweave.protocol.scenario.deployment import Service
+from laneweave.protocol.scenario.deployment_fields import Service
 
 REQUEST: dict[str, Any] = {
     "schema": "laneweave.plan.request/1",

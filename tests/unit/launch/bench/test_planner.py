@@ -5,7 +5,7 @@ import math
 import pytest
 from attrs import evolve
 
-from laneweave.coordinator.planning.facade import plan
+from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.bench.planner import FAMILIES, bench_planner, gap_percent, planner_table
 from laneweave.launch.bench.request_families import formation_request
 from laneweave.protocol.errors import BadInputError

@@ -9,7 +9,7 @@ import pytest
 from laneweave.agents.driving.tracker import Tracker
 from laneweave.launch.bench.tracker import SITUATIONS, bench_tracker, drive, tracker_table
 from laneweave.launch.cli import main as cli
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 
 SCENARIO = Scenario()
 

@@ -14,7 +14,7 @@ from laneweave.launch.run.logs import last_error
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 
 
 def new_folder(out: Path | None, settings: Scenario | None = None) -> Path:

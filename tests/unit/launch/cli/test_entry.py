@@ -19,7 +19,7 @@ def solve() -> None:
     from laneweave.agents.driving.tracker import Tracker
     from laneweave.agents.driving.reference import Reference
     from laneweave.protocol.vehicle.motion import cell_state
-    from laneweave.protocol.scenario.tables import Scenario
+    from laneweave.protocol.scenario.fields import Scenario
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     signal.alarm(90)  # end even if the test has died
     scenario = Scenario()

@@ -6,7 +6,7 @@ import pytest
 
 from laneweave.launch.deploy.assigned_vehicles import AssignedVehicles, assigned_vehicles
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.deployment import Security, Shard
+from laneweave.protocol.scenario.deployment_fields import Security, Shard
 
 FLEETS: dict[str, str | tuple[str, ...]] = {"even": "0/2", "odd": "1/2", "two": ("a", "b")}
 OPEN, SECURED = Security(fleets=FLEETS), Security(mode="mtls", fleets=FLEETS)

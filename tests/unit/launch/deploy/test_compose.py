@@ -13,7 +13,7 @@ from typer.main import get_command
 
 from laneweave.launch.cli.main import app
 from laneweave.protocol.config.loading import load_scenario
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 
 ROOT = Path(__file__).resolve().parents[4]
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "compose.yaml").read_text(encoding="utf-8"))

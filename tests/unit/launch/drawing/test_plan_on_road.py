@@ -13,9 +13,9 @@ from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 from PIL import Image
 
-from laneweave.coordinator.planning.facade import plan
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
+from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.cli import main as cli
 from laneweave.launch.cli import plan_answers
 from laneweave.launch.drawing import figures as drawing
@@ -30,7 +30,7 @@ from laneweave.launch.drawing.plan_on_road import (
 )
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import cell_state
 
 EXAMPLES = Path(__file__).resolve().parents[4] / "docs" / "examples"

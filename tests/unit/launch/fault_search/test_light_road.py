@@ -7,8 +7,8 @@ from itertools import count, pairwise
 
 import pytest
 
-from laneweave.launch.fault_search.bodies import Geometry
 from laneweave.launch.fault_search.checker import Checker
+from laneweave.launch.fault_search.checker_geometry import Geometry
 from laneweave.launch.fault_search.light_road import LightRoad, Visit
 from laneweave.launch.fault_search.setup import make_scenario
 from laneweave.protocol.lattice import Cell

@@ -9,9 +9,9 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
-from laneweave.launch.faults.board import MessageFaults, SharedBoard
 from laneweave.launch.faults.injection import FaultInjection
 from laneweave.launch.faults.network_namespaces import GroupNetwork, NamespacesUnavailableError
+from laneweave.launch.faults.shared_counters import MessageFaults, SharedBoard
 from laneweave.launch.faults.specification import (
     FaultSpec,
     Kill,
@@ -27,7 +27,7 @@ from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.loading import load_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.message_faults import MessageRule
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 
 LOSS = MessageRule(loss=0.5)
 CUT = Partition(between=("coordinators", "others"), from_s=5.0)

@@ -5,7 +5,7 @@ import pytest
 
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.progress import RunProgress
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import Name, RoadClock
 
 CLOCK = RoadClock(10, 1.0, demanded=4, entered=2, on_road=2, left=0, ended=False)

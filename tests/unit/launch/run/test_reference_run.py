@@ -10,12 +10,12 @@ import pytest
 from typer.testing import CliRunner
 
 from laneweave.launch.cli.main import app
-from laneweave.launch.methods import LC2013, RULE
 from laneweave.launch.run.outcome import Outcome
 from laneweave.launch.run.reference_run import ReferenceRun, check_reference
+from laneweave.launch.run_methods import LC2013, RULE
 from laneweave.protocol.config.loading import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.baselines import reference_road as road
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies
 from laneweave.sim_bridge.recording.run_record import Ending, RunRecord

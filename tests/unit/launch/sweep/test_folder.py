@@ -11,8 +11,8 @@ from attrs import evolve
 from laneweave.launch.recordings.runs import Run, write_point
 from laneweave.launch.sweep.folder import SweepFolder
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.deployment import Security
-from laneweave.protocol.scenario.tables import Road, Scenario
+from laneweave.protocol.scenario.deployment_fields import Security
+from laneweave.protocol.scenario.fields import Road, Scenario
 from laneweave.protocol.summary import read_summary, write_summary
 from support.summaries import make_summary
 

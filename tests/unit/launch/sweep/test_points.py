@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from laneweave.launch.cli import main as cli
-from laneweave.launch.methods import METHODS, KeepTrajectories, parse_methods, rank
+from laneweave.launch.run_methods import METHODS, KeepTrajectories, parse_methods, rank
 from laneweave.launch.sweep.points import parse_volumes, plan_points
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 
 ROOT = Path(__file__).resolve().parents[4]
 

@@ -12,7 +12,7 @@ import psutil
 import pyarrow.parquet as pq
 import pytest
 
-from laneweave.launch.methods import affects
+from laneweave.launch.run_methods import affects
 from support.sweeping import command, results, short_road, sweep
 
 LISTS = ("--volumes", "1200,1600", "--seeds", "1:3")

@@ -11,7 +11,7 @@ import pytest
 
 from laneweave.launch.watch.frames import scene_of
 from laneweave.launch.web import road_script, text_of
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 
 NODE = shutil.which("node")
 pytestmark = pytest.mark.skipif(

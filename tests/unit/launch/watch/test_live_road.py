@@ -12,7 +12,7 @@ from laneweave.launch.watch.frames import UNATTENDED, UNHEARD, compact
 from laneweave.launch.watch.live_road import STILL_S, LiveRoad
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.codec import decode, encode
 from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, LogEvent, Name
 from support.convoy import BALLOT, ROLLING, Convoy

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laneweave.protocol.config.loading import load_scenario, parse_scenario, to_tables
-from laneweave.protocol.scenario.tables import FormationSettings, Scenario
+from laneweave.protocol.scenario.fields import FormationSettings, Scenario
 from support.refusals import refusal
 
 FOLDER = Path(__file__).parents[4] / "scenarios"

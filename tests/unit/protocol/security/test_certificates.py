@@ -11,8 +11,8 @@ import structlog
 
 from laneweave.launch.deploy.certificate_authority import issue, load_authority, make_authority
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.security.access import Credentials
 from laneweave.protocol.security.certificates import check_credentials, examine
+from laneweave.protocol.security.connection import Credentials
 from laneweave.protocol.wire.identities import parse_identity
 from support.refusals import refusal
 

@@ -45,7 +45,7 @@ from laneweave.protocol.runtime.transport import (
     TokenUp,
     Transport,
 )
-from laneweave.protocol.security.access import Access
+from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
 from laneweave.protocol.transports.zenoh.runner import run_core
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
@@ -205,7 +205,7 @@ run_router([sys.argv[1]], float(sys.argv[2]), ready=lambda: print("ready", flush
 MEMBER = """
 import sys, time
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
-from laneweave.protocol.security.access import Access
+from laneweave.protocol.security.connection import Access
 transport = ZenohTransport(Access(sys.argv[1], lease_s=float(sys.argv[2])), lambda delivery: None)
 transport.serve(sys.argv[4])
 transport.announce(sys.argv[3])

@@ -9,10 +9,7 @@ import pytest
 from attrs import evolve
 
 from laneweave.protocol.lattice import PlannedMove
-from laneweave.protocol.vehicle.execution import (
-    ExecutionPhase,
-    PlanExecution,
-)
+from laneweave.protocol.vehicle.plan_execution import ExecutionPhase, PlanExecution
 from laneweave.protocol.vehicle.plans import ownership_problems, plan_problems
 from laneweave.protocol.wire.messages import Deed, Plan, Prepare
 from support.rolling_samples import (

@@ -13,7 +13,7 @@ from attrs import evolve
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from laneweave.protocol.scenario.tables import Scenario, Vehicle
+from laneweave.protocol.scenario.fields import Scenario, Vehicle
 from laneweave.protocol.vehicle.motion import (
     ARRIVED_ACROSS_M,
     ARRIVED_ALONG_M,

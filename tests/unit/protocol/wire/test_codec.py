@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.validators import NAME_PATTERN
+from laneweave.protocol.field_validators import NAME_PATTERN
 from laneweave.protocol.wire import messages
 from laneweave.protocol.wire.codec import KINDS, MAX_BYTES, VERSION, decode, encode
 from laneweave.protocol.wire.messages import (

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from laneweave.protocol.scenario.tables import Scenario
-from laneweave.protocol.vehicle.braking import EmergencyBrake, last_tick_m
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.vehicle.emergency_brake import EmergencyBrake, last_tick_m
 from laneweave.protocol.vehicle.motion import Jerk, commanded_state, limited_jerk
 from laneweave.protocol.wire.messages import Name, Neighbour
 from laneweave.sim_bridge.bodies.motion_controller import MotionController, Rung

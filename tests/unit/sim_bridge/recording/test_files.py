@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 from attrs import astuple
 
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import Safety, TravelTime
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
 from laneweave.sim_bridge.recording import trajectories as trajectories_module

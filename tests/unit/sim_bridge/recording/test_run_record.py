@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from laneweave.protocol.config.loading import parse_scenario
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import Heartbeat, LogEvent, Name, Report
 from laneweave.sim_bridge.bodies.motion_controller import Rung
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps

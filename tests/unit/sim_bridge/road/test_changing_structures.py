@@ -14,7 +14,7 @@ from attrs import asdict
 
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.core import TickPhase
 from laneweave.sim_bridge.road.demand import Arrival
 from support.bridge_bench import Street, arrival, read_summary

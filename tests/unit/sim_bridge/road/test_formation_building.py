@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laneweave.protocol.lattice import Lattice
-from laneweave.protocol.scenario.tables import FormationSettings, Scenario
+from laneweave.protocol.scenario.fields import FormationSettings, Scenario
 from laneweave.protocol.wire.messages import ClosedFormation
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission, EntryMeter

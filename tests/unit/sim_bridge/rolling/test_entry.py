@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.lattice import Cell, Lattice
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.road.demand import Arrival, arrivals
 from laneweave.sim_bridge.road.entry import Admission, EntryMeter

@@ -11,11 +11,11 @@ import pytest
 
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.baselines.lc2013 import check_lc2013
 from laneweave.sim_bridge.sumo.network import write_network
+from laneweave.sim_bridge.sumo.sumo_world import SumoWorld
 from laneweave.sim_bridge.sumo.traffic import SumoTraffic
-from laneweave.sim_bridge.sumo.world import SumoWorld
 
 
 def written(

@@ -36,14 +36,8 @@ from scipy.optimize import linear_sum_assignment
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
 from laneweave.coordinator.planning.exact.arrays import Floats, Ints, move_arrays, teams
 from laneweave.coordinator.planning.exact.branching_kernel import FULL, STUCK, search
-from laneweave.coordinator.planning.exact.negotiation import Negotiation
-from laneweave.coordinator.planning.exact.reachability import explore
-from laneweave.coordinator.planning.exact.relaxation import (
-    Relaxation,
-    Stack,
-    upper_bound_of,
-)
-from laneweave.coordinator.planning.exact.relaxation_kernel import (
+from laneweave.coordinator.planning.exact.lagrangian_bound import Relaxation, Stack, upper_bound_of
+from laneweave.coordinator.planning.exact.lagrangian_kernel import (
     BEST,
     FOUND,
     OPEN,
@@ -52,6 +46,8 @@ from laneweave.coordinator.planning.exact.relaxation_kernel import (
     REFUTED,
     UNREACHABLE,
 )
+from laneweave.coordinator.planning.exact.negotiation import Negotiation
+from laneweave.coordinator.planning.exact.reachability import explore
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.problem import Problem, Search, Solution
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from laneweave.coordinator.planning.exact.relaxation_kernel import (
+from laneweave.coordinator.planning.exact.lagrangian_kernel import (
     OPEN,
     REFUTED,
     STEP_SIZE,

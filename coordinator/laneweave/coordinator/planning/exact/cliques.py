@@ -16,7 +16,12 @@ from collections.abc import Iterator
 from functools import lru_cache
 from itertools import product
 
-from laneweave.coordinator.planning.conflicts import ConflictModel, Move, Offset, conflict_offsets
+from laneweave.coordinator.planning.conflict_model import (
+    ConflictModel,
+    Move,
+    Offset,
+    conflict_offsets,
+)
 from laneweave.protocol.lattice import Mode, displacements
 
 Clique = tuple[Offset, ...]

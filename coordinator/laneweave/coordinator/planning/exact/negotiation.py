@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from laneweave.coordinator.planning.exact.arrays import Floats, Ints, MoveArrays, Teams
+from laneweave.coordinator.planning.exact.lagrangian_kernel import PARKED, UNREACHABLE
 from laneweave.coordinator.planning.exact.negotiation_kernel import improve_paths, negotiate
-from laneweave.coordinator.planning.exact.relaxation_kernel import PARKED, UNREACHABLE
 
 _HORIZON, _HORIZON_GROWTH, _MAX_HORIZON = 2.0, 1.25, 10.0
 """The horizon relative to the steps with multipliers, and its growth if it was too short."""

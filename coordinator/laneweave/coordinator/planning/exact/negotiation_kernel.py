@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from laneweave.coordinator.planning.exact.relaxation_kernel import PARKED, PER_MOVE, penalty_of
+from laneweave.coordinator.planning.exact.lagrangian_kernel import PARKED, PER_MOVE, penalty_of
 from laneweave.coordinator.planning.random_kernel import random_below
 
 NOT_IN_TIME = 1_000_000

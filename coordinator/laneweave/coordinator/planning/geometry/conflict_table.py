@@ -23,8 +23,8 @@ from typing import Final
 
 import numpy as np
 
-from laneweave.coordinator.planning.conflicts import MAX_OFFSET, ConflictTable, Pair
-from laneweave.coordinator.planning.geometry.bodies import (
+from laneweave.coordinator.planning.conflict_model import MAX_OFFSET, ConflictTable, Pair
+from laneweave.coordinator.planning.geometry.swept_bodies import (
     FRONT,
     LEFT,
     REAR,

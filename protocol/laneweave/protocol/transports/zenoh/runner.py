@@ -25,7 +25,7 @@ from laneweave.protocol.runtime.node import (
     run_job,
 )
 from laneweave.protocol.runtime.processes import stop_signals
-from laneweave.protocol.security.access import Access
+from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import connect
 from laneweave.protocol.wire.messages import Name
 from laneweave.protocol.wire.topics import Keys

@@ -9,7 +9,7 @@ import base64
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from laneweave.protocol.security.access import Access, Credentials, RouterGuard
+from laneweave.protocol.security.connection import Access, Credentials, RouterGuard
 
 DROP_AFTER_US = 50
 OPEN_MS = 2000

@@ -21,6 +21,7 @@ import structlog
 import zenoh
 
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.field_validators import check_endpoint
 from laneweave.protocol.runtime.metrics import Observe, RouterMetrics, unobserved
 from laneweave.protocol.runtime.processes import stop_signals
 from laneweave.protocol.runtime.transport import (
@@ -34,10 +35,9 @@ from laneweave.protocol.runtime.transport import (
     TokenUp,
     learn,
 )
-from laneweave.protocol.security.access import Access, RouterGuard
 from laneweave.protocol.security.certificates import check_credentials
+from laneweave.protocol.security.connection import Access, RouterGuard
 from laneweave.protocol.transports.zenoh.settings import Setting, client_settings, router_settings
-from laneweave.protocol.validators import check_endpoint
 from laneweave.protocol.wire.codec import MAX_BYTES
 from laneweave.protocol.wire.topics import Party, Quality
 

@@ -7,14 +7,14 @@ from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.budget import Budget
 from laneweave.coordinator.planning.exact.branching import Branching
-from laneweave.coordinator.planning.exact.relaxation import upper_bound_of
-from laneweave.coordinator.planning.exact.relaxation_kernel import PER_MOVE
-from laneweave.coordinator.planning.facade import plan
+from laneweave.coordinator.planning.exact.lagrangian_bound import upper_bound_of
+from laneweave.coordinator.planning.exact.lagrangian_kernel import PER_MOVE
 from laneweave.coordinator.planning.grid import Grid
+from laneweave.coordinator.planning.plan_validator import problems_of_response
 from laneweave.coordinator.planning.problem import Problem
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanResponse
-from laneweave.coordinator.planning.validator import problems_of_response
+from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.bench.request_families import formation_request
 from laneweave.protocol.lattice import Cell, Mode
 from support.planning_oracles import requests

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from laneweave.coordinator.planning.exact.arrays import MoveArrays, Teams, move_arrays, teams
+from laneweave.coordinator.planning.exact.lagrangian_bound import Relaxation
+from laneweave.coordinator.planning.exact.lagrangian_kernel import PARKED
 from laneweave.coordinator.planning.exact.negotiation import Negotiation
-from laneweave.coordinator.planning.exact.relaxation import Relaxation
-from laneweave.coordinator.planning.exact.relaxation_kernel import PARKED
-from laneweave.coordinator.planning.facade import plan
+from laneweave.coordinator.planning.plan_validator import problems_of_response
 from laneweave.coordinator.planning.request import PlanRequest
-from laneweave.coordinator.planning.validator import problems_of_response
+from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.bench.request_families import formation_request
 from laneweave.protocol.lattice import Mode
 

@@ -11,7 +11,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from laneweave.agents.driving.trajectory import move_profile
-from laneweave.coordinator.planning.conflicts import (
+from laneweave.coordinator.planning.conflict_model import (
     MAX_OFFSET,
     PAPER_KINDS,
     ConflictModel,
@@ -20,20 +20,20 @@ from laneweave.coordinator.planning.conflicts import (
     is_oblique,
 )
 from laneweave.coordinator.planning.geometry import conflict_table as clearances
-from laneweave.coordinator.planning.geometry.bodies import (
-    BodyGeometry,
-    Floats,
-    minimum_jerk_path,
-    outline,
-)
 from laneweave.coordinator.planning.geometry.conflict_table import (
     conflict_table,
     min_clearances,
     pairs_closer_than,
 )
+from laneweave.coordinator.planning.geometry.swept_bodies import (
+    BodyGeometry,
+    Floats,
+    minimum_jerk_path,
+    outline,
+)
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, Mode, displacements, footprint
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from oracles.moving_bodies import Bodies, least_gap_m
 
 NEAR = range(-MAX_OFFSET, MAX_OFFSET + 1)

@@ -9,11 +9,11 @@ import attrs
 import numpy as np
 import pytest
 
-from laneweave.coordinator.planning.geometry.bodies import BodyGeometry
+from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.launch.bench.request_families import formation_request
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.scenario.tables import Scenario
+from laneweave.protocol.scenario.fields import Scenario
 from oracles.moving_bodies import Bodies, motion
 
 

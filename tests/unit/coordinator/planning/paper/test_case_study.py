@@ -9,8 +9,7 @@ import math
 import pytest
 
 from laneweave.coordinator.planning.budget import Budget
-from laneweave.coordinator.planning.conflicts import ConflictModel
-from laneweave.coordinator.planning.facade import plan
+from laneweave.coordinator.planning.conflict_model import ConflictModel
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.paper.assignments import (
     Assignment,
@@ -22,9 +21,10 @@ from laneweave.coordinator.planning.paper.assignments import (
 from laneweave.coordinator.planning.paper.cbs import ConstraintTree, Improvements, Node
 from laneweave.coordinator.planning.paper.explanation import entries
 from laneweave.coordinator.planning.path_map import RelativePathMap
+from laneweave.coordinator.planning.plan_validator import problems_of_response
 from laneweave.coordinator.planning.problem import Problem, Solution
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
-from laneweave.coordinator.planning.validator import problems_of_response
+from laneweave.coordinator.planning.solve import plan
 
 CELLS = ((0, 0), (0, 2), (1, 1), (2, 0), (2, 2))
 VEHICLE_GROUPS = (1, 1, 2, 2, 3)

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
 from laneweave.coordinator.planning.paper.cbs import ConstraintTree, Improvements, Node
 from laneweave.coordinator.planning.path_map import RelativePathMap
+from laneweave.coordinator.planning.plan_validator import problems_of_paths
 from laneweave.coordinator.planning.problem import Solution
 from laneweave.coordinator.planning.request import PlanRequest
-from laneweave.coordinator.planning.validator import problems_of_paths
 from support.planning_oracles import cheapest_plan, requests
 
 ENOUGH = 600

@@ -6,14 +6,14 @@ import attrs
 from hypothesis import given, settings
 
 from laneweave.coordinator.planning.budget import Budget
-from laneweave.coordinator.planning.facade import plan
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.paper.cbs import Improvements
 from laneweave.coordinator.planning.paper.joint_search import JointSearch
 from laneweave.coordinator.planning.paper.tappa import Tappa
 from laneweave.coordinator.planning.path_map import RelativePathMap
+from laneweave.coordinator.planning.plan_validator import problems_of_paths
 from laneweave.coordinator.planning.request import PlanRequest
-from laneweave.coordinator.planning.validator import problems_of_paths
+from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.bench.request_families import traffic_request
 from support.planning_oracles import cheapest_plan, requests
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from laneweave.coordinator.planning.conflicts import ConflictModel
+from laneweave.coordinator.planning.conflict_model import ConflictModel
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.paper.constraints import (
     Conflict,
@@ -21,7 +21,7 @@ from laneweave.coordinator.planning.paper.constraints import (
 from laneweave.coordinator.planning.problem import Bans, Diagram, MoveTable, Path, bits
 from laneweave.coordinator.planning.shortest_paths import choose_path, shortest_paths
 from laneweave.protocol.lattice import Mode
-from laneweave.protocol.scenario.tables import CONFLICT_KINDS
+from laneweave.protocol.scenario.fields import CONFLICT_KINDS
 
 STEPS = 3
 Case = tuple[MoveTable, tuple[Diagram, Diagram], tuple[Path, Path]]

@@ -1,0 +1,329 @@
+"""The tracker's quadratic program: costs, constraint rows and their bounds.
+
+In error coordinates z = z_ref + e, u = u_ref + w, over N ticks of h seconds:
+
+    minimise    sum_k 1/2 (e_k' Q e_k + w_k' R w_k) + 1/2 e_N' S e_N + 1/2 G sum_k g_k^2
+    subject to  e_{k+1} = A e_k + B w_k + c_k                  exact: jerks are constant per tick
+                0 <= v_k <= v_max,  a_min <= a_k <= a_max,  |a_y,k| <= a_y,max
+                |v_y,k| <= slip v_k                            no sliding sideways
+                |j_s,k| <= j_max,  |j_y,k| <= j_y,max
+                earliest_k <= s_k - g_k <= latest_k            vehicles behind and ahead (`Gaps`)
+
+c is zero for a reference that obeys the dynamics. S is the cost to go of the unconstrained problem.
+On the reference the solution is zero, which the solver's tolerance cannot spoil; in absolute
+coordinates the tolerance leaves 1.6 m/s3 of noise on the jerk. The slack g has a quadratic penalty:
+an exact (linear) one takes four times as long. All matrices are set up once; a tick changes bounds.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+from attrs import define, frozen
+from numpy.typing import NDArray
+from scipy import sparse
+
+from laneweave.agents.driving.qp_solver import QPResult, QPScale, QPSettings, QuadraticProgram
+from laneweave.agents.driving.regulator import (
+    JERK_WEIGHT,
+    LATERAL_WEIGHTS,
+    WEIGHTS,
+    axis_matrices,
+    cost_to_go,
+)
+from laneweave.protocol.scenario.fields import Scenario, Vehicle
+from laneweave.protocol.vehicle.motion import State, integrate
+
+Array = NDArray[np.float64]
+
+_GAP_WEIGHT = 10.0
+# A fixed rho leaves nothing behind but the warm start, so a reset is complete.
+SETTINGS = QPSettings(
+    eps_abs=6e-3,
+    max_iter=100,
+    check_termination=4,
+    rho=0.1,
+    adaptive_rho_interval=0,
+    alpha=1.25,
+    row_tolerance=2e-2,
+)
+_GAP_SCALE, _JERK_SCALE = 20.0, 0.4
+"""Row scales for OSQP; other rows have 1. With 1 for all, active gap rows take 300 iterations."""
+_STATE_SCALE = 0.3
+"""Scale of states and slacks for OSQP; jerks have 1, since their gradient must vanish."""
+FAR_M = 1e4
+"""Bound of a gap row without a vehicle: finite, so that OSQP keeps the row's type and factors."""
+_MAX_PUSH_M = 1.0
+"""Vehicles behind push a vehicle at most this far ahead of its reference: they can brake, too."""
+_SPEED_TOLERANCE_MPS = 0.3
+_SLIP_TOLERANCE_MPS = 0.1
+"""By how much OSQP's prediction may violate these limits near standstill."""
+
+
+@frozen(eq=False)
+class Gaps:
+    """Positions that other vehicles leave free for the front bumper, now and at N ticks [m].
+
+    Commanded positions, each (N + 1,); infinite where there is no vehicle.
+    """
+
+    earliest: Array | None = None
+    """Lower bounds set by vehicles behind; None: there are none."""
+    latest: Array | None = None
+    """Upper bounds set by vehicles ahead; None: there are none."""
+
+    def check(self, ticks: int) -> None:
+        """Check the shapes for a horizon of N ticks.
+
+        Raises:
+            ValueError: one is not (N + 1,).
+        """
+        shape = (ticks + 1,)
+        for name, positions in (("earliest", self.earliest), ("latest", self.latest)):
+            if positions is not None and positions.shape != shape:
+                raise ValueError(f"{name} has shape {positions.shape}, expected {shape}")
+
+
+NO_GAPS = Gaps()
+
+
+@define(eq=False)
+class ErrorBounds:
+    """Smallest and largest errors beside a reference at which no limit is exceeded, for n ticks.
+
+    Unlike the program's bounds they have no tolerance near standstill: the fast path of the
+    tracker is exact.
+    """
+
+    low: Array
+    """(5, n): of v, a, a_y, v_y - slip v and v_y + slip v; -inf for none."""
+    high: Array
+    """Likewise; +inf for none."""
+    low_jerk: Array
+    """(n, 2)."""
+    high_jerk: Array
+
+    @classmethod
+    def beside(cls, states: Array, jerks: Array, limits: Vehicle) -> ErrorBounds:
+        """Return the bounds beside states (n, 6) and jerks (n, 2).
+
+        The tolerance is added and subtracted again, so that both kinds of bounds round alike.
+        """
+        _, speed, accel, _, slip, lateral_accel = states.T
+        low, high = np.full((5, len(states)), -np.inf), np.full((5, len(states)), np.inf)
+        low[0] = (-_SPEED_TOLERANCE_MPS - speed) + _SPEED_TOLERANCE_MPS
+        high[0] = limits.max_speed_mps - speed
+        low[1] = limits.min_accel_mps2 - accel
+        high[1] = limits.max_accel_mps2 - accel
+        low[2] = -limits.max_lateral_accel_mps2 - lateral_accel
+        high[2] = limits.max_lateral_accel_mps2 - lateral_accel
+        margin = limits.max_slip_ratio * speed + _SLIP_TOLERANCE_MPS
+        high[3] = (margin - slip) - _SLIP_TOLERANCE_MPS
+        low[4] = -(margin + slip) + _SLIP_TOLERANCE_MPS
+        max_jerk = np.array([limits.max_jerk_mps3, limits.max_lateral_jerk_mps3])
+        return cls(low, high, -(max_jerk + jerks), max_jerk - jerks)
+
+    def part(self, first: int, end: int) -> ErrorBounds:
+        """Return the bounds of ticks `first` to `end`, excluding `end`."""
+        return ErrorBounds(
+            self.low[:, first:end],
+            self.high[:, first:end],
+            self.low_jerk[first:end],
+            self.high_jerk[first:end],
+        )
+
+
+class RowBounds:
+    """One bound vector (14 N,) and views of its blocks."""
+
+    def __init__(self, n: int) -> None:
+        """Begin with zeros for N ticks."""
+        self.all = np.zeros(14 * n)
+        self.dynamics = self.all[: 6 * n].reshape(n, 6)
+        self.speed = self.all[6 * n : 7 * n]
+        self.accel = self.all[7 * n : 8 * n]
+        self.lateral_accel = self.all[8 * n : 9 * n]
+        self.slip_left = self.all[9 * n : 10 * n]
+        self.slip_right = self.all[10 * n : 11 * n]
+        self.jerk = self.all[11 * n : 13 * n].reshape(n, 2)
+        self.limits = self.all[6 * n : 13 * n]
+        self.gap = self.all[13 * n :]
+
+
+class TrackingProgram:
+    """The program of one vehicle: bounds that change at each tick, and OSQP to solve it."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Prepare the bounds; OSQP is set up when it is needed first.
+
+        Most vehicles never need OSQP, and its set-up takes as long as hundreds of ticks.
+        """
+        n = self._n = scenario.horizon_ticks
+        self._tick_s = scenario.runtime.tick_s
+        self._limits = scenario.vehicle
+        self._jerk_limits = np.array(
+            [self._limits.max_jerk_mps3, self._limits.max_lateral_jerk_mps3]
+        )
+        self.cost = _cost(n, self._tick_s)
+        """P, sparse, over x = (e_1 .. e_N, w_0 .. w_N-1, g_1 .. g_N)."""
+        self.rows = _rows(n, self._tick_s, self._limits.max_slip_ratio)
+        """A, sparse; the first 6 N rows are the dynamics."""
+        self.low, self.high = _initial_bounds(n)
+        self._gaps = NO_GAPS
+        self._qp: QuadraticProgram | None = None
+        self._stale = False
+
+    def discard_solution(self) -> None:
+        """Do not start the next solution from the previous one: the situation has changed."""
+        self._stale = True
+
+    def solve(self) -> QPResult:
+        """Solve with the bounds that were written last."""
+        qp = self._qp
+        if qp is None:
+            qp = self.set_up()
+        if self._stale:
+            qp.reset()
+            self._stale = False
+        qp.update(self.low.all, self.high.all)
+        return qp.solve()
+
+    def set_up(self) -> QuadraticProgram:
+        """Set OSQP up with initial bounds, so that the result does not depend on the moment."""
+        low, high = _initial_bounds(self._n)
+        self._qp = QuadraticProgram(
+            self.cost,
+            self.rows,
+            low.all,
+            high.all,
+            settings=SETTINGS,
+            scale=program_scale(self._n),
+        )
+        return self._qp
+
+    def jerks(self, result: QPResult) -> Array:
+        """Return the jerks w (N, 2) of a solution."""
+        return result.x[6 * self._n : 8 * self._n].reshape(-1, 2)
+
+    def write_bounds(
+        self, error: State, states: Array, jerks: Array, defect: Array | None, gaps: Gaps
+    ) -> None:
+        """Write all bounds.
+
+        Args:
+            error: e_0.
+            states: the reference (N + 1, 6).
+            jerks: its jerks (N, 2).
+            defect: c (N, 3) of the axis along the road; None for zero.
+            gaps: positions that other vehicles leave free.
+        """
+        low, high, limits = self.low, self.high, self._limits
+        low.dynamics[:] = 0.0
+        if defect is not None:
+            low.dynamics[:, :3] -= defect
+        self.write_gaps(states, gaps)
+        low.dynamics[0] -= integrate(error, (0.0, 0.0), self._tick_s)
+        high.dynamics[:] = low.dynamics
+
+        _, speed, accel, _, slip, lateral_accel = states[1:].T
+        np.subtract(-_SPEED_TOLERANCE_MPS, speed, out=low.speed)
+        np.subtract(limits.max_speed_mps, speed, out=high.speed)
+        np.subtract(limits.min_accel_mps2, accel, out=low.accel)
+        np.subtract(limits.max_accel_mps2, accel, out=high.accel)
+        np.subtract(-limits.max_lateral_accel_mps2, lateral_accel, out=low.lateral_accel)
+        np.subtract(limits.max_lateral_accel_mps2, lateral_accel, out=high.lateral_accel)
+        margin = limits.max_slip_ratio * speed
+        margin += _SLIP_TOLERANCE_MPS
+        np.subtract(margin, slip, out=high.slip_left)
+        np.add(margin, slip, out=low.slip_right)
+        np.negative(low.slip_right, out=low.slip_right)
+        np.subtract(self._jerk_limits, jerks, out=high.jerk)
+        np.add(self._jerk_limits, jerks, out=low.jerk)
+        np.negative(low.jerk, out=low.jerk)
+
+    def write_gaps(self, states: Array, gaps: Gaps) -> None:
+        """Write the bounds of the gap rows for a reference (N + 1, 6)."""
+        low, high = self.low.gap, self.high.gap
+        if gaps.latest is not None:
+            np.subtract(gaps.latest[1:], states[1:, 0], out=high)
+            # Where even the yielding path violates a gap, the row asks for the path only.
+            high.clip(0.0, FAR_M, out=high)
+        elif self._gaps.latest is not None:
+            high[:] = FAR_M
+        if gaps.earliest is not None:
+            np.subtract(gaps.earliest[1:], states[1:, 0], out=low)
+            low.clip(-FAR_M, _MAX_PUSH_M, out=low)
+            np.minimum(low, high, out=low)
+        elif self._gaps.earliest is not None:
+            low[:] = -FAR_M
+        self._gaps = gaps
+
+    def admit_zero(self) -> None:
+        """Widen the limits' bounds so that zero, the reference itself, is a solution."""
+        np.minimum(self.low.limits, 0.0, out=self.low.limits)
+        np.maximum(self.high.limits, 0.0, out=self.high.limits)
+
+
+def program_scale(n: int) -> QPScale:
+    """Return the units in which OSQP solves the program over n ticks fast."""
+    rows = RowBounds(n)
+    rows.all[:] = 1.0
+    rows.jerk[:] = _JERK_SCALE
+    rows.gap[:] = _GAP_SCALE
+    unknowns = np.full(9 * n, _STATE_SCALE)
+    unknowns[6 * n : 8 * n] = 1.0
+    return QPScale(rows.all, unknowns)
+
+
+def _initial_bounds(n: int) -> tuple[RowBounds, RowBounds]:
+    """Return lower and upper bounds in which those that never change are set."""
+    low, high = RowBounds(n), RowBounds(n)
+    low.slip_left[:] = -np.inf
+    high.slip_right[:] = np.inf
+    low.gap[:], high.gap[:] = -FAR_M, FAR_M
+    return low, high
+
+
+@cache
+def _rows(n: int, h: float, slip: float) -> Any:  # noqa: ANN401 - scipy.sparse has no types
+    """Return A, rows in the order of `RowBounds`."""
+    transition, effect = axis_matrices(h)
+    eye = sparse.eye(n)
+    shift = sparse.diags([np.ones(n - 1)], [-1], shape=(n, n))
+    step = sparse.kron(shift, np.kron(np.eye(2), transition)) - sparse.eye(6 * n)
+    drive = sparse.kron(eye, np.kron(np.eye(2), effect))
+
+    def pick(*row: float) -> Any:  # noqa: ANN401
+        return sparse.kron(eye, np.array([row]))
+
+    return sparse.bmat(
+        [
+            [step, drive, None],
+            [pick(0, 1, 0, 0, 0, 0), None, None],
+            [pick(0, 0, 1, 0, 0, 0), None, None],
+            [pick(0, 0, 0, 0, 0, 1), None, None],
+            [pick(0, -slip, 0, 0, 1, 0), None, None],
+            [pick(0, slip, 0, 0, 1, 0), None, None],
+            [None, sparse.eye(2 * n), None],
+            [pick(1, 0, 0, 0, 0, 0), None, -eye],
+        ],
+        format="csc",
+    )
+
+
+@cache
+def _cost(n: int, h: float) -> Any:  # noqa: ANN401
+    """Return P."""
+    stage = sparse.block_diag([WEIGHTS, LATERAL_WEIGHTS])
+    last = sparse.block_diag([cost_to_go(WEIGHTS, h), cost_to_go(LATERAL_WEIGHTS, h)])
+    return sparse.block_diag(
+        [
+            sparse.kron(sparse.eye(n - 1), stage),
+            last,
+            JERK_WEIGHT * sparse.eye(2 * n),
+            _GAP_WEIGHT * sparse.eye(n),
+        ],
+        format="csc",
+    )

@@ -1,0 +1,361 @@
+"""Planning of formations: orders, and what becomes of the results (rule L5).
+
+The planning itself runs beside the core (`Compute`), one formation at a time; here its orders are
+written and its results turned into plans, into failures, or into formations that are joined because
+one alone lacks room.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Mapping
+from functools import partial
+from typing import Any
+
+from attrs import define, field
+
+from laneweave.coordinator.ballots.ballot_round import FAILED, TOO_LATE, BallotPhase
+from laneweave.coordinator.formations.leader import FormationLeader
+from laneweave.coordinator.formations.pacing import comfortable_steps, paced, steps_of
+from laneweave.coordinator.formations.roster import (
+    STAGE_LEAD_S,
+    Formation,
+    Groups,
+    Numbers,
+    on_tick,
+    stage_begin_s,
+    start_time_s,
+    steps_left,
+    time_left_s,
+)
+from laneweave.coordinator.formations.sorting import Sorting, SortingTask, sort_lanes
+from laneweave.coordinator.operation import LogEntry
+from laneweave.coordinator.planning.paper.assignments import Weights
+from laneweave.coordinator.planning.response import PlanResponse
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.runtime.node import Compute, Computed
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.vehicle.plans import plan_problems
+from laneweave.protocol.wire.events import (
+    FORMATION_TOO_LATE,
+    FORMATIONS_JOINED,
+    LANE_OUT_OF_REACH,
+    NEIGHBOURS_AWAITED,
+    PLAN_MADE,
+    PLANNING_FAILED,
+    ROOM_AWAITED,
+    STRUCTURE_IMPOSSIBLE,
+    STRUCTURE_TOO_LATE,
+)
+from laneweave.protocol.wire.messages import Ballot, Plan
+
+START_MARGIN_S = 0.5
+"""A plan that is made late starts this much road time after it is ready."""
+ROOM_S = 2.5
+"""Longest wait of a formation that lacks room for the next one to close (road time)."""
+SHORTEST_DEADLINE_S = 1.0
+"""Deadline of planning where the first move could begin at once."""
+LONGEST_DEADLINE_S = 15.0
+"""Deadline of planning where the first move is far off: the other formations wait meanwhile."""
+MAX_DOUBLINGS = 4
+"""The bound on search nodes doubles with each failed planning, this often."""
+PACE_WINDOW_S = 2.0
+"""Measurement window of the road's pace (node clock)."""
+LOGGED = (
+    *("status", "cost", "lower_bound", "steps", "solve_ms"),
+    *("assignments_tried", "nodes_expanded", "solver", "fallback"),
+)
+"""Fields of a response that are logged with its plan."""
+MIN_PACE = 0.1
+"""Lowest pace, so that deadlines stay finite while the road stands still."""
+
+
+@define
+class RoadPace:
+    """Ratio of road time to the node's clock, measured from the messages of the road's clock."""
+
+    pace: float = field(default=1.0, init=False)
+    """Road seconds per second of the node's clock, as measured last."""
+    _since: tuple[float, float] | None = field(default=None, init=False)
+    """Road time and node clock when the measurement under way began."""
+
+    def on_clock(self, t_s: float, now_s: float) -> None:
+        """Process a clock message.
+
+        Args:
+            t_s: road time; a smaller one than before restarts the measurement.
+            now_s: node clock.
+        """
+        if self._since is None or t_s < self._since[0]:
+            self._since = t_s, now_s
+            return
+        road_s, node_s = t_s - self._since[0], now_s - self._since[1]
+        if node_s >= PACE_WINDOW_S:
+            self.pace = max(road_s / node_s, MIN_PACE)
+            self._since = t_s, now_s
+
+
+class FormationPlanner:
+    """Orders and results of planning."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        groups: Groups,
+        leaders: Mapping[int, FormationLeader],
+        new_job: Callable[[], int],
+    ) -> None:
+        """Begin with nothing ordered.
+
+        Args:
+            scenario: road, lattice, settings of planning.
+            groups: which formations are joined; it grows here.
+            leaders: of all formations, each under its lowest block.
+            new_job: returns the number of a new computation.
+        """
+        self._scenario = scenario
+        self._groups = groups
+        self._leaders = leaders
+        self._new_job = new_job
+        self._waiting: dict[int, tuple[Ballot, Callable[[], Sorting]]] = {}
+        """Orders that have not begun, oldest first: for each formation its ballot and the work."""
+        self._under_way: tuple[int, int, Ballot] | None = None
+        """Number, formation and ballot of the computation under way."""
+        self.pace = RoadPace()
+        """From which deadlines follow."""
+        formation = scenario.formation
+        oblique = formation.weight_oblique
+        self._weights = Weights(
+            formation.weight_straight, formation.oblique_steps if oblique is None else oblique
+        )
+
+    def forget(self) -> None:
+        """Drop all orders that have not begun."""
+        self._waiting.clear()
+
+    def _deadline_s(self, start_s: float, t_s: float) -> float:
+        """Return the deadline: that of the scenario, or the time until the first move."""
+        given_s = self._scenario.formation.planning_deadline_s
+        if given_s is not None:
+            return given_s
+        until_start_s = (start_s - t_s) / self.pace.pace
+        return min(max(until_start_s, SHORTEST_DEADLINE_S), LONGEST_DEADLINE_S)
+
+    def order(
+        self, leader: FormationLeader, t_s: float, now_s: float
+    ) -> Iterator[Compute | LogEntry]:
+        """Order a plan from the promises of a formation; give up if no step fits in.
+
+        Args:
+            leader: in phase `PLANNING`.
+            t_s: road time.
+            now_s: node clock.
+        """
+        numbers, ballot = leader.formation.numbers, leader.ballot
+        assert ballot is not None  # noqa: S101 (set before planning begins)
+        formation, scenario = leader.formation, self._scenario
+        block_of = scenario.lattice.block_of
+        # A promise of a cell elsewhere makes planning fail; it says nothing of the time left.
+        cells = [cell for cell in leader.hold_cells.values() if block_of(cell[0]) in numbers]
+        cells = cells or self._block_cells(numbers)
+        start_s, end_s = self._start_s(formation, cells, t_s), self._end_s(formation)
+        if not formation.sorts and end_s < start_s + scenario.cycles_s[0]:
+            leader.take(FAILED, now_s)
+            yield LogEntry(STRUCTURE_TOO_LATE, {"formation": numbers[0], "stage": formation.stage})
+            return
+        if steps_left(cells, start_s, scenario.cycles_s[0], scenario) == 0:
+            leader.take(TOO_LATE, now_s)
+            yield LogEntry(FORMATION_TOO_LATE, {"formation": numbers[0]})
+            return
+        task = SortingTask(
+            numbers,
+            leader.hold_cells,
+            {member.vehicle: member.preferred_lane for member in leader.formation.members},
+            leader.unattended,
+            scenario,
+            self._deadline_s(start_s, t_s),
+            comfortable_steps(start_s, end_s, scenario),
+            formation.deserted,
+            None if formation.sorts else scenario.formation.structures[formation.stage],
+        )
+        nodes = scenario.formation.max_nodes * 2 ** min(leader.failures, MAX_DOUBLINGS)
+        # An order under an earlier ballot is replaced, and waits for its turn anew.
+        self._waiting.pop(numbers[0], None)
+        # In the job: promises that cannot be planned from fail there, as any failed planning does.
+        self._waiting[numbers[0]] = ballot, partial(sort_lanes, task, nodes, self._weights)
+        yield from self._begin()
+
+    def _begin(self) -> Iterator[Compute]:
+        """Begin with the oldest order that is still wanted, unless a computation is under way."""
+        while self._waiting and self._under_way is None:
+            number = next(iter(self._waiting))
+            ballot, work = self._waiting.pop(number)
+            if self._wanted(number, ballot):
+                self._under_way = self._new_job(), number, ballot
+                yield Compute(self._under_way[0], work)
+
+    def _wanted(self, number: int, ballot: Ballot) -> bool:
+        """Return whether the leader of a formation still waits for a plan under a ballot."""
+        leader = self._leaders.get(number)
+        return (
+            leader is not None
+            and (leader.ballot, leader.phase) == (ballot, BallotPhase.PLANNING)
+            and leader.formation.numbers == self._groups.of(number)
+        )
+
+    def _end_s(self, formation: Formation) -> float:
+        """Return the road time by which the plan of a formation should have ended.
+
+        That is when its next plan is to be made, or when its foremost column leaves the road.
+        """
+        if not formation.sorts:
+            next_s = stage_begin_s(formation.numbers, formation.stage + 1, self._scenario)
+            return next_s - STAGE_LEAD_S
+        front = self._scenario.lattice.block_range(formation.numbers[0])[-1]
+        return time_left_s([(front, 0)], 0.0, self._scenario)
+
+    def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterator[Compute | LogEntry]:
+        """Take a result, drop it if it is not wanted any more, and begin with the next order.
+
+        Args:
+            computed: the result of a job, a `Sorting`, or an error.
+            t_s: road time.
+            now_s: node clock.
+        """
+        if self._under_way is None or computed.job != self._under_way[0]:
+            return
+        _, number, ballot = self._under_way
+        self._under_way = None
+        if self._wanted(number, ballot):
+            yield from self._use(computed, self._leaders[number], t_s, now_s)
+        yield from self._begin()
+
+    def _use(
+        self, computed: Computed, leader: FormationLeader, t_s: float, now_s: float
+    ) -> Iterator[LogEntry]:
+        number = leader.formation.numbers[0]
+        result, error, status = computed.result, computed.error, "error"
+        if isinstance(result, Sorting):
+            status = result.response.status if result.response is not None else "optimal"
+            if result.short_of_room and self._join_neighbour(leader, t_s):
+                yield LogEntry(FORMATIONS_JOINED, {"formations": list(self._groups.of(number))})
+                return
+            if result.short_of_room and self._room_is_coming(leader.formation.numbers, t_s):
+                leader.take(FAILED, now_s)
+                yield LogEntry(ROOM_AWAITED, {"formation": number})
+                return
+            if result.solved:
+                planned = self._plan(leader, result, t_s)
+                plan = self._paced(planned, leader, t_s)
+                problems = plan_problems(plan)
+                if not problems:
+                    leader.on_plan(plan, now_s, result.out_of_reach)
+                    pauses = steps_of(plan) - steps_of(planned)
+                    yield from _notes(leader.formation, result, pauses, plan)
+                    return
+                error = "; ".join(problems)
+        leader.take(FAILED, now_s)
+        data = {"formation": number, "status": status, "error": error}
+        yield LogEntry(PLANNING_FAILED, data)
+
+    def _join_neighbour(self, leader: FormationLeader, t_s: float) -> bool:
+        """Join a formation that lacks room with a neighbour; false when none can help.
+
+        Both plan under one ballot from now on.
+        """
+        numbers, most = leader.formation.numbers, self._scenario.formation.max_joined
+        for other in self._neighbours(numbers):
+            if other.phase is BallotPhase.GIVEN_UP:
+                continue
+            if leader.formation.joined + other.formation.joined > most:
+                continue
+            union = (*numbers, *other.formation.numbers)
+            if self._steps_left_in(union, t_s) > 0:
+                return self._groups.join(union)
+        return False
+
+    def _steps_left_in(self, numbers: Numbers, t_s: float) -> int:
+        """Return how many steps fit in for all cells of some blocks."""
+        cells, scenario = self._block_cells(numbers), self._scenario
+        start_s = start_time_s(cells, t_s + START_MARGIN_S, scenario)
+        return steps_left(cells, start_s, scenario.cycles_s[0], scenario)
+
+    def _block_cells(self, numbers: Numbers) -> list[Cell]:
+        lattice = self._scenario.lattice
+        return [cell for number in numbers for cell in lattice.block_cells(number)]
+
+    def _neighbours(self, numbers: Numbers) -> Iterator[FormationLeader]:
+        """Yield the formation behind and the one ahead, as far as there are any."""
+        for number in (numbers[-1] + 1, numbers[0] - 1):
+            neighbour = self._leaders.get(self._groups.of(number)[0])
+            if neighbour is not None:
+                yield neighbour
+
+    def _room_is_coming(self, numbers: Numbers, t_s: float) -> bool:
+        """Return whether the next formation, which may be joined, is about to close."""
+        formation, lattice = self._scenario.formation, self._scenario.lattice
+        if formation.closes_by_vehicles or len(numbers) >= formation.max_joined:
+            return False
+        rear = lattice.block_range(numbers[-1] + 1)[0]
+        closes_s = lattice.passing_time_s(rear) + formation.entry_spread_s
+        return closes_s - ROOM_S < t_s <= closes_s + START_MARGIN_S
+
+    def _plan(self, leader: FormationLeader, sorting: Sorting, t_s: float) -> Plan:
+        t0_s = self._start_s(leader.formation, leader.hold_cells.values(), t_s)
+        slot_s = self._scenario.cycles_s[0]
+        return leader.make_plan(leader.formation.numbers, sorting.moves, t0_s, slot_s)
+
+    def _paced(self, plan: Plan, leader: FormationLeader, t_s: float) -> Plan:
+        """Choose the slots of a plan; it begins when its vehicles have settled in their cells."""
+        formation, cells = leader.formation, plan.start_cells.values()
+        others = self._plans_beside(plan)
+        if not formation.sorts:
+            return paced(plan, others, plan.t0_s, self._end_s(formation), self._scenario)
+        end_s = time_left_s({*cells, *plan.territory}, 0.0, self._scenario)
+        not_before_s = max(self._settled_s(cells), t_s + START_MARGIN_S)
+        return paced(plan, others, not_before_s, end_s, self._scenario)
+
+    def _plans_beside(self, plan: Plan) -> list[Plan]:
+        """Return the plans of the neighbours that this leader has made and that are driven."""
+        if "closing" not in self._scenario.formation.conflict_kinds:
+            return []
+        return [
+            neighbour.plan
+            for neighbour in self._neighbours(plan.formations)
+            # In other phases it has been outbid, or given up, and is not what is driven.
+            if neighbour.plan is not None
+            and neighbour.plan.ballot == neighbour.ballot
+            and neighbour.phase in (BallotPhase.ISSUING, BallotPhase.IN_FORCE)
+        ]
+
+    def _start_s(self, formation: Formation, cells: Collection[Cell], t_s: float) -> float:
+        """Return the road time at which a formation may begin to move."""
+        if formation.sorts:
+            return start_time_s(cells, t_s + START_MARGIN_S, self._scenario)
+        begin_s = stage_begin_s(formation.numbers, formation.stage, self._scenario)
+        return on_tick(max(begin_s, self._settled_s(cells), t_s + START_MARGIN_S), self._scenario)
+
+    def _settled_s(self, cells: Collection[Cell]) -> float:
+        """Return the road time at which vehicles that entered in some cells rest in them."""
+        formation, lattice = self._scenario.formation, self._scenario.lattice
+        rear = min(column for column, _ in cells)
+        return lattice.passing_time_s(rear) + formation.entry_spread_s + formation.settle_s
+
+
+def _notes(formation: Formation, sorting: Sorting, pauses: int, plan: Plan) -> Iterator[LogEntry]:
+    number = formation.numbers[0]
+    if sorting.impossible:
+        data = {"formation": number, "stage": formation.stage, "why": sorting.impossible}
+        yield LogEntry(STRUCTURE_IMPOSSIBLE, data)
+    if sorting.response is not None:
+        timing = {"t0_s": plan.t0_s, "slot_s": plan.slot_s}
+        yield LogEntry(PLAN_MADE, _facts(number, sorting.response) | timing)
+    if pauses:
+        yield LogEntry(NEIGHBOURS_AWAITED, {"formation": number, "slots": pauses})
+    if sorting.out_of_reach:
+        vehicles = [str(name) for name in sorting.out_of_reach]
+        yield LogEntry(LANE_OUT_OF_REACH, {"formation": number, "vehicles": vehicles})
+
+
+def _facts(number: int, response: PlanResponse) -> dict[str, Any]:
+    facts = {name: getattr(response, name) for name in LOGGED}
+    return {"formation": number, "vehicles": len(response.paths), **facts}

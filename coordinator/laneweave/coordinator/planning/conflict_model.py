@@ -1,0 +1,220 @@
+"""The paper's conflict model: which two moves must not be made in the same step.
+
+Section "Conflict model" defines node conflicts, edge conflicts and four special types of edge
+conflict. Which special types matter depends on the lane width and on the column pitch, so each can
+be chosen separately. Every kind is symmetric in the two vehicles.
+
+Two kinds go beyond the paper. `geometric` compares footprints, the cells that the execution
+protocol reserves; with a `ConflictTable`, computed from sizes and motions (`geometry`), it is that
+table. `closing` leaves enough distance for an emergency brake.
+
+Conflicts depend on the relative position of two vehicles only, so one table of offsets serves all
+grids (`conflict_offsets`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from functools import lru_cache
+from itertools import product
+from typing import Final
+
+import attrs
+
+from laneweave.protocol.lattice import Cell, Mode, displacements, footprint
+from laneweave.protocol.scenario.fields import BASE_CONFLICTS, CONFLICT_KINDS
+
+Move = tuple[Cell, Cell]
+"""From-cell and to-cell of one step; both are equal when the vehicle waits."""
+Pair = tuple[Cell, Cell, Cell]
+"""Offset from A's cell to B's, displacement of A, displacement of B."""
+Offset = tuple[int, int, int]
+"""Columns and lanes from A's cell to B's, and the number of B's displacement."""
+
+PAPER_KINDS: Final = ("node", "edge", "special-1", "special-2", "special-3", "special-4")
+DEFAULT_KINDS: Final[dict[Mode, tuple[str, ...]]] = {1: BASE_CONFLICTS, 2: ("geometric",)}
+
+MAX_OFFSET: Final = 2
+"""Moves from cells that are further apart, in columns or lanes, are in conflict only if their kind
+is in `_COLUMNS_OF_KIND`."""
+CLOSING_COLUMNS: Final = 3
+"""Columns between two vehicles that close up from two free columns to none."""
+_COLUMNS_OF_KIND: Final = {"closing": CLOSING_COLUMNS}
+
+
+def is_wait(move: Move) -> bool:
+    """Return whether the vehicle stays in its cell."""
+    return move[0] == move[1]
+
+
+def is_oblique(move: Move) -> bool:
+    """Return whether the move changes column and lane at once."""
+    return move[0][0] != move[1][0] and move[0][1] != move[1][1]
+
+
+def is_longitudinal(move: Move) -> bool:
+    """Return whether the move changes the column only."""
+    return move[0][0] != move[1][0] and move[0][1] == move[1][1]
+
+
+def is_lateral(move: Move) -> bool:
+    """Return whether the move changes the lane only."""
+    return move[0][0] == move[1][0] and move[0][1] != move[1][1]
+
+
+def corners(move: Move) -> frozenset[Cell]:
+    """Return the two cells that an oblique move passes between."""
+    return frozenset({(move[0][0], move[1][1]), (move[1][0], move[0][1])})
+
+
+def _node(a: Move, b: Move) -> bool:
+    """Both arrive at the same cell, or one moves to where the other waits."""
+    return a[1] == b[1]
+
+
+def _edge(a: Move, b: Move) -> bool:
+    """The paths overlap (swap) or cross (two diagonals): both move and share their midpoint."""
+    if is_wait(a) or is_wait(b):
+        return False
+    return a[0][0] + a[1][0] == b[0][0] + b[1][0] and a[0][1] + a[1][1] == b[0][1] + b[1][1]
+
+
+def _special_1(a: Move, b: Move) -> bool:
+    """A moves into the cell that B is leaving."""
+    return a[1] == b[0] and not is_wait(a) and not is_wait(b)
+
+
+def _triangle(a: Move, b: Move) -> bool:
+    """A is oblique, and B starts or ends at a corner of the square between A's cells.
+
+    The corner and A's cells are a right triangle. B's other cell may lie outside of the square: a
+    vehicle that enters or leaves the corner blocks A as much as one that stays (ADR 27).
+    """
+    return is_oblique(a) and not corners(a).isdisjoint(b)
+
+
+def _geometric(a: Move, b: Move) -> bool:
+    return not footprint(*a).isdisjoint(footprint(*b))
+
+
+def _closing(a: Move, b: Move) -> bool:
+    """A moves forwards; B, three columns ahead, moves backwards; both touch a common lane."""
+    return (
+        a[1][0] - a[0][0] == 1
+        and b[1][0] - b[0][0] == -1
+        and b[0][0] - a[0][0] == CLOSING_COLUMNS
+        and not {a[0][1], a[1][1]}.isdisjoint((b[0][1], b[1][1]))
+    )
+
+
+_PREDICATES: Final[dict[str, Callable[[Move, Move], bool]]] = {
+    "node": _node,
+    "edge": _edge,
+    "special-1": _special_1,
+    "special-2": lambda a, b: is_longitudinal(b) and _triangle(a, b),
+    "special-3": lambda a, b: is_lateral(b) and _triangle(a, b),
+    "special-4": lambda a, b: is_wait(b) and _triangle(a, b),
+    "geometric": _geometric,
+    "closing": _closing,
+}
+
+
+def _as_kinds(kinds: Iterable[str]) -> tuple[str, ...]:
+    chosen = frozenset(kinds)
+    unknown = chosen.difference(CONFLICT_KINDS)
+    if unknown:
+        known = ", ".join(CONFLICT_KINDS)
+        raise ValueError(f"unknown conflict kinds {sorted(unknown)}; known: {known}")
+    return tuple(kind for kind in CONFLICT_KINDS if kind in chosen)
+
+
+@attrs.frozen
+class ConflictTable:
+    """The pairs of moves that bring two bodies too close; see `geometry.conflict_table`.
+
+    any_lateness: the table holds however late a move begins.
+    """
+
+    pairs: frozenset[Pair]
+    any_lateness: bool
+
+
+@attrs.frozen
+class ConflictModel:
+    """The kinds of conflict that a plan must avoid, in the order of `CONFLICT_KINDS`.
+
+    node: both vehicles end in the same cell, including a move to a waiting vehicle.
+    edge: the two paths cross or overlap: a swap, or crossing diagonals.
+    special-1: A moves into B's current cell while B moves to another one; this also forbids trains
+        of vehicles in the same direction.
+    special-2, special-3, special-4: A moves obliquely, B moves longitudinally, moves laterally or
+        stays, and three of their initial and target cells form a right triangle: B leaves, enters
+        or stays at a corner of the square between A's cells.
+    geometric: without a table, the footprints intersect (`lattice.footprint`). The execution
+        protocol reserves footprints, so this holds for any lateness. It contains all kinds above
+        and any `ConflictTable`. With a table, exactly the pairs in the table.
+    closing: A moves forwards, straight or obliquely, B moves backwards and starts three columns
+        ahead of A, and some lane is the from-lane or to-lane of both. No other kind contains it.
+    """
+
+    kinds: tuple[str, ...] = attrs.field(converter=_as_kinds)
+    table: ConflictTable | None = None
+
+    def __attrs_post_init__(self) -> None:
+        """Check that the table is used.
+
+        Raises:
+            ValueError: there is a table, but `geometric` is not among the kinds.
+        """
+        if self.table is not None and "geometric" not in self.kinds:
+            raise ValueError(f"a conflict table, but conflict kinds {self.kinds} without geometric")
+
+    @property
+    def reach(self) -> Cell:
+        """Columns and lanes between two from-cells beyond which no two moves conflict."""
+        columns = max(_COLUMNS_OF_KIND.get(kind, MAX_OFFSET) for kind in self.kinds or ("node",))
+        return columns, MAX_OFFSET
+
+    @property
+    def vehicles_share_cells(self) -> bool:
+        """Whether two vehicles may be in one cell.
+
+        Bodies that start or end in one cell are too close in every geometry.
+        """
+        return not {"node", "geometric"} & set(self.kinds)
+
+    def kind(self, a: Move, b: Move) -> str | None:
+        """Return the first kind of conflict between two moves made in the same step, or None."""
+        for kind in self.kinds:
+            if kind == "geometric" and self.table is not None:
+                if _relative(a, b) in self.table.pairs:
+                    return kind
+                continue
+            predicate = _PREDICATES[kind]
+            if predicate(a, b) or predicate(b, a):
+                return kind
+        return None
+
+
+def _relative(a: Move, b: Move) -> Pair:
+    offset = b[0][0] - a[0][0], b[0][1] - a[0][1]
+    return offset, _displacement(a), _displacement(b)
+
+
+def _displacement(move: Move) -> Cell:
+    return move[1][0] - move[0][0], move[1][1] - move[0][1]
+
+
+@lru_cache(maxsize=64)
+def conflict_offsets(mode: Mode, model: ConflictModel) -> tuple[tuple[Offset, ...], ...]:
+    """Return, per displacement of A, the offsets and displacements of B that conflict with it."""
+    steps = displacements(mode)
+    columns, lanes = (range(-reach, reach + 1) for reach in model.reach)
+
+    def conflicting(step: Cell) -> Iterator[Offset]:
+        for column, lane, (e, other) in product(columns, lanes, enumerate(steps)):
+            b = (column, lane), (column + other[0], lane + other[1])
+            if model.kind(((0, 0), step), b) is not None:
+                yield column, lane, e
+
+    return tuple(tuple(conflicting(step)) for step in steps)

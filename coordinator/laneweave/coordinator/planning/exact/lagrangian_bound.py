@@ -1,0 +1,259 @@
+"""A lower bound on the cost of all path sets: Lagrangian relaxation of the conflicts.
+
+Without conflicts the problem decomposes: each vehicle takes a shortest path, and targets are
+assigned at minimum cost. Every conflict clique in every step gets a Lagrange multiplier, which each
+move in the clique costs. The shortest paths then avoid contested cliques, and their cost minus the
+sum of all multipliers is a lower bound on every solution, whatever its number of steps: beyond the
+last step with multipliers vehicles ignore each other. Good multipliers are found by a subgradient
+method (Held, Wolfe and Crowder, Mathematical Programming 6, 1974) with momentum.
+
+At given multipliers each move of a team has a reduced cost, a lower bound on what it adds to every
+solution that contains it. So for a given upper bound, moves whose reduced cost is too high are
+forbidden (reduced-cost fixing), which makes the rest smaller and its lower bound higher.
+
+Costs are steps until the final arrival, and `PER_MOVE` for each move that is not a wait.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from laneweave.coordinator.planning.exact.arrays import (
+    Bools,
+    Floats,
+    Ints,
+    MoveArrays,
+    Teams,
+)
+from laneweave.coordinator.planning.exact.lagrangian_kernel import (
+    BEST,
+    BOUND,
+    PER_MOVE,
+    STEP_SIZE,
+    UNREACHABLE,
+    evaluate,
+    fix_by_reduced_cost,
+    improve,
+    list_moves,
+    may_need_more_steps,
+    start_over,
+)
+
+_ESTIMATE = -1.0
+"""Value for `goal` of `relaxation_kernel.improve`."""
+_TOLERANCE = 1e-6
+
+
+class Scratch(NamedTuple):
+    """Working memory of the compiled code. Shapes: T steps, R cliques; others as in `arrays`."""
+
+    cost_to_go: Floats
+    """(T + 1, X, P) minimum cost from a cell before a step to the target of a pair."""
+    parked: Floats
+    """(T + 1, P) multipliers of waiting at the target from a step on."""
+    move: Ints
+    """(moves, 3) displacement, from-cell and to-cell of the allowed moves, by step and team."""
+    move_from: Ints
+    """(T, K + 1) where the moves of a step and team begin."""
+    move_cost: Floats
+    """(moves,)"""
+    present: Floats
+    """(T, R) multipliers of the current iteration."""
+    direction: Floats
+    """(T, R)"""
+    use: Floats
+    """(T, R) number of vehicles in each clique on their cheapest paths; then the subgradient."""
+    mass: Floats
+    """(K, T, D, X) weights of the relaxed solutions that contain a move."""
+    mass_of_team: Floats
+    """(T, R, K)"""
+    mass_of_cell: Floats
+    """(T, R, numbers of from-cells in a clique)"""
+    reach: Floats
+    """(K, T + 1, X) minimum reduced cost at which a team reaches a cell before a step."""
+    min_cost: Floats
+    """(K, T + 1, X) minimum of `cost_to_go` minus the dual value of the target."""
+    cost: Floats
+    """(N, J)"""
+    holder: Ints
+    """(J,) the vehicle that has a target; -1: none."""
+    dual: Floats
+    """(J,) dual values of the targets."""
+    path: Ints
+    """(N, T) displacements of the vehicles; `PARKED`: arrived."""
+    best_path: Ints
+    """(N, T) paths of the best relaxed solution without conflicts."""
+
+
+class Stack(NamedTuple):
+    """The open nodes of branch and bound. Shapes: S nodes; others as above."""
+
+    allowed: Bools
+    """(S, K, T, D, X) moves that a team may make."""
+    earliest: Ints
+    """(S, P) earliest step before which a vehicle may have finally arrived."""
+    multipliers: Floats
+    """(S, T, R)"""
+    step_size: Floats
+    """(S,) factor of the step size."""
+
+
+def scratch(arrays: MoveArrays, teams: Teams, steps: int) -> Scratch:
+    """Return working memory for so many steps."""
+    displacements, cells = arrays.valid.shape
+    groups, goals = teams.pair.shape
+    vehicles, pairs, cliques = len(teams.start), len(teams.pair_cell), arrays.clique_count
+    max_moves = groups * steps * int(arrays.valid.sum())
+    return Scratch(
+        cost_to_go=np.zeros((steps + 1, cells, pairs)),
+        parked=np.zeros((steps + 1, pairs)),
+        move=np.zeros((max_moves, 3), dtype=np.int64),
+        move_from=np.zeros((steps, groups + 1), dtype=np.int64),
+        move_cost=np.zeros(max_moves),
+        present=np.zeros((steps, cliques)),
+        direction=np.zeros((steps, cliques)),
+        use=np.zeros((steps, cliques)),
+        mass=np.zeros((groups, steps, displacements, cells)),
+        mass_of_team=np.zeros((steps, cliques, groups)),
+        mass_of_cell=np.zeros((steps, cliques, arrays.residue_count)),
+        reach=np.zeros((groups, steps + 1, cells)),
+        min_cost=np.zeros((groups, steps + 1, cells)),
+        cost=np.zeros((vehicles, goals)),
+        holder=np.zeros(goals, dtype=np.int64),
+        dual=np.zeros(goals),
+        path=np.zeros((vehicles, steps), dtype=np.int64),
+        best_path=np.zeros((vehicles, steps), dtype=np.int64),
+    )
+
+
+def upper_bound_of(cost: int) -> float:
+    """Return an upper bound on the value of solutions of a cost, for any number of moves.
+
+    Values are multiples of `PER_MOVE`, so half of it is a margin for rounding.
+    """
+    return cost * (1.0 + PER_MOVE) + 0.5 * PER_MOVE
+
+
+class Relaxation:
+    """The relaxed problem at its best multipliers so far.
+
+    multipliers: (T, R); T is the number of steps in which cliques have multipliers.
+    """
+
+    def __init__(self, arrays: MoveArrays, teams: Teams, steps: int) -> None:
+        """Start with multipliers of 0 in so many steps."""
+        self.arrays = arrays
+        self.teams = teams
+        self.state = np.zeros(BEST + 1)
+        self.state[BOUND], self.state[STEP_SIZE], self.state[BEST] = -UNREACHABLE, 1.0, UNREACHABLE
+        self._allocate(np.zeros((steps, arrays.clique_count)))
+
+    def _allocate(self, multipliers: Floats) -> None:
+        self.multipliers = multipliers
+        self.scratch = scratch(self.arrays, self.teams, len(multipliers))
+        shape = len(self.teams.pair), len(multipliers), *self.arrays.valid.shape
+        self.allowed = np.empty(shape, dtype=np.bool_)
+        self.allowed[:] = self.arrays.valid
+        self.earliest = np.zeros(len(self.teams.pair_cell), dtype=np.int64)
+        # Forbid moves from cells that no vehicle can reach in time.
+        self._begin()
+        self._fix(self.allowed, self.earliest, self.multipliers, UNREACHABLE)
+        self._begin()
+
+    def _begin(self) -> None:
+        """List the allowed moves and reset the subgradient method."""
+        self._span = list_moves(self.arrays, self.allowed, self.scratch)[1]
+        start_over(self.multipliers, self._span, self.scratch, self.state)
+
+    def _fix(
+        self, allowed: Bools, earliest: Ints, multipliers: Floats, upper_bound: float
+    ) -> float:
+        bound, _ = fix_by_reduced_cost(
+            self.arrays,
+            self.teams,
+            allowed,
+            earliest,
+            multipliers,
+            self._span,
+            self.scratch,
+            upper_bound,
+        )
+        return float(bound)
+
+    @property
+    def min_cost(self) -> float:
+        """Lower bound on every solution, as a number of steps; infinite: there is none."""
+        bound = float(self.state[BOUND])
+        if bound >= UNREACHABLE:
+            return math.inf
+        return math.ceil(bound / (1.0 + PER_MOVE) - _TOLERANCE)
+
+    def stack(self, size: int) -> Stack:
+        """Return an empty stack for nodes of this problem."""
+        return Stack(
+            allowed=np.zeros((size, *self.allowed.shape), dtype=np.bool_),
+            earliest=np.zeros((size, *self.earliest.shape), dtype=np.int64),
+            multipliers=np.zeros((size, *self.multipliers.shape)),
+            step_size=np.ones(size),
+        )
+
+    def improve(self, iterations: int) -> None:
+        """Run some iterations of the subgradient method."""
+        improve(
+            self.arrays,
+            self.teams,
+            self.allowed,
+            self.earliest,
+            self.multipliers,
+            self._span,
+            self.scratch,
+            self.state,
+            iterations,
+            UNREACHABLE,
+            _ESTIMATE,
+        )
+
+    def assignment(self) -> Ints:
+        """Return (N,) the number of the best target of each vehicle at the multipliers."""
+        self._begin()
+        evaluate(self.arrays, self.teams, self.earliest, self.multipliers, self._span, self.scratch)
+        return self.held_targets()
+
+    def held_targets(self) -> Ints:
+        """Return (N,) the number of the target of each vehicle in the last relaxed solution."""
+        target = np.zeros(len(self.teams.start), dtype=np.int64)
+        taken = np.flatnonzero(self.scratch.holder >= 0)
+        target[self.scratch.holder[taken]] = taken
+        return target
+
+    def put(self, nodes: Stack, upper_bound: float) -> bool | None:
+        """Put the moves that solutions below an upper bound may contain at the bottom of a stack.
+
+        Returns:
+            Whether there may be such a solution; None: perhaps one with more steps than have
+            multipliers.
+        """
+        nodes.allowed[0], nodes.earliest[0] = self.allowed, self.earliest
+        nodes.multipliers[0], nodes.step_size[0] = self.multipliers, 1.0
+        self._begin()
+        bound = self._fix(nodes.allowed[0], nodes.earliest[0], nodes.multipliers[0], upper_bound)
+        if bound > upper_bound:
+            return False
+        steps = len(self.multipliers)
+        if self._span == steps and may_need_more_steps(
+            self.teams, steps, self.scratch, upper_bound - bound + _TOLERANCE
+        ):
+            return None
+        return True
+
+    def set_multipliers(self, multipliers: Floats) -> None:
+        """Continue from other multipliers."""
+        self.multipliers = multipliers.copy()
+
+    def lengthen(self, steps: int) -> None:
+        """Add multipliers for more steps; this discards the best relaxed solution so far."""
+        self.state[BEST] = UNREACHABLE
+        self._allocate(np.pad(self.multipliers, ((0, steps), (0, 0))))

@@ -1,0 +1,125 @@
+"""Check the plan of a stream, without code of the search.
+
+Only the definition of a conflict is shared, because plans are checked against it. Called for every
+plan before it is issued: about a millisecond for 130 vehicles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from functools import lru_cache
+
+from laneweave.coordinator.planning.conflict_model import ConflictModel
+from laneweave.coordinator.planning.rolling.problem import (
+    CellPath,
+    StreamPlan,
+    StreamRoad,
+    StreamVehicle,
+)
+from laneweave.protocol.lattice import Cell, Mode, displacements
+
+_ROUNDING_M = 1e-6
+
+
+def problems_of_plan(
+    road: StreamRoad,
+    plan: StreamPlan,
+    vehicles: Sequence[StreamVehicle],
+    blocked: Collection[Cell] = (),
+) -> list[str]:
+    """Return the errors in a plan for these vehicles; it may be issued if there are none."""
+    names = {vehicle.vehicle for vehicle in vehicles}
+    if plan.paths.keys() != names:
+        return [f"paths of {sorted(plan.paths)} for vehicles {sorted(names)}"]
+    barred = frozenset(blocked)
+    problems: list[str] = []
+    for vehicle in vehicles:
+        problems += _problems_of_path(road, plan.slot, vehicle, plan.paths[vehicle.vehicle], barred)
+    missed = {
+        v.vehicle
+        for v in vehicles
+        if plan.paths[v.vehicle][-1:] != () and plan.paths[v.vehicle][-1][1] != v.lane
+    }
+    if set(plan.missed) != missed:
+        problems.append(f"says that {sorted(plan.missed)} miss their lanes, not {sorted(missed)}")
+    return problems or list(_conflicts(road, plan))
+
+
+def _problems_of_path(
+    road: StreamRoad, slot: int, vehicle: StreamVehicle, path: CellPath, blocked: frozenset[Cell]
+) -> Iterator[str]:
+    name = vehicle.vehicle
+    if not path or path[0] != vehicle.cell:
+        yield f"{name} starts at {path[:1]} instead of {vehicle.cell}"
+        return
+    here = path[0]
+    for s, there in enumerate(path[1:], start=slot):
+        if there != here:
+            yield from _problems_of_move(road, s, name, here, there, blocked)
+            if vehicle.held:
+                yield f"{name} is held, but moves in slot {s}"
+            here = there
+    ends_m = path[-1][0] * road.pitch_m + (slot + len(path) - 1) * road.advance_m
+    if ends_m <= road.length_m + _ROUNDING_M:
+        yield f"the path of {name} ends at {ends_m} m, on the road"
+    # Its last slot begins on the road.
+    if len(path) > 1:
+        last_m = path[-2][0] * road.pitch_m + (slot + len(path) - 2) * road.advance_m
+        if last_m > road.length_m + _ROUNDING_M:
+            yield f"the path of {name} goes on at {last_m} m, after the road"
+
+
+def _problems_of_move(
+    road: StreamRoad, slot: int, name: str, here: Cell, there: Cell, blocked: frozenset[Cell]
+) -> Iterator[str]:
+    columns, lanes = abs(there[0] - here[0]), abs(there[1] - here[1])
+    if (columns + lanes if road.mode == 1 else max(columns, lanes)) != 1:
+        yield f"{name} jumps from {here} to {there} in slot {slot}"
+    if not 0 <= there[1] < road.lanes:
+        yield f"{name} leaves the road to {there} in slot {slot}"
+    rear_m = min(here[0], there[0]) * road.pitch_m + slot * road.advance_m - road.body_m
+    front_m = max(here[0], there[0]) * road.pitch_m + (slot + 1) * road.advance_m
+    start_m, end_m = road.sorting_m
+    if rear_m < start_m - _ROUNDING_M or front_m > end_m + _ROUNDING_M:
+        yield f"{name} moves between {rear_m} m and {front_m} m in slot {slot}"
+    entered = {there, (here[0], there[1]), (there[0], here[1])} - {here}
+    if not blocked.isdisjoint(entered):
+        yield f"{name} enters {sorted(blocked & entered)}, blocked, in slot {slot}"
+
+
+def _conflicts(road: StreamRoad, plan: StreamPlan) -> Iterator[str]:
+    """Compare each move with those of all nearby vehicles in the same slot."""
+    near = {step: _near(road.mode, road.model, step) for step in displacements(road.mode)}
+    for s in range(max((len(path) for path in plan.paths.values()), default=1) - 1):
+        made: dict[Cell, tuple[Cell, str]] = {}
+        moving: list[Cell] = []
+        for name, path in plan.paths.items():
+            if s + 1 < len(path):
+                here, there = path[s], path[s + 1]
+                if here in made:
+                    yield f"{name} and {made[here][1]} are both in {here} in slot {plan.slot + s}"
+                made[here] = (there[0] - here[0], there[1] - here[1]), name
+                if here != there:
+                    moving.append(here)
+        for here in moving:
+            step, name = made[here]
+            for (column, lane), conflicting in near[step].items():
+                other = made.get((here[0] + column, here[1] + lane))
+                if other is not None and other[0] in conflicting:
+                    kind = conflicting[other[0]]
+                    yield f"{kind} conflict of {name} and {other[1]} in slot {plan.slot + s}"
+
+
+@lru_cache(maxsize=256)
+def _near(mode: Mode, model: ConflictModel, step: Cell) -> dict[Cell, dict[Cell, str]]:
+    """Return the conflicting displacements and their kinds, by offset of the other vehicle."""
+    columns, lanes = model.reach
+    found: dict[Cell, dict[Cell, str]] = {}
+    for column in range(-columns, columns + 1):
+        for lane in range(-lanes, lanes + 1):
+            for other in displacements(mode):
+                b = (column, lane), (column + other[0], lane + other[1])
+                kind = model.kind(((0, 0), step), b)
+                if kind is not None and (column, lane) != (0, 0):
+                    found.setdefault((column, lane), {})[other] = kind
+    return found

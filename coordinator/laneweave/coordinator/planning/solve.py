@@ -1,0 +1,194 @@
+"""Plan one request with the solver it asks for, and fall back on the other one."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Final
+
+import attrs
+
+from laneweave.coordinator.planning.budget import (
+    DEFAULT_MEMORY_MB,
+    Budget,
+    BudgetSpentError,
+    Clock,
+)
+from laneweave.coordinator.planning.paper.assignments import Weights
+from laneweave.coordinator.planning.paper.tappa import Tappa
+from laneweave.coordinator.planning.path_map import RelativePathMap
+from laneweave.coordinator.planning.plan_validator import problems_of_response
+from laneweave.coordinator.planning.problem import Problem, Search
+from laneweave.coordinator.planning.request import PlanRequest, checked_solver
+from laneweave.coordinator.planning.response import PlanResponse, Status
+from laneweave.coordinator.planning.shortest_paths import without_needless_moves
+from laneweave.protocol.scenario.fields import DEFAULT_SOLVER
+
+TAPPA_SHARE: Final = 0.75
+"""Share of the deadline, and of the node limit, after which branching replaces TAPPA.
+
+15,000 of the 20,000 nodes of a scenario take TAPPA 3 to 5 s of CPU for six to eight vehicles;
+branching needs 0.1 s for such formations (95th percentile), 0.6 s at most.
+"""
+MAX_NODES: Final = 500_000
+"""Bounds the memory of TAPPA's trees to about 1 GB; it takes minutes to get there."""
+
+
+@attrs.frozen
+class _Result:
+    """The result of a solver, without the memory of its search."""
+
+    solver: str
+    nodes: int
+    found: Search
+
+
+def plan(
+    request: PlanRequest,
+    *,
+    max_nodes: int | None = None,
+    max_memory_mb: float = DEFAULT_MEMORY_MB,
+    weights: Weights | None = None,
+    solver: str | None = None,
+    fallback: bool = True,
+    clock: Clock = time.monotonic,
+) -> PlanResponse:
+    """Plan one request; the plan is checked by code that shares nothing with the searches.
+
+    Equal requests get equal plans unless the deadline passes first.
+
+    Args:
+        request: what to plan.
+        max_nodes: limit on search nodes, which is repeatable; at most `MAX_NODES`.
+        max_memory_mb: limit on the arrays of branch and bound. Where it is reached the other
+            solver continues; with a path set and no proof the status is `feasible`.
+        weights: of the formation relative distance; they must give a lower bound.
+        solver: one of `SOLVERS`, instead of the request's; if neither names one, the default.
+        fallback: branching continues when TAPPA has spent `TAPPA_SHARE`, and the cheaper of both
+            path sets is returned; False: TAPPA may spend everything. A solver that cannot handle
+            the request at all is always replaced by the other one.
+        clock: returns the time in s.
+
+    Raises:
+        RuntimeError: the plan is wrong, which is an error in the planner.
+    """
+    started = clock()
+    asked_request, request = request, request.settled()
+    asked = checked_solver(solver or request.solver or DEFAULT_SOLVER)
+    weights = (weights or Weights.for_mode(request.mode)).checked(request.mode)
+    nodes = MAX_NODES if max_nodes is None else min(max_nodes, MAX_NODES)
+    problem = request.problem()
+    order = _order(asked, problem, fallback=fallback)
+    results: list[_Result] = []
+    for name in order:
+        if name == "branching":
+            began = clock()
+            _warm_up_branching()
+            started += clock() - began  # loading compiled code is not part of planning
+        shares = name == "tappa" and order[-1] != name
+        share = TAPPA_SHARE if shares else 1.0
+        left = nodes - sum(result.nodes for result in results)
+        budget = Budget(
+            deadline=started + share * request.deadline_s,
+            max_nodes=math.ceil(share * left),
+            max_memory_mb=max_memory_mb,
+            clock=clock,
+        )
+        results.append(_solve(name, problem, request, weights, budget))
+        if results[-1].found.finished or not (results[-1].found.gave_up or shares):
+            break
+    response = _response(request, problem, asked, results, started, clock)
+    if asked_request.structure is not None:
+        response = attrs.evolve(response, targets=request.targets)
+    problems = problems_of_response(asked_request, response)
+    if problems:
+        raise RuntimeError("the planner made a wrong plan: " + "; ".join(problems))
+    return response
+
+
+def _order(asked: str, problem: Problem, *, fallback: bool) -> tuple[str, ...]:
+    """Return the solvers to run, one after the other."""
+    if problem.table.model.vehicles_share_cells:
+        return ("tappa",)
+    if asked == "tappa":
+        return ("tappa", "branching") if fallback else ("tappa",)
+    return (asked, "tappa")
+
+
+def _solve(
+    solver: str, problem: Problem, request: PlanRequest, weights: Weights, budget: Budget
+) -> _Result:
+    """Run one solver until it has finished, gives up or has spent its budget."""
+    found = Search()
+    with suppress(BudgetSpentError):
+        search: Search
+        if solver == "branching":
+            from laneweave.coordinator.planning.exact.branching import Branching  # noqa: PLC0415
+
+            search = Branching(problem, request.choices(), budget)
+        else:
+            search = Tappa(request, problem, weights, budget)
+        search.run()
+        found = Search(**attrs.asdict(search, recurse=False))
+    return _Result(solver, budget.nodes, found)
+
+
+def _response(
+    request: PlanRequest,
+    problem: Problem,
+    asked: str,
+    results: Sequence[_Result],
+    started: float,
+    clock: Clock,
+) -> PlanResponse:
+    """Combine the results of the solvers: the cheapest path set and the highest lower bound."""
+    searches = [result.found for result in results]
+    found = [search.best for search in reversed(searches) if search.best is not None]
+    best = min(found, key=lambda solution: solution.cost, default=None)
+    if best is not None and not any(search.has_fewest_moves for search in searches):
+        budget = Budget(deadline=started + request.deadline_s, clock=clock)
+        best = without_needless_moves(problem, best, budget)
+    cells = [] if best is None else problem.cells_of(best)
+    path_map = RelativePathMap.padded([v.id for v in request.vehicles][: len(cells)], cells)
+    bound = max(search.lower_bound for search in searches)
+    cost = None if best is None else best.cost
+    finished = any(search.finished for search in searches) or cost == bound
+    last = results[-1].solver
+    return PlanResponse(
+        status=_status(found=best is not None, finished=finished),
+        cost=cost,
+        lower_bound=None if math.isinf(bound) else int(bound if cost is None else min(bound, cost)),
+        steps=None if best is None else path_map.steps,
+        assignment=() if best is None else best.assignment,
+        paths=path_map.rows,
+        solve_ms=round(1e3 * (clock() - started), 3),
+        assignments_tried=sum(search.tried for search in searches),
+        nodes_expanded=sum(result.nodes for result in results),
+        solver=last,
+        fallback=last != asked,
+    )
+
+
+def _status(*, found: bool, finished: bool) -> Status:
+    if found:
+        return "optimal" if finished else "feasible"
+    return "infeasible" if finished else "timeout"
+
+
+def warm_up() -> None:
+    """Load the compiled parts of all planners; compile them if there is no cache yet.
+
+    Loading takes a second, compiling a minute.
+    """
+    from laneweave.coordinator.planning.rolling import path_search as stream  # noqa: PLC0415 (numba is slow to load)
+
+    _warm_up_branching()
+    stream.warm_up()
+
+
+def _warm_up_branching() -> None:
+    from laneweave.coordinator.planning.exact import branching  # noqa: PLC0415
+
+    branching.warm_up()

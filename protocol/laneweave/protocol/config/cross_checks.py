@@ -1,0 +1,297 @@
+"""Checks between the fields of a scenario."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from operator import attrgetter, ge, gt, le, lt
+from typing import Any
+
+from laneweave.protocol.config.participants import identities_of, max_vehicles
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.field_validators import is_tls
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.vehicle.emergency_brake import min_pitch_m
+from laneweave.protocol.wire.identities import MAX_COMMON_NAME
+
+MIN_GAP_M = 1.0
+"""Minimum gap between bumpers of neighbouring cells: bodies turn, and track with some error."""
+MIN_SIDE_GAP_M = 0.5
+"""Minimum gap between bodies side by side, for the same reasons."""
+MAX_TICKS = 200
+"""Maximum horizon of the tracker."""
+MAX_SECURED_VEHICLES = 5000
+"""Maximum number of vehicles for which a router has rules."""
+
+_RELATIONS = {"at least": ge, "at most": le, "more than": gt, "less than": lt}
+_Comparison = tuple[str, str, float, str]
+"""(field, relation, limit, what the limit is)."""
+
+ROLLING_ONLY = ("sort_in_s2", "reward_drift")
+"""Fields of `formation` that only the rolling operation reads."""
+FORMATIONS_ONLY = (
+    "entry",
+    "close",
+    "max_vehicles",
+    "max_columns",
+    "max_joined",
+    "join",
+    "structures",
+    "solver",
+    "weight_straight",
+    "weight_oblique",
+    "planning_deadline_s",
+    "max_nodes",
+)
+"""Fields of `formation` that the rolling operation does not read."""
+
+
+def check_scenario(scenario: Scenario) -> None:
+    """Check the fields against each other.
+
+    Raises:
+        BadInputError: the first field that violates a rule.
+    """
+    for check in (
+        _check_lanes,
+        _check_motion,
+        _check_structures,
+        _check_timing,
+        _check_braking,
+        _check_settling,
+        _check_security,
+    ):
+        check(scenario)
+
+
+def check_effects(data: Mapping[str, Any], scenario: Scenario) -> None:
+    """Check that each value of a file's tables has an effect in the scenario that they define.
+
+    Raises:
+        BadInputError: the first field without an effect.
+    """
+    formation, given = scenario.formation, data.get("formation", {})
+    by_vehicles = formation.closes_by_vehicles
+    for fields, has_effect, allowed in (
+        (ROLLING_ONLY, formation.rolling, 'none, unless formation.operation is "rolling"'),
+        (FORMATIONS_ONLY, not formation.rolling, 'none where formation.operation is "rolling"'),
+        (("max_columns",), by_vehicles, 'none, unless formation.close is "vehicles"'),
+        (("join",), formation.max_joined > 1, "none, unless formation.max_joined is above 1"),
+        (("block_columns",), not by_vehicles, 'none, unless formation.close is "columns"'),
+    ):
+        for name in fields:
+            _require(name not in given or has_effect, f"formation.{name}", given.get(name), allowed)
+
+
+def _require(ok: bool, name: str, value: object, allowed: str) -> None:
+    if not ok:
+        raise BadInputError(name, value, allowed)
+
+
+def _compare(scenario: Scenario, comparisons: Iterable[_Comparison]) -> None:
+    """Check that fields have the stated relations to their limits."""
+    for name, relation, limit, meaning in comparisons:
+        value = attrgetter(name)(scenario)
+        _require(
+            _RELATIONS[relation](value, limit), name, value, f"{relation} {limit:g}: {meaning}"
+        )
+
+
+def _check_lanes(scenario: Scenario) -> None:
+    road, demand, vehicle = scenario.road, scenario.demand, scenario.vehicle
+    shares = demand.lane_shares
+    _require(
+        len(shares) in (0, road.lanes),
+        "demand.lane_shares",
+        list(shares),
+        f"one share for each of the {road.lanes} lanes of road.lanes, or none",
+    )
+    _require(
+        all(share >= 0 for share in shares) and (not shares or 0 < sum(shares) < math.inf),
+        "demand.lane_shares",
+        list(shares),
+        "numbers >= 0, not all 0, with a finite sum",
+    )
+    width_m = vehicle.width_m + MIN_SIDE_GAP_M
+    what = f"vehicle.width_m and {MIN_SIDE_GAP_M:g} between bodies side by side"
+    _compare(scenario, [("road.lane_width_m", "at least", width_m, what)])
+    _require(
+        3600.0 / demand.volume_veh_per_lane_h >= demand.min_headway_s,
+        "demand.volume_veh_per_lane_h",
+        demand.volume_veh_per_lane_h,
+        f"at most 3600 / demand.min_headway_s = {3600.0 / max(demand.min_headway_s, 1e-9):g}",
+    )
+
+
+def _check_motion(scenario: Scenario) -> None:
+    formation, vehicle = scenario.formation, scenario.vehicle
+    gap_m = max(scenario.tracking.min_gap_m, MIN_GAP_M)
+    what = f"vehicle.length_m, and tracking.min_gap_m between bumpers, at least {MIN_GAP_M:g}"
+    _compare(scenario, [("formation.gap_m", "at least", vehicle.length_m + gap_m, what)])
+    cycle_s, move_s = formation.cycle_s, formation.move_s
+    if move_s is not None:
+        allowed = "none without" if cycle_s is None else f"at most {cycle_s:g},"
+        ok = cycle_s is not None and move_s <= cycle_s
+        _require(ok, "formation.move_s", move_s, f"{allowed} formation.cycle_s")
+    max_mps = vehicle.max_speed_mps
+    _compare(scenario, [("formation.speed_mps", "less than", max_mps, "vehicle.max_speed_mps")])
+    _require(
+        (formation.weight_oblique or 0) <= formation.oblique_steps,
+        "formation.weight_oblique",
+        formation.weight_oblique,
+        "at most 1 in mode 2 (an oblique edge is one step), at most 2 in mode 1",
+    )
+    block_m = (formation.max_length - 1) * formation.gap_m
+    needed_m = block_m + vehicle.length_m + formation.speed_mps * scenario.cycles_s[0]
+    _compare(scenario, [("road.s3_m", "at least", needed_m, "a whole formation and one step")])
+    _require(
+        formation.executable,
+        "formation.conflicts",
+        sorted(formation.conflict_kinds),
+        "geometric, or in mode 1 node, edge and special-1: moves of one step must have disjoint "
+        "footprints to be executed without a timetable",
+    )
+
+
+def _check_structures(scenario: Scenario) -> None:
+    """Check that structures are in order along the road, before S3, and on existing lanes."""
+    road, before_m = scenario.road, -1.0
+    for number, structure in enumerate(scenario.formation.structures):
+        name = f"formation.structures[{number}]"
+        _require(
+            before_m < structure.from_m < road.sorting_start_m,
+            f"{name}.from_m",
+            structure.from_m,
+            f"ascending, and less than road.s1_m + road.s2_m = {road.sorting_start_m:g}",
+        )
+        before_m = structure.from_m
+        lanes = structure.lanes
+        _require(
+            len(set(lanes)) == len(lanes) and set(lanes) <= set(range(road.lanes)),
+            f"{name}.lanes",
+            list(lanes),
+            f"some of 0 to {road.lanes - 1}, each once",
+        )
+
+
+def _check_timing(scenario: Scenario) -> None:
+    network, runtime, formation = scenario.network, scenario.runtime, scenario.formation
+    shortest_s, longest_s = scenario.cycles_s
+    longest_move_s = longest_s - formation.slack_s
+    heartbeat_s, silent_s = network.heartbeat_s, runtime.agent_silent_s
+    _compare(
+        scenario,
+        [
+            ("network.election_s", "more than", 2 * heartbeat_s, "twice network.heartbeat_s"),
+            ("network.lease_s", "more than", heartbeat_s, "network.heartbeat_s"),
+        ],
+    )
+    for name, value in (
+        ("cycle_s", shortest_s),
+        ("cycle_s", longest_s),
+        ("move_s", shortest_s - formation.slack_s),
+    ):
+        allowed = f"a multiple of runtime.tick_s = {runtime.tick_s:g}, at least twice it"
+        _require(_in_ticks(scenario, value, 2), f"formation.{name}", value, allowed)
+    _require(
+        scenario.horizon_ticks * runtime.tick_s >= longest_move_s - 1e-6,
+        "tracking.horizon_ticks",
+        scenario.horizon_ticks,
+        f"long enough to hold a whole move of {longest_move_s:g} s, at most {MAX_TICKS}",
+    )
+    _require(
+        scenario.horizon_ticks <= MAX_TICKS,
+        "runtime.tick_s",  # a horizon that is given has its own bound
+        runtime.tick_s,
+        f"long enough for the longest T_F, {longest_s:g} s, to have at most {MAX_TICKS} ticks",
+    )
+    what = "runtime.agent_silent_s, so that a lost session is noticed before its agent is silent"
+    deadline_s = runtime.tick_deadline_s
+    _compare(
+        scenario,
+        [
+            ("runtime.tick_resend_s", "less than", deadline_s, "runtime.tick_deadline_s"),
+            ("runtime.tick_deadline_s", "at most", silent_s, "runtime.agent_silent_s"),
+            ("network.lease_s", "at most", silent_s, what),
+        ],
+    )
+
+
+def _in_ticks(scenario: Scenario, time_s: float, min_ticks: int) -> bool:
+    """Return whether a time is a whole number of ticks, and not too few."""
+    ticks = time_s / scenario.runtime.tick_s
+    return ticks >= min_ticks - 1e-6 and abs(ticks - round(ticks)) < 1e-6
+
+
+def _check_braking(scenario: Scenario) -> None:
+    reaction_s = scenario.braking.reaction_s
+    allowed = (
+        f"a multiple of runtime.tick_s = {scenario.runtime.tick_s:g}: sensors measure each tick"
+    )
+    _require(_in_ticks(scenario, reaction_s, 1), "braking.reaction_s", reaction_s, allowed)
+    gap_m, min_m = scenario.formation.gap_m, min_pitch_m(scenario)
+    _require(
+        gap_m >= min_m,
+        "formation.gap_m",
+        gap_m,
+        f"at least {math.ceil(1000.0 * min_m) / 1000.0:g}: a vehicle that holds behind another at "
+        f"formation.speed_mps = {scenario.formation.speed_mps:g} must not brake in emergency "
+        "(vehicle.length_m, the tables braking and sensing)",
+    )
+
+
+def _check_settling(scenario: Scenario) -> None:
+    """Check that a vehicle can settle in its cell within its limits.
+
+    The minimum-jerk motion from rest to rest over d in T takes a speed of 15/8 d/T, an acceleration
+    of 10/sqrt(3) d/T2 and a jerk of 60 d/T3.
+    """
+    formation, vehicle = scenario.formation, scenario.vehicle
+    offset_m = formation.entry_spread_s * formation.speed_mps
+    speed_mps = min(vehicle.max_speed_mps - formation.speed_mps, formation.speed_mps)
+    accel_mps2 = min(vehicle.max_accel_mps2, -vehicle.min_accel_mps2)
+    min_s = max(
+        15.0 / 8.0 * offset_m / speed_mps,
+        math.sqrt(10.0 / math.sqrt(3.0) * offset_m / accel_mps2),
+        math.cbrt(60.0 * offset_m / vehicle.max_jerk_mps3),
+    )
+    _require(
+        formation.settle_s >= min_s,
+        "formation.settle_s",
+        formation.settle_s,
+        f"at least {math.ceil(10.0 * min_s) / 10.0:g}: a vehicle that enters up to "
+        f"{offset_m:g} m beside its cell settles there within its limits",
+    )
+
+
+def _check_security(scenario: Scenario) -> None:
+    network, security = scenario.network, scenario.security
+    secured = security.mode == "mtls"
+    endpoints = [("network.endpoint", network.endpoint)] if network.endpoint else []
+    endpoints += [("network.listen", endpoint) for endpoint in network.listen]
+    for name, endpoint in endpoints:
+        if secured:
+            _require(
+                is_tls(endpoint), name, endpoint, "tls/HOST:PORT only, as security.mode is mtls"
+            )
+        else:
+            _require(not is_tls(endpoint), "security.mode", "off", f"mtls, as {name} is {endpoint}")
+    if not secured:
+        return
+    _require(bool(security.folder), "security.folder", "", "the folder of the certificates")
+    count = max_vehicles(scenario.demand, scenario.road.lanes)
+    _require(
+        count <= MAX_SECURED_VEHICLES,
+        "demand.duration_s",
+        scenario.demand.duration_s,
+        f"a demand of at most {MAX_SECURED_VEHICLES} vehicles where security.mode is mtls, this "
+        f"one may have {count}: the router has rules for each of them",
+    )
+    for identity in identities_of(scenario):
+        name = identity.common_name
+        _require(
+            len(name) <= MAX_COMMON_NAME,
+            f"security.{identity.party}s",
+            name,
+            f"at most {MAX_COMMON_NAME} characters: it is the common name of a certificate",
+        )

@@ -1,0 +1,161 @@
+"""The emergency brake: whether a vehicle must brake now, according to its own sensors.
+
+A vehicle decides at each tick. It continues for one more tick if it would still come to rest behind
+the vehicle ahead, should that one brake as hard as it can from now on and this one from the next
+tick on. Otherwise it brakes now, beyond its jerk limit: jerk-limited braking comes too late. By
+induction there is no impact: at every tick, braking from now on was enough one tick earlier
+(docs/SAFETY.md derives it, with the measurement errors).
+
+A body that moves at v with acceleration a and brakes with b through a first-order lag L travels
+
+    (v + L (a + b))^2 / (2 b)  -  L^2 (a + b)
+
+until it stands still. Lag costs a speed of L (a + b), which limits the reaction time: cells of
+length d_F and moves that take T_F leave little room (`config.checks`, and `check_moves` of the
+agents).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.vehicle.motion import Jerk, State
+from laneweave.protocol.wire.messages import Neighbour
+
+ERROR_SIGMAS = 4.5
+"""Measurement errors for which plans leave room, in standard deviations."""
+
+
+def stopping_distance_m(
+    speed_mps: float, accel_mps2: float, brake_mps2: float, lag_s: float
+) -> float:
+    """Return the distance that a body travels until it stands still, if it brakes from now on.
+
+    Args:
+        speed_mps: its speed, >= 0.
+        accel_mps2: its acceleration.
+        brake_mps2: its braking, > 0, which its acceleration approaches.
+        lag_s: time constant of that approach.
+    """
+    change = accel_mps2 + brake_mps2
+    gained = speed_mps + lag_s * change
+    travelled = gained * gained / (2.0 * brake_mps2) - lag_s * lag_s * change
+    # Near standstill the body stops before the lag has decayed; this is a lower bound.
+    return max(travelled, speed_mps * speed_mps / (2.0 * brake_mps2))
+
+
+def own_braking_mps2(scenario: Scenario) -> float:
+    """Return the braking that a vehicle assumes of itself: its own, but at most the one ahead's.
+
+    A vehicle that brakes harder than the one ahead may be closest to it before both stand still.
+    """
+    return min(-scenario.vehicle.min_accel_mps2, scenario.braking.lead_brake_mps2)
+
+
+def lead_lag_s(scenario: Scenario) -> float:
+    """Return the lag that is assumed of the brakes ahead: not longer than the vehicle's own."""
+    return min(scenario.braking.lead_lag_s, scenario.vehicle.actuator_lag_s)
+
+
+def lead_path_m(speed_mps: float, accel_mps2: float, brake_mps2: float, lag_s: float) -> float:
+    """Return the minimum distance that a vehicle ahead travels, if it brakes from now on."""
+    # It may stop accelerating at once; if it brakes harder than assumed, it continues to do so.
+    accel = min(max(accel_mps2, -brake_mps2), 0.0)
+    return stopping_distance_m(max(speed_mps, 0.0), accel, brake_mps2, lag_s)
+
+
+def spare_error_m(scenario: Scenario, speed_mps: float) -> float:
+    """Return the standard deviation of `EmergencyBrake.spare_m` that sensor errors cause.
+
+    Args:
+        scenario: tables `sensing`, `braking` and `vehicle`.
+        speed_mps: speed of the vehicle itself; the one ahead drives at v_F.
+    """
+    noise, assumed, limits = scenario.sensing, scenario.braking, scenario.vehicle
+    own_s = limits.actuator_lag_s + assumed.reaction_s + speed_mps / own_braking_mps2(scenario)
+    other_s = scenario.formation.speed_mps / assumed.lead_brake_mps2 + assumed.lead_lag_s
+    return math.hypot(
+        noise.gap_noise_m,
+        noise.speed_noise_mps * own_s,
+        noise.accel_noise_mps2 * limits.actuator_lag_s * own_s,
+        noise.other_speed_noise_mps * other_s,
+        noise.other_accel_noise_mps2 * assumed.lead_lag_s * other_s,
+    )
+
+
+def last_tick_m(brake_mps2: float, tick_s: float) -> float:
+    """Return the maximum extra distance because braking ends with a whole tick.
+
+    In its last tick a body brakes just hard enough to stand still at the end of it.
+    """
+    return brake_mps2 * tick_s * tick_s / 8.0
+
+
+class EmergencyBrake:
+    """Decides when a vehicle must brake, whatever its commands are."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Take the assumptions from the tables `braking` and `vehicle`, and the tick."""
+        limits, assumed = scenario.vehicle, scenario.braking
+        self._brake_mps2 = own_braking_mps2(scenario)
+        self._lag_s = limits.actuator_lag_s
+        self._lead_brake_mps2, self._lead_lag_s = assumed.lead_brake_mps2, lead_lag_s(scenario)
+        self._tick_s = scenario.runtime.tick_s
+        self._last_tick_m = last_tick_m(self._brake_mps2, self._tick_s)
+        self._later_s = max(assumed.reaction_s - self._tick_s, 0.0)
+        self._margin_m = assumed.margin_m
+
+    def spare_m(
+        self, state: State, setpoint_mps2: float, jerk: Jerk, others: Iterable[Neighbour]
+    ) -> float:
+        """Return the net gap beyond the margin that is left if all vehicles brake in time.
+
+        Args:
+            state: measured state of the body.
+            setpoint_mps2: set-point of its acceleration along the road.
+            jerk: its jerk until the next tick, within its limits; only that along the road counts.
+            others: vehicles ahead that it must not hit.
+
+        Returns:
+            Negative: it must brake now. Infinite: there is no vehicle ahead.
+        """
+        spare_m = float("inf")
+        own_m: float | None = None
+        for other in others:
+            if own_m is None:
+                own_m = self._own_path_m(state, setpoint_mps2, jerk[0])
+            path_m = lead_path_m(
+                other.speed_mps, other.accel_mps2, self._lead_brake_mps2, self._lead_lag_s
+            )
+            spare_m = min(spare_m, other.gap_m + path_m - own_m)
+        return spare_m - self._margin_m
+
+    def _own_path_m(self, state: State, setpoint_mps2: float, jerk_mps3: float) -> float:
+        """Return the distance that it travels if it brakes after its reaction time."""
+        _, v, a, _, _, _ = state
+        lag_s, tick_s, later_s = self._lag_s, self._tick_s, self._later_s
+        # The commanded state has no lag, and the body comes to rest where it does. It is integrated
+        # as in `integrate`, for a tick and for the rest of the reaction time.
+        speed, half = v + lag_s * a, tick_s * tick_s / 2.0
+        ahead_m = (
+            lag_s * v + speed * tick_s + setpoint_mps2 * half + jerk_mps3 * (half * tick_s / 3.0)
+        )
+        speed = speed + setpoint_mps2 * tick_s + jerk_mps3 * half
+        accel = setpoint_mps2 + jerk_mps3 * tick_s
+        ahead_m = ahead_m + speed * later_s + accel * (later_s * later_s / 2.0)
+        speed = max(speed + accel * later_s, 0.0)
+        return ahead_m + speed * speed / (2.0 * self._brake_mps2) + self._last_tick_m
+
+
+def min_pitch_m(scenario: Scenario) -> float:
+    """Return the minimum column pitch at which vehicles that hold one cell apart do not brake.
+
+    It leaves room for measurement errors up to `ERROR_SIGMAS`.
+    """
+    speed_mps, pitch_m = scenario.formation.speed_mps, scenario.formation.gap_m
+    ahead = Neighbour(0, pitch_m - scenario.vehicle.length_m, speed_mps)
+    holding = (0.0, speed_mps, 0.0, 0.0, 0.0, 0.0)
+    spare_m = EmergencyBrake(scenario).spare_m(holding, 0.0, (0.0, 0.0), [ahead])
+    return pitch_m - spare_m + ERROR_SIGMAS * spare_error_m(scenario, speed_mps)

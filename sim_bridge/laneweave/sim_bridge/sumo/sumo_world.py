@@ -1,0 +1,127 @@
+"""The road in SUMO, with bodies that SUMO shows but does not drive.
+
+SUMO shows every vehicle exactly where the plant says it is: position, lateral position, heading
+and speed, between lanes as well. It drives none of them. Each tick runs
+
+    place() every vehicle  ->  step()  ->  positions(), collisions()
+
+`place` gives SUMO the middle of the front bumper and the angle (moveToXY with keepRoute=2, which
+keeps both unchanged). During its step SUMO derives a speed of its own from the displacement;
+`step` replaces it by the vehicle's (setPreviousSpeed), so the speed read back is exact, too.
+
+There is one `SumoWorld` per process at a time, see `simulation`.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.vehicle.motion import State
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose, pose_of
+from laneweave.sim_bridge.sumo.network import EDGE, ROUTE, VEHICLE_TYPE, margin_m
+from laneweave.sim_bridge.sumo.simulation import SumoSession
+
+
+class SumoWorld(SumoSession):
+    """One road with vehicles in SUMO. Close it, or use it as a context manager."""
+
+    def __init__(self, scenario: Scenario, folder: Path) -> None:
+        """Start SUMO on an empty road; see `SumoSession`."""
+        super().__init__(scenario, folder)
+        margin = margin_m(scenario)
+        self._range_m = (-margin, scenario.road.length_m + margin)
+        """Positions at which SUMO can show vehicles."""
+        self._lane_width_m = scenario.road.lane_width_m
+        self._lanes = scenario.road.lanes
+        self._states: dict[str, State] = {}
+        self._placed: set[str] = set()
+        self._shown: list[str] = []
+
+    def add(self, vehicle: str, state: State) -> None:
+        """Put a new vehicle on the road; SUMO shows it from the next step on.
+
+        Raises:
+            ValueError: it is on the road already, or `state` is not on the edge.
+        """
+        if vehicle in self._states:
+            raise ValueError(f"{vehicle} is on the road already")
+        self._check(vehicle, state)  # before SUMO knows the vehicle
+        api = self.vehicle
+        api.add(vehicle, ROUTE, typeID=VEHICLE_TYPE, depart="now", departPos="0", departSpeed="0")
+        api.setSpeedMode(vehicle, 0)
+        api.setLaneChangeMode(vehicle, 0)
+        self._states[vehicle] = state
+        self._move(vehicle, state)
+
+    def place(self, vehicle: str, state: State) -> None:
+        """Set the state of a vehicle at the end of the next step.
+
+        Raises:
+            ValueError: the vehicle is not on the road, or `state` is not on the edge.
+        """
+        if vehicle not in self._states:
+            raise ValueError(f"{vehicle} is not on the road")
+        self._check(vehicle, state)
+        self._states[vehicle] = state
+        self._move(vehicle, state)
+
+    def step(self) -> None:
+        """Advance SUMO by one tick.
+
+        A vehicle that was not placed since the last step stays where it is.
+
+        Raises:
+            RuntimeError: SUMO shows other vehicles than those that were added (it never should).
+        """
+        if len(self._placed) < len(self._states):
+            for vehicle, state in self._states.items():
+                if vehicle not in self._placed:
+                    self._move(vehicle, state)
+        self._placed.clear()
+        super().step()
+        api = self.vehicle
+        if api.getIDCount() != len(self._states):
+            raise RuntimeError(f"SUMO shows {api.getIDCount()} of {len(self._states)} vehicles")
+        set_previous_speed = api.setPreviousSpeed
+        for vehicle, state in self._states.items():
+            set_previous_speed(vehicle, state[1], state[2])
+        self._shown = list(self._states)
+
+    def positions(self) -> dict[str, Pose]:
+        """Return the pose of each vehicle after the last step, in the order of addition."""
+        return self.poses(self._shown)
+
+    def remove(self, vehicle: str) -> None:
+        """Take a vehicle off the road.
+
+        Raises:
+            ValueError: it is not on the road.
+        """
+        if self._states.pop(vehicle, None) is None:
+            raise ValueError(f"{vehicle} is not on the road")
+        self._placed.discard(vehicle)
+        self._shown = [other for other in self._shown if other != vehicle]
+        self.vehicle.remove(vehicle)
+
+    def _check(self, vehicle: str, state: State) -> None:
+        """Reject a state that SUMO would map to another place."""
+        if not math.isfinite(sum(state)):
+            raise ValueError(f"{vehicle} must be at a finite state, not {state}")
+        low_m, high_m = self._range_m
+        if not low_m <= state[0] <= high_m:
+            raise ValueError(
+                f"{vehicle} must be at s in [{low_m:g}, {high_m:g}] m, not at {state[0]:g} m"
+            )
+
+    def _move(self, vehicle: str, state: State) -> None:
+        """Give SUMO the middle of the front bumper, its lane, and the angle."""
+        s_m, front_y_m, heading, _ = pose_of(state)
+        degrees = 90.0
+        if heading != 0.0:
+            front_y_m += self._half_body_m * math.sin(heading)
+            degrees -= math.degrees(heading)
+        lane = min(max(int(front_y_m // self._lane_width_m), 0), self._lanes - 1)
+        self.vehicle.moveToXY(vehicle, EDGE, lane, s_m, front_y_m, degrees, 2)
+        self._placed.add(vehicle)

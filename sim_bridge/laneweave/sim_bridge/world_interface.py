@@ -1,0 +1,65 @@
+"""The world in which bodies are shown, measured and sensed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol
+
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.vehicle.motion import State
+from laneweave.protocol.wire.messages import Name
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, Pose
+from laneweave.sim_bridge.recording.run_record import RunRecord
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
+
+
+class World(Protocol):
+    """Shows bodies; `SumoWorld` outside tests."""
+
+    def add(self, vehicle: str, state: State) -> None:
+        """Put a vehicle on the road."""
+
+    def place(self, vehicle: str, state: State) -> None:
+        """Set the state of a vehicle at the end of the next step."""
+
+    def step(self) -> None:
+        """Advance by one tick."""
+
+    def positions(self) -> dict[str, Pose]:
+        """Return the pose of each vehicle."""
+
+    def collisions(self) -> list[tuple[str, str]]:
+        """Return the pairs that the world itself reports as colliding."""
+
+    def remove(self, vehicle: str) -> None:
+        """Take a vehicle off the road."""
+
+
+def show_bodies(
+    world: World,
+    vehicles: Mapping[Name, RoadVehicle],
+    scenario: Scenario,
+    record: RunRecord,
+    t_s: float,
+) -> None:
+    """Show all bodies after a tick, record their poses, and update every vehicle's sensors.
+
+    The vehicles have already moved by one tick; `t_s` is the road time after it.
+    """
+    states = {name: vehicle.state for name, vehicle in vehicles.items()}
+    for name, state in states.items():
+        world.place(name, state)
+    world.step()
+    road, size = scenario.road, scenario.vehicle
+    bodies = Bodies(world.positions(), size.length_m, size.width_m)
+    accels_mps2: dict[str, float] = {name: state[2] for name, state in states.items()}
+    around = bodies.exact_neighbours(road.lanes, road.lane_width_m, accels_mps2)
+    for name, vehicle in vehicles.items():
+        vehicle.perceive(around[name])
+    record.on_shown(
+        t_s,
+        vehicles.values(),
+        overlaps=bodies.overlapping_pairs(),
+        collisions=world.collisions(),
+        gaps=bodies.min_gaps(),
+    )

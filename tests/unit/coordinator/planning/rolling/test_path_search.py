@@ -1,0 +1,268 @@
+"""The stream planner: legal whatever comes, the same each time, and as good as can be proven."""
+
+from __future__ import annotations
+
+from itertools import combinations, pairwise
+from random import Random
+
+import attrs
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+from laneweave.coordinator.planning.conflict_model import ConflictModel
+from laneweave.coordinator.planning.rolling import search_kernel as kernel
+from laneweave.coordinator.planning.rolling.arrays import window
+from laneweave.coordinator.planning.rolling.path_search import (
+    StreamCosts,
+    StreamPlan,
+    StreamPlanner,
+    StreamRoad,
+    StreamVehicle,
+)
+from laneweave.coordinator.planning.rolling.rolling_validator import problems_of_plan
+from support import rolling_oracles as oracle
+from support.rolling_oracles import ROAD, SHORT, Stream, streams
+
+JAM = 1
+"""Seed of a jam."""
+
+
+def dense(
+    random: Random, columns: range, share: float, road: StreamRoad = ROAD
+) -> list[StreamVehicle]:
+    cells = [(c, lane) for c in columns for lane in range(road.lanes) if random.random() < share]
+    return [StreamVehicle(f"v{i}", cell, random.randrange(3)) for i, cell in enumerate(cells)]
+
+
+def driven(plan: StreamPlan, vehicles: list[StreamVehicle]) -> list[StreamVehicle]:
+    """Return the vehicles that are on the road in the next slot, where their ways lead."""
+    ways = plan.paths
+    return [attrs.evolve(v, cell=ways[v.vehicle][1]) for v in vehicles if len(ways[v.vehicle]) > 2]
+
+
+def is_legal(road: StreamRoad, plan: StreamPlan, vehicles: list[StreamVehicle]) -> bool:
+    """Look at all pairs in all slots, by the rules that the tests state themselves."""
+    starts = {v.vehicle: v.cell for v in vehicles}
+    if {name: way[0] for name, way in plan.paths.items()} != starts:
+        return False
+    for one, other in combinations(plan.paths.values(), 2):
+        pairs = zip(pairwise(one), pairwise(other), strict=False)
+        if any(oracle.conflicts(road.model, a, b) for a, b in pairs):
+            return False
+    return True
+
+
+# --------------------------------------------------------------------------- whatever comes
+
+
+@settings(max_examples=150, deadline=None)
+@given(streams())
+def test_every_stream_gets_complete_paths_without_conflicts(stream: Stream) -> None:
+    road, slot, vehicles, blocked = stream
+    planner = StreamPlanner(road)
+    plan = planner.plan(slot, vehicles, None, blocked)
+    assert problems_of_plan(road, plan, vehicles, blocked) == []
+    assert is_legal(road, plan, vehicles)
+    # What was planned is driven for a slot, with other cells blocked then.
+    later = driven(plan, vehicles)
+    again = planner.plan(slot + 1, later, plan, blocked[1:])
+    assert problems_of_plan(road, again, later, blocked[1:]) == []
+
+
+@settings(max_examples=60, deadline=None)
+@given(streams())
+def test_vehicles_need_not_be_where_they_were_planned(stream: Stream) -> None:
+    """Everybody is a cell further, and some are new, held, gone, or want another lane."""
+    road, slot, vehicles, blocked = stream
+    planner = StreamPlanner(road)
+    plan = planner.plan(slot, vehicles)
+    moved = [
+        attrs.evolve(
+            v,
+            vehicle=v.vehicle if i % 3 else f"new{i}",
+            cell=(v.cell[0] + 1, v.cell[1]),
+            lane=(v.lane + i % 2) % road.lanes,
+            held=i % 7 == 0,
+        )
+        for i, v in enumerate(vehicles[1:])
+    ]
+    for skipped in (1, 3):
+        later = planner.plan(slot + skipped, moved, plan, blocked)
+        assert problems_of_plan(road, later, moved, blocked) == []
+
+
+def test_an_empty_road() -> None:
+    assert StreamPlanner(ROAD).plan(3, []) == StreamPlan(3, {}, ())
+
+
+@pytest.mark.parametrize("column", [-400, -3, 0, 30, 66, 67, 400])
+def test_one_vehicle_from_anywhere(column: int) -> None:
+    """It reaches its lane from wherever there are slots enough."""
+    for lane in range(3):
+        vehicle = StreamVehicle("v", (column, lane), 0)
+        plan = StreamPlanner(ROAD).plan(0, [vehicle])
+        assert problems_of_plan(ROAD, plan, [vehicle]) == []
+        slots = (1000 - 15 * column) // 60
+        assert plan.missed == (("v",) if lane > max(0, slots) else ())
+
+
+def test_vehicles_beyond_the_road_have_no_path() -> None:
+    vehicles = [StreamVehicle("past", (67, 0), 2), StreamVehicle("last", (66, 0), 0)]
+    plan = StreamPlanner(ROAD).plan(0, vehicles)
+    assert plan.paths == {"past": ((67, 0),), "last": ((66, 0), (66, 0))}
+    assert plan.missed == ("past",)
+
+
+def test_shared_cells_and_unknown_lanes_are_refused() -> None:
+    planner = StreamPlanner(ROAD)
+    with pytest.raises(ValueError, match="a and b are both in"):
+        planner.plan(0, [StreamVehicle("a", (1, 1), 0), StreamVehicle("b", (1, 1), 0)])
+    with pytest.raises(ValueError, match="3 lanes"):
+        planner.plan(0, [StreamVehicle("a", (1, 3), 0)])
+    with pytest.raises(ValueError, match="share a cell"):
+        attrs.evolve(ROAD, model=ConflictModel(("edge",)))
+
+
+def test_blocked_cells_may_be_left_but_not_entered() -> None:
+    blocked = [(30, 0), (30, 1)]
+    vehicles = [StreamVehicle("in", (30, 0), 2), StreamVehicle("beside", (30, 2), 0)]
+    plan = StreamPlanner(ROAD).plan(0, vehicles, None, blocked)
+    assert problems_of_plan(ROAD, plan, vehicles, blocked) == []
+    assert plan.missed == ()
+    assert plan.paths["in"][1] in {(29, 0), (31, 0)}
+    assert set(plan.paths["beside"]).isdisjoint(blocked)
+
+
+def test_held_vehicles_stay_and_others_drive_around_them() -> None:
+    vehicles = [
+        StreamVehicle("held", (30, 1), 0, held=True),
+        StreamVehicle("a", (30, 0), 2),
+        StreamVehicle("b", (30, 2), 0),
+    ]
+    plan = StreamPlanner(ROAD).plan(0, vehicles)
+    assert set(plan.paths["held"]) == {(30, 1)}
+    assert plan.missed == ("held",)
+
+
+def test_a_path_blocked_by_a_held_vehicle_is_replaced() -> None:
+    planner = StreamPlanner(ROAD)
+    vehicles = [StreamVehicle("a", (30, 0), 2), StreamVehicle("b", (31, 1), 1)]
+    before = planner.plan(0, vehicles)
+    held = [vehicles[0], StreamVehicle("b", (30, 1), 1, held=True)]
+    assert problems_of_plan(ROAD, before, held) != []
+    plan = planner.plan(0, held, before)
+    assert problems_of_plan(ROAD, plan, held) == []
+    assert plan.missed == ()
+
+
+# ------------------------------------------------------------------------- the same each time
+
+
+def test_equal_streams_get_equal_plans_from_any_planner() -> None:
+    vehicles = dense(Random(1), range(24), 0.8)
+    first, second = StreamPlanner(ROAD, seed=5), StreamPlanner(ROAD, seed=5)
+    plan = first.plan(0, vehicles)
+    for slot in range(1, 8):
+        vehicles = driven(plan, vehicles)
+        later = first.plan(slot, vehicles, plan)
+        # It knows only the last plan, and is given the vehicles in another order.
+        assert second.plan(slot, vehicles[::-1], plan) == attrs.evolve(
+            later, missed=later.missed[::-1]
+        )
+        plan = later
+
+
+def test_paths_change_only_for_cheaper_ones() -> None:
+    planner = StreamPlanner(ROAD)
+    vehicles = dense(Random(2), range(30), 0.6)
+    plan = planner.plan(0, vehicles)
+    kept = 0
+    for slot in range(1, 9):
+        vehicles = driven(plan, vehicles)
+        later = planner.plan(slot, vehicles, plan)
+        old = StreamPlan(slot, {v.vehicle: plan.paths[v.vehicle][1:] for v in vehicles}, ())
+        gained = oracle.cost_of_plan(ROAD, old, vehicles) - oracle.cost_of_plan(
+            ROAD, later, vehicles
+        )
+        if later.paths == old.paths:
+            kept += 1
+        else:
+            assert gained > 0
+        plan = later
+    assert kept >= 1
+    assert plan.missed == ()
+
+
+def test_an_optimal_plan_is_kept_without_a_round() -> None:
+    planner = StreamPlanner(ROAD)
+    vehicles = [StreamVehicle("a", (0, 0), 1), StreamVehicle("b", (8, 2), 0)]
+    plan = planner.plan(0, vehicles)
+    again = planner.plan(1, driven(plan, vehicles), plan)
+    assert again.rounds == 0
+    assert all(again.paths[name] == way[1:] for name, way in plan.paths.items())
+
+
+# ------------------------------------------------------------------------------ how good it is
+
+
+def test_two_vehicles_cost_the_minimum_nearly_always() -> None:
+    """The least cost: joint search over all cells of both."""
+    random = Random(7)
+    equal = 0
+    for seed in range(30):
+        vehicles = random.sample(dense(random, range(3), 1.0, SHORT), 2)
+        plan = StreamPlanner(SHORT, seed=seed).plan(0, vehicles)
+        cost = oracle.cost_of_plan(SHORT, plan, vehicles)
+        least = oracle.least_cost_of_two(SHORT, 0, vehicles[0], vehicles[1])
+        assert cost >= least - 1e-6
+        equal += cost <= least + 1e-6
+    assert equal >= 28
+
+
+@pytest.mark.parametrize("share", [0.5, 0.8, 1.0])
+def test_streams_cost_the_minimum_nearly_always(share: float) -> None:
+    """The least cost: a mixed-integer programme."""
+    random = Random(3)
+    equal = 0
+    for seed in range(6):
+        vehicles = dense(random, range(3), share, SHORT)
+        plan = StreamPlanner(SHORT, seed=seed).plan(0, vehicles)
+        assert is_legal(SHORT, plan, vehicles)
+        cost = oracle.cost_of_plan(SHORT, plan, vehicles)
+        least = oracle.Programme(SHORT, 0, vehicles).least_cost()
+        assert cost >= least - 1e-6
+        equal += cost <= least + 1e-6
+    assert equal >= 4
+
+
+def test_ejection_chains_solve_streams_that_reorderings_do_not() -> None:
+    vehicles = dense(Random(JAM), range(20, 30), 0.85)
+    assert StreamPlanner(ROAD).plan(0, vehicles).missed == ()
+    order = sorted(vehicles, key=lambda one: one.cell)
+    table, ways, costs, scratch = window(ROAD, StreamCosts(), 0, order, ())[1:]
+    rng = np.array([1], dtype=np.uint64)
+    nothing = np.zeros((0, 2), dtype=np.int64), np.zeros(len(order) + 1, dtype=np.int64)
+    kernel.set_paths(table, ways, costs, *nothing, rng, scratch)
+    assert (ways.cost >= ways.missing_cost).any()
+    for turn in range(3000):
+        seed, size = turn % len(order), 2 + turn % 12
+        kernel._reorder(table, ways, costs, seed, size, 0.0, rng, scratch)
+    assert (ways.cost >= ways.missing_cost).any()
+
+
+@pytest.mark.parametrize("forward", [-0.6, 5.0])
+def test_drift_follows_its_cost(forward: float) -> None:
+    vehicles = dense(Random(4), range(20), 0.3)
+    costs = StreamCosts(forward=forward)
+    plan = StreamPlanner(ROAD, costs).plan(0, vehicles)
+    assert problems_of_plan(ROAD, plan, vehicles) == []
+    drift = sum(way[-1][0] - way[0][0] for way in plan.paths.values())
+    assert drift > 3 * len(vehicles) if forward < 0 else drift <= 1
+
+
+def test_the_limit_on_path_searches_is_kept() -> None:
+    vehicles = dense(Random(5), range(20, 40), 1.0)
+    quick = attrs.evolve(ROAD, rounds=3)
+    assert StreamPlanner(quick).plan(0, vehicles).rounds == 3
+    assert StreamPlanner(attrs.evolve(ROAD, max_paths=1)).plan(0, vehicles).rounds <= 2

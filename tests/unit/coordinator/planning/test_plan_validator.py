@@ -1,0 +1,132 @@
+"""The validator finds every kind of error in a plan."""
+
+from typing import Any
+
+import attrs
+import pytest
+
+from laneweave.coordinator.planning import conflict_model as conflicts
+from laneweave.coordinator.planning.grid import Grid
+from laneweave.coordinator.planning.plan_validator import problems_of_paths, problems_of_response
+from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
+from laneweave.coordinator.planning.response import PlanResponse
+from laneweave.coordinator.planning.solve import plan
+from laneweave.protocol.lattice import Cell, Mode
+
+REQUEST = PlanRequest(
+    Grid(4, 3, [(0, 2)]),
+    1,
+    ("node", "edge", "special-1"),
+    (VehicleRequest("a", (0, 0), lane=0), VehicleRequest("b", (1, 1), eligible=(1, 2))),
+    ((2, 0), (1, 2), (3, 0)),
+    deadline_s=60.0,
+)
+ASSIGNMENT = (0, 1)
+GOOD: tuple[tuple[Cell, ...], ...] = (
+    ((0, 0), (1, 0), (2, 0)),
+    ((1, 1), (1, 2), (1, 2)),
+)
+
+
+def test_a_good_plan_has_no_problems() -> None:
+    assert problems_of_paths(REQUEST, ASSIGNMENT, GOOD) == []
+
+
+A, B = GOOD
+BAD: list[tuple[tuple[int, ...], tuple[tuple[Cell, ...], ...], str]] = [
+    ((0,), GOOD, "2 vehicles"),
+    (ASSIGNMENT, (A,), "2 vehicles"),
+    (ASSIGNMENT, (A, B[:2]), "different lengths"),
+    (ASSIGNMENT, ((), ()), "different lengths"),
+    (ASSIGNMENT, (((1, 0), (1, 0), (2, 0)), B), "a starts at"),
+    (ASSIGNMENT, (((0, 0), (0, 0), (2, 0)), B), "a jumps"),
+    (ASSIGNMENT, (A, ((1, 1), (0, 2), (1, 2))), "b jumps"),
+    (ASSIGNMENT, (A, ((1, 1), (0, 2), (1, 2))), "blocked or outside"),
+    (ASSIGNMENT, (((0, 0), (0, -1), (2, 0)), B), "blocked or outside"),
+    (ASSIGNMENT, (((0, 0), (1, 0), (1, 0)), B), "a ends at"),
+    ((1, 1), (((0, 0), (1, 0), (1, 2)), B), "prefers lane 0"),
+    ((0, 0), (A, ((1, 1), (1, 0), (2, 0))), "not eligible"),
+    ((0, 0), (A, ((1, 1), (1, 0), (2, 0))), "both assigned"),
+    ((0, 7), GOOD, "does not exist"),
+    ((0, -1), GOOD, "does not exist"),
+    (ASSIGNMENT, (A, ((1, 1), (1, 0), (1, 1))), "node conflict of a and b in step 0"),
+    (
+        ASSIGNMENT,
+        (((0, 0), (1, 0), (1, 1)), ((1, 1), (1, 1), (1, 0))),
+        "edge conflict of a and b in step 1",
+    ),
+    (
+        ASSIGNMENT,
+        (((0, 0), (1, 0), (1, 1)), ((1, 1), (1, 1), (1, 2))),
+        "special-1 conflict of a and b in step 1",
+    ),
+]
+
+
+@pytest.mark.parametrize(("assignment", "paths", "text"), BAD)
+def test_problems_are_found(
+    assignment: tuple[int, ...], paths: tuple[tuple[Cell, ...], ...], text: str
+) -> None:
+    assert any(text in problem for problem in problems_of_paths(REQUEST, assignment, paths))
+
+
+@pytest.mark.parametrize(("mode", "kinds"), [(1, REQUEST.conflicts), (2, ("geometric",))])
+def test_closing_moves_three_columns_apart_are_compared(mode: Mode, kinds: tuple[str, ...]) -> None:
+    vehicles = VehicleRequest("a", (0, 0), eligible=(0,)), VehicleRequest("b", (3, 0), lane=0)
+    paths = ((0, 0), (1, 0)), ((3, 0), (2, 0))
+    targets = ((1, 0), (2, 0))
+    request = PlanRequest(Grid(4, 1), mode, (*kinds, "closing"), vehicles, targets)
+    found = problems_of_paths(request, (0, 1), paths)
+    assert found == ["closing conflict of a and b in step 0"]
+    free = PlanRequest(Grid(4, 1), mode, kinds, vehicles, targets)
+    assert problems_of_paths(free, (0, 1), paths) == []
+
+
+def test_pairs_are_compared_as_far_as_conflicts_reach(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A new conflict kind with a longer reach must not be skipped."""
+    monkeypatch.setitem(conflicts._COLUMNS_OF_KIND, "edge", 6)
+    monkeypatch.setitem(conflicts._PREDICATES, "edge", lambda a, b: b[0][0] - a[0][0] == 6)
+    request = PlanRequest(
+        Grid(8, 1),
+        1,
+        ("node", "edge"),
+        (VehicleRequest("a", (0, 0)), VehicleRequest("b", (6, 0))),
+        ((0, 0), (6, 0)),
+    )
+    paths = (((0, 0), (0, 0)), ((6, 0), (6, 0)))
+    assert problems_of_paths(request, (0, 1), paths) == ["edge conflict of a and b in step 0"]
+
+
+def test_oblique_moves_belong_to_mode_2() -> None:
+    paths = (((0, 0), (1, 0), (2, 0)), ((1, 1), (2, 2), (1, 2)))
+    assert any("b jumps" in p for p in problems_of_paths(REQUEST, ASSIGNMENT, paths))
+    assert problems_of_paths(attrs.evolve(REQUEST, mode=2), ASSIGNMENT, paths) == []
+
+
+def _response() -> PlanResponse:
+    response = plan(REQUEST)
+    assert response.status == "optimal"
+    return response
+
+
+def test_a_good_response_has_no_problems() -> None:
+    assert problems_of_response(REQUEST, _response()) == []
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"cost": 2},
+        {"cost": None},
+        {"steps": 7},
+        {"lower_bound": 99},
+        {"lower_bound": 0},
+        {"lower_bound": None},
+        {"status": "infeasible"},
+        {"status": "timeout"},
+        {"paths": ()},
+        {"assignment": (1, 0)},
+    ],
+)
+def test_wrong_claims_of_a_response_are_found(change: dict[str, Any]) -> None:
+    assert problems_of_response(REQUEST, attrs.evolve(_response(), **change)) != []

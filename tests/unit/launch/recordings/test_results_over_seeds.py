@@ -1,0 +1,56 @@
+"""The table over runs, and its aggregation over seeds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+from attrs import evolve
+
+from laneweave.launch.recordings.results_over_seeds import PREFERRED, over_seeds, results_table
+from laneweave.launch.recordings.runs import Run
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.summary import RunSummary
+from support.summaries import make_summary
+
+
+def run(seed: int, summary: RunSummary | None, label: str = "rule") -> Run:
+    return Run(Path("x"), label, "rule", evolve(Scenario(), seed=seed), summary)
+
+
+def travel(mean: float | None) -> RunSummary:
+    return make_summary(travel_time_s={"mean": mean})
+
+
+def test_means_and_deviations_over_seeds() -> None:
+    runs = [run(1, travel(1.0)), run(2, travel(3.0)), run(3, travel(None)), run(4, None)]
+    (row,) = over_seeds(
+        results_table(runs), [("travel_time_s_mean", name) for name in ("mean", "stddev")]
+    )
+    assert row["runs"] == 4
+    assert row["travel_time_s_mean_mean"] == 2.0
+    assert row["travel_time_s_mean_stddev"] == pytest.approx(2.0**0.5)
+
+
+def test_a_single_seed_has_no_deviation_and_a_missing_figure_is_null() -> None:
+    wanted = [("travel_time_s_mean", "stddev"), ("planning_fallbacks", "sum")]
+    (row,) = over_seeds(results_table([run(1, travel(1.0))]), wanted)
+    assert row["travel_time_s_mean_stddev"] is row["planning_fallbacks_sum"] is None
+
+
+def test_labels_keep_their_order() -> None:
+    table = results_table([run(1, travel(1.0), "rule"), run(1, travel(2.0), "lc2013")])
+    assert [row["label"] for row in over_seeds(table, [])] == ["rule", "lc2013"]
+
+
+def test_the_share_on_the_preferred_lane() -> None:
+    vehicles = ({"left": 0, "on_preferred_lane": 0}, {"left": 4, "on_preferred_lane": 3})
+    table = results_table(run(n, make_summary(vehicles=one)) for n, one in enumerate(vehicles))
+    assert table[PREFERRED].to_pylist() == [None, 75.0]
+
+
+def test_counts_are_integers() -> None:
+    table = results_table([run(1, make_summary()), run(2, None)])
+    assert table.schema.field("vehicles_left").type == pa.int64()
+    assert table.schema.field("road_m").type == pa.float64()

@@ -1,0 +1,224 @@
+"""The tables of a scenario: the paper's defaults, and the allowed values of each field."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import attrs
+import pytest
+
+from laneweave.protocol.config.loading import load_scenario, parse_scenario
+from laneweave.protocol.scenario.fields import FormationSettings, Scenario
+from support.refusals import refusal
+
+FOLDER = Path(__file__).parents[4] / "scenarios"
+TABLES = [
+    attribute.name for attribute in attrs.fields(Scenario) if attrs.has(type(attribute.default))
+]
+
+
+def nested(dotted: str, value: object) -> dict[str, Any]:
+    *tables, key = dotted.split(".")
+    data: dict[str, Any] = {key: value}
+    for table in reversed(tables):
+        data = {table: data}
+    return data
+
+
+# --- defaults and what follows from them -----------------------------------------------------
+
+
+def test_defaults_are_the_table_of_the_paper() -> None:
+    scenario = load_scenario(None)
+    formation, vehicle, road = scenario.formation, scenario.vehicle, scenario.road
+    assert formation.gap_m == 15.0
+    assert scenario.cycles_s == (4.0, 7.0)
+    assert formation.speed_mps == 15.0
+    assert vehicle.max_speed_mps == 25.0
+    assert vehicle.min_accel_mps2 == -10.0
+    assert vehicle.max_accel_mps2 == 5.0
+    assert (road.s1_m, road.s2_m, road.s3_m) == (50.0, 350.0, 600.0)
+    assert road.lanes == 3
+    assert formation.max_vehicles == 6
+    assert formation.mode == 1
+    assert formation.conflict_kinds == ("node", "edge", "special-1", "closing")
+    assert FormationSettings(mode=2).conflict_kinds == ("geometric", "closing")
+    assert scenario.demand.volume_veh_per_lane_h == 1000.0
+    assert road.length_m == 1000.0
+    assert road.sorting_start_m == 400.0
+    assert scenario.lane_shares == pytest.approx((1 / 3,) * 3)
+
+
+@pytest.mark.parametrize(
+    ("formation", "bound"),
+    [
+        ({"operation": "paper"}, 1800.0),
+        ({"operation": "paper", "gap_m": 20.0}, 1350.0),
+        ({}, 3600.0),
+        ({"operation": "rolling"}, 3600.0),
+    ],
+)
+def test_bound_of_the_road(formation: dict[str, Any], bound: float) -> None:
+    """V_u = 3600 v_F / (2 d_F) of the paper, for interlaced entry."""
+    settings = parse_scenario({"formation": formation}).formation
+    assert settings.bound_veh_per_lane_h == pytest.approx(bound)
+    share = 2.0 if settings.interlaced else 1.0
+    assert bound == pytest.approx(3600.0 * settings.speed_mps / (share * settings.gap_m))
+
+
+def test_the_file_of_the_paper_holds_the_defaults_but_for_its_formations() -> None:
+    explicit = ("node", "edge", "special-1", "closing")
+    default = Scenario()
+    formation = attrs.evolve(
+        default.formation,
+        entry="interlaced",
+        close="columns",
+        cycle_s=4.0,
+        move_s=3.8,
+        conflicts=explicit,
+    )
+    assert load_scenario(FOLDER / "paper.toml") == attrs.evolve(default, formation=formation)
+
+
+@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.toml")), ids=lambda path: path.stem)
+def test_every_scenario_of_the_repository_loads(path: Path) -> None:
+    assert load_scenario(path).schema == "laneweave.scenario/1"
+
+
+def test_the_lattice_is_that_of_the_tables() -> None:
+    formation = {"close": "columns", "block_columns": 6}
+    lattice = parse_scenario({"road": {"lanes": 2}, "formation": formation}).lattice
+    assert (lattice.lanes, lattice.block_columns) == (2, 6)
+    assert Scenario().lattice.block_columns == 1
+    assert (lattice.pitch_m, lattice.speed_mps, lattice.lane_width_m) == (15.0, 15.0, 3.5)
+
+
+def test_lane_shares_sum_to_one() -> None:
+    scenario = parse_scenario({"demand": {"lane_shares": [2, 1, 1]}})
+    assert scenario.lane_shares == (0.5, 0.25, 0.25)
+
+
+def test_slots_are_from_four_to_seven_seconds_unless_they_are_given() -> None:
+    scenario = Scenario()
+    assert scenario.slots_s == pytest.approx([4.0 + 0.2 * number for number in range(16)])
+    assert scenario.move_durations == set(range(38, 70, 2))
+    assert (scenario.move_s, scenario.horizon_ticks) == (3.8, 70)
+    given = parse_scenario({"formation": {"cycle_s": 5.0}})
+    assert (given.slots_s, given.horizon_ticks, given.move_s) == ((5.0,), 50, 4.8)
+    assert given.move_durations == {48}
+    slower = parse_scenario({"formation": {"cycle_s": 5.0, "move_s": 4.0}})
+    assert slower.move_durations == {40}
+    rolling = parse_scenario({"formation": {"operation": "rolling"}})
+    assert (rolling.slots_s, rolling.horizon_ticks) == ((6.0,), 60)
+    dense = parse_scenario(
+        {"formation": {"operation": "rolling"}, "demand": {"volume_veh_per_lane_h": 2001.0}}
+    )
+    assert (dense.slots_s, dense.horizon_ticks) == ((4.0,), 40)
+    long = parse_scenario({"tracking": {"horizon_ticks": 80}})
+    assert long.horizon_ticks == 80
+
+
+# --- one field that is wrong ------------------------------------------------------------------
+
+LEAVES = [
+    (f"{table}.{attribute.name}", attribute.default)
+    for table in TABLES
+    for attribute in attrs.fields(type(getattr(Scenario(), table)))
+]
+TABLE_BY_NAME: type = type(attrs.Factory(dict))
+NOT_NUMBERS: tuple[Any, ...] = ("1", True, None, [], [1], {}, math.nan, math.inf, -math.inf)
+
+
+@pytest.mark.parametrize("table", ["", *(f"{table}." for table in TABLES)])
+def test_an_unknown_key_is_refused_by_name(table: str) -> None:
+    error = refusal(parse_scenario, nested(f"{table}speling", 1))
+    assert error.field == f"{table}speling"
+    assert "one of" in error.allowed
+
+
+@pytest.mark.parametrize("table", TABLES)
+@pytest.mark.parametrize("value", [5, "x", True, None, [], [{}], 1.5])
+def test_a_table_that_is_none_is_refused(table: str, value: object) -> None:
+    assert refusal(parse_scenario, {table: value}).field == table
+
+
+@pytest.mark.parametrize(("field", "default"), LEAVES, ids=[field for field, _ in LEAVES])
+def test_every_wrong_type_of_every_field_is_refused_by_name(field: str, default: object) -> None:
+    if isinstance(default, str):
+        wrongs: tuple[Any, ...] = (1, True, None, [], {}, 1.5)
+    elif isinstance(default, tuple):
+        wrongs = (1, True, None, "node", {}, {"a": 1}, [True], [[]], [None], [math.nan], [{}])
+    elif isinstance(default, TABLE_BY_NAME):
+        wrongs = (1, True, None, [], "x", 1.5, {"a": 1}, {"a": []}, {"a": "x"}, {"a": [1]})
+    elif field in ("formation.cycle_s", "formation.planning_deadline_s"):
+        wrongs = tuple(wrong for wrong in NOT_NUMBERS if wrong is not None)
+    elif default is None:
+        wrongs = ("1", True, 1.0, [], {}, math.nan)
+    elif isinstance(default, bool):
+        wrongs = (0, 1, 1.0, "true", None, [], {}, math.nan)
+    elif isinstance(default, int):
+        wrongs = (*NOT_NUMBERS, 1.0, 16**5000)
+    else:
+        wrongs = (*NOT_NUMBERS, 10**400, -(10**400), 16**5000)
+    for wrong in wrongs:
+        assert refusal(parse_scenario, nested(field, wrong)).field.split("[")[0] == field, wrong
+
+
+OUT_OF_RANGE: dict[str, list[Any]] = {
+    "schema": ["laneweave.scenario/2", 1],
+    "seed": [-1, 2**63, 1.0, 10**400],
+    "road.lanes": [0, 9, -3],
+    "road.lane_width_m": [1.9, 10.1],
+    "road.s1_m": [-0.1],
+    "road.s2_m": [20_001],
+    "road.s3_m": [0],
+    "demand.volume_veh_per_lane_h": [-5, 0, 5000, math.nan],
+    "demand.duration_s": [0, 86_401],
+    "demand.min_headway_s": [-1, 61],
+    "formation.gap_m": [0.5],
+    "formation.cycle_s": [0.4],
+    "formation.move_s": [61],
+    "formation.speed_mps": [0],
+    "formation.block_columns": [0, 25],
+    "formation.max_vehicles": [0, 37],
+    "formation.mode": [0, 3],
+    "formation.conflicts": [["nod"], ["node", ""]],
+    "formation.weight_straight": [2],
+    "formation.weight_oblique": [3, -1],
+    "formation.solver": ["magic", None],
+    "formation.planning_deadline_s": [0],
+    "formation.max_nodes": [0],
+    "vehicle.length_m": [0.9],
+    "vehicle.width_m": [4.5],
+    "vehicle.max_speed_mps": [81],
+    "vehicle.min_accel_mps2": [0, 10],
+    "vehicle.max_accel_mps2": [0],
+    "vehicle.max_jerk_mps3": [0],
+    "vehicle.max_lateral_accel_mps2": [-1],
+    "vehicle.max_lateral_jerk_mps3": [101],
+    "vehicle.max_slip_ratio": [0, 1.01],
+    "tracking.horizon_ticks": [9, 201],
+    "tracking.min_gap_m": [-1],
+    "network.realm": ["", "a/b", "*", "a b", "x" * 65, "é", "a\n"],
+    "network.lease_s": [0],
+    "network.heartbeat_s": [0],
+    "network.election_s": [61],
+    "network.resend_s": [0],
+    "runtime.tick_s": [0, 1.1],
+    "runtime.tick_resend_s": [0],
+    "runtime.tick_deadline_s": [0],
+    "runtime.agent_silent_s": [0],
+    "runtime.agent_start_s": [121],
+    "runtime.announce_s": [-1],
+    "runtime.coordinators": [0, 10],
+    "runtime.vehicles_per_process": [0],
+    "runtime.max_road_s": [0],
+}
+
+
+@pytest.mark.parametrize(("field", "values"), OUT_OF_RANGE.items(), ids=OUT_OF_RANGE)
+def test_values_out_of_range_are_refused_by_name(field: str, values: list[Any]) -> None:
+    for value in values:
+        assert refusal(parse_scenario, nested(field, value)).field == field, value

@@ -1,0 +1,256 @@
+"""A router's rules: what follows from the table of topics, and nothing else."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+
+import pytest
+
+from laneweave.protocol.config.loading import load_scenario, parse_scenario, to_tables
+from laneweave.protocol.config.participants import identities_of
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.security.access_control import (
+    Flow,
+    Rule,
+    access_control,
+    access_of,
+    guard_of,
+    rules_of,
+    size_limits,
+)
+from laneweave.protocol.security.connection import Credentials
+from laneweave.protocol.wire.identities import parse_identity
+from laneweave.protocol.wire.topics import TOPICS, Exchange, Keys, Party, matches
+from support.refusals import refusal
+
+SCENARIO = parse_scenario(
+    {
+        "demand": {"duration_s": 20.0},
+        "network": {"realm": "r", "endpoint": "tls/router:7447"},
+        "security": {
+            "mode": "mtls",
+            "folder": "/keys",
+            "fleets": {"even": "0/2", "odd": "1/2", "two": ["a", "b"]},
+            "vehicles": ["a", "b", "c"],
+        },
+    }
+)
+PREFIX = "laneweave/r/"
+
+
+def may(who: str, flow: str, message: str, key: str) -> bool:
+    """Tell whether somebody may send or get a kind of Zenoh's messages on a key."""
+    return any(
+        rule.flow == flow and rule.message == message and matches(expression, PREFIX + key)
+        for rule in rules_of(parse_identity(who), SCENARIO)
+        for expression in rule.keys
+    )
+
+
+def may_send(who: str, key: str) -> bool:
+    return may(who, "ingress", "put", key)
+
+
+def may_read(who: str, key: str) -> bool:
+    # What somebody may subscribe to is what it is given.
+    subscribes = may(who, "ingress", "declare_subscriber", key)
+    assert subscribes == may(who, "egress", "put", key)
+    return subscribes
+
+
+@pytest.mark.parametrize(
+    ("key", "senders"),
+    [
+        ("clock", {"bridge"}),
+        ("census", {"bridge"}),
+        ("sense/a", {"bridge"}),
+        ("command/a", {"vehicle.a", "fleet.two"}),
+        ("state/7/a", {"vehicle.a", "fleet.two", "bridge"}),
+        ("motion/-7/a", {"vehicle.a", "fleet.two"}),
+        ("prepare/a", {"coordinator.c1", "coordinator.c2"}),
+        ("plan/a", {"coordinator.c1", "coordinator.c2"}),
+        ("heartbeat/c1", {"coordinator.c1"}),
+        ("report/agent/a", {"vehicle.a", "fleet.two"}),
+        ("report/coordinator/c1", {"coordinator.c1"}),
+        ("report/bridge/bridge", {"bridge"}),
+        ("event/coordinator/c1", {"coordinator.c1"}),
+        ("event/agent/c1", set()),
+        ("unknown", set()),
+    ],
+)
+def test_who_sends(key: str, senders: set[str]) -> None:
+    everybody = ("bridge", "coordinator.c1", "coordinator.c2", "vehicle.a", "vehicle.b",
+                 "fleet.two", "client.plan", "observer.watch", "router")  # fmt: skip
+    assert {who for who in everybody if may_send(who, key)} == senders
+
+
+@pytest.mark.parametrize(
+    ("key", "readers"),
+    [
+        ("clock", {"coordinator.c1", "observer.watch"}),
+        ("census", {"coordinator.c1", "observer.watch", "fleet.two"}),
+        ("sense/a", {"vehicle.a", "fleet.two"}),
+        ("command/a", {"bridge"}),
+        ("state/7/a", {"coordinator.c1", "vehicle.a", "vehicle.c", "fleet.two", "observer.watch"}),
+        ("motion/7/a", {"vehicle.a", "vehicle.c", "fleet.two", "observer.watch"}),
+        ("prepare/a", {"vehicle.a", "fleet.two", "bridge"}),
+        ("plan/a", {"vehicle.a", "fleet.two", "bridge", "observer.watch"}),
+        ("heartbeat/c1", {"coordinator.c1", "bridge", "observer.watch"}),
+        ("report/agent/a", {"bridge", "observer.watch"}),
+        ("event/coordinator/c1", {"bridge", "observer.watch"}),
+        ("unknown", set()),
+    ],
+)
+def test_who_reads(key: str, readers: set[str]) -> None:
+    everybody = ("bridge", "coordinator.c1", "vehicle.a", "vehicle.c", "fleet.two", "client.plan",
+                 "observer.watch", "router")  # fmt: skip
+    assert {who for who in everybody if may_read(who, key)} == readers
+
+
+def test_tokens_and_the_service() -> None:
+    shows, watches, asks = "liveliness_token", "declare_liveliness_subscriber", "query"
+    assert may("vehicle.a", "ingress", shows, "alive/vehicle/a")
+    assert not may("vehicle.a", "ingress", shows, "alive/vehicle/b")
+    assert may("coordinator.c1", "ingress", shows, "alive/coordinator/c1/77")
+    assert not may("coordinator.c1", "ingress", shows, "alive/coordinator/c2/77")
+    assert may("bridge", "ingress", watches, "alive/vehicle/a")
+    assert may("vehicle.a", "egress", shows, "alive/bridge/5")
+    assert not may("client.plan", "ingress", watches, "alive/vehicle/a")
+    assert may("client.plan", "ingress", asks, "service/plan")
+    assert may("client.plan", "egress", "reply", "service/plan")
+    assert may("coordinator.c1", "ingress", "declare_queryable", "service/plan")
+    for who in ("vehicle.a", "bridge", "observer.watch", "client.plan"):
+        assert not may(who, "ingress", "declare_queryable", "service/plan")
+
+
+@pytest.mark.parametrize("flow", list(Flow))
+@pytest.mark.parametrize("message", ["delete", "put", "query", "declare_subscriber", "reply"])
+@pytest.mark.parametrize("key", ["**", "*", "clock/**", "../other", "@/router", "state/*/*/x"])
+def test_nobody_may_do_anything_on_what_is_no_key(flow: Flow, message: str, key: str) -> None:
+    for identity in identities_of(SCENARIO):
+        assert not may(identity.common_name, flow, message, key)
+
+
+def _all_rules(scenario: Scenario) -> Iterator[Rule]:
+    for identity in identities_of(scenario):
+        yield from rules_of(identity, scenario)
+
+
+def test_all_keys_are_of_topics_of_the_realm() -> None:
+    keys = Keys("r")
+    concrete = [keys.key(topic, **dict.fromkeys(topic.parameters, "x")) for topic in TOPICS]
+    for rule in _all_rules(SCENARIO):
+        assert rule.message != "delete"
+        for expression in rule.keys:
+            assert "**" not in expression
+            assert len(expression.split("/")) in {len(key.split("/")) for key in concrete}
+            assert expression.startswith(PREFIX)
+
+
+def test_every_topic_has_somebody_on_both_sides() -> None:
+    parties = set(Party)
+    for topic in TOPICS:
+        assert topic.sender in {*parties, "any"}, topic.name
+        assert {*topic.readers, *filter(None, (topic.addressee, topic.deputy))} <= parties
+        assert topic.readers or topic.addressee, topic.name
+        # Whom a key names is among its parameters.
+        assert not topic.addressee or topic.addressee in topic.parameters
+
+
+def test_the_rights_of_a_fleet_are_those_of_its_vehicles_and_the_census() -> None:
+    def rights(who: str) -> set[tuple[Flow, str, str]]:
+        return {
+            (rule.flow, rule.message, key)
+            for rule in rules_of(parse_identity(who), SCENARIO)
+            for key in rule.keys
+        }
+
+    more = rights("fleet.two") - rights("vehicle.a") - rights("vehicle.b")
+    assert {key for _, _, key in more} == {PREFIX + "census"}
+    assert rights("vehicle.a") | rights("vehicle.b") < rights("fleet.two")
+    even, odd = rights("fleet.even"), rights("fleet.odd")
+    own = {key for _, _, key in even & odd if "v0" in key}
+    assert not own
+    assert any("v0001" in key for _, _, key in even | odd)
+
+
+def test_the_form_that_zenoh_takes() -> None:
+    control = access_control(SCENARIO)
+    assert (control["enabled"], control["default_permission"]) == (True, "deny")
+    ids = [rule["id"] for rule in control["rules"]]
+    assert len(set(ids)) == len(ids)
+    subjects = {subject["id"]: subject["cert_common_names"] for subject in control["subjects"]}
+    assert all(names == [subject] for subject, names in subjects.items())
+    used = {rule for policy in control["policies"] for rule in policy["rules"]}
+    assert used == set(ids)
+    assert {name for policy in control["policies"] for name in policy["subjects"]} == set(subjects)
+    # The router carries everything and takes part in nothing.
+    assert set(subjects) == {one.common_name for one in identities_of(SCENARIO)} - {"router"}
+    json.dumps(control, allow_nan=False)
+
+
+def test_what_is_longest() -> None:
+    requests, messages = size_limits(SCENARIO)
+    assert requests["size_limit"] > SCENARIO.service.max_request_bytes
+    asked = [topic for topic in TOPICS if topic.exchange is Exchange.QUESTIONS]
+    assert len(requests["key_exprs"]) == len(asked)
+    assert all(key.startswith(PREFIX) for key in requests["key_exprs"] + messages["key_exprs"])
+
+
+def test_an_open_network_has_no_guard() -> None:
+    assert guard_of(Scenario(), {}) is None
+    guard = guard_of(SCENARIO, {})
+    assert guard is not None
+    assert guard.host == "router"
+    everywhere = parse_scenario(
+        {"network": {"endpoint": "tls/0.0.0.0:7447"}, "security": {"mode": "mtls"}}
+    )
+    guard = guard_of(everywhere, {})
+    assert guard is not None
+    assert guard.host == ""
+
+
+# --- access ---------------------------------------------------------------------------------------
+
+
+def test_credentials_lie_in_the_folder() -> None:
+    access = access_of(SCENARIO, "coordinator.c1", {})
+    assert access.identity == "coordinator.c1"
+    assert access.credentials == Credentials(
+        "/keys/ca.pem", "/keys/coordinator.c1.pem", "/keys/coordinator.c1.key"
+    )
+    assert access_of(load_scenario(None), "coordinator.c1", {}).credentials is None
+
+
+def test_the_environment_goes_before_the_folder() -> None:
+    environment = {
+        "LANEWEAVE_CA_FILE": "ca",
+        "LANEWEAVE_CERTIFICATE_FILE": "own",
+        "LANEWEAVE_PRIVATE_KEY": "secret words",
+    }
+    credentials = access_of(SCENARIO, "bridge", environment).credentials
+    assert credentials == Credentials("ca", "own", "", "secret words")
+    assert "secret" not in repr(credentials)
+    both = environment | {"LANEWEAVE_PRIVATE_KEY_FILE": "key"}
+    error = refusal(access_of, SCENARIO, "bridge", both)
+    assert error.field == "LANEWEAVE_PRIVATE_KEY_FILE"
+    assert "secret" not in str(error)
+
+
+def test_only_identities_have_credentials() -> None:
+    assert refusal(access_of, SCENARIO, "somebody", {}).field == "identity"
+
+
+@pytest.mark.parametrize("identity", ["coordinator.c9", "client.nobody", "fleet.none"])
+def test_whom_the_configuration_does_not_know_is_refused(identity: str) -> None:
+    # The router would let it in, and let it do nothing.
+    error = refusal(access_of, SCENARIO, identity, {})
+    assert error.field == "identity"
+    assert "security.clients" in str(error)
+    assert access_of(load_scenario(None), identity, {}).credentials is None
+
+
+def test_a_secured_scenario_survives_the_way_to_a_process() -> None:
+    assert parse_scenario(to_tables(SCENARIO)) == SCENARIO
+    hash(SCENARIO)

@@ -1,0 +1,130 @@
+"""Strict structuring: nothing is coerced, and the path leads to what is wrong."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from attrs import field, frozen
+
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.field_validators import within
+from laneweave.protocol.parsing import NumberOrRange, structure
+from support.refusals import refusal
+
+
+@frozen
+class Part:
+    """A nested table."""
+
+    size: float = field(validator=within(0.0, 10.0))
+    name: str = "none"
+
+
+@frozen
+class Whole:
+    """Everything that structuring knows."""
+
+    count: int
+    flag: bool = False
+    raw: bytes = b""
+    part: Part = Part(1.0)
+    parts: tuple[Part, ...] = ()
+    pair: tuple[int, str] = (1, "a")
+    table: dict[str, tuple[int, ...]] = field(factory=dict)
+    maybe: int | None = None
+    span: NumberOrRange = 1.0
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"), [(2, 2.0), (2.5, 2.5), ([1, 2.5], (1.0, 2.5)), ((1, 2), (1.0, 2.0))]
+)
+def test_a_number_or_a_range(given: object, expected: NumberOrRange) -> None:
+    assert structure({"count": 1, "span": given}, Whole).span == expected
+
+
+@pytest.mark.parametrize("given", ["1", True, [1], [1, 2, 3], [1, "2"], [1, math.inf], {"a": 1}])
+def test_neither_a_number_nor_a_range(given: object) -> None:
+    with pytest.raises(BadInputError, match=r"^span: got "):
+        structure({"count": 1, "span": given}, Whole)
+
+
+def test_good_data_becomes_the_class() -> None:
+    data = {
+        "count": 1,
+        "flag": True,
+        "raw": b"x",
+        "part": {"size": 2},
+        "parts": [{"size": 3.0, "name": "p"}, {"size": 4}],
+        "pair": [2, "b"],
+        "table": {"k": [1, 2]},
+        "maybe": 5,
+    }
+    whole = structure(data, Whole)
+    assert whole == Whole(
+        1, True, b"x", Part(2.0), (Part(3.0, "p"), Part(4.0)), (2, "b"), {"k": (1, 2)}, 5
+    )
+    assert type(whole.part.size) is float
+
+
+@pytest.mark.parametrize(
+    ("change", "path"),
+    [
+        ({"count": True}, "count"),
+        ({"count": "1"}, "count"),
+        ({"count": 1.0}, "count"),
+        ({"flag": 1}, "flag"),
+        ({"raw": "x"}, "raw"),
+        ({"raw": [1]}, "raw"),
+        ({"part": None}, "part"),
+        ({"part": []}, "part"),
+        ({"part": {}}, "part.size"),
+        ({"part": {"size": True}}, "part.size"),
+        ({"part": {"size": "1"}}, "part.size"),
+        ({"part": {"size": math.nan}}, "part.size"),
+        ({"part": {"size": 10**400}}, "part.size"),
+        ({"part": {"size": 11}}, "part.size"),
+        ({"part": {"size": 1, "name": 1}}, "part.name"),
+        ({"part": {"size": 1, "more": 1}}, "part.more"),
+        ({"part": {"size": 1, 2: 3}}, "part"),
+        ({"parts": {}}, "parts"),
+        ({"parts": "ab"}, "parts"),
+        ({"parts": {"size": 1}}, "parts"),
+        ({"parts": [{"size": 1}, {"size": -1}]}, "parts[1].size"),
+        ({"parts": [{"size": 1}, 5]}, "parts[1]"),
+        ({"pair": "1a"}, "pair"),
+        ({"pair": [1]}, "pair"),
+        ({"pair": [1, "a", 2]}, "pair"),
+        ({"pair": [1, 2]}, "pair[1]"),
+        ({"pair": {1: 1, 2: "a"}}, "pair"),
+        ({"table": []}, "table"),
+        ({"table": {1: []}}, "table[1]"),
+        ({"table": {"k": 1}}, "table[k]"),
+        ({"table": {"k": [1, "2"]}}, "table[k][1]"),
+        ({"maybe": "x"}, "maybe"),
+        ({"maybe": False}, "maybe"),
+        ({"more": 1}, "more"),
+    ],
+)
+def test_what_is_wrong_is_named_by_its_path(change: dict[str, Any], path: str) -> None:
+    error = refusal(structure, {"count": 1} | change, Whole)
+    assert error.field == path
+    assert str(error).startswith(f"{path}: got ")
+
+
+@pytest.mark.parametrize("data", [None, 5, "x", [], [("count", 1)], {1: 2}])
+def test_what_is_no_table_is_refused(data: Any) -> None:  # noqa: ANN401
+    with pytest.raises(BadInputError):
+        structure(data, Whole)
+
+
+def test_a_missing_field_says_so() -> None:
+    with pytest.raises(BadInputError, match=r"^count: got 'nothing'; allowed: .*required$"):
+        structure({}, Whole)
+
+
+def test_the_value_is_not_changed() -> None:
+    data = {"count": 1, "table": {"k": [1]}}
+    structure(data, Whole)
+    assert data == {"count": 1, "table": {"k": [1]}}

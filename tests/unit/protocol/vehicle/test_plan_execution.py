@@ -1,0 +1,619 @@
+"""Rules V1 to V7 of the execution protocol, guard by guard."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from attrs import evolve
+
+from laneweave.protocol.lattice import Cell, Lattice, PlannedMove
+from laneweave.protocol.vehicle.plan_execution import (
+    LISTEN_S,
+    VEHICLE_RULES,
+    ExecutionPhase,
+    PlanExecution,
+)
+from laneweave.protocol.wire.messages import Ballot, Name, Plan, Prepare, Sense, VehicleState
+from support.rule_books import RuleRecorder
+from support.states import holding
+from support.states import make_plan as plan_of
+
+A, B, C = Name("A"), Name("B"), Name("C")
+LOW = Ballot(1, Name("c1"), 10, 1)
+MID = Ballot(1, Name("c2"), 5, 9)
+HIGH = Ballot(2, Name("c1"), 10, 2)
+SLOT_S = 4.0
+T0_S = 100.0
+OVERDUE_S = 6.0
+LATTICE = Lattice(pitch_m=15.0, speed_mps=15.0, lane_width_m=3.5, lanes=3, block_columns=8)
+"""Block 0 has the columns -7 to 0, block 1 those from -15 to -8."""
+AT: dict[Name, Cell] = {A: (-4, 0), B: (-3, 0)}
+
+
+def vehicle(
+    name: Name = A,
+    cell: Cell = (-4, 0),
+    *,
+    moving: bool = False,
+    joined: tuple[int, ...] = (0,),
+) -> PlanExecution:
+    return PlanExecution(name, 7, cell, LATTICE, joined, moving=moving)
+
+
+def prepare(ballot: Ballot, *roster: Name, formations: tuple[int, ...] = (0,)) -> Prepare:
+    return Prepare(ballot, formations, roster or (A, B))
+
+
+def make_plan(
+    ballot: Ballot = MID,
+    moves: dict[Name, tuple[PlannedMove, ...]] | None = None,
+    cells: dict[Name, Cell] | None = None,
+    formations: tuple[int, ...] = (0,),
+) -> Plan:
+    cells = cells or AT
+    return plan_of(
+        cells,
+        moves or {A: ((0, (-4, 0), (-4, 1)),)},
+        ballot=ballot,
+        formations=formations,
+        incarnations=dict.fromkeys(cells, 7),
+        t0_s=T0_S,
+        slot_s=SLOT_S,
+    )
+
+
+def shown(name: Name = B, ballot: Ballot | None = MID, **more: object) -> VehicleState:
+    """Return the state of a vehicle that has accepted a plan and is ready."""
+    return holding(name, ballot, (-4, 0), **({"accepted": True, "ready": True} | more))
+
+
+def taken(plan: Plan | None = None, name: Name = A) -> PlanExecution:
+    """Promise and take a plan, which the controller has not noted yet."""
+    plan = plan or make_plan()
+    execution = vehicle(name, plan.start_cells[name])
+    execution.on_prepare(prepare(plan.ballot, *plan.roster))
+    assert execution.on_plan(plan)
+    return execution
+
+
+def accept(execution: PlanExecution, plan: Plan) -> None:
+    """Take a plan, and let the controller note it."""
+    assert execution.on_plan(plan)
+    assert execution.on_noted(plan.ballot)
+
+
+def accepted(plan: Plan | None = None, name: Name = A) -> PlanExecution:
+    execution = taken(plan, name)
+    assert execution.promised is not None
+    assert execution.on_noted(execution.promised)
+    return execution
+
+
+def going(plan: Plan | None = None, name: Name = A) -> PlanExecution:
+    """Accept a plan and hear the open gate from the first other member."""
+    execution = accepted(plan, name)
+    assert execution.plan is not None
+    other = next(each for each in execution.plan.roster if each != name)
+    execution.on_state(shown(other, go=True))
+    assert execution.go
+    return execution
+
+
+# --- V1 ---------------------------------------------------------------------------------------
+
+
+def test_v1_starts_with_nothing() -> None:
+    execution = vehicle(joined=(0, 3))
+    assert (execution.promised, execution.plan, execution.completed) == (None, None, 0)
+    assert not any((execution.go, execution.ready, execution.done, execution.moving))
+    assert (execution.phase, execution.next_move, execution.tick(1e9)) == (
+        ExecutionPhase.FREE,
+        None,
+        None,
+    )
+    assert not execution.overdue(1e9)
+    assert execution.wanted_joined == execution.joined == (0, 3)
+
+
+def test_v1_takes_a_motion_over() -> None:
+    execution = vehicle(cell=(-4, 1), moving=True)
+    assert not execution.ready
+    execution.end_motion()
+    assert (execution.moving, execution.completed, execution.hold_cell) == (False, 0, (-4, 1))
+
+
+# --- V2 ---------------------------------------------------------------------------------------
+
+
+def test_v2_promises_rising_ballots_only() -> None:
+    execution = vehicle()
+    for ballot, promised in ((MID, MID), (LOW, MID), (MID, MID), (HIGH, HIGH), (MID, HIGH)):
+        assert execution.on_prepare(prepare(ballot))  # whatever the ballot, the state answers
+        assert execution.promised == promised
+        assert execution.phase is ExecutionPhase.PROMISED
+
+
+@pytest.mark.parametrize(
+    ("lower", "higher"),
+    [
+        (Ballot(1, Name("z"), 9, 9), Ballot(2, Name("a"), 1, 1)),
+        (Ballot(1, Name("a"), 9, 9), Ballot(1, Name("b"), 1, 1)),
+        (Ballot(1, Name("a"), 1, 9), Ballot(1, Name("a"), 2, 1)),
+        (Ballot(1, Name("a"), 1, 9), Ballot(1, Name("a"), 1, 10)),
+    ],
+)
+def test_v2_term_then_coordinator_then_incarnation_then_seq(lower: Ballot, higher: Ballot) -> None:
+    execution = vehicle()
+    execution.on_prepare(prepare(lower))
+    execution.on_prepare(prepare(higher))
+    assert execution.promised == higher
+    execution.on_prepare(prepare(lower))
+    assert execution.promised == higher
+
+
+def test_v2_not_in_the_roster() -> None:
+    execution = vehicle()
+    assert not execution.on_prepare(prepare(HIGH, B, C, formations=(0, 1)))
+    assert (execution.promised, execution.phase) == (None, ExecutionPhase.FREE)
+    assert execution.wanted_joined == (0,)
+
+
+def test_v2_forgets_plan_progress_gate_and_what_was_heard() -> None:
+    execution = going()
+    execution.on_state(shown(completed=3))
+    assert execution.tick(T0_S) is not None
+    execution.end_motion()
+    assert (execution.completed, execution.heard) == (1, {B: 3})
+    execution.on_prepare(prepare(HIGH))
+    assert (execution.plan, execution.completed, execution.go) == (None, 0, False)
+    assert (execution.heard, execution.needs) == ({}, ())
+    assert execution.hold_cell == (-4, 1)
+
+
+@pytest.mark.parametrize("ballot", [LOW, MID])
+@pytest.mark.parametrize("reach", [taken, accepted, going])
+def test_v2_a_repeat_or_a_lower_ballot_changes_nothing(
+    ballot: Ballot, reach: Callable[[], PlanExecution]
+) -> None:
+    execution = reach()
+    execution.on_state(shown())
+    before = repr(execution)
+    assert execution.on_prepare(prepare(ballot, formations=(0, 1)))
+    assert repr(execution) == before
+
+
+def test_v2_while_moving_the_motion_ends_but_counts_for_no_plan() -> None:
+    execution = accepted()
+    execution.on_state(shown())
+    assert execution.tick(T0_S) == (0, (-4, 0), (-4, 1))
+    assert (execution.hold_cell, execution.moving, execution.ready) == ((-4, 1), True, True)
+
+    execution.on_prepare(prepare(HIGH))
+    assert (execution.hold_cell, execution.moving, execution.ready) == ((-4, 1), True, False)
+    newer = make_plan(HIGH, {A: ((0, (-4, 1), (-4, 2)),)}, {A: (-4, 1), B: (-3, 0)})
+    accept(execution, newer)
+    assert not execution.ready  # it still occupies the footprint of the old move
+    execution.on_state(shown(ballot=HIGH))
+    assert execution.tick(T0_S) is None
+    assert not execution.go
+
+    execution.end_motion()
+    assert execution.completed == 0
+    assert execution.ready
+    assert execution.tick(T0_S) == (0, (-4, 1), (-4, 2))
+
+
+def test_v2_asks_for_the_formations_of_the_ballot_and_never_for_fewer() -> None:
+    execution = vehicle(joined=(0, 2))
+    for ballot, formations, wanted in (
+        (LOW, (0, 1), (0, 1, 2)),
+        (MID, (0,), (0, 1, 2)),
+        (HIGH, (5, 0), (0, 1, 2, 5)),
+    ):
+        execution.on_prepare(prepare(ballot, formations=formations))
+        assert execution.wanted_joined == wanted
+        assert execution.joined == (0, 2)  # only the motion controller changes that
+
+
+def test_late_reports_do_not_undo_joining() -> None:
+    execution = vehicle(joined=(0, 2))
+    for heard, news, known in (
+        ((0,), False, (0, 2)),
+        ((), False, (0, 2)),
+        ((0, 1, 2), True, (0, 1, 2)),
+        ((0, 1, 2), False, (0, 1, 2)),
+        ((5, 0), True, (0, 1, 2, 5)),
+        ((0, 2), False, (0, 1, 2, 5)),
+    ):
+        assert execution.on_joined(heard) == news
+        assert execution.joined == known
+
+
+# --- V3 ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("reach", "phase"), [(accepted, ExecutionPhase.GATED), (going, ExecutionPhase.GOING)]
+)
+def test_v3_accepts_the_plan_of_the_promised_ballot_once(
+    reach: Callable[[], PlanExecution], phase: ExecutionPhase
+) -> None:
+    execution = reach()
+    plan = execution.plan
+    assert (execution.ready, execution.phase) == (True, phase)
+    for second in (make_plan(), make_plan(moves={A: ((0, (-4, 0), (-5, 0)),)})):
+        assert not execution.on_plan(second)
+        assert (execution.plan, execution.phase) == (plan, phase)
+
+
+@pytest.mark.parametrize("promised", [None, LOW, HIGH])
+def test_v3_ignores_plans_of_ballots_that_it_has_not_promised(promised: Ballot | None) -> None:
+    execution = vehicle()
+    if promised is not None:
+        execution.on_prepare(prepare(promised))
+    assert not execution.on_plan(make_plan(MID))
+    assert (execution.plan, execution.promised) == (None, promised)
+
+
+SPOILED = {
+    "older incarnation": evolve(make_plan(), incarnations={A: 6, B: 7}),
+    "newer incarnation": evolve(make_plan(), incarnations={A: 8, B: 7}),
+    "no incarnation": evolve(make_plan(), incarnations={B: 7}),
+    "other start cell": make_plan(cells={A: (-4, 2), B: (-3, 0)}, moves={B: ()}),
+    "no start cell": evolve(make_plan(), start_cells={B: (-3, 0)}),
+    "territory": evolve(make_plan(), territory=()),
+    "not in the roster": evolve(make_plan(), roster=(B,)),
+    "drives into B": make_plan(moves={A: ((0, (-4, 0), (-3, 0)),)}),
+    "jumps": make_plan(moves={A: ((0, (-4, 0), (-4, 2)),)}),
+    "no time": evolve(make_plan(), slot_s=0.0),
+    "no block": evolve(make_plan(), formations=()),
+    "another block": evolve(make_plan(), formations=(1,)),
+    "a block that is not joined": make_plan(formations=(0, 1)),
+}
+
+
+@pytest.mark.parametrize("spoiled", SPOILED.values(), ids=SPOILED.keys())
+def test_v3_ignores_a_plan_that_does_not_fit(spoiled: Plan) -> None:
+    execution = vehicle()
+    execution.on_prepare(prepare(MID))
+    assert not execution.on_plan(spoiled)
+    assert (execution.plan, execution.needs, execution.phase) == (None, (), ExecutionPhase.PROMISED)
+    assert execution.on_plan(make_plan())  # the right one is still accepted
+
+
+@pytest.mark.parametrize("beyond", [(-8, 0), (1, 0), (-4, 3), (-4, -1), (-20, 0)])
+def test_v3_the_territory_stays_within_the_blocks_of_the_plan(beyond: Cell) -> None:
+    """Plans of other formations run at the same time; only the blocks keep them apart."""
+    execution = vehicle()
+    execution.on_prepare(prepare(MID))
+    plan = make_plan()
+    assert not execution.on_plan(evolve(plan, territory=(*plan.territory, beyond)))
+    assert execution.on_plan(evolve(plan, territory=(*plan.territory, (-7, 2), (0, 2))))
+
+
+def test_v3_a_joint_plan_waits_until_the_controller_has_confirmed_its_formations() -> None:
+    execution = vehicle()
+    execution.on_prepare(prepare(MID, formations=(0, 1)))
+    joint = make_plan(
+        moves={A: ((0, (-4, 0), (-4, 1)),)}, cells={A: (-4, 0), B: (-9, 0)}, formations=(0, 1)
+    )
+    for joined in ((0,), (1,), (), (0, 2)):
+        execution.joined = joined
+        assert not execution.on_plan(joint)
+    execution.joined = (0, 1)
+    assert execution.on_plan(joint)
+
+
+@pytest.mark.parametrize("formations", [(0,), (1,), (0, 1), (1, 2), (0, 2)])
+def test_v3_ignores_a_plan_for_some_of_the_blocks_that_are_joined(
+    formations: tuple[int, ...],
+) -> None:
+    """Vehicles of the other blocks may be in any of them."""
+    execution = vehicle(joined=(0, 1, 2))
+    execution.on_prepare(prepare(MID, formations=(0, 1, 2)))
+    cells: dict[Name, Cell] = {A: (-4, 0)}
+    assert not execution.on_plan(make_plan(cells=cells, formations=formations))
+    assert execution.on_plan(make_plan(cells=cells, formations=(0, 1, 2)))
+
+
+def waits(execution: PlanExecution) -> bool:
+    """Return whether a vehicle neither acts nor reports as one that has accepted."""
+    return (
+        execution.phase is ExecutionPhase.TAKEN
+        and execution.tick(T0_S + 100.0) is None
+        and not any((execution.accepted, execution.ready, execution.go, execution.done))
+        and not execution.overdue(T0_S + 1000.0)
+    )
+
+
+@pytest.mark.parametrize("name", [A, B])  # B has no moves
+def test_v3_a_plan_is_accepted_when_the_controller_has_noted_it(name: Name) -> None:
+    execution = taken(name=name)
+    for heard in ((), (shown(A), shown(B)), (shown(A, go=True), shown(B, go=True))):
+        for state in heard:
+            execution.on_state(state)
+        assert waits(execution)  # whatever the others show
+    assert execution.needs_states(0.0)
+    assert execution.on_noted(MID)
+    assert (execution.phase, execution.accepted, execution.ready) == (
+        ExecutionPhase.GATED,
+        True,
+        True,
+    )
+    assert execution.done == (name == B)
+    execution.tick(T0_S)
+    assert execution.go  # what it has heard meanwhile counts
+
+
+@pytest.mark.parametrize("noted", [None, LOW, HIGH])
+def test_v3_a_note_of_another_ballot_is_ignored(
+    noted: Ballot | None,
+) -> None:
+    execution = taken()
+    assert not execution.on_noted(noted)
+    assert waits(execution)
+    assert execution.on_noted(MID)
+
+
+def test_v3_a_note_counts_once_and_only_for_a_plan_that_was_taken() -> None:
+    free, promised = vehicle(), vehicle()
+    promised.on_prepare(prepare(MID))
+    for execution in (free, promised, accepted(), going()):
+        before = repr(execution)
+        assert not execution.on_noted(MID)
+        assert not execution.on_noted(None)
+        assert repr(execution) == before
+
+
+def test_v3_a_plan_that_was_dropped_before_it_was_noted_is_not_accepted() -> None:
+    execution = taken()
+    execution.on_prepare(prepare(HIGH))
+    assert not execution.on_noted(MID)
+    newer = make_plan(HIGH)
+    assert execution.on_plan(newer)
+    assert not execution.on_noted(MID)  # that was the other one
+    assert waits(execution)
+    assert execution.on_noted(HIGH)
+
+
+# --- V4 and V5 --------------------------------------------------------------------------------
+
+
+IRRELEVANT = {
+    "not accepted": shown(accepted=False),
+    "not accepted, but go": shown(accepted=False, go=True),
+    "older ballot": shown(ballot=LOW),
+    "newer ballot": shown(ballot=HIGH, completed=5, go=True),
+    "nothing": shown(ballot=None, accepted=False),
+    "a stranger": shown(name=C, go=True),
+    "itself": shown(name=A, go=True),
+}
+
+
+@pytest.mark.parametrize("state", IRRELEVANT.values(), ids=IRRELEVANT.keys())
+def test_v4_irrelevant_states_are_ignored(state: VehicleState) -> None:
+    execution = accepted()
+    execution.on_state(state)
+    assert execution.heard == {}
+    assert execution.tick(T0_S) is None
+    assert not execution.go
+
+
+def test_v4_without_a_plan_nothing_is_heard() -> None:
+    execution = vehicle()
+    execution.on_state(shown(go=True))
+    execution.on_prepare(prepare(MID))
+    execution.on_state(shown(go=True))
+    assert (execution.heard, execution.go) == ({}, False)
+
+
+def test_v4_not_ready_counts_as_nothing_completed() -> None:
+    execution = accepted()
+    execution.on_state(shown(ready=False, completed=2))
+    assert execution.heard == {B: -1}
+    assert execution.tick(T0_S) is None
+    execution.on_state(shown(completed=0))
+    assert execution.heard == {B: 0}
+
+
+@pytest.mark.parametrize("reach", [taken, accepted, going])
+def test_v4_late_states_do_not_lower_what_was_heard(reach: Callable[[], PlanExecution]) -> None:
+    execution = reach()
+    for completed, ready, known in ((2, True, 2), (1, True, 2), (5, False, 2), (3, True, 3)):
+        execution.on_state(shown(completed=completed, ready=ready))
+        assert execution.heard == {B: known}
+
+
+def test_v4_an_open_gate_spreads() -> None:
+    execution = accepted()
+    execution.on_state(shown(ready=False, go=True))
+    assert execution.go
+    execution.on_state(shown(go=False))
+    assert execution.go
+    assert execution.tick(T0_S) is not None
+
+
+def test_v5_the_gate_needs_all_members() -> None:
+    cells: dict[Name, Cell] = {A: (-4, 0), B: (-2, 0), C: (-1, 0)}
+    execution = accepted(make_plan(cells=cells))
+    assert execution.tick(T0_S) is None
+    execution.on_state(shown(B))
+    assert execution.tick(T0_S) is None
+    execution.on_state(shown(C, ready=False))
+    assert execution.tick(T0_S) is None
+    assert not execution.go
+    execution.on_state(shown(C))
+    assert execution.tick(T0_S) == (0, (-4, 0), (-4, 1))
+    assert execution.go
+
+
+def test_v5_alone_in_the_roster() -> None:
+    execution = accepted(make_plan(cells={A: (-4, 0)}))
+    assert not execution.go
+    assert execution.tick(T0_S) is not None
+    assert execution.go
+
+
+def test_v5_opens_for_others_before_the_own_time_and_without_own_moves() -> None:
+    execution = accepted(name=B)
+    execution.on_state(shown(A))
+    assert execution.tick(T0_S - 50.0) is None
+    assert execution.go
+
+
+# --- V6 and V7 --------------------------------------------------------------------------------
+
+
+def test_v6_not_before_its_time() -> None:
+    execution = going(make_plan(moves={A: ((3, (-4, 0), (-4, 1)),)}))
+    due_s = T0_S + 3 * SLOT_S
+    assert execution.tick(due_s - 0.01) is None
+    assert (execution.hold_cell, execution.moving) == ((-4, 0), False)
+    assert execution.tick(due_s) == (3, (-4, 0), (-4, 1))
+    assert (execution.hold_cell, execution.moving) == ((-4, 1), True)
+
+
+def test_v6_a_late_move_needs_the_open_gate_and_nothing_else() -> None:
+    assert accepted().tick(T0_S + 100.0) is None
+    assert going().tick(T0_S + 100.0) == (0, (-4, 0), (-4, 1))
+
+
+def test_v6_dependencies() -> None:
+    """B follows A through two cells: each of its moves waits for the count that frees them."""
+    moves: dict[Name, tuple[PlannedMove, ...]] = {
+        A: ((0, (-3, 0), (-2, 0)), (1, (-2, 0), (-1, 0)), (5, (-1, 0), (-1, 1))),
+        B: ((1, (-4, 0), (-3, 0)), (2, (-3, 0), (-2, 0))),
+    }
+    execution = accepted(make_plan(moves=moves, cells={A: (-3, 0), B: (-4, 0)}), B)
+    late_s = T0_S + 100.0
+    execution.on_state(shown(A, completed=0))
+    assert execution.tick(late_s) is None
+    execution.on_state(shown(A, completed=1))
+    assert execution.tick(late_s) == (1, (-4, 0), (-3, 0))
+    assert execution.tick(late_s) is None  # one at a time
+    execution.end_motion()
+    assert execution.tick(late_s) is None
+    execution.on_state(shown(A, completed=2))
+    assert execution.tick(late_s) == (2, (-3, 0), (-2, 0))
+
+
+def test_v7_counts_and_is_done() -> None:
+    moves: dict[Name, tuple[PlannedMove, ...]] = {A: ((0, (-4, 0), (-4, 1)), (1, (-4, 1), (-4, 2)))}
+    execution = going(make_plan(moves=moves))
+    for count, t_s in ((0, T0_S), (1, T0_S + SLOT_S)):
+        assert execution.completed == count
+        assert not execution.done
+        assert execution.tick(t_s) is not None
+        assert execution.completed == count  # only once it is there
+        execution.end_motion()
+    assert execution.done
+    assert execution.hold_cell == (-4, 2)
+    assert execution.tick(T0_S + 1000.0) is None
+
+
+@pytest.mark.parametrize("reach", [vehicle, taken, accepted, going])
+def test_v7_without_a_motion_nothing_ends(reach: Callable[[], PlanExecution]) -> None:
+    execution = reach()
+    before = repr(execution)
+    execution.end_motion()
+    assert repr(execution) == before
+
+
+def test_without_moves_it_is_done_at_once() -> None:
+    execution = accepted(name=B)
+    assert execution.done
+    assert not execution.overdue(T0_S + 1000.0)
+
+
+# --- published states and needed states -------------------------------------------------------
+
+
+def test_states_matter_until_the_gate_is_open_and_while_a_move_waits() -> None:
+    assert not vehicle().needs_states(T0_S)
+    moves: dict[Name, tuple[PlannedMove, ...]] = {
+        A: ((0, (-3, 0), (-2, 0)),),
+        B: ((1, (-4, 0), (-3, 0)),),
+    }
+    execution = accepted(make_plan(moves=moves, cells={A: (-3, 0), B: (-4, 0)}), B)
+    assert execution.needs_states(0.0)
+    execution.on_state(shown(A, go=True))
+    assert not execution.needs_states(T0_S + SLOT_S - LISTEN_S - 0.1)
+    assert execution.needs_states(T0_S + SLOT_S - LISTEN_S)
+    execution.on_state(shown(A, completed=1))
+    assert not execution.needs_states(T0_S + SLOT_S)
+
+
+def test_overdue_runs_from_the_moment_the_next_move_is_due() -> None:
+    execution = accepted(make_plan(moves={A: ((2, (-4, 0), (-4, 1)),)}))
+    due_s = T0_S + 2 * SLOT_S
+    assert not execution.overdue(due_s + OVERDUE_S - 0.01)
+    assert execution.overdue(due_s + OVERDUE_S)
+    execution.on_state(shown())
+    assert execution.tick(due_s + OVERDUE_S) is not None
+    assert not execution.overdue(due_s + OVERDUE_S)  # on its way
+    execution.end_motion()
+    assert not execution.overdue(due_s + 100.0)  # done
+    execution.on_prepare(prepare(HIGH))
+    assert not execution.overdue(due_s + 100.0)  # no plan
+
+
+@pytest.mark.parametrize(("slot_s", "patience_s"), [(1.0, 1.5), (4.0, 6.0), (7.0, 9.0)])
+def test_how_long_a_move_may_be_due_follows_the_slots_of_its_plan(
+    slot_s: float, patience_s: float
+) -> None:
+    execution = accepted(evolve(make_plan(), slot_s=slot_s))
+    assert not execution.overdue(T0_S + patience_s - 0.01)
+    assert execution.overdue(T0_S + patience_s)
+
+
+@pytest.mark.parametrize("attended", [True, False])
+def test_the_state_says_what_the_vehicle_knows_and_senses(*, attended: bool) -> None:
+    sense = Sense(
+        A, 1001, 100.1, (7.0, 14.0, 0.5, 2.0, 0.1, 0.0), (-4, 1), 1038, (-4, 0), 2, (), joined=(0,)
+    )
+    execution = going()
+    assert execution.tick(T0_S) is not None
+    expected = holding(
+        A, MID, (-4, 1), incarnation=7, formation=3, accepted=True, ready=True, moving=True,
+        go=True, attended=attended, s_m=7.0, y_m=2.0, speed_mps=14.0, t_s=100.1,
+    )  # fmt: skip
+    assert execution.state(sense, 3, attended=attended) == expected
+    execution.end_motion()
+    assert execution.state(sense, 3, attended=attended) == evolve(
+        expected, moving=False, done=True, completed=1
+    )
+    late = evolve(sense, t_s=T0_S + OVERDUE_S)
+    assert accepted().state(late, 3, attended=attended).overdue
+
+
+# --- the table as a whole ---------------------------------------------------------------------
+
+
+def test_a_history_takes_every_row_of_the_table() -> None:
+    """No row is hidden behind an earlier one."""
+    book = RuleRecorder(VEHICLE_RULES)
+    execution = evolve(vehicle(moving=True), rules=book)
+    execution.on_plan(make_plan())
+    execution.end_motion()
+    for _ in range(2):
+        execution.on_prepare(prepare(MID))
+    for _ in range(2):
+        execution.on_plan(make_plan())
+    for _ in range(2):
+        execution.on_noted(MID)
+    execution.on_state(shown())
+    for _ in range(2):
+        execution.tick(T0_S)
+    for _ in range(2):
+        execution.end_motion()
+    execution.on_prepare(prepare(HIGH))
+    accept(execution, make_plan(HIGH, {A: ()}, {A: (-4, 1), B: (-3, 0)}))
+    for _ in range(2):
+        execution.on_state(shown(ballot=HIGH, go=True))
+    rules = [f"{book.table[row].rule} row {row}" for row in book.taken]
+    assert rules == [
+        "V7 row 9", "V2 row 0", "V2 row 1", "V3 row 2", "V3 row 3", "V4 row 5", "V5 row 6",
+        "V6 row 7", "V7 row 8", "V2 row 0", "V3 row 2", "V3 row 3", "V4 row 4", "V4 row 5",
+    ]  # fmt: skip
+    assert {*book.taken} == {*range(len(VEHICLE_RULES.table))}

@@ -1,0 +1,268 @@
+"""Which agents a tick waits for, and which count as silent."""
+
+from __future__ import annotations
+
+import pytest
+from attrs import evolve
+
+from laneweave.protocol.scenario.fields import Runtime
+from laneweave.protocol.wire.messages import Name
+from laneweave.sim_bridge.road.tick_answers import LATE_SHARE, MAX_STRETCH, Answers
+
+RUNTIME = Runtime()
+DEADLINE_S, SILENT_S = RUNTIME.tick_deadline_s, RUNTIME.agent_silent_s
+A, B, C = Name("A"), Name("B"), Name("C")
+TICKS = round(SILENT_S / DEADLINE_S)
+"""Deadlines after which an agent is silent."""
+
+
+@pytest.fixture
+def answers() -> Answers:
+    """The agents of A and B are up; C is on the road, too."""
+    answers = Answers(RUNTIME)
+    for name in (A, B):
+        answers.agent_up(name)
+    return answers
+
+
+def tick(answers: Answers, now_s: float, *heard: Name, lasts_s: float = DEADLINE_S) -> list[Name]:
+    """Ask all agents, let some answer; return those that are silent when the next tick begins."""
+    answers.ask((A, B, C), now_s, link_up=True)
+    for name in heard:
+        answers.heard(name)
+        answers.awaited.discard(name)
+    answers.close()
+    return answers.settle(now_s + lasts_s)
+
+
+def test_waits_for_agents_that_are_up_until_the_deadline(answers: Answers) -> None:
+    answers.ask((A, B, C), 5.0, link_up=True)
+    assert answers.awaited == {A, B}
+    answers.awaited.discard(A)
+    assert not answers.complete(5.0 + 0.99 * DEADLINE_S)
+    assert answers.complete(5.0 + DEADLINE_S)
+    assert answers.close() == 1  # B's answer is missing
+    assert answers.awaited == set()
+    assert answers.complete(5.0)
+
+
+def test_awaited_agents_are_asked_again_at_intervals(answers: Answers) -> None:
+    answers.ask((A, B, C), 5.0, link_up=True)
+    resend_s = RUNTIME.tick_resend_s
+    assert answers.ask_again(5.0 + 0.99 * resend_s) == []
+    assert answers.ask_again(5.0 + resend_s) == [A, B]
+    answers.awaited.discard(B)
+    assert answers.ask_again(5.0 + 1.5 * resend_s) == []
+    assert answers.ask_again(5.0 + 2.0 * resend_s) == [A]
+
+
+def test_an_agent_without_answers_for_long_is_silent(answers: Answers) -> None:
+    for number in range(-100, 1):  # some misses are no silence
+        heard = (A,) if number % (TICKS - 1) else (A, B)
+        assert tick(answers, number * DEADLINE_S, *heard) == []
+        assert answers.silent == set()
+    answers.ask((A, B), 1.0, link_up=True)
+    assert answers.awaited == {A, B}
+    answers.heard(B)
+    fallen = [tick(answers, number * DEADLINE_S, A) for number in range(TICKS + 3)]
+    assert fallen == [[]] * (TICKS - 1) + [[B], [], [], []]
+    answers.ask((A, B), 100.0, link_up=True)
+    assert answers.awaited == {A}
+
+
+@pytest.mark.parametrize("sign", ["answer", "token"])
+def test_a_sign_of_life_ends_the_silence(answers: Answers, sign: str) -> None:
+    for number in range(TICKS):
+        tick(answers, number * DEADLINE_S, A)
+    if sign == "answer":
+        answers.heard(B)
+    else:
+        answers.agent_down(B)
+        answers.agent_up(B)
+    for number in range(TICKS - 1):  # all the time again
+        assert tick(answers, 50.0 + number * DEADLINE_S, A) == []
+    assert tick(answers, 99.0, A) == [B]
+
+
+@pytest.mark.parametrize(
+    ("lasts_s", "ticks"),
+    [(20.0, TICKS), (0.1 * DEADLINE_S, 10 * TICKS)],
+    ids=["the entrance waits or the pace is slow", "ticks of others are short"],
+)
+def test_silence_is_the_time_spent_waiting_for_an_answer(
+    answers: Answers, lasts_s: float, ticks: int
+) -> None:
+    fallen = [tick(answers, number * lasts_s, A, lasts_s=lasts_s) for number in range(ticks)]
+    assert fallen == [[]] * (ticks - 1) + [[B]]
+
+
+def test_agents_without_a_token_and_departed_ones_are_not_silent(answers: Answers) -> None:
+    for number in range(2 * TICKS):
+        answers.ask((A, C), number * DEADLINE_S, link_up=True)
+        answers.heard(A)
+        assert answers.settle((number + 1) * DEADLINE_S) == []
+    for number in range(TICKS - 1):
+        tick(answers, 50.0 + number * DEADLINE_S, A)
+    answers.forget(B)
+    assert tick(answers, 99.0, A) == []
+
+
+def test_without_a_connection_no_agent_is_awaited_or_becomes_silent(answers: Answers) -> None:
+    for number in range(2 * TICKS):
+        answers.ask((A, B), number * DEADLINE_S, link_up=False)
+        assert answers.awaited == set()
+        assert answers.settle((number + 1) * DEADLINE_S) == []
+    assert not answers.deaf
+    for number in range(2 * TICKS):  # lost while the tick is under way
+        answers.ask((A, B), 50.0 + number * DEADLINE_S, link_up=True)
+        answers.link_down()
+        assert answers.settle(50.0 + (number + 1) * DEADLINE_S) == []
+
+
+# --- answers that come too late ---------------------------------------------------------------
+
+LATE_TICKS = round(LATE_SHARE * TICKS)
+"""Deadlines that an agent may miss with all its answers."""
+
+
+def late_tick(answers: Answers, number: int, *effective: Name) -> None:
+    """Let A and B be heard, but only some in time."""
+    answers.ask((A, B, C), number * DEADLINE_S, link_up=True)
+    for name in (A, B):
+        answers.heard(name)
+    for name in effective:
+        answers.effective(name)
+        answers.awaited.discard(name)
+    answers.close()
+    assert answers.settle((number + 1) * DEADLINE_S) == []
+
+
+def test_an_agent_that_always_answers_late_is_ineffective_but_not_silent(answers: Answers) -> None:
+    for number in range(LATE_TICKS - 1):
+        late_tick(answers, number, A)
+        assert not answers.ineffective(B)
+    late_tick(answers, LATE_TICKS, A)
+    assert [answers.ineffective(name) for name in (A, B, C)] == [False, True, False]
+    assert answers.silent == set()
+    answers.ask((A, B), 100.0, link_up=True)
+    assert answers.awaited == {A, B}  # it may catch up
+
+
+def test_one_answer_in_time_in_a_while_is_enough_to_be_effective(answers: Answers) -> None:
+    for number in range(10 * LATE_TICKS):
+        late_tick(answers, number, *((A, B) if number % LATE_TICKS == 0 else (A,)))
+        assert not answers.ineffective(B)
+
+
+@pytest.mark.parametrize("sign", ["in time", "token", "no token", "left"])
+def test_what_ends_being_ineffective(answers: Answers, sign: str) -> None:
+    for number in range(LATE_TICKS):
+        late_tick(answers, number, A)
+    assert answers.ineffective(B)
+    match sign:
+        case "in time":
+            answers.effective(B)
+        case "token":
+            answers.agent_up(B)
+        case "no token":
+            answers.agent_down(B)
+        case _:
+            answers.forget(B)
+    assert not answers.ineffective(B)
+
+
+def test_time_off_the_network_makes_no_agent_ineffective(answers: Answers) -> None:
+    for number in range(2 * LATE_TICKS):
+        answers.ask((A, B), number * DEADLINE_S, link_up=number % 2 == 0)
+        answers.link_down()
+        answers.settle((number + 1) * DEADLINE_S)
+    assert not answers.ineffective(A)
+
+
+# --- no agent answers -------------------------------------------------------------------------
+
+
+def make_deaf(answers: Answers) -> None:
+    for number in range(TICKS):
+        assert not answers.deaf
+        tick(answers, number * DEADLINE_S)
+    assert answers.deaf
+
+
+def test_a_deaf_network_awaits_no_agent(answers: Answers) -> None:
+    make_deaf(answers)
+    answers.agent_up(C)  # tokens come through when messages do not
+    answers.ask((A, B, C), 100.0, link_up=True)
+    assert answers.awaited == set()
+    assert answers.complete(100.0)
+
+
+def test_an_agent_that_joins_a_deaf_network_becomes_silent(answers: Answers) -> None:
+    make_deaf(answers)
+    answers.agent_up(C)
+    short_s = 0.25 * DEADLINE_S
+    fallen = [tick(answers, 90.0 + n * short_s, lasts_s=short_s) for n in range(4 * TICKS)]
+    assert fallen == [[]] * (4 * TICKS - 1) + [[C]]
+
+
+def test_any_answer_ends_the_deafness(answers: Answers) -> None:
+    make_deaf(answers)
+    answers.heard(A)
+    assert not answers.deaf
+    answers.ask((A, B), 100.0, link_up=True)
+    assert answers.awaited == {A}  # B is silent for itself
+
+
+def test_one_answer_in_a_while_is_enough(answers: Answers) -> None:
+    for number in range(10 * TICKS):
+        tick(answers, number * DEADLINE_S, *((A,) if number % (TICKS - 1) == 0 else ()))
+        assert not answers.deaf
+
+
+def test_an_empty_road_is_not_deaf(answers: Answers) -> None:
+    for number in range(3 * TICKS):
+        answers.ask((), number * DEADLINE_S, link_up=True)
+        assert answers.settle((number + 1) * DEADLINE_S) == []
+    assert not answers.deaf
+
+
+def test_deadlines_may_be_as_long_as_silence() -> None:
+    answers = Answers(evolve(RUNTIME, tick_deadline_s=SILENT_S))
+    answers.agent_up(A)
+    answers.agent_up(B)
+    assert tick(answers, 0.0, B, lasts_s=SILENT_S) == [A]
+
+
+def slow_ticks(answers: Answers, names: list[Name], count: int, *, late: bool) -> float:
+    """Let ticks pass; return how long the next one may last."""
+    now_s = 100.0
+    for _ in range(count):
+        answers.ask(names, now_s, link_up=True)
+        for name in names:
+            answers.heard(name)
+            answers.effective(name)
+            if late:
+                answers.late(name)
+        now_s += 1.0
+    answers.ask(names, now_s, link_up=True)
+    return answers.deadline_s - now_s
+
+
+def test_ticks_get_more_time_while_many_answers_are_late_and_less_again() -> None:
+    answers = Answers(RUNTIME)
+    names = [Name(f"v{number}") for number in range(40)]
+    for name in names:
+        answers.agent_up(name)
+    answers.ask(names, 0.0, link_up=True)
+    answers.late(names[0])  # one of many changes nothing
+    answers.ask(names, 1.0, link_up=True)
+    assert answers.deadline_s == pytest.approx(1.0 + DEADLINE_S)
+    assert slow_ticks(answers, names, 3, late=False) == pytest.approx(DEADLINE_S)
+    assert slow_ticks(answers, names, 1, late=True) == pytest.approx(1.5 * DEADLINE_S)
+    assert slow_ticks(answers, names, 30, late=True) == pytest.approx(MAX_STRETCH * DEADLINE_S)
+    assert answers.resend_s - (answers.deadline_s - MAX_STRETCH * DEADLINE_S) == pytest.approx(
+        MAX_STRETCH * RUNTIME.tick_resend_s
+    )
+    relaxed_s = slow_ticks(answers, names, 30, late=False)
+    assert DEADLINE_S < relaxed_s < MAX_STRETCH * DEADLINE_S
+    assert slow_ticks(answers, names, 200, late=False) == pytest.approx(DEADLINE_S)
