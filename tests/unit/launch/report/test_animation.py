@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-import shutil
-import subprocess
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -21,11 +19,7 @@ from laneweave.launch.report import animation
 from laneweave.launch.report.animation import KINDS, animation_data
 from laneweave.launch.report.snapshots import _shade
 from laneweave.launch.web import road_script
-
-NODE = shutil.which("node")
-needs_node = pytest.mark.skipif(
-    NODE is None, reason="node is not installed: nothing here can run the page's script"
-)
+from support.javascript import needs_node, printed_json
 
 
 @pytest.fixture(scope="module")
@@ -101,16 +95,7 @@ def in_node(expression: str, data: dict[str, Any]) -> Any:  # noqa: ANN401 - any
         f"{script}\nconst run = laneweave.decode(JSON.parse(require('fs').readFileSync(0)));\n"
         f"console.log(JSON.stringify({expression}));"
     )
-    done = subprocess.run(
-        [str(NODE), "-e", program],
-        input=json.dumps(data),
-        capture_output=True,
-        text=True,
-        timeout=30,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    return printed_json(program, data)
 
 
 @needs_node

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import subprocess
 from typing import Any
 
 import pytest
@@ -12,11 +10,9 @@ import pytest
 from laneweave.launch.watch.frames import scene_of
 from laneweave.launch.web import road_script, text_of
 from laneweave.protocol.scenario.fields import Scenario
+from support.javascript import needs_node, printed_json
 
-NODE = shutil.which("node")
-pytestmark = pytest.mark.skipif(
-    NODE is None, reason="node is not installed: nothing here can run the page's script"
-)
+pytestmark = needs_node
 PAGE = "laneweave.launch.watch"
 BEGIN = "const store = new laneweaveFrames.FrameStore();"
 
@@ -28,16 +24,7 @@ def in_node(program: str, data: object = None) -> Any:  # noqa: ANN401 - any JSO
         "\nconst data = JSON.parse(require('fs').readFileSync(0));"
         f"\nconsole.log(JSON.stringify((() => {{ {program} }})()));"
     )
-    done = subprocess.run(
-        [str(NODE), "-e", whole],
-        input=json.dumps(data),
-        capture_output=True,
-        text=True,
-        timeout=30,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    return printed_json(whole, data)
 
 
 PARTS = ("frames", "layers")
