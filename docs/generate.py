@@ -231,13 +231,15 @@ def _planted_bugs() -> str:
     """Return the table of planted bugs."""
     found = json.loads(FOUND.read_text(encoding="utf-8"))
     lines = [
-        "| planted bug | rule | what is broken | spoils the story | it ends with | random search |",
+        "| planted bug | rule | what is broken | fails the scenario | it ends with | random search |",
         "|---|---|---|---|---|---|",
     ]
     for bug in BUGS:
         end = "two vehicles in one cell" if bug.collides else "disorder, or a wait"
         seed = found.get(bug.name, "-")
-        lines.append(f"| `{bug.name}` | {bug.rule} | {bug.text} | `{bug.story}` | {end} | {seed} |")
+        lines.append(
+            f"| `{bug.name}` | {bug.rule} | {bug.text} | `{bug.scenario}` | {end} | {seed} |"
+        )
     return "\n".join(lines)
 
 

@@ -1,4 +1,4 @@
-"""Every planted bug spoils a story: the stories would notice if a rule were missing."""
+"""Every planted bug makes a scenario fail: the scenarios would notice if a rule were missing."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import pytest
 from laneweave.coordinator.formations.leader import LEADER_RULES
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES
 from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES
-from scenarios.stories import check_story, ends_in_collision, player_of
-from scenarios.story_text import StoryError
+from scenarios.scenario_files import check_scenario, ends_in_collision, runner_of
+from scenarios.scenario_text import ScenarioError
 from support.planted_bugs import BUGS, NOT_A_SAFETY_MATTER, ROWS_OF_OTHERS, Bug, unchanged
 
 HERE = Path(__file__).parent
@@ -18,12 +18,12 @@ BOOKS = (VEHICLE_RULES, LEADER_RULES, TRANSFER_RULES)
 
 
 @pytest.mark.parametrize("bug", BUGS, ids=lambda bug: bug.name)
-def test_planted_bug_spoils_its_story(bug: Bug, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = HERE / f"{bug.story}.txt"
+def test_planted_bug_fails_its_scenario(bug: Bug, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = HERE / f"{bug.scenario}.txt"
     bug.plant(monkeypatch)
-    with pytest.raises(StoryError):
-        check_story(path, player_of(path, bug.vehicle_rules, bug.leader_rules))
-    collides = ends_in_collision(path, player_of(path, bug.vehicle_rules, bug.leader_rules))
+    with pytest.raises(ScenarioError):
+        check_scenario(path, runner_of(path, bug.vehicle_rules, bug.leader_rules))
+    collides = ends_in_collision(path, runner_of(path, bug.vehicle_rules, bug.leader_rules))
     assert collides is bug.collides
 
 

@@ -3,7 +3,7 @@
     python tests/simulation/search_bugs.py [SEEDS] [PROFILE ...]
 
 prints a Markdown table: for each bug of `planted_bugs.BUGS` the first seed that catches it, and
-what was violated. Bugs without one need a scripted schedule: the stories of tests/scenarios.
+what was violated. Bugs without one need a scripted schedule: the scenarios of tests/scenarios.
 """
 
 from __future__ import annotations
@@ -78,11 +78,11 @@ def bug_named(name: str) -> Bug:
 
 def table(catches: Iterable[Catch | None]) -> Iterator[str]:
     """Return the lines of a Markdown table."""
-    yield "| planted bug | rule | what is broken | random search | story |"
+    yield "| planted bug | rule | what is broken | random search | scenario |"
     yield "|---|---|---|---|---|"
     for bug, catch in zip(BUGS, catches, strict=True):
         found = "-" if catch is None else f"{catch.profile} {catch.seed}: {', '.join(catch.kinds)}"
-        yield f"| `{bug.name}` | {bug.rule} | {bug.text} | {found} | `{bug.story}` |"
+        yield f"| `{bug.name}` | {bug.rule} | {bug.text} | {found} | `{bug.scenario}` |"
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -1,7 +1,7 @@
 """The random search can fail: it finds planted bugs.
 
-`search_bugs.py` prints which ones, and with which seed; docs/SAFETY.md has its table. What random
-search does not find the stories of tests/scenarios do.
+`search_bugs.py` prints which ones, and with which seed; docs/SAFETY.md has its table. The text
+scenarios of tests/scenarios catch the others.
 """
 
 from __future__ import annotations

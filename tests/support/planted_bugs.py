@@ -1,8 +1,8 @@
 """Planted bugs: each breaks one rule of the protocol, to show that the tests would notice.
 
 Most replace a guard or an action in a rule book; a few change a row of the table, or something
-outside the books (`plant`). For each there is a story that it spoils; where it says so, the story
-then ends with two vehicles in one cell. docs/SAFETY.md lists what else catches it.
+outside the books (`plant`). Each makes a scenario of tests/scenarios fail. docs/SAFETY.md lists them
+and what else catches them.
 """
 
 from __future__ import annotations
@@ -47,12 +47,11 @@ class Bug:
     """Of docs/PROTOCOL.md, or one of `ROWS_OF_OTHERS`."""
     text: str
     """What is broken."""
-    story: str
-    """A story of tests/scenarios that it spoils."""
+    scenario: str
+    """A scenario of tests/scenarios that it makes fail."""
     collides: bool = True
-    """The spoilt story ends with two vehicles in one cell (in the rolling operation also: with two
-    owners of one, or with a body in a cell that is not its own); otherwise nothing worse than
-    disorder, or a vehicle that waits for ever."""
+    """That scenario ends with two vehicles in one cell (in the rolling operation also: with two
+    owners of one, or with a body in a cell that is not its own)."""
     replaced: Mapping[Function, Function] = field(factory=dict)
     """Guards and actions of a vehicle or a leader, and their replacements."""
     vehicle_row: Callable[[Transition], Transition] | None = None

@@ -1,4 +1,4 @@
-"""Stories of the rolling operation: vehicles own cells, and short ballots transfer them.
+"""Scenarios of the rolling operation: vehicles own cells, and short ballots transfer them.
 
 | command | what it does |
 |---|---|
@@ -29,17 +29,17 @@ from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.launch.fault_search.cell_ownership import CellOwnership
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import Ballot, Command, Heartbeat, Name, VehicleState
-from scenarios.story_leaders import RESEND_S, Mail, post
-from scenarios.story_player import Player
-from scenarios.story_road import ROLLING, SLOT_S, Agent, Vehicle
-from scenarios.story_text import CollisionError, StoryError, cell_of, written
+from scenarios.scenario_leaders import RESEND_S, Mail, post
+from scenarios.scenario_road import ROLLING, SLOT_S, Agent, Vehicle
+from scenarios.scenario_runner import Runner
+from scenarios.scenario_text import CollisionError, ScenarioError, cell_of, written
 
 Lines = Iterator[str]
 
 
 @define(eq=False)
 class StreamLeader:
-    """A leader with one ballot under way; the story plans for it."""
+    """A leader with one ballot under way; the scenario plans for it."""
 
     name: str
     term: int
@@ -91,8 +91,8 @@ class StreamLeader:
         return f"{self.name} {transfer.phase.value} {written(transfer.ballot)}{why}"
 
 
-class RollingPlayer(Player):
-    """The world of a story of the rolling operation."""
+class RollingRunner(Runner):
+    """The world of a scenario of the rolling operation."""
 
     def __init__(self, *rules: object) -> None:
         """Begin with an empty road; other rules plant a bug."""
@@ -160,7 +160,7 @@ class RollingPlayer(Player):
     def _agent_named(self, name: str) -> Agent:
         process = self.processes[name]
         if not isinstance(process, Agent):
-            raise StoryError(f"{name} is no agent")
+            raise ScenarioError(f"{name} is no agent")
         return process
 
     # --- leaders ------------------------------------------------------------------------------
@@ -231,17 +231,17 @@ class RollingPlayer(Player):
     def _transfer_of(self, name: str) -> CellTransfer:
         transfer = self.streams[name].transfer
         if transfer is None:
-            raise StoryError(f"{name} has no ballot")
+            raise ScenarioError(f"{name} has no ballot")
         return transfer
 
     def _shown_by(self, name: str) -> VehicleState:
         """Return what a process shows, or whoever is in charge of a vehicle of this name."""
         process = self._in_charge_of(name) if name in self.vehicles else self.processes[name]
         if process.shown is None:
-            raise StoryError(f"{name} has shown nothing")
+            raise ScenarioError(f"{name} has shown nothing")
         return process.shown
 
 
 def is_rolling(stem: str) -> bool:
-    """Tell whether a story of this name is one of the rolling operation."""
+    """Tell whether a scenario of this name is one of the rolling operation."""
     return re.match("rolling_", stem) is not None

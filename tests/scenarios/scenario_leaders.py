@@ -1,4 +1,4 @@
-"""The coordinators of a story: leaders that have taken a formation over, and whole candidates."""
+"""Coordinators of a scenario: leaders that have taken a formation over, and whole candidates."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ from laneweave.protocol.wire.messages import (
     VehicleState,
 )
 from laneweave.protocol.wire.topics import CENSUS, HEARTBEAT, STATE, Topic
-from scenarios.story_road import SCENARIO, SLOT_S, Vehicle
-from scenarios.story_text import cell_of, shown, written
+from scenarios.scenario_road import SCENARIO, SLOT_S, Vehicle
+from scenarios.scenario_text import cell_of, shown, written
 from support.paper import PAPER, closed_blocks
 
 Mail = dict[tuple[str, str, str], Prepare | Plan]
@@ -49,7 +49,7 @@ RESEND_S = 0.2
 
 @define(eq=False)
 class Leader:
-    """A coordinator that has taken a formation over; the story plans for it."""
+    """A coordinator that has taken a formation over; the scenario plans for it."""
 
     name: str
     control: FormationLeader
@@ -91,7 +91,7 @@ class Leader:
         yield from self._watched(lambda: self.control.on_members(formation, now_s))
 
     def plan(self, text: str, now_s: float) -> Iterator[str]:
-        """Issue a plan that the story gives."""
+        """Issue a plan that the scenario gives."""
         control = self.control
         if not control.take(PROMISED, now_s) or control.ballot is None:
             yield f"{self.name} cannot plan"
@@ -240,7 +240,7 @@ def formation_of(vehicles: Mapping[str, Vehicle], roster: str) -> Formation:
 
 
 def written_plan(text: str, control: FormationLeader, ballot: Ballot) -> Plan:
-    """Return the plan that a story gives, as the leader would issue it.
+    """Return the plan that a scenario gives, as the leader would issue it.
 
     Args:
         text: `A@0>0,2 B@1>0,1`; with `A:0,1@0>0,2` the leader takes A to be in (0, 1), with

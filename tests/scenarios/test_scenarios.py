@@ -1,4 +1,4 @@
-"""Every story in this folder goes exactly as written (`stories` tells how to read one)."""
+"""Every scenario in this folder runs exactly as written; `scenario_files` explains the language."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from pathlib import Path
 
 import pytest
 
-from scenarios.stories import check_story, ends_in_collision, read_story
-from scenarios.story_player import Player
-from scenarios.story_text import CollisionError, StoryError
+from scenarios.scenario_files import check_scenario, ends_in_collision, read_scenario
+from scenarios.scenario_runner import Runner
+from scenarios.scenario_text import CollisionError, ScenarioError
 
 HERE = Path(__file__).parent
-STORIES = sorted(HERE.glob("*.txt"))
+SCENARIOS = sorted(HERE.glob("*.txt"))
 
 
-@pytest.mark.parametrize("path", STORIES, ids=lambda path: path.stem)
-def test_story(path: Path) -> None:
-    check_story(path)
+@pytest.mark.parametrize("path", SCENARIOS, ids=lambda path: path.stem)
+def test_scenario(path: Path) -> None:
+    check_scenario(path)
 
 
-@pytest.mark.parametrize("path", STORIES, ids=lambda path: path.stem)
-def test_story_says_first_what_it_shows(path: Path) -> None:
+@pytest.mark.parametrize("path", SCENARIOS, ids=lambda path: path.stem)
+def test_scenario_says_first_what_it_shows(path: Path) -> None:
     lines = path.read_text(encoding="utf-8").splitlines()
     head = [line for line in lines[:5] if line.startswith("#")]
     assert 1 <= len(head) <= 4
@@ -29,7 +29,7 @@ def test_story_says_first_what_it_shows(path: Path) -> None:
     assert head[0].endswith("."), "the first line is a sentence of its own: README.md lists it"
 
 
-def test_readme_lists_all_stories() -> None:
+def test_readme_lists_all_scenarios() -> None:
     listed = re.findall(
         r"^\| \[(\w+)\]\((\w+)\.txt\) \| (.+) \|$",
         (HERE / "README.md").read_text(encoding="utf-8"),
@@ -37,10 +37,10 @@ def test_readme_lists_all_stories() -> None:
     )
     first_lines = {
         path.stem: path.read_text(encoding="utf-8").splitlines()[0].removeprefix("# ")
-        for path in STORIES
+        for path in SCENARIOS
     }
     assert all(name == link for name, link, _ in listed)
-    assert len(listed) == len(STORIES)
+    assert len(listed) == len(SCENARIOS)
     assert {name: text for name, _, text in listed} == first_lines
 
 
@@ -57,11 +57,11 @@ def test_readme_lists_all_stories() -> None:
         ("vehicle A at 0,0 wants 1\nleader L1 term 1 leads A\nL1 hears A", "L1 preparing"),
     ],
 )
-def test_a_wrong_story_is_told_why(tmp_path: Path, text: str, complaint: str) -> None:
+def test_a_wrong_scenario_names_its_error(tmp_path: Path, text: str, complaint: str) -> None:
     path = tmp_path / "wrong.txt"
     path.write_text(text, encoding="utf-8")
-    with pytest.raises(StoryError, match=complaint):
-        check_story(path)
+    with pytest.raises(ScenarioError, match=complaint):
+        check_scenario(path)
 
 
 def test_a_moving_vehicle_occupies_both_cells(tmp_path: Path) -> None:
@@ -82,6 +82,6 @@ def test_a_moving_vehicle_occupies_both_cells(tmp_path: Path) -> None:
         encoding="utf-8",
     )
     with pytest.raises(CollisionError, match="both occupy"):
-        check_story(path)
-    assert ends_in_collision(path, Player())
-    assert len(read_story(path)) == 6
+        check_scenario(path)
+    assert ends_in_collision(path, Runner())
+    assert len(read_scenario(path)) == 6

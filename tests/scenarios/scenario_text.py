@@ -1,4 +1,4 @@
-"""The notation of stories, and the errors that a story can end with."""
+"""The notation of scenarios, and the errors that a scenario can end with."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import Ballot, VehicleState
 
 
-class StoryError(AssertionError):
-    """A story does not go as written, or cannot be parsed."""
+class ScenarioError(AssertionError):
+    """A scenario does not go as written, or cannot be parsed."""
 
 
-class CollisionError(StoryError):
+class CollisionError(ScenarioError):
     """Two vehicles occupy one cell."""
 
 

@@ -1,9 +1,9 @@
-"""Plays stories: hand-written schedules of messages for the real protocol code.
+"""Runs text scenarios: hand-written schedules of messages for the real protocol code.
 
-A story is a text file. `#` begins a comment, and the first lines say what the story shows. Every
-other line is a command, and the lines below it that begin with `=>` are exactly what must happen.
+A scenario is a text file. `#` begins a comment, and the first lines say what it shows. Every other
+line is a command, and the lines below it that begin with `=>` are exactly what must happen.
 Nothing happens by itself: a message that is not delivered is lost, one that is delivered twice is
-duplicated, one delivered later is late. Whatever the story says, no two vehicles may ever occupy
+duplicated, one delivered later is late. No two vehicles may ever occupy
 the same cell, and a moving vehicle occupies the cell that it leaves, too.
 
 Cells are written column,lane. Columns count backwards from the front: formation 0 owns the block of
@@ -28,12 +28,12 @@ written term/coordinator/incarnation/seq, the higher one wins. Time is in second
 | `A leaves` | the vehicle has left the road |
 | `show A` | what A knows |
 
-**Leaders.** A leader has been elected and takes one formation over; the story plans for it.
+**Leaders.** A leader has been elected and takes one formation over; the scenario plans for it.
 
 | command | what it does |
 |---|---|
 | `leader L1 term 1 leads A B` | L1 takes over the formations in whose blocks A and B entered |
-| `clock 4.0` | it is that late; step n of the story's plans may begin at n seconds |
+| `clock 4.0` | it is that late; step n of the scenario's plans may begin at n seconds |
 | `L1 hears A` | the state that A has shown last arrives |
 | `L1 sends` | its timers run; what it sends is listed and goes into the mail |
 | `L1 plans A@0>0,2 B@1>0,1` | planning succeeds: A moves in step 0 to 0,2, B in step 1 to 0,1 |
@@ -60,7 +60,7 @@ real planner. It understands what a leader does, but it plans itself:
 | `c1 plans` | the planner finishes what c1 has ordered first |
 | `c1 brings its plan into force` | in short: it plans, all get the PLAN and hear each other |
 
-Stories of the rolling operation have names that begin with `rolling_`; `story_rolling` has what
+Scenarios of the rolling operation have names that begin with `rolling_`; `scenario_rolling` has what
 they understand beside.
 """
 
@@ -73,32 +73,32 @@ from attrs import frozen
 from laneweave.coordinator.formations.leader import LEADER_RULES
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES
-from scenarios.story_player import Player
-from scenarios.story_rolling import RollingPlayer, is_rolling
-from scenarios.story_text import CollisionError, StoryError
+from scenarios.scenario_rolling import RollingRunner, is_rolling
+from scenarios.scenario_runner import Runner
+from scenarios.scenario_text import CollisionError, ScenarioError
 
 
 @frozen
 class Line:
-    """One command of a story with what it must lead to."""
+    """One command of a scenario with what it must lead to."""
 
     number: int
     command: str
     expected: tuple[str, ...]
 
 
-def read_story(path: Path) -> list[Line]:
-    """Read a story's lines.
+def read_scenario(path: Path) -> list[Line]:
+    """Read a scenario's lines.
 
     Raises:
-        StoryError: an expectation has no command above it.
+        ScenarioError: an expectation has no command above it.
     """
     lines: list[Line] = []
     for number, raw in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
         text = raw.split("#")[0].strip()
         if text.startswith("=>"):
             if not lines:
-                raise StoryError(f"{path.name}:{number}: `=>` without a command")
+                raise ScenarioError(f"{path.name}:{number}: `=>` without a command")
             last = lines.pop()
             lines.append(Line(last.number, last.command, (*last.expected, text[2:].strip())))
         elif text:
@@ -106,44 +106,44 @@ def read_story(path: Path) -> list[Line]:
     return lines
 
 
-def player_of(
+def runner_of(
     path: Path, vehicle_rules: RuleBook = VEHICLE_RULES, leader_rules: RuleBook = LEADER_RULES
-) -> Player:
-    """Return an empty road for a story; other rules plant a bug."""
+) -> Runner:
+    """Return an empty road for a scenario; other rules plant a bug."""
     if is_rolling(path.stem):
-        return RollingPlayer(vehicle_rules, leader_rules)
-    return Player(vehicle_rules, leader_rules)
+        return RollingRunner(vehicle_rules, leader_rules)
+    return Runner(vehicle_rules, leader_rules)
 
 
-def check_story(path: Path, player: Player | None = None) -> None:
-    """Play a story.
+def check_scenario(path: Path, runner: Runner | None = None) -> None:
+    """Run a scenario.
 
     Args:
-        path: the story.
-        player: an empty road; None: one with the rules as they are.
+        path: the scenario.
+        runner: an empty road; None: one with the rules as they are.
 
     Raises:
-        StoryError: it went otherwise; the message names the line.
+        ScenarioError: it went otherwise; the message names the line.
     """
-    player = player or player_of(path)
-    for line in read_story(path):
+    runner = runner or runner_of(path)
+    for line in read_scenario(path):
         try:
-            happened = tuple(player.play(line.command))
-        except StoryError as error:
+            happened = tuple(runner.run(line.command))
+        except ScenarioError as error:
             raise type(error)(f"{path.name}:{line.number}: {error}") from error
         if happened != line.expected:
             happened_lines = "".join(f"\n  => {each}" for each in happened) or "\n  nothing"
-            raise StoryError(f"{path.name}:{line.number}: {line.command}{happened_lines}")
+            raise ScenarioError(f"{path.name}:{line.number}: {line.command}{happened_lines}")
 
 
-def ends_in_collision(path: Path, player: Player) -> bool:
-    """Play a story to its end, whatever happens instead of what should, and look for collisions."""
-    for line in read_story(path):
+def ends_in_collision(path: Path, runner: Runner) -> bool:
+    """Run a scenario to its end even if it fails, and return whether vehicles collide."""
+    for line in read_scenario(path):
         try:
-            for _ in player.play(line.command):
+            for _ in runner.run(line.command):
                 pass
         except CollisionError:
             return True
-        except StoryError:
+        except ScenarioError:
             continue
     return False

@@ -1,4 +1,4 @@
-"""Plays the commands of a story; `stories` explains them."""
+"""Runs the commands of a scenario; `scenario_files` explains them."""
 
 from __future__ import annotations
 
@@ -15,15 +15,22 @@ from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES, PlanExecution
 from laneweave.protocol.wire.messages import Heartbeat, Plan, VehicleState
 from laneweave.protocol.wire.topics import COORDINATOR_ALIVE
-from scenarios.story_leaders import Candidate, Leader, Mail, formation_of
-from scenarios.story_road import TICK_S, Agent, CaretakerProcess, Process, Vehicle
-from scenarios.story_text import CollisionError, StoryError, cell_of, shown, state_text, written
+from scenarios.scenario_leaders import Candidate, Leader, Mail, formation_of
+from scenarios.scenario_road import TICK_S, Agent, CaretakerProcess, Process, Vehicle
+from scenarios.scenario_text import (
+    CollisionError,
+    ScenarioError,
+    cell_of,
+    shown,
+    state_text,
+    written,
+)
 
 Lines = Iterator[str]
 
 
-class Player:
-    """The world of one story."""
+class Runner:
+    """The world of one scenario."""
 
     def __init__(
         self, vehicle_rules: RuleBook = VEHICLE_RULES, leader_rules: RuleBook = LEADER_RULES
@@ -71,11 +78,11 @@ class Player:
         """Road time, which all clocks show."""
         return self.tick * TICK_S
 
-    def play(self, command: str) -> Lines:
+    def run(self, command: str) -> Lines:
         """Execute a command; yield what happened.
 
         Raises:
-            StoryError: the command is unknown, or names an unknown process or vehicle.
+            ScenarioError: the command is unknown, or names an unknown process or vehicle.
             CollisionError: two vehicles occupy one cell.
         """
         for pattern, action in self._grammar:
@@ -84,10 +91,10 @@ class Player:
                 try:
                     yield from action(*match.groups()) or ()
                 except KeyError as error:
-                    raise StoryError(f"{command}: there is no {error}") from error
+                    raise ScenarioError(f"{command}: there is no {error}") from error
                 self._check_cells(command)
                 return
-        raise StoryError(f"no such command: {command}")
+        raise ScenarioError(f"no such command: {command}")
 
     def _check_cells(self, command: str) -> None:
         owner: dict[Cell, str] = {}
@@ -116,7 +123,7 @@ class Player:
         for _ in range(2):
             list(self._ticks(name))
         if not agent.in_charge:
-            raise StoryError(f"{name} is not put in charge")
+            raise ScenarioError(f"{name} is not put in charge")
 
     def _leader(self, name: str, term: str, roster: str) -> None:
         formation = formation_of(self.vehicles, roster)
@@ -151,7 +158,7 @@ class Player:
     def _clock(self, t_s: str) -> None:
         tick = round(float(t_s) / TICK_S)
         if tick < self.tick:
-            raise StoryError(f"it is {self.t_s:g} s already")
+            raise ScenarioError(f"it is {self.t_s:g} s already")
         self.tick = tick
 
     def _sends(self, name: str) -> Lines:
@@ -239,7 +246,7 @@ class Player:
         for process in self.processes.values():
             if process.vehicle.name == vehicle and process.incarnation == attendant:
                 return process
-        raise StoryError(f"no process is in charge of {vehicle}")
+        raise ScenarioError(f"no process is in charge of {vehicle}")
 
     # --- mail and states ----------------------------------------------------------------------
 
@@ -273,7 +280,7 @@ class Player:
         elif name in self.candidates:
             yield from self.candidates[name].hear(what, self._mail, self.t_s)
         elif isinstance(what, Heartbeat):
-            raise StoryError(f"{name} does not listen to heartbeats")
+            raise ScenarioError(f"{name} does not listen to heartbeats")
         elif name in self.leaders:
             yield from self.leaders[name].hear(what, self._mail, self.t_s)
         else:
@@ -289,7 +296,7 @@ class Player:
         else:
             what = self.processes[name].shown
         if what is None:
-            raise StoryError(f"{name} has shown nothing yet")
+            raise ScenarioError(f"{name} has shown nothing yet")
         self._noted[label] = what
 
     # --- ticks --------------------------------------------------------------------------------
@@ -330,7 +337,7 @@ class Player:
     def _commands(self, name: str) -> Lines:
         process = self.processes[name]
         if not isinstance(process, Agent) or process.command is None:
-            raise StoryError(f"{name} has commanded nothing")
+            raise ScenarioError(f"{name} has commanded nothing")
         controller = process.vehicle.road.controller
         before = controller.attendant
         if not controller.take(process.command):

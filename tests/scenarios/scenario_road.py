@@ -1,7 +1,7 @@
-"""The road of a story: bodies, their real motion controllers, and the processes that act for them.
+"""The road of a scenario: bodies with real motion controllers, and the processes that act for them.
 
 A body does not move by itself: it is in its cell, or between the cell that it left and the one that
-its controller makes for, until the story says that it arrives. Everything else is the real code.
+its controller makes for, until the scenario says that it arrives. Everything else is the real code.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ ROLLING = evolve(SCENARIO, formation=evolve(SCENARIO.formation, operation="rolli
 """The same with vehicles that own cells."""
 
 
-class StoryDriver(LightDriver):
-    """Driver without dynamics: a motion ends when the story has brought the body to its target."""
+class ScenarioDriver(LightDriver):
+    """Driver without dynamics: a motion ends when the scenario puts the body at its target."""
 
     def at_rest(self, sense: Sense) -> bool:
         return at_rest_in_cell(sense.state, self._lattice, self._goal, sense.t_s)
@@ -124,7 +124,7 @@ class Vehicle:
         return self.road.sense(tick, caretaker=controller.attendant in self.caretakers)
 
     def place_body(self, tick: int) -> None:
-        """Put the body where the story has it: the lattice keeps moving."""
+        """Put the body where the scenario has it: the lattice keeps moving."""
         state = cell_state(SCENARIO.lattice, self.at, tick * TICK_S)
         self.road.controller.plant = Plant(state, SCENARIO.vehicle, TICK_S)
 
@@ -141,7 +141,11 @@ class Agent:
         self.tick = -1
         """The newest tick that it has sensed."""
         self._core = AgentCore(
-            vehicle.name, lambda: next(vehicle.incarnations), vehicle.scenario, StoryDriver, rules
+            vehicle.name,
+            lambda: next(vehicle.incarnations),
+            vehicle.scenario,
+            ScenarioDriver,
+            rules,
         )
         self._note(self._core.handle(Started(), 0.0))
 
