@@ -231,7 +231,7 @@ def _planted_bugs() -> str:
     """Return the table of planted bugs."""
     found = json.loads(FOUND.read_text(encoding="utf-8"))
     lines = [
-        "| planted bug | rule | what is broken | fails the scenario | it ends with | random search |",
+        "| planted bug | rule | what is broken | failed scenario | it ends with | random search |",
         "|---|---|---|---|---|---|",
     ]
     for bug in BUGS:

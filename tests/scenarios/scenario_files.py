@@ -60,8 +60,8 @@ real planner. It understands what a leader does, but it plans itself:
 | `c1 plans` | the planner finishes what c1 has ordered first |
 | `c1 brings its plan into force` | in short: it plans, all get the PLAN and hear each other |
 
-Scenarios of the rolling operation have names that begin with `rolling_`; `scenario_rolling` has what
-they understand beside.
+Scenarios of the rolling operation have names that begin with `rolling_`; `scenario_rolling` lists
+their further commands.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Planted bugs: each breaks one rule of the protocol, to show that the tests would notice.
 
 Most replace a guard or an action in a rule book; a few change a row of the table, or something
-outside the books (`plant`). Each makes a scenario of tests/scenarios fail. docs/SAFETY.md lists them
-and what else catches them.
+outside the books (`plant`). Each makes a scenario of tests/scenarios fail. docs/SAFETY.md lists
+them and what else catches them.
 """
 
 from __future__ import annotations
