@@ -22,6 +22,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import count
 from typing import Any, cast
 
@@ -34,6 +35,7 @@ from laneweave.coordinator.formations.planning_orders import LONGEST_DEADLINE_S
 from laneweave.coordinator.formations.roster import start_time_s, steps_left
 from laneweave.coordinator.formations.sorting import SortingTask, sort_lanes
 from laneweave.coordinator.planning.paper.assignments import Weights
+from laneweave.coordinator.planning.solve import plan
 from laneweave.protocol.lattice import territory
 from laneweave.protocol.runtime.node import Node, Started, read_message
 from laneweave.protocol.runtime.transport import Received
@@ -293,7 +295,7 @@ class Road:
         wishes = {name: each.admission.arrival.preferred_lane for name, each in members.items()}
         start_s = start_time_s(cells.values(), self.tick * scenario.runtime.tick_s, scenario)
         task = SortingTask((block,), cells, wishes, (), scenario, LONGEST_DEADLINE_S)
-        moves = sort_lanes(task, scenario.formation.max_nodes, WEIGHTS).moves
+        moves = sort_lanes(task, scenario.formation.max_nodes, partial(plan, weights=WEIGHTS)).moves
         every = [move for each in moves.values() for move in each]
         slot_s = scenario.cycles_s[0]
         if max(step for step, _, _ in every) >= steps_left(

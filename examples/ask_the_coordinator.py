@@ -32,4 +32,4 @@ with PlanClient(endpoint) as client:
         raise SystemExit(f"no plan: {error}") from None
 
 print(f"{plan.status}: cost {plan.cost}, {plan.steps} steps, {plan.solve_ms:.1f} ms")
-print(plan.path_map(request))
+print(plan.path_map(request.ids))

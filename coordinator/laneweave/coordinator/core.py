@@ -12,6 +12,7 @@ from laneweave.coordinator.formations.leader import LEADER_RULES
 from laneweave.coordinator.formations.operation import FormationsOperation
 from laneweave.coordinator.metrics import CoordinatorMetrics
 from laneweave.coordinator.operation import LogEntry, Operation
+from laneweave.coordinator.planning.solve import plan
 from laneweave.coordinator.rolling.checked_planner import Planner, stream_planner
 from laneweave.coordinator.rolling.operation import RollingOperation
 from laneweave.coordinator.service.server import PlanningService
@@ -90,7 +91,9 @@ class CoordinatorCore:
         self.name = name
         self.scenario = scenario
         self.election = Election(name, incarnation, scenario.network.election_s, 0.0)
-        self.service = PlanningService(name, scenario.service, workers, scenario.formation.solver)
+        self.service = PlanningService(
+            name, scenario.service, workers, plan, scenario.formation.solver
+        )
         self.census: Census | None = None
         self.t_s = 0.0
         self._formation_of: dict[Name, int] = {}
@@ -117,7 +120,7 @@ class CoordinatorCore:
             return RollingOperation(scenario, self._new_ballot, self._new_job, planner)
         rng = random.Random(f"{scenario.seed}/{self.name}/{self._incarnation}")  # noqa: S311
         return FormationsOperation(
-            scenario, self._new_ballot, self._new_job, self._has_watched, rng, rules
+            scenario, self._new_ballot, self._new_job, self._has_watched, rng, plan, rules
         )
 
     @property

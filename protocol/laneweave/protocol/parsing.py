@@ -183,6 +183,13 @@ def structure(data: Mapping[str, Any], kind: type[T]) -> T:
         raise first_problem(error) from None
 
 
+def as_lists(_: object, __: object, value: object) -> object:
+    """Return tuples and sorted sets as lists; a serializer for `attrs.asdict`."""
+    if isinstance(value, frozenset):
+        value = tuple(sorted(value))
+    return [as_lists(_, __, item) for item in value] if isinstance(value, tuple) else value
+
+
 def first_problem(error: Exception, path: str = "") -> BadInputError:
     """Return the first leaf of a cattrs error group as one line with its path."""
     if isinstance(error, BaseValidationError):

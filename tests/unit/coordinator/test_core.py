@@ -12,7 +12,7 @@ from laneweave.coordinator.formations import planning_orders as formation_planne
 from laneweave.coordinator.formations.planning_orders import START_MARGIN_S
 from laneweave.coordinator.formations.roster import start_time_s
 from laneweave.coordinator.formations.sorting import Sorting, SortingTask, sort_lanes
-from laneweave.coordinator.planning.paper.assignments import Weights
+from laneweave.coordinator.planning.response import PlanFunction
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.runtime.node import (
     Announce,
@@ -508,9 +508,9 @@ def test_planning_may_last_until_the_first_move(
 ) -> None:
     asked = list[float]()
 
-    def record(task: SortingTask, max_nodes: int, weights: Weights) -> Sorting:
+    def record(task: SortingTask, max_nodes: int, plan: PlanFunction) -> Sorting:
         asked.append(task.deadline_s)
-        return sort_lanes(task, max_nodes, weights)
+        return sort_lanes(task, max_nodes, plan)
 
     monkeypatch.setattr(formation_planner, "sort_lanes", record)
     formation = evolve(SCENARIO.formation, planning_deadline_s=given_s)

@@ -10,6 +10,7 @@ from laneweave.coordinator.formations.leader import LEADER_RULES, FormationLeade
 from laneweave.coordinator.formations.planning_orders import FormationPlanner
 from laneweave.coordinator.formations.roster import Formation, Groups, closed_formations, with_room
 from laneweave.coordinator.operation import LogEntry, to_vehicle
+from laneweave.coordinator.planning.response import PlanFunction
 from laneweave.protocol.runtime.node import Compute, Computed, Effect
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.state_machine import RuleBook
@@ -30,6 +31,7 @@ class FormationsOperation:
         new_job: Callable[[], int],
         has_watched: Callable[[float], bool],
         rng: random.Random,
+        plan: PlanFunction,
         rules: RuleBook = LEADER_RULES,
     ) -> None:
         """Begin without formations.
@@ -41,6 +43,7 @@ class FormationsOperation:
             has_watched: returns whether this leader has missed nothing for an election time, at a
                 time of the node's clock.
             rng: for pauses.
+            plan: plans one request.
             rules: of a leader; others than `LEADER_RULES` only in tests.
         """
         self.leaders: dict[int, FormationLeader] = {}
@@ -51,7 +54,7 @@ class FormationsOperation:
         self._rng = rng
         self._rules = rules
         self._groups = Groups()
-        self._planner = FormationPlanner(scenario, self._groups, self.leaders, new_job)
+        self._planner = FormationPlanner(scenario, self._groups, self.leaders, new_job, plan)
 
     def forget(self) -> None:
         """Forget all formations, and which of them are joined."""

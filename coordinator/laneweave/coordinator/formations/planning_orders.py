@@ -30,7 +30,7 @@ from laneweave.coordinator.formations.roster import (
 from laneweave.coordinator.formations.sorting import Sorting, SortingTask, sort_lanes
 from laneweave.coordinator.operation import LogEntry
 from laneweave.coordinator.planning.paper.assignments import Weights
-from laneweave.coordinator.planning.response import PlanResponse
+from laneweave.coordinator.planning.response import PlanFunction, PlanResponse
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Compute, Computed
 from laneweave.protocol.scenario.fields import Scenario
@@ -103,6 +103,7 @@ class FormationPlanner:
         groups: Groups,
         leaders: Mapping[int, FormationLeader],
         new_job: Callable[[], int],
+        plan: PlanFunction,
     ) -> None:
         """Begin with nothing ordered.
 
@@ -111,6 +112,7 @@ class FormationPlanner:
             groups: which formations are joined; it grows here.
             leaders: of all formations, each under its lowest block.
             new_job: returns the number of a new computation.
+            plan: plans one request.
         """
         self._scenario = scenario
         self._groups = groups
@@ -124,9 +126,10 @@ class FormationPlanner:
         """From which deadlines follow."""
         formation = scenario.formation
         oblique = formation.weight_oblique
-        self._weights = Weights(
+        weights = Weights(
             formation.weight_straight, formation.oblique_steps if oblique is None else oblique
         )
+        self._make_plan = partial(plan, weights=weights)
 
     def forget(self) -> None:
         """Drop all orders that have not begun."""
@@ -181,7 +184,10 @@ class FormationPlanner:
         # An order under an earlier ballot is replaced, and waits for its turn anew.
         self._waiting.pop(numbers[0], None)
         # In the job: promises that cannot be planned from fail there, as any failed planning does.
-        self._waiting[numbers[0]] = ballot, partial(sort_lanes, task, nodes, self._weights)
+        self._waiting[numbers[0]] = (
+            ballot,
+            partial(sort_lanes, task, nodes, self._make_plan),
+        )
         yield from self._begin()
 
     def _begin(self) -> Iterator[Compute]:

@@ -20,10 +20,8 @@ from attrs import evolve, frozen
 
 from laneweave.coordinator.formations.roster import Numbers
 from laneweave.coordinator.planning.budget import Clock
-from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.request import PlanRequest
-from laneweave.coordinator.planning.response import PlanResponse
-from laneweave.coordinator.planning.solve import plan
+from laneweave.coordinator.planning.response import PlanFunction, PlanResponse
 from laneweave.coordinator.planning.targets import placements
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, PlannedMove
@@ -173,20 +171,23 @@ def _plan_request(
 
 
 def sort_lanes(
-    task: SortingTask, max_nodes: int, weights: Weights, clock: Clock = time.monotonic
+    task: SortingTask,
+    max_nodes: int,
+    plan: PlanFunction,
+    clock: Clock = time.monotonic,
 ) -> Sorting:
     """Plan a sorting; if that is impossible, excuse one member from reaching its lane.
 
     Args:
         task: what is to be sorted.
         max_nodes: bound on search nodes of each attempt.
-        weights: l_s and l_o of the formation relative distance.
+        plan: plans each attempt.
         clock: returns the time, in seconds, for the deadline.
     """
     if not task.movers:
         return _sorting(task, None)
     memory_mb = task.scenario.service.worker_memory_mb
-    make_plan = partial(plan, max_nodes=max_nodes, max_memory_mb=memory_mb, weights=weights)
+    make_plan = partial(plan, max_nodes=max_nodes, max_memory_mb=memory_mb)
     if task.structure is not None:
         return _form(task, task.structure, make_plan)
     ends_s = clock() + task.deadline_s

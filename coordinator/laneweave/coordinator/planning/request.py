@@ -25,7 +25,7 @@ from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.problem import Problem
 from laneweave.protocol.errors import BadInputError, one_line
 from laneweave.protocol.lattice import Cell, Mode
-from laneweave.protocol.parsing import structure
+from laneweave.protocol.parsing import as_lists, structure
 from laneweave.protocol.scenario.fields import CONFLICT_KINDS, SOLVERS
 
 REQUEST_SCHEMA: Final = "laneweave.plan.request/1"
@@ -173,17 +173,15 @@ class PlanRequest:
         )
         return cls(**fields | {"grid": document.grid.grid(), "mode": mode, "conflicts": conflicts})
 
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Ids of the vehicles, in the order of the request."""
+        return tuple(vehicle.id for vehicle in self.vehicles)
+
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON form."""
-        fields = attrs.asdict(self, filter=_is_given, value_serializer=as_json)
+        fields = attrs.asdict(self, filter=_is_given, value_serializer=as_lists)
         return {"schema": REQUEST_SCHEMA, **fields}
-
-
-def as_json(_: object, __: object, value: object) -> object:
-    """Return tuples and sorted sets as lists; a serializer for `attrs.asdict`."""
-    if isinstance(value, frozenset):
-        value = tuple(sorted(value))
-    return [as_json(_, __, item) for item in value] if isinstance(value, tuple) else value
 
 
 def checked_solver(name: str, field: str = "solver") -> str:

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, Literal, get_args
 
 import attrs
 from attrs.validators import optional
 
 from laneweave.coordinator.planning.path_map import RelativePathMap
-from laneweave.coordinator.planning.request import PlanRequest, as_json
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.field_validators import within
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.parsing import structure
+from laneweave.protocol.parsing import as_lists, structure
 
 RESPONSE_SCHEMA: Final = "laneweave.plan.response/1"
 
@@ -55,14 +54,13 @@ class PlanResponse:
     targets: tuple[Cell, ...] | None = None
     waited_ms: float | None = attrs.field(default=None, validator=optional(_count))
 
-    def path_map(self, request: PlanRequest) -> RelativePathMap:
-        """Return the plan as a relative path map."""
-        ids = tuple(vehicle.id for vehicle in request.vehicles)
-        return RelativePathMap(ids if self.paths else (), self.paths)
+    def path_map(self, ids: Sequence[str]) -> RelativePathMap:
+        """Return the plan as a relative path map; `ids` are those of the request's vehicles."""
+        return RelativePathMap(tuple(ids) if self.paths else (), self.paths)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON form."""
-        fields = attrs.asdict(self, filter=_is_given, value_serializer=as_json)
+        fields = attrs.asdict(self, filter=_is_given, value_serializer=as_lists)
         return {"schema": RESPONSE_SCHEMA, **fields}
 
     @classmethod
@@ -79,6 +77,10 @@ class PlanResponse:
         if data.get("status") not in STATUSES:
             raise BadInputError("status", data.get("status"), "one of " + ", ".join(STATUSES))
         return structure({key: data[key] for key in data if key != "schema"}, cls)
+
+
+PlanFunction = Callable[..., PlanResponse]
+"""Plans a `PlanRequest`, with keyword arguments as `solve.plan` has them."""
 
 
 def _is_given(attribute: attrs.Attribute[Any], value: object) -> bool:

@@ -151,7 +151,7 @@ def _response(
         budget = Budget(deadline=started + request.deadline_s, clock=clock)
         best = without_needless_moves(problem, best, budget)
     cells = [] if best is None else problem.cells_of(best)
-    path_map = RelativePathMap.padded([v.id for v in request.vehicles][: len(cells)], cells)
+    path_map = RelativePathMap.padded(request.ids[: len(cells)], cells)
     bound = max(search.lower_bound for search in searches)
     cost = None if best is None else best.cost
     finished = any(search.finished for search in searches) or cost == bound

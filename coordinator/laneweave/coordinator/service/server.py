@@ -19,8 +19,7 @@ import attrs
 from attrs import define, field, frozen
 
 from laneweave.coordinator.planning.request import PlanRequest
-from laneweave.coordinator.planning.response import PlanResponse
-from laneweave.coordinator.planning.solve import plan
+from laneweave.coordinator.planning.response import PlanFunction, PlanResponse
 from laneweave.coordinator.service.format import (
     FAILED,
     INVALID,
@@ -102,7 +101,12 @@ class PlanningService:
     """Pure core of the service; its coordinator passes it questions, results and the time."""
 
     def __init__(
-        self, name: str, settings: Service, workers: int, solver: str = DEFAULT_SOLVER
+        self,
+        name: str,
+        settings: Service,
+        workers: int,
+        plan: PlanFunction,
+        solver: str = DEFAULT_SOLVER,
     ) -> None:
         """Make a service without requests.
 
@@ -110,10 +114,12 @@ class PlanningService:
             name: of the coordinator, among those that share the load.
             settings: limits.
             workers: how many requests are planned at a time.
+            plan: plans one request, in a worker process.
             solver: for requests that name none.
         """
         self._name = name
         self._solver = solver
+        self._plan = plan
         self._settings = settings
         self._workers = workers
         self._waiting: deque[_Entry] = deque()
@@ -236,9 +242,10 @@ class PlanningService:
                 yield from self._end(entry, self._late(entry, now_s), now_s)
                 continue
             self._planning[entry.job] = entry
-            job = partial(
-                plan_in_time, entry.request, self._solver, self._settings.worker_memory_mb
-            )
+            solver = entry.request.solver or self._solver
+            memory_mb = self._settings.worker_memory_mb
+            plan = partial(self._plan, solver=solver, max_memory_mb=memory_mb)
+            job = partial(plan_in_time, plan, entry.request)
             yield Delegate(entry.job, job, entry.deadline_s)
 
     def finish(self, job: int, result: object, error: str, now_s: float) -> Iterator[Effect]:
@@ -313,15 +320,9 @@ def _digest(request: PlanRequest) -> bytes:
     return blake2b(JSON.write(request.to_dict()), digest_size=16).digest()
 
 
-def plan_in_time(
-    request: PlanRequest, solver: str, memory_mb: float, left_s: float
-) -> PlanResponse:
-    """Plan a request in the time that is left of its deadline; see `plan`.
-
-    `solver` plans where the request names none.
-    """
+def plan_in_time(plan: PlanFunction, request: PlanRequest, left_s: float) -> PlanResponse:
+    """Plan a request in the time that is left of its deadline."""
     left_s = min(left_s, request.deadline_s)
-    hurried = attrs.evolve(request, deadline_s=left_s)
-    response = plan(hurried, solver=request.solver or solver, max_memory_mb=memory_mb)
+    response = plan(attrs.evolve(request, deadline_s=left_s))
     waited_ms = round(1e3 * (request.deadline_s - left_s), 3)
     return attrs.evolve(response, waited_ms=waited_ms)

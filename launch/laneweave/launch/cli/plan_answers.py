@@ -174,7 +174,9 @@ def _table(request: PlanRequest, response: PlanResponse) -> str:
     if not response.paths:
         return f"{response.status}, lower bound {response.lower_bound}\n"
     by = f"{response.solver}{' (fallback)' if response.fallback else ''}"
-    return f"{verdict}, {response.steps} steps, planned by {by}\n\n{response.path_map(request)}\n"
+    return (
+        f"{verdict}, {response.steps} steps, planned by {by}\n\n{response.path_map(request.ids)}\n"
+    )
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -9,10 +9,8 @@ from attrs import evolve
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from laneweave.coordinator.formations import sorting as sorting_module
 from laneweave.coordinator.formations.roster import Numbers
 from laneweave.coordinator.formations.sorting import Sorting, SortingTask, plan_requests, sort_lanes
-from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.solve import plan
@@ -24,7 +22,6 @@ from support.paper import FORMATIONS, PAPER
 
 SCENARIO = PAPER
 LATTICE = SCENARIO.lattice
-WEIGHTS = Weights(1, 2)
 NODES = SCENARIO.formation.max_nodes
 DEADLINE_S = 60.0
 A, B, C, D, E, F = (Name(letter) for letter in "ABCDEF")
@@ -42,7 +39,7 @@ def task(
 
 
 def sort(order: SortingTask) -> Sorting:
-    return sort_lanes(order, NODES, WEIGHTS)
+    return sort_lanes(order, NODES, plan)
 
 
 def ends(order: SortingTask, sorting: Sorting) -> dict[Name, Cell]:
@@ -198,7 +195,7 @@ def walled_in() -> SortingTask:
 def test_one_in_a_corner_does_not_keep_the_others_from_their_lanes() -> None:
     order = walled_in()
     whole = next(plan_requests(order))
-    assert plan(whole, max_nodes=NODES, weights=WEIGHTS).status == "infeasible"
+    assert plan(whole, max_nodes=NODES).status == "infeasible"
     sorting = sort(order)
     assert sorting.solved
     assert sorting.moves[A] == ()
@@ -227,7 +224,7 @@ def test_a_search_that_ran_out_of_nodes_says_nothing_of_room() -> None:
     """With a neighbour's block as well it would only take longer."""
     cells = {A: (0, 0), B: (-1, 1), C: (-2, 0), D: (-3, 1), E: (0, 2), F: (-2, 2)}
     order = task(cells, {A: 2, B: 2, C: 1, D: 0, E: 0, F: 1})
-    sorting = sort_lanes(order, 1, WEIGHTS)
+    sorting = sort_lanes(order, 1, plan)
     assert sorting.response is not None
     assert sorting.response.status == "timeout"
     assert (sorting.solved, sorting.short_of_room) == (False, False)
@@ -246,9 +243,7 @@ def test_a_structure_without_room_for_all_is_not_tried() -> None:
     assert sort(evolve(order, structure=two_lanes)).impossible == ""
 
 
-def test_a_structure_that_cannot_be_reached_is_planned_once(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_structure_that_cannot_be_reached_is_planned_once() -> None:
     """Excusing one vehicle from its lane, as in a sorting, would plan the same request again."""
     asked = list[PlanRequest]()
 
@@ -256,15 +251,14 @@ def test_a_structure_that_cannot_be_reached_is_planned_once(
         asked.append(request)
         return plan(request, **limits)
 
-    monkeypatch.setattr(sorting_module, "plan", count)
     held: dict[Name, Cell] = {C: (0, 1), D: (-1, 0), E: (-2, 0), F: (-3, 1)}
     order = task({A: (0, 0), B: (-3, 0)} | held, dict.fromkeys([A, B, *held], 0), *held)
     lane_2 = DrivingStructure(from_m=200.0, structure="parallel", lanes=(2,))
-    sorting = sort(evolve(order, structure=lane_2))
+    sorting = sort_lanes(evolve(order, structure=lane_2), NODES, count)
     assert (sorting.solved, len(asked)) == (False, 1)
 
 
-def test_all_placements_share_one_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_placements_share_one_deadline() -> None:
     """Each attempt takes 2 s of a deadline of 5 s, and every plan has too many steps."""
     asked, now_s = list[float](), [100.0]
 
@@ -273,12 +267,11 @@ def test_all_placements_share_one_deadline(monkeypatch: pytest.MonkeyPatch) -> N
         now_s[0] += 2.0
         return plan(request, **limits)
 
-    monkeypatch.setattr(sorting_module, "plan", slow_plan)
     cells = {A: (0, 0), B: (-1, 1), C: (-2, 0), D: (-3, 1), E: (0, 2), F: (-2, 2)}
     order = task(cells, {A: 2, B: 2, C: 1, D: 0, E: 0, F: 1}, numbers=(0, 1))
     hurried = evolve(order, deadline_s=5.0, steps=0)
     assert len(list(plan_requests(hurried))) > 3
-    assert sort_lanes(hurried, NODES, WEIGHTS, lambda: now_s[0]).solved
+    assert sort_lanes(hurried, NODES, slow_plan, lambda: now_s[0]).solved
     assert asked == [5.0, 3.0, 1.0]
 
 

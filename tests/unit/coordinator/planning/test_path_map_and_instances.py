@@ -50,7 +50,7 @@ def test_only_the_final_arrival_counts(path: list[tuple[int, int]], arrival: int
 def test_path_map_of_a_response() -> None:
     request = block_request(0, deadline_s=60.0)
     response = plan(request)
-    path_map = response.path_map(request)
+    path_map = response.path_map(request.ids)
     assert path_map.cost() == response.cost
     assert path_map.steps == response.steps
     assert path_map.ids == tuple(vehicle.id for vehicle in request.vehicles)

@@ -13,6 +13,7 @@ from attrs import define, field
 from hypothesis import given
 from hypothesis import strategies as st
 
+from laneweave.coordinator.planning.solve import plan
 from laneweave.coordinator.service import server as service
 from laneweave.coordinator.service.format import FAILED, INVALID, LATE, OVERLOADED
 from laneweave.coordinator.service.rendezvous import falls_to
@@ -51,7 +52,7 @@ SETTINGS = Service(queue_limit=8, max_request_bytes=4096, cache_entries=4, cache
 class Desk:
     """A service with one worker, its clock, and its replies so far."""
 
-    service: PlanningService = field(factory=lambda: PlanningService("c1", SETTINGS, workers=1))
+    service: PlanningService = field(factory=lambda: PlanningService("c1", SETTINGS, 1, plan))
     now_s: float = 100.0
     replies: dict[int, Reply] = field(factory=dict)
     orders: list[Delegate] = field(factory=list)
@@ -137,7 +138,7 @@ def test_an_answer_has_the_encoding_of_its_request(
 def test_a_request_without_a_solver_gets_the_coordinators(
     setting: str, asked: str | None, planned: str
 ) -> None:
-    desk = Desk(PlanningService("c1", SETTINGS, 1, setting))
+    desk = Desk(PlanningService("c1", SETTINGS, 1, plan, setting))
     token = desk.ask(REQUEST | ({} if asked is None else {"solver": asked}))
     desk.work()
     assert desk.answer(token)["solver"] == planned
@@ -424,7 +425,7 @@ def test_answers_are_forgotten_by_age_and_by_number(desk: Desk) -> None:
 
 
 def test_no_answers_are_kept_where_none_may_be() -> None:
-    desk = Desk(PlanningService("c1", Service(cache_entries=0), workers=1))
+    desk = Desk(PlanningService("c1", Service(cache_entries=0), 1, plan))
     for _ in range(2):
         desk.ask(named("r"))
         desk.work()
@@ -452,7 +453,7 @@ def test_large_requests_leave_little_behind() -> None:
         "lanes": 16,
         "blocked": [[c, n] for c in range(3, 100) for n in range(16)],
     }
-    desk = Desk(PlanningService("c1", Service(), workers=1))
+    desk = Desk(PlanningService("c1", Service(), 1, plan))
     tracemalloc.start()
     try:
         for number in range(20):
