@@ -93,7 +93,7 @@ SNAPSHOTS: dict[type[MetricsSnapshot], str] = {
 _VERBS = {
     Exchange.MESSAGES: ("sends", "reads"),
     Exchange.TOKENS: ("shows", "watches"),
-    Exchange.QUESTIONS: ("asks", "serves"),
+    Exchange.QUERIES: ("asks", "serves"),
 }
 _PARTIES = (
     Party.BRIDGE,

@@ -217,7 +217,7 @@ def ask_all(access: Access, asked: Iterator[Mutant]) -> Counter[str]:
             if len(waiting) == IN_FLIGHT:
                 first, answer = waiting.popleft()
                 verdicts[verdict(first, answer.result(ANSWER_S))] += 1
-            asking = transport.ask(key, mutant.payload, ANSWER_S, mutant.encoding)
+            asking = transport.query(key, mutant.payload, ANSWER_S, mutant.encoding)
             waiting.append((mutant, asking))
         for mutant, answer in waiting:
             verdicts[verdict(mutant, answer.result(ANSWER_S))] += 1

@@ -117,7 +117,7 @@ def perform(network: SimulatedNetwork, name: str, *effects: Effect) -> None:
 
 
 def chatter(
-    seed: int, conditions: Conditions, trace: Trace | None = None, *, in_kind: bool = False
+    seed: int, conditions: Conditions, trace: Trace | None = None, *, skip_codec: bool = False
 ) -> tuple[list[list[tuple[float, Event]]], tuple[int, int]]:
     """Run nodes that talk, with all faults, and return what each saw."""
 
@@ -140,7 +140,7 @@ def chatter(
         return core
 
     cores = {name: make(name) for name in ("a", "b", "c")}
-    network = SimulatedNetwork(seed, conditions, in_kind=in_kind)
+    network = SimulatedNetwork(seed, conditions, skip_codec=skip_codec)
     network.trace = trace
     for name, core in cores.items():
         network.add(name, core, REALM)

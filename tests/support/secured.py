@@ -12,7 +12,7 @@ import zenoh
 from attrs import define, field
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.runtime.transport import Delivery, Question, Received, TokenUp
+from laneweave.protocol.runtime.transport import Delivery, Query, Received, TokenUp
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.connection import (
     Access,
@@ -94,7 +94,7 @@ class Network:
         member = self.join(identity)
 
         def answer(delivery: Delivery) -> None:
-            if isinstance(delivery, Question):
+            if isinstance(delivery, Query):
                 member.transport.answer(delivery.token, identity.encode(), ok=True)
 
         member.transport._deliver = answer
@@ -123,7 +123,7 @@ class Network:
 def answer_to(member: Member, key: str, payload: bytes = b"plan", timeout_s: float = 5.0) -> bytes:
     """Ask a service; empty when nobody answers."""
     try:
-        answer = member.transport.ask(key, payload, timeout_s).result()
+        answer = member.transport.query(key, payload, timeout_s).result()
     except TimeoutError:
         return b""
     return answer.payload if answer is not None else b""

@@ -198,7 +198,7 @@ def test_nonsense_changes_nothing(
                 for key in keys_of(topic, "v0001"):
                     transport.publish(key, payload, Quality.ASSURED)
         for question in (b"", b"{", b"\xc1", b"{}", b"[" * 5000, bytes(MAX_BYTES + 1)):
-            given = transport.ask(KEYS.key(SERVICE), question, END_S).result(END_S)
+            given = transport.query(KEYS.key(SERVICE), question, END_S).result(END_S)
             if given is not None:  # else the run is over
                 answers.append(given.ok)
 

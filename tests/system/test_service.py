@@ -73,7 +73,7 @@ def transport(service: ServiceLab) -> Iterator[ZenohTransport]:
 
 
 def asked(transport: ZenohTransport, payload: bytes, encoding: str = "") -> Answer:
-    answer = transport.ask(KEY, payload, END_S, encoding).result()
+    answer = transport.query(KEY, payload, END_S, encoding).result()
     assert answer is not None
     return answer
 
@@ -137,7 +137,7 @@ def test_an_id_that_is_repeated_gets_the_same_plan(
     told: bool,
 ) -> None:
     payload = write(request(f"again-{encoding}-{told}"))
-    asking = [transport.ask(KEY, payload, END_S, encoding if told else "") for _ in range(5)]
+    asking = [transport.query(KEY, payload, END_S, encoding if told else "") for _ in range(5)]
     answers = {answer.result() for answer in asking}
     answers.add(asked(transport, payload, encoding if told else ""))
     # To the last digit of the time that planning took.
@@ -236,7 +236,7 @@ def test_a_queue_that_is_full_refuses_and_drops_what_is_late(
     deadlines_s = (6.0, *(QUEUE_LIMIT + 5) * (2.5,))
     made = [service.for_one("c1", slow_request("", deadline_s)) for deadline_s in deadlines_s]
     begun_s = time.monotonic()
-    asking = [transport.ask(KEY, json.dumps(data).encode(), END_S) for data in made]
+    asking = [transport.query(KEY, json.dumps(data).encode(), END_S) for data in made]
     # A client asks again until there is room.
     patient = PlanRequest.from_dict(service.for_one("c1", request()))
     assert client.plan(patient, END_S).status == "optimal"

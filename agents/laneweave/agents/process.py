@@ -8,7 +8,7 @@ from itertools import product
 from laneweave.agents.core import AgentCore
 from laneweave.agents.driving.driver import TrackingDriver
 from laneweave.agents.host import AgentHost
-from laneweave.protocol.runtime.message_faults import Wrap, bare
+from laneweave.protocol.runtime.message_faults import CoreWrapper, unwrapped
 from laneweave.protocol.runtime.metrics import Observe, unobserved
 from laneweave.protocol.scenario.deployment_fields import Shard
 from laneweave.protocol.scenario.fields import Scenario
@@ -45,7 +45,7 @@ def run_agents(
     access: Access,
     vehicles: Iterable[str],
     shard: Shard | None = None,
-    wrap: Wrap = bare,
+    wrap: CoreWrapper = unwrapped,
     observe: Observe = unobserved,
 ) -> None:
     """Run agents until their vehicles have left the road, or until SIGINT or SIGTERM.

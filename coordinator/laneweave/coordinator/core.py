@@ -20,13 +20,13 @@ from laneweave.protocol.runtime.metrics import MetricsSnapshot
 from laneweave.protocol.runtime.node import (
     Announce,
     Arrived,
-    Asked,
     Computed,
     Effect,
     Event,
     Listen,
     PeerDown,
     PeerUp,
+    QueryArrived,
     Send,
     Serve,
     Started,
@@ -181,7 +181,7 @@ class CoordinatorCore:
                 self._meet_bridge(incarnation_of(parameters))
             case LinkUp() | LinkDown():
                 self.election.on_link(up=isinstance(event, LinkUp), now_s=now_s)
-            case Asked(token, payload, encoding):
+            case QueryArrived(token, payload, encoding):
                 others = self.election.living(now_s)
                 yield from self.service.take(
                     token, payload, encoding, self._new_job(), others, now_s

@@ -12,7 +12,7 @@ import structlog
 
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.planning.solve import warm_up
-from laneweave.protocol.runtime.message_faults import Wrap, bare
+from laneweave.protocol.runtime.message_faults import CoreWrapper, unwrapped
 from laneweave.protocol.runtime.metrics import Observe, unobserved
 from laneweave.protocol.runtime.worker_pool import WorkerPool
 from laneweave.protocol.scenario.fields import Scenario
@@ -30,7 +30,7 @@ LONG_S = 8.0
 def run_coordinator(
     scenario: Scenario,
     name: str,
-    wrap: Wrap = bare,
+    wrap: CoreWrapper = unwrapped,
     observe: Observe = unobserved,
     *,
     workers_at_once: bool = False,

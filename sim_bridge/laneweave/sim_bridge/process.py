@@ -6,7 +6,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from laneweave.protocol.runtime.message_faults import Wrap, bare
+from laneweave.protocol.runtime.message_faults import CoreWrapper, unwrapped
 from laneweave.protocol.runtime.metrics import Observe, unobserved
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import access_of
@@ -22,7 +22,7 @@ def run_bridge(
     folder: Path,
     method: str = "formation",
     pace: float | None = None,
-    wrap: Wrap = bare,
+    wrap: CoreWrapper = unwrapped,
     observe: Observe = unobserved,
 ) -> None:
     """Run the simulated world until all vehicles have left, or until SIGINT or SIGTERM.

@@ -81,8 +81,8 @@ def test_messages_in_kind_make_the_same_run(
     tmp_path: Path, conditions: Conditions, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     as_bytes = run(tmp_path / "bytes", conditions)
-    monkeypatch.setattr(bench, "SimulatedNetwork", partial(SimulatedNetwork, in_kind=True))
-    in_kind = run(tmp_path / "kind", conditions)
-    assert as_bytes.world.shown == in_kind.world.shown
+    monkeypatch.setattr(bench, "SimulatedNetwork", partial(SimulatedNetwork, skip_codec=True))
+    skip_codec = run(tmp_path / "kind", conditions)
+    assert as_bytes.world.shown == skip_codec.world.shown
     assert len(as_bytes.world.shown) > 300
-    assert as_bytes.network.delivered == in_kind.network.delivered
+    assert as_bytes.network.delivered == skip_codec.network.delivered

@@ -16,7 +16,6 @@ from laneweave.coordinator.planning.response import PlanFunction
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.runtime.node import (
     Announce,
-    Asked,
     Compute,
     Computed,
     Delegate,
@@ -24,6 +23,7 @@ from laneweave.protocol.runtime.node import (
     Listen,
     PeerDown,
     PeerUp,
+    QueryArrived,
     Reply,
     Send,
     Serve,
@@ -576,10 +576,10 @@ def test_the_service_answers_without_leading() -> None:
         b'{"schema": "laneweave.plan.request/1", "grid": {"columns": 2, "lanes": 2},'
         b' "vehicles": [{"id": "a", "cell": [0, 0]}], "targets": [[1, 0]]}'
     )
-    (job,) = [e for e in desk.give(Asked(5, request)) if isinstance(e, Delegate)]
+    (job,) = [e for e in desk.give(QueryArrived(5, request)) if isinstance(e, Delegate)]
     (reply,) = [
         e for e in desk.give(run_delegated(job, lambda: desk.now_s)) if isinstance(e, Reply)
     ]
     assert (reply.token, reply.ok) == (5, True)
-    (refusal,) = [e for e in desk.give(Asked(6, b"{}")) if isinstance(e, Reply)]
+    (refusal,) = [e for e in desk.give(QueryArrived(6, b"{}")) if isinstance(e, Reply)]
     assert (refusal.token, refusal.ok) == (6, False)

@@ -43,7 +43,7 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.transport import Answer
 from laneweave.protocol.security.access_control import access_of
 from laneweave.protocol.security.connection import Access
-from laneweave.protocol.transports.zenoh.transport import connect_patiently
+from laneweave.protocol.transports.zenoh.transport import connect_blocking
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.topics import SERVICE, Keys, Party
 
@@ -206,7 +206,7 @@ class _Connection:
         access = Access(access) if isinstance(access, str) else access
         self._patience_s = patience_s
         self._key = Keys(access.realm).key(SERVICE)
-        self._transport = connect_patiently(access, lambda _: None)
+        self._transport = connect_blocking(access, lambda _: None)
         self._closed = False
 
     def _begin(self, request: PlanRequest, timeout_s: float) -> PendingRequest:
@@ -219,7 +219,7 @@ class _Connection:
             raise ServiceUnavailableError("this client is closed")
         left_s = min(max(0.0, pending.left_s(time.monotonic())), LONGEST_ATTEMPT_S)
         encoding = pending.form.encoding
-        return self._transport.ask(self._key, pending.payload, left_s, encoding)
+        return self._transport.query(self._key, pending.payload, left_s, encoding)
 
     def _close(self) -> None:
         self._closed = True

@@ -28,7 +28,7 @@ from laneweave.launch.faults.network_namespaces import join_namespace
 from laneweave.launch.run.logs import log_to_file
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.errors import BadInputError, CommandFailedError
-from laneweave.protocol.runtime.message_faults import Wrap, bare
+from laneweave.protocol.runtime.message_faults import CoreWrapper, unwrapped
 from laneweave.protocol.runtime.processes import die_with_parent
 from laneweave.protocol.security.access_control import access_of
 
@@ -170,9 +170,9 @@ def wake_children(parent: int) -> None:
                 os.kill(int(child), signal.SIGCONT)
 
 
-def _wrap(options: dict[str, Any]) -> Wrap:
+def _wrap(options: dict[str, Any]) -> CoreWrapper:
     faults = options.get("faults")
-    return bare if faults is None else faults.wrap
+    return unwrapped if faults is None else faults.wrap
 
 
 def _router(_: str, tables: dict[str, Any], options: dict[str, Any]) -> None:

@@ -139,7 +139,7 @@ class SimulatedRun:
         scenario = self.scenario
         self.faults.check_simulated()
         self.folder.mkdir(parents=True, exist_ok=True)
-        network = SimulatedNetwork(scenario.seed, self.conditions, in_kind=True)
+        network = SimulatedNetwork(scenario.seed, self.conditions, skip_codec=True)
         self._roles = SimulatedRoles(network, coordinator_names(scenario), self._start)
         if self.faults:
             self._injection = FaultInjection(

@@ -29,7 +29,7 @@ from laneweave.protocol.runtime.node import Arrived
 from laneweave.protocol.runtime.transport import Delivery
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import access_of
-from laneweave.protocol.transports.zenoh.transport import connect_patiently
+from laneweave.protocol.transports.zenoh.transport import connect_blocking
 from laneweave.protocol.wire.topics import Keys
 
 log = structlog.get_logger(__name__)
@@ -115,7 +115,7 @@ class _LiveObserver:
         self.audience = Audience()
         self.buffer = FrameBuffer(scene_of(scenario, "live", scenario.network.realm, STEP_S))
         self._observer = Observer(Keys(scenario.network.realm), topics=TOPICS)
-        self._transport = connect_patiently(access_of(scenario, IDENTITY), self._deliver)
+        self._transport = connect_blocking(access_of(scenario, IDENTITY), self._deliver)
         # Seconds that do not jump when the system clock is set.
         self._offset_s = time.time() - time.monotonic()
         self._road = LiveRoad(scenario, self._wall_s())

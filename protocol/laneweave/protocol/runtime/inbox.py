@@ -10,11 +10,11 @@ from collections.abc import Iterator
 
 from laneweave.protocol.runtime.metrics import SnapshotRequest
 from laneweave.protocol.runtime.node import Computed, Stopping
-from laneweave.protocol.runtime.transport import Delivery, Question
+from laneweave.protocol.runtime.transport import Delivery, Query
 
-MAX_QUESTION_WAIT_S = 0.02
-"""Longest time a query waits while other work is queued, unless that exceeds `QUESTION_SHARE`."""
-QUESTION_SHARE = 0.1
+MAX_QUERY_WAIT_S = 0.02
+"""Longest time a query waits while other work is queued, unless that exceeds `QUERY_SHARE`."""
+QUERY_SHARE = 0.1
 """Maximum share of the time for queries while other work is queued."""
 
 Item = Delivery | Computed | SnapshotRequest | Stopping
@@ -24,7 +24,7 @@ Item = Delivery | Computed | SnapshotRequest | Stopping
 class Inbox:
     """Queue of a node's inputs.
 
-    Queries wait until no other work is queued, or for `MAX_QUESTION_WAIT_S`: a flood of them must
+    Queries wait until no other work is queued, or for `MAX_QUERY_WAIT_S`: a flood of them must
     not stop a leader. `put` may be called from callbacks and signal handlers, because
     `SimpleQueue.put` is reentrant.
     """
@@ -32,14 +32,14 @@ class Inbox:
     def __init__(self) -> None:
         """Create an empty queue."""
         self._items: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
-        self._questions: deque[Question] = deque()
-        self._next_question_s = 0.0
+        self._queries: deque[Query] = deque()
+        self._next_query_s = 0.0
         """Time at which the next query is taken even if other work is queued."""
 
     def put(self, item: Item) -> None:
         """Add an input; may be called from any thread, callback or signal handler."""
-        if isinstance(item, Question):
-            self._questions.append(item)
+        if isinstance(item, Query):
+            self._queries.append(item)
             self._items.put(None)  # wakes `take`
         else:
             self._items.put(item)
@@ -47,11 +47,11 @@ class Inbox:
     def take(self, timeout_s: float) -> Iterator[Item]:
         """Yield the next inputs within this time: at most one item and one query."""
         with contextlib.suppress(queue.Empty):
-            item = self._items.get(timeout=0.0 if self._questions else timeout_s)
+            item = self._items.get(timeout=0.0 if self._queries else timeout_s)
             if item is not None:
                 yield item
         now_s = time.monotonic()
-        if self._questions and (self._items.empty() or now_s > self._next_question_s):
-            yield self._questions.popleft()
+        if self._queries and (self._items.empty() or now_s > self._next_query_s):
+            yield self._queries.popleft()
             took_s = time.monotonic() - now_s
-            self._next_question_s = now_s + max(MAX_QUESTION_WAIT_S, took_s / QUESTION_SHARE)
+            self._next_query_s = now_s + max(MAX_QUERY_WAIT_S, took_s / QUERY_SHARE)

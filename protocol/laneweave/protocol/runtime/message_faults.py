@@ -37,7 +37,7 @@ SENDER_OF_ROLE = {"agent": "vehicle", "coordinator": "coordinator", "bridge": "b
 """Sender that a process of each role counts as, in rules."""
 SENDERS = tuple(SENDER_OF_ROLE.values())
 MESSAGE_TOPICS = tuple(topic.name for topic in TOPICS if topic.kind is not None)
-Wrap = Callable[[Core], Core]
+CoreWrapper = Callable[[Core], Core]
 """Function that wraps a core, or returns it unchanged."""
 MAX_HELD = 10_000
 """Maximum number of delayed messages; more are lost."""
@@ -210,8 +210,8 @@ class FaultyCore:
         return generator
 
 
-def bare(core: Core) -> Core:
-    """Return a core unchanged: the `Wrap` of a run without faults."""
+def unwrapped(core: Core) -> Core:
+    """Return a core unchanged: the `CoreWrapper` of a run without faults."""
     return core
 
 

@@ -22,7 +22,7 @@ from laneweave.protocol.runtime.transport import (
     Delivery,
     LinkDown,
     LinkUp,
-    Question,
+    Query,
     Received,
     TokenDown,
     TokenUp,
@@ -85,7 +85,7 @@ class Computed:
 
 
 @frozen
-class Asked:
+class QueryArrived:
     """A question to this node's service; answer with `Reply` or `Decline`."""
 
     token: int
@@ -100,7 +100,16 @@ class Stopping:
 
 
 Event = (
-    Started | Arrived | PeerUp | PeerDown | LinkUp | LinkDown | Wakeup | Computed | Asked | Stopping
+    Started
+    | Arrived
+    | PeerUp
+    | PeerDown
+    | LinkUp
+    | LinkDown
+    | Wakeup
+    | Computed
+    | QueryArrived
+    | Stopping
 )
 
 
@@ -234,7 +243,7 @@ class Node:
         core: Core,
         transport: Transport,
         keys: Keys,
-        order_work: Callable[[Compute | Delegate], None],
+        submit: Callable[[Compute | Delegate], None],
         label: Name,
         read: Callable[[str, bytes], Arrived] | None = None,
         write: Callable[[object], bytes] = encode,
@@ -245,7 +254,7 @@ class Node:
             core: receives the events.
             transport: carries out the effects.
             keys: key grammar of the realm.
-            order_work: runs computations elsewhere, and calls `dispatch(Computed(...))` at the end.
+            submit: runs computations elsewhere, and calls `dispatch(Computed(...))` at the end.
             label: distinguishes this process from all others in reports.
             read: decodes a message, as `read_message` does, which is the default; may cache.
             write: encodes a message for `read`.
@@ -263,7 +272,7 @@ class Node:
         """Total handling time, added up by the runner."""
         self._transport = transport
         self._keys = keys
-        self._order_work = order_work
+        self._submit = submit
         self._read = read or partial(read_message, keys)
         self._write = write
         self._encoded: tuple[object, bytes] = (None, b"")
@@ -302,11 +311,11 @@ class Node:
         )
         return [own, *core_metrics(self.core)]
 
-    def _news(self, delivery: LinkUp | LinkDown | Question | TokenUp | TokenDown) -> Event:
+    def _news(self, delivery: LinkUp | LinkDown | Query | TokenUp | TokenDown) -> Event:
         if isinstance(delivery, (LinkUp, LinkDown)):
             return delivery
-        if isinstance(delivery, Question):
-            return Asked(delivery.token, delivery.payload, delivery.encoding)
+        if isinstance(delivery, Query):
+            return QueryArrived(delivery.token, delivery.payload, delivery.encoding)
         known = known_key(self._keys, delivery.key)
         return PeerUp(*known) if isinstance(delivery, TokenUp) else PeerDown(*known)
 
@@ -336,7 +345,7 @@ class Node:
         transport = self._transport
         match effect:
             case Compute() | Delegate():
-                self._order_work(effect)
+                self._submit(effect)
             case Reply(token, payload, ok, encoding):
                 transport.answer(token, payload, ok=ok, encoding=encoding)
             case Decline(token):
@@ -393,7 +402,7 @@ def run_job(job: Compute) -> Computed:
         return Computed(job.job, job.work())
     except Exception as error:
         log.exception("computation failed", job=job.job)
-        return Computed(job.job, None, described(error))
+        return Computed(job.job, None, error_text(error))
 
 
 def run_delegated(job: Delegate, now_s: Callable[[], float]) -> Computed:
@@ -404,6 +413,6 @@ def run_delegated(job: Delegate, now_s: Callable[[], float]) -> Computed:
     return run_job(Compute(job.job, partial(job.work, left_s)))
 
 
-def described(error: Exception) -> str:
+def error_text(error: Exception) -> str:
     """Return an exception as the `error` of a `Computed`."""
     return f"{type(error).__name__}: {error}"

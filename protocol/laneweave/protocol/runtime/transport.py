@@ -51,7 +51,7 @@ class LinkDown:
 
 
 @frozen
-class Question:
+class Query:
     """A query on a key that this node serves; the answer must carry its `token`."""
 
     key: str
@@ -71,7 +71,7 @@ class Answer:
     encoding: str = ""
 
 
-def learn(seen: dict[str, None], news: TokenUp | TokenDown) -> bool:
+def update_tokens(seen: dict[str, None], news: TokenUp | TokenDown) -> bool:
     """Update the visible tokens; return False if the event repeats what is known."""
     known = news.key in seen
     if isinstance(news, TokenUp):
@@ -81,7 +81,7 @@ def learn(seen: dict[str, None], news: TokenUp | TokenDown) -> bool:
     return known
 
 
-Delivery = Received | TokenUp | TokenDown | LinkUp | LinkDown | Question
+Delivery = Received | TokenUp | TokenDown | LinkUp | LinkDown | Query
 Deliver = Callable[[Delivery], None]
 
 

@@ -21,7 +21,7 @@ from multiprocessing.context import SpawnProcess
 
 import structlog
 
-from laneweave.protocol.runtime.node import Computed, Delegate, described, run_delegated
+from laneweave.protocol.runtime.node import Computed, Delegate, error_text, run_delegated
 from laneweave.protocol.runtime.processes import die_with_parent
 
 log = structlog.get_logger(__name__)
@@ -67,7 +67,7 @@ class WorkerPool:
             for worker in self._workers:
                 worker.thread.start()
 
-    def order(self, job: Delegate, done: Callable[[Computed], None]) -> None:
+    def submit(self, job: Delegate, done: Callable[[Computed], None]) -> None:
         """Queue a job; `done` is called from a thread."""
         self.start()
         self._orders.put((job, done))
@@ -130,7 +130,7 @@ class _Worker:
                 # The thread must go on, or a share of the requests would wait forever.
                 log.exception("a worker is replaced after an error", job=job.job)
                 self._forget()
-                result = Computed(job.job, None, described(error))
+                result = Computed(job.job, None, error_text(error))
             if not self._ending.is_set():
                 done(result)
                 if self._connection is None:
@@ -192,7 +192,7 @@ class _Worker:
         except Exception as error:
             # It cannot be pickled. The pipe carries whole messages, so nothing of it is left there.
             log.exception("a job or its result cannot be handed over", job=job.job)
-            return Computed(job.job, None, described(error))
+            return Computed(job.job, None, error_text(error))
         self._forget()
         log.warning("a worker was stopped: it went on too long", job=job.job)
         return Computed(job.job, None, "the worker was stopped: it went on too long")
@@ -237,4 +237,4 @@ def _do_next(connection: Connection) -> None:
         raise
     except Exception as error:  # it cannot be pickled
         log.exception("a job or its result cannot be handed over")
-        connection.send((None, described(error)))
+        connection.send((None, error_text(error)))

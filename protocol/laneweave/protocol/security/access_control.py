@@ -59,7 +59,7 @@ SENDING: dict[Exchange, tuple[tuple[Flow, str], ...]] = {
     Exchange.MESSAGES: ((Flow.IN, "put"),),
     Exchange.TOKENS: ((Flow.IN, "liveliness_token"),),
     # A querier learns that a server exists before it queries.
-    Exchange.QUESTIONS: ((Flow.IN, "query"), (Flow.OUT, "reply"), (Flow.OUT, "declare_queryable")),
+    Exchange.QUERIES: ((Flow.IN, "query"), (Flow.OUT, "reply"), (Flow.OUT, "declare_queryable")),
 }
 """Rights of a topic's sender: flow, and kind of Zenoh message."""
 READING: dict[Exchange, tuple[tuple[Flow, str], ...]] = {
@@ -69,7 +69,7 @@ READING: dict[Exchange, tuple[tuple[Flow, str], ...]] = {
         (Flow.IN, "liveliness_query"),
         (Flow.OUT, "liveliness_token"),
     ),
-    Exchange.QUESTIONS: ((Flow.IN, "declare_queryable"), (Flow.IN, "reply"), (Flow.OUT, "query")),
+    Exchange.QUERIES: ((Flow.IN, "declare_queryable"), (Flow.IN, "reply"), (Flow.OUT, "query")),
 }
 """Rights of its readers."""
 _REPORTING = {Party.VEHICLE: "agent", Party.COORDINATOR: "coordinator", Party.BRIDGE: "bridge"}
@@ -244,7 +244,7 @@ def size_limits(scenario: Scenario) -> list[dict[str, Any]]:
             "size_limit": max_bytes,
         }
         for name, message, exchange, max_bytes in (
-            ("requests", "query", Exchange.QUESTIONS, request_bytes),
+            ("requests", "query", Exchange.QUERIES, request_bytes),
             ("messages", "put", Exchange.MESSAGES, MAX_BYTES),
         )
     ]

@@ -41,7 +41,7 @@ class Exchange(Enum):
     """The sender publishes; readers subscribe."""
     TOKENS = "tokens"
     """The sender shows a liveliness token; readers watch it."""
-    QUESTIONS = "questions"
+    QUERIES = "queries"
     """The sender queries; readers serve and answer."""
 
 
@@ -166,7 +166,7 @@ BRIDGE_ALIVE = Topic(
 )  # fmt: skip
 SERVICE = Topic(
     "service", "service/plan", None, Party.CLIENT, Quality.ASSURED,
-    readers=(Party.COORDINATOR,), exchange=Exchange.QUESTIONS,
+    readers=(Party.COORDINATOR,), exchange=Exchange.QUERIES,
     remark="a query",
 )  # fmt: skip
 

@@ -10,7 +10,7 @@ from laneweave.launch.faults.shared_counters import (
     MessageFaults,
     SharedBoard,
 )
-from laneweave.protocol.runtime.message_faults import FaultBoard, FaultyCore, MessageRule, bare
+from laneweave.protocol.runtime.message_faults import FaultBoard, FaultyCore, MessageRule, unwrapped
 
 
 def test_road_time_passes_from_one_process_to_all(tmp_path: Path) -> None:
@@ -58,4 +58,4 @@ def test_a_role_process_puts_message_faults_before_its_core(tmp_path: Path) -> N
     )
     core = _Silent()
     assert isinstance(faults.wrap(core), FaultyCore)
-    assert bare(core) is core
+    assert unwrapped(core) is core

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import time
 
-from laneweave.protocol.runtime.inbox import MAX_QUESTION_WAIT_S, QUESTION_SHARE, Inbox
+from laneweave.protocol.runtime.inbox import MAX_QUERY_WAIT_S, QUERY_SHARE, Inbox
 from laneweave.protocol.runtime.node import Stopping
-from laneweave.protocol.runtime.transport import Question, Received
+from laneweave.protocol.runtime.transport import Query, Received
 
 MESSAGE = Received("k", b"")
-QUESTION = Question("k", b"", 1)
+QUESTION = Query("k", b"", 1)
 
 
 def test_what_came_first_is_taken_first_and_questions_last() -> None:
@@ -58,6 +58,6 @@ def test_questions_that_take_long_get_a_small_part_of_the_time() -> None:
                 begun_s.append(time.monotonic())
                 time.sleep(long_s)
                 ended_s.append(time.monotonic())
-    assert long_s / QUESTION_SHARE > MAX_QUESTION_WAIT_S
+    assert long_s / QUERY_SHARE > MAX_QUERY_WAIT_S
     for begin_s, end_s, next_s in zip(begun_s, ended_s, begun_s[1:], strict=False):
-        assert next_s - begin_s >= (end_s - begin_s) / QUESTION_SHARE
+        assert next_s - begin_s >= (end_s - begin_s) / QUERY_SHARE

@@ -9,16 +9,16 @@ import pytest
 from attrs import define
 
 from laneweave.protocol.runtime import message_faults as faulty_core
-from laneweave.protocol.runtime.message_faults import FaultyCore, MessageRule, bare
+from laneweave.protocol.runtime.message_faults import FaultyCore, MessageRule, unwrapped
 from laneweave.protocol.runtime.metrics import RouterMetrics
 from laneweave.protocol.runtime.node import (
     Arrived,
-    Asked,
     Effect,
     Event,
     Node,
     PeerDown,
     PeerUp,
+    QueryArrived,
     Send,
     Started,
     Stopping,
@@ -248,7 +248,7 @@ def test_what_is_no_message_passes_untouched() -> None:
         PeerDown(COORDINATOR_ALIVE, {}),
         LinkDown(),
         LinkUp(),
-        Asked(1, b""),
+        QueryArrived(1, b""),
         Stopping(),
     ]
     for event in events:
@@ -309,7 +309,7 @@ def test_the_bridge_tells_the_road_time() -> None:
 
 def test_a_bare_core_is_the_core_itself() -> None:
     core = Recorder()
-    assert bare(core) is core
+    assert unwrapped(core) is core
 
 
 @pytest.mark.parametrize(

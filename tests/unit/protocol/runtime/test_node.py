@@ -13,7 +13,6 @@ from laneweave.protocol.runtime.metrics import NodeMetrics
 from laneweave.protocol.runtime.node import (
     Announce,
     Arrived,
-    Asked,
     Compute,
     Computed,
     Decline,
@@ -25,6 +24,7 @@ from laneweave.protocol.runtime.node import (
     Node,
     PeerDown,
     PeerUp,
+    QueryArrived,
     Reply,
     Send,
     Serve,
@@ -39,7 +39,7 @@ from laneweave.protocol.runtime.transport import (
     Delivery,
     LinkDown,
     LinkUp,
-    Question,
+    Query,
     Received,
     TokenDown,
     TokenUp,
@@ -105,7 +105,7 @@ def test_a_message_arrives_typed(bench: Bench) -> None:
     [
         (LinkUp(), LinkUp()),
         (LinkDown(), LinkDown()),
-        (Question("any/key", b"q", 4), Asked(4, b"q")),
+        (Query("any/key", b"q", 4), QueryArrived(4, b"q")),
         (
             TokenUp("laneweave/r/alive/vehicle/v1"),
             PeerUp(VEHICLE_ALIVE, {"vehicle": "v1"}),

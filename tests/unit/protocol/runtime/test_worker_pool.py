@@ -43,7 +43,7 @@ class Bench:
         """Order a job; returns its number."""
         self._jobs += 1
         job = Delegate(self._jobs, work, time.monotonic() + within_s)
-        self.pool.order(job, self.done.put)
+        self.pool.submit(job, self.done.put)
         return self._jobs
 
     def do(self, work: Callable[[float], Any], within_s: float = WAIT_S) -> Computed:
@@ -263,10 +263,10 @@ if __name__ == "__main__":
     met = []
     meet = partial(jobs.meet, Path(sys.argv[1]))
     for number in range(2):
-        pool.order(Delegate(number, meet, time.monotonic() + 60), met.append)
+        pool.submit(Delegate(number, meet, time.monotonic() + 60), met.append)
     while len(met) < 2:
         time.sleep(0.01)
-    pool.order(Delegate(3, partial(jobs.sleep, 1000.0), time.monotonic() + 60), met.append)
+    pool.submit(Delegate(3, partial(jobs.sleep, 1000.0), time.monotonic() + 60), met.append)
     print(*pool.process_ids, flush=True)
     time.sleep(1000.0)
 """

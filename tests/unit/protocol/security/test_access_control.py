@@ -193,7 +193,7 @@ def test_the_form_that_zenoh_takes() -> None:
 def test_what_is_longest() -> None:
     requests, messages = size_limits(SCENARIO)
     assert requests["size_limit"] > SCENARIO.service.max_request_bytes
-    asked = [topic for topic in TOPICS if topic.exchange is Exchange.QUESTIONS]
+    asked = [topic for topic in TOPICS if topic.exchange is Exchange.QUERIES]
     assert len(requests["key_exprs"]) == len(asked)
     assert all(key.startswith(PREFIX) for key in requests["key_exprs"] + messages["key_exprs"])
 

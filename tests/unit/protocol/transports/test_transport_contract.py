@@ -17,7 +17,6 @@ from attrs import define, field
 from laneweave.protocol.runtime.node import (
     Announce,
     Arrived,
-    Asked,
     Compute,
     Computed,
     Core,
@@ -27,6 +26,7 @@ from laneweave.protocol.runtime.node import (
     Listen,
     PeerDown,
     PeerUp,
+    QueryArrived,
     Reply,
     Send,
     Serve,
@@ -39,7 +39,7 @@ from laneweave.protocol.runtime.transport import (
     Delivery,
     LinkDown,
     LinkUp,
-    Question,
+    Query,
     Received,
     TokenDown,
     TokenUp,
@@ -106,8 +106,8 @@ class Party:
             if isinstance(item, (TokenUp, TokenDown)) and item.key != SETTLED
         ]
 
-    def questions(self) -> list[Question]:
-        return [item for item in self.got if isinstance(item, Question)]
+    def queries(self) -> list[Query]:
+        return [item for item in self.got if isinstance(item, Query)]
 
 
 Answers = list[Answer | None]
@@ -135,8 +135,8 @@ class Recorder:
                 self.got.append(TokenUp(KEYS.key(topic, **parameters)))
             case PeerDown(topic, parameters):
                 self.got.append(TokenDown(KEYS.key(topic, **parameters)))
-            case Asked(token, payload):
-                self.got.append(Question(PLAN_SERVICE, payload, token))
+            case QueryArrived(token, payload):
+                self.got.append(Query(PLAN_SERVICE, payload, token))
             case LinkUp() | LinkDown():
                 self.got.append(event)
             case _:
@@ -172,7 +172,7 @@ class SimulatedBed:
     def ask(self, payload: bytes) -> Answers:
         """Ask the service; the list gets the answer, or None when there is no service."""
         answers: Answers = []
-        self.network.ask(PLAN_SERVICE, payload, answers.append)
+        self.network.query(PLAN_SERVICE, payload, answers.append)
         return answers
 
     def break_link(self, *parties: Party) -> None:
@@ -283,7 +283,7 @@ class ZenohBed:
         client = self.join("client").transport
         assert isinstance(client, ZenohTransport)
 
-        asked = client.ask(PLAN_SERVICE, payload, ASK_S)
+        asked = client.query(PLAN_SERVICE, payload, ASK_S)
         asked.add_done_callback(lambda done: answers.append(done.result()))
         return answers
 
@@ -535,7 +535,7 @@ def test_a_killed_process_loses_its_token(bed: Bed) -> None:
     assert LinkDown() not in b.got
 
 
-# --- questions --------------------------------------------------------------------------------
+# --- queries ----------------------------------------------------------------------------------
 
 
 def serving(bed: Bed, *names: str) -> list[Party]:
@@ -550,8 +550,8 @@ def serving(bed: Bed, *names: str) -> list[Party]:
 def asked(bed: Bed, *servers: Party) -> tuple[Answers, list[int]]:
     """Ask a question and wait until all servers have it; return its answers and its tokens."""
     answers = bed.ask(b"?")
-    bed.until(lambda: all(server.questions() for server in servers))
-    return answers, [server.questions()[0].token for server in servers]
+    bed.until(lambda: all(server.queries() for server in servers))
+    return answers, [server.queries()[0].token for server in servers]
 
 
 def payloads(answers: Answers) -> list[bytes | None]:
@@ -564,7 +564,7 @@ def test_a_question_gets_its_answer(bed: Bed, *, ok: bool) -> None:
     server.transport.serve(PLAN_SERVICE)
     settle(bed, server)
     answers, (number,) = asked(bed, server)
-    (question,) = server.questions()
+    (query,) = server.queries()
     assert (question.key, question.payload) == (PLAN_SERVICE, b"?")
     assert answers == []
     server.transport.answer(number, b"that", ok=ok)
@@ -572,17 +572,17 @@ def test_a_question_gets_its_answer(bed: Bed, *, ok: bool) -> None:
     bed.until(lambda: answers)
     bed.quiet()
     assert [given and (given.payload, given.ok) for given in answers] == [(b"that", ok)]
-    assert len(server.questions()) == 1
+    assert len(server.queries()) == 1
 
 
-def test_questions_have_tokens_of_their_own_and_unknown_ones_are_ignored(bed: Bed) -> None:
+def test_queries_have_tokens_of_their_own_and_unknown_ones_are_ignored(bed: Bed) -> None:
     (server,) = serving(bed, "server")
     server.transport.answer(12345, b"x", ok=True)
     server.transport.answer(-1, b"x", ok=False)
     first, second = bed.ask(b"1"), bed.ask(b"2")
-    bed.until(lambda: len(server.questions()) == 2)
-    for question in reversed(server.questions()):
-        server.transport.answer(question.token, b"to " + question.payload, ok=True)
+    bed.until(lambda: len(server.queries()) == 2)
+    for query in reversed(server.queries()):
+        server.transport.answer(query.token, b"to " + question.payload, ok=True)
     bed.until(lambda: first and second)
     assert payloads(first + second) == [b"to 1", b"to 2"]
 
@@ -725,7 +725,7 @@ def test_a_service_that_does_not_answer_is_a_timeout(router: Router) -> None:
         client = bed.join("client").transport
         assert isinstance(client, ZenohTransport)
         with pytest.raises(TimeoutError, match="in time"):
-            client.ask(PLAN_SERVICE, b"", 0.2).result(WAIT_S)
+            client.query(PLAN_SERVICE, b"", 0.2).result(WAIT_S)
 
 
 @define
@@ -751,7 +751,7 @@ class Errand:
                 yield Compute(1, lambda: "done")
             case Computed(1, "done"):
                 self.wakeup_s = None
-            case Asked(token):
+            case QueryArrived(token):
                 yield Reply(token, b"yes")
                 yield End()
             case _:
@@ -769,7 +769,7 @@ def test_a_core_runs_over_zenoh_until_it_ends(router: Router) -> None:
     def ask_at_last() -> None:
         watcher.until(lambda: any(isinstance(event, Computed) for event in core.events))
         assert isinstance(client.transport, ZenohTransport)
-        answers.append(client.transport.ask(PLAN_SERVICE, b"?", WAIT_S).result(WAIT_S))
+        answers.append(client.transport.query(PLAN_SERVICE, b"?", WAIT_S).result(WAIT_S))
 
     thread = threading.Thread(target=ask_at_last, daemon=True)
     thread.start()
@@ -781,5 +781,5 @@ def test_a_core_runs_over_zenoh_until_it_ends(router: Router) -> None:
     assert [given and (given.payload, given.ok) for given in answers] == [(b"yes", True)]
     kinds = [type(event) for event in core.events]
     assert kinds[0] is Started
-    for kind in (Wakeup, Arrived, Computed, PeerUp, Asked):
+    for kind in (Wakeup, Arrived, Computed, PeerUp, QueryArrived):
         assert kinds.count(kind) == 1

@@ -19,12 +19,12 @@ from laneweave.protocol.runtime.transport import (
     Delivery,
     LinkDown,
     LinkUp,
-    Question,
+    Query,
     Received,
     TokenDown,
     TokenUp,
     Transport,
-    learn,
+    update_tokens,
 )
 from laneweave.protocol.transports.simulated.virtual_time import Clock, Item, Simulation
 from laneweave.protocol.wire.topics import matches_any
@@ -35,7 +35,7 @@ INJECTED_FAILURE = "injected failure"
 """Error of a computation that fails because of `Conditions.compute_failure`."""
 
 
-_DELIVERIES = (Received, TokenUp, TokenDown, LinkUp, LinkDown, Question)
+_DELIVERIES = (Received, TokenUp, TokenDown, LinkUp, LinkDown, Query)
 
 
 class Member:
@@ -65,7 +65,7 @@ class Member:
         self.pauses = 0
         self.lapsed = False
         """Paused for longer than its lease."""
-        self.news_s = 0.0
+        self.last_token_s = 0.0
         """Arrival time of the newest token event: these do not overtake each other."""
         self.seen: dict[str, None] = {}
         """Tokens that its node knows to be there."""
@@ -85,26 +85,26 @@ class Member:
 
     # --- input ------------------------------------------------------------------------------
 
-    def arrive(self, connection: int, delivery: Delivery) -> None:
+    def receive(self, connection: int, delivery: Delivery) -> None:
         """Deliver what was sent during this connection."""
         if not self.connected or self.connection != connection:
             return
-        if not isinstance(delivery, (TokenUp, TokenDown)) or learn(self.seen, delivery):
-            self.hand_over(delivery)
+        if not isinstance(delivery, (TokenUp, TokenDown)) or update_tokens(self.seen, delivery):
+            self.handle(delivery)
 
-    def hand_over(self, item: Item) -> None:
+    def handle(self, item: Item) -> None:
         """Let the node handle an input, now or when it is resumed."""
         if self.closed:
             return
         if self.paused:
             self._backlog.append(item)
         else:
-            self._handle(item)
+            self._process(item)
             if isinstance(item, Stopping):
                 self.transport.close()
             self._set_alarm()
 
-    def _handle(self, item: Item) -> None:
+    def _process(self, item: Item) -> None:
         simulation = self._simulation
         now_s = simulation.now_s
         if simulation.trace is not None:
@@ -123,12 +123,12 @@ class Member:
         now_s = self._simulation.now_s
         return now_s if self.clock is None else self.clock.local_s(now_s)
 
-    def wake(self) -> None:
+    def resume(self) -> None:
         """End a pause: handle all queued inputs in order."""
         self.paused = False
         backlog, self._backlog = self._backlog, []
         for item in backlog:
-            self.hand_over(item)
+            self.handle(item)
         self._reset_alarm()
 
     def set_clock(self, clock: Clock) -> None:
@@ -166,7 +166,7 @@ class Member:
         wakeup_s = self.node.core.wakeup_s
         local_s = self._local_s()
         if wakeup_s is not None and wakeup_s <= local_s:
-            self._handle(Wakeup())
+            self._process(Wakeup())
         self._set_alarm(now_s + WAKE_AGAIN_S)
 
     # --- computations -----------------------------------------------------------------------
@@ -187,7 +187,7 @@ class Member:
         # As on one thread and one worker: jobs of a kind end in the order of their requests.
         end_s = max(self._computed_s[type(job)], simulation.now_s + duration_s)
         self._computed_s[type(job)] = end_s
-        simulation.at(end_s, self.hand_over, computed)
+        simulation.at(end_s, self.handle, computed)
 
 
 class Tokens:
@@ -220,7 +220,7 @@ class Tokens:
                     if watches and matches_any(member.watched, key):
                         self._send(member, news)
 
-    def introduce(self, watcher: Member, expressions: Iterable[str]) -> None:
+    def report_existing(self, watcher: Member, expressions: Iterable[str]) -> None:
         """Report the tokens that are there to one watcher."""
         keys = (
             key
@@ -241,5 +241,5 @@ class Tokens:
 
     def _send(self, watcher: Member, news: TokenUp | TokenDown) -> None:
         simulation = self._simulation
-        watcher.news_s = max(watcher.news_s, simulation.now_s + simulation.delay_s())
-        simulation.at(watcher.news_s, watcher.arrive, watcher.connection, news)
+        watcher.last_token_s = max(watcher.last_token_s, simulation.now_s + simulation.delay_s())
+        simulation.at(watcher.last_token_s, watcher.receive, watcher.connection, news)

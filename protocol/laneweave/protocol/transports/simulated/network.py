@@ -8,7 +8,7 @@ process is noticed at once, a silent one after its lease, and a node that loses 
 others vanish.
 
 Messages travel as bytes and are checked on receipt, as on Zenoh. All receivers of the same bytes
-share one decoded message, so no core may modify it. With `in_kind`, messages travel as objects,
+share one decoded message, so no core may modify it. With `skip_codec`, messages travel as objects,
 without codec and checks, for speed.
 """
 
@@ -36,7 +36,7 @@ from laneweave.protocol.runtime.transport import (
     Delivery,
     LinkDown,
     LinkUp,
-    Question,
+    Query,
     Received,
     TokenDown,
     TokenUp,
@@ -51,7 +51,7 @@ KILL_SEEN_S = 0.005
 """Time until others notice a killed process (measured on Zenoh: 2 to 9 ms)."""
 REJOIN_S = (0.2, 0.9)
 """Range of the time until a node reconnects to a router that is back (measured on Zenoh)."""
-_REMEMBERED = 4096
+_CACHE_SIZE = 4096
 """Size of the caches of decoded messages, which all receivers share."""
 
 
@@ -75,7 +75,7 @@ class _Reader:
         self._known: dict[str, tuple[Topic, Mapping[str, str]]] = {}
         # A plan has many receivers, each with a key of its own: it is still decoded only once.
         read = partial(read_message, keys, decode=read_payload)
-        self._read = lru_cache(maxsize=_REMEMBERED)(read)
+        self._read = lru_cache(maxsize=_CACHE_SIZE)(read)
 
     def __call__(self, key: str, payload: bytes) -> Arrived:
         if not isinstance(payload, Parcel):
@@ -87,7 +87,7 @@ class _Reader:
 
 
 @frozen
-class _Question:
+class _OpenQuery:
     """A question at one of the servers that may answer it."""
 
     server: Member
@@ -106,15 +106,15 @@ class _Transport:
     def publish(self, key: str, payload: bytes, quality: Quality) -> None:
         del quality
         if not self._member.closed:
-            self._network.carry(self._member.name, key, payload)
+            self._network.transmit(self._member.name, key, payload)
 
     def subscribe(self, key_expression: str) -> None:
         self._member.subscriptions[key_expression] = None
-        self._network.reroute(self._member, key_expression)
+        self._network.update_routes(self._member, key_expression)
 
     def unsubscribe(self, key_expression: str) -> None:
         self._member.subscriptions.pop(key_expression, None)
-        self._network.reroute(self._member, key_expression)
+        self._network.update_routes(self._member, key_expression)
 
     def announce(self, key: str) -> None:
         if key not in self._member.tokens and not self._member.closed:
@@ -131,16 +131,16 @@ class _Transport:
         if key_expression not in member.watched and not member.closed:
             member.watched[key_expression] = None
             if member.connected:
-                self._network.tokens.introduce(member, (key_expression,))
+                self._network.tokens.report_existing(member, (key_expression,))
 
     def serve(self, key: str) -> None:
         self._member.served.add(key)
 
     def answer(self, token: int, payload: bytes, *, ok: bool, encoding: str = "") -> None:
-        self._network.take_answer(self._member, token, Answer(payload, ok, encoding))
+        self._network.accept_answer(self._member, token, Answer(payload, ok, encoding))
 
     def decline(self, token: int) -> None:
-        self._network.take_answer(self._member, token, None)
+        self._network.accept_answer(self._member, token, None)
 
     def close(self) -> None:
         if not self._member.closed:
@@ -151,28 +151,28 @@ class SimulatedNetwork(Simulation):
     """The network and its nodes, in virtual time."""
 
     def __init__(
-        self, seed: int, conditions: Conditions | None = None, *, in_kind: bool = False
+        self, seed: int, conditions: Conditions | None = None, *, skip_codec: bool = False
     ) -> None:
-        """Create an empty network at time 0; `in_kind`: messages bypass codec and checks."""
+        """Create an empty network at time 0; `skip_codec`: messages bypass codec and checks."""
         super().__init__(seed, conditions)
-        self._in_kind = in_kind
+        self._skip_codec = skip_codec
         self._members: dict[str, Member] = {}
         self.tokens = Tokens(self, self._members)
         self._clocks: dict[str, Clock] = {}
         self._routes: dict[str, tuple[Member, ...]] = {}
         """Receivers of each key, in order of their start."""
-        self._beside: dict[str, list[str]] = {}
+        self._keys_by_prefix: dict[str, list[str]] = {}
         """Keys of the routes, by all but their last part."""
         self._cut: Callable[[str, str], bool] | None = None
         self._router_up = True
         self._outages = 0
-        self._questions: dict[int, _Question] = {}
+        self._queries: dict[int, _OpenQuery] = {}
         """Open questions, by the token under which each server knows them."""
         self._token_count = count(1)
         self._label_count = count(1)
         self._member_count = count()
         self._readers: dict[str, _Reader] = {}
-        self._decode = lru_cache(maxsize=_REMEMBERED)(decode)
+        self._decode = lru_cache(maxsize=_CACHE_SIZE)(decode)
 
     # --- nodes ------------------------------------------------------------------------------
 
@@ -194,13 +194,13 @@ class SimulatedNetwork(Simulation):
             member.compute,
             Name(f"{next(self._label_count)}"),
             self._reader(realm),
-            Parcel if self._in_kind else encode,
+            Parcel if self._skip_codec else encode,
         )
         self._members[name] = member
-        self.at(self.now_s, member.hand_over, Started())
+        self.at(self.now_s, member.handle, Started())
         if not self._router_up:
             member.connected = False
-            self.at(self.now_s, member.hand_over, LinkDown())
+            self.at(self.now_s, member.handle, LinkDown())
         return member.node
 
     def __contains__(self, name: str) -> bool:
@@ -226,7 +226,7 @@ class SimulatedNetwork(Simulation):
         """Ask a node to end, as SIGTERM does; a paused one ends when it is resumed."""
         member = self._members.get(name)
         if member is not None:
-            member.hand_over(Stopping())
+            member.handle(Stopping())
 
     def pause(self, name: str) -> None:
         """Pause a node, as SIGSTOP does; its tokens vanish after the lease."""
@@ -245,7 +245,7 @@ class SimulatedNetwork(Simulation):
         if member.lapsed:
             member.lapsed = False
             self.tokens.report(TokenUp, member, member.tokens)
-        member.wake()
+        member.resume()
         self._rejoin_later(member)
 
     def set_clock(self, name: str, offset_s: float = 0.0, rate: float = 1.0) -> None:
@@ -304,7 +304,7 @@ class SimulatedNetwork(Simulation):
 
     # --- what transports call ---------------------------------------------------------------
 
-    def carry(self, sender: str, key: str, payload: bytes) -> None:
+    def transmit(self, sender: str, key: str, payload: bytes) -> None:
         """Send a payload to every subscriber of its key."""
         source = self._members.get(sender)
         if source is None or not source.connected:
@@ -325,11 +325,11 @@ class SimulatedNetwork(Simulation):
             # `_send`, inlined: most events of a simulation originate here.
             arrival_s = self.now_s + conditions.delay_s + conditions.jitter_s * draw()
             arguments = (receiver.connection, message)
-            heapq.heappush(self.queue, (arrival_s, next(self.order), receiver.arrive, arguments))
+            heapq.heappush(self.queue, (arrival_s, next(self.order), receiver.receive, arguments))
             if duplication and draw() < duplication:
                 self._send(receiver, message)
 
-    def ask(self, key: str, payload: bytes, answer: Callable[[Answer | None], None]) -> None:
+    def query(self, key: str, payload: bytes, answer: Callable[[Answer | None], None]) -> None:
         """Ask all servers of the key and take the first answer.
 
         The answer is None if there is no server, or if each has declined, died or been cut off.
@@ -340,33 +340,33 @@ class SimulatedNetwork(Simulation):
         numbered = {next(self._token_count): server for server in servers}
         tokens = set(numbered)
         for token, server in numbered.items():
-            self._questions[token] = _Question(server, answer, tokens)
-            self._send(server, Question(key, payload, token))
+            self._queries[token] = _OpenQuery(server, answer, tokens)
+            self._send(server, Query(key, payload, token))
         if not servers:
             self.at(self.now_s + self.delay_s(), answer, None)
 
-    def take_answer(self, server: Member, token: int, given: Answer | None) -> None:
+    def accept_answer(self, server: Member, token: int, given: Answer | None) -> None:
         """Take the answer of a server; None: it declines."""
-        if token in self._questions and server.connected and not server.closed:
+        if token in self._queries and server.connected and not server.closed:
             self._settle(token, given)
 
     def _settle(self, token: int, given: Answer | None) -> None:
         """Pass the first answer on; None when no server is left that may answer."""
-        question = self._questions.get(token)
+        question = self._queries.get(token)
         if question is None:
             return
         for other in tuple(question.tokens) if given is not None else (token,):
-            del self._questions[other]
+            del self._queries[other]
             question.tokens.discard(other)
         if not question.tokens:
             self.at(self.now_s + self.delay_s(), question.answer, given)
 
-    def _abandon_questions(self, server: Member) -> None:
+    def _abandon_queries(self, server: Member) -> None:
         """Settle the questions that a server can no longer answer."""
-        for token in [token for token, one in self._questions.items() if one.server is server]:
+        for token in [token for token, one in self._queries.items() if one.server is server]:
             self._settle(token, None)
 
-    def reroute(self, member: Member, expression: str) -> None:
+    def update_routes(self, member: Member, expression: str) -> None:
         """Update the routes of all matching keys after a subscription has changed."""
         for key in self._known_keys(expression):
             receivers = [other for other in self._routes[key] if other is not member]
@@ -380,7 +380,7 @@ class SimulatedNetwork(Simulation):
         if not star:
             return [expression] if expression in self._routes else []
         if not rest and fixed.endswith("/"):
-            return self._beside.get(fixed, [])
+            return self._keys_by_prefix.get(fixed, [])
         return [key for key in self._routes if matches(expression, key)]
 
     def remove(self, name: str) -> None:
@@ -401,10 +401,10 @@ class SimulatedNetwork(Simulation):
             return
         member.closed = True
         for expression in member.subscriptions:
-            self.reroute(member, expression)
+            self.update_routes(member, expression)
         if member.visible:
             self.at(self.now_s + seen_after_s, self._hide, member)
-        self.at(self.now_s + seen_after_s, self._abandon_questions, member)
+        self.at(self.now_s + seen_after_s, self._abandon_queries, member)
 
     def _hide(self, member: Member) -> None:
         """Report to all others that the tokens of a member are gone."""
@@ -414,7 +414,7 @@ class SimulatedNetwork(Simulation):
         if member.paused and member.pauses == pause and not member.closed:
             self._hide(member)
             member.lapsed = True
-            self._abandon_questions(member)
+            self._abandon_queries(member)
 
     def _break_links(self, members: Iterable[Member]) -> None:
         broken = [member for member in members if member.connected]
@@ -422,21 +422,21 @@ class SimulatedNetwork(Simulation):
             self._hide(member)
             member.connected = False
             member.connection += 1
-            self._abandon_questions(member)
+            self._abandon_queries(member)
         for member in broken:
             news: list[Delivery] = [TokenDown(key) for key in member.seen]
             member.seen.clear()
             news.insert(self.random.randint(0, len(news)), LinkDown())
             for item in news:
-                member.hand_over(item)
+                member.handle(item)
 
     def _join(self, member: Member) -> None:
         if member.connected:
             return
         member.connected = True
         self.tokens.report(TokenUp, member, member.tokens, but=member)
-        self.tokens.introduce(member, member.watched)
-        member.hand_over(LinkUp())
+        self.tokens.report_existing(member, member.watched)
+        member.handle(LinkUp())
 
     def _rejoin_later(self, member: Member) -> None:
         if self._router_up and not member.connected and not member.unplugged:
@@ -457,11 +457,11 @@ class SimulatedNetwork(Simulation):
                 for member in self._members.values()
                 if matches_any(member.subscriptions, key)
             )
-            self._beside.setdefault(key[: key.rfind("/") + 1], []).append(key)
+            self._keys_by_prefix.setdefault(key[: key.rfind("/") + 1], []).append(key)
         return route
 
     def _send(self, receiver: Member, delivery: Delivery) -> None:
-        # Must draw exactly as `carry` does.
+        # Must draw exactly as `transmit` does.
         conditions = self.conditions
         arrival_s = self.now_s + conditions.delay_s + conditions.jitter_s * self.random.random()
-        self.at(arrival_s, receiver.arrive, receiver.connection, delivery)
+        self.at(arrival_s, receiver.receive, receiver.connection, delivery)

@@ -16,7 +16,7 @@ from attrs.validators import and_, ge, gt, le, lt
 from laneweave.protocol.runtime.node import Computed, Started, Stopping, Wakeup
 from laneweave.protocol.runtime.transport import (
     Delivery,
-    Question,
+    Query,
     Received,
     TokenDown,
     TokenUp,
@@ -145,7 +145,7 @@ class TraceDigest:
                 about = (key,)
             case TokenUp(key) | TokenDown(key):
                 about = (key,)
-            case Question(key, payload, token):
+            case Query(key, payload, token):
                 about = (key, token)
             case Computed(job, _, error):
                 about = (job, error)

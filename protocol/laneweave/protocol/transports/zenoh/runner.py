@@ -55,11 +55,11 @@ def run_core(
     inbox = Inbox()
     worker = _Worker(inbox.put)
 
-    def order(job: Compute | Delegate) -> None:
+    def submit(job: Compute | Delegate) -> None:
         if isinstance(job, Compute):
-            worker.order(job)
+            worker.submit(job)
         elif pool is not None:
-            pool.order(job, inbox.put)
+            pool.submit(job, inbox.put)
         else:
             inbox.put(Computed(job.job, None, "this process has no workers"))
 
@@ -68,7 +68,7 @@ def run_core(
         transport = connect(access, inbox.put, lambda wait_s: any(inbox.take(wait_s)))
         if transport is None:
             return
-        node = Node(core, transport, keys, order, Name(f"{os.getpid()}-{time.time_ns()}"))
+        node = Node(core, transport, keys, submit, Name(f"{os.getpid()}-{time.time_ns()}"))
         observe(snapshot_source(inbox.put))
         try:
             node.dispatch(Started(), time.monotonic())
@@ -82,7 +82,7 @@ def _step(node: Node, inbox: Inbox) -> None:
     wakeup_s = node.core.wakeup_s
     timeout_s = 1.0 if wakeup_s is None else min(1.0, max(0.0, wakeup_s - time.monotonic()))
     for item in inbox.take(timeout_s):
-        _hand_over(node, item)
+        _handle(node, item)
     now_s = time.monotonic()
     wakeup_s = node.core.wakeup_s
     if wakeup_s is not None and wakeup_s <= now_s:
@@ -90,7 +90,7 @@ def _step(node: Node, inbox: Inbox) -> None:
         node.handling_s += time.monotonic() - now_s
 
 
-def _hand_over(node: Node, item: Item) -> None:
+def _handle(node: Node, item: Item) -> None:
     now_s = time.monotonic()
     if isinstance(item, Stopping):
         log.info("stopping")
@@ -116,7 +116,7 @@ class _Worker:
         self._done = done
         self._jobs: queue.SimpleQueue[Compute] | None = None
 
-    def order(self, job: Compute) -> None:
+    def submit(self, job: Compute) -> None:
         """Queue a job."""
         if self._jobs is None:
             self._jobs = queue.SimpleQueue()

@@ -29,11 +29,11 @@ from laneweave.protocol.runtime.transport import (
     Deliver,
     LinkDown,
     LinkUp,
-    Question,
+    Query,
     Received,
     TokenDown,
     TokenUp,
-    learn,
+    update_tokens,
 )
 from laneweave.protocol.security.certificates import check_credentials
 from laneweave.protocol.security.connection import Access, RouterGuard
@@ -54,7 +54,7 @@ _QUALITY: dict[Quality, dict[str, Any]] = {
     )
 }
 
-MAX_QUESTIONS = 4096
+MAX_OPEN_QUERIES = 4096
 """Maximum number of open questions; more are declined."""
 TOO_LONG = bytes(MAX_BYTES + 1)
 """Payload that replaces one that is too long, which is not read."""
@@ -130,9 +130,9 @@ class ZenohTransport:
         """Keys of the tokens that the node knows to be there."""
         self._seen_lock = threading.Lock()
         self._served: dict[str, Any] = {}
-        self._questions: dict[int, zenoh.Query] = {}
-        self._question_lock = threading.Lock()
-        self._question_count = 0
+        self._queries: dict[int, zenoh.Query] = {}
+        self._query_lock = threading.Lock()
+        self._query_count = 0
         self._closed = False
         self._link_listener = self._session.info.declare_transport_events_listener(
             self._on_link, history=False
@@ -181,7 +181,7 @@ class ZenohTransport:
 
     def answer(self, token: int, payload: bytes, *, ok: bool, encoding: str = "") -> None:
         """Answer a query once."""
-        query = self._take_question(token)
+        query = self._pop_query(token)
         if query is None:
             return
         with contextlib.suppress(zenoh.ZError):
@@ -193,15 +193,15 @@ class ZenohTransport:
 
     def decline(self, token: int) -> None:
         """Leave a query to the other servers of its key."""
-        query = self._take_question(token)
+        query = self._pop_query(token)
         if query is not None:
             query.drop()  # type: ignore[no-untyped-call]
 
-    def _take_question(self, token: int) -> zenoh.Query | None:
-        with self._question_lock:
-            return self._questions.pop(token, None)
+    def _pop_query(self, token: int) -> zenoh.Query | None:
+        with self._query_lock:
+            return self._queries.pop(token, None)
 
-    def ask(
+    def query(
         self, key: str, payload: bytes, timeout_s: float, encoding: str = ""
     ) -> Future[Answer | None]:
         """Ask the servers of a key.
@@ -251,25 +251,25 @@ class ZenohTransport:
         kind = TokenUp if sample.kind == zenoh.SampleKind.PUT else TokenDown
         news = kind(str(sample.key_expr))
         with self._seen_lock:
-            if learn(self._seen, news):
+            if update_tokens(self._seen, news):
                 self._deliver(news)
 
     def _on_link(self, event: zenoh.TransportEvent) -> None:
         self._deliver(LinkUp() if event.kind == zenoh.SampleKind.PUT else LinkDown())
 
     def _on_query(self, query: zenoh.Query) -> None:
-        with self._question_lock:
-            if len(self._questions) >= MAX_QUESTIONS:
+        with self._query_lock:
+            if len(self._queries) >= MAX_OPEN_QUERIES:
                 query.drop()  # type: ignore[no-untyped-call]
                 return
-            self._question_count += 1
-            token = self._question_count
-            self._questions[token] = query
+            self._query_count += 1
+            token = self._query_count
+            self._queries[token] = query
         payload = b""
         if query.payload is not None:
             payload = query.payload.to_bytes() if len(query.payload) <= MAX_BYTES else TOO_LONG
         encoding = "" if query.encoding is None else str(query.encoding)
-        self._deliver(Question(str(query.key_expr), payload, token, encoding))
+        self._deliver(Query(str(query.key_expr), payload, token, encoding))
 
 
 def connect(
@@ -304,7 +304,7 @@ def connect(
             return None
 
 
-def connect_patiently(access: Access, deliver: Deliver) -> ZenohTransport:
+def connect_blocking(access: Access, deliver: Deliver) -> ZenohTransport:
     """Connect as `connect` does, without a way to stop.
 
     Raises:

@@ -124,9 +124,9 @@ def test_a_cut_loses_messages_where_it_says_until_it_heals() -> None:
     assert receivers["b"].numbers == [2, 3]
 
 
-@pytest.mark.parametrize("in_kind", [False, True])
-def test_injected_bytes_are_read_or_refused_by_each_receiver(*, in_kind: bool) -> None:
-    network = SimulatedNetwork(1, CALM, in_kind=in_kind)
+@pytest.mark.parametrize("skip_codec", [False, True])
+def test_injected_bytes_are_read_or_refused_by_each_receiver(*, skip_codec: bool) -> None:
+    network = SimulatedNetwork(1, CALM, skip_codec=skip_codec)
     for name in ("a", "b"):
         network.add(name, listener(), REALM)
     network.run(0.1)
@@ -140,19 +140,19 @@ def test_injected_bytes_are_read_or_refused_by_each_receiver(*, in_kind: bool) -
         assert network.node(name).rejected == 2
 
 
-@pytest.mark.parametrize("in_kind", [False, True])
-def test_a_message_arrives_as_the_same_object_or_an_equal_one(*, in_kind: bool) -> None:
-    network, receiver, sent = SimulatedNetwork(1, CALM, in_kind=in_kind), listener(), beat(7)
+@pytest.mark.parametrize("skip_codec", [False, True])
+def test_a_message_arrives_as_the_same_object_or_an_equal_one(*, skip_codec: bool) -> None:
+    network, receiver, sent = SimulatedNetwork(1, CALM, skip_codec=skip_codec), listener(), beat(7)
     network.add("b", receiver, REALM)
     network.add("a", Recorder(at_start(sent)), REALM)
     network.run(0.2)
     (arrived,) = receiver.of(Arrived)
     assert isinstance(arrived, Arrived)
     assert arrived.message == sent.message
-    assert (arrived.message is sent.message) == in_kind
+    assert (arrived.message is sent.message) == skip_codec
     # An object on a key where it does not belong is refused, as its bytes would be.
     for key in (f"{KEY}/b", Keys(REALM).key(COMMAND, vehicle="a")):
-        network.inject(key, Parcel(sent.message) if in_kind else BEAT)
+        network.inject(key, Parcel(sent.message) if skip_codec else BEAT)
     network.run(0.3)
     assert receiver.of(Arrived) == [arrived]
 
@@ -621,7 +621,7 @@ def test_a_node_may_end_when_it_loses_the_router() -> None:
     assert sorted(cores["a"].tokens[4:]) == ["+a", "+c", "+d"]
 
 
-# --- questions --------------------------------------------------------------------------------
+# --- queries ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("fault", ["kill", "disconnect", "pause", "stop"])
@@ -631,7 +631,7 @@ def test_a_question_is_settled_when_no_server_can_answer_it(fault: str) -> None:
         network.add(name, Recorder(at_start(Serve(SERVICE))), REALM)
     network.run(0.1)
     answers: list[Answer | None] = []
-    network.ask(Keys(REALM).key(SERVICE), b"?", answers.append)
+    network.query(Keys(REALM).key(SERVICE), b"?", answers.append)
     network.run(0.2)
     getattr(network, fault)("a")
     network.run(1.0)

@@ -23,7 +23,7 @@ from laneweave.protocol.runtime.node import (
 from laneweave.protocol.runtime.transport import (
     LinkDown,
     LinkUp,
-    Question,
+    Query,
     Received,
     TokenDown,
     TokenUp,
@@ -136,7 +136,7 @@ def test_a_run_is_the_same_with_a_trace_and_with_messages_in_kind(
     events: list[tuple[float, str, Item]] = []
     run = chatter(seed, conditions, lambda *event: events.append(event))
     assert run == chatter(seed, conditions)
-    assert run == chatter(seed, conditions, in_kind=True)
+    assert run == chatter(seed, conditions, skip_codec=True)
     seen, _ = run
     assert len(events) == sum(len(core) for core in seen) > 300
     for name, core in zip(("a", "b"), seen, strict=False):
@@ -161,10 +161,10 @@ ITEMS: list[Item] = [
     TokenDown("q"),
     LinkUp(),
     LinkDown(),
-    Question("k", b"p", 1),
-    Question("k", b"p", 2),
-    Question("k", b"q", 1),
-    Question("q", b"p", 1),
+    Query("k", b"p", 1),
+    Query("k", b"p", 2),
+    Query("k", b"q", 1),
+    Query("q", b"p", 1),
     Computed(1, None),
     Computed(2, None),
     Computed(1, None, "no"),
