@@ -559,13 +559,13 @@ def payloads(answers: Answers) -> list[bytes | None]:
 
 
 @pytest.mark.parametrize("ok", [True, False])
-def test_a_question_gets_its_answer(bed: Bed, *, ok: bool) -> None:
+def test_a_query_gets_its_answer(bed: Bed, *, ok: bool) -> None:
     (server,) = serving(bed, "server")
     server.transport.serve(PLAN_SERVICE)
     settle(bed, server)
     answers, (number,) = asked(bed, server)
     (query,) = server.queries()
-    assert (question.key, question.payload) == (PLAN_SERVICE, b"?")
+    assert (query.key, query.payload) == (PLAN_SERVICE, b"?")
     assert answers == []
     server.transport.answer(number, b"that", ok=ok)
     server.transport.answer(number, b"again", ok=True)
@@ -582,12 +582,12 @@ def test_queries_have_tokens_of_their_own_and_unknown_ones_are_ignored(bed: Bed)
     first, second = bed.ask(b"1"), bed.ask(b"2")
     bed.until(lambda: len(server.queries()) == 2)
     for query in reversed(server.queries()):
-        server.transport.answer(query.token, b"to " + question.payload, ok=True)
+        server.transport.answer(query.token, b"to " + query.payload, ok=True)
     bed.until(lambda: first and second)
     assert payloads(first + second) == [b"to 1", b"to 2"]
 
 
-def test_a_question_without_a_service_is_not_answered(bed: Bed) -> None:
+def test_a_query_without_a_service_is_not_answered(bed: Bed) -> None:
     answers = bed.ask(b"?")
     bed.until(lambda: answers)
     assert answers == [None]
@@ -605,7 +605,7 @@ def test_a_server_that_hangs_does_not_delay_the_answer_of_another(bed: Bed) -> N
 
 
 @pytest.mark.parametrize("others_answer", [True, False])
-def test_a_declined_question_is_left_to_the_other_servers(bed: Bed, *, others_answer: bool) -> None:
+def test_a_declined_query_is_answered_by_another_server(bed: Bed, *, others_answer: bool) -> None:
     declines, other = serving(bed, "declines", "other")
     answers, (first, second) = asked(bed, declines, other)
     for number in (first, first, -1):
@@ -621,7 +621,7 @@ def test_a_declined_question_is_left_to_the_other_servers(bed: Bed, *, others_an
     assert payloads(answers) == [b"!" if others_answer else None]
 
 
-def test_a_question_is_settled_when_its_only_server_is_killed(bed: Bed) -> None:
+def test_a_query_ends_when_its_only_server_is_killed(bed: Bed) -> None:
     bed.join_process("server")
     answers = bed.ask(b"?")
     bed.quiet()
