@@ -26,12 +26,16 @@ import psutil
 import pyarrow.parquet as pq
 from attrs import define, field, frozen
 
-from laneweave.launch.cli.entry import main
+from laneweave.launch import cli
+from laneweave.launch.cli.main import main
 
 LANEWEAVE = str(Path(sys.executable).with_name("laneweave"))
 MARK = "LANEWEAVE_TEST_MARK"
 LOADED = (
-    "laneweave.launch.cli.main",
+    *(
+        f"laneweave.launch.cli.{path.stem}"
+        for path in Path(cli.__file__).parent.glob("*_command*.py")
+    ),
     "laneweave.launch.run.simulated_run",
     *(f"laneweave.{role}.process" for role in ("agents", "coordinator", "sim_bridge")),
 )

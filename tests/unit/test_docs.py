@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from laneweave.agents.driving.trajectory import move_profile
 from laneweave.coordinator.planning.request import PlanRequest
-from laneweave.launch.cli.main import app
+from laneweave.launch.cli.main import command_line
 from laneweave.launch.cli.plan_answers import answer_request
 from laneweave.launch.faults.specification import load_faults
 from laneweave.launch.observe.status import SCHEMA, Status
@@ -320,7 +320,7 @@ def test_all_metrics_are_documented() -> None:
 
 
 def test_log_options_are_as_documented() -> None:
-    program: Any = typer.main.get_command(app)
+    program: Any = typer.main.get_command(command_line())
     for option, variable, *_ in rows(section(read("DEPLOYMENT.md"), "### Logs")):
         for role in ("router", "coordinator", "agent", "bridge"):
             (found,) = (
@@ -372,7 +372,7 @@ def commands(text: str) -> Iterator[str]:
 
 @each_document
 def test_commands_exist(path: Path) -> None:
-    program = typer.main.get_command(app)
+    program = typer.main.get_command(command_line())
     subcommands: dict[str, Any] = getattr(program, "commands", {})
     for command in commands(path.read_text(encoding="utf-8")):
         words = shlex.split(command, comments=True)[1:]

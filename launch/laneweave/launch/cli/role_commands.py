@@ -28,7 +28,7 @@ from laneweave.launch.cli.options import (
     refuse_inert,
 )
 from laneweave.launch.run.logs import LogFormat, LogLevel, log_role
-from laneweave.launch.run.run_folder import draw_report, new_folder
+from laneweave.launch.run.run_folder import new_folder
 from laneweave.launch.run_methods import FORMATION
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.metrics import Observe, unobserved
@@ -134,6 +134,7 @@ def bridge(
     log_level: Level = None,
 ) -> None:
     """Run the simulated world of a deployment."""
+    from laneweave.launch.report.build import draw_report
     from laneweave.launch.run.outcome import complete_summary, print_outcome
     from laneweave.sim_bridge.process import run_bridge
 

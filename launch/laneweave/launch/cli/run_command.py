@@ -19,7 +19,7 @@ from laneweave.launch.cli.options import (
     refuse_inert,
     shows_progress,
 )
-from laneweave.launch.run.run_folder import draw_report, new_folder
+from laneweave.launch.run.run_folder import new_folder
 from laneweave.launch.run_methods import FORMATION, LC2013, RULE
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.scenario.fields import Scenario
@@ -124,6 +124,8 @@ def run(
 
     print_outcome(outcome, Console())
     if outcome.summary is not None:
+        from laneweave.launch.report.build import draw_report
+
         draw_report(outcome.folder)
     raise typer.Exit(outcome.exit_status)
 

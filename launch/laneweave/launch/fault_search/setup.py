@@ -13,8 +13,8 @@ from collections.abc import Iterator, Sequence
 from attrs import evolve, frozen
 
 from laneweave.launch.fault_search.faults import CLOCK_DRIFT, CLOCK_OFFSET_S, LEASE_S, FaultMix
-from laneweave.launch.fault_search.light_road import Grant, Visit
 from laneweave.launch.fault_search.profiles import Profile
+from laneweave.launch.fault_search.stand_ins import Grant, Visit
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.deployment_fields import Network
 from laneweave.protocol.scenario.fields import FormationSettings, Road, Runtime, Scenario

@@ -1,6 +1,6 @@
-"""Fast stand-ins for the two costly parts of a run: the trajectory driver and the rolling planner.
+"""Fast stand-ins for the costly parts of a run: bodies, trajectory drivers, the rolling planner.
 
-Safety does not depend on either of them.
+Safety depends on none of them.
 """
 
 from __future__ import annotations
@@ -8,16 +8,136 @@ from __future__ import annotations
 import random
 from collections.abc import Collection, Sequence
 
+import attrs
+from attrs import frozen
+
 from laneweave.agents.driving.driver import Drive, SolverStats
 from laneweave.coordinator.planning.rolling.path_search import CellPath, StreamPlan, StreamVehicle
 from laneweave.coordinator.rolling.checked_planner import stream_road
 from laneweave.protocol.lattice import Cell, PlannedMove, displacements, footprint
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.vehicle.motion import at_rest_in_cell
-from laneweave.protocol.wire.messages import Motion, Sense
+from laneweave.protocol.vehicle.motion import State, at_rest_in_cell
+from laneweave.protocol.wire.messages import Motion, Name, Sense
+from laneweave.sim_bridge.bodies.motion_controller import MotionController
+from laneweave.sim_bridge.bodies.plant import Plant
+from laneweave.sim_bridge.road.demand import Arrival
+from laneweave.sim_bridge.road.entry import Admission
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 RESTLESS = 0.4
 """Probability that a vehicle on its preferred lane is moved nevertheless."""
+SYNC_S = 1.0
+"""Interval between synchronizations of a vehicle's clock, which drifts in between."""
+
+
+@frozen
+class Visit:
+    """One vehicle's visit to the road."""
+
+    vehicle: Name
+    cell: Cell
+    """Cell in which it enters."""
+    enters_s: float
+    leaves_s: float | None
+    """None: it stays until the end."""
+    clock_offset_s: float = 0.0
+    clock_drift: float = 0.0
+    """Seconds that its clock gains per second."""
+
+
+@frozen
+class Grant:
+    """Assignment of an empty cell to an owner, as by the roadside (rolling operation)."""
+
+    t_s: float
+    owner: Name
+    cell: Cell
+
+
+class LightBody(Plant):
+    """A body that moves in a straight line of the lattice in a given time."""
+
+    def __init__(self, scenario: Scenario, cell: Cell) -> None:
+        """Start at rest in a cell."""
+        super().__init__((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), scenario.vehicle, scenario.runtime.tick_s)
+        self.t_s = 0.0
+        """Time of the newest tick."""
+        self._lattice = scenario.lattice
+        self._origin: tuple[float, float] = cell
+        self._goal: Cell = cell
+        self._begin_s = self._end_s = 0.0
+
+    @property
+    def state(self) -> State:
+        """(s m, v m/s, a m/s2, y m, v_y m/s, a_y m/s2) at the newest tick."""
+        column, lane = self._place(self.t_s)
+        lattice = self._lattice
+        s_m = lattice.speed_mps * self.t_s + column * lattice.pitch_m
+        y_m = (lane + 0.5) * lattice.lane_width_m
+        return (s_m, lattice.speed_mps, 0.0, y_m, 0.0, 0.0)
+
+    def go(self, cell: Cell, now_s: float, lasts_s: float) -> None:
+        """Begin a motion to a cell from the current position."""
+        self._origin, self._goal = self._place(now_s), cell
+        self._begin_s, self._end_s = now_s, now_s + lasts_s
+
+    def has_arrived(self, now_s: float) -> bool:
+        """Return whether it is in the centre of its target cell."""
+        return now_s >= self._end_s
+
+    def _place(self, t_s: float) -> tuple[float, float]:
+        if t_s >= self._end_s:
+            return self._goal
+        share = (t_s - self._begin_s) / (self._end_s - self._begin_s)
+        (column, lane), (to_column, to_lane) = self._origin, self._goal
+        return (column + share * (to_column - column), lane + share * (to_lane - lane))
+
+
+class LightVehicle(RoadVehicle):
+    """A vehicle with a light body, its own clock, and a preferred lane that changes."""
+
+    def __init__(self, visit: Visit, preferred_lane: int, scenario: Scenario) -> None:
+        """Start in the cell of a visit."""
+        self.body = LightBody(scenario, visit.cell)
+        arrival = Arrival(visit.vehicle, visit.cell[1], preferred_lane, visit.enters_s)
+        super().__init__(
+            visit.vehicle,
+            Admission(arrival, visit.cell, visit.enters_s),
+            MotionController(self.body, scenario, visit.cell),
+        )
+        if scenario.formation.rolling:
+            self.controller.assign_cell(visit.cell)
+        self._visit = visit
+        self._speed_mps = scenario.lattice.speed_mps
+
+    @property
+    def preferred_lane(self) -> int:
+        """Preferred lane."""
+        return self.admission.arrival.preferred_lane
+
+    def leaves_by(self, t_s: float) -> bool:
+        """Return whether it leaves the road by a time."""
+        return self._visit.leaves_s is not None and t_s >= self._visit.leaves_s
+
+    def prefer(self, lane: int) -> None:
+        """Change the preferred lane."""
+        arrival = attrs.evolve(self.admission.arrival, preferred_lane=lane)
+        self.admission = attrs.evolve(self.admission, arrival=arrival)
+
+    def sense(self, tick: int, *, caretaker: bool, left: bool = False) -> Sense:
+        """Return its SENSE message, by its own clock.
+
+        It knows its position in the lattice from the vehicles around it: a wrong clock makes it act
+        late or early, but does not shift its cell.
+        """
+        sense = super().sense(tick, caretaker=caretaker, left=left)
+        visit = self._visit
+        ahead_s = visit.clock_offset_s + visit.clock_drift * (sense.t_s % SYNC_S)
+        if ahead_s == 0.0:
+            return sense
+        s, v, a, y, v_y, a_y = sense.state
+        state = (s + self._speed_mps * ahead_s, v, a, y, v_y, a_y)
+        return attrs.evolve(sense, t_s=sense.t_s + ahead_s, state=state)
 
 
 class LightDriver:

@@ -12,7 +12,7 @@ from pathlib import Path
 from attrs import define, field
 
 from laneweave.launch.drawing.figures import DPI
-from laneweave.launch.recordings.runs import Comparison, Run
+from laneweave.launch.recordings.runs import Comparison, Run, single_run
 from laneweave.launch.recordings.trajectories import read_tracks
 from laneweave.launch.report import distributions, figures
 from laneweave.launch.report.animation import animation_data
@@ -20,6 +20,7 @@ from laneweave.launch.report.page import Animation, Picture, Section, write_page
 from laneweave.launch.report.path_maps import DrivenMap, draw_path_map, driven_map
 from laneweave.launch.report.snapshots import road_snapshots
 from laneweave.launch.report.tables import tables_of
+from laneweave.protocol.errors import CommandFailedError
 
 REPORT_DPI = 300
 PAPER_STRETCH_M = (500.0, 800.0)
@@ -74,6 +75,18 @@ class _Report:
     ) -> None:
         """Draw a picture, and add a section with it."""
         self.sections.append(Section(title, pictures=self.draw(name, draw, caption, alt)))
+
+
+def draw_report(folder: Path) -> None:
+    """Write the pictures and the page of a finished run.
+
+    Raises:
+        CommandFailedError: they cannot be written.
+    """
+    try:
+        report_run(single_run(folder))
+    except OSError as error:
+        raise CommandFailedError(f"{folder}: pictures not drawn: {error}") from error
 
 
 def report_run(run: Run, *, formation: int | None = None, dpi: int = DPI) -> Path:

@@ -10,8 +10,7 @@ object it visits, so each process would soon have its own copy of all of them.
 
 from __future__ import annotations
 
-import laneweave.coordinator.process
-import laneweave.launch.cli.entry  # noqa: F401 (loaded by every process)
+import laneweave.coordinator.process  # noqa: F401
 from laneweave.agents.process import warm_up
 from laneweave.launch.run.roles import collect_rarely
 from laneweave.protocol.config.loading import parse_scenario

@@ -1,4 +1,4 @@
-"""The folder of a run: its creation, and the report in it."""
+"""The folder of a new run."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from laneweave.protocol.errors import BadInputError, CommandFailedError
+from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 
 LOG = "log.jsonl"
@@ -56,18 +56,3 @@ def _claim(folder: Path) -> None:
         raise BadInputError("--out", str(folder), "a new or empty folder") from error
     except OSError as error:
         raise BadInputError("--out", str(folder), f"a folder ({error.strerror})") from error
-
-
-def draw_report(folder: Path) -> None:
-    """Write the figures and the page of a finished run.
-
-    Raises:
-        CommandFailedError: they cannot be written.
-    """
-    from laneweave.launch.recordings.runs import single_run
-    from laneweave.launch.report.build import report_run
-
-    try:
-        report_run(single_run(folder))
-    except OSError as error:
-        raise CommandFailedError(f"{folder}: pictures not drawn: {error}") from error

@@ -11,7 +11,7 @@ import pytest
 import yaml
 from typer.main import get_command
 
-from laneweave.launch.cli.main import app
+from laneweave.launch.cli.main import command_line
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.scenario.fields import Scenario
 
@@ -58,7 +58,7 @@ def check(service: str) -> list[str]:
 
 def parameters(words: list[str]) -> dict[str, Any]:
     """Parse a command line as the command itself does."""
-    group: Any = get_command(app)
+    group: Any = get_command(command_line())
     command = group.commands[words[0]]
     words = words[1:]
     while hasattr(command, "commands"):

@@ -9,8 +9,9 @@ import pytest
 
 from laneweave.launch.fault_search.checker import Checker
 from laneweave.launch.fault_search.checker_geometry import Geometry
-from laneweave.launch.fault_search.light_road import LightRoad, Visit
+from laneweave.launch.fault_search.light_road import LightRoad
 from laneweave.launch.fault_search.setup import make_scenario
+from laneweave.launch.fault_search.stand_ins import Visit
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Arrived, Effect, PeerDown, PeerUp, Send, Started, Wakeup
 from laneweave.protocol.vehicle.motion import at_rest_in_cell

@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
-from laneweave.launch.cli.main import app
+from laneweave.launch.cli.main import command_line
 from laneweave.launch.run.outcome import Outcome
 from laneweave.launch.run.reference_run import ReferenceRun, check_reference
 from laneweave.launch.run_methods import LC2013, RULE
@@ -151,7 +151,7 @@ def test_an_interrupted_run_leaves_its_summary(
 def test_the_command_leaves_all_files(tmp_path: Path, method: str) -> None:
     out = tmp_path / "run"
     options = ("--duration", "5", "--volume", "600", "--out", str(out))
-    done = CliRunner().invoke(app, ["run", "--method", method, *options])
+    done = CliRunner().invoke(command_line(), ["run", "--method", method, *options])
     assert done.exit_code == 0
     assert {path.name for path in out.iterdir()} == {
         *("events.jsonl", "log.jsonl", "summary.json"),
@@ -165,7 +165,7 @@ def test_the_command_leaves_all_files(tmp_path: Path, method: str) -> None:
 def test_faults_are_refused(tmp_path: Path, method: str) -> None:
     out = tmp_path / "run"
     done = CliRunner().invoke(
-        app, ["run", "--method", method, "--faults", "lossy10", "--out", str(out)]
+        command_line(), ["run", "--method", method, "--faults", "lossy10", "--out", str(out)]
     )
     assert isinstance(done.exception, BadInputError)
     assert done.exception.field == "--faults"

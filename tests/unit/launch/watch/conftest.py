@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from laneweave.launch.cli.main import app
+from laneweave.launch.cli.main import command_line
 
 
 @pytest.fixture(scope="session")
@@ -16,7 +16,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scenario = folder / "road.toml"
     scenario.write_text('schema = "laneweave.scenario/1"\n[road]\ns2_m = 60.0\ns3_m = 240.0\n')
     options = ["--transport", "simulated", "--volume", "1600", "--duration", "12", "--no-progress"]
-    assert not app(
+    assert not command_line()(
         ["run", str(scenario), *options, "--out", str(folder / "run")], standalone_mode=False
     )
     return folder / "run"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from laneweave.launch.cli.main import app
+from laneweave.launch.cli.main import command_line
 from laneweave.launch.recordings.runs import single_run
 from laneweave.launch.recordings.trajectories import read_tracks
 from laneweave.launch.watch.frames import MOVING
@@ -141,4 +141,4 @@ def test_a_run_with_damaged_events_is_refused(recorded: Path, tmp_path: Path) ->
 )
 def test_bad_input_of_the_command(arguments: list[str], words: str) -> None:
     with pytest.raises(BadInputError, match=words):
-        app(["watch", *arguments, "--listen", "127.0.0.1:0"], standalone_mode=False)
+        command_line()(["watch", *arguments, "--listen", "127.0.0.1:0"], standalone_mode=False)

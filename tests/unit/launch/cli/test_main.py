@@ -10,12 +10,12 @@ import time
 
 INTERRUPTS = 60
 
-# The entry point loads everything, as in the real command: threads inherit its signal mask.
+# Everything is loaded by the real entry point: threads inherit its signal mask.
 SOLVING = """
 import signal, sys
-from laneweave.launch.cli import entry
+from laneweave.launch.cli import main
 
-def solve() -> None:
+def solve(_: list[str]) -> None:
     from laneweave.agents.driving.tracker import Tracker
     from laneweave.agents.driving.reference import Reference
     from laneweave.protocol.vehicle.motion import cell_state
@@ -33,12 +33,8 @@ def solve() -> None:
         except KeyboardInterrupt:
             print("interrupted", flush=True)
 
-class Cli:
-    main = staticmethod(solve)
-
-sys.modules["laneweave.launch.cli.main"] = Cli
-sys.modules["laneweave.launch.cli"].main = Cli
-entry.main()
+main._status = solve
+main.main()
 """
 
 
