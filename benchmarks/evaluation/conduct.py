@@ -28,7 +28,7 @@ from evaluation.trials import (
 from laneweave.launch.recordings.runs import is_sweep, runs_of
 from laneweave.launch.sweep.execution import StoppedError, run_locally
 from laneweave.launch.sweep.folder import SweepFolder
-from laneweave.launch.sweep.sweep import conduct
+from laneweave.launch.sweep.sweep import run_sweep
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 
@@ -75,7 +75,7 @@ class Rounds:
                     say(f"no time for seed {seed} and later ones; the next call goes on with them")
                     break
                 say(f"sweep, seed {seed}")
-                conduct(points, folder, partial(run_locally, workers=self.jobs), show=True)
+                run_sweep(points, folder, partial(run_locally, workers=self.jobs), show=True)
                 last_s = time.monotonic() - began_s
                 kept &= not any(
                     folder.runs[point.name].reason for point in points if point.label in FORMATIONS

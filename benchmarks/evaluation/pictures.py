@@ -63,7 +63,7 @@ def _draw_snapshots(comparison: Comparison, out: Path, dpi: int) -> None:
 def _draw_spacings(comparison: Comparison, out: Path, dpi: int) -> None:
     counted: dict[tuple[str, float], Counts] = {}
     for label in comparison.labels:
-        run = comparison.shown(label, SHOWN_VOLUME)
+        run = comparison.representative(label, SHOWN_VOLUME)
         if run is not None:
             counted[label, SHOWN_VOLUME] = count(read_tracks(run.folder), run.scenario)
     draw_spacings(counted, comparison.runs[0].scenario, out, dpi)

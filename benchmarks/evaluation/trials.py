@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 from attrs import frozen
 
 from laneweave.launch.recordings.runs import scenario_of
-from laneweave.launch.sweep.execution import StoppedError, follow
+from laneweave.launch.sweep.execution import StoppedError, wait_for_exit
 from laneweave.protocol.errors import CommandFailedError
 from laneweave.protocol.summary import RunSummary, read_summary
 
@@ -206,7 +206,7 @@ def run_trial(trial: Trial, out: Path, root: Path, stopped: Callable[[], bool]) 
         )
         end_s = time.monotonic() + TIMEOUT_S
         try:
-            follow(process, trial.name, lambda: stopped() or time.monotonic() > end_s)
+            wait_for_exit(process, trial.name, lambda: stopped() or time.monotonic() > end_s)
         except StoppedError as error:
             if stopped():
                 raise

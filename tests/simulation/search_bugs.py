@@ -22,7 +22,7 @@ if __name__ == "__main__":  # run as a program: as `pythonpath` in pyproject.tom
 
 from laneweave.launch.fault_search.fault_run import FaultRun
 from laneweave.launch.fault_search.profiles import PROFILES
-from laneweave.launch.fault_search.search import quiet_logs
+from laneweave.launch.fault_search.search import silence_logs
 from support.planted_bugs import BUGS, Bug
 
 SEEDS = 500
@@ -67,7 +67,7 @@ def _first_failure(bug: Bug, seeds: Iterable[int], profiles: Sequence[str]) -> C
 
 
 def _search(name: str, count: int, profiles: Sequence[str]) -> Catch | None:
-    quiet_logs()
+    silence_logs()
     return first_catch(bug_named(name), range(count), profiles)
 
 

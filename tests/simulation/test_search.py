@@ -27,8 +27,8 @@ DIGESTS = 60
 _PRINT_DIGESTS = """
 import json, sys
 from laneweave.launch.fault_search.profiles import PROFILES
-from laneweave.launch.fault_search.search import quiet_logs, run_seeds
-quiet_logs()
+from laneweave.launch.fault_search.search import silence_logs, run_seeds
+silence_logs()
 outcomes = run_seeds(range(*map(int, sys.argv[1:])), PROFILES["mixed"], digest=True)
 print(json.dumps([outcome.digest for outcome in outcomes]))
 """
@@ -104,7 +104,7 @@ def test_every_kind_of_fault_happens() -> None:
         "slow-moves",
         "wrong-clocks",
     }
-    assert set(faults) == set(mixed.harm) | lasting
+    assert set(faults) == set(mixed.event_kinds) | lasting
     assert all(count > 0 for count in faults.values())
 
 
@@ -114,7 +114,7 @@ def test_without_faults_the_last_plan_is_not_late(seed: int) -> None:
     assert not outcome.violations
     # The last preferences change at most 1 s before the end of the phase; then follow one census,
     # the margin of a plan, and the steps: one of the current plan, at most eight of the last one.
-    assert outcome.totals.longest_healing_s < 1.0 + 0.5 + 9 * SLOT_S
+    assert outcome.totals.longest_recovery_s < 1.0 + 0.5 + 9 * SLOT_S
     assert outcome.totals.dropped == 0
 
 

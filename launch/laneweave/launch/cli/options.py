@@ -121,7 +121,7 @@ def check_pace(pace: float | None) -> None:
         raise BadInputError("--pace", pace, "[0.01, 1000]")
 
 
-def refuse_inert(where: str, **options: object) -> None:
+def reject_unused_options(where: str, **options: object) -> None:
     """Refuse options that would have no effect.
 
     Args:

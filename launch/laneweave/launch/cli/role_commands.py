@@ -25,7 +25,7 @@ from laneweave.launch.cli.options import (
     Solver,
     check_pace,
     load_deployment,
-    refuse_inert,
+    reject_unused_options,
 )
 from laneweave.launch.run.logs import LogFormat, LogLevel, log_role
 from laneweave.launch.run.run_folder import new_folder
@@ -171,7 +171,7 @@ def watch(
     if folder is None:
         watch_live(load_deployment(config, endpoint), listen, typer.echo)
         return
-    refuse_inert("with DIR, which needs no network", config=config, endpoint=endpoint)
+    reject_unused_options("with DIR, which needs no network", config=config, endpoint=endpoint)
     watch_recorded(folder, listen, typer.echo)
 
 
@@ -186,7 +186,7 @@ def _as_role(
     if not address:
         yield unobserved
         return
-    from laneweave.launch.observe.metrics_server import shown_metrics
+    from laneweave.launch.observe.metrics_server import serve_metrics
 
-    with shown_metrics(address, role=role, name=name, realm=network.realm) as observe:
+    with serve_metrics(address, role=role, name=name, realm=network.realm) as observe:
         yield observe

@@ -16,7 +16,7 @@ from laneweave.launch.cli.options import (
     ScenarioArgument,
     Solver,
     check_pace,
-    refuse_inert,
+    reject_unused_options,
     shows_progress,
 )
 from laneweave.launch.run.run_folder import new_folder
@@ -102,13 +102,13 @@ def run(
     show = shows_progress(no_progress)
     if method is Method.formation:
         if settings.formation.rolling:
-            refuse_inert("with the rolling operation", solver=solver)
+            reject_unused_options("with the rolling operation", solver=solver)
         simulated = transport is Transport.simulated
         if simulated:
-            refuse_inert("with --transport simulated", pace=pace)
+            reject_unused_options("with --transport simulated", pace=pace)
         outcome = _run_formations(settings, out, faults, pace, simulated=simulated, show=show)
     else:
-        refuse_inert(
+        reject_unused_options(
             f"with --method {method.value}",
             operation=operation,
             solver=solver,
@@ -150,10 +150,10 @@ def _run_formations(
     specification = load_faults(faults, coordinator_names(settings), vehicles)
     with new_folder(out, settings, FORMATION) as folder:
         if simulated:
-            from laneweave.launch.run.roles import collect_rarely
+            from laneweave.launch.run.roles import tune_garbage_collector
             from laneweave.launch.run.simulated_run import SimulatedRun
 
-            collect_rarely()
+            tune_garbage_collector()
             return SimulatedRun(settings, folder, faults=specification, show_progress=show).run()
         return LocalRun(settings, folder, FORMATION, specification, show, pace).run()
 

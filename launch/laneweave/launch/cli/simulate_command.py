@@ -30,7 +30,9 @@ def simulate(
     ] = False,
     verbose: Annotated[
         bool,
-        typer.Option("--verbose", help="Print the story of the first failed seed, or of one seed."),
+        typer.Option(
+            "--verbose", help="Print the timeline of the first failed seed, or of one seed."
+        ),
     ] = False,
     no_progress: NoProgress = False,
 ) -> None:
@@ -39,12 +41,12 @@ def simulate(
 
     chosen = profiles.profile_named(profile)
     numbers, count = parse_seeds(seeds), check_jobs(jobs)
-    search.quiet_logs()
+    search.silence_logs()
     show = shows_progress(no_progress)
     result = search.search(numbers, chosen, count, digest=digest, show=show)
     if verbose and (result.failed or len(numbers) == 1):
         seed = result.failed[0].seed if result.failed else numbers[0]
-        for line in search.story_of(seed, chosen):
+        for line in search.timeline_of(seed, chosen):
             typer.echo(line)
     if digest:
         typer.echo(f"digest {result.digest}")

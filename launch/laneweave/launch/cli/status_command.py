@@ -127,9 +127,9 @@ def listen(settings: Scenario, seconds: float, health: RoleHealth | None = None)
         end_s = began_s + seconds
         observer.subscribe(transport)
         while now_s < end_s:
-            for news in observer.news(min(WAIT_S, end_s - now_s)):
+            for event in observer.receive(min(WAIT_S, end_s - now_s)):
                 now_s = time.monotonic()
-                view.take(news, now_s)
+                view.update(event, now_s)
                 if now_s >= end_s:
                     break  # more messages than can be processed must not delay the end
             now_s = time.monotonic()

@@ -63,7 +63,7 @@ def sweep(
     from laneweave.launch.sweep.execution import run_locally
     from laneweave.launch.sweep.folder import SweepFolder
     from laneweave.launch.sweep.points import parse_volumes, plan_points
-    from laneweave.launch.sweep.sweep import Runner, conduct, print_results
+    from laneweave.launch.sweep.sweep import Runner, print_results, run_sweep
 
     base = load_scenario(scenario, demand__duration_s=duration)
     points = plan_points(
@@ -85,7 +85,7 @@ def sweep(
     stamp = time.strftime("%Y%m%d-%H%M%S")
     with SweepFolder(out or Path("runs") / f"sweep-{stamp}") as folder:
         folder.check_settings(base)
-        failed = conduct(points, folder, run, show=not no_progress)
+        failed = run_sweep(points, folder, run, show=not no_progress)
         print_results(points, folder, Console())
     sys.stdout.flush()
     raise typer.Exit(1 if failed else 0)

@@ -28,7 +28,7 @@ from laneweave.launch.fault_search.light_road import LightRoad
 from laneweave.launch.fault_search.profiles import Profile
 from laneweave.launch.fault_search.setup import Setup
 from laneweave.launch.fault_search.stand_ins import LightDriver, LightPlanner
-from laneweave.launch.fault_search.story import Story
+from laneweave.launch.fault_search.timeline import Timeline
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Core, Effect, Event, Send
 from laneweave.protocol.scenario.fields import Scenario
@@ -76,14 +76,14 @@ class Totals:
     """Number of times that a caretaker has taken charge of a vehicle."""
     delivered: int = 0
     dropped: int = 0
-    longest_healing_s: float = 0.0
+    longest_recovery_s: float = 0.0
     faults: Counter[str] = field(factory=Counter)
 
     def __add__(self, other: Totals) -> Totals:
         """Return the sum, with the maximum of the healing times."""
         names = [attribute.name for attribute in attrs.fields(Totals)]
         sums = {name: getattr(self, name) + getattr(other, name) for name in names}
-        sums["longest_healing_s"] = max(self.longest_healing_s, other.longest_healing_s)
+        sums["longest_recovery_s"] = max(self.longest_recovery_s, other.longest_recovery_s)
         return Totals(**sums)
 
 
@@ -129,7 +129,7 @@ class FaultRun:
         profile: Profile,
         vehicle_rules: RuleBook = VEHICLE_RULES,
         leader_rules: RuleBook = LEADER_RULES,
-        story: Story | None = None,
+        timeline: Timeline | None = None,
         *,
         digest: bool = False,
     ) -> None:
@@ -140,7 +140,7 @@ class FaultRun:
             profile: profile from which the setup is drawn.
             vehicle_rules: rules of plan execution; others plant a bug.
             leader_rules: rules of leaders; others plant a bug.
-            story: log to write.
+            timeline: log to write.
             digest: whether to compute a digest of all delivered messages.
         """
         self.seed = seed
@@ -156,17 +156,17 @@ class FaultRun:
             Geometry(
                 scenario.formation.gap_m, scenario.road.lane_width_m, size.length_m, size.width_m
             ),
-            story.add if story is not None else None,
+            timeline.add if timeline is not None else None,
             rolling=profile.rolling,
         )
         self._rules = vehicle_rules, leader_rules
-        self._story = story
+        self._timeline = timeline
         self._keys = Keys(scenario.network.realm)
         self._incarnations = count(1)
         self._kept: deque[Send] = deque(maxlen=KEPT)
         self._sent = 0
         self.faults = RandomFaults(
-            self.network, self, mix, self._rng, scenario.network.realm, self._note
+            self.network, self, mix, self._rng, scenario.network.realm, self._log
         )
         self._proposed: Counter[str] = Counter()
         """Number of plans since the fault phase in which each vehicle moves or is held."""
@@ -197,7 +197,7 @@ class FaultRun:
         """Run the fault phase, then wait until all vehicles have arrived; stop at a violation."""
         began_s = time.process_time()
         network, fault_s = self.network, self.setup.mix.fault_s
-        self.faults.plan(self.profile.harm)
+        self.faults.plan(self.profile.event_kinds)
         change_s, last = 0.0, False
         while not last:
             change_s += self._rng.uniform(*NEW_PREFERENCES_S)
@@ -315,7 +315,7 @@ class FaultRun:
     def _change_preferences(self, last: bool) -> None:
         self._preferences = self.setup.preferences(self._rng, last=last)
         self.road.prefer(self._preferences)
-        self._note(f"new preferred lanes: {self._preferences}")
+        self._log(f"new preferred lanes: {self._preferences}")
 
     # --- messages -----------------------------------------------------------------------------
 
@@ -325,12 +325,12 @@ class FaultRun:
         self._sent += 1
         if self._sent % KEEP_EVERY == 0 and isinstance(effect.message, _REPLAYABLE):
             self._kept.append(effect)
-        if self._story is not None:
-            self._story.add_message(now_s, sender, effect)
+        if self._timeline is not None:
+            self._timeline.add_message(now_s, sender, effect)
 
-    def _note(self, text: str) -> None:
-        if self._story is not None:
-            self._story.add(self.network.now_s, text)
+    def _log(self, text: str) -> None:
+        if self._timeline is not None:
+            self._timeline.add(self.network.now_s, text)
 
     # --- the end ------------------------------------------------------------------------------
 
@@ -387,7 +387,7 @@ class FaultRun:
             takeovers=self.road.takeovers,
             delivered=network.delivered,
             dropped=network.dropped,
-            longest_healing_s=network.now_s - self.setup.mix.fault_s,
+            longest_recovery_s=network.now_s - self.setup.mix.fault_s,
             faults=self.faults.counts,
         )
         digest = self._trace.hexdigest() if self._trace is not None else ""

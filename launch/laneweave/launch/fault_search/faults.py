@@ -124,7 +124,7 @@ class RandomFaults:
         mix: FaultMix,
         rng: random.Random,
         realm: str,
-        note: Callable[[str], None],
+        log: Callable[[str], None],
     ) -> None:
         """Prepare the faults of a run."""
         self.counts = mix.kinds()
@@ -135,7 +135,7 @@ class RandomFaults:
         self._mix = mix
         self._rng = rng
         self._realm = realm
-        self._note = note
+        self._log = log
         self._cuts: list[Callable[[str, str], bool]] = []
         self._blackouts = 0
         self._twins: list[str] = []
@@ -149,7 +149,7 @@ class RandomFaults:
     def heal(self) -> None:
         """End all faults; only clocks stay wrong."""
         self.healed = True
-        self._note("--- all faults end")
+        self._log("--- all faults end")
         network = self._network
         network.conditions = HEALTHY
         network.cut(None)
@@ -166,7 +166,7 @@ class RandomFaults:
     def _apply(self, kind: str) -> None:
         target = self._target(kind)
         of = f" of {target}" if kind.startswith(_TARGETED) else ""
-        self._note(f"--- fault: {kind}{of}")
+        self._log(f"--- fault: {kind}{of}")
         match kind:
             case "leader-kill" | "coordinator-kill" | "agent-kill":
                 done = self._kill(target, may_stay_dead=kind == "agent-kill")
@@ -207,7 +207,7 @@ class RandomFaults:
 
     def _undo(self, action: Callable[[], None], what: str) -> None:
         if not self.healed:
-            self._note(f"--- {what}")
+            self._log(f"--- {what}")
             action()
 
     # --- processes ----------------------------------------------------------------------------
@@ -275,7 +275,7 @@ class RandomFaults:
         self._cuts.append(blocked)
         self._apply_cuts()
         relation = "not heard by" if one_way else "separated from"
-        self._note(f"--- {relation} the others: {' '.join(sorted(inside))}")
+        self._log(f"--- {relation} the others: {' '.join(sorted(inside))}")
         self._later(LONG_S, partial(self._join, blocked), "a partition ends")
         return True
 

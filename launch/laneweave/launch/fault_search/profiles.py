@@ -54,7 +54,7 @@ class Profile:
     """Maximum additional planning time."""
     wrong_clocks: float = 0.7
     """Share of runs with wrong clocks: offsets up to 50 ms, rate errors up to 5 %."""
-    harm: tuple[str, ...] = ()
+    event_kinds: tuple[str, ...] = ()
     """Kinds of fault events, equally likely; see `faults`. A kind may be named twice."""
     events: Span = (0, 12)
     """Number of fault events in a run."""

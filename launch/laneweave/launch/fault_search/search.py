@@ -20,8 +20,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from laneweave.launch.fault_search.checker import Violation
 from laneweave.launch.fault_search.fault_run import FaultRun, SeedResult, Totals
 from laneweave.launch.fault_search.profiles import Profile
-from laneweave.launch.fault_search.story import Story
-from laneweave.launch.run.roles import collect_rarely, die_with_supervisor
+from laneweave.launch.fault_search.timeline import Timeline
+from laneweave.launch.run.roles import die_with_supervisor, tune_garbage_collector
 from laneweave.protocol.errors import CommandFailedError
 
 BATCH = 20
@@ -103,7 +103,7 @@ def _batches(
 ) -> Iterator[list[SeedResult]]:
     batches = [seeds[first : first + BATCH] for first in range(0, len(seeds), BATCH)]
     if jobs == 1 or len(batches) == 1:
-        collect_rarely()
+        tune_garbage_collector()
         for batch in batches:
             yield run_seeds(batch, profile, digest=digest)
         return
@@ -136,11 +136,11 @@ def _quiet() -> None:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     die_with_supervisor()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    quiet_logs()
-    collect_rarely()
+    silence_logs()
+    tune_garbage_collector()
 
 
-def quiet_logs() -> None:
+def silence_logs() -> None:
     """Log only critical errors, since a search consists of refused messages and failed plans."""
     structlog.configure(
         wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL),
@@ -175,7 +175,7 @@ def describe(result: SearchResult, profile: Profile) -> Iterator[str]:
 
 
 def replay_command(seed: int, profile: Profile) -> str:
-    """Return the command that runs one seed again and prints its story."""
+    """Return the command that runs one seed again and prints its timeline."""
     return f"laneweave simulate --seeds {seed}:{seed + 1} --profile {profile.name} --verbose"
 
 
@@ -193,15 +193,15 @@ def describe_totals(totals: Totals) -> Iterator[str]:
     yield (
         f"{totals.delivered} messages delivered, {totals.dropped} lost, "
         f"{totals.takeovers} times a caretaker took charge, "
-        f"longest healing {totals.longest_healing_s:.1f} s"
+        f"longest recovery {totals.longest_recovery_s:.1f} s"
     )
     faults = ", ".join(f"{kind} {count}" for kind, count in sorted(totals.faults.items()))
     yield f"faults: {faults or 'none'}"
 
 
-def story_of(seed: int, profile: Profile) -> Iterator[str]:
-    """Run one seed again and yield the story around its first violation."""
-    story = Story()
-    outcome = FaultRun(seed, profile, story=story).run()
+def timeline_of(seed: int, profile: Profile) -> Iterator[str]:
+    """Run one seed again and yield the timeline around its first violation."""
+    timeline = Timeline()
+    outcome = FaultRun(seed, profile, timeline=timeline).run()
     yield f"seed {seed}, profile {profile.name}:"
-    yield from story.around(outcome.violations)
+    yield from timeline.around(outcome.violations)

@@ -24,7 +24,7 @@ from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
-RESTLESS = 0.4
+UNNEEDED_MOVES = 0.4
 """Probability that a vehicle on its preferred lane is moved nevertheless."""
 SYNC_S = 1.0
 """Interval between synchronizations of a vehicle's clock, which drifts in between."""
@@ -215,7 +215,7 @@ class LightPlanner:
         paths: dict[str, CellPath] = {vehicle.vehicle: (vehicle.cell,) for vehicle in vehicles}
         in_order = sorted(vehicles, key=lambda one: (one.cell[1] == one.lane, rng.random()))
         for vehicle in in_order:
-            if vehicle.held or (vehicle.cell[1] == vehicle.lane and rng.random() > RESTLESS):
+            if vehicle.held or (vehicle.cell[1] == vehicle.lane and rng.random() > UNNEEDED_MOVES):
                 continue
             target = self._target(vehicle, taken, rng)
             if target is not None:

@@ -54,16 +54,16 @@ class Failover:
             self._awake_s = math.inf if for_s is None else now_s + for_s
         view.leader = None
 
-    def look(self, view: RoadView, now_s: float) -> None:
+    def update(self, view: RoadView, now_s: float) -> None:
         """Update leader and plans from the current view."""
         if not self._road_s or view.t_s > self._road_s[-1]:
             self._road_s.append(view.t_s)
             self._seen_s.append(now_s)
-        self._look_for_leader(view, now_s)
+        self._update_leader(view, now_s)
         for event in view.take_events():
             self._on_event(event, now_s)
 
-    def _look_for_leader(self, view: RoadView, now_s: float) -> None:
+    def _update_leader(self, view: RoadView, now_s: float) -> None:
         if view.leader not in (None, self._target):
             self._led_again = True
         if self._lost is None or view.leader is None:

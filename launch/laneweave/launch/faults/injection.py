@@ -70,7 +70,7 @@ class FaultInjection:
     lease_s: float
     network: GroupNetwork | None = None
     """Namespaces for the partitions that use them; None: messages are dropped instead."""
-    why_no_network: str = ""
+    no_network_reason: str = ""
     injected: list[dict[str, Any]] = field(factory=list)
     """Applied faults: road time, name of the fault, and what happened to which target."""
     failover: Failover = field(init=False)
@@ -125,7 +125,7 @@ class FaultInjection:
             CommandFailedError: a role cannot be restarted, or a link not be changed.
         """
         self._recover(now_s)
-        self.failover.look(view, now_s)
+        self.failover.update(view, now_s)
         self._waiting += self.schedule.due(road_s)
         waiting, self._waiting = self._waiting, []
         for event in waiting:
@@ -150,8 +150,8 @@ class FaultInjection:
             for name, partition in self.specification.partitions()
         }
         faults: dict[str, Any] = {"injected": self.injected, "partition_methods": methods}
-        if self.why_no_network:
-            faults["why_no_namespaces"] = self.why_no_network
+        if self.no_network_reason:
+            faults["why_no_namespaces"] = self.no_network_reason
         return {"failover": self.failover, "dropped": dropped, "faults": faults}
 
     def close(self) -> None:

@@ -1,6 +1,6 @@
 """Observing a deployment from outside: views, status, health, message loss, metrics server.
 
 Entry points: `observer.Observer` with its `road_view.RoadView`, `status.status_of`,
-`metrics_server.shown_metrics`. An observer publishes nothing. Imported by `faults`, `run`, `watch`,
+`metrics_server.serve_metrics`. An observer publishes nothing. Imported by `faults`, `run`, `watch`,
 `report`, `bench` and `cli`.
 """

@@ -3,7 +3,7 @@
 A bridge publishes its clock once in each tick of road time; every vehicle on the road publishes
 its state once in each tick; a census lists the vehicles on the road. So when a tick is over, the
 messages that should have arrived are known. A vehicle counts from the tick at which it was first
-heard, at the latest `MEETING_S` after it entered: until then its agent may not have connected.
+heard, at the latest `CONNECT_S` after it entered: until then its agent may not have connected.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from laneweave.protocol.wire.messages import Census, CensusEntry, Name, RoadCloc
 
 GRACE_TICKS = 5
 """A message may arrive this many ticks after its own and is not lost."""
-MEETING_S = 1.0
+CONNECT_S = 1.0
 TOLERANCE_S = 1e-6
 
 
@@ -111,7 +111,7 @@ class LossMeter:
             entry.vehicle
             for entry in self._census_at(t_s)
             if self._first_heard.get(entry.vehicle, tick + 1) <= tick
-            or entry.entered_s <= t_s - MEETING_S
+            or entry.entered_s <= t_s - CONNECT_S
         }
         self._closed.append((len(expected), len(expected - heard), tick in self._clocks))
 

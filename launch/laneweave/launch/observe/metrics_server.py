@@ -81,7 +81,7 @@ class _Server(ThreadingHTTPServer):
 
 
 @contextlib.contextmanager
-def shown_metrics(address: str, **labels: str) -> Iterator[Observe]:
+def serve_metrics(address: str, **labels: str) -> Iterator[Observe]:
     """Serve metrics while the context lasts.
 
     All its threads are daemons, so that no client, active or idle, keeps the process from ending.

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 from attrs import define, field
 
-from laneweave.launch.observe.road_view import News, RoadView
+from laneweave.launch.observe.road_view import NetworkEvent, RoadView
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.node import PeerDown, PeerUp, known_key, read_message
 from laneweave.protocol.runtime.transport import (
@@ -46,12 +46,12 @@ class Observer:
             transport.subscribe(self.keys.all_of(topic))
 
     def wait(self, timeout_s: float) -> None:
-        """Wait for news for at most `timeout_s`, then collect all of it in the view."""
-        for news in self.news(timeout_s):
-            self.view.take(news, time.monotonic())
+        """Wait for event for at most `timeout_s`, then collect all of it in the view."""
+        for event in self.receive(timeout_s):
+            self.view.update(event, time.monotonic())
 
-    def news(self, timeout_s: float) -> Iterator[News]:
-        """Wait for news for at most `timeout_s`, then yield all of it."""
+    def receive(self, timeout_s: float) -> Iterator[NetworkEvent]:
+        """Wait for event for at most `timeout_s`, then yield all of it."""
         try:
             delivery = self.inbox.get(timeout=timeout_s)
             while True:
@@ -61,7 +61,7 @@ class Observer:
         except queue.Empty:
             return
 
-    def _read(self, delivery: Delivery) -> Iterator[News]:
+    def _read(self, delivery: Delivery) -> Iterator[NetworkEvent]:
         match delivery:
             case Received(key, payload):
                 known = self.keys.read(key)

@@ -30,7 +30,7 @@ from laneweave.protocol.wire.topics import (
     incarnation_of,
 )
 
-News = Arrived | PeerUp | PeerDown | LinkUp | LinkDown
+NetworkEvent = Arrived | PeerUp | PeerDown | LinkUp | LinkDown
 
 MAX_EVENTS = 1000
 """Log events that are kept until they are taken."""
@@ -119,33 +119,33 @@ class RoadView:
         """Road time."""
         return self.clock.t_s if self.clock is not None else 0.0
 
-    def take(self, news: object, now_s: float) -> None:
-        """Process a message or other `News`; messages older than what is known are ignored.
+    def update(self, event: object, now_s: float) -> None:
+        """Process a message or other `NetworkEvent`; messages older than what is known are ignored.
 
         Args:
-            news: what arrived.
+            event: what arrived.
             now_s: when, on the observer's clock.
         """
-        match news:
+        match event:
             case Arrived(topic, _, message):
                 self.message_counts[topic.name] += 1
-                self.take(message, now_s)
+                self.update(message, now_s)
             case VehicleState():
-                self._on_state(news)
-            case RoadClock() if self._is_of_newest_road(news.bridge):
-                self._on_clock(news, now_s)
-            case Census() if self._is_of_newest_road(news.bridge):
-                if self.census is None or news.t_s >= self.census.t_s:
-                    self.census = news
-                    self.loss.on_census(news)
+                self._on_state(event)
+            case RoadClock() if self._is_of_newest_road(event.bridge):
+                self._on_clock(event, now_s)
+            case Census() if self._is_of_newest_road(event.bridge):
+                if self.census is None or event.t_s >= self.census.t_s:
+                    self.census = event
+                    self.loss.on_census(event)
             case Heartbeat():
-                self._on_heartbeat(news, now_s)
+                self._on_heartbeat(event, now_s)
             case LogEvent():
-                self._events.append(news)
+                self._events.append(event)
             case PeerUp() | PeerDown():
-                self._on_token(news)
+                self._on_token(event)
             case LinkUp() | LinkDown():
-                self.linked = isinstance(news, LinkUp)
+                self.linked = isinstance(event, LinkUp)
             case _:
                 pass
 
@@ -225,8 +225,8 @@ class RoadView:
             self.term = heartbeat.term
         self.heartbeats[heartbeat.coordinator, heartbeat.incarnation] = heartbeat, now_s
 
-    def _on_token(self, news: PeerUp | PeerDown) -> None:
-        topic, parameters, up = news.topic, news.parameters, isinstance(news, PeerUp)
+    def _on_token(self, event: PeerUp | PeerDown) -> None:
+        topic, parameters, up = event.topic, event.parameters, isinstance(event, PeerUp)
         if topic is COORDINATOR_ALIVE:
             process = Name(parameters["coordinator"]), incarnation_of(parameters)
             _update(self.coordinator_tokens, process, present=up)

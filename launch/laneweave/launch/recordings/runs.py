@@ -103,14 +103,14 @@ class Comparison:
             if run.label == label and run.volume_veh_per_lane_h == volume_veh_per_lane_h
         )
 
-    def shown(self, label: str, volume_veh_per_lane_h: float) -> Run | None:
+    def representative(self, label: str, volume_veh_per_lane_h: float) -> Run | None:
         """Return the run that represents a label at a volume: the first with trajectories."""
         runs = self.at(label, volume_veh_per_lane_h)
         return next((run for run in runs if run.has_trajectories), None)
 
     def busiest(self, label: str) -> Run | None:
         """Return the run that represents a label at its highest volume with trajectories."""
-        found = (self.shown(label, volume) for volume in reversed(self.volumes))
+        found = (self.representative(label, volume) for volume in reversed(self.volumes))
         return next((run for run in found if run is not None), None)
 
 

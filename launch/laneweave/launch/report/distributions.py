@@ -16,9 +16,9 @@ from attrs import field, frozen
 from laneweave.launch.recordings.trajectories import Bools, Floats, Tracks
 from laneweave.launch.report.style import (
     REFERENCE,
+    explain_empty_axes,
     label_colours,
     legend_above,
-    note,
     picture,
     spread_evenly,
     volume_title,
@@ -178,7 +178,7 @@ def _draw(
                 if (label, volume) in counted:
                     _draw_one(axes, counted[label, volume], quantity, label, colours[label])
             if not axes.lines:
-                note(axes, "no trajectories")
+                explain_empty_axes(axes, "no trajectories")
             axes.axvline(_set_value(quantity, scenario), zorder=1, **REFERENCE)
             axes.set_xlabel(f"{quantity.name} ({quantity.unit})")
             if volume == volumes[0]:

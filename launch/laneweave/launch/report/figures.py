@@ -16,11 +16,11 @@ from laneweave.launch.drawing.figures import INK
 from laneweave.launch.recordings.runs import Comparison, Run
 from laneweave.launch.recordings.trajectories import Floats, read_tracks
 from laneweave.launch.report.style import (
-    NOTE,
     REFERENCE,
+    SMALL_TEXT,
+    explain_empty_axes,
     label_colours,
     legend_above,
-    note,
     picture,
     spread_evenly,
     volume_title,
@@ -69,7 +69,7 @@ def draw_travel_times(comparison: Comparison, out: Path, dpi: int) -> None:
                 textcoords="offset points",
                 va="center",
                 annotation_clip=False,
-                **NOTE,
+                **SMALL_TEXT,
             )
         if break_s is not None:
             _break_axis(upper, lower, break_s)
@@ -83,7 +83,7 @@ def draw_travel_times(comparison: Comparison, out: Path, dpi: int) -> None:
                         "ha": "center",
                         "va": "bottom",
                     }
-                    lower.text(place, 0.03, "no vehicle", **style, **NOTE)
+                    lower.text(place, 0.03, "no vehicle", **style, **SMALL_TEXT)
         lower.set_xticks(range(len(volumes)), labels=[f"{volume:g}" for volume in volumes])
         lower.set_xlim(-0.6, len(volumes) - 0.4)
         lower.set_xlabel("traffic volume (veh/(lane·h))")
@@ -168,7 +168,7 @@ def draw_flows(comparison: Comparison, out: Path, dpi: int) -> None:
         left, right = figure.subplots(1, 2)
         left.plot(span, span, zorder=0, **REFERENCE)
         text = "dashed: throughput = demand"
-        left.annotate(text, (0.97, 0.04), xycoords="axes fraction", ha="right", **NOTE)
+        left.annotate(text, (0.97, 0.04), xycoords="axes fraction", ha="right", **SMALL_TEXT)
         left.set_ylabel("throughput (veh/(lane·h))")
         right.set_ylabel("left on the preferred lane (%)")
         for axes, figure_name in (
@@ -207,14 +207,16 @@ def _draw_seeds(
         style: dict[str, Any] = {"marker": "o", "markersize": 4.5, "linewidth": 1.5, "capsize": 3}
         axes.errorbar(places, means, spreads, color=colours[label], label=label, **style)
     if nothing:
-        note(axes, "runs too short to count vehicles")
+        explain_empty_axes(axes, "runs too short to count vehicles")
 
 
 def draw_speeds(comparison: Comparison, out: Path, dpi: int) -> None:
     """Draw the mean speed over space and time, a panel for each label and volume."""
     labels, volumes = comparison.labels, spread_evenly(comparison.volumes)
     shown = {
-        (label, volume): comparison.shown(label, volume) for label in labels for volume in volumes
+        (label, volume): comparison.representative(label, volume)
+        for label in labels
+        for volume in volumes
     }
     maps = {key: mean_speeds(run) for key, run in shown.items() if run is not None}
     fastest_mps = [float(one.speed_mps.max()) for one in maps.values() if one.speed_mps.count()]
@@ -231,7 +233,7 @@ def draw_speeds(comparison: Comparison, out: Path, dpi: int) -> None:
             if volume == volumes[0]:
                 axes.set_ylabel(label, fontweight="bold")
             if run is None:
-                note(axes, "no trajectories")
+                explain_empty_axes(axes, "no trajectories")
                 continue
             one, top_mps = maps[label, volume], max(fastest_mps + set_mps)
             mesh = axes.pcolormesh(

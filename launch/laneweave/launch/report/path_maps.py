@@ -25,7 +25,7 @@ from laneweave.launch.observe.column_owners import (
 )
 from laneweave.launch.recordings.runs import Run
 from laneweave.launch.recordings.trajectories import OFF_LATTICE, Tracks, read_trips
-from laneweave.launch.report.style import NOTE, picture
+from laneweave.launch.report.style import SMALL_TEXT, picture
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.wire.events import FORMATIONS_JOINED, PLAN_MADE
 
@@ -181,7 +181,7 @@ def draw_path_map(driven: DrivenMap, out: Path, dpi: int) -> None:
         for point in range(points):
             _write(axes, point, -0.62, "start" if point == 0 else f"slot {point}")
             t_s = driven.start_s + point * driven.slot_s
-            _write(axes, point, -0.25, f"{t_s:.1f} s", **NOTE)
+            _write(axes, point, -0.25, f"{t_s:.1f} s", **SMALL_TEXT)
         for row in range(rows):
             _draw_row(axes, row, driven)
         axes.set_title(

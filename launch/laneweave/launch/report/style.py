@@ -50,7 +50,7 @@ _STYLE: Final[Any] = {
 }
 REFERENCE: Final[dict[str, Any]] = {"color": "#8a9099", "linewidth": 1.0, "linestyle": "--"}
 """The style of lines for limits and set values."""
-NOTE: Final[dict[str, Any]] = {"fontsize": 7.5, "color": FAINT_INK}
+SMALL_TEXT: Final[dict[str, Any]] = {"fontsize": 7.5, "color": FAINT_INK}
 """The style of small texts."""
 MAX_COLUMNS: Final = 6
 """Volumes that fit side by side."""
@@ -104,6 +104,6 @@ def legend_above(figure: Figure) -> None:
         )
 
 
-def note(axes: Axes, text: str) -> None:
+def explain_empty_axes(axes: Axes, text: str) -> None:
     """Write the reason into the middle of empty axes."""
-    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", **NOTE)
+    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", **SMALL_TEXT)

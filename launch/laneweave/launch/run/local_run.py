@@ -27,7 +27,7 @@ from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.logs import last_error
 from laneweave.launch.run.outcome import Outcome, complete_summary
 from laneweave.launch.run.progress import RunProgress
-from laneweave.launch.run.role_processes import ROUTER, RoleEnd, RoleProcesses, StartOrder
+from laneweave.launch.run.role_processes import ROUTER, RoleExit, RoleProcesses, RoleStart
 from laneweave.launch.run.roles import fork_server
 from laneweave.protocol.config.loading import to_tables
 from laneweave.protocol.config.participants import coordinator_names
@@ -149,7 +149,7 @@ class LocalRun:
                 self.folder, problems=self._problems, processes=processes, **results
             )
 
-    def _prepare(self, order: StartOrder) -> tuple[dict[str, Any], dict[str, Any]]:
+    def _prepare(self, order: RoleStart) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return the tables of the scenario and the options for a start of a role."""
         tables, options = to_tables(self.scenario), self._options | dict(order.options)
         if self._injection is not None:
@@ -193,20 +193,20 @@ class LocalRun:
 
     def _connect(self, observer: Observer) -> ZenohTransport:
         access = access_of(self.scenario, "observer.run")
-        give_up = time.monotonic() + ROUTER_START_S
+        deadline_s = time.monotonic() + ROUTER_START_S
         while True:
             try:
                 return ZenohTransport(access, observer.inbox.put)
             except BadInputError:
                 if self._stop:
                     raise KeyboardInterrupt from None
-                if time.monotonic() > give_up or not self._processes.is_alive(ROUTER):
+                if time.monotonic() > deadline_s or not self._processes.is_alive(ROUTER):
                     raise
                 time.sleep(0.02)
 
     def _await_leader(self, observer: Observer) -> None:
-        give_up = time.monotonic() + LEADER_S + 2 * self.scenario.network.election_s
-        while observer.view.leader is None and not self._stop and time.monotonic() < give_up:
+        deadline_s = time.monotonic() + LEADER_S + 2 * self.scenario.network.election_s
+        while observer.view.leader is None and not self._stop and time.monotonic() < deadline_s:
             observer.wait(POLL_S)
 
     def _check_processes(self) -> bool:
@@ -224,7 +224,7 @@ class LocalRun:
             return False
         return True
 
-    def _record_end(self, subject: str, end: RoleEnd) -> None:
+    def _record_end(self, subject: str, end: RoleExit) -> None:
         error = last_error(self.folder / "log.jsonl", end.name)
         reason = f": {error}" if error else ""
         self._problems.append(f"{subject} ended with status {end.status}{reason}")
@@ -258,7 +258,7 @@ def fault_injection(
 def add_faults(
     injection: FaultInjection,
     board: SharedBoard,
-    order: StartOrder,
+    order: RoleStart,
     tables: dict[str, Any],
     options: dict[str, Any],
 ) -> None:

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import laneweave.coordinator.process  # noqa: F401
 from laneweave.agents.process import warm_up
-from laneweave.launch.run.roles import collect_rarely
+from laneweave.launch.run.roles import tune_garbage_collector
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.wire import codec
 
 codec.warm_up()
 warm_up(parse_scenario({}))
-collect_rarely()
+tune_garbage_collector()

@@ -23,7 +23,7 @@ ROUTER = "router"
 
 
 @frozen
-class StartOrder:
+class RoleStart:
     """Arguments with which a role is started and restarted."""
 
     role: str
@@ -32,7 +32,7 @@ class StartOrder:
 
 
 @frozen
-class RoleEnd:
+class RoleExit:
     """Name and exit status of a process that has ended."""
 
     name: str
@@ -44,13 +44,13 @@ class RoleProcesses:
     """All role processes of a run by name; the `RoleControl` of faults."""
 
     context: ForkServerContext
-    prepare: Callable[[StartOrder], tuple[dict[str, Any], dict[str, Any]]]
+    prepare: Callable[[RoleStart], tuple[dict[str, Any], dict[str, Any]]]
     """Returns the tables of the scenario and the options for a start of a role."""
     coordinators: tuple[str, ...]
     peak: int = 0
     """Largest number of simultaneous processes."""
     _running: dict[str, ForkServerProcess] = field(factory=dict)
-    _orders: dict[str, StartOrder] = field(factory=dict)
+    _orders: dict[str, RoleStart] = field(factory=dict)
     _process_of: dict[str, str] = field(factory=dict)
     """Name of the agent process of each vehicle."""
     _paused: set[str] = field(factory=set)
@@ -66,7 +66,7 @@ class RoleProcesses:
         Raises:
             CommandFailedError: no process can be created.
         """
-        order = self._orders[name] = StartOrder(role, name, options)
+        order = self._orders[name] = RoleStart(role, name, options)
         for vehicle in order.options.get("vehicles", ()):
             self._process_of[vehicle] = name
         tables, all_options = self.prepare(order)
@@ -83,7 +83,7 @@ class RoleProcesses:
         process = self._running.get(name)
         return process is not None and process.is_alive()
 
-    def ended(self) -> Iterator[RoleEnd]:
+    def ended(self) -> Iterator[RoleExit]:
         """Yield the processes that have ended on their own since the last call."""
         names = {process.sentinel: name for name, process in self._running.items()}
         for sentinel in wait_for_sentinels(list(names), timeout=0):
@@ -92,7 +92,7 @@ class RoleProcesses:
             process = self._running.pop(name)
             process.join()
             self._paused.discard(name)
-            yield RoleEnd(name, process.exitcode)
+            yield RoleExit(name, process.exitcode)
 
     # --- control by faults --------------------------------------------------------------------
 

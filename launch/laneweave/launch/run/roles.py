@@ -47,7 +47,7 @@ GC_THRESHOLD = 50_000
 _PR_SET_NAME = 15
 
 
-def collect_rarely() -> None:
+def tune_garbage_collector() -> None:
     """Exclude existing objects from garbage collection, and collect new ones rarely.
 
     The garbage collector looks for reference cycles, and the roles make hardly any.
@@ -153,7 +153,7 @@ def die_with_supervisor() -> None:
     def watch() -> None:
         supervisor.join()
         if os.getppid() == parent:
-            wake_children(parent)
+            resume_children(parent)
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(ORPHAN_S)
         os._exit(1)
@@ -161,7 +161,7 @@ def die_with_supervisor() -> None:
     threading.Thread(target=watch, name="supervisor", daemon=True).start()
 
 
-def wake_children(parent: int) -> None:
+def resume_children(parent: int) -> None:
     """Resume processes that a fault has paused, so that they notice the death of the launcher."""
     with contextlib.suppress(OSError):
         children = Path(f"/proc/{parent}/task/{parent}/children").read_text(encoding="ascii")

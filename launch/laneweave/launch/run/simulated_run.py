@@ -56,7 +56,7 @@ class _ObserverCore:
             for topic in TOPICS:
                 yield Listen(topic)
         elif isinstance(event, Arrived):
-            self._view.take(event, now_s)
+            self._view.update(event, now_s)
             self._on_message()
 
 

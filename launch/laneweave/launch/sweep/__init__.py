@@ -1,6 +1,6 @@
 """Sweeps: methods x volumes x seeds, each point a run in a process of its own.
 
-Entry point: `sweep.conduct`, with points of `points.plan_points`, a `folder.SweepFolder`, and a
+Entry point: `sweep.run_sweep`, with points of `points.plan_points`, a `folder.SweepFolder`, and a
 runner: `execution.run_locally`, or `dask_workers.run_on_dask` on a cluster. Imported by `cli` and
 the evaluation in benchmarks/.
 """

@@ -16,20 +16,20 @@ from pathlib import Path
 from attrs import evolve
 from distributed import Client, Event, Future, as_completed, connect
 
-from laneweave.launch.sweep.execution import LOG_FILE, Ended, kept_files, run_in_process
+from laneweave.launch.sweep.execution import LOG_FILE, PointResult, kept_files, run_in_process
 from laneweave.launch.sweep.points import Point
 from laneweave.protocol.errors import BadInputError
 
 CONNECT_S = 10.0
 
 
-Returned = tuple[Ended, dict[str, bytes]]
+TaskResult = tuple[PointResult, dict[str, bytes]]
 """The result of a task: the point as it ended on its worker, and its files."""
 
 
 def run_on_dask(
     points: Sequence[Point], unfinished: Path, address: str
-) -> Generator[Ended, None, None]:
+) -> Generator[PointResult, None, None]:
     """Run all points on a cluster, and yield each at its end; closing the generator ends them.
 
     Args:
@@ -44,7 +44,7 @@ def run_on_dask(
     sweep = f"laneweave-{uuid.uuid4().hex}"
     # A client that does not connect logs a second error when it is garbage-collected.
     try:
-        asyncio.run(_greet(address))
+        asyncio.run(_check_connection(address))
     except (OSError, ValueError) as error:
         raise BadInputError("--dask", address, "a Dask scheduler that answers") from error
     with Client(address, timeout=CONNECT_S, set_as_default=False, name=sweep) as client:
@@ -63,21 +63,21 @@ def run_on_dask(
             stop.set()
 
 
-def run_as_task(point: Point, sweep: str) -> Returned:
+def run_as_task(point: Point, sweep: str) -> TaskResult:
     """Run a point on a worker (the task)."""
     stop = Event(sweep)
     with tempfile.TemporaryDirectory(prefix="laneweave-point-") as temporary:
-        ended = run_in_process(point, Path(temporary) / point.name, stop.is_set)
-        paths = (ended.folder / name for name in (*kept_files(point), LOG_FILE))
-        return ended, {path.name: path.read_bytes() for path in paths if path.is_file()}
+        result = run_in_process(point, Path(temporary) / point.name, stop.is_set)
+        paths = (result.folder / name for name in (*kept_files(point), LOG_FILE))
+        return result, {path.name: path.read_bytes() for path in paths if path.is_file()}
 
 
-async def _greet(address: str) -> None:
+async def _check_connection(address: str) -> None:
     comm = await connect(address, timeout=CONNECT_S)
     await comm.close()
 
 
-def _received(future: Future[Returned], point: Point, unfinished: Path) -> Ended:
+def _received(future: Future[TaskResult], point: Point, unfinished: Path) -> PointResult:
     """Write the files that a task returned; a failed task is a failed run."""
     folder = unfinished / point.name
     folder.mkdir(parents=True)
@@ -85,10 +85,10 @@ def _received(future: Future[Returned], point: Point, unfinished: Path) -> Ended
         error = future.exception() if future.status == "error" else None
         reason = f"{type(error).__name__}: {error}" if error is not None else str(future.status)
         future.release()
-        return Ended(point, folder, (f"its task failed: {' '.join(reason.split())}",), 0.0)
-    ended, files = future.result()
+        return PointResult(point, folder, (f"its task failed: {' '.join(reason.split())}",), 0.0)
+    result, files = future.result()
     # Lets the cluster drop the result.
     future.release()
     for name, content in files.items():
         (folder / name).write_bytes(content)
-    return evolve(ended, folder=folder)
+    return evolve(result, folder=folder)

@@ -34,7 +34,7 @@ END_S = 10.0
 
 
 @frozen
-class Ended:
+class PointResult:
     """A point that was run; its files are in `folder`."""
 
     point: Point
@@ -54,7 +54,7 @@ class StoppedError(Exception):
     """The sweep was stopped before this run was finished."""
 
 
-def run_in_process(point: Point, folder: Path, stopped: Callable[[], bool]) -> Ended:
+def run_in_process(point: Point, folder: Path, stopped: Callable[[], bool]) -> PointResult:
     """Run a point in a new process and return its result.
 
     Args:
@@ -82,14 +82,14 @@ def run_in_process(point: Point, folder: Path, stopped: Callable[[], bool]) -> E
             # Ctrl-C would reach the whole group; the sweep ends its processes itself.
             process_group=0,
         )
-    follow(process, point.name, stopped)
+    wait_for_exit(process, point.name, stopped)
     wall_s = time.monotonic() - began_s
-    return Ended(point, folder, _problems(folder, process.returncode), wall_s)
+    return PointResult(point, folder, _problems(folder, process.returncode), wall_s)
 
 
 def run_locally(
     points: Sequence[Point], unfinished: Path, workers: int
-) -> Generator[Ended, None, None]:
+) -> Generator[PointResult, None, None]:
     """Run all points on this machine, and yield each at its end; closing the generator ends them.
 
     Args:
@@ -114,7 +114,7 @@ def run_locally(
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def follow(process: subprocess.Popen[bytes], name: str, stopped: Callable[[], bool]) -> None:
+def wait_for_exit(process: subprocess.Popen[bytes], name: str, stopped: Callable[[], bool]) -> None:
     """Wait for a process; it has ended when this returns or raises.
 
     Args:

@@ -30,7 +30,7 @@ from laneweave.launch.recordings.runs import (
     write_point,
 )
 from laneweave.launch.run_methods import METHODS, affects
-from laneweave.launch.sweep.execution import LOG_FILE, Ended, kept_files
+from laneweave.launch.sweep.execution import LOG_FILE, PointResult, kept_files
 from laneweave.launch.sweep.points import Point
 from laneweave.protocol.config.loading import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError, CommandFailedError
@@ -123,33 +123,33 @@ class SweepFolder:
             and (not point.keep_trajectories or run.has_trajectories)
         )
 
-    def take(self, ended: Ended) -> Run:
+    def add(self, result: PointResult) -> Run:
         """Move a point that was run into the folder, and update the table of results.
 
         Raises:
             CommandFailedError: it cannot be written.
         """
-        point = ended.point
+        point = result.point
         run = Run(
             folder=self.out / point.name,
             label=point.label,
             method=point.method,
             scenario=point.scenario,
-            summary=read_summary(ended.folder),
-            reason="; ".join(ended.problems),
-            wall_s=round(ended.wall_s, 3),
+            summary=read_summary(result.folder),
+            reason="; ".join(result.problems),
+            wall_s=round(result.wall_s, 3),
         )
-        kept = (*kept_files(point), LOG_FILE) if ended.problems else kept_files(point)
+        kept = (*kept_files(point), LOG_FILE) if result.problems else kept_files(point)
         try:
-            for path in ended.folder.iterdir():
+            for path in result.folder.iterdir():
                 if path.is_dir():
                     shutil.rmtree(path)
                 elif path.name not in kept:
                     path.unlink()
-            write_point(run, ended.folder)
+            write_point(run, result.folder)
             if run.folder.exists():
                 shutil.rmtree(run.folder)
-            ended.folder.rename(run.folder)
+            result.folder.rename(run.folder)
             self._runs[point.name] = run
             self.write_results()
         except OSError as error:

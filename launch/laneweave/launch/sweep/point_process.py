@@ -10,7 +10,7 @@ from pathlib import Path
 
 from laneweave.launch.run.logs import log_to_terminal
 from laneweave.launch.run.reference_run import ReferenceRun
-from laneweave.launch.run.roles import collect_rarely
+from laneweave.launch.run.roles import tune_garbage_collector
 from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.launch.run_methods import FORMATION
 from laneweave.launch.sweep.execution import JOB_FILE, RESULT_FILE
@@ -32,7 +32,7 @@ def main(folder: Path, parent: int) -> None:
     if os.getppid() != parent:
         sys.exit("the sweep has ended")
     log_to_terminal()
-    collect_rarely()
+    tune_garbage_collector()
     job = json.loads((folder / JOB_FILE).read_text(encoding="utf-8"))
     method, run = job["method"], SimulatedRun if job["method"] == FORMATION else ReferenceRun
     outcome = run(parse_scenario(job["tables"]), folder, method, show_progress=False).run()

@@ -14,16 +14,16 @@ from rich.table import Table
 
 from laneweave.launch.recordings.results_over_seeds import PREFERRED, over_seeds, results_table
 from laneweave.launch.recordings.runs import Run
-from laneweave.launch.sweep.execution import Ended
+from laneweave.launch.sweep.execution import PointResult
 from laneweave.launch.sweep.folder import SweepFolder
 from laneweave.launch.sweep.points import Point, volume_text
 from laneweave.protocol.errors import CommandFailedError
 
-Runner = Callable[[Sequence[Point], Path], Generator[Ended, None, None]]
+Runner = Callable[[Sequence[Point], Path], Generator[PointResult, None, None]]
 """Runs points in a folder and yields each at its end; closing the generator ends all of them."""
 
 
-def conduct(points: Sequence[Point], folder: SweepFolder, run: Runner, *, show: bool) -> int:
+def run_sweep(points: Sequence[Point], folder: SweepFolder, run: Runner, *, show: bool) -> int:
     """Run the points that are not finished, and return the number of failed points.
 
     Args:
@@ -43,7 +43,7 @@ def conduct(points: Sequence[Point], folder: SweepFolder, run: Runner, *, show: 
             closing(run(waiting, folder.unfinished)) as ends,
         ):
             for ended in ends:
-                progress.count(folder.take(ended))
+                progress.count(folder.add(ended))
     except OSError as error:
         raise CommandFailedError(f"the sweep cannot go on: {error}") from error
     return sum(bool(folder.runs[point.name].reason) for point in points)

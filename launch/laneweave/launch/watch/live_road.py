@@ -60,19 +60,19 @@ class LiveRoad:
         self._shown: tuple[int, str, int] | None = None
         """Run, status and tick of the last frame."""
 
-    def take(self, news: object, wall_s: float) -> None:
+    def update(self, event: object, wall_s: float) -> None:
         """Process a message or a change of the link, at a wall-clock time."""
         roads = self.view.roads
-        self.view.take(news, wall_s)
+        self.view.update(event, wall_s)
         if 0 < roads < self.view.roads:
             self._plan, self._events = None, EventFeed()
             self._targets.clear()
-        match news:
+        match event:
             case Plan():
-                self._on_plan(news)
+                self._on_plan(event)
             case LogEvent():
-                self._plan = plan_row(news.t_s, news.kind, news.data) or self._plan
-                self._events.add(news.t_s, news.name, news.kind, news.data)
+                self._plan = plan_row(event.t_s, event.kind, event.data) or self._plan
+                self._events.add(event.t_s, event.name, event.kind, event.data)
             case _:
                 pass
 

@@ -23,7 +23,7 @@ import uvicorn
 from laneweave.launch.observe.observer import Observer
 from laneweave.launch.watch.frames import FrameBuffer, FrameSource, compact, scene_of
 from laneweave.launch.watch.live_road import TOPICS, LiveRoad
-from laneweave.launch.watch.server import Audience, Health, make_app
+from laneweave.launch.watch.server import Browsers, Health, make_app
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.node import Arrived
 from laneweave.protocol.runtime.transport import Delivery
@@ -64,7 +64,7 @@ def watch_live(scenario: Scenario, listen: str, ready: Callable[[str], None]) ->
         BadInputError: there is no router at the endpoint, or the address cannot be used.
     """
     with contextlib.closing(open_socket(listen)) as listener, _LiveObserver(scenario) as observer:
-        _serve(listener, observer.buffer, observer.audience, observer.health, ready, observer.start)
+        _serve(listener, observer.buffer, observer.browsers, observer.health, ready, observer.start)
         observer.check()
 
 
@@ -82,7 +82,7 @@ def watch_recorded(folder: Path, listen: str, ready: Callable[[str], None]) -> N
         return True, {"recorded": str(folder)}
 
     with contextlib.closing(open_socket(listen)) as listener:
-        _serve(listener, recording, Audience(), health, ready)
+        _serve(listener, recording, Browsers(), health, ready)
 
 
 def open_socket(listen: str) -> socket.socket:
@@ -112,7 +112,7 @@ class _LiveObserver:
         Raises:
             BadInputError: there is no router at the endpoint.
         """
-        self.audience = Audience()
+        self.browsers = Browsers()
         self.buffer = FrameBuffer(scene_of(scenario, "live", scenario.network.realm, STEP_S))
         self._observer = Observer(Keys(scenario.network.realm), topics=TOPICS)
         self._transport = connect_blocking(access_of(scenario, IDENTITY), self._deliver)
@@ -124,7 +124,7 @@ class _LiveObserver:
         self._thread = threading.Thread(target=self._run, name="watch", daemon=True)
         self._failure: BaseException | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._give_up: Callable[[], None] = lambda: None
+        self._abort: Callable[[], None] = lambda: None
 
     def __enter__(self) -> _LiveObserver:
         """Return itself; the context ends with a closed connection."""
@@ -137,9 +137,9 @@ class _LiveObserver:
             self._thread.join(END_S)
         self._transport.close()
 
-    def start(self, give_up: Callable[[], None]) -> None:
-        """Subscribe and start the thread; call from the event loop. `give_up` ends the process."""
-        self._loop, self._give_up = asyncio.get_running_loop(), give_up
+    def start(self, abort: Callable[[], None]) -> None:
+        """Subscribe and start the thread; call from the event loop. `abort` ends the process."""
+        self._loop, self._abort = asyncio.get_running_loop(), abort
         self._observer.subscribe(self._transport)
         self._thread.start()
 
@@ -166,13 +166,13 @@ class _LiveObserver:
     def _run(self) -> None:
         try:
             while not self._stop.is_set():
-                for news in islice(self._observer.news(POLL_S), MAX_BATCH):
-                    message = news.message if isinstance(news, Arrived) else news
-                    self._road.take(message, self._wall_s())
+                for event in islice(self._observer.receive(POLL_S), MAX_BATCH):
+                    message = event.message if isinstance(event, Arrived) else event
+                    self._road.update(message, self._wall_s())
                 self._make_frame()
         except Exception as error:  # noqa: BLE001 (reported by the main thread, which ends)
             self._failure = error
-            self._call(self._give_up)
+            self._call(self._abort)
 
     def _make_frame(self) -> None:
         wall_s = self._wall_s()
@@ -190,7 +190,7 @@ class _LiveObserver:
     def _publish(self, frame: str) -> None:
         """Offer a frame to all browsers; runs in the event loop."""
         self.buffer.append(frame)
-        self.audience.offer(frame)
+        self.browsers.offer(frame)
 
     def _call(self, function: Callable[..., None], *arguments: object) -> None:
         assert self._loop is not None  # noqa: S101 (set before the thread starts)
@@ -211,13 +211,13 @@ class _Server(uvicorn.Server):
 def _serve(
     listener: socket.socket,
     source: FrameSource,
-    audience: Audience,
+    browsers: Browsers,
     health: Health,
     ready: Callable[[str], None],
     start: Callable[[Callable[[], None]], None] = lambda _: None,
 ) -> None:
     config = uvicorn.Config(
-        make_app(source, audience, health),
+        make_app(source, browsers, health),
         log_config=None,
         # Connecting and disconnecting browsers are of no interest on a terminal.
         log_level="critical",

@@ -83,14 +83,14 @@ class Browser:
 
 
 @define
-class Audience:
+class Browsers:
     """All connected browsers."""
 
-    browsers: set[Browser] = field(factory=set)
+    connected: set[Browser] = field(factory=set)
 
     def offer(self, frame: str) -> None:
         """Offer a frame to every browser."""
-        for browser in self.browsers:
+        for browser in self.connected:
             browser.offer(frame)
 
 
@@ -98,29 +98,29 @@ Health = Callable[[], tuple[bool, dict[str, Any]]]
 """Returns whether the server is healthy, and facts about it."""
 
 
-def make_app(source: FrameSource, audience: Audience, health: Health) -> Starlette:
+def make_app(source: FrameSource, browsers: Browsers, health: Health) -> Starlette:
     """Return the application.
 
     Args:
         source: the frames that can be requested.
-        audience: the browsers that get live frames.
+        browsers: the browsers that get live frames.
         health: called at each health check.
     """
     scene = partial(opening, source, uuid4().hex)
 
     async def healthz(_request: Request) -> Response:
         healthy, facts = health()
-        facts = {"ok": healthy, **facts, "browsers": len(audience.browsers)}
+        facts = {"ok": healthy, **facts, "browsers": len(browsers.connected)}
         return JSONResponse(facts, status_code=200 if healthy else 503, headers=HEADERS)
 
     async def stream(socket: WebSocket) -> None:
         if not same_origin(socket):
             await socket.close(POLICY_VIOLATION)
-        elif len(audience.browsers) >= MAX_BROWSERS:
+        elif len(browsers.connected) >= MAX_BROWSERS:
             await socket.accept()
             await socket.close(TRY_LATER)
         else:
-            await _serve(socket, source, audience, scene)
+            await _serve(socket, source, browsers, scene)
 
     return Starlette(
         routes=[
@@ -153,16 +153,16 @@ def request_of(text: str | None) -> tuple[int, int] | None:
 
 
 async def _serve(
-    socket: WebSocket, source: FrameSource, audience: Audience, scene: Callable[[], str]
+    socket: WebSocket, source: FrameSource, browsers: Browsers, scene: Callable[[], str]
 ) -> None:
     await socket.accept()
     browser = Browser()
-    audience.browsers.add(browser)
+    browsers.connected.add(browser)
     sender = asyncio.create_task(_send(socket, browser, source, scene()))
     try:
         await _listen(socket, browser)
     finally:
-        audience.browsers.discard(browser)
+        browsers.connected.discard(browser)
         sender.cancel()
         await asyncio.gather(sender, return_exceptions=True)
 

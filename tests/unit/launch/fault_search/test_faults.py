@@ -114,7 +114,7 @@ def test_lasting_faults_are_counted() -> None:
 
 
 def test_every_kind_in_a_profile_can_be_applied() -> None:
-    for kind in sorted({kind for profile in PROFILES.values() for kind in profile.harm}):
+    for kind in sorted({kind for profile in PROFILES.values() for kind in profile.event_kinds}):
         world = FaultRun(3, PROFILES["calm"])
         world.network.run(2.0)
         harm(world, kind)

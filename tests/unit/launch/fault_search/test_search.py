@@ -23,7 +23,7 @@ from laneweave.launch.fault_search.search import (
     describe,
     run_seeds,
     search,
-    story_of,
+    timeline_of,
 )
 from laneweave.protocol.errors import BadInputError
 
@@ -93,8 +93,8 @@ def test_failures_are_described_with_the_command_that_replays_them() -> None:
     assert lines[-1] == "19 passed, 1 failed"
 
 
-def test_the_story_of_a_run() -> None:
-    lines = list(story_of(1, CALM))
+def test_timeline_of_a_run() -> None:
+    lines = list(timeline_of(1, CALM))
     assert lines[0] == "seed 1, profile calm:"
     told = "\n".join(lines)
     for word in (

@@ -27,20 +27,20 @@ class History:
 
     def look(self, now_s: float) -> None:
         road_s = round((now_s - START_S) * self.pace, 1)
-        self.view.take(RoadClock(round(road_s * 10), road_s, 0, 0, 0, 0, ended=False), 0.0)
-        self.failover.look(self.view, now_s)
+        self.view.update(RoadClock(round(road_s * 10), road_s, 0, 0, 0, 0, ended=False), 0.0)
+        self.failover.update(self.view, now_s)
 
     def look_until(self, now_s: float) -> None:
         for index in range(round((now_s - START_S) * 10) + 1):
             self.look(START_S + index / 10)
 
     def leads(self, name: Name, term: int, now_s: float) -> None:
-        self.view.take(Heartbeat(name, 1, term, leading=True, formations=0), 0.0)
+        self.view.update(Heartbeat(name, 1, term, leading=True, formations=0), 0.0)
         self.look(now_s)
 
     def plan(self, name: Name, closed_s: float, now_s: float) -> None:
         data = {"closed_s": closed_s}
-        self.view.take(LogEvent(Name("coordinator"), name, 0.0, Name(IN_FORCE), data), 0.0)
+        self.view.update(LogEvent(Name("coordinator"), name, 0.0, Name(IN_FORCE), data), 0.0)
         self.look(now_s)
 
 
@@ -89,6 +89,6 @@ def test_a_leader_that_was_paused_shortly_continues() -> None:
 
 def test_other_events_are_ignored() -> None:
     history = leader_fault(110.0)
-    history.view.take(LogEvent(Name("coordinator"), C2, 0.0, Name("plan-made"), {}), 0.0)
+    history.view.update(LogEvent(Name("coordinator"), C2, 0.0, Name("plan-made"), {}), 0.0)
     history.look(110.2)
     assert history.failover.plan_recovery_s == []

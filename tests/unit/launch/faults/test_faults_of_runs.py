@@ -21,7 +21,7 @@ from laneweave.launch.faults.specification import (
 )
 from laneweave.launch.run.local_run import add_faults, fault_injection
 from laneweave.launch.run.outcome import Outcome
-from laneweave.launch.run.role_processes import RoleProcesses, StartOrder
+from laneweave.launch.run.role_processes import RoleProcesses, RoleStart
 from laneweave.launch.run.roles import fork_server
 from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.loading import load_scenario, to_tables
@@ -62,7 +62,7 @@ def prepared(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return tables and options of a role with faults."""
     tables, options = to_tables(Scenario()), {"folder": "f"}
-    add_faults(injection, board, StartOrder(role, name, {}), tables, options)
+    add_faults(injection, board, RoleStart(role, name, {}), tables, options)
     return tables, options
 
 

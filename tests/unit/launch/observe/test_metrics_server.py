@@ -13,7 +13,7 @@ import pytest
 from attrs import Factory, frozen
 from prometheus_client.parser import text_string_to_metric_families
 
-from laneweave.launch.observe.metrics_server import families, shown_metrics
+from laneweave.launch.observe.metrics_server import families, serve_metrics
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.metrics import MetricsSnapshot, metric, metrics_of, snapshot_source
 
@@ -69,7 +69,7 @@ def test_metrics_are_read_at_each_request() -> None:
         eaten += 1
         return [Counted(apples_total=eaten)]
 
-    with shown_metrics(address, role="test", name="t1") as observe:
+    with serve_metrics(address, role="test", name="t1") as observe:
         assert scrape(address)["laneweave_process_info", "t1", "test"] == 1.0
         observe(source)
         assert scrape(address)["laneweave_test_apples_total",] == 1.0
@@ -93,7 +93,7 @@ def test_a_process_that_hangs_tells_nothing() -> None:
     def source() -> Iterable[MetricsSnapshot]:
         raise TimeoutError
 
-    with shown_metrics(address) as observe:
+    with serve_metrics(address) as observe:
         observe(source)
         with pytest.raises(OSError):  # noqa: PT011 (closed, in one way or another)
             scrape(address)
@@ -102,7 +102,7 @@ def test_a_process_that_hangs_tells_nothing() -> None:
 def test_an_idle_client_does_not_delay_the_end() -> None:
     address = free_address()
     host, port = address.split(":")
-    with shown_metrics(address), socket.create_connection((host, int(port))) as open_end:
+    with serve_metrics(address), socket.create_connection((host, int(port))) as open_end:
         open_end.sendall(b"GET /metrics HTTP/1.1\r\n")
         scrape(address)
         began_s = time.monotonic()
@@ -111,7 +111,7 @@ def test_an_idle_client_does_not_delay_the_end() -> None:
 
 def test_it_listens_nowhere_else() -> None:
     address = free_address()
-    with shown_metrics(address), pytest.raises(ConnectionRefusedError):
+    with serve_metrics(address), pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.2", int(address.split(":")[1])))
 
 
@@ -120,4 +120,4 @@ def test_unusable_addresses_are_refused(host: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"{host}:{taken.getsockname()[1]}"
         with pytest.raises(BadInputError, match=r"observation.metrics: got .*a free port"):
-            shown_metrics(address).__enter__()
+            serve_metrics(address).__enter__()

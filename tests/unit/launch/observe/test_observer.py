@@ -22,7 +22,7 @@ def heartbeat(name: str, term: int, *, leading: bool = True) -> Heartbeat:
 
 def test_an_empty_view() -> None:
     view = RoadView()
-    view.take(object(), 0.0)
+    view.update(object(), 0.0)
     Observer(Keys("here"), view=view).wait(0.001)
     assert view == RoadView()
     assert (view.clock, view.census, view.leader, view.term) == (None, None, None, 0)
@@ -32,15 +32,15 @@ def test_an_empty_view() -> None:
 def test_road_time_does_not_go_back() -> None:
     view = RoadView()
     for tick in (5, 7, 6, 7):
-        view.take(clock(tick), 0.0)
+        view.update(clock(tick), 0.0)
     assert view.t_s == 0.7
 
 
 def test_messages_of_an_earlier_bridge_are_ignored() -> None:
     view = RoadView()
     for bridge, tick in ((1, 50), (2, 3), (1, 51), (2, 4)):
-        view.take(evolve(clock(tick), bridge=bridge), 0.0)
-        view.take(Census(tick / 10, (), (), bridge=bridge), 0.0)
+        view.update(evolve(clock(tick), bridge=bridge), 0.0)
+        view.update(Census(tick / 10, (), (), bridge=bridge), 0.0)
     assert (view.roads, view.bridge, view.t_s) == (2, 2, 0.4)
     assert view.census is not None
     assert view.census.t_s == 0.4
@@ -49,17 +49,17 @@ def test_messages_of_an_earlier_bridge_are_ignored() -> None:
 def test_an_older_census_is_ignored() -> None:
     view = RoadView()
     for t_s in (2.0, 1.0):
-        view.take(Census(t_s, (), ()), 0.0)
+        view.update(Census(t_s, (), ()), 0.0)
     assert view.census == Census(2.0, (), ())
 
 
 def test_the_highest_term_leads() -> None:
     view = RoadView()
-    view.take(heartbeat("c2", 3), 0.0)
-    view.take(heartbeat("c1", 2), 0.0)
-    view.take(heartbeat("c3", 9, leading=False), 0.0)
+    view.update(heartbeat("c2", 3), 0.0)
+    view.update(heartbeat("c1", 2), 0.0)
+    view.update(heartbeat("c3", 9, leading=False), 0.0)
     assert (view.leader, view.term) == ("c2", 3)
-    view.take(heartbeat("c1", 4), 0.0)
+    view.update(heartbeat("c1", 4), 0.0)
     assert (view.leader, view.term) == ("c1", 4)
 
 

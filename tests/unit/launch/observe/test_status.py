@@ -57,38 +57,38 @@ class Listener:
         self, name: str, term: int, now_s: float, *, leading: bool = False, incarnation: int = 1
     ) -> None:
         message = Heartbeat(Name(name), incarnation, term, leading=leading, formations=2)
-        self.view.take(Arrived(HEARTBEAT, {"coordinator": name}, message), now_s)
+        self.view.update(Arrived(HEARTBEAT, {"coordinator": name}, message), now_s)
 
     def coordinator(self, name: str, *, up: bool = True) -> None:
         kind = PeerUp if up else PeerDown
-        self.view.take(kind(COORDINATOR_ALIVE, {"coordinator": name, "incarnation": "1"}), 0.0)
+        self.view.update(kind(COORDINATOR_ALIVE, {"coordinator": name, "incarnation": "1"}), 0.0)
 
     def bridge(self, *, up: bool = True) -> None:
         kind = PeerUp if up else PeerDown
-        self.view.take(kind(BRIDGE_ALIVE, {"incarnation": "7"}), 0.0)
+        self.view.update(kind(BRIDGE_ALIVE, {"incarnation": "7"}), 0.0)
 
     def agent(self, vehicle: str) -> None:
-        self.view.take(PeerUp(VEHICLE_ALIVE, {"vehicle": vehicle}), 0.0)
+        self.view.update(PeerUp(VEHICLE_ALIVE, {"vehicle": vehicle}), 0.0)
 
     def clock(self, tick: int, *, ended: bool = False, bridge: int = 7, on_road: int = 1) -> None:
         message = RoadClock(
             tick, tick / 10, demanded=9, entered=5, on_road=on_road, left=4, ended=ended,
             bridge=bridge,
         )  # fmt: skip
-        self.view.take(Arrived(CLOCK, {}, message), tick / 10)
+        self.view.update(Arrived(CLOCK, {}, message), tick / 10)
 
     def census(
         self, tick: int, closed: tuple[ClosedFormation, ...] = (), **entered_s: float
     ) -> None:
         entries = tuple(CensusEntry(Name(one), (0, 0), 0, at) for one, at in entered_s.items())
         message = Census(tick / 10, entries, (), closed, bridge=7)
-        self.view.take(Arrived(CENSUS, {}, message), tick / 10)
+        self.view.update(Arrived(CENSUS, {}, message), tick / 10)
 
     def states(self, vehicle: str, ticks: Iterable[int], **changes: object) -> None:
         for tick in ticks:
             values: dict[str, Any] = {"promised": None, "speed_mps": 15.0, "t_s": tick / 10}
             state = holding(Name(vehicle), **values | changes)
-            self.view.take(Arrived(STATE, {"vehicle": vehicle}, state), tick / 10)
+            self.view.update(Arrived(STATE, {"vehicle": vehicle}, state), tick / 10)
 
     def status(self, now_s: float = 2.0) -> Status:
         return status_of(self.view, 0.0, now_s, ELECTION_S)
@@ -194,7 +194,7 @@ def _gone(listener: Listener) -> None:
         (_standing, "the road stands still at 0.5 s for 2.0 s"),
         (_gone, "the bridge has gone at 0.6 s, before its road had ended"),
         (
-            lambda listener: listener.view.take(LinkDown(), 1.0),
+            lambda listener: listener.view.update(LinkDown(), 1.0),
             "the connection to the router was lost",
         ),
     ],

@@ -33,11 +33,11 @@ def watched(ticks: int = 21, convoy: Convoy = CONVOY) -> LiveRoad:
 
 def hear(road: LiveRoad, convoy: Convoy, tick: int) -> None:
     if tick == START:
-        road.take(convoy.clock(tick), 0.0)
-        road.take(convoy.census(tick), 0.0)
-        road.take(convoy.plan(tick), 0.0)
+        road.update(convoy.clock(tick), 0.0)
+        road.update(convoy.census(tick), 0.0)
+        road.update(convoy.plan(tick), 0.0)
     for send in convoy.messages(tick):
-        road.take(decode(encode(send.message)), (tick - START) / 10)
+        road.update(decode(encode(send.message)), (tick - START) / 10)
 
 
 def shown(road: LiveRoad, wall_s: float = 2.0) -> dict[str, Any]:
@@ -79,51 +79,51 @@ def test_targets_are_those_of_accepted_plans() -> None:
     )
     for changed in changes:
         hear(road, CONVOY, START + 20)
-        road.take(evolve(done, **changed), 2.0)
+        road.update(evolve(done, **changed), 2.0)
         assert shown(road)["vehicles"][0][7] == 0
 
 
 def test_positions_are_extrapolated_between_states() -> None:
     road = watched()
     before = shown(road)["vehicles"][0][1]
-    road.take(CONVOY.clock(START + 22), 2.0)
+    road.update(CONVOY.clock(START + 22), 2.0)
     assert shown(road)["vehicles"][0][1] == pytest.approx(before + 0.2 * 15.0)
 
 
 def test_a_vehicle_that_is_not_heard_is_shown_in_its_cell_and_marked() -> None:
     road = watched()
     for tick in range(START + 21, START + 40):
-        road.take(CONVOY.clock(tick), 2.0)
+        road.update(CONVOY.clock(tick), 2.0)
         for number in range(1, 9):
-            road.take(CONVOY.state(number, tick), 2.0)
+            road.update(CONVOY.state(number, tick), 2.0)
     rows = shown(road)["vehicles"]
     assert [row[8] for row in rows] == [UNHEARD, *[0] * 8]
     assert rows[0][1] == pytest.approx(CONVOY.state(0, START + 39).s_m, abs=0.01)
     assert rows[0][7] == 0
     # Never heard at all: the cell in which it entered is all that is known.
     silent = LiveRoad(ROLLING, wall_s=0.0)
-    silent.take(CONVOY.clock(START), 0.0)
-    silent.take(CONVOY.census(START), 0.0)
+    silent.update(CONVOY.clock(START), 0.0)
+    silent.update(CONVOY.census(START), 0.0)
     assert {row[8] for row in shown(silent)["vehicles"]} == {UNHEARD}
 
 
 def test_a_vehicle_without_an_agent_is_marked() -> None:
     road = watched()
-    road.take(evolve(CONVOY.state(3, START + 20), attended=False), 2.0)
+    road.update(evolve(CONVOY.state(3, START + 20), attended=False), 2.0)
     assert [row[8] for row in shown(road)["vehicles"]] == [0, 0, 0, UNATTENDED, 0, 0, 0, 0, 0]
 
 
 def test_vehicles_that_have_left_are_not_shown() -> None:
     road = watched()
-    road.take(CONVOY.clock(START + 21), 2.0)
-    road.take(CONVOY.census(START + 21, without=frozenset(CONVOY.names[:4])), 2.0)
+    road.update(CONVOY.clock(START + 21), 2.0)
+    road.update(CONVOY.census(START + 21, without=frozenset(CONVOY.names[:4])), 2.0)
     assert [row[0] for row in shown(road)["vehicles"]] == CONVOY.names[4:]
 
 
 def test_a_vehicle_that_is_not_listed_yet_is_shown_without_a_lane() -> None:
     road, more = watched(), Convoy(10, scenario=ROLLING)
-    road.take(CONVOY.clock(START + 21), 2.0)
-    road.take(more.state(9, START + 21), 2.0)
+    road.update(CONVOY.clock(START + 21), 2.0)
+    road.update(more.state(9, START + 21), 2.0)
     assert shown(road)["vehicles"][-1][:1] == ["v0009"]
     assert shown(road)["vehicles"][-1][4] == -1
 
@@ -135,8 +135,8 @@ def with_formations(
     convoy = Convoy(count, scenario=scenario)
     road = watched(convoy=convoy)
     census = convoy.census(START + 21)
-    road.take(convoy.clock(START + 21), 2.0)
-    road.take(evolve(census, formations=closed, closed_to=closed[-1].last_block), 2.0)
+    road.update(convoy.clock(START + 21), 2.0)
+    road.update(evolve(census, formations=closed, closed_to=closed[-1].last_block), 2.0)
     return road, convoy
 
 
@@ -149,9 +149,9 @@ def test_formations_of_different_lengths() -> None:
     assert [row[5] for row in frame["vehicles"]] == [0] * 9 + [3] * 15 + [-1] * 3
     # All blocks of one formation are one; only several formations are joined.
     for number, blocks in ((0, (0, 1, 2)), (9, (3, 4, 5, 6, 7)), (24, (8,))):
-        road.take(evolve(convoy.state(number, START + 21), joined=blocks), 2.0)
+        road.update(evolve(convoy.state(number, START + 21), joined=blocks), 2.0)
     assert shown(road)["joined"] == []
-    road.take(evolve(convoy.state(1, START + 21), joined=tuple(range(8))), 2.0)
+    road.update(evolve(convoy.state(1, START + 21), joined=tuple(range(8))), 2.0)
     assert shown(road)["joined"] == [[0, 3]]
 
 
@@ -162,7 +162,7 @@ def test_formations_of_equal_length_and_those_that_are_joined() -> None:
     assert frame["formations"][-2:] == [[1, -7, -4], [0, -3, 0]]
     assert [row[5] for row in frame["vehicles"]] == [0] * 12 + [1] * 12
     for number, joined in ((0, (0, 1)), (1, (1, 2)), (2, (5, 6)), (3, (4,)), (4, (6, 9))):
-        road.take(evolve(convoy.state(number, START + 21), joined=joined), 2.0)
+        road.update(evolve(convoy.state(number, START + 21), joined=joined), 2.0)
     assert shown(road)["joined"] == [[0, 1, 2], [5, 6]]
 
 
@@ -170,7 +170,7 @@ def test_a_vehicle_that_is_not_listed_yet_is_in_the_formation_of_its_block() -> 
     road, _ = with_formations(FORMATIONS, 9, ClosedFormation(0, 2, 5.0))
     entering = Convoy(10, scenario=FORMATIONS).state(9, START + 22)
     for block, formation in ((2, 0), (3, -1)):
-        road.take(evolve(entering, formation=block), 2.0)
+        road.update(evolve(entering, formation=block), 2.0)
         row = shown(road)["vehicles"][-1]
         assert (row[0], row[5]) == ("v0009", formation)
 
@@ -187,7 +187,7 @@ def test_leader_and_candidates() -> None:
     assert frame["leader"] == ["c1", 3]
     assert frame["candidates"] == [["c1", 3, True, False], ["c2", 3, False, False]]
     # A new leader; the old one is silent.
-    road.take(Heartbeat(Name("c2"), 18, 4, True, 0), 10.0)
+    road.update(Heartbeat(Name("c2"), 18, 4, True, 0), 10.0)
     frame = shown(road, 10.1)
     assert frame["leader"] == ["c2", 4]
     assert frame["candidates"] == [["c1", 3, False, True], ["c2", 4, True, False]]
@@ -198,12 +198,12 @@ def test_leader_and_candidates() -> None:
 
 def test_a_newer_bridge_begins_a_new_road() -> None:
     road, later = watched(), Convoy(4, bridge=2, scenario=ROLLING)
-    road.take(later.clock(1), 3.0)
-    road.take(later.census(1), 3.0)
+    road.update(later.clock(1), 3.0)
+    road.update(later.census(1), 3.0)
     # Late messages of the earlier road are ignored.
-    road.take(CONVOY.clock(START + 21), 3.0)
-    road.take(CONVOY.census(START + 21), 3.0)
-    road.take(CONVOY.state(0, START + 100), 3.0)
+    road.update(CONVOY.clock(START + 21), 3.0)
+    road.update(CONVOY.census(START + 21), 3.0)
+    road.update(CONVOY.state(0, START + 100), 3.0)
     frame = shown(road, 3.0)
     assert (frame["run"], frame["t"], frame["loss"]) == (2, 0.1, None)
     assert [row[0] for row in frame["vehicles"]] == later.names
@@ -220,13 +220,13 @@ def test_the_status_and_its_beginning() -> None:
     assert status(2.0) == ["live", 2.0]
     assert status(2.5) == ["live", 2.0]
     assert status(2.1 + STILL_S) == ["still", 2.0]
-    road.take(LinkDown(), 5.0)
+    road.update(LinkDown(), 5.0)
     assert status(5.0) == ["lost", 5.0]
     assert status(9.0) == ["lost", 5.0]
-    road.take(LinkUp(), 10.0)
-    road.take(CONVOY.clock(START + 30), 10.0)
+    road.update(LinkUp(), 10.0)
+    road.update(CONVOY.clock(START + 30), 10.0)
     assert status(10.0) == ["live", 10.0]
-    road.take(CONVOY.clock(START + 31, ended=True), 11.0)
+    road.update(CONVOY.clock(START + 31, ended=True), 11.0)
     assert status(20.0) == ["ended", 20.0]
 
 
@@ -236,9 +236,9 @@ def test_frames_are_made_after_changes() -> None:
     road.frame(0, 2.0)
     assert not road.changed(2.0)
     assert road.changed(2.1 + STILL_S)
-    road.take(CONVOY.state(0, START + 20), 2.0)
+    road.update(CONVOY.state(0, START + 20), 2.0)
     assert not road.changed(2.0)
-    road.take(CONVOY.clock(START + 21), 2.1)
+    road.update(CONVOY.clock(START + 21), 2.1)
     assert road.changed(2.1)
 
 
@@ -250,11 +250,11 @@ def test_events_and_plans() -> None:
         ("formations-joined", {"formations": [1, 2], "why": "x" * 500}),
         ("plan-in-force", {"slot": 3}),
     ):
-        road.take(LogEvent(Name("coordinator"), Name("c1"), 12.0, Name(kind), dict(more)), 2.0)
+        road.update(LogEvent(Name("coordinator"), Name("c1"), 12.0, Name(kind), dict(more)), 2.0)
     frame = shown(road)
     assert frame["plan"] == [12.0, 9, 4.25, "rolling", False]
     made = {"vehicles": 6, "solve_ms": 2.5, "solver": "branching", "fallback": True}
-    road.take(LogEvent(Name("coordinator"), Name("c1"), 13.0, Name("plan-made"), made), 2.0)
+    road.update(LogEvent(Name("coordinator"), Name("c1"), 13.0, Name("plan-made"), made), 2.0)
     assert shown(road)["plan"] == [13.0, 6, 2.5, "branching", True]
     ((t_s, who, what, details),) = frame["news"]
     assert (t_s, who, what) == (12.0, "c1", "formations-joined")
@@ -269,7 +269,7 @@ def test_malformed_events_do_no_harm(value: object) -> None:
     road = watched()
     data = {"vehicles": value, "solve_ms": value, "solver": value, "fallback": value}
     for kind in ("plan-made", "odd"):
-        road.take(LogEvent(Name("x"), Name("y"), 1.0, Name(kind), dict(data)), 2.0)
+        road.update(LogEvent(Name("x"), Name("y"), 1.0, Name(kind), dict(data)), 2.0)
     shown(road)
 
 
@@ -278,5 +278,5 @@ def test_a_frame_of_90_vehicles_is_small() -> None:
     road = LiveRoad(convoy.scenario, 0.0)
     for tick in range(400, 411):
         for send in convoy.messages(tick):
-            road.take(send.message, 1.0)
+            road.update(send.message, 1.0)
     assert len(compact(road.frame(0, 1.0))) < 9000

@@ -24,7 +24,7 @@ from websockets.sync.client import ClientConnection, connect
 from laneweave.launch.watch.frames import MAX_REQUESTED, FrameBuffer, FrameSource, compact
 from laneweave.launch.watch.process import open_socket
 from laneweave.launch.watch.recorded_run import Recording
-from laneweave.launch.watch.server import Audience, Browser, make_app, request_of
+from laneweave.launch.watch.server import Browser, Browsers, make_app, request_of
 from laneweave.protocol.errors import BadInputError
 
 WAIT_S = 20.0
@@ -36,14 +36,14 @@ class Site:
     """A server in a thread."""
 
     source: FrameSource
-    audience: Audience = field(factory=Audience)
+    browsers: Browsers = field(factory=Browsers)
     healthy: bool = True
     _listener: socket.socket = field(factory=lambda: open_socket("127.0.0.1:0"))
     _loop: asyncio.AbstractEventLoop | None = None
 
     @contextlib.contextmanager
     def running(self) -> Iterator[Site]:
-        app = make_app(self.source, self.audience, lambda: (self.healthy, {"more": 1}))
+        app = make_app(self.source, self.browsers, lambda: (self.healthy, {"more": 1}))
         config = uvicorn.Config(app, log_config=None, lifespan="off", timeout_graceful_shutdown=1)
         server = uvicorn.Server(config)
         thread = threading.Thread(target=lambda: asyncio.run(self._serve(server)))
@@ -63,7 +63,7 @@ class Site:
         """Offer a frame to all browsers, from another thread than the server's."""
         wait_until(lambda: self._loop is not None)
         assert self._loop is not None
-        self._loop.call_soon_threadsafe(self.audience.offer, frame)
+        self._loop.call_soon_threadsafe(self.browsers.offer, frame)
 
     @property
     def host(self) -> str:
@@ -114,7 +114,7 @@ def shared_site() -> Iterator[Site]:
 def site(shared_site: Site) -> Site:
     """Return a healthy server without browsers."""
     shared_site.healthy = True
-    wait_until(lambda: not shared_site.audience.browsers)
+    wait_until(lambda: not shared_site.browsers.connected)
     return shared_site
 
 
@@ -149,26 +149,26 @@ def test_a_browser_gets_the_scene_and_new_frames_and_those_that_it_requests(site
 def test_several_browsers_come_and_go(site: Site) -> None:
     with site.browser() as one, site.browser() as other:
         receive(one), receive(other)
-        wait_until(lambda: len(site.audience.browsers) == 2)
+        wait_until(lambda: len(site.browsers.connected) == 2)
         # One disconnects without closing the websocket.
         one.socket.shutdown(socket.SHUT_RDWR)
-        wait_until(lambda: len(site.audience.browsers) == 1)
+        wait_until(lambda: len(site.browsers.connected) == 1)
         site.offer('{"n":5}')
         assert receive(other) == {"n": 5}
-    wait_until(lambda: not site.audience.browsers)
+    wait_until(lambda: not site.browsers.connected)
 
 
 def test_a_slow_browser_gets_fewer_frames_and_delays_no_other(site: Site) -> None:
     with contextlib.closing(deaf_socket(site)), site.browser(max_size=None) as fast:
         receive(fast)
-        wait_until(lambda: len(site.audience.browsers) == 2)
+        wait_until(lambda: len(site.browsers.connected) == 2)
         for number in range(120):
             site.offer(compact({"n": number, "filling": BIG}))
             # The fast one reads every frame, the slow one none.
             assert receive(fast)["n"] == number
-        assert max(browser.skipped for browser in site.audience.browsers) > 20
+        assert max(browser.skipped for browser in site.browsers.connected) > 20
     # It is disconnected at last, with frames still unsent.
-    wait_until(lambda: not site.audience.browsers)
+    wait_until(lambda: not site.browsers.connected)
 
 
 def deaf_socket(site: Site) -> socket.socket:

@@ -1,4 +1,4 @@
-"""The story of a run: a readable log of its messages, motions and violations, to find a cause."""
+"""Timeline of a run: a readable log of its messages, motions and violations."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from laneweave.protocol.wire.messages import (
 )
 
 BEFORE_S = 4.0
-"""Time before a violation from which the story is printed."""
+"""Time before a violation from which the timeline is printed."""
 AFTER_S = 0.2
 
 
-class Story:
+class Timeline:
     """Collects lines, without repeated states and commands."""
 
     def __init__(self) -> None:
