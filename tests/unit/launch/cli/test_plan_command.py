@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from laneweave.launch.cli import main as cli
+from laneweave.launch.run import logs
 
 CASE_STUDY = Path(__file__).parents[4] / "docs" / "examples" / "case-study.json"
 
@@ -16,7 +17,7 @@ CASE_STUDY = Path(__file__).parents[4] / "docs" / "examples" / "case-study.json"
 @pytest.fixture(autouse=True)
 def _logs_stay_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
     """The command would bind them to a stream that ends with the test."""
-    monkeypatch.setattr(cli, "log_to_terminal", lambda: None)
+    monkeypatch.setattr(logs, "log_to_terminal", lambda: None)
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from laneweave.launch.cli import plan_answers
 from laneweave.launch.cli.plan_answers import answer_request
 from laneweave.launch.drawing import plan as plan_drawing
 from laneweave.launch.drawing.plan import check_drawing, plan_figure, write_gif, write_png
+from laneweave.launch.run import logs
 from laneweave.protocol.errors import BadInputError
 
 CASE_STUDY = Path(__file__).resolve().parents[4] / "docs" / "examples" / "case-study.json"
@@ -62,7 +63,7 @@ def outlines(axes: Axes, label: str) -> list[Rectangle]:
 @pytest.fixture(autouse=True)
 def _logs_stay_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
     """The command would bind them to a stream that ends with the test."""
-    monkeypatch.setattr(cli, "log_to_terminal", lambda: None)
+    monkeypatch.setattr(logs, "log_to_terminal", lambda: None)
 
 
 def test_a_panel_per_time_point_shows_all_vehicles() -> None:

@@ -28,6 +28,7 @@ from laneweave.launch.drawing.plan_on_road import (
     drive_plan,
     road_figure,
 )
+from laneweave.launch.run import logs
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
@@ -45,7 +46,7 @@ SCENARIO = Scenario()
 @pytest.fixture(autouse=True)
 def _logs_stay_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
     """The command would bind them to a stream that ends with the test."""
-    monkeypatch.setattr(cli, "log_to_terminal", lambda: None)
+    monkeypatch.setattr(logs, "log_to_terminal", lambda: None)
 
 
 @pytest.fixture(scope="module")
