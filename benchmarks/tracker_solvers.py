@@ -57,7 +57,7 @@ _EXACT = QPSettings(
     check_termination=25,
     rho=0.3,
     polishing=True,
-    row_tolerance=1e-4,
+    tolerance=1e-4,
 )
 
 

@@ -74,7 +74,7 @@ class StreamLeader:
     def hear(self, state: VehicleState, now_s: float) -> Lines:
         transfer = self.transfer
         if self.claims and transfer is not None and state.vehicle in transfer.moves:
-            state = evolve(state, estate=tuple(sorted({*state.estate, *self.claims})))
+            state = evolve(state, owned=tuple(sorted({*state.owned, *self.claims})))
         self.states[state.vehicle] = state
         if transfer is None:
             return
@@ -87,7 +87,7 @@ class StreamLeader:
         transfer = self.transfer
         if transfer is None:
             return f"{self.name} has no ballot"
-        why = f": {transfer.why}" if transfer.phase is BallotPhase.GIVEN_UP else ""
+        why = f": {transfer.reason}" if transfer.phase is BallotPhase.ABORTED else ""
         return f"{self.name} {transfer.phase.value} {written(transfer.ballot)}{why}"
 
 

@@ -49,9 +49,9 @@ def state_text(name: str, state: VehicleState) -> str:
             parts.append(word)
     if len(state.joined) > 1:
         parts.append(f"joined {' '.join(map(str, state.joined))}")
-    if state.estate:
-        parts.append(f"owns {' '.join(map(shown, state.estate))}")
-    if state.deed is not None:
-        gate = "open" if state.deed.open else "closed"
-        parts.append(f"transfer {written(state.deed.ballot)} {gate}")
+    if state.owned:
+        parts.append(f"owns {' '.join(map(shown, state.owned))}")
+    if state.transfer is not None:
+        gate = "open" if state.transfer.open else "closed"
+        parts.append(f"transfer {written(state.transfer.ballot)} {gate}")
     return ", ".join(parts)

@@ -13,7 +13,14 @@ from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.vehicle import plan_execution as vehicle_rules
 from laneweave.protocol.vehicle.plan_execution import PlanExecution
-from laneweave.protocol.wire.messages import Command, Deed, Name, Plan, Sense, VehicleState
+from laneweave.protocol.wire.messages import (
+    Command,
+    Name,
+    PendingTransfer,
+    Plan,
+    Sense,
+    VehicleState,
+)
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
 
 Patch = pytest.MonkeyPatch
@@ -35,17 +42,17 @@ def obey(patch: Patch) -> None:
 def own_at_once(patch: Patch) -> None:
     begin_transfer = MotionController.begin_transfer
 
-    def mutant(self: MotionController, deed: Deed) -> None:
-        begin_transfer(self, deed)
-        self.complete_transfer(deed.ballot)
+    def mutant(self: MotionController, transfer: PendingTransfer) -> None:
+        begin_transfer(self, transfer)
+        self.complete_transfer(transfer.ballot)
 
     patch.setattr(MotionController, "begin_transfer", mutant)
 
 
 def note_any_transfer(patch: Patch) -> None:
-    def mutant(self: MotionController, deed: Deed) -> None:
-        if deed != self.transfer:
-            self.transfer, self.owned = deed, deed.before
+    def mutant(self: MotionController, transfer: PendingTransfer) -> None:
+        if transfer != self.transfer:
+            self.transfer, self.owned = transfer, transfer.before
 
     patch.setattr(MotionController, "begin_transfer", mutant)
 
@@ -85,7 +92,7 @@ def show_owned_cells_at_once(patch: Patch) -> None:
 
 
 def cancel_closed_transfers(patch: Patch) -> None:
-    patch.setattr(transfer, "owned_cells", lambda state, *_: frozenset(state.estate))
+    patch.setattr(transfer, "owned_cells", lambda state, *_: frozenset(state.owned))
 
 
 def cancel_on_common_promise(patch: Patch) -> None:
@@ -94,11 +101,11 @@ def cancel_on_common_promise(patch: Patch) -> None:
     def mutant(
         state: VehicleState, states: States, gone: Collection[Name]
     ) -> frozenset[Cell] | None:
-        deed = state.deed
-        if deed is not None and not deed.open:
-            promised = {states[name].promised for name in deed.roster if name in states}
-            if promised == {state.promised} and state.promised != deed.ballot:
-                return frozenset(deed.before)
+        transfer = state.transfer
+        if transfer is not None and not transfer.open:
+            promised = {states[name].promised for name in transfer.roster if name in states}
+            if promised == {state.promised} and state.promised != transfer.ballot:
+                return frozenset(transfer.before)
         return owned_cells(state, states, gone)
 
     patch.setattr(transfer, "owned_cells", mutant)

@@ -110,13 +110,13 @@ def accepted_mine_or_newer(me: PlanExecution, state: VehicleState) -> bool:
 
 
 def hear_any_state(me: PlanExecution, state: VehicleState) -> None:
-    me.heard[state.vehicle] = max(me.heard.get(state.vehicle, -1), state.completed)
+    me.progress[state.vehicle] = max(me.progress.get(state.vehicle, -1), state.completed)
 
 
 def hear_moves_under_way(me: PlanExecution, state: VehicleState) -> None:
     if state.ready:
         shown = state.completed + state.moving
-        me.heard[state.vehicle] = max(me.heard.get(state.vehicle, -1), shown)
+        me.progress[state.vehicle] = max(me.progress.get(state.vehicle, -1), shown)
 
 
 def ready_with_plan(patch: pytest.MonkeyPatch) -> None:
@@ -125,13 +125,13 @@ def ready_with_plan(patch: pytest.MonkeyPatch) -> None:
 
 def all_but_one_are_ready(me: PlanExecution, _: object) -> bool:
     roster = me.plan.roster if me.plan is not None else ()
-    ready = sum(me.heard.get(other, -1) >= 0 for other in roster if other != me.vehicle)
+    ready = sum(me.progress.get(other, -1) >= 0 for other in roster if other != me.vehicle)
     return ready >= len(roster) - 2
 
 
 def is_released_after_a_while(me: PlanExecution, _: object) -> bool:
     needs = me.needs[me.completed]
-    heard = all(me.heard.get(other, -1) >= count for other, count in needs.items())
+    heard = all(me.progress.get(other, -1) >= count for other, count in needs.items())
     return heard or me.is_due(me.t_s - LEASE_S)
 
 
@@ -336,14 +336,14 @@ def always_in_charge(patch: pytest.MonkeyPatch) -> None:
 
 
 def note_by_itself(patch: pytest.MonkeyPatch) -> None:
-    ask = AgentCore._request_note
+    ask = AgentCore._request_storage
 
     def mutant(self: AgentCore, execution: PlanExecution) -> Iterator[Effect]:
         yield from ask(self, execution)
-        if execution.plan is not None and execution.on_noted(execution.plan.ballot):
+        if execution.plan is not None and execution.on_stored(execution.plan.ballot):
             yield self._state()
 
-    patch.setattr(AgentCore, "_request_note", mutant)
+    patch.setattr(AgentCore, "_request_storage", mutant)
 
 
 def keep_incarnation(patch: pytest.MonkeyPatch) -> None:

@@ -13,9 +13,9 @@ from laneweave.protocol.wire.messages import (
     Ballot,
     Census,
     CensusEntry,
-    Deed,
     Heartbeat,
     Name,
+    PendingTransfer,
     Plan,
     RoadClock,
     VehicleState,
@@ -90,7 +90,7 @@ class Convoy:
         """Return what a vehicle shows in a tick."""
         lattice, t_s = self.scenario.lattice, tick * self.scenario.runtime.tick_s
         cell = self.cell(number)
-        estate = (cell, (cell[0] - 100, cell[1]))
+        owned = (cell, (cell[0] - 100, cell[1]))
         return holding(
             self.names[number],
             BALLOT,
@@ -100,8 +100,8 @@ class Convoy:
             y_m=lattice.cell_y_m(cell[1]),
             speed_mps=lattice.speed_mps,
             t_s=t_s,
-            estate=estate,
-            deed=Deed(BALLOT, estate, estate, (self.names[number],)),
+            owned=owned,
+            transfer=PendingTransfer(BALLOT, owned, owned, (self.names[number],)),
         )
 
     def plan(self, tick: int) -> Plan:

@@ -38,7 +38,7 @@ UNDER_WAY = 2**40
 LONG_AGO_S, LATER_S = 0.0, 1e3
 SLOT_S = 4.0
 
-ESTATES: dict[str, tuple[Cell, ...]] = {
+OWNED: dict[str, tuple[Cell, ...]] = {
     "A": ((0, 0), (1, 0), (2, 0), (-1, 0)),
     "B": ((-2, 0), (-3, 0), (-4, 0)),
     "C": ((1, 1), (2, 1), (0, 1), (-1, 1)),
@@ -100,7 +100,7 @@ class Car:
             self.name, self.tick, LATER_S + self.tick, controller.plant.state, controller.hold_cell,
             controller.motion_end_tick, controller.motion_origin, 0, (), (),
             attendant=controller.attendant, accepted=controller.accepted,
-            estate=controller.owned, promised=controller.promised, deed=controller.transfer,
+            owned=controller.owned, promised=controller.promised, transfer=controller.transfer,
         )  # fmt: skip
 
     def command(self) -> Command:
@@ -108,7 +108,7 @@ class Car:
         return Command(
             self.name, execution.incarnation, self.tick, execution.hold_cell, 0,
             self.controller.hold_cell, b"", accepted=execution.wanted_accepted,
-            promised=execution.wanted_promised, deed=execution.transfer,
+            promised=execution.wanted_promised, transfer=execution.transfer,
         )  # fmt: skip
 
     def state(self) -> VehicleState:
@@ -123,7 +123,7 @@ class Car:
         if sense.attendant != self.execution.incarnation or sense.tick < self.sense.tick:
             return
         self.sense = sense
-        self.execution.on_noted(sense.accepted)
+        self.execution.on_stored(sense.accepted)
         self.execution.on_owned(sense)
 
     def act(self) -> None:
@@ -248,7 +248,7 @@ class Road:
         """Let everybody hold in its cell."""
         self.cars = {
             Name(name): Car(Name(name), controller_of(cells), self.rules)
-            for name, cells in ESTATES.items()
+            for name, cells in OWNED.items()
         }
         self.leaders = (Leader(Name("c1")), Leader(Name("c2")))
 
@@ -289,9 +289,9 @@ class Road:
             self.obey(car, message)
             self.post(car.name, car.sense_now())
         elif isinstance(message, Sense):
-            shown = car.execution.promise_noted, car.execution.accepted
+            shown = car.execution.promise_stored, car.execution.accepted
             car.take(message)
-            if (car.execution.promise_noted, car.execution.accepted) != shown:
+            if (car.execution.promise_stored, car.execution.accepted) != shown:
                 self.show(car)
         elif isinstance(message, Prepare | Plan | VehicleState):
             car.told(message)
@@ -352,10 +352,10 @@ class Road:
 
     def owned(self, car: Car) -> frozenset[Cell]:
         """Return what a car owns, as somebody knows who has seen all."""
-        deed = car.controller.transfer
-        if deed is None or deed.open:
+        transfer = car.controller.transfer
+        if transfer is None or transfer.open:
             return frozenset(car.controller.owned)
-        return frozenset(deed.after if deed.ballot in self.opened else deed.before)
+        return frozenset(transfer.after if transfer.ballot in self.opened else transfer.before)
 
     def check(self) -> None:
         """Check that no cell has two owners, and that everybody is where it may be."""

@@ -7,7 +7,14 @@ from attrs import evolve
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES, PlanExecution
-from laneweave.protocol.wire.messages import Ballot, Deed, Name, Plan, Sense, VehicleState
+from laneweave.protocol.wire.messages import (
+    Ballot,
+    Name,
+    PendingTransfer,
+    Plan,
+    Sense,
+    VehicleState,
+)
 from support.rolling_road import LATTICE
 from support.states import make_plan as plan_of
 
@@ -35,8 +42,8 @@ def make_plan(ballot: Ballot = MID) -> Plan:
     )
 
 
-def deed_of(name: Name, ballot: Ballot = MID, roster: tuple[Name, ...] = (A, B)) -> Deed:
-    return Deed(ballot, BEFORE[name], AFTER[name], roster)
+def pending(name: Name, ballot: Ballot = MID, roster: tuple[Name, ...] = (A, B)) -> PendingTransfer:
+    return PendingTransfer(ballot, BEFORE[name], AFTER[name], roster)
 
 
 def vehicle(name: Name = A, rules: RuleBook = VEHICLE_RULES) -> PlanExecution:
@@ -49,32 +56,32 @@ def vehicle(name: Name = A, rules: RuleBook = VEHICLE_RULES) -> PlanExecution:
 def sense(
     name: Name = A,
     promised: Ballot | None = None,
-    deed: Deed | None = None,
+    transfer: PendingTransfer | None = None,
     accepted: Ballot | None = None,
-    estate: tuple[Cell, ...] | None = None,
+    owned: tuple[Cell, ...] | None = None,
 ) -> Sense:
     return Sense(
         name, 1, 1.0, (0.0,) * 6, HOME, 0, HOME, 0, (), (), attendant=INCARNATION,
-        promised=promised, deed=deed, accepted=accepted,
-        estate=BEFORE[name] if estate is None else estate,
+        promised=promised, transfer=transfer, accepted=accepted,
+        owned=BEFORE[name] if owned is None else owned,
     )  # fmt: skip
 
 
 def state(
     name: Name = A,
     promised: Ballot | None = None,
-    deed: Deed | None = None,
+    transfer: PendingTransfer | None = None,
     *,
-    estate: tuple[Cell, ...] | None = None,
+    owned: tuple[Cell, ...] | None = None,
     accepted: bool = False,
     t_s: float = 1.0,
 ) -> VehicleState:
     """Return what a vehicle shows that holds in the cell where the plan begins."""
-    if estate is None:
-        estate = BEFORE.get(name, ((9, 2),))
-    cell = make_plan().start_cells.get(name, estate[0] if estate else (9, 2))
+    if owned is None:
+        owned = BEFORE.get(name, ((9, 2),))
+    cell = make_plan().start_cells.get(name, owned[0] if owned else (9, 2))
     shown = vehicle().state(sense(), 0, attended=True)
     return evolve(
-        shown, vehicle=name, hold_cell=cell, promised=promised, deed=deed, estate=estate,
+        shown, vehicle=name, hold_cell=cell, promised=promised, transfer=transfer, owned=owned,
         accepted=accepted, ready=accepted, t_s=t_s,
     )  # fmt: skip

@@ -18,7 +18,7 @@ from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.service.client import PlanClient, PlanError
 from laneweave.coordinator.service.format import JSON
-from laneweave.coordinator.service.rendezvous import falls_to
+from laneweave.coordinator.service.rendezvous import is_assigned_to
 from laneweave.protocol.runtime.transport import Delivery, TokenDown, TokenUp
 from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
@@ -150,7 +150,7 @@ workers = 1
             named = data | {"id": f"{data.get('id', '')}-{name}-{number}-{time.monotonic_ns()}"}
             # As the client writes it.
             payload = JSON.write(PlanRequest.from_dict(named).to_dict())
-            if falls_to(name, others, payload):
+            if is_assigned_to(name, others, payload):
                 result: dict[str, Any] = json.loads(payload)
                 return result
 

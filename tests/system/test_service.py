@@ -26,7 +26,7 @@ from laneweave.coordinator.service.client import (
     ServiceUnavailableError,
 )
 from laneweave.coordinator.service.format import LATE, OVERLOADED
-from laneweave.coordinator.service.rendezvous import falls_to
+from laneweave.coordinator.service.rendezvous import is_assigned_to
 from laneweave.protocol.runtime.transport import Answer
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.topics import SERVICE, Keys
@@ -152,7 +152,7 @@ def test_an_id_names_one_request(service: ServiceLab, transport: ZenohTransport)
     found = []
     for number in range(100):
         payload = json.dumps(request("taken", deadline_s=10.0 + number)).encode()
-        if falls_to("c1", ("c2", "c3"), payload):
+        if is_assigned_to("c1", ("c2", "c3"), payload):
             found.append(payload)
     first, second = found[:2]
     assert asked(transport, first).ok

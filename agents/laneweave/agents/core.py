@@ -173,10 +173,10 @@ class AgentCore:
                 execution.on_state(message)
             case Prepare():
                 if execution.on_prepare(message):
-                    return [*self._request_note(execution), self._state()]
+                    return [*self._request_storage(execution), self._state()]
             case Plan():
                 if execution.on_plan(message):
-                    return self._request_note(execution)
+                    return self._request_storage(execution)
             case _:
                 pass
         return []
@@ -217,7 +217,7 @@ class AgentCore:
             stretch = stretch_of(execution.hold_cell[0])
             self.wanted_motions = stretch - 1, stretch, stretch + 1
             execution.on_joined(sense.joined)
-            execution.on_noted(sense.accepted)
+            execution.on_stored(sense.accepted)
             execution.on_owned(sense)
             self._decide(sense, execution)
         drive = self._driver.drive(sense, moving=execution.moving)
@@ -233,7 +233,7 @@ class AgentCore:
             joined=execution.wanted_joined,
             accepted=execution.wanted_accepted,
             promised=execution.wanted_promised,
-            deed=execution.transfer,
+            transfer=execution.transfer,
         )
         effects: list[Effect] = [Send(COMMAND, self._command, self._own)]
         if in_charge:
@@ -253,12 +253,12 @@ class AgentCore:
         self._sense = sense
         changes = [
             execution.on_joined(sense.joined),
-            execution.on_noted(sense.accepted),
+            execution.on_stored(sense.accepted),
             execution.on_owned(sense),
         ]
         return [self._state()] if any(changes) else []
 
-    def _request_note(self, execution: PlanExecution) -> list[Effect]:
+    def _request_storage(self, execution: PlanExecution) -> list[Effect]:
         """Ask the controller to note something now, before the next tick's COMMAND."""
         command = self._command
         assert command is not None  # noqa: S101 (in charge: it has sent one)
@@ -267,7 +267,7 @@ class AgentCore:
             joined=execution.wanted_joined,
             accepted=execution.wanted_accepted,
             promised=execution.wanted_promised,
-            deed=execution.transfer,
+            transfer=execution.transfer,
         )
         return [Send(COMMAND, self._command, self._own)] if self._command != command else []
 
@@ -290,7 +290,7 @@ class AgentCore:
             joined=sense.joined,
             moving=not self._driver.at_rest(sense),
             rules=self._rules,
-            owned=frozenset(sense.estate) if self._scenario.formation.rolling else None,
+            owned=frozenset(sense.owned) if self._scenario.formation.rolling else None,
         )
 
     def _decide(self, sense: Sense, execution: PlanExecution) -> None:

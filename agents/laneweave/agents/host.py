@@ -34,7 +34,7 @@ from laneweave.protocol.wire.topics import (
     incarnation_of,
 )
 
-ALONE_S = 60.0
+NO_BRIDGE_S = 60.0
 """Agents of named vehicles end when there was no bridge for this long (node clock)."""
 
 
@@ -73,7 +73,7 @@ class AgentHost:
         self._census_s = 0.0
         self._bridge = -1
         """Incarnation of the newest bridge."""
-        self._alone_since_s: float | None = 0.0
+        self._no_bridge_since_s: float | None = 0.0
         """When the bridge was lost; None: there is one."""
         self._solves = self._unusable = 0
         """Counters of agents that have ended."""
@@ -95,9 +95,9 @@ class AgentHost:
     @property
     def wakeup_s(self) -> float | None:
         """When to stop waiting for a bridge; a shard never stops."""
-        if self._shard is not None or self._alone_since_s is None:
+        if self._shard is not None or self._no_bridge_since_s is None:
             return None
-        return self._alone_since_s + ALONE_S
+        return self._no_bridge_since_s + NO_BRIDGE_S
 
     def handle(self, event: Event, now_s: float) -> list[Effect]:
         """Take an event; see `Core`."""
@@ -120,7 +120,7 @@ class AgentHost:
     def _on_event(self, event: Event, now_s: float) -> list[Effect]:
         match event:
             case Started():
-                self._alone_since_s = now_s
+                self._no_bridge_since_s = now_s
                 effects: list[Effect] = [Watch(BRIDGE_ALIVE)]
                 if self._shard is not None:
                     effects.append(Listen(CENSUS))
@@ -129,7 +129,7 @@ class AgentHost:
                 return self._on_bridge(incarnation_of(parameters))
             case PeerDown(topic, parameters) if topic is BRIDGE_ALIVE:
                 if incarnation_of(parameters) == self._bridge:
-                    self._alone_since_s = now_s
+                    self._no_bridge_since_s = now_s
             case Wakeup() if self.wakeup_s is not None and now_s >= self.wakeup_s:
                 return [End()]
             case Stopping():
@@ -168,7 +168,7 @@ class AgentHost:
         effects: list[Effect] = []
         if incarnation < max(self._bridge, 0):
             return effects  # left over from an earlier run, or no bridge at all
-        self._alone_since_s = None
+        self._no_bridge_since_s = None
         if self._shard is not None and self._bridge not in (-1, incarnation):
             for name in list(self._agents):
                 effects += self._remove(name).leave()

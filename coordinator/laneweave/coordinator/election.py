@@ -14,7 +14,7 @@ from attrs import define, field
 
 from laneweave.protocol.wire.messages import Heartbeat, Name
 
-NEWCOMER_SHARE = 1.5
+NEWCOMER_FACTOR = 1.5
 """A leader waits this many election times for a better-ranked newcomer to lead."""
 MAX_TERM = 2**62
 """Higher terms are ignored: following one would leave no room to count on."""
@@ -139,7 +139,7 @@ class Election:
         A newcomer may not lead before it is old enough; stepping down at once would leave no
         leader.
         """
-        return peer.since_s + NEWCOMER_SHARE * self.election_s
+        return peer.since_s + NEWCOMER_FACTOR * self.election_s
 
     def next_change_s(self, now_s: float) -> float:
         """Return when the next decision after `now_s` may be due without any message."""

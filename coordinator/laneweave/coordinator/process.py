@@ -23,7 +23,7 @@ from laneweave.protocol.wire.messages import Name
 
 log = structlog.get_logger(__name__)
 
-LONG_S = 8.0
+WARN_AFTER_S = 8.0
 """Loading takes a second or two, compiling most of a minute."""
 
 
@@ -50,7 +50,7 @@ def run_coordinator(
     Raises:
         BadInputError: no router answers at the scenario's endpoint.
     """
-    with _ends_at_once(), _told_when_long():
+    with _exits_on_sigterm(), _warns_when_slow():
         warm_up()
     workers = scenario.service.workers or max(1, len(os.sched_getaffinity(0)) - 1)
     core = CoordinatorCore(Name(name), Incarnations()(), scenario, workers=workers)
@@ -61,7 +61,7 @@ def run_coordinator(
 
 
 @contextlib.contextmanager
-def _ends_at_once() -> Iterator[None]:
+def _exits_on_sigterm() -> Iterator[None]:
     """Let SIGTERM end the process with status 0: it has nothing to complete yet.
 
     An exception that a handler raises inside a callback of the compiler would only be printed. So
@@ -87,9 +87,11 @@ def _ends_at_once() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _told_when_long() -> Iterator[None]:
+def _warns_when_slow() -> Iterator[None]:
     """Warn if the planner has to be compiled, not only loaded."""
-    timer = threading.Timer(LONG_S, log.warning, ("compiling the planner: once, for a minute",))
+    timer = threading.Timer(
+        WARN_AFTER_S, log.warning, ("compiling the planner: once, for a minute",)
+    )
     timer.daemon = True
     timer.start()
     try:

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from laneweave.coordinator.rolling import ownership
 from laneweave.coordinator.rolling.ownership import _Sign, owned_cells
 from laneweave.protocol.state_machine import Function, RuleBook
-from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES, all_are_ready, take_ownership
-from laneweave.protocol.wire.messages import Ballot, Deed, VehicleState
+from laneweave.protocol.vehicle.plan_execution import VEHICLE_RULES, all_are_ready, open_transfer
+from laneweave.protocol.wire.messages import Ballot, PendingTransfer, VehicleState
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
 from support.broken_cell_ownership import cancel_closed_transfers, forget_promise
 from support.rolling_road import Road, WrongError
@@ -55,20 +55,20 @@ def test_leaders_never_conclude_wrong_owned_cells() -> None:
             road.run(5)
             for leader in road.leaders:
                 for car in road.cars.values():
-                    deed, state = car.controller.transfer, car.state_now()
-                    if not state.estate:
+                    transfer, state = car.controller.transfer, car.state_now()
+                    if not state.owned:
                         continue  # a promise that its controller has not noted
-                    estate = owned_cells(state, leader.states)
-                    if estate is None:
+                    cells = owned_cells(state, leader.states)
+                    if cells is None:
                         not_told += 1
-                    elif estate == road.owned(car):
+                    elif cells == road.owned(car):
                         told += 1
                     else:
-                        assert deed is not None
-                        assert estate == set(deed.before) & set(deed.after)
-                        assert estate <= road.owned(car)
+                        assert transfer is not None
+                        assert cells == set(transfer.before) & set(transfer.after)
+                        assert cells <= road.owned(car)
                         told_in_part += 1
-                    assert estate is not None or (deed is not None and not deed.open)
+                    assert cells is not None or (transfer is not None and not transfer.open)
     assert told > 10 * told_in_part > 0
     assert told > not_told > 0
 
@@ -90,8 +90,8 @@ def newer_counts_as_closed(patch: pytest.MonkeyPatch) -> None:
     """A vehicle with a newer transfer counts as one whose gate stayed closed."""
     sign = ownership._sign
 
-    def mutant(state: VehicleState | None, deed: Deed) -> _Sign:
-        found = sign(state, deed)
+    def mutant(state: VehicleState | None, transfer: PendingTransfer) -> _Sign:
+        found = sign(state, transfer)
         return _Sign.CLOSED if found is _Sign.NEWER else found
 
     patch.setattr(ownership, "_sign", mutant)
@@ -106,6 +106,6 @@ def test_a_planted_bug_is_found(plant: object, monkeypatch: pytest.MonkeyPatch) 
     assert first_wrong() is not None
 
 
-@pytest.mark.parametrize("rule", [all_are_ready, take_ownership], ids=lambda rule: rule.__name__)
+@pytest.mark.parametrize("rule", [all_are_ready, open_transfer], ids=lambda rule: rule.__name__)
 def test_a_broken_rule_is_found(rule: Function) -> None:
     assert first_wrong(replacing(VEHICLE_RULES, {rule: lambda *_: True})) is not None

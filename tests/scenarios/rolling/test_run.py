@@ -39,9 +39,9 @@ def watched(street: Street) -> Callable[[], bool]:
             if controller.transfer is not None and controller.transfer.open:
                 opened.add(controller.transfer.ballot)
         for name, controller in controllers.items():
-            deed, cells = controller.transfer, set(controller.owned)
-            if deed is not None and not deed.open and deed.ballot in opened:
-                cells = set(deed.after)
+            transfer, cells = controller.transfer, set(controller.owned)
+            if transfer is not None and not transfer.open and transfer.ballot in opened:
+                cells = set(transfer.after)
             assert controller.hold_cell in cells
             for cell in cells:
                 assert cell not in owners, f"{cell} is of {owners[cell]} and of {name}"

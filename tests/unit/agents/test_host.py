@@ -9,7 +9,7 @@ import pytest
 from attrs import evolve
 
 from laneweave.agents.core import AgentCore
-from laneweave.agents.host import ALONE_S, AgentHost, AgentMetrics
+from laneweave.agents.host import NO_BRIDGE_S, AgentHost, AgentMetrics
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import (
     Announce,
@@ -211,8 +211,8 @@ def test_ends_when_no_bridge_comes(strangers: list[str]) -> None:
     give(host, Started(), 10.0)
     for stranger in strangers:
         give(host, PeerUp(BRIDGE_ALIVE, {"incarnation": stranger}), 11.0)
-    assert host.wakeup_s == 10.0 + ALONE_S
-    assert give(host, Wakeup(), 10.0 + ALONE_S) == [End()]
+    assert host.wakeup_s == 10.0 + NO_BRIDGE_S
+    assert give(host, Wakeup(), 10.0 + NO_BRIDGE_S) == [End()]
 
 
 def test_waits_for_its_vehicle_as_long_as_the_bridge_is_there() -> None:
@@ -223,8 +223,8 @@ def test_waits_for_its_vehicle_as_long_as_the_bridge_is_there() -> None:
     give(host, PeerDown(BRIDGE_ALIVE, {"incarnation": "6"}), 12.0)
     assert host.wakeup_s is None
     give(host, PeerDown(BRIDGE_ALIVE, {"incarnation": "7"}), 100.0)
-    assert give(host, Wakeup(), 99.0 + ALONE_S) == []
-    give(host, PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}), 99.5 + ALONE_S)
+    assert give(host, Wakeup(), 99.0 + NO_BRIDGE_S) == []
+    give(host, PeerUp(BRIDGE_ALIVE, {"incarnation": "7"}), 99.5 + NO_BRIDGE_S)
     assert host.wakeup_s is None
 
 
@@ -251,7 +251,7 @@ def test_what_is_no_newer_bridge_changes_nothing(other: str) -> None:
         assert give(host, PeerUp(BRIDGE_ALIVE, {"incarnation": other}), 12.0) == []
         assert give(host, PeerDown(BRIDGE_ALIVE, {"incarnation": other}), 13.0) == []
         assert host.wakeup_s is None
-        assert give(host, Wakeup(), 14.0 + ALONE_S) == []
+        assert give(host, Wakeup(), 14.0 + NO_BRIDGE_S) == []
     assert give(shard, census_of(A)) == []  # it has the vehicle still
 
 

@@ -446,7 +446,7 @@ def test_too_late_for_any_step_settles() -> None:
     effects = desk.tell(state(A, (0, 0), desk.ballot, t_s=1.0))
     assert jobs(effects) == []
     assert logged(effects) == ["formation-too-late"]
-    assert desk.leaders[0].phase is BallotPhase.GIVEN_UP
+    assert desk.leaders[0].phase is BallotPhase.ABORTED
     assert logged(desk.wait(5.0)) == []
 
 

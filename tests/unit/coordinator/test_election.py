@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from laneweave.coordinator.election import NEWCOMER_SHARE, Election
+from laneweave.coordinator.election import NEWCOMER_FACTOR, Election
 from laneweave.protocol.wire.messages import Heartbeat, Name
 
 ELECTION_S = 0.4
@@ -197,7 +197,7 @@ def test_a_leader_waits_for_a_newcomer_for_a_limited_time() -> None:
     """There is always a leader while a better-ranked candidate is too young to lead."""
     election = candidate()
     election.update(ELECTION_S)
-    patience_s = 1.0 + NEWCOMER_SHARE * ELECTION_S
+    patience_s = 1.0 + NEWCOMER_FACTOR * ELECTION_S
     for index in range(5):
         election.on_heartbeat(beat("a"), 1.0 + 0.1 * index)
         assert not election.update(1.0 + 0.1 * index)

@@ -51,7 +51,7 @@ class QPSettings:
     """Accuracy of the certificate of infeasibility."""
     polishing: bool = False
     """Whether a solution is refined on its active rows, usually to machine accuracy."""
-    row_tolerance: float = 2e-3
+    tolerance: float = 2e-3
     """A result that violates a row by more is not usable, whatever OSQP's status."""
 
 
@@ -80,7 +80,7 @@ class QPResult:
     status: int
     """OSQP's status: 1 solved, 2 inaccurate, 7 out of iterations, others: no solution."""
     iterations: int
-    row_violation: float
+    violation: float
     """Largest violation of a row by x, in the row's unit; infinite without a solution."""
 
 
@@ -173,7 +173,7 @@ class QuadraticProgram:
         violation = math.inf
         if status in (SOLVED, SOLVED_INACCURATE, MAX_ITERATIONS):
             violation = self._row_violation(scaled)
-        usable = violation <= self._settings.row_tolerance
+        usable = violation <= self._settings.tolerance
         x = scaled * self._scale.unknowns
         result = QPResult(x, usable, status, int(info.iter), violation)
         if not usable:

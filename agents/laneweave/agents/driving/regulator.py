@@ -89,7 +89,7 @@ class Regulator:
             ]
         )
         """Matrix (8 N, 6) that maps e_0 to the values of all constraint rows except the dynamics,
-        in the order of `program.RowBounds`."""
+        in the order of `program.ConstraintBounds`."""
         self.inputs = np.ascontiguousarray(self.rows[5 * ticks : 7 * ticks])
         """Matrix (2 N, 6) that maps e_0 to the jerks."""
         self._ticks = ticks

@@ -53,7 +53,7 @@ class TrackResult:
     """OSQP's; 0 on the fast path."""
     solve_ms: float
     """CPU time of the calling thread [ms]; the first tick that needs OSQP sets it up."""
-    row_violation: float
+    violation: float
     """Largest violation of a row by the solver's answer, before limits were applied."""
 
 
@@ -126,7 +126,7 @@ class Tracker:
         else:
             jerk = np.zeros((self._n, 2))
         elapsed_ms = (time.thread_time() - start) * 1e3
-        return TrackResult(jerk, usable, iterations, elapsed_ms, result.row_violation)
+        return TrackResult(jerk, usable, iterations, elapsed_ms, result.violation)
 
     def rest(self, state: State, goal: State) -> TrackResult | None:
         """Return the jerks that keep a vehicle in its cell when no other vehicle is near.

@@ -47,7 +47,7 @@ SETTINGS = QPSettings(
     rho=0.1,
     adaptive_rho_interval=0,
     alpha=1.25,
-    row_tolerance=2e-2,
+    tolerance=2e-2,
 )
 _GAP_SCALE, _JERK_SCALE = 20.0, 0.4
 """Row scales for OSQP; other rows have 1. With 1 for all, active gap rows take 300 iterations."""
@@ -135,7 +135,7 @@ class ErrorBounds:
         )
 
 
-class RowBounds:
+class ConstraintBounds:
     """One bound vector (14 N,) and views of its blocks."""
 
     def __init__(self, n: int) -> None:
@@ -268,7 +268,7 @@ class TrackingProgram:
 
 def program_scale(n: int) -> QPScale:
     """Return the units in which OSQP solves the program over n ticks fast."""
-    rows = RowBounds(n)
+    rows = ConstraintBounds(n)
     rows.all[:] = 1.0
     rows.jerk[:] = _JERK_SCALE
     rows.gap[:] = _GAP_SCALE
@@ -277,9 +277,9 @@ def program_scale(n: int) -> QPScale:
     return QPScale(rows.all, unknowns)
 
 
-def _initial_bounds(n: int) -> tuple[RowBounds, RowBounds]:
+def _initial_bounds(n: int) -> tuple[ConstraintBounds, ConstraintBounds]:
     """Return lower and upper bounds in which those that never change are set."""
-    low, high = RowBounds(n), RowBounds(n)
+    low, high = ConstraintBounds(n), ConstraintBounds(n)
     low.slip_left[:] = -np.inf
     high.slip_right[:] = np.inf
     low.gap[:], high.gap[:] = -FAR_M, FAR_M
@@ -288,7 +288,7 @@ def _initial_bounds(n: int) -> tuple[RowBounds, RowBounds]:
 
 @cache
 def _rows(n: int, h: float, slip: float) -> Any:  # noqa: ANN401 - scipy.sparse has no types
-    """Return A, rows in the order of `RowBounds`."""
+    """Return A, rows in the order of `ConstraintBounds`."""
     transition, effect = axis_matrices(h)
     eye = sparse.eye(n)
     shift = sparse.diags([np.ones(n - 1)], [-1], shape=(n, n))

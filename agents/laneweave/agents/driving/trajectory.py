@@ -67,7 +67,7 @@ _SETTINGS = QPSettings(
     alpha=1.8,
     eps_infeasible=1e-8,
     polishing=True,
-    row_tolerance=1e-4,
+    tolerance=1e-4,
 )
 
 

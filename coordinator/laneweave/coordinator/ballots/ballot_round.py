@@ -41,7 +41,7 @@ class BallotPhase(Enum):
     """All have accepted the plan."""
     BACKING_OFF = "backing off"
     """L7: a vehicle promised a higher ballot."""
-    GIVEN_UP = "given up"
+    ABORTED = "aborted"
     """Nothing more is sent; the vehicles hold, or follow the plan that is in force."""
 
 
@@ -145,77 +145,81 @@ class BallotRound:
         return self.due_s
 
 
-_WITHOUT_TIMER = (BallotPhase.PLANNING, BallotPhase.IN_FORCE, BallotPhase.GIVEN_UP)
+_WITHOUT_TIMER = (BallotPhase.PLANNING, BallotPhase.IN_FORCE, BallotPhase.ABORTED)
 
 
 # --- guards and actions -----------------------------------------------------------------------
 
 
-def shows_higher_promise(me: BallotRound, state: VehicleState) -> bool:
+def has_higher_promise(ballot_round: BallotRound, state: VehicleState) -> bool:
     """It promised more than b."""
-    return me.ballot is not None and state.promised is not None and state.promised > me.ballot
+    return (
+        ballot_round.ballot is not None
+        and state.promised is not None
+        and state.promised > ballot_round.ballot
+    )
 
 
-def had_promised(me: BallotRound, state: VehicleState) -> bool:
+def had_promised(ballot_round: BallotRound, state: VehicleState) -> bool:
     """Its promise was counted."""
-    return state.vehicle in me.promises
+    return state.vehicle in ballot_round.promises
 
 
-def restarted(me: BallotRound, state: VehicleState) -> bool:
+def restarted(ballot_round: BallotRound, state: VehicleState) -> bool:
     """Its incarnation is not the one that promised."""
-    promise = me.promises.get(state.vehicle)
+    promise = ballot_round.promises.get(state.vehicle)
     return promise is None or promise.incarnation != state.incarnation
 
 
-def is_promise(me: BallotRound, state: VehicleState) -> bool:
+def is_promise(ballot_round: BallotRound, state: VehicleState) -> bool:
     """It promised b and has not accepted."""
-    return state.promised == me.ballot and not state.accepted
+    return state.promised == ballot_round.ballot and not state.accepted
 
 
-def count_promise(me: BallotRound, state: VehicleState) -> None:
+def count_promise(ballot_round: BallotRound, state: VehicleState) -> None:
     """Count the promise, with hold cell and incarnation."""
-    me.promises[state.vehicle] = state
-    if len(me.promises) == len(me.roster) and not me.failures:
-        me.due_s = me.now_s
+    ballot_round.promises[state.vehicle] = state
+    if len(ballot_round.promises) == len(ballot_round.roster) and not ballot_round.failures:
+        ballot_round.due_s = ballot_round.now_s
 
 
-def all_have_promised(me: BallotRound, _: object) -> bool:
+def all_have_promised(ballot_round: BallotRound, _: object) -> bool:
     """The whole roster has promised."""
-    return set(me.promises) == set(me.roster)
+    return set(ballot_round.promises) == set(ballot_round.roster)
 
 
-def may_try(me: BallotRound, _: object) -> bool:
+def may_plan(ballot_round: BallotRound, _: object) -> bool:
     """The pause after failed planning is over."""
-    return not me.failures or me.now_s >= me.due_s
+    return not ballot_round.failures or ballot_round.now_s >= ballot_round.due_s
 
 
-def order_plan(me: BallotRound, _: object) -> None:
+def order_plan(ballot_round: BallotRound, _: object) -> None:
     """Plan from the hold cells."""
 
 
-def issue(me: BallotRound, plan: Plan) -> None:
+def issue(ballot_round: BallotRound, plan: Plan) -> None:
     """PLAN, the one and only of b."""
-    me.plan = plan
-    me.failures = 0
-    me.accepted = set()
-    me.due_s = me.now_s
-    me.until_s = me.now_s + ISSUE_S
+    ballot_round.plan = plan
+    ballot_round.failures = 0
+    ballot_round.accepted = set()
+    ballot_round.due_s = ballot_round.now_s
+    ballot_round.until_s = ballot_round.now_s + ISSUE_S
 
 
-def is_acceptance(me: BallotRound, state: VehicleState) -> bool:
+def is_acceptance(ballot_round: BallotRound, state: VehicleState) -> bool:
     """It accepted b."""
-    return state.promised == me.ballot and state.accepted
+    return state.promised == ballot_round.ballot and state.accepted
 
 
-def is_the_last(me: BallotRound, state: VehicleState) -> bool:
+def is_last_acceptance(ballot_round: BallotRound, state: VehicleState) -> bool:
     """All others have accepted."""
-    return me.accepted | {state.vehicle} >= set(me.roster)
+    return ballot_round.accepted | {state.vehicle} >= set(ballot_round.roster)
 
 
-def count_acceptance(me: BallotRound, state: VehicleState) -> None:
+def count_acceptance(ballot_round: BallotRound, state: VehicleState) -> None:
     """Count the acceptance."""
-    me.accepted.add(state.vehicle)
-    me.back_offs = 0
+    ballot_round.accepted.add(state.vehicle)
+    ballot_round.back_offs = 0
 
 
 # --- the rows that both operations share ------------------------------------------------------
@@ -225,11 +229,16 @@ _IN_FORCE = BallotPhase.IN_FORCE
 
 PLAN_RULES = (
     Transition(
-        "L5", PROMISED, (_PREPARING,), (all_have_promised, may_try), (order_plan,), _PLANNING
+        "L5", PROMISED, (_PREPARING,), (all_have_promised, may_plan), (order_plan,), _PLANNING
     ),
     Transition("L5", PLANNED, (_PLANNING,), (), (issue,), _ISSUING),
     Transition(
-        "L6", STATE, (_ISSUING,), (is_acceptance, is_the_last), (count_acceptance,), _IN_FORCE
+        "L6",
+        STATE,
+        (_ISSUING,),
+        (is_acceptance, is_last_acceptance),
+        (count_acceptance,),
+        _IN_FORCE,
     ),
     Transition("L6", STATE, (_ISSUING,), (is_acceptance,), (count_acceptance,)),
 )
@@ -248,12 +257,12 @@ def is_older(state: VehicleState, other: VehicleState) -> bool:
 
 
 def _age(state: VehicleState) -> tuple[object, ...]:
-    transfer = state.deed
+    transfer = state.transfer
     return (
         state.incarnation,
         state.t_s,
         state.promised or (),
-        bool(state.estate),
+        bool(state.owned),
         state.accepted,
         (transfer.ballot, transfer.open) if transfer is not None else (),
     )

@@ -25,10 +25,10 @@ from laneweave.coordinator.ballots.ballot_round import (
     BallotRound,
     count_promise,
     had_promised,
+    has_higher_promise,
     is_older,
     is_promise,
     restarted,
-    shows_higher_promise,
 )
 from laneweave.coordinator.formations.roster import Formation
 from laneweave.protocol.state_machine import RuleBook, Transition
@@ -123,72 +123,72 @@ class FormationLeader(BallotRound):
 # --- guards and actions -----------------------------------------------------------------------
 
 
-def observe_members(me: FormationLeader, _: object) -> None:
+def observe_members(leader: FormationLeader, _: object) -> None:
     """Listen to all members."""
-    me.states.clear()
-    me.promises = {}
-    me.until_s = me.due_s = me.now_s + OBSERVE_S
+    leader.states.clear()
+    leader.promises = {}
+    leader.until_s = leader.due_s = leader.now_s + OBSERVE_S
 
 
-def all_are_heard(me: FormationLeader, _: object) -> bool:
+def all_have_reported(leader: FormationLeader, _: object) -> bool:
     """All members have shown their states."""
-    return all(name in me.states for name in me.roster)
+    return all(name in leader.states for name in leader.roster)
 
 
-def one_plan_is_in_force(me: FormationLeader, _: object) -> bool:
+def one_plan_is_in_force(leader: FormationLeader, _: object) -> bool:
     """All show the same ballot as accepted, no member is overdue."""
-    states = [me.states[name] for name in me.roster]
+    states = [leader.states[name] for name in leader.roster]
     return len({state.promised for state in states}) == 1 and all(
         state.accepted and not state.overdue for state in states
     )
 
 
-def adopt(me: FormationLeader, _: object) -> None:
+def adopt(leader: FormationLeader, _: object) -> None:
     """Adopt: send nothing, watch."""
-    me.ballot = next(iter(me.states.values())).promised
+    leader.ballot = next(iter(leader.states.values())).promised
     # The promises were given to another leader; a vehicle that has accepted has promised.
-    me.promises = dict(me.states)
-    me.back_offs = 0
+    leader.promises = dict(leader.states)
+    leader.back_offs = 0
     # This plan may bring members to their lanes that an earlier one could not.
-    me.out_of_reach = frozenset()
+    leader.out_of_reach = frozenset()
 
 
-def time_is_up(me: FormationLeader, _: object) -> bool:
+def time_is_up(leader: FormationLeader, _: object) -> bool:
     """The phase has lasted for long enough."""
-    return me.now_s >= me.until_s
+    return leader.now_s >= leader.until_s
 
 
-def prepare(me: FormationLeader, _: object) -> None:
+def prepare(leader: FormationLeader, _: object) -> None:
     """PREPARE a new ballot, above all that members have shown."""
-    me.ballot = me.new_ballot(me.highest)
-    me.plan = None
-    me.promises = {}
-    me.accepted = set()
-    me.failures = 0
-    me.due_s = me.now_s
+    leader.ballot = leader.new_ballot(leader.highest)
+    leader.plan = None
+    leader.promises = {}
+    leader.accepted = set()
+    leader.failures = 0
+    leader.due_s = leader.now_s
 
 
-def back_off(me: FormationLeader, _: object) -> None:
+def back_off(leader: FormationLeader, _: object) -> None:
     """Pause for 0.05 to 0.3 s, twice as long each time in a row."""
-    pause_s = me.rng.uniform(*BACK_OFF_S) * 2.0 ** min(me.back_offs, MAX_BACK_OFFS)
-    me.back_offs += 1
-    me.until_s = me.due_s = me.now_s + pause_s
+    pause_s = leader.rng.uniform(*BACK_OFF_S) * 2.0 ** min(leader.back_offs, MAX_BACK_OFFS)
+    leader.back_offs += 1
+    leader.until_s = leader.due_s = leader.now_s + pause_s
 
 
-def has_joined(me: FormationLeader, state: VehicleState) -> bool:
+def has_joined(leader: FormationLeader, state: VehicleState) -> bool:
     """It has joined the formations of b and no others."""
-    return state.joined == me.formation.numbers
+    return state.joined == leader.formation.numbers
 
 
-def void_promise(me: FormationLeader, state: VehicleState) -> None:
+def void_promise(leader: FormationLeader, state: VehicleState) -> None:
     """Void the promise: it has lost its memory since."""
-    del me.promises[state.vehicle]
+    del leader.promises[state.vehicle]
 
 
-def keep_ballot(me: FormationLeader, _: object) -> None:
+def keep_ballot(leader: FormationLeader, _: object) -> None:
     """Keep the ballot, try again after 1, 2, 4, 8, 8, ... s."""
-    me.due_s = me.now_s + min(RETRY_S * 2.0**me.failures, LONGEST_RETRY_S)
-    me.failures += 1
+    leader.due_s = leader.now_s + min(RETRY_S * 2.0**leader.failures, LONGEST_RETRY_S)
+    leader.failures += 1
 
 
 def stalls(_: FormationLeader, state: VehicleState) -> bool:
@@ -196,27 +196,27 @@ def stalls(_: FormationLeader, state: VehicleState) -> bool:
     return state.overdue
 
 
-def is_astray(me: FormationLeader, state: VehicleState) -> bool:
+def is_off_lane(leader: FormationLeader, state: VehicleState) -> bool:
     """It is done on a lane that it does not prefer, though it could reach its own.
 
     An adopted plan may have been made for targets that this leader never saw.
     """
     return (
-        me.formation.sorts
+        leader.formation.sorts
         and state.done
         and state.attended
-        and state.vehicle not in me.out_of_reach
+        and state.vehicle not in leader.out_of_reach
         and any(
             member.vehicle == state.vehicle and member.preferred_lane != state.hold_cell[1]
-            for member in me.formation.members
+            for member in leader.formation.members
         )
     )
 
 
-def has_new_targets(me: FormationLeader, formation: Formation) -> bool:
+def has_new_targets(leader: FormationLeader, formation: Formation) -> bool:
     """There are new targets, new members, or another structure to take on."""
-    return formation.stage != me.formation.stage or not (
-        set(formation.members) <= set(me.formation.members)
+    return formation.stage != leader.formation.stage or not (
+        set(formation.members) <= set(leader.formation.members)
     )
 
 
@@ -229,10 +229,10 @@ _PREPARE = (prepare,), BallotPhase.PREPARING
 
 LEADER_RULES: RuleBook = RuleBook(
     (
-        Transition("L2", STATE, _OBSERVING, (all_are_heard, one_plan_is_in_force), *_ADOPT),
-        Transition("L3", STATE, _OBSERVING, (all_are_heard,), *_PREPARE),
+        Transition("L2", STATE, _OBSERVING, (all_have_reported, one_plan_is_in_force), *_ADOPT),
+        Transition("L3", STATE, _OBSERVING, (all_have_reported,), *_PREPARE),
         Transition("L3", TIME, _OBSERVING, (time_is_up,), *_PREPARE),
-        Transition("L7", STATE, (*UNFINISHED, *_IN_FORCE), (shows_higher_promise,), *_BACK_OFF),
+        Transition("L7", STATE, (*UNFINISHED, *_IN_FORCE), (has_higher_promise,), *_BACK_OFF),
         Transition("L8", STATE, (*_PLANNING, *_ISSUING, *_IN_FORCE), (restarted,), *_PREPARE),
         Transition("L4", STATE, _PREPARING, (is_promise, has_joined), (count_promise,)),
         *PLAN_RULES,
@@ -241,10 +241,10 @@ LEADER_RULES: RuleBook = RuleBook(
             "L7", TIME, _BACKING_OFF, (time_is_up,), (observe_members,), BallotPhase.OBSERVING
         ),
         Transition("L4", STATE, _PREPARING, (had_promised,), (void_promise,)),
-        Transition("L5", TOO_LATE, _PLANNING, (), (), BallotPhase.GIVEN_UP),
+        Transition("L5", TOO_LATE, _PLANNING, (), (), BallotPhase.ABORTED),
         Transition("L8", TIME, _ISSUING, (time_is_up,), *_PREPARE),
         Transition("L8", STATE, _IN_FORCE, (stalls,), *_PREPARE),
-        Transition("L8", STATE, _IN_FORCE, (is_astray,), *_PREPARE),
+        Transition("L8", STATE, _IN_FORCE, (is_off_lane,), *_PREPARE),
         Transition("L8", MEMBERS, UNFINISHED, (), *_PREPARE),
         Transition("L8", MEMBERS, _IN_FORCE, (has_new_targets,), *_PREPARE),
     )

@@ -73,7 +73,7 @@ def paced(
         if len(slots_s) > 1:
             t0_s = _start_s(plan, slot_s, not_before_s, scenario)
         max_steps = max(0, int((end_s - t0_s) / slot_s))
-        best = kept_apart(evolve(plan, t0_s=t0_s, slot_s=slot_s), others, slack_s, max_steps)
+        best = with_pauses(evolve(plan, t0_s=t0_s, slot_s=slot_s), others, slack_s, max_steps)
         if t0_s + steps_of(best) * slot_s <= end_s - reserve_s:
             return best
     return best
@@ -90,7 +90,7 @@ def _start_s(plan: Plan, slot_s: float, not_before_s: float, scenario: Scenario)
     return min(plan.t0_s, on_tick(max([not_before_s, *in_time]), scenario))
 
 
-def kept_apart(plan: Plan, others: Iterable[Plan], slack_s: float, max_steps: int) -> Plan:
+def with_pauses(plan: Plan, others: Iterable[Plan], slack_s: float, max_steps: int) -> Plan:
     """Return a plan with pauses, so that none of its moves closes up with one of other plans.
 
     All vehicles pause together, so the order of moves stays as it was planned.

@@ -232,10 +232,10 @@ class FormationPlanner:
         _, number, ballot = self._under_way
         self._under_way = None
         if self._wanted(number, ballot):
-            yield from self._use(computed, self._leaders[number], t_s, now_s)
+            yield from self._apply(computed, self._leaders[number], t_s, now_s)
         yield from self._begin()
 
-    def _use(
+    def _apply(
         self, computed: Computed, leader: FormationLeader, t_s: float, now_s: float
     ) -> Iterator[LogEntry]:
         number = leader.formation.numbers[0]
@@ -245,7 +245,7 @@ class FormationPlanner:
             if result.short_of_room and self._join_neighbour(leader, t_s):
                 yield LogEntry(FORMATIONS_JOINED, {"formations": list(self._groups.of(number))})
                 return
-            if result.short_of_room and self._room_is_coming(leader.formation.numbers, t_s):
+            if result.short_of_room and self._next_closes_soon(leader.formation.numbers, t_s):
                 leader.take(FAILED, now_s)
                 yield LogEntry(ROOM_AWAITED, {"formation": number})
                 return
@@ -256,7 +256,7 @@ class FormationPlanner:
                 if not problems:
                     leader.on_plan(plan, now_s, result.out_of_reach)
                     pauses = steps_of(plan) - steps_of(planned)
-                    yield from _notes(leader.formation, result, pauses, plan)
+                    yield from _log_entries(leader.formation, result, pauses, plan)
                     return
                 error = "; ".join(problems)
         leader.take(FAILED, now_s)
@@ -268,11 +268,11 @@ class FormationPlanner:
 
         Both plan under one ballot from now on.
         """
-        numbers, most = leader.formation.numbers, self._scenario.formation.max_joined
+        numbers, max_joined = leader.formation.numbers, self._scenario.formation.max_joined
         for other in self._neighbours(numbers):
-            if other.phase is BallotPhase.GIVEN_UP:
+            if other.phase is BallotPhase.ABORTED:
                 continue
-            if leader.formation.joined + other.formation.joined > most:
+            if leader.formation.joined + other.formation.joined > max_joined:
                 continue
             union = (*numbers, *other.formation.numbers)
             if self._steps_left_in(union, t_s) > 0:
@@ -296,7 +296,7 @@ class FormationPlanner:
             if neighbour is not None:
                 yield neighbour
 
-    def _room_is_coming(self, numbers: Numbers, t_s: float) -> bool:
+    def _next_closes_soon(self, numbers: Numbers, t_s: float) -> bool:
         """Return whether the next formation, which may be joined, is about to close."""
         formation, lattice = self._scenario.formation, self._scenario.lattice
         if formation.closes_by_vehicles or len(numbers) >= formation.max_joined:
@@ -313,14 +313,14 @@ class FormationPlanner:
     def _paced(self, plan: Plan, leader: FormationLeader, t_s: float) -> Plan:
         """Choose the slots of a plan; it begins when its vehicles have settled in their cells."""
         formation, cells = leader.formation, plan.start_cells.values()
-        others = self._plans_beside(plan)
+        others = self._neighbouring_plans(plan)
         if not formation.sorts:
             return paced(plan, others, plan.t0_s, self._end_s(formation), self._scenario)
         end_s = time_left_s({*cells, *plan.territory}, 0.0, self._scenario)
         not_before_s = max(self._settled_s(cells), t_s + START_MARGIN_S)
         return paced(plan, others, not_before_s, end_s, self._scenario)
 
-    def _plans_beside(self, plan: Plan) -> list[Plan]:
+    def _neighbouring_plans(self, plan: Plan) -> list[Plan]:
         """Return the plans of the neighbours that this leader has made and that are driven."""
         if "closing" not in self._scenario.formation.conflict_kinds:
             return []
@@ -347,14 +347,16 @@ class FormationPlanner:
         return lattice.passing_time_s(rear) + formation.entry_spread_s + formation.settle_s
 
 
-def _notes(formation: Formation, sorting: Sorting, pauses: int, plan: Plan) -> Iterator[LogEntry]:
+def _log_entries(
+    formation: Formation, sorting: Sorting, pauses: int, plan: Plan
+) -> Iterator[LogEntry]:
     number = formation.numbers[0]
     if sorting.impossible:
         data = {"formation": number, "stage": formation.stage, "why": sorting.impossible}
         yield LogEntry(STRUCTURE_IMPOSSIBLE, data)
     if sorting.response is not None:
         timing = {"t0_s": plan.t0_s, "slot_s": plan.slot_s}
-        yield LogEntry(PLAN_MADE, _facts(number, sorting.response) | timing)
+        yield LogEntry(PLAN_MADE, _log_data(number, sorting.response) | timing)
     if pauses:
         yield LogEntry(NEIGHBOURS_AWAITED, {"formation": number, "slots": pauses})
     if sorting.out_of_reach:
@@ -362,6 +364,6 @@ def _notes(formation: Formation, sorting: Sorting, pauses: int, plan: Plan) -> I
         yield LogEntry(LANE_OUT_OF_REACH, {"formation": number, "vehicles": vehicles})
 
 
-def _facts(number: int, response: PlanResponse) -> dict[str, Any]:
+def _log_data(number: int, response: PlanResponse) -> dict[str, Any]:
     facts = {name: getattr(response, name) for name in LOGGED}
     return {"formation": number, "vehicles": len(response.paths), **facts}

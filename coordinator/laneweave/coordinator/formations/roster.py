@@ -110,14 +110,14 @@ def closed_formations(
     for entry in census.on_road:
         first = groups.of(lattice.block_of(entry.cell[0]))[0]
         members.setdefault(first, []).append(entry)
-    inhabited = {block for closed in census.formations for block in closed.blocks}
+    listed_blocks = {block for closed in census.formations for block in closed.blocks}
     return {
         first: Formation(
             groups.of(first),
             tuple(sorted(each, key=lambda entry: entry.vehicle)),
             max(closed_s.get(first, [0.0])),
             len(closed_s.get(first, [0.0])),
-            tuple(block for block in groups.of(first) if block not in inhabited),
+            tuple(block for block in groups.of(first) if block not in listed_blocks),
             stage := stage_at(groups.of(first), t_s, scenario),
             stage == len(scenario.formation.structures),
         )
@@ -146,7 +146,7 @@ def stage_begin_s(numbers: Numbers, stage: int, scenario: Scenario) -> float:
     return lattice.passing_time_s(rear, from_m + scenario.vehicle.length_m)
 
 
-def with_room(
+def pairs_to_join(
     formations: Mapping[int, Formation], t_s: float, scenario: Scenario
 ) -> Iterator[Numbers]:
     """Yield the blocks of neighbouring formations whose vehicles fit into one (paper, Fig. 2b).

@@ -119,7 +119,7 @@ def _at(t_s: float, newest: _News | None, before: _News | None) -> _News | None:
 
 def _gone(states: Iterable[VehicleState], census: Census | None) -> frozenset[Name]:
     listed = {entry.vehicle for entry in census.on_road} if census else set[Name]()
-    transfers = [state.deed for state in states if state.deed is not None]
+    transfers = [state.transfer for state in states if state.transfer is not None]
     return frozenset(
         name for transfer in transfers for name in transfer.roster if name not in listed
     )

@@ -25,28 +25,28 @@ from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.runtime.node import Compute, Computed, Effect
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.events import (
-    HANDOVER_GIVEN_UP,
     PLAN_IN_FORCE,
     PLANNING_FAILED,
     PLANNING_LATE,
     STREAM_PLANNED,
+    TRANSFER_ABORTED,
 )
 from laneweave.protocol.wire.messages import Ballot, Census, Name, Plan, Prepare, VehicleState
 
-SHOWN_S = 0.5
+SNAPSHOT_S = 0.5
 """Vehicles that move in a slot have begun, and shown it, this long after the slot has begun.
 
 Plans are made from the states up to then, one tick later, when all of them have arrived: so plans
 do not depend on how fast messages are."""
-PATIENCE_S = 0.5
+LISTEN_S = 0.5
 """How long a new leader listens before it plans (node clock). One that leads only for a moment,
 because it has not heard another leader, must not outbid the ballots of that one."""
-LATEST_S = 1.0
+MAX_DELAY_S = 1.0
 """A plan that is ready later than this after its slot has begun is dropped."""
-AHEAD_M = 600.0
+LOOKAHEAD_M = 600.0
 """How far before the place where moves begin vehicles are planned for: the length of S3, so that
 all vehicles that can come near each other there are known in time."""
-BESIDE = 10
+MARGIN_COLUMNS = 10
 """Columns ahead of the foremost vehicle and behind the rearmost one that may be planned with."""
 
 
@@ -82,13 +82,13 @@ class RollingOperation:
         self._ordered: tuple[int, int] | None = None
         """Numbers of the computation under way and of the slot that it plans."""
         self._newest_slot = -1
-        self._table: StreamPlan | None = None
+        self._last_plan: StreamPlan | None = None
 
     def forget(self) -> None:
         """Forget everything: there is another road."""
         self.take_over()
         self.observed.forget()
-        self._table, self._newest_slot = None, -1
+        self._last_plan, self._newest_slot = None, -1
 
     def take_over(self) -> None:
         """Begin anew: listen for a while before anything is planned.
@@ -118,13 +118,13 @@ class RollingOperation:
         if transfer is None or not transfer.unfinished:
             return None
         transfer.on_state(state, self.observed.states, now_s)
-        if transfer.phase is BallotPhase.GIVEN_UP:
-            data = {"roster": list(transfer.roster), "why": transfer.why}
-            return [LogEntry(HANDOVER_GIVEN_UP, data)]
+        if transfer.phase is BallotPhase.ABORTED:
+            data = {"roster": list(transfer.roster), "why": transfer.reason}
+            return [LogEntry(TRANSFER_ABORTED, data)]
         if transfer.phase is BallotPhase.IN_FORCE and self.in_force == 1:
             slot = round(transfer.t0_s / self._slot_s)
             begun_s = transfer.t0_s - self._slot_s
-            return [LogEntry(PLAN_IN_FORCE, {"slot": slot, "closed_s": begun_s + SHOWN_S})]
+            return [LogEntry(PLAN_IN_FORCE, {"slot": slot, "closed_s": begun_s + SNAPSHOT_S})]
         return []
 
     def lead(
@@ -157,32 +157,32 @@ class RollingOperation:
         if self._since is None:
             self._since = t_s, now_s
         for transfer in self.transfers:
-            if t_s > transfer.t0_s + LATEST_S:
-                transfer.give_up("its slot has begun")
+            if t_s > transfer.t0_s + MAX_DELAY_S:
+                transfer.abort("its slot has begun")
         if not census.on_road or self._ordered is not None:
             return
         slot = math.floor(t_s / self._slot_s + 1e-9)
-        look_s = slot * self._slot_s + SHOWN_S + 1e-6
-        if slot < self._newest_slot or t_s <= look_s or now_s < self._since[1] + PATIENCE_S:
+        snapshot_s = slot * self._slot_s + SNAPSHOT_S + 1e-6
+        if slot < self._newest_slot or t_s <= snapshot_s or now_s < self._since[1] + LISTEN_S:
             return
-        if max(self._since[0], t_s - 1.5 * self._scenario.runtime.tick_s) > look_s:
-            look_s = t_s  # too late for that time: take the newest states
-        vehicles, blocked = self._observed_at(look_s, slot + 1)
+        if max(self._since[0], t_s - 1.5 * self._scenario.runtime.tick_s) > snapshot_s:
+            snapshot_s = t_s  # too late for that time: take the newest states
+        vehicles, blocked = self._observed_at(snapshot_s, slot + 1)
         self._newest_slot = slot + 1
         job = self._new_job()
         self._ordered = (job, slot + 1)
-        yield Compute(job, partial(self._planner, slot + 1, vehicles, self._table, blocked))
+        yield Compute(job, partial(self._planner, slot + 1, vehicles, self._last_plan, blocked))
 
     def _observed_at(
-        self, look_s: float, slot: int
+        self, snapshot_s: float, slot: int
     ) -> tuple[tuple[StreamVehicle, ...], frozenset[Cell]]:
         """Return the vehicles to plan for from a slot on, and the cells that they cannot use."""
         vehicles: dict[Cell, StreamVehicle] = {}
         owned, taken = set[Cell](), set[Cell]()
         # States received while this coordinator led before do not tell where vehicles are now.
         since_s = self._since[0] - 1e-6 if self._since is not None else 0.0
-        far_m = self._scenario.moves_from_m - AHEAD_M
-        then = self.observed.at(look_s)
+        far_m = self._scenario.moves_from_m - LOOKAHEAD_M
+        then = self.observed.at(snapshot_s)
         # A vehicle that was not heard may be elsewhere by now, and another one in its cell.
         for entry in sorted(
             then.census.on_road, key=lambda entry: entry.vehicle not in then.states
@@ -200,14 +200,14 @@ class RollingOperation:
             late = state.go and not state.done and not state.moving
             owned |= certain_cells(state, then.states, then.gone)
             if late:
-                taken |= {*state.estate} - {state.hold_cell}
+                taken |= {*state.owned} - {state.hold_cell}
             held = late or not state.attended or state.t_s < since_s
             heard = StreamVehicle(entry.vehicle, state.hold_cell, entry.preferred_lane, held)
             vehicles.setdefault(state.hold_cell, heard)
         columns = [column for column, _ in vehicles] or [0]
         blocked = frozenset(
             (column, lane)
-            for column in range(min(columns) - BESIDE, max(columns) + BESIDE + 1)
+            for column in range(min(columns) - MARGIN_COLUMNS, max(columns) + MARGIN_COLUMNS + 1)
             for lane in range(self._scenario.road.lanes)
             if (column, lane) not in owned or (column, lane) in taken
         )
@@ -226,35 +226,35 @@ class RollingOperation:
         slot = self._ordered[1]
         self._ordered = None
         for transfer in self.transfers:
-            transfer.give_up("the next slot is planned")
-        table = computed.result
-        if not isinstance(table, StreamPlan):
+            transfer.abort("the next slot is planned")
+        plan = computed.result
+        if not isinstance(plan, StreamPlan):
             yield LogEntry(PLANNING_FAILED, {"slot": slot, "error": computed.error})
             return
-        self._table = table
+        self._last_plan = plan
         t0_s = slot * self._slot_s
-        if t_s > t0_s + LATEST_S:
+        if t_s > t0_s + MAX_DELAY_S:
             yield LogEntry(PLANNING_LATE, {"slot": slot})
             return
-        self.transfers = list(self._make_transfers(table, t0_s, now_s))
+        self.transfers = list(self._make_transfers(plan, t0_s, now_s))
         self._transfer_of = {name: each for each in self.transfers for name in each.roster}
-        yield LogEntry(STREAM_PLANNED, self._facts(table))
+        yield LogEntry(STREAM_PLANNED, self._log_data(plan))
 
-    def _facts(self, table: StreamPlan) -> dict[str, Any]:
+    def _log_data(self, plan: StreamPlan) -> dict[str, Any]:
         sizes = [len(transfer.roster) for transfer in self.transfers]
         return {
-            "slot": table.slot,
-            "vehicles": len(table.paths),
-            "missed": len(table.missed),
+            "slot": plan.slot,
+            "vehicles": len(plan.paths),
+            "missed": len(plan.missed),
             "moves": sum(len(transfer.moves) for transfer in self.transfers),
             "ballots": len(sizes),
             "largest": max(sizes, default=0),
             "status": "feasible",
-            "solve_ms": table.solve_ms,
+            "solve_ms": plan.solve_ms,
         }
 
     def _make_transfers(
-        self, table: StreamPlan, t0_s: float, now_s: float
+        self, plan: StreamPlan, t0_s: float, now_s: float
     ) -> Iterator[CellTransfer]:
         states, gone = self.observed.states, self.observed.gone
         owner = {
@@ -263,19 +263,19 @@ class RollingOperation:
             for cell in certain_cells(state, states, gone)
         }
         moves: dict[Name, tuple[Cell, Cell]] = {}
-        concerned: dict[Name, set[Name]] = {}
-        for vehicle, way in table.paths.items():
-            if len(way) < 2 or way[0] == way[1]:
+        rosters: dict[Name, set[Name]] = {}
+        for vehicle, path in plan.paths.items():
+            if len(path) < 2 or path[0] == path[1]:
                 continue
             name = Name(vehicle)
             state = states.get(name)
-            if state is None or state.hold_cell != way[0]:
+            if state is None or state.hold_cell != path[0]:
                 continue  # it has moved meanwhile
-            cells = footprint(way[0], way[1])
+            cells = footprint(path[0], path[1])
             if all(cell in owner for cell in cells):
-                moves[name] = (way[0], way[1])
-                concerned[name] = self._with_partners({owner[cell] for cell in cells} | {name})
-        for roster in _clusters(concerned.values()):
+                moves[name] = (path[0], path[1])
+                rosters[name] = self._with_partners({owner[cell] for cell in cells} | {name})
+        for roster in _clusters(rosters.values()):
             yield CellTransfer(
                 ballot=self._new_ballot(self._highest),
                 roster=tuple(sorted(roster)),

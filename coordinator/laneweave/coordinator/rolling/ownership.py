@@ -11,7 +11,7 @@ from collections.abc import Collection, Mapping
 from enum import Enum
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.wire.messages import Deed, Name, VehicleState
+from laneweave.protocol.wire.messages import Name, PendingTransfer, VehicleState
 
 States = Mapping[Name, VehicleState]
 
@@ -35,9 +35,9 @@ def owned_cells(
     Returns:
         None: it cannot be told yet.
     """
-    transfer = state.deed
+    transfer = state.transfer
     if transfer is None or transfer.open:
-        return frozenset(state.estate)
+        return frozenset(state.owned)
     before, after = frozenset(transfer.before), frozenset(transfer.after)
     signs = _signs(state, transfer, states, gone)
     if _Sign.OPEN in signs:
@@ -53,7 +53,7 @@ def certain_cells(
     state: VehicleState, states: States, gone: Collection[Name] = ()
 ) -> frozenset[Cell]:
     """Return the cells that a vehicle owns whichever way its pending transfer resolves."""
-    owned, transfer = owned_cells(state, states, gone), state.deed
+    owned, transfer = owned_cells(state, states, gone), state.transfer
     if owned is not None or transfer is None:
         return owned or frozenset()
     return frozenset(transfer.before) & frozenset(transfer.after)
@@ -61,7 +61,7 @@ def certain_cells(
 
 def partners(state: VehicleState, states: States) -> frozenset[Name]:
     """Return the vehicles whose promises would tell what a vehicle owns; none if that is known."""
-    transfer = state.deed
+    transfer = state.transfer
     if transfer is None or transfer.open:
         return frozenset()
     signs = _signs(state, transfer, states, ())
@@ -82,7 +82,7 @@ class _Sign(Enum):
 
 
 def _signs(
-    state: VehicleState, transfer: Deed, states: States, gone: Collection[Name]
+    state: VehicleState, transfer: PendingTransfer, states: States, gone: Collection[Name]
 ) -> set[_Sign]:
     others = [name for name in transfer.roster if name != state.vehicle]
     signs = {_sign(states.get(name), transfer) for name in others if name not in gone}
@@ -91,15 +91,15 @@ def _signs(
     return signs | {_sign(state, transfer)}
 
 
-def _sign(state: VehicleState | None, transfer: Deed) -> _Sign:
+def _sign(state: VehicleState | None, transfer: PendingTransfer) -> _Sign:
     if state is None:
         return _Sign.NONE
-    theirs = state.deed
+    theirs = state.transfer
     if theirs is not None and theirs.ballot > transfer.ballot:
         return _Sign.NEWER
     known = theirs is not None and theirs.ballot == transfer.ballot
     if known and theirs is not None and theirs.open:
         return _Sign.OPEN
-    if state.promised is None or state.promised <= transfer.ballot or not state.estate:
+    if state.promised is None or state.promised <= transfer.ballot or not state.owned:
         return _Sign.NONE
     return _Sign.CLOSED if known else _Sign.WITHOUT

@@ -25,9 +25,9 @@ from laneweave.coordinator.ballots.ballot_round import (
     BallotRound,
     count_promise,
     had_promised,
+    has_higher_promise,
     is_promise,
     restarted,
-    shows_higher_promise,
 )
 from laneweave.coordinator.rolling.ownership import States, owned_cells
 from laneweave.protocol.lattice import Cell, PlannedMove, footprint
@@ -52,7 +52,7 @@ class CellTransfer(BallotRound):
     slot_s: float
     gone: frozenset[Name] = frozenset()
     """Vehicles that have left the road, of those in pending transfers of members."""
-    why: str = ""
+    reason: str = ""
     """Why it was given up."""
 
     @property
@@ -71,9 +71,9 @@ class CellTransfer(BallotRound):
         """Give up: a member has left the road."""
         self.rules.take(self, MEMBERS, f"{vehicle} has left")
 
-    def give_up(self, why: str) -> None:
+    def abort(self, reason: str) -> None:
         """Give up, unless it is in force or given up already: no time is left."""
-        self.rules.take(self, TOO_LATE, why)
+        self.rules.take(self, TOO_LATE, reason)
 
     def _make_plan(self, states: States) -> Plan | str:
         """Return the plan from the promises, or why it cannot be made any more."""
@@ -107,38 +107,38 @@ class CellTransfer(BallotRound):
 # --- guards and actions -----------------------------------------------------------------------
 
 
-def shows_owned_cells(_: CellTransfer, state: VehicleState) -> bool:
+def reports_owned_cells(_: CellTransfer, state: VehicleState) -> bool:
     """It shows the cells that it owns: its controller has noted the promise."""
-    return bool(state.estate)
+    return bool(state.owned)
 
 
-def note_outbid(me: CellTransfer, _: object) -> None:
+def record_outbid(transfer: CellTransfer, _: object) -> None:
     """Give up until the next slot."""
-    me.why = "outbid"
+    transfer.reason = "outbid"
 
 
-def note_restart(me: CellTransfer, state: VehicleState) -> None:
+def record_restart(transfer: CellTransfer, state: VehicleState) -> None:
     """Give up until the next slot."""
-    me.why = f"{state.vehicle} has restarted"
+    transfer.reason = f"{state.vehicle} has restarted"
 
 
-def note_reason(me: CellTransfer, why: str) -> None:
+def record_reason(transfer: CellTransfer, reason: str) -> None:
     """Give up until the next slot."""
-    me.why = why
+    transfer.reason = reason
 
 
 _PREPARING, _PLANNING, _ISSUING = UNFINISHED
-_WAITING, _GIVEN_UP = (_PREPARING, _ISSUING), BallotPhase.GIVEN_UP
+_WAITING, _ABORTED = (_PREPARING, _ISSUING), BallotPhase.ABORTED
 
 TRANSFER_RULES: RuleBook = RuleBook(
     (
-        Transition("L7", STATE, _WAITING, (shows_higher_promise,), (note_outbid,), _GIVEN_UP),
-        Transition("L8", STATE, _WAITING, (had_promised, restarted), (note_restart,), _GIVEN_UP),
-        Transition("L4", STATE, (_PREPARING,), (is_promise, shows_owned_cells), (count_promise,)),
+        Transition("L7", STATE, _WAITING, (has_higher_promise,), (record_outbid,), _ABORTED),
+        Transition("L8", STATE, _WAITING, (had_promised, restarted), (record_restart,), _ABORTED),
+        Transition("L4", STATE, (_PREPARING,), (is_promise, reports_owned_cells), (count_promise,)),
         *PLAN_RULES,
-        Transition("L5", FAILED, (_PLANNING,), (), (note_reason,), _GIVEN_UP),
-        Transition("L8", MEMBERS, _WAITING, (), (note_reason,), _GIVEN_UP),
-        Transition("L8", TOO_LATE, _WAITING, (), (note_reason,), _GIVEN_UP),
+        Transition("L5", FAILED, (_PLANNING,), (), (record_reason,), _ABORTED),
+        Transition("L8", MEMBERS, _WAITING, (), (record_reason,), _ABORTED),
+        Transition("L8", TOO_LATE, _WAITING, (), (record_reason,), _ABORTED),
     )
 )
 """Rules L4 to L8 of cell transfers."""

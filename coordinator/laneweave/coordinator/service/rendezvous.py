@@ -15,7 +15,7 @@ from collections.abc import Iterable
 from hashlib import blake2b
 
 
-def falls_to(name: str, others: Iterable[str], payload: bytes) -> bool:
+def is_assigned_to(name: str, others: Iterable[str], payload: bytes) -> bool:
     """Return whether a request is assigned to `name` rather than to one of the others."""
     rivals = [other for other in others if other != name]
     if not rivals:

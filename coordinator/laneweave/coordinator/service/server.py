@@ -31,7 +31,7 @@ from laneweave.coordinator.service.format import (
     Refusal,
     format_of,
 )
-from laneweave.coordinator.service.rendezvous import falls_to
+from laneweave.coordinator.service.rendezvous import is_assigned_to
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.metrics import metric
 from laneweave.protocol.runtime.node import TOO_LATE, Decline, Delegate, Effect, Reply
@@ -75,20 +75,20 @@ class _Entry:
     """A request that waits or is being planned."""
 
     request: PlanRequest
-    came_s: float
+    arrived_s: float
     job: int
-    askers: list[tuple[int, Format]] = field(factory=list)
+    clients: list[tuple[int, Format]] = field(factory=list)
     """Tokens of the questions that wait for the answer, and their formats."""
     dropped: bool = False
     """It was answered before its computation ended."""
 
     @property
     def deadline_s(self) -> float:
-        return self.came_s + self.request.deadline_s
+        return self.arrived_s + self.request.deadline_s
 
 
 @frozen
-class _Kept:
+class _CachedAnswer:
     """A cached answer, packed: in Python it would take twenty times as much memory."""
 
     request: bytes
@@ -124,11 +124,11 @@ class PlanningService:
         self._workers = workers
         self._waiting: deque[_Entry] = deque()
         self._planning: dict[int, _Entry] = {}
-        self._in_hand: dict[str, _Entry] = {}
+        self._pending: dict[str, _Entry] = {}
         """Requests that wait or are planned, by id; those without one are not here."""
-        self._answers: dict[str, _Kept] = {}
+        self._answers: dict[str, _CachedAnswer] = {}
         """Answers by the request's id, in order of their time."""
-        self._kept_bytes = 0
+        self._cached_bytes = 0
         self._metrics = ServiceMetrics()
 
     @property
@@ -168,7 +168,7 @@ class PlanningService:
             others: names of the other live coordinators.
             now_s: node clock.
         """
-        if not falls_to(self._name, others, payload):
+        if not is_assigned_to(self._name, others, payload):
             self._count("left_total")
             yield Decline(token)
             return
@@ -176,19 +176,19 @@ class PlanningService:
         form = format_of(payload, encoding)
         try:
             request = self._read(form, payload)
-            self._forget_old(now_s)
-            entry, kept = self._known(request)
+            self._expire_answers(now_s)
+            entry, cached = self._known(request)
         except BadInputError as error:
             self._count("invalid_total")
             yield form.reply(token, Refusal(INVALID, str(error), error.field))
             return
         if entry is not None:
             self._count("repeated_total")
-            entry.askers.append((token, form))
+            entry.clients.append((token, form))
             return
-        if kept is not None:
+        if cached is not None:
             self._count("repeated_total")
-            yield Reply(token, form.write(MSGPACK.read(kept.answer)), encoding=form.encoding)
+            yield Reply(token, form.write(MSGPACK.read(cached.answer)), encoding=form.encoding)
             return
         if len(self._waiting) + len(self._planning) >= self._settings.queue_limit:
             self._count("overloaded_total")
@@ -196,29 +196,31 @@ class PlanningService:
             return
         entry = _Entry(request, now_s, job, [(token, form)])
         if request.id:
-            self._in_hand[request.id] = entry
+            self._pending[request.id] = entry
         self._waiting.append(entry)
         yield from self._hand_out(now_s)
 
     def _read(self, form: Format, payload: bytes) -> PlanRequest:
-        most = self._settings.max_request_bytes
-        if len(payload) > most:
-            raise BadInputError("request", f"{len(payload)} bytes or more", f"at most {most} bytes")
+        max_bytes = self._settings.max_request_bytes
+        if len(payload) > max_bytes:
+            raise BadInputError(
+                "request", f"{len(payload)} bytes or more", f"at most {max_bytes} bytes"
+            )
         request = PlanRequest.from_dict(form.read(payload))
         if request.deadline_s > self._settings.max_deadline_s:
             allowed = f"at most {self._settings.max_deadline_s:g} at this service"
             raise BadInputError("deadline_s", request.deadline_s, allowed)
         return request
 
-    def _known(self, request: PlanRequest) -> tuple[_Entry | None, _Kept | None]:
+    def _known(self, request: PlanRequest) -> tuple[_Entry | None, _CachedAnswer | None]:
         """Return the entry or the cached answer of a repeated request."""
-        entry, kept = self._in_hand.get(request.id), self._answers.get(request.id)
+        entry, cached = self._pending.get(request.id), self._answers.get(request.id)
         another = (entry is not None and entry.request != request) or (
-            kept is not None and kept.request != _digest(request)
+            cached is not None and cached.request != _digest(request)
         )
         if another:
             raise BadInputError("id", request.id, "an id that no other request has had of late")
-        return entry, kept
+        return entry, cached
 
     def _overloaded(self) -> Refusal:
         limit = self._settings.queue_limit
@@ -235,8 +237,8 @@ class PlanningService:
 
     def _hand_out(self, now_s: float) -> Iterator[Effect]:
         """Give workers what waits, in the order of its coming."""
-        most_planning = self._workers * (1 + HANDED_OUT_AHEAD)
-        while self._waiting and len(self._planning) < most_planning:
+        max_planning = self._workers * (1 + HANDED_OUT_AHEAD)
+        while self._waiting and len(self._planning) < max_planning:
             entry = self._waiting.popleft()
             if entry.deadline_s <= now_s:
                 yield from self._end(entry, self._late(entry, now_s), now_s)
@@ -277,7 +279,7 @@ class PlanningService:
 
     def _late(self, entry: _Entry, now_s: float) -> Refusal:
         self._count("late_total")
-        waited_s, deadline_s = now_s - entry.came_s, entry.request.deadline_s
+        waited_s, deadline_s = now_s - entry.arrived_s, entry.request.deadline_s
         text = (
             f"deadline_s: got {deadline_s:g}; allowed: longer than the {waited_s:.3f} s that "
             "requests wait for a worker at present"
@@ -290,25 +292,25 @@ class PlanningService:
             self._count("answered_total")
             planned_s = answer.solve_ms / 1e3
             self._count("planning_seconds_total", planned_s)
-            self._count("service_seconds_total", max(0.0, now_s - entry.came_s - planned_s))
-        for token, form in entry.askers:
+            self._count("service_seconds_total", max(0.0, now_s - entry.arrived_s - planned_s))
+        for token, form in entry.clients:
             yield form.reply(token, answer)
-        if self._in_hand.pop(entry.request.id, None) and isinstance(answer, PlanResponse):
-            kept = _Kept(_digest(entry.request), MSGPACK.write(answer.to_dict()), now_s)
-            self._answers[entry.request.id] = kept
-            self._kept_bytes += len(kept.answer)
-            self._forget_old(now_s)
+        if self._pending.pop(entry.request.id, None) and isinstance(answer, PlanResponse):
+            cached = _CachedAnswer(_digest(entry.request), MSGPACK.write(answer.to_dict()), now_s)
+            self._answers[entry.request.id] = cached
+            self._cached_bytes += len(cached.answer)
+            self._expire_answers(now_s)
 
-    def _forget_old(self, now_s: float) -> None:
+    def _expire_answers(self, now_s: float) -> None:
         """Let answers go that are too many, too long together, or too old."""
         answers, settings = self._answers, self._settings
         while answers:
             oldest = next(iter(answers))
             old = answers[oldest].answered_s <= now_s - settings.cache_s
-            many = len(answers) > settings.cache_entries or self._kept_bytes > CACHE_BYTES
+            many = len(answers) > settings.cache_entries or self._cached_bytes > CACHE_BYTES
             if not many and not old:
                 return
-            self._kept_bytes -= len(answers.pop(oldest).answer)
+            self._cached_bytes -= len(answers.pop(oldest).answer)
 
     def _count(self, name: str, by: float = 1) -> None:
         counted = getattr(self._metrics, name) + by

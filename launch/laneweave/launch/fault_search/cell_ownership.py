@@ -14,7 +14,7 @@ from collections.abc import Callable
 from attrs import frozen
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.wire.messages import Ballot, Deed
+from laneweave.protocol.wire.messages import Ballot, PendingTransfer
 
 Cells = frozenset[Cell]
 Report = Callable[[str, float, list[str], str], None]
@@ -26,7 +26,7 @@ class Holding:
     """Owned cells and newest transfer of one vehicle, as its motion controller shows them."""
 
     cells: Cells
-    transfer: Deed | None
+    transfer: PendingTransfer | None
 
     def owned(self, opened: set[Ballot]) -> Cells:
         """Return the owned cells, given the ballots under which possession has been taken."""
@@ -54,7 +54,7 @@ class CellOwnership:
         t_s: float,
         vehicle: str,
         cells: tuple[Cell, ...],
-        transfer: Deed | None,
+        transfer: PendingTransfer | None,
         body: Cells | None = None,
     ) -> None:
         """Update what a motion controller shows.

@@ -26,7 +26,14 @@ from attrs import define, frozen
 from laneweave.launch.fault_search.cell_ownership import CellOwnership
 from laneweave.launch.fault_search.checker_geometry import Body, Geometry, overlap_between
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.wire.messages import Ballot, Deed, Name, Plan, Sense, VehicleState
+from laneweave.protocol.wire.messages import (
+    Ballot,
+    Name,
+    PendingTransfer,
+    Plan,
+    Sense,
+    VehicleState,
+)
 
 MAX_VIOLATIONS = 20
 """Number of violations recorded per run."""
@@ -103,7 +110,9 @@ class Checker:
         self._bodies[vehicle] = Body.standing(self._geometry, cell, t_s)
         self._check_cells(t_s, vehicle)
 
-    def own(self, t_s: float, vehicle: str, owned: tuple[Cell, ...], transfer: Deed | None) -> None:
+    def own(
+        self, t_s: float, vehicle: str, owned: tuple[Cell, ...], transfer: PendingTransfer | None
+    ) -> None:
         """Record what a motion controller shows as owned."""
         if self._ownership is not None:
             self._ownership.show(t_s, vehicle, owned, transfer)

@@ -94,9 +94,9 @@ def _text_of(effect: Send) -> str | None:
 
 def _ownership(state: VehicleState) -> str:
     """Return the owned cells and the pending transfer of a vehicle (rolling operation)."""
-    transfer = state.deed
+    transfer = state.transfer
     if transfer is None:
-        return f" owns {list(state.estate)}" if state.estate else ""
+        return f" owns {list(state.owned)}" if state.owned else ""
     change = f"{list(transfer.after)} with {' '.join(transfer.roster)}"
     status = "open" if transfer.open else f"pending, then {change}"
-    return f" owns {list(state.estate)}, transfer {short(transfer.ballot)} {status}"
+    return f" owns {list(state.owned)}, transfer {short(transfer.ballot)} {status}"

@@ -200,7 +200,7 @@ class LiveRoad:
                 hold=state.hold_cell,
                 target=self._target_of(state),
                 flags=flags | OVERDUE * state.overdue,
-                owned=[cell for cell in state.estate if cell != state.hold_cell],
+                owned=[cell for cell in state.owned if cell != state.hold_cell],
             )
         cell = state.hold_cell if state is not None else entry.cell if entry is not None else (0, 0)
         return Row(

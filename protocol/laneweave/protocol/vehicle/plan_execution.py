@@ -21,8 +21,8 @@ from laneweave.protocol.state_machine import RuleBook, Transition
 from laneweave.protocol.vehicle.plans import Needs, dependencies, ownership_problems, plan_problems
 from laneweave.protocol.wire.messages import (
     Ballot,
-    Deed,
     Name,
+    PendingTransfer,
     Plan,
     Prepare,
     Sense,
@@ -54,7 +54,7 @@ class ExecutionPhase(Enum):
 ACCEPTED = (ExecutionPhase.GATED, ExecutionPhase.GOING)
 """Phases in which a plan is accepted."""
 
-PREPARE, PLAN, NOTED, STATE = "PREPARE", "PLAN", "SENSE", "STATE"
+PREPARE, PLAN, STORED, STATE = "PREPARE", "PLAN", "SENSE", "STATE"
 GATE, TICK, REST = "tick (gate)", "tick (move)", "motion ends"
 
 
@@ -64,7 +64,7 @@ class PlanExecution:
 
     Constructing it is V1: nothing promised, no plan.
 
-    `hold_cell`, `moving`, `joined`, `owned` and `noted_transfer` mirror the motion controller,
+    `hold_cell`, `moving`, `joined`, `owned` and `stored_transfer` mirror the motion controller,
     which outlives this object.
     """
 
@@ -79,7 +79,7 @@ class PlanExecution:
     promised: Ballot | None = None
     plan: Plan | None = None
     completed: int = 0
-    heard: dict[Name, int] = field(factory=dict)
+    progress: dict[Name, int] = field(factory=dict)
     """Completed moves of my plan that each other member has shown; -1: not ready yet."""
     wanted_joined: tuple[int, ...] = field(init=False)
     """Blocks that the motion controller should note."""
@@ -89,13 +89,13 @@ class PlanExecution:
     """For each of my moves what it needs of the others."""
     t_s: float = 0.0
     """Road time of the tick."""
-    promise_noted: bool = False
+    promise_stored: bool = False
     """The motion controller has noted the promise, so it counts."""
     owned: frozenset[Cell] | None = None
     """Cells that the vehicle owns, from its controller; None: formations own blocks."""
-    transfer: Deed | None = None
+    transfer: PendingTransfer | None = None
     """Pending transfer of the newest plan that was taken."""
-    noted_transfer: Deed | None = None
+    stored_transfer: PendingTransfer | None = None
     """The newest pending transfer that the controller has noted."""
     rules: RuleBook = field(factory=lambda: VEHICLE_RULES)
 
@@ -111,13 +111,13 @@ class PlanExecution:
         """V3: take the plan of the promised ballot, once; return whether it was taken now.
 
         A plan that cannot be executed safely is never taken. A taken plan is accepted, and shown
-        as accepted, when the motion controller has noted it for this process (`on_noted`).
+        as accepted, when the motion controller has noted it for this process (`on_stored`).
         """
         return self.rules.take(self, PLAN, plan) is not None
 
-    def on_noted(self, ballot: Ballot | None) -> bool:
+    def on_stored(self, ballot: Ballot | None) -> bool:
         """V3: the controller has noted a plan; return whether it is newly accepted now."""
-        return self.rules.take(self, NOTED, ballot) is not None
+        return self.rules.take(self, STORED, ballot) is not None
 
     def on_joined(self, formations: tuple[int, ...]) -> bool:
         """Add the blocks that the controller has noted as joined; return whether any is new.
@@ -140,10 +140,10 @@ class PlanExecution:
             return False
         if sense.promised is not None and sense.promised != self.promised:
             self.on_prepare(Prepare(sense.promised, (), (self.vehicle,)))
-        before = self.promise_noted
-        self.owned, self.noted_transfer = frozenset(sense.estate), sense.deed
-        self.promise_noted = sense.promised == self.promised
-        return self.promise_noted and not before
+        before = self.promise_stored
+        self.owned, self.stored_transfer = frozenset(sense.owned), sense.transfer
+        self.promise_stored = sense.promised == self.promised
+        return self.promise_stored and not before
 
     def on_state(self, state: VehicleState) -> None:
         """V4: remember what another member of the same plan has shown."""
@@ -220,8 +220,8 @@ class PlanExecution:
             y_m=sense.state[3],
             speed_mps=sense.state[1],
             t_s=sense.t_s,
-            estate=sense.estate if sense.promised == self.promised else (),
-            deed=sense.deed,
+            owned=sense.owned if sense.promised == self.promised else (),
+            transfer=sense.transfer,
         )
 
     def needs_states(self, t_s: float) -> bool:
@@ -238,7 +238,7 @@ class PlanExecution:
         if self.next_move is None or not self.is_due(t_s + LISTEN_S):
             return False
         needs = self.needs[self.completed]
-        return any(self.heard.get(other, -1) < count for other, count in needs.items())
+        return any(self.progress.get(other, -1) < count for other, count in needs.items())
 
     @property
     def next_move(self) -> PlannedMove | None:
@@ -266,53 +266,53 @@ class PlanExecution:
 # --- guards and actions ---------------------------------------------------------------------------
 
 
-def is_in_roster(me: PlanExecution, prepare: Prepare) -> bool:
+def is_in_roster(execution: PlanExecution, prepare: Prepare) -> bool:
     """I am in the roster."""
-    return me.vehicle in prepare.roster
+    return execution.vehicle in prepare.roster
 
 
-def is_above_promise(me: PlanExecution, prepare: Prepare) -> bool:
+def is_above_promise(execution: PlanExecution, prepare: Prepare) -> bool:
     """The ballot is above the one that I promised, if any."""
-    return me.promised is None or prepare.ballot > me.promised
+    return execution.promised is None or prepare.ballot > execution.promised
 
 
-def promise(me: PlanExecution, prepare: Prepare) -> None:
+def promise(execution: PlanExecution, prepare: Prepare) -> None:
     """Promise the ballot, ask the controller to note its blocks as joined."""
-    me.promised, me.promise_noted = prepare.ballot, False
-    if me.owned is None:
-        me.wanted_joined = tuple(sorted({*me.wanted_joined, *prepare.formations}))
+    execution.promised, execution.promise_stored = prepare.ballot, False
+    if execution.owned is None:
+        execution.wanted_joined = tuple(sorted({*execution.wanted_joined, *prepare.formations}))
 
 
-def drop_plan(me: PlanExecution, _: object) -> None:
+def drop_plan(execution: PlanExecution, _: object) -> None:
     """Drop the plan: k = 0, nothing heard; the motion under way ends and belongs to no plan."""
-    me.plan = None
-    me.completed = 0
-    me.needs = ()
-    me.moving_in_plan = False
+    execution.plan = None
+    execution.completed = 0
+    execution.needs = ()
+    execution.moving_in_plan = False
 
 
-def forget_heard(me: PlanExecution, _: object) -> None:
+def forget_progress(execution: PlanExecution, _: object) -> None:
     """Forget what others have shown."""
-    me.heard = {}
+    execution.progress = {}
 
 
-def show(me: PlanExecution, _: object) -> None:
+def publish_state(execution: PlanExecution, _: object) -> None:
     """Show my state."""
 
 
-def is_promised_ballot(me: PlanExecution, plan: Plan) -> bool:
+def is_promised_ballot(execution: PlanExecution, plan: Plan) -> bool:
     """Its ballot is the one that I promised."""
-    return plan.ballot == me.promised
+    return plan.ballot == execution.promised
 
 
-def names_my_incarnation(me: PlanExecution, plan: Plan) -> bool:
+def names_own_incarnation(execution: PlanExecution, plan: Plan) -> bool:
     """It names my incarnation."""
-    return plan.incarnations.get(me.vehicle) == me.incarnation
+    return plan.incarnations.get(execution.vehicle) == execution.incarnation
 
 
-def starts_in_my_cell(me: PlanExecution, plan: Plan) -> bool:
+def starts_in_hold_cell(execution: PlanExecution, plan: Plan) -> bool:
     """I start in my hold cell."""
-    return plan.start_cells.get(me.vehicle) == me.hold_cell
+    return plan.start_cells.get(execution.vehicle) == execution.hold_cell
 
 
 def is_executable(_: PlanExecution, plan: Plan) -> bool:
@@ -320,130 +320,136 @@ def is_executable(_: PlanExecution, plan: Plan) -> bool:
     return not plan_problems(plan)
 
 
-def keeps_to_its_blocks(me: PlanExecution, plan: Plan) -> bool:
+def stays_in_its_blocks(execution: PlanExecution, plan: Plan) -> bool:
     """Its territory lies in the blocks of its formations."""
-    if me.owned is not None:
+    if execution.owned is not None:
         return True
     blocks = set(plan.formations)
     return all(
-        me.lattice.block_of(column) in blocks and 0 <= lane < me.lattice.lanes
+        execution.lattice.block_of(column) in blocks and 0 <= lane < execution.lattice.lanes
         for column, lane in plan.territory
     )
 
 
-def has_joined(me: PlanExecution, plan: Plan) -> bool:
+def has_joined(execution: PlanExecution, plan: Plan) -> bool:
     """Its blocks are exactly those that my controller has noted as joined."""
-    return me.owned is not None or set(plan.formations) == set(me.joined)
+    return execution.owned is not None or set(plan.formations) == set(execution.joined)
 
 
-def transfers_only_owned_cells(me: PlanExecution, plan: Plan) -> bool:
+def transfers_only_owned_cells(execution: PlanExecution, plan: Plan) -> bool:
     """It transfers cells among their owners only, and counts no cell as mine that I do not own."""
-    if me.owned is None:
+    if execution.owned is None:
         return True
-    mine = me.owned | set(me.noted_transfer.after if me.noted_transfer is not None else ())
-    return not ownership_problems(plan) and set(plan.before[me.vehicle]) <= mine
+    mine = execution.owned | set(
+        execution.stored_transfer.after if execution.stored_transfer is not None else ()
+    )
+    return not ownership_problems(plan) and set(plan.before[execution.vehicle]) <= mine
 
 
-def accept(me: PlanExecution, plan: Plan) -> None:
+def take_plan(execution: PlanExecution, plan: Plan) -> None:
     """Take the plan, derive what its moves need, ask the controller to note it."""
-    me.plan = plan
-    me.needs = dependencies(plan, me.vehicle)
-    if me.owned is not None:
-        name = me.vehicle
-        me.transfer = Deed(plan.ballot, plan.before[name], plan.after[name], plan.roster)
+    execution.plan = plan
+    execution.needs = dependencies(plan, execution.vehicle)
+    if execution.owned is not None:
+        name = execution.vehicle
+        execution.transfer = PendingTransfer(
+            plan.ballot, plan.before[name], plan.after[name], plan.roster
+        )
 
 
-def is_noted(me: PlanExecution, ballot: Ballot | None) -> bool:
+def is_stored(execution: PlanExecution, ballot: Ballot | None) -> bool:
     """My controller has noted for me that I accept it."""
-    return me.plan is not None and ballot == me.plan.ballot
+    return execution.plan is not None and ballot == execution.plan.ballot
 
 
-def is_of_my_plan(me: PlanExecution, state: VehicleState) -> bool:
+def is_of_same_plan(execution: PlanExecution, state: VehicleState) -> bool:
     """A is another member and shows my plan's ballot as accepted."""
-    plan = me.plan
+    plan = execution.plan
     return (
         plan is not None
         and state.accepted
         and state.promised == plan.ballot
         and state.vehicle in plan.moves
-        and state.vehicle != me.vehicle
+        and state.vehicle != execution.vehicle
     )
 
 
-def shows_open_gate(_: PlanExecution, state: VehicleState) -> bool:
+def reports_open_gate(_: PlanExecution, state: VehicleState) -> bool:
     """A has go."""
     return state.go
 
 
-def hear(me: PlanExecution, state: VehicleState) -> None:
-    """heard[A] = max(heard[A], k if A is ready, else -1)."""
+def record_progress(execution: PlanExecution, state: VehicleState) -> None:
+    """progress[A] = max(progress[A], k if A is ready, else -1)."""
     shown = state.completed if state.ready else -1
-    me.heard[state.vehicle] = max(me.heard.get(state.vehicle, -1), shown)
+    execution.progress[state.vehicle] = max(execution.progress.get(state.vehicle, -1), shown)
 
 
-def is_holding(me: PlanExecution, _: object) -> bool:
+def is_holding(execution: PlanExecution, _: object) -> bool:
     """I hold my cell."""
-    return not me.moving
+    return not execution.moving
 
 
-def all_are_ready(me: PlanExecution, _: object) -> bool:
-    """heard[A] >= 0 for every other member."""
-    return me.plan is not None and all(
-        me.heard.get(other, -1) >= 0 for other in me.plan.roster if other != me.vehicle
+def all_are_ready(execution: PlanExecution, _: object) -> bool:
+    """progress[A] >= 0 for every other member."""
+    return execution.plan is not None and all(
+        execution.progress.get(other, -1) >= 0
+        for other in execution.plan.roster
+        if other != execution.vehicle
     )
 
 
-def take_ownership(me: PlanExecution, _: object) -> None:
+def open_transfer(execution: PlanExecution, _: object) -> None:
     """Own the cells of `after`: the transfer is open."""
-    if me.transfer is not None:
-        me.transfer = Deed(me.transfer.ballot, open=True)
+    if execution.transfer is not None:
+        execution.transfer = PendingTransfer(execution.transfer.ballot, open=True)
 
 
-def has_next_move(me: PlanExecution, _: object) -> bool:
+def has_next_move(execution: PlanExecution, _: object) -> bool:
     """There is a next move."""
-    return me.next_move is not None
+    return execution.next_move is not None
 
 
-def is_time(me: PlanExecution, _: object) -> bool:
+def move_is_due(execution: PlanExecution, _: object) -> bool:
     """My clock >= t0 + step * slot."""
-    return me.is_due(me.t_s)
+    return execution.is_due(execution.t_s)
 
 
-def is_released(me: PlanExecution, _: object) -> bool:
-    """heard[A] >= need(A) for all dependencies of the move."""
-    heard = me.heard
-    for other, count in me.needs[me.completed].items():  # noqa: SIM110 (asked at each tick)
-        if heard.get(other, -1) < count:
+def is_released(execution: PlanExecution, _: object) -> bool:
+    """progress[A] >= need(A) for all dependencies of the move."""
+    progress = execution.progress
+    for other, count in execution.needs[execution.completed].items():
+        if progress.get(other, -1) < count:
             return False
     return True
 
 
-def start_move(me: PlanExecution, _: object) -> None:
+def start_move(execution: PlanExecution, _: object) -> None:
     """Move: from now on I count as being at the target."""
-    move = me.next_move
+    move = execution.next_move
     if move is not None:
-        me.hold_cell = move[2]
-        me.moving = me.moving_in_plan = True
+        execution.hold_cell = move[2]
+        execution.moving = execution.moving_in_plan = True
 
 
-def is_moving(me: PlanExecution, _: object) -> bool:
+def is_moving(execution: PlanExecution, _: object) -> bool:
     """I was moving."""
-    return me.moving
+    return execution.moving
 
 
-def moved_in_plan(me: PlanExecution, _: object) -> bool:
+def moved_in_plan(execution: PlanExecution, _: object) -> bool:
     """The motion was a move of my plan."""
-    return me.moving_in_plan
+    return execution.moving_in_plan
 
 
-def count_move(me: PlanExecution, _: object) -> None:
+def count_move(execution: PlanExecution, _: object) -> None:
     """Count it: k += 1."""
-    me.completed += 1
+    execution.completed += 1
 
 
-def rest(me: PlanExecution, _: object) -> None:
+def rest(execution: PlanExecution, _: object) -> None:
     """Hold the target."""
-    me.moving = me.moving_in_plan = False
+    execution.moving = execution.moving_in_plan = False
 
 
 _ANY = tuple(ExecutionPhase)
@@ -456,34 +462,43 @@ VEHICLE_RULES: RuleBook = RuleBook(
             PREPARE,
             _ANY,
             (is_in_roster, is_above_promise),
-            (promise, drop_plan, forget_heard, show),
+            (promise, drop_plan, forget_progress, publish_state),
             _PROMISED,
         ),
-        Transition("V2", PREPARE, _ANY, (is_in_roster,), (show,)),
+        Transition("V2", PREPARE, _ANY, (is_in_roster,), (publish_state,)),
         Transition(
             "V3",
             PLAN,
             (_PROMISED,),
             (
                 is_promised_ballot,
-                names_my_incarnation,
-                starts_in_my_cell,
+                names_own_incarnation,
+                starts_in_hold_cell,
                 is_executable,
-                keeps_to_its_blocks,
+                stays_in_its_blocks,
                 has_joined,
                 transfers_only_owned_cells,
             ),
-            (accept,),
+            (take_plan,),
             _TAKEN,
         ),
-        Transition("V3", NOTED, (_TAKEN,), (is_noted,), (show,), _GATED),
+        Transition("V3", STORED, (_TAKEN,), (is_stored,), (publish_state,), _GATED),
         Transition(
-            "V4", STATE, (_GATED,), (is_of_my_plan, shows_open_gate), (hear, take_ownership), _GOING
+            "V4",
+            STATE,
+            (_GATED,),
+            (is_of_same_plan, reports_open_gate),
+            (record_progress, open_transfer),
+            _GOING,
         ),
-        Transition("V4", STATE, (_TAKEN, _GATED, _GOING), (is_of_my_plan,), (hear,)),
-        Transition("V5", GATE, (_GATED,), (is_holding, all_are_ready), (take_ownership,), _GOING),
+        Transition("V4", STATE, (_TAKEN, _GATED, _GOING), (is_of_same_plan,), (record_progress,)),
+        Transition("V5", GATE, (_GATED,), (is_holding, all_are_ready), (open_transfer,), _GOING),
         Transition(
-            "V6", TICK, (_GOING,), (is_holding, has_next_move, is_time, is_released), (start_move,)
+            "V6",
+            TICK,
+            (_GOING,),
+            (is_holding, has_next_move, move_is_due, is_released),
+            (start_move,),
         ),
         Transition("V7", REST, _ANY, (is_moving, moved_in_plan), (count_move, rest)),
         Transition("V7", REST, _ANY, (is_moving,), (rest,)),

@@ -8,9 +8,10 @@ for each class, generated from the docstrings of this module.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, NewType
+from typing import Annotated, Any, NamedTuple, NewType
 
 from attrs import field, frozen
+from cattrs import override
 
 from laneweave.protocol.lattice import Cell, Lattice, PlannedMove
 
@@ -56,7 +57,7 @@ class Heartbeat:
 
 
 @frozen
-class Deed:
+class PendingTransfer:
     """Pending transfer of cells with one plan of the rolling operation, as one vehicle stores it.
 
     Part of other messages. The vehicle owns `before` until it knows that the start gate is open,
@@ -166,10 +167,10 @@ class VehicleState:
     """Speed along the road [m/s]."""
     t_s: float
     """Road time of the tick [s]."""
-    estate: tuple[Cell, ...] = ()
+    owned: Annotated[tuple[Cell, ...], override(rename="estate")] = ()
     """Rolling operation: cells that it owns; empty until its motion controller has stored the
     promise."""
-    deed: Deed | None = None
+    transfer: Annotated[PendingTransfer | None, override(rename="deed")] = None
     """Rolling operation: its newest pending transfer of cells."""
 
 
@@ -261,12 +262,12 @@ class Sense:
     """Newest plan accepted by the process in charge, as the controller has stored it."""
     left: bool = False
     """The vehicle has left the road: its agent reports and ends."""
-    estate: tuple[Cell, ...] = ()
+    owned: Annotated[tuple[Cell, ...], override(rename="estate")] = ()
     """Rolling operation: cells that the vehicle owns."""
     promised: Ballot | None = None
     """Rolling operation: highest ballot promised by any process in charge, as the controller has
     stored it."""
-    deed: Deed | None = None
+    transfer: Annotated[PendingTransfer | None, override(rename="deed")] = None
     """Rolling operation: the newest pending transfer of cells."""
     bridge: int = 0
     """Incarnation of the bridge [ns]: another one means another road; 0: not given."""
@@ -307,7 +308,7 @@ class Command:
     """Accepted plan, which the controller shall store."""
     promised: Ballot | None = None
     """Rolling operation: promised ballot, which the controller shall store."""
-    deed: Deed | None = None
+    transfer: Annotated[PendingTransfer | None, override(rename="deed")] = None
     """Rolling operation: transfer of the newest plan, which the controller shall store or open."""
 
 

@@ -41,7 +41,7 @@ from laneweave.protocol.vehicle.motion import (
     keep_gap,
     limited_accel,
 )
-from laneweave.protocol.wire.messages import Ballot, Command, Deed, Neighbour
+from laneweave.protocol.wire.messages import Ballot, Command, Neighbour, PendingTransfer
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import NONE_AROUND, Around
 from laneweave.sim_bridge.bodies.plant import Plant
 
@@ -80,7 +80,7 @@ class MotionController:
     binds later processes."""
     owned: tuple[Cell, ...] = ()
     """Cells that the vehicle owns, ascending (rolling operation)."""
-    transfer: Deed | None = None
+    transfer: PendingTransfer | None = None
     """Newest transfer of cells, pending or completed."""
     _granted: frozenset[Cell] = frozenset()
     """Cells from the roadside that no plan contains yet."""
@@ -188,19 +188,19 @@ class MotionController:
         """
         if command.incarnation != self.attendant:
             return False
-        asked = command.joined, command.accepted, command.promised, command.deed
+        asked = command.joined, command.accepted, command.promised, command.transfer
         if asked == (self.joined, self.accepted, self.promised, self.transfer):
             return False  # the usual case
         if not _in_range(command.joined):
             return False
         before = self.joined, self.accepted, self.promised, self.transfer
         self.join(command.joined)
-        if command.deed is not None and command.deed.open:
-            self.complete_transfer(command.deed.ballot)
+        if command.transfer is not None and command.transfer.open:
+            self.complete_transfer(command.transfer.ballot)
         if command.promised is not None:
             self.promise(command.promised)
-        if command.deed is not None and not command.deed.open:
-            self.begin_transfer(command.deed)
+        if command.transfer is not None and not command.transfer.open:
+            self.begin_transfer(command.transfer)
         if command.accepted is not None:
             self.accept(command.accepted)
         return (self.joined, self.accepted, self.promised, self.transfer) != before
@@ -218,21 +218,21 @@ class MotionController:
         """Note a promise, unless it is older."""
         self.promised = ballot if self.promised is None else max(self.promised, ballot)
 
-    def begin_transfer(self, deed: Deed) -> None:
+    def begin_transfer(self, transfer: PendingTransfer) -> None:
         """Note the pending transfer of an accepted plan, unless a higher ballot is promised.
 
         Cells that the roadside has assigned since the plan was made stay with the vehicle.
         """
-        newer = self.transfer is None or deed.ballot > self.transfer.ballot
-        if newer and self.promised is not None and deed.ballot >= self.promised:
-            self._granted -= set(deed.before)
-            self.transfer = _with_cells(deed, self._granted)
+        newer = self.transfer is None or transfer.ballot > self.transfer.ballot
+        if newer and self.promised is not None and transfer.ballot >= self.promised:
+            self._granted -= set(transfer.before)
+            self.transfer = _with_cells(transfer, self._granted)
             self.owned = self.transfer.before
 
     def complete_transfer(self, ballot: Ballot) -> None:
         """Complete the pending transfer: the start gate of its plan is open."""
         if self.transfer is not None and self.transfer.ballot == ballot and not self.transfer.open:
-            self.owned, self.transfer = self.transfer.after, Deed(ballot, open=True)
+            self.owned, self.transfer = self.transfer.after, PendingTransfer(ballot, open=True)
 
     def assign_cell(self, cell: Cell) -> None:
         """Add an empty cell that the roadside has assigned to the vehicle."""
@@ -329,12 +329,12 @@ class MotionController:
         return [other for other in others if first <= other.lane <= last or other.lane == goal]
 
 
-def _with_cells(deed: Deed, cells: Iterable[Cell]) -> Deed:
+def _with_cells(transfer: PendingTransfer, cells: Iterable[Cell]) -> PendingTransfer:
     """Return a transfer with additional cells that stay with the vehicle."""
     return evolve(
-        deed,
-        before=tuple(sorted({*deed.before, *cells})),
-        after=tuple(sorted({*deed.after, *cells})),
+        transfer,
+        before=tuple(sorted({*transfer.before, *cells})),
+        after=tuple(sorted({*transfer.after, *cells})),
     )
 
 

@@ -88,7 +88,7 @@ class Caretaker:
                 if execution.transfer is not None:
                     controller.begin_transfer(execution.transfer)
                 controller.accept(message.ballot)
-                execution.on_noted(controller.accepted)
+                execution.on_stored(controller.accepted)
         return self.state(tick) if accepted else None
 
     def state(self, tick: int) -> VehicleState:

@@ -121,9 +121,9 @@ class RoadVehicle:
             joined=controller.joined,
             accepted=controller.accepted,
             left=left,
-            estate=controller.owned,
+            owned=controller.owned,
             promised=controller.promised,
-            deed=controller.transfer,
+            transfer=controller.transfer,
             bridge=self.bridge,
         )
 

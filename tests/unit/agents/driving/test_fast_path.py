@@ -69,7 +69,7 @@ def random_gaps(rng: random.Random, window: Window, scale: float) -> Gaps:
 @pytest.fixture
 def exact(monkeypatch: pytest.MonkeyPatch) -> Tracker:
     """Return a tracker that always runs OSQP, with tight tolerances."""
-    tight = evolve(program_module.SETTINGS, eps_abs=1e-7, max_iter=20_000, row_tolerance=1e-3)
+    tight = evolve(program_module.SETTINGS, eps_abs=1e-7, max_iter=20_000, tolerance=1e-3)
     monkeypatch.setattr(program_module, "SETTINGS", tight)
     return Tracker(ALWAYS)
 

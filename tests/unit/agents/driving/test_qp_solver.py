@@ -14,7 +14,7 @@ from scipy import sparse
 
 from laneweave.agents.driving.qp_solver import QPScale, QPSettings, QuadraticProgram
 
-TIGHT = QPSettings(eps_abs=1e-8, max_iter=4000, row_tolerance=1e-6)
+TIGHT = QPSettings(eps_abs=1e-8, max_iter=4000, tolerance=1e-6)
 
 
 def box(n: int = 3, settings: QPSettings = TIGHT) -> QuadraticProgram:
@@ -43,7 +43,7 @@ def test_solves_projections_onto_boxes(entries: list[tuple[float, float]]) -> No
     program.update(lower, upper)
     result = program.solve()
     assert result.usable
-    assert result.row_violation <= 1e-6
+    assert result.violation <= 1e-6
     np.testing.assert_allclose(result.x, np.clip(0.0, lower, upper), atol=1e-5)
 
 
@@ -77,7 +77,7 @@ def test_scales_change_neither_the_solution_nor_what_violates_a_row() -> None:
     unfinished = QuadraticProgram(cost, rows, lower, upper, short, scale).solve()
     values = rows @ unfinished.x
     violation = max((values - upper).max(), (lower - values).max())
-    assert unfinished.row_violation == pytest.approx(violation, abs=1e-12)
+    assert unfinished.violation == pytest.approx(violation, abs=1e-12)
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, float("nan"), float("inf")])
@@ -126,7 +126,7 @@ def test_refuses_bad_vectors_and_stays_as_it_was(
         program.update(np.array(lower), np.array(upper))
     result, expected = program.solve(), twin.solve()
     assert result.usable
-    assert result.row_violation == expected.row_violation
+    assert result.violation == expected.violation
     assert result.x.tobytes() == expected.x.tobytes()
     assert capfd.readouterr() == ("", "")
 
@@ -150,7 +150,7 @@ def test_infeasible_program_is_not_usable_and_leaves_nothing_behind(
     result = program.solve()
     assert not result.usable
     assert result.status == 3
-    assert result.row_violation == float("inf")
+    assert result.violation == float("inf")
 
     bounds = np.array([-np.inf, 0.25]), np.array([1.0, np.inf])
     program.update(*bounds)
@@ -194,7 +194,7 @@ def test_out_of_iterations_counts_only_within_the_row_tolerance() -> None:
     lower, upper = np.full(3, 5.0), np.full(3, 6.0)
     results = {}
     for tolerance in (1e-9, 1e9):
-        hasty = QPSettings(eps_abs=1e-12, max_iter=1, check_termination=1, row_tolerance=tolerance)
+        hasty = QPSettings(eps_abs=1e-12, max_iter=1, check_termination=1, tolerance=tolerance)
         program = box(settings=hasty)
         program.update(lower, upper)
         results[tolerance] = program.solve()
@@ -204,12 +204,12 @@ def test_out_of_iterations_counts_only_within_the_row_tolerance() -> None:
     assert not strict.usable
     assert lax.usable == (lax.status in (2, 7))
     expected = np.max(np.maximum(lower - lax.x, lax.x - upper))
-    assert lax.row_violation == pytest.approx(max(expected, 0.0))
+    assert lax.violation == pytest.approx(max(expected, 0.0))
 
 
 def test_an_interrupt_during_a_solve_is_not_lost() -> None:
     """OSQP catches SIGINT while it works, and only stops; a long solve makes sure of that."""
-    endless = QPSettings(eps_abs=1e-300, max_iter=2_000_000_000, row_tolerance=1e-6)
+    endless = QPSettings(eps_abs=1e-300, max_iter=2_000_000_000, tolerance=1e-6)
     program = box(200, settings=endless)
     program.update(np.linspace(-1.0, 5.0, 200) / 3.0, np.full(200, 6.0))
     timer = threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT))

@@ -171,7 +171,7 @@ def test_a_formation_that_has_given_up_is_not_joined() -> None:
     """Block 0 is about to leave; behind it there is an overfull lane."""
     desk = Desk(scenario=JOINING)
     (job,) = jobs(behind_of_one(desk, 63.0))
-    assert desk.leaders[0].phase is BallotPhase.GIVEN_UP
+    assert desk.leaders[0].phase is BallotPhase.ABORTED
     assert plan_of(desk.give(run_job(job))).formations == (1,)
     assert sorted(desk.leaders) == [0, 1]
 

@@ -616,7 +616,7 @@ def test_a_formation_that_was_given_up_stays_so() -> None:
     hear(leader, state(A, ballot, incarnation=2, overdue=True))
     leader.take(TIME, 1e6)
     leader.on_members(formation(A, lane=2), 1e6)
-    assert (leader.phase, leader.wakeup_s) == (BallotPhase.GIVEN_UP, None)
+    assert (leader.phase, leader.wakeup_s) == (BallotPhase.ABORTED, None)
     assert list(leader.outgoing(1e6)) == []
 
 

@@ -6,7 +6,7 @@ import pytest
 from attrs import evolve
 
 from laneweave.coordinator.formations import pacing
-from laneweave.coordinator.formations.pacing import MIN_RESERVE_S, RESERVE_S, kept_apart, steps_of
+from laneweave.coordinator.formations.pacing import MIN_RESERVE_S, RESERVE_S, steps_of, with_pauses
 from laneweave.coordinator.formations.roster import start_time_s, time_left_s
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.fields import FormationSettings, Scenario
@@ -130,5 +130,5 @@ def test_neighbours_with_slots_of_other_lengths_are_kept_apart(
     mine = evolve(climbing(1), moves={A: ((0, (-5, 1), (-4, 1)),)}, slot_s=slot_s)
     theirs = evolve(mine, moves={A: ((0, (-2, 1), (-3, 1)),)}, slot_s=their_slot_s)
     late = evolve(mine, t0_s=mine.t0_s + late_s)
-    paused = kept_apart(late, [theirs], SCENARIO.formation.slack_s, 9)
+    paused = with_pauses(late, [theirs], SCENARIO.formation.slack_s, 9)
     assert (steps_of(paused) - 1 > 0) is bool(pauses)

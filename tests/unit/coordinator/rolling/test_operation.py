@@ -15,11 +15,11 @@ from laneweave.coordinator.operation import LogEntry
 from laneweave.coordinator.planning.rolling.path_search import StreamPlan, StreamVehicle
 from laneweave.coordinator.rolling.checked_planner import checked, stream_planner, stream_road
 from laneweave.coordinator.rolling.operation import (
-    AHEAD_M,
-    BESIDE,
-    LATEST_S,
-    PATIENCE_S,
-    SHOWN_S,
+    LISTEN_S,
+    LOOKAHEAD_M,
+    MARGIN_COLUMNS,
+    MAX_DELAY_S,
+    SNAPSHOT_S,
     RollingOperation,
     _clusters,
 )
@@ -27,7 +27,15 @@ from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.config.loading import parse_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Compute, Computed
-from laneweave.protocol.wire.messages import Ballot, Census, CensusEntry, Deed, Name, Plan, Prepare
+from laneweave.protocol.wire.messages import (
+    Ballot,
+    Census,
+    CensusEntry,
+    Name,
+    PendingTransfer,
+    Plan,
+    Prepare,
+)
 from laneweave.protocol.wire.messages import VehicleState as State
 from support.rolling_road import ROLLING
 from support.rolling_samples import state
@@ -36,10 +44,10 @@ A, B, C, D = (Name(letter) for letter in "ABCD")
 SLOT_S = ROLLING.cycles_s[0]
 SLOT = 5
 BEGUN_S = SLOT * SLOT_S
-LOOK_S = BEGUN_S + SHOWN_S + 0.1
+LOOK_S = BEGUN_S + SNAPSHOT_S + 0.1
 """The first tick after what is planned from."""
 HOMES: dict[Name, Cell] = {A: (0, 0), B: (2, 1), C: (-4, 0), D: (-8, 2)}
-ESTATES: dict[Name, tuple[Cell, ...]] = {
+OWNED: dict[Name, tuple[Cell, ...]] = {
     A: ((0, 0), (1, 0), (-1, 0)),
     B: ((2, 1), (1, 1), (0, 1), (-1, 1)),
     C: ((-4, 0), (-5, 0), (-4, 1)),
@@ -51,10 +59,10 @@ OLD = Ballot(1, Name("c0"), 1, 1)
 def shown(
     name: Name,
     promised: Ballot | None = None,
-    deed: Deed | None = None,
+    transfer: PendingTransfer | None = None,
     **changes: Any,  # noqa: ANN401 (fields)
 ) -> State:
-    plain = state(name, promised, deed, estate=ESTATES[name], t_s=BEGUN_S + 0.4)
+    plain = state(name, promised, transfer, owned=OWNED[name], t_s=BEGUN_S + 0.4)
     values: dict[str, Any] = {"hold_cell": HOMES[name], "done": True} | changes
     return evolve(plain, **values)
 
@@ -153,11 +161,11 @@ def bench(*names: Name, ways: dict[str, tuple[Cell, ...]] | None = None) -> Benc
 
 def test_plans_the_next_slot_when_this_one_s_moves_are_shown() -> None:
     desk = bench(A, B)
-    assert desk.order(BEGUN_S + SHOWN_S) is None
+    assert desk.order(BEGUN_S + SNAPSHOT_S) is None
     desk.think()
     assert [call.slot for call in desk.calls] == [SLOT + 1]
     assert desk.order(BEGUN_S + SLOT_S - 0.1) is None  # once a slot
-    assert desk.order(BEGUN_S + SLOT_S + SHOWN_S) is None
+    assert desk.order(BEGUN_S + SLOT_S + SNAPSHOT_S) is None
     desk.think(LOOK_S + SLOT_S)
     assert [call.slot for call in desk.calls] == [SLOT + 1, SLOT + 2]
 
@@ -187,8 +195,8 @@ def test_a_new_leader_listens_first() -> None:
     assert desk.order(LOOK_S, now_s=10.0) is None
     desk.control.on_census(evolve(census(A), t_s=BEGUN_S + 0.9))
     desk.hear(evolve(shown(A), t_s=BEGUN_S + 1.0))
-    assert desk.order(BEGUN_S + 3.0, now_s=10.0 + PATIENCE_S - 0.01) is None
-    compute = desk.order(BEGUN_S + 1.0, now_s=10.0 + PATIENCE_S)
+    assert desk.order(BEGUN_S + 3.0, now_s=10.0 + LISTEN_S - 0.01) is None
+    compute = desk.order(BEGUN_S + 1.0, now_s=10.0 + LISTEN_S)
     assert compute is not None
     compute.work()
     assert not desk.calls[0].vehicles[A].held
@@ -201,11 +209,11 @@ def test_a_leader_that_is_elected_again_listens_again() -> None:
     assert (desk.control.transfers, desk.control.wakeups) == ([], [])
     assert set(desk.control.observed.states) == {A, B}  # what they have shown stays true
     later_s = LOOK_S + SLOT_S
-    assert desk.order(later_s + PATIENCE_S) is None  # it needs a census, too
+    assert desk.order(later_s + LISTEN_S) is None  # it needs a census, too
     desk.control.on_census(census(A, B))
     assert desk.order(later_s) is None
     desk.hear(evolve(shown(A), hold_cell=(1, 0), t_s=later_s + 0.2))
-    compute = desk.order(later_s + PATIENCE_S)
+    compute = desk.order(later_s + LISTEN_S)
     assert compute is not None
     compute.work()
     assert desk.calls[-1].vehicles == {
@@ -221,7 +229,7 @@ def test_a_plan_that_comes_late_is_dropped(late_s: float, kind: str, ballots: in
     desk = bench(A, ways={A: ((0, 0), (1, 0))})
     compute = desk.order()
     assert compute is not None
-    entries = desk.finish(compute, (SLOT + 1) * SLOT_S + LATEST_S + late_s)
+    entries = desk.finish(compute, (SLOT + 1) * SLOT_S + MAX_DELAY_S + late_s)
     assert [entry.kind for entry in entries] == [kind]
     assert len(desk.control.transfers) == ballots
 
@@ -248,9 +256,13 @@ def test_the_planner_gets_all_vehicles_and_owned_cells() -> None:
     assert call.vehicles == {
         name: StreamVehicle(name, HOMES[name], 1, held=False) for name in (A, B)
     }
-    free = {*ESTATES[A], *ESTATES[B]}
+    free = {*OWNED[A], *OWNED[B]}
     lanes = range(ROLLING.road.lanes)
-    window = {(column, lane) for column in range(-BESIDE, 2 + BESIDE + 1) for lane in lanes}
+    window = {
+        (column, lane)
+        for column in range(-MARGIN_COLUMNS, 2 + MARGIN_COLUMNS + 1)
+        for lane in lanes
+    }
     assert call.blocked == window - free
     assert call.before is None
     desk.think(LOOK_S + SLOT_S)
@@ -260,7 +272,7 @@ def test_the_planner_gets_all_vehicles_and_owned_cells() -> None:
 def test_it_plans_from_where_vehicles_will_hold() -> None:
     desk = bench(A, B)
     desk.hear(shown(A, OLD, moving=True, accepted=True, t_s=BEGUN_S + 0.4))
-    moved = shown(A, OLD, moving=True, accepted=True, t_s=BEGUN_S + SHOWN_S)
+    moved = shown(A, OLD, moving=True, accepted=True, t_s=BEGUN_S + SNAPSHOT_S)
     desk.hear(evolve(moved, hold_cell=(1, 0)))
     desk.think()
     assert desk.calls[0].vehicles[A].cell == (1, 0)
@@ -284,8 +296,8 @@ def test_later_states_do_not_count() -> None:
 def test_states_may_arrive_in_any_order() -> None:
     desk = bench(A)
     desk.hear(evolve(shown(A), hold_cell=(2, 0), t_s=LOOK_S))
-    desk.hear(evolve(shown(A), hold_cell=(1, 0), t_s=BEGUN_S + SHOWN_S))
-    desk.hear(evolve(shown(A), hold_cell=(0, 0), t_s=BEGUN_S + SHOWN_S - 0.1))
+    desk.hear(evolve(shown(A), hold_cell=(1, 0), t_s=BEGUN_S + SNAPSHOT_S))
+    desk.hear(evolve(shown(A), hold_cell=(0, 0), t_s=BEGUN_S + SNAPSHOT_S - 0.1))
     desk.hear(evolve(shown(A, OLD), hold_cell=(2, 0), t_s=LOOK_S))  # twice in a tick
     desk.think()
     assert desk.calls[0].vehicles[A].cell == (1, 0)
@@ -303,11 +315,11 @@ def test_an_unheard_vehicle_does_not_keep_others_from_being_planned() -> None:
     for names in ((A, B), (B, A)):
         desk = bench(*names)
         desk.control.on_census(census(*names, C))
-        desk.hear(evolve(shown(A), hold_cell=HOMES[C], t_s=BEGUN_S + SHOWN_S))
+        desk.hear(evolve(shown(A), hold_cell=HOMES[C], t_s=BEGUN_S + SNAPSHOT_S))
         desk.think()
         assert set(desk.calls[0].vehicles) == {A, B}
     desk = bench(A, B)
-    desk.hear(evolve(shown(A), hold_cell=HOMES[B], t_s=BEGUN_S + SHOWN_S))
+    desk.hear(evolve(shown(A), hold_cell=HOMES[B], t_s=BEGUN_S + SNAPSHOT_S))
     desk.think()
     assert len(desk.calls[0].vehicles) == 1
 
@@ -317,7 +329,7 @@ def test_a_vehicle_that_has_moved_since_is_left_out() -> None:
     compute = desk.order()
     assert compute is not None
     desk.hear(evolve(shown(A, OLD, moving=True), hold_cell=(1, 0), t_s=LOOK_S))
-    desk.hear(evolve(shown(B), estate=(*ESTATES[B], (2, 2)), t_s=LOOK_S))
+    desk.hear(evolve(shown(B), owned=(*OWNED[B], (2, 2)), t_s=LOOK_S))
     desk.finish(compute, LOOK_S)
     assert [set(transfer.moves) for transfer in desk.control.transfers] == [{B}]
 
@@ -326,10 +338,10 @@ def test_a_ballot_that_is_not_in_force_is_given_up_when_its_slot_has_begun() -> 
     desk = bench(A, ways={A: ((0, 0), (1, 0))})
     desk.think()
     transfer = desk.transfer
-    desk.order(transfer.t0_s + LATEST_S)
+    desk.order(transfer.t0_s + MAX_DELAY_S)
     assert transfer.wakeup_s is not None
-    desk.order(transfer.t0_s + LATEST_S + 0.1)
-    assert transfer.phase is BallotPhase.GIVEN_UP
+    desk.order(transfer.t0_s + MAX_DELAY_S + 0.1)
+    assert transfer.phase is BallotPhase.ABORTED
 
 
 @pytest.mark.parametrize("result", ["in time", "late", "failed"])
@@ -343,8 +355,8 @@ def test_the_result_of_the_next_planning_ends_older_ballots(result: str) -> None
         list(desk.control.finish(Computed(compute.job, None, "out of memory"), LOOK_S, 0.0))
     else:
         late_s = 0.1 if result == "late" else -0.1
-        desk.finish(compute, (SLOT + 2) * SLOT_S + LATEST_S + late_s)
-    assert old.phase is BallotPhase.GIVEN_UP
+        desk.finish(compute, (SLOT + 2) * SLOT_S + MAX_DELAY_S + late_s)
+    assert old.phase is BallotPhase.ABORTED
     if result == "in time":
         assert desk.transfer.ballot > old.ballot
 
@@ -357,14 +369,14 @@ def test_a_vehicle_without_a_state_in_time_is_held() -> None:
     assert [vehicle.held for vehicle in desk.calls[0].vehicles.values()] == [False, True]
 
 
-CLOSED = Deed(OLD, ESTATES[A], (HOMES[A], (1, 0)), (A, B))
+CLOSED = PendingTransfer(OLD, OWNED[A], (HOMES[A], (1, 0)), (A, B))
 
 
 @pytest.mark.parametrize(
     ("observed", "held", "blocked", "usable"),
     [
         (  # its gate is open: its move may begin at any time until it promises another ballot
-            shown(A, OLD, Deed(OLD, open=True), accepted=True, go=True, done=False),
+            shown(A, OLD, PendingTransfer(OLD, open=True), accepted=True, go=True, done=False),
             True,
             {(1, 0), (-1, 0)},
             {HOMES[A]},
@@ -375,14 +387,14 @@ CLOSED = Deed(OLD, ESTATES[A], (HOMES[A], (1, 0)), (A, B))
             {(-1, 0)},
             {HOMES[A], (1, 0)},
         ),
-        (shown(A, attended=False), True, set(), {*ESTATES[A]}),
+        (shown(A, attended=False), True, set(), {*OWNED[A]}),
         (  # what it owns cannot be told
-            shown(A, OLD, Deed(OLD, ESTATES[A], (HOMES[A],), (A, B)), accepted=True),
+            shown(A, OLD, PendingTransfer(OLD, OWNED[A], (HOMES[A],), (A, B)), accepted=True),
             False,
-            {*ESTATES[A]} - {HOMES[A]},
+            {*OWNED[A]} - {HOMES[A]},
             {HOMES[A]},
         ),
-        (shown(A, OLD, estate=()), False, {*ESTATES[A]}, set()),
+        (shown(A, OLD, owned=()), False, {*OWNED[A]}, set()),
     ],
     ids=["late", "closed gate", "without agent", "no certain owner", "promise not noted"],
 )
@@ -401,7 +413,7 @@ def test_vehicles_far_from_where_moves_begin_are_not_planned_for() -> None:
     road = parse_scenario({"formation": {"operation": "rolling"}, "road": {"s2_m": 2000.0}})
     desk = Bench()
     desk.control = RollingOperation(road, desk.new_ballot, desk.new_job, desk.plan)
-    far_s = (road.moves_from_m - AHEAD_M) / 15.0
+    far_s = (road.moves_from_m - LOOKAHEAD_M) / 15.0
     slot = math.ceil(far_s / SLOT_S)
     desk.control.on_census(census(A, D))  # D is 120 m behind A
     assert desk.order(slot * SLOT_S - 2.0) is None
@@ -416,7 +428,7 @@ def test_an_unheard_vehicle_stays_where_it_entered_and_owns_nothing() -> None:
     desk.ways = {A: ((0, 0), (0, 1)), B: ((2, 1), (2, 1))}
     call = desk.call()
     assert call.vehicles[B] == StreamVehicle(B, HOMES[B], 1, held=True)
-    assert set(ESTATES[B]) <= call.blocked
+    assert set(OWNED[B]) <= call.blocked
     assert desk.control.transfers == []  # A would need a cell that is B's
 
 
@@ -429,12 +441,12 @@ def test_an_unheard_vehicle_stays_where_it_entered_and_owns_nothing() -> None:
         (shown(A), evolve(shown(A), t_s=BEGUN_S + 1.0)),
         (evolve(shown(A), t_s=BEGUN_S + 1.0), evolve(shown(A), incarnation=8)),
         (shown(A), shown(A, OLD)),
-        (evolve(shown(A, OLD), estate=()), shown(A, OLD)),
+        (evolve(shown(A, OLD), owned=()), shown(A, OLD)),
         (shown(A, OLD), shown(A, OLD, accepted=True)),
-        (shown(A, OLD), shown(A, OLD, Deed(OLD))),
-        (shown(A, OLD, Deed(OLD)), shown(A, OLD, Deed(OLD, open=True))),
+        (shown(A, OLD), shown(A, OLD, PendingTransfer(OLD))),
+        (shown(A, OLD, PendingTransfer(OLD)), shown(A, OLD, PendingTransfer(OLD, open=True))),
     ],
-    ids=["tick", "process", "promise", "noted", "acceptance", "deed", "gate"],
+    ids=["tick", "process", "promise", "noted", "acceptance", "transfer", "gate"],
 )
 def test_the_newest_state_counts_in_whichever_order_they_come(older: State, newer: State) -> None:
     for states in ((older, newer), (newer, older)):
@@ -484,9 +496,9 @@ def test_vehicles_whose_promises_tell_ownership_are_in_the_roster() -> None:
     newer = OLD._replace(seq=2)
     desk = bench(A, B, C, D)
     desk.hear(
-        shown(C, newer, Deed(newer, ESTATES[C], ESTATES[C], (B, C)), accepted=True),
-        shown(B, newer, Deed(newer, ESTATES[B], ESTATES[B], (B, C)), accepted=True),
-        shown(D, OLD, Deed(OLD, open=True), accepted=True),
+        shown(C, newer, PendingTransfer(newer, OWNED[C], OWNED[C], (B, C)), accepted=True),
+        shown(B, newer, PendingTransfer(newer, OWNED[B], OWNED[B], (B, C)), accepted=True),
+        shown(D, OLD, PendingTransfer(OLD, open=True), accepted=True),
     )
     desk.ways = {C: ((-4, 0), (-5, 0))}
     desk.think()
@@ -525,7 +537,7 @@ def test_from_the_plan_to_a_ballot_in_force() -> None:
     ]
     assert desk.hear(accepted[0]) == []
     assert desk.hear(accepted[1]) == [
-        LogEntry("plan-in-force", {"slot": SLOT + 1, "closed_s": BEGUN_S + SHOWN_S})
+        LogEntry("plan-in-force", {"slot": SLOT + 1, "closed_s": BEGUN_S + SNAPSHOT_S})
     ]
     assert desk.control.in_force == 1
     assert desk.control.wakeups == []
@@ -548,7 +560,7 @@ def test_a_vehicle_that_leaves_is_forgotten_and_its_ballot_given_up() -> None:
     first, second = desk.control.transfers
     desk.control.on_census(census(A, C))
     assert set(desk.control.observed.states) == {A, C}
-    assert (first.phase, first.why) == (BallotPhase.GIVEN_UP, "B has left")
+    assert (first.phase, first.reason) == (BallotPhase.ABORTED, "B has left")
     assert second.phase is BallotPhase.PREPARING
 
 
@@ -574,7 +586,7 @@ def test_a_new_road_starts_without_memory() -> None:
     assert desk.order(LOOK_S + SLOT_S) is None
     desk.control.on_census(evolve(census(A), t_s=0.0))
     assert desk.order(0.0, now_s=100.0) is None  # it listens first
-    compute = desk.order(SHOWN_S + 0.1, now_s=101.0)
+    compute = desk.order(SNAPSHOT_S + 0.1, now_s=101.0)
     assert compute is not None
     compute.work()
     call = desk.calls[-1]

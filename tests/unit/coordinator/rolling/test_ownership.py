@@ -14,7 +14,14 @@ from laneweave.coordinator.rolling.ownership import certain_cells, owned_cells, 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Computed
 from laneweave.protocol.scenario.fields import FormationSettings, Road, Scenario
-from laneweave.protocol.wire.messages import Ballot, Census, CensusEntry, Deed, Name, VehicleState
+from laneweave.protocol.wire.messages import (
+    Ballot,
+    Census,
+    CensusEntry,
+    Name,
+    PendingTransfer,
+    VehicleState,
+)
 from support.states import holding
 
 A, B, C = Name("a"), Name("b"), Name("c")
@@ -27,18 +34,18 @@ def ballot(seq: int) -> Ballot:
     return Ballot(1, Name("c1"), 1, seq)
 
 
-def deed(seq: int, before: tuple[Cell, ...], after: tuple[Cell, ...]) -> Deed:
-    return Deed(ballot(seq), before, after, (A, B))
+def transfer(seq: int, before: tuple[Cell, ...], after: tuple[Cell, ...]) -> PendingTransfer:
+    return PendingTransfer(ballot(seq), before, after, (A, B))
 
 
-def state(vehicle: Name, promised: int, *estate: Cell, **more: object) -> VehicleState:
-    return holding(vehicle, ballot(promised), estate[0], estate=estate, **more)
+def state(vehicle: Name, promised: int, *owned: Cell, **more: object) -> VehicleState:
+    return holding(vehicle, ballot(promised), owned[0], owned=owned, **more)
 
 
-TAKES = deed(1, ((3, 0),), ((3, 0), (3, 1)))
-GIVES = deed(1, ((4, 1), (3, 1)), ((4, 1),))
-TAKER = state(A, 1, (3, 0), deed=TAKES, accepted=True, ready=True)
-GIVER = state(B, 1, (4, 1), (3, 1), deed=GIVES, accepted=True, ready=True, done=True)
+TAKES = transfer(1, ((3, 0),), ((3, 0), (3, 1)))
+GIVES = transfer(1, ((4, 1), (3, 1)), ((4, 1),))
+TAKER = state(A, 1, (3, 0), transfer=TAKES, accepted=True, ready=True)
+GIVER = state(B, 1, (4, 1), (3, 1), transfer=GIVES, accepted=True, ready=True, done=True)
 
 
 def owned(giver: VehicleState, *others: VehicleState) -> frozenset[Cell] | None:
@@ -52,22 +59,22 @@ def test_ownership_is_unknown_while_both_may_open_their_gates() -> None:
 
 
 @pytest.mark.parametrize(
-    ("taker", "estate"),
+    ("taker", "cells"),
     [
-        (state(A, 1, (3, 0), (3, 1), deed=Deed(ballot(1), open=True)), {(4, 1)}),
+        (state(A, 1, (3, 0), (3, 1), transfer=PendingTransfer(ballot(1), open=True)), {(4, 1)}),
         (state(A, 2, (3, 0)), {(4, 1), (3, 1)}),  # it has never had the transfer
         (evolve(TAKER, promised=ballot(2), accepted=False), {(4, 1), (3, 1)}),
         (
-            state(A, 3, (3, 0), deed=Deed(ballot(2), open=True)),
+            state(A, 3, (3, 0), transfer=PendingTransfer(ballot(2), open=True)),
             {(4, 1)},
         ),  # it shows a newer one
     ],
 )
 def test_the_state_of_one_vehicle_tells_what_the_other_owns(
-    taker: VehicleState, estate: set[Cell]
+    taker: VehicleState, cells: set[Cell]
 ) -> None:
     giver = evolve(GIVER, promised=ballot(2), accepted=False)
-    assert owned(giver, taker) == frozenset(estate)
+    assert owned(giver, taker) == frozenset(cells)
 
 
 def test_a_vehicle_that_has_left_is_not_waited_for() -> None:
@@ -122,15 +129,15 @@ def plan_once(planner: Orders, *states: VehicleState) -> RollingOperation:
 
 def test_vehicles_that_may_know_what_a_member_owns_are_in_the_roster() -> None:
     other = state(C, 1, (5, 1), (5, 0))
-    giver = evolve(GIVER, deed=deed(1, ((4, 1), (3, 1), (4, 0)), ((4, 1), (4, 0))))
-    giver = evolve(giver, estate=((4, 1), (3, 1), (4, 0)))
+    giver = evolve(GIVER, transfer=transfer(1, ((4, 1), (3, 1), (4, 0)), ((4, 1), (4, 0))))
+    giver = evolve(giver, owned=((4, 1), (3, 1), (4, 0)))
     control = plan_once(Orders({B: (4, 0)}), TAKER, giver, other)
     assert [transfer.roster for transfer in control.transfers] == [(A, B)]
 
 
 def test_a_vehicle_at_a_gate_that_never_opens_is_planned_for() -> None:
-    taker = evolve(TAKER, estate=((3, 0), (2, 0)))
-    taker = evolve(taker, deed=deed(1, ((3, 0), (2, 0)), ((3, 0), (2, 0), (3, 1))))
+    taker = evolve(TAKER, owned=((3, 0), (2, 0)))
+    taker = evolve(taker, transfer=transfer(1, ((3, 0), (2, 0)), ((3, 0), (2, 0), (3, 1))))
     planner = Orders({A: (2, 0)})
     control = plan_once(planner, taker, GIVER)
     assert not planner.held

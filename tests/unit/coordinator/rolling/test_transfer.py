@@ -10,7 +10,14 @@ from laneweave.coordinator.rolling.ownership import certain_cells, owned_cells, 
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES, CellTransfer
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.vehicle.plans import ownership_problems, plan_problems
-from laneweave.protocol.wire.messages import Ballot, Deed, Name, Plan, Prepare, VehicleState
+from laneweave.protocol.wire.messages import (
+    Ballot,
+    Name,
+    PendingTransfer,
+    Plan,
+    Prepare,
+    VehicleState,
+)
 from support.rolling_samples import (
     AFTER,
     BEFORE,
@@ -22,8 +29,8 @@ from support.rolling_samples import (
     A,
     B,
     C,
-    deed_of,
     make_plan,
+    pending,
     state,
 )
 from support.rule_books import RuleRecorder
@@ -64,30 +71,31 @@ def issued() -> CellTransfer:
 
 # --- what a vehicle owns -----------------------------------------------------------------------
 
-DEED = deed_of(A, MID, (A, B, C))
-CLOSED = state(A, HIGH, DEED)
+OPEN = PendingTransfer(MID, open=True)
+TRANSFER = pending(A, MID, (A, B, C))
+CLOSED = state(A, HIGH, TRANSFER)
 """A has promised more, and its gate was closed then."""
 
 
 def test_without_a_transfer_or_with_an_open_one_the_state_shows_the_owned_cells() -> None:
     assert owned_cells(state(A, HIGH), {}) == OWNED_BEFORE
-    taken = state(A, HIGH, Deed(MID, open=True), estate=AFTER[A])
+    taken = state(A, HIGH, OPEN, owned=AFTER[A])
     assert owned_cells(taken, {}) == OWNED_AFTER
 
 
 def test_one_that_knows_the_open_gate_is_enough() -> None:
-    knows = state(C, MID, Deed(MID, open=True))
+    knows = state(C, MID, OPEN)
     assert owned_cells(CLOSED, {C: knows}) == OWNED_AFTER
     # Also while A still could open its own gate.
-    assert owned_cells(state(A, MID, DEED), {C: knows}) == OWNED_AFTER
+    assert owned_cells(state(A, MID, TRANSFER), {C: knows}) == OWNED_AFTER
 
 
-@pytest.mark.parametrize("older", [None, Deed(LOW, open=True)])
+@pytest.mark.parametrize("older", [None, PendingTransfer(LOW, open=True)])
 def test_a_higher_promise_without_the_transfer_keeps_the_gate_closed(
-    older: Deed | None,
+    older: PendingTransfer | None,
 ) -> None:
     assert owned_cells(CLOSED, {C: state(C, BETWEEN, older)}) == OWNED_BEFORE
-    assert owned_cells(state(A, MID, DEED), {C: state(C, BETWEEN, older)}) == OWNED_BEFORE
+    assert owned_cells(state(A, MID, TRANSFER), {C: state(C, BETWEEN, older)}) == OWNED_BEFORE
 
 
 @pytest.mark.parametrize(
@@ -96,39 +104,37 @@ def test_a_higher_promise_without_the_transfer_keeps_the_gate_closed(
         state(C, MID),  # it may accept yet
         state(C, LOW),
         state(C, None),
-        state(C, BETWEEN, estate=()),  # its controller has not noted the promise
-        state(C, MID, DEED),  # it may open its gate yet
+        state(C, BETWEEN, owned=()),  # its controller has not noted the promise
+        state(C, MID, TRANSFER),  # it may open its gate yet
     ],
 )  # fmt: skip
 def test_states_that_may_still_change_tell_nothing(silent: VehicleState) -> None:
-    others = {B: state(B, HIGH, DEED), C: silent}
+    others = {B: state(B, HIGH, TRANSFER), C: silent}
     assert owned_cells(CLOSED, others) is None
     assert certain_cells(CLOSED, others) == SURE
     assert partners(CLOSED, others) == {B, C}
 
 
 def test_when_all_have_promised_more_with_closed_gates_the_old_cells_are_owned() -> None:
-    others = {B: state(B, BETWEEN, DEED), C: state(C, HIGH, DEED)}
+    others = {B: state(B, BETWEEN, TRANSFER), C: state(C, HIGH, TRANSFER)}
     assert owned_cells(CLOSED, others) == certain_cells(CLOSED, others) == OWNED_BEFORE
     assert partners(CLOSED, others) == frozenset()
-    assert owned_cells(state(A, MID, DEED), others) is None  # A may open its own gate
-    assert owned_cells(evolve(CLOSED, estate=()), others) is None
+    assert owned_cells(state(A, MID, TRANSFER), others) is None  # A may open its own gate
+    assert owned_cells(evolve(CLOSED, owned=()), others) is None
 
 
-@pytest.mark.parametrize("newer", [None, state(C, HIGH, Deed(BETWEEN, open=True))])
+@pytest.mark.parametrize("newer", [None, state(C, HIGH, PendingTransfer(BETWEEN, open=True))])
 def test_cells_owned_either_way_are_certain(
     newer: VehicleState | None,
 ) -> None:
     """A member may have opened the gate; it has left, or has had another plan since."""
     there = {} if newer is None else {C: newer}
     gone = {C} if newer is None else set[Name]()
-    assert owned_cells(CLOSED, {B: state(B, HIGH, DEED), **there}, gone) == SURE
-    assert owned_cells(CLOSED, {B: state(B, MID, DEED), **there}, gone) == SURE
-    assert (
-        owned_cells(CLOSED, {B: state(B, HIGH, Deed(MID, open=True)), **there}, gone) == OWNED_AFTER
-    )
+    assert owned_cells(CLOSED, {B: state(B, HIGH, TRANSFER), **there}, gone) == SURE
+    assert owned_cells(CLOSED, {B: state(B, MID, TRANSFER), **there}, gone) == SURE
+    assert owned_cells(CLOSED, {B: state(B, HIGH, OPEN), **there}, gone) == OWNED_AFTER
     assert owned_cells(CLOSED, {B: state(B, HIGH), **there}, gone) == OWNED_BEFORE
-    assert partners(CLOSED, {B: state(B, HIGH, DEED), **there}) == {B, *there}
+    assert partners(CLOSED, {B: state(B, HIGH, TRANSFER), **there}) == {B, *there}
     # Under way it may still be in a cell that it is about to give.
     moving = evolve(CLOSED, moving=True)
     assert owned_cells(moving, there, gone) is None
@@ -136,13 +142,13 @@ def test_cells_owned_either_way_are_certain(
 
 
 def test_states_of_other_vehicles_and_own_older_ones_are_ignored() -> None:
-    stranger, others = Name("X"), {B: state(B, MID, DEED), C: state(C, MID, DEED)}
+    stranger, others = Name("X"), {B: state(B, MID, TRANSFER), C: state(C, MID, TRANSFER)}
     assert owned_cells(CLOSED, {stranger: state(stranger, HIGH), **others}) is None
-    assert owned_cells(CLOSED, {A: state(A, HIGH, Deed(MID, open=True)), **others}) is None
+    assert owned_cells(CLOSED, {A: state(A, HIGH, OPEN), **others}) is None
 
 
 def test_a_single_member_of_a_plan_knows_what_it_owns() -> None:
-    alone = deed_of(A, MID, (A,))
+    alone = pending(A, MID, (A,))
     assert owned_cells(state(A, HIGH, alone), {}) == OWNED_BEFORE
     assert owned_cells(state(A, MID, alone), {}) is None
 
@@ -164,7 +170,7 @@ def test_prepares_until_all_have_promised() -> None:
 
 @pytest.mark.parametrize(
     "no_promise",
-    [state(B, LOW), state(B), state(B, MID, estate=()), state(B, MID, accepted=True)],
+    [state(B, LOW), state(B), state(B, MID, owned=()), state(B, MID, accepted=True)],
     ids=["of an older ballot", "none", "not noted", "accepted already"],
 )
 def test_what_is_no_promise_does_not_count(no_promise: VehicleState) -> None:
@@ -194,7 +200,7 @@ def test_the_plan_is_made_from_the_promises() -> None:
 def test_the_newest_promise_counts() -> None:
     """It includes cells that the roadside assigned between two states."""
     transfer = make_transfer()
-    hear(transfer, state(A, MID), state(A, MID, estate=(*BEFORE[A], (5, 0))), state(B, MID))
+    hear(transfer, state(A, MID), state(A, MID, owned=(*BEFORE[A], (5, 0))), state(B, MID))
     assert transfer.plan is not None
     assert transfer.plan.before[A] == (*BEFORE[A], (5, 0))
     assert transfer.plan.after[A] == (*AFTER[A], (5, 0))
@@ -207,14 +213,18 @@ def test_a_cell_that_is_left_in_a_slot_cannot_be_entered_in_it() -> None:
     assert transfer.phase is BallotPhase.ISSUING
     transfer = make_transfer({A: (HOME, (1, 1)), B: ((2, 1), (1, 1))})
     hear(transfer, state(A, MID), state(B, MID))
-    assert transfer.phase is BallotPhase.GIVEN_UP
-    assert "meet in step 0" in transfer.why
+    assert transfer.phase is BallotPhase.ABORTED
+    assert "meet in step 0" in transfer.reason
 
 
 def test_a_closed_transfer_of_an_older_plan_is_resolved_by_the_others() -> None:
-    old = Deed(LOW, ((2, 1),), BEFORE[B], (A, B))
+    old = PendingTransfer(LOW, ((2, 1),), BEFORE[B], (A, B))
     transfer = make_transfer()
-    hear(transfer, state(A, MID, Deed(LOW, open=True)), state(B, MID, old, estate=((2, 1),)))
+    hear(
+        transfer,
+        state(A, MID, PendingTransfer(LOW, open=True)),
+        state(B, MID, old, owned=((2, 1),)),
+    )
     assert isinstance(transfer.plan, Plan)
     assert transfer.plan.before == BEFORE
 
@@ -224,12 +234,12 @@ def test_a_closed_transfer_of_an_older_plan_is_resolved_by_the_others() -> None:
 WRONG = {
     "A is not where it was planned from": [evolve(state(A, MID), hold_cell=(1, 0)), state(B, MID)],
     "B does not own": [state(A, MID), evolve(state(B, MID), hold_cell=TARGET)],
-    "no member owned": [state(A, MID), state(B, MID, estate=((2, 1),))],
-    "a cell has two owners": [state(A, MID, estate=(*BEFORE[A], (2, 1))), state(B, MID)],
+    "no member owned": [state(A, MID), state(B, MID, owned=((2, 1),))],
+    "a cell has two owners": [state(A, MID, owned=(*BEFORE[A], (2, 1))), state(B, MID)],
     "it cannot be told what B owns": [
-        state(C, LOW, Deed(LOW, (), (), (A, B, C))),  # it may open its gate yet
-        state(A, MID, Deed(LOW, BEFORE[A], BEFORE[A], (A,))),
-        state(B, MID, Deed(LOW, BEFORE[B], (), (A, B, C))),
+        state(C, LOW, PendingTransfer(LOW, (), (), (A, B, C))),  # it may open its gate yet
+        state(A, MID, PendingTransfer(LOW, BEFORE[A], BEFORE[A], (A,))),
+        state(B, MID, PendingTransfer(LOW, BEFORE[B], (), (A, B, C))),
     ],
     "outbid": [state(A, MID), state(B, HIGH)],
     "A has restarted": [state(A, MID), evolve(state(A, LOW), incarnation=8)],
@@ -240,8 +250,8 @@ WRONG = {
 def test_is_given_up_when_it_cannot_succeed(why: str) -> None:
     transfer = make_transfer()
     hear(transfer, *WRONG[why])
-    assert transfer.phase is BallotPhase.GIVEN_UP
-    assert why in transfer.why
+    assert transfer.phase is BallotPhase.ABORTED
+    assert why in transfer.reason
     assert transfer.plan is None
     assert transfer.wakeup_s is None
     assert transfer.outgoing(9.0) == []
@@ -250,7 +260,7 @@ def test_is_given_up_when_it_cannot_succeed(why: str) -> None:
 def test_a_vehicle_without_agent_is_not_moved() -> None:
     transfer = make_transfer()
     hear(transfer, evolve(state(A, MID), attended=False), state(B, MID))
-    assert transfer.why == "A is not where it was planned from"
+    assert transfer.reason == "A is not where it was planned from"
     transfer = make_transfer()
     hear(transfer, state(A, MID), evolve(state(B, MID), attended=False))
     assert (
@@ -265,7 +275,7 @@ def test_a_vehicle_without_agent_is_not_moved() -> None:
 def test_is_given_up_while_the_plan_is_sent(shown: VehicleState, why: str) -> None:
     transfer = issued()
     hear(transfer, shown)
-    assert (transfer.phase, transfer.why) == (BallotPhase.GIVEN_UP, why)
+    assert (transfer.phase, transfer.reason) == (BallotPhase.ABORTED, why)
 
 
 def test_what_is_in_force_or_given_up_stays_so() -> None:
@@ -274,9 +284,9 @@ def test_what_is_in_force_or_given_up_stays_so() -> None:
     hear(transfer, state(A, HIGH))
     assert transfer.phase is BallotPhase.IN_FORCE
     transfer = make_transfer()
-    transfer.give_up("no reason")
+    transfer.abort("no reason")
     hear(transfer, state(A, MID), state(B, MID))
-    assert (transfer.phase, transfer.why) == (BallotPhase.GIVEN_UP, "no reason")
+    assert (transfer.phase, transfer.reason) == (BallotPhase.ABORTED, "no reason")
 
 
 # --- the table as a whole ---------------------------------------------------------------------
@@ -296,7 +306,7 @@ def test_histories_take_every_row_of_the_table() -> None:
     begun(state(A, HIGH))  # outbid
     begun(*promised, evolve(state(A, MID), incarnation=9))  # restarted
     begun(evolve(state(A, MID), attended=False), state(B, MID))  # cannot be planned
-    begun(*promised).give_up("late")
+    begun(*promised).abort("late")
     begun(*promised).on_left(A)
     assert {*book.taken} == {*range(len(TRANSFER_RULES.table))}
 
@@ -304,7 +314,7 @@ def test_histories_take_every_row_of_the_table() -> None:
 def test_a_vehicle_that_restarts_while_the_ballot_is_outbid_does_not_revive_it() -> None:
     transfer = issued()
     hear(transfer, evolve(state(A, HIGH), incarnation=9))
-    assert (transfer.phase, transfer.why) == (BallotPhase.GIVEN_UP, "outbid")
+    assert (transfer.phase, transfer.reason) == (BallotPhase.ABORTED, "outbid")
     hear(transfer, evolve(state(A, MID), incarnation=9), evolve(state(A, MID), incarnation=10))
-    assert (transfer.phase, transfer.why) == (BallotPhase.GIVEN_UP, "outbid")
+    assert (transfer.phase, transfer.reason) == (BallotPhase.ABORTED, "outbid")
     assert list(transfer.outgoing(1e6)) == []

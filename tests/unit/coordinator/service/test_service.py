@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from laneweave.coordinator.planning.solve import plan
 from laneweave.coordinator.service import server as service
 from laneweave.coordinator.service.format import FAILED, INVALID, LATE, OVERLOADED
-from laneweave.coordinator.service.rendezvous import falls_to
+from laneweave.coordinator.service.rendezvous import is_assigned_to
 from laneweave.coordinator.service.server import PlanningService, ServiceMetrics
 from laneweave.protocol.runtime.node import (
     Computed,
@@ -472,7 +472,9 @@ NAMES = tuple(f"c{number}" for number in range(5))
 
 
 def owners(payload: bytes, names: tuple[str, ...]) -> list[str]:
-    return [name for name in names if falls_to(name, (n for n in names if n != name), payload)]
+    return [
+        name for name in names if is_assigned_to(name, (n for n in names if n != name), payload)
+    ]
 
 
 @given(st.binary(), st.sets(st.sampled_from(NAMES), min_size=1))

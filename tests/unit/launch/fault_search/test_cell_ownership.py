@@ -6,12 +6,12 @@ import pytest
 
 from laneweave.launch.fault_search.cell_ownership import CellOwnership
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.wire.messages import Ballot, Deed, Name
+from laneweave.protocol.wire.messages import Ballot, Name, PendingTransfer
 
 HERE, THERE, BEYOND = (0, 0), (0, 1), (0, 2)
 BALLOT = Ballot(1, Name("c1"), 1, 1)
 ROSTER = (Name("a"), Name("b"))
-OPEN = Deed(BALLOT, open=True)
+OPEN = PendingTransfer(BALLOT, open=True)
 
 
 class Watched:
@@ -26,8 +26,8 @@ class Watched:
         del t_s, vehicles, text
         self.kinds.append(kind)
 
-    def show(self, vehicle: str, *estate: Cell, deed: Deed | None = None) -> None:
-        self.ownership.show(0.0, vehicle, estate, deed)
+    def show(self, vehicle: str, *owned: Cell, transfer: PendingTransfer | None = None) -> None:
+        self.ownership.show(0.0, vehicle, owned, transfer)
 
     def stand(self, vehicle: str, *cells: Cell) -> None:
         self.ownership.occupy(0.0, vehicle, frozenset(cells))
@@ -44,15 +44,15 @@ def watched() -> Watched:
     return watched
 
 
-def shut(before: tuple[Cell, ...], after: tuple[Cell, ...]) -> Deed:
-    return Deed(BALLOT, before, after, ROSTER)
+def shut(before: tuple[Cell, ...], after: tuple[Cell, ...]) -> PendingTransfer:
+    return PendingTransfer(BALLOT, before, after, ROSTER)
 
 
 def hand_over(watched: Watched) -> None:
     """Both accept that THERE becomes A's; A opens its gate."""
-    watched.show("a", HERE, deed=shut((HERE,), (HERE, THERE)))
-    watched.show("b", THERE, BEYOND, deed=shut((THERE, BEYOND), (BEYOND,)))
-    watched.show("a", HERE, THERE, deed=OPEN)
+    watched.show("a", HERE, transfer=shut((HERE,), (HERE, THERE)))
+    watched.show("b", THERE, BEYOND, transfer=shut((THERE, BEYOND), (BEYOND,)))
+    watched.show("a", HERE, THERE, transfer=OPEN)
 
 
 def test_while_gates_open_a_cell_is_of_whom_the_plan_gives_it(watched: Watched) -> None:
@@ -64,7 +64,7 @@ def test_while_gates_open_a_cell_is_of_whom_the_plan_gives_it(watched: Watched) 
 
 def test_a_cell_has_one_owner(watched: Watched) -> None:
     hand_over(watched)
-    watched.show("b", THERE, BEYOND, deed=Deed(BALLOT._replace(seq=2), open=True))
+    watched.show("b", THERE, BEYOND, transfer=PendingTransfer(BALLOT._replace(seq=2), open=True))
     assert watched.kinds == ["owner"]
 
 

@@ -226,7 +226,7 @@ def test_attended_and_unattended_vehicles(healthy: Listener) -> None:
     healthy.states("b", [112], attended=False, accepted=True, promised=Ballot(1, Name("c"), 1, 1))
     vehicles = healthy.status().vehicles
     assert (vehicles.attended, vehicles.unattended, vehicles.unheard) == (1, 1, 1)
-    healthy.states("b", [113], estate=((0, 0),))
+    healthy.states("b", [113], owned=((0, 0),))
     assert healthy.status().plans.operation == "rolling"
 
 

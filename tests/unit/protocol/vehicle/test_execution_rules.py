@@ -10,7 +10,7 @@ from attrs import evolve
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.vehicle.plan_execution import ExecutionPhase, PlanExecution
 from laneweave.protocol.vehicle.plans import ownership_problems, plan_problems
-from laneweave.protocol.wire.messages import Deed, Plan, Prepare
+from laneweave.protocol.wire.messages import PendingTransfer, Plan, Prepare
 from support.rolling_samples import (
     AFTER,
     BEFORE,
@@ -23,8 +23,8 @@ from support.rolling_samples import (
     A,
     B,
     C,
-    deed_of,
     make_plan,
+    pending,
     sense,
     state,
     vehicle,
@@ -41,11 +41,11 @@ def promised() -> PlanExecution:
 
 
 def accepted() -> PlanExecution:
-    """Accept the plan, and let the controller note it with its deed."""
+    """Accept the plan, and let the controller note it with its transfer."""
     execution = promised()
     assert execution.on_plan(make_plan())
-    noted = sense(promised=MID, deed=deed_of(A), accepted=MID)
-    assert execution.on_noted(noted.accepted)
+    noted = sense(promised=MID, transfer=pending(A), accepted=MID)
+    assert execution.on_stored(noted.accepted)
     execution.on_owned(noted)
     return execution
 
@@ -95,12 +95,12 @@ def test_a_plan_that_claims_more_cells_than_the_vehicle_owns_is_refused() -> Non
 def test_cells_of_a_closed_transfer_may_be_owned() -> None:
     """Others may know that its gate is open."""
     plan = with_before_of_a(make_plan(HIGH), *BEFORE[A], (7, 0))
-    deed = Deed(LOW, BEFORE[A], (*BEFORE[A], (7, 0)), (A, C))
+    transfer = PendingTransfer(LOW, BEFORE[A], (*BEFORE[A], (7, 0)), (A, C))
     execution = vehicle()
     execution.on_prepare(Prepare(HIGH, (), (A, B)))
     execution.on_owned(sense(promised=HIGH))
     assert not execution.on_plan(plan)
-    execution.on_owned(sense(promised=HIGH, deed=deed))
+    execution.on_owned(sense(promised=HIGH, transfer=transfer))
     assert execution.on_plan(plan)
 
 
@@ -116,15 +116,15 @@ def test_neither_blocks_nor_joined_formations_matter() -> None:
 
 def test_a_promise_shows_owned_cells_only_when_the_controller_has_noted_it() -> None:
     execution = vehicle()
-    old = sense(deed=deed_of(A, LOW))
-    assert execution.state(old, 0, attended=True).estate == BEFORE[A]
+    old = sense(transfer=pending(A, LOW))
+    assert execution.state(old, 0, attended=True).owned == BEFORE[A]
     execution.on_prepare(PREPARE)
     assert execution.wanted_promised == MID
     assert not execution.on_owned(old)
-    assert execution.state(old, 0, attended=True).estate == ()
+    assert execution.state(old, 0, attended=True).owned == ()
     noted = sense(promised=MID)
     assert execution.on_owned(noted)
-    assert execution.state(noted, 0, attended=True).estate == BEFORE[A]
+    assert execution.state(noted, 0, attended=True).owned == BEFORE[A]
     assert not execution.on_owned(noted)  # nothing new
 
 
@@ -146,7 +146,7 @@ def test_a_later_promise_drops_the_plan_and_keeps_the_gate_closed() -> None:
     execution.on_state(evolve(state(B, MID, accepted=True), go=True))
     execution.tick(T0_S)
     assert execution.go is False
-    assert execution.transfer == deed_of(A)  # it says no more than what was accepted
+    assert execution.transfer == pending(A)  # it says no more than what was accepted
 
 
 # --- taking ownership -------------------------------------------------------------------------
@@ -167,10 +167,10 @@ def test_takes_ownership_with_the_open_gate(
 ) -> None:
     execution = accepted()
     assert execution.tick(T0_S) is None
-    assert execution.transfer == deed_of(A)
+    assert execution.transfer == pending(A)
     execution.on_state(evolve(state(B, MID, accepted=True), **shown))
     assert execution.tick(t_s) == move
-    assert execution.transfer == (Deed(MID, open=True) if owns else deed_of(A))
+    assert execution.transfer == (PendingTransfer(MID, open=True) if owns else pending(A))
     assert execution.go is owns
 
 

@@ -74,7 +74,7 @@ def taken(plan: Plan | None = None, name: Name = A) -> PlanExecution:
 
 def accepted(plan: Plan | None = None, name: Name = A) -> PlanExecution:
     execution = taken(plan, name)
-    assert execution.on_noted(MID)
+    assert execution.on_stored(MID)
     return execution
 
 
@@ -265,10 +265,10 @@ def test_v3_a_plan_is_accepted_when_the_controller_has_noted_it(name: Name) -> N
         assert waits(execution)  # whatever the others show
     assert execution.needs_states(0.0)
     for other in (None, LOW, HIGH):
-        assert not execution.on_noted(other)
+        assert not execution.on_stored(other)
         assert waits(execution)
-    assert execution.on_noted(MID)
-    assert not execution.on_noted(MID)  # once
+    assert execution.on_stored(MID)
+    assert not execution.on_stored(MID)  # once
     assert execution.phase is ExecutionPhase.GATED
     assert execution.accepted
     assert execution.ready
@@ -295,7 +295,7 @@ IRRELEVANT = {
 def test_v4_irrelevant_states_are_ignored(state: VehicleState) -> None:
     execution = accepted()
     execution.on_state(state)
-    assert execution.heard == {}
+    assert execution.progress == {}
     assert execution.tick(T0_S) is None
     assert not execution.go
 
@@ -303,12 +303,12 @@ def test_v4_irrelevant_states_are_ignored(state: VehicleState) -> None:
 @pytest.mark.parametrize("reach", [taken, accepted, going])
 def test_v4_late_states_do_not_lower_what_was_heard(reach: Callable[[], PlanExecution]) -> None:
     execution = reach()
-    execution.heard = {}
+    execution.progress = {}
     for completed, ready, known in (
         (2, False, -1), (2, True, 2), (1, True, 2), (5, False, 2), (3, True, 3)
     ):  # fmt: skip
         execution.on_state(shown(completed=completed, ready=ready))
-        assert execution.heard == {B: known}
+        assert execution.progress == {B: known}
 
 
 def test_v4_an_open_gate_spreads() -> None:
@@ -436,7 +436,7 @@ def test_a_history_takes_every_row_of_the_table() -> None:
     for _ in range(2):
         execution.on_plan(make_plan())
     for _ in range(2):
-        execution.on_noted(MID)
+        execution.on_stored(MID)
     execution.on_state(shown())
     for _ in range(2):
         execution.tick(T0_S)
@@ -444,7 +444,7 @@ def test_a_history_takes_every_row_of_the_table() -> None:
         execution.end_motion()
     execution.on_prepare(prepare(HIGH))
     assert execution.on_plan(make_plan(HIGH, {A: ()}, {A: (-4, 1), B: (-3, 0)}))
-    assert execution.on_noted(HIGH)
+    assert execution.on_stored(HIGH)
     for _ in range(2):
         execution.on_state(shown(ballot=HIGH, go=True))
     rules = [f"{book.table[row].rule} row {row}" for row in book.taken]

@@ -152,7 +152,7 @@ class Entrance:
             self.tick += 1
         return self
 
-    def estate(self, name: str) -> list[Cell]:
+    def owned(self, name: str) -> list[Cell]:
         return sorted(self.vehicles[Name(name)].controller.owned, reverse=True)
 
     def owners(self) -> dict[Cell, Name]:
@@ -200,22 +200,22 @@ def test_every_cell_near_a_vehicle_has_an_owner(stream: list[Arrival], tick_s: f
 
 def test_cells_ahead_of_the_first_vehicle_are_its_as_far_as_they_are_near() -> None:
     entrance = Entrance([Arrival("first", 1, 0, 20.2)]).run(20.3)
-    estate = entrance.estate("first")
-    assert estate[0][0] == -20 + MAX_EMPTY
-    assert {lane for _, lane in estate} == {0, 1, 2}
+    owned = entrance.owned("first")
+    assert owned[0][0] == -20 + MAX_EMPTY
+    assert {lane for _, lane in owned} == {0, 1, 2}
 
 
 def test_a_cell_is_assigned_when_no_vehicle_can_enter_it() -> None:
     entrance = Entrance([Arrival("first", 1, 0, 0.0)]).run(1.4)
-    assert min(entrance.estate("first")) == (0, 0)
+    assert min(entrance.owned("first")) == (0, 0)
     entrance.run(1.6)
-    assert min(entrance.estate("first")) == (-1, 0)
+    assert min(entrance.owned("first")) == (-1, 0)
 
 
 def test_most_get_no_more_than_some_cells() -> None:
     entrance = Entrance([Arrival("first", 1, 0, 0.0), Arrival("next", 1, 0, 50.0)]).run(60.0)
-    assert min(entrance.estate("first"))[0] == -MAX_EMPTY
-    assert max(entrance.estate("next"))[0] == -50 + MAX_EMPTY
+    assert min(entrance.owned("first"))[0] == -MAX_EMPTY
+    assert max(entrance.owned("next"))[0] == -50 + MAX_EMPTY
 
 
 def test_cells_behind_a_departed_vehicle_have_no_owner() -> None:
@@ -229,7 +229,7 @@ def test_cells_behind_a_departed_vehicle_have_no_owner() -> None:
 
 def test_where_formations_own_blocks_nothing_is_assigned_to() -> None:
     entrance = Entrance([Arrival("first", 1, 0, 0.0)], make_scenario(operation="paper")).run(9.0)
-    assert entrance.estate("first") == []
+    assert entrance.owned("first") == []
 
 
 def test_a_whole_demand_enters_without_waiting() -> None:

@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.wire.messages import Ballot, Command, Deed, Name, Prepare
+from laneweave.protocol.wire.messages import Ballot, Command, Name, PendingTransfer, Prepare
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
 from laneweave.sim_bridge.road.attendance import Caretaker
 from support.road_vehicles import controller_in, vehicle_in
 from support.rolling_road import controller_of
-from support.rolling_samples import AFTER, BEFORE, HIGH, HOME, LOW, MID, A, B, deed_of, make_plan
+from support.rolling_samples import AFTER, BEFORE, HIGH, HOME, LOW, MID, A, B, make_plan, pending
 
 AGENT = 7
 
@@ -34,18 +34,27 @@ def make_controller() -> MotionController:
 
 def order(
     promised: Ballot | None = None,
-    deed: Deed | None = None,
+    transfer: PendingTransfer | None = None,
     accepted: Ballot | None = None,
     incarnation: int = AGENT,
 ) -> Command:
     return Command(
-        A, incarnation, 0, HOME, 0, HOME, b"", promised=promised, deed=deed, accepted=accepted
+        A,
+        incarnation,
+        0,
+        HOME,
+        0,
+        HOME,
+        b"",
+        promised=promised,
+        transfer=transfer,
+        accepted=accepted,
     )
 
 
-OPEN = Deed(MID, open=True)
+OPEN = PendingTransfer(MID, open=True)
 PROMISE = order(MID)
-ACCEPTANCE = order(MID, deed_of(A), MID)
+ACCEPTANCE = order(MID, pending(A), MID)
 POSSESSION = order(MID, OPEN, MID)
 """Successive commands of an agent, each with everything that it requests."""
 NEXT_PROMISE = order(HIGH, OPEN)
@@ -53,8 +62,8 @@ NEXT_PROMISE = order(HIGH, OPEN)
 
 
 def kept(controller: MotionController) -> tuple[object, ...]:
-    deed = controller.transfer
-    return controller.promised, controller.accepted, deed, frozenset(controller.owned)
+    transfer = controller.transfer
+    return controller.promised, controller.accepted, transfer, frozenset(controller.owned)
 
 
 def test_orders_one_after_the_other(controller: MotionController) -> None:
@@ -62,7 +71,7 @@ def test_orders_one_after_the_other(controller: MotionController) -> None:
     assert controller.note(PROMISE)
     assert not controller.note(PROMISE)
     assert controller.note(ACCEPTANCE)
-    assert kept(controller) == (MID, MID, deed_of(A), frozenset(BEFORE[A]))
+    assert kept(controller) == (MID, MID, pending(A), frozenset(BEFORE[A]))
     assert controller.note(POSSESSION)
     assert kept(controller) == (MID, MID, OPEN, frozenset(AFTER[A]))
     assert not controller.note(ACCEPTANCE)  # a duplicate opens and closes nothing
@@ -72,13 +81,13 @@ def test_orders_one_after_the_other(controller: MotionController) -> None:
 def test_without_its_deed_a_plan_is_not_accepted(controller: MotionController) -> None:
     controller.note(order(MID, None, MID))
     assert controller.accepted is None
-    controller.note(order(MID, deed_of(A, LOW), MID))
+    controller.note(order(MID, pending(A, LOW), MID))
     assert (controller.accepted, controller.transfer) == (None, None)
 
 
 def test_only_the_newest_deed_can_be_opened(controller: MotionController) -> None:
     controller.note(ACCEPTANCE)
-    newer = Deed(HIGH, BEFORE[A], BEFORE[A], (A,))
+    newer = PendingTransfer(HIGH, BEFORE[A], BEFORE[A], (A,))
     controller.note(order(HIGH, newer, HIGH))
     controller.note(POSSESSION)
     assert controller.transfer == newer
@@ -89,7 +98,7 @@ def test_only_the_newest_deed_can_be_opened(controller: MotionController) -> Non
 def test_a_promise_binds_this_process_and_the_next(
     controller: MotionController, process: int
 ) -> None:
-    """No deed of less than was promised is drawn up."""
+    """No transfer of less than was promised is drawn up."""
     controller.note(order(HIGH))
     if process != AGENT:
         controller.put_in_charge(process)
@@ -102,9 +111,9 @@ def test_a_deed_outlives_the_process_and_its_acceptance_does_not(
 ) -> None:
     controller.note(ACCEPTANCE)
     controller.put_in_charge(AGENT + 1)
-    assert kept(controller) == (MID, None, deed_of(A), frozenset(BEFORE[A]))
+    assert kept(controller) == (MID, None, pending(A), frozenset(BEFORE[A]))
     assert not controller.note(POSSESSION)  # of the process that was replaced
-    assert controller.transfer == deed_of(A)
+    assert controller.transfer == pending(A)
 
 
 def test_where_formations_own_blocks_acceptance_needs_no_deed() -> None:
@@ -128,15 +137,15 @@ def test_any_order_of_one_plan_ends_sound(orders: tuple[Command, ...]) -> None:
 
 def check(controller: MotionController) -> None:
     """Check that what is kept fits together."""
-    deed = controller.transfer
-    if deed is not None and not deed.open:
-        assert set(controller.owned) == set(deed.before)
+    transfer = controller.transfer
+    if transfer is not None and not transfer.open:
+        assert set(controller.owned) == set(transfer.before)
     if controller.accepted is not None:
-        assert deed is not None
-        assert deed.ballot >= controller.accepted
-    if deed is not None:
+        assert transfer is not None
+        assert transfer.ballot >= controller.accepted
+    if transfer is not None:
         assert controller.promised is not None
-        assert deed.ballot <= controller.promised
+        assert transfer.ballot <= controller.promised
 
 
 BALLOTS = [Ballot(term, Name("c1"), 1, seq) for term in (1, 2) for seq in (1, 2)]
@@ -147,19 +156,19 @@ CELLS: list[Cell] = [(column, lane) for column in (0, 1, 2) for lane in (0, 1)]
 def histories(draw: st.DrawFn) -> list[Command | Cell]:
     """Commands of a correct agent over several ballots, in any order, with repetitions."""
     said: list[Command | Cell] = []
-    deed: Deed | None = None
-    estate = set(BEFORE[A])
+    transfer: PendingTransfer | None = None
+    owned = set(BEFORE[A])
     for ballot in sorted(draw(st.sets(st.sampled_from(BALLOTS), min_size=1))):
-        said.append(order(ballot, deed))
+        said.append(order(ballot, transfer))
         how_far = draw(st.integers(0, 2))
         if how_far >= 1:
             after = {HOME, *draw(st.sets(st.sampled_from(CELLS), max_size=3))}
-            deed = Deed(ballot, tuple(sorted(estate)), tuple(sorted(after)), (A, B))
-            said.append(order(ballot, deed, ballot))
+            transfer = PendingTransfer(ballot, tuple(sorted(owned)), tuple(sorted(after)), (A, B))
+            said.append(order(ballot, transfer, ballot))
             if how_far == 2:
-                deed = Deed(ballot, open=True)
-                said.append(order(ballot, deed, ballot))
-                estate = after
+                transfer = PendingTransfer(ballot, open=True)
+                said.append(order(ballot, transfer, ballot))
+                owned = after
     late = draw(st.lists(st.sampled_from(said), max_size=6))
     granted: list[Command | Cell] = [(50 + index, 0) for index in range(draw(st.integers(0, 2)))]
     return draw(st.permutations([*said, *late, *granted]))
@@ -171,7 +180,7 @@ def test_however_orders_arrive_what_is_kept_is_sound(
     history: list[Command | Cell], restart: int
 ) -> None:
     controller = make_controller()
-    final: dict[Ballot, Deed | None] = {}
+    final: dict[Ballot, PendingTransfer | None] = {}
     granted = set()
     for index, each in enumerate(history):
         if index == restart:
@@ -188,11 +197,11 @@ def test_however_orders_arrive_what_is_kept_is_sound(
         if before[1] is not None:
             assert controller.transfer is not None
             assert controller.transfer.ballot >= before[1].ballot
-        # With a promise, which deed is the newest of the older ones is final.
-        promised, deed = controller.promised, controller.transfer
-        if promised is not None and (deed is None or deed.ballot < promised):
-            newest = final.setdefault(promised, deed)
-            assert (newest and newest.ballot) == (deed and deed.ballot)
+        # With a promise, which transfer is the newest of the older ones is final.
+        promised, transfer = controller.promised, controller.transfer
+        if promised is not None and (transfer is None or transfer.ballot < promised):
+            newest = final.setdefault(promised, transfer)
+            assert (newest and newest.ballot) == (transfer and transfer.ballot)
 
 
 # --- cells from the roadside ------------------------------------------------------------------
@@ -202,13 +211,13 @@ GIVEN: Cell = (-1, 0)
 
 @pytest.mark.parametrize("when", range(4))
 def test_a_cell_that_comes_at_any_time_is_kept(controller: MotionController, when: int) -> None:
-    """The plan was made before the cell was assigned; a closed deed has it on both sides."""
+    """The plan was made before the cell was assigned; a closed transfer has it on both sides."""
     for step, each in enumerate((PROMISE, ACCEPTANCE, POSSESSION, POSSESSION)):
         if when == step:
             controller.assign_cell(GIVEN)
-            if (deed := controller.transfer) is not None and not deed.open:
-                assert GIVEN in deed.before
-                assert GIVEN in deed.after
+            if (transfer := controller.transfer) is not None and not transfer.open:
+                assert GIVEN in transfer.before
+                assert GIVEN in transfer.after
         controller.note(each)
     assert set(controller.owned) == {*AFTER[A], GIVEN}
 
@@ -219,12 +228,12 @@ def test_a_cell_that_a_plan_knew_is_not_kept_by_force(when: int, *, opened: bool
     controller.assign_cell(GIVEN)
     if when:
         controller.note(PROMISE)
-    given_away = Deed(MID, (*BEFORE[A], GIVEN), AFTER[A], (A, B))
+    given_away = PendingTransfer(MID, (*BEFORE[A], GIVEN), AFTER[A], (A, B))
     controller.note(order(MID, given_away, MID))
     if opened:
         controller.note(POSSESSION)
     assert (GIVEN in controller.owned) is not opened
-    later = Deed(HIGH, AFTER[A], AFTER[A], (A,))
+    later = PendingTransfer(HIGH, AFTER[A], AFTER[A], (A,))
     controller.note(order(HIGH, later, HIGH))
     assert GIVEN not in controller.owned
 
@@ -238,15 +247,15 @@ def test_the_caretaker_hands_cells_over_and_moves_nothing() -> None:
     plan = make_plan()
     state = caretaker.on_message(Prepare(MID, (), (A, B)), 0)
     assert state is not None
-    assert (state.promised, state.estate) == (MID, controller.owned)
+    assert (state.promised, state.owned) == (MID, controller.owned)
     state = caretaker.on_message(plan, 0)
     assert state is not None
     assert state.accepted
-    assert state.deed == controller.transfer == deed_of(B)
+    assert state.transfer == controller.transfer == pending(B)
     assert controller.accepted == MID
 
 
 def test_the_caretaker_is_bound_by_what_the_agent_promised(controller: MotionController) -> None:
     controller.note(order(HIGH))
     shown = Caretaker(vehicle_in(HOME, A, controller=controller), AGENT + 1, 0).state(0)
-    assert (shown.promised, shown.estate) == (HIGH, tuple(sorted(BEFORE[A])))
+    assert (shown.promised, shown.owned) == (HIGH, tuple(sorted(BEFORE[A])))
