@@ -232,24 +232,6 @@ def test_a_lost_claim_is_repeated_with_the_same_incarnation_and_without_old_prom
     assert {claim.joined for claim in claims} == {(0,)}
 
 
-def test_after_another_agent_has_died_it_claims_the_vehicle_from_its_caretaker() -> None:
-    seat = Seat()
-    seat.take_charge()
-    another, caretaker = seat.rig.new_incarnation(), seat.rig.new_incarnation()
-    assert seat.feel(another) == []
-    assert command_of(seat.feel(caretaker, caretaker=True)).incarnation == 4 > caretaker
-
-
-def test_without_a_process_in_charge_the_agent_starts_anew() -> None:
-    seat = Seat()
-    seat.take_charge()
-    seat.prepare()
-    assert kinds(seat.feel(0)) == [Command]
-    assert seat.prepare() == []
-    seat.feel(1)
-    assert seat.shown.promised is None
-
-
 def test_it_ends_with_its_vehicle_whatever_process_is_in_charge() -> None:
     seat = Seat()
     seat.take_charge()
@@ -268,7 +250,8 @@ def taken() -> Seat:
     seat = Seat()
     seat.take_charge()
     seat.prepare()
-    assert kinds(seat.plan()) == [Command]
+    (command,) = sent(seat.repeat(), Command)
+    assert sent(seat.plan(), Command) == [evolve(command, accepted=BALLOT)]  # the same motion
     return seat
 
 
@@ -281,43 +264,24 @@ def test_an_acceptance_is_requested_at_once_and_published_when_noted() -> None:
     assert (seat.shown.accepted, seat.shown.ready) == (True, True)
     assert kinds(seat.note()) == [Command]  # once
     assert kinds(seat.repeat()) == [Command]  # an older one that comes late takes nothing back
+    assert seat.plan() == []
     seat.feel(1)
     assert seat.shown.accepted
 
 
-def test_a_note_may_come_with_the_next_tick() -> None:
+@pytest.mark.parametrize(
+    ("noted", "attendant"),
+    [(None, 1), (BALLOT._replace(seq=0), 1), (BALLOT._replace(seq=2), 1), (BALLOT, 0), (BALLOT, 2)],
+)
+def test_a_note_for_another_plan_or_process_is_no_acceptance(
+    noted: Ballot | None, attendant: int
+) -> None:
     seat = taken()
-    assert kinds(seat.feel(1, accepted=BALLOT)) == [Command, VehicleState]
-    assert seat.shown.accepted
-
-
-@pytest.mark.parametrize("noted", [None, BALLOT._replace(seq=0), BALLOT._replace(seq=2)])
-def test_a_note_for_another_plan_is_no_acceptance(noted: Ballot | None) -> None:
-    seat = taken()
-    assert kinds(seat.note(noted)) == [Command]
-    seat.feel(1, accepted=noted)
-    assert not seat.shown.accepted
-
-
-@pytest.mark.parametrize("attendant", [0, 2])
-def test_a_note_for_another_process_is_no_acceptance(attendant: int) -> None:
-    """A process that has been replaced without knowing it shows nothing that counts."""
-    seat = taken()
-    assert kinds(seat.note(attendant=attendant)) == [Command]
-    assert not seat.shown.accepted
+    assert kinds(seat.note(noted, attendant=attendant)) == [Command]
     shown = len(seat.rig.shown)
-    seat.feel(attendant, accepted=BALLOT)
-    assert len(seat.rig.shown) == shown
-    assert not seat.agent.in_charge
-
-
-def test_an_acceptance_of_the_previous_process_does_not_count() -> None:
-    seat = Seat()
-    seat.feel(0)
-    for promised in (None, BALLOT):
-        seat.feel(1, accepted=BALLOT)
-        assert (seat.shown.promised, seat.shown.accepted) == (promised, False)
-        seat.prepare()
+    seat.feel(attendant, accepted=noted)
+    assert len(seat.rig.shown) - shown == seat.agent.in_charge == (attendant == 1)
+    assert not seat.shown.accepted
 
 
 def test_a_higher_promise_cancels_a_requested_note() -> None:

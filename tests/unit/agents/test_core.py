@@ -12,13 +12,11 @@ from laneweave.protocol.runtime.node import (
     Listen,
     Send,
     Started,
-    Stopping,
     Unlisten,
     Withdraw,
 )
 from laneweave.protocol.vehicle.motion import ARRIVED_ACROSS_M, ARRIVED_ALONG_M
-from laneweave.protocol.vehicle.plan_execution import OVERDUE_SLOTS
-from laneweave.protocol.wire.messages import Command, Name, Neighbour, Prepare, Report, VehicleState
+from laneweave.protocol.wire.messages import Command, Name, Neighbour, Prepare, Report
 from laneweave.protocol.wire.topics import (
     COMMAND,
     PLAN,
@@ -77,12 +75,6 @@ def test_left_reports_once_and_withdraws_its_token_last() -> None:
     assert rig.hand(SENSE, rig.sense(left=True)) == []
 
 
-def test_stopping_reports() -> None:
-    rig = up_and_running()
-    (report,) = sent(rig.handle(Stopping()), Report)
-    assert report.solves == 2
-
-
 # --- one answer per tick ----------------------------------------------------------------------
 
 
@@ -128,26 +120,6 @@ def test_an_agent_starts_anew_on_the_road_of_a_newer_bridge() -> None:
     assert not rig.agent.ended
 
 
-def test_a_promise_is_shown_at_once_and_an_acceptance_as_soon_as_it_is_noted() -> None:
-    rig = up_and_running()
-    tick = rig.tick
-    rig.hand(PREPARE, Prepare(BALLOT, (0,), (ME, OTHER)))
-    assert (rig.shown[-1].promised, rig.shown[-1].accepted) == (BALLOT, False)
-    plan = make_plan(BOTH)
-    shown = len(rig.shown)
-    asked = rig.hand(PLAN, plan)
-    assert len(rig.shown) == shown
-    assert rig.played is not None
-    assert sent(asked, Command) == [attrs.evolve(rig.played, accepted=BALLOT)]  # the same motion
-    assert rig.agent.wanted_states == (0,)
-    effects = rig.confirm(asked)
-    assert [(s.accepted, s.ready) for s in sent(effects, VehicleState)] == [(True, True)]
-    assert sent(effects, Command) == sent(asked, Command)
-    assert rig.tick == tick
-    assert rig.hand(PLAN, plan) == []
-    assert rig.hand(PREPARE, Prepare(BALLOT, (0,), (OTHER,))) == []
-
-
 def test_a_lost_note_is_requested_again_with_each_tick() -> None:
     rig = up_and_running()
     rig.hand(PREPARE, Prepare(BALLOT, (0,), (ME,)))
@@ -163,17 +135,6 @@ def test_a_lost_note_is_requested_again_with_each_tick() -> None:
     assert not rig.run().accepted  # now the controller hears of it
     state = rig.run()
     assert (state.accepted, state.moving) == (True, True)
-
-
-@pytest.mark.parametrize("beyond", [(-4, 1), (1, 1), (-1, 3)])
-def test_a_plan_beyond_its_own_block_is_not_accepted(beyond: Cell) -> None:
-    """Plans of other formations run at the same time; only the blocks keep them apart."""
-    rig = up_and_running()
-    rig.hand(PREPARE, Prepare(BALLOT, (0,), (ME,)))
-    plan = make_plan({ME: HOME})
-    assert rig.hand(PLAN, attrs.evolve(plan, territory=(HOME, beyond))) == []
-    rig.confirm(rig.hand(PLAN, plan))
-    assert rig.shown[-1].accepted
 
 
 # --- moves ------------------------------------------------------------------------------------
@@ -233,15 +194,6 @@ def kept_back() -> Rig:
     return rig
 
 
-def test_overdue_is_shown() -> None:
-    rig = up_and_running()
-    rig.hand(PREPARE, Prepare(BALLOT, (0,), (ME, OTHER)))
-    rig.confirm(rig.hand(PLAN, make_plan(BOTH, {ME: ((0, HOME, (-1, 2)),)})))
-    patience = round(OVERDUE_SLOTS * SCENARIO.cycles_s[0] / TICK_S)
-    assert not rig.run(patience - rig.tick).overdue
-    assert rig.run().overdue
-
-
 # --- restarts ---------------------------------------------------------------------------------
 
 
@@ -263,22 +215,6 @@ def test_restart_takes_the_motion_over(silent_ticks: int) -> None:
     state = rig.run(MOVE_TICKS)
     assert (state.moving, state.completed) == (False, 0)
     assert rig.off((0, 2)) < 0.1
-
-
-def test_restart_while_moving_is_not_ready_before_the_motion_ends() -> None:
-    rig = up_and_running()
-    rig.accept((0, HOME, (-1, 2)))
-    rig.run(10)
-    rig.restart()
-    rig.claim()
-    rig.run()
-    rig.accept((0, (-1, 2), (-1, 1)), ballot=BALLOT._replace(seq=2))
-    assert not rig.shown[-1].ready
-    while rig.run().hold_cell != (-1, 1):
-        assert rig.shown[-1].completed == 0
-        assert rig.tick < 100
-    assert rig.tick - 1 >= 2 + MOVE_TICKS
-    assert rig.run(MOVE_TICKS).completed == 1
 
 
 def test_restart_of_a_vehicle_that_is_late_still_counts_as_moving() -> None:
