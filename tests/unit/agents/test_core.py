@@ -124,7 +124,9 @@ def test_a_lost_note_is_requested_again_with_each_tick() -> None:
     rig = up_and_running()
     rig.hand(PREPARE, Prepare(BALLOT, (0,), (ME,)))
     plan = make_plan({ME: HOME}, {ME: ((0, HOME, (-1, 2)),)})
-    rig.hand(PLAN, plan)  # what it asks is lost
+    (asked,) = sent(rig.hand(PLAN, plan), Command)  # it is lost
+    assert rig.played is not None
+    assert asked == attrs.evolve(rig.played, accepted=BALLOT)  # the same motion
     for _ in range(3):
         effects = rig.hand(SENSE, rig.sense())
         (command,) = sent(effects, Command)
