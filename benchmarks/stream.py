@@ -22,10 +22,10 @@ from attrs import field, frozen
 from laneweave.coordinator.planning.conflict_model import ConflictModel
 from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
 from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
-from laneweave.coordinator.planning.rolling.path_search import (
+from laneweave.coordinator.planning.rolling.path_search import StreamPlanner
+from laneweave.coordinator.planning.rolling.problem import (
     StreamCosts,
     StreamPlan,
-    StreamPlanner,
     StreamRoad,
     StreamVehicle,
 )

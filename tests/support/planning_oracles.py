@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.conflict_model import ConflictModel, Move
 from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
-from laneweave.coordinator.planning.grid import Grid
+from laneweave.coordinator.planning.problem import Grid
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.solve import plan
 from laneweave.protocol.lattice import Cell, Mode

@@ -14,7 +14,7 @@ from scipy.sparse import coo_array
 from laneweave.coordinator.planning.conflict_model import ConflictModel, Move
 from laneweave.coordinator.planning.geometry.conflict_table import conflict_table
 from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
-from laneweave.coordinator.planning.rolling.path_search import (
+from laneweave.coordinator.planning.rolling.problem import (
     CellPath,
     StreamCosts,
     StreamPlan,

@@ -42,29 +42,12 @@ CLOSING_COLUMNS: Final = 3
 _COLUMNS_OF_KIND: Final = {"closing": CLOSING_COLUMNS}
 
 
-def is_wait(move: Move) -> bool:
-    """Return whether the vehicle stays in its cell."""
-    return move[0] == move[1]
+_WAIT, _LONGITUDINAL, _LATERAL, _OBLIQUE = product((False, True), repeat=2)
 
 
-def is_oblique(move: Move) -> bool:
-    """Return whether the move changes column and lane at once."""
-    return move[0][0] != move[1][0] and move[0][1] != move[1][1]
-
-
-def is_longitudinal(move: Move) -> bool:
-    """Return whether the move changes the column only."""
-    return move[0][0] != move[1][0] and move[0][1] == move[1][1]
-
-
-def is_lateral(move: Move) -> bool:
-    """Return whether the move changes the lane only."""
-    return move[0][0] == move[1][0] and move[0][1] != move[1][1]
-
-
-def corners(move: Move) -> frozenset[Cell]:
-    """Return the two cells that an oblique move passes between."""
-    return frozenset({(move[0][0], move[1][1]), (move[1][0], move[0][1])})
+def _direction(move: Move) -> tuple[bool, bool]:
+    """Return whether a move changes the lane, and whether it changes the column."""
+    return move[0][1] != move[1][1], move[0][0] != move[1][0]
 
 
 def _node(a: Move, b: Move) -> bool:
@@ -74,14 +57,14 @@ def _node(a: Move, b: Move) -> bool:
 
 def _edge(a: Move, b: Move) -> bool:
     """The paths overlap (swap) or cross (two diagonals): both move and share their midpoint."""
-    if is_wait(a) or is_wait(b):
+    if a[0] == a[1] or b[0] == b[1]:
         return False
     return a[0][0] + a[1][0] == b[0][0] + b[1][0] and a[0][1] + a[1][1] == b[0][1] + b[1][1]
 
 
 def _special_1(a: Move, b: Move) -> bool:
     """A moves into the cell that B is leaving."""
-    return a[1] == b[0] and not is_wait(a) and not is_wait(b)
+    return a[1] == b[0] and a[0] != a[1] and b[0] != b[1]
 
 
 def _triangle(a: Move, b: Move) -> bool:
@@ -90,7 +73,8 @@ def _triangle(a: Move, b: Move) -> bool:
     The corner and A's cells are a right triangle. B's other cell may lie outside of the square: a
     vehicle that enters or leaves the corner blocks A as much as one that stays (ADR 27).
     """
-    return is_oblique(a) and not corners(a).isdisjoint(b)
+    corners = {(a[0][0], a[1][1]), (a[1][0], a[0][1])}
+    return _direction(a) == _OBLIQUE and not corners.isdisjoint(b)
 
 
 def _geometric(a: Move, b: Move) -> bool:
@@ -111,9 +95,9 @@ _PREDICATES: Final[dict[str, Callable[[Move, Move], bool]]] = {
     "node": _node,
     "edge": _edge,
     "special-1": _special_1,
-    "special-2": lambda a, b: is_longitudinal(b) and _triangle(a, b),
-    "special-3": lambda a, b: is_lateral(b) and _triangle(a, b),
-    "special-4": lambda a, b: is_wait(b) and _triangle(a, b),
+    "special-2": lambda a, b: _direction(b) == _LONGITUDINAL and _triangle(a, b),
+    "special-3": lambda a, b: _direction(b) == _LATERAL and _triangle(a, b),
+    "special-4": lambda a, b: _direction(b) == _WAIT and _triangle(a, b),
     "geometric": _geometric,
     "closing": _closing,
 }
@@ -187,7 +171,8 @@ class ConflictModel:
         """Return the first kind of conflict between two moves made in the same step, or None."""
         for kind in self.kinds:
             if kind == "geometric" and self.table is not None:
-                if _relative(a, b) in self.table.pairs:
+                pair = _difference(a[0], b[0]), _difference(*a), _difference(*b)
+                if pair in self.table.pairs:
                     return kind
                 continue
             predicate = _PREDICATES[kind]
@@ -196,13 +181,8 @@ class ConflictModel:
         return None
 
 
-def _relative(a: Move, b: Move) -> Pair:
-    offset = b[0][0] - a[0][0], b[0][1] - a[0][1]
-    return offset, _displacement(a), _displacement(b)
-
-
-def _displacement(move: Move) -> Cell:
-    return move[1][0] - move[0][0], move[1][1] - move[0][1]
+def _difference(cell: Cell, other: Cell) -> Cell:
+    return other[0] - cell[0], other[1] - cell[1]
 
 
 @lru_cache(maxsize=64)

@@ -6,23 +6,11 @@ same time, so conflicts can be read off two neighbouring columns.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from itertools import combinations
+from collections.abc import Sequence
 
 import attrs
 
-from laneweave.coordinator.planning.conflict_model import ConflictModel, Move
 from laneweave.protocol.lattice import Cell
-
-
-@attrs.frozen(order=True)
-class FoundConflict:
-    """Two vehicles (rows, from 0) whose moves in a step (from 0) conflict."""
-
-    step: int
-    first: int
-    second: int
-    kind: str
 
 
 @attrs.frozen
@@ -44,22 +32,9 @@ class RelativePathMap:
         """Return the number of steps between the first and the last time point."""
         return len(self.rows[0]) - 1 if self.rows else 0
 
-    def move(self, row: int, step: int) -> Move:
-        """Return the move of a vehicle (a row) in a step."""
-        return self.rows[row][step], self.rows[row][step + 1]
-
     def cost(self) -> int:
         """Return the sum over vehicles of the number of steps until their final arrival."""
         return sum(final_arrival(row) for row in self.rows)
-
-    def conflicts(self, model: ConflictModel) -> Iterator[FoundConflict]:
-        """Yield all conflicts, step by step."""
-        for step in range(self.steps):
-            moves = [self.move(row, step) for row in range(len(self.rows))]
-            for i, j in combinations(range(len(moves)), 2):
-                kind = model.kind(moves[i], moves[j])
-                if kind is not None:
-                    yield FoundConflict(step, i, j, kind)
 
     def __str__(self) -> str:
         """Return the table as text; columns are headed by the time point, from 1."""

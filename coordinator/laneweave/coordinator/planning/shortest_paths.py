@@ -12,14 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
-from laneweave.coordinator.planning.problem import (
-    Bans,
-    Diagram,
-    MoveTable,
-    Path,
-    Problem,
-    Solution,
-)
+from laneweave.coordinator.planning.problem import Bans, Diagram, MoveTable, Path, Problem, Solution
 
 
 def shortest_paths(table: MoveTable, start: int, target: int, bans: Bans) -> Diagram | None:

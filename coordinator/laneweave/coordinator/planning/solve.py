@@ -10,12 +10,7 @@ from typing import Final
 
 import attrs
 
-from laneweave.coordinator.planning.budget import (
-    DEFAULT_MEMORY_MB,
-    Budget,
-    BudgetSpentError,
-    Clock,
-)
+from laneweave.coordinator.planning.budget import DEFAULT_MEMORY_MB, Budget, BudgetSpentError, Clock
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.paper.tappa import Tappa
 from laneweave.coordinator.planning.path_map import RelativePathMap

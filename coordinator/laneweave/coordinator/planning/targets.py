@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from itertools import product
 
 from attrs import frozen
 
@@ -89,12 +90,7 @@ def _combinations(choices: Sequence[Sequence[tuple[float, list[Cell]]]]) -> Iter
 
 
 def _ranked_targets(
-    lane: int,
-    cells: Sequence[Cell],
-    columns: int,
-    free: Sequence[int],
-    *,
-    ahead: bool,
+    lane: int, cells: Sequence[Cell], columns: int, free: Sequence[int], *, ahead: bool
 ) -> list[tuple[float, list[Cell]]]:
     """Return all runs of neighbouring cells on a lane, each with its rank, the best one first."""
     count = len(cells)
@@ -108,12 +104,5 @@ def _ranked_targets(
 
 def _nearest_free(cell: Cell, columns: int, lanes: int, taken: Collection[Cell]) -> Cell:
     """Return the nearest cell that is not taken; there is one, since a vehicle has left it."""
-    return min(
-        (
-            (column, lane)
-            for column in range(columns)
-            for lane in range(lanes)
-            if (column, lane) not in taken
-        ),
-        key=lambda other: (abs(other[0] - cell[0]) + abs(other[1] - cell[1]), other),
-    )
+    free = (other for other in product(range(columns), range(lanes)) if other not in taken)
+    return min(free, key=lambda other: (abs(other[0] - cell[0]) + abs(other[1] - cell[1]), other))

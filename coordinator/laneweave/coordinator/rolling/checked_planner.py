@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 
 from laneweave.coordinator.planning.conflict_model import ConflictModel
-from laneweave.coordinator.planning.rolling.path_search import (
+from laneweave.coordinator.planning.rolling.path_search import StreamPlanner
+from laneweave.coordinator.planning.rolling.problem import (
     StreamCosts,
     StreamPlan,
-    StreamPlanner,
     StreamRoad,
     StreamVehicle,
 )

@@ -52,10 +52,7 @@ def road_scene(scenario: Scenario) -> dict[str, Any]:
             "sorting_start_m": road.sorting_start_m,
         },
         "body_m": [scenario.vehicle.length_m, scenario.vehicle.width_m],
-        "lattice": {
-            "speed_mps": formation.speed_mps,
-            "pitch_m": formation.gap_m,
-        },
+        "lattice": {"speed_mps": formation.speed_mps, "pitch_m": formation.gap_m},
         "shade": {"span_mps": SPEED_SPAN_MPS, "strength": SHADE_STRENGTH},
         "colours": list(lane_colours(road.lanes)),
     }

@@ -19,7 +19,7 @@ from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.formations.leader import LEADER_RULES
-from laneweave.coordinator.planning.rolling.path_search import StreamPlan, StreamVehicle
+from laneweave.coordinator.planning.rolling.problem import StreamPlan, StreamVehicle
 from laneweave.coordinator.rolling.checked_planner import Planner, stream_planner
 from laneweave.launch.fault_search.checker import Checker, Violation
 from laneweave.launch.fault_search.checker_geometry import Geometry

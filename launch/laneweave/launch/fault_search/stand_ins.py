@@ -12,7 +12,7 @@ import attrs
 from attrs import frozen
 
 from laneweave.agents.driving.driver import Drive, SolverStats
-from laneweave.coordinator.planning.rolling.path_search import CellPath, StreamPlan, StreamVehicle
+from laneweave.coordinator.planning.rolling.problem import CellPath, StreamPlan, StreamVehicle
 from laneweave.coordinator.rolling.checked_planner import stream_road
 from laneweave.protocol.lattice import Cell, PlannedMove, displacements, footprint
 from laneweave.protocol.scenario.fields import Scenario

@@ -2,7 +2,7 @@
 
 import pytest
 
-from laneweave.coordinator.planning.grid import Grid
+from laneweave.coordinator.planning.problem import Grid
 from laneweave.protocol.lattice import displacements
 
 GRID = Grid(4, 3, [(1, 1)])

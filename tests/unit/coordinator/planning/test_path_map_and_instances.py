@@ -2,8 +2,7 @@
 
 import pytest
 
-from laneweave.coordinator.planning.conflict_model import ConflictModel
-from laneweave.coordinator.planning.path_map import FoundConflict, RelativePathMap, final_arrival
+from laneweave.coordinator.planning.path_map import RelativePathMap, final_arrival
 from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.bench.request_families import (
     block_request,
@@ -24,14 +23,6 @@ def test_text() -> None:
     assert str(path_map) == (
         "Vehicle ID  step 1  step 2\n1           (0,0)   (1,0)\nlorry       (10,2)  (10,2)"
     )
-
-
-def test_conflicts_follow_from_neighbouring_columns() -> None:
-    path_map = RelativePathMap.padded(
-        ["a", "b"], [[(0, 0), (1, 0), (2, 0)], [(1, 0), (2, 0), (1, 0)]]
-    )
-    found = list(path_map.conflicts(ConflictModel(["node", "edge", "special-1"])))
-    assert found == [FoundConflict(0, 0, 1, "special-1"), FoundConflict(1, 0, 1, "edge")]
 
 
 @pytest.mark.parametrize(

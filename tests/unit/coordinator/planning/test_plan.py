@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 import laneweave.coordinator
 import laneweave.protocol
-from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.paper.assignments import Weights
-from laneweave.coordinator.planning.path_map import RelativePathMap, final_arrival
+from laneweave.coordinator.planning.path_map import final_arrival
 from laneweave.coordinator.planning.plan_validator import problems_of_response
+from laneweave.coordinator.planning.problem import Grid
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.solve import plan
@@ -112,9 +112,9 @@ def _is_lazy(request: PlanRequest, path: tuple[Cell, ...], others: list[tuple[Ce
     model = request.conflict_model
     for k in range(len(path) - 2):
         if path[k] == path[k + 2] != path[k + 1]:
-            calm = (*path[: k + 1], path[k], *path[k + 2 :])
-            path_map = RelativePathMap.padded(["" for _ in request.vehicles], [calm, *others])
-            if all(conflict.first > 0 for conflict in path_map.conflicts(model)):
+            wait = path[k], path[k]
+            moves = [(other[s], other[s + 1]) for other in others for s in (k, k + 1)]
+            if all(model.kind(wait, move) is None for move in moves):
                 return False
     return True
 

@@ -12,7 +12,7 @@ from attrs import define, evolve, field
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.operation import LogEntry
-from laneweave.coordinator.planning.rolling.path_search import StreamPlan, StreamVehicle
+from laneweave.coordinator.planning.rolling.problem import StreamPlan, StreamVehicle
 from laneweave.coordinator.rolling.checked_planner import checked, stream_planner, stream_road
 from laneweave.coordinator.rolling.operation import (
     LISTEN_S,

@@ -8,7 +8,7 @@ from itertools import count
 import pytest
 from attrs import evolve
 
-from laneweave.coordinator.planning.rolling.path_search import StreamPlan, StreamVehicle
+from laneweave.coordinator.planning.rolling.problem import StreamPlan, StreamVehicle
 from laneweave.coordinator.rolling.operation import RollingOperation
 from laneweave.coordinator.rolling.ownership import certain_cells, owned_cells, partners
 from laneweave.protocol.lattice import Cell

@@ -48,11 +48,8 @@ def search(arrays, teams, stack, depth, scratch, state, upper_bound, nodes):
         if depth == 0:
             return REFUTED, depth, examined
         top = depth - 1
-        allowed, earliest, multipliers = (
-            stack.allowed[top],
-            stack.earliest[top],
-            stack.multipliers[top],
-        )
+        allowed, earliest = stack.allowed[top], stack.earliest[top]
+        multipliers = stack.multipliers[top]
         state[STEP_SIZE] = stack.step_size[top]
         ending = _examine(
             arrays, teams, allowed, earliest, multipliers, scratch, state, upper_bound, choice
@@ -62,11 +59,8 @@ def search(arrays, teams, stack, depth, scratch, state, upper_bound, nodes):
             continue
         if ending != OPEN or depth == len(stack.step_size):
             return (FULL if ending == OPEN else ending), depth, examined + 1
-        stack.allowed[depth], stack.earliest[depth], stack.multipliers[depth] = (
-            allowed,
-            earliest,
-            multipliers,
-        )
+        stack.allowed[depth], stack.earliest[depth] = allowed, earliest
+        stack.multipliers[depth] = multipliers
         stack.step_size[top] = stack.step_size[depth] = max(state[STEP_SIZE], _MIN_STEP_SIZE)
         likely = choice[4] == 1
         _restrict(arrays, teams, choice, not likely, allowed, earliest)

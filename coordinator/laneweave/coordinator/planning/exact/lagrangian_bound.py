@@ -21,13 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from laneweave.coordinator.planning.exact.arrays import (
-    Bools,
-    Floats,
-    Ints,
-    MoveArrays,
-    Teams,
-)
+from laneweave.coordinator.planning.exact.arrays import Bools, Floats, Ints, MoveArrays, Teams
 from laneweave.coordinator.planning.exact.lagrangian_kernel import (
     BEST,
     BOUND,

@@ -283,12 +283,8 @@ def _walk(arrays, teams, allowed, earliest, multipliers, span, scratch, state):
 
     Returns the sum of costs, and whether all vehicles arrive.
     """
-    clique, step, cost_to_go, parked = (
-        arrays.clique,
-        arrays.step,
-        scratch.cost_to_go,
-        scratch.parked,
-    )
+    clique, step = arrays.clique, arrays.step
+    cost_to_go, parked = scratch.cost_to_go, scratch.parked
     use, mass, path = scratch.use, scratch.mass, scratch.path
     weight = state[WEIGHT]
     use[:] = 0.0
@@ -364,12 +360,8 @@ def fix_by_reduced_cost(arrays, teams, allowed, earliest, multipliers, span, scr
     groups, cells = len(allowed), allowed.shape[3]
     bound = evaluate(arrays, teams, earliest, multipliers, span, scratch)
     budget = upper_bound - bound + _TOLERANCE
-    cost_to_go, parked, min_cost, reach = (
-        scratch.cost_to_go,
-        scratch.parked,
-        scratch.min_cost,
-        scratch.reach,
-    )
+    cost_to_go, parked = scratch.cost_to_go, scratch.parked
+    min_cost, reach = scratch.min_cost, scratch.reach
     move, move_from, move_cost = scratch.move, scratch.move_from, scratch.move_cost
     dual, pair_target = scratch.dual, teams.pair_target
     for k in range(groups):

@@ -25,9 +25,13 @@ _SWAP_SHARE = 60
 
 
 @njit(cache=True)
-def _cheapest_path(arrays, weight, distance, start, target, cost_to_go, parked, path):
-    """Fill in the cheapest path of one vehicle at given clique costs; return its steps."""
+def _find_path(arrays, teams, candidate, i):
+    """Set the cheapest path of one vehicle at the current clique costs, and its cost."""
     valid, step, clique = arrays.valid, arrays.step, arrays.clique
+    weight, cost_to_go, parked = candidate.weight, candidate.cost_to_go, candidate.parked
+    pair = teams.pair[teams.team[i], candidate.target[i]]
+    start, target, distance = teams.start[i], teams.pair_cell[pair], teams.distance[:, pair]
+    path = candidate.path[i]
     steps = len(weight)
     displacements, cells = valid.shape
     max_cliques = clique.shape[2]
@@ -60,7 +64,8 @@ def _cheapest_path(arrays, weight, distance, start, target, cost_to_go, parked, 
     cell = start
     for t in range(steps):
         if cell == target and parked[t] <= cost_to_go[t, cell]:
-            return t
+            candidate.cost[i] = t
+            return
         best, choice = np.inf, 0
         for d in range(displacements):
             if valid[d, cell]:
@@ -73,7 +78,7 @@ def _cheapest_path(arrays, weight, distance, start, target, cost_to_go, parked, 
                     best, choice = total, d
         path[t] = choice
         cell += step[choice]
-    return steps if cell == target else NOT_IN_TIME
+    candidate.cost[i] = steps if cell == target else NOT_IN_TIME
 
 
 @njit(cache=True)
@@ -143,21 +148,6 @@ def negotiate(arrays, teams, candidate, number):
                 settled = False
                 history[t, clique] += _HISTORY * (use[t, clique] - 1.0)
     return settled
-
-
-@njit(cache=True)
-def _find_path(arrays, teams, candidate, i):
-    pair = teams.pair[teams.team[i], candidate.target[i]]
-    candidate.cost[i] = _cheapest_path(
-        arrays,
-        candidate.weight,
-        teams.distance[:, pair],
-        teams.start[i],
-        teams.pair_cell[pair],
-        candidate.cost_to_go,
-        candidate.parked,
-        candidate.path[i],
-    )
 
 
 @njit(cache=True, nogil=True)

@@ -125,10 +125,7 @@ def _sorted_by_team(cells: Sequence[int], team: Sequence[int]) -> tuple[State, t
 
 
 def _solution(
-    problem: Problem,
-    found: dict[State, _Step | None],
-    goal: State,
-    vehicles: Sequence[int],
+    problem: Problem, found: dict[State, _Step | None], goal: State, vehicles: Sequence[int]
 ) -> Solution:
     """Follow the search back to the start, then walk each vehicle through it."""
     steps: list[_Step] = []

@@ -96,21 +96,15 @@ class Saved(NamedTuple):
     vehicle: Ints
     slots: Ints
     cost: Floats
+    made: NDArray[np.int8]
     column: Ints
     lane: Ints
-    made: NDArray[np.int8]
 
 
 class Scratch(NamedTuple):
     """Memory of the search, allocated once."""
 
     saved: Saved
-    queue: Ints
-    hit: Ints
-    chosen: Ints
-    off_lane: Ints
-    costly: Ints
-    """The work lists each hold up to all vehicles."""
     marked: Bools
     """Vehicles whose paths are saved."""
     value: Singles
@@ -120,6 +114,12 @@ class Scratch(NamedTuple):
     """Extra cost of a move in each slot."""
     searches: Ints
     """Number of path searches; (1)."""
+    queue: Ints
+    hit: Ints
+    chosen: Ints
+    off_lane: Ints
+    costly: Ints
+    """The work lists each hold up to all vehicles."""
 
 
 class Window(NamedTuple):
@@ -216,8 +216,7 @@ def _may_move(road: StreamRoad, at_m: Floats, barred: Bools) -> Bools:
 
 def _paths(costs: StreamCosts, table: Table, low: int, vehicles: Sequence[StreamVehicle]) -> Paths:
     slots, count = len(table.load), len(vehicles)
-    column = np.zeros((count, slots + 1), dtype=np.int64)
-    lane = np.zeros((count, slots + 1), dtype=np.int64)
+    column, lane = np.zeros((2, count, slots + 1), dtype=np.int64)
     column[:, 0] = [vehicle.cell[0] - low for vehicle in vehicles]
     lane[:, 0] = [vehicle.cell[1] for vehicle in vehicles]
     target_lane = np.array([vehicle.lane for vehicle in vehicles], dtype=np.int64)
@@ -260,19 +259,14 @@ def _scratch(count: int, slots: int, reach: int, lanes: int) -> Scratch:
             np.zeros(_SAVED, dtype=np.int64),
             np.zeros(_SAVED, dtype=np.int64),
             np.zeros(_SAVED),
-            np.zeros((_SAVED, slots + 1), dtype=np.int64),
-            np.zeros((_SAVED, slots + 1), dtype=np.int64),
             np.zeros((_SAVED, slots), dtype=np.int8),
+            *np.zeros((2, _SAVED, slots + 1), dtype=np.int64),
         ),
-        np.zeros(count + 1, dtype=np.int64),
-        np.zeros(count + 1, dtype=np.int64),
-        np.zeros(count + 1, dtype=np.int64),
-        np.zeros(count + 1, dtype=np.int64),
-        np.zeros(count + 1, dtype=np.int64),
         np.zeros(count, dtype=np.bool_),
         np.zeros((slots + 1, lanes, 2 * reach + 3), dtype=np.float32),
         np.zeros(slots, dtype=np.float32),
         np.zeros(1, dtype=np.int64),
+        *np.zeros((5, count + 1), dtype=np.int64),
     )
 
 

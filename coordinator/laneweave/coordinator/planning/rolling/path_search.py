@@ -34,16 +34,6 @@ from laneweave.coordinator.planning.rolling.problem import (
 )
 from laneweave.protocol.lattice import Cell
 
-__all__ = [
-    "CellPath",
-    "StreamCosts",
-    "StreamPlan",
-    "StreamPlanner",
-    "StreamRoad",
-    "StreamVehicle",
-    "warm_up",
-]
-
 
 @cache
 def warm_up() -> None:

@@ -30,13 +30,8 @@ NO_PATH = 1e9
 @njit(cache=True, nogil=True)
 def put(table, paths, v, sign):
     """Add a vehicle's path to the table (sign 1), or remove it (sign -1)."""
-    load, vehicle, made, offsets, first = (
-        table.load,
-        table.vehicle,
-        table.made,
-        table.offsets,
-        table.first,
-    )
+    load, vehicle, made = table.load, table.vehicle, table.made
+    offsets, first = table.offsets, table.first
     _, _, lanes, columns = load.shape
     amount = sign * paths.penalty[v]
     for s in range(paths.slots[v]):
@@ -196,13 +191,8 @@ def stay(table, paths, costs, v):
 @njit(cache=True, nogil=True)
 def find_hit(table, paths, v, hit):
     """List the vehicles in conflict with a path that is not in the table; return how many."""
-    load, vehicle, made, offsets, first = (
-        table.load,
-        table.vehicle,
-        table.made,
-        table.offsets,
-        table.first,
-    )
+    load, vehicle, made = table.load, table.vehicle, table.made
+    offsets, first = table.offsets, table.first
     _, _, lanes, columns = load.shape
     count = 0
     for s in range(paths.slots[v]):

@@ -10,7 +10,6 @@ import pytest
 
 from laneweave.coordinator.planning.budget import Budget
 from laneweave.coordinator.planning.conflict_model import ConflictModel
-from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.paper.assignments import (
     Assignment,
     Weights,
@@ -22,7 +21,7 @@ from laneweave.coordinator.planning.paper.cbs import ConstraintTree, Improvement
 from laneweave.coordinator.planning.paper.explanation import entries
 from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.coordinator.planning.plan_validator import problems_of_response
-from laneweave.coordinator.planning.problem import Problem, Solution
+from laneweave.coordinator.planning.problem import Grid, Problem, Solution
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.solve import plan
 

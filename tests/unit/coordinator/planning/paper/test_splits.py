@@ -8,7 +8,6 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.conflict_model import ConflictModel
-from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.paper.constraints import (
     Conflict,
     Constraint,
@@ -18,7 +17,7 @@ from laneweave.coordinator.planning.paper.constraints import (
     is_at_node,
     rises,
 )
-from laneweave.coordinator.planning.problem import Bans, Diagram, MoveTable, Path, bits
+from laneweave.coordinator.planning.problem import Bans, Diagram, Grid, MoveTable, Path, bits
 from laneweave.coordinator.planning.shortest_paths import choose_path, shortest_paths
 from laneweave.protocol.lattice import Mode
 from laneweave.protocol.scenario.fields import CONFLICT_KINDS

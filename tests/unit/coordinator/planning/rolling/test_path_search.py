@@ -13,10 +13,10 @@ from hypothesis import given, settings
 from laneweave.coordinator.planning.conflict_model import ConflictModel
 from laneweave.coordinator.planning.rolling import search_kernel as kernel
 from laneweave.coordinator.planning.rolling.arrays import window
-from laneweave.coordinator.planning.rolling.path_search import (
+from laneweave.coordinator.planning.rolling.path_search import StreamPlanner
+from laneweave.coordinator.planning.rolling.problem import (
     StreamCosts,
     StreamPlan,
-    StreamPlanner,
     StreamRoad,
     StreamVehicle,
 )

@@ -9,13 +9,9 @@ import attrs
 import pytest
 
 from laneweave.coordinator.planning.conflict_model import ConflictModel
-from laneweave.coordinator.planning.rolling.path_search import (
-    CellPath,
-    StreamPlan,
-    StreamPlanner,
-    StreamRoad,
-)
-from laneweave.coordinator.planning.rolling.path_search import StreamVehicle as Vehicle
+from laneweave.coordinator.planning.rolling.path_search import StreamPlanner
+from laneweave.coordinator.planning.rolling.problem import CellPath, StreamPlan, StreamRoad
+from laneweave.coordinator.planning.rolling.problem import StreamVehicle as Vehicle
 from laneweave.coordinator.planning.rolling.rolling_validator import problems_of_plan
 from laneweave.protocol.lattice import Cell
 
