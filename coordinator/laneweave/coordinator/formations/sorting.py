@@ -139,8 +139,8 @@ def plan_requests(task: SortingTask, excused: Name | None = None) -> Iterator[Pl
         vehicles: list[dict[str, Any]] = [
             {"id": name, "cell": list(cell)}
             | (
-                {"eligible": [index[targets.own[name]]]}
-                if name in targets.own
+                {"eligible": [index[targets.off_lane[name]]]}
+                if name in targets.off_lane
                 else {"lane": wanted[name]}
             )
             for name, cell in task.movers.items()

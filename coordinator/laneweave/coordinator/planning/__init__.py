@@ -1,27 +1,23 @@
 """Target assignment and path planning in the relative coordinate system.
 
-Entry points: `facade.plan` answers one `request.PlanRequest` with a `response.PlanResponse`;
-`rolling.planner.StreamPlanner` plans a whole stream. Imported by the rest of the coordinator and by
-launch; imports the protocol only. Pure: no I/O, no state between calls, and time only through the
+Entry points: `solve.plan` answers a `request.PlanRequest` with a `response.PlanResponse`;
+`rolling.path_search.StreamPlanner` plans a stream. Imported by the rest of the coordinator and by
+launch; imports the protocol only. Pure: no I/O, no state between calls, and time only from the
 clock that is passed in.
-
-Where the parts of the paper are:
 
 | paper | module |
 |---|---|
-| relative motion modes 1 and 2 | `protocol.lattice`, `grid` |
-| conflict model | `conflicts` |
-| formation relative distance, cost matrix C | `paper.assignments` |
-| preference matrix P | `paper.assignments` |
-| assignments in non-decreasing order of cost | `paper.assignments` |
+| relative motion modes 1 and 2 | `protocol.lattice`, `problem.Grid` |
+| conflict model | `conflict_model` |
+| formation relative distance, matrices C and P, assignments by cost | `paper.assignments` |
 | TAPPA, Algorithm 1 | `paper.tappa` |
 | CBSA, Algorithm 2 | `paper.cbs` |
 | conflicts and constraints of the tree | `paper.constraints` |
 | SPPA | `shortest_paths` |
 | relative path map | `path_map` |
-| parallel and interlaced structure | `structures` |
+| parallel and interlaced structure | `formation_structures` |
 
-Beyond the paper: improvements of TAPPA (`paper.cbs.Improvements`, `paper.joint_search`), a record
-of its run (`paper.explanation`), branch and bound (`exact`), the rolling planner (`rolling`), and
-conflicts computed from sizes and motions (`geometry`).
+Additions: improvements of TAPPA (`paper.cbs.Improvements`, `paper.joint_search`), a record of its
+run (`paper.explanation`), branch and bound (`exact`), the planner of the rolling operation
+(`rolling`), and conflicts computed from sizes and motions (`geometry`).
 """

@@ -53,7 +53,7 @@ class Budget:
         self.nodes += 1
 
     def take_nodes(self, nodes: int) -> None:
-        """Count nodes that were examined; raise as `take_node` does."""
+        """Count examined nodes; raise `BudgetSpentError` at the deadline or the limit."""
         self.nodes += nodes
         self.check_time()
         if self._max_nodes is not None and self.nodes >= self._max_nodes:

@@ -1,4 +1,4 @@
-"""The paper's conflict model: which two moves must not be made in the same step.
+"""The paper's conflict model: pairs of moves that must not be made in the same step.
 
 Section "Conflict model" defines node conflicts, edge conflicts and four special types of edge
 conflict. Which special types matter depends on the lane width and on the column pitch, so each can
@@ -35,10 +35,9 @@ PAPER_KINDS: Final = ("node", "edge", "special-1", "special-2", "special-3", "sp
 DEFAULT_KINDS: Final[dict[Mode, tuple[str, ...]]] = {1: BASE_CONFLICTS, 2: ("geometric",)}
 
 MAX_OFFSET: Final = 2
-"""Moves from cells that are further apart, in columns or lanes, are in conflict only if their kind
-is in `_COLUMNS_OF_KIND`."""
+"""Maximum distance of conflicting from-cells, in columns and lanes, except `_COLUMNS_OF_KIND`."""
 CLOSING_COLUMNS: Final = 3
-"""Columns between two vehicles that close up from two free columns to none."""
+"""Column distance of two vehicles with two free columns between them."""
 _COLUMNS_OF_KIND: Final = {"closing": CLOSING_COLUMNS}
 
 
@@ -51,12 +50,12 @@ def _direction(move: Move) -> tuple[bool, bool]:
 
 
 def _node(a: Move, b: Move) -> bool:
-    """Both arrive at the same cell, or one moves to where the other waits."""
+    """Both end in the same cell; one of them may wait there."""
     return a[1] == b[1]
 
 
 def _edge(a: Move, b: Move) -> bool:
-    """The paths overlap (swap) or cross (two diagonals): both move and share their midpoint."""
+    """Both move and share their midpoint: they swap cells or cross diagonally."""
     if a[0] == a[1] or b[0] == b[1]:
         return False
     return a[0][0] + a[1][0] == b[0][0] + b[1][0] and a[0][1] + a[1][1] == b[0][1] + b[1][1]
@@ -116,7 +115,7 @@ def _as_kinds(kinds: Iterable[str]) -> tuple[str, ...]:
 class ConflictTable:
     """The pairs of moves that bring two bodies too close; see `geometry.conflict_table`.
 
-    any_lateness: the table holds however late a move begins.
+    any_lateness: whether the table also holds for moves that begin arbitrarily late.
     """
 
     pairs: frozenset[Pair]
@@ -155,7 +154,7 @@ class ConflictModel:
 
     @property
     def reach(self) -> Cell:
-        """Columns and lanes between two from-cells beyond which no two moves conflict."""
+        """Maximum column and lane distance of the from-cells of conflicting moves."""
         columns = max(_COLUMNS_OF_KIND.get(kind, MAX_OFFSET) for kind in self.kinds or ("node",))
         return columns, MAX_OFFSET
 

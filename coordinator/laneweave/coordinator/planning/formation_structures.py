@@ -4,15 +4,13 @@ The cells of a structure are free cells of its lanes: all of them if it is paral
 even, or those with an odd, column + lane if it is interlaced. On each lane a structure takes as
 many neighbouring cells as it has vehicles there, without gaps except for blocked cells:
 
-- Where every vehicle names its lane, the cells of each lane are where its vehicles have the
-  shortest total distance.
-- Otherwise the structure is filled from a common front to the rear, column by column, and in each
-  column over its lanes from the right. A lane that vehicles name is filled until they have their
-  cells; vehicles that name none get the other cells. The front is where the total distance along
-  the road is shortest.
+- If every vehicle names a lane, the cells of each lane minimize the total distance of its vehicles.
+- Otherwise cells are filled from a common front to the rear, column by column, and in each column
+  from the right lane to the left. The cells of a lane go to the vehicles that name it first, then
+  to vehicles that name none. The front minimizes the total distance along the road.
 
-Of the two interlaced structures the one with the shorter total distance is taken, the even one if
-both are equal. Ties between positions go to the one nearest to the middle of the grid.
+The interlaced structure with the shorter total distance is chosen, the even one if both are equal.
+Of equal positions the one nearest to the middle of the grid is chosen.
 """
 
 from __future__ import annotations
@@ -34,7 +32,7 @@ STRUCTURES: Final = (PARALLEL, INTERLACED)
 _Columns = Mapping[int, Sequence[int]]
 """Columns of a structure's cells, ascending, for each of its lanes."""
 _Placed = tuple[float, list[Cell]]
-"""Total distance along the road, with a share of the distance from the middle; cells."""
+"""Total distance along the road plus a tie-breaker, and the cells."""
 
 
 def structure_targets(
@@ -48,13 +46,13 @@ def structure_targets(
 
     Args:
         structure: one of `STRUCTURES`.
-        lanes: lanes that it uses.
-        grid: with cells that are blocked.
-        cells: where the vehicles are.
+        lanes: lanes of the structure.
+        grid: the grid with its blocked cells.
+        cells: current cells of the vehicles.
         preferred: the preferred lane of each vehicle, one of `lanes`; None: any.
 
     Raises:
-        ValueError: it has too few cells; see `shortage`.
+        ValueError: the structure has too few cells; see `shortage`.
     """
     placed = [
         _place(columns, grid, cells, preferred)
@@ -70,7 +68,7 @@ def structure_targets(
 def shortage(
     structure: str, lanes: Sequence[int], grid: Grid, preferred: Sequence[int | None]
 ) -> str | None:
-    """Return why a structure has too few cells for its vehicles; None: it has enough."""
+    """Return why a structure has too few cells for its vehicles, or None."""
     found = [_shortage(columns, preferred) for columns in _variants(structure, lanes, grid)]
     return None if None in found else found[0]
 
@@ -80,22 +78,25 @@ def ranked_runs(
 ) -> list[tuple[float, int]]:
     """Return the runs of neighbouring cells of a lane, those nearest to its vehicles first.
 
-    Vehicles that take them in the order of their columns have the shortest total path.
+    Assigning the cells to vehicles in the order of columns minimizes the total distance.
 
     Args:
         columns: of the vehicles; at most as many as there are in `free`.
         free: columns of the cells that may be taken, ascending.
         width: columns of the grid.
-        ahead: which of two equal runs comes first: the one further ahead, or the one nearer to the
-            middle of the grid.
+        ahead: of equal runs, the one further ahead comes first, not the one nearer to the middle.
 
     Returns:
-        For each run the total distance along the road, plus a small share that decides between
-        equal ones, and the index in `free` of its first cell.
+        For each run, the total distance along the road plus a small tie-breaker, and the index in
+        `free` of its first cell.
     """
     runs = np.lib.stride_tricks.sliding_window_view(np.asarray(free), len(columns))
-    share = (width - 1 - runs.mean(axis=1)) / (10 * width) if ahead else _off_middle(runs, width)
-    totals = np.abs(runs - np.sort(columns)).sum(axis=1) + share
+    tie_breaker = (
+        (width - 1 - runs.mean(axis=1)) / (10 * width)
+        if ahead
+        else _distance_from_middle(runs, width)
+    )
+    totals = np.abs(runs - np.sort(columns)).sum(axis=1) + tie_breaker
     return [(float(totals[first]), int(first)) for first in np.argsort(totals, kind="stable")]
 
 
@@ -116,7 +117,7 @@ def _variants(structure: str, lanes: Sequence[int], grid: Grid) -> list[_Columns
 
 
 def _shortage(columns: _Columns, preferred: Sequence[int | None]) -> str | None:
-    for lane, count in sorted(_named(preferred).items()):
+    for lane, count in sorted(_vehicles_per_lane(preferred).items()):
         if count > len(columns[lane]):
             return f"lane {lane} has {len(columns[lane])} such cells for {count} vehicles"
     cells = sum(map(len, columns.values()))
@@ -125,7 +126,7 @@ def _shortage(columns: _Columns, preferred: Sequence[int | None]) -> str | None:
     return None
 
 
-def _named(preferred: Sequence[int | None]) -> Counter[int]:
+def _vehicles_per_lane(preferred: Sequence[int | None]) -> Counter[int]:
     """Return how many vehicles name each lane."""
     return Counter(lane for lane in preferred if lane is not None)
 
@@ -136,29 +137,31 @@ def _place(
     if None in preferred:
         return _filled(columns, grid, [column for column, _ in cells], preferred)
     total, targets = 0.0, []
-    for lane in sorted(_named(preferred)):
-        wanting = [cell[0] for cell, own in zip(cells, preferred, strict=True) if own == lane]
-        distance, first = ranked_runs(wanting, columns[lane], grid.columns)[0]
+    for lane in sorted(_vehicles_per_lane(preferred)):
+        starts = [cell[0] for cell, own in zip(cells, preferred, strict=True) if own == lane]
+        distance, first = ranked_runs(starts, columns[lane], grid.columns)[0]
         total += distance
-        targets += [(column, lane) for column in columns[lane][first : first + len(wanting)]]
+        targets += [(column, lane) for column in columns[lane][first : first + len(starts)]]
     return total, targets
 
 
 def _filled(
     columns: _Columns, grid: Grid, starts: Sequence[int], preferred: Sequence[int | None]
 ) -> _Placed:
-    """Fill a structure from its front to its rear, for each front; return the nearest one."""
+    """Return the nearest of the structures that are filled from each possible front."""
     lanes_of: dict[int, list[int]] = {}
     for lane in sorted(columns):
         for column in columns[lane]:
             lanes_of.setdefault(column, []).append(lane)
-    in_order = np.sort(starts)
+    starts_in_order = np.sort(starts)
     found: list[_Placed] = []
     for front in sorted(lanes_of):
         targets = _fill(front, lanes_of, preferred)
         if targets is not None:
             places = np.sort([column for column, _ in targets])
-            distance = float(np.abs(places - in_order).sum() + _off_middle(places, grid.columns))
+            distance = float(
+                np.abs(places - starts_in_order).sum() + _distance_from_middle(places, grid.columns)
+            )
             found.append((distance, targets))
     return min(found, key=lambda one: one[0])
 
@@ -166,14 +169,14 @@ def _filled(
 def _fill(
     front: int, lanes_of: Mapping[int, Sequence[int]], preferred: Sequence[int | None]
 ) -> list[Cell] | None:
-    """Take cells from a front to the rear; None: there are too few."""
-    named = _named(preferred)
-    others = len(preferred) - named.total()
+    """Return the cells from a front to the rear, or None if there are too few."""
+    per_lane = _vehicles_per_lane(preferred)
+    others = len(preferred) - per_lane.total()
     targets: list[Cell] = []
     for column in range(front, min(lanes_of) - 1, -1):
         for lane in lanes_of.get(column, ()):
-            if named[lane]:
-                named[lane] -= 1
+            if per_lane[lane]:
+                per_lane[lane] -= 1
             elif others:
                 others -= 1
             else:
@@ -184,6 +187,6 @@ def _fill(
     return None
 
 
-def _off_middle(columns: NDArray[np.int64], width: int) -> NDArray[np.float64]:
-    """Return a tie-breaker below 0.06: the smaller, the nearer to the middle."""
+def _distance_from_middle(columns: NDArray[np.int64], width: int) -> NDArray[np.float64]:
+    """Return a tie-breaker below 0.06 that grows with the distance from the middle."""
     return np.asarray(np.abs(columns.mean(axis=-1) - (width - 1) / 2) / (10 * width))

@@ -22,7 +22,7 @@ class RelativePathMap:
 
     @classmethod
     def padded(cls, ids: Sequence[str], paths: Sequence[Sequence[Cell]]) -> RelativePathMap:
-        """Make a map of paths of different lengths; a vehicle that has arrived stays."""
+        """Return a map of paths of different lengths, each padded with its last cell."""
         length = max((len(path) for path in paths), default=1)
         rows = (tuple(path) + (path[-1],) * (length - len(path)) for path in paths)
         return cls(tuple(ids), tuple(rows))
@@ -51,7 +51,7 @@ class RelativePathMap:
 
 
 def final_arrival(path: Sequence[Cell]) -> int:
-    """Return the number of steps until a vehicle reaches the path's last cell to stay."""
+    """Return the number of steps until a path reaches its last cell for the last time."""
     steps = len(path) - 1
     while steps > 0 and path[steps - 1] == path[-1]:
         steps -= 1

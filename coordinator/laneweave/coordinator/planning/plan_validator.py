@@ -1,7 +1,6 @@
-"""Check a plan against its request, without code of the search.
+"""Check a plan against its request, independently of the search.
 
-Only the definition of a conflict is shared, because plans are checked against it. `facade.plan`
-calls this for every plan.
+Only the definition of a conflict is shared with the planner. `solve.plan` checks every plan.
 """
 
 from __future__ import annotations
@@ -56,7 +55,7 @@ def problems_of_paths(
 
 
 def _problems_of_targets(request: PlanRequest, targets: Sequence[Cell]) -> Iterator[str]:
-    """Yield how targets differ from the requested structure."""
+    """Yield the differences between the targets and the requested structure."""
     if len(targets) != len(request.vehicles) or len(set(targets)) != len(targets):
         yield f"{len(set(targets))} targets for {len(request.vehicles)} vehicles"
     for cell in targets:
@@ -110,7 +109,7 @@ def _conflicts(request: PlanRequest, paths: Sequence[Sequence[Cell]]) -> Iterato
     columns, lanes = model.reach
     for (i, a), (j, b) in combinations(enumerate(paths), 2):
         for step in range(len(a) - 1):
-            # Most pairs are further apart than any two moves conflict.
+            # Most pairs are too far apart for any conflict.
             if abs(a[step][0] - b[step][0]) > columns or abs(a[step][1] - b[step][1]) > lanes:
                 continue
             kind = model.kind((a[step], a[step + 1]), (b[step], b[step + 1]))

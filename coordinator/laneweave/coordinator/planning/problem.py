@@ -1,8 +1,7 @@
-"""A planning problem as the searches see it: moves as bits, starts, targets, paths.
+"""A planning problem in the form that the searches use: moves as bits, starts, targets, paths.
 
-The planner asks two questions very often: which moves are possible in this step, and with which
-of them does this move conflict. With one bit per move both are answered for all moves at once, and
-a set of moves is one integer.
+A set of moves is one integer with a bit per move, so that the moves that are possible in a step,
+or that conflict with a given move, are found with a few bit operations.
 
 Cells are numbered column by column, with two unused lanes between columns so that nothing wraps
 around. Each cell has one bit per displacement: bit `cell_bit + d` is the move from that cell with
@@ -24,7 +23,7 @@ Path = tuple[int, ...]
 """The moves of one vehicle until its final arrival."""
 
 _MAX_CACHED_BITS: Final = 1 << 15
-"""On larger grids conflict sets are computed again instead of being kept."""
+"""On larger grids conflict sets are not cached."""
 
 
 def bits(mask: int) -> Iterator[int]:
@@ -57,7 +56,7 @@ class Grid:
 
 
 class MoveTable:
-    """The numbering of moves on one grid, and the sets that follow from it."""
+    """The numbered moves of one grid, and operations on sets of moves and cells."""
 
     def __init__(self, grid: Grid, mode: Mode, model: ConflictModel) -> None:
         """Number the moves and store the conflict relation as bit patterns."""
@@ -206,12 +205,10 @@ class Bans:
 
 @attrs.frozen(eq=False)
 class Diagram:
-    """Every path of minimum cost from a start to a target, for one vehicle.
-
-    Known in the literature as a multi-valued decision diagram.
+    """All minimum-cost paths of a vehicle to a target, as a multi-valued decision diagram.
 
     layers: per step, the moves that lie on at least one such path; there are `cost` steps.
-    target: the bit of the target cell, and so of waiting there after arrival.
+    target: the bit of the target cell, which is also that of waiting there.
     """
 
     layers: tuple[int, ...]
@@ -223,7 +220,7 @@ class Diagram:
         return len(self.layers)
 
     def layer(self, step: int) -> int:
-        """Return the possible moves of a step, which after arrival is waiting at the target."""
+        """Return the possible moves of a step; after arrival, only waiting at the target."""
         return self.layers[step] if step < len(self.layers) else 1 << self.target
 
 
@@ -242,20 +239,20 @@ class Solution:
 
 @attrs.define(eq=False)
 class Search:
-    """A search for the best path set: what all solvers have in common.
+    """Base class of the solvers: a search for the cheapest path set.
 
     best: the cheapest path set so far.
-    lower_bound: no path set costs less; infinite: there is none.
-    finished: the search is complete: `best` is optimal, or nothing exists.
-    gave_up: this solver cannot decide the problem within its memory; another one may.
-    tried: number of assignments examined one by one.
-    has_fewest_moves: it is proven that no path set of the same cost as `best` has fewer moves.
+    lower_bound: on the cost of all path sets; infinite: there is none.
+    finished: whether `best` is proven optimal, or that no path set exists.
+    aborted: whether this solver cannot decide the problem within its limits; another one may.
+    tried: number of assignments that were examined one by one.
+    has_fewest_moves: whether it is proven that no path set of equal cost has fewer moves.
     """
 
     best: Solution | None = None
     lower_bound: float = 0
     finished: bool = False
-    gave_up: bool = False
+    aborted: bool = False
     tried: int = 0
     has_fewest_moves: bool = False
 
@@ -268,8 +265,7 @@ class Problem:
     """Vehicles and targets on a grid.
 
     starts, targets: bits of their cells.
-    free_paths: the unconstrained shortest paths of a vehicle to a target, which all constraint
-        trees share; filled in by `shortest_paths.free_paths`.
+    free_paths: cache of `shortest_paths.free_paths`, which all constraint trees share.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""A planning request: vehicles, targets and rules, checked when it is made.
+"""A planning request: vehicles, targets and rules, checked on construction.
 
 The JSON form is fixed (`laneweave.plan.request/1`). Every error is a `BadInputError` that names the
 field, the value and what is allowed. Unknown keys are errors, too: a misspelt preference must not
@@ -50,7 +50,7 @@ class VehicleRequest:
     eligible: tuple[int, ...] | None = None
 
     def choice(self, targets: Sequence[Cell]) -> frozenset[int]:
-        """Return the targets on `lane`, those in `eligible`, or else all."""
+        """Return the indices of eligible targets: `eligible`, those on `lane`, or all."""
         if self.eligible is not None:
             return frozenset(self.eligible)
         lane = self.lane
@@ -61,12 +61,12 @@ class VehicleRequest:
 class PlanRequest:
     """Vehicles, targets and rules of one planning problem.
 
-    targets: none where a structure is given.
-    structure: one of `STRUCTURES`, whose cells are the targets; see `structures`.
-    lanes: lanes that the structure uses; None: all.
-    geometry: from which `geometric` is computed; None: footprints.
+    targets: empty if a structure is given.
+    structure: one of `STRUCTURES`, whose cells are the targets; see `formation_structures`.
+    lanes: lanes of the structure; None: all.
+    geometry: defines the conflict kind `geometric`; None: footprints.
     solver: one of `SOLVERS`; None: the planner's default.
-    id: identifies a repeated request, which a service answers as before. Empty: no identity.
+    id: a service answers a repeated id with the same response. Empty: none.
     """
 
     grid: Grid
@@ -114,12 +114,12 @@ class PlanRequest:
 
     @property
     def conflict_model(self) -> ConflictModel:
-        """Which moves must not be made in the same step."""
+        """The definition of conflicts between moves."""
         table = None if self.geometry is None else conflict_table(self.geometry)
         return ConflictModel(self.conflicts, table)
 
     def problem(self) -> Problem:
-        """Return the request as the searches see it."""
+        """Return the problem in the form that the searches use."""
         starts = [vehicle.cell for vehicle in self.vehicles]
         return Problem(self.grid, self.mode, self.conflict_model, starts, self.targets)
 
@@ -132,8 +132,8 @@ class PlanRequest:
         """The lanes that a structure may use."""
         return range(self.grid.lanes) if self.lanes is None else self.lanes
 
-    def settled(self) -> PlanRequest:
-        """Return the request with the targets of its structure; itself if it names targets."""
+    def resolved(self) -> PlanRequest:
+        """Return the request with its structure, if it has one, replaced by targets."""
         if self.structure is None:
             return self
         cells = [vehicle.cell for vehicle in self.vehicles]
@@ -143,7 +143,7 @@ class PlanRequest:
         )
 
     def with_targets(self, targets: Sequence[Cell]) -> PlanRequest:
-        """Return the request with these targets instead of its own, or of its structure."""
+        """Return the request with other targets and without a structure."""
         return attrs.evolve(self, targets=tuple(targets), structure=None, lanes=None)
 
     @classmethod
@@ -184,10 +184,10 @@ class PlanRequest:
 
 
 def checked_solver(name: str, field: str = "solver") -> str:
-    """Return the name of a solver.
+    """Return the name of an existing solver.
 
     Raises:
-        BadInputError: there is none of this name.
+        BadInputError: no solver has this name.
     """
     if name not in SOLVERS:
         raise BadInputError(field, name, "one of " + ", ".join(SOLVERS))
@@ -231,15 +231,12 @@ class _Document:
 
 
 def _is_given(attribute: attrs.Attribute[Any], value: object) -> bool:
-    """Return whether the JSON form has a field."""
+    """Return whether the JSON form contains a field."""
     return value is not None and value != "" and (attribute.name != "targets" or value != ())
 
 
 def _check_json(parent: str, value: object) -> None:
-    """Reject null and unreadable keys; error messages show keys on one line.
-
-    Absent keys have defaults. A geometry may have null for no limit.
-    """
+    """Reject nulls, except in a geometry, and keys that do not fit on one printable line."""
     items: Any = ()
     if isinstance(value, Mapping):
         prefix = f"{parent}." if parent else ""
@@ -268,7 +265,7 @@ def _check_count(field: str, values: Sequence[object], maximum: int) -> None:
 
 
 def _check_unique(field: str, values: Sequence[object], allowed: str, name: str = "") -> None:
-    """Reject a value that occurs twice; `name` is that of the field in each item."""
+    """Reject a value that occurs twice; `name`: suffix of the field in each item."""
     first: dict[object, int] = {}
     for i, value in enumerate(values):
         if first.setdefault(value, i) != i:

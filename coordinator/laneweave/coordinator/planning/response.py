@@ -1,4 +1,4 @@
-"""The planner's answer (`laneweave.plan.response/1`)."""
+"""The planner's response (`laneweave.plan.response/1`)."""
 
 from __future__ import annotations
 
@@ -25,10 +25,11 @@ _OPTIONAL: Final = ("solver", "targets", "waited_ms")
 
 @attrs.frozen
 class PlanResponse:
-    """A plan, or why there is none.
+    """A plan, or the reason why there is none.
 
-    status: `optimal` is proven without any bound on the number of steps, `feasible` means that
-        the budget was spent first, `infeasible` is proven, `timeout` means that nothing is known.
+    status: `optimal` is proven without any bound on the number of steps, `feasible` means that the
+        budget was spent first, `infeasible` is proven, `timeout` means that no plan was found in
+        time.
     cost, steps: None without a plan. lower_bound: proven; None if infeasible.
     assignment: per vehicle, the index of its target; empty without a plan.
     paths: per vehicle, its cells at all `steps` + 1 time points; empty without a plan.
@@ -84,7 +85,7 @@ PlanFunction = Callable[..., PlanResponse]
 
 
 def _is_given(attribute: attrs.Attribute[Any], value: object) -> bool:
-    """Return whether the JSON form has a field."""
+    """Return whether the JSON form contains a field."""
     if attribute.name == "fallback":
         return bool(value)
     return value is not None or attribute.name not in _OPTIONAL

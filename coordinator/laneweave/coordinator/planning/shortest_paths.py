@@ -1,10 +1,9 @@
 """SPPA, the single-vehicle path planning algorithm of the paper.
 
 The paper uses A* in space and time. Here all shortest paths of a vehicle under its constraints are
-computed at once, as sets of moves per step (`Diagram`): forwards, the moves that can be made until
-the vehicle can have arrived for the last time; then backwards, to drop the moves that do not lead
-there. What is left is to choose one of them: the fewest conflicts with the paths of the other
-vehicles, then the fewest moves, then the lowest index.
+computed at once, as sets of moves per step (`Diagram`): a forward pass collects the moves up to the
+earliest final arrival, a backward pass removes those that do not lead to it. `choose_path` selects
+the path with the fewest conflicts with other vehicles, then fewest moves, then lowest index.
 """
 
 from __future__ import annotations
@@ -28,13 +27,13 @@ def shortest_paths(table: MoveTable, start: int, target: int, bans: Bans) -> Dia
             return None
     cells = arriving = 1 << start
     layers: list[int] = []
-    lasting = 0
+    banned_since = 0
     while len(layers) < arrival or not arriving >> target & 1:
         step = len(layers)
         if not cells or step >= limit:
             return None
-        lasting |= bans.since.get(step, 0)
-        moves = table.starting_in(cells) & ~(bans.at.get(step, 0) | lasting)
+        banned_since |= bans.since.get(step, 0)
+        moves = table.starting_in(cells) & ~(bans.at.get(step, 0) | banned_since)
         layers.append(moves)
         cells = table.ends(moves)
         # A vehicle that waits at the target arrived earlier, unless a later wait is banned.
@@ -66,23 +65,23 @@ def conflicting_moves(
     Each other vehicle is given as its path and its target, where it waits after arrival.
     """
     conflicts = table.conflicts
-    taken = [0] * steps
+    conflicting = [0] * steps
     for path, target in others:
         arrived = len(path)
         for step in range(steps):
-            taken[step] |= conflicts[path[step] if step < arrived else target]
-    return taken
+            conflicting[step] |= conflicts[path[step] if step < arrived else target]
+    return conflicting
 
 
-def choose_path(table: MoveTable, diagram: Diagram, taken: Sequence[int]) -> Path:
+def choose_path(table: MoveTable, diagram: Diagram, conflicting: Sequence[int]) -> Path:
     """Return the best path of a diagram, given the moves that conflict with other vehicles."""
     fan, shifts = table.fan, table.shifts
     conflict_weight = diagram.cost + 1
-    worth = {diagram.target: 0}
+    cost_to_go = {diagram.target: 0}
     choices: list[dict[int, int]] = []
     for step in range(diagram.cost - 1, -1, -1):
-        layer, bad = diagram.layers[step], taken[step]
-        earlier: dict[int, int] = {}
+        layer, bad = diagram.layers[step], conflicting[step]
+        cost_before: dict[int, int] = {}
         choice: dict[int, int] = {}
         while layer:
             low = layer & -layer
@@ -90,19 +89,19 @@ def choose_path(table: MoveTable, diagram: Diagram, taken: Sequence[int]) -> Pat
             bit = low.bit_length() - 1
             d = bit % fan
             cell = bit - d
-            value = worth[cell + shifts[d]]
+            value = cost_to_go[cell + shifts[d]]
             if d:
                 value += 1
             if bad & low:
                 value += conflict_weight
-            if cell not in earlier or value < earlier[cell]:
-                earlier[cell] = value
+            if cell not in cost_before or value < cost_before[cell]:
+                cost_before[cell] = value
                 choice[cell] = bit
-        worth = earlier
+        cost_to_go = cost_before
         choices.append(choice)
     path: list[int] = []
     if choices:
-        (cell,) = worth
+        (cell,) = cost_to_go
         for choice in reversed(choices):
             path.append(choice[cell])
             cell = table.landing(choice[cell])

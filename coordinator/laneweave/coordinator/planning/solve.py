@@ -1,4 +1,4 @@
-"""Plan one request with the solver it asks for, and fall back on the other one."""
+"""Plan one request with the selected solver, and fall back to the other one."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from laneweave.protocol.scenario.fields import DEFAULT_SOLVER
 TAPPA_SHARE: Final = 0.75
 """Share of the deadline, and of the node limit, after which branching replaces TAPPA.
 
-15,000 of the 20,000 nodes of a scenario take TAPPA 3 to 5 s of CPU for six to eight vehicles;
-branching needs 0.1 s for such formations (95th percentile), 0.6 s at most.
+With six to eight vehicles TAPPA needs 3 to 5 s of CPU for 15,000 of the 20,000 nodes of a scenario;
+branching needs 0.1 s for such formations (95th percentile), at most 0.6 s.
 """
 MAX_NODES: Final = 500_000
-"""Bounds the memory of TAPPA's trees to about 1 GB; it takes minutes to get there."""
+"""Limits the memory of TAPPA's trees to about 1 GB, which takes minutes to reach."""
 
 
 @attrs.frozen
@@ -50,16 +50,16 @@ def plan(
     fallback: bool = True,
     clock: Clock = time.monotonic,
 ) -> PlanResponse:
-    """Plan one request; the plan is checked by code that shares nothing with the searches.
+    """Plan one request, and check the plan with `plan_validator`.
 
     Equal requests get equal plans unless the deadline passes first.
 
     Args:
         request: what to plan.
-        max_nodes: limit on search nodes, which is repeatable; at most `MAX_NODES`.
-        max_memory_mb: limit on the arrays of branch and bound. Where it is reached the other
+        max_nodes: limit on search nodes, for repeatable results; at most `MAX_NODES`.
+        max_memory_mb: limit on the arrays of branch and bound. When it is reached, the other
             solver continues; with a path set and no proof the status is `feasible`.
-        weights: of the formation relative distance; they must give a lower bound.
+        weights: of the formation relative distance, which must be a lower bound on steps.
         solver: one of `SOLVERS`, instead of the request's; if neither names one, the default.
         fallback: branching continues when TAPPA has spent `TAPPA_SHARE`, and the cheaper of both
             path sets is returned; False: TAPPA may spend everything. A solver that cannot handle
@@ -67,23 +67,23 @@ def plan(
         clock: returns the time in s.
 
     Raises:
-        RuntimeError: the plan is wrong, which is an error in the planner.
+        RuntimeError: the plan is invalid because of an error in the planner.
     """
     started = clock()
-    asked_request, request = request, request.settled()
-    asked = checked_solver(solver or request.solver or DEFAULT_SOLVER)
+    original, request = request, request.resolved()
+    requested = checked_solver(solver or request.solver or DEFAULT_SOLVER)
     weights = (weights or Weights.for_mode(request.mode)).checked(request.mode)
     nodes = MAX_NODES if max_nodes is None else min(max_nodes, MAX_NODES)
     problem = request.problem()
-    order = _order(asked, problem, fallback=fallback)
+    order = _order(requested, problem, fallback=fallback)
     results: list[_Result] = []
     for name in order:
         if name == "branching":
             began = clock()
             _warm_up_branching()
             started += clock() - began  # loading compiled code is not part of planning
-        shares = name == "tappa" and order[-1] != name
-        share = TAPPA_SHARE if shares else 1.0
+        is_limited = name == "tappa" and order[-1] != name
+        share = TAPPA_SHARE if is_limited else 1.0
         left = nodes - sum(result.nodes for result in results)
         budget = Budget(
             deadline=started + share * request.deadline_s,
@@ -92,30 +92,30 @@ def plan(
             clock=clock,
         )
         results.append(_solve(name, problem, request, weights, budget))
-        if results[-1].found.finished or not (results[-1].found.gave_up or shares):
+        if results[-1].found.finished or not (results[-1].found.aborted or is_limited):
             break
-    response = _response(request, problem, asked, results, started, clock)
-    if asked_request.structure is not None:
+    response = _response(request, problem, requested, results, started, clock)
+    if original.structure is not None:
         response = attrs.evolve(response, targets=request.targets)
-    problems = problems_of_response(asked_request, response)
+    problems = problems_of_response(original, response)
     if problems:
-        raise RuntimeError("the planner made a wrong plan: " + "; ".join(problems))
+        raise RuntimeError("the planner made an invalid plan: " + "; ".join(problems))
     return response
 
 
-def _order(asked: str, problem: Problem, *, fallback: bool) -> tuple[str, ...]:
-    """Return the solvers to run, one after the other."""
+def _order(requested: str, problem: Problem, *, fallback: bool) -> tuple[str, ...]:
+    """Return the solvers in the order in which to run them."""
     if problem.table.model.vehicles_share_cells:
         return ("tappa",)
-    if asked == "tappa":
+    if requested == "tappa":
         return ("tappa", "branching") if fallback else ("tappa",)
-    return (asked, "tappa")
+    return (requested, "tappa")
 
 
 def _solve(
     solver: str, problem: Problem, request: PlanRequest, weights: Weights, budget: Budget
 ) -> _Result:
-    """Run one solver until it has finished, gives up or has spent its budget."""
+    """Run one solver until it finishes, aborts or has spent its budget."""
     found = Search()
     with suppress(BudgetSpentError):
         search: Search
@@ -133,7 +133,7 @@ def _solve(
 def _response(
     request: PlanRequest,
     problem: Problem,
-    asked: str,
+    requested: str,
     results: Sequence[_Result],
     started: float,
     clock: Clock,
@@ -162,7 +162,7 @@ def _response(
         assignments_tried=sum(search.tried for search in searches),
         nodes_expanded=sum(result.nodes for result in results),
         solver=last,
-        fallback=last != asked,
+        fallback=last != requested,
     )
 
 
@@ -173,10 +173,7 @@ def _status(*, found: bool, finished: bool) -> Status:
 
 
 def warm_up() -> None:
-    """Load the compiled parts of all planners; compile them if there is no cache yet.
-
-    Loading takes a second, compiling a minute.
-    """
+    """Load the compiled parts of all planners (1 s); compile them if they are not cached (60 s)."""
     from laneweave.coordinator.planning.rolling import path_search as stream  # noqa: PLC0415 (numba is slow to load)
 
     _warm_up_branching()

@@ -1,8 +1,8 @@
 """Targets of a formation: the parallel structure after lane sorting (paper, Section 5.2.1).
 
-Each lane offers as many neighbouring cells as vehicles need it, placed where their paths are
-shortest. A vehicle without an agent keeps its cell, and the others sort themselves around it.
-When a lane has fewer free cells than vehicles that need it, those with the longest path stay out.
+Each lane provides as many neighbouring cells as vehicles prefer it, where their paths are shortest.
+Vehicles without an agent keep their cells, which are blocked for others. If more vehicles prefer a
+lane than it has free cells, those furthest from it get the nearest other cells.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from laneweave.protocol.wire.messages import Name
 
 @frozen
 class Targets:
-    """Where the vehicles of a formation should go."""
+    """Target cells of a formation."""
 
     cells: tuple[Cell, ...]
-    """All targets, as many as there are vehicles to place."""
-    own: dict[Name, Cell]
-    """Targets of those that cannot get their lanes: the nearest cell that is left."""
+    """All targets, one for each vehicle."""
+    off_lane: dict[Name, Cell]
+    """Targets of the vehicles that do not fit on their lanes."""
 
 
 def placements(
@@ -40,43 +40,43 @@ def placements(
     """Yield all parallel structures on a grid, those with the shortest paths first.
 
     Args:
-        cells: where each vehicle is.
-        preferred_lanes: lane that each of them needs.
+        cells: current cell of each vehicle.
+        preferred_lanes: of each vehicle.
         columns: columns of the grid.
         lanes: lanes of the grid.
         blocked: cells that cannot be targets.
-        ahead: which of two placements with equal paths comes first: the one further ahead, or the
-            one nearer to the middle of the grid.
+        ahead: of placements with equal paths, the one further ahead comes first, not the one nearer
+            to the middle of the grid.
     """
     choices: list[list[tuple[float, list[Cell]]]] = []
-    left_over: list[Name] = []
+    displaced: list[Name] = []
     for lane in range(lanes):
         free = [column for column in range(columns) if (column, lane) not in blocked]
-        wanting = [name for name in cells if preferred_lanes[name] == lane]
-        if len(wanting) > len(free):
-            # Those furthest away stay out; by name where it makes no difference.
-            wanting.sort(key=lambda name: (abs(cells[name][1] - lane), name))
-            left_over += wanting[len(free) :]
-            wanting = wanting[: len(free)]
-        starts = [cells[name] for name in wanting]
+        assigned = [name for name in cells if preferred_lanes[name] == lane]
+        if len(assigned) > len(free):
+            # The furthest vehicles are displaced; ties are broken by name.
+            assigned.sort(key=lambda name: (abs(cells[name][1] - lane), name))
+            displaced += assigned[len(free) :]
+            assigned = assigned[: len(free)]
+        starts = [cells[name] for name in assigned]
         choices.append(_ranked_targets(lane, starts, columns, free, ahead=ahead))
     for chosen in _combinations(choices):
         targets = list(chosen)
-        own: dict[Name, Cell] = {}
-        for name in left_over:
-            own[name] = _nearest_free(cells[name], columns, lanes, {*blocked, *targets})
-            targets.append(own[name])
-        yield Targets(tuple(targets), own)
+        off_lane: dict[Name, Cell] = {}
+        for name in displaced:
+            off_lane[name] = _nearest_free(cells[name], columns, lanes, {*blocked, *targets})
+            targets.append(off_lane[name])
+        yield Targets(tuple(targets), off_lane)
 
 
 def _combinations(choices: Sequence[Sequence[tuple[float, list[Cell]]]]) -> Iterator[list[Cell]]:
-    """Yield one choice of each lane, joined, in ascending order of the sum of their ranks."""
+    """Yield the cells of one choice per lane, in ascending order of the sum of ranks."""
 
-    def total(indices: tuple[int, ...]) -> float:
+    def rank_sum(indices: tuple[int, ...]) -> float:
         return sum(lane[index][0] for lane, index in zip(choices, indices, strict=True))
 
     first = (0,) * len(choices)
-    heap, seen = [(total(first), first)], {first}
+    heap, seen = [(rank_sum(first), first)], {first}
     while heap:
         _, indices = heapq.heappop(heap)
         yield [
@@ -86,7 +86,7 @@ def _combinations(choices: Sequence[Sequence[tuple[float, list[Cell]]]]) -> Iter
             following = (*indices[:place], index + 1, *indices[place + 1 :])
             if index + 1 < len(choices[place]) and following not in seen:
                 seen.add(following)
-                heapq.heappush(heap, (total(following), following))
+                heapq.heappush(heap, (rank_sum(following), following))
 
 
 def _ranked_targets(
@@ -103,6 +103,6 @@ def _ranked_targets(
 
 
 def _nearest_free(cell: Cell, columns: int, lanes: int, taken: Collection[Cell]) -> Cell:
-    """Return the nearest cell that is not taken; there is one, since a vehicle has left it."""
+    """Return the nearest cell that is not taken."""
     free = (other for other in product(range(columns), range(lanes)) if other not in taken)
     return min(free, key=lambda other: (abs(other[0] - cell[0]) + abs(other[1] - cell[1]), other))

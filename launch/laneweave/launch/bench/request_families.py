@@ -123,39 +123,41 @@ class _Arrivals:
         self._waiting: list[deque[_Vehicle]] = [deque() for _ in range(_TRAFFIC_LANES)]
         self._last_s = [0.0] * _TRAFFIC_LANES
 
-    def _heads(self) -> list[tuple[int, _Vehicle]]:
+    def _first_vehicles(self) -> list[tuple[int, _Vehicle]]:
         """Return lane and vehicle of those that may enter the next column, first come first."""
-        heads = []
+        first = []
         for lane, queue in enumerate(self._waiting):
             while not queue or self._last_s[lane] <= self._column:
                 headway_s = _MIN_HEADWAY_S + self._rng.expovariate(1.0 / self._mean_rest_s)
                 self._last_s[lane] += headway_s
                 queue.append(_Vehicle(self._last_s[lane], self._rng.randrange(_TRAFFIC_LANES)))
             if queue[0].arrival_s <= self._column:
-                heads.append((lane, queue[0]))
-        return sorted(heads, key=lambda head: (head[1].arrival_s, head[0]))
+                first.append((lane, queue[0]))
+        return sorted(first, key=lambda head: (head[1].arrival_s, head[0]))
 
     def formation(self) -> tuple[int, list[tuple[Cell, int]]]:
         """Return the columns of the next formation, and cell and preferred lane of its vehicles."""
         shortest, longest = _TRAFFIC_COLUMNS
-        self._column = max(self._column, math.ceil(min(q[0].arrival_s for q in self._filled())))
+        self._column = max(
+            self._column, math.ceil(min(q[0].arrival_s for q in self._nonempty_queues()))
+        )
         entered: list[tuple[int, int, int]] = []
         columns = 0
         while columns < longest and (len(entered) < self._most or columns < shortest):
-            room = max(shortest, columns + 1)
+            max_per_lane = max(shortest, columns + 1)
             preferred = [preferred_lane for _, _, preferred_lane in entered]
             entering = []
-            for lane, vehicle in self._heads():
+            for lane, vehicle in self._first_vehicles():
                 # A vehicle for whose lane the formation is too short waits.
-                if preferred.count(vehicle.preferred_lane) < room:
+                if preferred.count(vehicle.preferred_lane) < max_per_lane:
                     preferred.append(vehicle.preferred_lane)
                     entering.append(lane)
-            room_left = self._most - len(entered)
-            if len(entering) > room_left and columns >= shortest:
+            free_places = self._most - len(entered)
+            if len(entering) > free_places and columns >= shortest:
                 break
             entered += [
                 (columns, lane, self._waiting[lane].popleft().preferred_lane)
-                for lane in entering[:room_left]
+                for lane in entering[:free_places]
             ]
             columns += 1
             self._column += 1
@@ -163,9 +165,9 @@ class _Arrivals:
             ((columns - 1 - back, lane), preferred_lane) for back, lane, preferred_lane in entered
         ]
 
-    def _filled(self) -> list[deque[_Vehicle]]:
+    def _nonempty_queues(self) -> list[deque[_Vehicle]]:
         """Return the queues, each with at least one vehicle."""
-        self._heads()
+        self._first_vehicles()
         return self._waiting
 
 

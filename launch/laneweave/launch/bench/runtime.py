@@ -27,8 +27,8 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.recording.trips import spread
 
 ROLES = ("router", "coordinator", "bridge", "agent")
-LOOK_EVERY_S = 0.3
-SETTLE_S = 10.0
+CPU_PERIOD_S = 0.3
+WARM_UP_S = 10.0
 """Road seconds after the road has filled before anything is measured."""
 
 
@@ -40,7 +40,7 @@ class _Window:
     end_s: float
     seen: dict[str, tuple[psutil.Process, float]] = field(factory=dict)
     """Each process, and its CPU time when it was last looked at."""
-    looked_s: float = 0.0
+    measured_s: float = 0.0
     began: tuple[float, float] | None = None
     ended: tuple[float, float] | None = None
     cpu_s: dict[str, float] = field(factory=dict)
@@ -51,18 +51,18 @@ class _Window:
         now_s = time.perf_counter()
         if self.began is None and view.t_s >= self.begin_s:
             self.began = (view.t_s, now_s)
-            self._look(process_ids, count=False)
+            self._measure_cpu(process_ids, count=False)
         elif self.began is not None and self.ended is None:
             if view.t_s >= self.end_s:
                 self.ended = (view.t_s, now_s)
-                self._look(process_ids, count=True)
-                self._weigh(process_ids)
-            elif now_s >= self.looked_s + LOOK_EVERY_S:
+                self._measure_cpu(process_ids, count=True)
+                self._measure_memory(process_ids)
+            elif now_s >= self.measured_s + CPU_PERIOD_S:
                 # Vehicles leave, and their agents' accounts with them: look often.
-                self.looked_s = now_s
-                self._look(process_ids, count=True)
+                self.measured_s = now_s
+                self._measure_cpu(process_ids, count=True)
 
-    def _look(self, process_ids: Mapping[str, int], *, count: bool) -> None:
+    def _measure_cpu(self, process_ids: Mapping[str, int], *, count: bool) -> None:
         for name, process_id in process_ids.items():
             with contextlib.suppress(psutil.Error):
                 process, before = self.seen.get(name) or (psutil.Process(process_id), 0.0)
@@ -72,7 +72,7 @@ class _Window:
                     role = _role(name)
                     self.cpu_s[role] = self.cpu_s.get(role, 0.0) + cpu_s - before
 
-    def _weigh(self, process_ids: Mapping[str, int]) -> None:
+    def _measure_memory(self, process_ids: Mapping[str, int]) -> None:
         for name, process_id in process_ids.items():
             with contextlib.suppress(psutil.Error):
                 info = psutil.Process(process_id).memory_full_info()
@@ -88,7 +88,7 @@ def bench_runtime(vehicles: int, *, seconds: float, per_process: int, seed: int)
     base = load_scenario(None)
     travel_s = base.road.length_m / base.formation.speed_mps
     volume = vehicles / (travel_s * base.road.lanes) * 3600.0
-    begin_s = travel_s + SETTLE_S
+    begin_s = travel_s + WARM_UP_S
     scenario = load_scenario(
         None,
         seed=seed,
@@ -108,7 +108,7 @@ def bench_runtime(vehicles: int, *, seconds: float, per_process: int, seed: int)
         "volume_veh_per_lane_h": round(volume, 1),
         "vehicles_per_process": per_process,
         "vehicles_on_road": round(float(ticks.column("on_road").to_numpy()[measured].mean()), 1),
-        "real_time_factor": _rate(window),
+        "real_time_factor": _real_time_factor(window),
         "tick_ms": spread(ticks.column("tick_ms").to_numpy()[measured], 50, 99),
         "cpu_ms_per_tick": _per_tick(window, scenario),
         "memory_mib": _memory(window),
@@ -153,7 +153,7 @@ def _cpu_s(process: psutil.Process) -> float:
     return float(times.user + times.system)
 
 
-def _rate(window: _Window) -> float:
+def _real_time_factor(window: _Window) -> float:
     if window.began is None or window.ended is None:
         return 0.0
     road_s, wall_s = (end - begin for begin, end in zip(window.began, window.ended, strict=True))

@@ -121,7 +121,7 @@ def explain_request(path: Path, deadline_s: float | None, drawing: Path | None =
         if drawing.suffix.lower() != ".png":
             raise BadInputError("--draw", str(drawing), "a file that ends with .png, for --explain")
         check_drawing(drawing)
-    explanation = explain(_request(path, deadline_s).settled())
+    explanation = explain(_request(path, deadline_s).resolved())
     sys.stdout.write(explanation_text(explanation))
     if drawing is not None:
         from laneweave.launch.drawing.tappa_process import draw_explanation

@@ -24,10 +24,10 @@ from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK, new_figure, save, write
 from laneweave.protocol.errors import BadInputError
 
-Place = tuple[float, float]
+Position = tuple[float, float]
 """Column and lane, between two cells while a vehicle moves."""
 
-ENDINGS: Final = (".png", ".gif")
+SUFFIXES: Final = (".png", ".gif")
 MAX_PANELS: Final = 120
 """Longer plans are drawn up to this number of time points."""
 FRAMES_PER_STEP: Final = 10
@@ -44,12 +44,14 @@ _SHADES = ((0.0, 0.0), (0.45, 0.0), (0.5, 1.0))
 _CELL, _BORDER, _BLOCKED = "#f1f2f4", "#d3d6db", "#a3a9b1"
 _LANE_HEIGHT, _BODY_LENGTH, _BODY_WIDTH, _OUTLINE = 0.8, 0.68, 0.46, 0.9
 """In lengths of a cell; the outline is a share of the cell."""
-_MAX_ACROSS, _MAX_WIDTH_IN, _MIN_WIDTH_IN = 4, 12.0, 5.6
+_MAX_PANEL_COLUMNS, _MAX_WIDTH_IN, _MIN_WIDTH_IN = 4, 12.0, 5.6
 _MIN_CELL_IN, _MAX_CELL_IN = 0.34, 0.62
 _LEFT_IN, _BETWEEN_IN, _TITLE_IN = 0.32, 0.5, 0.64
 _MAX_PIXELS, _MAX_FRAME_PIXELS, _MAX_SIDE_PIXELS = 3e7, 8e5, 3e4
 _MAX_LABEL_LENGTH = 6
-_NOTE = "front to the right, left lane on top; outlines are targets in the colours of their teams"
+_CAPTION = (
+    "front to the right, left lane on top; outlines are targets in the colours of their teams"
+)
 
 
 def check_drawing(out: Path, option: str = "--draw") -> None:
@@ -62,8 +64,8 @@ def check_drawing(out: Path, option: str = "--draw") -> None:
     Raises:
         BadInputError: the ending is unknown, or nothing can be written there.
     """
-    if out.suffix.lower() not in ENDINGS:
-        raise BadInputError(option, str(out), "a file that ends with " + " or ".join(ENDINGS))
+    if out.suffix.lower() not in SUFFIXES:
+        raise BadInputError(option, str(out), "a file that ends with " + " or ".join(SUFFIXES))
     try:
         if not out.parent.is_dir():
             raise BadInputError(option, str(out), "a file in a folder that exists")
@@ -92,14 +94,14 @@ def write_gif(request: PlanRequest, response: PlanResponse, out: Path, dpi: int 
     """Write an animation of the plan in an endless loop."""
     figure, (axes,), cell_in = _new_panels(request, response, 1)
     vehicles = _Vehicles.draw(axes, request, cell_in)
-    _name_time(axes, 0)
+    _label_time(axes, 0)
     figure.draw_without_rendering()
-    figure.set_layout_engine("none")  # the panel keeps its place
+    figure.set_layout_engine("none")  # the panel keeps its position
     writer = PillowWriter(fps=FRAMES_PER_S)
     with writer.saving(figure, str(out), _limited_dpi(figure, dpi, _MAX_FRAME_PIXELS)):
         for time in _frame_times(_steps(response)):
-            vehicles.move(_places(request, response, time))
-            _name_time(axes, math.floor(time))
+            vehicles.move(_positions(request, response, time))
+            _label_time(axes, math.floor(time))
             writer.grab_frame()
 
 
@@ -111,10 +113,10 @@ def plan_figure(request: PlanRequest, response: PlanResponse) -> Figure:
     count = min(_steps(response) + 1, MAX_PANELS)
     figure, panels, cell_in = _new_panels(request, response, count)
     for time, axes in enumerate(panels):
-        _name_time(axes, time)
-        places = _places(request, response, time)
-        _Vehicles.draw(axes, request, cell_in).move(places)
-        _draw_moves(axes, places, _places(request, response, time + 1))
+        _label_time(axes, time)
+        positions = _positions(request, response, time)
+        _Vehicles.draw(axes, request, cell_in).move(positions)
+        _draw_moves(axes, positions, _positions(request, response, time + 1))
     return figure
 
 
@@ -130,16 +132,16 @@ def _new_panels(
     """Return a figure with a title, `count` lattices without vehicles, and a cell's length [in]."""
     grid = request.grid
     fitting = int(_MAX_WIDTH_IN / (grid.columns * _MIN_CELL_IN + _LEFT_IN))
-    rows = math.ceil(count / max(1, min(_MAX_ACROSS, fitting)))
-    across = math.ceil(count / rows)
-    room_in = (_MAX_WIDTH_IN / across - _LEFT_IN) / grid.columns
-    cell_in = max(_MIN_CELL_IN, min(_MAX_CELL_IN, room_in))
-    width_in = max(_MIN_WIDTH_IN, across * (grid.columns * cell_in + _LEFT_IN))
+    rows = math.ceil(count / max(1, min(_MAX_PANEL_COLUMNS, fitting)))
+    panel_columns = math.ceil(count / rows)
+    available_in = (_MAX_WIDTH_IN / panel_columns - _LEFT_IN) / grid.columns
+    cell_in = max(_MIN_CELL_IN, min(_MAX_CELL_IN, available_in))
+    width_in = max(_MIN_WIDTH_IN, panel_columns * (grid.columns * cell_in + _LEFT_IN))
     panel_in = grid.lanes * _LANE_HEIGHT * cell_in + _BETWEEN_IN
     figure = new_figure(width_in, rows * panel_in + _TITLE_IN)
     figure.suptitle(_title(response), fontsize=11, color=INK)
-    figure.supxlabel(_NOTE, fontsize=7, color=FAINT_INK)
-    panels = list(figure.subplots(rows, across, squeeze=False).flat)
+    figure.supxlabel(_CAPTION, fontsize=7, color=FAINT_INK)
+    panels = list(figure.subplots(rows, panel_columns, squeeze=False).flat)
     for axes in panels[count:]:
         axes.remove()
     for axes in panels[:count]:
@@ -177,10 +179,10 @@ class _Vehicles:
         drawn.move([vehicle.cell for vehicle in request.vehicles])
         return drawn
 
-    def move(self, places: Sequence[Place]) -> None:
+    def move(self, positions: Sequence[Position]) -> None:
         """Move each vehicle to its position."""
-        for body, label, place in zip(self.bodies, self.labels, places, strict=True):
-            x, y = _point(place)
+        for body, label, position in zip(self.bodies, self.labels, positions, strict=True):
+            x, y = _point(position)
             body.set_x(x - _BODY_LENGTH / 2)
             body.set_y(y - _BODY_WIDTH / 2)
             label.set_position((x, y))
@@ -190,7 +192,7 @@ def _steps(response: PlanResponse) -> int:
     return len(response.paths[0]) - 1 if response.paths else 0
 
 
-def _places(request: PlanRequest, response: PlanResponse, time: float) -> list[Place]:
+def _positions(request: PlanRequest, response: PlanResponse, time: float) -> list[Position]:
     """Return the positions of the vehicles at a time in steps; after the end they do not change."""
     if not response.paths:
         return [vehicle.cell for vehicle in request.vehicles]
@@ -229,7 +231,7 @@ def _title(response: PlanResponse) -> str:
     return title if steps < MAX_PANELS else f"{title}, the first {MAX_PANELS - 1} drawn"
 
 
-def _name_time(axes: Axes, steps: int) -> None:
+def _label_time(axes: Axes, steps: int) -> None:
     name = "start" if steps == 0 else f"after {steps} step{'s' if steps > 1 else ''}"
     axes.set_title(name, fontsize=8, pad=3.5, color=INK)
 
@@ -242,8 +244,10 @@ def _draw_lattice(axes: Axes, request: PlanRequest) -> None:
     axes.vlines(columns, *axes.get_ylim(), colors=_BORDER, linewidth=0.6, zorder=1)
     lanes = [(lane - 0.5) * _LANE_HEIGHT for lane in range(1, grid.lanes)]
     axes.hlines(lanes, *axes.get_xlim(), colors=_BORDER, linewidth=0.6, zorder=1)
-    every = math.ceil(grid.columns / 20)
-    axes.set_xticks(range(0, grid.columns, every), labels=map(str, range(0, grid.columns, every)))
+    tick_spacing = math.ceil(grid.columns / 20)
+    axes.set_xticks(
+        range(0, grid.columns, tick_spacing), labels=map(str, range(0, grid.columns, tick_spacing))
+    )
     axes.set_yticks(
         [lane * _LANE_HEIGHT for lane in range(grid.lanes)], labels=map(str, range(grid.lanes))
     )
@@ -257,7 +261,7 @@ def _draw_lattice(axes: Axes, request: PlanRequest) -> None:
         _draw_target(axes, target, [colours[team] for team in colours if number in team])
 
 
-def _draw_target(axes: Axes, cell: Place, colours: Sequence[str]) -> None:
+def _draw_target(axes: Axes, cell: Position, colours: Sequence[str]) -> None:
     """Outline a target, with alternating dashes if several teams may take it."""
     for number, colour in enumerate(colours or [_BLOCKED]):
         outline = _rectangle(cell, _OUTLINE, facecolor="none", edgecolor=colour)
@@ -268,7 +272,7 @@ def _draw_target(axes: Axes, cell: Place, colours: Sequence[str]) -> None:
         axes.add_patch(outline)
 
 
-def _draw_moves(axes: Axes, here: Sequence[Place], there: Sequence[Place]) -> None:
+def _draw_moves(axes: Axes, here: Sequence[Position], there: Sequence[Position]) -> None:
     """Draw arrows that do not cover the names of vehicles."""
     for a, b in zip(here, there, strict=True):
         if a == b:
@@ -281,12 +285,12 @@ def _draw_moves(axes: Axes, here: Sequence[Place], there: Sequence[Place]) -> No
         axes.add_patch(arrow)
 
 
-def _point(place: Place) -> tuple[float, float]:
-    return place[0], place[1] * _LANE_HEIGHT
+def _point(position: Position) -> tuple[float, float]:
+    return position[0], position[1] * _LANE_HEIGHT
 
 
 def _rectangle(
-    cell: Place, share: float, *, facecolor: str, edgecolor: str, hatch: str | None = None
+    cell: Position, share: float, *, facecolor: str, edgecolor: str, hatch: str | None = None
 ) -> Rectangle:
     x, y = _point(cell)
     width, height = share, share * _LANE_HEIGHT

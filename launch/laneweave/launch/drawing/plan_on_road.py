@@ -51,7 +51,7 @@ _HELD_FRAMES: Final = 8
 
 _WIDTH_IN, _LANE_IN, _ROAD_GAP_IN, _TIMES_IN = 11.0, 0.24, 0.24, 2.3
 _MARGIN_M = 10.0
-_NOTE = "front to the right, left lane on top, lanes drawn wider than they are"
+_CAPTION = "front to the right, left lane on top, lanes drawn wider than they are"
 _ROAD, _MARKING = "#e3e5e8", "#ffffff"
 
 
@@ -195,7 +195,7 @@ def road_figure(picture: _Picture) -> Figure:
     roads, times = figure.subfigures(2, 1, squeeze=False, height_ratios=heights_in)[:, 0]
     panels = list(roads.subplots(count, sharex=True, squeeze=False)[:, 0])
     for axes, step in zip(panels, instants, strict=True):
-        _draw_empty_road(axes, picture, named=axes is panels[-1])
+        _draw_empty_road(axes, picture, label_axis=axes is panels[-1])
         _draw_instant(axes, picture, step * drive.slot_ticks)
     along, across = times.subplots(1, 2)
     moved_m = drive.scenario.formation.speed_mps * drive.time_s(1) * np.arange(drive.ticks + 1)
@@ -209,15 +209,15 @@ def road_figure(picture: _Picture) -> Figure:
 
 def _draw_instant(axes: Axes, picture: _Picture, tick: int) -> None:
     """Draw the vehicles at a tick, with the path of each one since the start."""
-    _name_time(axes, picture.drive.time_s(tick))
+    _label_time(axes, picture.drive.time_s(tick))
     for number, colour in enumerate(picture.colours):
         along_m, _, _, across_m, _, _ = picture.drive.states[number, : tick + 1].T
         axes.plot(along_m, across_m, color=colour, linewidth=1.0, alpha=0.55, zorder=2)
         _Body.draw(axes, picture, number).move(picture.drive, number, tick)
 
 
-def _draw_empty_road(axes: Axes, picture: _Picture, *, named: bool) -> None:
-    """Draw the lanes, and if `named` what the axis shows."""
+def _draw_empty_road(axes: Axes, picture: _Picture, *, label_axis: bool) -> None:
+    """Draw the lanes, and if `label_axis` what the axis shows."""
     width_m = picture.drive.scenario.road.lane_width_m
     axes.set_xlim(*picture.extent_m)
     axes.set_ylim(-0.3, picture.lanes * width_m + 0.3)
@@ -225,13 +225,15 @@ def _draw_empty_road(axes: Axes, picture: _Picture, *, named: bool) -> None:
     for lane in range(1, picture.lanes):
         axes.axhline(lane * width_m, color=_MARKING, linewidth=1.4, dashes=(5, 5), zorder=1)
     axes.set_yticks([])
-    axes.tick_params(length=2, labelsize=7, labelcolor=FAINT_INK, bottom=named, labelbottom=named)
+    axes.tick_params(
+        length=2, labelsize=7, labelcolor=FAINT_INK, bottom=label_axis, labelbottom=label_axis
+    )
     axes.spines[:].set_visible(False)
-    if named:
-        axes.set_xlabel(f"position on the road s (m); {_NOTE}", fontsize=8, color=INK)
+    if label_axis:
+        axes.set_xlabel(f"position on the road s (m); {_CAPTION}", fontsize=8, color=INK)
 
 
-def _name_time(axes: Axes, time_s: float) -> None:
+def _label_time(axes: Axes, time_s: float) -> None:
     axes.set_ylabel(f"{time_s:.1f} s", rotation=0, ha="right", va="center", fontsize=8, color=INK)
 
 
@@ -282,24 +284,24 @@ def _draw_over_time(
     for line, colour in zip(values, picture.colours, strict=True):
         axes.plot(times_s, line, color=colour, linewidth=1.6)
     axes.set_xlim(-0.02 * times_s[-1], 1.02 * times_s[-1] or 1.0)
-    _name_places(axes, picture.labels, times_s[0], values[:, 0].tolist(), (1, 3), "bottom")
+    _label_vehicles(axes, picture.labels, times_s[0], values[:, 0].tolist(), (1, 3), "bottom")
     if len(times_s) > 1:
-        _name_places(axes, picture.labels, times_s[-1], values[:, -1].tolist(), (6, 0), "center")
+        _label_vehicles(axes, picture.labels, times_s[-1], values[:, -1].tolist(), (6, 0), "center")
 
 
-def _name_places(
+def _label_vehicles(
     axes: Axes,
     labels: Sequence[str],
     time_s: float,
-    places: Sequence[float],
+    positions: Sequence[float],
     offset_pt: tuple[float, float],
     alignment: str,
 ) -> None:
-    """Write names beside places at a time; vehicles in the same place share a text."""
+    """Write names beside positions at a time; vehicles in the same position share a text."""
     names: dict[int, list[str]] = {}
-    for name, place in zip(labels, places, strict=True):
-        names.setdefault(round(place), []).append(name)
-    where = {round(place): place for place in places}
+    for name, position in zip(labels, positions, strict=True):
+        names.setdefault(round(position), []).append(name)
+    where = {round(position): position for position in positions}
     for key, together in names.items():
         axes.annotate(
             ", ".join(together),
@@ -337,14 +339,14 @@ def _write_gif(picture: _Picture, out: Path) -> None:
     figure = new_figure(_WIDTH_IN, 0.8 + 1.6 * picture.lanes * _LANE_IN)
     figure.suptitle(picture.title, fontsize=9, color=INK)
     axes = figure.subplots()
-    _draw_empty_road(axes, picture, named=True)
+    _draw_empty_road(axes, picture, label_axis=True)
     bodies = [_Body.draw(axes, picture, number) for number in range(len(picture.labels))]
-    every = max(1, math.ceil(drive.ticks / MAX_FRAMES))
-    ticks = [*range(0, drive.ticks, every), drive.ticks]
-    writer = PillowWriter(fps=max(1, round(1.0 / (every * drive.scenario.runtime.tick_s))))
+    frame_ticks = max(1, math.ceil(drive.ticks / MAX_FRAMES))
+    ticks = [*range(0, drive.ticks, frame_ticks), drive.ticks]
+    writer = PillowWriter(fps=max(1, round(1.0 / (frame_ticks * drive.scenario.runtime.tick_s))))
     with writer.saving(figure, str(out), GIF_DPI):
         for tick in [0] * _HELD_FRAMES + ticks + [ticks[-1]] * _HELD_FRAMES:
             for number, body in enumerate(bodies):
                 body.move(drive, number, tick)
-            _name_time(axes, drive.time_s(tick))
+            _label_time(axes, drive.time_s(tick))
             writer.grab_frame()

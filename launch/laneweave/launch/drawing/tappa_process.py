@@ -23,7 +23,7 @@ from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK, new_figure, sa
 from laneweave.launch.drawing.tappa_text import number, trees_shown, vector
 
 MAX_ASSIGNMENTS: Final = 6
-MAX_LAYERS, MAX_ACROSS, MAX_ENTRIES = 3, 5, 4
+MAX_LAYERS, MAX_PER_LAYER, MAX_ENTRIES = 3, 5, 4
 MAX_MAPS: Final = 3
 
 _WIDTH_IN, _MARGIN_IN, _TITLE_IN, _CHAIN_IN, _HEADING_IN = 12.0, 0.25, 0.55, 1.75, 0.4
@@ -52,7 +52,7 @@ def draw_explanation(explanation: Explanation, out: Path) -> None:
 
 def explanation_figure(explanation: Explanation) -> Figure:
     """Return the figure; its axes are in inches, from the upper left corner."""
-    best = _best(explanation.assignments)
+    best = _best_assignment(explanation.assignments)
     layers = [] if best is None else _layers(best[1].nodes)
     maps = [] if best is None else _chosen_maps(best[1].nodes, layers)
     tree_in = sum(_layer_height_in(layer) + _LAYER_GAP_IN for layer in layers)
@@ -64,7 +64,7 @@ def explanation_figure(explanation: Explanation) -> Figure:
     axes.set_axis_off()
     axes.set_xlim(0, _WIDTH_IN)
     axes.set_ylim(height_in, 0)
-    write(axes, (_MARGIN_IN, 0.25), f"Ended: {explanation.why_it_ended}", 11)
+    write(axes, (_MARGIN_IN, 0.25), f"Ended: {explanation.stop_reason}", 11)
     _draw_chain(axes, explanation, best, _TITLE_IN)
     if best is None:
         return figure
@@ -79,7 +79,9 @@ def explanation_figure(explanation: Explanation) -> Figure:
     return figure
 
 
-def _best(assignments: Sequence[ExplainedAssignment]) -> tuple[int, ExplainedAssignment] | None:
+def _best_assignment(
+    assignments: Sequence[ExplainedAssignment],
+) -> tuple[int, ExplainedAssignment] | None:
     """Return k and A_k of the best path set, else of the first tree."""
     found = [(k, one) for k, one in enumerate(assignments, start=1) if one.best_cost is not None]
     if not found:
@@ -139,7 +141,7 @@ def _layers(nodes: Sequence[ExplainedNode]) -> list[Layer]:
         if not layer:
             break
         ranked = sorted(layer, key=lambda node: (node.number not in kept, node.number))
-        shown = sorted(ranked[:MAX_ACROSS], key=lambda node: (node.parent, node.number))
+        shown = sorted(ranked[:MAX_PER_LAYER], key=lambda node: (node.parent, node.number))
         layers.append((shown, len(layer) - len(shown)))
         above = {node.number for node in shown}
     return layers

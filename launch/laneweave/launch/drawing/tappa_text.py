@@ -37,7 +37,7 @@ def explanation_text(explanation: Explanation) -> str:
         "",
         *_assignments(explanation.assignments),
         "",
-        f"Ended: {explanation.why_it_ended}",
+        f"Ended: {explanation.stop_reason}",
     ]
     for k, assignment in enumerate(explanation.assignments[:MAX_TREES_PRINTED], start=1):
         lines += ["", *_tree(k, assignment)]

@@ -46,7 +46,7 @@ def test_case_study() -> None:
         (6, 8, 7),
     ]
     assert told.next_cost == 8
-    assert told.why_it_ended == "C_3 = 8 >= C'* = 7"
+    assert told.stop_reason == "C_3 = 8 >= C'* = 7"
     tree = told.assignments[0]
     assert [node.cost for node in tree.nodes] == [6, 7, 7, 7, 7]
     assert [node.constraint for node in tree.nodes[1:]] == list(tree.nodes[0].conflicts)
@@ -78,4 +78,4 @@ def test_a_run_without_a_plan_is_explained() -> None:
     assert told.optimal
     assert told.best_cost == math.inf
     assert not told.literal
-    assert "infinite" in told.why_it_ended
+    assert "infinite" in told.stop_reason

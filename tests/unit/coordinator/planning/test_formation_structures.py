@@ -33,7 +33,7 @@ LANE_DROP: dict[str, Any] = {
 
 def targets_of(structure: str, lanes: list[int], **changes: Any) -> set[Cell]:  # noqa: ANN401
     request = LANE_DROP | {"structure": structure, "lanes": lanes} | changes
-    return set(PlanRequest.from_dict(request).settled().targets)
+    return set(PlanRequest.from_dict(request).resolved().targets)
 
 
 # --- vehicles that name no lane ---------------------------------------------------------------

@@ -172,7 +172,7 @@ def test_a_ring_can_only_turn_as_a_whole(geometry: dict[str, float], cost: int |
     assert joint_search.optimal_cost(document) == cost
     request = PlanRequest.from_dict(document)
     verdict = explore(request.problem(), request.choices(), Budget(), 10**6)
-    assert verdict.impossible == (cost is None)
+    assert verdict.infeasible == (cost is None)
     assert (verdict.solution is None) == (cost is None)
     assert plan(request).cost == cost
 

@@ -53,7 +53,7 @@ def parallel_targets(
     blocked = {(column, lane) for column in range(columns) if column not in open_columns}
     held = {Name(f"v{index}"): cell for index, cell in enumerate(cells)}
     targets = next(placements(held, dict.fromkeys(held, lane), columns, LANES, blocked))
-    return [cell for cell in targets.cells if cell not in targets.own.values()]
+    return [cell for cell in targets.cells if cell not in targets.off_lane.values()]
 
 
 # --- a whole formation ------------------------------------------------------------------------
@@ -78,12 +78,12 @@ def test_each_lane_offers_as_many_cells_as_are_wanted_or_free(
     """Who gets no place on its lane gets one of its own, and nobody else does."""
     cells, lanes, blocked = drawn
     targets = place_all(cells, lanes, blocked)
-    shared = [cell for cell in targets.cells if cell not in targets.own.values()]
+    shared = [cell for cell in targets.cells if cell not in targets.off_lane.values()]
     for lane in range(LANES):
         wanting = [name for name in cells if lanes[name] == lane]
         free = sum((column, lane) not in blocked for column in range(COLUMNS))
         assert sum(cell[1] == lane for cell in shared) == min(len(wanting), free)
-        assert sum(name in targets.own for name in wanting) == max(0, len(wanting) - free)
+        assert sum(name in targets.off_lane for name in wanting) == max(0, len(wanting) - free)
 
 
 @settings(max_examples=100, deadline=None)
@@ -93,7 +93,7 @@ def test_with_enough_room_no_vehicle_has_a_target_of_its_own(
 ) -> None:
     cells, lanes, blocked = drawn
     targets = place_all(cells, lanes, blocked)
-    assert targets.own == {}
+    assert targets.off_lane == {}
     assert sorted(lane for _, lane in targets.cells) == sorted(lanes[name] for name in cells)
 
 
@@ -136,13 +136,13 @@ def test_on_an_overfull_lane_those_furthest_away_stay_out() -> None:
     )
     targets = place_all(cells, dict.fromkeys(names, 0))
     assert set(targets.cells[:4]) == {(column, 0) for column in range(4)}
-    assert targets.own == {Name("a"): (0, 2)}  # it stays where it is
+    assert targets.off_lane == {Name("a"): (0, 2)}  # it stays where it is
     assert targets.cells[4] == (0, 2)
 
 
 def test_where_all_are_as_far_away_names_decide() -> None:
     cells: dict[Name, Cell] = {Name(letter): (0, 0) for letter in "cab"}
-    assert set(next(placements(cells, dict.fromkeys(cells, 0), 2, 2)).own) == {Name("c")}
+    assert set(next(placements(cells, dict.fromkeys(cells, 0), 2, 2)).off_lane) == {Name("c")}
 
 
 def test_a_vehicle_that_stays_out_gets_the_nearest_free_cell() -> None:
@@ -154,7 +154,7 @@ def test_a_vehicle_that_stays_out_gets_the_nearest_free_cell() -> None:
     lanes = dict.fromkeys(names, 2) | {Name("c"): 0}
     targets = place_all(cells, lanes)
     assert (2, 0) in targets.cells  # for c
-    assert targets.own == {Name("f"): (1, 0)}
+    assert targets.off_lane == {Name("f"): (1, 0)}
 
 
 def test_a_blocked_cell_is_no_target_and_leaves_a_gap() -> None:
@@ -167,7 +167,7 @@ def test_a_lane_without_free_cells_offers_none() -> None:
     cells: dict[Name, Cell] = {Name("a"): (0, 1)}
     full = {(column, 0) for column in range(COLUMNS)}
     targets = place_all(cells, {Name("a"): 0}, full)
-    assert (targets.cells, targets.own) == (((0, 1),), {Name("a"): (0, 1)})
+    assert (targets.cells, targets.off_lane) == (((0, 1),), {Name("a"): (0, 1)})
 
 
 def test_without_vehicles_there_are_no_targets() -> None:

@@ -165,7 +165,7 @@ def test_vehicles_move_gently_between_cells() -> None:
     moves = [there - here for here, there in pairwise(times)]
     assert moves[0] < 0.1 < moves[5]
     assert moves[-1] < 0.1
-    assert plan_drawing._places(REQUEST, PLAN, 0.5)[1] == (0.5, 2)
+    assert plan_drawing._positions(REQUEST, PLAN, 0.5)[1] == (0.5, 2)
 
 
 def test_names_are_short_and_harmless() -> None:

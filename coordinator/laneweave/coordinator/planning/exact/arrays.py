@@ -1,8 +1,8 @@
 """A planning problem as arrays, for the compiled parts of the planner.
 
 Cells are numbered column by column; `cell = column * lanes + lane`. A move is a displacement and a
-from-cell. Vehicles with equal eligibility are one *team*: they may exchange their targets. A *pair*
-is a team and a target that it may have.
+from-cell. Vehicles with the same eligible targets form a *team* and may exchange targets. A *pair*
+is a team and one of its eligible targets.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Bools = NDArray[np.bool_]
 class MoveArrays(NamedTuple):
     """The moves of a grid under a conflict model.
 
-    Shapes: D displacements, X cells, M maximum number of cliques that a move is in.
+    Shapes: D displacements, X cells, M maximum number of cliques that contain a move.
     """
 
     lanes: int
@@ -37,7 +37,7 @@ class MoveArrays(NamedTuple):
     valid: Bools
     """(D, X) whether the move stays on free cells."""
     clique: Ints
-    """(D, X, M) numbers of the cliques that a move is in; -1: no more."""
+    """(D, X, M) numbers of the cliques that contain a move, then -1."""
     clique_count: int
     residue: Ints
     """(X,) a number from 0 to `residue_count` - 1 that differs between the from-cells of the moves
@@ -55,7 +55,7 @@ class Teams(NamedTuple):
     target: Ints
     """(J,) cells."""
     pairs_from: Ints
-    """(K + 1,) team k has the pairs from `pairs_from[k]` to `pairs_from[k + 1]`."""
+    """(K + 1,) team k has the pairs from `pairs_from[k]` to `pairs_from[k + 1] - 1`."""
     pair_target: Ints
     """(P,) number of the target."""
     pair_cell: Ints

@@ -1,24 +1,23 @@
 """The solver for large formations: branch and bound with Lagrange multipliers.
 
-1. Multipliers of the conflict cliques give a lower bound and reduced costs (`relaxation`).
+1. Multipliers of the conflict cliques give a lower bound and reduced costs (`lagrangian_bound`).
 2. For the lowest cost that is still possible a search decides whether there is a solution of this
    cost. In each of its nodes multipliers are improved, and moves that no such solution contains are
-   forbidden by their reduced cost. Then either the lower bound exceeds the cost; or the vehicles on
-   their cheapest paths are not in conflict, which is a solution; or the node is split at a clique:
-   at most one of its moves is made in its step, so either all moves of a team (or from a cell) are
-   forbidden in this clique, or all others (`branching_kernel`; this kind of branching is by Beale
-   and Tomlin, Proc. 5th Int. Conf. on Operational Research, 1970).
+   forbidden by their reduced cost. Then either the lower bound exceeds the cost; or the cheapest
+   paths of the vehicles do not conflict, which is a solution; or the node is split at a clique: at
+   most one of its moves is made in its step, so either all moves of a team (or from a cell) are
+   forbidden in this clique, or all others (`branching_kernel`; branching on sets: Beale and Tomlin,
+   Proc. 5th Int. Conf. on Operational Research, 1970).
 3. If no node is left, the next cost is tried.
 
-The first cost with a solution is the minimum. A small cost of moves lets the search continue for a
-solution of the same cost with fewer moves, for about half as long as it took until then.
+The first cost with a solution is the minimum. Moves have a small cost, so that the search continues
+for a solution of equal cost with fewer moves, for about half as many nodes as before.
 
-The gap between the cost and the lower bound is small; so few moves remain, and most nodes are
-decided soon. Unlike in trees of conflicts between single vehicles, the number of vehicles in a team
-that could replace one another does not matter.
+The gap between the cost and the lower bound is small, so few moves remain, and most nodes are
+decided quickly. Unlike in conflict trees, interchangeable vehicles do not multiply the nodes.
 
-Between the nodes path sets are made by negotiation (`negotiation`), so that there is an answer if
-the deadline comes first; if that fails, by a joint search (`reachability`), which can also prove
+Every few nodes, negotiation (`negotiation`) looks for path sets, so that there is a plan if the
+deadline comes first; if it fails, a joint search (`reachability`) looks for a path set or proves
 that there is none.
 """
 
@@ -53,7 +52,7 @@ from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.shortest_paths import without_needless_moves
 
 _SPARE_STEPS, _MORE_STEPS = 8, 6
-"""Steps with multipliers beyond the longest path; more when a solution may need more."""
+"""Steps with multipliers beyond the longest path; steps added when a solution may need more."""
 _ITERATIONS, _FEW_ITERATIONS, _BATCH = 40, 10, 10
 """Iterations for the first multipliers with many or few vehicles; iterations between two checks."""
 _FEW_VEHICLES = 11
@@ -61,9 +60,9 @@ _FIRST_STACK = 16
 _CHUNK_S = 0.005
 """Approximate time between two readings of the clock."""
 _NODES_BETWEEN = 8
-"""Nodes between two attempts to find path sets by other means."""
+"""Nodes between two attempts to find path sets by heuristics."""
 _MANY_VEHICLES = 20
-"""Formations from this size on take long to decide, so they get a path set first."""
+"""Size from which formations, which then take long to decide, get a path set first."""
 _FIRST_WORK, _WORK_FOR_GAP, _STALE = 200, 100, 100
 """Passes of negotiation until there is a path set; later, passes for a gap of 100 %, and the number
 of passes without improvement that halves them."""
@@ -78,8 +77,8 @@ _BYTES_PER_S = 1_000_000_000
 
 @cache
 def warm_up() -> None:
-    """Load the compiled code; compile it if there is no cache yet, which takes half a minute."""
-    # Two vehicles that change places: an instance that needs branching.
+    """Load the compiled code; compile it if it is not cached (half a minute)."""
+    # Two vehicles that swap cells: an instance that needs branching.
     vehicles = (VehicleRequest("a", (0, 0), lane=1), VehicleRequest("b", (0, 1), lane=0))
     request = PlanRequest(Grid(2, 2), 1, ("geometric",), vehicles, ((0, 0), (0, 1)))
     branching = Branching(request.problem(), request.choices(), Budget())
@@ -88,7 +87,7 @@ def warm_up() -> None:
 
 
 class Branching(Search):
-    """The state of the search; `gave_up`: stuck (`branching_kernel.STUCK`), or out of memory."""
+    """Branch and bound; aborts if it is stuck (`branching_kernel.STUCK`) or out of memory."""
 
     def __init__(self, problem: Problem, choices: Sequence[frozenset[int]], budget: Budget) -> None:
         """Prepare the search."""
@@ -98,7 +97,7 @@ class Branching(Search):
         self._choices = choices
         self._budget = budget
         self._nodes = 0
-        self._next_look = _NODES_BETWEEN
+        self._next_check = _NODES_BETWEEN
         self._explore_nodes, self._explore_moves = _EXPLORE_NODES, _EXPLORE_MOVES
         self._s_per_node = 0.0
         self._s_per_iteration = 1.0
@@ -107,7 +106,7 @@ class Branching(Search):
         table = problem.table
         pairs = sum(map(len, set(choices)))
         if 8 * pairs * table.grid.columns * table.grid.lanes > budget.max_bytes:
-            self.gave_up = True
+            self.aborted = True
             return
         self._arrays = move_arrays(table.grid, table.mode, table.model)
         starts = [table.cell(start) for start in problem.starts]
@@ -116,7 +115,7 @@ class Branching(Search):
 
     def run(self) -> None:
         """Search until the optimum is proven or the budget is spent."""
-        if self.gave_up:
+        if self.aborted:
             return
         try:
             self._search()
@@ -130,46 +129,46 @@ class Branching(Search):
             return
         steps = self._longest_path() + _SPARE_STEPS
         if not self._fits(steps, _FIRST_STACK):
-            self.gave_up = True
+            self.aborted = True
             return
-        whole = self.relaxation(steps)
+        root = self.relaxation(steps)
         few = len(self._choices) <= _FEW_VEHICLES
         for number in range(0, _FEW_ITERATIONS if few else _ITERATIONS, _BATCH):
-            self._improve(whole, _BATCH)
+            self._improve(root, _BATCH)
             if math.isinf(self.lower_bound) or self._is_proven():
                 break
             if number == _BATCH and len(self._choices) >= _MANY_VEHICLES:
-                self.negotiate(whole, _FIRST_WORK, stop_at_first=True)
-        nodes = whole.stack(_FIRST_STACK)
-        while not self.finished and not self.gave_up:
+                self.negotiate(root, _FIRST_WORK, stop_at_first=True)
+        nodes = root.stack(_FIRST_STACK)
+        while not self.finished and not self.aborted:
             if math.isinf(self.lower_bound):
                 self.finished = True
             elif self._is_proven():
-                nodes = self._break_ties(whole, nodes)
+                nodes = self._break_ties(root, nodes)
                 self.finished = True
             else:
-                nodes = self._decide(whole, nodes, int(self.lower_bound))
+                nodes = self._decide(root, nodes, int(self.lower_bound))
 
     def _is_proven(self) -> bool:
         return self.best is not None and self.best.cost <= self.lower_bound
 
-    def _improve(self, whole: Relaxation, iterations: int) -> None:
+    def _improve(self, root: Relaxation, iterations: int) -> None:
         """Improve the first multipliers; check the clock every few iterations."""
         while iterations > 0:
             count = max(1, min(iterations, int(_CHUNK_S / max(self._s_per_iteration, 1e-6))))
             started = time.thread_time()
-            whole.improve(count)
+            root.improve(count)
             self._s_per_iteration = (time.thread_time() - started) / count
             iterations -= count
             self._budget.check_time()
-        self._keep_relaxed_solution(whole)
-        self.lower_bound = max(self.lower_bound, whole.min_cost)
+        self._keep_relaxed_solution(root)
+        self.lower_bound = max(self.lower_bound, root.min_cost)
 
     def _fits(self, steps: int, nodes: int) -> bool:
-        """Return whether arrays of so many steps and nodes fit into the memory limit.
+        """Return whether the arrays for a number of steps and nodes fit into the memory limit.
 
         Raises:
-            BudgetSpentError: they do, but there is no time left to fill them.
+            BudgetSpentError: they fit, but there is no time left to fill them.
         """
         displacements, cells = self._arrays.valid.shape
         groups, rows = len(self._teams.pair), self._arrays.clique_count
@@ -194,117 +193,117 @@ class Branching(Search):
         steps = distances[linear_sum_assignment(distances)]
         return int(max(steps[steps < UNREACHABLE], default=0))
 
-    def _decide(self, whole: Relaxation, nodes: Stack, cost: int) -> Stack:
+    def _decide(self, root: Relaxation, nodes: Stack, cost: int) -> Stack:
         """Find a solution of a cost, prove that there is none, or add steps with multipliers."""
         self._budget.check_time()
         upper_bound = upper_bound_of(cost)
-        may_be = whole.put(nodes, upper_bound)
-        if may_be is None:
-            return self._with_more_steps(whole, nodes)
-        depth, ending = 1, OPEN if may_be else REFUTED
+        may_exist = root.put(nodes, upper_bound)
+        if may_exist is None:
+            return self._with_more_steps(root, nodes)
+        depth, outcome = 1, OPEN if may_exist else REFUTED
         first = True
-        while ending in (OPEN, FULL):
-            if ending == FULL:
-                if not self._fits(len(whole.multipliers), 2 * len(nodes.step_size)):
+        while outcome in (OPEN, FULL):
+            if outcome == FULL:
+                if not self._fits(len(root.multipliers), 2 * len(nodes.step_size)):
                     break
                 nodes = _doubled(nodes)
-            ending, depth = self._search_nodes(
-                whole, nodes, depth, upper_bound, 1 if first else None
+            outcome, depth = self._search_nodes(
+                root, nodes, depth, upper_bound, 1 if first else None
             )
             if first and depth > 1:
-                whole.set_multipliers(nodes.multipliers[0])
+                root.set_multipliers(nodes.multipliers[0])
             first = False
-            if ending == OPEN:
-                self._search_otherwise(whole, nodes.multipliers[depth - 1])
+            if outcome == OPEN:
+                self._run_heuristics(root, nodes.multipliers[depth - 1])
                 if self.finished or (self.best is not None and self.best.cost <= cost):
                     return nodes
-        if ending == REFUTED:
+        if outcome == REFUTED:
             self.lower_bound = cost + 1
-        elif ending == FOUND:
-            self._search_fewer_moves(whole, nodes, depth)
+        elif outcome == FOUND:
+            self._search_fewer_moves(root, nodes, depth)
             self.finished = True
-        elif ending == STUCK and self._stuck_at != cost:
+        elif outcome == STUCK and self._stuck_at != cost:
             # A vehicle may have to cross a target of its team after the last step with multipliers.
             self._stuck_at = cost
-            return self._with_more_steps(whole, nodes)
+            return self._with_more_steps(root, nodes)
         else:
-            self.gave_up = True
+            self.aborted = True
         return nodes
 
-    def _with_more_steps(self, whole: Relaxation, nodes: Stack) -> Stack:
+    def _with_more_steps(self, root: Relaxation, nodes: Stack) -> Stack:
         """Add steps with multipliers; return an empty stack."""
-        more = max(_MORE_STEPS, len(whole.multipliers) // 2)
-        if not self._fits(len(whole.multipliers) + more, len(nodes.step_size)):
-            self.gave_up = True
+        more = max(_MORE_STEPS, len(root.multipliers) // 2)
+        if not self._fits(len(root.multipliers) + more, len(nodes.step_size)):
+            self.aborted = True
             return nodes
-        whole.lengthen(more)
-        return whole.stack(len(nodes.step_size))
+        root.lengthen(more)
+        return root.stack(len(nodes.step_size))
 
-    def _break_ties(self, whole: Relaxation, nodes: Stack) -> Stack:
+    def _break_ties(self, root: Relaxation, nodes: Stack) -> Stack:
         """Search for a solution of the same cost as the best one with fewer moves."""
         upper_bound = self._best_value - 0.5 * PER_MOVE
-        may_be = whole.put(nodes, upper_bound)
-        if may_be:
-            whole.state[BEST] = self._best_value
-            self._search_fewer_moves(whole, nodes, 1)
-        self.has_fewest_moves = self.has_fewest_moves or may_be is False
+        may_exist = root.put(nodes, upper_bound)
+        if may_exist:
+            root.state[BEST] = self._best_value
+            self._search_fewer_moves(root, nodes, 1)
+        self.has_fewest_moves = self.has_fewest_moves or may_exist is False
         return nodes
 
-    def _search_fewer_moves(self, whole: Relaxation, nodes: Stack, depth: int) -> None:
-        """Continue a search for about half as many nodes; ends quietly at the deadline."""
+    def _search_fewer_moves(self, root: Relaxation, nodes: Stack, depth: int) -> None:
+        """Continue a search for about half as many nodes, at most until the deadline."""
         left = self._nodes // 2 + _TIE_NODES
         try:
             while left > 0 and depth > 0:
                 upper_bound = self._best_value - 0.5 * PER_MOVE
                 before = self._nodes
-                ending, depth = self._search_nodes(whole, nodes, depth, upper_bound, left)
+                outcome, depth = self._search_nodes(root, nodes, depth, upper_bound, left)
                 left -= self._nodes - before
-                if ending not in (OPEN, FOUND):
-                    self.has_fewest_moves = ending == REFUTED
+                if outcome not in (OPEN, FOUND):
+                    self.has_fewest_moves = outcome == REFUTED
                     return
         except BudgetSpentError:
             return
 
     def _search_nodes(
-        self, whole: Relaxation, nodes: Stack, depth: int, upper_bound: float, max_nodes: int | None
+        self, root: Relaxation, nodes: Stack, depth: int, upper_bound: float, max_nodes: int | None
     ) -> tuple[int, int]:
         """Examine some nodes; return the outcome and the new depth."""
         left = self._budget.nodes_left(self._s_per_node)
         chunk = max(1, int(_CHUNK_S / max(self._s_per_node, 1e-5)))
         if left < 1:
             raise BudgetSpentError
-        # By default up to the next look, which does not depend on the speed of the machine.
+        # By default up to the next check, which does not depend on the speed of the machine.
         if max_nodes is None:
-            max_nodes = max(1, self._next_look - self._nodes)
+            max_nodes = max(1, self._next_check - self._nodes)
         count = min(chunk, left, max_nodes)
         started = time.thread_time()
-        ending, depth, examined = search(
-            self._arrays, self._teams, nodes, depth, whole.scratch, whole.state, upper_bound, count
+        outcome, depth, examined = search(
+            self._arrays, self._teams, nodes, depth, root.scratch, root.state, upper_bound, count
         )
         if examined:
             spent = (time.thread_time() - started) / examined
             self._s_per_node = max(spent, 0.5 * (self._s_per_node + spent))
-        self._keep_relaxed_solution(whole)
+        self._keep_relaxed_solution(root)
         self._nodes += examined
         self._budget.take_nodes(examined)
-        return ending, depth
+        return outcome, depth
 
-    def _keep_relaxed_solution(self, whole: Relaxation) -> None:
+    def _keep_relaxed_solution(self, root: Relaxation) -> None:
         """Keep the best relaxed solution without conflicts, if there is one."""
-        if whole.state[BEST] < self._best_value - 0.5 * PER_MOVE:
-            self._prefer(self._solution(whole.scratch.best_path))
+        if root.state[BEST] < self._best_value - 0.5 * PER_MOVE:
+            self._keep_if_better(self._solution(root.scratch.best_path))
 
-    def _search_otherwise(self, whole: Relaxation, multipliers: Floats) -> None:
+    def _run_heuristics(self, root: Relaxation, multipliers: Floats) -> None:
         """Every few nodes, look for path sets by negotiation and joint search."""
-        if self._nodes < self._next_look:
+        if self._nodes < self._next_check:
             return
-        self._next_look = self._nodes + _NODES_BETWEEN
+        self._next_check = self._nodes + _NODES_BETWEEN
         if self._negotiation is None or self._negotiation.cost is None:
-            self.negotiate(whole, _FIRST_WORK, stop_at_first=True)
+            self.negotiate(root, _FIRST_WORK, stop_at_first=True)
         else:
-            self._negotiation.suggest(multipliers.copy(), whole.held_targets())
+            self._negotiation.suggest(multipliers.copy(), root.held_targets())
             hope = 1.0 / (1.0 + self._negotiation.stale / _STALE)
-            self.negotiate(whole, 1 + int(_WORK_FOR_GAP * self._gap() * hope))
+            self.negotiate(root, 1 + int(_WORK_FOR_GAP * self._gap() * hope))
         if self.best is None and self._nodes >= self._explore_nodes:
             self._explore()
 
@@ -313,28 +312,30 @@ class Branching(Search):
             return 0.0
         return min(1.0, (self.best.cost - self.lower_bound) / self.lower_bound)
 
-    def negotiate(self, whole: Relaxation, work: int, *, stop_at_first: bool = False) -> None:
-        """Continue the negotiation for so many passes; see `Negotiation.work`."""
+    def negotiate(self, root: Relaxation, work: int, *, stop_at_first: bool = False) -> None:
+        """Continue the negotiation for `work` passes."""
         if self._negotiation is None:
             self._negotiation = Negotiation(
-                self._arrays, self._teams, whole.multipliers, whole.assignment()
+                self._arrays, self._teams, root.multipliers, root.assignment()
             )
         for _ in range(work):
             if self._negotiation.work(self._budget.check_time):
-                self._prefer(self._solution(self._negotiation.path))
+                self._keep_if_better(self._solution(self._negotiation.path))
                 if stop_at_first:
                     return
 
     def _explore(self) -> None:
-        verdict = explore(self._problem, self._choices, self._budget, self._explore_moves)
+        reached = explore(self._problem, self._choices, self._budget, self._explore_moves)
         self._explore_nodes *= _GROWTH
         self._explore_moves = min(self._explore_moves * _GROWTH, _MAX_EXPLORE_MOVES)
-        if verdict.impossible:
+        if reached.infeasible:
             self.lower_bound, self.finished = math.inf, True
-        elif verdict.solution is not None:
-            self._prefer(without_needless_moves(self._problem, verdict.solution, self._budget))
+        elif reached.solution is not None:
+            self._keep_if_better(
+                without_needless_moves(self._problem, reached.solution, self._budget)
+            )
 
-    def _prefer(self, solution: Solution) -> None:
+    def _keep_if_better(self, solution: Solution) -> None:
         """Keep a path set if it is cheaper than the best so far, or equal with fewer moves."""
         value = self._value(solution)
         if value < self._best_value:

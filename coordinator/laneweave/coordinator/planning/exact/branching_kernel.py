@@ -1,7 +1,7 @@
 """Compiled code of `branching`: the search over the open nodes, depth first.
 
 A node is decided by its lower bound or by a relaxed solution without conflicts; otherwise it is
-split at a conflict clique. See `relaxation_kernel` for the style.
+split at a conflict clique. See `lagrangian_kernel` for the style.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ STUCK, FULL = 3, 4
 BY_TEAM, BY_CELL = 0, 1
 _ITERATIONS = 10
 _KEPT = 0.8
-"""If a smaller share of the moves is still allowed, multipliers are improved again first."""
+"""If a smaller fraction of the moves remains, multipliers are improved again before branching."""
 _ROUNDS = 12
-"""Rounds without a choice by mass after which any choice is taken."""
+"""Rounds without a choice by mass after which any choice is accepted."""
 _ABOVE_UPPER_BOUND = 0.5
 _MIN_STEP_SIZE = 0.05
 _MIN_MASS = 0.01
@@ -51,14 +51,14 @@ def search(arrays, teams, stack, depth, scratch, state, upper_bound, nodes):
         allowed, earliest = stack.allowed[top], stack.earliest[top]
         multipliers = stack.multipliers[top]
         state[STEP_SIZE] = stack.step_size[top]
-        ending = _examine(
+        outcome = _examine(
             arrays, teams, allowed, earliest, multipliers, scratch, state, upper_bound, choice
         )
-        if ending == REFUTED:
+        if outcome == REFUTED:
             depth -= 1
             continue
-        if ending != OPEN or depth == len(stack.step_size):
-            return (FULL if ending == OPEN else ending), depth, examined + 1
+        if outcome != OPEN or depth == len(stack.step_size):
+            return (FULL if outcome == OPEN else outcome), depth, examined + 1
         stack.allowed[depth], stack.earliest[depth] = allowed, earliest
         stack.multipliers[depth] = multipliers
         stack.step_size[top] = stack.step_size[depth] = max(state[STEP_SIZE], _MIN_STEP_SIZE)
@@ -78,7 +78,7 @@ def _examine(arrays, teams, allowed, earliest, multipliers, scratch, state, uppe
     moves, span = list_moves(arrays, allowed, scratch)
     start_over(multipliers, span, scratch, state)
     for attempt in range(2 * _ROUNDS):
-        ending = improve(
+        outcome = improve(
             arrays,
             teams,
             allowed,
@@ -91,8 +91,8 @@ def _examine(arrays, teams, allowed, earliest, multipliers, scratch, state, uppe
             upper_bound,
             upper_bound + _ABOVE_UPPER_BOUND,
         )
-        if ending != OPEN:
-            return ending
+        if outcome != OPEN:
+            return outcome
         _, kept = fix_by_reduced_cost(
             arrays, teams, allowed, earliest, multipliers, span, scratch, upper_bound
         )
@@ -120,8 +120,8 @@ def _examine(arrays, teams, allowed, earliest, multipliers, scratch, state, uppe
 def _choose(arrays, teams, allowed, earliest, multipliers, span, scratch, state, choice, by_mass):
     """Choose a clique, and a part of its moves to branch on: those of a team, or from a cell.
 
-    The best choice is a clique with a high multiplier of which both parts have much mass, that is,
-    a large share of the relaxed solutions. Without masses all moves count equally.
+    The best clique has a high multiplier, and both its parts have a large mass, that is, weight in
+    the relaxed solutions. Without masses all moves count equally.
 
     choice: step, clique, `BY_TEAM` or `BY_CELL`, number of the team or cell, 1 if its part has the
         larger mass.
@@ -178,12 +178,12 @@ def _add(arrays, t, k, d, cell, share, of_team, of_cell):
 @njit(cache=True)
 def _restrict(arrays, teams, choice, inside, allowed, earliest):
     """Allow only the chosen moves of the clique, or only the others."""
-    t, chosen_row, kind, number = choice[0], choice[1], choice[2], choice[3]
+    t, chosen_clique, kind, number = choice[0], choice[1], choice[2], choice[3]
     groups, _, displacements, cells = allowed.shape
     for d in range(displacements):
         for cell in range(cells):
             for m in range(arrays.clique.shape[2]):
-                if arrays.clique[d, cell, m] != chosen_row:
+                if arrays.clique[d, cell, m] != chosen_clique:
                     continue
                 for k in range(groups):
                     chosen = k == number if kind == BY_TEAM else arrays.residue[cell] == number

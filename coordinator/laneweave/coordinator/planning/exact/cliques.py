@@ -1,10 +1,9 @@
-"""Conflict cliques: sets of moves of which one step admits at most one.
+"""Conflict cliques: sets of moves at most one of which is made in a step.
 
-Pairs of conflicting moves define the conflicts, but a linear relaxation with pairs only is weak. A
-conflict clique is a clique of the conflict relation: at most one of its moves is made in a step.
-The cliques here are maximal and cover every conflicting pair. With footprints (mode 1 with node,
-edge and special-1; geometric) one pattern is enough: all moves whose footprint contains a cell.
-Tables computed from a geometry, and `closing`, take more patterns.
+A linear relaxation with only the pairs of conflicting moves is weak, so they are grouped into
+cliques of the conflict relation, which are maximal and cover every conflicting pair. With
+footprints (mode 1 with node, edge and special-1; geometric) one pattern is enough: all moves whose
+footprint contains a cell. Tables computed from a geometry, and `closing`, take more patterns.
 
 Conflicts are the same everywhere on the lattice, so a clique is a pattern that is placed on every
 cell, its anchor.
@@ -25,8 +24,7 @@ from laneweave.coordinator.planning.conflict_model import (
 from laneweave.protocol.lattice import Mode, displacements
 
 Clique = tuple[Offset, ...]
-"""Moves of which one step admits at most one: columns and lanes from the anchor to the from-cell of
-each move, and its displacement."""
+"""Columns and lanes from the anchor to the from-cell of each move, and its displacement."""
 
 
 @lru_cache(maxsize=64)

@@ -1,15 +1,15 @@
 """A lower bound on the cost of all path sets: Lagrangian relaxation of the conflicts.
 
 Without conflicts the problem decomposes: each vehicle takes a shortest path, and targets are
-assigned at minimum cost. Every conflict clique in every step gets a Lagrange multiplier, which each
-move in the clique costs. The shortest paths then avoid contested cliques, and their cost minus the
+assigned at minimum cost. Every conflict clique in every step has a Lagrange multiplier, the cost of
+each move in the clique. The shortest paths then avoid contested cliques, and their cost minus the
 sum of all multipliers is a lower bound on every solution, whatever its number of steps: beyond the
 last step with multipliers vehicles ignore each other. Good multipliers are found by a subgradient
 method (Held, Wolfe and Crowder, Mathematical Programming 6, 1974) with momentum.
 
 At given multipliers each move of a team has a reduced cost, a lower bound on what it adds to every
 solution that contains it. So for a given upper bound, moves whose reduced cost is too high are
-forbidden (reduced-cost fixing), which makes the rest smaller and its lower bound higher.
+forbidden (reduced-cost fixing), which shrinks the problem and raises its lower bound.
 
 Costs are steps until the final arrival, and `PER_MOVE` for each move that is not a wait.
 """
@@ -37,7 +37,7 @@ from laneweave.coordinator.planning.exact.lagrangian_kernel import (
 )
 
 _ESTIMATE = -1.0
-"""Value for `goal` of `relaxation_kernel.improve`."""
+"""Value of `goal` of `lagrangian_kernel.improve`."""
 _TOLERANCE = 1e-6
 
 
@@ -96,7 +96,7 @@ class Stack(NamedTuple):
 
 
 def scratch(arrays: MoveArrays, teams: Teams, steps: int) -> Scratch:
-    """Return working memory for so many steps."""
+    """Return working memory for a number of steps."""
     displacements, cells = arrays.valid.shape
     groups, goals = teams.pair.shape
     vehicles, pairs, cliques = len(teams.start), len(teams.pair_cell), arrays.clique_count
@@ -138,7 +138,7 @@ class Relaxation:
     """
 
     def __init__(self, arrays: MoveArrays, teams: Teams, steps: int) -> None:
-        """Start with multipliers of 0 in so many steps."""
+        """Start with multipliers of 0 in `steps` steps."""
         self.arrays = arrays
         self.teams = teams
         self.state = np.zeros(BEST + 1)
@@ -224,11 +224,10 @@ class Relaxation:
         return target
 
     def put(self, nodes: Stack, upper_bound: float) -> bool | None:
-        """Put the moves that solutions below an upper bound may contain at the bottom of a stack.
+        """Start a stack with the moves that solutions below an upper bound may contain.
 
         Returns:
-            Whether there may be such a solution; None: perhaps one with more steps than have
-            multipliers.
+            Whether such a solution may exist; None: it may need more steps than have multipliers.
         """
         nodes.allowed[0], nodes.earliest[0] = self.allowed, self.earliest
         nodes.multipliers[0], nodes.step_size[0] = self.multipliers, 1.0

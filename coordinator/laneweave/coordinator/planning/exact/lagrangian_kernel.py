@@ -1,6 +1,7 @@
-"""Compiled code of `relaxation`.
+"""Compiled code of `lagrangian_bound`.
 
-Parameters are the named tuples of `arrays` and `relaxation`. Arrays are taken out of their tuples
+Parameters are the named tuples of `arrays` and `lagrangian_bound`. Arrays are read from their
+tuples
 before loops, and inner loops are separate functions: otherwise they take five times as long.
 """
 
@@ -12,7 +13,7 @@ from numba import njit
 UNREACHABLE = 1e9
 """Represents infinity in sums of costs."""
 PER_MOVE = 1e-5
-"""Added to the cost of each move that is not a wait: of equal costs the fewest moves win."""
+"""Cost of each move that is not a wait, so that of equal costs the fewest moves win."""
 PARKED = -1
 """In a path: the vehicle has finally arrived."""
 REFUTED, FOUND, OPEN = 0, 1, 2
@@ -29,7 +30,7 @@ _PATIENCE = 12
 """Iterations without a better bound after which the step size is reduced."""
 _SHORTER, _SHORTEST = 0.6, 0.0005
 _FADING = 0.92
-"""Weight of a relaxed solution relative to the next one."""
+"""Weight of a relaxed solution relative to its successor."""
 
 
 @njit(cache=True, nogil=True)
@@ -110,7 +111,9 @@ def improve(
             multipliers[:] = present
             if bound > upper_bound:
                 return REFUTED
-        value, arrived = _walk(arrays, teams, allowed, earliest, present, span, scratch, state)
+        value, arrived = _follow_paths(
+            arrays, teams, allowed, earliest, present, span, scratch, state
+        )
         clash, square = _excess(present, use, span)
         if not clash and arrived and value < state[BEST] - _TOLERANCE:
             state[BEST] = value
@@ -139,16 +142,16 @@ def improve(
 @njit(cache=True, nogil=True)
 def evaluate(arrays, teams, earliest, multipliers, span, scratch):
     """Return the bound at some multipliers; fill in costs to go and the assignment."""
-    _look_back(arrays, teams, earliest, multipliers, span, scratch)
+    _fill_costs_to_go(arrays, teams, earliest, multipliers, span, scratch)
     total = 0.0
     for t in range(span):
         for clique in range(multipliers.shape[1]):
             total += multipliers[t, clique]
-    return _match(teams, scratch) - total
+    return _assign_targets(teams, scratch) - total
 
 
 @njit(cache=True)
-def _look_back(arrays, teams, earliest, multipliers, span, scratch):
+def _fill_costs_to_go(arrays, teams, earliest, multipliers, span, scratch):
     """Fill in the minimum cost from each cell before each step to the target of each pair.
 
     Every step until the final arrival costs 1, and each move the multipliers of its cliques. A
@@ -168,7 +171,7 @@ def _look_back(arrays, teams, earliest, multipliers, span, scratch):
     for t in range(span - 1, -1, -1):
         cost_to_go[t] = UNREACHABLE
         for k in range(len(pairs_from) - 1):
-            _step_back(
+            _relax_moves(
                 move,
                 move_cost,
                 move_from[t, k],
@@ -189,22 +192,24 @@ def _look_back(arrays, teams, earliest, multipliers, span, scratch):
 
 
 @njit(cache=True)
-def _step_back(move, move_cost, begin, end, first_pair, end_pair, clique, multipliers, here, then):
+def _relax_moves(
+    move, move_cost, begin, end, first_pair, end_pair, clique, multipliers, here, then
+):
     # The sum of multipliers is inlined: as a call it takes four times as long.
     max_cliques = clique.shape[2]
     for m in range(begin, end):
         d, cell, next_cell = move[m, 0], move[m, 1], move[m, 2]
-        price = 1.0
+        cost = 1.0
         if d != 0:
-            price += PER_MOVE
+            cost += PER_MOVE
         for n in range(max_cliques):
             r = clique[d, cell, n]
             if r < 0:
                 break
-            price += multipliers[r]
-        move_cost[m] = price
+            cost += multipliers[r]
+        move_cost[m] = cost
         for p in range(first_pair, end_pair):
-            total = price + then[next_cell, p]
+            total = cost + then[next_cell, p]
             if total < here[cell, p]:
                 here[cell, p] = total
 
@@ -222,7 +227,7 @@ def penalty_of(clique, multipliers, t, d, cell):
 
 
 @njit(cache=True)
-def _match(teams, scratch):
+def _assign_targets(teams, scratch):
     """Assign targets at minimum cost; fill in each target's vehicle (or -1) and dual value.
 
     Successive shortest paths with potentials (Jonker and Volgenant, Computing 38, 1987).
@@ -278,7 +283,7 @@ def _match(teams, scratch):
 
 
 @njit(cache=True)
-def _walk(arrays, teams, allowed, earliest, multipliers, span, scratch, state):
+def _follow_paths(arrays, teams, allowed, earliest, multipliers, span, scratch, state):
     """Follow each vehicle's cheapest path; count the uses of cliques and add up masses.
 
     Returns the sum of costs, and whether all vehicles arrive.

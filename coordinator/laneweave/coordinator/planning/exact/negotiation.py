@@ -1,13 +1,13 @@
-"""Path sets by negotiation: solutions early, for any number of vehicles.
+"""Path sets by negotiation: early solutions for any number of vehicles.
 
-At first vehicles may be in conflict. Then all vehicles on contested cliques are rerouted, one after
-the other and repeatedly, while the cost of cliques that others use rises, and the cost of those
-that stay contested rises permanently. That nearly always ends without conflicts (McMurchie and
-Ebeling, PathFinder, FPGA 1995, who route wires in this way).
+Vehicles first take their cheapest paths, which may conflict. Then all vehicles on contested cliques
+are rerouted repeatedly, one after the other; the cost of cliques in use rises with each pass, that
+of contested ones permanently. This nearly always ends without conflicts (McMurchie and Ebeling,
+PathFinder, FPGA 1995, a method for routing wires).
 
-After that a few vehicles at a time are removed, perhaps exchange targets, and negotiate again
-around all others; the result is kept if it is not worse (large-neighbourhood search). When that has
-found nothing for long, negotiation restarts from the latest suggested multipliers and targets.
+After that a few vehicles at a time are removed, may exchange targets, and negotiate again around
+all others; the result is kept if it is not worse (large-neighbourhood search). After many attempts
+without improvement, negotiation restarts from the latest suggested multipliers and targets.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from laneweave.coordinator.planning.exact.lagrangian_kernel import PARKED, UNREA
 from laneweave.coordinator.planning.exact.negotiation_kernel import improve_paths, negotiate
 
 _HORIZON, _HORIZON_GROWTH, _MAX_HORIZON = 2.0, 1.25, 10.0
-"""The horizon relative to the steps with multipliers, and its growth if it was too short."""
+"""The horizon relative to the steps with multipliers, and its growth if it is too short."""
 _PASSES = 300
 _SPARE_STEPS = 4
 _ATTEMPTS = 4
-"""Attempts to improve that count as a pass."""
+"""Attempts to improve the path set in one pass."""
 _MAX_REMOVED = (6, 12)
 """Maximum number of vehicles that are removed together, in alternation."""
 _IDLE_ATTEMPTS = 800
@@ -62,7 +62,7 @@ class CandidatePaths(NamedTuple):
 def candidate_paths(
     arrays: MoveArrays, path: Ints, target: Ints, history: Floats
 ) -> CandidatePaths:
-    """Return a candidate with paths (N, T), whose uses of cliques are not counted yet."""
+    """Return a candidate with paths (N, T) and without counted uses of cliques."""
     shape = history.shape
     return CandidatePaths(
         path=path,
@@ -79,7 +79,7 @@ def candidate_paths(
 
 
 class Negotiation:
-    """The best path set so far; equal problems and equal work give equal path sets.
+    """A deterministic negotiation and its best path set so far.
 
     cost: of the best path set; None: there is none yet.
     path: (N, T) its displacements.
@@ -87,7 +87,7 @@ class Negotiation:
     """
 
     def __init__(self, arrays: MoveArrays, teams: Teams, multipliers: Floats, target: Ints) -> None:
-        """Start.
+        """Prepare the first pass.
 
         Args:
             arrays: the moves.
@@ -123,20 +123,20 @@ class Negotiation:
         self._candidate.random[0] = self._rounds
         self._rounds += 1
         self._passes = self._idle = 0
-        self._settled = False
+        self._conflict_free = False
 
     def work(self, check_time: Callable[[], None]) -> bool:
-        """Run one pass; return whether there is a better path set now.
+        """Run one pass; return whether it found a better path set.
 
         `check_time` may raise an error to end the work.
         """
         check_time()
         self.stale += 1
-        if self._settled:
+        if self._conflict_free:
             return self._improve()
-        self._settled = negotiate(self._arrays, self._teams, self._candidate, self._passes)
+        self._conflict_free = negotiate(self._arrays, self._teams, self._candidate, self._passes)
         self._passes += 1
-        if self._settled:
+        if self._conflict_free:
             self._drop_idle_steps()
             return self._keep()
         if self._passes >= _PASSES:
@@ -165,7 +165,7 @@ class Negotiation:
         return True
 
     def _drop_idle_steps(self) -> None:
-        """Drop the last steps without moves, except a few."""
+        """Drop the last steps, in which no vehicle moves, except a few."""
         old = self._candidate
         steps = int(old.cost.max()) + _SPARE_STEPS
         if steps < old.path.shape[1]:

@@ -1,4 +1,4 @@
-"""Compiled code of `negotiation`; see `relaxation_kernel` for its style."""
+"""Compiled code of `negotiation`; see `lagrangian_kernel` for its style."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _FIRST_COST, _GROWTH, _MAX_COST = 2.0, 1.01, 50.0
 _HISTORY = 1.0
 """Permanently added to the cost of a clique in each pass in which it is used twice."""
 _ROUNDS, _ROUND_GROWTH, _ROUND_HISTORY = 10, 1.5, 0.5
-"""The same for vehicles that are rerouted together, which have few passes."""
+"""Passes, growth and permanent cost when only removed vehicles negotiate."""
 _BLUR = 15.0
 _DELAY_WEIGHT = 0.5
 _SWAP_SHARE = 60
@@ -51,7 +51,7 @@ def _find_path(arrays, teams, candidate, i):
                     total = 1.0 + cost_to_go[t + 1, cell + step[d]]
                     if d != 0:
                         total += PER_MOVE
-                    # Inlined, as in `relaxation_kernel._step_back`.
+                    # Inlined, as in `lagrangian_kernel._relax_moves`.
                     for m in range(max_cliques):
                         r = clique[d, cell, m]
                         if r < 0:
@@ -83,7 +83,7 @@ def _find_path(arrays, teams, candidate, i):
 
 @njit(cache=True)
 def add_uses(arrays, start, path, use, times):
-    """Add the cliques that a vehicle uses `times` times; -1 removes them."""
+    """Count the cliques on a path `times` times; -1 removes them."""
     clique, step = arrays.clique, arrays.step
     cell = start
     for t in range(len(path)):
@@ -121,7 +121,7 @@ def _shuffle(items, random):
 
 @njit(cache=True, nogil=True)
 def negotiate(arrays, teams, candidate, number):
-    """Run one pass of negotiation, counted from 0; return whether no clique is used twice.
+    """Run pass `number` (from 0) of a negotiation; return whether no clique is used twice.
 
     All vehicles on contested cliques are rerouted, one after the other.
     """
@@ -141,20 +141,20 @@ def negotiate(arrays, teams, candidate, number):
                 weight[t, clique] = history[t, clique] + cost * use[t, clique]
         _find_path(arrays, teams, candidate, i)
         add_uses(arrays, teams.start[i], candidate.path[i], use, 1.0)
-    settled = candidate.cost.max() < NOT_IN_TIME
+    conflict_free = candidate.cost.max() < NOT_IN_TIME
     for t in range(steps):
         for clique in range(cliques):
             if use[t, clique] > 1.5:
-                settled = False
+                conflict_free = False
                 history[t, clique] += _HISTORY * (use[t, clique] - 1.0)
-    return settled
+    return conflict_free
 
 
 @njit(cache=True, nogil=True)
 def improve_paths(arrays, teams, candidate, attempts, max_size):
     """Remove a few vehicles, let them negotiate, and keep the result if it is not worse.
 
-    Returns how many of the attempts came after the last improvement.
+    Returns the number of attempts since the last improvement.
     """
     start, team, pair, target = teams.start, teams.team, teams.pair, candidate.target
     use, path, cost = candidate.use, candidate.path, candidate.cost
@@ -201,7 +201,7 @@ def improve_paths(arrays, teams, candidate, attempts, max_size):
 
 @njit(cache=True)
 def _negotiate_among(arrays, teams, candidate, chosen, max_cost):
-    """Let removed vehicles negotiate; the cliques that the others use are forbidden."""
+    """Negotiate among removed vehicles; the cliques that all others use are forbidden."""
     use, own, history, weight = candidate.use, candidate.own, candidate.history, candidate.weight
     path, start, cost = candidate.path, teams.start, candidate.cost
     steps, cliques = use.shape

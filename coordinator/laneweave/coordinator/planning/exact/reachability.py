@@ -1,7 +1,7 @@
 """Joint search for small state spaces: find any path set, or prove that there is none.
 
-Branch and bound and conflict trees may not end when no path set exists. A search over the cells of
-all vehicles together does: vehicles with the same eligible targets form a team and are
+Branch and bound and conflict trees may not terminate if no path set exists. A search over the cells
+of all vehicles together does: vehicles with the same eligible targets form a team and are
 interchangeable, so a state is the set of cells of each team. States whose vehicles are close to
 their targets come first, so a path set is found soon if there is one. After a given number of joint
 moves the search ends without a result.
@@ -24,20 +24,20 @@ _MOVES_PER_TIME_CHECK = 256
 
 
 @attrs.frozen
-class Verdict:
+class Reachability:
     """The result of the search.
 
     solution: a path set, if one was found; not necessarily optimal.
-    impossible: no state with all vehicles at their targets can be reached.
+    infeasible: no state with all vehicles at their targets can be reached.
     """
 
     solution: Solution | None = None
-    impossible: bool = False
+    infeasible: bool = False
 
 
 @attrs.frozen
 class _Step:
-    """How a state was first reached; `order` holds the index of each place's vehicle before it."""
+    """The joint move that first reached a state; `order` permutes the vehicles into its order."""
 
     state: State
     moves: tuple[int, ...]
@@ -46,7 +46,7 @@ class _Step:
 
 def explore(
     problem: Problem, choices: Sequence[frozenset[int]], budget: Budget, max_moves: int
-) -> Verdict:
+) -> Reachability:
     """Search the reachable joint states, up to `max_moves` joint moves."""
     vehicles = sorted(range(len(choices)), key=lambda v: (sorted(choices[v]), v))
     teams = [sorted(choices[v]) for v in vehicles]
@@ -56,28 +56,30 @@ def explore(
 
     start, order = _sorted_by_team([problem.starts[v] for v in vehicles], team)
     vehicles = [vehicles[i] for i in order]
-    away = [problem.table.distances(sum(1 << cell for cell in goal)) for goal in goals]
+    distances = [problem.table.distances(sum(1 << cell for cell in goal)) for goal in goals]
     found: dict[State, _Step | None] = {start: None}
     frontier = [(0, 0, start)]
-    made = 0
+    move_count = 0
     while frontier:
         _, _, state = heapq.heappop(frontier)
         arrived = all(cell in goal for cell, goal in zip(state, goals, strict=True))
         if arrived and len(set(state)) == len(state):
-            return Verdict(solution=_solution(problem, found, state, vehicles))
+            return Reachability(solution=_solution(problem, found, state, vehicles))
         successors = _single_moves if one_at_a_time else _joint_moves
         for moves in successors(problem.table, state):
-            made += 1
-            if made % _MOVES_PER_TIME_CHECK == 0:
+            move_count += 1
+            if move_count % _MOVES_PER_TIME_CHECK == 0:
                 budget.check_time()
-            if made > max_moves:
-                return Verdict()
-            following, order = _sorted_by_team([problem.table.landing(m) for m in moves], team)
-            if following not in found:
-                found[following] = _Step(state, moves, order)
-                left = sum(steps.get(cell, 0) for steps, cell in zip(away, following, strict=True))
-                heapq.heappush(frontier, (left, len(found), following))
-    return Verdict(impossible=True)
+            if move_count > max_moves:
+                return Reachability()
+            successor, order = _sorted_by_team([problem.table.landing(m) for m in moves], team)
+            if successor not in found:
+                found[successor] = _Step(state, moves, order)
+                remaining = sum(
+                    steps.get(cell, 0) for steps, cell in zip(distances, successor, strict=True)
+                )
+                heapq.heappush(frontier, (remaining, len(found), successor))
+    return Reachability(infeasible=True)
 
 
 def _can_be_made_one_after_another(table: MoveTable) -> bool:
@@ -127,7 +129,7 @@ def _sorted_by_team(cells: Sequence[int], team: Sequence[int]) -> tuple[State, t
 def _solution(
     problem: Problem, found: dict[State, _Step | None], goal: State, vehicles: Sequence[int]
 ) -> Solution:
-    """Follow the search back to the start, then walk each vehicle through it."""
+    """Reconstruct the paths of the vehicles from the start to a goal state."""
     steps: list[_Step] = []
     step = found[goal]
     while step is not None:

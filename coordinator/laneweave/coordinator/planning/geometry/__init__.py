@@ -1,5 +1,5 @@
 """Conflicts computed from the sizes and motions of bodies.
 
-Entry points: `BodyGeometry` in `bodies` (sizes, times, clearances), `conflict_table` in the module
-of that name. Imported by `planning.request`. Imports `planning.conflicts` only, for the types.
+Entry points: `swept_bodies.BodyGeometry` (sizes, times, clearances) and
+`conflict_table.conflict_table`. Imported by `planning.request`.
 """

@@ -1,17 +1,17 @@
-"""The conflict table computed from geometry: which two moves bring two bodies too close.
+"""The conflict table computed from geometry: pairs of moves that bring two bodies too close.
 
 Two vehicles make one move each in the same step, from cells that lie an offset apart. Their
 clearance is the smallest gap between bumpers over all moments at which the bodies are less than
-`clearance_across_m` apart sideways:
+`clearance_across_m` shift sideways:
 
 - all pairs of moments of both moves, beginning and end included, if each may be late by any amount
   (`BodyGeometry.lateness_s` is None): one may not have started, or may have arrived long ago;
-- all moments at which they can be there together, if neither is later than `lateness_s`.
+- all pairs of moments that may coincide if neither move is later than `lateness_s`.
 
 The computation is conservative. A move is cut into parts of 1/160 of its time, 24 ms; during a
-part the body stays in the box around all its outlines (`bodies.outline`), and two parts count as
-simultaneous if any of their moments may be. So a computed clearance is too small by at most what
-both bodies travel in a part (0.36 m in the default geometry), and never too large.
+part the body stays in the box around all its outlines (`swept_bodies.outline`), and two parts count
+as simultaneous if any of their moments may coincide. So a computed clearance is never too large,
+and too small by at most the distance that both bodies travel in a part (0.36 m by default).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from laneweave.protocol.lattice import Cell, displacements
 PARTS: Final = 160
 """Parts into which a move is cut."""
 
-_LOOK = MAX_OFFSET + 1
+_MAX_SCANNED = MAX_OFFSET + 1
 _ROUNDING_M: Final = 1e-9
 
 
@@ -51,22 +51,23 @@ def min_clearances(geometry: BodyGeometry, paths: Mapping[Cell, Floats] | None =
     """Return the minimum clearance of every pair of moves.
 
     Args:
-        geometry: sizes, times and how late vehicles may be.
+        geometry: sizes, times and lateness.
         paths: the actual motion of each displacement: positions (n + 1, 2) [m] along and across,
             from the cell, evenly spaced over `geometry.move_s`; None: `geometry.paths()`.
 
     Returns:
         [m], (7, 7, D, D): columns from A's cell to B's (-3 to 3), lanes (-3 to 3), and A's and B's
-        displacement by their number in `displacements(2)`; D is 9, or 5 where `paths` are only
-        those of mode 1. Negative: they overlap along the road. Infinite: never that close sideways.
+        displacement by their number in `displacements(2)`; D is 9, or 5 if `paths` are only those
+        of mode 1. Negative: bodies overlap along the road. Infinite: bodies are never close
+        sideways.
     """
-    known = geometry.paths() if paths is None else paths
-    steps = [step for step in displacements(2) if step in known]
-    boxes = [_boxes(geometry, known[step]) for step in steps]
+    motions = geometry.paths() if paths is None else paths
+    steps = [step for step in displacements(2) if step in motions]
+    boxes = [_boxes(geometry, motions[step]) for step in steps]
     number = np.arange(PARTS)
-    apart = np.abs(number[:, None] - number[None, :])
-    first, second = np.nonzero(apart <= _parts_late(geometry))
-    found = np.full((2 * _LOOK + 1, 2 * _LOOK + 1, len(steps), len(steps)), np.inf)
+    shift = np.abs(number[:, None] - number[None, :])
+    first, second = np.nonzero(shift <= _parts_late(geometry))
+    found = np.full((2 * _MAX_SCANNED + 1, 2 * _MAX_SCANNED + 1, len(steps), len(steps)), np.inf)
     for i, a in enumerate(boxes):
         for j, b in enumerate(boxes):
             _fill(found[:, :, i, j], a[:, first], b[:, second], geometry)
@@ -76,18 +77,18 @@ def min_clearances(geometry: BodyGeometry, paths: Mapping[Cell, Floats] | None =
 def pairs_closer_than(
     geometry: BodyGeometry, paths: Mapping[Cell, Floats] | None = None
 ) -> frozenset[Pair]:
-    """Return the pairs that come closer than the clearances of the geometry.
+    """Return the pairs of moves that come closer than the clearances of the geometry.
 
     Raises:
-        ValueError: moves from cells further apart than `MAX_OFFSET` come too close; not with the
-            default profile.
+        ValueError: moves from cells further apart than `MAX_OFFSET` come too close, which cannot
+            happen with the default profile.
     """
-    known = geometry.paths() if paths is None else paths
-    steps = [step for step in displacements(2) if step in known]
-    close = min_clearances(geometry, known) < geometry.clearance_along_m - _ROUNDING_M
+    motions = geometry.paths() if paths is None else paths
+    steps = [step for step in displacements(2) if step in motions]
+    close = min_clearances(geometry, motions) < geometry.clearance_along_m - _ROUNDING_M
     pairs = []
     for column, lane, i, j in np.argwhere(close).tolist():
-        offset = column - _LOOK, lane - _LOOK
+        offset = column - _MAX_SCANNED, lane - _MAX_SCANNED
         if max(map(abs, offset)) > MAX_OFFSET:
             raise ValueError(f"moves from cells {offset} apart come too close on these paths")
         pairs.append((offset, steps[i], steps[j]))
@@ -95,14 +96,14 @@ def pairs_closer_than(
 
 
 def _parts_late(geometry: BodyGeometry) -> int:
-    """Return by how many parts two moves may be shifted."""
+    """Return the maximum shift between two moves, in parts."""
     if geometry.lateness_s is None:
         return PARTS
     return min(PARTS, math.ceil(PARTS * geometry.lateness_s / geometry.move_s))
 
 
 def _boxes(geometry: BodyGeometry, path: Floats) -> Floats:
-    """Return the edges (4, PARTS) within which a body stays during each part of its move."""
+    """Return the edges (4, PARTS) of the box that contains a body during each part of a move."""
     outline = geometry.outline(path)
     sampled, ends = np.linspace(0.0, 1.0, len(outline)), np.linspace(0.0, 1.0, PARTS + 1)
     times = np.union1d(sampled, ends)
@@ -122,7 +123,7 @@ def _fill(found: Floats, a: Floats, b: Floats, geometry: BodyGeometry) -> None:
     behind, ahead = b[REAR] - a[FRONT], a[REAR] - b[FRONT]
     right, left = b[RIGHT] - a[LEFT], a[RIGHT] - b[LEFT]
     min_m = geometry.clearance_across_m + geometry.profile_error_across_m - _ROUNDING_M
-    offsets = range(-_LOOK, _LOOK + 1)
+    offsets = range(-_MAX_SCANNED, _MAX_SCANNED + 1)
     for lane in offsets:
         side_m = lane * geometry.lane_width_m
         close = np.maximum(right + side_m, left - side_m) < min_m
@@ -132,4 +133,6 @@ def _fill(found: Floats, a: Floats, b: Floats, geometry: BodyGeometry) -> None:
         for column in offsets:
             shift_m = column * geometry.pitch_m
             gap_m = np.maximum(near_behind + shift_m, near_ahead - shift_m).min()
-            found[column + _LOOK, lane + _LOOK] = gap_m - geometry.profile_error_along_m
+            found[column + _MAX_SCANNED, lane + _MAX_SCANNED] = (
+                gap_m - geometry.profile_error_along_m
+            )

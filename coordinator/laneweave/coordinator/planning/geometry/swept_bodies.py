@@ -2,7 +2,7 @@
 
 A vehicle's position is the middle of its front bumper along the road and its body's centre across
 it, in metres from its position in the cell that it leaves. A body points in its direction of
-travel, so it turns while it changes lanes; `outline` covers it with upright boxes.
+travel, so it turns while it changes lanes; `outline` covers it with axis-aligned boxes.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ REAR, FRONT, RIGHT, LEFT = range(4)
 PEAK_SPEED: Final = 1.875
 """Maximum speed of a minimum-jerk motion, as a multiple of its mean speed."""
 _SAMPLES: Final = 128
-"""Of a move of the default profile."""
+"""Number of samples of the default profile."""
 
 
 def minimum_jerk_share(time: Floats) -> Floats:
-    """Return the share of the distance travelled after a share of the time, from rest to rest.
+    """Return the fraction of the distance travelled after a fraction of the time, rest to rest.
 
     The minimum-jerk quintic (Flash and Hogan, Journal of Neuroscience 5, 1985).
     """
@@ -49,7 +49,7 @@ def minimum_jerk_path(along_m: float, across_m: float, samples: int) -> Floats:
 def outline(
     path: Floats, duration_s: float, speed_mps: float, length_m: float, width_m: float
 ) -> Floats:
-    """Return upright boxes around a body that turns along its path.
+    """Return axis-aligned boxes around a body that turns along its path.
 
     Edges may be interpolated linearly between samples: each box is enlarged by an upper bound of
     the interpolation error, an eighth of the largest second difference. (At 0.1 s and 6 m/s2 that
@@ -58,7 +58,7 @@ def outline(
     Args:
         path: positions (n + 1, 2) [m], evenly spaced in time, n >= 2; at rest at both ends.
         duration_s: time of the whole path.
-        speed_mps: of the lattice; it determines how far a body turns.
+        speed_mps: of the lattice; determines how far a body turns.
         length_m: of the body.
         width_m: of the body.
 
@@ -81,7 +81,7 @@ def outline(
 
 
 def _velocity(path: Floats, sample_s: float) -> Floats:
-    """Return speeds (n + 1, 2) [m/s]; the body is at rest before the first and after the last."""
+    """Return velocities (n + 1, 2) [m/s]; the body is at rest before and after the path."""
     held = np.pad(path, ((2, 2), (0, 0)), mode="edge")
     near, far = held[3:-1] - held[1:-3], held[4:] - held[:-4]
     velocity: Floats = (8.0 * near - far) / (12.0 * sample_s)
@@ -100,8 +100,8 @@ class BodyGeometry:
     The minimum gap for which a vehicle's tracker follows its plan is 3 m (`tracking.min_gap_m`);
     the default clearance of 5 m leaves 2 m for errors and for braking. Two vehicles that follow
     each other are 10 m apart when both are on time, 6.4 m when the one ahead is 0.5 s late.
-    Sideways 1.7 m are between bodies at rest. Moves that pass come either much closer than that or
-    not at all: for any lateness the default geometry gives the same table from 0 to 1.4 m.
+    Bodies at rest on neighbouring lanes are 1.7 m apart. For any lateness, all clearances across
+    from 0 to 1.4 m give the same table.
     """
 
     length_m: float = field(default=5.0, validator=within(1, 30))
@@ -118,22 +118,22 @@ class BodyGeometry:
     clearance_along_m: float = field(default=5.0, validator=within(0, 200))
     clearance_across_m: float = field(default=0.3, validator=within(0, 10))
     profile_error_along_m: float = field(default=0.6, validator=within(0, 50))
-    """How much smaller the gap between two vehicles may be than with the default profile, because
-    they drive another one. The default holds for minimum-jerk trajectories within the default
-    limits of acceleration (0.55 m)."""
+    """Upper bound on how much smaller gaps are with the actual motions than with the default
+    profile. The default covers minimum-jerk trajectories within the default limits of acceleration
+    (0.55 m)."""
     profile_error_across_m: float = field(default=0.1, validator=within(0, 10))
     """The same sideways (0.05 m)."""
     lateness_s: float | None = field(
         default=None, validator=attrs.validators.optional(within(0, 60))
     )
-    """Longest time by which a move may begin late. None: a move may begin at any time within its
+    """Maximum delay of the start of a move. None: a move may begin at any time within its
     step, and the execution protocol keeps the steps in order."""
 
     def __attrs_post_init__(self) -> None:
         """Check the fields against each other.
 
-        They are consistent when moves whose footprints are disjoint keep the clearances, however
-        late they are; then the table forbids no pair that footprints allow.
+        Moves with disjoint footprints must keep the clearances at any lateness, so that the table
+        forbids no pair that footprints allow.
 
         Raises:
             BadInputError: names the first inconsistent field.
@@ -224,12 +224,11 @@ class BodyGeometry:
         )
 
     def _max_lateness_s(self, along_m: float, across_m: float) -> float:
-        """Return how late moves may be without blocking those of the next step.
+        """Return the maximum lateness at which moves keep clear of those of the next step.
 
-        A late move ends after others have begun to leave their cells, which are different ones.
-        The distance it still has to travel and the distance they have travelled add up to at most
-        the distance travelled in the time by which the lateness exceeds the rest of the slot (the
-        share of distance is convex in the first half of a move).
+        A late move ends after moves of the next step have begun. The rest of its distance and the
+        distance that they have travelled add up to at most the distance travelled in the overlap
+        of both, since the fraction of distance is convex in the first half of a move.
         """
         share = min(
             (along_m - self.clearance_along_m) / self.pitch_m,
@@ -242,10 +241,10 @@ class BodyGeometry:
 
 
 def _up(value: float) -> str:
-    """Return a number that is not below the value."""
+    """Return the value rounded up to 3 decimals."""
     return f"{math.ceil(value * 1e3) / 1e3:g}"
 
 
 def _down(value: float) -> str:
-    """Return a number that is not above the value."""
+    """Return the value rounded down to 3 decimals."""
     return f"{math.floor(value * 1e3) / 1e3:g}"

@@ -24,10 +24,10 @@ from laneweave.coordinator.planning.paper.constraints import (
     Conflict,
     Constraint,
     bans_for,
+    cardinality,
     constraints_of,
     disjoint_constraints,
     is_at_node,
-    rises,
 )
 from laneweave.coordinator.planning.problem import Diagram, Path, Problem
 from laneweave.coordinator.planning.shortest_paths import (
@@ -45,8 +45,8 @@ Limit = Callable[[], float]
 class Improvements:
     """Additions to Algorithms 1 and 2; without any of them the algorithms are the paper's.
 
-    Each addition leaves the result exact. `benchmarks/planner_switches.py` measures what each is
-    worth; docs/PLANNING.md has the figures.
+    The result stays exact with each of them. `benchmarks/planner_switches.py` measures their
+    effects; docs/PLANNING.md has the figures.
 
     cutoff: CBSA of an assignment ends as soon as it cannot find a path set that costs less than
         C'* (`tappa`).
@@ -200,22 +200,22 @@ class ConstraintTree:
                 for constraint in constraints_of(table, conflict, node.moves(conflict))
             )
             return
-        conflict = self._most_expensive(node)
+        conflict = self._most_cardinal(node)
         moves = node.moves(conflict)
         if self._improvements.bicliques:
             yield from disjoint_constraints(table, conflict, moves, node.diagrams)
         else:
             yield from constraints_of(table, conflict, moves)
 
-    def _most_expensive(self, node: Node) -> Conflict:
+    def _most_cardinal(self, node: Node) -> Conflict:
         """Return the conflict that raises the cost of most children; of equal ones the first."""
         table = self._problem.table
-        best, most_rising = node.conflicts[0], -1
+        best, highest = node.conflicts[0], -1
         for conflict in node.conflicts:
-            rising = rises(table, conflict, node.moves(conflict), node.diagrams)
-            if rising > most_rising:
-                best, most_rising = conflict, rising
-            if most_rising == CARDINAL:
+            found = cardinality(table, conflict, node.moves(conflict), node.diagrams)
+            if found > highest:
+                best, highest = conflict, found
+            if highest == CARDINAL:
                 break
         return best
 
@@ -226,7 +226,7 @@ class ConstraintTree:
         diagrams, paths = list(node.diagrams), list(node.paths)
         rerouted = []
         for vehicle, diagram in enumerate(node.diagrams):
-            if added.spares(vehicle, diagram):
+            if added.is_satisfied_by(vehicle, diagram):
                 continue
             self._budget.check_time()
             bans = bans_for(vehicle, constraints)
@@ -243,8 +243,8 @@ class ConstraintTree:
                 if i != vehicle
             ]
             diagram = diagrams[vehicle]
-            taken = conflicting_moves(table, others, diagram.cost)
-            paths[vehicle] = choose_path(table, diagram, taken)
+            conflicting = conflicting_moves(table, others, diagram.cost)
+            paths[vehicle] = choose_path(table, diagram, conflicting)
         conflicts = set(node.conflicts)
         for vehicle in rerouted:
             conflicts = {c for c in conflicts if vehicle not in (c.first, c.second)}

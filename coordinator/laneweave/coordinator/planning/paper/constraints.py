@@ -1,7 +1,7 @@
 """Conflicts and constraints of the constraint tree (paper, section `cppm`).
 
-A conflict C^f of two vehicles has an entry for each of them, written {N | (x, y), step, id} or
-{E | (x1, y1), (x2, y2), step, id}; the constraint C^t made of it is written in the same way and
+A conflict C^f of two vehicles has an entry for each of them, written {N | (x, y), step, id} or {E |
+(x1, y1), (x2, y2), step, id}; the constraint C^t derived from it is written in the same way and
 forbids that vehicle to arrive at the node, or to travel along the edge, in that step.
 
 The paper's children for all conflicts of a node overlap: a solution may be found below several of
@@ -9,7 +9,7 @@ them. One conflict is enough, since a solution contains at most one of its two m
 of the paper's tree (`cbs.Improvements`) use this:
 
 - Cardinal conflicts first (Boyarski et al., IJCAI 2015): where all shortest paths of both vehicles
-  conflict, both children cost more than their parent (`rises`).
+  conflict, both children cost more than their parent (`cardinality`).
 - Bicliques (Li et al., ICAPS 2019, call them mutex propagation and positive constraints): S_A and
   S_B may be any sets of moves in the same step such that every move of S_A conflicts with every
   move of S_B. Either A makes no move of S_A, or it makes one; then no other vehicle makes a move
@@ -34,7 +34,7 @@ CARDINAL = 2
 class Conflict(NamedTuple):
     """Two vehicles whose moves in a step conflict; `first` < `second`, steps count from 0.
 
-    on_edge: not a node conflict. In a list, node conflicts come first in each step.
+    on_edge: whether it is not a node conflict. Node conflicts sort first in each step.
     """
 
     step: int
@@ -63,7 +63,7 @@ class Constraint(NamedTuple):
     others: int = 0
     arrived: bool | None = None
 
-    def spares(self, vehicle: int, diagram: Diagram) -> bool:
+    def is_satisfied_by(self, vehicle: int, diagram: Diagram) -> bool:
         """Return whether all paths of a vehicle's diagram satisfy this constraint."""
         if vehicle == self.vehicle:
             if self.arrived is not None:
@@ -129,12 +129,12 @@ def constraints_of(
 
 
 def is_at_node(table: MoveTable, a: int, b: int) -> bool:
-    """Tell whether two conflicting moves are a node conflict, the first of the kinds."""
+    """Return whether two conflicting moves are a node conflict, the first of the kinds."""
     return "node" in table.model.kinds and table.landing(a) == table.landing(b)
 
 
 def bans_for(vehicle: int, constraints: Iterable[Constraint]) -> Bans:
-    """Return all that is forbidden to one vehicle."""
+    """Return the bans that constraints impose on one vehicle."""
     at: dict[int, int] = {}
     since: dict[int, int] = {}
     earliest = 0
@@ -154,26 +154,26 @@ def bans_for(vehicle: int, constraints: Iterable[Constraint]) -> Bans:
     return Bans(at, since, earliest, latest)
 
 
-def rises(
+def cardinality(
     table: MoveTable, conflict: Conflict, moves: tuple[int, int], diagrams: Sequence[Diagram]
 ) -> int:
-    """Return how many of the children of a conflict must cost more than their parent.
+    """Return how many children of a conflict are certain to cost more than their parent.
 
     2: cardinal, all shortest paths of both conflict in this step. 1: semi-cardinal, all shortest
     paths of one conflict with the move of the other.
     """
     first = diagrams[conflict.first].layer(conflict.step)
     second = diagrams[conflict.second].layer(conflict.step)
-    against_first = table.common_conflicts(first)
-    if against_first >> moves[1] & 1:
-        return 1 if second & ~against_first else CARDINAL
+    excluded_by_first = table.common_conflicts(first)
+    if excluded_by_first >> moves[1] & 1:
+        return 1 if second & ~excluded_by_first else CARDINAL
     return table.common_conflicts(second) >> moves[0] & 1
 
 
 def disjoint_constraints(
     table: MoveTable, conflict: Conflict, moves: tuple[int, int], diagrams: Sequence[Diagram]
 ) -> tuple[Constraint, Constraint]:
-    """Return two constraints of which every solution satisfies exactly one."""
+    """Return two constraints such that every solution satisfies exactly one of them."""
     step = conflict.step
     pair = conflict.first, conflict.second
     for vehicle in pair:
@@ -185,7 +185,7 @@ def disjoint_constraints(
             )
     layers = diagrams[pair[0]].layer(step), diagrams[pair[1]].layer(step)
     sets = _exclusive_sets(table, moves, layers)
-    side = _side_to_decide(sets, layers)
+    side = _side_to_branch_on(sets, layers)
     vehicle, chosen = pair[side], sets[side]
     others = table.common_conflicts(chosen)
     return (
@@ -194,10 +194,10 @@ def disjoint_constraints(
     )
 
 
-def _side_to_decide(sets: tuple[int, int], layers: tuple[int, int]) -> int:
+def _side_to_branch_on(sets: tuple[int, int], layers: tuple[int, int]) -> int:
     """Return the vehicle (0 or 1) whose set covers the larger share of its shortest paths.
 
-    A share of 1 means that its cost rises.
+    A share of 1 means that its cost cardinality.
     """
     first, second = (
         (chosen & layer).bit_count() / layer.bit_count()
@@ -211,12 +211,12 @@ def _exclusive_sets(
 ) -> tuple[int, int]:
     """Return large sets S_A and S_B around two conflicting moves."""
     a, b = 1 << moves[0], 1 << moves[1]
-    against_first = table.common_conflicts(layers[0])
-    if against_first & b:
-        return table.common_conflicts(against_first), against_first
-    against_second = table.common_conflicts(layers[1])
-    if against_second & a:
-        return against_second, table.common_conflicts(against_second)
+    excluded_by_first = table.common_conflicts(layers[0])
+    if excluded_by_first & b:
+        return table.common_conflicts(excluded_by_first), excluded_by_first
+    excluded_by_second = table.common_conflicts(layers[1])
+    if excluded_by_second & a:
+        return excluded_by_second, table.common_conflicts(excluded_by_second)
     return _grown(table, moves, layers)
 
 

@@ -1,6 +1,6 @@
-"""A record of Algorithms 1 and 2 for readers: assignments, constraint trees, why the run ended.
+"""A record of a run of Algorithms 1 and 2: assignments, constraint trees, stop reason.
 
-The trees are the paper's literal ones while they are small, otherwise those of the improved
+The trees are the paper's literal ones if they are small, otherwise those of the improved
 algorithms.
 """
 
@@ -23,9 +23,9 @@ from laneweave.coordinator.planning.problem import MoveTable, Problem, Solution
 from laneweave.coordinator.planning.request import PlanRequest
 
 MAX_LITERAL_NODES: Final = 150
-"""Limit on nodes of literal trees; beyond it the improved ones are shown."""
+"""Limit on nodes of literal trees; beyond it the improved ones are recorded."""
 MAX_NODES: Final = 50_000
-"""Limit on nodes of improved trees; the run is shown up to there."""
+"""Limit on nodes of improved trees; the record ends there."""
 
 NodeStatus = Literal["expanded", "solution", "open"]
 """open: still in T when the search ended."""
@@ -58,7 +58,7 @@ class ExplainedAssignment:
     targets: the assignment vector, targets counted from 0.
     cost: C_k.
     best_cost: C'_k; None: no path set that costs less than C'* was found.
-    best_so_far: C'* after it.
+    best_so_far: C'* after this assignment.
     nodes: the constraint tree in the order in which its nodes were made.
     """
 
@@ -73,11 +73,11 @@ class ExplainedAssignment:
 class Explanation:
     """The run of Algorithm 1.
 
-    literal: the trees are those of the paper, with all improvements off.
-    optimal: the optimum is proven, or that there is none.
-    joint_bound: what the joint search proved to be a lower bound; 0: nothing.
-    joint_cost: C'* came from the joint search; None: it did not.
-    next_cost: C_{k+1}; None: there is no further assignment, or it was not looked at.
+    literal: whether the trees are those of the paper, with all improvements off.
+    optimal: whether C'* is proven optimal, or that there is no path set.
+    joint_bound: lower bound proven by the joint search; 0: none.
+    joint_cost: C'* if the joint search found it, else None.
+    next_cost: C_{k+1}; None: there is no further assignment, or it was not examined.
     """
 
     literal: bool
@@ -89,8 +89,8 @@ class Explanation:
     next_cost: float | None
 
     @property
-    def why_it_ended(self) -> str:
-        """Return in one line why no further assignment was tried."""
+    def stop_reason(self) -> str:
+        """Return one line that says why no further assignment was tried."""
         k = len(self.assignments)
         best = "infinite" if math.isinf(self.best_cost) else f"{self.best_cost:g}"
         if not self.optimal:
@@ -107,7 +107,7 @@ class Explanation:
 def explain(
     request: PlanRequest, weights: Weights | None = None, clock: Clock = time.monotonic
 ) -> Explanation:
-    """Run Algorithm 1 on a request and return what it did."""
+    """Run Algorithm 1 on a request and return the record of the run."""
     deadline = clock() + request.deadline_s
     run = _run(request, Improvements.none(), deadline, MAX_LITERAL_NODES, weights, clock)
     literal = run.finished

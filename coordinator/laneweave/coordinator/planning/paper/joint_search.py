@@ -2,18 +2,16 @@
 
 Where there are few empty cells, most combinations of cheapest paths conflict, and constraint trees
 grow without bound; an unsolvable tree never ends. All vehicles planned together (one meta-agent, in
-the terms of Sharon et al., AIJ 219, 2015, section 7) make a finite state space, which is small in
-these cases. Vehicles with the same eligible targets are a team
-and interchangeable, so one search stands for all assignments: its lower bound holds for every
-C'_k, and its path set is optimal.
+the terms of Sharon et al., AIJ 219, 2015, section 7) have a finite state space, which is small in
+these cases. Vehicles with the same eligible targets form a team and are interchangeable, so one
+search covers all assignments: its lower bound holds for every C'_k, and its path set is optimal.
 
 The search goes backwards from the targets. A vehicle is active in a state if it still has to move;
-it pays one for each step from the start until it is not. Backwards, a vehicle becomes active with
-its first move, stays so, and pays for every step from there to the start: that is known exactly as
-soon as the number of steps is, which the heuristic uses.
+each active vehicle costs one per step. Backwards, a vehicle becomes active with its first move and
+stays active, so its cost is the number of steps from there to the start; the heuristic uses this.
 
-Which joint moves end in a set of occupied cells does not depend on which vehicle is where. They are
-made once for each set, as exchanges of labels; a label is a team and whether the vehicle is active.
+The joint moves that end in a set of occupied cells do not depend on which vehicle is where. They
+are computed once for each set, as permutations of labels: (team, whether the vehicle is active).
 """
 
 from __future__ import annotations
@@ -43,11 +41,11 @@ are given twice: as they are, and with all vehicles active. Moving vehicles are 
 
 
 class JointSearch:
-    """The search, which continues in portions of work.
+    """The search, which runs in portions.
 
-    lower_bound: no path set of any assignment costs less; infinite: there is none.
+    lower_bound: on the path sets of all assignments; infinite: there is none.
     solution: the optimal path set, when it is found.
-    ended: the search is complete, or reached its limits.
+    ended: whether the search is complete or has reached its limits.
     """
 
     def __init__(self, problem: Problem, choices: Sequence[frozenset[int]], budget: Budget) -> None:
@@ -57,9 +55,9 @@ class JointSearch:
         self.ended = False
         self._problem = problem
         self._budget = budget
-        self._may_share = problem.table.model.vehicles_share_cells
+        self._share_cells = problem.table.model.vehicles_share_cells
         self._credit = 0
-        self._made = 0
+        self._move_count = 0
         teams = sorted(set(choices), key=sorted)
         labels = [2 * teams.index(choice) + 1 for choice in choices]
         self._vehicles = sorted(range(len(choices)), key=lambda v: (problem.starts[v], labels[v]))
@@ -72,8 +70,8 @@ class JointSearch:
             for own in range(1, 2 * len(teams), 2)
         ]
         self._active: dict[Labels, int] = {}
-        self._into: dict[Cells, list[JointMove]] = {}
-        self._to: dict[int, list[tuple[int, int, int]]] = {}
+        self._joint_moves: dict[Cells, list[JointMove]] = {}
+        self._moves_into: dict[int, list[tuple[int, int, int]]] = {}
         self._cost: dict[State, int] = {}
         self._next: dict[State, tuple[State, Callable[[Labels], Labels]]] = {}
         self._open: list[tuple[int, int, State]] = []
@@ -81,12 +79,12 @@ class JointSearch:
         self._add_goals(teams, sizes)
 
     def work(self, moves: int) -> None:
-        """Make about so many more joint moves; the next call makes up for an excess."""
+        """Make about `moves` more joint moves; an excess is deducted from the next call."""
         self._credit += moves
         while self._credit > 0 and not self.ended:
-            before = self._made
+            before = self._move_count
             self._expand()
-            self._credit -= 1 + self._made - before
+            self._credit -= 1 + self._move_count - before
 
     def _add_goals(self, teams: Sequence[frozenset[int]], sizes: Sequence[int]) -> None:
         """Add a goal state for every choice of targets for the teams."""
@@ -103,13 +101,13 @@ class JointSearch:
                 return
         for goal in goals:
             placed = sorted((targets[j], label) for j, label in goal.items())
-            self._reach((tuple(c for c, _ in placed), tuple(label for _, label in placed)), 0)
+            self._open_state((tuple(c for c, _ in placed), tuple(label for _, label in placed)), 0)
         if not self._open:
             self.lower_bound, self.ended = math.inf, True
 
-    def _reach(self, state: State, cost: int) -> bool:
-        """Add a state to those that are open; return whether it can be reached from the start."""
-        steps = active = alone = 0
+    def _open_state(self, state: State, cost: int) -> bool:
+        """Add a state to the open ones; return whether it can be reached from the start."""
+        steps = active = inactive_steps = 0
         for cell, label in zip(*state, strict=True):
             distance = self._distance[label >> 1].get(cell)
             if distance is None:
@@ -118,9 +116,9 @@ class JointSearch:
             if label & 1:
                 active += 1
             else:
-                alone += distance
+                inactive_steps += distance
         self._cost[state] = cost
-        heapq.heappush(self._open, (cost + active * steps + alone, -cost, state))
+        heapq.heappush(self._open, (cost + active * steps + inactive_steps, -cost, state))
         return True
 
     def _expand(self) -> None:
@@ -134,26 +132,26 @@ class JointSearch:
         self.lower_bound = max(self.lower_bound, bound)
         cells, labels = state
         if cells == self._start and tuple(label | 1 for label in labels) == self._start_labels:
-            self.solution, self.ended = self._followed(state), True
+            self.solution, self.ended = self._solution_from(state), True
             return
         both = labels + tuple(label | 1 for label in labels)
         active, known = self._active, self._cost
-        moves = self._joint_moves_into(cells)
-        self._made += len(moves)
+        moves = self._joint_moves_to(cells)
+        self._move_count += len(moves)
         for cells_before, labels_before in moves:
             before = labels_before(both)
             if before not in active:
                 active[before] = sum(label & 1 for label in before)
             cost = active[before] - negative_cost
             reached = cells_before, before
-            if known.get(reached, math.inf) > cost and self._reach(reached, cost):
+            if known.get(reached, math.inf) > cost and self._open_state(reached, cost):
                 self._next[reached] = state, labels_before
-        if self._made > _MAX_MOVES:
+        if self._move_count > _MAX_MOVES:
             self.ended = True
 
-    def _joint_moves_into(self, cells: Cells) -> list[JointMove]:
+    def _joint_moves_to(self, cells: Cells) -> list[JointMove]:
         """Return all joint moves without conflicts that end in these cells."""
-        found = self._into.get(cells)
+        found = self._joint_moves.get(cells)
         if found is not None:
             return found
         partial: list[tuple[Cells, int]] = [((), 0)]
@@ -162,10 +160,10 @@ class JointSearch:
             partial = [
                 ((*starts, start), excluded | more)
                 for starts, excluded in partial
-                for move, start, more in self._moves_to(cell)
+                for move, start, more in self._moves_into_cell(cell)
                 if not excluded & move
             ]
-        found = self._into[cells] = []
+        found = self._joint_moves[cells] = []
         count = len(cells)
         for starts, _ in partial:
             origins = [
@@ -174,22 +172,22 @@ class JointSearch:
             ]
             before, picked = zip(*sorted(zip(starts, origins, strict=True)), strict=True)
             found.append((before, _picker(picked)))
-        self._made += len(found)
+        self._move_count += len(found)
         return found
 
-    def _moves_to(self, cell: int) -> list[tuple[int, int, int]]:
+    def _moves_into_cell(self, cell: int) -> list[tuple[int, int, int]]:
         """Return the moves that end in a cell: as a set, with its start and the excluded moves."""
-        found = self._to.get(cell)
+        found = self._moves_into.get(cell)
         if found is None:
             table = self._problem.table
-            found = self._to[cell] = []
+            found = self._moves_into[cell] = []
             for move in bits(table.leading_to(1 << cell)):
                 start = move - move % table.fan
-                same_start = 0 if self._may_share else table.starting_in(1 << start)
+                same_start = 0 if self._share_cells else table.starting_in(1 << start)
                 found.append((1 << move, start, table.conflicts[move] | same_start))
         return found
 
-    def _followed(self, state: State) -> Solution:
+    def _solution_from(self, state: State) -> Solution:
         """Return the paths of the vehicles from the start to their targets."""
         problem, table = self._problem, self._problem.table
         count = len(self._vehicles)

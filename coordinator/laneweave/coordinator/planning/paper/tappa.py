@@ -54,8 +54,8 @@ class Tappa(Search):
 
     best: the best path set P* so far; its cost is C'*.
     tried: k, the number of assignments to which CBSA was applied.
-    attempts: what CBSA did for each of them, if that is recorded.
-    next_cost: C_{k+1}, if it was the last cost examined.
+    attempts: the record of each of them, if recording is on.
+    next_cost: C_{k+1}; None: there is no further assignment.
     """
 
     def __init__(
@@ -72,10 +72,10 @@ class Tappa(Search):
 
         Args:
             request: what to plan.
-            problem: the same as the searches see it.
+            problem: the same request in the form that the searches use.
             weights: of the formation relative distance.
             budget: deadline and limit on nodes.
-            improvements: what is added to the paper's algorithms; None: everything.
+            improvements: additions to the paper's algorithms; None: all.
             record: whether to keep all constraint trees.
         """
         super().__init__()
@@ -97,7 +97,7 @@ class Tappa(Search):
 
     @property
     def joint_bound(self) -> float:
-        """Return the lower bound of every C'_k that the joint search has found."""
+        """Return the lower bound on every C'_k that the joint search has proven."""
         return 0 if self._joint is None else self._joint.lower_bound
 
     def run(self) -> None:
@@ -116,17 +116,17 @@ class Tappa(Search):
         while assignment is not None:  # line 4
             self.tried += 1  # line 14
             self.lower_bound = min(assignment.cost, self.best_cost)
-            self._offer(self._cbsa(assignment))  # lines 5 to 8, and 16 to 19 for the last one
+            self._update_best(self._cbsa(assignment))  # lines 5 to 8, and 16 to 19 for the last one
             assignment = next(self._assignments, None)  # line 9
             self.next_cost = None if assignment is None else assignment.cost
             if self.next_cost is not None and self.best_cost <= self._bound(self.next_cost):
                 return  # lines 10 to 13
 
     def _bound(self, cost: float) -> float:
-        """Return a lower bound of the path sets of assignments that cost at least so much."""
+        """Return a lower bound on the path sets of assignments that cost at least `cost`."""
         return max(cost, self.joint_bound)
 
-    def _offer(self, solution: Solution | None) -> None:
+    def _update_best(self, solution: Solution | None) -> None:
         """Set P* and C'* if a path set is better (lines 6 to 8)."""
         if solution is not None and solution.cost < self.best_cost:
             self.best = solution
@@ -147,7 +147,7 @@ class Tappa(Search):
         joint = self._joint
         if joint is not None and not joint.ended and self._budget.nodes >= _JOINT_AFTER:
             joint.work(min(self._budget.nodes, _MAX_JOINT_MOVES_PER_NODE))
-            self._offer(joint.solution)
+            self._update_best(joint.solution)
         if self.best_cost <= self.joint_bound:
             return -math.inf
         return self.best_cost if self._improvements.cutoff else math.inf

@@ -25,7 +25,7 @@ from laneweave.coordinator.planning.rolling.problem import StreamCosts, StreamRo
 from laneweave.protocol.lattice import Cell, Mode, displacements
 
 _SAVED = MAX_EJECTED + 32
-"""Paths that are saved during a chain or a reordering."""
+"""Maximum number of paths saved during a chain or a reordering."""
 ROUNDING_M = 1e-6
 
 Ints = NDArray[np.int64]
@@ -42,19 +42,19 @@ class Table(NamedTuple):
     forbidden moves; (slots, displacements, lanes, columns)."""
     vehicle: NDArray[np.int32]
     """The vehicle in a cell at the beginning of a slot, -1: none; (slots, lanes, columns)."""
-    made: NDArray[np.int8]
-    """Its displacement in the slot; same shape."""
+    move: NDArray[np.int8]
+    """Displacement of that vehicle in the slot; same shape."""
     offsets: Ints
     """Column, lane and displacement of a conflicting move, and the factor of its penalty;
     (conflicts, 4)."""
     first: Ints
-    """Where in `offsets` the conflicts of each displacement begin; (displacements + 1)."""
+    """Index in `offsets` of the first conflict of each displacement; (displacements + 1)."""
     steps: Ints
     """Column and lane of each displacement; (displacements, 2)."""
-    opened: Ints
-    """First and last column with moves in a slot; (slots, 2)."""
-    ended: Ints
-    """First column beyond the end of the road; (slots + 1)."""
+    moving_columns: Ints
+    """First and last column in which moves may start in each slot; (slots, 2)."""
+    road_end: Ints
+    """First column beyond the end of the road at the beginning of each slot; (slots + 1)."""
 
 
 class Paths(NamedTuple):
@@ -63,7 +63,7 @@ class Paths(NamedTuple):
     column: Ints
     """At the beginning of each slot; (vehicles, slots + 1)."""
     lane: Ints
-    made: NDArray[np.int8]
+    move: NDArray[np.int8]
     """Displacements; (vehicles, slots)."""
     slots: Ints
     """Number of slots of the path up to the end of the road."""
@@ -96,7 +96,7 @@ class Saved(NamedTuple):
     vehicle: Ints
     slots: Ints
     cost: Floats
-    made: NDArray[np.int8]
+    move: NDArray[np.int8]
     column: Ints
     lane: Ints
 
@@ -140,16 +140,16 @@ def window(
     vehicles: Sequence[StreamVehicle],
     blocked: Collection[Cell],
 ) -> Window:
-    """Return the arrays for vehicles that are on the road, sorted by column; no path is set."""
+    """Return the arrays for vehicles on the road, sorted by column, without paths."""
     start_m, end_m = road.sorting_m
-    # A vehicle moves in at most as many slots as it takes to pass S3.
+    # Upper bound on the moves of a vehicle: the slots that it takes to pass S3.
     reach = max(0, int((end_m - start_m) / road.advance_m) + 1)
     low = vehicles[0].cell[0] - reach
     columns = vehicles[-1].cell[0] + reach - low + 1
     now_m = (np.arange(columns) + low) * road.pitch_m + slot * road.advance_m
     rearmost_m = now_m[reach]
     slots = max(1, int(np.ceil((road.length_m - rearmost_m) / road.advance_m)) + 1)
-    # A vehicle that falls back needs longer.
+    # More slots for vehicles that fall back.
     slots += int(np.ceil(reach * road.pitch_m / road.advance_m))
     at_m = now_m + np.arange(slots + 1)[:, None] * road.advance_m
     table = _table(road, at_m, low, blocked)
@@ -166,17 +166,19 @@ def _table(road: StreamRoad, at_m: Floats, low: int, blocked: Collection[Cell]) 
     """Return an empty table; `at_m`: positions of columns at the beginning of slots."""
     slots, columns = at_m.shape[0] - 1, at_m.shape[1]
     offsets, first = _offsets(road.mode, road.model)
-    barred = np.zeros((road.lanes, columns), dtype=np.bool_)
+    is_blocked = np.zeros((road.lanes, columns), dtype=np.bool_)
     for column, lane in blocked:
         if 0 <= column - low < columns and 0 <= lane < road.lanes:
-            barred[lane, column - low] = True
+            is_blocked[lane, column - low] = True
     steps = displacements(road.mode)
     load = np.zeros((slots, len(steps), road.lanes, columns), dtype=np.float32)
-    may_move = _may_move(road, at_m, barred)
+    may_move = _may_move(road, at_m, is_blocked)
     load[:, 1:][~may_move] = FIXED * ENTERING
     may_leave: NDArray[np.bool_] = np.asarray(may_move.any(axis=(1, 2)), dtype=np.bool_)
-    opened = np.stack([may_leave.argmax(axis=1), columns - 1 - may_leave[:, ::-1].argmax(axis=1)])
-    opened[:, ~may_leave.any(axis=1)] = [[columns], [-1]]
+    moving_columns = np.stack(
+        [may_leave.argmax(axis=1), columns - 1 - may_leave[:, ::-1].argmax(axis=1)]
+    )
+    moving_columns[:, ~may_leave.any(axis=1)] = [[columns], [-1]]
     return Table(
         load,
         np.full((slots, road.lanes, columns), -1, dtype=np.int32),
@@ -184,12 +186,12 @@ def _table(road: StreamRoad, at_m: Floats, low: int, blocked: Collection[Cell]) 
         offsets,
         first,
         np.array(steps, dtype=np.int64),
-        np.ascontiguousarray(opened.T),
+        np.ascontiguousarray(moving_columns.T),
         (at_m <= road.length_m + ROUNDING_M).sum(axis=1),
     )
 
 
-def _may_move(road: StreamRoad, at_m: Floats, barred: Bools) -> Bools:
+def _may_move(road: StreamRoad, at_m: Floats, is_blocked: Bools) -> Bools:
     """Return which moves stay on the road and in S3, and enter no blocked cell.
 
     The corners of an oblique move count as entered, except the vehicle's own cell. Shape:
@@ -198,7 +200,7 @@ def _may_move(road: StreamRoad, at_m: Floats, barred: Bools) -> Bools:
     start_m, end_m = road.sorting_m
     rear = at_m[:-1] - road.body_m >= start_m - ROUNDING_M
     front = at_m[1:] <= end_m + ROUNDING_M
-    lanes, columns = barred.shape
+    lanes, columns = is_blocked.shape
     steps = displacements(road.mode)[1:]
     allowed = np.zeros((len(rear), len(steps), lanes, columns), dtype=np.bool_)
     for d, (column, lane) in enumerate(steps):
@@ -207,9 +209,9 @@ def _may_move(road: StreamRoad, at_m: Floats, barred: Bools) -> Bools:
         here_l = slice(max(0, -lane), lanes - max(0, lane))
         there_l = slice(max(0, lane), lanes + min(0, lane))
         inside = (rear & front)[:, here_c] & (rear & front)[:, there_c]
-        free = ~barred[there_l, there_c]
+        free = ~is_blocked[there_l, there_c]
         if column and lane:
-            free &= ~barred[here_l, there_c] & ~barred[there_l, here_c]
+            free &= ~is_blocked[here_l, there_c] & ~is_blocked[there_l, here_c]
         allowed[:, d, here_l, here_c] = inside[:, None, :] & free
     return allowed
 
@@ -221,8 +223,8 @@ def _paths(costs: StreamCosts, table: Table, low: int, vehicles: Sequence[Stream
     lane[:, 0] = [vehicle.cell[1] for vehicle in vehicles]
     target_lane = np.array([vehicle.lane for vehicle in vehicles], dtype=np.int64)
     held = np.array([vehicle.held for vehicle in vehicles], dtype=np.bool_)
-    # Slots in which it may change lanes, without other vehicles.
-    begin, end = table.opened.T[:, :, None]
+    # Number of slots in which each vehicle may change lanes, ignoring others.
+    begin, end = table.moving_columns.T[:, :, None]
     may_move = (begin <= column[:, 0]) & (column[:, 0] <= end)
     chances = may_move.sum(axis=0)
     # Lower bounds on the slots off the lane and on the moves.
@@ -272,7 +274,7 @@ def _scratch(count: int, slots: int, reach: int, lanes: int) -> Scratch:
 
 @lru_cache(maxsize=16)
 def _offsets(mode: Mode, model: ConflictModel) -> tuple[Ints, Ints]:
-    """Return the conflicts of all displacements in one array, and where those of each begin."""
+    """Return the conflicts of all displacements in one array, and the first index of each."""
     table = conflict_offsets(mode, model)
     flat = [
         (*entry, 1 if (d, *entry) == (0, 0, 0, 0) else ENTERING)

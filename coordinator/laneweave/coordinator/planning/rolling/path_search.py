@@ -1,15 +1,15 @@
 """Planning of a whole stream: a complete path for every vehicle, replanned each slot.
 
 The problem is that of the paper's Section 3, without formations: every vehicle on the road gets a
-path from its cell to the end of the road, in one window of the lattice that moves with it. At any
-moment the paths are without conflicts, so the plan can be executed as it is; a vehicle that cannot
-reach its lane stays in the stream and is tried again in the next slot.
+path from its cell to the end of the road, in one window of the lattice that moves with it. The
+paths never conflict, so that each plan can be executed. A vehicle whose path misses its lane is
+planned again in the next slot.
 
-A path is found by exact dynamic programming over (slot, column, lane) against all others. Where a
-vehicle then misses its lane, *ejection chains* make room: the vehicle takes its path through others
-at a penalty, those that it hits are rerouted in turn, and the chain is kept if the sum of costs has
-fallen. In between, neighbours are removed and rerouted in another order (large-neighbourhood
-search). Paths are carried over from slot to slot.
+A path is found by exact dynamic programming over (slot, column, lane) around all others. If a
+vehicle then misses its lane, *ejection chains* make room: the vehicle takes a path through others
+at a penalty, the vehicles that it hits are rerouted in turn, and the chain is kept if the sum of
+costs decreases. In between, neighbours are removed and rerouted in another order
+(large-neighbourhood search). Paths are carried over from slot to slot.
 
 Conflicts are those of the `ConflictModel`, as for the other planners.
 """
@@ -37,9 +37,9 @@ from laneweave.protocol.lattice import Cell
 
 @cache
 def warm_up() -> None:
-    """Load the compiled code; where there is none yet, compile it, which takes half a minute."""
+    """Load the compiled code; compile it if it is not cached (half a minute)."""
     road = StreamRoad(2, 15.0, 60.0, (0.0, 600.0), 600.0, 5.0)
-    # Two who change places.
+    # Two vehicles that swap lanes.
     vehicles = [StreamVehicle("a", (5, 0), 1), StreamVehicle("b", (5, 1), 0)]
     StreamPlanner(road).plan(0, vehicles)
 
@@ -63,13 +63,13 @@ class StreamPlanner:
         """Return paths for all vehicles from the beginning of a slot on.
 
         Args:
-            slot: number of the slot; the lattice begins at 0 with slot 0.
+            slot: number of the slot; in slot 0, column 0 is at the start of the road.
             vehicles: all vehicles on the road, each in a different cell.
-            before: an earlier plan; its paths are starting points where they are still valid.
+            before: an earlier plan; vehicles start from its paths that are still valid.
             blocked: cells that must not be entered; a vehicle in one may leave it.
 
         Raises:
-            ValueError: two vehicles are in one cell, or one is beside the road.
+            ValueError: two vehicles are in one cell, or one is off the lanes.
         """
         began_s = time.monotonic()
         _check(self.road, vehicles)
@@ -80,10 +80,12 @@ class StreamPlanner:
         rounds = 0
         if order:
             arrays = window(self.road, self.costs, slot, order, blocked)
-            kept = _kept(slot, order, before, arrays.low)
-            # Mixed, so that the sequences of neighbouring slots are independent.
+            earlier = _earlier_paths(slot, order, before, arrays.low)
+            # Hashed, so that the sequences of neighbouring slots are independent.
             rng = np.random.SeedSequence((self._seed, slot & 0xFFFFFFFF)).generate_state(1, "u8")
-            kernel.set_paths(arrays.table, arrays.paths, arrays.costs, *kept, rng, arrays.scratch)
+            kernel.set_paths(
+                arrays.table, arrays.paths, arrays.costs, *earlier, rng, arrays.scratch
+            )
             if len(order) > 1:
                 rounds = kernel.improve(
                     arrays.table,
@@ -109,10 +111,10 @@ def _check(road: StreamRoad, vehicles: Sequence[StreamVehicle]) -> None:
             raise ValueError(f"{taken[one.cell]} and {one.vehicle} are both in {one.cell}")
 
 
-def _kept(
+def _earlier_paths(
     slot: int, vehicles: Sequence[StreamVehicle], before: StreamPlan | None, low: int
 ) -> tuple[Ints, Ints]:
-    """Return the cells of all earlier paths from this slot on, and where those of each begin."""
+    """Return the cells of all earlier paths from this slot on, and the first index of each."""
     paths: Mapping[str, CellPath] = {}
     age = 0
     if before is not None and before.slot <= slot:

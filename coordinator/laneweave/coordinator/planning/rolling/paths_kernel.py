@@ -1,6 +1,6 @@
 """Compiled code of the rolling planner: paths of single vehicles.
 
-The style is that of `exact.relaxation_kernel`. The table of a window holds, for each slot, cell and
+The style is that of `exact.lagrangian_kernel`. The table of a window holds, for each slot, cell and
 displacement, the sum of the penalties of all vehicles whose own moves conflict (`load`). Adding a
 vehicle to the table or removing it changes a few entries; the search for a path only reads them.
 """
@@ -13,12 +13,12 @@ from numba import njit
 FIXED = 100_000
 """Penalty of a vehicle that cannot be moved."""
 PENALTY = 8
-"""Initial penalty of a vehicle; penalties grow by parts of it."""
+"""Initial penalty of a conflict with a vehicle."""
 ENTERING = 8
-"""Factor of the penalty for moves that conflict with a vehicle; the factor is 1 for staying in its
-cell as long as it does, so a vehicle that takes its place does not pay again in each slot."""
+"""Factor of the penalty of a conflicting move. It is 1 for waiting in the cell in which the other
+vehicle waits, so that taking its place is not penalized again in each slot."""
 MAX_EJECTED = 100
-"""Vehicles hit by one ejection chain."""
+"""Maximum number of vehicles hit by one ejection chain."""
 _IMPASSABLE = 5e3
 """Higher than the cost of any path; lower than a conflict with a `FIXED` vehicle in the chain of a
 vehicle that misses its lane. The paths of other vehicles cost at most a hundredth of it."""
@@ -30,15 +30,15 @@ NO_PATH = 1e9
 @njit(cache=True, nogil=True)
 def put(table, paths, v, sign):
     """Add a vehicle's path to the table (sign 1), or remove it (sign -1)."""
-    load, vehicle, made = table.load, table.vehicle, table.made
+    load, vehicle, move = table.load, table.vehicle, table.move
     offsets, first = table.offsets, table.first
     _, _, lanes, columns = load.shape
     amount = sign * paths.penalty[v]
     for s in range(paths.slots[v]):
-        column, lane, d = paths.column[v, s], paths.lane[v, s], paths.made[v, s]
+        column, lane, d = paths.column[v, s], paths.lane[v, s], paths.move[v, s]
         if sign > 0:
             vehicle[s, lane, column] = v
-            made[s, lane, column] = d
+            move[s, lane, column] = d
         else:
             vehicle[s, lane, column] = -1
         for k in range(first[d], first[d + 1]):
@@ -75,7 +75,7 @@ def find_path(table, paths, costs, v, softness, upper_bound, scratch):
     value[0, paths.lane[v, 0], low] = 0.0
     best, best_s, best_offset, best_lane = min(upper_bound, _IMPASSABLE), -1, 0, 0
     for s in range(slots + 1):
-        end = table.ended[s] - shift if s < slots else low
+        end = table.road_end[s] - shift if s < slots else low
         for lane in range(lanes):
             for offset in range(max(low, end), high + 1):
                 total = value[s, lane, offset] + (
@@ -86,7 +86,9 @@ def find_path(table, paths, costs, v, softness, upper_bound, scratch):
         high = min(high, end - 1)
         if high < low:
             break
-        moves = low + shift <= table.opened[s, 1] and high + shift >= table.opened[s, 0]
+        moves = (
+            low + shift <= table.moving_columns[s, 1] and high + shift >= table.moving_columns[s, 0]
+        )
         for lane in range(lanes):
             here = value[s, lane, low : high + 1]
             for d in range(fan if moves else 1):
@@ -115,12 +117,12 @@ def _trace(table, paths, costs, v, scale, slots, lane, offset, scratch):
     paths.slots[v] = slots
     for s in range(slots - 1, -1, -1):
         paths.column[v, s + 1], paths.lane[v, s + 1] = offset + shift, lane
-        best, made = np.float32(np.inf), 0
+        best, move = np.float32(np.inf), 0
         for d in range(fan):
             before, from_lane = offset - steps[d, 0], lane - steps[d, 1]
             if not (0 <= from_lane < lanes and 1 <= before < value.shape[2] - 1):
                 continue
-            if before + shift >= table.ended[s]:
+            if before + shift >= table.road_end[s]:
                 continue
             total = value[s, from_lane, before] + costs.of_move[d]
             if d > 0:
@@ -129,9 +131,9 @@ def _trace(table, paths, costs, v, scale, slots, lane, offset, scratch):
             if from_lane != paths.target_lane[v]:
                 total += costs.off_lane
             if total < best:
-                best, made = total, d
-        paths.made[v, s] = made
-        offset, lane = offset - steps[made, 0], lane - steps[made, 1]
+                best, move = total, d
+        paths.move[v, s] = move
+        offset, lane = offset - steps[move, 0], lane - steps[move, 1]
 
 
 @njit(cache=True, nogil=True)
@@ -139,7 +141,7 @@ def own_cost(paths, costs, v):
     """Return the cost of a vehicle's path without penalties."""
     total, slots = 0.0, paths.slots[v]
     for s in range(slots):
-        total += costs.of_move[paths.made[v, s]]
+        total += costs.of_move[paths.move[v, s]]
         if paths.lane[v, s] != paths.target_lane[v]:
             total += costs.off_lane
     if paths.lane[v, slots] != paths.target_lane[v]:
@@ -151,24 +153,24 @@ def own_cost(paths, costs, v):
 def follow(table, paths, costs, v, cells):
     """Set an earlier path if it is still valid and without conflicts; return whether it was set.
 
-    `cells`: columns and lanes at the beginning of each slot. It must reach the road's end.
+    `cells`: columns and lanes at the beginning of each slot, up to the end of the road.
     """
     slots, fan = table.load.shape[:2]
     if len(cells) == 0 or cells[0, 0] != paths.column[v, 0] or cells[0, 1] != paths.lane[v, 0]:
         return False
     s = 0
-    while s < slots and paths.column[v, s] < table.ended[s]:
+    while s < slots and paths.column[v, s] < table.road_end[s]:
         if s + 1 >= len(cells):
             return False
         column, lane = paths.column[v, s], paths.lane[v, s]
-        made = -1
+        move = -1
         for d in range(fan):
             step = table.steps[d]
             if cells[s + 1, 0] == column + step[0] and cells[s + 1, 1] == lane + step[1]:
-                made = d
-        if made < 0 or table.load[s, made, lane, column] > 0.0:
+                move = d
+        if move < 0 or table.load[s, move, lane, column] > 0.0:
             return False
-        paths.made[v, s] = made
+        paths.move[v, s] = move
         paths.column[v, s + 1], paths.lane[v, s + 1] = cells[s + 1, 0], cells[s + 1, 1]
         s += 1
     paths.slots[v] = s
@@ -180,9 +182,9 @@ def follow(table, paths, costs, v, cells):
 def stay(table, paths, costs, v):
     """Set the path of a vehicle that stays in its cell."""
     s = 0
-    while s < len(table.load) and paths.column[v, s] < table.ended[s]:
+    while s < len(table.load) and paths.column[v, s] < table.road_end[s]:
         paths.column[v, s + 1], paths.lane[v, s + 1] = paths.column[v, s], paths.lane[v, s]
-        paths.made[v, s] = 0
+        paths.move[v, s] = 0
         s += 1
     paths.slots[v] = s
     paths.cost[v] = own_cost(paths, costs, v)
@@ -191,19 +193,19 @@ def stay(table, paths, costs, v):
 @njit(cache=True, nogil=True)
 def find_hit(table, paths, v, hit):
     """List the vehicles in conflict with a path that is not in the table; return how many."""
-    load, vehicle, made = table.load, table.vehicle, table.made
+    load, vehicle, move = table.load, table.vehicle, table.move
     offsets, first = table.offsets, table.first
     _, _, lanes, columns = load.shape
     count = 0
     for s in range(paths.slots[v]):
-        column, lane, d = paths.column[v, s], paths.lane[v, s], paths.made[v, s]
+        column, lane, d = paths.column[v, s], paths.lane[v, s], paths.move[v, s]
         if load[s, d, lane, column] == 0:
             continue
         for k in range(first[d], first[d + 1]):
             c, n = column + offsets[k, 0], lane + offsets[k, 1]
             if 0 <= c < columns and 0 <= n < lanes:
                 u = vehicle[s, n, c]
-                if u >= 0 and made[s, n, c] == offsets[k, 2]:
+                if u >= 0 and move[s, n, c] == offsets[k, 2]:
                     known = False
                     for i in range(count):
                         known |= hit[i] == u
@@ -221,7 +223,7 @@ def save(paths, saved, count, v):
     saved.cost[count] = paths.cost[v]
     saved.column[count] = paths.column[v]
     saved.lane[count] = paths.lane[v]
-    saved.made[count] = paths.made[v]
+    saved.move[count] = paths.move[v]
 
 
 @njit(cache=True, nogil=True)
@@ -236,5 +238,5 @@ def restore(table, paths, saved, begin, count):
         paths.cost[v] = saved.cost[i]
         paths.column[v] = saved.column[i]
         paths.lane[v] = saved.lane[i]
-        paths.made[v] = saved.made[i]
+        paths.move[v] = saved.move[i]
         put(table, paths, v, 1)

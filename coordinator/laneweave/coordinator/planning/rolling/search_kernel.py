@@ -1,6 +1,6 @@
 """Compiled code of the rolling planner: the search over the paths of all vehicles.
 
-Ejection chains and reorderings improve a plan; see `planner`.
+Ejection chains and reorderings improve a plan; see `path_search`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _MIN_SOFTNESS, _SOFTNESS_RANGE = 15.0, 25.0
 """Cost of a conflict in a chain: minimum, and range of a random addition."""
 _MAX_DELAY_COST = 0.9
 _TRIES = 4
-"""Ejection chains for a vehicle without a path."""
+"""Maximum number of ejection chains for a vehicle without a path."""
 _FIRST_SLACK, _COOLED_AFTER = 16.0, 0.67
 """Initial increase allowed for the sum of costs, and the share of the work after which it is 0."""
 _REORDER_EVERY = 8
@@ -41,10 +41,10 @@ _ROUNDING = 1e-4
 
 @njit(cache=True, nogil=True)
 def set_paths(table, paths, costs, kept, first, rng, scratch):
-    """Add every vehicle to the table, on its earlier path where that is still valid.
+    """Add every vehicle to the table, on its earlier path if that is still valid.
 
     kept: columns and lanes of the earlier paths, one vehicle after the other; (cells, 2).
-    first: where those of each vehicle begin.
+    first: index in `kept` of the first cell of each vehicle.
     """
     count = len(paths.cost)
     for v in range(count):
@@ -72,9 +72,9 @@ def set_paths(table, paths, costs, kept, first, rng, scratch):
 
 @njit(cache=True, nogil=True)
 def _hold(table, paths, costs, start, scratch):
-    """Let a vehicle without a path stay in its cell, and every vehicle in conflict with that, too.
+    """Make a vehicle without a path, and every vehicle in conflict with that, stay in its cell.
 
-    This always ends without conflicts: vehicles that all stay never meet.
+    No conflicts remain, since vehicles that stay never conflict.
     """
     queue, hit = scratch.queue, scratch.hit
     queue[0] = start
@@ -96,7 +96,7 @@ def _eject(table, paths, costs, start, softness, slack, rng, scratch):
 
     Vehicles that are hit are rerouted in turn, and may hit others (ejection chains: Glover 1996).
     Each hit raises the penalty of the vehicle. The chain is undone, and the decrease is 0, if it
-    hits more than `MAX_EJECTED` or the sum of costs grows by `slack` or more.
+    hits costly_count than `MAX_EJECTED` or the sum of costs grows by `slack` or costly_count.
     """
     saved, queue, hit, marked = scratch.saved, scratch.queue, scratch.hit, scratch.marked
     was_placed = paths.placed[start]
@@ -136,13 +136,13 @@ def _eject(table, paths, costs, start, softness, slack, rng, scratch):
     for k in range(kept):
         after += paths.cost[saved.vehicle[k]]
     better = hits <= MAX_EJECTED and after < before + slack
-    _settle(table, paths, kept, better, was_placed, scratch)
+    _finish_chain(table, paths, kept, better, was_placed, scratch)
     return before - after if better else 0.0
 
 
 @njit(cache=True, nogil=True)
 def _draw_delays(delay, rng):
-    """Draw an extra cost of moves in each slot, for the next path.
+    """Draw a random extra cost of moves in each slot.
 
     Without it two vehicles that must swap would compete for the same slot forever.
     """
@@ -151,7 +151,7 @@ def _draw_delays(delay, rng):
 
 
 @njit(cache=True, nogil=True)
-def _settle(table, paths, kept, better, was_placed, scratch):
+def _finish_chain(table, paths, kept, better, was_placed, scratch):
     """End a chain that has changed `kept` paths: reset the penalties, or undo the chain."""
     saved = scratch.saved
     for k in range(kept):
@@ -170,12 +170,12 @@ def _settle(table, paths, kept, better, was_placed, scratch):
 
 
 @njit(cache=True, nogil=True)
-def _take_out(table, paths, seed, size, share, rng, scratch):
+def _remove_neighbours(table, paths, seed, size, share, rng, scratch):
     """Remove a vehicle and some neighbours from the table, in random order; return how many."""
     saved, chosen = scratch.saved, scratch.chosen
     count = len(paths.cost)
     near = 0
-    # Those nearest by column: vehicles are in the order of their columns.
+    # Vehicles are sorted by column, so those with neighbouring indices are the nearest.
     low = high = seed
     while near < size:
         pick_low = low - 1 >= 0 and (high + 1 >= count or random_below(rng, 2) == 0)
@@ -206,7 +206,7 @@ def _reorder(table, paths, costs, seed, size, slack, rng, scratch):
     (Large neighbourhood search: Shaw 1998.)
     """
     saved, chosen = scratch.saved, scratch.chosen
-    near = _take_out(table, paths, seed, size, 67, rng, scratch)
+    near = _remove_neighbours(table, paths, seed, size, 67, rng, scratch)
     before = min_cost = 0.0
     for i in range(near):
         before += saved.cost[i]
@@ -228,16 +228,16 @@ def _reorder(table, paths, costs, seed, size, slack, rng, scratch):
 @njit(cache=True, nogil=True)
 def _list_costly(paths, off_lane, costly):
     """List the vehicles that miss a reachable lane, and those without the cheapest path."""
-    missed = more = 0
+    missing_count = costly_count = 0
     for v in range(len(paths.cost)):
         if paths.can_arrive[v]:
             if paths.cost[v] >= paths.missing_cost[v]:
-                off_lane[missed] = v
-                missed += 1
+                off_lane[missing_count] = v
+                missing_count += 1
             elif paths.cost[v] > paths.min_cost[v] + _ROUNDING:
-                costly[more] = v
-                more += 1
-    return missed, more
+                costly[costly_count] = v
+                costly_count += 1
+    return missing_count, costly_count
 
 
 @njit(cache=True, nogil=True)
@@ -245,31 +245,35 @@ def improve(table, paths, costs, rounds, max_paths, rng, scratch):
     """Improve all paths for some rounds; return the number of rounds.
 
     While vehicles miss their lanes, ejection chains and reorderings alternate; the slack decreases
-    from several moves to none. Afterwards a few more rounds look for cheaper paths.
+    from several moves to none. Afterwards a few costly_count rounds look for cheaper paths.
     """
     off_lane, costly = scratch.off_lane, scratch.costly
     turn = idle = 0
     scratch.searches[0] = 0
     while turn < rounds and scratch.searches[0] < max_paths and idle < _IDLE_ROUNDS:
-        missed, more = _list_costly(paths, off_lane, costly)
-        if missed == 0 and more == 0:
+        missing_count, costly_count = _list_costly(paths, off_lane, costly)
+        if missing_count == 0 and costly_count == 0:
             break
         slack = -_ROUNDING
-        if missed > 0:
+        if missing_count > 0:
             done = max(turn / rounds, scratch.searches[0] / max_paths)
             slack = max(slack, _FIRST_SLACK * (1.0 - done / _COOLED_AFTER))
         else:
             idle += 1
-        if missed > 0 and turn % _REORDER_EVERY > 0:
-            v = off_lane[random_below(rng, missed)]
+        if missing_count > 0 and turn % _REORDER_EVERY > 0:
+            v = off_lane[random_below(rng, missing_count)]
             softness = _MIN_SOFTNESS + _SOFTNESS_RANGE * random_below(rng, 1000) / 1000.0
             _eject(table, paths, costs, v, softness, slack, rng, scratch)
-        elif missed == 0 and turn % 2 > 0:
-            v = costly[random_below(rng, more)]
+        elif missing_count == 0 and turn % 2 > 0:
+            v = costly[random_below(rng, costly_count)]
             softness = _IDLE_SOFTNESS * random_below(rng, 1000) / 1000.0 + 0.2
             _eject(table, paths, costs, v, softness, slack, rng, scratch)
         else:
-            v = costly[random_below(rng, more)] if more > 0 else off_lane[random_below(rng, missed)]
+            v = (
+                costly[random_below(rng, costly_count)]
+                if costly_count > 0
+                else off_lane[random_below(rng, missing_count)]
+            )
             size = min(2 + random_below(rng, _MAX_REORDERED - 1), len(paths.cost) - 1)
             _reorder(table, paths, costs, v, size, slack, rng, scratch)
         turn += 1

@@ -211,7 +211,7 @@ def test_arrays_for_too_many_targets_are_not_made() -> None:
     problem = Problem(request.grid, 1, request.conflict_model, [v.cell for v in vehicles], targets)
     search = Branching(problem, request.choices(), Budget())
     search.run()
-    assert search.gave_up
+    assert search.aborted
 
 
 def test_wide_roads_and_long_paths_are_planned() -> None:

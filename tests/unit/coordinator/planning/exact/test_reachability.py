@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
-from laneweave.coordinator.planning.exact.reachability import Verdict, explore
+from laneweave.coordinator.planning.exact.reachability import Reachability, explore
 from laneweave.coordinator.planning.geometry.swept_bodies import BodyGeometry
 from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.coordinator.planning.plan_validator import problems_of_paths, problems_of_response
@@ -14,7 +14,7 @@ from laneweave.coordinator.planning.solve import plan
 from support.planning_oracles import cheapest_plan, requests
 
 
-def _explore(request: PlanRequest, max_moves: int = 10**6) -> tuple[Problem, Verdict]:
+def _explore(request: PlanRequest, max_moves: int = 10**6) -> tuple[Problem, Reachability]:
     cells = [vehicle.cell for vehicle in request.vehicles]
     model = request.conflict_model
     problem = Problem(request.grid, request.mode, model, cells, request.targets)
@@ -26,7 +26,7 @@ def _explore(request: PlanRequest, max_moves: int = 10**6) -> tuple[Problem, Ver
 def test_verdict_agrees_with_the_joint_search(request: PlanRequest) -> None:
     problem, verdict = _explore(request)
     solvable = cheapest_plan(request) is not None
-    assert verdict.impossible != solvable
+    assert verdict.infeasible != solvable
     assert (verdict.solution is not None) == solvable
     if verdict.solution is not None:
         cells = problem.cells_of(verdict.solution)
@@ -49,7 +49,7 @@ PUZZLE = PlanRequest(
 
 def test_a_truncated_search_has_no_result() -> None:
     _, verdict = _explore(PUZZLE, max_moves=500)
-    assert verdict == Verdict(solution=None, impossible=False)
+    assert verdict == Reachability(solution=None, infeasible=False)
 
 
 def test_time_is_checked() -> None:

@@ -1,4 +1,4 @@
-"""The children of a node lose no solution; those of `splits` have each of them only once."""
+"""Children of a node keep all solutions; disjoint children have each solution once."""
 
 import itertools
 from collections.abc import Iterator
@@ -12,10 +12,10 @@ from laneweave.coordinator.planning.paper.constraints import (
     Conflict,
     Constraint,
     bans_for,
+    cardinality,
     constraints_of,
     disjoint_constraints,
     is_at_node,
-    rises,
 )
 from laneweave.coordinator.planning.problem import Bans, Diagram, Grid, MoveTable, Path, bits
 from laneweave.coordinator.planning.shortest_paths import choose_path, shortest_paths
@@ -166,7 +166,7 @@ def test_children_cost_more_as_predicted(case: Case) -> None:
     costs = [_cost_of_child(table, diagrams, (c,)) for c in children]
     before = diagrams[0].cost + diagrams[1].cost
     rising = sum(cost is None or cost > before for cost in costs)
-    assert rising >= rises(table, conflict, moves, diagrams)
+    assert rising >= cardinality(table, conflict, moves, diagrams)
 
 
 @pytest.mark.parametrize("vehicle", [0, 1])
@@ -175,9 +175,9 @@ def test_a_constraint_spares_a_diagram_that_it_does_not_touch(vehicle: int) -> N
     diagram = shortest_paths(table, table.bit((0, 0)), table.bit((1, 0)), Bans())
     assert diagram is not None
     middle, right = 1 << table.bit((1, 0)), 1 << table.bit((2, 0))
-    assert Constraint(vehicle, 2, right, right).spares(0, diagram)
-    assert not Constraint(vehicle, 2, middle, middle).spares(0, diagram)
+    assert Constraint(vehicle, 2, right, right).is_satisfied_by(0, diagram)
+    assert not Constraint(vehicle, 2, middle, middle).is_satisfied_by(0, diagram)
     arrived = Constraint(vehicle, 0, others=middle, arrived=True)
-    assert not arrived.spares(0, diagram)
+    assert not arrived.is_satisfied_by(0, diagram)
     late = Constraint(vehicle, 1, others=right, arrived=True)
-    assert late.spares(0, diagram)
+    assert late.is_satisfied_by(0, diagram)

@@ -49,7 +49,7 @@ def only_problem(
         (to_the_end((50, 0), (50, -1), (50, 0)), "leaves the road"),
         (to_the_end((50, 0))[:-1], "on the road"),
         (((50, 0),), "on the road"),
-        ((*to_the_end((50, 0)), (50, 0)), "after the road"),
+        ((*to_the_end((50, 0)), (50, 0)), "beyond the road"),
         (to_the_end((50, 0), (50, 0), (50, 0), (50, 0), (51, 0)), "moves between"),
     ],
 )
@@ -81,7 +81,7 @@ def test_vehicles_that_miss_their_lanes_are_listed() -> None:
     vehicle = Vehicle("v", (50, 0), 1)
     way = to_the_end((50, 0))
     assert problems_of_plan(ROAD, StreamPlan(0, {"v": way}, ("v",)), [vehicle]) == []
-    assert "miss their lanes" in only_problem([vehicle], {"v": way})
+    assert "off their lanes" in only_problem([vehicle], {"v": way})
     assert "starts at" in problems_of_plan(ROAD, StreamPlan(0, {"v": ()}, ()), [vehicle])[0]
     assert "for vehicles" in only_problem([vehicle, Vehicle("w", (51, 0), 0)], {"v": way})
 
