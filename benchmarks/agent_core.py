@@ -152,7 +152,7 @@ class Meadow:
         """Take a vehicle away."""
         del self.at[vehicle]
 
-    def on_shown(self, t_s: float, vehicles: object, **measured: object) -> None:
+    def on_positions(self, t_s: float, vehicles: object, **measured: object) -> None:
         """Keep nothing."""
 
 
@@ -257,7 +257,7 @@ class Road:
             self.answers.append((key, payload))
             message = decode(payload)
             if isinstance(message, Command):
-                if not stand.vehicle.controller.take(message):
+                if not stand.vehicle.controller.accept_command(message):
                     raise RuntimeError(f"a command was refused at tick {self.tick}")
             else:
                 yield key, payload
@@ -281,7 +281,7 @@ class Road:
                 for _, payload in stand.take():
                     answer = decode(payload)
                     if isinstance(answer, Command):
-                        stand.vehicle.controller.note(answer)
+                        stand.vehicle.controller.store_requests(answer)
         # The controllers' confirmations come with the next tick.
 
     def _plan(self, block: int) -> Plan:

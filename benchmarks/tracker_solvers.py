@@ -38,7 +38,7 @@ from laneweave.launch.bench.tracker import SITUATIONS, drive
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
-from laneweave.sim_bridge.recording.trips import spread
+from laneweave.sim_bridge.recording.trips import percentiles_of
 
 Array = NDArray[np.float64]
 
@@ -462,14 +462,14 @@ def _summary(measured: _Measured, recording: Recording, family: str) -> dict[str
     counted = iterations[iterations != np.array(None)].astype(float)
     return {
         "problems": len(members),
-        "prepare_ms": spread(prepare_ms, 50),
+        "prepare_ms": percentiles_of(prepare_ms, 50),
         "cpu_ms": {
             "mean": round(float(cpu_ms.mean()), 3) if len(cpu_ms) else None,
-            **spread(cpu_ms, 50, 99, largest=True),
+            **percentiles_of(cpu_ms, 50, 99, largest=True),
         },
         "solved_share": round(float(of(measured.solved).mean()), 4) if members else None,
-        "first_jerk_difference_mps3": spread(differences, 50, 99, largest=True),
-        "iterations": spread(counted, 50, 99, largest=True),
+        "first_jerk_difference_mps3": percentiles_of(differences, 50, 99, largest=True),
+        "iterations": percentiles_of(counted, 50, 99, largest=True),
     }
 
 

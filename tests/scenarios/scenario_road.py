@@ -177,7 +177,11 @@ class Agent:
         # What is to be noted goes to the controller at once, and back: within one vehicle.
         if not noted:
             return
-        if asked is not None and asked is not before and self.vehicle.road.controller.note(asked):
+        if (
+            asked is not None
+            and asked is not before
+            and self.vehicle.road.controller.store_requests(asked)
+        ):
             sense = self.vehicle.sense(self.tick)
             self._note(self._core.handle(self._arrived(SENSE, sense), 0.0))
 

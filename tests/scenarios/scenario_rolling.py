@@ -153,8 +153,8 @@ class RollingRunner(Runner):
     def _late_command(self, name: str) -> Lines:
         controller = self._agent_named(name).vehicle.road.controller
         command = self._late.pop(name)
-        noted = controller.note(command)
-        controller.take(command)
+        noted = controller.store_requests(command)
+        controller.accept_command(command)
         yield "something is noted" if noted else "nothing is noted"
 
     def _agent_named(self, name: str) -> Agent:

@@ -340,7 +340,7 @@ class Runner:
             raise ScenarioError(f"{name} has commanded nothing")
         controller = process.vehicle.road.controller
         before = controller.attendant
-        if not controller.take(process.command):
+        if not controller.accept_command(process.command):
             yield f"{name} is refused"
         elif controller.attendant != before:
             yield f"{name} takes charge"

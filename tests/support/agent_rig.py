@@ -23,7 +23,7 @@ from laneweave.protocol.wire.messages import (
     VehicleState,
 )
 from laneweave.protocol.wire.topics import PLAN, PREPARE, SENSE, Topic
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import Around
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Neighbours
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from support.paper import PAPER
 from support.road_vehicles import vehicle_in
@@ -67,7 +67,7 @@ class Rig:
         return next(self._incarnations)
 
     def sense(self, *, left: bool = False) -> Sense:
-        self.controller.perceive(self.state, Around(self.ahead, ()))
+        self.controller.perceive(self.state, Neighbours(self.ahead, ()))
         self._sensed = self.vehicle.sense(self.tick, caretaker=False, left=left)
         return self._sensed
 
@@ -83,7 +83,7 @@ class Rig:
         """Let one tick pass: sense, answer, drive; return what the agent sent."""
         effects = self.hand(SENSE, self.sense())
         (self.played,) = sent(effects, Command)
-        assert self.controller.take(self.played)
+        assert self.controller.accept_command(self.played)
         self.coast(1)
         return effects
 
@@ -103,7 +103,7 @@ class Rig:
     def confirm(self, effects: Iterable[Effect]) -> list[Effect]:
         """Note what the agent asks for between two ticks, and confirm it at once."""
         (command,) = sent(effects, Command)
-        self.controller.note(command)
+        self.controller.store_requests(command)
         joined, accepted = self.controller.joined, self.controller.accepted
         return self.hand(SENSE, evolve(self._sensed, joined=joined, accepted=accepted))
 

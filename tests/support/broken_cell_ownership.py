@@ -27,16 +27,16 @@ Patch = pytest.MonkeyPatch
 
 
 def obey(patch: Patch) -> None:
-    take = MotionController.take
+    accept_command = MotionController.accept_command
 
     def mutant(self: MotionController, command: Command) -> bool:
         owned = self.owned
         self.owned = tuple(sorted({*owned, command.hold_cell}))
-        taken = take(self, command)
+        taken = accept_command(self, command)
         self.owned = owned
         return taken
 
-    patch.setattr(MotionController, "take", mutant)
+    patch.setattr(MotionController, "accept_command", mutant)
 
 
 def own_at_once(patch: Patch) -> None:

@@ -320,12 +320,14 @@ def join_nothing(patch: pytest.MonkeyPatch) -> None:
 
 
 def play_any_command(patch: pytest.MonkeyPatch) -> None:
-    take = MotionController.take
+    accept_command = MotionController.accept_command
 
     def mutant(self: MotionController, command: Command) -> bool:
-        return take(self, evolve(command, incarnation=max(command.incarnation, self.attendant)))
+        return accept_command(
+            self, evolve(command, incarnation=max(command.incarnation, self.attendant))
+        )
 
-    patch.setattr(MotionController, "take", mutant)
+    patch.setattr(MotionController, "accept_command", mutant)
 
 
 def always_in_charge(patch: pytest.MonkeyPatch) -> None:

@@ -156,7 +156,7 @@ class Road:
             motion_ticks=drive.motion_ticks,
             jerks=drive.jerks,
         )
-        if not one.vehicle.controller.take(command):
+        if not one.vehicle.controller.accept_command(command):
             raise RuntimeError(f"the motion controller refused {command}")
 
     def _publish_motions(self) -> None:

@@ -39,6 +39,6 @@ def closed_blocks(
     builder = formation_builder(scenario)
     assert builder is not None, "the rolling operation has no formations"
     for entry in on_road:
-        builder.takes(entry.cell, entry.preferred_lane, entry.entered_s)
+        builder.try_add(entry.cell, entry.preferred_lane, entry.entered_s)
     formations = tuple(builder.closed(t_s))
     return formations, builder.closed_to

@@ -138,7 +138,7 @@ class Car:
     def obey(self, command: Command) -> None:
         """Take a COMMAND in the controller."""
         controller = self.controller
-        controller.note(command)
+        controller.store_requests(command)
         if command.incarnation != controller.attendant or command.tick <= controller.command_tick:
             return
         controller.command_tick = command.tick

@@ -62,7 +62,7 @@ from laneweave.sim_bridge.world_interface import World, show_bodies
 log = structlog.get_logger(__name__)
 
 BRIDGE = Name("bridge")
-WIND_UP_S = 2.0
+SHUT_DOWN_S = 2.0
 """How long the bridge waits for final reports at the end of a run."""
 
 
@@ -93,7 +93,7 @@ class TickPhase(Enum):
     ANSWERS = "answers"
     PACE = "pace"
     """The time of the next tick."""
-    WIND_UP = "wind-up"
+    SHUTTING_DOWN = "wind-up"
     ENDED = "ended"
 
 
@@ -137,7 +137,7 @@ class BridgeCore:
         self._at_entrance: list[RoadVehicle] = []
         self._unreported: set[str] = {BRIDGE}
         """Processes whose final report is awaited."""
-        self._patience_s = scenario.runtime.agent_start_s
+        self._agent_wait_s = scenario.runtime.agent_start_s
         """How long to wait for the next agent that is not up yet."""
         self._ending = Ending.COMPLETE
         self._tick_began = 0.0
@@ -160,7 +160,7 @@ class BridgeCore:
                 vehicles_entered_total=clock.entered,
                 vehicles_left_total=clock.left,
                 vehicles_on_road=clock.on_road,
-                vehicles_unattended=self._attendance.cared_for,
+                vehicles_unattended=self._attendance.caretaker_count,
             ),
         )
 
@@ -175,7 +175,7 @@ class BridgeCore:
         match self.phase:
             case TickPhase.ANSWERS:
                 return min(self._answers.resend_s, self._answers.deadline_s)
-            case TickPhase.AGENTS | TickPhase.PACE | TickPhase.WIND_UP:
+            case TickPhase.AGENTS | TickPhase.PACE | TickPhase.SHUTTING_DOWN:
                 return self._until_s
             case _:
                 return None
@@ -202,16 +202,16 @@ class BridgeCore:
             case Arrived(_, parameters, message):
                 yield from self._on_message(message, parameters, now_s)
             case PeerUp(topic, parameters) if topic is VEHICLE_ALIVE:
-                self._patience_s = self.scenario.runtime.agent_start_s
+                self._agent_wait_s = self.scenario.runtime.agent_start_s
                 if parameters["vehicle"] in self.vehicles:
                     self._unreported.add(parameters["vehicle"])
             case Wakeup() if self.phase is TickPhase.ANSWERS:
-                for name in self._answers.ask_again(now_s):
+                for name in self._answers.due_resends(now_s):
                     yield self._sense_of(self.vehicles[name])
             case Stopping():
                 # Stopped while it waits for final reports: the run itself has ended.
-                winding_up = self.phase is TickPhase.WIND_UP
-                self._finish(self._ending if winding_up else Ending.INTERRUPTED)
+                shutting_down = self.phase is TickPhase.SHUTTING_DOWN
+                self._finish(self._ending if shutting_down else Ending.INTERRUPTED)
             case _:
                 pass
 
@@ -238,8 +238,8 @@ class BridgeCore:
         if vehicle is None:
             return effects
         attendant = vehicle.controller.attendant
-        cared_for = name in self._attendance
-        if self._attendance.hear(vehicle, command):
+        had_caretaker = name in self._attendance
+        if self._attendance.register_command(vehicle, command):
             effects.append(self._sense_of(vehicle))
         if command.tick != self.tick or self.phase is not TickPhase.ANSWERS:
             # A late answer was computed for a past state: executed now, it would end elsewhere.
@@ -247,13 +247,13 @@ class BridgeCore:
                 self._answers.late(name)
             return effects
         try:
-            effects += self._attendance.take(vehicle, command)
+            effects += self._attendance.accept_command(vehicle, command)
         except BadInputError as error:
             log.warning("command ignored", vehicle=name, reason=str(error))
             return effects
         # Only an accepted command changes the process in charge.
         if attendant not in (0, vehicle.controller.attendant):
-            previous = "caretaker" if cared_for else "agent"
+            previous = "caretaker" if had_caretaker else "agent"
             self._record.on_agent_took_over(self.t_s, name, previous)
         return effects
 
@@ -276,7 +276,9 @@ class BridgeCore:
                 yield from self._begin_tick(now_s)
         if self.phase is TickPhase.ANSWERS and self._answers.complete(now_s):
             yield from self._end_tick(now_s)
-        if self.phase is TickPhase.WIND_UP and (now_s >= self._until_s or not self._unreported):
+        if self.phase is TickPhase.SHUTTING_DOWN and (
+            now_s >= self._until_s or not self._unreported
+        ):
             self._finish(self._ending)
             yield End()
 
@@ -291,19 +293,19 @@ class BridgeCore:
                 RoadVehicle.entering(admission, self.t_s, self.scenario, self._incarnation)
             )
         self.phase = TickPhase.AGENTS
-        self._until_s = now_s + self._patience_s
+        self._until_s = now_s + self._agent_wait_s
 
     def _begin_tick(self, now_s: float) -> Iterator[Effect]:
         self._enter()
         self._close_formations()
         self._roadside.assign_empty_cells(self.vehicles)
         yield from self._roadside.publish(self.tick, self.t_s, self.vehicles.values())
-        yield from self._take_care(now_s)
+        yield from self._start_caretakers(now_s)
         for vehicle in self.vehicles.values():
             yield self._sense_of(vehicle)
         yield from self._attendance.states(self.tick)
         yield from self._attendance.notify_departed(self.tick)
-        self._attendance.ask(self.vehicles, now_s)
+        self._attendance.start_tick(self.vehicles, now_s)
         self.phase = TickPhase.ANSWERS
 
     def _enter(self) -> None:
@@ -314,9 +316,9 @@ class BridgeCore:
             if vehicle.name in self._answers.up:
                 self._unreported.add(vehicle.name)
             else:
-                self._record.note(self.t_s, AGENT_MISSING, vehicle=vehicle.name)
+                self._record.event(self.t_s, AGENT_MISSING, vehicle=vehicle.name)
                 # After a missing agent, do not wait long for the next ones until one appears.
-                self._patience_s = self.scenario.network.resend_s
+                self._agent_wait_s = self.scenario.network.resend_s
         self._at_entrance.clear()
 
     def _close_formations(self) -> None:
@@ -327,10 +329,10 @@ class BridgeCore:
                 vehicle.join(closed)
             self._record.on_closed(closed, [vehicle.name for vehicle in members])
 
-    def _take_care(self, now_s: float) -> Iterator[Effect]:
+    def _start_caretakers(self, now_s: float) -> Iterator[Effect]:
         """Put caretakers in charge of vehicles whose agents are absent, silent or too late."""
-        for name in self._answers.settle(now_s):
-            self._record.note(self.t_s, AGENT_SILENT, vehicle=name)
+        for name in self._answers.finish_tick(now_s):
+            self._record.event(self.t_s, AGENT_SILENT, vehicle=name)
         for vehicle, absence in self._attendance.unattended(self.vehicles, now_s):
             self._record.on_caretaker_took_over(self.t_s, vehicle.name, absence)
             yield from self._attendance.take_charge(vehicle, self.tick)
@@ -350,11 +352,11 @@ class BridgeCore:
         yield from self._remove_departed()
         duration_s = self._stopwatch() - self._tick_began
         self._record.on_tick(self.t_s, len(self.vehicles), duration_s)
-        if self._over():
-            yield from self._wind_up(now_s)
+        if self._is_over():
+            yield from self._shut_down(now_s)
             return
         lasts_s = self._tick_lasts_s
-        if self._answers.deaf or not self._attendance.link_up:
+        if self._answers.all_silent or not self._attendance.link_up:
             # No agent can answer: do not run ahead of the vehicles during a network failure.
             lasts_s = max(lasts_s, self.scenario.runtime.tick_s)
         self._until_s = max(now_s, self._opened_s + lasts_s)
@@ -370,7 +372,7 @@ class BridgeCore:
                 self._record.on_left(vehicle, self.t_s, attended=name not in self._attendance)
                 yield from self._attendance.leave(vehicle)
 
-    def _over(self) -> bool:
+    def _is_over(self) -> bool:
         if not self.vehicles and self._roadside.exhausted(self.t_s):
             return True
         if self.t_s >= self.scenario.runtime.max_road_s:
@@ -380,7 +382,7 @@ class BridgeCore:
 
     # --- the end ------------------------------------------------------------------------------
 
-    def _wind_up(self, now_s: float) -> Iterator[Effect]:
+    def _shut_down(self, now_s: float) -> Iterator[Effect]:
         on_road = self.vehicles.values()
         yield from self._roadside.publish(self.tick, self.t_s, on_road, ended=True)
         yield from self._attendance.notify_departed(self.tick)
@@ -389,8 +391,8 @@ class BridgeCore:
         # Last, so that it counts everything, and through the network like the others: the node adds
         # its own counters.
         yield Send(REPORT, Report(role=BRIDGE, name=BRIDGE), {"role": BRIDGE, "name": BRIDGE})
-        self.phase = TickPhase.WIND_UP
-        self._until_s = now_s + WIND_UP_S
+        self.phase = TickPhase.SHUTTING_DOWN
+        self._until_s = now_s + SHUT_DOWN_S
 
     def _finish(self, ending: Ending) -> None:
         if self.phase is not TickPhase.ENDED:

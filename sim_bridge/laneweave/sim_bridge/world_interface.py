@@ -56,7 +56,7 @@ def show_bodies(
     around = bodies.exact_neighbours(road.lanes, road.lane_width_m, accels_mps2)
     for name, vehicle in vehicles.items():
         vehicle.perceive(around[name])
-    record.on_shown(
+    record.on_positions(
         t_s,
         vehicles.values(),
         overlaps=bodies.overlapping_pairs(),

@@ -83,7 +83,7 @@ def forget_all_promises(patch: pytest.MonkeyPatch) -> None:
         self.accepted = ballot if self.accepted is None else max(self.accepted, ballot)
 
     forget_promise(patch)
-    patch.setattr(MotionController, "accept", accept)
+    patch.setattr(MotionController, "store_acceptance", accept)
 
 
 def newer_counts_as_closed(patch: pytest.MonkeyPatch) -> None:

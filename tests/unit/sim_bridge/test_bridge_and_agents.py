@@ -266,7 +266,7 @@ def test_a_whole_run_counts_every_message_once_and_keeps_little_of_vehicles_that
     def look() -> bool:
         nonlocal most
         most = max(most, len(bridge._attendance.departed))
-        if bridge.phase is TickPhase.WIND_UP and not ended_s:
+        if bridge.phase is TickPhase.SHUTTING_DOWN and not ended_s:
             ended_s.append(street.network.now_s)
         return bridge.phase is TickPhase.ENDED
 

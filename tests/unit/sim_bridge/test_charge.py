@@ -391,7 +391,7 @@ def test_vehicles_that_leave_off_their_lane_are_reported(tmp_path: Path) -> None
     ]
     desk = Desk(SCENARIO, tmp_path, arrivals)
     desk.start(A, "C")
-    desk.drive(lambda: desk.core.phase is TickPhase.WIND_UP)
+    desk.drive(lambda: desk.core.phase is TickPhase.SHUTTING_DOWN)
     found = {
         event["vehicle"]: (event["lane"], event["preferred_lane"], event["attended"])
         for event in read_events(tmp_path, "left-off-lane")

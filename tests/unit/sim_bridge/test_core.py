@@ -32,7 +32,7 @@ from laneweave.protocol.wire.topics import (
 )
 from laneweave.sim_bridge.bodies.motion_controller import Rung
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import pose_of
-from laneweave.sim_bridge.core import WIND_UP_S, TickPhase
+from laneweave.sim_bridge.core import SHUT_DOWN_S, TickPhase
 from laneweave.sim_bridge.road.attendance import LEFT_REPEATS
 from support.bridge_bench import (
     TWO,
@@ -198,7 +198,7 @@ def test_a_vehicle_without_an_answer_continues_its_trajectory(desk: Desk) -> Non
     desk.drive(lambda: desk.core.tick > tick, B)
     controller = desk.core.vehicles[B].controller
     assert controller.plant.setpoint[0] == pytest.approx(before + 1.0 * TICK_S)
-    assert controller.rung is Rung.PLAY
+    assert controller.rung is Rung.EXECUTE
 
 
 def test_an_agent_without_answers_is_awaited_to_each_deadline_until_it_is_silent(
@@ -314,7 +314,7 @@ def test_a_network_without_any_answers_does_not_stop_the_road(tmp_path: Path) ->
     desk.start(*names)
     desk.drive_to_entry(names[0])
     began_s, tick = desk.now_s, desk.core.tick
-    desk.drive(lambda: desk.core.phase is TickPhase.WIND_UP, *names)
+    desk.drive(lambda: desk.core.phase is TickPhase.SHUTTING_DOWN, *names)
     road_s = (desk.core.tick - tick) * TICK_S
     # Real time, and not faster, though the pace would allow it.
     paid_s = SILENT_S - MISSES * TICK_S
@@ -329,7 +329,7 @@ def test_a_network_without_any_answers_does_not_stop_the_road(tmp_path: Path) ->
 
 
 def test_the_network_may_come_back(desk: Desk) -> None:
-    desk.drive(lambda: desk.core._answers.deaf and desk.core.phase is TickPhase.PACE, A, B)
+    desk.drive(lambda: desk.core._answers.all_silent and desk.core.phase is TickPhase.PACE, A, B)
     desk.wake()
     assert desk.core.phase is TickPhase.PACE  # no agent was awaited
     for name in (A, B):
@@ -401,7 +401,7 @@ def test_departures_are_notified_until_the_agent_is_gone(tmp_path: Path) -> None
 def test_departures_are_notified_a_limited_number_of_times(tmp_path: Path) -> None:
     desk = Desk(SCENARIO, tmp_path, [arrival(A, 0.5), arrival(B, 8.5)])
     desk.start(A, B)
-    desk.drive(lambda: desk.core.phase is TickPhase.WIND_UP)
+    desk.drive(lambda: desk.core.phase is TickPhase.SHUTTING_DOWN)
     notified = [sense.vehicle for sense in sent(desk.effects, Sense) if sense.left]
     assert notified.count(A) == LEFT_REPEATS
     assert notified.count(B) == 1  # it was the last one
@@ -414,7 +414,7 @@ def test_departures_are_notified_a_limited_number_of_times(tmp_path: Path) -> No
 def wound_up(tmp_path: Path, scenario: Scenario = SCENARIO) -> Desk:
     desk = Desk(scenario, tmp_path, TWO)
     desk.start(A, B)
-    desk.drive(lambda: desk.core.phase is TickPhase.WIND_UP)
+    desk.drive(lambda: desk.core.phase is TickPhase.SHUTTING_DOWN)
     return desk
 
 
@@ -429,7 +429,7 @@ def test_the_end_is_published_to_all_vehicles(tmp_path: Path) -> None:
 
 def test_winds_up_until_all_have_reported(tmp_path: Path) -> None:
     desk = wound_up(tmp_path)
-    ends_s = desk.now_s + WIND_UP_S
+    ends_s = desk.now_s + SHUT_DOWN_S
     assert desk.core.wakeup_s == ends_s
     assert desk.report("agent", A) == []
     assert desk.report_own() == []
@@ -448,10 +448,10 @@ def test_reports_about_vehicles_of_an_earlier_run_do_not_count(tmp_path: Path) -
     desk.start(A, B)
     for name in (A, B, "v0099"):
         desk.report("agent", name, solves=1000)
-    desk.drive(lambda: desk.core.phase is TickPhase.WIND_UP)
+    desk.drive(lambda: desk.core.phase is TickPhase.SHUTTING_DOWN)
     desk.report_own()
     desk.report("agent", A, solves=1)
-    assert desk.core.phase is TickPhase.WIND_UP
+    assert desk.core.phase is TickPhase.SHUTTING_DOWN
     assert ended(desk.report("agent", B, solves=2))
     assert read_summary(tmp_path)["tracking"]["solves"] == 3
 
@@ -463,7 +463,7 @@ def test_winding_up_has_a_deadline_and_may_be_stopped(tmp_path: Path, *, stopped
     began_s = desk.now_s
     desk.give(Stopping()) if stopped else desk.wake()
     assert desk.core.phase is TickPhase.ENDED
-    assert desk.now_s == (began_s if stopped else began_s + WIND_UP_S)
+    assert desk.now_s == (began_s if stopped else began_s + SHUT_DOWN_S)
     assert read_summary(tmp_path)["ending"] == "complete"
 
 
@@ -472,9 +472,9 @@ def test_reports_are_awaited_of_agents_that_came_late_and_of_no_others(tmp_path:
     desk.start()
     desk.drive(lambda: desk.core.tick >= 40)
     desk.up(B)
-    desk.drive(lambda: desk.core.phase is TickPhase.WIND_UP)
+    desk.drive(lambda: desk.core.phase is TickPhase.SHUTTING_DOWN)
     desk.report_own()
-    assert desk.core.phase is TickPhase.WIND_UP
+    assert desk.core.phase is TickPhase.SHUTTING_DOWN
     assert ended(desk.report("agent", B))
 
 
@@ -512,7 +512,7 @@ def test_nothing_is_left_over_at_the_end(tmp_path: Path) -> None:
     desk.start(A, B, "C")
     desk.drive(lambda: desk.core.tick > 60, B)
     assert desk.core._answers.silent == {B}
-    desk.drive(lambda: desk.core.phase is TickPhase.WIND_UP, B)
+    desk.drive(lambda: desk.core.phase is TickPhase.SHUTTING_DOWN, B)
     for name in (A, B, "C"):
         desk.report("agent", name)
         desk.down(name)
@@ -521,7 +521,7 @@ def test_nothing_is_left_over_at_the_end(tmp_path: Path) -> None:
     assert core.phase is TickPhase.ENDED
     for left_over in (
         *(core.vehicles, core._attendance.departed, core._attendance._caretakers),
-        *(core._answers._unheard, core._answers._unheard_s),
+        *(core._answers._without_message, core._answers._silence_s),
         *(core._answers.silent, core._answers.awaited, core._answers.up),
         *(core._at_entrance, core._unreported, desk.world.at),
     ):
@@ -531,7 +531,7 @@ def test_nothing_is_left_over_at_the_end(tmp_path: Path) -> None:
 def test_a_run_without_vehicles_ends(tmp_path: Path) -> None:
     desk = Desk(SCENARIO, tmp_path, [])
     desk.start()
-    assert desk.core.phase is TickPhase.WIND_UP
+    assert desk.core.phase is TickPhase.SHUTTING_DOWN
     assert ended(desk.report_own())
     assert read_summary(tmp_path)["vehicles"]["demanded"] == 0
 

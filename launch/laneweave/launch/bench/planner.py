@@ -26,7 +26,7 @@ from laneweave.launch.bench.request_families import (
 )
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Mode
-from laneweave.sim_bridge.recording.trips import spread
+from laneweave.sim_bridge.recording.trips import percentiles_of
 
 
 @attrs.frozen
@@ -125,8 +125,8 @@ def _measured(requests: Sequence[PlanRequest], solver: str) -> dict[str, Any]:
     return {
         "optimal": statuses.count("optimal"),
         "feasible": statuses.count("feasible"),
-        "cpu_ms": spread(np.array(times_ms), 50, 95, largest=True),
-        "gap_percent": spread(finite, 50, largest=True),
+        "cpu_ms": percentiles_of(np.array(times_ms), 50, 95, largest=True),
+        "gap_percent": percentiles_of(finite, 50, largest=True),
         "answered_in_100_ms": early_plans,
         "late_ms": round(max(0.0, max(times_ms) - 1e3 * requests[0].deadline_s), 1),
     }

@@ -24,7 +24,7 @@ from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.local_run import LocalRun
 from laneweave.protocol.config.loading import load_scenario
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.sim_bridge.recording.trips import spread
+from laneweave.sim_bridge.recording.trips import percentiles_of
 
 ROLES = ("router", "coordinator", "bridge", "agent")
 CPU_PERIOD_S = 0.3
@@ -109,7 +109,7 @@ def bench_runtime(vehicles: int, *, seconds: float, per_process: int, seed: int)
         "vehicles_per_process": per_process,
         "vehicles_on_road": round(float(ticks.column("on_road").to_numpy()[measured].mean()), 1),
         "real_time_factor": _real_time_factor(window),
-        "tick_ms": spread(ticks.column("tick_ms").to_numpy()[measured], 50, 99),
+        "tick_ms": percentiles_of(ticks.column("tick_ms").to_numpy()[measured], 50, 99),
         "cpu_ms_per_tick": _per_tick(window, scenario),
         "memory_mib": _memory(window),
         "problems": list(outcome.problems),

@@ -24,7 +24,7 @@ from laneweave.agents.driving.tracker import Tracker, TrackResult
 from laneweave.agents.driving.tracking_problem import NO_GAPS, Gaps
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State, integrate
-from laneweave.sim_bridge.recording.trips import spread
+from laneweave.sim_bridge.recording.trips import percentiles_of
 
 Array = NDArray[np.float64]
 
@@ -120,7 +120,7 @@ def bench_tracker(
                 "unusable": unusable,
                 "cpu_ms": {
                     "mean": round(float(every.mean()), 3),
-                    **spread(every, 50, 99, largest=True),
+                    **percentiles_of(every, 50, 99, largest=True),
                 },
             }
         )

@@ -139,10 +139,10 @@ class LightRoad:
             return
         controller = vehicle.controller
         held = controller.hold_cell
-        if self._attendance.hear(vehicle, command) and not self._lost():
+        if self._attendance.register_command(vehicle, command) and not self._lost():
             yield self._sense_of(command.vehicle, vehicle)
         try:
-            taken = yield from self._attendance.take(vehicle, command)
+            taken = yield from self._attendance.accept_command(vehicle, command)
         except BadInputError:
             taken = False
         self.refused += not taken
@@ -166,7 +166,7 @@ class LightRoad:
         for vehicle in self.vehicles.values():
             vehicle.body.t_s = t_s
         yield from self._attend(now_s)
-        self._attendance.ask(self.vehicles, now_s)
+        self._attendance.start_tick(self.vehicles, now_s)
         for name, vehicle in self.vehicles.items():
             if not self._lost():
                 yield self._sense_of(name, vehicle)
@@ -223,7 +223,7 @@ class LightRoad:
 
     def _attend(self, now_s: float) -> Iterator[Effect]:
         """Let caretakers take charge of vehicles with absent or silent agents."""
-        self._attendance.answers.settle(now_s)
+        self._attendance.answers.finish_tick(now_s)
         for vehicle, absence in self._attendance.unattended(self.vehicles, now_s):
             if absence is Absence.ABSENT and now_s < vehicle.admission.t_s + AGENT_START_S:
                 continue

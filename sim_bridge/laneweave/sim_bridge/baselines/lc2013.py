@@ -43,14 +43,14 @@ class Lc2013Traffic:
         self._offer(t_s, entrance)
         entered = self._sumo.advance()
         self._poses = self._sumo.positions()
-        came = [self._entered(name, t_s, entrance) for name in sorted(entered)]
+        new_vehicles = [self._entered(name, t_s, entrance) for name in sorted(entered)]
         for vehicle in self._vehicles.values():
-            self._look(vehicle)
+            self._update(vehicle)
         for vehicle in list(self._kept_on_lane):
             if vehicle.s_m >= self._road.sorting_start_m:
                 self._kept_on_lane.remove(vehicle)
                 self._sumo.allow_lane_changes(vehicle.name, allowed=True)
-        return came
+        return new_vehicles
 
     def poses(self) -> dict[str, Pose]:
         """Return the pose of each vehicle in SUMO."""
@@ -69,9 +69,9 @@ class Lc2013Traffic:
     def _offer(self, t_s: float, entrance: Entrance) -> None:
         """Offer SUMO the next vehicle of each lane once; SUMO inserts it when there is room."""
         for lane in range(self._road.lanes):
-            arrival = entrance.first(lane)
+            arrival = entrance.next_on(lane)
             if arrival is not None and arrival.vehicle not in self._offered:
-                s_m = entrance.furthest_m(arrival, t_s)
+                s_m = entrance.max_entry_m(arrival, t_s)
                 self._sumo.offer(arrival.vehicle, arrival.lane, arrival.preferred_lane, s_m)
                 if not self._everywhere:
                     self._sumo.allow_lane_changes(arrival.vehicle, allowed=False)
@@ -93,7 +93,7 @@ class Lc2013Traffic:
             self._kept_on_lane.add(vehicle)
         return vehicle
 
-    def _look(self, vehicle: ReferenceVehicle) -> None:
+    def _update(self, vehicle: ReferenceVehicle) -> None:
         """Read a vehicle's position from SUMO."""
         s_m, y_m, _, speed_mps = self._poses[vehicle.name]
         vehicle.accel_mps2 = (speed_mps - vehicle.speed_mps) / self._tick_s

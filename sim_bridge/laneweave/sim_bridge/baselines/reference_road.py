@@ -87,11 +87,11 @@ class Entrance:
         """Add a vehicle to the queue of its lane."""
         self._queues[arrival.lane].append(arrival)
 
-    def first(self, lane: int) -> Arrival | None:
+    def next_on(self, lane: int) -> Arrival | None:
         """Return the next vehicle of a lane."""
         return self._queues[lane][0] if self._queues[lane] else None
 
-    def furthest_m(self, arrival: Arrival, t_s: float) -> float:
+    def max_entry_m(self, arrival: Arrival, t_s: float) -> float:
         """Return how far beyond s = 0 a vehicle can be at the tick at which it enters.
 
         Vehicles arrive between ticks: one that does not wait has driven at v_F since its arrival.
@@ -179,14 +179,14 @@ class ReferenceRoad:
         """Advance by one tick."""
         began = self._stopwatch()
         self.tick += 1
-        self._demand()
+        self._queue_arrivals()
         for vehicle in self._traffic.step(self.t_s, self._entrance):
             self._record.on_entered(vehicle)
         self._measure()
-        self._let_leave()
+        self._remove_departed()
         self._record.on_tick(self.t_s, len(self._traffic.vehicles), self._stopwatch() - began)
 
-    def _demand(self) -> None:
+    def _queue_arrivals(self) -> None:
         """Queue the vehicles that arrived since the last tick."""
         while self._demanded < len(self._arrivals):
             arrival = self._arrivals[self._demanded]
@@ -200,7 +200,7 @@ class ReferenceRoad:
         """Record positions, overlaps and gaps."""
         size = self._scenario.vehicle
         bodies = Bodies(self._traffic.poses(), size.length_m, size.width_m)
-        self._record.on_shown(
+        self._record.on_positions(
             self.t_s,
             self._traffic.vehicles,
             overlaps=bodies.overlapping_pairs(),
@@ -208,7 +208,7 @@ class ReferenceRoad:
             gaps=bodies.min_gaps(),
         )
 
-    def _let_leave(self) -> None:
+    def _remove_departed(self) -> None:
         length_m = self._scenario.road.length_m
         for vehicle in [each for each in self._traffic.vehicles if each.s_m >= length_m]:
             self._traffic.remove(vehicle)

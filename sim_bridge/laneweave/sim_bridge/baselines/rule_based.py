@@ -44,9 +44,9 @@ class RuleTraffic:
         slowing = self._rules.sort(self._lanes)
         leaders = self._lanes.leaders()
         for vehicle in sorted(self._vehicles.values(), key=priority):
-            self._drive(vehicle, leaders.get(vehicle, ()), slows_down=vehicle in slowing)
-            self._shift(vehicle)
-        entered = self._let_enter(t_s, entrance)
+            self._move_along(vehicle, leaders.get(vehicle, ()), slows_down=vehicle in slowing)
+            self._move_across(vehicle)
+        entered = self._admit(t_s, entrance)
         for vehicle in self._vehicles.values():
             self._world.place(vehicle.name, vehicle.state)
         self._world.step()
@@ -66,7 +66,7 @@ class RuleTraffic:
         self._lanes.leave(vehicle)
         self._world.remove(vehicle.name)
 
-    def _drive(
+    def _move_along(
         self, vehicle: ReferenceVehicle, leaders: Iterable[ReferenceVehicle], *, slows_down: bool
     ) -> None:
         """Move a vehicle along the road by one tick, after the vehicles ahead of it."""
@@ -90,7 +90,7 @@ class RuleTraffic:
         vehicle.s_m = s_m + 0.5 * (before_mps + after_mps) * tick_s
         vehicle.accel_mps2 = (after_mps - before_mps) / tick_s
 
-    def _shift(self, vehicle: ReferenceVehicle) -> None:
+    def _move_across(self, vehicle: ReferenceVehicle) -> None:
         """Move a vehicle across the road by one tick."""
         target_m = self._centre_m(vehicle.lane)
         if vehicle.previous_lane is None:
@@ -106,11 +106,11 @@ class RuleTraffic:
             vehicle.lateral_speed_mps = math.copysign(max_mps, distance_m)
             vehicle.y_m += vehicle.lateral_speed_mps * self._tick_s
 
-    def _let_enter(self, t_s: float, entrance: Entrance) -> list[ReferenceVehicle]:
+    def _admit(self, t_s: float, entrance: Entrance) -> list[ReferenceVehicle]:
         entered = []
         for lane in range(self._road.lanes):
-            while (arrival := entrance.first(lane)) is not None:
-                s_m = self._room_m(lane, entrance.furthest_m(arrival, t_s))
+            while (arrival := entrance.next_on(lane)) is not None:
+                s_m = self._room_m(lane, entrance.max_entry_m(arrival, t_s))
                 if s_m is None:
                     break
                 entrance.take(lane)
@@ -128,14 +128,14 @@ class RuleTraffic:
                 entered.append(vehicle)
         return entered
 
-    def _room_m(self, lane: int, furthest_m: float) -> float | None:
+    def _room_m(self, lane: int, max_entry_m: float) -> float | None:
         """Return where on a lane a vehicle can enter at v_F, None if there is no room."""
         if not self._lanes[lane]:
-            return furthest_m
+            return max_entry_m
         ahead, speed_mps = self._lanes[lane][-1], self._speed_mps
         following = self._rules.following
-        s_m = min(furthest_m, ahead.s_m - following.gap_m(speed_mps) - _ROUNDING_M)
-        if s_m < 0.0 or not following.suits(s_m, speed_mps, ahead.s_m, ahead.speed_mps):
+        s_m = min(max_entry_m, ahead.s_m - following.gap_m(speed_mps) - _ROUNDING_M)
+        if s_m < 0.0 or not following.is_safe(s_m, speed_mps, ahead.s_m, ahead.speed_mps):
             return None
         return s_m
 

@@ -52,7 +52,9 @@ class Following:
         """Return the required gap d_R = d_0 + v tau, front to front, of a follower at speed v."""
         return max(self._standstill_m + self._headway_s * speed_mps, self._min_distance_m)
 
-    def suits(self, s_m: float, speed_mps: float, ahead_s_m: float, ahead_speed_mps: float) -> bool:
+    def is_safe(
+        self, s_m: float, speed_mps: float, ahead_s_m: float, ahead_speed_mps: float
+    ) -> bool:
         """Return whether a vehicle may begin to follow: the gap is d_R, with room to brake.
 
         d_R alone is not enough behind a much slower vehicle.
@@ -185,31 +187,31 @@ class Rules:
         slowing: set[ReferenceVehicle] = set()
         for vehicle in unsorted:
             lane = self.next_lane(vehicle)
-            hindered = list(self._hindered(vehicle, *lanes.around(vehicle, lane)))
-            if not hindered:
+            slowed = list(self._slowed(vehicle, *lanes.around(vehicle, lane)))
+            if not slowed:
                 lanes.begin_change(vehicle, lane)
                 if self._change_m == 0.0:
                     lanes.end_change(vehicle)
-            slowing.update(hindered)
+            slowing.update(slowed)
         return slowing
 
     def next_lane(self, vehicle: ReferenceVehicle) -> int:
         """Return the next lane towards the preferred one."""
         return vehicle.lane + (1 if vehicle.preferred_lane > vehicle.lane else -1)
 
-    def _hindered(
+    def _slowed(
         self,
         vehicle: ReferenceVehicle,
         ahead: ReferenceVehicle | None,
         behind: ReferenceVehicle | None,
     ) -> Iterator[ReferenceVehicle]:
         """Yield the vehicles that must slow down before a vehicle can change lanes."""
-        suits = self.following.suits
-        if ahead is not None and not suits(
+        is_safe = self.following.is_safe
+        if ahead is not None and not is_safe(
             vehicle.s_m, vehicle.speed_mps, ahead.s_m, ahead.speed_mps
         ):
             yield vehicle
-        if behind is not None and not suits(
+        if behind is not None and not is_safe(
             behind.s_m, behind.speed_mps, vehicle.s_m, vehicle.speed_mps
         ):
             # By rule 1 a vehicle that has finished continues at v_F: then the other one waits. One

@@ -42,7 +42,7 @@ from laneweave.protocol.vehicle.motion import (
     limited_accel,
 )
 from laneweave.protocol.wire.messages import Ballot, Command, Neighbour, PendingTransfer
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import NONE_AROUND, Around
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import NO_NEIGHBOURS, Neighbours
 from laneweave.sim_bridge.bodies.plant import Plant
 
 MAX_COLUMN = 2**31 - 1
@@ -56,7 +56,7 @@ and these errors would add up."""
 class Rung(IntEnum):
     """What a vehicle executes; see the module."""
 
-    PLAY = 0
+    EXECUTE = 0
     HOLD = 1
     GIVE_WAY = 2
     EMERGENCY = 3
@@ -94,7 +94,7 @@ class MotionController:
     """Rung of the last tick."""
     rung_ticks: dict[Rung, int] = field(init=False)
     """Ticks on each rung."""
-    around: Around = NONE_AROUND
+    around: Neighbours = NO_NEIGHBOURS
     """Its measured neighbours."""
     _measured: State | None = None
     _jerks: array[float] = field(init=False)
@@ -126,11 +126,11 @@ class MotionController:
         """Measured state of the body; the exact one before the first measurement."""
         return self.plant.state if self._measured is None else self._measured
 
-    def perceive(self, measured: State, around: Around) -> None:
+    def perceive(self, measured: State, around: Neighbours) -> None:
         """Set the measurements of this tick."""
         self._measured, self.around = measured, around
 
-    def take(self, command: Command) -> bool:
+    def accept_command(self, command: Command) -> bool:
         """Take a command of the process in charge, or of one that takes charge with it.
 
         A command is refused when its incarnation is lower than that of the process in charge, when
@@ -157,7 +157,7 @@ class MotionController:
         if command.incarnation > self.attendant:
             self.put_in_charge(command.incarnation)
         self.command_tick = command.tick
-        self.note(command)
+        self.store_requests(command)
         leaves = command.hold_cell != self.hold_cell
         if self.rolling and leaves and command.hold_cell not in self.owned:
             return False
@@ -180,7 +180,7 @@ class MotionController:
         self.attendant = incarnation
         self.accepted = None
 
-    def note(self, command: Command) -> bool:
+    def store_requests(self, command: Command) -> bool:
         """Note what the process in charge requests, whatever the tick of its command.
 
         Returns:
@@ -198,14 +198,14 @@ class MotionController:
         if command.transfer is not None and command.transfer.open:
             self.complete_transfer(command.transfer.ballot)
         if command.promised is not None:
-            self.promise(command.promised)
+            self.store_promise(command.promised)
         if command.transfer is not None and not command.transfer.open:
             self.begin_transfer(command.transfer)
         if command.accepted is not None:
-            self.accept(command.accepted)
+            self.store_acceptance(command.accepted)
         return (self.joined, self.accepted, self.promised, self.transfer) != before
 
-    def accept(self, ballot: Ballot) -> None:
+    def store_acceptance(self, ballot: Ballot) -> None:
         """Note a plan that the process in charge has accepted, unless it is older.
 
         Where vehicles own cells, its transfer must be pending.
@@ -214,7 +214,7 @@ class MotionController:
             return
         self.accepted = ballot if self.accepted is None else max(self.accepted, ballot)
 
-    def promise(self, ballot: Ballot) -> None:
+    def store_promise(self, ballot: Ballot) -> None:
         """Note a promise, unless it is older."""
         self.promised = ballot if self.promised is None else max(self.promised, ballot)
 
@@ -259,7 +259,7 @@ class MotionController:
         measured, plant = self.measured, self.plant
         near: Sequence[Neighbour] = self.around.ahead
         if near:
-            near = self._in_the_way(near, measured[3])
+            near = self._relevant(near, measured[3])
         rung, jerk = self._next(tick, near)
         if near and self._must_brake(measured, jerk, near):
             rung = Rung.EMERGENCY
@@ -292,7 +292,7 @@ class MotionController:
         """Return rung and jerk of a tick without an emergency."""
         index = 2 * (tick - self._jerks_tick)
         if 0 <= index < len(self._jerks):
-            return Rung.PLAY, (self._jerks[index], self._jerks[index + 1])
+            return Rung.EXECUTE, (self._jerks[index], self._jerks[index + 1])
         limits, speed_mps = self._scenario.vehicle, self.lattice.speed_mps
         body = self.measured
         state = commanded_state(body, self.plant.setpoint, limits, speed_mps)
@@ -322,7 +322,7 @@ class MotionController:
             return spare_m < RELEASE_M + measured[1] * tick_s
         return spare_m < 0.0
 
-    def _in_the_way(self, others: Iterable[Neighbour], y_m: float) -> list[Neighbour]:
+    def _relevant(self, others: Iterable[Neighbour], y_m: float) -> list[Neighbour]:
         """Return the neighbours on lanes that the body touches or moves to."""
         first, last = self.lattice.lanes_touched(y_m, self._scenario.vehicle.width_m)
         goal = self.hold_cell[1]

@@ -39,14 +39,14 @@ class MinGaps(NamedTuple):
     """Distance front to front divided by the speed of the follower."""
 
 
-class Around(NamedTuple):
+class Neighbours(NamedTuple):
     """The neighbours of a vehicle, by lane."""
 
     ahead: tuple[Neighbour, ...]
     behind: tuple[Neighbour, ...]
 
 
-NONE_AROUND = Around((), ())
+NO_NEIGHBOURS = Neighbours((), ())
 
 ExactNeighbour = tuple[int, float, float, float]
 """(lane, gap m, speed m/s, acceleration m/s2): a `Neighbour` without measurement errors."""

@@ -13,7 +13,7 @@ import numpy as np
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import Name, Neighbour
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import Around, ExactNeighbours
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import ExactNeighbours, Neighbours
 
 _DRAWN = 1024
 """Random numbers drawn at once."""
@@ -57,7 +57,7 @@ class Sensors:
             a_y + e_ay * ay_mps2,
         )
 
-    def measure_neighbours(self, around: ExactNeighbours) -> Around:
+    def measure_neighbours(self, around: ExactNeighbours) -> Neighbours:
         """Return the measured neighbours."""
         ahead, behind = around
         sigma_m, sigma_mps, sigma_mps2 = self._other_noise
@@ -78,7 +78,7 @@ class Sensors:
                 )
             )
             index += 3
-        return Around(tuple(seen[: len(ahead)]), tuple(seen[len(ahead) :]))
+        return Neighbours(tuple(seen[: len(ahead)]), tuple(seen[len(ahead) :]))
 
     def _draw(self, count: int) -> list[float]:
         """Return the next samples of the standard normal distribution."""

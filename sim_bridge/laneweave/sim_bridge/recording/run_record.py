@@ -59,7 +59,7 @@ from laneweave.sim_bridge.recording.trajectories import Sample, Trajectories
 from laneweave.sim_bridge.recording.trips import (
     Trip,
     metadata_of,
-    spread,
+    percentiles_of,
     throughput,
     travel_time,
     trips_table,
@@ -104,7 +104,7 @@ class _Leadership:
     """The leader, as seen in heartbeats."""
 
     leader: tuple[Name, int] | None = None
-    heard_s: float = 0.0
+    last_heartbeat_s: float = 0.0
     changes: int = 0
     recovery_s: list[float] = field(factory=list)
 
@@ -155,7 +155,7 @@ class RunRecord:
 
     # --- the road -----------------------------------------------------------------
 
-    def note(self, t_s: float, kind: str, /, **data: object) -> None:
+    def event(self, t_s: float, kind: str, /, **data: object) -> None:
         """Write an event of the bridge."""
         self._write_event(t_s, kind, {"role": "bridge"} | data)
 
@@ -167,7 +167,7 @@ class RunRecord:
         """Record a vehicle that has entered the road."""
         trip = self._trips[Name(vehicle.name)]
         trip.entered_s, trip.formation = vehicle.entered_s, vehicle.formation
-        self.note(
+        self.event(
             vehicle.entered_s,
             ENTERED,
             vehicle=vehicle.name,
@@ -181,7 +181,7 @@ class RunRecord:
         number, columns = closed.first_block, closed.columns(self._scenario.lattice)
         for vehicle in members:
             self._trips[vehicle].formation = number
-        self.note(
+        self.event(
             closed.closed_s,
             FORMATION_CLOSED,
             formation=number,
@@ -205,10 +205,10 @@ class RunRecord:
         preferred_lane = vehicle.arrival.preferred_lane
         on_preferred_lane = lane == preferred_lane
         where = {"vehicle": vehicle.name, "lane": lane}
-        self.note(left_s, LEFT, **where, on_preferred_lane=on_preferred_lane)
+        self.event(left_s, LEFT, **where, on_preferred_lane=on_preferred_lane)
         if not on_preferred_lane:
             lanes = {**where, "preferred_lane": preferred_lane}
-            self.note(left_s, LEFT_OFF_LANE, **lanes, attended=attended)
+            self.event(left_s, LEFT_OFF_LANE, **lanes, attended=attended)
 
     def on_still_on_road(self, vehicle: RecordedVehicle) -> None:
         """Record a vehicle that is on the road at the end of the run."""
@@ -221,14 +221,14 @@ class RunRecord:
     def on_caretaker_took_over(self, t_s: float, vehicle: Name, reason: str) -> None:
         """Record that a caretaker has taken charge, and why: see `Absence`."""
         self._caretaker_takeovers += 1
-        self.note(t_s, CARETAKER_TOOK_OVER, vehicle=vehicle, reason=reason)
+        self.event(t_s, CARETAKER_TOOK_OVER, vehicle=vehicle, reason=reason)
 
     def on_agent_took_over(self, t_s: float, vehicle: Name, previous: str) -> None:
         """Record that an agent has taken charge from the `caretaker` or an earlier `agent`."""
         self._agent_takeovers += 1
-        self.note(t_s, AGENT_TOOK_OVER, vehicle=vehicle, previous=previous)
+        self.event(t_s, AGENT_TOOK_OVER, vehicle=vehicle, previous=previous)
 
-    def on_shown(
+    def on_positions(
         self,
         t_s: float,
         vehicles: Iterable[RecordedVehicle],
@@ -240,7 +240,7 @@ class RunRecord:
         """Record positions, overlaps, collisions and gaps at a tick."""
         overlaps = list(overlaps)
         for pair in overlaps:
-            self.note(t_s, OVERLAP, vehicles=pair)
+            self.event(t_s, OVERLAP, vehicles=pair)
         self._trajectories.distances(overlaps, collisions, gaps)
         self._trajectories.tick(t_s, [_sample(vehicle) for vehicle in vehicles])
 
@@ -277,10 +277,10 @@ class RunRecord:
         if sender != leadership.leader:
             if leadership.leader is not None:
                 leadership.changes += 1
-                leadership.recovery_s.append(round(now_s - leadership.heard_s, 4))
+                leadership.recovery_s.append(round(now_s - leadership.last_heartbeat_s, 4))
             leadership.leader = sender
-            self.note(t_s, LEADER, coordinator=heartbeat.coordinator, term=heartbeat.term)
-        leadership.heard_s = now_s
+            self.event(t_s, LEADER, coordinator=heartbeat.coordinator, term=heartbeat.term)
+        leadership.last_heartbeat_s = now_s
 
     # --- the end ------------------------------------------------------------------------------
 
@@ -288,7 +288,7 @@ class RunRecord:
         """Write all files. Idempotent: the first ending counts."""
         if self._closed:
             return
-        self.note(t_s, RUN_ENDED, ending=ending.value)
+        self.event(t_s, RUN_ENDED, ending=ending.value)
         self._closed = True
         trips = trips_table(self._trips.values(), self._metadata)
         try:
@@ -353,7 +353,9 @@ class RunRecord:
                 wall_s=round(wall_s, 3),
                 processes=None,
                 vehicles_per_process=scenario.runtime.vehicles_per_process,
-                tick_ms=DurationMs(**spread(np.array([tick[2] for tick in self._ticks]), 50, 99)),
+                tick_ms=DurationMs(
+                    **percentiles_of(np.array([tick[2] for tick in self._ticks]), 50, 99)
+                ),
             ),
             messages=Messages(
                 published=_per_process(reports, "published"),
@@ -376,7 +378,7 @@ class RunRecord:
             largest_formation=max(sizes, default=0),
             by_solver=dict(self._plans_by_solver),
             fallbacks=sum(plan.get("fallback") is True for plan in plans),
-            solve_ms=PlanningMs(**spread(solve_ms, 50, 95, largest=True)),
+            solve_ms=PlanningMs(**percentiles_of(solve_ms, 50, 95, largest=True)),
         )
 
     def _tracking(self) -> Tracking:
@@ -394,7 +396,7 @@ class RunRecord:
             missed_ticks=self.missed_ticks,
             caretaker_takeovers=self._caretaker_takeovers,
             agent_takeovers=self._agent_takeovers,
-            solve_ms=DurationMs(**spread(solve_ms, 50, 99)),
+            solve_ms=DurationMs(**percentiles_of(solve_ms, 50, 99)),
         )
 
 

@@ -88,7 +88,7 @@ def travel_time(trips: pa.Table) -> TravelTime:
     """Return the figures of the counted vehicles' travel times."""
     times_s = trips.filter(pc.field("counted"))["travel_time_s"].to_numpy()
     mean_s = finite(float(np.mean(times_s))) if len(times_s) else None
-    return TravelTime(mean=mean_s, **spread(times_s, 50, 95, largest=True))
+    return TravelTime(mean=mean_s, **percentiles_of(times_s, 50, 95, largest=True))
 
 
 def throughput(trips: pa.Table, lanes: int) -> float | None:
@@ -109,7 +109,7 @@ def finite(value: float) -> float | None:
     return round(value, 3) if math.isfinite(value) else None
 
 
-def spread(
+def percentiles_of(
     values: NDArray[Any], *percentiles: int, largest: bool = False
 ) -> dict[str, float | None]:
     """Return percentiles by name, `max` too if it is wanted; None where there are no values."""

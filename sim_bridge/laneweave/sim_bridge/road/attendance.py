@@ -80,14 +80,14 @@ class Caretaker:
             controller.join(execution.wanted_joined)
             execution.on_joined(controller.joined)
             if execution.promised is not None:
-                controller.promise(execution.promised)
+                controller.store_promise(execution.promised)
         else:
             execution.on_owned(self._vehicle.sense(tick, caretaker=True))
             accepted = not message.moves.get(execution.vehicle) and execution.on_plan(message)
             if accepted:
                 if execution.transfer is not None:
                     controller.begin_transfer(execution.transfer)
-                controller.accept(message.ballot)
+                controller.store_acceptance(message.ballot)
                 execution.on_stored(controller.accepted)
         return self.state(tick) if accepted else None
 
@@ -124,7 +124,7 @@ class Attendance:
         return vehicle in self._caretakers
 
     @property
-    def cared_for(self) -> int:
+    def caretaker_count(self) -> int:
         """Number of vehicles whose caretaker is in charge."""
         return len(self._caretakers)
 
@@ -150,11 +150,11 @@ class Attendance:
             case _:
                 pass
 
-    def ask(self, vehicles: Mapping[Name, RoadVehicle], now_s: float) -> None:
+    def start_tick(self, vehicles: Mapping[Name, RoadVehicle], now_s: float) -> None:
         """Begin a tick that is sent to all vehicles on the road."""
-        self.answers.ask(vehicles, now_s, link_up=self.link_up)
+        self.answers.start_tick(vehicles, now_s, link_up=self.link_up)
 
-    def hear(self, vehicle: RoadVehicle, command: Command) -> bool:
+    def register_command(self, vehicle: RoadVehicle, command: Command) -> bool:
         """Register a COMMAND as a sign of life, and note what its agent has joined and accepted.
 
         Returns:
@@ -163,10 +163,12 @@ class Attendance:
         # An agent that answers late is present: the next tick waits for it, and it catches up. An
         # agent that is no longer in charge is no evidence for the one that is.
         if command.incarnation >= vehicle.controller.attendant or vehicle.name in self:
-            self.answers.heard(vehicle.name)
-        return vehicle.controller.note(command)
+            self.answers.on_message(vehicle.name)
+        return vehicle.controller.store_requests(command)
 
-    def take(self, vehicle: RoadVehicle, command: Command) -> Generator[Effect, None, bool]:
+    def accept_command(
+        self, vehicle: RoadVehicle, command: Command
+    ) -> Generator[Effect, None, bool]:
         """Hand a COMMAND to the vehicle's motion controller; a claim ends its caretaker.
 
         Returns:
@@ -177,9 +179,9 @@ class Attendance:
         """
         controller = vehicle.controller
         attendant = controller.attendant
-        if not controller.take(command):
+        if not controller.accept_command(command):
             return False
-        self.answers.effective(vehicle.name)
+        self.answers.in_time(vehicle.name)
         if controller.attendant != attendant:
             # An agent that claims a vehicle is present even if its token has not been seen.
             self.answers.agent_up(vehicle.name)
@@ -188,7 +190,7 @@ class Attendance:
 
     def leave(self, vehicle: RoadVehicle) -> Iterator[Effect]:
         """Take a vehicle off the road, and notify its agent from now on."""
-        self.answers.forget(vehicle.name)
+        self.answers.remove(vehicle.name)
         self.departed[vehicle.name] = (vehicle, LEFT_REPEATS)
         yield from self._end_caretaker(vehicle.name)
 
@@ -218,7 +220,7 @@ class Attendance:
                 yield vehicle, Absence.ABSENT
             elif name in answers.silent:
                 yield vehicle, Absence.SILENT
-            elif answers.ineffective(name):
+            elif answers.always_late(name):
                 yield vehicle, Absence.LATE
 
     def take_charge(self, vehicle: RoadVehicle, tick: int) -> Iterator[Effect]:

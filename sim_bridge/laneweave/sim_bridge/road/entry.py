@@ -106,7 +106,7 @@ class EntryMeter:
             if t_s > until_s + TIME_TOLERANCE_S:
                 break
             cell = (self._columns[lane], lane)
-            arrival = self._takes(cell, t_s)
+            arrival = self._dequeue(cell, t_s)
             if arrival is not None:
                 late_s = self._lattice.passing_time_s(cell[0]) - t_s
                 offset_m = late_s * self._lattice.speed_mps
@@ -138,10 +138,10 @@ class EntryMeter:
             column -= 1
         self._columns[lane] = column
 
-    def _takes(self, cell: Cell, t_s: float) -> Arrival | None:
+    def _dequeue(self, cell: Cell, t_s: float) -> Arrival | None:
         """Remove and return the first of the queue, unless no formation takes it."""
         builder, queue = self._builder, self._queues[cell[1]]
-        if builder is not None and not builder.takes(cell, queue[0].preferred_lane, t_s):
+        if builder is not None and not builder.try_add(cell, queue[0].preferred_lane, t_s):
             return None
         self._names.discard(queue[0].vehicle)
         return queue.pop(0)

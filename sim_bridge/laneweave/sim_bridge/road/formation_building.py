@@ -44,7 +44,7 @@ class ColumnBlocks:
     _next: int = 0
     """The next block to be closed."""
 
-    def takes(self, cell: Cell, preferred_lane: int, t_s: float) -> bool:
+    def try_add(self, cell: Cell, preferred_lane: int, t_s: float) -> bool:
         """Take a vehicle that would enter in a cell; False: it needs a cell further back."""
         del t_s
         block = self.lattice.block_of(cell[0])
@@ -101,7 +101,7 @@ class GrowingFormations:
         """Columns of a full formation with no more cells than it needs."""
         return self._length_for(self.max_vehicles)
 
-    def takes(self, cell: Cell, preferred_lane: int, t_s: float) -> bool:
+    def try_add(self, cell: Cell, preferred_lane: int, t_s: float) -> bool:
         """Take a vehicle that would enter in a cell; False: it needs a cell further back."""
         column = cell[0]
         if self._front is not None and column <= self._front - self.max_columns:

@@ -60,7 +60,7 @@ class Roadside:
         """Column, lane and name of recently entered vehicles."""
         self._next: list[list[tuple[int, Name]]] = [[] for _ in range(self._lanes)]
         """By lane: vehicles that have entered since cells were assigned, foremost first."""
-        self._left_over: list[Cell] = []
+        self._unassigned: list[Cell] = []
         """Empty cells that no vehicle owns yet."""
         self._assigned_to = [1 + MAX_EMPTY] * self._lanes
         """By lane: the last column whose cells were assigned."""
@@ -133,8 +133,8 @@ class Roadside:
                 else:
                     self._assign((column, lane), vehicles)
             self._assigned_to[lane] = closed
-        left_over, self._left_over = self._left_over, []
-        for cell in left_over:
+        unassigned, self._unassigned = self._unassigned, []
+        for cell in unassigned:
             if cell[0] <= max(self._assigned_to) + 2 * self._max_empty:
                 self._assign(cell, vehicles)
 
@@ -150,7 +150,7 @@ class Roadside:
         if near:
             vehicles[min(near)[-1]].controller.assign_cell(cell)
         else:
-            self._left_over.append(cell)
+            self._unassigned.append(cell)
 
     def _remember(self, column: int, lane: int, name: Name) -> None:
         """Remember an entered vehicle, and forget those far ahead of it."""

@@ -4,7 +4,7 @@ A tick waits for every agent with a token until its deadline. An agent that miss
 and then has lost messages, and the next tick waits for it again. An agent that has not answered for
 `agent_silent_s` is *silent*: ticks no longer wait for it.
 
-When no agent at all has answered for that long, the network is *deaf*: no tick waits, so that
+When no agent at all has answered for that long, the network is *all_silent*: no tick waits, so that
 vehicles which enter then do not each cost the same wait.
 
 Answers that come after their tick was closed indicate a slow machine rather than lost messages.
@@ -51,26 +51,26 @@ class Answers:
     """When SENSE is repeated to them."""
     deadline_s: float = math.inf
     """When the current tick proceeds without them."""
-    _asked_s: float = 0.0
-    _unheard: set[Name] = field(factory=set)
+    _sent_s: float = 0.0
+    _without_message: set[Name] = field(factory=set)
     """Agents up when the current tick was sent that have sent nothing since."""
-    _unheard_s: dict[Name, float] = field(factory=dict)
+    _silence_s: dict[Name, float] = field(factory=dict)
     """Duration of the ticks sent to each agent since it was heard."""
-    _idle_s: dict[Name, float] = field(factory=dict)
+    _late_s: dict[Name, float] = field(factory=dict)
     """Duration of the ticks sent to each agent since it answered in time."""
-    _asked: set[Name] = field(factory=set)
+    _without_answer: set[Name] = field(factory=set)
     """Agents up when the current tick was sent that have not answered in time."""
     _late: set[Name] = field(factory=set)
     """Agents that answered an earlier tick since the current one was sent."""
     _stretch: float = 1.0
-    _heard_any: bool = False
-    _deaf_s: float = 0.0
+    _any_message: bool = False
+    _all_silent_s: float = 0.0
     """Duration of the ticks since any agent was heard."""
 
     @property
-    def deaf(self) -> bool:
+    def all_silent(self) -> bool:
         """Whether no agent at all has answered for too long."""
-        return self._too_long(self._deaf_s)
+        return self._too_long(self._all_silent_s)
 
     def agent_up(self, name: Name) -> None:
         """Register an agent's token; all its counters start again."""
@@ -83,49 +83,49 @@ class Answers:
         self.awaited.discard(name)
         self._reset(name)
 
-    def forget(self, name: Name) -> None:
+    def remove(self, name: Name) -> None:
         """Forget a vehicle that left the road; its agent may still be up."""
         self.awaited.discard(name)
         self._reset(name)
 
-    def heard(self, name: Name) -> None:
+    def on_message(self, name: Name) -> None:
         """Register a sign of life: an answer to any tick."""
         self._reset_silence(name)
-        self._heard_any = True
-        self._deaf_s = 0.0
+        self._any_message = True
+        self._all_silent_s = 0.0
 
     def late(self, name: Name) -> None:
         """Register an answer that came after its tick was closed."""
         self._late.add(name)
 
-    def effective(self, name: Name) -> None:
+    def in_time(self, name: Name) -> None:
         """Register an answer that came in time."""
         self.awaited.discard(name)
-        self._asked.discard(name)
-        self._idle_s.pop(name, None)
+        self._without_answer.discard(name)
+        self._late_s.pop(name, None)
 
     def link_down(self) -> None:
         """Register that the bridge lost its own connection: silence is no evidence then."""
-        self._unheard.clear()
-        self._asked.clear()
+        self._without_message.clear()
+        self._without_answer.clear()
 
-    def settle(self, now_s: float) -> list[Name]:
+    def finish_tick(self, now_s: float) -> list[Name]:
         """Account for the previous tick; return the agents that have become silent."""
-        lasted_s = min(now_s - self._asked_s, self._stretch * self.runtime.tick_deadline_s)
-        for name in self._asked & self.up:
-            self._idle_s[name] = self._idle_s.get(name, 0.0) + lasted_s
+        lasted_s = min(now_s - self._sent_s, self._stretch * self.runtime.tick_deadline_s)
+        for name in self._without_answer & self.up:
+            self._late_s[name] = self._late_s.get(name, 0.0) + lasted_s
         fallen_silent = []
-        for name in sorted(self._unheard):
-            self._unheard_s[name] = self._unheard_s.get(name, 0.0) + lasted_s
-            if name not in self.silent and self._too_long(self._unheard_s[name]):
+        for name in sorted(self._without_message):
+            self._silence_s[name] = self._silence_s.get(name, 0.0) + lasted_s
+            if name not in self.silent and self._too_long(self._silence_s[name]):
                 self.silent.add(name)
                 fallen_silent.append(name)
-        if self._unheard and not self._heard_any:
-            self._deaf_s += lasted_s
-        self._unheard.clear()
+        if self._without_message and not self._any_message:
+            self._all_silent_s += lasted_s
+        self._without_message.clear()
         return fallen_silent
 
-    def ask(self, on_road: Iterable[Name], now_s: float, *, link_up: bool) -> None:
+    def start_tick(self, on_road: Iterable[Name], now_s: float, *, link_up: bool) -> None:
         """Begin a tick that is sent to all vehicles on the road.
 
         Args:
@@ -133,19 +133,19 @@ class Answers:
             now_s: the node's clock.
             link_up: whether the bridge is connected; otherwise no agent can answer.
         """
-        self._unheard = {name for name in on_road if name in self.up} if link_up else set()
-        self._asked = set(self._unheard)
-        self._heard_any = False
-        self.awaited = set() if self.deaf else self._unheard - self.silent
+        self._without_message = {name for name in on_road if name in self.up} if link_up else set()
+        self._without_answer = set(self._without_message)
+        self._any_message = False
+        self.awaited = set() if self.all_silent else self._without_message - self.silent
         slow = len(self._late) > _LATE_AGENTS * len(self.up)
         self._stretch *= _STRETCH if slow else _RELAX
         self._stretch = min(max(self._stretch, 1.0), MAX_STRETCH)
         self._late.clear()
-        self._asked_s = now_s
+        self._sent_s = now_s
         self.resend_s = now_s + self._stretch * self.runtime.tick_resend_s
         self.deadline_s = now_s + self._stretch * self.runtime.tick_deadline_s
 
-    def ask_again(self, now_s: float) -> list[Name]:
+    def due_resends(self, now_s: float) -> list[Name]:
         """Return the agents to which SENSE is repeated now."""
         if now_s < self.resend_s:
             return []
@@ -162,20 +162,20 @@ class Answers:
         self.awaited.clear()
         return missed
 
-    def ineffective(self, name: Name) -> bool:
+    def always_late(self, name: Name) -> bool:
         """Return whether an agent that may be alive has not answered in time for too long."""
-        return self._too_long(self._idle_s.get(name, 0.0) / LATE_SHARE)
+        return self._too_long(self._late_s.get(name, 0.0) / LATE_SHARE)
 
     def _reset(self, name: Name) -> None:
         """Reset all counters of an agent."""
         self._reset_silence(name)
-        self._asked.discard(name)
-        self._idle_s.pop(name, None)
+        self._without_answer.discard(name)
+        self._late_s.pop(name, None)
 
     def _reset_silence(self, name: Name) -> None:
         self.silent.discard(name)
-        self._unheard.discard(name)
-        self._unheard_s.pop(name, None)
+        self._without_message.discard(name)
+        self._silence_s.pop(name, None)
 
-    def _too_long(self, unheard_s: float) -> bool:
-        return unheard_s >= self.runtime.agent_silent_s - _ROUNDING_S
+    def _too_long(self, duration_s: float) -> bool:
+        return duration_s >= self.runtime.agent_silent_s - _ROUNDING_S

@@ -295,7 +295,7 @@ def test_meanwhile_the_body_goes_on_with_the_last_good_trajectory_and_then_holds
     assert np.array(bad)[trajectory] == pytest.approx(np.array(good)[trajectory], abs=1e-4)
     controller = roads[1].vehicles[ME].controller
     assert controller.rung_ticks == {
-        Rung.PLAY: broken_at + N, Rung.HOLD: 10 + 4 * N - broken_at - N,
+        Rung.EXECUTE: broken_at + N, Rung.HOLD: 10 + 4 * N - broken_at - N,
         Rung.GIVE_WAY: 0, Rung.EMERGENCY: 0,
     }  # fmt: skip
     goal = cell_state(LATTICE, MOVE[2], roads[1].tick * TICK_S)

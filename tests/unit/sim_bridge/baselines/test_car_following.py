@@ -36,10 +36,10 @@ def test_a_vehicle_at_its_gap_keeps_its_speed() -> None:
 
 def test_a_small_gap_or_one_behind_a_slow_vehicle_does_not_suit() -> None:
     following = Following(PAPER)
-    assert following.suits(0.0, 15.0, 14.91, 15.0)
-    assert not following.suits(0.0, 15.0, 14.89, 15.0)
+    assert following.is_safe(0.0, 15.0, 14.91, 15.0)
+    assert not following.is_safe(0.0, 15.0, 14.89, 15.0)
     # 14.91 m are the headway, but 11.25 m to stop and a body do not fit in.
-    assert not following.suits(0.0, 15.0, 14.91, 0.0)
+    assert not following.is_safe(0.0, 15.0, 14.91, 0.0)
 
 
 @settings(max_examples=100, deadline=None)
@@ -55,7 +55,7 @@ def test_following_from_a_suitable_gap_never_touches(
 ) -> None:
     following = Following(rule_scenario(gap=gap))
     s_m, ahead_m = 0.0, following.gap_m(speed_mps) + more_m
-    if not following.suits(s_m, speed_mps, ahead_m, ahead_mps):
+    if not following.is_safe(s_m, speed_mps, ahead_m, ahead_mps):
         return
     for accel in wishes:
         ahead_m, ahead_mps = moved(ahead_m, ahead_mps, min(ahead_mps + accel * TICK_S, 15.0))

@@ -12,7 +12,7 @@ from laneweave.protocol.vehicle.emergency_brake import EmergencyBrake, last_tick
 from laneweave.protocol.vehicle.motion import Jerk, commanded_state, limited_jerk
 from laneweave.protocol.wire.messages import Name, Neighbour
 from laneweave.sim_bridge.bodies.motion_controller import MotionController, Rung
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import Around
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Neighbours
 from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.bodies.sensors import Sensors
 from support.paper import EXACT
@@ -125,7 +125,9 @@ def drive_behind(
     sensors = Sensors(scenario, Name(f"v{number}"))
     least_m = gap_m
     for tick in range(braking_tick + 60):
-        controller.take(command(tick, (15.0, 0.0), hold_cell=(0, 0), motion_origin=(0, 0)))
+        controller.accept_command(
+            command(tick, (15.0, 0.0), hold_cell=(0, 0), motion_origin=(0, 0))
+        )
         around = sensors.measure_neighbours(([attrs.astuple(seen(own, other))], []))
         controller.perceive(sensors.measure(own.state), around)
         controller.step(tick)
@@ -142,8 +144,10 @@ def test_commanding_more_than_the_body_can_brake_does_not_count_as_braking(jerk:
     controller = controller_in((0, 0), SCENARIO, state=(0.0, 15.0, 0.0, 1.75, 0.0, 0.0))
     own, wall = controller.plant, plant_at(24.0, 0.0)
     for tick in range(40):
-        controller.take(command(tick, (jerk, 0.0), hold_cell=(0, 0), motion_origin=(0, 0)))
-        controller.perceive(own.state, Around((seen(own, wall),), ()))
+        controller.accept_command(
+            command(tick, (jerk, 0.0), hold_cell=(0, 0), motion_origin=(0, 0))
+        )
+        controller.perceive(own.state, Neighbours((seen(own, wall),), ()))
         controller.step(tick)
         assert seen(own, wall).gap_m > MARGIN_M - 0.1
     assert controller.rung_ticks[Rung.EMERGENCY] > 0

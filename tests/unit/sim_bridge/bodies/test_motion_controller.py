@@ -42,7 +42,7 @@ def driven(controller: MotionController) -> dict[Rung, int]:
 def plays(controller: MotionController, tick: int) -> Jerk | None:
     """Return the jerk that it would play at a tick; None: it would play nothing."""
     rung, jerk = controller._next(tick, ())
-    return jerk if rung is Rung.PLAY else None
+    return jerk if rung is Rung.EXECUTE else None
 
 
 def test_without_a_command_it_holds_its_cell(controller: MotionController) -> None:
@@ -56,31 +56,31 @@ def test_without_a_command_it_holds_its_cell(controller: MotionController) -> No
 def test_plays_jerk_by_jerk_and_from_the_middle_when_ticks_were_missed(
     controller: MotionController,
 ) -> None:
-    assert controller.take(command(10, (1.0, 0.0), (2.0, 0.5), (-4.0, 0.0)))
+    assert controller.accept_command(command(10, (1.0, 0.0), (2.0, 0.5), (-4.0, 0.0)))
     controller.step(11)
     assert controller.plant.setpoint == pytest.approx((2.0 * TICK_S, 0.5 * TICK_S))
     controller.step(12)
     assert controller.plant.setpoint == pytest.approx((-2.0 * TICK_S, 0.5 * TICK_S))
-    assert driven(controller) == {Rung.PLAY: 2}
+    assert driven(controller) == {Rung.EXECUTE: 2}
 
 
 def test_comes_to_rest_in_the_last_cell_when_the_trajectory_has_run_out(
     controller: MotionController,
 ) -> None:
     target: Cell = (1, 2)
-    controller.take(command(0, *[(3.0, 0.0)] * 4, hold_cell=target))
+    controller.accept_command(command(0, *[(3.0, 0.0)] * 4, hold_cell=target))
     for tick in range(300):
         controller.step(tick)
-    assert driven(controller) == {Rung.PLAY: 4, Rung.HOLD: 296}
+    assert driven(controller) == {Rung.EXECUTE: 4, Rung.HOLD: 296}
     assert controller.plant.state == pytest.approx(cell_state(LATTICE, target, 30.0), abs=0.01)
 
 
 def test_the_newest_command_counts(controller: MotionController) -> None:
-    assert controller.take(command(5, (1.0, 0.0)))
+    assert controller.accept_command(command(5, (1.0, 0.0)))
     for tick in (5, 4, -1):
-        assert not controller.take(command(tick, (9.0, 0.0), hold_cell=(1, 1)))
+        assert not controller.accept_command(command(tick, (9.0, 0.0), hold_cell=(1, 1)))
     assert (controller.command_tick, controller.hold_cell) == (5, HOME)
-    assert controller.take(command(6, (2.0, 0.0), hold_cell=(1, 1)))
+    assert controller.accept_command(command(6, (2.0, 0.0), hold_cell=(1, 1)))
     assert (controller.command_tick, controller.hold_cell) == (6, (1, 1))
     assert (controller.motion_origin, controller.motion_end_tick) == (HOME, 7)
 
@@ -88,17 +88,17 @@ def test_the_newest_command_counts(controller: MotionController) -> None:
 def test_a_command_without_jerks_leaves_the_motion_as_it_is_unless_it_names_another_cell(
     controller: MotionController,
 ) -> None:
-    controller.take(command(5, *[(1.0, 0.0)] * 3, hold_cell=(1, 1)))
+    controller.accept_command(command(5, *[(1.0, 0.0)] * 3, hold_cell=(1, 1)))
     controller.step(5)
-    assert controller.take(command(6, hold_cell=(1, 1)))
+    assert controller.accept_command(command(6, hold_cell=(1, 1)))
     assert (controller.command_tick, controller.motion_end_tick) == (6, 8)
     controller.step(6)
     assert controller.plant.setpoint[0] == pytest.approx(2.0 * TICK_S)
-    assert driven(controller) == {Rung.PLAY: 2}
-    assert controller.take(command(7, hold_cell=(2, 1)))  # by the hold law
+    assert driven(controller) == {Rung.EXECUTE: 2}
+    assert controller.accept_command(command(7, hold_cell=(2, 1)))  # by the hold law
     controller.step(7)
     assert controller.hold_cell == (2, 1)
-    assert driven(controller) == {Rung.PLAY: 2, Rung.HOLD: 1}
+    assert driven(controller) == {Rung.EXECUTE: 2, Rung.HOLD: 1}
 
 
 # --- the process in charge --------------------------------------------------------------------
@@ -124,48 +124,54 @@ def test_a_new_vehicle_has_no_process_in_charge() -> None:
 
 
 def test_an_older_process_is_refused(controller: MotionController) -> None:
-    controller.take(command(3, (1.0, 0.0)))
+    controller.accept_command(command(3, (1.0, 0.0)))
     before = known(controller)
     for cell in (HOME, (1, 1)):
         late = evolve(command(4, (9.0, 0.0), hold_cell=cell, incarnation=AGENT - 1), joined=(7,))
-        assert not controller.take(late)
+        assert not controller.accept_command(late)
         assert known(controller) == before
-    assert not controller.take(evolve(command(4, incarnation=AGENT - 1), jerks=b"nonsense"))
+    assert not controller.accept_command(
+        evolve(command(4, incarnation=AGENT - 1), jerks=b"nonsense")
+    )
 
 
 def test_a_newer_process_takes_charge_with_its_command(controller: MotionController) -> None:
-    controller.take(command(3, (1.0, 0.0)))
-    assert controller.take(command(4, (2.0, 0.0), incarnation=AGENT + 1))
+    controller.accept_command(command(3, (1.0, 0.0)))
+    assert controller.accept_command(command(4, (2.0, 0.0), incarnation=AGENT + 1))
     assert controller.attendant == AGENT + 1
     assert plays(controller, 4) == (2.0, 0.0)
-    assert not controller.take(command(5, (3.0, 0.0)))
+    assert not controller.accept_command(command(5, (3.0, 0.0)))
     assert plays(controller, 4) == (2.0, 0.0)
 
 
 def test_a_claim_cannot_move_the_vehicle(controller: MotionController) -> None:
     """It could not act for the vehicle before, so no plan can allow its move."""
-    controller.take(evolve(command(3, (1.0, 0.0)), accepted=LOW))
+    controller.accept_command(evolve(command(3, (1.0, 0.0)), accepted=LOW))
     before = known(controller)
-    assert not controller.take(command(4, (2.0, 0.0), hold_cell=(1, 1), incarnation=AGENT + 1))
+    assert not controller.accept_command(
+        command(4, (2.0, 0.0), hold_cell=(1, 1), incarnation=AGENT + 1)
+    )
     assert known(controller) == before
-    assert controller.take(command(4, (2.0, 0.0), incarnation=AGENT + 1))
-    assert controller.take(command(5, (2.0, 0.0), hold_cell=(1, 1), incarnation=AGENT + 1))
+    assert controller.accept_command(command(4, (2.0, 0.0), incarnation=AGENT + 1))
+    assert controller.accept_command(
+        command(5, (2.0, 0.0), hold_cell=(1, 1), incarnation=AGENT + 1)
+    )
 
 
 def test_a_claim_that_came_second_is_tried_again_with_the_next_tick(
     controller: MotionController,
 ) -> None:
     """The one before has begun to move in this tick, of which the claim does not know."""
-    assert controller.take(command(3, (1.0, 0.0), hold_cell=(1, 1)))
-    assert not controller.take(command(3, (2.0, 0.0), incarnation=AGENT + 1))
+    assert controller.accept_command(command(3, (1.0, 0.0), hold_cell=(1, 1)))
+    assert not controller.accept_command(command(3, (2.0, 0.0), incarnation=AGENT + 1))
     assert (controller.attendant, controller.hold_cell) == (AGENT, (1, 1))
     claim = command(4, (2.0, 0.0), hold_cell=(1, 1), incarnation=AGENT + 1)
-    assert controller.take(claim)
+    assert controller.accept_command(claim)
     assert controller.attendant == AGENT + 1
 
 
 def test_handing_over_leaves_the_motion_as_it_is(controller: MotionController) -> None:
-    controller.take(command(3, *[(1.0, 0.0)] * 9, hold_cell=(1, 1)))
+    controller.accept_command(command(3, *[(1.0, 0.0)] * 9, hold_cell=(1, 1)))
     before = known(controller)
     controller.put_in_charge(AGENT + 7)
     assert known(controller) == (AGENT + 7, *before[1:])
@@ -178,12 +184,12 @@ def test_formations_stay_joined_and_only_the_process_in_charge_joins(
     controller: MotionController,
 ) -> None:
     own = LATTICE.block_of(HOME[0])
-    controller.take(evolve(command(3), joined=(own + 2,)))
+    controller.accept_command(evolve(command(3), joined=(own + 2,)))
     assert [*controller.joined] == [own, own + 2]
-    controller.take(evolve(command(4), joined=()))
-    controller.take(evolve(command(5), joined=(own + 1, own + 2)))
-    controller.take(evolve(command(6, incarnation=AGENT - 1), joined=(own + 5,)))
-    controller.take(evolve(command(5), joined=(own + 6,)))
+    controller.accept_command(evolve(command(4), joined=()))
+    controller.accept_command(evolve(command(5), joined=(own + 1, own + 2)))
+    controller.accept_command(evolve(command(6, incarnation=AGENT - 1), joined=(own + 5,)))
+    controller.accept_command(evolve(command(5), joined=(own + 6,)))
     assert [*controller.joined] == [own, own + 1, own + 2]
 
 
@@ -201,12 +207,12 @@ def asking(
 def test_requests_of_the_process_in_charge_are_noted_whatever_the_tick(
     controller: MotionController,
 ) -> None:
-    controller.take(command(5, (1.0, 0.0)))
+    controller.accept_command(command(5, (1.0, 0.0)))
     before = known(controller)
     for tick, ballot in ((5, LOW), (4, HIGH)):
         late = evolve(command(tick, (9.0, 0.0), hold_cell=(1, 1)), accepted=ballot, joined=(7,))
-        assert controller.note(late)
-        assert not controller.note(late)  # nothing new
+        assert controller.store_requests(late)
+        assert not controller.store_requests(late)  # nothing new
         assert (controller.accepted, controller.joined[-1]) == (ballot, 7)
     assert known(controller)[3:] == before[3:]  # it is not played
 
@@ -215,7 +221,11 @@ def test_requests_of_the_process_in_charge_are_noted_whatever_the_tick(
 def test_the_newest_acceptance_counts(controller: MotionController, *, with_command: bool) -> None:
     for tick, (ballot, noted) in enumerate(((HIGH, True), (LOW, False), (None, False)), start=3):
         request = asking(ballot, tick=tick)
-        assert controller.take(request) if with_command else controller.note(request) is noted
+        assert (
+            controller.accept_command(request)
+            if with_command
+            else controller.store_requests(request) is noted
+        )
         assert controller.accepted == HIGH
 
 
@@ -225,13 +235,13 @@ def test_nothing_is_noted_for_a_process_that_is_not_in_charge(
 ) -> None:
     """Neither for one that has been replaced nor, before its claim, for its successor."""
     before = known(controller)
-    assert not controller.note(asking(LOW, 7, incarnation=incarnation))
+    assert not controller.store_requests(asking(LOW, 7, incarnation=incarnation))
     assert known(controller) == before
 
 
 def test_numbers_out_of_range_are_not_noted(controller: MotionController) -> None:
     before = known(controller)
-    assert not controller.note(asking(LOW, 0, MAX_COLUMN + 1))
+    assert not controller.store_requests(asking(LOW, 0, MAX_COLUMN + 1))
     assert known(controller) == before
 
 
@@ -239,16 +249,16 @@ def test_numbers_out_of_range_are_not_noted(controller: MotionController) -> Non
 def test_an_acceptance_is_forgotten_when_another_takes_charge(
     controller: MotionController, claim: str
 ) -> None:
-    controller.take(asking(LOW, 7))
+    controller.accept_command(asking(LOW, 7))
     joined = controller.joined
     if claim == "command":
-        assert controller.take(asking(None, tick=4, incarnation=AGENT + 1))
+        assert controller.accept_command(asking(None, tick=4, incarnation=AGENT + 1))
     else:
         controller.put_in_charge(AGENT + 1)
     assert (controller.accepted, controller.joined) == (None, joined)
-    assert not controller.note(asking(HIGH, tick=4))  # its time is over
+    assert not controller.store_requests(asking(HIGH, tick=4))  # its time is over
     assert controller.accepted is None
-    assert controller.note(asking(LOW, tick=4, incarnation=AGENT + 1))
+    assert controller.store_requests(asking(LOW, tick=4, incarnation=AGENT + 1))
 
 
 # --- what it refuses --------------------------------------------------------------------------
@@ -272,17 +282,17 @@ def test_an_acceptance_is_forgotten_when_another_takes_charge(
 def test_a_bad_command_is_refused_whole(
     controller: MotionController, changes: dict[str, object]
 ) -> None:
-    controller.take(command(3, (1.0, 0.0)))
+    controller.accept_command(command(3, (1.0, 0.0)))
     before = known(controller)
     for incarnation in (AGENT, AGENT + 1):
         good = command(4, (2.0, 0.0), hold_cell=(1, 1), incarnation=incarnation)
         with pytest.raises(BadInputError):
-            controller.take(evolve(good, **changes))  # type: ignore[arg-type]
+            controller.accept_command(evolve(good, **changes))  # type: ignore[arg-type]
         assert known(controller) == before
 
 
 def test_the_body_has_its_own_limits(controller: MotionController) -> None:
-    controller.take(command(0, *[(3e38, -3e38)] * 100))
+    controller.accept_command(command(0, *[(3e38, -3e38)] * 100))
     for tick in range(100):
         controller.step(tick)
         _, v, a, _, v_y, a_y = controller.plant.state
@@ -299,11 +309,11 @@ def test_a_motion_is_over_when_its_time_is_and_the_body_is_there(
     controller: MotionController,
 ) -> None:
     assert not controller.moving(0)
-    controller.take(command(0, (0.0, 0.0), (0.0, 0.0)))
+    controller.accept_command(command(0, (0.0, 0.0), (0.0, 0.0)))
     for tick, moving in ((0, True), (1, True), (2, False)):
         assert controller.moving(tick) == moving
         controller.step(tick)
-    controller.take(command(3, (0.0, 0.0), hold_cell=(1, 1)))
+    controller.accept_command(command(3, (0.0, 0.0), hold_cell=(1, 1)))
     ends = [tick for tick in range(4, 200) if _moving_after(controller, tick)]
     assert 30 < len(ends) < 120  # one column, by the hold law
     assert ends == list(range(4, 4 + len(ends)))

@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 from laneweave.protocol.wire.messages import Neighbour
 from laneweave.sim_bridge.bodies import overlaps_and_gaps as overlap
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import (
-    Around,
     Bodies,
     MinGaps,
+    Neighbours,
     Pose,
     corners,
     pose_of,
@@ -162,10 +162,12 @@ def test_gap_and_headway_of_a_simple_queue() -> None:
     assert bodies(road).min_gaps() == MinGaps(4.0, 1.0)
 
 
-def sense(road: dict[str, Pose], accels_mps2: dict[str, float] | None = None) -> dict[str, Around]:
+def sense(
+    road: dict[str, Pose], accels_mps2: dict[str, float] | None = None
+) -> dict[str, Neighbours]:
     seen = bodies(road).exact_neighbours(3, LANE_M, accels_mps2 or {})
     return {
-        name: Around(*(tuple(Neighbour(*each) for each in others) for others in sides))
+        name: Neighbours(*(tuple(Neighbour(*each) for each in others) for others in sides))
         for name, sides in seen.items()
     }
 

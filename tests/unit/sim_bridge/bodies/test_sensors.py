@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from laneweave.protocol.scenario.fields import Scenario, Sensing
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import Name, Neighbour
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import NONE_AROUND, Around, ExactNeighbours
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import NO_NEIGHBOURS, ExactNeighbours, Neighbours
 from laneweave.sim_bridge.bodies.sensors import Sensors
 from support.paper import EXACT
 
@@ -27,7 +27,7 @@ NOISE = Sensing(
 SCENARIO = Scenario(seed=5, sensing=NOISE)
 STATE: State = (120.0, 15.0, -1.0, 5.25, 0.5, 0.25)
 AROUND: ExactNeighbours = ([(1, 10.0, 14.0, -2.0), (2, 7.0, 13.0, 1.0)], [(0, 9.0, 16.0, 0.0)])
-TRUE_AROUND = Around(
+TRUE_AROUND = Neighbours(
     (Neighbour(1, 10.0, 14.0, -2.0), Neighbour(2, 7.0, 13.0, 1.0)), (Neighbour(0, 9.0, 16.0),)
 )
 A, B = Name("a"), Name("b")
@@ -39,7 +39,7 @@ def states(scenario: Scenario = SCENARIO, name: Name = A, samples: int = 20) -> 
     return np.array([sensors.measure(STATE) for _ in range(samples)])
 
 
-def others(around: Around) -> list[tuple[float, float, float]]:
+def others(around: Neighbours) -> list[tuple[float, float, float]]:
     return [(n.gap_m, n.speed_mps, n.accel_mps2) for n in (*around.ahead, *around.behind)]
 
 
@@ -74,7 +74,7 @@ def test_what_is_seen_keeps_its_lane_and_its_side() -> None:
     seen = Sensors(SCENARIO, A).measure_neighbours(AROUND)
     assert [other.lane for other in seen.ahead] == [1, 2]
     assert [other.lane for other in seen.behind] == [0]
-    assert Sensors(SCENARIO, A).measure_neighbours(([], [])) == NONE_AROUND
+    assert Sensors(SCENARIO, A).measure_neighbours(([], [])) == NO_NEIGHBOURS
 
 
 def test_errors_are_equal_only_for_the_same_vehicle_and_seed() -> None:

@@ -83,7 +83,7 @@ def test_the_first_ending_counts_and_nothing_follows_it(record: RunRecord, tmp_p
     record.close(12.0, Ending.COMPLETE)
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     record.close(15.0, Ending.INTERRUPTED)
-    record.note(15.0, "leader")
+    record.event(15.0, "leader")
     record.on_event(LogEvent(Name("agent"), Name("A"), 15.0, Name("late")))
     record.on_heartbeat(Heartbeat(Name("c0"), 1, 1, leading=True, formations=0), 15.0, 1.0)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
@@ -188,7 +188,7 @@ def test_a_trip_is_recorded(record: RunRecord, tmp_path: Path) -> None:
     record.on_entered(traveller)
     plant = traveller.controller.plant
     plant._state = (SCENARIO.road.length_m + 6.0, 15.0, 0.0, 5.25, 0.0, 0.0)
-    traveller.controller.rung_ticks |= {Rung.PLAY: 90, Rung.HOLD: 3, Rung.GIVE_WAY: 1}
+    traveller.controller.rung_ticks |= {Rung.EXECUTE: 90, Rung.HOLD: 3, Rung.GIVE_WAY: 1}
     stays = vehicle("v0002")
     record.on_demanded(stays.admission.arrival)
     record.on_entered(stays)
@@ -224,7 +224,7 @@ def test_a_vehicle_that_stands_at_the_end_has_left(record: RunRecord, tmp_path: 
 def test_positions_and_overlaps_are_recorded(record: RunRecord, tmp_path: Path) -> None:
     pair = ("v0001", "v0002")
     for tick in range(3):
-        record.on_shown(
+        record.on_positions(
             0.1 * tick,
             [vehicle(name) for name in pair],
             overlaps=[pair] if tick == 1 else [],
@@ -282,9 +282,9 @@ def test_an_empty_run_has_all_files_and_an_agreed_summary(
 def test_events_are_written_at_once_and_begin_with_the_time(
     record: RunRecord, tmp_path: Path
 ) -> None:
-    record.note(1.5, "agent-missing", vehicle="v1", path=tmp_path)
+    record.event(1.5, "agent-missing", vehicle="v1", path=tmp_path)
     (line,) = (tmp_path / "events.jsonl").read_text().splitlines()
     assert list(json.loads(line)) == ["t_s", "kind", "role", "vehicle", "path"]
-    record.note(2.0, "odd", t_s=99, kind="other", more=[1, 2])
+    record.event(2.0, "odd", t_s=99, kind="other", more=[1, 2])
     (odd,) = read_events(tmp_path, "odd")
     assert odd == {"t_s": 2.0, "kind": "odd", "role": "bridge", "more": [1, 2]}

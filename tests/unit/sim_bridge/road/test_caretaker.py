@@ -98,7 +98,7 @@ def test_accepts_a_plan_in_which_its_vehicle_holds_and_the_controller_notes_it(
 
 
 def test_what_the_agent_before_it_accepted_is_not_its_own(vehicle: RoadVehicle) -> None:
-    vehicle.controller.accept(SECOND)
+    vehicle.controller.store_acceptance(SECOND)
     caretaker = Caretaker(vehicle, CARETAKER, 0)
     answer_of(caretaker, prepare())
     assert not caretaker.state(0).accepted
@@ -154,7 +154,7 @@ def test_the_move_of_the_agent_before_it_counts_until_its_end(vehicle: RoadVehic
     move = command(
         0, (0.0, 0.0), hold_cell=NEXT, incarnation=AGENT, motion_end_tick=38, motion_origin=HOME
     )
-    assert vehicle.controller.take(move)
+    assert vehicle.controller.accept_command(move)
     drive(vehicle, range(5))
     caretaker = Caretaker(vehicle, CARETAKER, 5)
     state = answer_of(caretaker, prepare(), 5)

@@ -214,7 +214,7 @@ BUGS = {
 def take(builder: GrowingFormations, *vehicles: tuple[int, int, int]) -> list[bool]:
     """Let vehicles (column, lane, preferred lane) enter as their cells pass."""
     return [
-        builder.takes((column, lane), preferred, builder.lattice.passing_time_s(column))
+        builder.try_add((column, lane), preferred, builder.lattice.passing_time_s(column))
         for column, lane, preferred in vehicles
     ]
 
@@ -307,8 +307,8 @@ def test_on_one_lane_a_formation_needs_no_free_column() -> None:
 def test_a_block_is_closed_when_its_last_column_has_passed() -> None:
     grid = lattice(block_columns=BLOCK_COLUMNS)
     builder = ColumnBlocks(grid, 6, 1.5)
-    assert builder.takes((-1, 1), 0, 1.0)
-    assert builder.takes((-9, 1), 0, 9.0)
+    assert builder.try_add((-1, 1), 0, 1.0)
+    assert builder.try_add((-9, 1), 0, 9.0)
     assert builder.closed(4.4) == []
     assert builder.closed_to == -1
     assert builder.closed(4.5) == [ClosedFormation(0, 0, 4.5)]

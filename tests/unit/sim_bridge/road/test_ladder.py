@@ -10,7 +10,7 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.vehicle.motion import State, cell_state, commanded_state, hold_law
 from laneweave.protocol.wire.messages import Neighbour
 from laneweave.sim_bridge.bodies.motion_controller import RELEASE_M, Rung
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import NONE_AROUND, Around
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import NO_NEIGHBOURS, Neighbours
 from laneweave.sim_bridge.bodies.plant import Plant
 from support.paper import PAPER
 from support.road_vehicles import controller_in
@@ -41,12 +41,12 @@ class Track:
         return float(self.rear_m - self.plant.state[0])
 
     def command(self, *pairs: tuple[float, float], hold_cell: Cell = HOME) -> None:
-        assert self.controller.take(command(self.tick, *pairs, hold_cell=hold_cell))
+        assert self.controller.accept_command(command(self.tick, *pairs, hold_cell=hold_cell))
 
     def step(self) -> Rung:
-        around = NONE_AROUND
+        around = NO_NEIGHBOURS
         if np.isfinite(self.rear_m):
-            around = Around((Neighbour(self.lane, self.gap_m, self.speed_mps),), ())
+            around = Neighbours((Neighbour(self.lane, self.gap_m, self.speed_mps),), ())
         self.controller.perceive(self.plant.state, around)
         self.controller.step(self.tick)
         self.min_accel_mps2 = min(self.min_accel_mps2, self.plant.state[2])
@@ -75,7 +75,7 @@ def test_it_plays_a_command_as_long_as_it_could_still_brake(
     """Four metres behind one that is as fast: nothing that it would do by itself."""
     track.put_ahead(4.0, V_F)
     track.command(*[(0.0, 0.0)] * 40)
-    assert set(track.run(40)) == {Rung.PLAY}
+    assert set(track.run(40)) == {Rung.EXECUTE}
     assert track.plant.state[1] == V_F
 
 
@@ -104,7 +104,7 @@ def test_a_holding_vehicle_gives_way_comfortably_on_its_target_lane(
     assert track.min_accel_mps2 >= 0.6 * LIMITS.min_accel_mps2 - 1e-9
     ticks = track.controller.rung_ticks
     assert ticks[Rung.GIVE_WAY] > 20
-    assert ticks[Rung.EMERGENCY] == ticks[Rung.PLAY] == 0
+    assert ticks[Rung.EMERGENCY] == ticks[Rung.EXECUTE] == 0
 
 
 def test_vehicles_on_other_lanes_are_not_in_its_way(track: Track) -> None:
@@ -122,8 +122,8 @@ def test_an_emergency_overrides_the_command(track: Track) -> None:
     track.command(*[(0.0, 0.0)] * 40)
     rungs = track.run(40)
     first = rungs.index(Rung.EMERGENCY)
-    assert set(rungs[:first]) <= {Rung.PLAY}
-    assert Rung.PLAY not in rungs[first:]
+    assert set(rungs[:first]) <= {Rung.EXECUTE}
+    assert Rung.EXECUTE not in rungs[first:]
     assert rungs[first : first + 12] == [Rung.EMERGENCY] * 12
     assert track.min_accel_mps2 < -9.5
     assert track.plant.state[1] == pytest.approx(0.0, abs=0.01)
@@ -139,7 +139,7 @@ def test_an_emergency_ends_in_a_hold_and_only_a_fresh_command_leads_back_up(trac
     track.command(hold_cell=HOME)  # it has nothing to play
     assert track.step() is Rung.HOLD
     track.command(*[(1.0, 0.0)] * 3)
-    assert track.run(4) == [Rung.PLAY] * 3 + [Rung.HOLD]
+    assert track.run(4) == [Rung.EXECUTE] * 3 + [Rung.HOLD]
 
 
 def test_after_an_emergency_it_gives_way_behind_a_slow_vehicle(track: Track) -> None:
@@ -150,7 +150,7 @@ def test_after_an_emergency_it_gives_way_behind_a_slow_vehicle(track: Track) -> 
         rung for rung, before in zip(rungs, [None, *rungs], strict=False) if rung is not before
     ]
     assert order[0] is Rung.EMERGENCY
-    assert Rung.PLAY not in order
+    assert Rung.EXECUTE not in order
     assert order[-1] is Rung.GIVE_WAY
     assert track.plant.state[1] == pytest.approx(6.0, abs=0.3)
     assert track.gap_m > 1.0
@@ -175,7 +175,7 @@ def test_an_emergency_ends_only_when_something_is_to_spare() -> None:
         level = Neighbour(HOME[1], 0.0, V_F)
         spare_m = controller._brake.spare_m(plant.state, plant.setpoint[0], (0.0, 0.0), [level])
         other = attrs.evolve(level, gap_m=wanted_m - spare_m)
-        controller.perceive(plant.state, Around((other,), ()))
+        controller.perceive(plant.state, Neighbours((other,), ()))
         controller.step(track.tick)
         track.tick += 1
         brakes.append(controller.rung is Rung.EMERGENCY)
@@ -205,7 +205,7 @@ def test_it_brakes_for_a_lane_that_the_body_touches(across_m: float, *, brakes: 
 
 
 def test_a_vehicle_behind_is_no_emergency(track: Track) -> None:
-    track.controller.perceive(track.plant.state, Around((), (Neighbour(HOME[1], -2.0, 25.0),)))
+    track.controller.perceive(track.plant.state, Neighbours((), (Neighbour(HOME[1], -2.0, 25.0),)))
     track.controller.step(track.tick)
     assert track.controller.rung is Rung.HOLD
 
@@ -224,7 +224,7 @@ def test_it_steers_on_while_it_brakes(track: Track) -> None:
 def test_it_drives_by_what_its_sensors_measure_in_this_tick() -> None:
     track = Track()
     s, *rest = track.plant.state
-    track.controller.perceive((s - 2.0, *rest), NONE_AROUND)  # type: ignore[arg-type]
+    track.controller.perceive((s - 2.0, *rest), NO_NEIGHBOURS)  # type: ignore[arg-type]
     assert track.controller.measured[0] == s - 2.0
     assert track.controller.moving(0)
     track.controller.step(0)

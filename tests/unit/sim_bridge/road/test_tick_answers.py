@@ -27,16 +27,16 @@ def answers() -> Answers:
 
 def tick(answers: Answers, now_s: float, *heard: Name, lasts_s: float = DEADLINE_S) -> list[Name]:
     """Ask all agents, let some answer; return those that are silent when the next tick begins."""
-    answers.ask((A, B, C), now_s, link_up=True)
+    answers.start_tick((A, B, C), now_s, link_up=True)
     for name in heard:
-        answers.heard(name)
+        answers.on_message(name)
         answers.awaited.discard(name)
     answers.close()
-    return answers.settle(now_s + lasts_s)
+    return answers.finish_tick(now_s + lasts_s)
 
 
 def test_waits_for_agents_that_are_up_until_the_deadline(answers: Answers) -> None:
-    answers.ask((A, B, C), 5.0, link_up=True)
+    answers.start_tick((A, B, C), 5.0, link_up=True)
     assert answers.awaited == {A, B}
     answers.awaited.discard(A)
     assert not answers.complete(5.0 + 0.99 * DEADLINE_S)
@@ -47,13 +47,13 @@ def test_waits_for_agents_that_are_up_until_the_deadline(answers: Answers) -> No
 
 
 def test_awaited_agents_are_asked_again_at_intervals(answers: Answers) -> None:
-    answers.ask((A, B, C), 5.0, link_up=True)
+    answers.start_tick((A, B, C), 5.0, link_up=True)
     resend_s = RUNTIME.tick_resend_s
-    assert answers.ask_again(5.0 + 0.99 * resend_s) == []
-    assert answers.ask_again(5.0 + resend_s) == [A, B]
+    assert answers.due_resends(5.0 + 0.99 * resend_s) == []
+    assert answers.due_resends(5.0 + resend_s) == [A, B]
     answers.awaited.discard(B)
-    assert answers.ask_again(5.0 + 1.5 * resend_s) == []
-    assert answers.ask_again(5.0 + 2.0 * resend_s) == [A]
+    assert answers.due_resends(5.0 + 1.5 * resend_s) == []
+    assert answers.due_resends(5.0 + 2.0 * resend_s) == [A]
 
 
 def test_an_agent_without_answers_for_long_is_silent(answers: Answers) -> None:
@@ -61,12 +61,12 @@ def test_an_agent_without_answers_for_long_is_silent(answers: Answers) -> None:
         heard = (A,) if number % (TICKS - 1) else (A, B)
         assert tick(answers, number * DEADLINE_S, *heard) == []
         assert answers.silent == set()
-    answers.ask((A, B), 1.0, link_up=True)
+    answers.start_tick((A, B), 1.0, link_up=True)
     assert answers.awaited == {A, B}
-    answers.heard(B)
+    answers.on_message(B)
     fallen = [tick(answers, number * DEADLINE_S, A) for number in range(TICKS + 3)]
     assert fallen == [[]] * (TICKS - 1) + [[B], [], [], []]
-    answers.ask((A, B), 100.0, link_up=True)
+    answers.start_tick((A, B), 100.0, link_up=True)
     assert answers.awaited == {A}
 
 
@@ -75,7 +75,7 @@ def test_a_sign_of_life_ends_the_silence(answers: Answers, sign: str) -> None:
     for number in range(TICKS):
         tick(answers, number * DEADLINE_S, A)
     if sign == "answer":
-        answers.heard(B)
+        answers.on_message(B)
     else:
         answers.agent_down(B)
         answers.agent_up(B)
@@ -98,25 +98,25 @@ def test_silence_is_the_time_spent_waiting_for_an_answer(
 
 def test_agents_without_a_token_and_departed_ones_are_not_silent(answers: Answers) -> None:
     for number in range(2 * TICKS):
-        answers.ask((A, C), number * DEADLINE_S, link_up=True)
-        answers.heard(A)
-        assert answers.settle((number + 1) * DEADLINE_S) == []
+        answers.start_tick((A, C), number * DEADLINE_S, link_up=True)
+        answers.on_message(A)
+        assert answers.finish_tick((number + 1) * DEADLINE_S) == []
     for number in range(TICKS - 1):
         tick(answers, 50.0 + number * DEADLINE_S, A)
-    answers.forget(B)
+    answers.remove(B)
     assert tick(answers, 99.0, A) == []
 
 
 def test_without_a_connection_no_agent_is_awaited_or_becomes_silent(answers: Answers) -> None:
     for number in range(2 * TICKS):
-        answers.ask((A, B), number * DEADLINE_S, link_up=False)
+        answers.start_tick((A, B), number * DEADLINE_S, link_up=False)
         assert answers.awaited == set()
-        assert answers.settle((number + 1) * DEADLINE_S) == []
-    assert not answers.deaf
+        assert answers.finish_tick((number + 1) * DEADLINE_S) == []
+    assert not answers.all_silent
     for number in range(2 * TICKS):  # lost while the tick is under way
-        answers.ask((A, B), 50.0 + number * DEADLINE_S, link_up=True)
+        answers.start_tick((A, B), 50.0 + number * DEADLINE_S, link_up=True)
         answers.link_down()
-        assert answers.settle(50.0 + (number + 1) * DEADLINE_S) == []
+        assert answers.finish_tick(50.0 + (number + 1) * DEADLINE_S) == []
 
 
 # --- answers that come too late ---------------------------------------------------------------
@@ -127,103 +127,103 @@ LATE_TICKS = round(LATE_SHARE * TICKS)
 
 def late_tick(answers: Answers, number: int, *effective: Name) -> None:
     """Let A and B be heard, but only some in time."""
-    answers.ask((A, B, C), number * DEADLINE_S, link_up=True)
+    answers.start_tick((A, B, C), number * DEADLINE_S, link_up=True)
     for name in (A, B):
-        answers.heard(name)
+        answers.on_message(name)
     for name in effective:
-        answers.effective(name)
+        answers.in_time(name)
         answers.awaited.discard(name)
     answers.close()
-    assert answers.settle((number + 1) * DEADLINE_S) == []
+    assert answers.finish_tick((number + 1) * DEADLINE_S) == []
 
 
 def test_an_agent_that_always_answers_late_is_ineffective_but_not_silent(answers: Answers) -> None:
     for number in range(LATE_TICKS - 1):
         late_tick(answers, number, A)
-        assert not answers.ineffective(B)
+        assert not answers.always_late(B)
     late_tick(answers, LATE_TICKS, A)
-    assert [answers.ineffective(name) for name in (A, B, C)] == [False, True, False]
+    assert [answers.always_late(name) for name in (A, B, C)] == [False, True, False]
     assert answers.silent == set()
-    answers.ask((A, B), 100.0, link_up=True)
+    answers.start_tick((A, B), 100.0, link_up=True)
     assert answers.awaited == {A, B}  # it may catch up
 
 
 def test_one_answer_in_time_in_a_while_is_enough_to_be_effective(answers: Answers) -> None:
     for number in range(10 * LATE_TICKS):
         late_tick(answers, number, *((A, B) if number % LATE_TICKS == 0 else (A,)))
-        assert not answers.ineffective(B)
+        assert not answers.always_late(B)
 
 
 @pytest.mark.parametrize("sign", ["in time", "token", "no token", "left"])
 def test_what_ends_being_ineffective(answers: Answers, sign: str) -> None:
     for number in range(LATE_TICKS):
         late_tick(answers, number, A)
-    assert answers.ineffective(B)
+    assert answers.always_late(B)
     match sign:
         case "in time":
-            answers.effective(B)
+            answers.in_time(B)
         case "token":
             answers.agent_up(B)
         case "no token":
             answers.agent_down(B)
         case _:
-            answers.forget(B)
-    assert not answers.ineffective(B)
+            answers.remove(B)
+    assert not answers.always_late(B)
 
 
 def test_time_off_the_network_makes_no_agent_ineffective(answers: Answers) -> None:
     for number in range(2 * LATE_TICKS):
-        answers.ask((A, B), number * DEADLINE_S, link_up=number % 2 == 0)
+        answers.start_tick((A, B), number * DEADLINE_S, link_up=number % 2 == 0)
         answers.link_down()
-        answers.settle((number + 1) * DEADLINE_S)
-    assert not answers.ineffective(A)
+        answers.finish_tick((number + 1) * DEADLINE_S)
+    assert not answers.always_late(A)
 
 
 # --- no agent answers -------------------------------------------------------------------------
 
 
-def make_deaf(answers: Answers) -> None:
+def silence_all(answers: Answers) -> None:
     for number in range(TICKS):
-        assert not answers.deaf
+        assert not answers.all_silent
         tick(answers, number * DEADLINE_S)
-    assert answers.deaf
+    assert answers.all_silent
 
 
-def test_a_deaf_network_awaits_no_agent(answers: Answers) -> None:
-    make_deaf(answers)
+def test_a_silent_network_awaits_no_agent(answers: Answers) -> None:
+    silence_all(answers)
     answers.agent_up(C)  # tokens come through when messages do not
-    answers.ask((A, B, C), 100.0, link_up=True)
+    answers.start_tick((A, B, C), 100.0, link_up=True)
     assert answers.awaited == set()
     assert answers.complete(100.0)
 
 
-def test_an_agent_that_joins_a_deaf_network_becomes_silent(answers: Answers) -> None:
-    make_deaf(answers)
+def test_an_agent_that_joins_a_silent_network_becomes_silent(answers: Answers) -> None:
+    silence_all(answers)
     answers.agent_up(C)
     short_s = 0.25 * DEADLINE_S
     fallen = [tick(answers, 90.0 + n * short_s, lasts_s=short_s) for n in range(4 * TICKS)]
     assert fallen == [[]] * (4 * TICKS - 1) + [[C]]
 
 
-def test_any_answer_ends_the_deafness(answers: Answers) -> None:
-    make_deaf(answers)
-    answers.heard(A)
-    assert not answers.deaf
-    answers.ask((A, B), 100.0, link_up=True)
+def test_any_answer_ends_the_silence(answers: Answers) -> None:
+    silence_all(answers)
+    answers.on_message(A)
+    assert not answers.all_silent
+    answers.start_tick((A, B), 100.0, link_up=True)
     assert answers.awaited == {A}  # B is silent for itself
 
 
 def test_one_answer_in_a_while_is_enough(answers: Answers) -> None:
     for number in range(10 * TICKS):
         tick(answers, number * DEADLINE_S, *((A,) if number % (TICKS - 1) == 0 else ()))
-        assert not answers.deaf
+        assert not answers.all_silent
 
 
-def test_an_empty_road_is_not_deaf(answers: Answers) -> None:
+def test_an_empty_road_is_not_silent(answers: Answers) -> None:
     for number in range(3 * TICKS):
-        answers.ask((), number * DEADLINE_S, link_up=True)
-        assert answers.settle((number + 1) * DEADLINE_S) == []
-    assert not answers.deaf
+        answers.start_tick((), number * DEADLINE_S, link_up=True)
+        assert answers.finish_tick((number + 1) * DEADLINE_S) == []
+    assert not answers.all_silent
 
 
 def test_deadlines_may_be_as_long_as_silence() -> None:
@@ -237,14 +237,14 @@ def slow_ticks(answers: Answers, names: list[Name], count: int, *, late: bool) -
     """Let ticks pass; return how long the next one may last."""
     now_s = 100.0
     for _ in range(count):
-        answers.ask(names, now_s, link_up=True)
+        answers.start_tick(names, now_s, link_up=True)
         for name in names:
-            answers.heard(name)
-            answers.effective(name)
+            answers.on_message(name)
+            answers.in_time(name)
             if late:
                 answers.late(name)
         now_s += 1.0
-    answers.ask(names, now_s, link_up=True)
+    answers.start_tick(names, now_s, link_up=True)
     return answers.deadline_s - now_s
 
 
@@ -253,9 +253,9 @@ def test_ticks_get_more_time_while_many_answers_are_late_and_less_again() -> Non
     names = [Name(f"v{number}") for number in range(40)]
     for name in names:
         answers.agent_up(name)
-    answers.ask(names, 0.0, link_up=True)
+    answers.start_tick(names, 0.0, link_up=True)
     answers.late(names[0])  # one of many changes nothing
-    answers.ask(names, 1.0, link_up=True)
+    answers.start_tick(names, 1.0, link_up=True)
     assert answers.deadline_s == pytest.approx(1.0 + DEADLINE_S)
     assert slow_ticks(answers, names, 3, late=False) == pytest.approx(DEADLINE_S)
     assert slow_ticks(answers, names, 1, late=True) == pytest.approx(1.5 * DEADLINE_S)

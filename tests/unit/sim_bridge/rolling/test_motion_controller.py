@@ -68,28 +68,28 @@ def kept(controller: MotionController) -> tuple[object, ...]:
 
 def test_orders_one_after_the_other(controller: MotionController) -> None:
     assert kept(controller) == (None, None, None, frozenset(BEFORE[A]))
-    assert controller.note(PROMISE)
-    assert not controller.note(PROMISE)
-    assert controller.note(ACCEPTANCE)
+    assert controller.store_requests(PROMISE)
+    assert not controller.store_requests(PROMISE)
+    assert controller.store_requests(ACCEPTANCE)
     assert kept(controller) == (MID, MID, pending(A), frozenset(BEFORE[A]))
-    assert controller.note(POSSESSION)
+    assert controller.store_requests(POSSESSION)
     assert kept(controller) == (MID, MID, OPEN, frozenset(AFTER[A]))
-    assert not controller.note(ACCEPTANCE)  # a duplicate opens and closes nothing
+    assert not controller.store_requests(ACCEPTANCE)  # a duplicate opens and closes nothing
     assert kept(controller) == (MID, MID, OPEN, frozenset(AFTER[A]))
 
 
 def test_without_its_deed_a_plan_is_not_accepted(controller: MotionController) -> None:
-    controller.note(order(MID, None, MID))
+    controller.store_requests(order(MID, None, MID))
     assert controller.accepted is None
-    controller.note(order(MID, pending(A, LOW), MID))
+    controller.store_requests(order(MID, pending(A, LOW), MID))
     assert (controller.accepted, controller.transfer) == (None, None)
 
 
 def test_only_the_newest_deed_can_be_opened(controller: MotionController) -> None:
-    controller.note(ACCEPTANCE)
+    controller.store_requests(ACCEPTANCE)
     newer = PendingTransfer(HIGH, BEFORE[A], BEFORE[A], (A,))
-    controller.note(order(HIGH, newer, HIGH))
-    controller.note(POSSESSION)
+    controller.store_requests(order(HIGH, newer, HIGH))
+    controller.store_requests(POSSESSION)
     assert controller.transfer == newer
     assert set(controller.owned) == set(BEFORE[A])
 
@@ -99,26 +99,26 @@ def test_a_promise_binds_this_process_and_the_next(
     controller: MotionController, process: int
 ) -> None:
     """No transfer of less than was promised is drawn up."""
-    controller.note(order(HIGH))
+    controller.store_requests(order(HIGH))
     if process != AGENT:
         controller.put_in_charge(process)
-    controller.note(evolve(ACCEPTANCE, incarnation=process))
+    controller.store_requests(evolve(ACCEPTANCE, incarnation=process))
     assert kept(controller) == (HIGH, None, None, frozenset(BEFORE[A]))
 
 
 def test_a_deed_outlives_the_process_and_its_acceptance_does_not(
     controller: MotionController,
 ) -> None:
-    controller.note(ACCEPTANCE)
+    controller.store_requests(ACCEPTANCE)
     controller.put_in_charge(AGENT + 1)
     assert kept(controller) == (MID, None, pending(A), frozenset(BEFORE[A]))
-    assert not controller.note(POSSESSION)  # of the process that was replaced
+    assert not controller.store_requests(POSSESSION)  # of the process that was replaced
     assert controller.transfer == pending(A)
 
 
 def test_where_formations_own_blocks_acceptance_needs_no_deed() -> None:
     controller = controller_in(HOME, attendant=AGENT)
-    controller.note(order(accepted=MID))
+    controller.store_requests(order(accepted=MID))
     assert (controller.accepted, controller.owned) == (MID, ())
 
 
@@ -130,7 +130,7 @@ def test_any_order_of_one_plan_ends_sound(orders: tuple[Command, ...]) -> None:
     """Possession is said after the acceptance is known to be noted, so it comes last once."""
     controller = make_controller()
     for each in (*orders, ACCEPTANCE, POSSESSION, *orders):
-        controller.note(each)
+        controller.store_requests(each)
         check(controller)
     assert kept(controller) == (MID, MID, OPEN, frozenset(AFTER[A]))
 
@@ -187,7 +187,7 @@ def test_however_orders_arrive_what_is_kept_is_sound(
             controller.put_in_charge(AGENT + 1)
         before = controller.promised, controller.transfer
         if isinstance(each, Command):
-            controller.note(each)
+            controller.store_requests(each)
         else:
             controller.assign_cell(each)
             granted.add(each)
@@ -218,7 +218,7 @@ def test_a_cell_that_comes_at_any_time_is_kept(controller: MotionController, whe
             if (transfer := controller.transfer) is not None and not transfer.open:
                 assert GIVEN in transfer.before
                 assert GIVEN in transfer.after
-        controller.note(each)
+        controller.store_requests(each)
     assert set(controller.owned) == {*AFTER[A], GIVEN}
 
 
@@ -227,14 +227,14 @@ def test_a_cell_that_a_plan_knew_is_not_kept_by_force(when: int, *, opened: bool
     controller = make_controller()
     controller.assign_cell(GIVEN)
     if when:
-        controller.note(PROMISE)
+        controller.store_requests(PROMISE)
     given_away = PendingTransfer(MID, (*BEFORE[A], GIVEN), AFTER[A], (A, B))
-    controller.note(order(MID, given_away, MID))
+    controller.store_requests(order(MID, given_away, MID))
     if opened:
-        controller.note(POSSESSION)
+        controller.store_requests(POSSESSION)
     assert (GIVEN in controller.owned) is not opened
     later = PendingTransfer(HIGH, AFTER[A], AFTER[A], (A,))
-    controller.note(order(HIGH, later, HIGH))
+    controller.store_requests(order(HIGH, later, HIGH))
     assert GIVEN not in controller.owned
 
 
@@ -256,6 +256,6 @@ def test_the_caretaker_hands_cells_over_and_moves_nothing() -> None:
 
 
 def test_the_caretaker_is_bound_by_what_the_agent_promised(controller: MotionController) -> None:
-    controller.note(order(HIGH))
+    controller.store_requests(order(HIGH))
     shown = Caretaker(vehicle_in(HOME, A, controller=controller), AGENT + 1, 0).state(0)
     assert (shown.promised, shown.owned) == (HIGH, tuple(sorted(BEFORE[A])))
